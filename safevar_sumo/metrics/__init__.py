@@ -1,4 +1,4 @@
-"""Safety metrics of method section 4, and those of comfort, by name."""
+"""Metrics by name: the safety metrics of method section 4, and metrics of comfort."""
 
 from safevar_sumo.metrics.base import F_DIFF, F_NUM_DIFF, F_SAFE, Metric, MetricFacts, Objective, Scoring, foreign_metric
 from safevar_sumo.metrics.comfort import BRAKE_HARSHNESS, MAX_JERK, RMS_ACCELERATION
@@ -19,9 +19,9 @@ FURTHER = {metric.name: metric for metric in (
     RMS_ACCELERATION,
     BRAKE_HARSHNESS,
 )}
-"""Metrics that only studies which name them have."""
+"""Metrics that a study has only if it names them."""
 OBJECTIVES = {F_SAFE.name: SAFETY_DEGREE_METRIC, "f_comfort": MAX_JERK}
-"""Metrics by the names of their objectives."""
+"""By name of an objective: the metric that it uses."""
 SAFEVAR = Scoring(metrics=tuple(metric.facts for metric in METRICS.values()), objectives=(F_SAFE, F_DIFF, F_NUM_DIFF))
 """Metrics and objectives of the published study (method sections 3 and 4)."""
 

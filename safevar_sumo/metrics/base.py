@@ -1,4 +1,4 @@
-"""Records of metrics, objectives and scorings, and what metrics share."""
+"""Records of metrics, objectives and scorings, and functions that several metrics use."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from safevar_sumo.plugins import Guard, read_only_copy
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray, SimulationRuns
 from safevar_sumo.study import SAFETY_DEGREE, MetricsTable
 
-ROUNDING = 1e-6
-"""Times with a smaller difference are equal [s]."""
+TIME_TOLERANCE = 1e-6
+"""Largest difference between two times that count as equal [s]."""
 
 
 def sampling_stride(step: float, interval: float | None) -> int:
@@ -29,13 +29,13 @@ def sampling_stride(step: float, interval: float | None) -> int:
     if interval is None:
         return 1
     steps = round(interval / step)
-    if steps < 1 or abs(steps * step - interval) > ROUNDING:
+    if steps < 1 or abs(steps * step - interval) > TIME_TOLERANCE:
         raise InputError("study", f"metrics.sampling_interval = {interval}", f"a whole multiple of the simulation's step, {step:g} s")
     return steps
 
 
 def total(samples: FloatArray) -> FloatArray:
-    """Sum over the first axis in order: numpy's own sum groups by the shape of the array, so results would depend on N."""
+    """Sum over the first axis in order; the order of numpy's own sum depends on the shape, so that results would depend on N."""
     return np.asarray(np.add.accumulate(samples, axis=0)[-1]) if len(samples) else np.zeros(samples.shape[1:])
 
 
@@ -50,7 +50,7 @@ class MetricFacts(Struct, frozen=True, kw_only=True):
     Attributes
     ----------
     name
-        Its column in results, and its name in a study.
+        Name of the metric in a study, and of its column in results.
     title, unit
         Title and unit in tables.
     more_is_unsafe
@@ -60,7 +60,7 @@ class MetricFacts(Struct, frozen=True, kw_only=True):
     description
         One sentence.
     head
-        Heading of a column, by default title and unit.
+        Heading of the metric's column in tables, by default title and unit.
     """
 
     name: Name
@@ -73,14 +73,14 @@ class MetricFacts(Struct, frozen=True, kw_only=True):
 
     @property
     def heading(self) -> str:
-        """Title and unit."""
+        """`head`, by default title and unit."""
         return self.head or (self.title if self.unit == "-" else f"{self.title}, {self.unit}")
 
 
 class Metric(MetricFacts, frozen=True, kw_only=True):
     """A metric: `function` takes N simulation runs and thresholds and returns an array of shape (N,), NaN where it is undefined.
 
-    Element i depends on run i alone, to the bit.
+    Element i depends, to the bit, on run i only.
     """
 
     function: MetricFunction
@@ -100,32 +100,32 @@ def without_collision(runs: SimulationRuns, values: FloatArray) -> FloatArray:
 
 
 def foreign_metric(metric: Any, guard: Guard) -> Metric:
-    """A metric from outside: its record and its results are checked, its function gets read-only copies.
+    """A metric from outside the package with its record checked; each call gives it read-only copies and checks its values.
 
     Raises
     ------
     InputError
-        If it is not a valid record of a metric.
+        If `metric` is not a valid record of a metric.
     """
-    legal = "a safevar_sumo.metrics.Metric(name=..., title=..., unit=..., more_is_unsafe=..., function=...)"
+    expected = "a safevar_sumo.metrics.Metric(name=..., title=..., unit=..., more_is_unsafe=..., function=...)"
     if not isinstance(metric, Metric):
-        raise InputError(guard.source, f"{guard.name} is of type {type(metric).__name__}, not Metric", legal)
+        raise InputError(guard.source, f"{guard.name} is of type {type(metric).__name__}, not Metric", expected)
     if not callable(metric.function):
         raise InputError(guard.source, f"{guard.name}: function = {metric.function!r}", "a function of simulation runs and thresholds")
     try:
         facts = msgspec.convert(msgspec.to_builtins(metric.facts), MetricFacts)
     except (msgspec.ValidationError, TypeError) as error:
-        raise InputError(guard.source, f"{guard.name}: {error}", legal) from None
+        raise InputError(guard.source, f"{guard.name}: {error}", expected) from None
 
-    def checked(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
+    def guarded_function(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
         values = guard.call(facts.name, metric.function, read_only_copy(runs), thresholds)
         return guard.numbers(facts.name, "values", values, (len(runs.outcome),), undefined=True)
 
-    return Metric(**{name: getattr(facts, name) for name in MetricFacts.__struct_fields__}, function=checked)
+    return Metric(**{name: getattr(facts, name) for name in MetricFacts.__struct_fields__}, function=guarded_function)
 
 
 class Objective(Struct, frozen=True, kw_only=True):
-    """A column of results that is minimised, or `maximised`."""
+    """A column of results that a search minimises, or maximises if `maximised` is true."""
 
     name: str
     title: str
@@ -141,22 +141,22 @@ class Objective(Struct, frozen=True, kw_only=True):
 
     @property
     def sign(self) -> float:
-        """Factor on its values with which smaller is better."""
+        """Factor on the objective's values after which smaller values are better."""
         return -1.0 if self.maximised else 1.0
 
 
 class Scoring(Struct, frozen=True, kw_only=True):
-    """The metrics of a study and the objectives of its searches; results keep it beside the study."""
+    """The metrics of a study and the objectives of its searches; stored in results beside the study."""
 
     metrics: tuple[MetricFacts, ...]
     objectives: tuple[Objective, ...]
 
     def values(self, evaluations: Evaluations) -> FloatArray:
-        """The objectives, all to be minimised, shape (M, objectives)."""
+        """Values of the objectives, smaller being better; shape (M, objectives)."""
         return np.stack([objective.sign * evaluations.column(objective.name) for objective in self.objectives], axis=1)
 
     def valid(self, evaluations: Evaluations) -> BoolArray:
-        """Where the simulation succeeded and every objective is defined; shape (M,)."""
+        """Whether the simulation succeeded and every objective is defined; shape (M,)."""
         return np.asarray(evaluations.valid & np.isfinite(self.values(evaluations)).all(axis=1))
 
     def metric(self, name: str) -> MetricFacts:

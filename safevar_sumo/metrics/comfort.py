@@ -1,4 +1,4 @@
-"""Longitudinal comfort of the occupants: jerk, weighted acceleration, harsh braking. Only studies that name the metrics have them."""
+"""Metrics of longitudinal comfort: jerk, weighted acceleration, harsh braking. A study has these metrics only if it names them."""
 
 from __future__ import annotations
 
@@ -13,32 +13,32 @@ from safevar_sumo.study import MetricsTable
 JERK_TIME = 1.0
 """Time over which jerk is averaged [s], as in ISO 15622 (adaptive cruise control), which allows 2.5 m/s^3 above 20 m/s."""
 BRAKING_TIME = 0.5
-"""Time over which a deceleration is averaged [s]: half a second, as for accelerations in UN R79."""
+"""Time over which a deceleration is averaged [s], as for accelerations in UN R79."""
 HIGH_PASS, TRANSITION, TRANSITION_QUALITY = 0.4, 2.0, 0.63
 """W_d of ISO 2631-1, annex A: f_1 and f_3 = f_4 [Hz], Q_4 [-]; the high pass is Butterworth's."""
 
 
-class _Biquad(NamedTuple):
-    """A second-order filter; coefficients from the latest sample to the oldest, the first one of the output being 1."""
+class _BiquadFilter(NamedTuple):
+    """A second-order filter; coefficients from the latest sample to the oldest; the output's first coefficient is 1 and not stored."""
 
-    of_input: tuple[float, float, float]
-    of_output: tuple[float, float]
+    input_coefficients: tuple[float, float, float]
+    output_coefficients: tuple[float, float]
 
     @classmethod
-    def bilinear(cls, numerator: tuple[float, float, float], denominator: tuple[float, float, float], step: float) -> _Biquad:
-        """The filter with a transfer function in s, highest power first, by Tustin's rule."""
+    def bilinear(cls, numerator: tuple[float, float, float], denominator: tuple[float, float, float], step: float) -> _BiquadFilter:
+        """The filter with a transfer function in s, by Tustin's rule; coefficients of polynomials from the highest power."""
         k = 2 / step
 
         def in_z(polynomial: tuple[float, float, float]) -> tuple[float, float, float]:
             a, b, c = polynomial
             return a * k * k + b * k + c, 2 * (c - a * k * k), a * k * k - b * k + c
 
-        first, *rest = in_z(denominator)
+        leading, *outputs = in_z(denominator)
         inputs = in_z(numerator)
-        return cls((inputs[0] / first, inputs[1] / first, inputs[2] / first), (rest[0] / first, rest[1] / first))
+        return cls((inputs[0] / leading, inputs[1] / leading, inputs[2] / leading), (outputs[0] / leading, outputs[1] / leading))
 
     def apply(self, samples: FloatArray) -> FloatArray:
-        """Filter samples along the first axis, from rest; one operation after the other, so that results do not depend on N."""
+        """Filter samples along the first axis, from rest, sample by sample, so that results do not depend on N."""
         (b0, b1, b2), (a1, a2) = self
         result = np.zeros_like(samples)
         x1 = x2 = y1 = y2 = np.zeros(samples.shape[1:])
@@ -51,12 +51,12 @@ class _Biquad(NamedTuple):
 def weighted(acceleration: FloatArray, step: float) -> FloatArray:
     """Acceleration along the vehicle, weighted with W_d of ISO 2631-1 [m/s^2], shape (T, N).
 
-    The low pass at 100 Hz is left out: samples of a simulation hold no frequencies above half their rate.
+    The low pass at 100 Hz is omitted, since the samples of a simulation contain no frequencies above half the sampling rate.
     """
-    high, transition = 2 * np.pi * HIGH_PASS, 2 * np.pi * TRANSITION
-    high_pass = _Biquad.bilinear((1.0, 0.0, 0.0), (1.0, float(np.sqrt(2.0)) * high, high * high), step)
-    weighting = _Biquad.bilinear((0.0, transition, transition * transition),
-                              (1.0, transition / TRANSITION_QUALITY, transition * transition), step)
+    high_pass_rate, transition = 2 * np.pi * HIGH_PASS, 2 * np.pi * TRANSITION
+    high_pass = _BiquadFilter.bilinear((1.0, 0.0, 0.0), (1.0, float(np.sqrt(2.0)) * high_pass_rate, high_pass_rate * high_pass_rate), step)
+    weighting = _BiquadFilter.bilinear((0.0, transition, transition * transition),
+                                       (1.0, transition / TRANSITION_QUALITY, transition * transition), step)
     return weighting.apply(high_pass.apply(acceleration))
 
 
@@ -84,12 +84,13 @@ def brake_harshness(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArra
 
 
 def _accelerations(runs: SimulationRuns) -> tuple[FloatArray, BoolArray]:
-    """Acceleration between two samples [m/s^2], shape (T - 1, N), and where both samples count."""
+    """Acceleration between two of the T samples [m/s^2], and whether both samples count; shape (T - 1, N) each."""
     return np.diff(runs.trace.speed, axis=0) / runs.trace.step, runs.trace.active[1:]
 
 
-def _steps(time: float, step: float, most: int) -> int:
-    return max(1, min(round(time / step), most))
+def _steps(time: float, step: float, step_count: int) -> int:
+    """Number of steps in a time [s], from 1 to `step_count`."""
+    return max(1, min(round(time / step), step_count))
 
 
 MAX_JERK = Metric(

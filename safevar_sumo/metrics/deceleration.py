@@ -10,19 +10,19 @@ from safevar_sumo.study import MetricsTable
 
 
 def average_deceleration(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
-    """Mean loss of speed per time over the samples in which the brake is commanded and the vehicle moves.
+    """Mean deceleration over the samples in which the brake is commanded and the vehicle moves [m/s^2].
 
-    In m/s^2, positive when slowing down; shape (N,); NaN for a vehicle that never braked.
+    Positive for a loss of speed; shape (N,); NaN for a vehicle that never braked.
     """
     stride = sampling_stride(runs.trace.step, thresholds.sampling_interval)
     interval = stride * runs.trace.step
     speed, active = runs.trace.speed[::stride], runs.trace.active[::stride]
     braking = active & (runs.trace.brake[::stride] > 0) & (np.abs(speed) > STANDSTILL)
     decelerations = (speed[:-1] - speed[1:]) / interval
-    counts = braking[1:]
-    number = np.count_nonzero(counts, axis=0)
-    summed = total(np.where(counts, decelerations, 0.0))
-    return np.asarray(np.divide(summed, number, out=np.full_like(summed, np.nan), where=number > 0))
+    is_counted = braking[1:]
+    number = np.count_nonzero(is_counted, axis=0)
+    deceleration_sum = total(np.where(is_counted, decelerations, 0.0))
+    return np.asarray(np.divide(deceleration_sum, number, out=np.full_like(deceleration_sum, np.nan), where=number > 0))
 
 
 AVE_DECE = Metric(

@@ -14,10 +14,10 @@ def safety_degree(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
 
     Shape (N,); NaN where there was neither an encounter nor a collision.
     """
-    counts = runs.trace.active & runs.encounter.in_conflict
-    least = np.min(np.where(counts, runs.encounter.separation, np.inf), axis=0)
-    least = np.where(np.isfinite(least), least, np.nan)
-    return np.where(np.isnan(runs.collision_speed), least, -runs.collision_speed)
+    is_counted = runs.trace.active & runs.encounter.in_conflict
+    least_separation = np.min(np.where(is_counted, runs.encounter.separation, np.inf), axis=0)
+    least_separation = np.where(np.isfinite(least_separation), least_separation, np.nan)
+    return np.where(np.isnan(runs.collision_speed), least_separation, -runs.collision_speed)
 
 
 SAFETY_DEGREE_METRIC = Metric(

@@ -10,32 +10,32 @@ from safevar_sumo.study import MetricsTable
 
 
 def time_to_collision(runs: SimulationRuns) -> FloatArray:
-    """TTC(t) = L_s / v_L, distance projected over closing speed [s]; shape (T, N).
+    """TTC(t) = L_s / v_L, the projected distance divided by the closing speed [s]; shape (T, N).
 
     Infinite while the distance does not shrink, outside the encounter, and once the vehicle has stopped after moving.
     """
-    moved = np.logical_or.accumulate(runs.trace.speed > STANDSTILL, axis=0)
-    stood = np.logical_or.accumulate(moved & (runs.trace.speed <= STANDSTILL), axis=0)
-    closing, distance = runs.encounter.closing_speed, runs.encounter.distance
-    counts = runs.trace.active & runs.encounter.in_conflict & ~stood & (closing > 0) & (distance >= 0)
-    return np.divide(distance, closing, out=np.full_like(distance, np.inf), where=counts)
+    has_moved = np.logical_or.accumulate(runs.trace.speed > STANDSTILL, axis=0)
+    has_stopped = np.logical_or.accumulate(has_moved & (runs.trace.speed <= STANDSTILL), axis=0)
+    closing_speed, distance = runs.encounter.closing_speed, runs.encounter.distance
+    is_counted = runs.trace.active & runs.encounter.in_conflict & ~has_stopped & (closing_speed > 0) & (distance >= 0)
+    return np.divide(distance, closing_speed, out=np.full_like(distance, np.inf), where=is_counted)
 
 
 def time_exposed(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
     """TET* = sum of dt over the samples with 0 <= TTC(t) <= TTC* [s]; shape (N,), NaN on a collision."""
-    critical, interval = _critical(runs, thresholds)
-    return without_collision(runs, np.round(np.count_nonzero(np.isfinite(critical), axis=0) * interval, TIME_DECIMALS))
+    critical_ttc, interval = _critical_ttc(runs, thresholds)
+    return without_collision(runs, np.round(np.count_nonzero(np.isfinite(critical_ttc), axis=0) * interval, TIME_DECIMALS))
 
 
 def time_integrated(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
-    """TIT* = sum of (TTC* - TTC(t)) dt over the same samples [s^2]; shape (N,), NaN on a collision."""
-    critical, interval = _critical(runs, thresholds)
-    deficit = np.where(np.isfinite(critical), thresholds.ttc_threshold - critical, 0.0)
+    """TIT* = sum of (TTC* - TTC(t)) dt over the samples of TET* [s^2]; shape (N,), NaN on a collision."""
+    critical_ttc, interval = _critical_ttc(runs, thresholds)
+    deficit = np.where(np.isfinite(critical_ttc), thresholds.ttc_threshold - critical_ttc, 0.0)
     return without_collision(runs, total(deficit) * interval)
 
 
-def _critical(runs: SimulationRuns, thresholds: MetricsTable) -> tuple[FloatArray, float]:
-    """TTC where it is critical, infinite elsewhere, at the samples; and the time between two samples."""
+def _critical_ttc(runs: SimulationRuns, thresholds: MetricsTable) -> tuple[FloatArray, float]:
+    """TTC at every sample, infinite where it is not critical; and the time between two samples [s]."""
     stride = sampling_stride(runs.trace.step, thresholds.sampling_interval)
     ttc = time_to_collision(runs)[::stride]
     return np.where(ttc <= thresholds.ttc_threshold, ttc, np.inf), stride * runs.trace.step

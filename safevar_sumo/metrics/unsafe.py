@@ -1,4 +1,4 @@
-"""Criteria for unsafe: a collision, a safety degree below a limit, or lost points of a rating."""
+"""Criteria of an unsafe vehicle: a collision, a safety degree below a limit, or lost points of a rating."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ if TYPE_CHECKING:
 
 EXPECTED = "collision, points=X with X points of a rating, or below=X with a safety degree X [m, or minus a collision's speed in m/s]"
 COLLISION = str(Outcome.COLLISION)
-HALF, DIGITS = 0.5, 6
-"""Share of the original's safety degree below which a vehicle is unsafe if nothing collides, and significant digits of that limit."""
-LOSS, DECIMALS = 1.0, 6
-"""Loss of points from which on a vehicle is unsafe in a rated study, and decimals of points."""
+DEGREE_SHARE, LIMIT_DIGITS = 0.5, 6
+"""The default limit if nothing collides: this share of the original's safety degree, to this many significant digits."""
+POINT_LOSS, POINT_DECIMALS = 1.0, 6
+"""The default limit in a rated study: the original's points minus this loss, to this many decimals."""
 
 
 @dataclass(frozen=True)
 class Unsafe:
-    """A criterion: a collision; with `below`, a safety degree below it [m, or -m/s]; with `points`, at most so many points of a rating."""
+    """A criterion: a collision; with `below`, a safety degree below this limit [m, or -m/s]; with `points`, at most that many points."""
 
     below: float | None = None
     points: float | None = None
@@ -59,7 +59,7 @@ class Unsafe:
         return outcome == COLLISION if self.below is None else column(F_SAFE.name) < self.below
 
     def margin(self, evaluations: Evaluations) -> FloatArray:
-        """Margin of evaluations above the limit, in its unit, shape (M,); for collisions the limit is a safety degree of 0."""
+        """Margin of evaluations above the limit, in the limit's unit; shape (M,). For collisions the limit is a safety degree of 0."""
         if self.points is not None:
             return evaluations.column(RATING_POINTS.name) - self.points
         return evaluations.f_safe - (self.below or 0.0)
@@ -90,36 +90,37 @@ class Unsafe:
     def default(cls, original: Mapping[str, Any], outcomes: Any) -> Unsafe:
         """The criterion if none is stated.
 
-        In a rated study a vehicle is unsafe that has lost at least one of the original's points. Otherwise the criterion is a
-        collision if any vehicle collides or the original has no safety degree to halve; else a safety degree below half of the original's.
+        In a rated study, a vehicle is unsafe if it has lost at least one of the original's points. In other studies the criterion is a
+        collision if any vehicle collides or the original has no safety degree to halve; otherwise, a safety degree below half of the
+        original's safety degree.
 
         Parameters
         ----------
         original
-            The original vehicle's metrics by name; an undefined one is NaN or None.
+            The original vehicle's metrics by name; an undefined metric is NaN or None.
         outcomes
             Outcomes of the other vehicles, as an array or a column of `Outcome`.
         """
         points, degree = original.get(RATING_POINTS.name), original.get(SAFETY_DEGREE) or 0.0
         if points is not None:
-            return cls(points=round(points - LOSS, DECIMALS))
+            return cls(points=round(points - POINT_LOSS, POINT_DECIMALS))
         if (outcomes == COLLISION).any() or not degree > 0:
             return cls()
-        return cls(float(f"{HALF * degree:.{DIGITS}g}"))
+        return cls(float(f"{DEGREE_SHARE * degree:.{LIMIT_DIGITS}g}"))
 
     @classmethod
     def default_among(cls, evaluations: Evaluations, original: Evaluations) -> Unsafe:
-        """The default among evaluated vehicles, the original one included.
+        """The default criterion for evaluated vehicles together with the original vehicle.
 
         Raises
         ------
         InputError
-            If nothing can be unsafe by that criterion.
+            If no vehicle can be unsafe by this criterion.
         """
         outcomes = np.concatenate([original.outcome, evaluations.outcome])
         unsafe = cls.default({name: float(values[0]) for name, values in original.metrics.items()}, outcomes)
         if unsafe.points is not None and unsafe.points < 0:
-            raise InputError("unsafe", f"the original vehicle earns {unsafe.points + LOSS:g} points and has none to lose", EXPECTED)
+            raise InputError("unsafe", f"the original vehicle earns {unsafe.points + POINT_LOSS:g} points and has none to lose", EXPECTED)
         if unsafe == cls() and not (outcomes == COLLISION).any():
             raise InputError("unsafe", "nothing collides, and the original vehicle has no safety degree to halve", EXPECTED)
         return unsafe

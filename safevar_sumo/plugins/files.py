@@ -1,7 +1,7 @@
-"""Files that results depend on: those that code from outside reads, and their digests by names that are the same on every machine.
+"""Files that results depend on: the files that code from outside the package reads, and digests by names equal on every machine.
 
 The interpreter raises an audit event for every file that Python code opens and for every module that is loaded. Compiled code
-raises none: files that a study's parameters name count in any case.
+raises no event: files that a study's parameters name always count.
 """
 
 from __future__ import annotations
@@ -23,34 +23,34 @@ from safevar_sumo.shipped import NETWORKS, PACKAGE, STUDIES
 DIGITS = 16
 """Length of a file's digest."""
 Files = dict[str, str]
-"""Digests of files by their names."""
-LIBRARIES = ("site-packages", "dist-packages")
-"""Names of folders of installed libraries, wherever they lie."""
-NOT_FOREIGN = tuple(f"{place}{os.sep}" for place in sorted({
+"""Digests of files by the names that `digests` gives them."""
+LIBRARY_FOLDERS = ("site-packages", "dist-packages")
+"""Names of folders of installed libraries; such folders may be anywhere."""
+KNOWN_FOLDERS = tuple(f"{folder}{os.sep}" for folder in sorted({
     str(PACKAGE), str(STUDIES), str(NETWORKS),
     *(os.path.realpath(sysconfig.get_path(name)) for name in ("stdlib", "platstdlib", "purelib", "platlib")),
     *(os.path.realpath(os.path.join(prefix, name)) for prefix in (sys.prefix, sys.base_prefix, "/", "/usr", "/usr/local")
       for name in ("bin", "etc", "include", "lib", "lib64", "sbin", "share")),
     "/dev", "/proc", "/sys", "/System", "/Library", os.environ.get("SYSTEMROOT", "/dev")}))
-"""Folders of this package, the interpreter, installed libraries and the operating system (devices, fonts, time zones)."""
-CACHES = ("__pycache__", ".cache", ".config")
-"""Names of folders with programs' own caches and settings."""
-WRITES = os.O_WRONLY | os.O_CREAT | os.O_TRUNC
-"""Flags of a file opened only for writing; a file opened for reading and writing counts as read."""
+"""Folders of this package, the interpreter, installed libraries and the operating system: the code in them is not foreign."""
+CACHE_FOLDERS = ("__pycache__", ".cache", ".config")
+"""Names of folders in which programs keep caches and settings."""
+WRITE_FLAGS = os.O_WRONLY | os.O_CREAT | os.O_TRUNC
+"""Flags of a file that is opened for writing only; a file opened for reading and writing counts as read."""
 
 
 class Reading:
-    """Absolute `paths` of the files that code from outside opened for reading, and names of the `modules` that it loaded."""
+    """Absolute `paths` of the files that code from outside opened for reading, and names of the `modules` that this code loaded."""
 
     def __init__(self) -> None:
         self.paths: set[str] = set()
         self.modules: set[str] = set()
 
     def files(self, packages: Sequence[str] = ()) -> set[str]:
-        """Every input file: sources in place of Python's caches; of installed packages only those named in `packages`."""
+        """Every input file: sources in place of Python's caches; files of an installed package only if `packages` names the package."""
         installed = {file for name in list(sys.modules) if name.partition(".")[0] in packages and not is_foreign(file := _file_of(name))}
         files = {*self.paths, *map(_file_of, self.modules), *installed} - {""}
-        return {path for path in map(_source_of, files) if _counts(path, packages)}
+        return {path for path in map(_source_of, files) if _is_input(path, packages)}
 
 
 def _file_of(module: str) -> str:
@@ -58,17 +58,17 @@ def _file_of(module: str) -> str:
 
 
 class _Watch:
-    """State of the process's one audit hook, which cannot be removed.
+    """State of the process's only audit hook, which cannot be removed.
 
-    `inside` counts the calls of code from outside under way; `written` are files that it wrote, which are no inputs; `imported` are
-    names of all modules that it has loaded.
+    `call_depth` is the number of calls of code from outside under way; `written_files` are files that such code wrote, hence no inputs;
+    `imported_modules` are the names of all modules that such code has loaded.
     """
 
     def __init__(self) -> None:
-        self.inside, self._hooked = 0, False
+        self.call_depth, self._hooked = 0, False
         self.readings: list[Reading] = []
-        self.written: set[str] = set()
-        self.imported: set[str] = set()
+        self.written_files: set[str] = set()
+        self.imported_modules: set[str] = set()
 
     def hook(self) -> None:
         if not self._hooked:
@@ -76,13 +76,13 @@ class _Watch:
             self._hooked = True
 
     def _note(self, event: str, arguments: tuple[Any, ...]) -> None:
-        if not self.inside or event not in ("open", "import", "ctypes.dlopen", "sqlite3.connect"):
+        if not self.call_depth or event not in ("open", "import", "ctypes.dlopen", "sqlite3.connect"):
             return
         target = arguments[0]
         if event == "import":
-            self.imported.add(target)
-            for one in self.readings:
-                one.modules.add(target)
+            self.imported_modules.add(target)
+            for reading in self.readings:
+                reading.modules.add(target)
             target = arguments[1]
         if not isinstance(target, str | bytes | os.PathLike):
             return
@@ -90,11 +90,11 @@ class _Watch:
         if event == "sqlite3.connect" and path.startswith("file:"):
             path = unquote(urlsplit(path).path)
         path = os.path.abspath(path)
-        if event == "open" and isinstance(arguments[2], int) and arguments[2] & WRITES:
-            self.written.add(path)
+        if event == "open" and isinstance(arguments[2], int) and arguments[2] & WRITE_FLAGS:
+            self.written_files.add(path)
             return
-        for one in self.readings:
-            one.paths.add(path)
+        for reading in self.readings:
+            reading.paths.add(path)
 
 
 watch = _Watch()
@@ -109,12 +109,12 @@ def noted_reading() -> Iterator[Reading]:
     try:
         yield reading
     finally:
-        watch.readings[:] = [one for one in watch.readings if one is not reading]
+        watch.readings[:] = [other for other in watch.readings if other is not reading]
 
 
 def is_foreign(path: str) -> bool:
-    """Whether a file is neither the interpreter's, nor an installed library's, nor of this package, nor the system's."""
-    return not path.startswith(NOT_FOREIGN) and not any(name in Path(path).parts for name in LIBRARIES)
+    """Whether a file lies outside the interpreter, installed libraries, this package and the operating system."""
+    return not path.startswith(KNOWN_FOLDERS) and not any(name in Path(path).parts for name in LIBRARY_FOLDERS)
 
 
 def _source_of(path: str) -> str:
@@ -125,21 +125,21 @@ def _source_of(path: str) -> str:
     return path
 
 
-def _counts(path: str, packages: Sequence[str]) -> bool:
+def _is_input(path: str, packages: Sequence[str]) -> bool:
     parts = Path(path).parts
-    if path in watch.written or any(name in parts for name in CACHES) or not os.path.isfile(path):
+    if path in watch.written_files or any(name in parts for name in CACHE_FOLDERS) or not os.path.isfile(path):
         return False
-    return is_foreign(path) or any(parts[parts.index(name) + 1].partition(".")[0] in packages for name in LIBRARIES if name in parts)
+    return is_foreign(path) or any(parts[parts.index(name) + 1].partition(".")[0] in packages for name in LIBRARY_FOLDERS if name in parts)
 
 
 def digest_of(path: Path | str) -> str:
     """Digest of a file's content; "" for a missing file.
 
-    A Python file counts as its syntax tree without docstrings, any other file as its content without differences in line ends.
+    The digest of a Python file covers its syntax tree without docstrings; any other digest does not depend on the kind of line ends.
     """
     try:
-        at = os.stat(path)
-        return _digest(str(path), at.st_mtime_ns, at.st_size, at.st_ino)
+        status = os.stat(path)
+        return _digest(str(path), status.st_mtime_ns, status.st_size, status.st_ino)
     except OSError:
         return ""
 
@@ -149,17 +149,17 @@ def _digest(path: str, *_: int) -> str:
     """Digest of a file, cached by its time, size and inode."""
     content = Path(path).read_bytes()
     if path.endswith(".py"):
-        with suppress(SyntaxError, ValueError, RecursionError):  # invalid Python counts as it is
-            content = "".join(_tree(ast.parse(content))).encode()
+        with suppress(SyntaxError, ValueError, RecursionError):  # the digest of invalid Python covers the file's content
+            content = "".join(_syntax_text(ast.parse(content))).encode()
     return sha256(content.replace(b"\r\n", b"\n")).hexdigest()[:DIGITS]
 
 
-def _tree(node: Any) -> Iterator[str]:
-    """A syntax tree without positions and docstrings as text, the same in all versions of Python."""
+def _syntax_text(node: Any) -> Iterator[str]:
+    """Pieces of text that describe a syntax tree without positions and docstrings, equal in all versions of Python."""
     if isinstance(node, list):
         yield "["
-        for one in node:
-            yield from _tree(one)
+        for child in node:
+            yield from _syntax_text(child)
             yield ","
         yield "]"
     elif isinstance(node, ast.Constant):
@@ -171,7 +171,7 @@ def _tree(node: Any) -> Iterator[str]:
                 value = value[1:] if _is_docstring(value) else value
             if value is not None and value != [] and name not in ("type_comment", "type_ignores"):
                 yield f"{name}="
-                yield from _tree(value)
+                yield from _syntax_text(value)
         yield ")"
     else:
         yield repr(node)
@@ -187,7 +187,7 @@ def digests(paths: Iterable[str], places: Sequence[str]) -> Files:
     Parameters
     ----------
     places
-        The folders of the study's file and of those that it extends.
+        The folders of the study's file and of the files that it extends.
     """
     named: dict[str, str] = {}
     for path in sorted(paths):
@@ -197,16 +197,16 @@ def digests(paths: Iterable[str], places: Sequence[str]) -> Files:
     return {name: digest_of(path) for name, path in sorted(named.items())}
 
 
-def _name_of(path: str, places: Sequence[str], more: int = 0) -> str:
-    """A file's path relative to the first place that holds it; without one, its last two parts, and `more`."""
+def _name_of(path: str, places: Sequence[str], extra_parts: int = 0) -> str:
+    """A file's path relative to the first of `places` that contains the file; if none does, the path's last 2 + `extra_parts` parts."""
     for root in (*places, *_roots()):
-        if not more and Path(path).is_relative_to(root):
+        if not extra_parts and Path(path).is_relative_to(root):
             return Path(path).relative_to(root).as_posix()
-    return Path(*Path(path).parts[-2 - more:]).as_posix()
+    return Path(*Path(path).parts[-2 - extra_parts:]).as_posix()
 
 
 def located(name: str, places: Sequence[str]) -> str:
-    """The file of that name; "" if there is none."""
+    """The file with the name that `digests` gives it; "" if there is no such file."""
     return next((str(path) for root in (*places, *_roots()) if (path := Path(root, name)).is_file()), "")
 
 
@@ -216,20 +216,20 @@ def changed_files(before: Mapping[str, str], now: Mapping[str, str]) -> list[str
 
 
 def named_files(value: Any, places: Sequence[str]) -> Iterator[str]:
-    """Files beside a study's file named by texts anywhere in a value."""
+    """Files beside a study's file whose names occur as texts anywhere in a value."""
     if isinstance(value, dict):
         value = list(value.values())
     if isinstance(value, list | tuple):
-        for one in value:
-            yield from named_files(one, places)
+        for item in value:
+            yield from named_files(item, places)
     elif isinstance(value, str):
-        path = beside(value, places or (os.getcwd(),))
+        path = file_beside(value, places or (os.getcwd(),))
         if path:
             yield path
 
 
-def beside(text: str, places: Sequence[str]) -> str:
-    """The file named by a text, relative to the folder of the study's file or of a file that it extends; "" if there is none."""
+def file_beside(text: str, places: Sequence[str]) -> str:
+    """The file that a text names, relative to the folder of the study's file or of a file that it extends; "" if there is none."""
     try:
         return next((os.path.abspath(path) for place in places if (path := Path(place, text)).is_file()), "")
     except (OSError, ValueError):  # the text is no path

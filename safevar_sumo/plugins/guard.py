@@ -1,4 +1,4 @@
-"""User code: the contracts of its classes, the guard that calls it, and checks of its results."""
+"""The contracts of users' classes, the guard that calls users' code, and checks of the results."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from safevar_sumo.errors import ForeignError, InputError, in_one_line
 from safevar_sumo.plugins.files import watch
 from safevar_sumo.records import BoolArray, FloatArray
 
-_OURS = str(Path(__file__).resolve().parents[1])
-_IMPORTS = str(Path(importlib.__file__).parent)
-INSTALLED = "site-packages"
-INFINITE = float("inf")
+_PACKAGE_FOLDER = str(Path(__file__).resolve().parents[1])
+_IMPORTLIB_FOLDER = str(Path(importlib.__file__).parent)
+LIBRARY_FOLDER = "site-packages"
+INFINITY = float("inf")
 
 
 class Contract(NamedTuple):
@@ -31,13 +31,13 @@ class Contract(NamedTuple):
     Attributes
     ----------
     title
-        What an instance is, such as "an ADS".
+        Words for an instance, such as "an ADS".
     methods, optional
-        The parameters of every required method, and of every optional one.
+        By name of a required or an optional method: the method's parameters.
     attributes
         Attributes of an instance besides its methods.
     base
-        The class that it must derive from, if there is one.
+        The class that a user's class must derive from, if any.
     """
 
     title: str
@@ -48,7 +48,7 @@ class Contract(NamedTuple):
 
     @classmethod
     def of(cls, protocol: type, title: str, optional: Iterable[str] = ()) -> Self:
-        """The public methods and annotated attributes of a protocol or base class; those in `optional` may be missing."""
+        """The public methods and annotated attributes of a protocol or base class; methods named in `optional` may be missing."""
         methods = {name: _required_parameters(member) for name, member in vars(protocol).items()
                    if not name.startswith("_") and inspect.isfunction(member)}
         return cls(title, {name: parameters for name, parameters in methods.items() if name not in optional},
@@ -60,7 +60,7 @@ class Contract(NamedTuple):
         return self.base is None or (inspect.isclass(candidate) and issubclass(candidate, self.base))
 
     def violation(self, candidate: Any) -> str:
-        """The reason why `candidate` does not meet the contract, by inspection alone; "" if it does."""
+        """The reason why `candidate` does not meet the contract, found by inspection only; "" if `candidate` meets it."""
         if not inspect.isclass(candidate):
             kind = "module" if inspect.ismodule(candidate) else "function" if callable(candidate) else f"value of type {_type(candidate)}"
             return f"is a {kind}, not a class"
@@ -73,8 +73,8 @@ class Contract(NamedTuple):
                 return f"has no method {name}({signature})"
             if not callable(member):
                 return f"has {name} = {member!r} instead of a method {name}({signature})"
-            itself = 1 if inspect.isfunction(inspect.getattr_static(candidate, name)) else 0
-            if not accepts(member, itself + len(parameters)):
+            self_count = 1 if inspect.isfunction(inspect.getattr_static(candidate, name)) else 0
+            if not accepts(member, self_count + len(parameters)):
                 return f"has a method {name} that does not take ({signature})"
         return ""
 
@@ -93,7 +93,7 @@ def _required_parameters(method: Any) -> tuple[str, ...]:
 
 
 def accepts(function: Any, number: int) -> bool:
-    """Whether a function can be called with that many positional arguments; True where it has no signature."""
+    """Whether a function can be called with `number` positional arguments; True if the function has no signature."""
     try:
         inspect.signature(function).bind(*[None] * number)
     except TypeError:
@@ -104,7 +104,7 @@ def accepts(function: Any, number: int) -> bool:
 
 
 def read_only_copy(value: Any) -> Any:
-    """A copy of a record and of the records in it, in which every array is a read-only copy."""
+    """A deep copy of a record in which every array is read-only."""
     if isinstance(value, np.ndarray):
         copy = value.copy()
         copy.flags.writeable = False
@@ -121,7 +121,7 @@ def read_only_copy(value: Any) -> Any:
 
 @contextmanager
 def guard_process_state(source: str, names: Sequence[str]) -> Iterator[None]:
-    """Restore the working directory, environment variables and numpy's error state after the plug-ins `names`, if there are any."""
+    """Restore the working directory, environment variables and numpy's error state after a block; nothing without plug-ins in `names`."""
     if not names:
         yield
         return
@@ -137,7 +137,7 @@ def guard_process_state(source: str, names: Sequence[str]) -> Iterator[None]:
 
 
 class Guard(NamedTuple):
-    """Calls a plug-in and checks what it returns.
+    """Calls a plug-in and checks the results.
 
     Attributes
     ----------
@@ -146,7 +146,7 @@ class Guard(NamedTuple):
     name
         The plug-in as the study names it, such as `ads.model = 'my_ads:Careful'`.
     folder
-        Folder of the plug-in's sources; an error names the innermost line in it.
+        Folder of the plug-in's sources; an error names the innermost line in this folder.
     target
         The class, function or record; the error for a wrong result names the line where the method begins.
     """
@@ -164,7 +164,7 @@ class Guard(NamedTuple):
         ForeignError
             If the function raises anything, `SystemExit` included.
         """
-        watch.inside += 1
+        watch.call_depth += 1
         try:
             return function(*arguments)
         except ForeignError:
@@ -172,23 +172,23 @@ class Guard(NamedTuple):
         except (Exception, SystemExit) as error:
             raise self.failed(method, error) from error
         finally:
-            watch.inside -= 1
+            watch.call_depth -= 1
 
     def failed(self, method: str, error: BaseException) -> ForeignError:
         """The error for an exception that the plug-in raised."""
-        place = self._place(error)
-        problem = f"{self.name} raised in {method}: {in_one_line(error)}{f' ({place})' if place else ''}"
+        location = self._location(error)
+        problem = f"{self.name} raised in {method}: {in_one_line(error)}{f' ({location})' if location else ''}"
         return ForeignError(self.source, problem, error.legal if isinstance(error, InputError) else "")
 
-    def wrong(self, method: str, part: str, got: object, expected: str) -> ForeignError:
-        """The error for a wrong part of a result."""
-        return self._returned(f"{part} = {_short(got)}", method, expected)
+    def wrong(self, method: str, part: str, value: object, expected: str) -> ForeignError:
+        """The error for a result whose part `part` has a wrong value."""
+        return self._returned(f"{part} = {_short(value)}", method, expected)
 
-    def _returned(self, what: str, method: str, expected: str) -> ForeignError:
+    def _returned(self, result: str, method: str, expected: str) -> ForeignError:
         function = inspect.unwrap(getattr(self.target, method, getattr(self.target, "function", self.target)))
         code = getattr(function, "__code__", None)  # FMUs and compiled code have none
-        place = f" ({code.co_filename}:{code.co_firstlineno})" if code is not None else ""
-        return ForeignError(self.source, f"{self.name} returned {what} from {method}{place}", expected)
+        location = f" ({code.co_filename}:{code.co_firstlineno})" if code is not None else ""
+        return ForeignError(self.source, f"{self.name} returned {result} from {method}{location}", expected)
 
     def parts(self, method: str, value: Any, expected: str, number: int = 2) -> tuple[Any, ...]:
         """The parts of a result that must be a tuple or list of `number` parts."""
@@ -203,21 +203,21 @@ class Guard(NamedTuple):
         except AttributeError:
             raise self._returned(_short(value), method, f"an object with the attribute {name}") from None
 
-    def numbers(self, method: str, part: str, value: Any, shape: tuple[int, ...], lowest: float = -INFINITE, highest: float = INFINITE,
+    def numbers(self, method: str, part: str, value: Any, shape: tuple[int, ...], lowest: float = -INFINITY, highest: float = INFINITY,
                 *, above: bool = False, infinite: bool = False, undefined: bool = False) -> FloatArray:
         """A result as a new array of float64.
 
         Parameters
         ----------
         shape
-            Expected shape; a plain number stands for all elements.
+            Expected shape; a plain number is accepted as the value of all elements.
         lowest, highest
-            Bounds; with `above` the lowest itself is excluded.
+            Bounds; `above` excludes `lowest` itself.
         infinite, undefined
             Whether infinities and NaN are legal.
         """
-        bounds = "" if (lowest, highest) == (-INFINITE, INFINITE) else f" {'above' if above else 'from'} {lowest:g}" \
-            if highest == INFINITE else f" in {'(' if above else '['}{lowest:g}, {highest:g}]"
+        bounds = "" if (lowest, highest) == (-INFINITY, INFINITY) else f" {'above' if above else 'from'} {lowest:g}" \
+            if highest == INFINITY else f" in {'(' if above else '['}{lowest:g}, {highest:g}]"
         expected = f"numbers{bounds}, {'' if infinite else 'finite, '}shape {shape}"
         numbers = self._array(method, part, value, shape, "biuf", expected).astype(float)
         valid = (numbers > lowest) if above else (numbers >= lowest)
@@ -245,15 +245,15 @@ class Guard(NamedTuple):
             raise self._returned(f"{part} of shape {array.shape}", method, expected)
         return np.broadcast_to(array, shape)
 
-    def _place(self, error: BaseException) -> str:
+    def _location(self, error: BaseException) -> str:
         """File and line of the innermost frame in the plug-in's folder, else of the innermost frame outside this package."""
         frames = [(frame.filename, frame.lineno) for frame in traceback.extract_tb(error.__traceback__)]
         if isinstance(error, SyntaxError) and error.filename:
             frames.append((error.filename, error.lineno))
-        outside = [frame for frame in frames if not frame[0].startswith((_OURS, _IMPORTS, "<frozen"))]
-        own = [frame for frame in outside if self.folder and frame[0].startswith(self.folder)
-               and (INSTALLED in self.folder or INSTALLED not in frame[0])]
-        return "{}:{}".format(*(own or outside)[-1]) if outside else ""
+        outside_frames = [frame for frame in frames if not frame[0].startswith((_PACKAGE_FOLDER, _IMPORTLIB_FOLDER, "<frozen"))]
+        own_frames = [frame for frame in outside_frames if self.folder and frame[0].startswith(self.folder)
+                      and (LIBRARY_FOLDER in self.folder or LIBRARY_FOLDER not in frame[0])]
+        return "{}:{}".format(*(own_frames or outside_frames)[-1]) if outside_frames else ""
 
 
 def _type(value: object) -> str:

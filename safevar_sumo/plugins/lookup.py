@@ -1,6 +1,6 @@
 """Turns a name in a study into a class or a record.
 
-The name is one of the package's own, or `package.module:Name` from beside the study, the working directory or an installed package.
+The name belongs to this package, or is `package.module:Name` of a module beside the study, in the working directory or installed.
 """
 
 from __future__ import annotations
@@ -21,18 +21,19 @@ from typing import Any, NamedTuple
 import msgspec
 
 from safevar_sumo.errors import ForeignError, InputError, did_you_mean, one_of
-from safevar_sumo.plugins.files import beside, is_foreign, watch
+from safevar_sumo.plugins.files import file_beside, is_foreign, watch
 from safevar_sumo.plugins.guard import Contract, Guard
 from safevar_sumo.study import converted
 
-_NOT_FOREIGN = {__name__.partition(".")[0], *sys.stdlib_module_names}
+_KNOWN_MODULES = {__name__.partition(".")[0], *sys.stdlib_module_names}
+"""Names of top modules that are not foreign: of this package and of Python."""
 
 
 class Member(NamedTuple):
     """The class or record that a name in a study stands for.
 
-    `guard` calls it (None for the package's own), `module` is the name of its module ("" for the package's own), `folder` the folder
-    of that module's top package. An FMU is a `file`; the class that simulates it is the package's own.
+    For a member from outside this package, `guard` calls the member, `module` is the name of its module, and `folder` the folder of
+    the module's top package; otherwise None and "". An FMU is a `file`, simulated by a class of this package.
     """
 
     target: Any
@@ -42,7 +43,7 @@ class Member(NamedTuple):
     file: str = ""
 
 
-class _Loaded(NamedTuple):
+class _LoadedModule(NamedTuple):
     """A module loaded from a user's folder, and the digest of its source at that time."""
 
     folder: str
@@ -50,16 +51,16 @@ class _Loaded(NamedTuple):
     digest: bytes
 
 
-_NOTHING = object()
-_loaded: dict[str, _Loaded] = {}
-_reachable: list[str] = []
+_NO_ATTRIBUTE = object()
+_loaded_modules: dict[str, _LoadedModule] = {}
+_added_folders: list[str] = []
 
 
 class Lookup(NamedTuple):
     """Looks up the names of a study.
 
-    `source` is the study, as errors name it; `places` are the folders that come first: those of the study's file and of the files
-    that it extends.
+    `source` is the study, as errors name it; `places` are the folders to search first: the folders of the study's file and of the
+    files that it extends.
     """
 
     source: str
@@ -77,22 +78,22 @@ class Lookup(NamedTuple):
         """
         if name in members:
             return Member(members[name])
-        legal = f"{one_of(members)}, or package.module:Name" if members else "package.module:Name"
+        expected = f"{one_of(members)}, or package.module:Name" if members else "package.module:Name"
         module_name, colon, attribute = name.partition(":")
         if not (colon and attribute.isidentifier() and all(part.isidentifier() for part in module_name.split("."))):
-            raise InputError(self.source, f"{key} = {name!r}{did_you_mean(name, members)}", legal)
+            raise InputError(self.source, f"{key} = {name!r}{did_you_mean(name, members)}", expected)
         places = [*self.places, os.getcwd()]
-        module, folder = self._imported(module_name, Guard(self.source, f"{key} = {name!r}"), places)
-        target = Guard(self.source, f"{key} = {name!r}", folder).call("import", getattr, module, attribute, _NOTHING)
-        if target is _NOTHING:
+        module, folder = self._import(module_name, Guard(self.source, f"{key} = {name!r}"), places)
+        target = Guard(self.source, f"{key} = {name!r}", folder).call("import", getattr, module, attribute, _NO_ATTRIBUTE)
+        if target is _NO_ATTRIBUTE:
             problem = f"{key} = {name!r} cannot be imported: AttributeError: {module.__file__ or module_name} has no {attribute!r}"
-            raise InputError(self.source, problem, legal)
+            raise InputError(self.source, problem, expected)
         return Member(target, Guard(self.source, f"{key} = {name!r}", folder, target), module_name, folder)
 
     def class_of(self, members: Mapping[str, Any], name: str, key: str, *contracts: Contract, otherwise: str = "") -> Member:
         """A class by name; a class from outside must meet the first contract that applies to it.
 
-        `otherwise` describes legal values that are no classes.
+        `otherwise` describes expected values that are no classes.
         """
         member = self.find(members, name, key)
         contract = next(contract for contract in contracts if contract.applies_to(member.target))
@@ -115,24 +116,24 @@ class Lookup(NamedTuple):
 
     def _with_paths(self, value: Any, key: str) -> Any:
         if isinstance(value, dict):
-            return {name: self._with_paths(one, f"{key}.{name}") for name, one in value.items()}
+            return {name: self._with_paths(item, f"{key}.{name}") for name, item in value.items()}
         if isinstance(value, list):
-            return [self._with_paths(one, key) for one in value]
+            return [self._with_paths(item, key) for item in value]
         if not isinstance(value, str):
             return value
-        path = beside(value, self.places)
-        if not path and beside(value, [os.getcwd()]):
+        path = file_beside(value, self.places)
+        if not path and file_beside(value, [os.getcwd()]):
             raise InputError(self.source, f"{key} = {value!r}: that file lies in the working directory, not beside the study's file",
                              f"a path relative to {self.places[0]}")
         return path or value
 
-    def _imported(self, name: str, guard: Guard, places: list[str]) -> tuple[ModuleType, str]:
+    def _import(self, name: str, guard: Guard, places: list[str]) -> tuple[ModuleType, str]:
         """The module and the folder of its top package."""
         importlib.invalidate_caches()
         top = name.partition(".")[0]
         if top == "__main__":
             raise InputError(self.source, f"{guard.name}: other processes cannot import from __main__", "a module in a file of its own")
-        place = _place_of(top, places)
+        place = _module_folder(top, places)
         _forget_all_but(places)
         make_reachable(places)
         if place:
@@ -143,35 +144,35 @@ class Lookup(NamedTuple):
             module = guard._replace(folder=place).call("import", importlib.import_module, name)
         except ForeignError as error:
             problem = error.problem.replace("raised in import", "cannot be imported", 1)
-            legal = f"a module in {' or '.join(dict.fromkeys(places))}, or an installed one"
-            raise ForeignError(self.source, problem, legal) from error
+            expected = f"a module in {' or '.join(dict.fromkeys(places))}, or an installed one"
+            raise ForeignError(self.source, problem, expected) from error
         finally:
             sys.dont_write_bytecode = writes_bytecode
             remember(set(sys.modules) - before, places)
         return module, place or _folder_of(sys.modules[top])
 
     def _refuse_installed_name(self, top: str, place: str, guard: Guard) -> None:
-        """Refuse a file with the name of an installed module; drop a module of the file that something else imported."""
-        loaded = sys.modules.get(top)
-        if loaded is None or top in _loaded:
+        """Raise an `InputError` if a file has the name of an installed module; unload the file's module if other code imported it."""
+        module = sys.modules.get(top)
+        if module is None or top in _loaded_modules:
             return
-        if _folder_of(loaded) != place:
-            raise InputError(self.source, f"{guard.name}: {top} in {place} has the name of {loaded.__file__ or 'a part of Python'}",
+        if _folder_of(module) != place:
+            raise InputError(self.source, f"{guard.name}: {top} in {place} has the name of {module.__file__ or 'a part of Python'}",
                              "a file of another name")
-        if not hasattr(loaded, "__path__"):
+        if not hasattr(module, "__path__"):
             del sys.modules[top]
 
 
-def _place_of(top: str, places: Iterable[str]) -> str:
-    """The first folder with a module or package of that name; "" if the name can only mean an installed module.
+def _module_folder(top: str, places: Iterable[str]) -> str:
+    """The first folder with a module or package named `top`; "" if only an installed module can have this name.
 
-    A package without __init__.py gives way to an installed one.
+    An installed module takes precedence over a package without __init__.py.
     """
     specs = {place: spec for place in places if (spec := PathFinder.find_spec(top, [place]))}
-    regular = [place for place, spec in specs.items() if spec.origin is not None]
-    if regular or not specs:
-        return next(iter(regular), "")
-    installed = PathFinder.find_spec(top, [place for place in sys.path if place and place not in _reachable])
+    regular_folders = [place for place, spec in specs.items() if spec.origin is not None]
+    if regular_folders or not specs:
+        return next(iter(regular_folders), "")
+    installed = PathFinder.find_spec(top, [place for place in sys.path if place and place not in _added_folders])
     return "" if installed else next(iter(specs))
 
 
@@ -182,63 +183,64 @@ def _folder_of(module: ModuleType) -> str:
 
 
 def make_reachable(places: Iterable[str]) -> None:
-    """Let modules import what lies beside them or in the working directory; installed modules come first."""
-    sys.path[:] = [place for place in sys.path if place not in _reachable]
-    _reachable[:] = [place for place in dict.fromkeys((*places, os.getcwd())) if place not in sys.path]
-    here = [i for i, place in enumerate(sys.path) if place in ("", os.getcwd())]
-    start = here[0] if here else len(sys.path)
-    sys.path[start:start] = _reachable
+    """Let modules import from `places` and the working directory; installed modules come first."""
+    sys.path[:] = [place for place in sys.path if place not in _added_folders]
+    _added_folders[:] = [place for place in dict.fromkeys((*places, os.getcwd())) if place not in sys.path]
+    indices = [i for i, place in enumerate(sys.path) if place in ("", os.getcwd())]
+    start = indices[0] if indices else len(sys.path)
+    sys.path[start:start] = _added_folders
 
 
 def reachable() -> list[str]:
     """The folders that `make_reachable` has added to Python's path."""
-    return list(_reachable)
+    return list(_added_folders)
 
 
 def inherit_reachable(folders: Iterable[str]) -> None:
-    """Record, in a process that inherited its path from another one, the folders that `make_reachable` had added there."""
-    _reachable[:] = folders
+    """Record the folders that `make_reachable` added in another process, from which this process inherited its path."""
+    _added_folders[:] = folders
 
 
 def forget_foreign() -> None:
-    """Unload all modules from outside: the next lookup loads them anew."""
-    _forget(list(_loaded))
-    for name in sorted(watch.imported):
+    """Unload all modules from outside the package: the next lookup loads them again."""
+    _forget(list(_loaded_modules))
+    for name in sorted(watch.imported_modules):
         module = sys.modules.get(name)
         place = getattr(module, "__file__", None) or next(iter(getattr(module, "__path__", [])), "")  # a namespace package has no file
-        if place and is_foreign(str(place)) and name.partition(".")[0] not in _NOT_FOREIGN:
+        if place and is_foreign(str(place)) and name.partition(".")[0] not in _KNOWN_MODULES:
             del sys.modules[name]
-    watch.imported.clear()
+    watch.imported_modules.clear()
 
 
 def _forget_all_but(places: Iterable[str]) -> None:
     """Unload modules from folders of other studies, and all modules of a folder in which a file has changed."""
-    stale = {one.folder for one in _loaded.values() if one.folder not in places or _digest(one.file) != one.digest}
-    _forget({name for name, one in _loaded.items() if one.folder in stale})
+    stale_folders = {module.folder for module in _loaded_modules.values()
+                     if module.folder not in places or _digest(module.file) != module.digest}
+    _forget({name for name, module in _loaded_modules.items() if module.folder in stale_folders})
 
 
 def _forget(names: Iterable[str]) -> None:
     for name in names:
-        if _loaded.pop(name, None) is not None:
+        if _loaded_modules.pop(name, None) is not None:
             sys.modules.pop(name, None)
 
 
 def foreign_modules(top: str) -> list[str]:
-    """Names of the modules loaded from users' folders; with those of the installed package `top`, if it is one."""
-    if top in _loaded:
-        return list(_loaded)
-    return [*_loaded, *(name for name in list(sys.modules) if name.partition(".")[0] == top)]
+    """Names of the modules loaded from users' folders and, if `top` is an installed package, of the modules of `top`."""
+    if top in _loaded_modules:
+        return list(_loaded_modules)
+    return [*_loaded_modules, *(name for name in list(sys.modules) if name.partition(".")[0] == top)]
 
 
 def remember(names: Iterable[str], places: Iterable[str]) -> None:
-    """Record which of these modules come from users' folders."""
+    """Record the modules among `names` that come from users' folders."""
     for name in names:
-        if name in _loaded:
+        if name in _loaded_modules:
             continue
         file = str(getattr(sys.modules.get(name), "__file__", None) or "")
         folder = next((place for place in places if file and Path(place) in Path(file).parents), "")
-        if folder and name.partition(".")[0] not in _NOT_FOREIGN and "site-packages" not in Path(file).parts:
-            _loaded[name] = _Loaded(folder, file, _digest(file))
+        if folder and name.partition(".")[0] not in _KNOWN_MODULES and "site-packages" not in Path(file).parts:
+            _loaded_modules[name] = _LoadedModule(folder, file, _digest(file))
 
 
 def _digest(file: str) -> bytes:
@@ -256,7 +258,7 @@ def instance_of(member: Member, parameters: Mapping[str, Any], name: str, key: s
     name
         The class as the study names it, such as `ads.model = 'my_ads:Careful'`.
     key
-        Key of its parameters in the study, such as `ads.parameters`.
+        Key of the class's parameters in the study, such as `ads.parameters`.
 
     Raises
     ------
@@ -265,18 +267,18 @@ def instance_of(member: Member, parameters: Mapping[str, Any], name: str, key: s
     """
     cls = member.target
     if issubclass(cls, msgspec.Struct):
-        watch.inside += member.guard is not None
+        watch.call_depth += member.guard is not None
         try:
             return converted(source, parameters, cls, key)
         finally:
-            watch.inside -= member.guard is not None
+            watch.call_depth -= member.guard is not None
     check_parameters(cls, (), parameters, name, key, source)
     return (member.guard or Guard(source, name)).call("__init__", partial(cls, **parameters))
 
 
 def check_parameters(function: Callable[..., Any], arguments: tuple[Any, ...], parameters: Mapping[str, Any], name: str, key: str,
                      source: str) -> None:
-    """Refuse parameters that a class or function does not take besides its arguments; raises as `instance_of`."""
+    """Raise an `InputError` if a class or function does not take these parameters besides the arguments."""
     try:
         inspect.signature(function).bind(*arguments, **parameters)
     except TypeError as error:
@@ -294,12 +296,12 @@ class OwnModules:
         Name of the member in its module.
     places
         The user's folders, as for `Lookup`.
-    others
-        Names of modules from elsewhere; this object adds to them.
+    other_names
+        Names of all other modules; this object adds names to the set.
     """
 
-    def __init__(self, member: Member, attribute: str, places: Sequence[str], others: set[str]) -> None:
-        self._member, self._attribute, self._places, self._others = member, attribute, places, others
+    def __init__(self, member: Member, attribute: str, places: Sequence[str], other_names: set[str]) -> None:
+        self._member, self._attribute, self._places, self._other_names = member, attribute, places, other_names
         self._modules: dict[str, ModuleType] = {}
 
     def load(self) -> Any:
@@ -308,8 +310,8 @@ class OwnModules:
 
     @contextmanager
     def inside(self) -> Iterator[None]:
-        """A context in which an import finds these copies, and loads further ones."""
-        shared = self._removed()
+        """A context in which imports find these copies; a module imported for the first time is added to them."""
+        shared = self._remove()
         sys.modules.update(self._modules)
         number, writes_bytecode, sys.dont_write_bytecode = len(sys.modules), sys.dont_write_bytecode, True
         try:
@@ -317,12 +319,12 @@ class OwnModules:
         finally:
             sys.dont_write_bytecode = writes_bytecode
             if len(sys.modules) != number:
-                remember(sys.modules.keys() - self._others, self._places)
-            self._modules = self._removed()
+                remember(sys.modules.keys() - self._other_names, self._places)
+            self._modules = self._remove()
             if len(sys.modules) + len(self._modules) != number:
-                self._others.update(sys.modules)
+                self._other_names.update(sys.modules)
             sys.modules.update(shared)
 
-    def _removed(self) -> dict[str, ModuleType]:
+    def _remove(self) -> dict[str, ModuleType]:
         names = foreign_modules(self._member.module.partition(".")[0])
         return {name: sys.modules.pop(name) for name in names if name in sys.modules}

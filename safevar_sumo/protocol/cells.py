@@ -1,4 +1,4 @@
-"""The cells of a rating as scenario parameters: all matrices of the protocol, and all robustness layers that can be simulated."""
+"""The cells of a rating, with their scenario parameters: all matrices of the protocol and all robustness layers that can be simulated."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ MITIGATION, AVOIDANCE, WARNING = "mitigation", "avoidance", "warning"
 NIGHT = "Illumination (Night)"
 SPEED, ACCELERATION, OFFSET, HEADING = "Speed", "Acceleration", "Initial position offset", "Trajectory/Heading"
 IN_DARKNESS = "Performance in darkness (1 lux)"
-WARNED = ("CPLA", "CBLA")
-"""Tests whose rows with a choice of AEB or FCW are rated by the warning; in other tests the calculator always rates the impact."""
+WARNING_TESTS = ("CPLA", "CBLA")
+"""Tests in which a row with a choice of AEB or FCW is rated by the warning; in other tests the calculator always rates the impact."""
 MODELS = {"CCR": "car_to_car", "CMR": "car_to_car", "CPLA": "along", "CBLA": "along"}
-"""Scenario models by the beginning of a test's name; all other tests are crossings."""
-BRAKING, HEADWAY_AT_START = 4.0, 1.0
-"""Deceleration and headway of the target in CCRb and CMRb, which the layers vary [m/s^2, s]."""
+"""Scenario models by the prefix of a test's name; the model of all other tests is `crossing`."""
+TARGET_DECELERATION, TARGET_HEADWAY = 4.0, 1.0
+"""The target's deceleration [m/s^2] and its headway at the start [s] in CCRb and CMRb; robustness layers vary both."""
 
 
 class CellRow(Struct, frozen=True, forbid_unknown_fields=True):
-    """A row of a matrix: speeds [km/h], and for every column S (standard), E (extended) or - (no cell)."""
+    """A row of a matrix: speeds of vehicle and target [km/h], and a letter per column: S (standard), E (extended) or - (no cell)."""
 
     vut: float
     ranges: str
@@ -38,9 +38,9 @@ class CellRow(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Block(Struct, frozen=True, forbid_unknown_fields=True):
-    """A matrix of a test, in one light if the test is driven by day and by night.
+    """A matrix of a test; a test that is driven by day and by night has one matrix for each `light`.
 
-    `sheet`, `label`, `first` and `function` locate it in the official template: sheet, name, first cell, column of functions.
+    `sheet`, `label`, `first` and `function` locate the matrix in the official template: sheet, name, first cell, column of functions.
     """
 
     test: str
@@ -61,7 +61,7 @@ class Block(Struct, frozen=True, forbid_unknown_fields=True):
 
     def is_warning(self, row: int) -> bool:
         """Whether a row is rated by the time to collision at the warning."""
-        return self.rows[row].choice and self.test in WARNED
+        return self.rows[row].choice and self.test in WARNING_TESTS
 
 
 class Condition(Struct, frozen=True, forbid_unknown_fields=True):
@@ -82,14 +82,14 @@ class Layer(Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def simulated(self) -> tuple[Condition, ...]:
-        """Its variations, if they can be simulated; the calculator has no words for CBLA by night, which is judged as the other tests."""
+        """The layer's variations if they can be simulated; the calculator lists none for CBLA by night, which is rated like other tests."""
         if self.layer == NIGHT:
             return self.conditions or (Condition(IN_DARKNESS, NOT_RED),)
         return self.conditions if self.layer in (SPEED, ACCELERATION, OFFSET, HEADING) else ()
 
 
 class CellScenario(NamedTuple):
-    """The simulation of a cell: scenario model, parameters, and whether by night."""
+    """The simulation of a cell: scenario model, parameters, and whether it is by night."""
 
     model: str
     parameters: dict[str, Any]
@@ -102,13 +102,13 @@ class Cell(NamedTuple):
     Attributes
     ----------
     block, row, column
-        Its position in the matrices.
+        The cell's position in the matrices.
     range
-        `standard`, `extended`, or the robustness layer that it varies.
+        `standard`, `extended`, or the name of the robustness layer that the cell belongs to.
     condition, criterion
-        The variation in the calculator's words and the criterion that must hold; "" in the matrices themselves.
+        The layer's variation in the calculator's words, and the criterion that must hold; "" for a cell of a matrix.
     judged
-        Measure that determines the colour: `mitigation`, `avoidance` or `warning`.
+        Measure that determines the cell's colour: `mitigation`, `avoidance` or `warning`.
     target
         Speed of the target [km/h].
     """
@@ -129,7 +129,7 @@ class Cell(NamedTuple):
 
     @property
     def location(self) -> float | None:
-        """Impact location [% of the width]; None in a matrix over the target's speed."""
+        """Impact location [% of the width]; None in a matrix whose columns are target speeds."""
         return self.block.impact_locations[self.column] if self.block.impact_locations else None
 
     @property
@@ -141,29 +141,29 @@ class Cell(NamedTuple):
         """The cell in words, such as `CPNA night, 40 km/h, 75 %, Speed +3 km/h`."""
         column = f"target {self.block.target_speeds[self.column]:g} km/h" if self.location is None else f"{self.location:g} %"
         choice = " FCW" if self.judged == WARNING else ""
-        varied = f", {self.range} {self.condition}" if self.is_varied else ""
-        return f"{self.block.name}, {self.vut:g} km/h{choice}, {column}{varied}"
+        variation = f", {self.range} {self.condition}" if self.is_varied else ""
+        return f"{self.block.name}, {self.vut:g} km/h{choice}, {column}{variation}"
 
     @property
     def scene(self) -> CellScenario:
         test = self.block.test
-        model = next((model for begin, model in MODELS.items() if test.startswith(begin)), "crossing")
+        model = next((model for prefix, model in MODELS.items() if test.startswith(prefix)), "crossing")
         parameters: dict[str, Any] = {"test": test, "speed": self.vut, "target_speed": self.target}
         if self.location is not None:
             parameters["impact_location"] = self.location
         night = self.block.light == "night" or self.range == NIGHT
         if self.range == ACCELERATION:
-            parameters["target_deceleration"] = BRAKING - _number(self.condition)
+            parameters["target_deceleration"] = TARGET_DECELERATION - _leading_number(self.condition)
         elif self.range == OFFSET and "headway" in self.condition:
-            parameters["headway"] = HEADWAY_AT_START + _number(self.condition)
+            parameters["headway"] = TARGET_HEADWAY + _leading_number(self.condition)
         elif self.range == OFFSET:
-            parameters["start_share"] = 1 + _number(self.condition) / 100
+            parameters["start_share"] = 1 + _leading_number(self.condition) / 100
         elif self.range == HEADING:
-            parameters["heading"] = _number(self.condition)
+            parameters["heading"] = _leading_number(self.condition)
         return CellScenario(model, parameters, night)
 
 
-def _number(condition: str) -> float:
+def _leading_number(condition: str) -> float:
     """The number at the beginning of a condition."""
     match = re.match(r"\s*([+-]?[\d.]+)", condition)
     assert match is not None, condition
@@ -171,7 +171,7 @@ def _number(condition: str) -> float:
 
 
 class Protocol(Struct, frozen=True, eq=False, forbid_unknown_fields=True, dict=True):
-    """A protocol: `mitigation` and `criteria` hold the values from which a cell has a colour, `scenarios` the points of every test."""
+    """A protocol; `mitigation` and `criteria` hold the value at which each colour begins, `scenarios` the points of every test."""
 
     calculator: str
     colours: dict[str, str]
@@ -183,12 +183,12 @@ class Protocol(Struct, frozen=True, eq=False, forbid_unknown_fields=True, dict=T
 
     @cached_property
     def cells(self) -> tuple[Cell, ...]:
-        """All simulations: the cells of the matrices, then those of the layers, which vary only the standard range."""
-        return (*self._matrices(), *self._varied())
+        """All simulations: the cells of the matrices, then the cells of the layers, which vary the standard range only."""
+        return (*self._matrix_cells(), *self._layer_cells())
 
     @cached_property
     def matrix_of(self) -> dict[tuple[str, int, int], int]:
-        """Numbers of the matrices' own cells, by block name, row and column."""
+        """Numbers of the cells of the matrices, by block name, row and column."""
         return {(cell.block.name, cell.row, cell.column): number for number, cell in enumerate(self.cells) if not cell.is_varied}
 
     @property
@@ -207,7 +207,7 @@ class Protocol(Struct, frozen=True, eq=False, forbid_unknown_fields=True, dict=T
         """Points of tests that cannot be simulated here, by test."""
         return {test: sum(points) for test, points in self.scenarios.items() if test not in self.tests}
 
-    def _matrices(self) -> Iterator[Cell]:
+    def _matrix_cells(self) -> Iterator[Cell]:
         for block in self.blocks:
             for row, values in enumerate(block.rows):
                 for column, letter in enumerate(values.ranges):
@@ -216,26 +216,26 @@ class Protocol(Struct, frozen=True, eq=False, forbid_unknown_fields=True, dict=T
                                    WARNING if block.is_warning(row) else block.criterion,
                                    block.target_speeds[column] if values.target is None else values.target)
 
-    def _varied(self) -> Iterator[Cell]:
-        standard = [cell for cell in self._matrices() if cell.range == STANDARD]
+    def _layer_cells(self) -> Iterator[Cell]:
+        standard_cells = [cell for cell in self._matrix_cells() if cell.range == STANDARD]
         for layer in self.layers:
             for condition in layer.simulated:
-                faster = _number(condition.condition) if layer.layer == SPEED else 0.0
-                for cell in standard:
+                speed_increase = _leading_number(condition.condition) if layer.layer == SPEED else 0.0
+                for cell in standard_cells:
                     if cell.block.test == layer.test:
                         yield cell._replace(range=layer.layer, condition=condition.condition, criterion=condition.criterion,
-                                            target=cell.target + faster)
+                                            target=cell.target + speed_increase)
 
 
 def part_of(protocol: Protocol, part: int, parts: int) -> list[int]:
-    """Numbers of the cells in part `part` of `parts`, counted from 0; cells on one network are in the same part as far as possible."""
+    """Numbers of the cells in part `part`, from 0, of `parts`; cells with the same network are in the same part as far as possible."""
     def network(number: int) -> tuple[Any, ...]:
         cell = protocol.cells[number]
-        varied = (cell.scene.parameters.get("heading", 0.0), "start_share" in cell.scene.parameters)
-        return cell.scene.model, cell.block.test in ("CPNA", "CPFA", "CPNCO"), varied, cell.block.test
+        variation = (cell.scene.parameters.get("heading", 0.0), "start_share" in cell.scene.parameters)
+        return cell.scene.model, cell.block.test in ("CPNA", "CPFA", "CPNCO"), variation, cell.block.test
 
-    ordered = sorted(range(len(protocol.cells)), key=network)
-    return ordered[len(ordered) * part // parts:len(ordered) * (part + 1) // parts]
+    numbers = sorted(range(len(protocol.cells)), key=network)
+    return numbers[len(numbers) * part // parts:len(numbers) * (part + 1) // parts]
 
 
 @lru_cache

@@ -12,28 +12,28 @@ from safevar_sumo.scenarios import Point
 from safevar_sumo.scenarios.euro_ncap import KMH
 from safevar_sumo.vehicles import Vehicle, VehicleState
 
-TOO_FAST, TOO_SLOW = 1.0 * KMH, -0.5 * KMH
-"""Tolerance of the test speed until the system brakes [m/s]: +1.0 and -0.5 km/h (Euro NCAP, test protocols of AEB, test execution)."""
-PROPORTIONAL, INTEGRAL = 1.0, 1.0
+MAX_ERROR, MIN_ERROR = 1.0 * KMH, -0.5 * KMH
+"""Tolerance of the test speed until the system brakes [m/s]: +1.0 and -0.5 km/h (Euro NCAP, AEB test protocols, "test execution")."""
+PROPORTIONAL_GAIN, INTEGRAL_GAIN = 1.0, 1.0
 """Gains of the robot [pedal per m/s, pedal per m], chosen so that `carla` is within 0.1 km/h 3 s after a pedal error of 0.15."""
-ACTS = 0.03
-"""Pedal change below the holding pedal that counts as the system acting [-]: about 0.3 m/s^2, Euro NCAP's onset of an AEB."""
+ACTION_THRESHOLD = 0.03
+"""Change of the pedal towards braking from which on the system acts [-]: about 0.3 m/s^2, the onset of an AEB by Euro NCAP."""
 
 
 class DrivingRobot:
     """Holds N vehicles at the speeds of their tests by accelerator and brake, in their initial gear.
 
-    It drives as long as the system under test neither brakes nor eases off an accelerator that it had pressed; once the system
-    has braked, it controls the vehicle and its automatic gearbox. Euro NCAP (test protocol AEB car-to-car, "test execution")
-    requires a steady speed, with an automatic gearbox in D and a manual one in the highest gear of at least 1,500 r/min, and allows a
-    cruise control; the robot holds the gear, as a gearbox that hunts between two gears would not keep the speed steady.
+    The robot drives as long as the system under test neither brakes nor eases off an accelerator that the system had pressed; once the
+    system has braked, the system controls the vehicle and its automatic gearbox. Euro NCAP (AEB car-to-car, "test execution") requires a
+    steady speed, with an automatic gearbox in D and a manual gearbox in the highest gear of at least 1,500 r/min, and allows a cruise
+    control; the robot holds the gear, since a gearbox that hunts between two gears would not keep the speed steady.
 
     Parameters
     ----------
     points
-        Points, each with an equal part of the vehicles; the robot drives only where the scenario has a `test_speed`.
+        Scenario points, each with an equal part of the vehicles; the robot drives only where the scenario has a `test_speed`.
     vehicle, prepared, state
-        The vehicles, and their state at the start, whose pedals hold the speed and are the robot's first command.
+        The vehicle model, its prepared settings, and the state at the start, whose pedals hold the speed and are the first command.
     step
         Time between two commands [s].
     """
@@ -43,42 +43,42 @@ class DrivingRobot:
         speeds = [getattr(point.scenario, "test_speed", None) for point in points]
         self._target = np.repeat([np.nan if speed is None else speed for speed in speeds], n // len(points))
         self.tested: BoolArray = ~np.isnan(self._target)
-        """Which vehicles are in a test at a speed."""
+        """Which vehicles are in a scenario with a `test_speed`."""
         self._drives = self.tested.copy()
-        self._any = bool(self.tested.any())
+        self._has_tests = bool(self.tested.any())
         self._prepared, self._hold_gear = prepared, getattr(vehicle, "hold_gear", None)
-        self._pedal, self._least_brake = state.throttle - state.brake, state.brake + ACTS
+        self._pedal, self._least_brake = state.throttle - state.brake, state.brake + ACTION_THRESHOLD
         self._step, self._integral = step, np.zeros(n)
-        self._braked, self._most = ~self.tested, np.full(n, -np.inf)
+        self._has_braked, self._highest_pedal = ~self.tested, np.full(n, -np.inf)
         self.error = np.where(self.tested, 0.0, np.nan)
-        """Largest deviation from the test speed, relative to the tolerance, while the robot acted [m/s]; NaN without a test."""
+        """Deviation from the test speed [m/s] that was largest relative to the tolerance while the robot drove; NaN without a test."""
 
     def drive(self, command: Command, state: Any, open_: BoolArray) -> tuple[Command, Any]:
-        """The robot's command in place of the system's while the robot acts, and the state with the gear held.
+        """The command of the robot while it drives, otherwise of the system; and the state, with the gear held while the robot drives.
 
-        `open_` are the runs that are not over: only they are checked against the tolerance.
+        `open_` marks the runs that are not over: only their speeds are compared with the tolerance.
         """
-        if not self._any:
+        if not self._has_tests:
             return command, state
         error = np.where(self._drives, state.speed - self._target, 0.0)
         self.error = np.where(open_ & (_share(error) > _share(self.error)), error, self.error)
-        self._braked |= command.brake > self._least_brake
-        wanted = command.throttle - command.brake
-        self._most = np.maximum(self._most, wanted)
-        self._drives = ~self._braked & (wanted >= np.minimum(self._most, self._pedal) - ACTS)
+        self._has_braked |= command.brake > self._least_brake
+        system_pedal = command.throttle - command.brake
+        self._highest_pedal = np.maximum(self._highest_pedal, system_pedal)
+        self._drives = ~self._has_braked & (system_pedal >= np.minimum(self._highest_pedal, self._pedal) - ACTION_THRESHOLD)
         error = np.where(self._drives, error, 0.0)
-        self._integral = np.minimum(np.maximum(self._integral - error * self._step, -1 / INTEGRAL), 1 / INTEGRAL)
-        pedal = self._pedal - PROPORTIONAL * error + INTEGRAL * self._integral
-        robot = Command(np.where(self._drives, np.minimum(np.maximum(pedal, 0.0), 1.0), command.throttle),
-                       np.where(self._drives, np.minimum(np.maximum(-pedal, 0.0), 1.0), command.brake))
-        return robot, state if self._hold_gear is None else self._hold_gear(self._prepared, state, self._drives)
+        self._integral = np.minimum(np.maximum(self._integral - error * self._step, -1 / INTEGRAL_GAIN), 1 / INTEGRAL_GAIN)
+        pedal = self._pedal - PROPORTIONAL_GAIN * error + INTEGRAL_GAIN * self._integral
+        robot_command = Command(np.where(self._drives, np.minimum(np.maximum(pedal, 0.0), 1.0), command.throttle),
+                                np.where(self._drives, np.minimum(np.maximum(-pedal, 0.0), 1.0), command.brake))
+        return robot_command, state if self._hold_gear is None else self._hold_gear(self._prepared, state, self._drives)
 
     @property
     def invalid(self) -> BoolArray:
-        """Which tests left the tolerance before the system acted; shape (N,)."""
+        """Which vehicles left the tolerance before the system acted; shape (N,)."""
         return self.tested & (_share(self.error) > 1)
 
 
 def _share(error: FloatArray) -> FloatArray:
-    """A speed error over the tolerance in its direction [-]; 0 without a test."""
-    return np.nan_to_num(np.where(error > 0, error / TOO_FAST, error / TOO_SLOW))
+    """A speed error divided by the tolerance in the error's direction [-]; 0 without a test."""
+    return np.nan_to_num(np.where(error > 0, error / MAX_ERROR, error / MIN_ERROR))

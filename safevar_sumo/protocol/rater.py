@@ -1,4 +1,4 @@
-"""The matrix of a protocol as points to simulate, and the rating of the simulated vehicles."""
+"""Turns the matrix of a protocol into tests to simulate, and rates the simulated vehicles."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from safevar_sumo.records import KMH_PER_MS, CellResults, FloatArray, Outcome, S
 from safevar_sumo.scenarios import weather_of
 from safevar_sumo.study import OBJECTIVES, MatrixTable, MatrixTest, RatingTable, Study, Weather
 
-SHARED = ("vut_length", "vut_width", "grade")
+SHARED_PARAMETERS = ("vut_length", "vut_width", "grade")
 """Parameters of a study's scenario that apply to every cell."""
 
 
-IN_SUMO = 8
-"""Number of cells of a protocol that SUMO simulates, too: all cells would take hours."""
+SUMO_CELLS = 8
+"""Number of a protocol's cells that a check simulates in SUMO: all cells would take hours."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Rater:
-    """Rates vehicles simulated at all points of a protocol's matrix, in the order of the points; `claims` are layers by test."""
+    """Rates vehicles that were simulated in all cells of a protocol, in the order of the cells; `claims` are claimed layers by test."""
 
     protocol: Protocol
     claims: dict[str, list[str]]
@@ -35,13 +35,13 @@ class Rater:
 
 
 def cell_columns(runs: SimulationRuns) -> tuple[FloatArray, FloatArray, Any]:
-    """Rated quantities of N simulations of a cell: impact [km/h], warning [s], validity; shape (N,) each, see `CellResults`."""
+    """Rated quantities of N simulations of a cell: impact [km/h], warning [s], validity; shape (N,) each; see `CellResults`."""
     warning = np.broadcast_to(runs.warning_ttc, runs.relative_speed.shape)
     return runs.relative_speed * KMH_PER_MS, warning, (runs.outcome != Outcome.INVALID_TEST) & (runs.outcome != Outcome.SIMULATOR_ERROR)
 
 
 def joined_cells(columns: Sequence[tuple[FloatArray, FloatArray, Any]]) -> CellResults:
-    """The cells of M vehicles, from the `cell_columns` of each cell."""
+    """The results of all cells for M vehicles, from the `cell_columns` of each cell."""
     return CellResults(*(np.stack(list(values), axis=1) for values in zip(*columns, strict=True)))
 
 
@@ -69,35 +69,35 @@ def rater_of(study: Study, source: str) -> Rater | None:
         key = f"rating.claims.{test}"
         if test not in protocol.tests:
             raise unknown(source, f"{key}: there is no such test, or it is not simulated", test, protocol.tests)
-        simulated = {layer.layer: bool(layer.simulated) for layer in protocol.layers_of(test)}
+        is_simulated = {layer.layer: bool(layer.simulated) for layer in protocol.layers_of(test)}
         for layer in layers:
-            if layer not in simulated:
-                raise unknown(source, f"{key}: {layer!r} does not count for {test}", layer, simulated)
-            if simulated[layer]:
+            if layer not in is_simulated:
+                raise unknown(source, f"{key}: {layer!r} does not count for {test}", layer, is_simulated)
+            if is_simulated[layer]:
                 raise InputError(source, f"{key}: {layer!r} is simulated for {test} and cannot be claimed",
-                                 "one of " + ", ".join(name for name, is_simulated in simulated.items() if not is_simulated))
+                                 "one of " + ", ".join(name for name in is_simulated if not is_simulated[name]))
     return Rater(protocol=protocol, claims=study.rating.claims)
 
 
 def driven_in_sumo(study: Study, weather: Weather) -> Study:
-    """The study for a check in SUMO: the study itself or, for a rated study, a few of its cells, spread over the matrices."""
+    """The study for a check in SUMO; a rated study is reduced to a few of its cells, spread over the matrices."""
     if not is_rated(study):
         return study
-    number = len(protocol_of(study.matrix.protocol).cells)  # type: ignore[union-attr]
-    return in_some_cells(study, weather, np.linspace(0, number - 1, IN_SUMO).astype(int).tolist())
+    cell_count = len(protocol_of(study.matrix.protocol).cells)  # type: ignore[union-attr]
+    return in_some_cells(study, weather, np.linspace(0, cell_count - 1, SUMO_CELLS).astype(int).tolist())
 
 
 def in_some_cells(study: Study, weather: Weather, numbers: Sequence[int]) -> Study:
     """A rated study reduced to some of its cells; it has no rating points."""
-    everything = rated(study, weather)
-    assert everything.matrix is not None
-    tests = [everything.matrix.tests[number] for number in numbers]
+    whole_matrix = rated(study, weather)
+    assert whole_matrix.matrix is not None
+    tests = [whole_matrix.matrix.tests[number] for number in numbers]
     search = replace(study.search, objectives=[*OBJECTIVES])
-    return replace(everything, matrix=MatrixTable(tests=tests), rating=RatingTable(), search=search)
+    return replace(whole_matrix, matrix=MatrixTable(tests=tests), rating=RatingTable(), search=search)
 
 
 def by_night(weather: Weather) -> Weather:
-    """A weather by night: the same road, with visibility and recognition delay changed by darkness."""
+    """The weather by night: an equal road, with visibility and recognition delay changed by darkness."""
     night = weather_of("night", "weather")
     if weather.light == "night":
         return weather
@@ -107,13 +107,13 @@ def by_night(weather: Weather) -> Weather:
 
 
 def rated(study: Study, weather: Weather) -> Study:
-    """The study with its protocol expanded to tests, one for each cell; tests by day have the study's weather."""
+    """The study with a test for each cell of its protocol; tests by day have the study's weather."""
     assert study.matrix is not None
-    shared = {name: value for name, value in study.scenario.parameters.items() if name in SHARED}
+    shared_parameters = {name: value for name, value in study.scenario.parameters.items() if name in SHARED_PARAMETERS}
     night, tests = by_night(weather), []
     for cell in protocol_of(study.matrix.protocol).cells:
         scene = cell.scene
-        tests.append(MatrixTest(name=cell.name, model=scene.model, parameters={**shared, **scene.parameters},
+        tests.append(MatrixTest(name=cell.name, model=scene.model, parameters={**shared_parameters, **scene.parameters},
                                 weathers=[night if scene.night else weather]))
     scenario = replace(study.scenario, parameters={})  # each test has its own parameters
     return replace(study, matrix=MatrixTable(tests=tests), scenario=scenario)

@@ -1,4 +1,4 @@
-"""A target ahead in the vehicle's lane: the common part of the car-to-car tests and of the tests along the lane."""
+"""A target ahead in the vehicle's lane: the common part of the scenarios `car_to_car` and `along`."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.records import Encounter, FloatArray, Trace
 from safevar_sumo.scenarios.base import Coordinates, Grade, Roads, World, XmlChanges
 from safevar_sumo.scenarios.euro_ncap import (
-    ACROSS_ON,
-    AHEAD,
-    APPROACH,
     BODIES,
-    INSIDE,
+    EXIT_LANE,
+    JUNCTION_LANE,
     KMH,
+    SAME_DIRECTION,
     TARGET,
+    VUT_LANE,
     VUT_LENGTH,
     VUT_WIDTH,
     BodySize,
@@ -30,19 +30,19 @@ from safevar_sumo.scenarios.euro_ncap import (
     target_type,
 )
 from safevar_sumo.scenarios.frame import Frame
-from safevar_sumo.scenarios.target import Course, Target, TargetTest, Times, at
+from safevar_sumo.scenarios.target import Course, Target, TargetTest, Times, value_at
 
-ROAD = "road_0"
-START = 50.0
+ROAD_LANE = "road_0"
+START_POSITION = 50.0
 """Position of the vehicle's front bumper on the lane at the start [m]."""
-BEYOND = 0.5
-"""Position of a rotated target's front on the lane beyond the junction [m]: SUMO inserts no vehicle on the junction itself."""
+FRONT_POSITION = 0.5
+"""Position of a rotated target's front on the lane beyond the junction [m]; SUMO cannot insert a vehicle on the junction itself."""
 
 
 class TargetAhead(NamedTuple):
-    """A target `gap` metres ahead of the vehicle under test, with a speed over time [m/s at s].
+    """A target `gap` metres ahead of the vehicle under test; `speed` maps a time [s] to the target's speed [m/s].
 
-    The middle of its rear is `offset` metres to the right of the lane's middle. A standing target may be rotated around that point.
+    The middle of the target's rear is `offset` metres right of the lane's middle. A standing target may be rotated around that point.
     """
 
     target: str
@@ -50,15 +50,15 @@ class TargetAhead(NamedTuple):
     gap: float
     offset: float
     speed: Callable[[float], float]
-    direction: Direction = AHEAD
+    direction: Direction = SAME_DIRECTION
 
     def lanes(self, roads: Roads) -> XmlChanges:
-        """The crossing lane turned into the direction of a rotated target: its rear is on the junction, its front on the lane beyond."""
+        """Turn the target's lanes into the direction of a rotated target, whose rear is on the junction and front on the exit lane."""
         if not self._is_rotated:
             return {}
-        frame, (along, left), length = Frame.of(roads.lane(APPROACH)), self.direction, self._body.length
-        rear = frame.place_of(roads.lane(INSIDE).start)[0], -self.offset
-        entry, exit_ = ((rear[0] + distance * along, rear[1] + distance * left) for distance in (-length, length - BEYOND))
+        frame, (along, left), length = Frame.of(roads.lane(VUT_LANE)), self.direction, self._body.length
+        rear = frame.lane_coordinates(roads.lane(JUNCTION_LANE).start)[0], -self.offset
+        entry, exit_ = ((rear[0] + distance * along, rear[1] + distance * left) for distance in (-length, length - FRONT_POSITION))
         return lanes_across(frame, entry, exit_, self.direction)
 
     def actors(self, speed: float, roads: Roads) -> XmlChanges:
@@ -74,29 +74,29 @@ class TargetAhead(NamedTuple):
 
     def _in_lane(self) -> tuple[float, XmlChanges]:
         """The vehicle's start on the straight road [m], and a target in line with the lane."""
-        kind = TYPES.get(self.target, self.target)
-        renamed = {f"vType[@id='{kind}']": target_type(self.target)} if kind != self.target else {}
-        return START, {**renamed, "vehicle[@id='target']": {
-            "type": self.target, "departPos": repr(START + self.gap + self._body.length), "departPosLat": repr(-self.offset),
+        kind = REPLACED_TYPES.get(self.target, self.target)
+        new_type = {f"vType[@id='{kind}']": target_type(self.target)} if kind != self.target else {}
+        return START_POSITION, {**new_type, "vehicle[@id='target']": {
+            "type": self.target, "departPos": repr(START_POSITION + self.gap + self._body.length), "departPosLat": repr(-self.offset),
             "departSpeed": repr(self.speed(0.0))}}
 
     def _at_junction(self, roads: Roads) -> tuple[float, XmlChanges]:
         """The vehicle's start before the junction [m], and a rotated target on it."""
-        along, _ = Frame.of(roads.lane(APPROACH)).place_of(roads.lane(ACROSS_ON).start)
-        start = along + BEYOND * self.direction.along - self._depth - self.gap
+        along, _ = Frame.of(roads.lane(VUT_LANE)).lane_coordinates(roads.lane(EXIT_LANE).start)
+        start = along + FRONT_POSITION * self.direction.along - self._depth - self.gap
         if start - self.vut.length < 0:
             raise InputError("scenario.parameters", f"a gap of {self.gap:.0f} m is longer than the road")
         parked = {f"vehicle[@id='parked_{size}']": None for size in ("small", "large")}
         return start, {**parked, "vType[@id='target']": target_type(self.target), "vehicle[@id='target']": {
-            "type": self.target, "route": "beyond", "departPos": repr(BEYOND), "departPosLat": "0", "departSpeed": "0"}}
+            "type": self.target, "route": "beyond", "departPos": repr(FRONT_POSITION), "departPosLat": "0", "departSpeed": "0"}}
 
-    def meeting(self, world: World) -> _Meeting:
-        """The target's motion in a run."""
-        return _Meeting(Frame.of(world.lane(APPROACH if self._is_rotated else ROAD)), Course(follows=True), self, self._depth)
+    def meeting(self, world: World) -> _MeetingAhead:
+        """How the vehicle meets the target in a run."""
+        return _MeetingAhead(Frame.of(world.lane(VUT_LANE if self._is_rotated else ROAD_LANE)), Course(follows=True), self, self._depth)
 
     @property
     def _is_rotated(self) -> bool:
-        return self.direction != AHEAD
+        return self.direction != SAME_DIRECTION
 
     @property
     def _body(self) -> BodySize:
@@ -104,7 +104,7 @@ class TargetAhead(NamedTuple):
 
     @property
     def _depth(self) -> float:
-        """Distance along the lane from the middle of the target's front back to the point that the vehicle reaches first [m]."""
+        """Distance along the lane from the first point of contact to the middle of the target's front [m]."""
         if not self._is_rotated:
             return self._body.length
         (along, left), half = self.direction, self._body.width / 2
@@ -114,16 +114,16 @@ class TargetAhead(NamedTuple):
         return front[0] - _first_contact([corners[0], corners[1], corners[3], corners[2]], self.vut.width / 2)
 
 
-class _Meeting(NamedTuple):
-    """The vehicle behind a target whose first point of contact is `depth` metres behind its front; see `Meeting`."""
+class _MeetingAhead(NamedTuple):
+    """A meeting with a target whose first point of contact is `depth` metres behind the target's front; see `Meeting`."""
 
     frame: Frame
     course: Course
-    ahead: TargetAhead
+    target_ahead: TargetAhead
     depth: float
 
     def begin(self, world: World) -> float:
-        speed = self.ahead.speed(0.0)
+        speed = self.target_ahead.speed(0.0)
         world.drive(TARGET, speed)
         return speed
 
@@ -132,23 +132,23 @@ class _Meeting(NamedTuple):
 
     def target(self, positions: FloatArray, times: Times) -> Target:
         along = self.frame.along(positions)
-        return Target(along - self.depth, np.full_like(along, self.ahead.offset), speed=at(times, self.ahead.speed))
+        return Target(along - self.depth, np.full_like(along, self.target_ahead.offset), speed=value_at(times, self.target_ahead.speed))
 
     def next_speed(self, sample: int, step: float) -> float:
-        return self.ahead.speed((sample + 1) * step)
+        return self.target_ahead.speed((sample + 1) * step)
 
     def set_speed(self, world: World, speed: float) -> None:
         world.drive(TARGET, speed)
 
 
-TYPES = {"cyclist": "adult", "motorcyclist": "car"}
-"""Vehicle types of the traffic file that targets without a type of their own replace."""
+REPLACED_TYPES = {"cyclist": "adult", "motorcyclist": "car"}
+"""By target that has no type in the traffic file: the type that the target replaces."""
 
 
 def _first_contact(corners: list[Coordinates], half_width: float) -> float:
-    """Where a vehicle of a half width would first touch a body, as a position along the lane [m].
+    """Position along the lane at which a vehicle of this half width would first touch a body [m].
 
-    A body beside the vehicle's way counts with its rearmost corner.
+    For a body beside the vehicle's path, the position of the body's rearmost corner.
     """
     positions = [x for x, y in corners if abs(y) <= half_width]
     for (x, y), (to_x, to_y) in pairwise([*corners, corners[0]]):
@@ -179,17 +179,17 @@ class TargetAheadTest(TargetTest, frozen=True, kw_only=True, forbid_unknown_fiel
 
     def lanes(self, roads: Roads) -> XmlChanges:
         """Changes to the lanes for a rotated target."""
-        return self._ahead.lanes(roads)
+        return self._target_ahead.lanes(roads)
 
     def actors(self, roads: Roads) -> XmlChanges:
         """The vehicle at its speed, and the target."""
-        return self._ahead.actors(self.test_speed, roads)
+        return self._target_ahead.actors(self.test_speed, roads)
 
-    def _meeting(self, world: World) -> _Meeting:
-        return self._ahead.meeting(world)
+    def _meeting(self, world: World) -> _MeetingAhead:
+        return self._target_ahead.meeting(world)
 
     def encounter(self, trace: Trace) -> Encounter:
-        """Distances from bumper to body; TTC is that distance over the difference of speeds."""
+        """Distance from the front bumper to the target's body; TTC is this distance over the difference of speeds."""
         return Encounter(separation=trace.gap, distance=trace.gap, closing_speed=trace.speed - trace.obstacle_speed,
                          in_conflict=trace.gap > 0)
 
@@ -198,11 +198,12 @@ class TargetAheadTest(TargetTest, frozen=True, kw_only=True, forbid_unknown_fiel
         """Speed that the vehicle holds until it brakes [m/s]."""
         return self.speed * KMH
 
-    def _ahead_of(self, target: str, gap: float, speed: Callable[[float], float], direction: Direction = AHEAD) -> TargetAhead:
-        """A target at the impact location."""
+    def _target_at_impact_location(self, target: str, gap: float, speed: Callable[[float], float],
+                                   direction: Direction = SAME_DIRECTION) -> TargetAhead:
+        """The target with the middle of its rear at the impact location."""
         vut = BodySize(self.vut_length, self.vut_width)
         return TargetAhead(target, vut, gap, lateral_of(self.impact_location, self.vut_width), speed, direction)
 
     @property
-    def _ahead(self) -> TargetAhead:
+    def _target_ahead(self) -> TargetAhead:
         raise NotImplementedError

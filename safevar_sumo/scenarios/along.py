@@ -8,13 +8,14 @@ from msgspec import Meta
 
 from safevar_sumo.scenarios.ahead import TargetAhead, TargetAheadTest
 from safevar_sumo.scenarios.base import PreCrash
-from safevar_sumo.scenarios.euro_ncap import KMH, Range, Walk
+from safevar_sumo.scenarios.euro_ncap import KMH, Range, SpeedProfile
 
-LOCATIONS = (50.0, 10.0, 25.0, 75.0, 90.0)
+IMPACT_LOCATIONS = (50.0, 10.0, 25.0, 75.0, 90.0)
+"""Impact locations [% of the width]."""
 
 
 class _Test(NamedTuple):
-    """A row of the protocol's table: speeds in km/h, distances in m, and the range of the tests."""
+    """A row of the protocol's table: target, target speed [km/h], acceleration distance [m], tested speeds and impact locations, type."""
 
     target: str
     target_speed: float
@@ -24,8 +25,8 @@ class _Test(NamedTuple):
 
 
 TESTS = {
-    "CPLA": _Test("adult", 5.0, 1.0, Range(10, 80, LOCATIONS), PreCrash.PEDESTRIAN),
-    "CBLA": _Test("cyclist", 15.0, 0.0, Range(20, 80, LOCATIONS), PreCrash.CYCLIST),
+    "CPLA": _Test("adult", 5.0, 1.0, Range(10, 80, IMPACT_LOCATIONS), PreCrash.PEDESTRIAN),
+    "CBLA": _Test("cyclist", 15.0, 0.0, Range(20, 80, IMPACT_LOCATIONS), PreCrash.CYCLIST),
 }
 
 
@@ -41,9 +42,9 @@ class Along(TargetAheadTest, frozen=True, kw_only=True):
     impact_location
         Point of the vehicle's front that would hit the target, from the left corner [% of the width].
     target, target_speed, acceleration_distance
-        `adult`, `child` or `cyclist`; its speed, and the distance from the start within which it reaches that speed [km/h, m].
+        `adult`, `child` or `cyclist`; the target's speed [km/h], and the distance within which the target reaches that speed [m].
     time_to_impact, time_after
-        Time from the start to the impact if nobody brakes, and from there to the end of the run [s].
+        Time from the start to the impact if nobody brakes, and time from the impact to the end of the run [s].
     vut_length, vut_width
         Size of the vehicle under test [m].
     grade
@@ -51,7 +52,7 @@ class Along(TargetAheadTest, frozen=True, kw_only=True):
 
     Notes
     -----
-    From the start on the cyclist rides 15 km/h; the protocol's rows that are judged by the warning have 20 km/h.
+    By default the cyclist rides at 15 km/h from the start; the protocol has 20 km/h in its rows that are rated by the warning.
     """
 
     test: Literal["CPLA", "CBLA"] = "CPLA"
@@ -78,12 +79,12 @@ class Along(TargetAheadTest, frozen=True, kw_only=True):
         return TESTS[self.test].range.remarks(self.test, self.speed, self.impact_location, self.grade)
 
     @property
-    def _ahead(self) -> TargetAhead:
-        walk = Walk(0.0, self._parameter("target_speed") * KMH, self._parameter("acceleration_distance"))
-        gap = self.speed * KMH * self.time_to_impact - walk.travelled(self.time_to_impact)
-        return self._ahead_of(self._parameter("target"), gap, walk.speed_at)
+    def _target_ahead(self) -> TargetAhead:
+        profile = SpeedProfile(0.0, self._parameter("target_speed") * KMH, self._parameter("acceleration_distance"))
+        gap = self.speed * KMH * self.time_to_impact - profile.travelled(self.time_to_impact)
+        return self._target_at_impact_location(self._parameter("target"), gap, profile.speed_at)
 
     def _parameter(self, name: str) -> Any:
-        """A parameter of the study, by default the protocol's."""
+        """A parameter as the study sets it, by default as the protocol does."""
         value = getattr(self, name)
         return getattr(TESTS[self.test], name) if value is None else value

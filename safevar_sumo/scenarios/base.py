@@ -1,4 +1,4 @@
-"""The contract of a scenario: the actors, the geometry of the encounter, and checks of scenarios from outside."""
+"""The contract of a scenario (its actors and the geometry of the encounter), and checks of scenarios from outside the package."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from safevar_sumo.study import Weather
 
 VUT = "vut"
 """Id of the vehicle under test in every network's traffic."""
-STEEPEST = 30.0
+MAX_GRADE = 30.0
 """Steepest road [%]."""
-Grade = Annotated[float, Meta(ge=-STEEPEST, le=STEEPEST)]
-BEND = 0.05
+Grade = Annotated[float, Meta(ge=-MAX_GRADE, le=MAX_GRADE)]
+MAX_BEND = 0.05
 """Largest deviation of a lane's centre line from a straight line for which the lane counts as straight [m]."""
 Coordinates = tuple[float, float]
 XmlChanges = Mapping[str, Mapping[str, str] | None]
-"""Changes to a network's traffic or lanes, by the XPath of an element below the file's root: attributes to set, or None to remove it."""
+"""Changes to a network's traffic or lanes: attributes by the XPath of an element below the file's root; None removes the element."""
 
 
 class Lane(NamedTuple):
@@ -38,19 +38,19 @@ class Lane(NamedTuple):
 
 
 class BentLane(Lane):
-    """A lane that is not straight: its id, and the largest distance of its centre line from the straight line between its ends [m]."""
+    """A lane that is not straight; `bend` is the largest distance of its centre line from the straight line between its ends [m]."""
 
     name: str
     bend: float
 
 
 def lane_through(name: str, points: Sequence[Coordinates]) -> Lane:
-    """The lane whose centre line goes through these points [m]."""
+    """The lane `name` whose centre line goes through these points [m]."""
     (x, y), (to_x, to_y) = points[0], points[-1]
     length = math.hypot(to_x - x, to_y - y)
     deviations = [abs((to_x - x) * (at_y - y) - (to_y - y) * (at_x - x)) / length if length else math.hypot(at_x - x, at_y - y)
               for at_x, at_y in points]
-    if max(deviations) <= BEND:
+    if max(deviations) <= MAX_BEND:
         return Lane(points[0], points[-1])
     bent = BentLane(points[0], points[-1])
     bent.name, bent.bend = name, max(deviations)
@@ -98,11 +98,11 @@ class World(Protocol):
         """Make a vehicle reach a speed [m/s] within the coming step, in all copies."""
 
     def turn_back(self, person: str) -> None:
-        """Make a person turn round and walk back to its first edge at the same speed."""
+        """Make a person turn round and walk back to its first edge at an unchanged speed."""
 
 
 class Scene(NamedTuple):
-    """The obstacle relative to N vehicles, each of shape (N,); see `Observation` for the quantities.
+    """The obstacle relative to N vehicles; arrays of shape (N,); see `Observation` for the quantities.
 
     `over` is true where the encounter has ended for good, `visible` where the obstacle is not occluded.
     """
@@ -188,7 +188,7 @@ def pre_crash_of(scenario: Any) -> str:
 
 
 def tags(points: Iterable[Point]) -> str:
-    """Pre-crash types and light of some points as a sentence; empty if the scenarios have no type."""
+    """A sentence with the pre-crash types and light of some points; "" if no scenario has a type."""
     points = tuple(points)
     types = dict.fromkeys(filter(None, (pre_crash_of(point.scenario) for point in points)))
     light = " and ".join(dict.fromkeys(f"by {point.weather.light}" for point in points))
@@ -196,14 +196,14 @@ def tags(points: Iterable[Point]) -> str:
 
 
 SCENARIO_CONTRACT = Contract.of(Scenario, "a scenario")
-LONGEST = 3600.0
+MAX_DURATION = 3600.0
 """Longest run [s]."""
-FASTEST_TEST = 100.0
+MAX_TEST_SPEED = 100.0
 """Highest speed of a test [m/s]."""
 
 
 class GuardedScenario:
-    """A scenario from outside: it gets read-only copies, and its results are checked."""
+    """A scenario from outside the package: it gets read-only copies, and this class checks its results."""
 
     def __init__(self, scenario: Any, guard: Guard) -> None:
         self._scenario, self._guard = scenario, guard
@@ -211,17 +211,17 @@ class GuardedScenario:
         if not isinstance(network, str):
             raise guard.wrong("__init__", "network", network, "the name or path of a folder with a network")
         self.network = network
-        duration = guard.numbers("__init__", "duration", guard.field("__init__", scenario, "duration"), (), 0.0, LONGEST, above=True)
+        duration = guard.numbers("__init__", "duration", guard.field("__init__", scenario, "duration"), (), 0.0, MAX_DURATION, above=True)
         self.duration = float(duration)
-        grade = guard.numbers("__init__", "grade", getattr(scenario, "grade", 0.0), (), -STEEPEST, STEEPEST)
+        grade = guard.numbers("__init__", "grade", getattr(scenario, "grade", 0.0), (), -MAX_GRADE, MAX_GRADE)
         speed = getattr(scenario, "test_speed", None)
         self.test_speed = speed if speed is None else float(
-            guard.numbers("__init__", "test_speed", speed, (), 0.0, FASTEST_TEST, above=True))
+            guard.numbers("__init__", "test_speed", speed, (), 0.0, MAX_TEST_SPEED, above=True))
         self.reactive_actors = bool(getattr(scenario, "reactive_actors", True))
         self.grade, self.pre_crash = float(grade), str(getattr(scenario, "pre_crash", ""))
 
     def actors(self, roads: Roads) -> XmlChanges:
-        """Its changes to the network's traffic; none if it has no such method."""
+        """The scenario's changes to the network's traffic; none if the scenario has no such method."""
         return self._changes("actors", "the traffic file", roads)
 
     def _changes(self, method: str, file: str, roads: Roads) -> XmlChanges:
@@ -232,11 +232,11 @@ class GuardedScenario:
                 for path, change in changes.items()}
 
     def lanes(self, roads: Roads) -> XmlChanges:
-        """Its changes to the network's lanes; none if it has no such method (a parameter may have that name)."""
+        """The scenario's changes to the network's lanes; none if the scenario has no such method (a parameter may have that name)."""
         return {} if not callable(getattr(self._scenario, "lanes", None)) else self._changes("lanes", "the network", roads)
 
     def remarks(self) -> list[str]:
-        """Remarks on its parameters for the user."""
+        """Remarks on the scenario's parameters for the user."""
         return [str(remark) for remark in self._guard.call("remarks", getattr(self._scenario, "remarks", list))]
 
     def begin(self, world: World) -> Any:
@@ -260,17 +260,17 @@ class GuardedScenario:
         shape = trace.speed.shape
         values = {name: self._guard.field("encounter", encounter, name) for name in Encounter._fields}
         in_conflict = self._guard.truths("encounter", "in_conflict", values.pop("in_conflict"), shape)
-        counts = in_conflict & trace.active
+        is_counted = in_conflict & trace.active
         numbers = {name: self._guard.numbers("encounter", name, value, shape, infinite=True, undefined=True)
                    for name, value in values.items()}
         for name, array in numbers.items():
-            if np.isnan(array[counts]).any():
+            if np.isnan(array[is_counted]).any():
                 raise self._guard.wrong("encounter", name, float("nan"), "numbers wherever in_conflict is true")
         return Encounter(**numbers, in_conflict=in_conflict)
 
 
 class _ReadOnlyWorld:
-    """A world with only the methods of the contract `World`, which return read-only results."""
+    """A world that has only the methods of the contract `World` and returns read-only results."""
 
     def __init__(self, world: World) -> None:
         self._world = world

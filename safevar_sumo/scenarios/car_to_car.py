@@ -1,4 +1,4 @@
-"""Euro NCAP's rear-end tests: a car ahead stands (CCRs), is slower (CCRm) or brakes (CCRb); likewise a motorcyclist (CMRs, CMRb)."""
+"""Euro NCAP's rear-end tests: a car ahead stands (CCRs), is slower (CCRm), brakes (CCRb); a motorcyclist stands (CMRs), brakes (CMRb)."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from msgspec.structs import force_setattr
 from safevar_sumo.errors import InputError
 from safevar_sumo.scenarios.ahead import TargetAhead, TargetAheadTest
 from safevar_sumo.scenarios.base import PreCrash
-from safevar_sumo.scenarios.euro_ncap import AHEAD, JUNCTION, KMH, Heading, Range
+from safevar_sumo.scenarios.euro_ncap import JUNCTION, KMH, SAME_DIRECTION, Heading, Range
 
-CAR, MOTORCYCLIST = (50.0, 0.0, 25.0, 75.0, 100.0, -25.0, 125.0), (50.0, 10.0, 25.0, 75.0, 90.0)
-"""Impact locations [%]."""
+CAR_LOCATIONS, MOTORCYCLIST_LOCATIONS = (50.0, 0.0, 25.0, 75.0, 100.0, -25.0, 125.0), (50.0, 10.0, 25.0, 75.0, 90.0)
+"""Impact locations [% of the width]."""
 NETWORK = "car_to_car"
-CRAWL = 2.0
-"""Speed down to which the braking target brakes [km/h]."""
-STEADY_UP_TO = 80.0
-"""Speed of the vehicle up to which the slower target drives 20 km/h [km/h]; above it both speeds rise alike."""
+FINAL_SPEED = 2.0
+"""Speed at which the braking target stops braking [km/h]."""
+STEADY_SPEED_LIMIT = 80.0
+"""Speed of the vehicle up to which the slower target drives at 20 km/h [km/h]; above, the target is slower by 60 km/h."""
 
 
 class _Test(NamedTuple):
-    """A row of the protocol's table: the target, the range of the tests, time headway at the start [s]."""
+    """A row of the protocol's table: the target, tested speeds and impact locations, and the time headway at the start [s]."""
 
     target: str
     range: Range
@@ -32,11 +32,11 @@ class _Test(NamedTuple):
 
 
 TESTS = {
-    "CCRs": _Test("car", Range(10, 80, CAR), 5.0, PreCrash.LEAD_STOPPED),
-    "CCRm": _Test("car", Range(30, 130, CAR), 5.0, PreCrash.LEAD_SLOWER),
-    "CCRb": _Test("car", Range(30, 130, CAR), 1.0, PreCrash.LEAD_DECELERATING),
-    "CMRs": _Test("motorcyclist", Range(10, 80, MOTORCYCLIST), 5.0, PreCrash.LEAD_STOPPED),
-    "CMRb": _Test("motorcyclist", Range(30, 130, MOTORCYCLIST), 1.0, PreCrash.LEAD_DECELERATING),
+    "CCRs": _Test("car", Range(10, 80, CAR_LOCATIONS), 5.0, PreCrash.LEAD_STOPPED),
+    "CCRm": _Test("car", Range(30, 130, CAR_LOCATIONS), 5.0, PreCrash.LEAD_SLOWER),
+    "CCRb": _Test("car", Range(30, 130, CAR_LOCATIONS), 1.0, PreCrash.LEAD_DECELERATING),
+    "CMRs": _Test("motorcyclist", Range(10, 80, MOTORCYCLIST_LOCATIONS), 5.0, PreCrash.LEAD_STOPPED),
+    "CMRb": _Test("motorcyclist", Range(30, 130, MOTORCYCLIST_LOCATIONS), 1.0, PreCrash.LEAD_DECELERATING),
 }
 
 
@@ -101,10 +101,10 @@ class CarToCar(TargetAheadTest, frozen=True, kw_only=True):
         return TESTS[self.test].range.remarks(self.test, self.speed, self.impact_location, self.grade)
 
     @property
-    def _ahead(self) -> TargetAhead:
+    def _target_ahead(self) -> TargetAhead:
         if self.heading and self._speed_at(0.0):
             raise InputError("scenario.parameters", f"heading = {self.heading:g} with a moving target", "a heading for a standing target")
-        return self._ahead_of(TESTS[self.test].target, self._gap, self._speed_at, AHEAD.turned(self.heading))
+        return self._target_at_impact_location(TESTS[self.test].target, self._gap, self._speed_at, SAME_DIRECTION.turned(self.heading))
 
     @property
     def _brakes(self) -> bool:
@@ -117,28 +117,31 @@ class CarToCar(TargetAheadTest, frozen=True, kw_only=True):
     @property
     def _target_speed(self) -> float:
         """Speed of the target at the start [m/s]."""
-        slower = 20.0 + max(self.speed - STEADY_UP_TO, 0.0)
-        usual = {PreCrash.LEAD_STOPPED: 0.0, PreCrash.LEAD_SLOWER: slower}.get(TESTS[self.test].pre_crash, self.speed)
-        return (usual if self.target_speed is None else self.target_speed) * KMH
+        slower_speed = 20.0 + max(self.speed - STEADY_SPEED_LIMIT, 0.0)
+        default = {PreCrash.LEAD_STOPPED: 0.0, PreCrash.LEAD_SLOWER: slower_speed}.get(TESTS[self.test].pre_crash, self.speed)
+        return (default if self.target_speed is None else self.target_speed) * KMH
 
     def _speed_at(self, time: float) -> float:
-        first = self._target_speed
+        initial_speed = self._target_speed
         if not self._brakes:
-            return first
-        return max(first - self.target_deceleration * max(time - self.brakes_at, 0.0), min(first, CRAWL * KMH))
+            return initial_speed
+        return max(initial_speed - self.target_deceleration * max(time - self.brakes_at, 0.0), min(initial_speed, FINAL_SPEED * KMH))
 
     def _time_to_impact(self) -> float:
-        """If nobody brakes: the gap closes at a constant speed or, with a braking target, by t^2 b / 2 and then at a constant speed."""
+        """Time to the impact if the vehicle does not brake [s].
+
+        The gap closes at a constant speed; with a braking target, first at a rising speed (by b t^2 / 2), then at a constant one.
+        """
         closing_speed, gap = self.speed * KMH - self._target_speed, self._gap
         if not self._brakes:
             if closing_speed <= 0:
                 raise InputError("scenario.parameters", f"speed = {self.speed:g} km/h never reaches the target", "a slower target")
             return gap / closing_speed
-        gap_left = gap - closing_speed * self.brakes_at
-        if gap_left <= 0:
+        remaining_gap = gap - closing_speed * self.brakes_at
+        if remaining_gap <= 0:
             return gap / closing_speed
         b, speed_lost = self.target_deceleration, self._target_speed - self._speed_at(1e9)
         distance = (closing_speed + speed_lost / 2) * speed_lost / b
-        if gap_left > distance:
-            return self.brakes_at + speed_lost / b + (gap_left - distance) / (closing_speed + speed_lost)
-        return self.brakes_at + (math.sqrt(closing_speed * closing_speed + 2 * b * gap_left) - closing_speed) / b
+        if remaining_gap > distance:
+            return self.brakes_at + speed_lost / b + (remaining_gap - distance) / (closing_speed + speed_lost)
+        return self.brakes_at + (math.sqrt(closing_speed * closing_speed + 2 * b * remaining_gap) - closing_speed) / b

@@ -12,14 +12,14 @@ from msgspec.structs import force_setattr
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import Encounter, FloatArray, Trace
 from safevar_sumo.scenarios.base import Grade, PreCrash, Roads, World, XmlChanges
-from safevar_sumo.scenarios.crossing_target import NETWORK_ON_FOOT, OnFoot, OnWheels
+from safevar_sumo.scenarios.crossing_target import FOOTPATH_NETWORK, PersonMover, VehicleMover
 from safevar_sumo.scenarios.euro_ncap import (
-    APPROACH,
     BODIES,
     FROM_LEFT,
     FROM_RIGHT,
     JUNCTION,
     KMH,
+    VUT_LANE,
     VUT_LENGTH,
     VUT_WIDTH,
     BodySize,
@@ -27,27 +27,28 @@ from safevar_sumo.scenarios.euro_ncap import (
     Heading,
     ImpactLocation,
     Range,
-    Walk,
+    SpeedProfile,
     gap_beside,
     lateral_of,
 )
 from safevar_sumo.scenarios.frame import Frame
-from safevar_sumo.scenarios.target import PARKED_GAP, Course, Target, TargetTest, Times, at
+from safevar_sumo.scenarios.target import PARKED_GAP, Course, Target, TargetTest, Times, value_at
 
-KERB = "kerb_0"
+KERB_LANE = "kerb_0"
 PARKED_LENGTH = {"parked_small": 4.25, "parked_large": 4.5}
 """Lengths of the parked cars [m]: the middle of the protocol's ranges, 4.1 to 4.4 and 4.3 to 4.7 m."""
 PARKED_WIDTH = 1.8
 TIME_TO_IMPACT = 6.0
 """Time from the start to the impact, unless the target needs longer [s]."""
-ROUNDED_TO = 0.5
-"""A longer time to impact is rounded up to a multiple of this [s]."""
+ROUNDING_STEP = 0.5
+"""A time to impact above `TIME_TO_IMPACT` is rounded up to a multiple of this step [s]."""
 Metres = Annotated[float, Meta(ge=0, le=100)]
-LOCATIONS = (50.0, 25.0, 75.0, 10.0, 90.0)
+IMPACT_LOCATIONS = (50.0, 25.0, 75.0, 10.0, 90.0)
+"""Impact locations [% of the width]."""
 
 
 class _Test(NamedTuple):
-    """A row of the protocol's table: km/h, m, m, range of the tests; without a `lateral_start` the target starts at its speed."""
+    """A row of the protocol's table, in km/h and m; without a `lateral_start` the target starts at its full speed."""
 
     side: str
     target: str
@@ -59,12 +60,12 @@ class _Test(NamedTuple):
 
 
 TESTS = {
-    "CPFA": _Test("far", "adult", 8.0, 6.0, 1.5, False, Range(10, 60, LOCATIONS)),
-    "CPNA": _Test("near", "adult", 5.0, 4.0, 1.0, False, Range(10, 60, LOCATIONS)),
-    "CPNCO": _Test("near", "child", 5.0, 4.0, 1.0, True, Range(10, 60, LOCATIONS)),
-    "CBNA": _Test("near", "cyclist", 15.0, None, 0.0, False, Range(10, 60, LOCATIONS)),
-    "CBFA": _Test("far", "cyclist", 20.0, None, 0.0, False, Range(10, 60, LOCATIONS)),
-    "CBNAO": _Test("near", "cyclist", 10.0, None, 0.0, True, Range(10, 60, LOCATIONS)),
+    "CPFA": _Test("far", "adult", 8.0, 6.0, 1.5, False, Range(10, 60, IMPACT_LOCATIONS)),
+    "CPNA": _Test("near", "adult", 5.0, 4.0, 1.0, False, Range(10, 60, IMPACT_LOCATIONS)),
+    "CPNCO": _Test("near", "child", 5.0, 4.0, 1.0, True, Range(10, 60, IMPACT_LOCATIONS)),
+    "CBNA": _Test("near", "cyclist", 15.0, None, 0.0, False, Range(10, 60, IMPACT_LOCATIONS)),
+    "CBFA": _Test("far", "cyclist", 20.0, None, 0.0, False, Range(10, 60, IMPACT_LOCATIONS)),
+    "CBNAO": _Test("near", "cyclist", 10.0, None, 0.0, True, Range(10, 60, IMPACT_LOCATIONS)),
     "CCCscp": _Test("near", "car", 40.0, None, 0.0, False, Range(20, 80, (50.0,))),
     "CMCscp": _Test("near", "motorcyclist", 40.0, None, 0.0, False, Range(20, 80, (50.0,))),
 }
@@ -78,22 +79,22 @@ class _Start(NamedTuple):
     Attributes
     ----------
     mover, direction, extent
-        How SUMO moves the target, where to, and the size of its body along the lane and across it [m].
+        How SUMO moves the target, the direction of motion, and the size of the target's body along the lane and across it [m].
     impact_left
         Distance of the impact to the left of the lane's middle [m].
     distance, time
-        From the target's start to the impact [m, s].
-    walk
-        The target's motion.
+        Distance and time from the target's start to the impact [m, s].
+    profile
+        The target's speed over time.
     """
 
-    mover: OnFoot | OnWheels
+    mover: PersonMover | VehicleMover
     direction: Direction
     extent: BodySize
     impact_left: float
     distance: float
     time: float
-    walk: Walk
+    profile: SpeedProfile
 
     @classmethod
     def of(cls, test: Crossing) -> _Start:
@@ -102,7 +103,7 @@ class _Start(NamedTuple):
         Raises
         ------
         InputError
-            If the target cannot be at the impact in time.
+            If the target cannot reach the impact location in time.
         """
         target, lateral_start, is_near = test.parameter("target"), test.parameter("lateral_start"), test.parameter("side") == "near"
         speed, sign, impact_lateral = test.parameter("target_speed") * KMH, 1.0 if is_near else -1.0, lateral_of(
@@ -112,18 +113,18 @@ class _Start(NamedTuple):
             if test.acceleration_distance is not None:
                 raise InputError("scenario.parameters", "acceleration_distance: the target starts at its speed", "lateral_start too")
             time = float(test.time_to_impact or TIME_TO_IMPACT) * test.start_share
-            distance, walk = speed * time, Walk(0.0, speed, 0.0)
+            distance, profile = speed * time, SpeedProfile(0.0, speed, 0.0)
         else:
             distance, run_up = (lateral_start + impact_lateral) * test.start_share, test.parameter("acceleration_distance")
-            needed = (distance + run_up) / speed
-            time = test.time_to_impact or float(max(TIME_TO_IMPACT, math.ceil(needed / ROUNDED_TO) * ROUNDED_TO))
-            walk = Walk.reaching(distance, time, speed, run_up)
-        mover = OnFoot(target, sign, -lateral_start) if test.is_on_foot else OnWheels(target, direction)
-        return cls(mover, direction, direction.extent(BODIES[target]), sign * impact_lateral, distance, time, walk)
+            shortest_time = (distance + run_up) / speed
+            time = test.time_to_impact or float(max(TIME_TO_IMPACT, math.ceil(shortest_time / ROUNDING_STEP) * ROUNDING_STEP))
+            profile = SpeedProfile.reaching(distance, time, speed, run_up)
+        mover = PersonMover(target, sign, -lateral_start) if test.is_on_foot else VehicleMover(target, direction)
+        return cls(mover, direction, direction.extent(BODIES[target]), sign * impact_lateral, distance, time, profile)
 
 
-class _Meeting(NamedTuple):
-    """A vehicle and a target that crosses its lane at `path` [m]; see `Meeting`."""
+class _CrossingMeeting(NamedTuple):
+    """A meeting with a target whose path crosses the vehicle's lane at the position `path` [m]; see `Meeting`."""
 
     frame: Frame
     course: Course
@@ -132,21 +133,21 @@ class _Meeting(NamedTuple):
     vut_width: float
 
     def begin(self, world: World) -> float:
-        return self.start.mover.begin(world, self.start.walk)
+        return self.start.mover.begin(world, self.start.profile)
 
     def positions(self, world: World) -> FloatArray:
         return self.start.mover.positions(world)
 
     def target(self, positions: FloatArray, times: Times) -> Target:
-        direction, extent, walk = self.start.direction, self.start.extent, self.start.walk
+        direction, extent, profile = self.start.direction, self.start.extent, self.start.profile
         along, left = self.start.mover.middle(self.frame, positions)
         lateral = left if direction.left > 0 else -left
         ahead = np.zeros_like(left) if along is None else along - self.path
         return Target(self.path - extent.length / 2 + ahead, lateral, has_left=lateral > (self.vut_width + extent.width) / 2,
-                      speed=at(times, lambda time: direction.along * walk.speed_at(time)) if direction.along else 0.0, ahead=ahead)
+                      speed=value_at(times, lambda time: direction.along * profile.speed_at(time)) if direction.along else 0.0, ahead=ahead)
 
     def next_speed(self, sample: int, step: float) -> float:
-        return self.start.mover.next_speed(self.start.walk, sample, step)
+        return self.start.mover.next_speed(self.start.profile, sample, step)
 
     def set_speed(self, world: World, speed: float) -> None:
         self.start.mover.set_speed(world, speed)
@@ -222,7 +223,7 @@ class Crossing(TargetTest, frozen=True, kw_only=True, forbid_unknown_fields=True
 
     def __post_init__(self) -> None:
         if not self.network:
-            force_setattr(self, "network", NETWORK_ON_FOOT if self.is_on_foot else JUNCTION)
+            force_setattr(self, "network", FOOTPATH_NETWORK if self.is_on_foot else JUNCTION)
 
     @property
     def pre_crash(self) -> PreCrash:
@@ -244,12 +245,12 @@ class Crossing(TargetTest, frozen=True, kw_only=True, forbid_unknown_fields=True
         return TESTS[self.test].range.remarks(self.test, self.speed, self.impact_location, self.grade)
 
     def lanes(self, roads: Roads) -> XmlChanges:
-        """Changes to the crossing lane: its direction."""
-        return _Start.of(self).mover.lanes(Frame.of(roads.lane(APPROACH)), roads)
+        """Changes to the target's lanes: their direction."""
+        return _Start.of(self).mover.lanes(Frame.of(roads.lane(VUT_LANE)), roads)
 
     def actors(self, roads: Roads) -> XmlChanges:
-        """The vehicle ahead of the target's path, the target beside the lane, and the parked cars, if any."""
-        frame, start = Frame.of(roads.lane(APPROACH)), _Start.of(self)
+        """The vehicle before the target's path, the target beside the vehicle's lane, and the parked cars, if any."""
+        frame, start = Frame.of(roads.lane(VUT_LANE)), _Start.of(self)
         path = start.mover.path(frame, roads, start.impact_left)
         front = path - start.extent.length / 2 - self.speed * KMH * start.time
         if front - self.vut_length < 0:
@@ -257,7 +258,7 @@ class Crossing(TargetTest, frozen=True, kw_only=True, forbid_unknown_fields=True
         return {
             "vType[@id='vut']": {"length": repr(self.vut_length), "width": repr(self.vut_width)},
             "vehicle[@id='vut']": {"departPos": repr(front), "departSpeed": repr(self.speed * KMH)},
-            **start.mover.actors(frame, roads, start.impact_left, start.distance, start.walk),
+            **start.mover.actors(frame, roads, start.impact_left, start.distance, start.profile),
             **self._parked(frame, path, roads),
         }
 
@@ -265,7 +266,7 @@ class Crossing(TargetTest, frozen=True, kw_only=True, forbid_unknown_fields=True
         """The parked cars beside the lane, if any."""
         if not self.parameter("hidden"):
             return {f"vehicle[@id='{car}']": None for car in PARKED_LENGTH}
-        start, left = frame.place_of(roads.lane(KERB).start)
+        start, left = frame.lane_coordinates(roads.lane(KERB_LANE).start)
         changes, end, across = dict[str, dict[str, str]](), path - PARKED_GAP - start, self._parked_side - PARKED_WIDTH / 2 - left
         for car, length in PARKED_LENGTH.items():
             changes[f"vehicle[@id='{car}']"] = {"departPos": repr(end), "departPosLat": repr(across)}
@@ -273,12 +274,12 @@ class Crossing(TargetTest, frozen=True, kw_only=True, forbid_unknown_fields=True
             end -= length + PARKED_GAP
         return changes
 
-    def _meeting(self, world: World) -> _Meeting:
-        frame, start = Frame.of(world.lane(APPROACH)), _Start.of(self)
+    def _meeting(self, world: World) -> _CrossingMeeting:
+        frame, start = Frame.of(world.lane(VUT_LANE)), _Start.of(self)
         course = Course(past=-start.extent.length - self.vut_length)
         if self.parameter("hidden"):
             course = course._replace(hidden=True, to_middle=start.extent.length / 2, setback=self.sensor_setback, kerb=-self._parked_side)
-        return _Meeting(frame, course, start.mover.path(frame, world, start.impact_left), start, self.vut_width)
+        return _CrossingMeeting(frame, course, start.mover.path(frame, world, start.impact_left), start, self.vut_width)
 
     def encounter(self, trace: Trace) -> Encounter:
         """Distance between the vehicle's front and the target's body, along and across the lane; TTC from its rate of change."""
@@ -297,10 +298,10 @@ class Crossing(TargetTest, frozen=True, kw_only=True, forbid_unknown_fields=True
 
     @property
     def _parked_side(self) -> float:
-        """Position of the parked cars' sides that face the lane, to the left of its middle [m]."""
+        """Position of the sides of the parked cars that face the lane, to the left of the lane's middle [m]."""
         return -self.vut_width / 2 - PARKED_GAP
 
     def parameter(self, name: str) -> Any:
-        """A parameter of the study, by default the protocol's."""
+        """A parameter as the study sets it, by default as the protocol does."""
         value = getattr(self, name)
         return getattr(TESTS[self.test], name) if value is None else value

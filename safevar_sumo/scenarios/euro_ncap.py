@@ -1,4 +1,4 @@
-"""Common parts of scenarios of Euro NCAP's frontal crash avoidance tests: targets, ranges, directions (protocol CA-FC, v1.2, July 2026).
+"""Common parts of scenarios of Euro NCAP's frontal crash avoidance tests (protocol CA-FC, v1.2, July 2026): targets, ranges, directions.
 
 Speeds are in km/h and impact locations in per cent of the vehicle's width, as in the protocol.
 """
@@ -19,7 +19,7 @@ from safevar_sumo.scenarios.frame import Frame
 KMH = 1 / KMH_PER_MS
 """m/s per km/h."""
 VUT_LENGTH, VUT_WIDTH = 4.9016, 2.1284
-"""The bounding box of CARLA's vehicle.lincoln.mkz2017 [m]."""
+"""Bounding box of CARLA's vehicle.lincoln.mkz2017 [m]."""
 
 
 ImpactLocation = Annotated[float, Meta(ge=-50, le=150)]
@@ -29,7 +29,7 @@ Heading = Annotated[float, Meta(ge=-30, le=30)]
 
 
 class BodySize(NamedTuple):
-    """Size of a target: length in its direction of motion, width across [m]."""
+    """Size of a body [m]: length in the direction of motion, width across."""
 
     length: float
     width: float
@@ -37,12 +37,12 @@ class BodySize(NamedTuple):
 
 BODIES = {"adult": BodySize(0.6, 0.5), "child": BodySize(0.711, 0.298), "cyclist": BodySize(1.9, 0.5), "motorcyclist": BodySize(2.1, 0.8),
           "car": BodySize(4.023, 1.712)}
-"""Bounding boxes of Euro NCAP's targets, including riders."""
+"""Bounding boxes of Euro NCAP's targets, including riders [m]."""
 SHAPES = {"adult": "pedestrian", "child": "pedestrian", "cyclist": "bicycle", "motorcyclist": "motorcycle", "car": "evehicle"}
 """Shapes that sumo-gui draws for the targets; SUMO does not cut off the corners of these shapes."""
 
 
-FASTEST_TARGET = "70"
+TARGET_TOP_SPEED = "70"
 """Highest speed of a target [m/s]."""
 
 
@@ -53,8 +53,8 @@ class Direction(NamedTuple):
     left: float
 
     def turned(self, heading: float) -> Direction:
-        """The direction after a turn [degrees, counterclockwise]; rounded, as the last bits of sine and cosine depend on the machine."""
-        cosine, sine = (round(part(math.radians(heading)), 12) for part in (math.cos, math.sin))
+        """The direction turned counterclockwise by `heading` [degrees]; rounded, since the last bits of sine and cosine vary by machine."""
+        cosine, sine = (round(function(math.radians(heading)), 12) for function in (math.cos, math.sin))
         return Direction(self.along * cosine - self.left * sine, self.left * cosine + self.along * sine)
 
     def extent(self, body: BodySize) -> BodySize:
@@ -63,36 +63,36 @@ class Direction(NamedTuple):
         return BodySize(body.length * along + body.width * left, body.length * left + body.width * along)
 
 
-AHEAD, FROM_RIGHT, FROM_LEFT = Direction(1.0, 0.0), Direction(0.0, 1.0), Direction(0.0, -1.0)
+SAME_DIRECTION, FROM_RIGHT, FROM_LEFT = Direction(1.0, 0.0), Direction(0.0, 1.0), Direction(0.0, -1.0)
 TARGET = "target"
 """Id of the target in every network where it is a vehicle."""
 JUNCTION = "junction"
-"""The network in which a target has a separate lane, in any direction."""
-APPROACH = "approach_0"
+"""The network in which a target has lanes apart from the vehicle's, in any direction."""
+VUT_LANE = "approach_0"
 """The vehicle's lane before the junction."""
-ACROSS, INSIDE, ACROSS_ON = "across_0", ":junction_0_0", "across_on_0"
+ENTRY_LANE, JUNCTION_LANE, EXIT_LANE = "across_0", ":junction_0_0", "across_on_0"
 """The target's lanes: before the junction, on it, and beyond."""
 
 
 def lanes_across(frame: Frame, entry: Coordinates, exit_: Coordinates, direction: Direction, length: float = 300.0) -> XmlChanges:
-    """The target's lanes, straight in a direction: from `entry` to `exit_` on the junction, and `length` metres before and after it.
+    """The target's lanes, straight in a direction: from `entry` to `exit_` on the junction, and `length` metres before and after.
 
     Points are given along the vehicle's lane and to its left [m].
     """
     begin, end = ((x + sign * length * direction.along, y + sign * length * direction.left) for (x, y), sign in ((entry, -1), (exit_, 1)))
     return {f"edge/lane[@id='{lane}']": {"shape": " ".join(",".join(map(repr, frame.point(*end))) for end in ends),
                                          "length": repr(math.dist(*ends))}
-            for lane, ends in ((ACROSS, (begin, entry)), (INSIDE, (entry, exit_)), (ACROSS_ON, (exit_, end)))}
+            for lane, ends in ((ENTRY_LANE, (begin, entry)), (JUNCTION_LANE, (entry, exit_)), (EXIT_LANE, (exit_, end)))}
 
 
 def target_type(target: str) -> dict[str, str]:
-    """Attributes of the target's type in the traffic."""
+    """Attributes of the target's vehicle type in the traffic file."""
     body = BODIES[target]
-    return {"id": target, "length": repr(body.length), "width": repr(body.width), "guiShape": SHAPES[target], "maxSpeed": FASTEST_TARGET}
+    return {"id": target, "length": repr(body.length), "width": repr(body.width), "guiShape": SHAPES[target], "maxSpeed": TARGET_TOP_SPEED}
 
 
 class Range(NamedTuple):
-    """Range of a test of the protocol: lowest and highest speed [km/h], impact locations [%]."""
+    """Range of a test in the protocol: lowest and highest speed [km/h], impact locations [% of the width]."""
 
     slowest: float
     fastest: float
@@ -104,51 +104,51 @@ class Range(NamedTuple):
         if not self.slowest <= speed <= self.fastest:
             remarks.append(f"{test}: speed = {speed:g} km/h is outside the protocol's {self.slowest:g} to {self.fastest:g} km/h")
         if location not in self.locations:
-            legal = ", ".join(f"{location:g}" for location in self.locations)
-            remarks.append(f"{test}: impact_location = {location:g} % is none of the protocol's {legal} %")
+            locations = ", ".join(f"{location:g}" for location in self.locations)
+            remarks.append(f"{test}: impact_location = {location:g} % is none of the protocol's {locations} %")
         if grade:
             remarks.append(f"{test}: grade = {grade:g} %, and the protocol's road is level")
         return remarks
 
 
-class Walk(NamedTuple):
-    """A target that stands, sets off at `begin` [s], accelerates evenly to `speed` [m/s] within `run_up` [m], and goes on."""
+class SpeedProfile(NamedTuple):
+    """Speed over time of a target that stands, sets off at `begin` [s], and accelerates evenly to `speed` [m/s] within `run_up` [m]."""
 
     begin: float
     speed: float
     run_up: float
 
     @classmethod
-    def reaching(cls, distance: float, time: float, speed: float, run_up: float) -> Walk:
-        """The walk that covers `distance` [m] by `time` [s]: distance = speed t - run_up once the run-up is over."""
+    def reaching(cls, distance: float, time: float, speed: float, run_up: float) -> SpeedProfile:
+        """The profile that covers `distance` [m] by `time` [s]; t seconds after `begin`, past the run-up, distance = speed t - run_up."""
         if distance < run_up:
             raise InputError("scenario.parameters", f"acceleration_distance = {run_up:g} m is longer than the distance of {distance:g} m")
         begin = time - (distance + run_up) / speed
         if begin < 0:
-            needed = (distance + run_up) / speed
-            raise InputError("scenario.parameters", f"the target needs {needed:.2f} s to the impact and has {time:g} s",
+            shortest_time = (distance + run_up) / speed
+            raise InputError("scenario.parameters", f"the target needs {shortest_time:.2f} s to the impact and has {time:g} s",
                              "a faster target, a shorter distance or a longer time_to_impact")
         return cls(begin, speed, run_up)
 
     def travelled(self, time: float) -> float:
         """Distance covered [m] at a time [s]."""
-        since = max(time - self.begin, 0.0)
-        if not self.run_up or since >= 2 * self.run_up / self.speed:
-            return self.speed * since - self.run_up
-        return self.speed * self.speed / (4 * self.run_up) * since * since
+        elapsed = max(time - self.begin, 0.0)
+        if not self.run_up or elapsed >= 2 * self.run_up / self.speed:
+            return self.speed * elapsed - self.run_up
+        return self.speed * self.speed / (4 * self.run_up) * elapsed * elapsed
 
     def speed_at(self, time: float) -> float:
         """Speed [m/s] at a time [s]."""
         if time < self.begin:
             return 0.0
-        since = max(time - self.begin, 0.0)
-        if not self.run_up or since >= 2 * self.run_up / self.speed:
+        elapsed = max(time - self.begin, 0.0)
+        if not self.run_up or elapsed >= 2 * self.run_up / self.speed:
             return self.speed
-        return self.speed * self.speed / (2 * self.run_up) * since
+        return self.speed * self.speed / (2 * self.run_up) * elapsed
 
 
 def lateral_of(location: float, width: float) -> float:
-    """Offset to the right of the middle of the front [m] of an impact location, given from the left [% of the vehicle's width]."""
+    """Offset of an impact location [% of the vehicle's width, from the left] to the right of the front's middle [m]."""
     return (location / 100 - 0.5) * width
 
 

@@ -9,8 +9,8 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.records import FloatArray
 from safevar_sumo.scenarios.base import BentLane, Coordinates, Lane
 
-SKEW = 0.05
-"""Largest offset along the road between the ends of a crossing that counts as being at right angles [m]."""
+MAX_SKEW = 0.05
+"""Largest offset along the road between the two ends of a crossing at right angles [m]."""
 
 
 class Frame(NamedTuple):
@@ -41,20 +41,20 @@ class Frame(NamedTuple):
         return cls((0.0, 0.0), cls.of(lane).direction)
 
     def along(self, positions: FloatArray) -> FloatArray:
-        """Distance along the lane [m], shape (N,), of positions of shape (N, 2)."""
+        """Distances of positions, shape (N, 2), along the lane [m]; shape (N,)."""
         (x, y), (dir_x, dir_y) = self.origin, self.direction
         return (positions[:, 0] - x) * dir_x + (positions[:, 1] - y) * dir_y
 
     def left(self, positions: FloatArray) -> FloatArray:
-        """Distance to the left of the lane's middle [m], shape (N,), of positions of shape (N, 2)."""
+        """Distances of positions, shape (N, 2), to the left of the lane's middle [m]; shape (N,)."""
         (x, y), (dir_x, dir_y) = self.origin, self.direction
         return (positions[:, 1] - y) * dir_x - (positions[:, 0] - x) * dir_y
 
-    def place_of(self, point: Coordinates) -> tuple[float, float]:
+    def lane_coordinates(self, point: Coordinates) -> tuple[float, float]:
         """Distances of one point along the lane and to its left [m]."""
         (x, y), (dir_x, dir_y) = self.origin, self.direction
-        right, up = point[0] - x, point[1] - y
-        return right * dir_x + up * dir_y, up * dir_x - right * dir_y
+        delta_x, delta_y = point[0] - x, point[1] - y
+        return delta_x * dir_x + delta_y * dir_y, delta_y * dir_x - delta_x * dir_y
 
     def point(self, along: float, left: float) -> Coordinates:
         """The point at these distances along the lane and to its left [m]."""

@@ -11,11 +11,11 @@ from safevar_sumo.records import Encounter, FloatArray, Trace
 from safevar_sumo.scenarios.base import VUT, Grade, PreCrash, Scene, World
 from safevar_sumo.scenarios.frame import Frame
 
-PARKED = "parked_ahead"
+PARKED_VEHICLE = "parked_ahead"
 
 
 class _Memory(NamedTuple):
-    """The frame of the lane, position of the parked vehicle's rear bumper along it [m], and zeros; shape (N,)."""
+    """The frame of the lane, the parked vehicle's rear bumper along the lane [m], and zeros; arrays of shape (N,)."""
 
     frame: Frame
     rear: FloatArray
@@ -45,7 +45,7 @@ class LeadVehicleStopped(Struct, frozen=True, kw_only=True, forbid_unknown_field
 
     def begin(self, world: World) -> _Memory:
         frame = Frame.through_origin(world.lane_of(VUT))
-        rear = frame.along(world.vehicle_positions(PARKED)) - world.vehicle_length(PARKED)
+        rear = frame.along(world.vehicle_positions(PARKED_VEHICLE)) - world.vehicle_length(PARKED_VEHICLE)
         return _Memory(frame, rear, np.zeros_like(rear))
 
     def observe(self, world: World, step: float, memory: _Memory) -> tuple[Scene, _Memory]:
@@ -53,7 +53,7 @@ class LeadVehicleStopped(Struct, frozen=True, kw_only=True, forbid_unknown_field
         return Scene(gap, memory.zeros, memory.zeros, memory.zeros > 0), memory
 
     def encounter(self, trace: Trace) -> Encounter:
-        """Safety degree from centre to centre of two vehicles of one length; TTC = (centre distance - length) / v (method section 4)."""
+        """Safety degree from centre to centre of two vehicles of equal length; TTC = (centre distance - length) / v (method section 4)."""
         return Encounter(
             separation=trace.gap + trace.vehicle_length,
             distance=trace.gap,

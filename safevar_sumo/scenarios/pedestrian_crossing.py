@@ -10,7 +10,7 @@ from msgspec import Meta, Struct
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import Encounter, FloatArray, Trace
 from safevar_sumo.scenarios.base import VUT, Grade, PreCrash, Scene, World
-from safevar_sumo.scenarios.frame import SKEW, Frame
+from safevar_sumo.scenarios.frame import MAX_SKEW, Frame
 
 Positive = Annotated[float, Meta(gt=0, le=3600)]
 PEDESTRIAN = "pedestrian"
@@ -18,8 +18,8 @@ CROSSING_LANE = ":crossing_c0_0"
 
 
 class _Memory(NamedTuple):
-    """The frame of the lane; positions along it where the conflict begins and where the vehicle has cleared it, the pedestrian's last
-    lateral position [m]; whether the pedestrian has turned round.
+    """The frame of the lane; positions of the vehicle's front along the lane at which the conflict begins and ends, last lateral position
+    of the pedestrian [m]; whether the pedestrian has turned round.
     """
 
     frame: Frame
@@ -39,13 +39,13 @@ class PedestrianCrossing(Struct, frozen=True, kw_only=True, forbid_unknown_field
     turns_after
         Distance past the middle of the lane at which the pedestrian turns round [m]; None if the pedestrian walks on.
     lane_width
-        Width of the lane, which the pedestrian leaves at half of it from the middle [m].
+        Width of the lane [m]: the pedestrian leaves the lane at half of this width from the middle.
     grade
         Rise of the road over its length, negative downhill [%].
 
     Notes
     -----
-    Positions, speed and the turn are those of the published study's package.
+    Positions, speed and the turn are taken from the published study's package.
     """
 
     network: str = "pedestrian_crossing"
@@ -58,8 +58,8 @@ class PedestrianCrossing(Struct, frozen=True, kw_only=True, forbid_unknown_field
 
     def begin(self, world: World) -> _Memory:
         frame, crossing = Frame.through_origin(world.lane_of(VUT)), world.lane(CROSSING_LANE)
-        (path, _), (end, _) = frame.place_of(crossing.start), frame.place_of(crossing.end)
-        if abs(end - path) > SKEW:
+        (path, _), (end, _) = frame.lane_coordinates(crossing.start), frame.lane_coordinates(crossing.end)
+        if abs(end - path) > MAX_SKEW:
             raise InputError("scenario.parameters.network", f"lane {CROSSING_LANE!r} leads {abs(end - path):.2f} m along the road",
                              "a crossing at right angles")
         lateral = frame.left(world.person_positions(PEDESTRIAN)) - frame.left(world.vehicle_positions(VUT))
@@ -78,21 +78,21 @@ class PedestrianCrossing(Struct, frozen=True, kw_only=True, forbid_unknown_field
             world.turn_back(PEDESTRIAN)
             memory = memory._replace(turned=True)
         front = memory.frame.along(vehicle)
-        left = (np.abs(lateral) > self.lane_width / 2) & (lateral * lateral_speed > 0)
-        passed = front > memory.clear_point
-        return Scene(memory.conflict_point - front, lateral, lateral_speed, left | passed), memory._replace(lateral=lateral)
+        has_left = (np.abs(lateral) > self.lane_width / 2) & (lateral * lateral_speed > 0)
+        has_passed = front > memory.clear_point
+        return Scene(memory.conflict_point - front, lateral, lateral_speed, has_left | has_passed), memory._replace(lateral=lateral)
 
     def encounter(self, trace: Trace) -> Encounter:
-        """Front bumper to the pedestrian's path; TTC along the line of sight from the vehicle's centre.
+        """Distance from the front bumper to the pedestrian's path; TTC along the line of sight from the vehicle's centre.
 
         TTC = (centre distance - half length) / (v cos(theta) + v_ped sin(theta)) (method section 4).
         """
         half_length = trace.vehicle_length / 2
         ahead = trace.gap + half_length
         centre_distance = np.sqrt(ahead * ahead + trace.lateral * trace.lateral)
-        nearing = trace.speed * ahead + np.abs(trace.lateral_speed * trace.lateral)
+        approach = trace.speed * ahead + np.abs(trace.lateral_speed * trace.lateral)
         return Encounter(
             separation=trace.gap,
             distance=centre_distance - half_length,
-            closing_speed=nearing / centre_distance,
+            closing_speed=approach / centre_distance,
             in_conflict=trace.gap > 0)

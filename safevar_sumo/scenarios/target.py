@@ -1,7 +1,7 @@
-"""A target that does not react, and vehicles that meet it: the common part of Euro NCAP's scenarios.
+"""A target that does not react, and vehicles that meet the target: the common part of Euro NCAP's scenarios.
 
-The motion of the target is computed independently of the vehicles, so that a recorded scene needs it only once, at all samples, for
-thousands of vehicles and for all scenes on one road.
+The motion of the target does not depend on the vehicles: for a recorded scene it is computed once, at all samples, for thousands of
+vehicles.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from safevar_sumo.records import EVERYWHERE, BoolArray, FloatArray
 from safevar_sumo.scenarios.base import VUT, Scene, World
 from safevar_sumo.scenarios.frame import Frame
 
-APPROACHES = 0.5
-"""Closing speed that counts as approaching [m/s]: once reached, a vehicle that is no longer faster has avoided a target ahead."""
+APPROACH_SPEED = 0.5
+"""Closing speed from which on a vehicle approaches a target ahead [m/s]; it avoids the target if it is later no longer faster."""
 PARKED_GAP = 1.0
 """Gap between vehicle and parked cars, between the nearer car's front and the target's path, and between the two cars [m]."""
 Times = float | Sequence[float]
@@ -27,8 +27,8 @@ Times = float | Sequence[float]
 class Target(NamedTuple):
     """Position and speed of a target: numbers, or arrays of shape (M,), of M copies at one time or of M samples.
 
-    `edge` is the position along the lane of the side of its body that vehicles reach first, `ahead` the distance of its middle beyond
-    the point of impact [m]; `speed` is its speed along the lane [m/s]; `has_left` is true once it has left the vehicle's path.
+    `edge` is the position along the lane of the side of the target's body that vehicles reach first, `ahead` the distance of the body's
+    middle beyond the point of impact [m]; `speed` is along the lane [m/s]; `has_left` is true once the target has left the vehicle's path.
     """
 
     edge: FloatArray
@@ -43,8 +43,8 @@ class Course(NamedTuple):
     """Constants of a run: numbers, or arrays of shape (N,).
 
     A vehicle is past the target when the gap is below `past` [m]. A vehicle that `follows` the target cannot pass: it has avoided the
-    target once it has approached and is no longer faster. Parked cars hide a `hidden` target: `to_middle` is the distance from its edge
-    to its middle, `setback` from the sensors to the front bumper, `kerb` from the middle of the lane to the cars' sides [m].
+    target once it has approached and is no longer faster. Parked cars hide a `hidden` target. Distances [m]: `to_middle` from the
+    target's edge to its middle, `setback` from the sensors to the front bumper, `kerb` from the lane's middle to the parked cars' sides.
     """
 
     past: Any = -np.inf
@@ -56,18 +56,18 @@ class Course(NamedTuple):
 
 
 class Meeting(Protocol):
-    """A target's motion in a run."""
+    """How vehicles meet a target in a run: the target's motion, and the constants of the run."""
 
     @property
     def frame(self) -> Frame:
-        """Frame of the lane that vehicles are on."""
+        """Frame of the vehicles' lane."""
 
     @property
     def course(self) -> Course:
         """Constants of the run."""
 
     def begin(self, world: World) -> float:
-        """Set the target's speed of the start; returns it [m/s]."""
+        """Set the target's initial speed; returns this speed [m/s]."""
 
     def positions(self, world: World) -> FloatArray:
         """Positions of the target's front; shape (N, 2) [m]."""
@@ -83,7 +83,7 @@ class Meeting(Protocol):
 
 
 class Memory(NamedTuple):
-    """The meeting; the target's last lateral position [m]; step number; last speed that was set [m/s]; which vehicles have approached."""
+    """The meeting; the target's last lateral position [m]; step number; the speed set last [m/s]; which vehicles have approached."""
 
     meeting: Meeting
     lateral: FloatArray
@@ -112,30 +112,30 @@ class TargetTest(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         return scene, self.move(world, step, memory)._replace(lateral=target.lateral, approached=approached)
 
     def move(self, world: World, step: float, memory: Memory) -> Memory:
-        """Move the target on, as `observe` does, without computing the scene."""
+        """Set the target's next speed, as `observe` does, without computing the scene."""
         speed = memory.meeting.next_speed(memory.sample, step)
         if speed != memory.speed:
             memory.meeting.set_speed(world, speed)
         return memory._replace(sample=memory.sample + 1, speed=speed)
 
     def at_all_samples(self, world: World, samples: World, step: float) -> tuple[Meeting, Target]:
-        """The meeting in a recorded scene, and its target at all samples; `samples` presents the T samples as N copies."""
+        """The meeting in a recorded scene, and the target at all T samples; the world `samples` has the T samples as its N copies."""
         meeting = self._meeting(world)
         positions = meeting.positions(samples)
         target = meeting.target(positions, [sample * step for sample in range(len(positions))])
-        before = np.concatenate([target.lateral[:1], target.lateral[:-1]])
-        return meeting, target._replace(lateral_speed=(target.lateral - before) / step)
+        previous = np.concatenate([target.lateral[:1], target.lateral[:-1]])
+        return meeting, target._replace(lateral_speed=(target.lateral - previous) / step)
 
     def _meeting(self, world: World) -> Meeting:
         raise NotImplementedError
 
 
 def scene_of(course: Course, target: Target, front: FloatArray, speed: FloatArray, approached: BoolArray) -> tuple[Scene, BoolArray]:
-    """The scene of vehicles with their fronts along the lane [m] and their speeds [m/s], and which have approached; shape (N,)."""
+    """The scene of N vehicles by the position of their fronts along the lane [m] and their speed [m/s], and which have approached."""
     gap, zeros = target.edge - front, np.zeros_like(front)
     over = np.asarray(target.has_left | (gap < course.past))
     if course.follows is not False:
-        approached = approached | (speed - target.speed > APPROACHES)
+        approached = approached | (speed - target.speed > APPROACH_SPEED)
         over = over | course.follows & approached & (speed <= target.speed)
     visible = EVERYWHERE if course.hidden is False else _visible(course, target, gap)
     return Scene(gap, zeros + target.lateral, zeros + target.lateral_speed, over, zeros + target.speed, visible), approached
@@ -148,6 +148,6 @@ def _visible(course: Course, target: Target, gap: FloatArray) -> BoolArray:
     return np.asarray(~np.asarray(course.hidden) | (corner <= 0) | (-target.lateral * corner < course.kerb * distance))
 
 
-def at(times: Times, function: Callable[[float], float]) -> Any:
+def value_at(times: Times, function: Callable[[float], float]) -> Any:
     """A function's value at one time, or an array of its values at all times."""
     return np.array([function(time) for time in times]) if isinstance(times, Sequence) else function(times)

@@ -1,4 +1,4 @@
-"""The contract of a search algorithm, which is independent of SUMO, processes and files, and checks of algorithms from outside."""
+"""The contract of a search algorithm, independent of SUMO, processes and files, and checks of algorithms from outside the package."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from safevar_sumo.records import BoolArray, Evaluations, FloatArray
 from safevar_sumo.vehicles import CharacteristicSet, FeasibleRegion
 
 Search = Generator[FloatArray, Evaluations, Evaluations]
-"""Yields filtered settings, shape (k, n), is sent their evaluations, and returns the result of the run."""
+"""A generator: yields k filtered settings of n characteristics, shape (k, n), receives their evaluations, and returns the run's result."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -23,7 +23,7 @@ class Problem:
     """The characteristics to vary, the original vehicle's evaluation and the budget of evaluations.
 
     `population` is the number of settings of a generation, for algorithms with generations; `scoring` defines the objectives. `region` is
-    the feasible region of a study with constraints: yielded settings must lie in it after the filter.
+    the feasible region of a study with constraints: yielded settings must lie in this region after the filter.
     """
 
     characteristics: CharacteristicSet
@@ -34,7 +34,7 @@ class Problem:
     region: FeasibleRegion | None = None
 
     def uniform(self, number: int, rng: np.random.Generator) -> FloatArray:
-        """Unfiltered settings drawn uniformly in the domains that are feasible after the filter; shape (number, n)."""
+        """Unfiltered settings, drawn uniformly in the domains and feasible after the filter; shape (number, n)."""
         lower, upper = self.characteristics.lower, self.characteristics.upper
         if not self.region:
             return rng.uniform(lower, upper, (number, len(lower)))
@@ -57,7 +57,7 @@ class Algorithm(Protocol):
         """One run, which requests at most `problem.evaluations` evaluations.
 
         All randomness comes from `rng`, because a resumed run is repeated from its journal. Yielded settings are in the domains and
-        filtered. The result holds valid evaluations (`problem.scoring.valid`) that the run was sent.
+        filtered. The result consists of valid evaluations (`problem.scoring.valid`) that the run received.
         """
 
 
@@ -65,7 +65,7 @@ ALGORITHM_CONTRACT = Contract.of(Algorithm, "an algorithm")
 
 
 class GuardedAlgorithm:
-    """An algorithm from outside: it gets read-only copies, and its settings and its result are checked."""
+    """An algorithm from outside the package: it gets read-only copies, and this class checks its settings and its result."""
 
     def __init__(self, algorithm: Algorithm, guard: Guard) -> None:
         self._algorithm, self._guard = algorithm, guard
@@ -74,31 +74,31 @@ class GuardedAlgorithm:
         search = self._guard.call("search", self._algorithm.search, read_only_copy(problem), rng)
         if not (hasattr(search, "send") and hasattr(search, "__next__")):
             raise self._guard.wrong("search", "the search", search, "a generator: a method that yields settings and returns its result")
-        sent: dict[bytes, Evaluations] = {}
+        answers: dict[bytes, Evaluations] = {}
         answer: Evaluations | None = None
-        left = problem.evaluations
+        budget = problem.evaluations
         while True:
-            output, finished = self._guard.call("search", _next, search, answer)
+            output, finished = self._guard.call("search", _next_output, search, answer)
             if finished:
-                return self._result(output, sent, problem)
-            settings = self._settings(output, problem, left)
-            left -= len(settings)
+                return self._result(output, answers, problem)
+            settings = self._settings(output, problem, budget)
+            budget -= len(settings)
             evaluated = yield settings
             for i, row in enumerate(settings):
-                sent[row.tobytes()] = evaluated.take([i])
+                answers[row.tobytes()] = evaluated.take([i])
             answer = read_only_copy(evaluated)
 
-    def _settings(self, output: Any, problem: Problem, left: int) -> FloatArray:
+    def _settings(self, output: Any, problem: Problem, budget: int) -> FloatArray:
         members = problem.characteristics
-        legal = f"an array of shape (k, {len(members)}) with k from 1 to the {left} evaluations that are left"
-        if not isinstance(output, np.ndarray) or output.ndim != 2 or output.shape[1] != len(members) or not 1 <= len(output) <= left:
-            raise self._guard.wrong("search", "settings", output, legal)
+        expected = f"an array of shape (k, {len(members)}) with k from 1 to the {budget} evaluations that are left"
+        if not isinstance(output, np.ndarray) or output.ndim != 2 or output.shape[1] != len(members) or not 1 <= len(output) <= budget:
+            raise self._guard.wrong("search", "settings", output, expected)
         settings = self._guard.numbers("search", "settings", output, output.shape)
         for column, member in enumerate(members):
             self._guard.numbers("search", member.name, settings[:, column], (len(settings),), member.lower, member.upper)
-        unfiltered = np.argwhere(members.filter(settings) != settings)
-        if len(unfiltered):
-            row, column = unfiltered[0]
+        unfiltered_cells = np.argwhere(members.filter(settings) != settings)
+        if len(unfiltered_cells):
+            row, column = unfiltered_cells[0]
             raise self._guard.wrong("search", members.names[column], float(settings[row, column]),
                                     "filtered settings: problem.characteristics.filter(settings)")
         if problem.region and not problem.region.feasible(settings).all():
@@ -106,22 +106,23 @@ class GuardedAlgorithm:
                                  "problem.characteristics.filter(problem.repaired(settings))")
         return settings
 
-    def _result(self, result: Any, sent: dict[bytes, Evaluations], problem: Problem) -> Evaluations:
-        legal = "an Evaluations of settings that it was sent, such as evaluations.take(rows)"
+    def _result(self, result: Any, answers: dict[bytes, Evaluations], problem: Problem) -> Evaluations:
+        expected = "an Evaluations of settings that it was sent, such as evaluations.take(rows)"
         if not isinstance(result, Evaluations):
-            raise self._guard.wrong("search", "its result", result, legal)
-        if not sent:
+            raise self._guard.wrong("search", "its result", result, expected)
+        if not answers:
             raise ForeignError(self._guard.source, f"{self._guard.name} ended in search without yielding any setting",
                                f"a generator that yields from 1 to {problem.evaluations} settings before it returns")
         rows = self._guard.numbers("search", "its result's settings", result.settings, (len(result), len(problem.characteristics)))
-        if any(row.tobytes() not in sent for row in rows):
-            raise self._guard.wrong("search", "its result", "settings that it never yielded", legal)
-        empty = next(iter(sent.values())).take([])
-        evaluations = Evaluations.concatenate([empty, *(sent[row.tobytes()] for row in rows)])
+        if any(row.tobytes() not in answers for row in rows):
+            raise self._guard.wrong("search", "its result", "settings that it never yielded", expected)
+        empty = next(iter(answers.values())).take([])
+        evaluations = Evaluations.concatenate([empty, *(answers[row.tobytes()] for row in rows)])
         return evaluations.take(problem.scoring.valid(evaluations))
 
 
-def _next(search: Any, answer: Evaluations | None) -> tuple[Any, bool]:
+def _next_output(search: Any, answer: Evaluations | None) -> tuple[Any, bool]:
+    """What a generator yields next, or its result; and whether the generator has finished."""
     try:
         return (next(search) if answer is None else search.send(answer)), False
     except StopIteration as end:

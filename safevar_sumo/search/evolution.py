@@ -1,4 +1,4 @@
-"""The parts of evolutionary algorithms: individuals, constrained domination, SBX and polynomial mutation by DEAP."""
+"""Parts of evolutionary algorithms: individuals, constrained domination, and DEAP's SBX and polynomial mutation."""
 
 from __future__ import annotations
 
@@ -20,38 +20,38 @@ Probability = Annotated[float, Meta(ge=0, le=1)]
 Index = Annotated[float, Meta(ge=0, le=1000)]
 Size = Annotated[int, Meta(ge=1, le=100_000)]
 TournamentSize = Annotated[int, Meta(ge=2, le=1000)]
-REDRAWS = 10
-"""Number of times that a child equal to an existing individual is drawn again before it is accepted."""
-MISSES = 50
-"""Number of consecutive groups without a feasible child after which the next group is repaired."""
+MAX_REDRAWS = 10
+"""Maximum number of draws to replace a child equal to an existing individual; then the child is accepted."""
+MAX_MISSES = 50
+"""Maximum number of consecutive groups without a feasible child; the next such group is repaired."""
 
 
 @cache
 def fitness_of(objectives: int) -> type[Any]:
-    """The class of a fitness with a number of objectives, all minimised."""
+    """The class of a fitness with this number of objectives, all minimised."""
     def set_values(self: base.Fitness, values: tuple[float, ...] = ()) -> None:
-        if values:  # DEAP's own constructor also checks the type of the weights, which takes longer than all the rest
+        if values:  # DEAP's own constructor also checks the type of the weights, which takes longer than everything else
             self.values = values
 
     return type("Fitness", (base.Fitness,), {"weights": (-1.0,) * objectives, "__init__": set_values})
 
 
 class Individual(list[float]):
-    """Unfiltered values of a setting; once evaluated, also its fitness and its `evaluation`, a batch and a row of it.
+    """Unfiltered values of a setting; once evaluated, also its fitness and its `evaluation`: a batch of evaluations and a row of it.
 
-    `failed` is true if the evaluation is not valid. A survivor's `standing` is the value that its algorithm compares: less is better.
+    `has_failed` is true if the evaluation is not valid. `standing` is the value by which an algorithm compares survivors: less is better.
     """
 
     fitness: base.Fitness
     evaluation: tuple[Evaluations, int]
     standing: tuple[float, ...]
-    failed: bool = False
+    has_failed: bool = False
 
 
 class Operators(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Simulated binary crossover and polynomial mutation, both bounded by the domains.
 
-    The default mutation probability is 1/n per variable. Tournaments are between `tournament_size` individuals.
+    The default mutation probability is 1/n per variable. A tournament has `tournament_size` individuals.
     """
 
     crossover_probability: Probability = 0.9
@@ -62,78 +62,78 @@ class Operators(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
 
 class Variation:
-    """Draws offspring; DEAP's own random state is set and restored around every draw."""
+    """Draws offspring; sets the random state that DEAP uses before every draw and restores it afterwards."""
 
     def __init__(self, operators: Operators, problem: Problem, rng: np.random.Generator) -> None:
         characteristics, self._problem = problem.characteristics, problem
         self._operators, self._state = operators, random.Random(int(rng.integers(2**63))).getstate()
         self._candidates: list[Individual] = []
-        self._missed = 0
+        self._misses = 0
         probability = operators.mutation_probability
-        self._mutation = 1 / len(characteristics) if probability is None else probability
+        self._mutation_probability = 1 / len(characteristics) if probability is None else probability
         self._lower, self._upper = characteristics.lower.tolist(), characteristics.upper.tolist()
 
     @contextmanager
     def randomness(self) -> Iterator[None]:
         """Set the global `random`, from which DEAP draws, to this run's state; restore the caller's state afterwards."""
-        callers_state = random.getstate()
+        state_of_caller = random.getstate()
         random.setstate(self._state)
         try:
             yield
         finally:
             self._state = random.getstate()
-            random.setstate(callers_state)
+            random.setstate(state_of_caller)
 
     def offspring(self, population: list[Individual], number: int) -> list[Individual]:
         """`number` new individuals: two tournaments, crossover, mutation, pair by pair."""
         children: list[Individual] = []
         with self.randomness():
             while population and len(children) < number:
-                pair = self._crossed(self.winner(population), self.winner(population))
-                children += self._feasible([self._mutated(child) for child in pair])
+                pair = self._crossover(self.winner(population), self.winner(population))
+                children += self._feasible_children([self._mutate(child) for child in pair])
         return children[:number]
 
     def distinct_offspring(self, population: list[Individual], number: int) -> list[Individual]:
-        """As `offspring`, but all individuals enter equally many tournaments, and children equal to existing ones are drawn again."""
-        existing, children, drawn = set(map(tuple, population)), list[Individual](), 0
+        """As `offspring`, but all individuals enter equally many tournaments, and a copy of an existing individual is drawn again."""
+        existing, children, draws = set(map(tuple, population)), list[Individual](), 0
         self._candidates = []
         with self.randomness():
             while population and len(children) < number:
-                for child in self._feasible([self._mutated(child) for child in self._crossed(*self._winners(population))]):
-                    repeated, drawn = tuple(child) in existing, drawn + 1
-                    if not repeated or drawn > REDRAWS * number:
+                for child in self._feasible_children([self._mutate(child) for child in self._crossover(*self._parents(population))]):
+                    is_repeated, draws = tuple(child) in existing, draws + 1
+                    if not is_repeated or draws > MAX_REDRAWS * number:
                         existing.add(tuple(child))
                         children.append(child)
         return children[:number]
 
     def child(self, first: list[Individual], second: list[Individual]) -> Individual:
-        """A new individual, in neither group; its parents are the winners of a tournament in each group; call it within `randomness`."""
+        """A new individual that is in neither group; its parents win a tournament in each group. Call this method within `randomness`."""
         feasible: list[Individual] = []
-        for _ in range(REDRAWS):
+        for _ in range(MAX_REDRAWS):
             while not feasible:
-                feasible = self._feasible([self._mutated(self._crossed(self.winner(first), self.winner(second))[0])])
+                feasible = self._feasible_children([self._mutate(self._crossover(self.winner(first), self.winner(second))[0])])
             child = feasible.pop()
             if child not in first and child not in second:
                 break
         return child
 
-    def _feasible(self, children: list[Individual]) -> list[Individual]:
+    def _feasible_children(self, children: list[Individual]) -> list[Individual]:
         """The children that satisfy the study's constraints.
 
         Under constrained domination (Deb 2000) a feasible individual dominates every infeasible one. The first population is feasible,
-        so an infeasible child would not survive: it is not simulated, and others are drawn in its place. After `MISSES` groups in a row
-        without a feasible child, the next children are moved towards the original until they are feasible.
+        so an infeasible child would not survive: it is not simulated; other children are drawn in its place. After `MAX_MISSES` groups in a
+        row without a feasible child, the next children are moved towards the original until they are feasible.
         """
         if not self._problem.region:
             return children
         feasible = self._problem.feasible(np.array(children))
-        self._missed = 0 if feasible.any() else self._missed + 1
-        if self._missed > MISSES:
-            self._missed = 0
+        self._misses = 0 if feasible.any() else self._misses + 1
+        if self._misses > MAX_MISSES:
+            self._misses = 0
             return [Individual(values) for values in self._problem.repaired(np.array(children)).tolist()]
         return [child for child, is_feasible in zip(children, feasible, strict=True) if is_feasible]
 
-    def _winners(self, population: list[Individual]) -> tuple[Individual, Individual]:
+    def _parents(self, population: list[Individual]) -> tuple[Individual, Individual]:
         """The winners of two tournaments; candidates are drawn without replacement until the population is used up."""
         size, winners = min(self._operators.tournament_size, len(population)), list[Individual]()
         for _ in range(2):
@@ -146,14 +146,14 @@ class Variation:
     def winner(self, population: list[Individual]) -> Individual:
         return tournament(population, self._operators.tournament_size)
 
-    def _crossed(self, first: Individual, second: Individual) -> tuple[Individual, Individual]:
+    def _crossover(self, first: Individual, second: Individual) -> tuple[Individual, Individual]:
         children = Individual(first), Individual(second)
         if random.random() <= self._operators.crossover_probability:
             tools.cxSimulatedBinaryBounded(*children, self._operators.crossover_index, self._lower, self._upper)
         return children
 
-    def _mutated(self, child: Individual) -> Individual:
-        tools.mutPolynomialBounded(child, self._operators.mutation_index, self._lower, self._upper, self._mutation)
+    def _mutate(self, child: Individual) -> Individual:
+        tools.mutPolynomialBounded(child, self._operators.mutation_index, self._lower, self._upper, self._mutation_probability)
         return child
 
 
@@ -162,12 +162,12 @@ def initial_population(problem: Problem, rng: np.random.Generator) -> list[Indiv
     return [Individual(values) for values in problem.uniform(min(problem.population, problem.evaluations), rng).tolist()]
 
 
-def simulated(individuals: Sequence[Individual], problem: Problem) -> Generator[FloatArray, Evaluations, int]:
-    """Request the evaluation of individuals; returns the number of evaluations."""
+def request_evaluations(individuals: Sequence[Individual], problem: Problem) -> Generator[FloatArray, Evaluations, int]:
+    """Request and store the evaluations of individuals; returns the number of evaluations."""
     evaluated = yield problem.characteristics.filter(np.array(individuals))
     fitness, valid = fitness_of(len(problem.scoring.objectives)), problem.scoring.valid(evaluated).tolist()
     for i, (individual, objectives) in enumerate(zip(individuals, problem.scoring.values(evaluated).tolist(), strict=True)):
-        individual.evaluation, individual.fitness, individual.failed = (evaluated, i), fitness(tuple(objectives)), not valid[i]
+        individual.evaluation, individual.fitness, individual.has_failed = (evaluated, i), fitness(tuple(objectives)), not valid[i]
     return len(individuals)
 
 
@@ -177,7 +177,7 @@ def objectives_of(individuals: Sequence[Individual]) -> FloatArray:
 
 
 def fronts(individuals: Sequence[Individual]) -> list[list[Individual]]:
-    """Individuals grouped by non-domination rank, in their given order."""
+    """Individuals grouped by non-domination rank; each group keeps the given order."""
     if not individuals:
         return []
     ranks = moocore.pareto_rank([individual.fitness.wvalues for individual in individuals], maximise=True).tolist()
@@ -188,28 +188,28 @@ def fronts(individuals: Sequence[Individual]) -> list[list[Individual]]:
 
 
 def set_standings(individuals: Sequence[Individual]) -> list[list[Individual]]:
-    """The fronts of individuals; sets their `standing` to their rank, from 0, and minus their crowding distance."""
+    """The fronts of individuals; sets the `standing` of each to its rank, from 0, and its negative crowding distance."""
     ranked = fronts(individuals)
     for rank, front in enumerate(ranked):
-        stand_in_front(front, rank)
+        set_front_standings(front, rank)
     return ranked
 
 
-def stand_in_front(front: Sequence[Individual], rank: int) -> None:
-    """Set the `standing` of a front's individuals to its rank, from 0, and minus their crowding distance."""
+def set_front_standings(front: Sequence[Individual], rank: int) -> None:
+    """Set the `standing` of a front's individuals to the front's rank, from 0, and the individual's negative crowding distance."""
     tools.emo.assignCrowdingDist(front)
     for individual in front:
         individual.standing = rank, -individual.fitness.crowding_dist
 
 
 def tournament(population: list[Individual], size: int = 2) -> Individual:
-    """The best by standing of `size` individuals drawn without replacement; ties are decided at random."""
+    """The best, by standing, of `size` individuals drawn without replacement; chance decides ties."""
     if len(population) == 1:
         return population[0]
-    best, *others = random.sample(population, min(size, len(population)))
-    for other in others:
-        if other.standing < best.standing or (other.standing == best.standing and random.random() >= 0.5):
-            best = other
+    best, *rivals = random.sample(population, min(size, len(population)))
+    for rival in rivals:
+        if rival.standing < best.standing or (rival.standing == best.standing and random.random() >= 0.5):
+            best = rival
     return best
 
 

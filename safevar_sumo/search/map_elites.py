@@ -1,4 +1,4 @@
-"""MAP-Elites (Mouret and Clune 2015) on pyribs: an atlas with the failure of the smallest changes in every cell."""
+"""MAP-Elites (Mouret and Clune 2015) on pyribs: an atlas whose cells hold the failures with the smallest changes."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from safevar_sumo.records import Evaluations, FloatArray, IntArray
 from safevar_sumo.search.base import Problem, Search
 from safevar_sumo.search.evolution import Probability, TournamentSize
 
-MOST_CELLS = 2**16
+MAX_CELLS = 2**16
 """Maximum number of cells of an atlas: with more than 16 characteristics, not every set of changes can be a cell."""
-FASTEST = 20.0
-"""Speed of a collision up to which the cells are equally wide; faster ones are in the last cell, too [m/s]."""
+FASTEST_COLLISION = 20.0
+"""Collision speed up to which the cells are equally wide [m/s]; the last cell holds faster collisions, too."""
 
-NEVER_REACHED = 1e6
-"""Larger than any objective."""
+QUALITY_OFFSET = 1e6
+"""A number larger than any objective, which makes a collision better than any setting without a collision."""
 
 
 class MapElites(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -33,11 +33,11 @@ class MapElites(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     behaviour
         Definition of a cell: the set of characteristics changed (changes), or the number of changes and the speed of the collision (speed).
     added, removed
-        Probabilities that a child changes a further characteristic, and that it removes a change.
+        Probability that a child changes a further characteristic, and probability that it removes a change.
     reach
         Standard deviation of the mutation of changed values [share of the domain].
     speeds
-        Number of cells over the speed of a collision; one more cell holds settings without a collision.
+        Number of intervals of the collision speed that have a cell; one more cell holds settings without a collision.
     tournament_size
         Number of elites in the tournament for a parent.
     """
@@ -58,7 +58,7 @@ class MapElites(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
             If there are too many cells, or pyribs is not installed.
         """
         number = 2**characteristics if self.behaviour == "changes" else characteristics * (self.speeds + 1)
-        if number > MOST_CELLS:
+        if number > MAX_CELLS:
             raise InputError(source, f"search.map_elites.behaviour = 'changes' has 2^{characteristics} cells", "'speed'")
         try:
             import ribs  # noqa: F401
@@ -77,8 +77,8 @@ class MapElites(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         while used < problem.evaluations:
             number, generation = min(problem.population, problem.evaluations - used), problem.population
             elites = np.sort(archive.data("solution")[:, 0]).astype(int) if len(archive) else np.zeros(0, dtype=int)
-            parents = settings[self._chosen(elites, quality, generation, rng)] if len(elites) else None
-            children = self._children(parents, generation, problem, rng)  # all, so that a run does not depend on its budget
+            parents = settings[self._parents(elites, quality, generation, rng)] if len(elites) else None
+            children = self._children(parents, generation, problem, rng)  # a whole generation, so that a run does not depend on its budget
             evaluated = yield problem.characteristics.filter(children[:number])
             batches.append(evaluated)
             settings[used:used + number] = evaluated.settings
@@ -88,32 +88,33 @@ class MapElites(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
                 cells = self._cell(evaluated, problem)[valid, np.newaxis]
                 archive.add((used + valid)[:, np.newaxis].astype(float), quality[used + valid], cells)
             used += number
-        everything = Evaluations.concatenate(batches)
+        evaluations = Evaluations.concatenate(batches)
         rows = np.sort(archive.data("solution")[:, 0]).astype(int) if len(archive) else np.zeros(0, dtype=int)
-        atlas = everything.take(rows)
-        better = problem.scoring.values(atlas)[:, 0] < problem.scoring.values(problem.original)[0, 0]
-        return atlas.take(atlas.collided if atlas.collided.any() else better)
+        atlas = evaluations.take(rows)
+        is_better = problem.scoring.values(atlas)[:, 0] < problem.scoring.values(problem.original)[0, 0]
+        return atlas.take(atlas.collided if atlas.collided.any() else is_better)
 
-    def _chosen(self, elites: IntArray, quality: FloatArray, number: int, rng: np.random.Generator) -> IntArray:
+    def _parents(self, elites: IntArray, quality: FloatArray, number: int, rng: np.random.Generator) -> IntArray:
         """`number` parents, each the best of `tournament_size` elites drawn at random."""
         candidates = rng.choice(elites, (number, self.tournament_size))
         return np.asarray(candidates[np.arange(number), np.argmax(quality[candidates], axis=1)])
 
     def _children(self, parents: FloatArray | None, number: int, problem: Problem, rng: np.random.Generator) -> FloatArray:
-        """Unfiltered settings, feasible after the filter; without parents, each has some random changes."""
+        """Unfiltered settings, feasible after the filter; without parents, each setting has random changes."""
         members = problem.characteristics
         size, width = len(members), members.upper - members.lower
         if parents is None:
             changes = rng.random((number, size)) < rng.integers(1, size + 1, (number, 1)) / size
             return problem.repaired(np.where(changes, problem.uniform(number, rng), members.original))
         changed = members.changed(parents)
-        moved = parents + rng.normal(0, self.reach, parents.shape) * width
-        children = np.where(changed, np.clip(moved, members.lower, members.upper), parents)
-        fresh = rng.uniform(members.lower, members.upper, parents.shape)
-        for probability, values in ((self.added, fresh), (self.removed, np.broadcast_to(members.original, parents.shape))):
-            at = rng.integers(0, size, number) if values is fresh else np.argmax(np.where(changed, rng.random(parents.shape), -1.0), axis=1)
+        mutated_values = parents + rng.normal(0, self.reach, parents.shape) * width
+        children = np.where(changed, np.clip(mutated_values, members.lower, members.upper), parents)
+        new_values = rng.uniform(members.lower, members.upper, parents.shape)
+        for probability, values in ((self.added, new_values), (self.removed, np.broadcast_to(members.original, parents.shape))):
+            columns = rng.integers(0, size, number) if values is new_values else np.argmax(
+                np.where(changed, rng.random(parents.shape), -1.0), axis=1)
             rows = np.flatnonzero(rng.random(number) < probability)
-            children[rows, at[rows]] = values[rows, at[rows]]
+            children[rows, columns[rows]] = values[rows, columns[rows]]
         return problem.repaired(children)
 
     def _cell(self, evaluated: Evaluations, problem: Problem) -> IntArray:
@@ -121,11 +122,11 @@ class MapElites(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         if self.behaviour == "changes":
             return np.asarray(changed @ (1 << np.arange(changed.shape[1])))
         speed = np.nan_to_num(evaluated.collision_speed, nan=-1.0)
-        place = np.where(speed < 0, 0, 1 + np.minimum(np.floor(np.maximum(speed, 0) / FASTEST * self.speeds), self.speeds - 1))
+        interval = np.where(speed < 0, 0, 1 + np.minimum(np.floor(np.maximum(speed, 0) / FASTEST_COLLISION * self.speeds), self.speeds - 1))
         number = np.maximum(changed.sum(axis=1) - 1, 0)
-        return np.asarray(number * (self.speeds + 1) + place.astype(int))
+        return np.asarray(number * (self.speeds + 1) + interval.astype(int))
 
 
 def _quality(evaluated: Evaluations, problem: Problem) -> FloatArray:
-    """More is better: collisions by a small largest change; other settings, always worse, by a small first objective; shape (M,)."""
-    return np.where(evaluated.collided, NEVER_REACHED - evaluated.f_diff, -problem.scoring.values(evaluated)[:, 0])
+    """Quality of M settings, more is better: collisions by their largest change; other settings, all worse, by the first objective."""
+    return np.where(evaluated.collided, QUALITY_OFFSET - evaluated.f_diff, -problem.scoring.values(evaluated)[:, 0])

@@ -18,21 +18,21 @@ from safevar_sumo.search.evolution import (
     Variation,
     initial_population,
     joined_evaluations,
+    request_evaluations,
     set_standings,
-    simulated,
 )
 
 Side = Annotated[int, Meta(ge=1, le=100_000)]
 CROSS = ((-1, 0), (1, 0), (0, 1), (0, -1))
 NEIGHBOURHOODS = {"von_neumann": CROSS, "moore": (*CROSS, (-1, 1), (-1, -1), (1, 1), (1, -1))}
-"""Offsets in rows and columns from a cell to its 4 or 8 neighbours."""
+"""Offsets, in rows and columns, from a cell to its 4 or 8 neighbours."""
 
 
 class MoCell(Operators, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Cells on a toroidal grid that mate with their neighbours and with an archive of non-dominated individuals.
 
-    All cells reproduce at once, from the previous grid. A child replaces its cell's individual if it dominates that individual, or if
-    neither dominates and the child is not the worst of the neighbourhood. The variables are the characteristics' unfiltered values;
+    All cells reproduce at once, from the previous grid. A child replaces its cell's individual if the child dominates that individual, or
+    if neither dominates and the child is not the worst of the neighbourhood. The variables are the characteristics' unfiltered values;
     simulation and results use filtered ones. The result is the archive.
 
     Parameters
@@ -48,7 +48,7 @@ class MoCell(Operators, frozen=True, kw_only=True, forbid_unknown_fields=True):
     grid
         Rows and columns, whose product is the population; by default as close to a square as possible.
     neighbourhood
-        The 4 (von_neumann) or 8 (moore) cells beside a cell.
+        Neighbours of a cell: the adjacent 4 (von_neumann) or 8 (moore) cells.
     """
 
     archive: Size | None = None
@@ -61,7 +61,7 @@ class MoCell(Operators, frozen=True, kw_only=True, forbid_unknown_fields=True):
         Raises
         ------
         InputError
-            If their product is not the population.
+            If the product of the two numbers is not the population.
         """
         if self.grid is None:
             rows = next(side for side in range(math.isqrt(population), 0, -1) if population % side == 0)
@@ -75,15 +75,15 @@ class MoCell(Operators, frozen=True, kw_only=True, forbid_unknown_fields=True):
         neighbours = self._neighbours(problem.population)
         variation, size = Variation(self, problem, rng), self.archive or problem.population
         cells = initial_population(problem, rng)
-        used = yield from simulated(cells, problem)
+        used = yield from request_evaluations(cells, problem)
         archive = updated_archive([], cells, size)
         while used < problem.evaluations and archive:
-            valid = [cell for cell in cells if not cell.failed]
+            valid = [cell for cell in cells if not cell.has_failed]
             set_standings(valid)
-            neighbourhoods = [[cells[i] for i in indices if not cells[i].failed] for indices in neighbours]
+            neighbourhoods = [[cells[i] for i in indices if not cells[i].has_failed] for indices in neighbours]
             with variation.randomness():
                 offspring = [variation.child(mates or archive, archive) for mates in neighbourhoods[:problem.evaluations - used]]
-            used += yield from simulated(offspring, problem)
+            used += yield from request_evaluations(offspring, problem)
             generation = zip(cells, offspring, neighbourhoods, strict=False)  # the last generation may be incomplete
             cells[:len(offspring)] = [survivor(cell, child, mates) for cell, child, mates in generation]
             archive = updated_archive(archive, offspring, size)
@@ -98,23 +98,23 @@ class MoCell(Operators, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
 
 def survivor(cell: Individual, child: Individual, mates: list[Individual]) -> Individual:
-    """The survivor in a cell after its child is evaluated; `mates` are the cell and its neighbours, whose `standing` this may change."""
-    if child.failed or (not cell.failed and cell.fitness.dominates(child.fitness)):
+    """The survivor of a cell and its evaluated child; `mates` are the cell and its neighbours, whose `standing` may change."""
+    if child.has_failed or (not cell.has_failed and cell.fitness.dominates(child.fitness)):
         return cell
-    if cell.failed or child.fitness.dominates(cell.fitness):
+    if cell.has_failed or child.fitness.dominates(cell.fitness):
         return child
     set_standings([*mates, child])
     return cell if all(mate.standing <= child.standing for mate in mates) else child
 
 
 def updated_archive(archive: list[Individual], offspring: list[Individual], size: int) -> list[Individual]:
-    """The non-dominated individuals of archive and offspring, without duplicates and without the most crowded; sets their `standing`.
+    """At most `size` non-dominated individuals of archive and offspring, without duplicates, the least crowded; sets their `standing`.
 
     Offspring are copied into the archive, because archive and grid each set the `standing` of their own copy.
     """
     distinct = {member.fitness.values: member for member in archive}
     for child in offspring:
-        if not child.failed and child.fitness.values not in distinct:
+        if not child.has_failed and child.fitness.values not in distinct:
             distinct[child.fitness.values] = copy(child)
     members = next(iter(set_standings(list(distinct.values()))), [])
     while len(members) > size:

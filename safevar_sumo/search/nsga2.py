@@ -12,13 +12,13 @@ from safevar_sumo.search.evolution import (
     fronts,
     initial_population,
     joined_evaluations,
-    simulated,
-    stand_in_front,
+    request_evaluations,
+    set_front_standings,
 )
 
 
 class Nsga2(Operators, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Elitist search by rank and crowding distance; population = offspring, SBX, polynomial mutation.
+    """Elitist search by rank and crowding distance; as many offspring as individuals; SBX, polynomial mutation.
 
     The variables are the characteristics' unfiltered values; simulation and results use filtered ones.
     The default mutation probability is 1/n per variable. The result is the non-dominated part of the last population.
@@ -29,18 +29,18 @@ class Nsga2(Operators, frozen=True, kw_only=True, forbid_unknown_fields=True):
         variation = Variation(self, problem, rng)
         offspring, population, used = initial_population(problem, rng), list[Individual](), 0
         while offspring:
-            used += yield from simulated(offspring, problem)
-            population = survivors(population + [individual for individual in offspring if not individual.failed], problem.population)
+            used += yield from request_evaluations(offspring, problem)
+            population = survivors(population + [individual for individual in offspring if not individual.has_failed], problem.population)
             offspring = variation.offspring(population, min(problem.population, problem.evaluations - used))
         return joined_evaluations([best for best in population if best.standing[0] == 0], problem)
 
 
 def survivors(individuals: list[Individual], number: int) -> list[Individual]:
     """The best `number` by rank, then by crowding distance; DEAP's `selNSGA2`, sorted by compiled code."""
-    ordered = sorted(individuals, key=lambda individual: individual.fitness.wvalues, reverse=True)
+    sorted_individuals = sorted(individuals, key=lambda individual: individual.fitness.wvalues, reverse=True)
     best: list[Individual] = []
-    for rank, front in enumerate(fronts(ordered)):
-        stand_in_front(front, rank)
+    for rank, front in enumerate(fronts(sorted_individuals)):
+        set_front_standings(front, rank)
         best += sorted(front, key=lambda individual: individual.standing)
         if len(best) >= number:
             break

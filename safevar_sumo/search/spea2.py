@@ -14,7 +14,7 @@ from safevar_sumo.search.evolution import (
     initial_population,
     joined_evaluations,
     objectives_of,
-    simulated,
+    request_evaluations,
 )
 
 
@@ -46,9 +46,9 @@ class Spea2(Operators, frozen=True, kw_only=True, forbid_unknown_fields=True):
         variation, size = Variation(self, problem, rng), self.archive or problem.population
         offspring, archive, used = initial_population(problem, rng), list[Individual](), 0
         while offspring:
-            used += yield from simulated(offspring, problem)
-            good = [individual for individual in offspring if not individual.failed]
-            archive = environmental_selection(archive + good, size, normalised=self.normalised)
+            used += yield from request_evaluations(offspring, problem)
+            valid_offspring = [individual for individual in offspring if not individual.has_failed]
+            archive = environmental_selection(archive + valid_offspring, size, normalised=self.normalised)
             offspring = variation.distinct_offspring(archive, min(problem.population, problem.evaluations - used))
         return joined_evaluations([best for best in archive if best.standing[0] < 1], problem)
 
@@ -60,14 +60,14 @@ def environmental_selection(individuals: list[Individual], number: int, *, norma
     objectives = objectives_of(individuals)
     dominates = domination(objectives)
     distances = _distances(_unit_range(objectives) if normalised else objectives)
-    fitness = _raw(dominates) + _density(distances)
+    fitness = _raw_fitness(dominates) + _density(distances)
     for individual, value in zip(individuals, fitness.tolist(), strict=True):
         individual.standing = (value,)
-    nondominated = ~dominates.any(axis=0)
-    chosen = _truncated(np.flatnonzero(nondominated), distances, number)
-    rest = np.flatnonzero(~nondominated)
-    chosen += rest[np.argsort(fitness[rest], kind="stable")][:number - len(chosen)].tolist()
-    return [individuals[i] for i in chosen]
+    is_nondominated = ~dominates.any(axis=0)
+    selection = _truncate(np.flatnonzero(is_nondominated), distances, number)
+    dominated = np.flatnonzero(~is_nondominated)
+    selection += dominated[np.argsort(fitness[dominated], kind="stable")][:number - len(selection)].tolist()
+    return [individuals[i] for i in selection]
 
 
 def domination(objectives: FloatArray) -> BoolArray:
@@ -76,20 +76,20 @@ def domination(objectives: FloatArray) -> BoolArray:
     return np.asarray((first <= second).all(axis=2) & (first < second).any(axis=2))
 
 
-def _raw(dominates: BoolArray) -> FloatArray:
-    """Raw fitness: the sum of the strengths of all that dominate an individual; a strength is the number of individuals dominated."""
+def _raw_fitness(dominates: BoolArray) -> FloatArray:
+    """Raw fitness: the sum of the strengths of the individuals that dominate; the strength is the number of dominated individuals."""
     strength = np.count_nonzero(dominates, axis=1)
     return np.asarray(np.where(dominates, strength[:, np.newaxis], 0).sum(axis=0), dtype=float)
 
 
 def _density(distances: FloatArray) -> FloatArray:
-    """1 / (distance to the k-th nearest + 2), k the square root of the number of individuals, counted from 0 as in pymoo."""
+    """1 / (distance to the k-th nearest individual + 2); k is the square root of the number of individuals, counted from 0 as in pymoo."""
     k = min(int(np.sqrt(len(distances))), len(distances) - 1)
     return np.asarray(1 / (np.sort(distances, axis=1)[:, k] + 2))
 
 
 def _distances(points: FloatArray) -> FloatArray:
-    """Euclidean distances, infinite from a point to itself; summed by objective, so that they do not depend on the array's shape."""
+    """Euclidean distances, infinite from a point to itself; summed objective by objective, so that they do not depend on the shape."""
     squares = np.zeros((len(points), len(points)))
     for column in points.T:
         squares += (column[:, np.newaxis] - column) ** 2
@@ -99,18 +99,18 @@ def _distances(points: FloatArray) -> FloatArray:
 
 
 def _unit_range(objectives: FloatArray) -> FloatArray:
-    """Objectives between 0 and 1."""
+    """Objectives scaled to [0, 1]."""
     least = objectives.min(axis=0)
     width = objectives.max(axis=0) - least
     return np.asarray((objectives - least) / np.where(width > 0, width, 1.0))
 
 
-def _truncated(places: np.ndarray, distances: FloatArray, number: int) -> list[int]:
-    """Remove the places with the nearest neighbour, one by one; ties are decided by the second nearest, and so on."""
-    kept: list[int] = places.tolist()
+def _truncate(indices: np.ndarray, distances: FloatArray, number: int) -> list[int]:
+    """Remove the individual with the nearest neighbour, one by one, until `number` are left; the second nearest decides ties, and so on."""
+    kept: list[int] = indices.tolist()
     while len(kept) > number:
-        between = distances[np.ix_(kept, kept)]
-        nearest = between.min(axis=1)
+        pair_distances = distances[np.ix_(kept, kept)]
+        nearest = pair_distances.min(axis=1)
         tied = np.flatnonzero(nearest == nearest.min())
-        del kept[tied[np.lexsort(np.sort(between[tied], axis=1).T[::-1])[0]]]
+        del kept[tied[np.lexsort(np.sort(pair_distances[tied], axis=1).T[::-1])[0]]]
     return kept

@@ -34,15 +34,15 @@ def sampled(speed: Callable[[np.ndarray], np.ndarray], seconds: float = 6.0) -> 
     return speed(np.arange(0, seconds + STEP / 2, STEP))
 
 
-def test_constant_deceleration_is_as_harsh_as_it_is_and_has_jerk_at_its_ends_alone() -> None:
-    """5 m/s^2 from 15 m/s, for 3 s: at the stop all of it is gone within the second that jerk is averaged over."""
+def test_harshness_of_a_constant_deceleration_equals_it_and_jerk_occurs_only_at_its_ends() -> None:
+    """5 m/s^2 from 15 m/s, for 3 s; at the stop the deceleration ends within the second over which jerk is averaged."""
     speed = sampled(lambda t: np.maximum(15 - 5 * t, 0))
     assert comfort("brake_harshness", speed)[0] == pytest.approx(5.0)
     assert comfort("max_jerk", speed)[0] == pytest.approx(5.0)
     assert comfort("max_jerk", speed, until=2.9)[0] == pytest.approx(0.0, abs=1e-9), "what follows the run's end does not count"
 
 
-def test_a_ramp_has_its_jerk_and_is_as_harsh_as_its_last_half_second() -> None:
+def test_jerk_of_a_ramp_is_its_slope_and_harshness_the_mean_of_its_last_half_second() -> None:
     """Deceleration 2 t: jerk 2 everywhere; the mean over the last half of the first 3 seconds is 2 (3 - 0.25)."""
     speed = sampled(lambda t: 20 - t**2, 3.0)
     assert comfort("max_jerk", speed)[0] == pytest.approx(2.0)
@@ -51,8 +51,8 @@ def test_a_ramp_has_its_jerk_and_is_as_harsh_as_its_last_half_second() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("frequency", [0.2, 0.5, 1.0, 2.0, 5.0])
-def test_weighting_is_that_of_iso_2631_1(frequency: float) -> None:
-    """The magnitude of H(s) by the standard's formula, on a sine that has settled, at a step short enough for it."""
+def test_weighting_agrees_with_iso_2631_1(frequency: float) -> None:
+    """The magnitude of H(s) by the standard's formula, on a settled sine sampled with a short step."""
     step, f = 0.001, frequency
     time = np.arange(0, 40, step)
     low = np.abs(1j * f) ** 2 / np.abs((1j * f) ** 2 + np.sqrt(2) * 0.4 * 1j * f + 0.4**2)
@@ -61,7 +61,7 @@ def test_weighting_is_that_of_iso_2631_1(frequency: float) -> None:
     assert np.sqrt(2 * np.mean(settled**2)) == pytest.approx(low * shape, rel=2e-3)
 
 
-def test_rms_is_that_of_scipys_filters() -> None:
+def test_rms_agrees_with_scipys_filters() -> None:
     rng = np.random.default_rng(1)
     speed = np.cumsum(rng.normal(size=(200, 3)), axis=0)
     high, corner = 2 * np.pi * 0.4, 2 * np.pi * 2

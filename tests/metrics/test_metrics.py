@@ -1,4 +1,4 @@
-"""Metrics against closed forms: a vehicle that brakes evenly towards a standing obstacle, and one that does not."""
+"""Metrics against closed forms: a vehicle approaches a standing obstacle and brakes evenly, or does not brake."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def value(name: str, run: SimulationRuns, thresholds: MetricsTable = THRESHOLDS)
     return float(METRICS[name](run, thresholds)[0])
 
 
-def test_safety_degree_is_the_distance_left_when_standing() -> None:
+def test_safety_degree_is_the_distance_at_standstill() -> None:
     assert value("safety_degree", braking_run(10, 5, 12)) == pytest.approx(2.0)
 
 
@@ -45,7 +45,7 @@ def test_safety_degree_of_a_collision_is_minus_its_speed() -> None:
 
 
 def test_safety_degree_is_the_least_separation_of_the_encounter_alone() -> None:
-    """Over after a second, 7.5 m on: 4.5 m are left then, 2 m in the end. Without any encounter there is none."""
+    """The encounter ends after 1 s and 7.5 m, at a gap of 4.5 m; the last gap is 2 m. Without an encounter it is undefined."""
     run = braking_run(10, 5, 12)
     while_it_lasts = run.encounter._replace(in_conflict=run.trace.time[:, np.newaxis] < 1.0)
     assert value("safety_degree", dataclasses.replace(run, encounter=while_it_lasts)) == pytest.approx(4.5, abs=10 * STEP)
@@ -89,7 +89,7 @@ def test_time_to_collision_ends_with_the_first_standstill() -> None:
     assert np.all(np.isinf(ttc[run.trace.time > 2.0]))
 
 
-def test_who_stands_at_the_start_has_a_time_to_collision_once_it_drives() -> None:
+def test_a_vehicle_that_stands_at_the_start_has_a_time_to_collision_once_it_drives() -> None:
     run = braking_run(10, 5, 12)
     speed = np.where(run.trace.time[:, np.newaxis] < 1.0, 0.0, 2.0)
     gap = 20.0 + 0 * speed
@@ -106,8 +106,8 @@ def test_a_vehicle_that_never_brakes_has_no_average_deceleration() -> None:
     assert np.isnan(value("ave_dece", never))
 
 
-def ended(run: SimulationRuns, after: float) -> SimulationRuns:
-    """The same drive of which only the samples before a moment count."""
+def with_end(run: SimulationRuns, after: float) -> SimulationRuns:
+    """An equal run in which only the samples before `after` [s] count."""
     return dataclasses.replace(run, trace=dataclasses.replace(run.trace, active=run.trace.time[:, np.newaxis] < after))
 
 
@@ -115,8 +115,8 @@ def ended(run: SimulationRuns, after: float) -> SimulationRuns:
 def test_samples_that_are_not_active_do_not_count(name: str) -> None:
     run = braking_run(10, 5, 12)
     slower = dataclasses.replace(run.trace, speed=np.where(run.trace.time[:, np.newaxis] < 1.0, run.trace.speed, run.trace.speed / 2))
-    assert value(name, ended(run, 0.5)) != value(name, run) or name == "ave_dece"
-    assert value(name, ended(run, 1.0)) == value(name, ended(dataclasses.replace(run, trace=slower), 1.0))
+    assert value(name, with_end(run, 0.5)) != value(name, run) or name == "ave_dece"
+    assert value(name, with_end(run, 1.0)) == value(name, with_end(dataclasses.replace(run, trace=slower), 1.0))
 
 
 def test_a_distance_below_zero_is_no_time_to_collision() -> None:
@@ -149,7 +149,7 @@ def test_a_time_to_collision_at_the_threshold_is_exposed() -> None:
 
 
 def test_a_batch_that_failed_as_a_whole_has_no_valid_objective() -> None:
-    """Nothing measured the metric of a user's own: it is undefined, as is the safety degree."""
+    """Without a simulation, a user's metric is undefined, and so is the safety degree."""
     undefined = np.full(2, np.nan)
     failed = Evaluations(settings=np.ones((2, 1)), outcome=np.full(2, "simulator-error"), collision_speed=undefined,
                          metrics={"safety_degree": undefined}, f_diff=np.zeros(2), f_num_diff=np.zeros(2))
@@ -163,8 +163,8 @@ def test_average_deceleration_is_that_of_the_braking_cycle() -> None:
     assert value("ave_dece", braking_run(10, 5, 12), MetricsTable(ttc_threshold=2, sampling_interval=0.2)) == pytest.approx(5.0)
 
 
-def test_who_keeps_just_the_points_of_the_limit_is_unsafe() -> None:
-    """An original with 40 points: unsafe from the loss of a whole point on."""
+def test_a_vehicle_with_exactly_the_points_of_the_limit_is_unsafe() -> None:
+    """The original has 40 points: a vehicle is unsafe from a loss of one point on."""
     unsafe, undefined = Unsafe.default({"rating_points": 40.0, "safety_degree": np.nan}, np.array(["stopped"])), np.full(4, np.nan)
     rated = Evaluations(settings=np.ones((4, 1)), outcome=np.full(4, "stopped"), collision_speed=undefined, f_diff=np.zeros(4),
                         f_num_diff=np.zeros(4), metrics={"safety_degree": undefined, "rating_points": np.array([40.0, 39.25, 39.0, 38.5])})

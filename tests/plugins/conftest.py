@@ -1,4 +1,4 @@
-"""A study file with a module of its own beside it, in a folder that is not the working directory."""
+"""A study file and a module beside it, in a folder other than the working directory."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from tests.plugins.beside import ADS, Mine
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Where study and module lie; the working directory is another, empty one."""
+    """The folder of study and module; the working directory is another, empty folder."""
     (tmp_path / "elsewhere").mkdir()
     (tmp_path / "study").mkdir()
     monkeypatch.chdir(tmp_path / "elsewhere")

@@ -1,4 +1,4 @@
-"""Whatever other people's models raise or return wrongly is one kind of error; nothing they do alters what is measured."""
+"""Every exception and every wrong result of a user's model is a ForeignError; a model cannot alter measurements."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ def test_a_vehicle_that_is_wrong(method: str, body: str, expected: str, mine: Mi
     assert "vehicle.model = 'mine:Mine'" in str(caught.value)
 
 
-def test_a_foreign_vehicle_drives_to_the_bit_as_the_one_that_it_wraps(mine: Mine, folder: Path) -> None:
+def test_a_foreign_vehicle_drives_to_the_bit_like_the_vehicle_that_it_wraps(mine: Mine, folder: Path) -> None:
     foreign = mine(vehicle("", ""), VEHICLE.format(ROWS))
     (folder / "ours.toml").write_text('extends = "smoke"\nname = "ours"\n' + VEHICLE.format(ROWS).replace(
         '"mine:Mine"', '"sumo"\nparameters = { reference_mass = 1500 }'))
@@ -138,7 +138,7 @@ def test_a_scenario_that_is_wrong(method: str, body: str, expected: str, mine: M
 
 @pytest.mark.parametrize("values", ["network, duration = 7, 2.0", "network, duration = 'pedestrian_crossing', 'long'",
                                     "network, duration = 'pedestrian_crossing', -1", "network = 'pedestrian_crossing'"])
-def test_a_scenario_without_a_network_or_a_duration_is_told(values: str, mine: Mine) -> None:
+def test_a_scenario_without_a_network_or_a_duration_is_refused(values: str, mine: Mine) -> None:
     with pytest.raises(ForeignError, match=r"network|duration"):
         mine(scenario("", "").replace("network, duration = 'pedestrian_crossing', 2.0", values), SCENARIO)
 

@@ -1,4 +1,4 @@
-"""Models that let settings see each other are found before a search begins; options that write files are refused."""
+"""Checks before a search find models in which one setting affects another; options that write files are refused."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def test_an_ads_that_mixes_settings_up_is_refused(module: str, message: str, min
     assert "mine.py:" in str(caught.value)
 
 
-def test_an_honest_ads_is_not(mine: Mine, folder: Path) -> None:
+def test_an_honest_ads_is_accepted(mine: Mine, folder: Path) -> None:
     checked(mine, HONEST, folder)
 
 
@@ -142,7 +142,7 @@ class Mine(ScalarAds):
 
 @pytest.mark.slow
 def test_a_class_that_makes_every_twelfth_vehicle_safer(mine: Mine, folder: Path, tmp_path: Path) -> None:
-    """Neither the most severe evaluation of a run nor its last one shows it; the checks at the start or another evaluation do."""
+    """Neither the most severe nor the last evaluation of a run reveals the class; the checks at the start or another evaluation do."""
     system = mine(SAFER)
     study = load_study(str(folder / "mine.toml"), search={"algorithms": ["rs"], "evaluations": 100, "runs": 2})
     with pytest.raises(ForeignError, match=r"ads.model = 'mine:Mine' (a result depends on what else is simulated|.* in another order)"):

@@ -1,4 +1,4 @@
-"""Where a name in a study is looked up, and that nothing of it is called before it meets its contract."""
+"""Places where a name in a study is looked up; code is not called before it meets its contract."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def test_a_file_with_the_name_of_an_installed_module_is_refused_where_it_is_mean
     ("__main__:Mine", "cannot import from __main__"),
     ("mine:", "mine:"), (":Mine", ":Mine"), ("no where:Mine", "no where:Mine"), ("mine:Mine.Inner", "mine:Mine.Inner"),
 ])
-def test_what_does_not_meet_the_contract_is_refused_before_it_is_called(model: str, expected: str, mine: Mine, folder: Path) -> None:
+def test_a_class_that_does_not_meet_the_contract_is_refused_before_a_call(model: str, expected: str, mine: Mine, folder: Path) -> None:
     module = (SCALAR + "    pass\n\n\nclass Called:\n    def __init__(self):\n        open('called', 'w').close()\n\n"
               "    def start(self, n, nominal, step): ...\n\n\nclass NotEnough(Called):\n    def drive(self, seen): ...\n\n\n"
               "class Odd(Called):\n    drive = 3\n\n\nclass Scalar(ScalarAds):\n    def drive(self, seen, memory): ...\n")
@@ -86,7 +86,7 @@ def test_what_does_not_meet_the_contract_is_refused_before_it_is_called(model: s
     ("\nraise SystemExit(3)\n", "SystemExit: 3 ({}:2)"), ("\n\n1 / 0\n", "ZeroDivisionError: division by zero ({}:3)"),
     ("x = (\n", "SyntaxError: '(' was never closed"),
 ])
-def test_a_module_that_fails_is_told_with_its_line_and_can_be_mended(module: str, expected: str, mine: Mine, folder: Path) -> None:
+def test_a_module_that_fails_is_reported_with_its_line_and_can_be_corrected(module: str, expected: str, mine: Mine, folder: Path) -> None:
     with pytest.raises(InputError) as caught:
         mine(module)
     assert expected.format(folder / "mine.py") in str(caught.value)

@@ -1,4 +1,4 @@
-"""Euro NCAP's own calculator, in an environment of its own: it needs another pandas than this package."""
+"""Euro NCAP's official calculator, in a separate environment: it needs another version of pandas than this package."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import openpyxl
 from safevar_sumo.protocol import EURO_NCAP_2026, protocol_of
 
 GIVEN = "SAFEVAR_CALCULATOR"
-"""Environment variable with the folder of an environment that has it already."""
+"""Environment variable with the folder of an environment in which the calculator is installed."""
 
 
 class Calculator:
@@ -61,7 +61,7 @@ class Calculator:
 
 
 class Scored:
-    """What the calculator made of a spreadsheet: points by test, and the rows that it verified."""
+    """The calculator's results for a spreadsheet: points by test, and the rows that it verified."""
 
     def __init__(self, path: Path) -> None:
         book = openpyxl.load_workbook(path)

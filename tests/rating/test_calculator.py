@@ -1,4 +1,4 @@
-"""Euro NCAP's own calculator accepts our spreadsheets, and scores and colours them as we do. It is built from PyPI."""
+"""Euro NCAP's official calculator, from PyPI, accepts this package's spreadsheets and computes equal points and colours."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def template(calculator: Calculator, tmp_path_factory: pytest.TempPathFactory) -
 
 
 def agrees(rated: RatedVehicle, calculator: Calculator, template: Path, place: Path) -> None:
-    """The calculator's points of every simulated test and its colour of every cell that it has drawn are ours."""
+    """Asserts that the calculator's points of every simulated test and its colour of every cell that it draws equal this package's."""
     place.mkdir(exist_ok=True)
     Template(template, place / "predicted.xlsx").fill(rated)
     drawn = calculator.preprocessed(place / "predicted.xlsx", place / "drawn")

@@ -1,4 +1,4 @@
-"""Wear that makes no cell better earns no point: whole protocol, simulated, on vehicles that wear step by step."""
+"""Wear that improves no cell earns no point: the whole protocol, simulated with vehicles that wear step by step."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ GAIN = {"treadDepth": 4.2, "brakeTorque": 0.87, "brakeResponse": 0.16, "payload"
 
 
 def monotone(better: RatedVehicle, worse: RatedVehicle, cells: list[int]) -> bool:
-    """Whether no cell is hit more slowly by the worse vehicle."""
+    """Whether the worse vehicle has no lower impact speed in any cell."""
     speeds = [np.nan_to_num(one.cells.impact[0, cells], nan=0.0) for one in (better, worse)]
     return bool((speeds[1] >= speeds[0]).all())
 

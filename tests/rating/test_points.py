@@ -1,4 +1,4 @@
-"""Colours and points against the protocol's tables; that worse never earns more; spreadsheets that are refused."""
+"""Colours and points against the protocol's tables; a worse vehicle never earns more; refused spreadsheets."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def test_a_warning_is_green_from_1_7_s_and_measured_values_have_two_decimals() -
     assert shown == ["green", "green", "red", "red"]
 
 
-def test_who_avoids_everything_earns_all_that_is_simulated_and_who_never_brakes_nothing() -> None:
+def test_a_vehicle_that_avoids_every_impact_earns_all_simulated_points_and_one_that_never_brakes_none() -> None:
     whole = points_of(PROTOCOL, results(vehicles=2), {test: [one.layer for one in PROTOCOL.layers_of(test) if not one.simulated]
                                                       for test in PROTOCOL.tests})
     assert whole.total.tolist() == [40.0, 40.0]
@@ -97,7 +97,7 @@ def test_robustness_counts_from_half_of_the_standard_range_and_claims_count_as_h
 
 
 def test_a_layer_of_a_test_whose_cells_are_all_red_does_not_hold() -> None:
-    """There is nothing whose variations could hold; one cell that is not red is enough."""
+    """No cell has variations that could hold; a single cell that is not red is enough."""
     layers = [("CBNA", one.layer) for one in PROTOCOL.layers_of("CBNA") if one.simulated]
     for red, holds in ((12, False), (11, True)):
         impact = np.full(N, np.nan)
@@ -125,8 +125,8 @@ def test_faster_impacts_never_gain_points_in_a_matrix(seed: int, share: float, m
         assert not after.fails[0] or (after.tests[name] == 0).all()
 
 
-def test_a_weather_by_night_has_its_road_and_is_as_dark_as_both() -> None:
-    """Hard rain leaves 68 % of the range of sight, low beams 75 % of that."""
+def test_a_weather_by_night_keeps_its_road_and_multiplies_both_visibilities() -> None:
+    """Hard rain leaves 68 % of the visibility; low beams leave 75 % of these 68 %."""
     dark = by_night(WEATHERS["hard_rain"])
     assert (dark.road_friction, dark.wet, dark.light) == (0.59, True, "night")
     assert dark.visibility == pytest.approx(0.68 * 0.75)
@@ -135,7 +135,7 @@ def test_a_weather_by_night_has_its_road_and_is_as_dark_as_both() -> None:
 
 
 @pytest.mark.slow
-def test_cells_are_what_their_points_are_alone_and_in_any_batch() -> None:
+def test_a_cell_has_equal_results_alone_and_in_any_batch() -> None:
     study = load_study("euro_ncap_rating")
     system = assemble(study)
     settings_ = np.array([system.characteristics.original, system.characteristics.lower])
@@ -164,7 +164,7 @@ def test_a_rated_study_has_its_points_as_an_objective_and_another_one_has_not() 
     ({"rating": {"claims": {"CCRx": ["Type"]}}}, "CCRx"), ({"rating": {"claims": {"CCRs": ["Typo"]}}}, "Typo"),
     ({"rating": {"claims": {"CCRs": ["Trajectory/Heading"]}}}, "is simulated"), ({"matrix": {"protocol": "euro_ncap_2023"}}, "protocol"),
     ({"matrix": {"protocol": ""}}, "tests, or a protocol")])
-def test_claims_and_protocols_that_there_are_not_are_refused_by_name(changes: dict[str, Any], message: str) -> None:
+def test_unknown_claims_and_protocols_are_refused_by_name(changes: dict[str, Any], message: str) -> None:
     with pytest.raises(InputError, match=message):
         assemble(load_study("euro_ncap_rating", **changes))
 

@@ -1,4 +1,4 @@
-"""A driver who does nothing: what a vehicle meets that nobody brakes."""
+"""A driving system that holds the pedals: the encounters of a vehicle that nobody brakes."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ NATIVE = assemble(load_study("native"))
 
 
 class Hold:
-    """Keeps the pedals where they are; brakes vehicle i fully from `brakes_at[i]` on [s]."""
+    """Holds the pedals; from `brakes_at[i]` on [s], brakes vehicle i fully."""
 
     def __init__(self, brakes_at: FloatArray | None = None) -> None:
         self._brakes_at = np.inf if brakes_at is None else brakes_at
@@ -33,13 +33,13 @@ class Hold:
 
 
 def driven(scenario: Scenario, ads: Any = None, settings: FloatArray | None = None, system: System = CARLA) -> SimulationRuns:
-    """The original vehicle of CARLA, or settings, in a scenario; held at its speed unless an ADS is given."""
+    """Simulates the original vehicle of a system, or settings, in a scenario; without an ADS, the vehicle keeps its speed."""
     system = replace(system, scenario=scenario, ads=ads or Hold())
     return simulate(system, system.characteristics.original[np.newaxis] if settings is None else settings)
 
 
 def at_contact(run: SimulationRuns, values: FloatArray, vehicle: int = 0) -> float:
-    """A value when the bumper reaches the obstacle, linear between the two samples around it."""
+    """The value when the bumper reaches the obstacle, interpolated linearly between two samples."""
     gap = run.trace.gap[:, vehicle]
     after = int(np.argmax(gap <= 1e-9))
     share = gap[after - 1] / (gap[after - 1] - gap[after])

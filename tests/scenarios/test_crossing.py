@@ -1,4 +1,4 @@
-"""Pedestrians who cross: where they are at every moment, where they are hit, what hides them, and that SUMO says so too."""
+"""Crossing pedestrians: their position over time, the point of impact, occlusion by parked cars, and agreement with SUMO."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.records import Outcome
 from safevar_sumo.scenarios.car_to_car import CarToCar
 from safevar_sumo.scenarios.crossing import Crossing
-from safevar_sumo.scenarios.euro_ncap import VUT_WIDTH, Walk
+from safevar_sumo.scenarios.euro_ncap import VUT_WIDTH, SpeedProfile
 from safevar_sumo.shipped import NETWORKS
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.matrix import evaluate, simulate
@@ -33,7 +33,7 @@ NUMBERS = {"CPFA": (8 / 3.6, 6.0, 1.5), "CPNA": (5 / 3.6, 4.0, 1.0), "CPNCO": (5
 
 @pytest.mark.parametrize(("test", "location"), [*STANDARD, ("CPFA", 0.0), ("CPNA", 100.0), ("CPNCO", 10.0)])
 @pytest.mark.parametrize("speed", [10.0, 30.0, 60.0])
-def test_whoever_does_not_brake_hits_the_impact_location_when_it_is_time(test: str, location: float, speed: float) -> None:
+def test_a_vehicle_that_does_not_brake_hits_the_impact_location_at_the_time_to_impact(test: str, location: float, speed: float) -> None:
     run = driven(Crossing(test=test, speed=speed, impact_location=location))
     assert run.outcome[0] == Outcome.COLLISION
     assert run.collision_speed[0] == pytest.approx(speed / 3.6)
@@ -48,7 +48,7 @@ def test_a_pedestrian_in_the_place_of_a_cyclist_starts_at_speed() -> None:
 
 
 @pytest.mark.parametrize("test", NUMBERS)
-def test_the_pedestrian_is_where_the_closed_form_has_him(test: str) -> None:
+def test_the_pedestrian_moves_as_the_closed_form_says(test: str) -> None:
     """s = a (t - t0)^2 / 2 up to the acceleration distance, with a = u^2 / (2 s_a); then steady; at the impact location at 6 s."""
     speed, start, run_up = NUMBERS[test]
     trace = driven(Crossing(test=test, speed=20.0), Hold(np.array([0.0]))).trace
@@ -62,16 +62,16 @@ def test_the_pedestrian_is_where_the_closed_form_has_him(test: str) -> None:
 
 @settings(max_examples=40)
 @given(speed=st.floats(1, 5), run_up=st.just(0.0) | st.floats(0.1, 3), rest=st.floats(0.01, 8), time=st.floats(20, 60))
-def test_a_walk_arrives_in_time_whatever_it_is(speed: float, run_up: float, rest: float, time: float) -> None:
-    walk = Walk.reaching(run_up + rest, time, speed, run_up)
-    assert walk.travelled(time) == pytest.approx(run_up + rest)
-    assert walk.travelled(walk.begin) == 0
+def test_a_target_arrives_in_time_with_any_speed_profile(speed: float, run_up: float, rest: float, time: float) -> None:
+    profile = SpeedProfile.reaching(run_up + rest, time, speed, run_up)
+    assert profile.travelled(time) == pytest.approx(run_up + rest)
+    assert profile.travelled(profile.begin) == 0
     if run_up:
-        assert walk.travelled(walk.begin + 2 * run_up / speed) == pytest.approx(run_up, abs=1e-9)
+        assert profile.travelled(profile.begin + 2 * run_up / speed) == pytest.approx(run_up, abs=1e-9)
 
 
-def test_sumo_reports_a_crash_just_where_bodies_overlap() -> None:
-    """Many ways to brake, from both sides: bodies overlap for sure, or do not even touch, and SUMO says the same."""
+def test_sumo_reports_a_crash_exactly_if_bodies_overlap() -> None:
+    """Many braking times, targets from both sides: bodies overlap clearly or do not touch, and SUMO agrees."""
     half_width, seen = VUT_WIDTH / 2, set()
     for test, location, (length, width) in (("CPFA", 20.0, (0.6, 0.5)), ("CPNA", 60.0, (0.6, 0.5)), ("CPNCO", 5.0, (0.711, 0.298))):
         brakes_at = np.linspace(3.0, 6.2, 60)
@@ -90,7 +90,7 @@ def test_sumo_reports_a_crash_just_where_bodies_overlap() -> None:
 
 @pytest.mark.parametrize("setback", [0.0, 2.0])
 def test_a_child_is_seen_once_the_line_to_it_passes_the_parked_cars_corner(setback: float) -> None:
-    """Corner: 1 m from the vehicle's side, 1 m before the child's path. Similar triangles from the sensors in the vehicle's middle."""
+    """The corner is 1 m from the vehicle's side and 1 m before the child's path; similar triangles from the sensors in the middle."""
     scenario = Crossing(test="CPNCO", speed=40.0, sensor_setback=setback)
     recorder = _Recorder()
     run = driven(scenario, recorder)
@@ -105,7 +105,7 @@ def test_a_child_is_seen_once_the_line_to_it_passes_the_parked_cars_corner(setba
 
 
 class _Recorder(Hold):
-    """Does nothing, and keeps what it sees."""
+    """Holds the pedals and records the observations."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -149,7 +149,7 @@ WORN = assemble(load_study("wear", matrix=None))
 
 @pytest.mark.parametrize("grade", [0.0, 10.0, -10.0])
 def test_the_braking_distance_is_v2_over_2_b_plus_g_sin(grade: float) -> None:
-    """The worn car on a dry road: b is what the brakes or tyres of mu g cos give."""
+    """The worn car on a dry road: b is the deceleration by the brakes, at most the grip of the tyres, mu g cos."""
     dry = replace(WORN, weather=CARLA.weather)
     trace = driven(CarToCar(test="CCRs", speed=50, grade=grade), Hold(np.array([1.0])), system=dry).trace
     speed, brakes = trace.speed[:, 0], WORN.vehicle.sumo_type(WORN.vehicle.prepare(values(), 1.0, 0.05)).decel[0]
@@ -164,7 +164,7 @@ def values() -> dict[str, np.ndarray]:
 
 
 @pytest.mark.parametrize("grade", [6.0, -6.0])
-def test_whoever_does_not_brake_keeps_his_speed_uphill_and_downhill(grade: float) -> None:
+def test_a_vehicle_that_does_not_brake_keeps_its_speed_uphill_and_downhill(grade: float) -> None:
     for system in (CARLA, NATIVE, WORN):
         run = driven(Crossing(test="CPFA", speed=40.0, grade=grade), Aeb(reach=0.1), system=system)
         assert run.trace.speed[:100, 0] == pytest.approx(40 / 3.6, rel=1e-3)
@@ -173,7 +173,7 @@ def test_whoever_does_not_brake_keeps_his_speed_uphill_and_downhill(grade: float
     assert at_contact(run, run.trace.lateral[:, 0]) / VUT_WIDTH + 0.5 == pytest.approx(0.25, abs=0.02)
 
 
-def test_points_of_a_matrix_may_rise_and_fall_and_are_each_as_if_alone() -> None:
+def test_points_of_a_matrix_may_differ_in_grade_and_do_not_depend_on_each_other() -> None:
     tests = [{"name": "CPLA", "model": "along", "parameters": {"speed": 40}, "over": {"grade": [-8, 0, 8]}}]
     together = assemble(load_study("euro_ncap_pedestrian", matrix={"tests": tests}))
     original = together.characteristics.original[None]
@@ -183,7 +183,7 @@ def test_points_of_a_matrix_may_rise_and_fall_and_are_each_as_if_alone() -> None
     assert len(set(degrees)) == 3
 
 
-def test_a_vehicle_that_knows_no_slope_is_refused_on_one_in_words(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_vehicle_model_without_slopes_is_refused_on_a_slope(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "flat.py").write_text(
         "from safevar_sumo.vehicles.sumo import SumoVehicle\n\n\nclass Flat(SumoVehicle, frozen=True):\n"
@@ -202,11 +202,11 @@ def test_a_vehicle_that_knows_no_slope_is_refused_on_one_in_words(tmp_path: Path
 
 
 TURNS = {"north": (0.0, 1.0), "west": (-1.0, 0.0), "north-west": (-0.6, 0.8)}
-"""Where a road that leads east leads then."""
+"""Direction of a rotated road that led east before."""
 
 
 def moved(folder: Path, network: str, forth: tuple[float, float], skew: float = 0.0) -> str:
-    """A copy of a network, turned, with its southern end shifted to the right by `skew` [m]."""
+    """A rotated copy of a network, with its southern end shifted to the right by `skew` [m]."""
     def place(match: re.Match[str]) -> str:
         x, y = float(match[1]), float(match[2])
         x += skew if y < -10 else 0
@@ -233,7 +233,7 @@ def test_a_turned_road_changes_nothing(study: str, forth: tuple[float, float], t
     assert np.allclose(way, same, atol=0.02), "a position is along the way"
 
 
-def test_a_skewed_way_across_is_refused(tmp_path: Path) -> None:
+def test_a_skewed_crossing_is_refused(tmp_path: Path) -> None:
     network = moved(tmp_path, "crossing", (1.0, 0.0), skew=4.0)
     system = assemble(load_study("rain", scenario={"model": "crossing", "parameters": {"network": network}}, title="", published={}))
     with pytest.raises(InputError, match=r"lane 'footpath_0' leads [\d.]+ m along the road"):

@@ -1,4 +1,4 @@
-"""The shipped scenarios seen from a world that is made up: where things are, when they count, when somebody turns."""
+"""The shipped scenarios in an artificial world: gaps, ends of encounters, and the pedestrian's turn."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from safevar_sumo.scenarios.target import Course, Target, scene_of
 STEP, LENGTH, LANE, PATH, WIDTH = 0.05, 5.0, 14.0, 40.0, 0.5
 
 
-class MadeUp:
-    """One vehicle and one pedestrian, placed by the test; lengths and widths are what the constants say."""
+class ArtificialWorld:
+    """One vehicle and one pedestrian at positions that the test sets; the constants define lengths and widths."""
 
-    def __init__(self, front: float, place: float) -> None:
-        self.front, self.place = front, place
+    def __init__(self, front: float, lateral: float) -> None:
+        self.front, self.lateral = front, lateral
         self.turned_at: float | None = None
 
     def vehicle_positions(self, actor: str) -> np.ndarray:
         return np.array([[self.front if actor == "vut" else 100.0, LANE]])
 
     def person_positions(self, actor: str) -> np.ndarray:
-        return np.array([[PATH, LANE + self.place]])
+        return np.array([[PATH, LANE + self.lateral]])
 
     def vehicle_length(self, actor: str) -> float:
         return LENGTH if actor == "vut" else 7.0
@@ -40,20 +40,20 @@ class MadeUp:
         return WIDTH
 
     def turn_back(self, person: str) -> None:
-        self.turned_at = self.place
+        self.turned_at = self.lateral
 
 
 def test_the_gap_to_a_parked_vehicle_ends_at_its_rear() -> None:
-    scenario, world = LeadVehicleStopped(), MadeUp(60.0, 0.0)
+    scenario, world = LeadVehicleStopped(), ArtificialWorld(60.0, 0.0)
     scene, _ = scenario.observe(world, STEP, scenario.begin(world))
     assert scene.gap[0] == 100.0 - 7.0 - 60.0
     assert not scene.over[0]
 
 
 def test_the_gap_to_a_pedestrian_ends_at_the_strip_that_he_walks_on() -> None:
-    scenario, world = PedestrianCrossing(), MadeUp(30.0, -5.0)
+    scenario, world = PedestrianCrossing(), ArtificialWorld(30.0, -5.0)
     memory = scenario.begin(world)
-    world.place = -4.91
+    world.lateral = -4.91
     scene, _ = scenario.observe(world, STEP, memory)
     assert scene.gap[0] == pytest.approx(PATH - WIDTH / 2 - 30.0)
     assert scene.lateral[0] == pytest.approx(-4.91)
@@ -62,7 +62,7 @@ def test_the_gap_to_a_pedestrian_ends_at_the_strip_that_he_walks_on() -> None:
 
 @pytest.mark.parametrize(("front", "over"), [(PATH + WIDTH / 2 + LENGTH - 0.01, False), (PATH + WIDTH / 2 + LENGTH + 0.01, True)])
 def test_the_vehicle_has_passed_once_its_rear_has_left_the_strip(front: float, over: bool) -> None:
-    scenario, world = PedestrianCrossing(), MadeUp(front, 0.0)
+    scenario, world = PedestrianCrossing(), ArtificialWorld(front, 0.0)
     scene, _ = scenario.observe(world, STEP, scenario.begin(world))
     assert scene.over[0] == over
 
@@ -70,18 +70,18 @@ def test_the_vehicle_has_passed_once_its_rear_has_left_the_strip(front: float, o
 @pytest.mark.parametrize(("before", "now", "over"), [
     (1.70, 1.79, True), (1.60, 1.74, False), (1.90, 1.81, False), (-1.90, -1.80, False), (-1.70, -1.79, True)])
 def test_the_pedestrian_has_left_the_lane_when_he_walks_away_beyond_its_edge(before: float, now: float, over: bool) -> None:
-    scenario, world = PedestrianCrossing(turns_after=None, lane_width=3.5), MadeUp(0.0, before)
+    scenario, world = PedestrianCrossing(turns_after=None, lane_width=3.5), ArtificialWorld(0.0, before)
     memory = scenario.begin(world)
-    world.place = now
+    world.lateral = now
     assert scenario.observe(world, STEP, memory)[0].over[0] == over
 
 
 def test_the_pedestrian_turns_in_the_last_step_that_keeps_him_within_the_distance() -> None:
-    """At 1.8 m/s, 0.09 m a step: told in the step from which the next one would lead beyond 0.7 m; and only once."""
-    scenario, world = PedestrianCrossing(), MadeUp(0.0, 0.0)
+    """At 1.8 m/s (0.09 m a step) the pedestrian turns, once only, in the step after which the next would lead beyond 0.7 m."""
+    scenario, world = PedestrianCrossing(), ArtificialWorld(0.0, 0.0)
     memory, turns = scenario.begin(world), []
     for k in range(1, 12):
-        world.place = 0.09 * k
+        world.lateral = 0.09 * k
         _, memory = scenario.observe(world, STEP, memory)
         if world.turned_at is not None:
             turns.append(k)
@@ -90,7 +90,7 @@ def test_the_pedestrian_turns_in_the_last_step_that_keeps_him_within_the_distanc
 
 
 @pytest.mark.parametrize(("faster", "avoids"), [(0.4, False), (0.6, True)])
-def test_who_has_come_nearer_by_half_a_metre_a_second_has_avoided_a_target_ahead_once_it_is_no_longer_faster(
+def test_a_vehicle_has_avoided_a_target_ahead_once_it_has_approached_at_half_a_metre_a_second_and_is_no_longer_faster(
         faster: float, avoids: bool) -> None:
     target, approached, over = Target(np.array([30.0]), np.zeros(1), speed=5.0), np.zeros(1, dtype=bool), []
     for speed in (5.0, 5.0 + faster, 5.1, 5.0):
@@ -108,7 +108,7 @@ def trace(gap: np.ndarray, speed: np.ndarray, lateral: np.ndarray, lateral_speed
 
 
 def test_closing_speed_of_a_pedestrian_has_both_speeds_along_the_line_of_sight() -> None:
-    """Vehicle's centre at (0, 0), he at (4, -3): distance 5, theta from cos = 0.8; v cos + v_ped sin = 0.8 * 6 + 0.6 * 1.5."""
+    """Vehicle's centre at (0, 0), pedestrian at (4, -3): distance 5, cos(theta) = 0.8; v cos + v_ped sin = 0.8 * 6 + 0.6 * 1.5."""
     encounter = PedestrianCrossing().encounter(trace(np.array([4.0 - LENGTH / 2]), np.array([6.0]), np.array([-3.0]), np.array([1.5])))
     assert encounter.distance[0, 0] == pytest.approx(5.0 - LENGTH / 2)
     assert encounter.closing_speed[0, 0] == pytest.approx(0.8 * 6 + 0.6 * 1.5)

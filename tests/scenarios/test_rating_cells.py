@@ -1,4 +1,4 @@
-"""Cells of Euro NCAP's rating and their robustness layers: when and where who does not brake meets the target, and how fast."""
+"""Cells of Euro NCAP's rating and their robustness layers: time, place and speed of the impact of a vehicle that does not brake."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ from safevar_sumo.sumo.system import assemble
 from tests.scenarios.holding import CARLA, NATIVE, Hold, at_contact, driven
 
 KMH = 1 / 3.6
-CAR, NARROW = (125, 100, 75, 50, 25, 0, -25), (90, 75, 50, 25, 10)
+CAR_LOCATIONS, NARROW_LOCATIONS = (125, 100, 75, 50, 25, 0, -25), (90, 75, 50, 25, 10)
 NEAR, FAR = 1, -1
 
 
 class Cell(NamedTuple):
-    """A scenario, and what the closed form has: arrival [s] and relative speed [m/s]."""
+    """A scenario, and the arrival [s] and relative speed [m/s] by the closed form."""
 
     scenario: Any
     arrival: float
@@ -34,14 +34,14 @@ class Cell(NamedTuple):
 
 
 class Row(NamedTuple):
-    """A crossing test of the protocol: where it starts from, or None, and its run-up [m]; headings of its layer; speed layers [km/h]."""
+    """A crossing test of the protocol: side, target speed [km/h], lateral start and run-up [m], headings and speed changes of layers."""
 
     side: int
     speed: float
     start: float | None
     run_up: float
     headings: tuple[float, ...]
-    faster_or_slower: tuple[float, float]
+    speed_changes: tuple[float, float]
 
 
 CROSSING = {
@@ -52,28 +52,28 @@ CROSSING = {
 
 
 def crossing(test: str, speed: float, location: float) -> Iterator[Cell]:
-    """A cell and its layers: the protocol's target is there after 6 s, or as soon as it can be."""
+    """A cell and its layers; the target arrives after 6 s, or as soon as it can."""
     row = CROSSING[test]
     width = Crossing().vut_width
     layers: list[dict[str, float]] = [{}, {"start_share": 0.75}, *({"heading": float(turn)} for turn in row.headings),
-                                      *({"target_speed": row.speed + more} for more in row.faster_or_slower)]
+                                      *({"target_speed": row.speed + increase} for increase in row.speed_changes)]
     for layer in layers:
-        share, pace = layer.get("start_share", 1.0), layer.get("target_speed", row.speed) * KMH
+        share, target_speed_ms = layer.get("start_share", 1.0), layer.get("target_speed", row.speed) * KMH
         arrival = 6.0 * share
         if row.start is not None:
-            way = (row.start + (location / 100 - 0.5) * width) * share
-            arrival = max(6.0, math.ceil((way + row.run_up) / pace * 2) / 2)
-        forward = -row.side * math.sin(math.radians(layer.get("heading", 0.0))) * pace
+            distance = (row.start + (location / 100 - 0.5) * width) * share
+            arrival = max(6.0, math.ceil((distance + row.run_up) / target_speed_ms * 2) / 2)
+        forward = -row.side * math.sin(math.radians(layer.get("heading", 0.0))) * target_speed_ms
         yield Cell(Crossing(test=test, speed=speed, impact_location=location, **layer), arrival, speed * KMH - forward)
 
 
 def junction(test: str, speed: float, target_speed: float) -> Iterator[Cell]:
-    for more in (0, 5, -5):
-        yield Cell(Crossing(test=test, speed=speed, target_speed=target_speed + more), 6.0, speed * KMH)
+    for increase in (0, 5, -5):
+        yield Cell(Crossing(test=test, speed=speed, target_speed=target_speed + increase), 6.0, speed * KMH)
 
 
 def behind(test: str, speed: float, location: float, target_speed: float) -> Iterator[Cell]:
-    """A cell and its layers of somebody who stands, or is slower; gap of 5 s."""
+    """A cell and its layers with a standing or slower target and a gap of 5 s."""
     turns = (0.0, -10.0, 20.0) if target_speed == 0 else (0.0,)
     closing = (speed - target_speed) * KMH
     for turn in turns:
@@ -82,13 +82,13 @@ def behind(test: str, speed: float, location: float, target_speed: float) -> Ite
 
 
 def behind_braking(test: str, speed: float, location: float) -> Iterator[Cell]:
-    """Headway of 1 s; from 3 s on the target brakes at 4 m/s^2 down to 2 km/h: gap = closing^2 / (2 b), then steady."""
+    """Headway of 1 s; from 3 s on, the target brakes at b = 4 m/s^2 down to 2 km/h: gap = closing^2 / (2 b), then a steady speed."""
     for headway, deceleration in ((1, 4), (1.5, 4), (0.5, 4), (1, 6), (1, 2)):
-        gap, slowed = headway * speed * KMH, (speed - 2) * KMH
-        closing = min(math.sqrt(2 * deceleration * gap), slowed)
-        since = closing / deceleration + max(gap - closing**2 / (2 * deceleration), 0) / closing
+        gap, speed_loss = headway * speed * KMH, (speed - 2) * KMH
+        closing = min(math.sqrt(2 * deceleration * gap), speed_loss)
+        braking_time = closing / deceleration + max(gap - closing**2 / (2 * deceleration), 0) / closing
         scenario = CarToCar(test=test, speed=speed, impact_location=location, headway=headway, target_deceleration=deceleration)
-        yield Cell(scenario, 3 + since, closing)
+        yield Cell(scenario, 3 + braking_time, closing)
 
 
 def along(test: str, speed: float, location: float, target_speed: float) -> Iterator[Cell]:
@@ -98,19 +98,19 @@ def along(test: str, speed: float, location: float, target_speed: float) -> Iter
 def all_cells() -> Iterator[Cell]:
     for test in CROSSING:
         for speed in range(10, 61, 10):
-            for location in NARROW:
+            for location in NARROW_LOCATIONS:
                 yield from crossing(test, speed, location)
     for test in ("CCCscp", "CMCscp"):
         for speed in range(20, 81, 10):
             for target_speed in range(20, 81, 10):
                 yield from junction(test, speed, target_speed)
-    for test, locations in (("CC", CAR), ("CM", NARROW)):
+    for test, locations in (("CC", CAR_LOCATIONS), ("CM", NARROW_LOCATIONS)):
         for location in locations:
             for speed in range(10, 81, 10):
                 yield from behind(f"{test}Rs", speed, location, 0)
             for speed in range(30, 131, 10):
                 yield from behind_braking(f"{test}Rb", speed, location)
-    for location in CAR:
+    for location in CAR_LOCATIONS:
         for speed in range(30, 131, 10):
             yield from behind("CCRm", speed, location, 20 + max(speed - 80, 0))
     for test, slowest, first, then in (("CPLA", 10, 5, 5), ("CBLA", 20, 15, 20)):
@@ -121,7 +121,7 @@ def all_cells() -> Iterator[Cell]:
                 yield from along(test, speed, location, then)
 
 
-def at_the_edges() -> Iterator[Cell]:
+def edge_cells() -> Iterator[Cell]:
     """One cell of every test and all its layers, at the ends of the ranges."""
     for k, test in enumerate(CROSSING):
         yield from crossing(test, (10, 60)[k % 2], (10, 90)[k // 2 % 2])
@@ -153,13 +153,13 @@ def check(cells: list[Cell]) -> None:
 
 
 @pytest.mark.slow
-def test_cells_at_the_edges_and_their_layers_are_where_the_closed_forms_have_them() -> None:
-    check([*at_the_edges()])
+def test_cells_at_the_edges_and_their_layers_agree_with_the_closed_forms() -> None:
+    check([*edge_cells()])
 
 
 @pytest.mark.slow
-def test_cells_and_layers_of_all_tests_are_where_the_closed_forms_have_them() -> None:
-    """Every seventh of some 2,400 cells: all rows, locations and layers come up."""
+def test_cells_and_layers_of_all_tests_agree_with_the_closed_forms() -> None:
+    """Every seventh of some 2,400 cells, among them all rows, locations and layers."""
     check([*all_cells()][::7])
 
 
@@ -169,8 +169,8 @@ def test_cells_and_layers_of_all_tests_are_where_the_closed_forms_have_them() ->
     CarToCar(test="CCRs", impact_location=125, heading=20), CarToCar(test="CMRs", impact_location=10, heading=-10),
     CarToCar(test="CMRb", speed=90, impact_location=90), Along(test="CBLA", speed=80, target_speed=20),
 ], ids=lambda scenario: scenario.test)
-def test_further_targets_are_hit_in_a_recorded_scene_as_in_sumo_to_the_last_bit(scenario: Any) -> None:
-    """One who never brakes, and who brakes at any time up to the impact: fronts that hit, corners, targets that have passed."""
+def test_other_targets_are_hit_in_a_recorded_scene_as_in_sumo_to_the_last_bit(scenario: Any) -> None:
+    """Vehicles that never brake, or brake at any time up to the impact: impacts at the front and the corners, and passed targets."""
     n, arrival = 30, scenario.duration - scenario.time_after
     brakes_at = np.append(np.random.default_rng(4).uniform(arrival - 3, arrival + 0.3, n - 1), 99.0)
     system = replace(CARLA, ads=Hold(brakes_at), matrix=(Point(scenario, WEATHERS["clear"]),))
@@ -200,7 +200,7 @@ def test_a_scenario_of_ones_own_may_turn_lanes_and_may_call_a_parameter_lanes(in
 
 
 def test_a_cyclist_behind_parked_cars_is_seen_past_the_corner_whatever_his_direction() -> None:
-    """Straight line from the front's middle to the cyclist's: it passes the corner 1 m beside the vehicle, 1 m before the impact."""
+    """The line from the front's middle to the cyclist's middle passes the corner 1 m beside the vehicle, 1 m before the impact."""
     for heading in (0.0, -10.0, 20.0):
         scenario = Crossing(test="CBNAO", heading=heading)
         trace = driven(scenario).trace
@@ -211,15 +211,15 @@ def test_a_cyclist_behind_parked_cars_is_seen_past_the_corner_whatever_his_direc
         corner = 40 * KMH * before + reach - 1.0
         y = 10 * KMH * before * math.cos(turned)
         hidden = (corner > 0) & (y * corner / x > scenario.vut_width / 2 + 1.0)
-        recorder = _Seen()
+        recorder = _GapRecorder()
         driven(scenario, recorder)
         seen = np.array(recorder.gaps)
         assert np.isinf(seen).tolist() == hidden[:len(seen)].tolist()
         assert 0.5 < before[np.argmin(hidden)] < 3.0
 
 
-class _Seen(Hold):
-    """Does nothing, and keeps the gaps that it sees."""
+class _GapRecorder(Hold):
+    """Holds the pedals and records the observed gaps."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -240,7 +240,7 @@ def test_impossible_targets_are_refused(kind: type, parameters: dict[str, Any], 
         driven(kind(**parameters), system=NATIVE)
 
 
-def test_a_speed_outside_the_protocol_is_allowed_with_a_word() -> None:
+def test_a_speed_outside_the_protocol_is_allowed_with_a_remark() -> None:
     assert Crossing(test="CMCscp", speed=90).remarks() == ["CMCscp: speed = 90 km/h is outside the protocol's 20 to 80 km/h"]
     assert CarToCar(test="CMRs", speed=10, impact_location=125).remarks() == [
         "CMRs: impact_location = 125 % is none of the protocol's 50, 10, 25, 75, 90 %"]

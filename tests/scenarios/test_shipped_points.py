@@ -1,4 +1,4 @@
-"""Every point of the matrices that ship: where and when it hits who does not brake, that the originals avoid it, and what fails."""
+"""Every point of the shipped matrices: place and time of the impact without braking, and that the original vehicles avoid it."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ BRAKE = {"euro_ncap_pedestrian": "maxBrakeTorque", "euro_ncap_car_to_car": "maxB
 
 
 def clear(study: str) -> System:
-    """The matrix by day: the dark changes nothing of who walks where."""
+    """The matrix by day: darkness does not change the motion of targets."""
     system = assemble(load_study(study))
     return replace(system, matrix=tuple(point for point in system.points if point.weather.name != "night"))
 
@@ -36,7 +36,7 @@ def original_and_half_its_brakes(study: str, system: System) -> np.ndarray:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("study", BRAKE)
-def test_who_does_not_brake_is_where_the_protocol_says_at_every_point(study: str) -> None:
+def test_a_vehicle_that_does_not_brake_hits_the_protocols_impact_location_at_every_point(study: str) -> None:
     """The impact location within 2 % of the width; a pedestrian's arrival within 5 cm of his way or of the vehicle's.
 
     So does a vehicle at any corner of the domains: within the protocol's +1.0 and -0.5 km/h of the test's speed.
@@ -96,7 +96,7 @@ STOPS_AT_ONCE = Hold(np.array([0.0]))
 
 
 def closed_in(test: str, speed: float) -> float:
-    """When the gap is closed that the protocol begins with: 5 s (CCRb: 1 s) of the vehicle's speed."""
+    """Time at which the protocol's initial gap is closed [s]: 5 s (CCRb: 1 s) at the vehicle's speed."""
     if test == "CCRs":
         return 5.0
     if test == "CCRm":
@@ -107,15 +107,15 @@ def closed_in(test: str, speed: float) -> float:
 
 @pytest.mark.parametrize(("test", "speed"), [("CCRs", 10), ("CCRs", 50), ("CCRm", 30), ("CCRm", 80), ("CCRb", 30), ("CCRb", 80)])
 @pytest.mark.parametrize("location", [0.0, 75.0])
-def test_whoever_does_not_brake_hits_the_car_when_and_where_the_closed_form_says(test: str, speed: float, location: float) -> None:
+def test_a_vehicle_that_does_not_brake_hits_the_car_when_and_where_the_closed_form_says(test: str, speed: float, location: float) -> None:
     run = driven(CarToCar(test=test, speed=speed, impact_location=location), system=NATIVE)
     assert run.outcome[0] == Outcome.COLLISION
     assert at_contact(run, run.trace.time) == pytest.approx(closed_in(test, speed), abs=2e-3)
     assert at_contact(run, run.trace.lateral[:, 0]) / VUT_WIDTH + 0.5 == pytest.approx(location / 100)
 
 
-def test_the_braking_car_is_where_the_closed_form_has_it() -> None:
-    """80 km/h, from 3 s on 4 m/s^2 less, down to 2 km/h; the vehicle stands behind it."""
+def test_the_braking_car_moves_as_the_closed_form_says() -> None:
+    """The car drives at 80 km/h and from 3 s on brakes at 4 m/s^2 down to 2 km/h; the vehicle stands behind it."""
     trace = driven(CarToCar(test="CCRb", speed=80), STOPS_AT_ONCE, system=NATIVE).trace
     first, last = 80 * KMH, 2 * KMH
     since = np.clip(trace.time - 3, 0, (first - last) / 4)
@@ -125,7 +125,7 @@ def test_the_braking_car_is_where_the_closed_form_has_it() -> None:
     assert trace.obstacle_speed[:, 0] == pytest.approx(np.where(trace.time < 3, first, np.maximum(first - 4 * (trace.time - 3), last)))
 
 
-def test_the_walker_ahead_is_where_the_closed_form_has_him() -> None:
+def test_the_pedestrian_ahead_moves_as_the_closed_form_says() -> None:
     trace = driven(Along(speed=30), STOPS_AT_ONCE, system=NATIVE).trace
     speed = 5 * KMH
     way = np.where(trace.time < 2 / speed, speed**2 / 4 * trace.time**2, speed * trace.time - 1)
@@ -137,7 +137,7 @@ def test_the_walker_ahead_is_where_the_closed_form_has_him() -> None:
 
 
 @pytest.mark.parametrize("scenario", [CarToCar(test="CCRm", speed=40), CarToCar(test="CCRb", speed=40), Along(speed=40)])
-def test_sumo_reports_a_collision_just_when_the_gap_is_gone(scenario: CarToCar | Along) -> None:
+def test_sumo_reports_a_collision_exactly_when_the_gap_is_closed(scenario: CarToCar | Along) -> None:
     n = 40
     run = driven(scenario, Hold(np.linspace(1.0, scenario.duration, n)), np.repeat(NATIVE.characteristics.original[np.newaxis], n, axis=0),
                  NATIVE)

@@ -1,4 +1,4 @@
-"""Problems whose answer is known, and a way to run an algorithm on them."""
+"""Problems with a known solution, and functions that run an algorithm on them."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def evaluated(characteristics: CharacteristicSet, settings: np.ndarray, safety: 
 
 
 def sphere(characteristics: CharacteristicSet, settings: np.ndarray) -> Evaluations:
-    """The safer, the nearer to the lower ends of the domains."""
+    """The nearer a setting is to the lower ends of the domains, the safer it is."""
     share = (settings - characteristics.lower) / (characteristics.upper - characteristics.lower)
     return evaluated(characteristics, settings, np.add.accumulate(share**2, axis=1)[:, -1])
 

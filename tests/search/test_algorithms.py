@@ -43,7 +43,7 @@ def test_the_budget_is_kept_to_the_evaluation(name: str, evaluations: int) -> No
     assert sum(len(settings) for settings in searched(name, 1, evaluations)[1]) == evaluations
 
 
-def test_what_is_asked_and_found_is_filtered_and_in_the_domains(name: str) -> None:
+def test_yielded_settings_and_results_are_filtered_and_in_the_domains(name: str) -> None:
     solutions, asked = searched(name, 2, 400)
     for settings in (*asked, solutions.settings):
         assert np.all((settings >= SUN.lower) & (settings <= SUN.upper))
@@ -113,7 +113,7 @@ def test_nsga2_finds_the_known_front_of_one_variable() -> None:
 
 
 class _Dtlz2(Evaluations):
-    """Evaluations whose three objectives are those of the standard problem DTLZ2, not those of a vehicle."""
+    """Evaluations with the three objectives of the standard problem DTLZ2 instead of a vehicle's objectives."""
 
     @property
     def objectives(self) -> np.ndarray:
@@ -136,7 +136,7 @@ def dtlz2(characteristics: CharacteristicSet, settings: np.ndarray) -> Evaluatio
 
 @pytest.mark.slow
 def test_hypervolumes_are_those_of_jmetalpy_on_dtlz2() -> None:
-    """The package of the study used jMetalPy; ten runs each of the same settings do not differ significantly."""
+    """The published study used jMetalPy; ten runs of each implementation with equal settings do not differ significantly."""
     variables, evaluations = 7, 3000
 
     class Unfiltered(CharacteristicSet):
@@ -179,7 +179,7 @@ def test_values_are_uniform_outside_the_filters_band() -> None:
     assert np.mean(drawn < 2404) == pytest.approx(below, abs=0.1)
 
 
-def test_it_ends_after_five_generations_without_improvement() -> None:
+def test_safe_fuzzer_ends_after_five_generations_without_improvement() -> None:
     single = CharacteristicSet((Characteristic(name="c", unit="-", original=5.0, lower=4.0, upper=6.0),))
 
     def constant(characteristics: CharacteristicSet, settings: np.ndarray) -> Evaluations:
@@ -224,7 +224,7 @@ def individuals(*objectives: tuple[float, float, float]) -> list[Individual]:
 
 @given(st.lists(st.tuples(*[st.integers(-2, 2)] * 3), max_size=40), st.integers(1, 40))
 def test_survivors_are_those_of_deap(objectives: list[tuple[float, float, float]], number: int) -> None:
-    """The very same ones, in the same order: with ties of all kinds."""
+    """Identical survivors in identical order, with ties of all kinds."""
     ours, deaps = individuals(*objectives), individuals(*objectives)
     fronts = tools.sortLogNondominated(deaps, number) if deaps else []
     expected = []
@@ -235,7 +235,7 @@ def test_survivors_are_those_of_deap(objectives: list[tuple[float, float, float]
     assert places == [next(i for i, one in enumerate(deaps) if one is survivor) for survivor in expected[:number]]
 
 
-def test_a_tournament_is_won_by_rank_then_by_room() -> None:
+def test_a_tournament_is_won_by_rank_then_by_crowding_distance() -> None:
     better, worse = individuals((0, 0, 0), (1, 1, 1))
     for one, rank, room in ((better, 0, 0.1), (worse, 1, 9.0)):
         one.standing = rank, -room
@@ -245,8 +245,8 @@ def test_a_tournament_is_won_by_rank_then_by_room() -> None:
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_nsga2_returns_of_its_population_what_nothing_dominates(seed: int) -> None:
-    """After the first population alone most of it is dominated."""
+def test_nsga2_returns_the_non_dominated_part_of_its_population(seed: int) -> None:
+    """After only one population, most individuals are dominated."""
     solutions, asked = searched("nsga2", seed, POPULATION)
     everything = sphere(SUN, asked[0])
     optimal = everything.take(moocore.is_nondominated(everything.objectives, keep_weakly=True))
@@ -254,7 +254,7 @@ def test_nsga2_returns_of_its_population_what_nothing_dominates(seed: int) -> No
     assert sorted(map(tuple, solutions.objectives.tolist())) == sorted(map(tuple, optimal.objectives.tolist()))
 
 
-def test_random_search_keeps_all_of_equal_worth() -> None:
+def test_random_search_keeps_all_solutions_with_equal_objectives() -> None:
     def equal(characteristics: CharacteristicSet, settings: np.ndarray) -> Evaluations:
         one = np.ones(len(settings))
         return Evaluations(settings=settings, outcome=np.full(len(settings), Outcome.STOPPED.value, dtype="U16"),
@@ -282,7 +282,7 @@ def test_ranges_narrow_to_means_of_the_unsafe_alone_and_never_across_the_origina
 def test_the_number_of_changes_is_rounded_half_up(settings: list[list[float]], most: int) -> None:
     ranges = _Ranges(problem())
     ranges.narrow(window(settings, [1.0] * len(settings)))
-    assert ranges.most_changed == most, "a mean of 1.5 makes 2, of 4/3 makes 1"
+    assert ranges.max_changes == most, "a mean of 1.5 makes 2, of 4/3 makes 1"
 
 
 def test_a_score_weighs_safety_six_times_and_the_others_once() -> None:
@@ -311,7 +311,7 @@ def test_a_grid_closes_on_itself() -> None:
     assert MoCell()._neighbours(2) == [[0, 1], [1, 0]]
 
 
-def test_a_child_that_is_as_good_as_its_cell_enters_only_where_somebody_else_is_worse() -> None:
+def test_a_child_that_neither_dominates_nor_is_dominated_enters_only_if_a_neighbour_is_worse() -> None:
     cell, child, far, worst = individuals((0, 2, 0), (0, 2, 0), (2, 0, 0), (3, 3, 0))
     assert survivor(cell, child, [cell]) is cell
     assert survivor(cell, child, [cell, far]) is cell
@@ -343,7 +343,7 @@ def test_options_change_what_a_search_asks_for(name: str, options: dict[str, obj
 
 
 def test_an_atlas_has_the_smallest_collision_of_every_set_of_changes() -> None:
-    """Whatever has more than three changes collides."""
+    """Every setting with more than three changes collides."""
     def colliding(characteristics: CharacteristicSet, settings: np.ndarray) -> Evaluations:
         good = sphere(characteristics, settings)
         outcome = np.where(good.f_num_diff > 3, Outcome.COLLISION.value, good.outcome).astype("U16")
@@ -358,7 +358,7 @@ def test_an_atlas_has_the_smallest_collision_of_every_set_of_changes() -> None:
 
 
 def test_cells_of_an_atlas_over_the_speed_are_a_metre_a_second_wide_and_the_last_one_is_open() -> None:
-    """20 of them, and one without a collision, for each number of changes."""
+    """For each number of changes, 20 cells of collisions and one cell without a collision."""
     speeds = [np.nan, 0.0, 0.9, 1.0, 18.9, 19.0, 25.0]
     one, two = (dataclasses.replace(window([setting] * 7, [1.0] * 7), collision_speed=np.array(speeds)) for setting in ([60, 50], [60, 60]))
     atlas = MapElites(behaviour="speed")
@@ -367,7 +367,7 @@ def test_cells_of_an_atlas_over_the_speed_are_a_metre_a_second_wide_and_the_last
     assert atlas.cells(2) == 42
 
 
-def test_an_atlas_that_cannot_be_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_impossible_atlas_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(InputError, match="2\\^17 cells"):
         MapElites().cells(17)
     assert MapElites(behaviour="speed").cells(17) == 17 * 21

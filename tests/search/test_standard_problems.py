@@ -1,4 +1,4 @@
-"""SPEA2 and MOCell on standard problems, beside pymoo's and jMetalPy's."""
+"""SPEA2 and MOCell on standard problems, compared with pymoo and jMetalPy."""
 
 from __future__ import annotations
 
@@ -48,8 +48,8 @@ def dtlz2(x: np.ndarray) -> np.ndarray:
                      g * np.sin(angles[:, 0])], axis=1)
 
 
-class Standard(NamedTuple):
-    """Variables in [0, 1], objectives, and the reference point of the hypervolume."""
+class StandardProblem(NamedTuple):
+    """The number of variables in [0, 1], the objectives, and the reference point of the hypervolume."""
 
     variables: int
     objectives: Callable[[np.ndarray], np.ndarray]
@@ -57,10 +57,10 @@ class Standard(NamedTuple):
 
 
 PROBLEMS = {
-    "zdt1": Standard(30, zdt(lambda first, g: 1 - np.sqrt(first / g)), (11.0, 11.0)),
-    "zdt2": Standard(30, zdt(lambda first, g: 1 - (first / g) ** 2), (11.0, 11.0)),
-    "zdt3": Standard(30, zdt(lambda first, g: 1 - np.sqrt(first / g) - first / g * np.sin(10 * np.pi * first)), (11.0, 11.0)),
-    "dtlz2": Standard(12, dtlz2, (2.0, 2.0, 2.0)),
+    "zdt1": StandardProblem(30, zdt(lambda first, g: 1 - np.sqrt(first / g)), (11.0, 11.0)),
+    "zdt2": StandardProblem(30, zdt(lambda first, g: 1 - (first / g) ** 2), (11.0, 11.0)),
+    "zdt3": StandardProblem(30, zdt(lambda first, g: 1 - np.sqrt(first / g) - first / g * np.sin(10 * np.pi * first)), (11.0, 11.0)),
+    "dtlz2": StandardProblem(12, dtlz2, (2.0, 2.0, 2.0)),
 }
 
 
@@ -73,7 +73,7 @@ class Unfiltered(CharacteristicSet):
 class StandardScoring:
     """The objectives of a standard problem in place of a vehicle's."""
 
-    problem: Standard
+    problem: StandardProblem
     metrics: Any = SAFEVAR.metrics
     objectives: list[None] = field(init=False)
 
@@ -87,7 +87,7 @@ class StandardScoring:
         return np.ones(len(evaluations), dtype=bool)
 
 
-def front_of_ours(name: str, standard: Standard, seed: int) -> np.ndarray:
+def front_of_ours(name: str, standard: StandardProblem, seed: int) -> np.ndarray:
     unit = Unfiltered(tuple(Characteristic(name=f"x{i}", unit="-", original=1.5, lower=1.0, upper=2.0) for i in range(standard.variables)))
     scoring: Any = StandardScoring(standard)
     problem = Problem(characteristics=unit, original=evaluated(unit, unit.original[np.newaxis], np.zeros(1)), evaluations=EVALUATIONS,
@@ -101,7 +101,7 @@ def front_of_ours(name: str, standard: Standard, seed: int) -> np.ndarray:
             return scoring.values(end.value)
 
 
-def front_of_pymoo(standard: Standard, seed: int) -> np.ndarray:
+def front_of_pymoo(standard: StandardProblem, seed: int) -> np.ndarray:
     class Theirs(PymooProblem):
         def __init__(self) -> None:
             super().__init__(n_var=standard.variables, n_obj=len(standard.reference), xl=0.0, xu=1.0)
@@ -113,7 +113,7 @@ def front_of_pymoo(standard: Standard, seed: int) -> np.ndarray:
     return np.asarray(minimize(Theirs(), algorithm, ("n_eval", EVALUATIONS), seed=seed).F)
 
 
-def front_of_jmetal(standard: Standard, seed: int) -> np.ndarray:
+def front_of_jmetal(standard: StandardProblem, seed: int) -> np.ndarray:
     class Theirs(FloatProblem):
         def __init__(self) -> None:
             super().__init__()
@@ -148,7 +148,7 @@ def front_of_jmetal(standard: Standard, seed: int) -> np.ndarray:
 @pytest.mark.parametrize("problem", sorted(PROBLEMS))
 @pytest.mark.parametrize(("name", "theirs"), [("spea2", front_of_pymoo), ("mocell", front_of_jmetal)])
 def test_hypervolumes_reach_those_of_the_second_implementation(problem: str, name: str,
-                                                               theirs: Callable[[Standard, int], np.ndarray]) -> None:
+                                                               theirs: Callable[[StandardProblem, int], np.ndarray]) -> None:
     standard = PROBLEMS[problem]
     ours, others = ([moocore.hypervolume(front, ref=standard.reference) for front in fronts] for fronts in (
         [front_of_ours(name, standard, seed) for seed in SEEDS], [theirs(standard, seed) for seed in SEEDS]))
@@ -186,7 +186,7 @@ def test_spea2_ranks_what_nothing_dominates_by_its_distance_to_the_third_nearest
 @pytest.mark.slow
 @pytest.mark.parametrize("hundred", range(10))
 def test_survivors_of_spea2_are_those_of_pymoo_on_random_fronts(hundred: int) -> None:
-    """The same objectives as often; but which of dominated ones of equal fitness is the last to survive, pymoo's sort leaves open."""
+    """Equal objectives, equally often; among dominated individuals of equal fitness, pymoo's sort does not define the last survivor."""
     for seed in range(100 * hundred, 100 * (hundred + 1)):
         objectives = random_front(seed)
         number = int(np.random.default_rng(seed + 10_000).integers(1, len(objectives) + 1))
