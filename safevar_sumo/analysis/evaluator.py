@@ -28,13 +28,13 @@ PARTS_PER_WORKER = 2
 CONFIDENCE = 0.95
 """Confidence level of the intervals of shares, unless an option sets another level."""
 CRITERION_SETTINGS = 1024
-"""Number of settings over the whole domain that decide the default criterion: a collision if any of them collides, else a safety degree."""
+"""Number of settings over the whole domain that decide the default criterion: a collision if any setting collides, else a safety degree."""
 Progress = Callable[[str, int, int], None]
 """A function that shows progress. Its arguments: the stage, the number of settings done in this stage, and the stage's total number."""
 
 
 MAX_REJECTIONS = 64
-"""Where fewer than one in this many points of the Sobol sequence is feasible, mixtures of the feasible region's vertices replace them."""
+"""If fewer than 1 in so many points of the Sobol sequence is feasible, mixtures of the feasible region's vertices replace the points."""
 
 
 def silent(stage: str, done: int, total: int) -> None:
@@ -66,9 +66,9 @@ class Evaluator:
         if self.region and not anywhere:
             feasible = self.region.feasible(settings)
             if not feasible.all():
-                parts = [self.evaluate(settings[feasible], stage, before, total), self._infeasible(settings[~feasible])]
+                parts = [self.evaluate(settings[feasible], stage, before, total), self._infeasible_evaluations(settings[~feasible])]
                 order = np.argsort(np.argsort(~feasible, kind="stable"), kind="stable")
-                return Evaluations.concatenate(parts).take(order)  # back to the order of settings: the feasible rows were evaluated first
+                return Evaluations.concatenate(parts).take(order)  # restores the order of the settings
         if not len(settings):
             return Evaluations.none(len(self.characteristics), METRICS)
         done, number = 0, len(np.unique(settings, axis=0))
@@ -84,7 +84,7 @@ class Evaluator:
         self.simulated += number
         return evaluations
 
-    def _infeasible(self, settings: FloatArray) -> Evaluations:
+    def _infeasible_evaluations(self, settings: FloatArray) -> Evaluations:
         undefined = np.full(len(settings), np.nan)
         return Evaluations(
             settings=settings, outcome=np.full(len(settings), Outcome.INFEASIBLE.value, dtype="U16"), collision_speed=undefined,
@@ -95,13 +95,13 @@ class Evaluator:
         """`number` settings that cover the feasible part of the domain evenly; with `filtered`, the filter leaves them feasible."""
         if not self.region:
             return sobol_design(self.characteristics, number, seed)
-        rng, drawn = np.random.default_rng(seed), 0
+        rng, length = np.random.default_rng(seed), 0
 
         def next_settings(count: int) -> FloatArray:
             """The next `count` settings of the Sobol sequence."""
-            nonlocal drawn
-            drawn += count
-            return sobol_design(self.characteristics, drawn, seed)[drawn - count:]
+            nonlocal length
+            length += count
+            return sobol_design(self.characteristics, length, seed)[length - count:]
 
         return self.region.sampled(next_settings, number, rng, filtered=filtered, rejections=MAX_REJECTIONS)
 

@@ -28,7 +28,7 @@ LIMIT = 20_000
 """Approximate limit of simulations for a study's preventability; beyond it only a random sample of the collisions is simulated."""
 
 SETTINGS_PER_CALL = 20
-"""Number of settings simulated at all points of a matrix in one call: enough to fill its batches."""
+"""Number of settings simulated in one call at all points of a matrix: enough to fill the batches of simulations."""
 
 
 class PreventableBy(StrEnum):

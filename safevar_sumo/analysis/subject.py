@@ -125,7 +125,7 @@ def study_or_case(source: StudyLike | Results, *, as_it_is_now: bool = False, re
 
 
 def study_of(source: StudyLike | Results, *, as_it_is_now: bool = False) -> Study:
-    """The study itself, or the study of the results; raises as `study_or_case`."""
+    """The study itself, or the study of the results; raises what `study_or_case` raises."""
     subject = study_or_case(source, as_it_is_now=as_it_is_now)
     return subject if isinstance(subject, Study) else subject.study
 
@@ -155,7 +155,7 @@ def changes_since(directory: Path, case: Case, *, as_it_is_now: bool = False) ->
     if changes and not as_it_is_now:
         rest = f" (and {len(changes) - MAX_CHANGES} more)" if len(changes) > MAX_CHANGES else ""
         raise InputError(directory / MANIFEST, f"{'; '.join(changes[:MAX_CHANGES])}{rest}: new simulations would not match these results",
-                         "the inputs of that time; or --as-it-is-now (as_it_is_now=True), which simulates with the present ones and warns")
+                         "the inputs of that time; or --as-it-is-now (as_it_is_now=True) to simulate with the present inputs and a warning")
     return [f"{difference}; simulated as it is now" for difference in changes]
 
 

@@ -18,7 +18,7 @@ ENDS = {
 
 
 def list_of_changes(characteristics: CharacteristicSet, values: Mapping[str, float]) -> str:
-    """The values that differ from the original, in the study's order, such as `mass 2404 -> 2600 kg (+8.2 %)`."""
+    """The values that differ from the original values, in the order of the study, such as `mass 2404 -> 2600 kg (+8.2 %)`."""
     changed = [(member, values[member.name]) for member in characteristics if values.get(member.name, member.original) != member.original]
     return ", ".join(f"{member.name} {member.original:g} -> {member.text(value)}{member.suffix} "
                      f"({(value - member.original) / abs(member.original):+.1%})" for member, value in changed) or "no change at all"

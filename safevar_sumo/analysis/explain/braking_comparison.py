@@ -80,14 +80,14 @@ class RunSummary(NamedTuple):
 class BrakingComparison(NamedTuple):
     """Original and changed vehicle side by side; `parts` [m], which include the remainder, add up to the lost distance.
 
-    `parts` is empty if one of the vehicles never braked. `place` names the point of a matrix; the key `place` of `parts` stands for the
-    place of the brake command. `slowing` are the distances that the two vehicles save by slowing down while the pedal moves [m].
+    `parts` is empty if one of the vehicles never braked. `point` names the point of a matrix. `slowing` are the distances that the two
+    vehicles save by slowing down while the pedal moves [m].
     """
 
     original: RunSummary
     changed: RunSummary
     parts: dict[str, float]
-    place: str = ""
+    point: str = ""
     slowing: tuple[float, float] = (0.0, 0.0)
 
     @property
@@ -103,7 +103,7 @@ def brake_onset(runs: SimulationRuns, column: int) -> int | None:
     where the throttle or a smaller brake command regulates the speed again. The manoeuvre that counts is under way when the vehicle
     last cruises (at `CRUISE_SHARE` of its highest speed or more), or is the first manoeuvre after that: earlier manoeuvres, such as
     those of a cruise control after an overshoot, did not slow the vehicle down. If there is no such manoeuvre, a vehicle that collides has
-    not braked for the obstacle; of a vehicle that does not collide, the last manoeuvre counts.
+    not braked for the obstacle; if the vehicle does not collide, its last manoeuvre counts.
     """
     trace, nearest = runs.trace, runs.nearest(column)
     active = trace.active[:None if nearest is None else nearest + 1, column]
@@ -137,10 +137,10 @@ def _braking(runs: SimulationRuns, column: int, first: int, last: int) -> Brakin
     """The braking from sample `first` to `last`; None if the vehicle only coasts after the pedal has followed."""
     trace = runs.trace
     speed, position = trace.speed[:last + 1, column], trace.position[:last + 1, column]
-    followed = trace.pedal[first:last + 1, column] >= PEDAL_SHARE * trace.brake[first:last + 1, column]
-    end_of_delay = first + int(np.argmax(followed))
+    has_followed = trace.pedal[first:last + 1, column] >= PEDAL_SHARE * trace.brake[first:last + 1, column]
+    end_of_delay = first + int(np.argmax(has_followed))
     distance, energy = float(position[last] - position[end_of_delay]), float(speed[end_of_delay]**2 - speed[last]**2) / 2
-    if not followed.any() or distance <= 0 or energy <= COAST_DECELERATION * distance:
+    if not has_followed.any() or distance <= 0 or energy <= COAST_DECELERATION * distance:
         return None
     initial_speed, delay = float(speed[first]), (end_of_delay - first) * trace.step
     return Braking(
@@ -149,15 +149,15 @@ def _braking(runs: SimulationRuns, column: int, first: int, last: int) -> Brakin
         speed_lost=initial_speed - float(speed[end_of_delay]), deceleration=energy / distance)
 
 
-def compare_braking(original: RunSummary, changed: RunSummary, place: str = "") -> BrakingComparison:
-    """Compare a changed vehicle's run with the original vehicle's run at the same point; `place` names the point."""
+def compare_braking(original: RunSummary, changed: RunSummary, point: str = "") -> BrakingComparison:
+    """Compare a changed vehicle's run with the original vehicle's run at the same point; `point` names the point of a matrix."""
     original_braking, changed_braking = original.braking, _braking_to_compare(changed, original)
     if original_braking is None or changed_braking is None:
-        return BrakingComparison(original, changed, {}, place)
+        return BrakingComparison(original, changed, {}, point)
     parts, slowing = _parts(original_braking, changed_braking)
     unexplained = original.least_gap - original_braking.margin, changed.least_gap - changed_braking.margin
     remainders = [0.0 if np.isnan(value) else value for value in unexplained]
-    return BrakingComparison(original, changed, {**parts, "remainder": remainders[0] - remainders[1]}, place, slowing)
+    return BrakingComparison(original, changed, {**parts, "remainder": remainders[0] - remainders[1]}, point, slowing)
 
 
 def _braking_to_compare(changed: RunSummary, original: RunSummary) -> Braking | None:
@@ -203,7 +203,7 @@ def ending(run: RunSummary) -> str:
 
 def sentence(comparison: BrakingComparison, *, full: bool = False) -> str:
     """Why the changed vehicle is less safe than the original, in one sentence or two; `full` explains what the lost distance is."""
-    subject = f"At {comparison.place}: the" if comparison.place else "The"
+    subject = f"At {comparison.point}: the" if comparison.point else "The"
     endings = f"{subject} original {ending(comparison.original)}; this one {ending(comparison.changed)}."
     original_braking, changed_braking = comparison.original.braking, comparison.changed.braking
     if original_braking is None and changed_braking is None:

@@ -1,6 +1,6 @@
 """Minimal causes: the smallest subsets of a setting's changes that are unsafe by themselves.
 
-Outcomes need not be monotone: one change may undo the effect of another. So all subsets of a size are simulated, size by size,
+Outcomes need not be monotone: a change may undo the effect of another change. So all subsets of a size are simulated, size by size,
 until some are unsafe. These are minimal, as no smaller subset is unsafe.
 """
 

@@ -166,7 +166,7 @@ def points_in_words(points: tuple[str, ...], number: int, limit: int = MAX_POINT
 
 
 class FailureSelection(NamedTuple):
-    """The failures that matter among those of a study or of results, with their minimal causes.
+    """The failures to explain, of a study or of results, with their minimal causes.
 
     Attributes
     ----------
@@ -186,7 +186,7 @@ class FailureSelection(NamedTuple):
 
 
 def chosen_failures(source: Study | Case, options: ExplainOptions, evaluator: Evaluator) -> FailureSelection:
-    """Choose the failures that the options name, or the failures that matter; raises as `explain_failures`."""
+    """Choose the failures that the options name, or the failures that matter; raises what `explain_failures` raises."""
     unsafe = None if options.unsafe is None else evaluator.parse_criterion(options.unsafe)
     named_solutions = [SolutionId.parse(text, "solutions") for text in options.solutions]
     limit = options.limit // len(assemble(evaluator.study).points)
@@ -196,10 +196,10 @@ def chosen_failures(source: Study | Case, options: ExplainOptions, evaluator: Ev
     sample = rows if named_solutions else [rows[i] for i in affordable_rows(settings[rows], evaluator, limit)]
     robust = None if named_solutions or is_rated(evaluator.study) else _robust_row(failures, evaluator, original, limit)
     reasons = dict.fromkeys(rows[:len(named_solutions)], ("asked for",)) if named_solutions else _choices(failures, robust)
-    explained = sorted({*sample, *reasons})
-    causes = dict(zip(explained, minimal_causes(evaluator, settings[explained], failures.unsafe), strict=True))
+    analysed_rows = sorted({*sample, *reasons})
+    causes = dict(zip(analysed_rows, minimal_causes(evaluator, settings[analysed_rows], failures.unsafe), strict=True))
     if not named_solutions:
-        reasons = _with_one_of_each_cause(failures, evaluator, {row: causes[row] for row in sample}, reasons, causes, options.top)
+        reasons = _with_distinct_causes(failures, evaluator, {row: causes[row] for row in sample}, reasons, causes, options.top)
     return FailureSelection(original, failures, sample, causes, reasons)
 
 
@@ -251,7 +251,7 @@ def _choices(failures: Failures, robust: int | None) -> dict[int, Reasons]:
     return reasons
 
 
-def _with_one_of_each_cause(failures: Failures, evaluator: Evaluator, sample: Causes, reasons: Mapping[int, Reasons], causes: Causes,
+def _with_distinct_causes(failures: Failures, evaluator: Evaluator, sample: Causes, reasons: Mapping[int, Reasons], causes: Causes,
                             top: int) -> dict[int, Reasons]:
     """Add, up to `top` failures in all, the simplest failure of each distinct minimal cause that no chosen failure has yet."""
     chosen = dict(list(reasons.items())[:top])
@@ -274,13 +274,13 @@ def _explanations(failures: Failures, evaluator: Evaluator, original: Evaluation
     rows = list(reasons)
     chosen, names = failures.evaluations.take(rows), evaluator.characteristics.names
     all_causes = [cause for row in rows for cause in causes[row]]
-    if is_rated(evaluator.study):  # a neighbour is simulated in all cells: too long for every cause
+    if is_rated(evaluator.study):  # each neighbour is simulated in all cells, which takes too long for all causes
         comparisons, step = compare_at_cells(evaluator, original.settings, chosen.settings)
-        robust = robustness(evaluator, chosen.settings, step, failures.unsafe, STEP_FACTORS[:1])
+        robustnesses = robustness(evaluator, chosen.settings, step, failures.unsafe, STEP_FACTORS[:1])
     else:
         comparisons, step = compare_at_points(assemble(evaluator.study), original.settings, chosen.settings, failures.unsafe)
-        robust = robustness(evaluator, np.array([*chosen.settings, *(cause.setting for cause in all_causes)]), step, failures.unsafe)
-    limits, neighbours = iter(boundaries(evaluator, all_causes, failures.unsafe)), iter(robust[len(rows):])
+        robustnesses = robustness(evaluator, np.array([*chosen.settings, *(cause.setting for cause in all_causes)]), step, failures.unsafe)
+    limits, neighbours = iter(boundaries(evaluator, all_causes, failures.unsafe)), iter(robustnesses[len(rows):])
     collided = np.flatnonzero(_avoidable_collisions(evaluator.study, chosen))
     driver_classes = dict(zip(collided.tolist(), preventable_by(evaluator, chosen.settings[collided]), strict=True))
     explanations = []
@@ -299,6 +299,7 @@ def _explanations(failures: Failures, evaluator: Evaluator, original: Evaluation
             handle=failures.handles[row], reasons=reasons[row], setting=dict(zip(names, chosen.settings[i].tolist(), strict=True)),
             outcome=str(chosen.outcome[i]), safety_degree=finite_or_none(chosen.f_safe[i]),
             changed=tuple(name for name, is_changed in zip(names, changed, strict=True) if is_changed),
-            necessary=tuple(names[column] for column in sorted(necessary_columns(causes[row]))), causes=tuple(group), robustness=robust[i],
-            because=comparisons[i].because, preventable=str(driver_classes.get(i) or ""), points=comparisons[i].points))
+            necessary=tuple(names[column] for column in sorted(necessary_columns(causes[row]))), causes=tuple(group),
+            robustness=robustnesses[i], because=comparisons[i].because, points=comparisons[i].points,
+            preventable=str(driver_classes.get(i) or "")))
     return tuple(explanations)

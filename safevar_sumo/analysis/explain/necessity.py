@@ -101,7 +101,7 @@ class Robustness(NamedTuple):
         return is_borderline(self.share)
 
     def __str__(self) -> str:
-        """Such as `robust: 84 % of the neighbours are unsafe too, but only 53 % with a step of 0.1 s`."""
+        """A phrase such as `robust: 84 % of the neighbours are unsafe too, but only 53 % with a step of 0.1 s`."""
         step, least_share = min(self.by_step.items(), key=lambda item: item[1])
         disagrees = is_borderline(least_share) and not self.borderline
         return in_words(self.share) + (f", but only {100 * least_share:.0f} % with a step of {step:g} s" if disagrees else "")
@@ -113,7 +113,7 @@ def is_borderline(share: float) -> bool:
 
 
 def in_words(share: float) -> str:
-    """Such as `borderline: only 44 % of the neighbours are unsafe too`."""
+    """A phrase such as `borderline: only 44 % of the neighbours are unsafe too`."""
     return f"{'borderline: only' if is_borderline(share) else 'robust:'} {100 * share:.0f} % of the neighbours are unsafe too"
 
 
@@ -139,7 +139,7 @@ def robustness(evaluator: Evaluator, settings: FloatArray, step: float, unsafe: 
 def smallest_robust_failure(evaluator: Evaluator, failures: Evaluations, step: float, unsafe: Unsafe, limit: int) -> int | None:
     """The row of the smallest robust failure: with the fewest changes, and among these with the smallest largest change.
 
-    Failures are tried in that order until one is robust or about `limit` simulations are spent; None if no failure was robust.
+    Failures are tried in this order until a failure is robust, or about `limit` simulations are spent; None if no failure was robust.
     """
     order = np.lexsort([failures.f_safe, failures.f_diff, failures.f_num_diff])
     number = max(FAILURES_PER_BATCH, limit // (NEIGHBOURS * len(STEP_FACTORS)))

@@ -129,7 +129,7 @@ def _print_explanation(console: Console, command_for: CommandFor, failure: Expla
     if len(failure.causes) > 1:
         print_text(console, f"Needed by all of them: {', '.join(failure.necessary) or 'nothing'}.")
     print_text(console, f"Because: {sentence(failure.because, full=True)}")
-    if failure.because.place:
+    if failure.because.point:
         number = len(assemble(result.study).matrix)
         if is_rated(result.study):
             print_text(console, f"{number_of(len(failure.points), 'cell')} of {number} turn: {'; '.join(failure.points)}.")

@@ -89,8 +89,7 @@ class Cause:
     outcome, safety_degree
         Outcome, and safety degree [m, or -m/s], of a vehicle with these changes only.
     end, at_threshold
-        What lies just below `fraction`: a safe setting, the filter's threshold, or a setting that could not be simulated. At the
-        threshold, `at_threshold` is the characteristic whose change the filter removes.
+        What lies just below `fraction`; at the filter's threshold, the characteristic whose change the filter would remove.
     neighbours
         Robustness of these changes by themselves; None in a rated study, where the simulations would take too long.
     """
@@ -125,8 +124,8 @@ class Explanation:
     """The explanation of one failure; `handle` is None if the setting is no solution, `reasons` state why the failure was chosen.
 
     `safety_degree` is in m, or -m/s. `changed` names the changed characteristics, and `necessary` those that every minimal cause
-    contains. `because` compares the failure with the original. `preventable` is a collision's `PreventableBy`. `points` are the points
-    of a matrix at which the setting is unsafe.
+    contains. `because` compares the failure with the original. `preventable` is a collision's `PreventableBy`. At `points`
+    of a matrix the setting is unsafe.
     """
 
     handle: SolutionId | None

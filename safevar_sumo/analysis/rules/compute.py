@@ -1,7 +1,7 @@
 """Finds rules in physical units that say where a study is unsafe, from an unbiased design, and validates them on a second design.
 
 A classification tree (CART, by scikit-learn) cuts the domain into boxes. The tree is pruned to the smallest tree whose score in
-cross-validation is within a standard error of the best score. Its boxes with more unsafe settings than safe ones become rules. A rule
+cross-validation is within a standard error of the best score. Its boxes with more unsafe than safe settings become rules. A rule
 then loses the conditions that do not make it denser.
 """
 
@@ -134,7 +134,7 @@ def find_rules(study: Study, options: RulesOptions, *, pool: Pool | None = None,
     if number == len(is_unsafe) > 0:
         boxes = [{}]
     elif min(number, len(is_unsafe) - number) < MIN_SETTINGS:
-        remark = (f"{number} of {len(is_unsafe)} settings are unsafe: rules need at least {MIN_SETTINGS} unsafe and as many safe ones "
+        remark = (f"{number} of {len(is_unsafe)} settings are unsafe: rules need at least {MIN_SETTINGS} unsafe and as many safe settings "
                   "(run `rules --samples N` for more)")
     else:
         boxes = _boxes(training.settings, is_unsafe, members)

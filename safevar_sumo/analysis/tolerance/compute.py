@@ -236,7 +236,7 @@ def _columns(study: Study, characteristics: Sequence[str] | None) -> list[int]:
         if name not in names:
             raise unknown("characteristics", f"there is no characteristic {name!r}", name, names)
     if len(set(chosen)) < len(chosen):
-        raise InputError("characteristics", f"{','.join(chosen)}: one is named twice", "each characteristic once")
+        raise InputError("characteristics", f"{','.join(chosen)}: a characteristic is named twice", "each characteristic once")
     return [column for column, name in enumerate(names) if characteristics is None or name in characteristics]
 
 

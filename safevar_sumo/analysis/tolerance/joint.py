@@ -70,7 +70,7 @@ class Pair:
 
 
 def planes(evaluator: Evaluator, columns: Sequence[int], unsafe: Unsafe) -> list[Pair]:
-    """The plane of every pair of characteristics, with its nearest unsafe setting if it has one."""
+    """The plane of every pair of characteristics, with the plane's unsafe setting nearest to the original."""
     members, original = evaluator.characteristics.members, evaluator.characteristics.original
     chosen = list(combinations(columns, 2))
     axes = {column: np.linspace(members[column].lower, members[column].upper, SIDE) for column in columns}
@@ -81,18 +81,18 @@ def planes(evaluator: Evaluator, columns: Sequence[int], unsafe: Unsafe) -> list
     shape = (len(chosen), SIDE, SIDE)
     degrees, valid, infeasible = (values.reshape(shape) for values in (evaluations.f_safe, evaluations.valid, evaluations.infeasible))
     is_unsafe = unsafe.of(evaluations).reshape(shape)
-    nearest = _nearest(evaluator, chosen, is_unsafe, unsafe)
+    nearest = _nearest_unsafe(evaluator, chosen, is_unsafe, unsafe)
     return [Pair(characteristics=(members[first], members[second]), values=np.stack([axes[first], axes[second]]), safety_degree=degrees[i],
                  unsafe=is_unsafe[i], valid=valid[i], infeasible=infeasible[i], nearest=nearest.get(i))
             for i, (first, second) in enumerate(chosen)]
 
 
-def _nearest(evaluator: Evaluator, chosen: Sequence[tuple[int, int]], is_unsafe: BoolArray,
+def _nearest_unsafe(evaluator: Evaluator, chosen: Sequence[tuple[int, int]], is_unsafe: BoolArray,
              unsafe: Unsafe) -> dict[int, tuple[float, float]]:
-    """The unsafe setting nearest to the original, in widths of the domains, of every plane that has one.
+    """For every plane with unsafe settings, the unsafe setting nearest to the original; distances are in widths of the domains.
 
-    A branch and bound search: squares with an unsafe corner are divided into smaller ones, as long as a point in them is nearer than
-    the nearest unsafe setting so far; each round divides the `SQUARES` nearest squares of each plane.
+    A branch and bound search: a square with an unsafe corner is divided into smaller squares if a point in it is nearer than the
+    nearest unsafe setting so far; each round divides the `SQUARES` nearest squares of each plane.
     """
     members = evaluator.characteristics
     columns = np.array(chosen, dtype=int).reshape(-1, 2)

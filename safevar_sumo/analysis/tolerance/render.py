@@ -121,7 +121,7 @@ def profiles_figure(result: Tolerance) -> Figure:
     for axis, scan in zip(axes, result.alone, strict=True):
         _profile(axis, scan, column)
         if degrees.size:
-            axis.set_ylim(degrees.min() - margin, degrees.max() + margin)  # the same for all, so that steep profiles stand out
+            axis.set_ylim(degrees.min() - margin, degrees.max() + margin)  # equal for all panels, so that steep profiles stand out
     figure.supylabel(DEGREE if column == SAFETY_DEGREE else RATING_POINTS.title, fontsize=FONT)
     notes = {"dot: the original vehicle": True, "hatched: unsafe": any(scan.unsafe for scan in result.alone),
                "below the dashed line: collisions": column == SAFETY_DEGREE and bool(degrees.size) and degrees.min() <= 0}
