@@ -128,8 +128,8 @@ def boundaries(evaluator: Evaluator, causes: list[MinimalCause], unsafe: Unsafe)
     all_changes = [(cause, cause.columns) for cause in causes]
     single_changes = [(cause, (column,)) for cause in causes for column in cause.columns]
     lines = [Line.from_original(evaluator, cause, columns) for cause, columns in [*all_changes, *single_changes]]
-    fractions, ends = edges(evaluator, lines, unsafe)
-    single_edges = iter(zip(lines[len(causes):], fractions[len(causes):], strict=True))
+    fractions, ends = boundary_shares(evaluator, lines, unsafe)
+    single_shares = iter(zip(lines[len(causes):], fractions[len(causes):], strict=True))
     result = []
     for i, cause in enumerate(causes):
         if not cause.columns:
@@ -137,7 +137,7 @@ def boundaries(evaluator: Evaluator, causes: list[MinimalCause], unsafe: Unsafe)
             continue
         single_limits = {}
         for column in cause.columns:
-            line, fraction = next(single_edges)
+            line, fraction = next(single_shares)
             single_limits[column] = float(line.at(np.array([fraction]))[0, column])
         setting = lines[i].at(fractions[i:i + 1])[0]
         filtered_column = lines[i].first_filtered(evaluator.characteristics.threshold) if ends[i] == BoundaryState.FILTER else None
@@ -175,10 +175,11 @@ class Line(NamedTuple):
 
 def first_unsafe_shares(evaluator: Evaluator, lines: list[Line], unsafe: Unsafe, stage: str = "boundaries") -> FloatArray:
     """The first unsafe share of every line, whose end is unsafe; exact to `RESOLUTION` of the line above `lowest`."""
-    return edges(evaluator, lines, unsafe, stage)[0]
+    return boundary_shares(evaluator, lines, unsafe, stage)[0]
 
 
-def edges(evaluator: Evaluator, lines: list[Line], unsafe: Unsafe, stage: str = "boundaries") -> tuple[FloatArray, list[BoundaryState]]:
+def boundary_shares(evaluator: Evaluator, lines: list[Line], unsafe: Unsafe,
+                    stage: str = "boundaries") -> tuple[FloatArray, list[BoundaryState]]:
     """The first unsafe share of every line, as `first_unsafe_shares` returns it, and the state just below this share.
 
     A setting that cannot be simulated is neither safe nor unsafe. If it lies just below the share, the state is `NOT_SIMULATED`.

@@ -58,7 +58,7 @@ class FailureEntry(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True
 
     @property
     def handle(self) -> str:
-        """The handle of the solution; empty if it is no solution."""
+        """The handle of the solution; empty if the setting is no solution."""
         return "" if self.algorithm is None else f"{self.algorithm}:{self.run}:{self.index}"
 
 
@@ -83,7 +83,7 @@ class Cause:
     changes
         The failure's values of these characteristics, in their units.
     boundary
-        The values if all changes are multiplied by `fraction`, the smallest factor at which they stay unsafe.
+        The values after every change is multiplied by `fraction`, the smallest factor at which the vehicle stays unsafe.
     alone
         For each characteristic, the value to which it can return towards the original while the other values stay as in `changes`.
     outcome, safety_degree
@@ -124,8 +124,8 @@ class Explanation:
     """The explanation of one failure; `handle` is None if the setting is no solution, `reasons` state why the failure was chosen.
 
     `safety_degree` is in m, or -m/s. `changed` names the changed characteristics, and `necessary` those that every minimal cause
-    contains. `because` compares the failure with the original. `preventable` is a collision's `PreventableBy`. At `points`
-    of a matrix the setting is unsafe.
+    contains. `because` compares the failure with the original. `preventable` is a collision's `PreventableBy`. `points`
+    are the points of a matrix at which the setting is unsafe.
     """
 
     handle: SolutionId | None
