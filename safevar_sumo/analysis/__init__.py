@@ -1,1 +1,1 @@
-"""Questions asked of a study or of its results: a package or a file for each question."""
+"""Questions about a study or its results; each question has its own package or file."""

@@ -1,4 +1,4 @@
-"""Evaluates settings of a study for every question, and makes designs that cover its domain."""
+"""Evaluates settings for all questions about a study, and draws settings that cover the study's domain."""
 
 from __future__ import annotations
 
@@ -24,30 +24,30 @@ from safevar_sumo.workers.local import available_cores, local_pool
 from safevar_sumo.workers.retrying import RetryingPool
 
 PARTS_PER_WORKER = 2
-"""A rating's cells are divided into this many parts for each worker."""
+"""Number of parts per worker into which the cells of a rating are divided."""
 CONFIDENCE = 0.95
-"""Confidence level of the intervals of shares, unless an option sets another."""
-PROBED = 1024
-"""Number of settings over the whole domain that decide whether a study has collisions at all."""
+"""Confidence level of the intervals of shares, unless an option sets another level."""
+CRITERION_SETTINGS = 1024
+"""Number of settings over the whole domain that decide the default criterion: a collision if any setting collides, else a safety degree."""
 Progress = Callable[[str, int, int], None]
-"""Called with the stage, the number of its settings done so far, and their total."""
+"""A function that shows progress. Its arguments: the stage, the number of settings done in this stage, and the stage's total number."""
 
 
-DRAWS_PER_FEASIBLE = 64
-"""Maximum number of points drawn from a sequence for each feasible point."""
+MAX_REJECTIONS = 64
+"""If fewer than 1 in so many points of the Sobol sequence is feasible, mixtures of the feasible region's vertices replace the points."""
 
 
 def silent(stage: str, done: int, total: int) -> None:
-    """Progress that is not shown."""
+    """Show no progress."""
 
 
 class Evaluator:
-    """Evaluates settings of one study as they are, without the filter, and makes designs that cover its domain.
+    """Evaluates settings of one study without the filter, and draws settings that cover the study's domain.
 
     Attributes
     ----------
     simulated
-        Number of settings evaluated so far.
+        Number of settings simulated so far; of equal settings in one call only one is simulated.
     """
 
     def __init__(self, study: Study, pool: Pool, progress: Progress = silent) -> None:
@@ -58,54 +58,55 @@ class Evaluator:
 
     def evaluate(self, settings: FloatArray, stage: str, before: int = 0, total: int | None = None, *,
                  anywhere: bool = False) -> Evaluations:
-        """Evaluate settings, shape (M, n); progress counts them in `stage`, of whose `total` settings `before` are done already.
+        """Evaluate M settings, shape (M, n). Progress is shown for `stage`, in which `before` of `total` settings are already done.
 
-        Unless `anywhere` is true, settings that violate a constraint of the study get the outcome `infeasible` without a simulation.
+        Settings that violate a constraint of the study are not simulated and get the outcome `infeasible`. If `anywhere` is true, the
+        constraints are ignored.
         """
         if self.region and not anywhere:
             feasible = self.region.feasible(settings)
             if not feasible.all():
-                parts = [self.evaluate(settings[feasible], stage, before, total), self._infeasible(settings[~feasible])]
+                parts = [self.evaluate(settings[feasible], stage, before, total), self._infeasible_evaluations(settings[~feasible])]
                 order = np.argsort(np.argsort(~feasible, kind="stable"), kind="stable")
-                return Evaluations.concatenate(parts).take(order)  # back to the order of settings: the feasible rows were evaluated first
+                return Evaluations.concatenate(parts).take(order)  # restores the order of the settings
         if not len(settings):
             return Evaluations.none(len(self.characteristics), METRICS)
-        done, distinct = 0, len(np.unique(settings, axis=0))
-        stage_total = distinct if total is None else total
+        done, number = 0, len(np.unique(settings, axis=0))
+        stage_total = number if total is None else total
         self.progress(stage, before, stage_total)
 
-        def count(number: int) -> None:
+        def count(increment: int) -> None:
             nonlocal done
-            done += number
+            done += increment
             self.progress(stage, before + done, stage_total)
 
         evaluations = evaluate_all(self.study, settings, self._pool, count)
-        self.simulated += distinct
+        self.simulated += number
         return evaluations
 
-    def _infeasible(self, settings: FloatArray) -> Evaluations:
+    def _infeasible_evaluations(self, settings: FloatArray) -> Evaluations:
         undefined = np.full(len(settings), np.nan)
         return Evaluations(
             settings=settings, outcome=np.full(len(settings), Outcome.INFEASIBLE.value, dtype="U16"), collision_speed=undefined,
             metrics=dict.fromkeys(METRICS, undefined), f_diff=self.characteristics.largest_change(settings),
             f_num_diff=self.characteristics.number_changed(settings))
 
-    def even_design(self, number: int, seed: int = 0, *, filtered: bool = False) -> FloatArray:
-        """Settings that cover the feasible part of the domain evenly; with `filtered` they are feasible after the filter."""
+    def feasible_design(self, number: int, seed: int = 0, *, filtered: bool = False) -> FloatArray:
+        """`number` settings that cover the feasible part of the domain evenly; with `filtered`, the filter leaves them feasible."""
         if not self.region:
-            return even_design(self.characteristics, number, seed)
-        rng, drawn = np.random.default_rng(seed), 0
+            return sobol_design(self.characteristics, number, seed)
+        rng, length = np.random.default_rng(seed), 0
 
-        def next_points(count: int) -> FloatArray:
-            """The next points of the sequence."""
-            nonlocal drawn
-            drawn += count
-            return even_design(self.characteristics, drawn, seed)[drawn - count:]
+        def next_settings(count: int) -> FloatArray:
+            """The next `count` settings of the Sobol sequence."""
+            nonlocal length
+            length += count
+            return sobol_design(self.characteristics, length, seed)[length - count:]
 
-        return self.region.sampled(next_points, number, rng, filtered=filtered, rejections=DRAWS_PER_FEASIBLE)
+        return self.region.sampled(next_settings, number, rng, filtered=filtered, rejections=MAX_REJECTIONS)
 
     def cells(self, settings: FloatArray, stage: str) -> CellResults:
-        """Results of settings, shape (M, n), in every cell of a rated study; the cells are divided among the workers.
+        """Simulate M settings, shape (M, n), in every cell of a rated study; the workers share the cells.
 
         Raises
         ------
@@ -119,22 +120,22 @@ class Evaluator:
         inputs, pool = inputs_of(self.study, self._pool), RetryingPool(self._pool, self.study)
         self.progress(stage, 0, number)
         futures = {pool.submit(packed(self.study, inputs, cells=(k, parts)), settings): k for k in range(parts)}
-        parts_done, done = dict[int, CellResults](), 0
-        while len(parts_done) < parts:
-            for future in first_of([future for future, k in futures.items() if k not in parts_done]):
+        results_by_part, done = dict[int, CellResults](), 0
+        while len(results_by_part) < parts:
+            for future in first_of([future for future, k in futures.items() if k not in results_by_part]):
                 evaluations = future.result()
                 if evaluations.cells is None:
                     raise SimulationError(f"study {self.study.name!r}: a vehicle cannot be simulated: {evaluations.reason(0)}")
-                parts_done[futures[future]] = evaluations.cells
+                results_by_part[futures[future]] = evaluations.cells
                 done += evaluations.cells.impact.shape[1]
                 self.progress(stage, done, number)
         order = np.argsort(np.concatenate([part_of(rater.protocol, k, parts) for k in range(parts)]))
         self.simulated += len(settings)
-        columns = zip(*(parts_done[k] for k in range(parts)), strict=True)
+        columns = zip(*(results_by_part[k] for k in range(parts)), strict=True)
         return CellResults._make(np.concatenate(column, axis=1)[:, order] for column in columns)
 
     def original(self) -> Evaluations:
-        """The original vehicle's evaluation.
+        """Evaluation of the original vehicle.
 
         Raises
         ------
@@ -146,25 +147,25 @@ class Evaluator:
             raise SimulationError(f"study {self.study.name!r} cannot be simulated with the original vehicle: {evaluations.outcome[0]}")
         return evaluations
 
-    def criterion(self, stated: str | None, original: Evaluations | None = None) -> Unsafe:
-        """The criterion that an option states, else the default one; raises as `parsed` and `Unsafe.default_among`."""
-        if stated is not None:
-            return self.parsed(stated)
+    def criterion(self, text: str | None, original: Evaluations | None = None) -> Unsafe:
+        """The criterion that an option states, or the default criterion; raises what `parse_criterion` and `Unsafe.default_among` raise."""
+        if text is not None:
+            return self.parse_criterion(text)
         original = self.original() if original is None else original
         if RATING_POINTS.name in original.metrics:
             return Unsafe.default_among(original, original)
-        return Unsafe.default_among(self.evaluate(self.even_design(PROBED), "settings over the whole domain"), original)
+        return Unsafe.default_among(self.evaluate(self.feasible_design(CRITERION_SETTINGS), "settings over the whole domain"), original)
 
-    def parsed(self, stated: str) -> Unsafe:
-        """The criterion that an option states; raises as `Unsafe.parse`, and where it asks for points of a study that is not rated."""
-        criterion = Unsafe.parse(stated)
+    def parse_criterion(self, text: str) -> Unsafe:
+        """Parse the criterion that an option states; raises what `Unsafe.parse` raises, and an error for points without a rating."""
+        criterion = Unsafe.parse(text)
         if criterion.points is not None and not is_rated(self.study):
-            raise InputError("unsafe", f"{stated!r}: study {self.study.name!r} is not rated and has no points", "collision or below=X")
+            raise InputError("unsafe", f"{text!r}: study {self.study.name!r} is not rated and has no points", "collision or below=X")
         return criterion
 
     def with_step(self, step: float) -> Evaluator:
         """An evaluator of the same study with another time step [s]."""
-        metrics = msgspec.structs.replace(self.study.metrics, sampling_interval=None)  # the study's may be no multiple of this step
+        metrics = msgspec.structs.replace(self.study.metrics, sampling_interval=None)  # the interval may be no multiple of this step
         return self.for_study(msgspec.structs.replace(self.study, step_length=step, metrics=metrics))
 
     def for_study(self, study: Study) -> Evaluator:
@@ -174,7 +175,7 @@ class Evaluator:
 
 @contextmanager
 def open_evaluator(study: Study, pool: Pool | None = None, jobs: int | None = None, progress: Progress = silent) -> Iterator[Evaluator]:
-    """An evaluator on a given pool, or on `jobs` worker processes of its own, by default one for each core.
+    """An evaluator that simulates on `pool`; without a pool, on `jobs` new worker processes, by default one for each core.
 
     Raises
     ------
@@ -190,21 +191,21 @@ def open_evaluator(study: Study, pool: Pool | None = None, jobs: int | None = No
 
 
 def sobol_points(number: int, dimensions: int, seed: int) -> FloatArray:
-    """Scrambled Sobol points in the unit cube, shape (number, dimensions); evenly spread where number is a power of two."""
+    """Scrambled Sobol points in the unit cube, shape (number, dimensions); they spread evenly if `number` is a power of two."""
     import scipy  # takes longer to load than a simulation
 
     points = scipy.stats.qmc.Sobol(dimensions, rng=np.random.default_rng(seed)).random_base2(max(0, math.ceil(math.log2(number))))
     return np.asarray(points[:number])
 
 
-def even_design(characteristics: CharacteristicSet, number: int, seed: int = 0) -> FloatArray:
-    """Settings that cover the whole domain evenly, shape (number, n)."""
+def sobol_design(characteristics: CharacteristicSet, number: int, seed: int = 0) -> FloatArray:
+    """`number` settings that cover the whole domain evenly, shape (number, n), feasible or not."""
     lower, upper = characteristics.lower, characteristics.upper
     return np.asarray(lower + sobol_points(number, len(characteristics), seed) * (upper - lower))
 
 
 def clopper_pearson(count: int, total: int, confidence: float = CONFIDENCE) -> tuple[float, float]:
-    """Clopper and Pearson's exact interval of the share count / total."""
+    """Exact confidence interval (Clopper and Pearson) of the share `count` / `total`."""
     import scipy
 
     interval = scipy.stats.binomtest(count, total).proportion_ci(confidence, method="exact")

@@ -16,17 +16,17 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 DPI = 200
-UNDATED: Mapping[str, dict[str, Any]] = {".pdf": {"CreationDate": None}, ".svg": {"Date": None}}
-"""Metadata that leaves no date in a picture."""
+METADATA: Mapping[str, dict[str, Any]] = {".pdf": {"CreationDate": None}, ".svg": {"Date": None}}
+"""Metadata by file ending; they keep the date out of a picture."""
 FONT = 8
 DEGREE = "safety degree [m]\n(below 0: minus the collision's speed [m/s])"
 UNSAFE = "#d55e00"
 CHANGED, INVOLVED, NECESSARY = "#bbbbbb", "#56b4e9", "#0072b2"
-"""Grey and Okabe and Ito's blues: of different lightness, so that they stay apart without colour."""
+"""Grey and two of Okabe and Ito's blues. Their lightness differs, so that a reader can tell them apart in a print without colours."""
 
 
 def new_figure(title: str, rows: int, columns: int, size: tuple[float, float], **options: Any) -> tuple[Figure, np.ndarray]:
-    """A figure outside pyplot's state, and its axes, shape (rows, columns); `size` in inches, `options` of `Figure.subplots`."""
+    """A figure outside pyplot's state, and its axes, shape (rows, columns). `size` is in inches; `options` go to `Figure.subplots`."""
     import matplotlib.style
     from matplotlib.figure import Figure
 
@@ -39,20 +39,20 @@ def new_figure(title: str, rows: int, columns: int, size: tuple[float, float], *
 
 
 def panels(title: str, number: int, across: int, panel: tuple[float, float], least_width: float, above: float) -> tuple[Figure, list[Axes]]:
-    """A figure with `number` panels of the size `panel`, at most `across` side by side, and the panels' axes.
+    """A figure with `number` panels of the size `panel`, at most `across` of them side by side, and the axes of the panels.
 
     The figure is at least `least_width` wide, and its title takes the height `above`; all sizes in inches.
     """
     columns = min(across, number)
     rows = -(-number // columns)
     figure, axes = new_figure(title, rows, columns, (max(panel[0] * columns, least_width), above + panel[1] * rows))
-    for unused in axes.flat[number:]:
-        unused.set_axis_off()
+    for axis in axes.flat[number:]:
+        axis.set_axis_off()
     return figure, list(axes.flat[:number])
 
 
 def save(figure: Figure, path: Path, source: str = "out") -> None:
-    """Write a figure to a file: png, pdf or svg; the same figure gives the same bytes.
+    """Write a figure to a png, pdf or svg file; the same figure gives the same bytes.
 
     Raises
     ------
@@ -63,14 +63,14 @@ def save(figure: Figure, path: Path, source: str = "out") -> None:
 
     try:
         with matplotlib.rc_context({"svg.hashsalt": "safevar_sumo"}):
-            figure.savefig(path, dpi=DPI, metadata=UNDATED.get(path.suffix.lower()))
+            figure.savefig(path, dpi=DPI, metadata=METADATA.get(path.suffix.lower()))
     except (OSError, ValueError) as error:
         raise InputError(source, f"cannot write {path}: {getattr(error, 'strerror', None) or error}",
                          "a file that ends in .png, .pdf or .svg, in a directory that can be written") from None
 
 
 def literal(name: str) -> str:
-    """A name, escaped so that matplotlib sees no formula in it."""
+    """A name with its dollar signs escaped, so that matplotlib does not read a formula in it."""
     return name.replace("$", r"\$")
 
 

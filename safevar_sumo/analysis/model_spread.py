@@ -1,4 +1,4 @@
-"""The vehicle model's own uncertainty: predictions for one setting by all parameter sets that fit the published data equally well."""
+"""Uncertainty of the vehicle model: predictions for one setting by all parameter sets that fit the published data equally well."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet
 
 BAND = 0.9
-"""Share of the predictions that lie in a band."""
+"""Share of the predictions that lie in the band."""
 DEVIATIONS = 1.645
-"""Half the width [standard deviations] of the interval around a normal distribution's mean that holds that share."""
+"""Half width [standard deviations] of the interval around the mean that holds this share of a normal distribution."""
 ROUNDING = 1e-5
-"""Relative tolerance within which a study's value equals the (rounded) value in the first set of its spread."""
+"""Relative tolerance within which a parameter's value in the study equals its (rounded) value in the first set of [spread]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,10 +33,10 @@ class ModelSpread:
     sets
         Number of parameter sets.
     lower, upper
-        Ends of the band that holds 90 % of their safety degrees and of repeats of one simulation, widened by the model's error where
-        the study states it [m, or -m/s]; None if no set has a safety degree.
+        Ends of the band that holds 90 % of the sets' safety degrees and of repeats of a simulation [m, or -m/s]. The model's error
+        widens the band if the study states this error. None if no set has a safety degree.
     collisions
-        Number of sets with which the setting collides.
+        Number of parameter sets with which the vehicle collides.
     """
 
     sets: int
@@ -52,15 +52,15 @@ class ModelSpread:
         """One sentence."""
         if self.lower is None or self.upper is None:
             return f"no safety degree with any of {self.sets} parameter sets that fit the published data equally well"
-        hits = "none of them" if not self.collisions else f"{self.collisions} of them"
+        number = "none of them" if not self.collisions else f"{self.collisions} of them"
         return (f"safety degree {self.lower:.2f} to {self.upper:.2f} ({BAND:.0%} band of {self.sets} parameter sets that fit the published "
-                f"data equally well, of repeats and of the model's error); a collision with {hits}")
+                f"data equally well, of repeats and of the model's error); a collision with {number}")
 
 
 def model_spreads(study: Study, settings: FloatArray, point: str = "") -> list[ModelSpread]:
-    """The model's own uncertainty for each setting, shape (M, n); the filter is not applied.
+    """The model's uncertainty for each of M settings, shape (M, n); the filter is not applied.
 
-    In a matrix the settings are simulated at `point`; without one, each setting at its worst point.
+    In a matrix, all settings are simulated at `point`; if no point is named, each setting at its worst point.
 
     Raises
     ------
@@ -69,15 +69,15 @@ def model_spreads(study: Study, settings: FloatArray, point: str = "") -> list[M
     """
     evaluations = evaluations_of_sets(study, settings, point)
     lower, upper = band_of(study, evaluations)
-    hits = np.stack([one.collided for one in evaluations]).sum(axis=0)
-    return [ModelSpread(sets=len(evaluations), lower=finite_or_none(low), upper=finite_or_none(high), collisions=int(hit))
-            for low, high, hit in zip(lower.tolist(), upper.tolist(), hits.tolist(), strict=True)]
+    collisions = np.stack([prediction.collided for prediction in evaluations]).sum(axis=0)
+    return [ModelSpread(sets=len(evaluations), lower=finite_or_none(low), upper=finite_or_none(high), collisions=int(count))
+            for low, high, count in zip(lower.tolist(), upper.tolist(), collisions.tolist(), strict=True)]
 
 
 def band_of(study: Study, evaluations: Sequence[Evaluations]) -> tuple[FloatArray, FloatArray]:
-    """Ends of the band of the sets' predictions for settings, including repeats and the model's error; each of shape (M,)."""
+    """Lower and upper ends, shape (M,) each, of the sets' predictions for M settings, widened by repeats and the model's error."""
     error = study.model_error.get(SAFETY_DEGREE, 0.0) * distance_from_original(study, evaluations[0].settings)
-    return band(np.stack([one.f_safe for one in evaluations]), study.repeatability.get(SAFETY_DEGREE, 0.0), error)
+    return band(np.stack([prediction.f_safe for prediction in evaluations]), study.repeatability.get(SAFETY_DEGREE, 0.0), error)
 
 
 def distance_from_original(study: Study, settings: FloatArray) -> FloatArray:
@@ -87,7 +87,7 @@ def distance_from_original(study: Study, settings: FloatArray) -> FloatArray:
 
 
 def band(safety_degrees: FloatArray, repeatability: float, error: FloatArray | float = 0.0) -> tuple[FloatArray, FloatArray]:
-    """Ends, shape (M,), of the band of predictions, shape (sets, M), and repeats of one simulation; `error` is added on each side."""
+    """Ends, shape (M,) each, of the band of predictions, shape (sets, M); repeats of a simulation and `error` widen it on each side."""
     lower, upper = np.full(safety_degrees.shape[1], np.nan), np.full(safety_degrees.shape[1], np.nan)
     defined = np.isfinite(safety_degrees).any(axis=0)
     lower[defined], upper[defined] = np.nanquantile(safety_degrees[:, defined], [(1 - BAND) / 2, (1 + BAND) / 2], axis=0)
@@ -95,18 +95,18 @@ def band(safety_degrees: FloatArray, repeatability: float, error: FloatArray | f
 
 
 def evaluations_of_sets(study: Study, settings: FloatArray, point: str = "") -> list[Evaluations]:
-    """Evaluate settings, shape (M, n), in this process with each parameter set, the study's own first."""
-    systems = [assemble(one) for one in studies_of_sets(study)]
-    return [evaluate(named_point(one, point, "point") if point else one, settings) for one in systems]
+    """Evaluate settings, shape (M, n), in this process with each parameter set, first with the study's values."""
+    systems = [assemble(variant) for variant in studies_of_sets(study)]
+    return [evaluate(named_point(system, point, "point") if point else system, settings) for system in systems]
 
 
 def studies_of_sets(study: Study) -> list[Study]:
-    """The study with each of the parameter sets. If the study's value of a parameter differs from the first set's, it stays as it is.
+    """One study for each parameter set. A parameter keeps its value in `study` if this value differs from the value in the first set.
 
     Raises
     ------
     InputError
-        If there are no sets, or the study lacks one of their parameters.
+        If the study has no parameter sets, or lacks a parameter that they name.
     """
     if not study.spread:
         raise InputError(study.source, "has no table [spread]", "a study that `calibrate` has fitted, such as sun or rain")

@@ -1,8 +1,8 @@
 """Options of a question: one record with defaults, legal ranges and help texts.
 
-Flags of the command, defaults and documentation of the Python function, the call of the report and the command that the report prints
-all derive from the record, which stands in the `__init__.py` of the question's package. The help of a command reads it, so it loads
-nothing heavy.
+The record defines the flags of the command, the defaults and the documentation of the Python function, the report's call of this
+function, and the command that the report prints. It stands in the `__init__.py` of the question's package. Because the help of a
+command needs this module, the module imports nothing that loads slowly.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from safevar_sumo.shipped import RUN
 
 
 class Option(NamedTuple):
-    """One option as a flag: help, legal range, name and form of its flag.
+    """One option: its help text, its legal range, and the name and form of its flag.
 
-    `kind` is the type of one value; `form` is "one" value, "commas" between several, or "repeated" flags. The ends `low` and
-    `high` belong to the range unless it is `is_open`. `python` describes the argument of the Python function where it differs
-    from the flag.
+    `kind` is the type of one value. `form` is "one" for a single value, "commas" for several values separated by commas, or "repeated"
+    for one flag per value. The ends `low` and `high` belong to the range unless the end's entry in `is_open` is true. `python`
+    describes the argument of the Python function if this argument differs from the flag.
     """
 
     help: str
@@ -45,10 +45,10 @@ class Option(NamedTuple):
         return fill(re.sub(r"--([a-z]+)", r"`\1`", text), 110, break_on_hyphens=False)
 
     def refusal(self, value: float) -> str:
-        """The expected range, if a number is outside it (as NaN is); empty if the number is inside."""
-        above = self.low is None or (value > self.low if self.is_open[0] else value >= self.low)
-        below = self.high is None or (value < self.high if self.is_open[1] else value <= self.high)
-        if above and below:
+        """The expected range in words if a number is outside the range (NaN always is), else an empty text."""
+        low_holds = self.low is None or (value > self.low if self.is_open[0] else value >= self.low)
+        high_holds = self.high is None or (value < self.high if self.is_open[1] else value <= self.high)
+        if low_holds and high_holds:
             return ""
         ends = [f"{'above' if self.is_open[0] else 'at least'} {self.low:,g}"] if self.low is not None else []
         ends += [f"{'below' if self.is_open[1] else 'at most'} {self.high:,g}"] if self.high is not None else []
@@ -60,16 +60,16 @@ def option(default: Any, text: str, **how: Any) -> Any:
 
 
 def unsafe_option() -> Any:
-    usual = "a collision if any evaluated setting collides, else half of the original's safety degree; of a rated study, any point lost"
-    return option(None, f"What is unsafe: a collision, a safety degree below X, or at most X points of a rating.  [default: {usual}]",
+    default = "a collision if any evaluated setting collides, else half of the original's safety degree; of a rated study, any point lost"
+    return option(None, f"What is unsafe: a collision, a safety degree below X, or at most X points of a rating.  [default: {default}]",
                   metavar="collision|below=X|points=X",
                   python="What is unsafe: `\"collision\"`, or a number X for a safety degree below X [m, or minus a collision's speed in "
-                         f"m/s], or an `Unsafe`. By default {usual}.")
+                         f"m/s], or an `Unsafe`. By default {default}.")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Options:
-    """Options of a question; refuses values outside their ranges.
+    """Options of a question; a value outside its range raises an error.
 
     Raises
     ------
@@ -81,14 +81,14 @@ class Options:
     """The command that asks the question."""
 
     def __post_init__(self) -> None:
-        for name, described in self.described().items():
+        for name, definition in self.described().items():
             value = getattr(self, name)
-            if described.form != "one" and value is not None and not isinstance(value, Mapping):
+            if definition.form != "one" and value is not None and not isinstance(value, Mapping):
                 object.__setattr__(self, name, (value,) if isinstance(value, str) else tuple(value))
-            if value is not None and described.kind in (int, float):
-                if isinstance(value, bool) or not isinstance(value, Integral if described.kind is int else Real):
-                    raise InputError(name, repr(value), "a whole number" if described.kind is int else "a number")
-                if expected := described.refusal(float(value)):
+            if value is not None and definition.kind in (int, float):
+                if isinstance(value, bool) or not isinstance(value, Integral if definition.kind is int else Real):
+                    raise InputError(name, repr(value), "a whole number" if definition.kind is int else "a number")
+                if expected := definition.refusal(float(value)):
                     raise InputError(name, repr(value), expected)
 
     @classmethod
@@ -102,31 +102,31 @@ class Options:
         return {name: option.flag or f"--{name.replace('_', '-')}" for name, option in cls.described().items()}
 
     def command_line(self, place: str, point: str = "") -> str:
-        """The command that asks the same of a study or results directory; options that differ from their defaults become flags."""
+        """The command that asks this question about a study or results directory, with a flag for each option off its default."""
         parts = [RUN, self.question, quote(place)]
         for item in fields(self):
-            value, flag, described = getattr(self, item.name), self.flags()[item.name], item.metadata["option"]
+            value, flag, definition = getattr(self, item.name), self.flags()[item.name], item.metadata["option"]
             if value == item.default:
                 continue
             if isinstance(value, Mapping):
                 value = [f"{key}={number!r}" for key, number in value.items()]
-            if described.kind is bool:
+            if definition.kind is bool:
                 parts.append(flag)
-            elif described.form == "repeated":
-                parts += [f"{flag} {quote(str(each))}" for each in value]
+            elif definition.form == "repeated":
+                parts += [f"{flag} {quote(str(element))}" for element in value]
             else:
-                parts.append(f"{flag} {quote(','.join(value) if described.form == 'commas' else str(value))}")
+                parts.append(f"{flag} {quote(','.join(value) if definition.form == 'commas' else str(value))}")
         return " ".join([*parts, *([f"--point {quote(point)}"] if point else [])])
 
 
-EVERY_QUESTION = """pool
-    Pool to simulate on; by default worker processes of its own.
+COMMON_ARGUMENTS = """pool
+    Pool that simulates; by default new worker processes.
 jobs
-    Worker processes, by default one for each core.
+    Number of worker processes, by default one for each core.
 progress
     True for a bar on the terminal, or a function called with the stage, the number of its settings done, and their total.
 as_it_is_now
-    If inputs have changed since results were computed, simulate with the present ones and warn; by default an error is raised.
+    If inputs have changed since results were computed, simulate with the present inputs and warn; by default an error is raised.
 
 Raises
 ------
@@ -138,10 +138,10 @@ QuestionFunction = TypeVar("QuestionFunction", bound=Callable[..., Any])
 
 
 def documented(options: type[Options]) -> Callable[[QuestionFunction], QuestionFunction]:
-    """Append the options, and the arguments common to all questions, to a function's docstring, which ends with its first argument."""
+    """Decorator: appends the options and the arguments common to all questions to a docstring, which must end with the first argument."""
     def complete(function: QuestionFunction) -> QuestionFunction:
-        arguments = [f"{name}\n{indent(described.argument, '    ')}" for name, described in options.described().items()]
-        function.__doc__ = "\n".join([cleandoc(function.__doc__ or ""), *arguments, EVERY_QUESTION])
+        arguments = [f"{name}\n{indent(definition.argument, '    ')}" for name, definition in options.described().items()]
+        function.__doc__ = "\n".join([cleandoc(function.__doc__ or ""), *arguments, COMMON_ARGUMENTS])
         return function
 
     return complete

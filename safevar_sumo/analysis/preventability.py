@@ -28,7 +28,7 @@ LIMIT = 20_000
 """Approximate limit of simulations for a study's preventability; beyond it only a random sample of the collisions is simulated."""
 
 SETTINGS_PER_CALL = 20
-"""Number of settings simulated at all points of a matrix in one call: enough to fill its batches."""
+"""Number of settings simulated in one call at all points of a matrix: enough to fill the batches of simulations."""
 
 
 class PreventableBy(StrEnum):
@@ -40,7 +40,7 @@ class PreventableBy(StrEnum):
 
 
 class PreventedShares(msgspec.Struct, frozen=True, kw_only=True):
-    """Shares of the collisions by class, and their number; shares and interval are None without any collision."""
+    """Shares of the simulated collisions by class, None without a collision; `looked_at` is the number of simulated collisions."""
 
     competent_driver: float | None
     full_braking: float | None
@@ -51,14 +51,14 @@ class PreventedShares(msgspec.Struct, frozen=True, kw_only=True):
 
 @dataclass(frozen=True, kw_only=True)
 class Preventability:
-    """Classes of the collisions of a study, or of a random sample of them, by the drivers that avoid them.
+    """Numbers of a study's collisions, or of a random sample of them, by the weakest driver that avoids each collision.
 
     Attributes
     ----------
     numbers
         Number of simulated collisions of each class; the classes are disjoint.
     collisions
-        Number of distinct collisions, whether simulated or not.
+        Number of distinct collisions of the study, simulated or not.
     """
 
     numbers: Mapping[PreventableBy, int]
@@ -69,20 +69,20 @@ class Preventability:
         """Number of collisions simulated with the reference drivers."""
         return sum(self.numbers.values())
 
-    def share(self, by: PreventableBy) -> float | None:
-        """The share of one class among the collisions looked at; None if there are none."""
-        return self.numbers.get(by, 0) / self.looked_at if self.looked_at else None
+    def share(self, category: PreventableBy) -> float | None:
+        """The share of one class among the simulated collisions; None if no collision was simulated."""
+        return self.numbers.get(category, 0) / self.looked_at if self.looked_at else None
 
-    def interval(self, by: PreventableBy) -> tuple[float, float] | None:
-        """95 % interval of the share among all of the study's collisions; None if none were looked at.
+    def interval(self, category: PreventableBy) -> tuple[float, float] | None:
+        """95 % confidence interval of a class's share in all collisions of the study; None if no collision was simulated.
 
-        If all collisions are looked at, the share has no sampling error and the interval is the share itself. For a sample it is
-        Clopper and Pearson's, which is too wide rather than too narrow, as it lacks the correction for a finite population.
+        If all collisions were simulated, the share has no sampling error and the interval is the share itself. For a sample the
+        interval is Clopper and Pearson's. It is slightly too wide, as it has no correction for a finite population.
         """
-        share = self.share(by)
+        share = self.share(category)
         if share is None or self.looked_at == self.collisions:
             return None if share is None else (share, share)
-        return clopper_pearson(self.numbers.get(by, 0), self.looked_at)
+        return clopper_pearson(self.numbers.get(category, 0), self.looked_at)
 
     @property
     def shares(self) -> PreventedShares:
@@ -94,30 +94,31 @@ class Preventability:
             interval_competent_driver=None if interval is None else list(interval))
 
     def __str__(self) -> str:
-        """One line; nothing without any collision."""
+        """One line; empty if no collision was simulated."""
         if not self.looked_at:
             return ""
         sample = "" if self.looked_at == self.collisions else f"{self.looked_at}, drawn at random, of "
-        parts = [f"{self.share(by):.0%} {by.replace('by full', 'only by full')}" for by in PreventableBy if self.numbers.get(by)]
+        parts = [f"{self.share(category):.0%} {category.replace('by full', 'only by full')}"
+                 for category in PreventableBy if self.numbers.get(category)]
         return f"Preventability in the same vehicle ({sample}{number_of(self.collisions, 'collision')}): {', '.join(parts)}."
 
 
 def preventability(evaluator: Evaluator, settings: FloatArray, limit: int = LIMIT) -> Preventability:
-    """Classify the collisions of settings, shape (M, n), by the driver that avoids them; equal settings count once.
+    """Classify collisions, settings of shape (M, n), by the weakest driver that avoids each collision; equal settings count once.
 
-    If that takes more than about `limit` simulations, only a random sample is looked at, drawn with the study's seed.
-    A setting that cannot be simulated with a reference driver counts as not looked at.
+    If that takes more than about `limit` simulations, only a random sample is simulated, drawn with the study's seed.
+    A setting that cannot be simulated with a reference driver is not counted.
     """
     unique = np.unique(settings, axis=0)
     sample_size = max(limit // (len(PreventableBy) - 1 + len(assemble(evaluator.study).matrix)), 1)
     rows = np.random.default_rng(evaluator.study.search.seed).permutation(len(unique))[:sample_size]
-    return Preventability(numbers=Counter(by for by in preventable_by(evaluator, unique[rows]) if by is not None), collisions=len(unique))
+    return Preventability(numbers=Counter(filter(None, preventable_by(evaluator, unique[rows]))), collisions=len(unique))
 
 
 def preventable_by(evaluator: Evaluator, settings: FloatArray) -> list[PreventableBy | None]:
-    """The class of each collision, for settings of shape (M, n); in a matrix, each setting collides again at its worst point.
+    """The class of each collision, settings of shape (M, n); in a matrix, each setting is simulated at its worst point.
 
-    None where a setting cannot be simulated.
+    The class is None if the setting cannot be simulated.
     """
     classes: list[PreventableBy | None] = [None] * len(settings)
     system = assemble(evaluator.study)
@@ -126,8 +127,8 @@ def preventable_by(evaluator: Evaluator, settings: FloatArray) -> list[Preventab
         rows = np.flatnonzero(worst == k)
         point = system.points[k]
         at_point = evaluator.for_study(study_at(evaluator.study, point.name, point.name) if system.matrix else evaluator.study)
-        for row, by in zip(rows.tolist(), _at_one_point(at_point, system.at(point), settings[rows]), strict=True):
-            classes[row] = by
+        for row, category in zip(rows.tolist(), _classes_at_point(at_point, system.at(point), settings[rows]), strict=True):
+            classes[row] = category
     return classes
 
 
@@ -141,32 +142,33 @@ def _worst_points(evaluator: Evaluator, system: System, settings: FloatArray) ->
     return worst
 
 
-def _at_one_point(evaluator: Evaluator, system: System, settings: FloatArray) -> list[PreventableBy | None]:
-    """Classes at one point; full braking is tried only where the competent driver collides, so the classes are disjoint."""
+def _classes_at_point(evaluator: Evaluator, system: System, settings: FloatArray) -> list[PreventableBy | None]:
+    """Classes of collisions at one point. Full braking is tried only if the competent driver collides, so the classes are disjoint."""
     parameters = approach(system)
-    drivers = {name: evaluator.for_study(_driven_by(evaluator.study, name, parameters)) for name in ("competent_driver", "full_braking")}
-    competent = drivers["competent_driver"].evaluate(settings, "a competent driver in the same vehicle")
-    remaining = np.flatnonzero(competent.collided)
-    braking = drivers["full_braking"].evaluate(settings[remaining], "full braking in the same vehicle")
-    classes: list[PreventableBy | None] = [PreventableBy.COMPETENT_DRIVER if valid else None for valid in competent.valid]
-    for row, collided, valid in zip(remaining.tolist(), braking.collided, braking.valid, strict=True):
+    drivers = {name: evaluator.for_study(_study_with_driver(evaluator.study, name, parameters))
+               for name in ("competent_driver", "full_braking")}
+    competent_driver = drivers["competent_driver"].evaluate(settings, "a competent driver in the same vehicle")
+    collisions = np.flatnonzero(competent_driver.collided)
+    full_braking = drivers["full_braking"].evaluate(settings[collisions], "full braking in the same vehicle")
+    classes: list[PreventableBy | None] = [PreventableBy.COMPETENT_DRIVER if valid else None for valid in competent_driver.valid]
+    for row, collided, valid in zip(collisions.tolist(), full_braking.collided, full_braking.valid, strict=True):
         classes[row] = None if not valid else PreventableBy.NOBODY if collided else PreventableBy.FULL_BRAKING
     return classes
 
 
 def approach(system: System) -> dict[str, Any]:
-    """How a reference driver approaches from rest: as the driving system does with the original vehicle.
+    """Parameters with which a reference driver approaches from rest as the driving system does with the original vehicle.
 
     The driver replays the throttle until the driving system first brakes or reaches its peak speed, and holds that speed, so that
-    both are at the same place when the danger begins. A run that begins at speed keeps that speed.
+    both are at the same place when the danger begins. If the run begins at speed, the driver keeps that speed.
     """
     trace = simulate(system, system.characteristics.original[np.newaxis]).trace
-    speed, braked = trace.speed[:, 0], trace.brake[:, 0] > 0
+    speed, is_braking = trace.speed[:, 0], trace.brake[:, 0] > 0
     if speed[0] > 0 or not speed.any():
         return {}
-    ends = min(int(np.argmax(speed)), int(np.argmax(braked)) if braked.any() else len(speed))
-    return {"cruise_speed": float(speed.max()), "start_throttle": trace.throttle[:ends, 0].tolist()}
+    end = min(int(np.argmax(speed)), int(np.argmax(is_braking)) if is_braking.any() else len(speed))
+    return {"cruise_speed": float(speed.max()), "start_throttle": trace.throttle[:end, 0].tolist()}
 
 
-def _driven_by(study: Study, driver: str, parameters: Mapping[str, Any]) -> Study:
+def _study_with_driver(study: Study, driver: str, parameters: Mapping[str, Any]) -> Study:
     return replace(study, ads=ModelTable(model=driver, parameters=dict(parameters)))

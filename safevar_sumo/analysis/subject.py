@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from safevar_sumo.analysis.research_questions.case import Case
 
-MOST_NAMED = 3
+MAX_CHANGES = 3
 """Maximum number of changes that an error names."""
 
 
@@ -33,7 +33,7 @@ class Results:
     directory
         The directory.
     case
-        Study, solutions and evaluations, as the research questions take them.
+        Study, solutions and evaluations, the input of the research questions.
     """
 
     directory: Path
@@ -91,9 +91,9 @@ def load(directory: str | Path) -> Results:
 
 
 def study_or_case(source: StudyLike | Results, *, as_it_is_now: bool = False, results_only: bool = False) -> Study | Case:
-    """The subject of a question: a study, or the case of results (given as such or by their directory).
+    """The subject of a question: a study, or the case of results, which may be named by their directory.
 
-    With `results_only` names and paths are those of directories, also where a study has the same name.
+    With `results_only`, a name or path means a directory, even if a study has the same name.
 
     Warns
     -----
@@ -103,7 +103,7 @@ def study_or_case(source: StudyLike | Results, *, as_it_is_now: bool = False, re
     Raises
     ------
     InputError
-        If `source` is neither, an input of the results has changed since they were computed, or a study is given `as_it_is_now`.
+        If `source` is no study and no results, if an input of the results has changed, or if `as_it_is_now` is set for a study.
     """
     if isinstance(source, str | Path):
         is_directory, is_study = os.path.isdir(source), str(source) in study_names()  # `os.path` accepts any text, unlike paths
@@ -125,18 +125,18 @@ def study_or_case(source: StudyLike | Results, *, as_it_is_now: bool = False, re
 
 
 def study_of(source: StudyLike | Results, *, as_it_is_now: bool = False) -> Study:
-    """The study itself, or the study of the results; raises as `study_or_case`."""
+    """The study itself, or the study of the results; raises what `study_or_case` raises."""
     subject = study_or_case(source, as_it_is_now=as_it_is_now)
     return subject if isinstance(subject, Study) else subject.study
 
 
 def changes_since(directory: Path, case: Case, *, as_it_is_now: bool = False) -> list[str]:
-    """Changes of a simulation's inputs since results were computed; empty for imported results, which record no inputs.
+    """Changes of the inputs since the results were computed; empty for imported results, which record no inputs.
 
     Raises
     ------
     InputError
-        If anything has changed and `as_it_is_now` is false; names the files.
+        If an input has changed and `as_it_is_now` is false; the message names the changes.
     """
     from safevar_sumo.campaign import read_by_algorithms
     from safevar_sumo.sumo.system import assemble
@@ -151,19 +151,19 @@ def changes_since(directory: Path, case: Case, *, as_it_is_now: bool = False) ->
     with local_pool(1, study.search.time_limit) as pool:
         sources = {**digests_of_sources(study, pool), **read_by_algorithms(study)}
     manifest, sources = comparable_inputs(manifest, sources, later_files(directory), study.origin.places)
-    changed = differences_now(manifest, manifest_of(study, identity_of(study, system, sources)))
-    if changed and not as_it_is_now:
-        more = f" (and {len(changed) - MOST_NAMED} more)" if len(changed) > MOST_NAMED else ""
-        raise InputError(directory / MANIFEST, f"{'; '.join(changed[:MOST_NAMED])}{more}: new simulations would not match these results",
-                         "the inputs of that time; or --as-it-is-now (as_it_is_now=True), which simulates with the present ones and warns")
-    return [f"{difference}; simulated as it is now" for difference in changed]
+    changes = differences_now(manifest, manifest_of(study, identity_of(study, system, sources)))
+    if changes and not as_it_is_now:
+        rest = f" (and {len(changes) - MAX_CHANGES} more)" if len(changes) > MAX_CHANGES else ""
+        raise InputError(directory / MANIFEST, f"{'; '.join(changes[:MAX_CHANGES])}{rest}: new simulations would not match these results",
+                         "the inputs of that time; or --as-it-is-now (as_it_is_now=True) to simulate with the present inputs and a warning")
+    return [f"{difference}; simulated as it is now" for difference in changes]
 
 
 T = TypeVar("T")
 
 
 def answer_question(compute: Callable[..., T], subject: Study | Case, options: type[Options], arguments: Mapping[str, Any]) -> T:
-    """The result of a question's computation; `arguments` are those of the question's function by name."""
+    """Compute the answer to a question; `arguments` are the arguments of the question's function, by name."""
     from safevar_sumo.metrics import Unsafe
 
     values = {name: arguments[name] for name in options.described()}

@@ -14,41 +14,41 @@ ENDS = {
     Outcome.STOPPED: "stops", Outcome.PASSED: "passes", Outcome.TIMEOUT: "is still under way at the end",
     Outcome.NEVER_MOVED: "never moves", Outcome.SIMULATOR_ERROR: "could not be simulated",
     Outcome.INVALID_TEST: "leaves the tolerance of the test's speed", Outcome.INFEASIBLE: "violates a constraint"}
-"""How a run ended, as the verb of a sentence; a collision is described by its speed instead."""
+"""How a run ended, as the verb of a sentence; other words describe a collision, with its speed."""
 
 
 def list_of_changes(characteristics: CharacteristicSet, values: Mapping[str, float]) -> str:
-    """The values that differ from the original, in the study's order, such as `mass 2404 -> 2600 kg (+8.2 %)`."""
+    """The values that differ from the original values, in the order of the study, such as `mass 2404 -> 2600 kg (+8.2 %)`."""
     changed = [(member, values[member.name]) for member in characteristics if values.get(member.name, member.original) != member.original]
     return ", ".join(f"{member.name} {member.original:g} -> {member.text(value)}{member.suffix} "
                      f"({(value - member.original) / abs(member.original):+.1%})" for member, value in changed) or "no change at all"
 
 
 def direction(member: Characteristic, value: float) -> str:
-    """Which way a characteristic is changed, such as `mass up`."""
+    """A characteristic and the direction of its change, such as `mass up`."""
     return f"{member.name} {'up' if value > member.original else 'down'}"
 
 
 def simulate_command(study: str, values: Mapping[str, float], point: str = "") -> str:
-    """The command that simulates these changes of a study, at one point of its matrix if one is named."""
+    """The command that simulates changes of a study; `point` may name a point of the study's matrix."""
     changes = (f"--set {quote(f'{name}={value!r}')}" for name, value in values.items())
     return " ".join([question_command("simulate", study, point), *changes])
 
 
-def question_command(question: str, place: str, point: str = "") -> str:
-    """The command that asks a question about results or a study, at one point of its matrix if one is named."""
-    return " ".join([RUN, question, quote(place), *(["--point", quote(point)] if point else [])])
+def question_command(question: str, subject: str, point: str = "") -> str:
+    """The command that asks a question about results or a study; `point` may name a point of the study's matrix."""
+    return " ".join([RUN, question, quote(subject), *(["--point", quote(point)] if point else [])])
 
 
 def joined(parts: Iterable[str]) -> str:
     """Parts of a sentence: `a, b and c`."""
-    *first, last = parts
-    return f"{', '.join(first)} and {last}" if first else last
+    *beginning, end = parts
+    return f"{', '.join(beginning)} and {end}" if beginning else end
 
 
-def number_of(count: int, what: str) -> str:
+def number_of(count: int, noun: str) -> str:
     """A number with its noun: `1 change`, `2 changes`."""
-    return f"{count} {what}{'' if count == 1 else 's'}"
+    return f"{count} {noun}{'' if count == 1 else 's'}"
 
 
 def decimal(value: float | None) -> str:

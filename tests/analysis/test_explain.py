@@ -19,12 +19,20 @@ from rich.console import Console
 from safevar_sumo.analysis.evaluator import Evaluator
 from safevar_sumo.analysis.explain import ExplainOptions
 from safevar_sumo.analysis.explain.braking_comparison import BrakingComparison, compare_braking, sentence, summary_of
-from safevar_sumo.analysis.explain.causes import RESOLUTION, End, affordable, boundaries, involved, minimal_causes, necessary
+from safevar_sumo.analysis.explain.causes import (
+    RESOLUTION,
+    BoundaryState,
+    affordable_rows,
+    boundaries,
+    involved_columns,
+    minimal_causes,
+    necessary_columns,
+)
 from safevar_sumo.analysis.explain.compute import explain_failures
-from safevar_sumo.analysis.explain.necessity import Robustness, distinct_causes, necessity, robustness, smallest_robust
+from safevar_sumo.analysis.explain.necessity import Robustness, distinct_causes, necessity, robustness, smallest_robust_failure
 from safevar_sumo.analysis.explain.render import print_explained
 from safevar_sumo.analysis.explain.result import Explained
-from safevar_sumo.analysis.explain.summary import NUMBERS, DescribedFailure, in_short, lead
+from safevar_sumo.analysis.explain.summary import NUMBERS, DescribedFailure, failures_paragraph, lead
 from safevar_sumo.analysis.preventability import Preventability
 from safevar_sumo.analysis.research_questions.case import Case, load_cases
 from safevar_sumo.cli.program import commands
@@ -310,8 +318,8 @@ def test_all_smallest_unsafe_subsets_and_no_other_whatever_the_outcomes(table: l
     assert [set(cause.columns) for cause in result] == smallest
     for cause in result:
         assert not any(set(subset) < set(cause.columns) for subset in unsafe)
-    assert necessary(result) == (set.intersection(*smallest) if smallest else set())
-    assert involved(result) == set().union(*smallest)
+    assert necessary_columns(result) == (set.intersection(*smallest) if smallest else set())
+    assert involved_columns(result) == set().union(*smallest)
 
 
 def test_a_boundary_is_the_first_unsafe_place_and_no_island_is_skipped() -> None:
@@ -320,8 +328,8 @@ def test_a_boundary_is_the_first_unsafe_place_and_no_island_is_skipped() -> None
     (result,) = boundaries(evaluator, causes, COLLISION)
     assert result.fraction == pytest.approx(1.5 / 4.5, abs=2 * RESOLUTION)
     assert result.setting[0] > 6.5 >= result.setting[0] - 2 * RESOLUTION * 4.5
-    assert result.alone == {0: result.setting[0]}
-    assert (result.end, result.at_threshold) == (End.SAFE, None)
+    assert result.single_limits == {0: result.setting[0]}
+    assert (result.end, result.at_threshold) == (BoundaryState.SAFE, None)
 
 
 def test_nothing_is_shrunk_into_what_the_filter_takes_for_no_change() -> None:
@@ -331,7 +339,7 @@ def test_nothing_is_shrunk_into_what_the_filter_takes_for_no_change() -> None:
     threshold = evaluator.characteristics.threshold[0]
     assert result.setting[0] == pytest.approx(ORIGINAL + threshold, rel=1e-3)
     assert evaluator.characteristics.filter(result.setting)[0] == result.setting[0]
-    assert (result.end, result.at_threshold) == (End.FILTER, 0)
+    assert (result.end, result.at_threshold) == (BoundaryState.FILTER, 0)
 
 
 def test_a_boundary_that_ends_where_nothing_can_be_simulated_says_so() -> None:
@@ -339,7 +347,7 @@ def test_a_boundary_that_ends_where_nothing_can_be_simulated_says_so() -> None:
     evaluator = Evaluator(study, Plant(study, lambda rows: rows[:, 0] > 7, failing=lambda rows: (rows[:, 0] > 6) & (rows[:, 0] <= 7)))
     (causes,) = minimal_causes(evaluator, np.array([[9.0]]), COLLISION)
     (result,) = boundaries(evaluator, causes, COLLISION)
-    assert (result.setting[0], result.end) == (pytest.approx(7, abs=1e-3), End.NOT_SIMULATED)
+    assert (result.setting[0], result.end) == (pytest.approx(7, abs=1e-3), BoundaryState.NOT_SIMULATED)
 
 
 def test_robust_is_what_its_neighbours_are_too() -> None:
@@ -357,8 +365,8 @@ def test_the_smallest_robust_failure_is_the_first_whose_neighbours_are_unsafe_to
     """Largest changes of 40, 70 and 80 %; the first lies at the edge of the box."""
     evaluator = made_up_evaluator(2, box)
     failures = evaluator.evaluate(np.array([[9.0, 1.0], [7.01, 2.99], [8.5, 2.0]]), "failures")
-    assert smallest_robust(evaluator, failures, 0.1, COLLISION, limit=1) == 2
-    assert smallest_robust(evaluator, failures.take([1]), 0.1, COLLISION, limit=1) is None
+    assert smallest_robust_failure(evaluator, failures, 0.1, COLLISION, limit=1) == 2
+    assert smallest_robust_failure(evaluator, failures.take([1]), 0.1, COLLISION, limit=1) is None
 
 
 def test_necessary_and_changed_over_failures() -> None:
@@ -380,12 +388,12 @@ def test_necessary_and_changed_over_failures() -> None:
 def test_more_failures_than_can_be_afforded_are_sampled_and_always_the_same() -> None:
     evaluator = made_up_evaluator(8, everywhere)
     settings = np.random.default_rng(1).uniform(6, 9, (50, 8))
-    few = affordable(settings, evaluator, 2000)
-    assert few == affordable(settings, evaluator, 2000)
+    few = affordable_rows(settings, evaluator, 2000)
+    assert few == affordable_rows(settings, evaluator, 2000)
     assert 0 < len(few) < 50
-    assert affordable(settings, evaluator, 10**6) == list(range(50))
+    assert affordable_rows(settings, evaluator, 10**6) == list(range(50))
     settings[:, 3:] = ORIGINAL
-    assert len(affordable(settings, evaluator, 70)) == 10, "of three changes no, one and two of them: 1 + 3 + 3 simulations"
+    assert len(affordable_rows(settings, evaluator, 70)) == 10, "of three changes no, one and two of them: 1 + 3 + 3 simulations"
 
 
 def test_robustness_in_words_says_where_a_time_step_disagrees() -> None:
@@ -397,6 +405,6 @@ def test_the_paragraph_says_how_robust_the_changes_that_suffice_are_by_themselve
     system, changes = assemble(load_study("sun")), {"tireFric": 1.04, "radius": 32.05, "mass": 2500.0}
     finding = DescribedFailure("rs:0:0", changes, "collision", -1.5, Robustness({0.05: 0.98}), 2, Robustness({0.05: 0.44}))
     original = evaluate(system, system.characteristics.original[None])
-    paragraph = in_short(system, original, finding, finding, Preventability(numbers={}, collisions=0))
+    paragraph = failures_paragraph(system, original, finding, finding, Preventability(numbers={}, collisions=0))
     assert "a collision at 5 km/h (robust: 98 % of" in paragraph.lower()
     assert "; two of them suffice (borderline: only 44 % of the neighbours are unsafe too)." in paragraph

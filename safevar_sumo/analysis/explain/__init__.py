@@ -1,4 +1,4 @@
-"""Why does a vehicle fail: which changes cause it, how little of them is enough, is the failure robust?
+"""Why does a vehicle fail? Which changes cause the failure, how small a change is enough, and is the failure robust?
 
 The options and the function of the library are defined here, so that a command's help can be shown without loading the computation.
 """
@@ -22,14 +22,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class ExplainOptions(Options):
-    """How failures are explained."""
+    """Options of the explanation of failures."""
 
     question: ClassVar[str] = "explain"
     solutions: tuple[str, ...] = option(
         (), "Explain the N-th solution of a run, from 0; may be repeated.  [default: the failures that matter]",
         flag="--solution", metavar="ALG:RUN:N", form="repeated",
-        python='Handles of solutions, such as "nsga2:3:0". By default the robust failure with the fewest changes, those with the fewest '
-               "and the smallest changes, the most severe one, and one of each distinct minimal cause, the most frequent first.")
+        python='Handles of solutions, such as "nsga2:3:0". By default the robust failure with the fewest changes, the failures with the '
+               "fewest and the smallest changes, the most severe failure, and one failure of each distinct cause, the most frequent first.")
     unsafe: str | None = unsafe_option()
     top: int = option(8, "Maximum number of failures explained in full.", kind=int, low=1, high=1000)
     limit: int = option(40_000, "Approximate number of simulations for the minimal causes of all failures; if all failures would take "
@@ -40,12 +40,12 @@ class ExplainOptions(Options):
 def explain(source: StudyLike | Results, *, solutions: Sequence[str] = ExplainOptions.solutions, unsafe: Criterion | None = None,
             top: int = ExplainOptions.top, limit: int = ExplainOptions.limit, pool: Pool | None = None, jobs: int | None = None,
             progress: bool | Progress = False, as_it_is_now: bool = False) -> Explained:
-    """Explain failures: minimal causes, their boundaries, why, and whether they are robust.
+    """Explain failures: their minimal causes with boundaries, the reason in words, and the robustness.
 
     Parameters
     ----------
     source
-        Results or their directory, to explain their solutions; or a study, to explain failures all over its domain.
+        Results or their directory: their solutions are explained. A study: failures all over its domain are explained.
     """
     from safevar_sumo.analysis.explain.compute import explain_failures
 

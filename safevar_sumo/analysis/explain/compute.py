@@ -1,4 +1,4 @@
-"""Explains failures: the changes that cause them, how little of these is enough, the reason, and robustness."""
+"""Explains failures: the changes that cause them, how small a change is enough, the reason in words, and the robustness."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import numpy as np
 from safevar_sumo.analysis.evaluator import Evaluator, Progress, open_evaluator, silent
 from safevar_sumo.analysis.explain import ExplainOptions
 from safevar_sumo.analysis.explain.braking_comparison import BrakingComparison, compare_braking, summary_of
-from safevar_sumo.analysis.explain.causes import MinimalCause, affordable, boundaries, minimal_causes, necessary
-from safevar_sumo.analysis.explain.necessity import STEP_FACTORS, distinct_causes, key_of, necessity, robustness, smallest_robust
+from safevar_sumo.analysis.explain.causes import MinimalCause, affordable_rows, boundaries, minimal_causes, necessary_columns
+from safevar_sumo.analysis.explain.necessity import STEP_FACTORS, distinct_causes, key_of, necessity, robustness, smallest_robust_failure
 from safevar_sumo.analysis.explain.result import REASONS, ROBUST, Cause, Explained, Explanation
 from safevar_sumo.analysis.preventability import preventability, preventable_by
 from safevar_sumo.analysis.research_questions.case import Case
@@ -29,88 +29,89 @@ Causes = Mapping[int, list[MinimalCause]]
 Reasons = tuple[str, ...]
 
 
-SEARCHED, SEARCHED_IF_RATED = 4096, 64
-"""Number of settings over the whole domain that are searched for failures of a study without results."""
+SEARCH_SETTINGS, RATED_SEARCH_SETTINGS = 4096, 64
+"""For a study without results: number of settings over the whole domain among which failures are searched, without and with a rating."""
 
 
 class Failures(NamedTuple):
-    """Evaluated settings and which of them are to be explained.
+    """Evaluated settings, and the rows of the settings to explain.
 
     Attributes
     ----------
     evaluations
-        Evaluations of filtered settings; equal solutions of several runs are evaluated once.
+        Evaluations of filtered settings; equal solutions of several runs are one row.
     handles
-        The settings' handles as solutions; None for a setting that is no solution.
+        Handle of each setting's solution; None for a setting that is no solution.
     unsafe
         The criterion.
     rows
-        Rows to explain: the unsafe ones, or the solutions that the options name.
-    otherwise
-        Number of settings with another outcome than the results record.
+        Rows to explain: the unsafe settings, or the solutions that the options name.
+    deviations
+        Number of settings whose outcome differs from the outcome in the results.
     """
 
     evaluations: Evaluations
     handles: list[SolutionId | None]
     unsafe: Unsafe
     rows: list[int]
-    otherwise: int
+    deviations: int
 
-    def least(self, choice: str) -> int:
-        """The row that a choice of `CHOICES` selects: fewest, smallest or most_severe."""
-        among = self.evaluations.take(self.rows)
-        return self.rows[int(np.lexsort([getattr(among, name) for name in reversed(CHOICES[choice])])[0])]
+    def row_of(self, choice: str) -> int:
+        """The row that the choice fewest, smallest or most_severe selects (`CHOICES`)."""
+        candidates = self.evaluations.take(self.rows)
+        return self.rows[int(np.lexsort([getattr(candidates, name) for name in reversed(CHOICES[choice])])[0])]
 
 
-def failures_of(source: Study | Case, evaluator: Evaluator, original: Evaluations, named: Sequence[SolutionId],
+def failures_of(source: Study | Case, evaluator: Evaluator, original: Evaluations, named_solutions: Sequence[SolutionId],
                 unsafe: Unsafe | None) -> Failures:
     """Evaluate all solutions of results, or settings all over a study's domain.
 
     Raises
     ------
     InputError
-        If a handle of `named` is no solution of the results.
+        If a handle in `named_solutions` is no solution of the results.
     """
     if isinstance(source, Study):
-        if named:
+        if named_solutions:
             raise InputError("solutions", f"{source.name!r} is a study and has no solutions", "a results directory")
-        number = SEARCHED_IF_RATED if is_rated(source) else SEARCHED
-        settings = evaluator.characteristics.filter(evaluator.even_design(number, source.search.seed, filtered=True))
+        number = RATED_SEARCH_SETTINGS if is_rated(source) else SEARCH_SETTINGS
+        settings = evaluator.characteristics.filter(evaluator.feasible_design(number, source.search.seed, filtered=True))
         solution_handles: list[SolutionId | None] = [None] * len(settings)
-        recorded = None
+        recorded_outcomes = None
         rows = None
     else:
         solutions = source.solutions
         all_handles, all_settings = handles(solutions), solutions[list(evaluator.characteristics.names)].to_numpy(dtype=float)
-        named_rows = list(dict.fromkeys(position_of(solutions, handle, "solutions") for handle in named))
-        distinct = [*named_rows, *(row for row in _distinct_rows(all_settings) if row not in set(named_rows))]
-        settings, solution_handles = all_settings[distinct], [all_handles[row] for row in distinct]
-        recorded = solutions["outcome"].to_numpy(dtype=str)[distinct]
-        rows = list(range(len(named_rows))) if named else None
+        named_rows = list(dict.fromkeys(position_of(solutions, handle, "solutions") for handle in named_solutions))
+        chosen_rows = [*named_rows, *(row for row in _distinct_rows(all_settings) if row not in set(named_rows))]
+        settings, solution_handles = all_settings[chosen_rows], [all_handles[row] for row in chosen_rows]
+        recorded_outcomes = solutions["outcome"].to_numpy(dtype=str)[chosen_rows]
+        rows = list(range(len(named_rows))) if named_solutions else None
     evaluations = evaluator.evaluate(settings, "settings to explain")
     criterion = unsafe or Unsafe.default_among(evaluations, original)
     if rows is None:
         rows = np.flatnonzero(criterion.of(evaluations)).tolist()
-    otherwise = 0 if recorded is None else int(np.count_nonzero((evaluations.outcome != recorded) & (recorded != UNKNOWN)))
-    return Failures(evaluations, solution_handles, criterion, rows, otherwise)
+    deviations = 0 if recorded_outcomes is None else int(
+        np.count_nonzero((evaluations.outcome != recorded_outcomes) & (recorded_outcomes != UNKNOWN)))
+    return Failures(evaluations, solution_handles, criterion, rows, deviations)
 
 
 def _distinct_rows(settings: np.ndarray) -> list[int]:
-    """The first row of every distinct setting, in their order."""
+    """The first row of every distinct setting, in the order of the rows."""
     return sorted(np.unique(settings, axis=0, return_index=True)[1].tolist())
 
 
-NAMED = 6
+MAX_POINTS_NAMED = 6
 """Maximum number of failing points that a sentence names."""
 
 
 class PointComparison(NamedTuple):
-    """A failure at the points of a study.
+    """One failure at the points of a study.
 
     Attributes
     ----------
     because
-        Original and failure side by side at the failure's worst point.
+        Comparison of the original vehicle with the failure at the failure's worst point.
     points
         Names of the points of a matrix at which the failure is unsafe, in the study's order.
     """
@@ -132,17 +133,17 @@ def compare_at_points(system: System, original: FloatArray, settings: FloatArray
 
 
 def compare_at_cells(evaluator: Evaluator, original: FloatArray, settings: FloatArray) -> tuple[list[PointComparison], float]:
-    """As `compare_at_points`, for a rated study: the cells with a worse colour than the original's, compared in the worst of them."""
+    """As `compare_at_points`, for a rated study: finds the cells whose colour is worse than the original's; compares in the worst cell."""
     system = assemble(evaluator.study)
     assert system.rater is not None
     colours = system.rater.points(evaluator.cells(np.concatenate([original, settings]), "cells that turn")).colours.astype(int)
     comparisons, step = list[PointComparison](), 0.0
     for row in range(1, len(colours)):
-        worse = colours[row] - colours[0]
-        point = system.matrix[int(np.argmax(worse))]
+        colour_change = colours[row] - colours[0]
+        point = system.matrix[int(np.argmax(colour_change))]
         (at_point,) = at_every_point(system.at(point), np.concatenate([original, settings[row - 1:row]]))
         original_run, changed_run = (summary_of(at_point.runs, column, float(at_point.evaluations.f_safe[column])) for column in (0, 1))
-        names = tuple(system.matrix[k].name for k in np.flatnonzero(worse).tolist())
+        names = tuple(system.matrix[k].name for k in np.flatnonzero(colour_change).tolist())
         comparisons.append(PointComparison(compare_braking(original_run, changed_run, point.name), names))
         step = at_point.runs.trace.step
     return comparisons, step
@@ -152,19 +153,20 @@ def unsafe_points_of(system: System, at_points: list[AtPoint], unsafe: Unsafe) -
     """For every setting the names of the matrix's points at which it is unsafe; empty without a matrix."""
     if not system.matrix:
         return [() for _ in at_points[0].evaluations.settings]
-    at = np.stack([unsafe.of(one.evaluations) for one in at_points])
-    return [tuple(one.point.name for one, is_unsafe in zip(at_points, column, strict=True) if is_unsafe) for column in at.T]
+    unsafe_at_points = np.stack([unsafe.of(at_point.evaluations) for at_point in at_points])
+    return [tuple(at_point.point.name for at_point, is_unsafe in zip(at_points, column, strict=True) if is_unsafe)
+            for column in unsafe_at_points.T]
 
 
-def points_in_words(points: tuple[str, ...], number: int, limit: int = NAMED) -> str:
+def points_in_words(points: tuple[str, ...], number: int, limit: int = MAX_POINTS_NAMED) -> str:
     """A sentence such as `Fails at 2 of 72 points: CPNA, speed 40, impact_location 25, night; CPLA, speed 60, clear.`"""
-    first, more = "; ".join(points[:limit]), len(points) - limit
-    others = f" and {more} more" if more > 0 else ""
-    return f"Fails at {len(points)} of {number} points{': ' + first if points else ''}{others}."
+    names, rest = "; ".join(points[:limit]), len(points) - limit
+    others = f" and {rest} more" if rest > 0 else ""
+    return f"Fails at {len(points)} of {number} points{': ' + names if points else ''}{others}."
 
 
-class Chosen(NamedTuple):
-    """The failures that matter among those of a study or of results, with their minimal causes.
+class FailureSelection(NamedTuple):
+    """The failures to explain, of a study or of results, with their minimal causes.
 
     Attributes
     ----------
@@ -183,22 +185,22 @@ class Chosen(NamedTuple):
     reasons: Mapping[int, Reasons]
 
 
-def chosen_failures(source: Study | Case, options: ExplainOptions, evaluator: Evaluator) -> Chosen:
-    """Choose failures by name, or those that matter; raises as `explain_failures`."""
-    unsafe = None if options.unsafe is None else evaluator.parsed(options.unsafe)
-    named = [SolutionId.parse(text, "solutions") for text in options.solutions]
+def chosen_failures(source: Study | Case, options: ExplainOptions, evaluator: Evaluator) -> FailureSelection:
+    """Choose the failures that the options name, or the failures that matter; raises what `explain_failures` raises."""
+    unsafe = None if options.unsafe is None else evaluator.parse_criterion(options.unsafe)
+    named_solutions = [SolutionId.parse(text, "solutions") for text in options.solutions]
     limit = options.limit // len(assemble(evaluator.study).points)
     original = evaluator.original()
-    failures = failures_of(source, evaluator, original, named, unsafe)
+    failures = failures_of(source, evaluator, original, named_solutions, unsafe)
     settings, rows = failures.evaluations.settings, failures.rows
-    sample = rows if named else [rows[i] for i in affordable(settings[rows], evaluator, limit)]
-    robust = None if named or is_rated(evaluator.study) else _robust(failures, evaluator, original, limit)
-    reasons = dict.fromkeys(rows[:len(named)], ("asked for",)) if named else _choices(failures, robust)
-    explained = sorted({*sample, *reasons})
-    causes = dict(zip(explained, minimal_causes(evaluator, settings[explained], failures.unsafe), strict=True))
-    if not named:
-        reasons = _with_one_of_each_cause(failures, evaluator, {row: causes[row] for row in sample}, reasons, causes, options.top)
-    return Chosen(original, failures, sample, causes, reasons)
+    sample = rows if named_solutions else [rows[i] for i in affordable_rows(settings[rows], evaluator, limit)]
+    robust = None if named_solutions or is_rated(evaluator.study) else _robust_row(failures, evaluator, original, limit)
+    reasons = dict.fromkeys(rows[:len(named_solutions)], ("asked for",)) if named_solutions else _choices(failures, robust)
+    analysed_rows = sorted({*sample, *reasons})
+    causes = dict(zip(analysed_rows, minimal_causes(evaluator, settings[analysed_rows], failures.unsafe), strict=True))
+    if not named_solutions:
+        reasons = _with_distinct_causes(failures, evaluator, {row: causes[row] for row in sample}, reasons, causes, options.top)
+    return FailureSelection(original, failures, sample, causes, reasons)
 
 
 def explain_failures(source: Study | Case, options: ExplainOptions, *, pool: Pool | None = None, jobs: int | None = None,
@@ -214,41 +216,42 @@ def explain_failures(source: Study | Case, options: ExplainOptions, *, pool: Poo
     with open_evaluator(study, pool, jobs, progress) as evaluator:
         original, failures, sample, causes, reasons = chosen_failures(source, options, evaluator)
         settings = failures.evaluations.settings
-        explanations = _explained(failures, evaluator, original, causes, reasons)
-        preventable = preventability(evaluator, settings[_avoidable(study, failures.evaluations)])
-    of_sample = [causes[row] for row in sample]
+        explanations = _explanations(failures, evaluator, original, causes, reasons)
+        preventable = preventability(evaluator, settings[_avoidable_collisions(study, failures.evaluations)])
+    sample_causes, characteristics = [causes[row] for row in sample], evaluator.characteristics
+    changed = characteristics.changed(settings[sample])
     return Explained(
         study=study, unsafe=failures.unsafe, original=original, explanations=explanations,
-        necessity=necessity(evaluator.characteristics, evaluator.characteristics.changed(settings[sample]), of_sample, len(failures.rows)),
-        distinct=distinct_causes(evaluator.characteristics, of_sample), looked_at=len(failures.evaluations), failures=len(failures.rows),
-        analysed=len(sample), otherwise=failures.otherwise, preventability=preventable)
+        necessity=necessity(characteristics, changed, sample_causes, len(failures.rows)),
+        distinct=distinct_causes(characteristics, sample_causes), looked_at=len(failures.evaluations), failures=len(failures.rows),
+        analysed=len(sample), otherwise=failures.deviations, preventability=preventable)
 
 
-def _avoidable(study: Study, evaluations: Evaluations) -> BoolArray:
-    """Collisions that another driver may avoid; none in a rated study, where every vehicle collides in some cell."""
+def _avoidable_collisions(study: Study, evaluations: Evaluations) -> BoolArray:
+    """Which settings collide and may be avoided by another driver; none in a rated study, where every vehicle collides in some cell."""
     return np.asarray(evaluations.collided & (not is_rated(study)))
 
 
-def _robust(failures: Failures, evaluator: Evaluator, original: Evaluations, limit: int) -> int | None:
-    """The smallest robust failure that the limit allows to find; None without one, or if the original vehicle itself is unsafe."""
+def _robust_row(failures: Failures, evaluator: Evaluator, original: Evaluations, limit: int) -> int | None:
+    """Row of the smallest robust failure found within the limit; None without such a failure, or if the original vehicle is unsafe."""
     if not failures.rows or failures.unsafe.of(original)[0]:
         return None
     _, step = compare_at_points(assemble(evaluator.study), original.settings, original.settings[:0], failures.unsafe)
-    row = smallest_robust(evaluator, failures.evaluations.take(failures.rows), step, failures.unsafe, limit)
+    row = smallest_robust_failure(evaluator, failures.evaluations.take(failures.rows), step, failures.unsafe, limit)
     return None if row is None else failures.rows[row]
 
 
 def _choices(failures: Failures, robust: int | None) -> dict[int, Reasons]:
-    """Reasons to explain a failure, by its row: smallest robust one, fewest changes, most severe, smallest changes."""
+    """Reasons to explain a failure, by its row: smallest robust, fewest changes, most severe, smallest changes."""
     reasons: dict[int, Reasons] = {} if robust is None else {robust: (ROBUST,)}
     for choice in ("fewest", "most_severe", "smallest"):
         if failures.rows:
-            row = failures.least(choice)
+            row = failures.row_of(choice)
             reasons[row] = (*reasons.get(row, ()), REASONS[choice])
     return reasons
 
 
-def _with_one_of_each_cause(failures: Failures, evaluator: Evaluator, sample: Causes, reasons: Mapping[int, Reasons], causes: Causes,
+def _with_distinct_causes(failures: Failures, evaluator: Evaluator, sample: Causes, reasons: Mapping[int, Reasons], causes: Causes,
                             top: int) -> dict[int, Reasons]:
     """Add, up to `top` failures in all, the simplest failure of each distinct minimal cause that no chosen failure has yet."""
     chosen = dict(list(reasons.items())[:top])
@@ -263,7 +266,7 @@ def _with_one_of_each_cause(failures: Failures, evaluator: Evaluator, sample: Ca
     return chosen
 
 
-def _explained(failures: Failures, evaluator: Evaluator, original: Evaluations, causes: Causes,
+def _explanations(failures: Failures, evaluator: Evaluator, original: Evaluations, causes: Causes,
                reasons: Mapping[int, Reasons]) -> tuple[Explanation, ...]:
     """The chosen failures explained in full."""
     if not reasons:
@@ -271,24 +274,24 @@ def _explained(failures: Failures, evaluator: Evaluator, original: Evaluations, 
     rows = list(reasons)
     chosen, names = failures.evaluations.take(rows), evaluator.characteristics.names
     all_causes = [cause for row in rows for cause in causes[row]]
-    if is_rated(evaluator.study):  # a neighbour is simulated in all cells: too long for every cause
+    if is_rated(evaluator.study):  # each neighbour is simulated in all cells, which takes too long for all causes
         comparisons, step = compare_at_cells(evaluator, original.settings, chosen.settings)
-        robust = robustness(evaluator, chosen.settings, step, failures.unsafe, STEP_FACTORS[:1])
+        robustnesses = robustness(evaluator, chosen.settings, step, failures.unsafe, STEP_FACTORS[:1])
     else:
         comparisons, step = compare_at_points(assemble(evaluator.study), original.settings, chosen.settings, failures.unsafe)
-        robust = robustness(evaluator, np.array([*chosen.settings, *(cause.setting for cause in all_causes)]), step, failures.unsafe)
-    shrunk, neighbours = iter(boundaries(evaluator, all_causes, failures.unsafe)), iter(robust[len(rows):])
-    collided = np.flatnonzero(_avoidable(evaluator.study, chosen))
-    avoided = dict(zip(collided.tolist(), preventable_by(evaluator, chosen.settings[collided]), strict=True))
+        robustnesses = robustness(evaluator, np.array([*chosen.settings, *(cause.setting for cause in all_causes)]), step, failures.unsafe)
+    limits, neighbours = iter(boundaries(evaluator, all_causes, failures.unsafe)), iter(robustnesses[len(rows):])
+    collided = np.flatnonzero(_avoidable_collisions(evaluator.study, chosen))
+    driver_classes = dict(zip(collided.tolist(), preventable_by(evaluator, chosen.settings[collided]), strict=True))
     explanations = []
     for i, row in enumerate(rows):
         group = []
         for cause in causes[row]:
-            boundary = next(shrunk)
+            boundary = next(limits)
             group.append(Cause(
                 changes={names[column]: float(cause.setting[column]) for column in cause.columns},
                 boundary={names[column]: float(boundary.setting[column]) for column in cause.columns}, fraction=boundary.fraction,
-                alone={names[column]: value for column, value in boundary.alone.items()}, outcome=cause.outcome,
+                alone={names[column]: value for column, value in boundary.single_limits.items()}, outcome=cause.outcome,
                 safety_degree=cause.safety_degree, end=boundary.end,
                 at_threshold=None if boundary.at_threshold is None else names[boundary.at_threshold], neighbours=next(neighbours, None)))
         changed = evaluator.characteristics.changed(chosen.settings[i])
@@ -296,6 +299,7 @@ def _explained(failures: Failures, evaluator: Evaluator, original: Evaluations, 
             handle=failures.handles[row], reasons=reasons[row], setting=dict(zip(names, chosen.settings[i].tolist(), strict=True)),
             outcome=str(chosen.outcome[i]), safety_degree=finite_or_none(chosen.f_safe[i]),
             changed=tuple(name for name, is_changed in zip(names, changed, strict=True) if is_changed),
-            necessary=tuple(names[column] for column in sorted(necessary(causes[row]))), causes=tuple(group), robustness=robust[i],
-            because=comparisons[i].because, preventable=str(avoided.get(i) or ""), points=comparisons[i].points))
+            necessary=tuple(names[column] for column in sorted(necessary_columns(causes[row]))), causes=tuple(group),
+            robustness=robustnesses[i], because=comparisons[i].because, points=comparisons[i].points,
+            preventable=str(driver_classes.get(i) or "")))
     return tuple(explanations)

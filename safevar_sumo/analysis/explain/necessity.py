@@ -10,14 +10,14 @@ import numpy as np
 import pandas as pd
 
 from safevar_sumo.analysis.evaluator import Evaluator, clopper_pearson
-from safevar_sumo.analysis.explain.causes import MinimalCause, involved, necessary
+from safevar_sumo.analysis.explain.causes import MinimalCause, involved_columns, necessary_columns
 from safevar_sumo.analysis.words import direction
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray
 from safevar_sumo.vehicles import CharacteristicSet
 
 Key = tuple[str, ...]
-"""A cause without its sizes: its changes with their directions, such as ('mass up', 'tireFric down')."""
+"""The changes of a cause with their directions, but without their sizes, such as ('mass up', 'tireFric down')."""
 
 
 def key_of(characteristics: CharacteristicSet, cause: MinimalCause) -> Key:
@@ -48,10 +48,10 @@ def necessity(characteristics: CharacteristicSet, changed: BoolArray, causes: Se
     """
     columns = range(len(characteristics) if len(changed) else 0)
     counts = {"changed": Counter(np.nonzero(changed)[1].tolist()),
-              "necessary": Counter(column for group in causes for column in necessary(group)),
-              "involved": Counter(column for group in causes for column in involved(group))}
-    sampled = len(changed) < failures
-    intervals = [clopper_pearson(counts["necessary"][column], len(changed)) if sampled
+              "necessary": Counter(column for group in causes for column in necessary_columns(group)),
+              "involved": Counter(column for group in causes for column in involved_columns(group))}
+    is_sample = len(changed) < failures
+    intervals = [clopper_pearson(counts["necessary"][column], len(changed)) if is_sample
                  else (counts["necessary"][column] / len(changed),) * 2 for column in columns]
     frame = pd.DataFrame({
         "characteristic": pd.Series([characteristics.names[column] for column in columns], dtype=object),
@@ -78,9 +78,9 @@ def distinct_causes(characteristics: CharacteristicSet, causes: Sequence[Sequenc
 
 
 NEIGHBOURS = 64
-"""Neighbours of a setting that are simulated with each time step."""
+"""Number of neighbours of a setting that are simulated with each time step."""
 STEP_FACTORS = (1.0, 0.5, 2.0)
-"""Factors on the study's time step."""
+"""Factors by which the study's time step is multiplied."""
 BORDERLINE = 0.8
 """Share of unsafe neighbours below which a failure is called borderline."""
 FAILURES_PER_BATCH = 8
@@ -101,19 +101,19 @@ class Robustness(NamedTuple):
         return is_borderline(self.share)
 
     def __str__(self) -> str:
-        """Such as `robust: 84 % of the neighbours are unsafe too, but only 53 % with a step of 0.1 s`."""
-        step, least = min(self.by_step.items(), key=lambda item: item[1])
-        disagrees = is_borderline(least) and not self.borderline
-        return in_words(self.share) + (f", but only {100 * least:.0f} % with a step of {step:g} s" if disagrees else "")
+        """A phrase such as `robust: 84 % of the neighbours are unsafe too, but only 53 % with a step of 0.1 s`."""
+        step, least_share = min(self.by_step.items(), key=lambda item: item[1])
+        disagrees = is_borderline(least_share) and not self.borderline
+        return in_words(self.share) + (f", but only {100 * least_share:.0f} % with a step of {step:g} s" if disagrees else "")
 
 
 def is_borderline(share: float) -> bool:
-    """Whether small perturbations remove a failure: too few of its neighbours are unsafe too."""
+    """Whether small perturbations remove a failure, because too few of its neighbours are unsafe."""
     return share < BORDERLINE
 
 
 def in_words(share: float) -> str:
-    """Such as `borderline: only 44 % of the neighbours are unsafe too`."""
+    """A phrase such as `borderline: only 44 % of the neighbours are unsafe too`."""
     return f"{'borderline: only' if is_borderline(share) else 'robust:'} {100 * share:.0f} % of the neighbours are unsafe too"
 
 
@@ -129,22 +129,22 @@ def robustness(evaluator: Evaluator, settings: FloatArray, step: float, unsafe: 
     neighbours = np.clip(settings[:, np.newaxis] + offsets, members.lower, members.upper).reshape(-1, len(members))
     shares = {}
     for factor in factors:
-        with_step = evaluator if factor == 1 else evaluator.with_step(step * factor)
-        evaluations = with_step.evaluate(neighbours, f"neighbours at {step * factor:g} s a step")
-        outcomes, valid = (flags.reshape(len(settings), NEIGHBOURS) for flags in (unsafe.of(evaluations), evaluations.valid))
-        shares[step * factor] = (outcomes & valid).sum(axis=1) / np.maximum(valid.sum(axis=1), 1)
+        step_evaluator = evaluator if factor == 1 else evaluator.with_step(step * factor)
+        evaluations = step_evaluator.evaluate(neighbours, f"neighbours at {step * factor:g} s a step")
+        is_unsafe, is_valid = (flags.reshape(len(settings), NEIGHBOURS) for flags in (unsafe.of(evaluations), evaluations.valid))
+        shares[step * factor] = (is_unsafe & is_valid).sum(axis=1) / np.maximum(is_valid.sum(axis=1), 1)
     return [Robustness({step: float(group[row]) for step, group in shares.items()}) for row in range(len(settings))]
 
 
-def smallest_robust(evaluator: Evaluator, failures: Evaluations, step: float, unsafe: Unsafe, limit: int) -> int | None:
-    """The row of the smallest failure that is not borderline: fewest changes first, then the smallest largest change.
+def smallest_robust_failure(evaluator: Evaluator, failures: Evaluations, step: float, unsafe: Unsafe, limit: int) -> int | None:
+    """The row of the smallest robust failure: with the fewest changes, and among these with the smallest largest change.
 
-    Failures are tried in that order until one is robust or about `limit` simulations are spent; None if no failure was robust by then.
+    Failures are tried in this order until a failure is robust, or about `limit` simulations are spent; None if no failure was robust.
     """
     order = np.lexsort([failures.f_safe, failures.f_diff, failures.f_num_diff])
-    affordable = max(FAILURES_PER_BATCH, limit // (NEIGHBOURS * len(STEP_FACTORS)))
-    for first in range(0, min(len(order), affordable), FAILURES_PER_BATCH):
-        rows = order[first:first + FAILURES_PER_BATCH]
+    number = max(FAILURES_PER_BATCH, limit // (NEIGHBOURS * len(STEP_FACTORS)))
+    for start in range(0, min(len(order), number), FAILURES_PER_BATCH):
+        rows = order[start:start + FAILURES_PER_BATCH]
         for row, result in zip(rows.tolist(), robustness(evaluator, failures.settings[rows], step, unsafe), strict=True):
             if not result.borderline:
                 return int(row)

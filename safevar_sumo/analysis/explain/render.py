@@ -13,7 +13,7 @@ from safevar_sumo.analysis.evaluator import CONFIDENCE
 from safevar_sumo.analysis.explain.braking_comparison import BrakingComparison, sentence
 from safevar_sumo.analysis.explain.compute import points_in_words
 from safevar_sumo.analysis.explain.result import REASONS, ROBUST, Cause, Explained, Explanation
-from safevar_sumo.analysis.explain.summary import LABELS, DescribedFailure, in_short
+from safevar_sumo.analysis.explain.summary import LABELS, DescribedFailure, failures_paragraph
 from safevar_sumo.analysis.figures import CHANGED, FONT, INVOLVED, NECESSARY, literal, new_figure
 from safevar_sumo.analysis.words import decimal, list_of_changes, number_of, question_command, simulate_command
 from safevar_sumo.protocol.rater import is_rated
@@ -24,12 +24,12 @@ from safevar_sumo.vehicles import Characteristic, CharacteristicSet
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-CAUSES_SHOWN = 3
+MAX_CAUSES = 3
 """Maximum number of minimal causes printed for a failure."""
-DISTINCT_SHOWN = 10
-NECESSARY_SHOWN = 4
+MAX_DISTINCT_CAUSES = 10
+MAX_CHARACTERISTICS = 4
 CommandFor = Callable[[Mapping[str, float]], str]
-"""Returns the command that simulates changes."""
+"""A function that returns the command that simulates changes."""
 
 
 def print_explained(console: Console, place: str, result: Explained, point: str = "", *, full: bool = False) -> None:
@@ -49,61 +49,62 @@ def print_explained(console: Console, place: str, result: Explained, point: str 
         print_text(console, f"{number_of(len(result.explanations), 'failure')} explained in full: "
                             f"{question_command('explain', place, point)} --full")
         return
-    print_text(console, _sawtooth(result))
+    print_text(console, _accuracy(result))
     for failure in result.explanations:
-        _print_one(console, command_for, failure, members, result)
+        _print_explanation(console, command_for, failure, members, result)
     if result.preventability.looked_at:
         print_text(console, str(result.preventability))
-    _print_common(console, result)
+    _print_statistics(console, result)
 
 
 def _print_answer(console: Console, command_for: CommandFor, result: Explained, members: CharacteristicSet) -> None:
-    """Print a paragraph, why the first failure fails and how little is enough, and the most frequent changes and causes."""
+    """Print a paragraph, the reason and the boundary of the first failure, and the most frequent changes and causes."""
     first = result.explanations[0]
     by_reason = {reason: failure for failure in result.explanations for reason in failure.reasons}
     smallest, robust = by_reason.get(REASONS["fewest"], first), by_reason.get(ROBUST)
-    print_text(console, in_short(assemble(result.study), result.original, _finding(smallest), _finding(robust), result.preventability))
+    descriptions = _description(smallest), _description(robust)
+    print_text(console, failures_paragraph(assemble(result.study), result.original, *descriptions, result.preventability))
     name = str(first.handle or "the first setting")
     print_text(console, f"Why {name} fails: {sentence(first.because, full=True)}")
     for cause in [cause for cause in first.causes if cause.changes][:1]:
-        limits = [f"{_named(member)} {member.original:g} -> {member.text(cause.boundary[member.name])}{member.suffix}"
+        limits = [f"{_full_name(member)} {member.original:g} -> {member.text(cause.boundary[member.name])}{member.suffix}"
                   for member in members if member.name in cause.boundary]
         print_text(console, f"How little is enough: {', '.join(limits)}. {command_for(cause.boundary)}")
     if result.analysed and len(result.distinct):
-        print_text(console, f"Necessary most often ({_looked_at(result)}): {_most_necessary(result, members)}.")
+        print_text(console, f"Necessary most often ({_sample_in_words(result)}): {_most_necessary(result, members)}.")
         common = result.distinct.iloc[0]
         print_text(console, f"{number_of(len(result.distinct), 'distinct minimal cause')}; the most frequent: "
                       f"{', '.join(common['cause']) or 'none'} ({common['share']:.0%} of the failures).")
 
 
-def _finding(failure: Explanation | None) -> DescribedFailure | None:
-    """The record of a failure for the paragraph; None for a setting that is not unsafe."""
+def _description(failure: Explanation | None) -> DescribedFailure | None:
+    """The description of a failure for the paragraph; None if the setting is not unsafe."""
     if failure is None or not failure.causes:
         return None
     changes = {name: failure.setting[name] for name in failure.changed}
     return DescribedFailure(str(failure.handle or "a sampled setting"), changes, failure.outcome, failure.safety_degree, failure.robustness,
-                   len(failure.causes[0].changes), failure.causes[0].neighbours)
+                            len(failure.causes[0].changes), failure.causes[0].neighbours)
 
 
 def _most_necessary(result: Explained, members: CharacteristicSet) -> str:
-    called = {member.name: _named(member) for member in members}
-    rows = result.necessity[result.necessity["necessary"] > 0].head(NECESSARY_SHOWN).to_dict("records")
-    return ", ".join(f"{called[row['characteristic']]} {_necessary(row)}" for row in rows) or "none, causes differ"
+    full_names = {member.name: _full_name(member) for member in members}
+    rows = result.necessity[result.necessity["necessary"] > 0].head(MAX_CHARACTERISTICS).to_dict("records")
+    return ", ".join(f"{full_names[row['characteristic']]} {_necessary_share(row)}" for row in rows) or "none, causes differ"
 
 
-def _necessary(row: Mapping[Any, Any]) -> str:
-    """The share of failures that need a characteristic, with the interval of a sample."""
+def _necessary_share(row: Mapping[Any, Any]) -> str:
+    """The share of failures that need a characteristic, for a sample with its interval."""
     interval = f" ({row['necessary_lower']:.0%} to {row['necessary_upper']:.0%})" if row["necessary_lower"] < row["necessary_upper"] else ""
     return f"{row['necessary']:.0%}{interval}"
 
 
-def _named(member: Characteristic) -> str:
+def _full_name(member: Characteristic) -> str:
     """The name of a characteristic with its short description."""
     return member.name if member.short_name == member.name else f"{member.name} ({member.short_name})"
 
 
-def _sawtooth(result: Explained) -> str:
-    """The accuracy of values along a characteristic: the distance that the vehicle covers between two decisions."""
+def _accuracy(result: Explained) -> str:
+    """A sentence on the accuracy of safety degrees: the distance that the vehicle covers between two decisions."""
     step = next(iter(result.explanations[0].robustness.by_step), None)
     braking = result.explanations[0].because.original.braking
     if step is None or braking is None:
@@ -113,21 +114,22 @@ def _sawtooth(result: Explained) -> str:
             "a value mean nothing.")
 
 
-def _print_one(console: Console, command_for: CommandFor, failure: Explanation, members: CharacteristicSet, result: Explained) -> None:
+def _print_explanation(console: Console, command_for: CommandFor, failure: Explanation, members: CharacteristicSet,
+                       result: Explained) -> None:
     title = f"{', '.join(LABELS.get(reason, reason) for reason in failure.reasons)}: {failure.handle or 'a sampled setting'}"
     console.rule(escape(title), align="left")
-    ends = f"{failure.outcome}, SD {decimal(failure.safety_degree)} with {number_of(len(failure.changed), 'change')}"
-    print_text(console, f"{ends}: {list_of_changes(members, failure.setting)}")
+    ending = f"{failure.outcome}, SD {decimal(failure.safety_degree)} with {number_of(len(failure.changed), 'change')}"
+    print_text(console, f"{ending}: {list_of_changes(members, failure.setting)}")
     if not failure.causes:
         print_text(console, "It is not unsafe.")
-    for cause in failure.causes[:CAUSES_SHOWN]:
+    for cause in failure.causes[:MAX_CAUSES]:
         _print_cause(console, command_for, cause, members)
-    if len(failure.causes) > CAUSES_SHOWN:
-        print_text(console, f"... and {len(failure.causes) - CAUSES_SHOWN} more of the same number of changes (--json has all).")
+    if len(failure.causes) > MAX_CAUSES:
+        print_text(console, f"... and {len(failure.causes) - MAX_CAUSES} more of the same number of changes (--json has all).")
     if len(failure.causes) > 1:
         print_text(console, f"Needed by all of them: {', '.join(failure.necessary) or 'nothing'}.")
     print_text(console, f"Because: {sentence(failure.because, full=True)}")
-    if failure.because.place:
+    if failure.because.point:
         number = len(assemble(result.study).matrix)
         if is_rated(result.study):
             print_text(console, f"{number_of(len(failure.points), 'cell')} of {number} turn: {'; '.join(failure.points)}.")
@@ -154,12 +156,12 @@ def _print_cause(console: Console, command_for: CommandFor, cause: Cause, member
             table.add_row(member.name, member.unit, f"{member.original:g}", *(member.text(value) for value in values))
     console.print(table)
     print_meanings(console, [member for member in members if member.name in cause.changes])
-    alone = "" if cause.neighbours is None else f"By themselves, these changes are {cause.neighbours}. "
-    print_text(console, f"{cause.limit} {alone}{command_for(cause.changes)}")
+    robustness = "" if cause.neighbours is None else f"By themselves, these changes are {cause.neighbours}. "
+    print_text(console, f"{cause.limit} {robustness}{command_for(cause.changes)}")
 
 
 def _side_by_side(comparison: BrakingComparison) -> WholeTable:
-    """Table of the original and the changed vehicle, with the part of the distance lost that each line explains."""
+    """Table of the original and the changed vehicle, with the part of the lost distance that each row explains."""
     table = WholeTable("", "unit", right=("original", "changed", "explains, m"))
     parts = comparison.parts
     brakings = comparison.original.braking, comparison.changed.braking
@@ -169,29 +171,29 @@ def _side_by_side(comparison: BrakingComparison) -> WholeTable:
             ("distance there - needed", "m", "margin", "all"))
     for head, unit, field, part in rows:
         cells = [decimal(getattr(braking, field)) if braking else "-" for braking in brakings]
-        explains = {"all": comparison.lost - parts["remainder"], **parts}[part] if part and parts else None
-        table.add_row(head, unit, *cells, "" if explains is None else decimal(explains))
+        distance = {"all": comparison.lost - parts["remainder"], **parts}[part] if part and parts else None
+        table.add_row(head, unit, *cells, "" if distance is None else decimal(distance))
     if parts:
         table.add_row("not explained", "m", "", "", decimal(parts["remainder"]))
     return table
 
 
-def _print_common(console: Console, result: Explained) -> None:
+def _print_statistics(console: Console, result: Explained) -> None:
     table = WholeTable("characteristic", right=("changed", "necessary", "in some cause"),
-                       title=f"Changed vs. necessary ({_looked_at(result)})")
+                       title=f"Changed vs. necessary ({_sample_in_words(result)})")
     for row in result.necessity.to_dict("records"):
-        table.add_row(row["characteristic"], f"{row['changed']:.0%}", _necessary(row), f"{row['involved']:.0%}")
+        table.add_row(row["characteristic"], f"{row['changed']:.0%}", _necessary_share(row), f"{row['involved']:.0%}")
     console.print(table)
-    sampled = "" if result.analysed == result.failures else (
+    intervals = "" if result.analysed == result.failures else (
         f" In brackets: {CONFIDENCE:.0%} intervals for all {result.failures} (Clopper and Pearson's, slightly too wide).")
-    print_text(console, f"necessary: in every minimal cause of a failure; shares of the failures.{sampled}")
+    print_text(console, f"necessary: in every minimal cause of a failure; shares of the failures.{intervals}")
     causes = WholeTable("minimal cause", right=("failures", "share"), title=f"Distinct minimal causes: {len(result.distinct)}")
-    for row in result.distinct.head(DISTINCT_SHOWN).to_dict("records"):
+    for row in result.distinct.head(MAX_DISTINCT_CAUSES).to_dict("records"):
         causes.add_row(", ".join(row["cause"]) or "none: the original vehicle", str(row["failures"]), f"{row['share']:.0%}")
     console.print(causes)
 
 
-def _looked_at(result: Explained) -> str:
+def _sample_in_words(result: Explained) -> str:
     if result.analysed == result.failures:
         return f"all {result.failures} failures"
     return f"random sample: {result.analysed} of {result.failures} failures"

@@ -10,7 +10,7 @@ import msgspec
 import pandas as pd
 
 from safevar_sumo.analysis.explain.braking_comparison import BrakingComparison, sentence
-from safevar_sumo.analysis.explain.causes import End
+from safevar_sumo.analysis.explain.causes import BoundaryState
 from safevar_sumo.analysis.explain.necessity import Robustness
 from safevar_sumo.analysis.preventability import Preventability, PreventedShares
 from safevar_sumo.metrics import Unsafe
@@ -20,8 +20,9 @@ from safevar_sumo.study import SAFETY_DEGREE, Study
 from safevar_sumo.vehicles import CharacteristicSet
 
 ROBUST = "smallest robust"
+"""Reason for the choice of the robust failure with the fewest changes."""
 REASONS = {"fewest": "fewest changes", "smallest": "smallest changes", "most_severe": "most severe"}
-"""Reasons for the choice of a failure, as in JSON."""
+"""Other reasons for the choice of a failure, by the name of the choice in `CHOICES`; the JSON contains these texts."""
 
 
 class CauseEntry(msgspec.Struct, frozen=True, kw_only=True):
@@ -32,14 +33,14 @@ class CauseEntry(msgspec.Struct, frozen=True, kw_only=True):
     fraction: float
     outcome: str
     safety_degree: float | None
-    end: End
+    end: BoundaryState
     robustness: float | None = None
 
 
 class FailureEntry(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """A failure in the JSON of `explain`: its handle in three keys, None if it is no solution; other fields as in `Explanation`.
+    """A failure in the JSON of `explain`; fields as in `Explanation`, but `because` is a sentence.
 
-    `robustness` is the unsafe share of its neighbours, `because` a sentence.
+    `algorithm`, `run` and `index` form the handle, None if the setting is no solution; `robustness` is the unsafe share of the neighbours.
     """
 
     algorithm: str | None
@@ -57,12 +58,15 @@ class FailureEntry(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True
 
     @property
     def handle(self) -> str:
-        """The handle of the solution; empty if it is no solution."""
+        """The handle of the solution; empty if the setting is no solution."""
         return "" if self.algorithm is None else f"{self.algorithm}:{self.run}:{self.index}"
 
 
 class SummaryEntry(msgspec.Struct, frozen=True, kw_only=True):
-    """The last entry in the JSON of `explain`: shares of the analysed failures by characteristic, and 95 % intervals of `necessary`."""
+    """The last entry in the JSON of `explain`.
+
+    `necessary` and `changed` are shares of the analysed failures by characteristic; `necessary_interval` has 95 % intervals of `necessary`.
+    """
 
     necessary: dict[str, float]
     changed: dict[str, float]
@@ -79,15 +83,15 @@ class Cause:
     changes
         The failure's values of these characteristics, in their units.
     boundary
-        The same, shrunk by a common factor as far as they stay unsafe: at `fraction` of the changes.
+        The values after every change is multiplied by `fraction`, the smallest factor at which the vehicle stays unsafe.
     alone
-        The value to which each change can be reduced while the others stay as in `changes`.
+        For each characteristic, the value to which it can return towards the original while the other values stay as in `changes`.
     outcome, safety_degree
-        Result of `changes` alone [m, or -m/s].
+        Outcome, and safety degree [m, or -m/s], of a vehicle with these changes only.
     end, at_threshold
-        State just below `fraction`; if that is the filter's threshold, the characteristic whose change the filter undoes.
+        What lies just below `fraction`; at the filter's threshold, the characteristic whose change the filter would remove.
     neighbours
-        Robustness of `changes` alone; None in a rated study, where it takes too long.
+        Robustness of these changes by themselves; None in a rated study, where the simulations would take too long.
     """
 
     changes: dict[str, float]
@@ -96,30 +100,32 @@ class Cause:
     alone: dict[str, float]
     outcome: str
     safety_degree: float | None
-    end: End = End.SAFE
+    end: BoundaryState = BoundaryState.SAFE
     at_threshold: str | None = None
     neighbours: Robustness | None = None
 
     @property
     def robustness(self) -> float | None:
-        """Share of the neighbours of `changes` that are unsafe too."""
+        """Share of the neighbours of these changes that are unsafe too."""
         return None if self.neighbours is None else self.neighbours.share
 
     @property
     def limit(self) -> str:
-        """The smallest unsafe share of the changes and the state just below it, in a sentence."""
-        below = {End.SAFE: "slightly less is safe",
-                 End.FILTER: f"with less, the change of {self.at_threshold} falls below the filter's threshold and counts as none",
-                 End.NOT_SIMULATED: "slightly less could not be simulated"}[self.end]
-        return f"Scaling all changes to {self.fraction:.1%} is still unsafe; {below}."
+        """A sentence on the smallest unsafe share of the changes, and on what lies just below this share."""
+        state = {BoundaryState.SAFE: "slightly less is safe",
+                 BoundaryState.FILTER: f"with less, the change of {self.at_threshold} falls below the filter's threshold "
+                                       "and counts as none",
+                 BoundaryState.NOT_SIMULATED: "slightly less could not be simulated"}[self.end]
+        return f"Scaling all changes to {self.fraction:.1%} is still unsafe; {state}."
 
 
 @dataclass(frozen=True, kw_only=True)
 class Explanation:
-    """One failure explained; `handle` is None if the setting is no solution, `reasons` are the reasons for its choice.
+    """The explanation of one failure; `handle` is None if the setting is no solution, `reasons` state why the failure was chosen.
 
-    `safety_degree` is in m, or -m/s; `changed` and `necessary` are names; `causes` are all minimal causes; `preventable` is
-    a collision's class of `PreventableBy`; `points` are the points of a matrix at which the setting is unsafe.
+    `safety_degree` is in m, or -m/s. `changed` names the changed characteristics, and `necessary` those that every minimal cause
+    contains. `because` compares the failure with the original. `preventable` is a collision's `PreventableBy`. `points`
+    are the points of a matrix at which the setting is unsafe.
     """
 
     handle: SolutionId | None
@@ -148,18 +154,18 @@ class Explanation:
 
 @dataclass(frozen=True, kw_only=True)
 class Explained:
-    """Failures explained, and what all of them have in common.
+    """The answer of `explain`: explanations of the chosen failures, and statistics of all analysed failures.
 
     Attributes
     ----------
     explanations
-        The failures that were chosen.
+        Explanations of the chosen failures.
     necessity, distinct
-        Frames over all analysed failures, of `safevar_sumo.analysis.explain.necessity`.
+        Statistics of all analysed failures, tables of `necessity` and `distinct_causes` in `safevar_sumo.analysis.explain.necessity`.
     looked_at, failures, analysed
-        Numbers of evaluated settings, of unsafe ones among them, and of unsafe ones that the two frames cover.
+        Numbers of evaluated settings, of failures among these, and of failures that the statistics cover.
     otherwise
-        Number of solutions whose outcome differs from the results.
+        Number of solutions whose outcome differs from the outcome in the results.
     preventability
         Shares of the collisions that reference drivers avoid.
     """
@@ -195,7 +201,7 @@ class Explained:
 
         Columns: `failure`, counted from 0, `algorithm`, `run`, `index`, `cause`, counted from 0, `characteristic`, `unit`,
         `original`, `value`, `boundary`, `alone` [unit], `fraction`, `outcome`, `safety_degree` [m or -m/s], `robustness`,
-        `whose`, and `points`, separated by semicolons.
+        `whose`, the class `preventable` of the failure, and `points`, separated by semicolons.
         """
         rows = []
         for i, failure in enumerate(self.explanations):

@@ -11,7 +11,7 @@ import pandas as pd
 from safevar_sumo.analysis.evaluator import Evaluator
 from safevar_sumo.analysis.explain.causes import MinimalCause, minimal_causes
 from safevar_sumo.analysis.explain.compute import compare_at_points, points_in_words, unsafe_points_of
-from safevar_sumo.analysis.explain.necessity import Robustness, robustness, smallest_robust
+from safevar_sumo.analysis.explain.necessity import Robustness, robustness, smallest_robust_failure
 from safevar_sumo.analysis.explain.result import REASONS, ROBUST
 from safevar_sumo.analysis.preventability import Preventability, PreventableBy, preventability
 from safevar_sumo.analysis.rating.summary import rated_lead
@@ -28,9 +28,9 @@ from safevar_sumo.vehicles import CharacteristicSet
 from safevar_sumo.workers.evaluation import Pool
 
 LABELS = {ROBUST: "robust with the fewest changes", REASONS["smallest"]: "smallest largest change", "a cause of its own": "distinct cause"}
-"""Titles that name the quantity; for other reasons the reason is the title."""
+"""Titles of failures by the reason for their choice; any other reason is itself the title."""
 LIMIT = 4000
-"""Approximate limit of simulations for the robust failure at the end of a study; `explain` has a higher one."""
+"""Approximate limit of simulations that search a robust failure at the end of a study; `explain` has a higher limit."""
 
 
 def lead(study: Study, solutions: pd.DataFrame, original: Evaluations, pool: Pool, place: str) -> list[str]:
@@ -41,7 +41,7 @@ def lead(study: Study, solutions: pd.DataFrame, original: Evaluations, pool: Poo
     Parameters
     ----------
     solutions
-        A frame as `safevar_sumo.results.solutions_frame` makes it.
+        A frame that `safevar_sumo.results.solutions_frame` has made.
     original
         The original vehicle's evaluation.
     pool
@@ -59,27 +59,27 @@ def lead(study: Study, solutions: pd.DataFrame, original: Evaluations, pool: Poo
     if not unsafe.any():
         return [f"Nothing unsafe found in {number_of(len(solutions), 'solution')}: no collision, no SD below half of the original's.",
                 f"How far each characteristic may go: {question_command('tolerance', place)}"]
-    chosen = {reason: chosen_handle(solutions, criterion, choice, study.name) for choice, reason in REASONS.items()}
-    rows = solutions.iloc[[position_of(solutions, handle) for handle in chosen.values()]]
+    handle_of = {reason: chosen_handle(solutions, criterion, choice, study.name) for choice, reason in REASONS.items()}
+    rows = solutions.iloc[[position_of(solutions, handle) for handle in handle_of.values()]]
     settings = rows[list(evaluator.characteristics.names)].to_numpy(dtype=float)
     causes_of, (failing_points, worst) = minimal_causes(evaluator, settings, criterion), _failing_points(study, settings, criterion)
-    different = len(solutions.drop_duplicates(list(evaluator.characteristics.names)))
-    settings_in_words = "" if different == len(solutions) else f" ({different} different settings)"
-    counted = f"{int(unsafe.sum())} of {number_of(len(solutions), 'solution')}{settings_in_words}"
+    number_distinct = len(solutions.drop_duplicates(list(evaluator.characteristics.names)))
+    settings_in_words = "" if number_distinct == len(solutions) else f" ({number_distinct} different settings)"
+    unsafe_in_words = f"{int(unsafe.sum())} of {number_of(len(solutions), 'solution')}{settings_in_words}"
     lines = [_paragraph(evaluator, solutions, unsafe, original, criterion, worst),
-             f"{counted} collide." if criterion.below is None else
-             f"No collision. {counted} keep less than half of the original's {degree:.2f} m."]
-    for (reason, handle), row, causes, fails_at in zip(chosen.items(), rows.to_dict("records"), causes_of, failing_points, strict=True):
+             f"{unsafe_in_words} collide." if criterion.below is None else
+             f"No collision. {unsafe_in_words} keep less than half of the original's {degree:.2f} m."]
+    for (reason, handle), row, causes, fails_at in zip(handle_of.items(), rows.to_dict("records"), causes_of, failing_points, strict=True):
         size = f"{number_of(int(row['f_num_diff']), 'change')} of up to {row['f_diff']:.0%}"
-        end = f"{row['outcome']}, SD {row['f_safe']:.2f}"
-        lines.append(f"{LABELS.get(reason, reason).capitalize()}: {handle}, {end}, {size}. {_in_words(evaluator, causes)}{fails_at}")
+        ending, cause = f"{row['outcome']}, SD {row['f_safe']:.2f}", _cause_in_words(evaluator, causes)
+        lines.append(f"{LABELS.get(reason, reason).capitalize()}: {handle}, {ending}, {size}. {cause}{fails_at}")
     at_worst = f"at the worst point of the first (without --point: at all {len(assemble(study).points)}, which takes long)"
     return [*lines, f"Why, and how far{f', {at_worst}' if worst else ''}: {question_command('explain', place, worst)}"]
 
 
 def _paragraph(evaluator: Evaluator, solutions: pd.DataFrame, is_unsafe: pd.Series[bool], original: Evaluations, unsafe: Unsafe,
                point: str) -> str:
-    """The unsafe solutions in one paragraph; with `point`, the solutions that are unsafe at that point of a matrix."""
+    """One paragraph on the unsafe solutions; with `point`, on the solutions that are unsafe at this point of a matrix."""
     names, all_handles = evaluator.characteristics.names, handles(solutions)
     candidates = np.flatnonzero(is_unsafe.to_numpy() & ~solutions.duplicated(list(names)).to_numpy())
     if point:
@@ -91,25 +91,25 @@ def _paragraph(evaluator: Evaluator, solutions: pd.DataFrame, is_unsafe: pd.Seri
     failing = np.flatnonzero(unsafe.of(evaluations))
     failures = evaluations.take(failing)
     if not len(failures):
-        return in_short(system, original, None, None, preventable)
+        return failures_paragraph(system, original, None, None, preventable)
     step = compare_at_points(system, original.settings, original.settings[:0], unsafe)[1]
-    robust = smallest_robust(evaluator, failures, step, unsafe, LIMIT // len(system.points))
+    robust = smallest_robust_failure(evaluator, failures, step, unsafe, LIMIT // len(system.points))
     fewest = int(np.lexsort([getattr(failures, name) for name in reversed(CHOICES["fewest"])])[0])
     rows = [fewest] if robust is None else [fewest, robust]
-    findings, chosen = [], failures.take(rows)
+    descriptions, chosen = [], failures.take(rows)
     causes = minimal_causes(evaluator, chosen.settings, unsafe)
-    shares = robustness(evaluator, np.array([*chosen.settings, *(group[0].setting for group in causes)]), step, unsafe)
+    robustnesses = robustness(evaluator, np.array([*chosen.settings, *(group[0].setting for group in causes)]), step, unsafe)
     for i, row in enumerate(rows):
         changed = np.flatnonzero(evaluator.characteristics.changed(chosen.settings[i]))
         changes = {names[column]: float(chosen.settings[i, column]) for column in changed}
         name, degree = str(all_handles[candidates[failing[row]]]), finite_or_none(chosen.f_safe[i])
-        findings.append(DescribedFailure(
-            name, changes, str(chosen.outcome[i]), degree, shares[i], len(causes[i][0].columns), shares[len(rows) + i]))
-    return in_short(system, original, findings[0], findings[1] if len(findings) > 1 else None, preventable)
+        descriptions.append(DescribedFailure(
+            name, changes, str(chosen.outcome[i]), degree, robustnesses[i], len(causes[i][0].columns), robustnesses[len(rows) + i]))
+    return failures_paragraph(system, original, descriptions[0], descriptions[1] if len(descriptions) > 1 else None, preventable)
 
 
 def _failing_points(study: Study, settings: FloatArray, unsafe: Unsafe) -> tuple[list[str], str]:
-    """Points of a matrix at which each setting fails, in words, and the first setting's worst point; empty without a matrix."""
+    """For each setting a sentence on the points at which it fails, and the first setting's worst point; empty without a matrix."""
     system = assemble(study)
     if not system.matrix:
         return [""] * len(settings), ""
@@ -118,18 +118,18 @@ def _failing_points(study: Study, settings: FloatArray, unsafe: Unsafe) -> tuple
     return words, at_points[worst_points(at_points)[0]].point.name
 
 
-def _in_words(evaluator: Evaluator, causes: list[MinimalCause]) -> str:
-    """The first of a setting's minimal causes, and how many others there are."""
+def _cause_in_words(evaluator: Evaluator, causes: list[MinimalCause]) -> str:
+    """A sentence on the first minimal cause of a setting, and on the number of its other causes."""
     if not causes:
         return "Simulated again, it is not unsafe."
     values = {evaluator.characteristics.names[column]: float(causes[0].setting[column]) for column in causes[0].columns}
-    more = len(causes) - 1
-    others = f" ({number_of(more, 'alternative set')} of the same size; see explain)" if more else ""
+    rest = len(causes) - 1
+    others = f" ({number_of(rest, 'alternative set')} of the same size; see explain)" if rest else ""
     return f"These changes alone cause it: {list_of_changes(evaluator.characteristics, values)}{others}."
 
 
 NUMBERS = ("no", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten", "eleven", "twelve")
-LISTED = 4
+MAX_CHANGES_LISTED = 4
 """Maximum number of changes that are listed, the largest first."""
 CONDITIONS = {"clear": "In clear weather", "wet": "On a wet road", "fog": "In fog", "night": "At night"}
 """Weathers in words; any other weather is named."""
@@ -141,11 +141,11 @@ class DescribedFailure(NamedTuple):
     Attributes
     ----------
     name
-        A name, such as a solution's handle.
+        Name of the failure, such as a solution's handle.
     changes
         All of the failure's changes, values by name in their units.
     outcome, safety_degree
-        Result of the changes [m, or -m/s].
+        Outcome and safety degree [m, or -m/s] of the failure.
     robustness
         Robustness of the failure.
     needed
@@ -163,14 +163,14 @@ class DescribedFailure(NamedTuple):
     cause: Robustness | None = None
 
 
-def in_short(system: System, original: Evaluations, smallest: DescribedFailure | None, robust: DescribedFailure | None,
+def failures_paragraph(system: System, original: Evaluations, smallest: DescribedFailure | None, robust: DescribedFailure | None,
              preventable: Preventability) -> str:
     """The paragraph about a study's failures.
 
     Parameters
     ----------
     system
-        The study's system; with a matrix, at the point or the points of the evaluations.
+        The study's system; in a matrix, with the points of the evaluations only.
     original
         The original vehicle's evaluation.
     smallest
@@ -180,18 +180,18 @@ def in_short(system: System, original: Evaluations, smallest: DescribedFailure |
     preventable
         Shares of the collisions that reference drivers avoid.
     """
-    parts = [f"{_conditions(system)} the original vehicle {_end(system, original)}."]
+    parts = [f"{_conditions(system)} the original vehicle {_original_ending(system, original)}."]
     if smallest is None:
         return " ".join([*parts, "Nothing unsafe was found."])
     members = CharacteristicSet(system.characteristics.members)
     if not smallest.needed:
         return " ".join([*parts, "No change is needed for it to be unsafe."])
-    suffices = _with_changes(members, smallest)
-    parts.append(f"{suffices[0].upper()}{suffices[1:]}")
+    words = _failure_in_words(members, smallest)
+    parts.append(f"{words[0].upper()}{words[1:]}")
     if smallest.robustness.borderline:
         parts.append("None of the failures that were tried is robust." if robust is None else
-                     f"The robust failure with the fewest changes, {robust.name}: {_with_changes(members, robust)}")
-    return " ".join([*parts, *_avoided(preventable)])
+                     f"The robust failure with the fewest changes, {robust.name}: {_failure_in_words(members, robust)}")
+    return " ".join([*parts, *_avoided_shares(preventable)])
 
 
 def _conditions(system: System) -> str:
@@ -206,7 +206,7 @@ def _weather(point: Point) -> str:
     return CONDITIONS.get(name, f"In {name}")
 
 
-def _end(system: System, original: Evaluations) -> str:
+def _original_ending(system: System, original: Evaluations) -> str:
     """How the original vehicle's run ends."""
     degree, outcome = float(original.f_safe[0]), Outcome(str(original.outcome[0]))
     if outcome == Outcome.COLLISION:
@@ -217,13 +217,13 @@ def _end(system: System, original: Evaluations) -> str:
     return f"{ENDS.get(outcome, outcome)}" + ("" if degree != degree else f" with a safety degree of {degree:.2f} m")
 
 
-def _with_changes(members: CharacteristicSet, failure: DescribedFailure) -> str:
-    """Such as `a collision at 5 km/h (robust: ...) was found with ten changes: ...; three of them suffice`."""
+def _failure_in_words(members: CharacteristicSet, failure: DescribedFailure) -> str:
+    """A sentence such as `a collision at 5 km/h (robust: ...) was found with ten changes: ...; three of them suffice`."""
     number, needed, effect = len(failure.changes), failure.needed, f"{_outcome(failure)} ({failure.robustness})"
     listed = _changes(members, failure.changes)
     if needed < number:
-        alone = "" if failure.cause is None else f" ({failure.cause})"
-        return f"{effect} was found with {_count(number)} changes: {listed}; {_count(needed)} of them {_suffice(needed)}{alone}."
+        cause = "" if failure.cause is None else f" ({failure.cause})"
+        return f"{effect} was found with {_count(number)} changes: {listed}; {_count(needed)} of them {_suffice(needed)}{cause}."
     return f"{_count(number)} {'change' if number == 1 else 'changes'} {_suffice(number)} for {effect}: {listed}."
 
 
@@ -244,22 +244,22 @@ def _outcome(failure: DescribedFailure) -> str:
 
 
 def _speed(degree: float) -> str:
-    """A collision's speed in whole km/h, below 3 km/h with a decimal."""
+    """The collision speed of a safety degree, in whole km/h or, below 3 km/h, with a decimal."""
     speed = -degree * KMH_PER_MS
     return f"{speed:.{int(speed < 3)}f} km/h"
 
 
 def _changes(members: CharacteristicSet, values: Mapping[str, float]) -> str:
-    """Short names and changes relative to the original, the largest first."""
+    """Short names with changes relative to the original values, the largest change first."""
     shares = {member.short_name: (values[member.name] - member.original) / abs(member.original) for member in members
               if member.name in values}
     largest = sorted(shares, key=lambda name: -abs(shares[name]))
-    parts = [f"{name} {100 * shares[name]:+.0f} %" for name in largest[:LISTED]]
-    return ", ".join(parts) + (f" and {len(shares) - LISTED} more" if len(shares) > LISTED else "")
+    parts = [f"{name} {100 * shares[name]:+.0f} %" for name in largest[:MAX_CHANGES_LISTED]]
+    return ", ".join(parts) + (f" and {len(shares) - MAX_CHANGES_LISTED} more" if len(shares) > MAX_CHANGES_LISTED else "")
 
 
-def _avoided(preventable: Preventability) -> list[str]:
-    """Shares of the collisions that each reference driver avoids, in a sentence; empty without a collision."""
+def _avoided_shares(preventable: Preventability) -> list[str]:
+    """A sentence on the shares of the collisions that each reference driver avoids; no sentence without a collision."""
     if not preventable.looked_at:
         return []
     words = {PreventableBy.COMPETENT_DRIVER: "a competent driver avoids {}", PreventableBy.FULL_BRAKING:

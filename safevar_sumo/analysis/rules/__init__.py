@@ -37,7 +37,7 @@ def rules(study: StudyLike | Results, *, samples: int = RulesOptions.samples, un
     Parameters
     ----------
     study
-        A study, or results or their directory, which stand for their study.
+        A study; or results or their directory, whose study is examined.
     """
     from safevar_sumo.analysis.rules.compute import find_rules
 

@@ -1,7 +1,7 @@
-"""Finds rules in physical units that say where a study is unsafe, from an unbiased design, and validates them on a second one.
+"""Finds rules in physical units that say where a study is unsafe, from an unbiased design, and validates them on a second design.
 
-A classification tree (CART, by scikit-learn) cuts the domain into boxes. The tree is pruned to the smallest whose score in
-cross-validation is within a standard error of the best. Its boxes with more unsafe settings than safe ones become rules. A rule
+A classification tree (CART, by scikit-learn) cuts the domain into boxes. The tree is pruned to the smallest tree whose score in
+cross-validation is within a standard error of the best score. Its boxes with more unsafe than safe settings become rules. A rule
 then loses the conditions that do not make it denser.
 """
 
@@ -26,26 +26,26 @@ from safevar_sumo.terminal import print_constraints, print_meanings, print_text
 from safevar_sumo.vehicles import Characteristic, CharacteristicSet
 from safevar_sumo.workers.evaluation import Pool
 
-LEAST_FOR_RULES = 10
-"""Minimum number of unsafe, and of safe, settings for rules."""
-FOLDS, DEEPEST, PRUNINGS = 5, 6, 24
+MIN_SETTINGS = 10
+"""Minimum number of unsafe settings, and of safe settings, that rules need."""
+FOLDS, MAX_DEPTH, PRUNINGS = 5, 6, 24
 """Number of folds of the cross-validation; maximum depth of the tree; maximum number of prunings compared."""
-LEAST_ADDED = 0.01
+MIN_ADDED_SHARE = 0.01
 """Share of the unsafe settings that a rule must cover in addition to the rules before it."""
 DIGITS = 3
 """Limits are rounded to this many digits of the domain's width."""
 Limits = dict[int, tuple[float | None, float | None]]
-"""By column: at least, at most; None where open."""
+"""Lower and upper limit by column; None if a side is open."""
 
 
 @dataclass(frozen=True)
 class Rule:
-    """A box, `limits` by characteristic (at least, at most; None where open), in which settings are unsafe with some density.
+    """A box of settings, and how dense unsafe settings are in the box; `limits` are lower and upper limits by name, None if a side is open.
 
     Attributes
     ----------
     inside, unsafe_inside, unsafe_everywhere
-        Numbers of validation settings: inside, unsafe inside, and unsafe anywhere.
+        Numbers of validation settings: inside the box, unsafe inside the box, and unsafe in the whole domain.
     """
 
     limits: Mapping[str, tuple[float | None, float | None]]
@@ -56,12 +56,12 @@ class Rule:
 
     @property
     def density(self) -> float | None:
-        """Share of the settings inside that are unsafe; None if there are none."""
+        """Unsafe share of the settings inside the box; None if no setting is inside."""
         return self.unsafe_inside / self.inside if self.inside else None
 
     @property
     def coverage(self) -> float | None:
-        """Share of the unsafe settings that lie inside; None if there are none."""
+        """Share of all unsafe settings that lie inside the box; None if no setting is unsafe."""
         return self.unsafe_inside / self.unsafe_everywhere if self.unsafe_everywhere else None
 
     @property
@@ -133,38 +133,38 @@ def find_rules(study: Study, options: RulesOptions, *, pool: Pool | None = None,
     remark, boxes = "", list[Limits]()
     if number == len(is_unsafe) > 0:
         boxes = [{}]
-    elif min(number, len(is_unsafe) - number) < LEAST_FOR_RULES:
-        remark = (f"{number} of {len(is_unsafe)} settings are unsafe: rules need at least {LEAST_FOR_RULES} unsafe and as many safe ones "
+    elif min(number, len(is_unsafe) - number) < MIN_SETTINGS:
+        remark = (f"{number} of {len(is_unsafe)} settings are unsafe: rules need at least {MIN_SETTINGS} unsafe and as many safe settings "
                   "(run `rules --samples N` for more)")
     else:
         boxes = _boxes(training.settings, is_unsafe, members)
-    rules = [_validated(limits, validation.settings, is_unsafe_validation, members) for limits in boxes]
+    rules = [_validated_rule(limits, validation.settings, is_unsafe_validation, members) for limits in boxes]
     return Rules(study=study, unsafe=unsafe, rules=sorted(rules, key=lambda rule: -rule.unsafe_inside), remark=remark,
                  samples=len(training) + len(validation), unsafe_share=float(np.mean(np.concatenate([is_unsafe, is_unsafe_validation]))))
 
 
 def _design(evaluator: Evaluator, number: int, seed: int) -> Evaluations:
-    """Evaluated settings over the whole domain, without those that could not be simulated."""
-    evaluations = evaluator.evaluate(evaluator.even_design(number, seed), "settings over the whole domain")
+    """Evaluations of settings over the whole domain, without the settings that could not be simulated."""
+    evaluations = evaluator.evaluate(evaluator.feasible_design(number, seed), "settings over the whole domain")
     return evaluations.take(evaluations.valid)
 
 
 def _boxes(settings: FloatArray, unsafe: BoolArray, members: CharacteristicSet) -> list[Limits]:
     """The distinct boxes that become rules."""
     tree = _pruned_tree((settings - members.lower) / (members.upper - members.lower), unsafe)
-    leaves = [(_rounded(limits, members), density) for limits, density in _leaves(tree, members)]
-    chosen = [limits for limits, density in leaves if density > 0.5] or [max(leaves, key=lambda leaf: leaf[1])[0]]
-    simple = [_without_useless_conditions(limits, settings, unsafe) for limits in chosen]
-    return _covering_more(simple, settings, unsafe)
+    leaves = [(_rounded_limits(limits, members), density) for limits, density in _leaves(tree, members)]
+    dense_boxes = [limits for limits, density in leaves if density > 0.5] or [max(leaves, key=lambda leaf: leaf[1])[0]]
+    short_boxes = [_without_useless_conditions(limits, settings, unsafe) for limits in dense_boxes]
+    return _ordered_by_coverage(short_boxes, settings, unsafe)
 
 
 def _pruned_tree(shares: FloatArray, unsafe: BoolArray) -> Any:
-    """The smallest tree whose cross-validated Brier score is within a standard error of the best one's."""
+    """The smallest tree whose cross-validated Brier score is within a standard error of the best score."""
     from sklearn.model_selection import StratifiedKFold, cross_val_score  # takes a second to load
     from sklearn.tree import DecisionTreeClassifier
 
     def tree(pruning: float) -> Any:
-        return DecisionTreeClassifier(max_depth=DEEPEST, min_samples_leaf=LEAST_FOR_RULES // 2, ccp_alpha=pruning, random_state=0)
+        return DecisionTreeClassifier(max_depth=MAX_DEPTH, min_samples_leaf=MIN_SETTINGS // 2, ccp_alpha=pruning, random_state=0)
 
     path = np.unique(np.maximum(tree(0.0).cost_complexity_pruning_path(shares, unsafe).ccp_alphas, 0.0))[:-1]
     prunings = path[np.unique(np.linspace(0, len(path) - 1, PRUNINGS).round().astype(int))] if len(path) else np.zeros(1)
@@ -193,7 +193,7 @@ def _leaves(tree: Any, members: CharacteristicSet) -> list[tuple[Limits, float]]
     return boxes
 
 
-def _rounded(limits: Limits, members: CharacteristicSet) -> Limits:
+def _rounded_limits(limits: Limits, members: CharacteristicSet) -> Limits:
     """Limits rounded to `DIGITS` of the domain's width, in the order of the characteristics."""
     def rounded(value: float | None, width: float) -> float | None:
         return None if value is None else round(value, DIGITS - 1 - math.floor(math.log10(width)))
@@ -203,43 +203,43 @@ def _rounded(limits: Limits, members: CharacteristicSet) -> Limits:
 
 
 def _without_useless_conditions(limits: Limits, settings: FloatArray, unsafe: BoolArray) -> Limits:
-    """Drop conditions as long as the lower bound of the density does not fall."""
+    """Drop conditions while the lower bound of the density does not fall."""
     def least_density(box: Limits) -> float:
         inside = within(box, settings)
         count = int(np.count_nonzero(inside))
         return clopper_pearson(int(np.count_nonzero(unsafe & inside)), count)[0] if count else 0.0
 
     while limits:
-        shorter = [{column: ends for column, ends in limits.items() if column != dropped} for dropped in limits]
-        best = max(shorter, key=least_density)
+        candidates = [{column: ends for column, ends in limits.items() if column != condition} for condition in limits]
+        best = max(candidates, key=least_density)
         if least_density(best) < least_density(limits):
             break
         limits = best
     return limits
 
 
-def _covering_more(boxes: list[Limits], settings: FloatArray, unsafe: BoolArray) -> list[Limits]:
-    """Boxes in order of coverage, without those that add few unsafe settings to the boxes before them; at least one."""
-    kept: list[Limits] = []
+def _ordered_by_coverage(boxes: list[Limits], settings: FloatArray, unsafe: BoolArray) -> list[Limits]:
+    """Boxes in order of coverage, without boxes that add few unsafe settings to the boxes before them; at least one box."""
+    chosen: list[Limits] = []
     uncovered = unsafe.copy()
     for limits in sorted(boxes, key=lambda box: -np.count_nonzero(unsafe & within(box, settings))):
         inside = within(limits, settings)
-        if not kept or np.count_nonzero(uncovered & inside) >= LEAST_ADDED * np.count_nonzero(unsafe):
-            kept.append(limits)
+        if not chosen or np.count_nonzero(uncovered & inside) >= MIN_ADDED_SHARE * np.count_nonzero(unsafe):
+            chosen.append(limits)
             uncovered &= ~inside
-    return kept
+    return chosen
 
 
 def within(limits: Limits, settings: FloatArray) -> BoolArray:
-    """Whether settings lie within limits; shape (M,)."""
+    """Whether each of M settings lies within limits; shape (M,)."""
     inside = np.ones(len(settings), dtype=bool)
     for column, (low, high) in limits.items():
         inside &= (settings[:, column] >= (-np.inf if low is None else low)) & (settings[:, column] <= (np.inf if high is None else high))
     return inside
 
 
-def _validated(limits: Limits, settings: FloatArray, unsafe: BoolArray, members: CharacteristicSet) -> Rule:
-    """A rule with its numbers on the validation settings."""
+def _validated_rule(limits: Limits, settings: FloatArray, unsafe: BoolArray, members: CharacteristicSet) -> Rule:
+    """A rule with its numbers of validation settings."""
     inside = within(limits, settings)
     return Rule({members.names[column]: ends for column, ends in limits.items()}, int(np.count_nonzero(inside)),
                 int(np.count_nonzero(inside & unsafe)), int(np.count_nonzero(unsafe)), CONFIDENCE)

@@ -1,4 +1,4 @@
-"""How far may each characteristic go, alone, in pairs, and all together?
+"""How far may each characteristic go by itself, in pairs, and together with all others?
 
 The options and the function of the library are defined here, so that a command's help can be shown without loading the computation.
 """
@@ -28,7 +28,7 @@ class ToleranceOptions(Options):
     unsafe: str | None = unsafe_option()
     characteristics: tuple[str, ...] | None = option(
         None, "Only these characteristics, separated by commas.  [default: all]", metavar="A,B", form="commas",
-        python="Characteristics that vary alone, in pairs, and together in the joint box; the others are the original's. By default all.")
+        python="Characteristics that vary alone, in pairs, and together in the joint box; the others keep their values. By default all.")
     pairs: bool = option(False, "Evaluate every pair too.", kind=bool)
 
 
@@ -36,12 +36,12 @@ class ToleranceOptions(Options):
 def tolerance(study: StudyLike | Results, *, unsafe: Criterion | None = None, characteristics: Sequence[str] | None = None,
               pairs: bool = ToleranceOptions.pairs, pool: Pool | None = None, jobs: int | None = None, progress: bool | Progress = False,
               as_it_is_now: bool = False) -> Tolerance:
-    """Find how far characteristics may go: each alone, with `pairs` two together, and all together.
+    """Find how far characteristics may go: each by itself, with `pairs` also two together, and all together.
 
     Parameters
     ----------
     study
-        A study, or results or their directory, which stand for their study.
+        A study; or results or their directory, whose study is examined.
     """
     from safevar_sumo.analysis.tolerance.compute import find_tolerances
 

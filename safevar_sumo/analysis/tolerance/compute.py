@@ -1,4 +1,4 @@
-"""Computes how far each characteristic may go alone, by scans of whole domains, in pairs, and all together."""
+"""Computes how far each characteristic may go by itself (from scans of whole domains), in pairs, and with all others."""
 
 from __future__ import annotations
 
@@ -24,24 +24,24 @@ from safevar_sumo.vehicles import Characteristic
 from safevar_sumo.workers.evaluation import Pool
 
 VALUES, RATED_VALUES = 201, 33
-"""Number of values over the domain; fewer in a rated study, where each takes a whole matrix. The original value is added."""
-FINER, ROUNDS, RATED_ROUNDS = 8, 4, 1
-"""Number of parts into which an interval with a change of state is divided, and how often: to a 4096th of the distance of two values."""
-ALMOST_ONE, SAME_POINTS = 1 - 1e-6, 1e-9
-"""A loss above the first counts as one point; a loss up to the second is rounding."""
-SAFE, UNSAFE, NOT_SIMULATED, INFEASIBLE = range(4)
+"""Number of values over the domain, besides the original value; smaller in a rated study, where each value takes a whole matrix."""
+PARTS_PER_ROUND, ROUNDS, RATED_ROUNDS = 8, 4, 1
+"""A round divides each interval with a change of state into so many parts; number of rounds, and of rounds in a rated study."""
+WHOLE_POINT, POINT_ROUNDING = 1 - 1e-6, 1e-9
+"""A loss of points above the first number counts as a whole point; a loss up to the second number is a rounding error."""
+SAFE, UNSAFE, NOT_SIMULATED, INFEASIBLE = range(4)  # states of a value
 Interval = tuple[float, float]
 
 
 @dataclass(frozen=True, kw_only=True)
 class OneAtATimeScan:
-    """One characteristic varies, all others are the original's.
+    """The scan of one characteristic while all others keep their original values.
 
     Attributes
     ----------
     profile
-        Columns `value` [unit], `safety_degree` [m, or -m/s], `outcome`, `unsafe`, `valid`, in the order of the values; closer
-        together where the state changes. A value that is not valid could not be simulated: it is neither safe nor unsafe.
+        Columns `value` [unit], `safety_degree` [m, or -m/s], `outcome`, `unsafe`, `valid`, in the order of the values, which
+        are closer together where the state changes. A value that is not valid was not simulated: it is neither safe nor unsafe.
     """
 
     characteristic: Characteristic
@@ -49,8 +49,8 @@ class OneAtATimeScan:
 
     def _intervals(self, state: int) -> list[pd.DataFrame]:
         """The parts of the profile in one state, in the order of the values."""
-        runs = groupby(enumerate(_states(self.profile).tolist()), key=lambda row: row[1])
-        return [self.profile.iloc[[place for place, _ in run]] for value, run in runs if value == state]
+        runs = groupby(enumerate(_states(self.profile).tolist()), key=lambda item: item[1])
+        return [self.profile.iloc[[index for index, _ in run]] for value, run in runs if value == state]
 
     @property
     def _safe_part(self) -> pd.DataFrame | None:
@@ -77,33 +77,33 @@ class OneAtATimeScan:
 
     @property
     def not_simulated(self) -> list[Interval]:
-        """All intervals that could not be simulated, as `unsafe`."""
+        """All intervals that could not be simulated, in the form of `unsafe`."""
         return [_ends(part) for part in self._intervals(NOT_SIMULATED)]
 
     @property
     def infeasible(self) -> list[Interval]:
-        """All intervals that violate a constraint of the study, as `unsafe`."""
+        """All intervals that violate a constraint of the study, in the form of `unsafe`."""
         return [_ends(part) for part in self._intervals(INFEASIBLE)]
 
     @property
     def points(self) -> list[tuple[float, float]] | None:
-        """Values in their order, each with the points that it keeps; None if the study is not rated."""
+        """Values in ascending order, each with the vehicle's points at this value; None if the study is not rated."""
         if RATING_POINTS.name not in self.profile:
             return None
         return list(zip(self.profile["value"].tolist(), self.profile[RATING_POINTS.name].tolist(), strict=True))
 
     def first_loss(self, points: float = 0.0) -> float | None:
-        """The value nearest to the original that loses more than `points` points; None if there is none."""
-        pairs, original = self.points or [], self.characteristic.original
-        full = next((kept for value, kept in pairs if value == original), math.nan)
-        losing = [value for value, kept in pairs if full - kept > points + SAME_POINTS]
-        return min(losing, key=lambda value: abs(value - original), default=None)
+        """The value nearest to the original that loses more than `points` points; None if no value does."""
+        kept_points, original = self.points or [], self.characteristic.original
+        full = next((kept for value, kept in kept_points if value == original), math.nan)
+        losses = [value for value, kept in kept_points if full - kept > points + POINT_ROUNDING]
+        return min(losses, key=lambda value: abs(value - original), default=None)
 
     def to_dict(self) -> dict[str, Any]:
-        """The entry of `alone` in `tolerance --json`; for a rated study with the points, and the values that first lose some."""
-        rated = {} if self.points is None else {
-            "points": [list(pair) for pair in self.points], "any_lost": self.first_loss(), "first_point_lost": self.first_loss(ALMOST_ONE)}
-        return {**rated,
+        """An entry of `alone` in `tolerance --json`; in a rated study with the points, and the values at which points are first lost."""
+        rating_entries = {} if self.points is None else {
+            "points": [list(pair) for pair in self.points], "any_lost": self.first_loss(), "first_point_lost": self.first_loss(WHOLE_POINT)}
+        return {**rating_entries,
                 "characteristic": self.characteristic.name, "unit": self.characteristic.unit, "original": self.characteristic.original,
                 "safe": None if self.safe is None else list(self.safe), "unsafe": [list(interval) for interval in self.unsafe],
                 "not_simulated": [list(interval) for interval in self.not_simulated],
@@ -119,32 +119,32 @@ def scan(evaluator: Evaluator, columns: Sequence[int], unsafe: Unsafe) -> list[O
     members = evaluator.characteristics.members
     number, rounds = (RATED_VALUES, RATED_ROUNDS) if is_rated(evaluator.study) else (VALUES, ROUNDS)
     values = [np.union1d(np.linspace(members[column].lower, members[column].upper, number), members[column].original) for column in columns]
-    profiles = _evaluated(evaluator, columns, values, unsafe)
+    profiles = _profiles(evaluator, columns, values, unsafe)
     for _ in range(rounds):
-        inner = [_between_states(profile) for profile in profiles]
-        if not any(map(len, inner)):
+        inner_values = [_values_between_states(profile) for profile in profiles]
+        if not any(map(len, inner_values)):
             break
-        finer = _evaluated(evaluator, columns, inner, unsafe)
-        profiles = [pd.concat([profile, more], ignore_index=True).sort_values("value", ignore_index=True)
-                    for profile, more in zip(profiles, finer, strict=True)]
+        inner_profiles = _profiles(evaluator, columns, inner_values, unsafe)
+        profiles = [pd.concat([profile, inner], ignore_index=True).sort_values("value", ignore_index=True)
+                    for profile, inner in zip(profiles, inner_profiles, strict=True)]
     return [OneAtATimeScan(characteristic=members[column], profile=profile) for column, profile in zip(columns, profiles, strict=True)]
 
 
-def _between_states(profile: pd.DataFrame) -> FloatArray:
-    """Values between two neighbours of different states."""
+def _values_between_states(profile: pd.DataFrame) -> FloatArray:
+    """New values between each two neighbouring values of different states."""
     values, states = profile["value"].to_numpy(), _states(profile)
     changes = np.flatnonzero(states[1:] != states[:-1])
-    inner = values[changes][:, np.newaxis] + np.diff(values)[changes][:, np.newaxis] * np.arange(1, FINER) / FINER
+    inner = values[changes][:, np.newaxis] + np.diff(values)[changes][:, np.newaxis] * np.arange(1, PARTS_PER_ROUND) / PARTS_PER_ROUND
     return np.setdiff1d(inner, values)
 
 
 def _states(profile: pd.DataFrame) -> npt.NDArray[np.int_]:
-    failed = np.where(profile["outcome"] == Outcome.INFEASIBLE, INFEASIBLE, NOT_SIMULATED)
-    return np.where(profile["valid"], np.where(profile["unsafe"], UNSAFE, SAFE), failed)
+    invalid_states = np.where(profile["outcome"] == Outcome.INFEASIBLE, INFEASIBLE, NOT_SIMULATED)
+    return np.where(profile["valid"], np.where(profile["unsafe"], UNSAFE, SAFE), invalid_states)
 
 
-def _evaluated(evaluator: Evaluator, columns: Sequence[int], values: Sequence[FloatArray], unsafe: Unsafe) -> list[pd.DataFrame]:
-    """Profiles of characteristics at some values each."""
+def _profiles(evaluator: Evaluator, columns: Sequence[int], values: Sequence[FloatArray], unsafe: Unsafe) -> list[pd.DataFrame]:
+    """The profile of each characteristic at its `values`."""
     ends = np.cumsum([len(group) for group in values])
     settings = np.tile(evaluator.characteristics.original, (ends[-1], 1))
     for column, group, end in zip(columns, values, ends, strict=True):
@@ -159,7 +159,7 @@ def _evaluated(evaluator: Evaluator, columns: Sequence[int], values: Sequence[Fl
 
 @dataclass(frozen=True, kw_only=True)
 class Tolerance:
-    """How far characteristics may go; `pairs` is None if the options do not ask for pairs."""
+    """How far characteristics may go: each by itself (`alone`), two together (`pairs`, None if not requested), and all (`joint`)."""
 
     study: Study
     unsafe: Unsafe
@@ -171,13 +171,13 @@ class Tolerance:
     @property
     def verdict(self) -> str:
         """One sentence on the characteristics and pairs that are unsafe by themselves."""
-        single = [scan.characteristic.name for scan in self.alone if scan.unsafe]
+        single_names = [scan.characteristic.name for scan in self.alone if scan.unsafe]
         unsafe_pairs = [" with ".join(member.name for member in pair.characteristics) for pair in self.pairs or []
                         if pair.nearest is not None]
         if self.unsafe.of(self.original)[0]:
             return "The original vehicle itself is unsafe."
-        if single:
-            return f"Unsafe alone: {', '.join(single)}."
+        if single_names:
+            return f"Unsafe alone: {', '.join(single_names)}."
         if self.pairs is None:
             return "No single characteristic makes it unsafe."
         if unsafe_pairs:
@@ -209,7 +209,7 @@ class Tolerance:
 
 def find_tolerances(study: Study, options: ToleranceOptions, *, pool: Pool | None = None, jobs: int | None = None,
                     progress: Progress = silent) -> Tolerance:
-    """Find how far the characteristics of a study may go. The filter is not applied: this is about the vehicle, not about a search.
+    """Find how far the characteristics of a study may go. The filter is not applied, as the question is about the vehicle.
 
     Raises
     ------
@@ -222,12 +222,12 @@ def find_tolerances(study: Study, options: ToleranceOptions, *, pool: Pool | Non
     with open_evaluator(study, pool, jobs, progress) as evaluator:
         original = evaluator.original()
         unsafe = evaluator.criterion(options.unsafe, original)
-        alone = scan(evaluator, columns, unsafe)
+        scans = scan(evaluator, columns, unsafe)
         pairs = planes(evaluator, columns, unsafe) if options.pairs else None
-        has_box = not unsafe.of(original)[0] and not is_rated(study)  # in a rated study it would take thousands of whole matrices
-        box = (safe_box(evaluator, columns, unsafe, _unsafe_settings(evaluator, alone, pairs or [])) if has_box
+        has_box = not unsafe.of(original)[0] and not is_rated(study)  # a box of a rated study would take thousands of whole matrices
+        box = (safe_box(evaluator, columns, unsafe, _unsafe_settings(evaluator, scans, pairs or [])) if has_box
                else no_box(evaluator, columns))
-    return Tolerance(study=study, unsafe=unsafe, original=original, alone=alone, pairs=pairs, joint=box)
+    return Tolerance(study=study, unsafe=unsafe, original=original, alone=scans, pairs=pairs, joint=box)
 
 
 def _columns(study: Study, characteristics: Sequence[str] | None) -> list[int]:
@@ -236,13 +236,13 @@ def _columns(study: Study, characteristics: Sequence[str] | None) -> list[int]:
         if name not in names:
             raise unknown("characteristics", f"there is no characteristic {name!r}", name, names)
     if len(set(chosen)) < len(chosen):
-        raise InputError("characteristics", f"{','.join(chosen)}: one is named twice", "each characteristic once")
+        raise InputError("characteristics", f"{','.join(chosen)}: a characteristic is named twice", "each characteristic once")
     return [column for column, name in enumerate(names) if characteristics is None or name in characteristics]
 
 
-def _unsafe_settings(evaluator: Evaluator, alone: Sequence[OneAtATimeScan], pairs: Sequence[Pair]) -> FloatArray:
-    """The unsafe settings of scans and pairs, shape (K, n)."""
-    changes = [{scan.characteristic.name: value} for scan in alone for interval in scan.unsafe for value in interval]
+def _unsafe_settings(evaluator: Evaluator, scans: Sequence[OneAtATimeScan], pairs: Sequence[Pair]) -> FloatArray:
+    """The K unsafe settings of scans and pairs, shape (K, n)."""
+    changes = [{scan.characteristic.name: value} for scan in scans for interval in scan.unsafe for value in interval]
     changes += [dict(zip((member.name for member in pair.characteristics), pair.nearest, strict=True)) for pair in pairs if pair.nearest]
     original = dict(zip(evaluator.characteristics.names, evaluator.characteristics.original.tolist(), strict=True))
     return np.array([list({**original, **values}.values()) for values in changes]).reshape(-1, len(original))

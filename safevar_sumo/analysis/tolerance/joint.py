@@ -1,4 +1,4 @@
-"""Several characteristics together: the plane of every pair on a grid, and the largest safe box of all around the original."""
+"""Several characteristics together: a grid in the plane of every pair, and the largest safe box around the original."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import numpy.typing as npt
 import scipy
 
 from safevar_sumo.analysis.evaluator import CONFIDENCE, Evaluator, sobol_points
-from safevar_sumo.analysis.explain.causes import Line, first_unsafe
+from safevar_sumo.analysis.explain.causes import Line, first_unsafe_shares
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.vehicles import Characteristic
@@ -29,18 +29,18 @@ _WEIGHT = np.outer(*[np.where(np.isin(np.arange(SIDE), (0, SIDE - 1)), 0.5, 1.0)
 
 @dataclass(frozen=True, kw_only=True)
 class Pair:
-    """The plane of two characteristics while all others are the original's.
+    """The plane of two characteristics while all others keep their original values.
 
     Attributes
     ----------
     values
         Values of both characteristics, shape (2, SIDE), each in its unit.
-    safety_degree, unsafe, valid
-        On the grid [m, or -m/s], shape (SIDE, SIDE), with the first characteristic on axis 0. A setting that is not valid could
-        not be simulated, or is `infeasible`, and is neither safe nor unsafe.
+    safety_degree, unsafe, valid, infeasible
+        Results on the grid [m, or -m/s], shape (SIDE, SIDE), with the first characteristic on axis 0. A setting that is not valid could
+        not be simulated, or violates a constraint (`infeasible`), and is neither safe nor unsafe.
     nearest
         The two values of the unsafe setting that is nearest to the original by distance in domain widths, exact to a 5120th of them; None
-        if the grid has none. Unsafe settings that lie only between safe values of the grid are not found.
+        if no setting of the grid is unsafe. Unsafe settings that lie only between safe values of the grid are not found.
     """
 
     characteristics: tuple[Characteristic, Characteristic]
@@ -54,8 +54,8 @@ class Pair:
     @property
     def unsafe_share(self) -> float:
         """Unsafe share of the simulated part of the plane, by the trapezoidal rule."""
-        simulated = np.sum(_WEIGHT * self.valid)
-        return float(np.sum(_WEIGHT * self.unsafe) / simulated) if simulated else 0.0
+        weight = np.sum(_WEIGHT * self.valid)
+        return float(np.sum(_WEIGHT * self.unsafe) / weight) if weight else 0.0
 
     @property
     def not_simulated_share(self) -> float:
@@ -70,7 +70,7 @@ class Pair:
 
 
 def planes(evaluator: Evaluator, columns: Sequence[int], unsafe: Unsafe) -> list[Pair]:
-    """The plane of every pair of characteristics, with its nearest unsafe setting if it has one."""
+    """The plane of every pair of characteristics, with the plane's unsafe setting nearest to the original."""
     members, original = evaluator.characteristics.members, evaluator.characteristics.original
     chosen = list(combinations(columns, 2))
     axes = {column: np.linspace(members[column].lower, members[column].upper, SIDE) for column in columns}
@@ -81,30 +81,30 @@ def planes(evaluator: Evaluator, columns: Sequence[int], unsafe: Unsafe) -> list
     shape = (len(chosen), SIDE, SIDE)
     degrees, valid, infeasible = (values.reshape(shape) for values in (evaluations.f_safe, evaluations.valid, evaluations.infeasible))
     is_unsafe = unsafe.of(evaluations).reshape(shape)
-    nearest = _nearest(evaluator, chosen, is_unsafe, unsafe)
+    nearest = _nearest_unsafe(evaluator, chosen, is_unsafe, unsafe)
     return [Pair(characteristics=(members[first], members[second]), values=np.stack([axes[first], axes[second]]), safety_degree=degrees[i],
                  unsafe=is_unsafe[i], valid=valid[i], infeasible=infeasible[i], nearest=nearest.get(i))
             for i, (first, second) in enumerate(chosen)]
 
 
-def _nearest(evaluator: Evaluator, chosen: Sequence[tuple[int, int]], is_unsafe: BoolArray,
+def _nearest_unsafe(evaluator: Evaluator, chosen: Sequence[tuple[int, int]], is_unsafe: BoolArray,
              unsafe: Unsafe) -> dict[int, tuple[float, float]]:
-    """The unsafe setting nearest to the original, in widths of the domains, of every plane that has one.
+    """For every plane with unsafe settings, the unsafe setting nearest to the original; distances are in widths of the domains.
 
-    A branch and bound search: squares with an unsafe corner are divided into smaller ones, as long as a point in them is nearer than
-    the nearest unsafe setting so far; each round divides the `SQUARES` nearest squares of each plane.
+    A branch and bound search: a square with an unsafe corner is divided into smaller squares if a point in it is nearer than the
+    nearest unsafe setting so far; each round divides the `SQUARES` nearest squares of each plane.
     """
     members = evaluator.characteristics
     columns = np.array(chosen, dtype=int).reshape(-1, 2)
     original, width = members.original[columns], (members.upper - members.lower)[columns]
     lower, size = members.lower[columns], width / (SIDE - 1)
-    best, place = np.full(len(chosen), np.inf), np.zeros((len(chosen), 2))
+    best_distance, best_values = np.full(len(chosen), np.inf), np.zeros((len(chosen), 2))
 
     def improve(plane: npt.NDArray[np.intp], values: FloatArray) -> None:
         distances = np.sqrt(np.sum(((values - original[plane]) / width[plane]) ** 2, axis=1))
         for row in np.lexsort((distances, plane)):  # the nearest of each plane first
-            if distances[row] < best[plane[row]]:
-                best[plane[row]], place[plane[row]] = distances[row], values[row]
+            if distances[row] < best_distance[plane[row]]:
+                best_distance[plane[row]], best_values[plane[row]] = distances[row], values[row]
 
     plane, i, j = np.nonzero(is_unsafe)
     improve(plane, lower[plane] + np.stack([i, j], axis=1) * size[plane])
@@ -112,24 +112,24 @@ def _nearest(evaluator: Evaluator, chosen: Sequence[tuple[int, int]], is_unsafe:
     corner = lower[plane_of] + np.stack([i, j], axis=1) * size[plane_of]  # its lower corner, shape (K, 2)
     steps = np.stack(np.meshgrid(np.arange(PARTS + 1), np.arange(PARTS + 1), indexing="ij"), axis=-1).reshape(-1, 2)
     for _ in range(ROUNDS):
-        beyond = corner - original[plane_of]
-        gap = np.maximum(np.maximum(beyond, -beyond - size[plane_of]), 0.0)
+        offset = corner - original[plane_of]
+        gap = np.maximum(np.maximum(offset, -offset - size[plane_of]), 0.0)
         bound = np.sqrt(np.sum((gap / width[plane_of]) ** 2, axis=1))
-        rows = np.flatnonzero(bound < best[plane_of])
+        rows = np.flatnonzero(bound < best_distance[plane_of])
         groups = [rows[plane_of[rows] == k] for k in np.unique(plane_of[rows])]
-        kept = np.array([row for group in groups for row in group[np.argsort(bound[group], kind="stable")[:SQUARES]]], dtype=np.intp)
-        if not len(kept):
+        squares = np.array([row for group in groups for row in group[np.argsort(bound[group], kind="stable")[:SQUARES]]], dtype=np.intp)
+        if not len(squares):
             break
-        plane_of, corner, size = plane_of[kept], corner[kept], size / PARTS
+        plane_of, corner, size = plane_of[squares], corner[squares], size / PARTS
         plane = np.repeat(plane_of, len(steps))
-        values = np.minimum(np.repeat(corner, len(steps), axis=0) + np.tile(steps, (len(kept), 1)) * size[plane], (lower + width)[plane])
+        values = np.minimum(np.repeat(corner, len(steps), axis=0) + np.tile(steps, (len(squares), 1)) * size[plane], (lower + width)[plane])
         settings = np.tile(members.original, (len(values), 1))
         np.put_along_axis(settings, columns[plane], values, axis=1)
         hits = unsafe.of(evaluator.evaluate(settings, "nearest unsafe settings"))
         improve(plane[hits], values[hits])
-        square, i, j = np.nonzero(_with_unsafe_corner(hits.reshape(len(kept), PARTS + 1, PARTS + 1)))
+        square, i, j = np.nonzero(_with_unsafe_corner(hits.reshape(len(squares), PARTS + 1, PARTS + 1)))
         plane_of, corner = plane_of[square], corner[square] + np.stack([i, j], axis=1) * size[plane_of[square]]
-    return {int(k): (float(place[k, 0]), float(place[k, 1])) for k in np.flatnonzero(np.isfinite(best))}
+    return {int(k): (float(best_values[k, 0]), float(best_values[k, 1])) for k in np.flatnonzero(np.isfinite(best_distance))}
 
 
 def _with_unsafe_corner(grids: BoolArray) -> BoolArray:
@@ -137,15 +137,15 @@ def _with_unsafe_corner(grids: BoolArray) -> BoolArray:
     return np.asarray(grids[:, 1:, 1:] | grids[:, :-1, 1:] | grids[:, 1:, :-1] | grids[:, :-1, :-1])
 
 
-UNSAFE_AT_MOST = 0.003
+MAX_UNSAFE_SHARE = 0.003
 """Share of a box that may be unsafe, with 95 % confidence, if every sampled setting is safe."""
-PROBE, SEARCHED = 256, 1024
-"""Number of Sobol points, and of corners, in the first search of a box, and in the second if the first has nothing unsafe."""
-FOLLOWED = 16
-"""Number of unsafe settings, the nearest ones, that are followed back towards the original."""
+FIRST_SEARCH, SECOND_SEARCH = 256, 1024
+"""Numbers of Sobol points, and also of corners, in the first search of a box, and in the second if the first finds nothing unsafe."""
+MAX_LINES = 16
+"""Maximum number of unsafe settings, the nearest first, from which the search goes back towards the original."""
 STEP_BACK = 0.999
 """The box ends at this share of the way to the nearest unsafe setting."""
-SMALLEST = 1e-6
+MIN_FACTOR = 1e-6
 """Smallest factor of a box; below it there is no safe box."""
 
 
@@ -171,63 +171,64 @@ class SafeBox(NamedTuple):
 
 
 def no_box(evaluator: Evaluator, columns: Sequence[int], attempts: int = 0) -> SafeBox:
-    """The result if the original vehicle itself is unsafe, or settings arbitrarily near to it are."""
+    """The result if no box is safe: the original vehicle, or a setting arbitrarily near to the original, is unsafe."""
     return SafeBox(0.0, CONFIDENCE, 0, 0, attempts, 1.0, tuple(evaluator.characteristics.names[column] for column in columns))
 
 
-def safe_box(evaluator: Evaluator, columns: Sequence[int], unsafe: Unsafe, beyond: FloatArray) -> SafeBox:
+def safe_box(evaluator: Evaluator, columns: Sequence[int], unsafe: Unsafe, unsafe_settings: FloatArray) -> SafeBox:
     """The largest safe box around an original vehicle that is safe itself.
 
     Parameters
     ----------
     columns
         The characteristics that vary.
-    beyond
+    unsafe_settings
         Unsafe settings, shape (K, n); the box ends before all of them.
 
     Notes
     -----
-    A box is searched with Sobol points and with as many corners, where all changes add up. Unsafe points are followed back towards the
-    original, and the box shrinks to end before them, until it has none. These points chose the box: they prove nothing about it.
+    The search of a box simulates Sobol points and as many corners, where all changes add up. From unsafe points the
+    search goes back towards the original, and the box shrinks to end before the first unsafe setting on the way, until the search finds
+    nothing unsafe. As these points chose the box, they prove nothing about it.
 
-    The box is then tested with settings drawn independently and uniformly in it, by a separate random generator. If one is unsafe,
+    The box is then tested with settings drawn independently and uniformly in it, by a separate random generator. If any is unsafe,
     the box shrinks and is searched and tested again. Test k, k = 1, 2, ..., may be wrong with probability alpha_k = alpha / 2^k, alpha
-    = 1 - `confidence`: if test k accepts, the bound is Clopper and Pearson's upper one at confidence 1 - alpha_k for the share of the
+    = 1 - `confidence`: if test k accepts, the bound is Clopper and Pearson's upper bound at confidence 1 - alpha_k for the share of the
     box that is unsafe or cannot be simulated. Box k depends on earlier samples alone, so given box k the bound fails with probability
-    alpha_k at the most; all tests together fail with probability sum alpha_k <= alpha, whichever of them accepts. Later tests draw more
-    settings, so that the bound stays `UNSAFE_AT_MOST` if all of them can be simulated.
+    at most alpha_k; all tests together fail with probability sum alpha_k <= alpha, whichever of them accepts. Later tests draw more
+    settings, so that the bound stays `MAX_UNSAFE_SHARE` if all of them can be simulated.
     """
-    factor = min(1.0, STEP_BACK * float(np.min(_factor_reaching(evaluator, beyond), initial=np.inf)))
+    factor = min(1.0, STEP_BACK * float(np.min(_box_factors(evaluator, unsafe_settings), initial=np.inf)))
     attempt = 0
     for search in range(10**6):
-        if factor < SMALLEST:
+        if factor < MIN_FACTOR:
             break
-        for number in (PROBE, SEARCHED):
+        for number in (FIRST_SEARCH, SECOND_SEARCH):
             sobol = sobol_points(number, len(columns), evaluator.study.search.seed + search)
             points = np.concatenate([sobol, np.round(sobol)])  # and corners
-            hits, _ = _unsafe_of(evaluator, factor, _in_box(evaluator, columns, factor, points), unsafe)
+            hits, _ = _unsafe_of(evaluator, factor, _settings_in_box(evaluator, columns, factor, points), unsafe)
             if len(hits):
                 break
         else:
             attempt += 1
             error = (1 - CONFIDENCE) / 2**attempt
-            samples = math.ceil(math.log(error) / math.log1p(-UNSAFE_AT_MOST))
-            settings = _drawn_in_box(evaluator, columns, factor, samples, np.random.default_rng((evaluator.study.search.seed, attempt)))
+            samples = math.ceil(math.log(error) / math.log1p(-MAX_UNSAFE_SHARE))
+            settings = _random_settings(evaluator, columns, factor, samples, np.random.default_rng((evaluator.study.search.seed, attempt)))
             samples = len(settings)
             hits, failed = _unsafe_of(evaluator, factor, settings, unsafe)
             if not len(hits):
                 share = float(scipy.stats.beta.ppf(1 - error, failed + 1, samples - failed)) if failed < samples else 1.0
                 return SafeBox(factor, CONFIDENCE, samples, failed, attempt, share,
                                tuple(evaluator.characteristics.names[column] for column in columns))
-        near = hits[np.argsort(_factor_reaching(evaluator, hits), kind="stable")[:FOLLOWED]]
-        lines = [Line(evaluator.characteristics.original, end, 0.0) for end in near]
-        shares = first_unsafe(evaluator, lines, unsafe, "nearest unsafe settings")
+        nearest_hits = hits[np.argsort(_box_factors(evaluator, hits), kind="stable")[:MAX_LINES]]
+        lines = [Line(evaluator.characteristics.original, end, 0.0) for end in nearest_hits]
+        shares = first_unsafe_shares(evaluator, lines, unsafe, "nearest unsafe settings")
         edge = np.stack([line.at(np.array([share]))[0] for line, share in zip(lines, shares, strict=True)])
-        factor = min(factor, float(np.min(_factor_reaching(evaluator, edge)))) * STEP_BACK
+        factor = min(factor, float(np.min(_box_factors(evaluator, edge)))) * STEP_BACK
     return no_box(evaluator, columns, attempt)
 
 
-def _in_box(evaluator: Evaluator, columns: Sequence[int], factor: float, points: FloatArray) -> FloatArray:
+def _settings_in_box(evaluator: Evaluator, columns: Sequence[int], factor: float, points: FloatArray) -> FloatArray:
     """Settings in a box around the original, from points of the unit cube; shape (K, n)."""
     members, indices = evaluator.characteristics, list(columns)
     lower = members.original - factor * (members.original - members.lower)
@@ -237,20 +238,20 @@ def _in_box(evaluator: Evaluator, columns: Sequence[int], factor: float, points:
     return settings
 
 
-def _drawn_in_box(evaluator: Evaluator, columns: Sequence[int], factor: float, number: int, rng: np.random.Generator) -> FloatArray:
+def _random_settings(evaluator: Evaluator, columns: Sequence[int], factor: float, number: int, rng: np.random.Generator) -> FloatArray:
     """Feasible settings drawn uniformly in a box; fewer than `number` where hardly any is feasible."""
-    return evaluator.region.sampled(lambda count: _in_box(evaluator, columns, factor, rng.random((count, len(columns)))), number)
+    return evaluator.region.sampled(lambda count: _settings_in_box(evaluator, columns, factor, rng.random((count, len(columns)))), number)
 
 
 def _unsafe_of(evaluator: Evaluator, factor: float, settings: FloatArray, unsafe: Unsafe) -> tuple[FloatArray, int]:
-    """The unsafe settings, shape (K, n), and the number of feasible ones that could not be simulated."""
+    """The unsafe settings, shape (K, n), and the number of feasible settings that could not be simulated."""
     evaluations = evaluator.evaluate(settings, f"all characteristics within {factor:.0%} of the domain")
     return settings[unsafe.of(evaluations)], int(np.count_nonzero(~evaluations.valid & ~evaluations.infeasible))
 
 
-def _factor_reaching(evaluator: Evaluator, settings: FloatArray) -> FloatArray:
-    """Factor of the box that has a setting on its surface, shape (K,)."""
+def _box_factors(evaluator: Evaluator, settings: FloatArray) -> FloatArray:
+    """Factor of the box on whose surface each of K settings lies, shape (K,)."""
     members = evaluator.characteristics
     change = settings - members.original
-    largest = np.where(change < 0, members.original - members.lower, members.upper - members.original)
-    return np.asarray(np.max(np.divide(np.abs(change), largest, out=np.zeros_like(change), where=largest > 0), axis=1, initial=0.0))
+    limit = np.where(change < 0, members.original - members.lower, members.upper - members.original)
+    return np.asarray(np.max(np.divide(np.abs(change), limit, out=np.zeros_like(change), where=limit > 0), axis=1, initial=0.0))

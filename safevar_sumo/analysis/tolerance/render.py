@@ -8,7 +8,7 @@ import numpy as np
 from rich.console import Console
 
 from safevar_sumo.analysis.figures import DEGREE, FONT, NECESSARY, UNSAFE, as_formula, literal, panels
-from safevar_sumo.analysis.tolerance.compute import ALMOST_ONE, OneAtATimeScan, Tolerance
+from safevar_sumo.analysis.tolerance.compute import WHOLE_POINT, OneAtATimeScan, Tolerance
 from safevar_sumo.analysis.tolerance.joint import Pair
 from safevar_sumo.analysis.words import decimal
 from safevar_sumo.errors import InputError
@@ -23,17 +23,17 @@ if TYPE_CHECKING:
     from matplotlib.collections import QuadMesh
     from matplotlib.figure import Figure
 
-PAIRS_SHOWN = 12
+MAX_PAIRS = 12
 
 
 def print_tolerance(console: Console, result: Tolerance) -> None:
-    """Print the verdict, each characteristic alone, the worst pairs, and all together."""
+    """Print the verdict, the limits of each characteristic by itself, the worst pairs, and the safe box."""
     print_text(console, result.study.title)
     original = result.original
     print_text(console, f"Unsafe: {result.unsafe}. The original vehicle: {original.outcome[0]}, SD {decimal(original.f_safe[0])}.")
     print_text(console, result.verdict)
     print_constraints(console, result.study)
-    console.print(_alone(result))
+    console.print(_scan_table(result))
     print_text(console, "* the end of the domain: values beyond it were not simulated.")
     print_meanings(console, [scan.characteristic for scan in result.alone])
     if result.pairs:
@@ -42,12 +42,12 @@ def print_tolerance(console: Console, result: Tolerance) -> None:
         for scan in result.alone:
             print_text(console, first_losses(scan))
     else:
-        print_text(console, _together(result))
+        print_text(console, _box_in_words(result))
 
 
 def first_losses(scan: OneAtATimeScan) -> str:
     """A sentence on the values at which a characteristic alone costs points."""
-    member, any_loss, whole_point = scan.characteristic, scan.first_loss(), scan.first_loss(ALMOST_ONE)
+    member, any_loss, whole_point = scan.characteristic, scan.first_loss(), scan.first_loss(WHOLE_POINT)
     if any_loss is None:
         return f"{member.name}: costs no points anywhere in its domain."
     least = min(kept for _, kept in scan.points or [])
@@ -55,7 +55,7 @@ def first_losses(scan: OneAtATimeScan) -> str:
     return f"{member.name}: points are lost from {any_loss:.5g}{member.suffix} on{first}; the fewest are {least:.2f}."
 
 
-def _together(result: Tolerance) -> str:
+def _box_in_words(result: Tolerance) -> str:
     box = result.joint
     subset = len(box.characteristics) < len(result.study.vehicle.characteristics)
     subject = f"{', '.join(box.characteristics)} together, the others as in the original" if subset else "All together"
@@ -69,17 +69,17 @@ def _together(result: Tolerance) -> str:
             f"{box.unsafe_at_most:.2%} of {box_settings} {predicate}.")
 
 
-def _alone(result: Tolerance) -> WholeTable:
-    others = {"could not be simulated": [scan.not_simulated for scan in result.alone],
-              "violates a constraint": [scan.infeasible for scan in result.alone]}
-    others = {head: intervals for head, intervals in others.items() if any(intervals)}
-    heads = ("original", "safe from", "to", "SD at the ends", "unsafe", *others)
+def _scan_table(result: Tolerance) -> WholeTable:
+    intervals_by_head = {"could not be simulated": [scan.not_simulated for scan in result.alone],
+                         "violates a constraint": [scan.infeasible for scan in result.alone]}
+    intervals_by_head = {head: intervals for head, intervals in intervals_by_head.items() if any(intervals)}
+    heads = ("original", "safe from", "to", "SD at the ends", "unsafe", *intervals_by_head)
     table = WholeTable("characteristic", right=heads, title="Each alone")
     for i, scan in enumerate(result.alone):
         member = scan.characteristic
         table.add_row(f"{member.name} [{member.unit}]", f"{member.original:g}", *_ends(scan),
                       *(", ".join(f"{low:.5g} to {high:.5g}" for low, high in intervals) or "nowhere"
-                        for intervals in (scan.unsafe, *(column[i] for column in others.values()))))
+                        for intervals in (scan.unsafe, *(column[i] for column in intervals_by_head.values()))))
     return table
 
 
@@ -102,14 +102,14 @@ def _print_pairs(console: Console, result: Tolerance) -> None:
         return
     table = WholeTable("pair", right=("unsafe share", "nearest unsafe setting"),
                        title=f"Pairs with unsafe settings: {len(unsafe_pairs)} of {len(result.pairs or [])}")
-    for pair in unsafe_pairs[:PAIRS_SHOWN]:
+    for pair in unsafe_pairs[:MAX_PAIRS]:
         names = [member.name for member in pair.characteristics]
         nearest = ", ".join(f"{name} {value:.5g}" for name, value in zip(names, pair.nearest or (), strict=True))
         failed = f" ({pair.not_simulated_share:.1%} could not be simulated)" if pair.not_simulated_share else ""
         table.add_row(" with ".join(names), f"{pair.unsafe_share:.1%}{failed}", nearest)
     console.print(table)
-    if len(unsafe_pairs) > PAIRS_SHOWN:
-        print_text(console, f"... and {len(unsafe_pairs) - PAIRS_SHOWN} more (--json has all).")
+    if len(unsafe_pairs) > MAX_PAIRS:
+        print_text(console, f"... and {len(unsafe_pairs) - MAX_PAIRS} more (--json has all).")
 
 
 def profiles_figure(result: Tolerance) -> Figure:
@@ -121,7 +121,7 @@ def profiles_figure(result: Tolerance) -> Figure:
     for axis, scan in zip(axes, result.alone, strict=True):
         _profile(axis, scan, column)
         if degrees.size:
-            axis.set_ylim(degrees.min() - margin, degrees.max() + margin)  # the same for all, so that steep profiles stand out
+            axis.set_ylim(degrees.min() - margin, degrees.max() + margin)  # equal for all panels, so that steep profiles stand out
     figure.supylabel(DEGREE if column == SAFETY_DEGREE else RATING_POINTS.title, fontsize=FONT)
     notes = {"dot: the original vehicle": True, "hatched: unsafe": any(scan.unsafe for scan in result.alone),
                "below the dashed line: collisions": column == SAFETY_DEGREE and bool(degrees.size) and degrees.min() <= 0}
