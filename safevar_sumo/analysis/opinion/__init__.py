@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class OpinionOptions(Options):
-    """Failures that are driven again with the second vehicle model."""
+    """Options for the failures that the second vehicle model simulates again."""
 
     question: ClassVar[str] = "opinion"
     solutions: tuple[str, ...] = option(

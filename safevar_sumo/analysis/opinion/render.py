@@ -28,7 +28,7 @@ def print_opinions(console: Console, result: Opinions) -> None:
 
 
 def opinion_in_words(result: Opinions) -> str:
-    """A sentence on the number of causes with each verdict."""
+    """A sentence with the number of causes for each verdict."""
     if not result.opinions:
         return "there is no cause to judge."
     parts = [f"{result.count(one)} {one}" for one in OpinionVerdict if result.count(one)]

@@ -23,7 +23,7 @@ class OpinionVerdict(StrEnum):
 
 
 class RunEnd(NamedTuple):
-    """How a run ends: outcome and safety degree [m, or -m/s]; None if it was not driven, or has no safety degree."""
+    """How a run ends: outcome and safety degree [m, or -m/s]; None if the run was not driven or has no safety degree."""
 
     outcome: str | None = None
     safety_degree: float | None = None
@@ -50,7 +50,7 @@ class Opinion:
     changes
         The cause: values by name, in their units.
     here, there
-        How the run with these changes ends with our model and with the second one.
+        How the run with these changes ends: `here` with our model, `there` with the second model.
     opinion, because
         The verdict, and its reason in a sentence or two.
     """
@@ -77,9 +77,9 @@ class Opinions:
     opinions
         One for each minimal cause of each failure.
     original_here, original_there
-        How the original vehicle's run ends with both models.
+        How the original vehicle's run ends: `original_here` with our model, `original_there` with the second model.
     without_cause
-        Requested solutions that are not unsafe and so have no cause.
+        Requested solutions that have no cause, because they are not unsafe.
     """
 
     study: Study

@@ -25,10 +25,10 @@ def print_risk(console: Console, result: Risk) -> None:
     """Print the probability with its interval, how vehicles vary, and which characteristics decide."""
     low, high = result.interval
     print_text(console, result.study.title)
-    drawn = "" if result.method == "monte_carlo" else f", drawn by {result.method.replace('_', ' ')}"
-    print_text(console, f"Unsafe: {result.unsafe}. {result.failures} of {result.samples} vehicles{drawn}.")
-    name = "Share of the domain that is unsafe:" if result.of_domain else "Probability"
-    print_text(console, f"{name} {result.probability:.4g}, with {result.confidence:.0%} confidence from {low:.4g} to {high:.4g}.")
+    sampling = "" if result.method == "monte_carlo" else f", drawn by {result.method.replace('_', ' ')}"
+    print_text(console, f"Unsafe: {result.unsafe}. {result.failures} of {result.samples} vehicles{sampling}.")
+    label = "Share of the domain that is unsafe:" if result.of_domain else "Probability"
+    print_text(console, f"{label} {result.probability:.4g}, with {result.confidence:.0%} confidence from {low:.4g} to {high:.4g}.")
     if result.remark:
         print_text(console, f"note: {result.remark}.")
     if result.design_point is not None:
@@ -46,10 +46,10 @@ def print_risk(console: Console, result: Risk) -> None:
         return
     table = WholeTable("characteristic", right=("SD: alone", "in all", "unsafe: alone", "in all"),
                        title="What decides: share of the variance")
-    second = result.sensitivity_of_unsafe.set_index("characteristic")
+    unsafe_indices = result.sensitivity_of_unsafe.set_index("characteristic")
     for row in result.sensitivity.sort_values("total", ascending=False, kind="stable").to_dict("records"):
-        other = second.loc[row["characteristic"]]
-        table.add_row(row["characteristic"], *(_index(one, name) for one in (row, other) for name in ("first_order", "total")))
+        unsafe_row = unsafe_indices.loc[row["characteristic"]]
+        table.add_row(row["characteristic"], *(_index(one, name) for one in (row, unsafe_row) for name in ("first_order", "total")))
     console.print(table)
     if result.sensitivity_of_unsafe["total"].isna().all():
         print_text(console, "Too few settings are unsafe, or safe, for indices of being unsafe; see those of the safety degree.")
@@ -72,12 +72,12 @@ def _index(row: object, name: str) -> str:
 
 
 def sensitivity_figure(result: Risk) -> Figure:
-    """First-order and total Sobol indices of every characteristic with intervals: one panel for the safety degree, one for being unsafe.
+    """First-order and total Sobol indices of every characteristic with intervals: one panel for the safety degree, one for unsafe outcomes.
 
     Raises
     ------
     InputError
-        If characteristics are correlated or bound by constraints, so that there are no indices.
+        If characteristics are correlated or bound by constraints, so that indices are undefined.
     """
     if result.sensitivity is None or result.sensitivity_of_unsafe is None:
         raise InputError("correlations", "there are no sensitivity indices of characteristics that are correlated or bound by constraints",
