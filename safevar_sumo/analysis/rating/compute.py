@@ -1,4 +1,4 @@
-"""Rates the original vehicle and variants of it: all cells and robustness layers are simulated, and scored by the official rules."""
+"""Rates the original vehicle and variants: simulates all cells and robustness layers, and scores them by the official rules."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ from safevar_sumo.vehicles import CharacteristicSet
 from safevar_sumo.workers.evaluation import Pool
 
 DECIMALS = 9
-"""Decimals of points and speeds in JSON; further ones would hold only rounding errors."""
+"""Decimals of points and speeds in JSON; further decimals would hold only rounding errors."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class RatedTest:
-    """A test of one vehicle, in one light if there are tests by day and by night; points of (standard, extended, robustness).
+    """One vehicle's result in a test, by day or by night if the test has both; `points` are (standard, extended, robustness).
 
-    `layers` states whether each robustness layer holds, None if it is neither simulated nor claimed; by day for both lights.
+    `layers` states whether each robustness layer holds, None if the layer is neither simulated nor claimed. Day and night share layers.
     """
 
     block: Block
@@ -45,7 +45,7 @@ class RatedTest:
 
 @dataclass(frozen=True, kw_only=True)
 class RatedVehicle:
-    """One vehicle: its setting, its results and its points; it `fails`, and earns nothing, if a required cell is not green."""
+    """One vehicle with its setting, results and points; the vehicle `fails` and earns nothing if a required cell is not green."""
 
     name: str
     setting: Mapping[str, float]
@@ -76,7 +76,7 @@ class RatedVehicle:
                 for one in self.protocol.layers_of(block.test)}
 
     def colour(self, number: int) -> str | None:
-        """Colour of the cell with this number; None if the test could not be driven."""
+        """Colour of the cell with this number; None if the vehicle could not drive the test."""
         colour = int(self.scored.colours[0, number])
         return None if colour < 0 else COLOURS[colour]
 
@@ -86,7 +86,7 @@ class RatedVehicle:
         return bool(colour >= 0 and (colour < RED if self.protocol.cells[number].criterion == NOT_RED else colour <= nominal))
 
     def nominal(self, number: int) -> int:
-        """Number of the matrix cell that a layer's cell varies."""
+        """Number of the matrix cell of which a layer's cell is a variation."""
         cell = self.protocol.cells[number]
         return self.protocol.matrix_of[cell.block.name, cell.row, cell.column]
 
@@ -99,25 +99,25 @@ class RatedVehicle:
                 "warning_ttc": None if warning is None else round(warning, DECIMALS)}
 
     def to_dict(self) -> dict[str, Any]:
-        of_block: dict[str, list[int]] = {}
+        block_cells: dict[str, list[int]] = {}
         for number, cell in enumerate(self.protocol.cells):
-            of_block.setdefault(cell.block.name, []).append(number)
+            block_cells.setdefault(cell.block.name, []).append(number)
         kinds = ("standard", "extended", "robustness")
         tests = [{"test": one.block.test, "light": one.block.light, **dict(zip(kinds, one.points, strict=True)),
                   "possible": dict(zip(kinds, one.block.points, strict=True)),
-                  "cells": [self.cell(number) for number in of_block[one.block.name]], "layers": dict(one.layers)} for one in self.tests]
+                  "cells": [self.cell(number) for number in block_cells[one.block.name]], "layers": dict(one.layers)} for one in self.tests]
         return {"name": self.name, "setting": dict(self.setting), "points": round(self.points, DECIMALS),
-                "possible": possible(self.protocol), "tests": tests}
+                "possible": max_points(self.protocol), "tests": tests}
 
 
-def possible(protocol: Protocol) -> float:
+def max_points(protocol: Protocol) -> float:
     """Maximum points of all simulated tests."""
     return round(sum(sum(block.points) for block in protocol.blocks), DECIMALS)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Rating:
-    """A rating of the original vehicle, `variants[0]`, and of variants of it."""
+    """A rating of the original vehicle, `variants[0]`, and of its variants."""
 
     study: Study
     protocol: Protocol
@@ -134,12 +134,12 @@ class Rating:
 
     @property
     def lost(self) -> float:
-        """Points that the variant earns less than the original; negative if it earns more."""
+        """The original vehicle's points minus the variant's points; negative if the variant earns more."""
         return 0.0 if self.variant is None else round(self.original.points - self.variant.points, DECIMALS)
 
     @property
     def left_open(self) -> float:
-        """Points of robustness layers in simulated tests that are neither simulated nor claimed."""
+        """Points of the robustness layers of simulated tests that are neither simulated nor claimed."""
         claims, open_points = self.original.claims, 0.0
         for test, blocks in self.protocol.tests.items():
             layers = self.protocol.layers_of(test)
@@ -172,12 +172,12 @@ class Rating:
 
     def __repr__(self) -> str:
         vehicles = "; ".join(f"{one.name} {one.points:.2f}" for one in self.variants)
-        return f"<Rating of {self.study.name}, points of {possible(self.protocol):g}: {vehicles}>"
+        return f"<Rating of {self.study.name}, points of {max_points(self.protocol):g}: {vehicles}>"
 
 
 def rate_variant(subject: Study | Case, options: RatingOptions, *, pool: Pool | None = None, jobs: int | None = None,
                  progress: Progress = silent) -> Rating:
-    """Rate the original vehicle and the variant that the options describe, if any; raises as `rate`.
+    """Rate the original vehicle, and the variant if the options describe one; raises as `rate`.
 
     Raises
     ------
@@ -200,7 +200,7 @@ def rate_variant(subject: Study | Case, options: RatingOptions, *, pool: Pool | 
 
 def rate(study: Study, settings: Mapping[str, FloatArray], *, pool: Pool | None = None, jobs: int | None = None,
          progress: Progress = silent) -> Rating:
-    """Rate the original vehicle of a study and its variants, settings of shape (n,) by name; the filter is not applied.
+    """Rate a study's original vehicle and variants, given as settings of shape (n,) by name; the filter is not applied.
 
     Raises
     ------
@@ -227,22 +227,22 @@ def rate_on(evaluator: Evaluator, settings: Mapping[str, FloatArray]) -> Rating:
 
 
 def remarks(rating: Rating) -> list[str]:
-    """Remarks that a user should read with a rating."""
+    """Remarks on a rating that its reader should know."""
     weather = weather_of(rating.study.weather, f"study {rating.study.name!r}")
     lines = []
     if weather.wet or weather.road_friction != 1:
-        lines.append(f"Euro NCAP tests on a dry road; this is rated in the weather {weather.name!r}, by night {by_night(weather).name!r}.")
+        lines.append(f"Euro NCAP tests on a dry road; this rating has the weather {weather.name!r}, by night {by_night(weather).name!r}.")
     for one in rating.variants:
         if one.fails:
-            lines.append(f"{one.name}: nothing is earned, as CCRs at 10 and 20 km/h is not green in all of the standard range.")
+            lines.append(f"{one.name}: it earns nothing, because CCRs at 10 and 20 km/h is not green in the whole standard range.")
         required = [number for number, cell in enumerate(one.protocol.cells) if cell.block.test == "CPNA" and cell.vut == 10
                     and cell.location == 75 and not cell.is_varied]
         if not one.fails and any(one.colour(number) != "green" for number in required):
             lines.append(f"{one.name}: CPNA at 10 km/h and 75 % is not green, which Euro NCAP requires; its calculator "
-                         f"{one.protocol.calculator} does not check it, and neither do these points.")
+                         f"{one.protocol.calculator} does not check this, so that these points do not either.")
         invalid = int(np.count_nonzero(~one.cells.valid))
         if invalid:
-            lines.append(f"{one.name}: {invalid} cells are no valid tests and earn nothing: the vehicle cannot hold their speed.")
+            lines.append(f"{one.name}: {invalid} cells are no valid tests and earn nothing, as the vehicle cannot hold the test speed.")
     if all(np.isnan(one.cells.warning).all() for one in rating.variants):
         lines.append("The driving system never warns: rows with FCW are red.")
     return lines
