@@ -102,7 +102,7 @@ def opinions_of(study: Study, causes: Sequence[JudgedCause], unsafe: Unsafe, pro
     our_runs = evaluate(system, settings)
     neighbours = _neighbours(system, causes, settings[1:], unsafe)
     scaled_settings = members.original + LADDER[:, np.newaxis, np.newaxis] * (settings[1:] - members.original)
-    neighbour_settings = np.stack([one.setting for one in neighbours]) if neighbours else settings[1:]
+    neighbour_settings = np.stack([neighbour.setting for neighbour in neighbours]) if neighbours else settings[1:]
     second_runs = evaluate(second, np.concatenate([settings, neighbour_settings, scaled_settings.reshape(-1, len(members))]))
     progress(stage, number, number)
     our_ends, second_ends = ([_end(evaluations, row) for row in range(number)] for evaluations in (our_runs, second_runs))
@@ -122,9 +122,9 @@ def opinions_of(study: Study, causes: Sequence[JudgedCause], unsafe: Unsafe, pro
 
 def _first_unsafe_step(fails: BoolArray) -> str:
     """The step of the ladder within which a cause becomes unsafe."""
-    safe = np.flatnonzero(~fails)
-    below = LADDER[safe[-1]] if len(safe) else 0.0
-    return f"{below:.0%} to {below + LADDER[0]:.0%}"
+    safe_steps = np.flatnonzero(~fails)
+    lower_share = LADDER[safe_steps[-1]] if len(safe_steps) else 0.0
+    return f"{lower_share:.0%} to {lower_share + LADDER[0]:.0%}"
 
 
 class _Original(NamedTuple):
@@ -143,8 +143,8 @@ def _opinion(cause: JudgedCause, mapping: VehicleMapping, original: _Original, o
         return Opinion(solution=cause.solution, changes=dict(cause.changes), here=our_end, there=second_end, opinion=verdict,
                        because=reason)
 
-    if outside := mapping.outside(cause.changes):
-        return judge(OpinionVerdict.OUTSIDE, "; ".join(outside), RunEnd())
+    if reasons := mapping.outside(cause.changes):
+        return judge(OpinionVerdict.OUTSIDE, "; ".join(reasons), RunEnd())
     if original.fails_ours:
         return judge(OpinionVerdict.OUTSIDE, "the original vehicle itself is unsafe, so that no change is a cause")
     if original.fails_second:
@@ -165,10 +165,10 @@ def _neighbours(system: System, causes: Sequence[JudgedCause], settings: FloatAr
     shares = np.array([cause.fraction * (1 - REDUCTIONS) for cause in causes])
     candidates = original + shares[..., np.newaxis] * (settings - original)[:, np.newaxis]
     evaluations = evaluate(system, candidates.reshape(-1, len(original)))
-    safe = (evaluations.valid & ~unsafe.of(evaluations)).reshape(shares.shape)
-    safe[:, -1] = True
-    first = np.argmax(safe, axis=1)
-    return [Neighbour(candidates[k, index], float(shares[k, index])) for k, index in enumerate(first.tolist())]
+    is_safe = (evaluations.valid & ~unsafe.of(evaluations)).reshape(shares.shape)
+    is_safe[:, -1] = True
+    indices = np.argmax(is_safe, axis=1)
+    return [Neighbour(candidates[k, index], float(shares[k, index])) for k, index in enumerate(indices.tolist())]
 
 
 def _end(evaluations: Evaluations, row: int) -> RunEnd:

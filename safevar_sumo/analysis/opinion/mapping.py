@@ -215,9 +215,10 @@ def mapping_of(study: Study, vehicle: Any) -> VehicleMapping:
     for name, cls in [*((name, cls) for name, cls in VEHICLES.items() if isinstance(model, cls)),
                       *((name, cls) for name, cls in VEHICLES.items() if cls.UNITS.items() <= units.items())]:
         table = TABLES[name]
-        shipped = load_study(table.study).vehicle.parameters
-        parameters = {one.name: getattr(model, one.name, study.vehicle.parameters.get(one.name, shipped.get(one.name, one.default)))
-                      for one in msgspec.structs.fields(cls)}
+        defaults = load_study(table.study).vehicle.parameters
+        parameters = {field.name: getattr(
+            model, field.name, study.vehicle.parameters.get(field.name, defaults.get(field.name, field.default)))
+            for field in msgspec.structs.fields(cls)}
         return VehicleMapping(name, cls(**parameters), table, tuple(key for key, unit in units.items() if cls.UNITS.get(key) != unit))
     alternatives = f"one of {', '.join(TABLES)}, a class derived from one, or one with the same characteristics in the same units"
     problem = f"vehicle.model = {study.vehicle.model!r} with {', '.join(units)} is no vehicle that the second model can represent"

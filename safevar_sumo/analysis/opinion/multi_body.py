@@ -22,7 +22,7 @@ STEP = 1e-3
 LEAST_SPEED = 0.1
 """Smallest speed to which slip is relative [m/s]: half of `v_s` in the package's `vehicle_dynamics_std`."""
 SLIP_LIMIT, LEAST_CONTROL_SPEED = 0.1, 2.0
-"""Slip above which the anti-lock controller releases brake pressure [-], and the speed above which it acts [m/s].
+"""Slip above which the anti-lock controller releases brake pressure [-], and speed above which the controller acts [m/s].
 
 Real controllers work between 0.1 and 0.2 from about 7 km/h on (Bosch, Automotive Handbook, "Antilock braking system").
 """
@@ -51,8 +51,8 @@ def commonroad() -> Any:
 
 
 @cache
-def _parameters(read: Any) -> Any:
-    return read()
+def _parameters(load_parameters: Any) -> Any:
+    return load_parameters()
 
 
 @cache
@@ -151,15 +151,15 @@ class Forces(NamedTuple):
 
 def tyre_forces(plant: Plant, body: MultiBody) -> Forces:
     """Pacejka's formula for pure longitudinal slip, as in the package's `formula_longitudinal`, and its derivative."""
-    tyre, relative_to = _tyre(), np.maximum(body.speed, LEAST_SPEED)
+    tyre, slip_speed = _tyre(), np.maximum(body.speed, LEAST_SPEED)
     load = np.maximum(body.heights * plant.tyre_spring, 1.0)
-    slip = (body.speed - plant.radius * body.wheels) / relative_to
+    slip = (body.speed - plant.radius * body.wheels) / slip_speed
     peak, stiffness = plant.friction * load, tyre.p_kx1 / (tyre.p_cx1 * plant.friction)
     scaled_slip = stiffness * (tyre.p_hx1 - slip)
     curve = (1 - tyre.p_ex1) * scaled_slip + tyre.p_ex1 * np.arctan(scaled_slip)
     angle = tyre.p_cx1 * np.arctan(curve) + load * tyre.p_vx1
     slope = peak * np.cos(angle) * (tyre.p_cx1 / (1 + curve * curve)) * (1 - tyre.p_ex1 + tyre.p_ex1 / (1 + scaled_slip * scaled_slip))
-    return Forces(peak * np.sin(angle), slope * (stiffness * plant.radius / relative_to), slip)
+    return Forces(peak * np.sin(angle), slope * (stiffness * plant.radius / slip_speed), slip)
 
 
 class Rates(NamedTuple):
@@ -187,19 +187,19 @@ def rates(plant: Plant, body: MultiBody, torques: FloatArray, forces: Forces) ->
         wheels=(torques / 2 - p.radius * forces.force) / p.wheel_inertia)
 
 
-def advance(plant: Plant, body: MultiBody, pedal: FloatArray, driving: FloatArray, step: float) -> MultiBody:
+def advance(plant: Plant, body: MultiBody, pedal: FloatArray, drive_torque: FloatArray, step: float) -> MultiBody:
     """One integration step under a brake pedal (0 to 1) and a torque of engine and drags on all wheels [N m].
 
     Wheel speeds, which are stiff, are integrated implicitly (linearised), all other states explicitly, rates before heights.
     """
     p, forces = plant, tyre_forces(plant, body)
     pressure_shares = _anti_lock(body, forces.slip, pedal, step)
-    change = rates(p, body, driving * p.drive_shares - np.minimum(pedal, pressure_shares) * (p.brake_torque * p.brake_shares), forces)
+    change = rates(p, body, drive_torque * p.drive_shares - np.minimum(pedal, pressure_shares) * (p.brake_torque * p.brake_shares), forces)
     gradients = np.maximum(forces.gradient, 0.0)
     wheels = np.maximum(body.wheels + step * change.wheels / (1 + step * gradients * p.radius / p.wheel_inertia), 0.0)
     added_force = gradients * (wheels - body.wheels)
     speed = np.maximum(body.speed + step * (change.speed + 2 * (added_force[0] + added_force[1]) / p.mass), 0.0)
-    is_standing = (body.speed <= 0) & (driving <= 0) & (p.back >= 0)  # Pacejka's tyres push slightly even without slip
+    is_standing = (body.speed <= 0) & (drive_torque <= 0) & (p.back >= 0)  # Pacejka's tyres push slightly even without slip
     pitch_rate, heave_rate = body.pitch_rate + step * change.pitch_rate, body.heave_rate + step * change.heave_rate
     height_rates = body.height_rates + step * change.height_rates
     return MultiBody(
@@ -211,5 +211,5 @@ def advance(plant: Plant, body: MultiBody, pedal: FloatArray, driving: FloatArra
 def _anti_lock(body: MultiBody, slip: FloatArray, pedal: FloatArray, step: float) -> FloatArray:
     """The share of full pressure that each axle may have: it falls while the axle's slip is too large, then rises to 1."""
     is_locking = (slip > SLIP_LIMIT) & (body.speed > LEAST_CONTROL_SPEED)
-    lowered = np.maximum(np.minimum(body.pressure_shares, pedal) - RELEASE * step, 0.0)
-    return np.where(is_locking, lowered, np.minimum(body.pressure_shares + BUILD_UP * step, 1.0))
+    lower_shares = np.maximum(np.minimum(body.pressure_shares, pedal) - RELEASE * step, 0.0)
+    return np.where(is_locking, lower_shares, np.minimum(body.pressure_shares + BUILD_UP * step, 1.0))

@@ -91,15 +91,16 @@ class Opinions:
 
     def count(self, verdict: OpinionVerdict) -> int:
         """Number of causes with this verdict."""
-        return sum(one.opinion == verdict for one in self.opinions)
+        return sum(opinion.opinion == verdict for opinion in self.opinions)
 
     def to_dict(self) -> list[dict[str, Any]]:
         """The JSON of `opinion`."""
-        return [one.to_dict() for one in self.opinions]
+        return [opinion.to_dict() for opinion in self.opinions]
 
     def to_frame(self) -> pd.DataFrame:
         """One row for each cause: `solution`, `changes`, outcome and safety degree `here` and `there`, `opinion`, `because`."""
-        rows = [(one.solution, one.changes, *one.here, *one.there, str(one.opinion), one.because) for one in self.opinions]
+        rows = [(opinion.solution, opinion.changes, *opinion.here, *opinion.there, str(opinion.opinion), opinion.because)
+                for opinion in self.opinions]
         return pd.DataFrame(rows, columns=["solution", "changes", "outcome_here", "safety_degree_here", "outcome_there",
                                            "safety_degree_there", "opinion", "because"])
 

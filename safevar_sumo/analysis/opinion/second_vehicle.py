@@ -68,20 +68,21 @@ class SecondVehicle:
     def __init__(self, vehicle: Vehicle, mapping: VehicleMapping, study: Study) -> None:
         self._vehicle, self._mapping = vehicle, mapping
         self.UNITS = vehicle.UNITS
-        shipped = load_study(mapping.table.study).vehicle.characteristics
-        rows = {**shipped, **{name: row for name, row in study.vehicle.characteristics.items() if name not in mapping.foreign}}
-        self._original = {one.name: one.original for one in CharacteristicSet.of({name: rows[name] for name in mapping.vehicle.UNITS})}
+        shipped_rows = load_study(mapping.table.study).vehicle.characteristics
+        rows = {**shipped_rows, **{name: row for name, row in study.vehicle.characteristics.items() if name not in mapping.foreign}}
+        self._original = {member.name: member.original
+                          for member in CharacteristicSet.of({name: rows[name] for name in mapping.vehicle.UNITS})}
 
     def prepare(self, characteristics: Characteristics, road_friction: Any, step: float, slope: Slope = LEVEL,
                 wet: bool | BoolArray = False) -> _Prepared:
         ones = np.ones_like(next(iter(characteristics.values())))
         original = {name: value * ones for name, value in self._original.items()}
         surface = (road_friction, slope, wet)
-        optional = () if slope is LEVEL and not np.any(wet) else (slope, wet) if np.any(wet) else (slope,)
+        road_arguments = () if slope is LEVEL and not np.any(wet) else (slope, wet) if np.any(wet) else (slope,)
         original_vehicle, represent = self._mapping.vehicle, self._mapping.table.represent
         engine = represent(original_vehicle, original, self._original, surface).plant
         return _Prepared(
-            vehicle=self._vehicle.prepare(characteristics, road_friction, step, *optional),
+            vehicle=self._vehicle.prepare(characteristics, road_friction, step, *road_arguments),
             original=original_vehicle.prepare(original, road_friction, step, slope, wet),
             parameters=represent(
                 original_vehicle, {**original, **{name: characteristics[name] for name in original if name in characteristics}},
@@ -111,8 +112,8 @@ class SecondVehicle:
 
     def sense(self, prepared: _Prepared, state: SecondState, seen: Observation) -> tuple[Observation, SecondState]:
         """Sense through the sensors of the study's vehicle."""
-        sensed, vehicle = self._vehicle.sense(prepared.vehicle, state.vehicle, seen)
-        return sensed, state._replace(vehicle=vehicle)
+        observation, vehicle = self._vehicle.sense(prepared.vehicle, state.vehicle, seen)
+        return observation, state._replace(vehicle=vehicle)
 
     def hold_gear(self, prepared: _Prepared, state: SecondState, holds: BoolArray) -> SecondState:
         hold = getattr(self._mapping.vehicle, "hold_gear", None)
@@ -120,7 +121,7 @@ class SecondVehicle:
 
     def advance(self, prepared: _Prepared, state: SecondState, command: Command) -> SecondState:
         p, r = prepared, prepared.parameters
-        original, driving = self._engine(p, state, command.throttle)
+        original, drive_torque = self._engine(p, state, command.throttle)
         commands = remembered(state.brake_commands, command.brake)
         demand, body, brake = delayed(commands, r.brake_delay, p.step), state.body, state.brake
         steps = math.ceil(p.step / STEP)
@@ -128,7 +129,7 @@ class SecondVehicle:
         response = step / (step + r.brake_lag)
         for _ in range(steps):
             brake = brake + np.minimum(np.maximum((demand - brake) * response, -r.brake_fall * step), r.brake_rise * step)
-            body = advance(r.plant, body, brake, driving, step)
+            body = advance(r.plant, body, brake, drive_torque, step)
         return SecondState(body.speed, original.throttle, brake, original.gear, state.vehicle, original, body, commands)
 
     def _engine(self, p: _Prepared, state: SecondState, throttle: FloatArray) -> tuple[Any, FloatArray]:

@@ -72,8 +72,8 @@ class RatedVehicle:
 
     def _layers(self, block: Block) -> dict[str, bool | None]:
         claimed = self.claims.get(block.test, ())
-        return {one.layer: bool(self.scored.layers[block.test, one.layer][0]) if one.simulated else (True if one.layer in claimed else None)
-                for one in self.protocol.layers_of(block.test)}
+        return {layer.layer: bool(self.scored.layers[block.test, layer.layer][0]) if layer.simulated
+                else (True if layer.layer in claimed else None) for layer in self.protocol.layers_of(block.test)}
 
     def colour(self, number: int) -> str | None:
         """Colour of the cell with this number; None if the vehicle could not drive the test."""
@@ -103,9 +103,10 @@ class RatedVehicle:
         for number, cell in enumerate(self.protocol.cells):
             block_cells.setdefault(cell.block.name, []).append(number)
         kinds = ("standard", "extended", "robustness")
-        tests = [{"test": one.block.test, "light": one.block.light, **dict(zip(kinds, one.points, strict=True)),
-                  "possible": dict(zip(kinds, one.block.points, strict=True)),
-                  "cells": [self.cell(number) for number in block_cells[one.block.name]], "layers": dict(one.layers)} for one in self.tests]
+        tests = [{"test": test.block.test, "light": test.block.light, **dict(zip(kinds, test.points, strict=True)),
+                  "possible": dict(zip(kinds, test.block.points, strict=True)),
+                  "cells": [self.cell(number) for number in block_cells[test.block.name]], "layers": dict(test.layers)}
+                 for test in self.tests]
         return {"name": self.name, "setting": dict(self.setting), "points": round(self.points, DECIMALS),
                 "possible": max_points(self.protocol), "tests": tests}
 
@@ -143,8 +144,8 @@ class Rating:
         claims, open_points = self.original.claims, 0.0
         for test, blocks in self.protocol.tests.items():
             layers = self.protocol.layers_of(test)
-            unknown = [one for one in layers if not one.simulated and one.layer not in claims.get(test, ())]
-            open_points += sum(block.points[2] for block in blocks) * len(unknown) / len(layers)
+            open_layers = [layer for layer in layers if not layer.simulated and layer.layer not in claims.get(test, ())]
+            open_points += sum(block.points[2] for block in blocks) * len(open_layers) / len(layers)
         return round(open_points, DECIMALS)
 
     def turned(self, variant: RatedVehicle | None = None) -> list[tuple[Cell, str | None, str | None]]:
@@ -161,9 +162,9 @@ class Rating:
         Columns: `vehicle`, `test`, `light`, `standard`, `extended`, `robustness`, `total`, `possible` [points].
         """
         return pd.DataFrame([{
-            "vehicle": one.name, "test": test.block.test, "light": test.block.light,
+            "vehicle": vehicle.name, "test": test.block.test, "light": test.block.light,
             **dict(zip(("standard", "extended", "robustness"), test.points, strict=True)), "total": test.total,
-            "possible": sum(test.block.points)} for one in self.variants for test in one.tests])
+            "possible": sum(test.block.points)} for vehicle in self.variants for test in vehicle.tests])
 
     def to_dict(self) -> dict[str, Any]:
         """The JSON of `rating`."""
@@ -171,7 +172,7 @@ class Rating:
                 "not_simulated": [{"test": test, "points": points} for test, points in self.protocol.not_simulated.items()]}
 
     def __repr__(self) -> str:
-        vehicles = "; ".join(f"{one.name} {one.points:.2f}" for one in self.variants)
+        vehicles = "; ".join(f"{vehicle.name} {vehicle.points:.2f}" for vehicle in self.variants)
         return f"<Rating of {self.study.name}, points of {max_points(self.protocol):g}: {vehicles}>"
 
 
@@ -190,7 +191,7 @@ def rate_variant(subject: Study | Case, options: RatingOptions, *, pool: Pool | 
         if isinstance(subject, Study):
             raise InputError("solution", f"{study.name!r} is a study and has no solutions", "a results directory")
         row = subject.solutions.iloc[position_of(subject.solutions, SolutionId.parse(options.solution))]
-        values, name = {one: float(row[one]) for one in characteristics.names}, options.solution
+        values, name = {characteristic: float(row[characteristic]) for characteristic in characteristics.names}, options.solution
     if options.changes:
         characteristics.setting(options.changes, "changes", switch="")  # refuses unknown names
         values, name = {**values, **options.changes}, f"{name} changed" if values else name
@@ -232,18 +233,18 @@ def remarks(rating: Rating) -> list[str]:
     lines = []
     if weather.wet or weather.road_friction != 1:
         lines.append(f"Euro NCAP tests on a dry road; this rating has the weather {weather.name!r}, by night {by_night(weather).name!r}.")
-    for one in rating.variants:
-        if one.fails:
-            lines.append(f"{one.name}: it earns nothing, because CCRs at 10 and 20 km/h is not green in the whole standard range.")
-        required = [number for number, cell in enumerate(one.protocol.cells) if cell.block.test == "CPNA" and cell.vut == 10
+    for vehicle in rating.variants:
+        if vehicle.fails:
+            lines.append(f"{vehicle.name}: it earns nothing, because CCRs at 10 and 20 km/h is not green in the whole standard range.")
+        required_cells = [number for number, cell in enumerate(vehicle.protocol.cells) if cell.block.test == "CPNA" and cell.vut == 10
                     and cell.location == 75 and not cell.is_varied]
-        if not one.fails and any(one.colour(number) != "green" for number in required):
-            lines.append(f"{one.name}: CPNA at 10 km/h and 75 % is not green, which Euro NCAP requires; its calculator "
-                         f"{one.protocol.calculator} does not check this, so that these points do not either.")
-        invalid = int(np.count_nonzero(~one.cells.valid))
-        if invalid:
-            lines.append(f"{one.name}: {invalid} cells are no valid tests and earn nothing, as the vehicle cannot hold the test speed.")
-    if all(np.isnan(one.cells.warning).all() for one in rating.variants):
+        if not vehicle.fails and any(vehicle.colour(number) != "green" for number in required_cells):
+            lines.append(f"{vehicle.name}: CPNA at 10 km/h and 75 % is not green, which Euro NCAP requires; Euro NCAP's calculator "
+                         f"{vehicle.protocol.calculator} does not check this, nor do these points.")
+        invalid_cells = int(np.count_nonzero(~vehicle.cells.valid))
+        if invalid_cells:
+            lines.append(f"{vehicle.name}: {invalid_cells} cells are no valid tests and earn nothing: the vehicle cannot hold the speed.")
+    if all(np.isnan(vehicle.cells.warning).all() for vehicle in rating.variants):
         lines.append("The driving system never warns: rows with FCW are red.")
     return lines
 

@@ -35,7 +35,7 @@ def rated_lead(study: Study, solutions: pd.DataFrame, original: Evaluations, pla
     for choice, title in TITLES.items():
         handle = chosen_handle(solutions, unsafe, choice, study.name)
         row = solutions.iloc[position_of(solutions, handle)]
-        setting = {one: float(row[one]) for one in characteristics.names}
+        setting = {characteristic: float(row[characteristic]) for characteristic in characteristics.names}
         lines.append(f"{title}: {handle} loses {points - row[name]:.2f} points with {list_of_changes(characteristics, setting)}.")
     return [*lines, f"Which cells change colour: {question_command('rating', place)} --solution {quote(str(handle))} --matrix; which "
                     f"changes cause it: {question_command('explain', place)}"]

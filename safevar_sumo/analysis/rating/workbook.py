@@ -1,4 +1,4 @@
-"""The official spreadsheet: predictions, claimed layers and input parameters in its template, measurements in a preprocessed one.
+"""The official spreadsheet: predictions, claimed layers and input parameters in its template, measurements in a preprocessed file.
 
 Before anything is written, every target cell is checked: if its headings are not where the protocol's data expects them, the
 spreadsheet is refused.
@@ -119,7 +119,7 @@ class Template(_Book):
             for k, row in enumerate(block.rows):
                 if row.choice:
                     self._sheet(block.sheet)[f"{block.function}{top + k}"].value = "FCW" if block.is_warning(k) else "AEB"
-        holds = {(one.block.test, layer): does_hold for one in rated.tests for layer, does_hold in one.layers.items()}
+        holds = {(test.block.test, layer): does_hold for test in rated.tests for layer, does_hold in test.layers.items()}
         for layer in self.protocol.layers:
             self._sheet(layer.sheet)[layer.cell].value = "YES" if holds[layer.test, layer.layer] else "NO"
         for test, parameter, cell in self._parameters():

@@ -79,9 +79,9 @@ def answer(cases: Sequence[Case], question: str | None = None) -> list[Answer]:
             answered_cases = {*frame["setting"], *frame["other"]} if name == WEATHER else set(names) - {error.source for error in errors}
             case_notes = [note for case in cases if case.name in answered_cases for note in _notes(name, case)]
             answers.append(Answer(table, frame, tuple(dict.fromkeys([*notes, *case_notes])), metrics))
-    if all_errors and all(one.frame.empty for one in answers):
+    if all_errors and all(reply.frame.empty for reply in answers):
         raise all_errors[0]
-    return [one for one in answers if one.name == SAFETY] if question == SAFETY else answers
+    return [reply for reply in answers if reply.name == SAFETY] if question == SAFETY else answers
 
 
 def _ask(name: str, cases: Sequence[Case]) -> tuple[dict[str, list[pd.DataFrame]], list[Unanswerable]]:
@@ -107,9 +107,9 @@ def _notes(question: str, case: Case) -> list[str]:
     if question in ("rq1", "rq2"):
         for metric in case.scoring.metrics:
             rows = counted_solutions(case.solutions, metric)
-            undefined = int(rows[metric.name].isna().sum())
-            if undefined:
-                notes.append(f"{case.name}: {metric.name} is undefined in {undefined} of {len(rows)} solutions, which are omitted.")
+            undefined_values = int(rows[metric.name].isna().sum())
+            if undefined_values:
+                notes.append(f"{case.name}: {metric.name} is undefined in {undefined_values} of {len(rows)} solutions, which are omitted.")
     if question == "rq1":
         undefined_metrics = [name for name, value in case.original.items() if pd.isna(value)]
         if undefined_metrics:

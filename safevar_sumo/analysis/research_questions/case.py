@@ -160,8 +160,8 @@ def load_cases(directories: Iterable[str | Path]) -> list[Case]:
     if duplicates:
         raise InputError("directories", f"{duplicates[0]} is given twice", "each results directory once")
     cases = [_load_or_refuse(path) for path in paths]
-    names = Counter(one.name for one in cases)
-    return [replace(one, name=f"{one.name} ({path})") if names[one.name] > 1 else one for one, path in zip(cases, paths, strict=True)]
+    names = Counter(case.name for case in cases)
+    return [replace(case, name=f"{case.name} ({path})") if names[case.name] > 1 else case for case, path in zip(cases, paths, strict=True)]
 
 
 def _load_or_refuse(path: Path) -> Case:

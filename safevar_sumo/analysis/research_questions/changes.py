@@ -44,10 +44,10 @@ def changes(case: Case, solutions: pd.DataFrame) -> FloatArray:
     return np.asarray(solutions[list(case.characteristics.names)].to_numpy(dtype=float) - case.characteristics.original)
 
 
-def by_number(case: Case, changed: FloatArray) -> dict[str, BoolArray]:
+def by_number(case: Case, deltas: FloatArray) -> dict[str, BoolArray]:
     """Whether solutions have j characteristics changed, for j = "1".."n" and "any"."""
-    number = np.count_nonzero(changed, axis=1)
-    return {**{str(j): number == j for j in range(1, len(case.characteristics) + 1)}, ANY: np.ones(len(changed), dtype=bool)}
+    number = np.count_nonzero(deltas, axis=1)
+    return {**{str(j): number == j for j in range(1, len(case.characteristics) + 1)}, ANY: np.ones(len(deltas), dtype=bool)}
 
 
 def rq31(case: Case) -> pd.DataFrame:
@@ -65,13 +65,13 @@ def rq32(case: Case) -> pd.DataFrame:
     Columns setting, characteristic, j ("1".."n", "any"), percent (None without such a solution), rank (only for
     j = "any"; ties share the better rank and the next one is skipped).
     """
-    changed = changes(case, critical(case))
-    change_counts = np.count_nonzero(changed, axis=0)
+    deltas = changes(case, critical(case))
+    change_counts = np.count_nonzero(deltas, axis=0)
     rows = []
     for i, member in enumerate(case.characteristics):
-        for j, mask in by_number(case, changed).items():
-            percent = 100 * float(np.mean(changed[mask, i] != 0)) if mask.any() else None
-            rank = 1 + int(np.count_nonzero(change_counts > change_counts[i])) if j == ANY and len(changed) else None
+        for j, mask in by_number(case, deltas).items():
+            percent = 100 * float(np.mean(deltas[mask, i] != 0)) if mask.any() else None
+            rank = 1 + int(np.count_nonzero(change_counts > change_counts[i])) if j == ANY and len(deltas) else None
             rows.append((case.name, member.name, j, percent, rank))
     return pd.DataFrame(rows, columns=["setting", "characteristic", "j", "percent", "rank"], dtype=object)
 
@@ -82,12 +82,12 @@ def rq33(case: Case) -> pd.DataFrame:
     Columns setting, characteristic, direction, j ("1".."n", "any"), pc (mean of |v - v''| / v, a fraction), delta (mean
     signed change in the characteristic's unit), n (number of changes); pc and delta are None where n is 0.
     """
-    changed = changes(case, critical(case))
+    deltas = changes(case, critical(case))
     rows = []
     for i, member in enumerate(case.characteristics):
         for direction, sign in (("increase", 1), ("decrease", -1)):
-            for j, mask in by_number(case, changed).items():
-                delta = changed[mask, i]
+            for j, mask in by_number(case, deltas).items():
+                delta = deltas[mask, i]
                 delta = delta[np.sign(delta) == sign]
                 mean = float(np.mean(delta)) if delta.size else None
                 pc = None if mean is None else abs(mean / member.original)
@@ -143,16 +143,16 @@ def combinations(case: Case) -> pd.DataFrame:
     """The most frequent combinations among the critical solutions with exactly four characteristics changed.
 
     Columns setting, rank (ties share the better one), characteristics (a list), percent of those solutions; no row
-    where there is no such solution. Of combinations that are equally frequent, those whose characteristics stand
-    earlier in the study come first.
+    where there is no such solution. Of combinations that are equally frequent, those with the earlier
+    characteristics in the study come first.
     """
-    changed = changes(case, critical(case)) != 0
-    masks = changed[np.count_nonzero(changed, axis=1) == COMBINATION_SIZE]
+    is_changed = changes(case, critical(case)) != 0
+    masks = is_changed[np.count_nonzero(is_changed, axis=1) == COMBINATION_SIZE]
     counts = Counter(tuple(np.flatnonzero(row).tolist()) for row in masks)
-    ordered = sorted(counts.items(), key=lambda item: (-item[1], item[0]))[:COMBINATIONS_SHOWN]
+    ranking = sorted(counts.items(), key=lambda item: (-item[1], item[0]))[:COMBINATIONS_SHOWN]
     names = case.characteristics.names
     rows = [(case.name, 1 + sum(other > number for other in counts.values()), [names[i] for i in members], 100 * number / len(masks))
-            for members, number in ordered]
+            for members, number in ranking]
     return pd.DataFrame(rows, columns=["setting", "rank", "characteristics", "percent"])
 
 
@@ -164,10 +164,10 @@ def weather_pairs(cases: Sequence[Case]) -> list[tuple[Case, Case]]:
     Unanswerable
         If there is no such pair.
     """
-    pairs = [(one, other) for one, other in permutations(cases, 2)
-             if _without_weather(one) == _without_weather(other) and _clearness(one) > _clearness(other)]
+    pairs = [(clear, wet) for clear, wet in permutations(cases, 2)
+             if _without_weather(clear) == _without_weather(wet) and _clearness(clear) > _clearness(wet)]
     if not pairs:
-        raise Unanswerable(", ".join(one.name for one in cases), "two cases are needed that differ in the weather alone",
+        raise Unanswerable(", ".join(clear.name for clear in cases), "two cases are needed that differ in the weather alone",
                            "results such as those of sun and rain")
     return pairs
 
@@ -199,9 +199,9 @@ def weather(clear: Case, wet: Case) -> pd.DataFrame:
 
 def effects(case: Case) -> pd.DataFrame:
     """Every change in every critical solution; columns setting, characteristic, change (signed, in the characteristic's unit)."""
-    changed = changes(case, critical(case))
+    deltas = changes(case, critical(case))
     parts = [pd.DataFrame({"setting": case.name, "characteristic": name, "change": column[column != 0]})
-             for name, column in zip(case.characteristics.names, changed.T, strict=True)]
+             for name, column in zip(case.characteristics.names, deltas.T, strict=True)]
     return pd.concat(parts, ignore_index=True)
 
 

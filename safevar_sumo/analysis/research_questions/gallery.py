@@ -36,7 +36,7 @@ FIGURES_OF_ONE_CASE: Mapping[str, Callable[[Case], Figure]] = {
 
 
 def draw(cases: Sequence[Case]) -> tuple[dict[str, Figure], list[str]]:
-    """Every figure of the cases by name, and the reasons for missing ones; with several cases, a figure's name begins with its case's name.
+    """Every figure of the cases by name, and the reasons for missing figures; with several cases, names start with the case's name.
 
     Raises
     ------
@@ -46,10 +46,10 @@ def draw(cases: Sequence[Case]) -> tuple[dict[str, Figure], list[str]]:
     figures, all_errors = {}, []
     is_single = len(cases) == 1
     for name, draw_cases in FIGURES_OF_ALL_CASES.items():
-        answerable, errors = _answerable(cases)
+        answerable_cases, errors = _answerable_cases(cases)
         all_errors += errors
-        if answerable:
-            figures[name] = draw_cases(answerable)
+        if answerable_cases:
+            figures[name] = draw_cases(answerable_cases)
     for case in cases:
         for name, draw_figure in FIGURES_OF_ONE_CASE.items():
             if draw_figure is critical_differences and len(case.algorithms) < LEAST_ALGORITHMS:
@@ -63,16 +63,16 @@ def draw(cases: Sequence[Case]) -> tuple[dict[str, Figure], list[str]]:
     return figures, list(dict.fromkeys(f"{error.source}: {error.problem}" for error in all_errors))
 
 
-def _answerable(cases: Sequence[Case]) -> tuple[list[Case], list[Unanswerable]]:
+def _answerable_cases(cases: Sequence[Case]) -> tuple[list[Case], list[Unanswerable]]:
     """The cases that have an answer to RQ3.1, and the errors of the others."""
-    answerable, errors = [], []
+    answerable_cases, errors = [], []
     for case in cases:
         try:
             rq31(case)
-            answerable.append(case)
+            answerable_cases.append(case)
         except Unanswerable as error:
             errors.append(error)
-    return answerable, errors
+    return answerable_cases, errors
 
 
 def draw_all(cases: Sequence[Case], directory: Path, kind: str) -> tuple[list[Path], list[str]]:

@@ -105,8 +105,8 @@ def indicators(case: Case) -> pd.DataFrame:
     for algorithm, run in runs:
         front = objectives(case, by_run[algorithm, run]) if (algorithm, run) in by_run else np.zeros((0, 0))
         if len(front):
-            scaled = scale.normalised(front)
-            rows.append((algorithm, run, igd(front, reference), igd_plus(scaled, scaled_reference), hypervolume(scaled)))
+            scaled_front = scale.normalised(front)
+            rows.append((algorithm, run, igd(front, reference), igd_plus(scaled_front, scaled_reference), hypervolume(scaled_front)))
     return pd.DataFrame(rows, columns=["algorithm", "run", *MORE_IS_BETTER])
 
 
@@ -134,13 +134,13 @@ def convergence(case: Case, points: int = 50) -> pd.DataFrame:
 
 def _growth(case: Case, evaluations: pd.DataFrame, scale: Scale, grid: np.ndarray) -> list[float]:
     """Hypervolume of the first k evaluations, for every k of the grid."""
-    scaled = scale.normalised(_values(case, evaluations))
-    defined = np.isfinite(scaled).all(axis=1)
-    scaled, numbers = scaled[defined], evaluations["evaluation"].to_numpy()[defined]
+    scaled_points = scale.normalised(_values(case, evaluations))
+    is_defined = np.isfinite(scaled_points).all(axis=1)
+    scaled_points, numbers = scaled_points[is_defined], evaluations["evaluation"].to_numpy()[is_defined]
     ends = np.searchsorted(numbers, grid, side="left")
-    front, volumes = np.zeros((0, scaled.shape[1])), []
+    front, volumes = np.zeros((0, scaled_points.shape[1])), []
     for start, end in zip([0, *ends[:-1]], ends, strict=True):
-        front = np.concatenate([front, scaled[start:end]])
+        front = np.concatenate([front, scaled_points[start:end]])
         front = nondominated(front) if len(front) else front
         volumes.append(hypervolume(front) if len(front) else 0.0)
     return volumes

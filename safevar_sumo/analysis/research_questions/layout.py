@@ -85,8 +85,8 @@ def pivoted(title: str, frame: pd.DataFrame, labels: Sequence[str], cells: Calla
     blocks = list(dict.fromkeys(frame[over]))
     keys = list(zip(*(frame[label] for label in labels), strict=True))
     cells_at = {(key, row[over]): cells(row) for key, row in zip(keys, frame.to_dict("records"), strict=True)}
-    empty = (UNDEFINED,) * (len(heads) or 1)
-    rows = [(*((names or {}).get(label, label) for label in key), *(cell for block in blocks for cell in cells_at.get((key, block), empty)))
+    gaps = (UNDEFINED,) * (len(heads) or 1)
+    rows = [(*((names or {}).get(label, label) for label in key), *(cell for block in blocks for cell in cells_at.get((key, block), gaps)))
             for key in dict.fromkeys(keys)]
     spans = tuple((block, len(heads)) for block in blocks) if heads else ()
     return Table(title, (*labels, *(tuple(heads) * len(blocks) or blocks)), rows, len(labels), spans, tuple(notes))
@@ -135,10 +135,10 @@ def _test_cells(row: Row, sizes: Sequence[str] = (), marks: Mapping[str, str] = 
     has_holm = "p_holm" in row
     if pd.isna(row["p_value"]):
         return (UNDEFINED,) * (3 + has_holm + len(sizes))
-    significant = row["p_holm" if has_holm else "p_value"] < ALPHA
+    is_significant = row["p_holm" if has_holm else "p_value"] < ALPHA
     p = p_value(row["p_value"]) + marks.get(row["method"], "")
-    effect = _bold(f"{row['effect_size']:.3f}", significant and (has_holm or row["magnitude"] in NOTABLE_MAGNITUDES))
-    tests = (p, _bold(p_value(row["p_holm"]), significant)) if has_holm else (_bold(p, significant),)
+    effect = _bold(f"{row['effect_size']:.3f}", is_significant and (has_holm or row["magnitude"] in NOTABLE_MAGNITUDES))
+    tests = (p, _bold(p_value(row["p_holm"]), is_significant)) if has_holm else (_bold(p, is_significant),)
     return (*tests, effect, row["magnitude"], *(str(row[size]) for size in sizes))
 
 
@@ -192,10 +192,10 @@ def _rq2_ranks(answer: Answer) -> list[Table]:
         rows: list[tuple[str, ...]] = []
         for metric, part in group.groupby("metric", sort=False):
             first = part.iloc[0]
-            significant = not pd.isna(first["p_holm"]) and first["p_holm"] < ALPHA
+            is_significant = not pd.isna(first["p_holm"]) and first["p_holm"] < ALPHA
             p, holm = (UNDEFINED if pd.isna(first[name]) else p_value(first[name]) for name in ("p_value", "p_holm"))
             rows.append((names.get(str(metric), str(metric)), *(_number(rank, ".2f") for rank in part["mean_rank"]),
-                         _number(first["critical_difference"], ".2f"), p, _bold(holm, significant), str(first["runs"])))
+                         _number(first["critical_difference"], ".2f"), p, _bold(holm, is_significant), str(first["runs"])))
         heads = ("metric", *(names.get(name, name) for name in algorithms), "critical difference", "p", "p Holm", "runs")
         tables.append(Table(f"{TITLES['rq2-ranks']}: {case}", heads, rows, 1, notes=(
             "p: Friedman's test; runs with the same number form a block. Holm's correction is for all metrics of a setting.",
@@ -227,24 +227,24 @@ def _rq32(answer: Answer) -> list[Table]:
 
 
 def _rq33(case: str, group: pd.DataFrame) -> list[Table]:
-    labels, forms = ("characteristic", "direction"), {"pc": ".1%", "delta": "+.3g"}
+    labels, specs = ("characteristic", "direction"), {"pc": ".1%", "delta": "+.3g"}
     paper_rows = group[group["j"].isin(PAPER_NUMBERS)]
     return [
         pivoted(f"{TITLES['rq3.3']}, 2 to 6 changed: {case}", paper_rows.assign(j="j = " + paper_rows["j"]), labels,
-                lambda row: [_number(row[name], form) for name, form in forms.items()], ("PC", "delta"), over="j",
+                lambda row: [_number(row[name], spec) for name, spec in specs.items()], ("PC", "delta"), over="j",
                 notes=("PC: mean of |v - v''| / v; delta: mean signed change in the characteristic's unit.",)),
-        *(pivoted(f"RQ3.3: {title}, any number changed: {case}", group, labels, _column(name, forms[name]), over="j")
+        *(pivoted(f"RQ3.3: {title}, any number changed: {case}", group, labels, _column(name, specs[name]), over="j")
           for title, name in (("PC", "pc"), ("delta", "delta")))]
 
 
-def _column(name: str, form: str) -> Callable[[Row], tuple[str]]:
+def _column(name: str, spec: str) -> Callable[[Row], tuple[str]]:
     """Cells that show one column of a frame."""
-    return lambda row: (_number(row[name], form),)
+    return lambda row: (_number(row[name], spec),)
 
 
 def _safety(case: str, group: pd.DataFrame) -> list[Table]:
-    values, shares = (pivoted("", group, ("quantity",), _column(name, form), over="j")
-                      for name, form in (("value", ".2f"), ("percent", ".1f")))
+    values, shares = (pivoted("", group, ("quantity",), _column(name, spec), over="j")
+                      for name, spec in (("value", ".2f"), ("percent", ".1f")))
     rows = []
     for (name, *cells), (_, *percent) in zip(values.rows, shares.rows, strict=True):
         rows.append((SAFETY_UNITS[name], *cells))
@@ -271,7 +271,7 @@ def _combinations(answer: Answer) -> list[Table]:
 def _weather(answer: Answer) -> list[Table]:
     tables = []
     for (case, other), group in answer.frame.groupby(["setting", "other"], sort=False):
-        rows = [(row["characteristic"], *(_number(row[name], form) for name, form in WEATHER_COLUMNS.items()))
+        rows = [(row["characteristic"], *(_number(row[name], spec) for name, spec in WEATHER_COLUMNS.items()))
                 for row in group.to_dict("records")]
         tables.append(Table(f"{TITLES['weather']}: {case} against {other}",
                             ("characteristic", str(case), str(other), "diff.", *(str(case), str(other)) * 3), rows, 1,
@@ -310,8 +310,8 @@ def _bold(cell: str, is_bold: bool) -> str:
     return Bold(cell) if is_bold else cell
 
 
-def _number(value: Any, form: str) -> str:
-    return UNDEFINED if value is None or pd.isna(value) else format(int(value) if form == "d" else float(value), form)
+def _number(value: Any, spec: str) -> str:
+    return UNDEFINED if value is None or pd.isna(value) else format(int(value) if spec == "d" else float(value), spec)
 
 
 def p_value(value: float) -> str:

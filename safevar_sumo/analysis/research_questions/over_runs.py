@@ -63,11 +63,11 @@ def rq2_runs(case: Case) -> pd.DataFrame:
 def holm(p_values: Sequence[float | None]) -> list[float | None]:
     """P-values corrected by Holm's step-down method (Holm 1979); None stays None and does not count as a test."""
     order = sorted((p, index) for index, p in enumerate(p_values) if p is not None)
-    corrected, highest = list(p_values), 0.0
+    corrected_p_values, maximum = list(p_values), 0.0
     for rank, (p, index) in enumerate(order):
-        highest = max(highest, min(1.0, p * (len(order) - rank)))
-        corrected[index] = highest
-    return corrected
+        maximum = max(maximum, min(1.0, p * (len(order) - rank)))
+        corrected_p_values[index] = maximum
+    return corrected_p_values
 
 
 def signed_rank(sample: FloatArray, value: float) -> TwoSampleTest:
@@ -107,8 +107,8 @@ def difference_line(case: Case) -> str:
     rq1_frame, rq2_frame = _corrected_frames(case)
     comparisons = [("RQ1", "algorithm", rq1(case), rq1_frame), *([] if rq2_frame is None else [("RQ2", "baseline", rq2(case), rq2_frame)])]
     changes, tests = [], 0
-    for question, group_column, paper, runs in comparisons:
-        for pooled_row, runs_row in zip(paper.to_dict("records"), runs.to_dict("records"), strict=True):
+    for question, group_column, pooled_frame, runs in comparisons:
+        for pooled_row, runs_row in zip(pooled_frame.to_dict("records"), runs.to_dict("records"), strict=True):
             pooled_p, runs_p = pooled_row["p_value"], runs_row["p_holm"]
             tests += runs_p is not None
             if pooled_p is None or runs_p is None or (pooled_p < ALPHA) == (runs_p < ALPHA):
@@ -137,11 +137,11 @@ def summary_lines(case: Case) -> list[str]:
         lines.append(f"{question} over runs: {meaning}; * p < {ALPHA:g} after Holm's correction")
         for name, group in frame.groupby(group_column, sort=False):
             rows = group.to_dict("records")
-            defined = [row for row in rows if row["effect_size"] is not None]
-            untestable = [titles[row["metric"]] for row in defined
+            defined_rows = [row for row in rows if row["effect_size"] is not None]
+            untestable = [titles[row["metric"]] for row in defined_rows
                           if min(row.get(size, np.inf) for size in ("runs", "n1", "n2")) < fewest_runs(question)]
-            any_testable = any_testable or len(untestable) < len(defined)
-            subject = "" if len(untestable) == len(defined) else f"{', '.join(untestable)}: "
+            any_testable = any_testable or len(untestable) < len(defined_rows)
+            subject = "" if len(untestable) == len(defined_rows) else f"{', '.join(untestable)}: "
             note = f"; {subject}too few runs for a test ({fewest_runs(question)} are needed)" if untestable else ""
             effects = ", ".join(f"{titles[row['metric']]} " + ("-" if row["effect_size"] is None or row["p_holm"] is None else
                                 f"{row['effect_size']:.2f}{'*' if row['p_holm'] < ALPHA else ''}") for row in rows)
@@ -158,20 +158,20 @@ def _rounded(value: float) -> str:
 
 
 def _corrected_frames(case: Case) -> tuple[pd.DataFrame, pd.DataFrame | None]:
-    """The frames of RQ1 and RQ2 over runs, with p-values corrected as one family; None for RQ2 if it has no answer."""
+    """The frames of RQ1 and RQ2 over runs, with p-values corrected as one family; None if RQ2 has no answer."""
     case.require_solutions()
     means = partial(run_means, case)
-    first = rq1_rows(case, means, signed_rank)
+    tests_of_rq1 = rq1_rows(case, means, signed_rank)
     has_rq2 = NSGA2 in case.algorithms and len(case.algorithms) > 1
-    second = rq2_rows(case, means) if has_rq2 else []
-    for row, p in zip([*first, *second], holm([row["p_value"] for row in [*first, *second]]), strict=True):
+    tests_of_rq2 = rq2_rows(case, means) if has_rq2 else []
+    for row, p in zip([*tests_of_rq1, *tests_of_rq2], holm([row["p_value"] for row in [*tests_of_rq1, *tests_of_rq2]]), strict=True):
         row["p_holm"] = p
-    return (pd.DataFrame(first, columns=RQ1_COLUMNS, dtype=object),
-            pd.DataFrame(second, columns=RQ2_COLUMNS, dtype=object) if has_rq2 else None)
+    return (pd.DataFrame(tests_of_rq1, columns=RQ1_COLUMNS, dtype=object),
+            pd.DataFrame(tests_of_rq2, columns=RQ2_COLUMNS, dtype=object) if has_rq2 else None)
 
 
 def run_means(case: Case, algorithm: str, metric: MetricFacts) -> FloatArray:
-    """A metric's mean over the solutions for which it is defined, for each finished run that has such solutions; shape (runs,).
+    """A metric's mean over the solutions with a defined value, for each finished run that has such solutions; shape (runs,).
 
     Raises
     ------

@@ -65,14 +65,14 @@ def as_json(answers: Sequence[Answer]) -> str:
 
 
 def records(frame: pd.DataFrame) -> list[dict[str, Any]]:
-    """The rows of a frame as plain values; undefined ones are None, and a missing rank has no key."""
+    """The rows of a frame as plain values; undefined values are None, and a missing rank has no key."""
     rows = [{str(name): _plain_value(value) for name, value in row.items()} for row in frame.to_dict("records")]
     return [{name: value for name, value in row.items() if not (name == "rank" and value is None)} for row in rows]
 
 
 LAYOUTS_BY_NAME: Mapping[str, Layouts] = {"full": LAYOUTS, "paper": PAPER}
 FORMATS_WITH_LAYOUT: Mapping[str, Callable[..., str]] = {"text": text, "markdown": markdown, "latex": latex}
-"""Formats for readers, whose functions take a layout; the other formats hold the frames."""
+"""Formats for human readers, whose functions take a layout; the other formats hold the frames."""
 FORMATS: Mapping[str, Callable[..., str]] = {**FORMATS_WITH_LAYOUT, "csv": csv, "json": as_json}
 ENDINGS = {"text": "txt", "markdown": "md", "latex": "tex", "csv": "csv", "json": "json"}
 
@@ -116,9 +116,9 @@ def _markdown(table: Table) -> str:
     return "\n".join([*lines, *(f"{_markdown_text(note)}  " for note in table.notes), ""])
 
 
-def _markdown_text(plain: str) -> str:
+def _markdown_text(source: str) -> str:
     """Plain text as Markdown, with Markdown's special characters escaped."""
-    return re.sub(r"([\\`*_|<>\[\]~^#$])", r"\\\1", plain.replace("\n", " "))
+    return re.sub(r"([\\`*_|<>\[\]~^#$])", r"\\\1", source.replace("\n", " "))
 
 
 def _latex(table: Table, label: str) -> str:
@@ -144,9 +144,9 @@ def _tabular(table: Table) -> list[str]:
     return [*lines, r"\bottomrule", r"\end{tabular}%"]
 
 
-def escaped_for_latex(plain: str) -> str:
+def escaped_for_latex(source: str) -> str:
     """Plain text as LaTeX; a character that LaTeX's fonts may lack becomes its code point."""
-    powers = re.split(r"\^(-?\d+)", re.sub(r"(?<![\w)^-])-(?=\.?\d)", MINUS, " ".join(plain.split())))
+    powers = re.split(r"\^(-?\d+)", re.sub(r"(?<![\w)^-])-(?=\.?\d)", MINUS, " ".join(source.split())))
     text = "".join(rf"\textsuperscript{{{''.join(map(_letter, part.replace('-', MINUS)))}}}" if i % 2 else "".join(map(_letter, part))
                     for i, part in enumerate(powers))
     return text.replace("--", "-{}-")
@@ -161,7 +161,7 @@ def _letter(character: str) -> str:
 
 def _span_starts(table: Table) -> list[int]:
     """The first column under each spanning heading."""
-    return [table.labels + before for before in accumulate([number for _, number in table.spans[:-1]], initial=0)] if table.spans else []
+    return [table.labels + offset for offset in accumulate([number for _, number in table.spans[:-1]], initial=0)] if table.spans else []
 
 
 def _plain_value(value: Any) -> Any:

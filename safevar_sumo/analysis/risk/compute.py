@@ -109,7 +109,7 @@ class VariationModel:
         try:
             return np.asarray(np.linalg.cholesky(matrix), dtype=float)
         except np.linalg.LinAlgError:
-            pairs = ", ".join(f"{' and '.join(one.between)} {one.value:g}" for one in correlations)
+            pairs = ", ".join(f"{' and '.join(correlation.between)} {correlation.value:g}" for correlation in correlations)
             raise InputError(self._source, f"correlations contradict each other: {pairs}", "a positive definite matrix") from None
 
 
@@ -126,7 +126,7 @@ FLEET = 1000
 
 
 def fleet_probability(probability: float, vehicles: int) -> float:
-    """Probability that at least one of independent vehicles is unsafe, 1 - (1 - p)^N."""
+    """Probability that at least one of N independent vehicles is unsafe, 1 - (1 - p)^N."""
     return float(-np.expm1(vehicles * np.log1p(-probability))) if probability < 1 else 1.0
 
 
@@ -202,7 +202,7 @@ class Risk:
     def to_frame(self) -> pd.DataFrame:
         """Sensitivity of the safety degree and of the unsafe outcome, one row per output and characteristic; empty if correlated.
 
-        Columns: `output` (safety_degree or unsafe), and those of `sensitivities`.
+        Columns: `output` (safety_degree or unsafe), and the columns of `sensitivities`.
         """
         frames = {SAFETY_DEGREE: self.sensitivity, "unsafe": self.sensitivity_of_unsafe}
         tables = [frame.assign(output=name) for name, frame in frames.items() if frame is not None]
@@ -284,19 +284,19 @@ def _draw_vehicles(evaluator: Evaluator, model: VariationModel, unsafe: Unsafe, 
         probabilities = rng.random((number, len(evaluator.characteristics))) if is_pilot else None
         settings = _feasible_vehicles(evaluator, model, number, rng) if probabilities is None else model.settings(probabilities)
         evaluations = evaluator.evaluate(settings, "vehicles as they vary", offset, requested)
-        valid = int(np.count_nonzero(evaluations.valid))
-        counts.vehicles, counts.errors = counts.vehicles + valid, counts.errors + number - valid
+        valid_vehicles = int(np.count_nonzero(evaluations.valid))
+        counts.vehicles, counts.errors = counts.vehicles + valid_vehicles, counts.errors + number - valid_vehicles
         counts.failures += int(np.count_nonzero(unsafe.of(evaluations)))
         if probabilities is not None:
             is_pilot = False
             values = response.take(scipy.stats.norm.ppf(probabilities), evaluations)
             is_frequent = not options.is_for_rare and counts.failures * (requested / number) >= ENOUGH_FAILURES
-            if valid and counts.failures < RARE_BELOW * valid and not is_frequent:
+            if valid_vehicles and counts.failures < RARE_BELOW * valid_vehicles and not is_frequent:
                 estimate = _rare_estimate(response, values, options, counts, evaluator.study.search.seed)
                 if estimate is not None:
                     return estimate
             elif options.is_for_rare:
-                counts.remark = f"more than {RARE_BELOW:g} of {valid} vehicles are unsafe: plain Monte Carlo is used"
+                counts.remark = f"more than {RARE_BELOW:g} of {valid_vehicles} vehicles are unsafe: plain Monte Carlo is used"
         low, high = clopper_pearson(counts.failures, counts.vehicles, options.confidence) if counts.vehicles else (0.0, 1.0)
         if options.width is not None and high - low <= options.width:
             break

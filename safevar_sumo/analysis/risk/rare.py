@@ -31,7 +31,7 @@ LEVEL_SHARE = 0.1
 LEVEL_SIZE = 1000
 """N: number of vehicles of a level. A block has p0 N vehicles, so that no vehicle continues from another vehicle of its block."""
 REPEATS, VERY_RARE_REPEATS = 4, 8
-"""Number of independent repeats for probabilities from `VERY_RARE_BELOW` on, and below it."""
+"""Number of independent repeats for probabilities of at least `VERY_RARE_BELOW`, and for lower probabilities."""
 VERY_RARE_BELOW = 3e-4
 INFLATION = 1.3
 """Factor on OpenTURNS' coefficient of variation, which assumes that the levels of a subset simulation are independent: over 240
@@ -53,7 +53,7 @@ PATH_POINTS = 9
 COMPARED_FAILURES = 14
 """Maximum number of failures that are compared pairwise."""
 SEARCH_SETTINGS = 100
-"""Number of settings around the design point in each round of the search for it."""
+"""Number of settings around the design point in each round of its search."""
 SEARCH_ROUNDS = 4
 SettingsFunction = Callable[[FloatArray], FloatArray]
 """Turns points of standard normal space into settings."""
@@ -118,7 +118,7 @@ def openturns() -> Any:
     Raises
     ------
     InputError
-        If it is not installed.
+        If OpenTURNS is not installed.
     """
     try:
         import openturns
