@@ -36,7 +36,7 @@ def bmw() -> Plant:
     p = parameters_vehicle2()
     plant = plant_of(p.m * ONE, p.m, LEVEL, radius=p.R_w, wheel_inertia=p.I_y_w, friction=p.tire.p_dx1,
                      brake_torque=9 * p.m * p.R_w, brake_front=p.T_sb, drive_front=p.T_se)
-    return plant._replace(sprung=p.m_s * ONE, unsprung=p.m_uf * ONE, height=p.h_s * ONE)
+    return plant._replace(sprung_mass=p.m_s * ONE, unsprung_mass=p.m_uf * ONE, height=p.h_s * ONE)
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -63,7 +63,7 @@ def stopping_distance(study: str, speed: float, road: float, **changes: float) -
     """Full braking of the second model's vehicle, from when the brake acts [m]."""
     setting = {name: row.original * ONE for name, row in load_study(study).vehicle.characteristics.items()}
     second = second_system(load_study(study))[1].vehicle
-    plant = second.prepare({**setting, **{name: value * ONE for name, value in changes.items()}}, road, 0.05).represented.plant
+    plant = second.prepare({**setting, **{name: value * ONE for name, value in changes.items()}}, road, 0.05).parameters.plant
     body, way = at_speed(plant, speed * ONE), 0.0
     while body.speed[0] > 0:
         before, body = body.speed[0], advance(plant, body, ONE, 0 * ONE, 1e-3)
@@ -93,21 +93,21 @@ def test_at_the_limit_the_anti_lock_controller_uses_the_friction(friction: float
 @pytest.mark.parametrize("name", VEHICLES)
 def test_every_characteristic_is_in_the_table_or_outside_and_acts_as_the_table_says(name: str) -> None:
     study = load_study(TABLES[name].study)
-    system, second, declared = second_system(study)
-    assert declared.name == name
-    assert declared.table.names | set(declared.table.outside) == set(VEHICLES[name].UNITS)
+    system, second, mapping = second_system(study)
+    assert mapping.name == name
+    assert mapping.table.names | set(mapping.table.outside) == set(VEHICLES[name].UNITS)
     original = {one.name: one.original * ONE for one in system.characteristics}
 
     def constants(**changes: float) -> list[float]:
         prepared = second.vehicle.prepare({**original, **{key: value * ONE for key, value in changes.items()}}, 0.8, 0.05, LEVEL, True)
         sensors = second.vehicle.sensors(prepared) or ()
-        flat = [*prepared.represented.plant, *prepared.represented[1:], prepared.engine_mass, *sensors]
+        flat = [*prepared.parameters.plant, *prepared.parameters[1:], prepared.engine_mass, *sensors]
         return [float(value) for part in flat for value in part.ravel()]
 
     for member in system.characteristics:
         value = member.lower if member.lower != member.original else member.upper
-        assert (constants(**{member.name: value}) != constants()) == (member.name in declared.table.names), member.name
-    rows = {row.characteristic: row.unit for row in declared.table.rows}
+        assert (constants(**{member.name: value}) != constants()) == (member.name in mapping.table.names), member.name
+    rows = {row.characteristic: row.unit for row in mapping.table.rows}
     assert rows.items() <= VEHICLES[name].UNITS.items()
 
 

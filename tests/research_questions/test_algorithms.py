@@ -13,7 +13,7 @@ from safevar_sumo.analysis.research_questions.algorithm_figures import attainmen
 from safevar_sumo.analysis.research_questions.algorithms import attainment, critical_difference, pairs, ranks
 from safevar_sumo.analysis.research_questions.answer import answer
 from safevar_sumo.analysis.research_questions.case import Case, Unanswerable
-from safevar_sumo.analysis.research_questions.comparisons import compare_samples, from_other_side
+from safevar_sumo.analysis.research_questions.comparisons import compare_samples, reverse_effect
 from safevar_sumo.analysis.research_questions.over_runs import holm
 from safevar_sumo.analysis.research_questions.tables import FORMATS_WITH_LAYOUT
 from tests.research_questions.made_up import made_up, made_up_study, row
@@ -41,7 +41,7 @@ def test_every_pair_is_tested_once_and_corrected_for_all() -> None:
     assert set(zip(frame["algorithm"], frame["other"], strict=True)) == {("nsga2", "spea2"), ("nsga2", "mocell"), ("spea2", "mocell")}
     means = {name: [group["safety_degree"].mean() for _, group in case.solutions_of(name).groupby("run")] for name in case.algorithms}
     chosen = frame[(frame["metric"] == "safety_degree") & (frame["algorithm"] == "spea2")].iloc[0]
-    expected = from_other_side(compare_samples(means["spea2"], means["mocell"]))
+    expected = reverse_effect(compare_samples(means["spea2"], means["mocell"]))
     assert (chosen["p_value"], chosen["effect_size"]) == (expected.p_value, expected.effect_size)
     assert (chosen["n1"], chosen["n2"]) == (RUNS, RUNS - 1)
     assert chosen["effect_size"] == 1, "every run of SPEA2 is more unsafe"

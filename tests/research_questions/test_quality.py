@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from safevar_sumo.analysis.research_questions.comparisons import ASYMPTOTIC, EXACT, TwoSampleTest, compare_samples, magnitude
+from safevar_sumo.analysis.research_questions.comparisons import ASYMPTOTIC_TEST, EXACT_TEST, TwoSampleTest, compare_samples, magnitude
 from safevar_sumo.analysis.research_questions.indicators import (
     Scale,
     convergence,
@@ -128,7 +128,7 @@ def test_p_is_never_undefined(x: list[float], y: list[float]) -> None:
 def test_exact_p_of_separated_samples_is_two_orders_of_all(size: int) -> None:
     result = compare_samples(np.arange(size), 100 + np.arange(size))
     assert result.p_value == pytest.approx(2 / math.comb(2 * size, size))
-    assert (result.effect_size, result.magnitude, result.method) == (0, "large", EXACT)
+    assert (result.effect_size, result.magnitude, result.method) == (0, "large", EXACT_TEST)
 
 
 def test_p_with_ties_is_the_corrected_normal_approximation() -> None:
@@ -140,7 +140,7 @@ def test_p_with_ties_is_the_corrected_normal_approximation() -> None:
     sigma = math.sqrt(n1 * n2 / 12 * (n + 1 - np.sum(ties**3 - ties) / (n * (n - 1))))
     expected = math.erfc((abs(u - n1 * n2 / 2) - 0.5) / sigma / math.sqrt(2))
     assert compare_samples(x, y).p_value == pytest.approx(expected)
-    assert compare_samples(x, y).method == ASYMPTOTIC
+    assert compare_samples(x, y).method == ASYMPTOTIC_TEST
 
 
 def test_an_empty_sample_is_undefined_not_zero() -> None:

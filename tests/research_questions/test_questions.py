@@ -93,7 +93,7 @@ def test_rq2_of_imported_solutions_leaves_the_fronts_open() -> None:
     assert any("need runs" in note for note in result.notes)
 
 
-@pytest.mark.parametrize(("rows", "expected"), [([row("rs")], "no finished run of nsga2"), ([row()], "nsga2 alone"),
+@pytest.mark.parametrize(("rows", "expected"), [([row("rs")], "no finished run of nsga2"), ([row()], "only nsga2"),
                                                    ([], "no finished run")])
 def test_rq2_without_an_algorithm_is_refused(rows: list[dict[str, Any]], expected: str) -> None:
     with pytest.raises(InputError, match=expected):
@@ -188,7 +188,7 @@ def test_every_question_at_once_tells_what_is_lacking() -> None:
     result = {one.name: one for one in answer([made_up(row(values=HEAVY))])}
     assert not result["rq1"].frame.empty
     assert result["rq2"].frame.empty
-    assert "nsga2 alone" in result["rq2"].notes[0]
+    assert "only nsga2" in result["rq2"].notes[0]
     assert result["weather"].frame.empty
     with pytest.raises(InputError, match="no finished run"):
         answer([made_up()])
@@ -209,7 +209,7 @@ def test_the_brief_lines_say_what_the_data_allows() -> None:
     lines = summary_lines(five)
     assert any("NSGA-II: SD 0.00, " in line and line.endswith("too few runs for a test (8 are needed)") for line in lines)
     assert any("RS: IGD " in line and "too few" not in line for line in lines), "five runs against five can differ significantly"
-    assert any("RQ2 over runs: has finished runs of nsga2 alone" in line for line in summary_lines(made_up(row())))
+    assert any("RQ2 over runs: only nsga2 has finished runs" in line for line in summary_lines(made_up(row())))
 
 
 def test_holms_correction_of_a_worked_example() -> None:

@@ -205,7 +205,7 @@ def test_the_original_vehicle_and_the_line_of_collisions_are_in_the_fronts(case:
     for axis, marked in zip(pareto_fronts(case).axes, (True, True, False), strict=True):
         output = {str(line.get_label()): line for line in axis.lines}
         assert float(output["original vehicle"].get_xdata()[0]) == (case.original["safety_degree"] if marked else 0.0)  # type: ignore[index,arg-type]
-        assert ("collision: 0 and left of it" in output) == marked
+        assert ("collision: 0 or less" in output) == marked
 
 
 def _check_layout(figure: Figure, name: str) -> None:

@@ -1,4 +1,4 @@
-"""Does another vehicle model confirm the failures: is each minimal cause unsafe with it too?
+"""Does another vehicle model confirm the failures: is each minimal cause unsafe with that model too?
 
 The options and the function of the library are defined here, so that a command's help can be shown without loading the computation.
 """
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class OpinionOptions(Options):
-    """Failures that are driven again with the second vehicle model."""
+    """Options for the failures that the second vehicle model simulates again."""
 
     question: ClassVar[str] = "opinion"
     solutions: tuple[str, ...] = option(
@@ -33,8 +33,8 @@ class OpinionOptions(Options):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        named = (name.strip() for text in self.solutions for name in text.split(","))
-        object.__setattr__(self, "solutions", tuple(dict.fromkeys(named)))
+        handles = (name.strip() for text in self.solutions for name in text.split(","))
+        object.__setattr__(self, "solutions", tuple(dict.fromkeys(handles)))
 
 
 @documented(OpinionOptions)

@@ -13,7 +13,7 @@ from safevar_sumo.analysis.explain import ExplainOptions
 from safevar_sumo.analysis.explain.causes import RESOLUTION, boundaries
 from safevar_sumo.analysis.explain.compute import chosen_failures
 from safevar_sumo.analysis.opinion import OpinionOptions
-from safevar_sumo.analysis.opinion.mapping import Declared, declared_of
+from safevar_sumo.analysis.opinion.mapping import VehicleMapping, mapping_of
 from safevar_sumo.analysis.opinion.multi_body import commonroad
 from safevar_sumo.analysis.opinion.result import Opinion, Opinions, OpinionVerdict, RunEnd
 from safevar_sumo.analysis.opinion.second_vehicle import SecondVehicle
@@ -26,13 +26,13 @@ from safevar_sumo.sumo.matrix import evaluate
 from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.workers.evaluation import Pool
 
-LIMIT = 12_000
-"""Approximate number of simulations for the minimal causes, as for a report."""
-BELOW = np.array([RESOLUTION, 2 * RESOLUTION, 0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0])
-"""Relative reductions of a cause's boundary at which its nearest safe neighbour is searched."""
+SIMULATION_LIMIT = 12_000
+"""Approximate number of simulations that search the minimal causes, the same as for a report."""
+REDUCTIONS = np.array([RESOLUTION, 2 * RESOLUTION, 0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0])
+"""Relative reductions below a cause's boundary at which its nearest safe neighbour is searched."""
 
 LADDER = np.arange(1, 10) / 10
-"""Shares of a cause's changes at which the second model is tried, to find where it begins to be unsafe."""
+"""Shares of a cause's changes that the second model simulates, to locate where they become unsafe."""
 
 
 class JudgedCause(NamedTuple):
@@ -50,10 +50,10 @@ class Neighbour(NamedTuple):
     share: float
 
 
-def second_system(study: Study) -> tuple[System, System, Declared]:
-    """A study's system, the same system with the second vehicle model, and that model's representation of the vehicle.
+def second_system(study: Study) -> tuple[System, System, VehicleMapping]:
+    """A study's system, the same system with the second vehicle model, and the vehicle's mapping to that model.
 
-    The driving system is the same, including its knowledge of our original vehicle.
+    Both have the same driving system, including its knowledge of our original vehicle.
 
     Raises
     ------
@@ -62,8 +62,8 @@ def second_system(study: Study) -> tuple[System, System, Declared]:
     """
     commonroad()
     system = assemble(study)
-    declared = declared_of(study, system.vehicle)
-    return system, replace(system, vehicle=SecondVehicle(system.vehicle, declared, study)), declared
+    mapping = mapping_of(study, system.vehicle)
+    return system, replace(system, vehicle=SecondVehicle(system.vehicle, mapping, study)), mapping
 
 
 def ask_for_opinions(source: Study | Case, options: OpinionOptions, *, pool: Pool | None = None, jobs: int | None = None,
@@ -79,94 +79,96 @@ def ask_for_opinions(source: Study | Case, options: OpinionOptions, *, pool: Poo
         raise InputError(source.origin.called or source.name, "is a study and has no solutions",
                          "a directory that the command study has written")
     second_system(source.study)
-    explain_options = ExplainOptions(solutions=options.solutions, unsafe=options.unsafe, limit=LIMIT)
+    explain_options = ExplainOptions(solutions=options.solutions, unsafe=options.unsafe, limit=SIMULATION_LIMIT)
     with open_evaluator(source.study, pool, jobs, progress) as evaluator:
-        chosen = chosen_failures(source, explain_options, evaluator)
-        minimal = [(str(chosen.failures.handles[row]), cause) for row in chosen.reasons for cause in chosen.causes[row]]
-        limits = boundaries(evaluator, [cause for _, cause in minimal], chosen.failures.unsafe)
+        selection = chosen_failures(source, explain_options, evaluator)
+        minimal_causes = [(str(selection.failures.handles[row]), cause) for row in selection.reasons for cause in selection.causes[row]]
+        limits = boundaries(evaluator, [cause for _, cause in minimal_causes], selection.failures.unsafe)
     names = evaluator.characteristics.names
     causes = [JudgedCause(handle, {names[column]: float(cause.setting[column]) for column in cause.columns}, limit.fraction)
-              for (handle, cause), limit in zip(minimal, limits, strict=True)]
-    opinions = opinions_of(source.study, causes, chosen.failures.unsafe, progress)
-    return replace(opinions, without_cause=tuple(str(chosen.failures.handles[row]) for row in chosen.reasons if not chosen.causes[row]))
+              for (handle, cause), limit in zip(minimal_causes, limits, strict=True)]
+    opinions = opinions_of(source.study, causes, selection.failures.unsafe, progress)
+    return replace(opinions, without_cause=tuple(str(selection.failures.handles[row])
+                                                 for row in selection.reasons if not selection.causes[row]))
 
 
 def opinions_of(study: Study, causes: Sequence[JudgedCause], unsafe: Unsafe, progress: Progress = silent) -> Opinions:
     """The second model's opinions on minimal causes; raises as `second_system`."""
-    system, second, declared = second_system(study)
+    system, second, mapping = second_system(study)
     members = system.characteristics
     settings = np.stack([members.original, *(members.setting(cause.changes, "cause", beyond=True) for cause in causes)])
     stage, number = "second vehicle model", len(settings)
     progress(stage, 0, number)
-    here = evaluate(system, settings)
+    our_runs = evaluate(system, settings)
     neighbours = _neighbours(system, causes, settings[1:], unsafe)
-    scaled = members.original + LADDER[:, np.newaxis, np.newaxis] * (settings[1:] - members.original)
-    beside = np.stack([one.setting for one in neighbours]) if neighbours else settings[1:]
-    there = evaluate(second, np.concatenate([settings, beside, scaled.reshape(-1, len(members))]))
+    scaled_settings = members.original + LADDER[:, np.newaxis, np.newaxis] * (settings[1:] - members.original)
+    neighbour_settings = np.stack([neighbour.setting for neighbour in neighbours]) if neighbours else settings[1:]
+    second_runs = evaluate(second, np.concatenate([settings, neighbour_settings, scaled_settings.reshape(-1, len(members))]))
     progress(stage, number, number)
-    ends_here, ends_there = ([_end(evaluations, row) for row in range(number)] for evaluations in (here, there))
-    fails_here, fails_there = unsafe.of(here), unsafe.of(there)
-    original = _Original(ends_here[0], ends_there[0], bool(fails_here[0]), bool(fails_there[0] or not there.valid[0]))
-    fails_beside = fails_there[number:number + len(causes)]
-    fails_scaled = fails_there[number + len(causes):].reshape(len(LADDER), len(causes))
+    our_ends, second_ends = ([_end(evaluations, row) for row in range(number)] for evaluations in (our_runs, second_runs))
+    fails_ours, fails_second = unsafe.of(our_runs), unsafe.of(second_runs)
+    original = _Original(our_ends[0], second_ends[0], bool(fails_ours[0]), bool(fails_second[0] or not second_runs.valid[0]))
+    neighbour_fails = fails_second[number:number + len(causes)]
+    scaled_fails = fails_second[number + len(causes):].reshape(len(LADDER), len(causes))
     opinions = []
     for k, (cause, neighbour) in enumerate(zip(causes, neighbours, strict=True)):
-        words = (f"The nearest setting that is safe with our model, {neighbour.share:.1%} of the changes, is "
-                 f"{'unsafe' if fails_beside[k] else 'safe'} with the second: with it {_first_unsafe_step(fails_scaled[:, k])} of the "
-                 f"changes are enough, with ours {cause.fraction:.1%}.")
-        fails = bool(fails_there[k + 1]) if there.valid[k + 1] else None
-        opinions.append(_opinion(cause, declared, original, ends_here[k + 1], ends_there[k + 1], fails, words))
-    return Opinions(study=study, unsafe=unsafe, opinions=tuple(opinions), original_here=ends_here[0], original_there=ends_there[0])
+        comparison = (f"The nearest setting that is safe with our model, {neighbour.share:.1%} of the changes, is "
+                      f"{'unsafe' if neighbour_fails[k] else 'safe'} with the second. {_first_unsafe_step(scaled_fails[:, k])} of the "
+                      f"changes are enough with the second model, {cause.fraction:.1%} with ours.")
+        fails = bool(fails_second[k + 1]) if second_runs.valid[k + 1] else None
+        opinions.append(_opinion(cause, mapping, original, our_ends[k + 1], second_ends[k + 1], fails, comparison))
+    return Opinions(study=study, unsafe=unsafe, opinions=tuple(opinions), original_here=our_ends[0], original_there=second_ends[0])
 
 
 def _first_unsafe_step(fails: BoolArray) -> str:
-    """The step of the ladder within which a cause begins to be unsafe."""
-    safe = np.flatnonzero(~fails)
-    below = LADDER[safe[-1]] if len(safe) else 0.0
-    return f"{below:.0%} to {below + LADDER[0]:.0%}"
+    """The step of the ladder within which a cause becomes unsafe."""
+    safe_steps = np.flatnonzero(~fails)
+    lower_share = LADDER[safe_steps[-1]] if len(safe_steps) else 0.0
+    return f"{lower_share:.0%} to {lower_share + LADDER[0]:.0%}"
 
 
 class _Original(NamedTuple):
-    """How the original vehicle's run ends with both models, and whether it is unsafe."""
+    """How the original vehicle's run ends with each model, and whether that run is unsafe."""
 
-    here: RunEnd
-    there: RunEnd
-    fails_here: bool
-    fails_there: bool
+    our_end: RunEnd
+    second_end: RunEnd
+    fails_ours: bool
+    fails_second: bool
 
 
-def _opinion(cause: JudgedCause, declared: Declared, original: _Original, here: RunEnd, there: RunEnd, fails: bool | None,
+def _opinion(cause: JudgedCause, mapping: VehicleMapping, original: _Original, our_end: RunEnd, second_end: RunEnd, fails: bool | None,
              neighbour: str) -> Opinion:
-    """The opinion on a cause; `fails` states whether it is unsafe with the second model, None if it could not be simulated."""
-    def says(verdict: OpinionVerdict, because: str, there: RunEnd = there) -> Opinion:
-        return Opinion(solution=cause.solution, changes=dict(cause.changes), here=here, there=there, opinion=verdict, because=because)
+    """The opinion on a cause; `fails` states whether the cause is unsafe with the second model, None if it could not be simulated."""
+    def judge(verdict: OpinionVerdict, reason: str, second_end: RunEnd = second_end) -> Opinion:
+        return Opinion(solution=cause.solution, changes=dict(cause.changes), here=our_end, there=second_end, opinion=verdict,
+                       because=reason)
 
-    if outside := declared.outside(cause.changes):
-        return says(OpinionVerdict.OUTSIDE, "; ".join(outside), RunEnd())
-    if original.fails_here:
-        return says(OpinionVerdict.OUTSIDE, "the original vehicle itself is unsafe: no change causes anything")
-    if original.fails_there:
-        return says(OpinionVerdict.OUTSIDE, f"the original vehicle itself is not safe with the second model: {original.there}")
+    if reasons := mapping.outside(cause.changes):
+        return judge(OpinionVerdict.OUTSIDE, "; ".join(reasons), RunEnd())
+    if original.fails_ours:
+        return judge(OpinionVerdict.OUTSIDE, "the original vehicle itself is unsafe, so that no change is a cause")
+    if original.fails_second:
+        return judge(OpinionVerdict.OUTSIDE, f"the original vehicle itself is not safe with the second model: {original.second_end}")
     if fails is None:
-        return says(OpinionVerdict.OUTSIDE, f"it could not be simulated with the second model: {there}")
+        return judge(OpinionVerdict.OUTSIDE, f"it could not be simulated with the second model: {second_end}")
     if fails:
-        return says(OpinionVerdict.CONFIRMED,
-                    f"also unsafe with the second: {there}; its original vehicle is safe: {original.there}. {neighbour}")
-    return says(OpinionVerdict.CONTRADICTED, f"safe with the second: {there}; its original vehicle: {original.there}")
+        return judge(OpinionVerdict.CONFIRMED,
+                    f"also unsafe with the second model: {second_end}; the original vehicle is safe: {original.second_end}. {neighbour}")
+    return judge(OpinionVerdict.CONTRADICTED, f"safe with the second model: {second_end}; the original vehicle: {original.second_end}")
 
 
 def _neighbours(system: System, causes: Sequence[JudgedCause], settings: FloatArray, unsafe: Unsafe) -> list[Neighbour]:
-    """For each cause, the first setting below its boundary that is safe with our model; the original if no other is."""
+    """For each cause, the first setting below its boundary that is safe with our model; the original setting if there is none."""
     if not causes:
         return []
     original = system.characteristics.original
-    shares = np.array([cause.fraction * (1 - BELOW) for cause in causes])
+    shares = np.array([cause.fraction * (1 - REDUCTIONS) for cause in causes])
     candidates = original + shares[..., np.newaxis] * (settings - original)[:, np.newaxis]
     evaluations = evaluate(system, candidates.reshape(-1, len(original)))
-    safe = (evaluations.valid & ~unsafe.of(evaluations)).reshape(shares.shape)
-    safe[:, -1] = True
-    first = np.argmax(safe, axis=1)
-    return [Neighbour(candidates[k, at], float(shares[k, at])) for k, at in enumerate(first.tolist())]
+    is_safe = (evaluations.valid & ~unsafe.of(evaluations)).reshape(shares.shape)
+    is_safe[:, -1] = True
+    indices = np.argmax(is_safe, axis=1)
+    return [Neighbour(candidates[k, index], float(shares[k, index])) for k, index in enumerate(indices.tolist())]
 
 
 def _end(evaluations: Evaluations, row: int) -> RunEnd:

@@ -1,6 +1,6 @@
 """How each characteristic of our vehicles is represented by parameters of the second model, with units and equations.
 
-Each shipped vehicle has a table; the second model cannot represent characteristics that have no row in it.
+Each shipped vehicle has a table; the second model cannot represent characteristics without a row in that table.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from safevar_sumo.vehicles.sumo import SumoVehicle
 from safevar_sumo.vehicles.worn import WornVehicle
 
 CM = 0.01  # m
-SENSORS, SAME = "the same sensors before the driving system", "as here"
+SENSOR_PARAMETER, SAME_EQUATION = "the same sensors before the driving system", "as here"
 
 
 class MapRow(NamedTuple):
@@ -36,12 +36,12 @@ class MapRow(NamedTuple):
     equation: str
 
 
-class Represented(NamedTuple):
-    """Vehicles as parameters of the second model.
+class SecondParameters(NamedTuple):
+    """N vehicles as parameters of the second model.
 
     `brake_delay` [s], `brake_rise`, `brake_fall` [1/s] and `brake_lag` [s] lead from the brake's command to its torque: a dead time, rates,
-    a first-order lag. Resistances in addition to the original vehicle's: `drag` [N s/m], `air_drag` [N s^2/m^2] and `wheel_damping` of all
-    wheels [N m s]. `drive` is the engine's torque over that of the original vehicle.
+    a first-order lag. `drag` [N s/m], `air_drag` [N s^2/m^2] and `wheel_damping` of all wheels [N m s] are resistances in addition to those
+    of the original vehicle. `drive` is the engine's torque divided by the original engine's.
     """
 
     plant: Plant
@@ -56,21 +56,21 @@ class Represented(NamedTuple):
 
 
 Surface = tuple[Any, Slope, bool | BoolArray]
-"""The road's factor on friction, its slope, whether it is wet."""
+"""Friction factor of the road, slope of the road, whether the road is wet."""
 
 
-def _represented(plant: Plant, **others: Any) -> Represented:
+def _parameters_of(plant: Plant, **values: Any) -> SecondParameters:
     defaults: dict[str, Any] = {"brake_delay": 0.0, "brake_rise": np.inf, "brake_fall": np.inf, "brake_lag": 0.0, "drag": 0.0,
                                 "air_drag": 0.0, "wheel_damping": 0.0, "drive": 1.0}
     ones = np.ones_like(plant.mass)
-    return Represented(plant, **{name: np.asarray(value, dtype=float) * ones for name, value in {**defaults, **others}.items()})
+    return SecondParameters(plant, **{name: np.asarray(value, dtype=float) * ones for name, value in {**defaults, **values}.items()})
 
 
-def _worn(vehicle: WornVehicle, c: Characteristics, original: Mapping[str, float], surface: Surface) -> Represented:
+def _worn(vehicle: WornVehicle, c: Characteristics, original: Mapping[str, float], surface: Surface) -> SecondParameters:
     p, (_, slope, _) = commonroad(), surface
     prepared = vehicle.prepare(c, surface[0], 1.0, *surface[1:])
     mass = vehicle.kerb_mass + original["payload"]
-    return _represented(
+    return _parameters_of(
         plant_of(prepared.mass, vehicle.kerb_mass, slope, centre=prepared.rear_load * vehicle.wheelbase, wheelbase=vehicle.wheelbase,
                  height=vehicle.centre_height, radius=p.R_w, wheel_inertia=p.I_y_w, friction=prepared.grip,
                  brake_front=vehicle.front_share, drive_front=p.T_se, brake_torque=_torque(c["brakeTorque"] * vehicle.brake_force, mass)),
@@ -78,15 +78,15 @@ def _worn(vehicle: WornVehicle, c: Characteristics, original: Mapping[str, float
 
 
 def _torque(force: FloatArray, mass: float) -> FloatArray:
-    """The torque at all wheels that brakes a vehicle of this mass like a force on its body; it has to stop the wheels as well."""
+    """The torque of all wheels [N m] that brakes a vehicle of this mass like a force on its body [N]; the torque also stops the wheels."""
     p = commonroad()
     return np.asarray(force * p.R_w * (1 + WHEELS * p.I_y_w / (mass * p.R_w**2)))
 
 
-def _carla(vehicle: Carla, c: Characteristics, original: Mapping[str, float], surface: Surface) -> Represented:
+def _carla(vehicle: Carla, c: Characteristics, original: Mapping[str, float], surface: Surface) -> SecondParameters:
     friction, slope, _ = surface
     radius = CM * c["radius"]
-    return _represented(
+    return _parameters_of(
         plant_of(c["mass"], original["mass"], slope, radius=radius, wheel_inertia=0.5 * WHEEL_MASS * radius**2,
                  friction=c["tireFric"] * vehicle.tyre_friction * friction, brake_torque=WHEELS * c["maxBrakeTorque"], brake_front=0.5,
                  drive_front=0.5),
@@ -95,10 +95,10 @@ def _carla(vehicle: Carla, c: Characteristics, original: Mapping[str, float], su
         wheel_damping=WHEELS * (c["dampRate"] - original["dampRate"]))
 
 
-def _lgsvl(vehicle: Lgsvl, c: Characteristics, original: Mapping[str, float], surface: Surface) -> Represented:
+def _lgsvl(vehicle: Lgsvl, c: Characteristics, original: Mapping[str, float], surface: Surface) -> SecondParameters:
     friction, slope, _ = surface
     wheels = WHEELS * vehicle.wheel_mass_share
-    return _represented(
+    return _parameters_of(
         plant_of(c["mass"] + wheels * c["wheelMass"], original["mass"] + wheels * original["wheelMass"], slope,
                  radius=c["radius"], wheel_inertia=0.5 * c["wheelMass"] * c["radius"]**2, friction=FRICTION * friction,
                  brake_torque=WHEELS * c["maxBrakeTorque"], brake_front=0.5, drive_front=0.5),
@@ -106,10 +106,10 @@ def _lgsvl(vehicle: Lgsvl, c: Characteristics, original: Mapping[str, float], su
         wheel_damping=WHEELS * vehicle.wheel_damping_share * (c["wheelDamping"] - original["wheelDamping"]))
 
 
-def _sumo(vehicle: SumoVehicle, c: Characteristics, original: Mapping[str, float], surface: Surface) -> Represented:
+def _sumo(vehicle: SumoVehicle, c: Characteristics, original: Mapping[str, float], surface: Surface) -> SecondParameters:
     p, (friction, slope, _) = commonroad(), surface
     force = vehicle.reference_mass * c["decel"] * c["brakeGain"]
-    return _represented(
+    return _parameters_of(
         plant_of(c["mass"], original["mass"], slope, radius=p.R_w, wheel_inertia=p.I_y_w,
                  friction=vehicle.tyre_friction * friction, brake_front=p.T_sb, drive_front=p.T_se,
                  brake_torque=_torque(force, original["mass"])),
@@ -117,12 +117,12 @@ def _sumo(vehicle: SumoVehicle, c: Characteristics, original: Mapping[str, float
 
 
 class MappingTable(NamedTuple):
-    """The declared table of a shipped vehicle.
+    """The mapping of a shipped vehicle.
 
     Attributes
     ----------
     study
-        A shipped study with the vehicle; it supplies parameters that your own vehicle lacks.
+        A shipped study with the vehicle; the study supplies parameters that your own vehicle lacks.
     rows
         The characteristics that the second model represents.
     outside
@@ -134,7 +134,7 @@ class MappingTable(NamedTuple):
     study: str
     rows: tuple[MapRow, ...]
     outside: Mapping[str, str]
-    represent: Callable[[Any, Characteristics, Mapping[str, float], Surface], Represented]
+    represent: Callable[[Any, Characteristics, Mapping[str, float], Surface], SecondParameters]
 
     @property
     def names(self) -> frozenset[str]:
@@ -142,17 +142,17 @@ class MappingTable(NamedTuple):
         return frozenset(row.characteristic for row in self.rows)
 
 
-ENGINE = "the model takes a torque at the wheels: it has no engine, clutch or gearbox"
-DELAY = "dead time from command to brake torque"
+NO_ENGINE = "the model takes a torque at the wheels: it has no engine, clutch or gearbox"
+DEAD_TIME = "dead time from command to brake torque"
 TABLES: Mapping[str, MappingTable] = {
     "worn": MappingTable("wear", (
         MapRow("treadDepth", "mm", "p_dx1", "-", "p_dx1 = mu, our friction coefficient of tyre, road and tread"),
         MapRow("brakeTorque", "-", "T_B", "N m", "T_B = brakeTorque brake_force R_w (1 + 4 I_y_w / (m_0 R_w^2)), m_0 the original's m"),
-        MapRow("brakeResponse", "s", DELAY, "s", SAME),
+        MapRow("brakeResponse", "s", DEAD_TIME, "s", SAME_EQUATION),
         MapRow("payload", "kg", "m, m_s", "kg", "m = kerb_mass + payload; m_s = m - m_uf - m_ur"),
         MapRow("payloadCentre", "m", "a, b", "m", "a = (m x - m_ur L) / m_s, b = L - a; x common centre from the front axle, L wheelbase"),
-        MapRow("sensorRange", "m", SENSORS, "m", SAME),
-        MapRow("sensorLatency", "s", SENSORS, "s", SAME)), {}, _worn),
+        MapRow("sensorRange", "m", SENSOR_PARAMETER, "m", SAME_EQUATION),
+        MapRow("sensorLatency", "s", SENSOR_PARAMETER, "s", SAME_EQUATION)), {}, _worn),
     "carla": MappingTable("sun", (
         MapRow("mass", "kg", "m, m_s", "kg", "m = mass; m_s = m - m_uf - m_ur"),
         MapRow("tireFric", "-", "p_dx1", "-", "p_dx1 = tireFric tyre_friction f, f the road's factor"),
@@ -160,7 +160,7 @@ TABLES: Mapping[str, MappingTable] = {
         MapRow("maxBrakeTorque", "N m", "T_B", "N m", "T_B = 4 maxBrakeTorque, T_sb = 0.5"),
         MapRow("dampRate", "kg m^2/s", "torque on the wheels", "N m", "-4 (dampRate - original) omega"),
         MapRow("dragCoeff", "-", "torque on the wheels", "N m", "-R_w (dragCoeff - original) rho A v^2 / 2, rho 1.2 kg/m^3, A 2.2 m^2")),
-        dict.fromkeys(("max_rpm", "dampRateFullT", "dampRateZeroT_CE", "dampRateZeroT_CD", "gearSwitchTime", "clutchStrength"), ENGINE),
+        dict.fromkeys(("max_rpm", "dampRateFullT", "dampRateZeroT_CE", "dampRateZeroT_CD", "gearSwitchTime", "clutchStrength"), NO_ENGINE),
         _carla),
     "lgsvl": MappingTable("lgsvl", (
         MapRow("mass", "kg", "m, m_s", "kg", "m = mass + 4 wheel_mass_share wheelMass; m_s = m - m_uf - m_ur"),
@@ -169,24 +169,27 @@ TABLES: Mapping[str, MappingTable] = {
         MapRow("maxBrakeTorque", "N m", "T_B", "N m", "T_B = 4 maxBrakeTorque, T_sb = 0.5"),
         MapRow("tireDragCoeff", "-", "torque on the wheels", "N m", "-R_w (tireDragCoeff - original) v"),
         MapRow("wheelDamping", "kg m^2/s", "torque on the wheels", "N m", "-4 wheel_damping_share (wheelDamping - original) omega")),
-        {**dict.fromkeys(("maxRpm", "minRpm", "maxMotorTorque", "shiftTime", "tractionControlSlipLimit"), ENGINE),
+        {**dict.fromkeys(("maxRpm", "minRpm", "maxMotorTorque", "shiftTime", "tractionControlSlipLimit"), NO_ENGINE),
          "maxSteeringAngle": "the model drives straight here"}, _lgsvl),
     "sumo": MappingTable("native", (
         MapRow("mass", "kg", "m, m_s", "kg", "m = mass; m_s = m - m_uf - m_ur"),
         MapRow("accel", "m/s^2", "T_E", "N m", "T_E = the original's accel / original"),
         MapRow("decel", "m/s^2", "T_B", "N m", "T_B = brakeGain decel reference_mass R_w (1 + 4 I_y_w / (m_0 R_w^2)), m_0 as above"),
         MapRow("brakeGain", "-", "T_B", "N m", "as decel"),
-        MapRow("brakeDelay", "s", DELAY, "s", SAME),
-        MapRow("tau", "s", "first-order lag of the brake torque", "s", SAME),
-        MapRow("sensorRange", "m", SENSORS, "m", SAME),
-        MapRow("reactionTime", "s", SENSORS, "s", SAME)),
+        MapRow("brakeDelay", "s", DEAD_TIME, "s", SAME_EQUATION),
+        MapRow("tau", "s", "first-order lag of the brake torque", "s", SAME_EQUATION),
+        MapRow("sensorRange", "m", SENSOR_PARAMETER, "m", SAME_EQUATION),
+        MapRow("reactionTime", "s", SENSOR_PARAMETER, "s", SAME_EQUATION)),
         {"maxSpeed": "the model has no governor"}, _sumo),
 }
 """Tables by the names of shipped vehicles."""
 
 
-class Declared(NamedTuple):
-    """Representation of a study's vehicle: the table of the shipped vehicle that it is or derives from, with its own parameters."""
+class VehicleMapping(NamedTuple):
+    """Mapping of a study's vehicle: the table of its shipped vehicle or base class, with the parameters of the study's vehicle.
+
+    `foreign` lists characteristics whose name or unit the shipped vehicle does not have.
+    """
 
     name: str
     vehicle: Any
@@ -199,23 +202,24 @@ class Declared(NamedTuple):
                 if name not in self.table.names or name in self.foreign]
 
 
-def declared_of(study: Study, vehicle: Any) -> Declared:
-    """The table for a study's vehicle: a shipped vehicle, a class derived from one, or your own with all characteristics of one.
+def mapping_of(study: Study, vehicle: Any) -> VehicleMapping:
+    """The mapping of a study's vehicle: a shipped vehicle, a class derived from one, or your own with all characteristics of a shipped one.
 
     Raises
     ------
     InputError
-        If there is no table for it.
+        If no table fits the vehicle.
     """
-    own = vehicle.model if isinstance(vehicle, GuardedVehicle) else vehicle
+    model = vehicle.model if isinstance(vehicle, GuardedVehicle) else vehicle
     units = {name: row.unit for name, row in study.vehicle.characteristics.items()}
-    for name, kind in [*((name, kind) for name, kind in VEHICLES.items() if isinstance(own, kind)),
-                       *((name, kind) for name, kind in VEHICLES.items() if kind.UNITS.items() <= units.items())]:
+    for name, cls in [*((name, cls) for name, cls in VEHICLES.items() if isinstance(model, cls)),
+                      *((name, cls) for name, cls in VEHICLES.items() if cls.UNITS.items() <= units.items())]:
         table = TABLES[name]
-        shipped = load_study(table.study).vehicle.parameters
-        parameters = {one.name: getattr(own, one.name, study.vehicle.parameters.get(one.name, shipped.get(one.name, one.default)))
-                      for one in msgspec.structs.fields(kind)}
-        return Declared(name, kind(**parameters), table, tuple(key for key, unit in units.items() if kind.UNITS.get(key) != unit))
-    allowed = f"one of {', '.join(TABLES)}, a class derived from one, or one with the same characteristics in the same units"
+        defaults = load_study(table.study).vehicle.parameters
+        parameters = {field.name: getattr(
+            model, field.name, study.vehicle.parameters.get(field.name, defaults.get(field.name, field.default)))
+            for field in msgspec.structs.fields(cls)}
+        return VehicleMapping(name, cls(**parameters), table, tuple(key for key, unit in units.items() if cls.UNITS.get(key) != unit))
+    alternatives = f"one of {', '.join(TABLES)}, a class derived from one, or one with the same characteristics in the same units"
     problem = f"vehicle.model = {study.vehicle.model!r} with {', '.join(units)} is no vehicle that the second model can represent"
-    raise InputError(study.source, problem, allowed)
+    raise InputError(study.source, problem, alternatives)

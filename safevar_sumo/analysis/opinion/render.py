@@ -21,15 +21,15 @@ def print_opinions(console: Console, result: Opinions) -> None:
     print_text(console, f"The original vehicle with our model: {result.original_here}; with the second: {result.original_there}.")
     for handle in result.without_cause:
         print_text(console, f"note: {handle} is not unsafe: it has no cause")
-    for one in result.opinions:
-        line = plain(f"{one.solution}: " if one.solution else "").append(str(one.opinion), STYLES[one.opinion])
-        console.print(line.append(plain(f": {list_of_changes(members, one.changes)}")), soft_wrap=True, highlight=False)
-        print_text(console, f"  with our model {one.here}; {one.because}")
+    for opinion in result.opinions:
+        line = plain(f"{opinion.solution}: " if opinion.solution else "").append(str(opinion.opinion), STYLES[opinion.opinion])
+        console.print(line.append(plain(f": {list_of_changes(members, opinion.changes)}")), soft_wrap=True, highlight=False)
+        print_text(console, f"  with our model {opinion.here}; {opinion.because}")
 
 
 def opinion_in_words(result: Opinions) -> str:
-    """A sentence on the number of causes with each verdict."""
+    """A sentence with the number of causes for each verdict."""
     if not result.opinions:
         return "there is no cause to judge."
-    parts = [f"{result.count(one)} {one}" for one in OpinionVerdict if result.count(one)]
+    parts = [f"{result.count(verdict)} {verdict}" for verdict in OpinionVerdict if result.count(verdict)]
     return f"of {number_of(len(result.opinions), 'minimal cause')} {joined(parts)}."

@@ -23,7 +23,7 @@ class OpinionVerdict(StrEnum):
 
 
 class RunEnd(NamedTuple):
-    """How a run ends: outcome and safety degree [m, or -m/s]; None if it was not driven, or has no safety degree."""
+    """How a run ends: outcome and safety degree [m, or -m/s]; None if the run was not driven or has no safety degree."""
 
     outcome: str | None = None
     safety_degree: float | None = None
@@ -50,7 +50,7 @@ class Opinion:
     changes
         The cause: values by name, in their units.
     here, there
-        How the run with these changes ends with our model and with the second one.
+        How the run with these changes ends: `here` with our model, `there` with the second model.
     opinion, because
         The verdict, and its reason in a sentence or two.
     """
@@ -77,9 +77,9 @@ class Opinions:
     opinions
         One for each minimal cause of each failure.
     original_here, original_there
-        How the original vehicle's run ends with both models.
+        How the original vehicle's run ends: `original_here` with our model, `original_there` with the second model.
     without_cause
-        Requested solutions that are not unsafe and so have no cause.
+        Requested solutions that have no cause, because they are not unsafe.
     """
 
     study: Study
@@ -91,15 +91,16 @@ class Opinions:
 
     def count(self, verdict: OpinionVerdict) -> int:
         """Number of causes with this verdict."""
-        return sum(one.opinion == verdict for one in self.opinions)
+        return sum(opinion.opinion == verdict for opinion in self.opinions)
 
     def to_dict(self) -> list[dict[str, Any]]:
         """The JSON of `opinion`."""
-        return [one.to_dict() for one in self.opinions]
+        return [opinion.to_dict() for opinion in self.opinions]
 
     def to_frame(self) -> pd.DataFrame:
         """One row for each cause: `solution`, `changes`, outcome and safety degree `here` and `there`, `opinion`, `because`."""
-        rows = [(one.solution, one.changes, *one.here, *one.there, str(one.opinion), one.because) for one in self.opinions]
+        rows = [(opinion.solution, opinion.changes, *opinion.here, *opinion.there, str(opinion.opinion), opinion.because)
+                for opinion in self.opinions]
         return pd.DataFrame(rows, columns=["solution", "changes", "outcome_here", "safety_degree_here", "outcome_there",
                                            "safety_degree_there", "opinion", "because"])
 

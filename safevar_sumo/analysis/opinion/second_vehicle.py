@@ -1,6 +1,6 @@
-"""The second vehicle model in place of ours: in the same simulation it takes a driving system's commands and returns speeds.
+"""The second vehicle model replaces ours: in the same simulation it takes the driving system's commands and returns speeds.
 
-Its sensors are the study's own; its engine torque is that of our original vehicle, which is simulated beside it with the same pedal at
+Its sensors are the study's; its engine torque comes from our original vehicle, which is simulated in parallel with the same pedal at
 the same speed. Brakes, tyres, axles and body are the second model's.
 """
 
@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from safevar_sumo.analysis.opinion.mapping import Declared, Represented
+from safevar_sumo.analysis.opinion.mapping import SecondParameters, VehicleMapping
 from safevar_sumo.analysis.opinion.multi_body import STEP, WHEELS, MultiBody, advance, at_speed
 from safevar_sumo.records import BoolArray, Command, FloatArray, Observation
 from safevar_sumo.study import Study, load_study
@@ -19,19 +19,20 @@ from safevar_sumo.vehicles import LEVEL, CharacteristicSet, Sensors, Slope, Sumo
 from safevar_sumo.vehicles.base import Characteristics
 from safevar_sumo.vehicles.sensors import delayed, history, remembered
 
-CREEPS = 0.01
+CREEP_SPEED = 0.01
 """Speed above which the original vehicle's wheel speed is scaled with its speed [m/s]."""
 
 
 class _Prepared(NamedTuple):
-    """Constants of a run: the study's vehicle, for its sensors; the original one, for its engine; and the second model's parameters.
+    """Constants of a run: the study's vehicle, for its sensors; the original vehicle, for its engine; the second model's parameters.
 
-    `engine_mass` is the mass that the original's engine moves, turning wheels included [kg], `engine_radius` that of its wheels [m].
+    `engine_mass` is the mass that the original vehicle's engine moves, with its turning wheels [kg], `engine_radius` the radius of
+    those wheels [m].
     """
 
-    own: Any
+    vehicle: Any
     original: Any
-    represented: Represented
+    parameters: SecondParameters
     engine_mass: FloatArray
     engine_radius: FloatArray
     slope: Slope
@@ -39,13 +40,13 @@ class _Prepared(NamedTuple):
 
 
 class SecondState(NamedTuple):
-    """State of N vehicles: speed [m/s], actuated pedals, gear, and the states of the vehicles behind it."""
+    """State of N vehicles: speed [m/s], actuated pedals, gear; states of the study's vehicle, the original vehicle and the second model."""
 
     speed: FloatArray
     throttle: FloatArray
     brake: FloatArray
     gear: FloatArray
-    own: Any
+    vehicle: Any
     original: Any
     body: MultiBody
     brake_commands: FloatArray
@@ -56,88 +57,90 @@ class SecondVehicle:
 
     Parameters
     ----------
-    own
+    vehicle
         The study's vehicle.
-    declared
-        The vehicle's representation in the second model.
+    mapping
+        The vehicle's mapping to the second model.
     study
         The study.
     """
 
-    def __init__(self, own: Vehicle, declared: Declared, study: Study) -> None:
-        self._own, self._declared = own, declared
-        self.UNITS = own.UNITS
-        shipped = load_study(declared.table.study).vehicle.characteristics
-        rows = {**shipped, **{name: row for name, row in study.vehicle.characteristics.items() if name not in declared.foreign}}
-        self._original = {one.name: one.original for one in CharacteristicSet.of({name: rows[name] for name in declared.vehicle.UNITS})}
+    def __init__(self, vehicle: Vehicle, mapping: VehicleMapping, study: Study) -> None:
+        self._vehicle, self._mapping = vehicle, mapping
+        self.UNITS = vehicle.UNITS
+        shipped_rows = load_study(mapping.table.study).vehicle.characteristics
+        rows = {**shipped_rows, **{name: row for name, row in study.vehicle.characteristics.items() if name not in mapping.foreign}}
+        self._original = {member.name: member.original
+                          for member in CharacteristicSet.of({name: rows[name] for name in mapping.vehicle.UNITS})}
 
     def prepare(self, characteristics: Characteristics, road_friction: Any, step: float, slope: Slope = LEVEL,
                 wet: bool | BoolArray = False) -> _Prepared:
         ones = np.ones_like(next(iter(characteristics.values())))
         original = {name: value * ones for name, value in self._original.items()}
         surface = (road_friction, slope, wet)
-        optional = () if slope is LEVEL and not np.any(wet) else (slope, wet) if np.any(wet) else (slope,)
-        twin, represent = self._declared.vehicle, self._declared.table.represent
-        engine = represent(twin, original, self._original, surface).plant
+        road_arguments = () if slope is LEVEL and not np.any(wet) else (slope, wet) if np.any(wet) else (slope,)
+        original_vehicle, represent = self._mapping.vehicle, self._mapping.table.represent
+        engine = represent(original_vehicle, original, self._original, surface).plant
         return _Prepared(
-            own=self._own.prepare(characteristics, road_friction, step, *optional),
-            original=twin.prepare(original, road_friction, step, slope, wet),
-            represented=represent(twin, {**original, **{name: characteristics[name] for name in original if name in characteristics}},
-                                  self._original, surface),
+            vehicle=self._vehicle.prepare(characteristics, road_friction, step, *road_arguments),
+            original=original_vehicle.prepare(original, road_friction, step, slope, wet),
+            parameters=represent(
+                original_vehicle, {**original, **{name: characteristics[name] for name in original if name in characteristics}},
+                self._original, surface),
             engine_mass=engine.mass + WHEELS * engine.wheel_inertia / engine.radius**2, engine_radius=engine.radius, slope=slope, step=step)
 
     def sumo_type(self, prepared: _Prepared) -> SumoType:
-        return self._own.sumo_type(prepared.own)
+        return self._vehicle.sumo_type(prepared.vehicle)
 
     def at_rest(self, prepared: _Prepared) -> SecondState:
-        standstill = np.zeros_like(prepared.engine_mass)
-        return self._state(prepared, standstill, self._own.at_rest(prepared.own), self._declared.vehicle.at_rest(prepared.original))
+        zeros = np.zeros_like(prepared.engine_mass)
+        return self._state(prepared, zeros, self._vehicle.at_rest(prepared.vehicle), self._mapping.vehicle.at_rest(prepared.original))
 
     def at_speed(self, prepared: _Prepared, speed: FloatArray) -> SecondState:
-        """The state with the pedals that hold the original vehicle's speed."""
-        return self._state(prepared, speed, self._own.at_speed(prepared.own, speed),
-                           self._declared.vehicle.at_speed(prepared.original, speed))
+        """The state in which the pedals hold the original vehicle's speed."""
+        return self._state(prepared, speed, self._vehicle.at_speed(prepared.vehicle, speed),
+                           self._mapping.vehicle.at_speed(prepared.original, speed))
 
-    def _state(self, p: _Prepared, speed: FloatArray, own: Any, original: Any) -> SecondState:
-        commands = history(float(np.max(p.represented.brake_delay)), p.step, original.brake)
-        return SecondState(speed, original.throttle, original.brake, original.gear, own, original, at_speed(p.represented.plant, speed),
+    def _state(self, p: _Prepared, speed: FloatArray, vehicle: Any, original: Any) -> SecondState:
+        commands = history(float(np.max(p.parameters.brake_delay)), p.step, original.brake)
+        return SecondState(speed, original.throttle, original.brake, original.gear, vehicle, original, at_speed(p.parameters.plant, speed),
                            commands)
 
     def sensors(self, prepared: _Prepared) -> Sensors | None:
-        sensors = getattr(self._own, "sensors", None)
-        return None if sensors is None else sensors(prepared.own)
+        sensors = getattr(self._vehicle, "sensors", None)
+        return None if sensors is None else sensors(prepared.vehicle)
 
     def sense(self, prepared: _Prepared, state: SecondState, seen: Observation) -> tuple[Observation, SecondState]:
-        """Sense through the study's own sensors."""
-        sensed, own = self._own.sense(prepared.own, state.own, seen)
-        return sensed, state._replace(own=own)
+        """Sense through the sensors of the study's vehicle."""
+        observation, vehicle = self._vehicle.sense(prepared.vehicle, state.vehicle, seen)
+        return observation, state._replace(vehicle=vehicle)
 
     def hold_gear(self, prepared: _Prepared, state: SecondState, holds: BoolArray) -> SecondState:
-        hold = getattr(self._declared.vehicle, "hold_gear", None)
+        hold = getattr(self._mapping.vehicle, "hold_gear", None)
         return state if hold is None else state._replace(original=hold(prepared.original, state.original, holds))
 
     def advance(self, prepared: _Prepared, state: SecondState, command: Command) -> SecondState:
-        p, r = prepared, prepared.represented
-        original, driving = self._engine(p, state, command.throttle)
+        p, r = prepared, prepared.parameters
+        original, drive_torque = self._engine(p, state, command.throttle)
         commands = remembered(state.brake_commands, command.brake)
         demand, body, brake = delayed(commands, r.brake_delay, p.step), state.body, state.brake
         steps = math.ceil(p.step / STEP)
         step = p.step / steps
-        follows = step / (step + r.brake_lag)
+        response = step / (step + r.brake_lag)
         for _ in range(steps):
-            brake = brake + np.minimum(np.maximum((demand - brake) * follows, -r.brake_fall * step), r.brake_rise * step)
-            body = advance(r.plant, body, brake, driving, step)
-        return SecondState(body.speed, original.throttle, brake, original.gear, state.own, original, body, commands)
+            brake = brake + np.minimum(np.maximum((demand - brake) * response, -r.brake_fall * step), r.brake_rise * step)
+            body = advance(r.plant, body, brake, drive_torque, step)
+        return SecondState(body.speed, original.throttle, brake, original.gear, state.vehicle, original, body, commands)
 
     def _engine(self, p: _Prepared, state: SecondState, throttle: FloatArray) -> tuple[Any, FloatArray]:
-        """The original vehicle one step later, and the torque of its engine and drags on all wheels, at the speed of these [N m]."""
-        r, before = p.represented, state.original
+        """The original vehicle one step later, and the torque of its engine and drags on all wheels at their speed [N m]."""
+        r, engine = p.parameters, state.original
         speed = state.speed * p.engine_radius / r.plant.radius
-        before = before._replace(speed=speed) if not hasattr(before, "wheel_speed") else before._replace(
-            speed=speed, wheel_speed=np.where(before.speed > CREEPS, before.wheel_speed * speed / np.maximum(before.speed, CREEPS),
-                                              before.wheel_speed))
-        after = self._declared.vehicle.advance(p.original, before, Command(throttle, np.zeros_like(throttle)))
-        torque = p.engine_mass * ((after.speed - speed) / p.step + p.slope.back) * p.engine_radius
+        engine = engine._replace(speed=speed) if not hasattr(engine, "wheel_speed") else engine._replace(
+            speed=speed, wheel_speed=np.where(
+                engine.speed > CREEP_SPEED, engine.wheel_speed * speed / np.maximum(engine.speed, CREEP_SPEED), engine.wheel_speed))
+        next_engine = self._mapping.vehicle.advance(p.original, engine, Command(throttle, np.zeros_like(throttle)))
+        torque = p.engine_mass * ((next_engine.speed - speed) / p.step + p.slope.back) * p.engine_radius
         torque = np.where(torque > 0, torque * r.drive, torque)
-        resists = r.plant.radius * (r.drag + r.air_drag * state.speed) * state.speed + r.wheel_damping * state.speed / r.plant.radius
-        return after, torque - resists
+        resistance = r.plant.radius * (r.drag + r.air_drag * state.speed) * state.speed + r.wheel_damping * state.speed / r.plant.radius
+        return next_engine, torque - resistance

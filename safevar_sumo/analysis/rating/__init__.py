@@ -1,4 +1,4 @@
-"""How many Euro NCAP points does a vehicle earn, and how many does a worn variant of it lose?
+"""How many Euro NCAP points does a vehicle earn, and how many does a worn variant lose?
 
 The options and the function of the library are defined here, so that a command's help can be shown without loading the computation.
 """
@@ -41,7 +41,7 @@ def rating(study: StudyLike | Results, changes: Mapping[str, float] | None = Rat
     Parameters
     ----------
     study
-        A study, or results or their directory, whose vehicle and driving system are rated; the tests by day have the study's weather.
+        A study, or results or their directory, whose vehicle and driving system are rated; tests by day take place in the study's weather.
     """
     from safevar_sumo.analysis.rating.compute import rate_variant
 

@@ -1,4 +1,4 @@
-"""Rates the original vehicle and variants of it: all cells and robustness layers are simulated, and scored by the official rules."""
+"""Rates the original vehicle and variants: simulates all cells and robustness layers, and scores them by the official rules."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ from safevar_sumo.vehicles import CharacteristicSet
 from safevar_sumo.workers.evaluation import Pool
 
 DECIMALS = 9
-"""Decimals of points and speeds in JSON; further ones would hold only rounding errors."""
+"""Decimals of points and speeds in JSON; further decimals would hold only rounding errors."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class RatedTest:
-    """A test of one vehicle, in one light if there are tests by day and by night; points of (standard, extended, robustness).
+    """One vehicle's result in a test, by day or by night if the test has both; `points` are (standard, extended, robustness).
 
-    `layers` states whether each robustness layer holds, None if it is neither simulated nor claimed; by day for both lights.
+    `layers` states whether each robustness layer holds, None if the layer is neither simulated nor claimed. Day and night share layers.
     """
 
     block: Block
@@ -45,7 +45,7 @@ class RatedTest:
 
 @dataclass(frozen=True, kw_only=True)
 class RatedVehicle:
-    """One vehicle: its setting, its results and its points; it `fails`, and earns nothing, if a required cell is not green."""
+    """One vehicle with its setting, results and points; the vehicle `fails` and earns nothing if a required cell is not green."""
 
     name: str
     setting: Mapping[str, float]
@@ -72,11 +72,11 @@ class RatedVehicle:
 
     def _layers(self, block: Block) -> dict[str, bool | None]:
         claimed = self.claims.get(block.test, ())
-        return {one.layer: bool(self.scored.layers[block.test, one.layer][0]) if one.simulated else (True if one.layer in claimed else None)
-                for one in self.protocol.layers_of(block.test)}
+        return {layer.layer: bool(self.scored.layers[block.test, layer.layer][0]) if layer.simulated
+                else (True if layer.layer in claimed else None) for layer in self.protocol.layers_of(block.test)}
 
     def colour(self, number: int) -> str | None:
-        """Colour of the cell with this number; None if the test could not be driven."""
+        """Colour of the cell with this number; None if the vehicle could not drive the test."""
         colour = int(self.scored.colours[0, number])
         return None if colour < 0 else COLOURS[colour]
 
@@ -86,7 +86,7 @@ class RatedVehicle:
         return bool(colour >= 0 and (colour < RED if self.protocol.cells[number].criterion == NOT_RED else colour <= nominal))
 
     def nominal(self, number: int) -> int:
-        """Number of the matrix cell that a layer's cell varies."""
+        """Number of the matrix cell of which a layer's cell is a variation."""
         cell = self.protocol.cells[number]
         return self.protocol.matrix_of[cell.block.name, cell.row, cell.column]
 
@@ -99,25 +99,26 @@ class RatedVehicle:
                 "warning_ttc": None if warning is None else round(warning, DECIMALS)}
 
     def to_dict(self) -> dict[str, Any]:
-        of_block: dict[str, list[int]] = {}
+        block_cells: dict[str, list[int]] = {}
         for number, cell in enumerate(self.protocol.cells):
-            of_block.setdefault(cell.block.name, []).append(number)
+            block_cells.setdefault(cell.block.name, []).append(number)
         kinds = ("standard", "extended", "robustness")
-        tests = [{"test": one.block.test, "light": one.block.light, **dict(zip(kinds, one.points, strict=True)),
-                  "possible": dict(zip(kinds, one.block.points, strict=True)),
-                  "cells": [self.cell(number) for number in of_block[one.block.name]], "layers": dict(one.layers)} for one in self.tests]
+        tests = [{"test": test.block.test, "light": test.block.light, **dict(zip(kinds, test.points, strict=True)),
+                  "possible": dict(zip(kinds, test.block.points, strict=True)),
+                  "cells": [self.cell(number) for number in block_cells[test.block.name]], "layers": dict(test.layers)}
+                 for test in self.tests]
         return {"name": self.name, "setting": dict(self.setting), "points": round(self.points, DECIMALS),
-                "possible": possible(self.protocol), "tests": tests}
+                "possible": max_points(self.protocol), "tests": tests}
 
 
-def possible(protocol: Protocol) -> float:
+def max_points(protocol: Protocol) -> float:
     """Maximum points of all simulated tests."""
     return round(sum(sum(block.points) for block in protocol.blocks), DECIMALS)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Rating:
-    """A rating of the original vehicle, `variants[0]`, and of variants of it."""
+    """A rating of the original vehicle, `variants[0]`, and of its variants."""
 
     study: Study
     protocol: Protocol
@@ -134,17 +135,17 @@ class Rating:
 
     @property
     def lost(self) -> float:
-        """Points that the variant earns less than the original; negative if it earns more."""
+        """The original vehicle's points minus the variant's points; negative if the variant earns more."""
         return 0.0 if self.variant is None else round(self.original.points - self.variant.points, DECIMALS)
 
     @property
     def left_open(self) -> float:
-        """Points of robustness layers in simulated tests that are neither simulated nor claimed."""
+        """Points of the robustness layers of simulated tests that are neither simulated nor claimed."""
         claims, open_points = self.original.claims, 0.0
         for test, blocks in self.protocol.tests.items():
             layers = self.protocol.layers_of(test)
-            unknown = [one for one in layers if not one.simulated and one.layer not in claims.get(test, ())]
-            open_points += sum(block.points[2] for block in blocks) * len(unknown) / len(layers)
+            open_layers = [layer for layer in layers if not layer.simulated and layer.layer not in claims.get(test, ())]
+            open_points += sum(block.points[2] for block in blocks) * len(open_layers) / len(layers)
         return round(open_points, DECIMALS)
 
     def turned(self, variant: RatedVehicle | None = None) -> list[tuple[Cell, str | None, str | None]]:
@@ -161,9 +162,9 @@ class Rating:
         Columns: `vehicle`, `test`, `light`, `standard`, `extended`, `robustness`, `total`, `possible` [points].
         """
         return pd.DataFrame([{
-            "vehicle": one.name, "test": test.block.test, "light": test.block.light,
+            "vehicle": vehicle.name, "test": test.block.test, "light": test.block.light,
             **dict(zip(("standard", "extended", "robustness"), test.points, strict=True)), "total": test.total,
-            "possible": sum(test.block.points)} for one in self.variants for test in one.tests])
+            "possible": sum(test.block.points)} for vehicle in self.variants for test in vehicle.tests])
 
     def to_dict(self) -> dict[str, Any]:
         """The JSON of `rating`."""
@@ -171,13 +172,13 @@ class Rating:
                 "not_simulated": [{"test": test, "points": points} for test, points in self.protocol.not_simulated.items()]}
 
     def __repr__(self) -> str:
-        vehicles = "; ".join(f"{one.name} {one.points:.2f}" for one in self.variants)
-        return f"<Rating of {self.study.name}, points of {possible(self.protocol):g}: {vehicles}>"
+        vehicles = "; ".join(f"{vehicle.name} {vehicle.points:.2f}" for vehicle in self.variants)
+        return f"<Rating of {self.study.name}, points of {max_points(self.protocol):g}: {vehicles}>"
 
 
 def rate_variant(subject: Study | Case, options: RatingOptions, *, pool: Pool | None = None, jobs: int | None = None,
                  progress: Progress = silent) -> Rating:
-    """Rate the original vehicle and the variant that the options describe, if any; raises as `rate`.
+    """Rate the original vehicle, and the variant if the options describe one; raises as `rate`.
 
     Raises
     ------
@@ -190,7 +191,7 @@ def rate_variant(subject: Study | Case, options: RatingOptions, *, pool: Pool | 
         if isinstance(subject, Study):
             raise InputError("solution", f"{study.name!r} is a study and has no solutions", "a results directory")
         row = subject.solutions.iloc[position_of(subject.solutions, SolutionId.parse(options.solution))]
-        values, name = {one: float(row[one]) for one in characteristics.names}, options.solution
+        values, name = {characteristic: float(row[characteristic]) for characteristic in characteristics.names}, options.solution
     if options.changes:
         characteristics.setting(options.changes, "changes", switch="")  # refuses unknown names
         values, name = {**values, **options.changes}, f"{name} changed" if values else name
@@ -200,7 +201,7 @@ def rate_variant(subject: Study | Case, options: RatingOptions, *, pool: Pool | 
 
 def rate(study: Study, settings: Mapping[str, FloatArray], *, pool: Pool | None = None, jobs: int | None = None,
          progress: Progress = silent) -> Rating:
-    """Rate the original vehicle of a study and its variants, settings of shape (n,) by name; the filter is not applied.
+    """Rate a study's original vehicle and variants, given as settings of shape (n,) by name; the filter is not applied.
 
     Raises
     ------
@@ -227,23 +228,23 @@ def rate_on(evaluator: Evaluator, settings: Mapping[str, FloatArray]) -> Rating:
 
 
 def remarks(rating: Rating) -> list[str]:
-    """Remarks that a user should read with a rating."""
+    """Remarks on a rating that its reader should know."""
     weather = weather_of(rating.study.weather, f"study {rating.study.name!r}")
     lines = []
     if weather.wet or weather.road_friction != 1:
-        lines.append(f"Euro NCAP tests on a dry road; this is rated in the weather {weather.name!r}, by night {by_night(weather).name!r}.")
-    for one in rating.variants:
-        if one.fails:
-            lines.append(f"{one.name}: nothing is earned, as CCRs at 10 and 20 km/h is not green in all of the standard range.")
-        required = [number for number, cell in enumerate(one.protocol.cells) if cell.block.test == "CPNA" and cell.vut == 10
+        lines.append(f"Euro NCAP tests on a dry road; this rating has the weather {weather.name!r}, by night {by_night(weather).name!r}.")
+    for vehicle in rating.variants:
+        if vehicle.fails:
+            lines.append(f"{vehicle.name}: it earns nothing, because CCRs at 10 and 20 km/h is not green in the whole standard range.")
+        required_cells = [number for number, cell in enumerate(vehicle.protocol.cells) if cell.block.test == "CPNA" and cell.vut == 10
                     and cell.location == 75 and not cell.is_varied]
-        if not one.fails and any(one.colour(number) != "green" for number in required):
-            lines.append(f"{one.name}: CPNA at 10 km/h and 75 % is not green, which Euro NCAP requires; its calculator "
-                         f"{one.protocol.calculator} does not check it, and neither do these points.")
-        invalid = int(np.count_nonzero(~one.cells.valid))
-        if invalid:
-            lines.append(f"{one.name}: {invalid} cells are no valid tests and earn nothing: the vehicle cannot hold their speed.")
-    if all(np.isnan(one.cells.warning).all() for one in rating.variants):
+        if not vehicle.fails and any(vehicle.colour(number) != "green" for number in required_cells):
+            lines.append(f"{vehicle.name}: CPNA at 10 km/h and 75 % is not green, which Euro NCAP requires; Euro NCAP's calculator "
+                         f"{vehicle.protocol.calculator} does not check this, nor do these points.")
+        invalid_cells = int(np.count_nonzero(~vehicle.cells.valid))
+        if invalid_cells:
+            lines.append(f"{vehicle.name}: {invalid_cells} cells are no valid tests and earn nothing: the vehicle cannot hold the speed.")
+    if all(np.isnan(vehicle.cells.warning).all() for vehicle in rating.variants):
         lines.append("The driving system never warns: rows with FCW are red.")
     return lines
 

@@ -1,4 +1,4 @@
-"""A rating as text on the terminal and as a picture of its matrices."""
+"""A rating as text on the terminal and as a figure of its matrices."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.text import Text
 
 from safevar_sumo.analysis.figures import FONT, literal, new_figure
-from safevar_sumo.analysis.rating.compute import RatedTest, RatedVehicle, Rating, possible
+from safevar_sumo.analysis.rating.compute import RatedTest, RatedVehicle, Rating, max_points
 from safevar_sumo.analysis.words import joined, number_of
 from safevar_sumo.protocol import COLOURS, Block
 from safevar_sumo.terminal import WholeTable, print_text
@@ -22,38 +22,38 @@ if TYPE_CHECKING:
 
 LETTERS = {colour: colour[0].upper() for colour in COLOURS}
 LEGEND = ", ".join(f"{letter} {colour}" for colour, letter in LETTERS.items())
-ON_TERMINAL = {"green": "black on green", "yellow": "black on bright_yellow", "orange": "black on dark_orange",
+TERMINAL_STYLES = {"green": "black on green", "yellow": "black on bright_yellow", "orange": "black on dark_orange",
                "brown": "white on dark_red", "red": "white on red"}
-DARK = ("green", "brown", "red")
-"""Colours on which text is white."""
+DARK_COLOURS = ("green", "brown", "red")
+"""Colours of cells whose text is white."""
 LIGHTS = {"day": " by day", "night": " by night", None: ""}
-COLUMNS_OF_PAIRS = 4
+FIGURE_COLUMNS = 4
 
 
 def print_rating(console: Console, result: Rating) -> None:
     """Print the verdict, the points of every test, the robustness layers that hold, and the tests not simulated."""
     print_text(console, result.study.title)
     print_text(console, rating_in_words(result))
-    console.print(_points(result))
-    console.print(_layers(result))
+    console.print(_points_table(result))
+    console.print(_layers_table(result))
     print_text(console, not_simulated(result))
 
 
 def rating_in_words(result: Rating) -> str:
     """The rating in a sentence: the points that a variant loses and in which test, or the points of the original vehicle."""
-    maximum, variant = possible(result.protocol), result.variant
+    maximum, variant = max_points(result.protocol), result.variant
     if variant is None:
         return f"The original vehicle earns {result.original.points:.2f} of the {maximum:g} points of the tests that are simulated."
-    changed = _changed(result, variant)
+    changes = _changes_in_words(result, variant)
     reference = f"of the {result.original.points:.2f} points that the original earns (of {maximum:g} that are simulated)"
     if not result.lost:
-        return f"With {changed} the vehicle keeps all {reference}."
+        return f"With {changes} the vehicle keeps all {reference}."
     if result.lost < 0:
-        return f"With {changed} the vehicle earns {-result.lost:.2f} points more, {variant.points:.2f} instead {reference}."
+        return f"With {changes} the vehicle earns {-result.lost:.2f} points more, {variant.points:.2f} instead {reference}."
     losses = lost_by_test(result)
     test, largest = losses[0]
     share = "all" if math.isclose(largest, result.lost, abs_tol=1e-6) else "most" if largest > result.lost / 2 else f"{largest:.2f}"
-    return f"With {changed} the vehicle loses {result.lost:.2f} {reference}, {share} of them in {test_in_words(test)}."
+    return f"With {changes} the vehicle loses {result.lost:.2f} {reference}, {share} of them in {test_in_words(test)}."
 
 
 def lost_by_test(result: Rating) -> list[tuple[RatedTest, float]]:
@@ -66,7 +66,7 @@ def lost_by_test(result: Rating) -> list[tuple[RatedTest, float]]:
 
 
 def turned_in_words(result: Rating) -> list[tuple[str, str]]:
-    """Tests with matrix cells in another colour than the original's, each with a text on colours and speeds."""
+    """Tests with matrix cells whose colour differs from the original's, each with a text on colours and speeds."""
     tests: dict[str, dict[tuple[str, str], list[str]]] = {}
     for cell, before, after in result.turned():
         if not cell.is_varied:
@@ -77,7 +77,7 @@ def turned_in_words(result: Rating) -> list[tuple[str, str]]:
 
 
 def not_simulated(result: Rating) -> str:
-    """Sentences on the tests and robustness layers that the points do not cover."""
+    """Sentences on the tests and robustness layers without points."""
     tests = result.protocol.not_simulated
     named = ", ".join(f"{test} {points:g}" for test, points in tests.items())
     text = f"Not simulated, neither passed nor failed: {named}; {sum(tests.values()):g} points."
@@ -90,47 +90,48 @@ def test_in_words(test: RatedTest) -> str:
     return f"{test.block.test}{LIGHTS[test.block.light]}"
 
 
-def _changed(result: Rating, variant: RatedVehicle) -> str:
+def _changes_in_words(result: Rating, variant: RatedVehicle) -> str:
     members = CharacteristicSet.of(result.study.vehicle.characteristics)
     parts = [f"{member.short_name} {float(member.text(variant.setting[member.name])):g}{member.suffix}" for member in members
              if variant.setting[member.name] != member.original]
     return joined(parts) if parts else "no change at all"
 
 
-def _points(result: Rating) -> WholeTable:
+def _points_table(result: Rating) -> WholeTable:
     """Points of every test as standard + extended + robustness = total."""
     names = [vehicle.name for vehicle in result.variants]
     table = WholeTable("test", right=[*names, *(["lost"] if result.variant else []), "of"],
                        title="Points: standard + extended + robustness = total")
     for tests in zip(*(vehicle.tests for vehicle in result.variants), strict=True):
         lost = round(tests[0].total - tests[-1].total, 2)
-        table.add_row(tests[0].block.name, *(_sum(test.points) for test in tests),
+        table.add_row(tests[0].block.name, *(_sum_in_words(test.points) for test in tests),
                       *([f"{lost:.2f}" if lost else ""] if result.variant else []), f"{sum(tests[0].block.points):.2f}")
     table.add_section()
     totals = [[sum(test.points[kind] for test in vehicle.tests) for kind in range(3)] for vehicle in result.variants]
-    table.add_row("all", *map(_sum, totals), *([f"{result.lost:.2f}"] if result.variant else []), f"{possible(result.protocol):g}")
+    table.add_row("all", *map(_sum_in_words, totals), *([f"{result.lost:.2f}"] if result.variant else []),
+                  f"{max_points(result.protocol):g}")
     return table
 
 
-def _sum(points: Sequence[float]) -> str:
+def _sum_in_words(points: Sequence[float]) -> str:
     return f"{'+'.join(f'{value:.2f}' for value in points)} = {sum(points):.2f}"
 
 
-def _layers(result: Rating) -> WholeTable:
+def _layers_table(result: Rating) -> WholeTable:
     """The layers that are simulated or claimed; a variant has a row only where it differs from the original."""
     table = WholeTable("test", "vehicle", "robustness layers that hold", "that do not", "that are claimed", title="Robustness layers")
     for tests in zip(*(vehicle.tests for vehicle in result.variants), strict=True):
         claimed = result.original.claims.get(tests[0].block.test, ())
         for vehicle, test in zip(result.variants, tests, strict=True):
             if test.block.light != "night" and (vehicle is result.original or test.layers != tests[0].layers):
-                holding, failing = ([layer for layer, holds in test.layers.items() if holds is expected and layer not in claimed]
+                held_layers, failed_layers = ([layer for layer, holds in test.layers.items() if holds is expected and layer not in claimed]
                                     for expected in (True, False))
-                table.add_row(test.block.test, vehicle.name, ", ".join(holding), ", ".join(failing), ", ".join(claimed))
+                table.add_row(test.block.test, vehicle.name, ", ".join(held_layers), ", ".join(failed_layers), ", ".join(claimed))
     return table
 
 
 def print_matrices(console: Console, result: Rating) -> None:
-    """Every matrix: a letter and a colour for each cell, the speed of the impact [km/h] or time to collision of the warning [s]."""
+    """Print every matrix: for each cell a letter, a colour, and the impact speed [km/h] or the time to collision at the warning [s]."""
     for block in result.protocol.blocks:
         columns = [f"{location:g} %" for location in block.impact_locations] or [f"{speed:g}" for speed in block.target_speeds]
         columns_are = "impact location" if block.impact_locations else "speed of the target"
@@ -153,7 +154,7 @@ def _cell(result: Rating, block: Block, row: int, column: int) -> Text:
     for k, vehicle in enumerate(result.variants if differs else result.variants[:1]):
         text.append(">" if k else "")
         is_last = k == len(result.variants) - 1 or not differs
-        text.append(_cell_text(vehicle, number, with_value=is_last), style=ON_TERMINAL.get(vehicle.colour(number) or "", ""))
+        text.append(_cell_text(vehicle, number, with_value=is_last), style=TERMINAL_STYLES.get(vehicle.colour(number) or "", ""))
     return text
 
 
@@ -168,49 +169,50 @@ def _cell_text(vehicle: RatedVehicle, number: int, *, with_value: bool) -> str:
 
 
 def matrices_figure(result: Rating) -> Figure:
-    """All matrices, the variant's beside the original's: colours and letters, extended cells hatched, cells that differ framed."""
+    """All matrices of both vehicles side by side: colours and letters; extended cells are hatched, cells that differ are framed."""
     blocks = result.protocol.blocks
-    rows = math.ceil(len(blocks) / COLUMNS_OF_PAIRS)
-    figure, axes = new_figure(verdict_title(result), rows, COLUMNS_OF_PAIRS, (15, 2.6 * rows))
+    rows = math.ceil(len(blocks) / FIGURE_COLUMNS)
+    figure, axes = new_figure(verdict_title(result), rows, FIGURE_COLUMNS, (15, 2.6 * rows))
     for axis in axes.flat[len(blocks):]:
         axis.set_axis_off()
     for axis, block in zip(axes.flat, blocks, strict=False):
         _draw_matrices(axis, result, block)
     figure.supxlabel(f"impact location [% of the width], or speed of the target [km/h] in CCCscp and CMCscp; {LEGEND}; hatched: extended "
-                     "range; thick frame: another colour than the original's", fontsize=FONT)
+                     "range; thick frame: colour differs from the original's", fontsize=FONT)
     figure.supylabel("speed of the vehicle under test [km/h]", fontsize=FONT)
     return figure
 
 
 def verdict_title(result: Rating) -> str:
     points = "; ".join(f"{vehicle.name}: {vehicle.points:.2f} points" for vehicle in result.variants)
-    return f"{result.study.name}: {points} of {possible(result.protocol):g}" + (" (original left, variant right)" if result.variant else "")
+    sides = " (original left, variant right)" if result.variant else ""
+    return f"{result.study.name}: {points} of {max_points(result.protocol):g}{sides}"
 
 
 def _draw_matrices(axis: Axes, result: Rating, block: Block) -> None:
     """Draw a block's matrix of each vehicle, side by side."""
     from matplotlib.patches import Rectangle
 
-    wide = max(len(row.ranges) for row in block.rows)
+    columns = max(len(row.ranges) for row in block.rows)
     heads = block.impact_locations or block.target_speeds
     ticks: list[tuple[float, str]] = []
     for k, vehicle in enumerate(result.variants):
-        shift = k * (wide + 0.6)
+        shift = k * (columns + 0.6)
         ticks += [(shift + column + 0.5, f"{head:g}") for column, head in enumerate(heads)]
         for row, column, number in _cells_of(block, result):
             colour, is_extended = vehicle.colour(number), result.protocol.cells[number].range == "extended"
-            turned = k > 0 and colour != result.original.colour(number)
-            face = f"#{result.protocol.colours[colour]}" if colour else "#808080"
-            ink = "white" if colour in DARK or colour is None else "black"
-            axis.add_patch(Rectangle((shift + column, row), 1, 1, facecolor=face, edgecolor="white", linewidth=0.6,
+            differs = k > 0 and colour != result.original.colour(number)
+            fill_colour = f"#{result.protocol.colours[colour]}" if colour else "#808080"
+            text_colour = "white" if colour in DARK_COLOURS or colour is None else "black"
+            axis.add_patch(Rectangle((shift + column, row), 1, 1, facecolor=fill_colour, edgecolor="white", linewidth=0.6,
                                      hatch="///" if is_extended else None))
-            if turned:
+            if differs:
                 axis.add_patch(Rectangle((shift + column + 0.08, row + 0.08), 0.84, 0.84, fill=False, edgecolor="black", linewidth=1.8))
             axis.text(shift + column + 0.5, row + 0.5, LETTERS.get(colour or "", "?"), ha="center", va="center", fontsize=FONT - 2,
-                      color=ink, bbox={"facecolor": face, "edgecolor": "none", "pad": 0.8})
-    axis.set_xlim(0, len(result.variants) * (wide + 0.6) - 0.6)
+                      color=text_colour, bbox={"facecolor": fill_colour, "edgecolor": "none", "pad": 0.8})
+    axis.set_xlim(0, len(result.variants) * (columns + 0.6) - 0.6)
     axis.set_ylim(len(block.rows), 0)
-    axis.set_xticks([place for place, _ in ticks], [text for _, text in ticks], fontsize=FONT - 3)
+    axis.set_xticks([position for position, _ in ticks], [text for _, text in ticks], fontsize=FONT - 3)
     names = [f"{row.vut:g}{' FCW' if block.is_warning(k) else ''}" for k, row in enumerate(block.rows)]
     axis.set_yticks([k + 0.5 for k in range(len(names))], names, fontsize=FONT - 2)
     axis.grid(visible=False)

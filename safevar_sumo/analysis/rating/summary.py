@@ -18,24 +18,24 @@ TITLES = {"fewest": "Fewest changes that cost a point", "smallest": "Smallest la
 
 
 def rated_lead(study: Study, solutions: pd.DataFrame, original: Evaluations, place: str) -> list[str]:
-    """Summarise the solutions of a rated study in lines; the last line has the commands for the next steps.
+    """Lines that summarise the solutions of a rated study; the last line has commands for the next steps.
 
     Parameters are those of `safevar_sumo.analysis.explain.summary.lead`, which calls this function for rated studies.
     """
     points, name = float(original.column(RATING_POINTS.name)[0]), RATING_POINTS.name
     unsafe = Unsafe.default(record(original, 0), solutions["outcome"])
-    losing = unsafe.rows(solutions)
-    if not losing.any():
+    has_loss = unsafe.rows(solutions)
+    if not has_loss.any():
         return [f"No solution loses a point of the original's {points:.2f}.",
                 f"Points against each characteristic: {question_command('tolerance', place)}"]
     characteristics = CharacteristicSet.of(study.vehicle.characteristics)
-    lines = [f"The original vehicle earns {points:.2f} points. {int(losing.sum())} of {number_of(len(solutions), 'vehicle')} found lose at "
-             "least one of them."]
+    lines = [f"The original vehicle earns {points:.2f} points. {int(has_loss.sum())} of {number_of(len(solutions), 'vehicle')} found lose "
+             "at least one of them."]
     handle = None
     for choice, title in TITLES.items():
         handle = chosen_handle(solutions, unsafe, choice, study.name)
         row = solutions.iloc[position_of(solutions, handle)]
-        setting = {one: float(row[one]) for one in characteristics.names}
+        setting = {characteristic: float(row[characteristic]) for characteristic in characteristics.names}
         lines.append(f"{title}: {handle} loses {points - row[name]:.2f} points with {list_of_changes(characteristics, setting)}.")
-    return [*lines, f"Which cells turn: {question_command('rating', place)} --solution {quote(str(handle))} --matrix; which changes do it: "
-                    f"{question_command('explain', place)}"]
+    return [*lines, f"Which cells change colour: {question_command('rating', place)} --solution {quote(str(handle))} --matrix; which "
+                    f"changes cause it: {question_command('explain', place)}"]

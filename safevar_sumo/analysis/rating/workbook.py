@@ -1,6 +1,6 @@
-"""The official spreadsheet: predictions, claimed layers and input parameters in its template, measurements in a preprocessed one.
+"""The official spreadsheet: predictions, claimed layers and input parameters in its template, measurements in a preprocessed file.
 
-Before anything is written, every target cell is checked: its headings must stand where the protocol's data expects them, or the
+Before anything is written, every target cell is checked: if its headings are not where the protocol's data expects them, the
 spreadsheet is refused.
 """
 
@@ -24,13 +24,13 @@ from safevar_sumo.protocol.points import DECIMALS, half_up
 PARAMETERS, VERSION = "Input parameters", "Version"
 NOT_ASSESSED, PREDICTED = "N/A", "Self claimed"
 HEADS = ("Scenario", "Test point", "Range", "Value")
-MADE_BY = "that pip install 'euroncap-rating-2026=={}' and euroncap_rating_2026 crash_avoidance {} write"
+MAKING_COMMANDS = "that pip install 'euroncap-rating-2026=={}' and euroncap_rating_2026 crash_avoidance {} write"
 
 
 class _Book:
-    """A spreadsheet that is read and checked on construction, and filled and saved later."""
+    """A spreadsheet. The constructor reads and checks it; `fill` fills and saves it."""
 
-    made_by = "generate-template"
+    command = "generate-template"
 
     def __init__(self, source: Path, output: Path) -> None:
         self.source, self.output, self.protocol = source, output, protocol_of(EURO_NCAP_2026)
@@ -39,12 +39,12 @@ class _Book:
         try:
             self._book = openpyxl.load_workbook(source)
         except (OSError, InvalidFileException, zipfile.BadZipFile, KeyError, ValueError) as error:
-            raise InputError(source, f"is no spreadsheet that can be read: {error}", self._expected_file) from None
+            raise InputError(source, f"cannot be read as a spreadsheet: {error}", self._expected_file) from None
         self._check_version()
 
     @property
     def _expected_file(self) -> str:
-        return f"the file {MADE_BY.format(self.protocol.calculator, self.made_by)}"
+        return f"the file {MAKING_COMMANDS.format(self.protocol.calculator, self.command)}"
 
     def _sheet(self, name: str) -> Any:
         if name not in self._book.sheetnames:
@@ -108,7 +108,7 @@ class Template(_Book):
                 yield test, str(sheet.cell(row, 6).value).strip(), sheet.cell(row, 7)
 
     def fill(self, rated: RatedVehicle) -> None:
-        """Fill in a vehicle's colours, the function of each row, whether layers hold (simulated or claimed), and the predicted tests."""
+        """Fill in a vehicle's colours, each row's function, whether each layer holds (simulated or claimed), and the predicted tests."""
         for number, cell in enumerate(self.protocol.cells):
             if not cell.is_varied:
                 top, left = coordinate_to_tuple(cell.block.first)
@@ -119,28 +119,28 @@ class Template(_Book):
             for k, row in enumerate(block.rows):
                 if row.choice:
                     self._sheet(block.sheet)[f"{block.function}{top + k}"].value = "FCW" if block.is_warning(k) else "AEB"
-        holds = {(one.block.test, layer): does_hold for one in rated.tests for layer, does_hold in one.layers.items()}
+        holds = {(test.block.test, layer): does_hold for test in rated.tests for layer, does_hold in test.layers.items()}
         for layer in self.protocol.layers:
             self._sheet(layer.sheet)[layer.cell].value = "YES" if holds[layer.test, layer.layer] else "NO"
         for test, parameter, cell in self._parameters():
-            if "Heading correction" not in parameter:  # a parameter of lane departure, which accepts no N/A
+            if "Heading correction" not in parameter:  # a lane departure parameter, which does not accept N/A
                 cell.value = PREDICTED if test in self.protocol.tests else NOT_ASSESSED
         self._save()
 
 
 class Preprocessed(_Book):
-    """The file that the calculator has preprocessed: it has drawn cells at random, whose measurements are filled in."""
+    """The file that the calculator has preprocessed, with randomly drawn cells whose measurements are to be filled in."""
 
-    made_by = "preprocess"
+    command = "preprocess"
 
     def __init__(self, source: Path, output: Path) -> None:
         super().__init__(source, output)
         self._sheets = [f"{sheet.removesuffix('pred.')}verif." for sheet in dict.fromkeys(block.sheet for block in self.protocol.blocks)]
-        self._rows = [drawn for sheet in self._sheets for drawn in self._drawn_cells(sheet)]
+        self._rows = [cells for sheet in self._sheets for cells in self._drawn_cells(sheet)]
 
     def _drawn_cells(self, name: str) -> list[tuple[Any, dict[str, int], int, int]]:
         """Sheet, columns by heading, row, and cell number of every drawn cell."""
-        sheet, drawn = self._sheet(name), []
+        sheet, cells = self._sheet(name), []
         columns: dict[str, int] = {}
         for row in range(1, sheet.max_row + 1):
             values = [str(cell.value or "").strip() for cell in sheet[row]]
@@ -156,34 +156,34 @@ class Preprocessed(_Book):
             scenario = values[columns["Scenario"] - 1]
             if scenario not in {block.name for block in self.protocol.blocks}:
                 continue  # the test is not simulated
-            place = point.strip("()").split(",")
-            number = self.protocol.matrix_of.get((scenario, int(place[0]), int(place[1]))) if all(
-                part.strip().isdigit() for part in place) and len(place) == 2 else None
+            indices = point.strip("()").split(",")
+            number = self.protocol.matrix_of.get((scenario, int(indices[0]), int(indices[1]))) if all(
+                part.strip().isdigit() for part in indices) and len(indices) == 2 else None
             if number is None:
                 raise InputError(self.source, f"sheet {name!r}, row {row}: {scenario} has no test point {point!r}", self._expected_file)
-            drawn.append((sheet, columns, row, number))
-        if not columns and sheet["A2"].value != "General requirements":  # held by a sheet without drawn cells (all red)
+            cells.append((sheet, columns, row, number))
+        if not columns and sheet["A2"].value != "General requirements":  # the text of a sheet of red cells, from which none is drawn
             raise InputError(self.source, f"sheet {name!r} has no column 'Test point'", self._expected_file)
-        return drawn
+        return cells
 
     def fill(self, rated: RatedVehicle) -> None:
-        """Fill in the simulated value of every drawn cell, and whether the robustness layer drawn with it holds there."""
-        varied = {(cell.block.name, cell.row, cell.column, cell.range, cell.condition): number
+        """Fill in each drawn cell's simulated value, and whether the robustness layer that is drawn with the cell holds."""
+        layer_cells = {(cell.block.name, cell.row, cell.column, cell.range, cell.condition): number
                   for number, cell in enumerate(self.protocol.cells) if cell.is_varied}
         for sheet, columns, row, number in self._rows:
             cell = self.protocol.cells[number]
-            sheet.cell(row, columns["Value"]).value = _measured(rated, number)
+            sheet.cell(row, columns["Value"]).value = _measurement(rated, number)
             if "Verification condition" in columns and "Robustness" in columns:
                 layer, condition = (str(sheet.cell(row, columns[head]).value or "")
                                     for head in ("Robustness layer", "Verification condition"))
-                of_layer = varied.get((cell.block.name, cell.row, cell.column, layer, condition))
-                if of_layer is not None:
-                    sheet.cell(row, columns["Robustness"]).value = "PASS" if rated.passes(of_layer) else "FAIL"
+                layer_number = layer_cells.get((cell.block.name, cell.row, cell.column, layer, condition))
+                if layer_number is not None:
+                    sheet.cell(row, columns["Robustness"]).value = "PASS" if rated.passes(layer_number) else "FAIL"
         self._save()
 
 
-def _measured(rated: RatedVehicle, number: int) -> float:
-    """Relative speed of the impact [km/h], 0 without an impact; in a row with FCW, the time to collision at the warning [s]."""
+def _measurement(rated: RatedVehicle, number: int) -> float:
+    """Relative impact speed [km/h], 0 without an impact; in a row with FCW, the time to collision at the warning [s]."""
     is_warning = rated.protocol.cells[number].judged == "warning"
     value = float((rated.cells.warning if is_warning else rated.cells.impact)[0, number])
     return 0.0 if math.isnan(value) else float(half_up(max(value, 0.0), DECIMALS))  # type: ignore[arg-type]

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from safevar_sumo.analysis.figures import FONT, literal, new_figure
-from safevar_sumo.analysis.research_questions.algorithms import ATTAINED, attainment, ranks
+from safevar_sumo.analysis.research_questions.algorithms import SURFACE_PERCENTAGES, attainment, ranks
 from safevar_sumo.analysis.research_questions.case import ALGORITHM_TITLES, Case, Unanswerable
 from safevar_sumo.analysis.research_questions.comparisons import ALPHA
 from safevar_sumo.analysis.research_questions.figures import COLOURS, legend_below, objective_title
@@ -18,12 +18,12 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-ROW = 0.34
+ALGORITHM_HEIGHT = 0.34
 """Height of an algorithm's line in a diagram [inch]."""
 
 
 def critical_differences(case: Case) -> Figure:
-    """Mean ranks of the algorithms by each quality indicator; bars join ranks that Nemenyi's test does not distinguish.
+    """Mean ranks of the algorithms for each quality indicator; a bar joins ranks that Nemenyi's test does not distinguish.
 
     Raises
     ------
@@ -34,31 +34,32 @@ def critical_differences(case: Case) -> Figure:
     frame = frame[frame["metric"].isin(list(INDICATOR_TITLES)) & frame["mean_rank"].notna()]
     if frame.empty:
         raise Unanswerable(case.name, "has no run in which every algorithm has solutions", "results of three algorithms or more")
-    metrics, number = list(dict.fromkeys(frame["metric"])), frame["algorithm"].nunique()
+    metrics, algorithms = list(dict.fromkeys(frame["metric"])), frame["algorithm"].nunique()
     runs, difference = int(frame["runs"].iloc[0]), float(frame["critical_difference"].iloc[0])
     title = f"{case.name}: mean ranks over {runs} runs, critical difference {difference:.2f}"
-    figure, axes = new_figure(title, len(metrics), 1, (6.8, 0.9 + len(metrics) * (0.75 + ROW * number)))
+    figure, axes = new_figure(title, len(metrics), 1, (6.8, 0.9 + len(metrics) * (0.75 + ALGORITHM_HEIGHT * algorithms)))
     for axis, metric in zip(axes.flat, metrics, strict=True):
-        part = frame[frame["metric"] == metric].sort_values("mean_rank", kind="stable")
-        _diagram(axis, part["algorithm"].tolist(), part["mean_rank"].to_numpy(dtype=float), difference)
+        metric_ranks = frame[frame["metric"] == metric].sort_values("mean_rank", kind="stable")
+        _diagram(axis, metric_ranks["algorithm"].tolist(), metric_ranks["mean_rank"].to_numpy(dtype=float), difference)
         axis.set_ylabel(INDICATOR_TITLES[metric])
         axis.set_xlabel("mean rank, 1 is best")
     figure.supxlabel(f"a bar joins ranks that differ by less than the critical difference (Nemenyi's test at {ALPHA:g})", fontsize=FONT)
     return figure
 
 
-def _diagram(axis: Axes, algorithms: list[str], mean: FloatArray, difference: float) -> None:
+def _diagram(axis: Axes, algorithms: list[str], mean_ranks: FloatArray, difference: float) -> None:
     number = len(algorithms)
     axis.set_xlim(0.85, number + 0.25 * number)
-    axis.set_ylim(-0.6 * len(mean) - 0.4, number)
-    for position, (name, rank) in enumerate(zip(algorithms, mean, strict=True)):
+    axis.set_ylim(-0.6 * len(mean_ranks) - 0.4, number)
+    for position, (name, rank) in enumerate(zip(algorithms, mean_ranks, strict=True)):
         height = number - 1 - position
         axis.plot([rank, rank], [height, -0.2], color="black", linewidth=0.8)
         axis.plot(rank, height, marker="o", markersize=4, color="#0072b2")
         axis.annotate(f"{literal(ALGORITHM_TITLES.get(name, name))} {rank:.2f}", (rank, height), xytext=(6, 0),
                       textcoords="offset points", va="center", fontsize=FONT)
-    for line, (first, last) in enumerate(cliques(mean, difference)):
-        axis.plot([mean[first] - 0.03, mean[last] + 0.03], [-0.6 - 0.5 * line] * 2, color="#d55e00", linewidth=3, solid_capstyle="round")
+    for bar, (first, last) in enumerate(cliques(mean_ranks, difference)):
+        axis.plot([mean_ranks[first] - 0.03, mean_ranks[last] + 0.03], [-0.6 - 0.5 * bar] * 2, color="#d55e00", linewidth=3,
+                  solid_capstyle="round")
     axis.set_yticks([])
     axis.grid(visible=False)
     for spine in ("left", "right"):
@@ -67,11 +68,11 @@ def _diagram(axis: Axes, algorithms: list[str], mean: FloatArray, difference: fl
     axis.xaxis.set_ticks_position("bottom")
 
 
-def cliques(mean: FloatArray, difference: float) -> list[tuple[int, int]]:
-    """First and last of the largest groups of sorted mean ranks that differ by less than the critical difference."""
+def cliques(mean_ranks: FloatArray, difference: float) -> list[tuple[int, int]]:
+    """First and last index of each largest group of sorted mean ranks that differ by less than the critical difference."""
     groups: list[tuple[int, int]] = []
-    for first in range(len(mean)):
-        last = int(np.flatnonzero(mean - mean[first] < difference)[-1])
+    for first in range(len(mean_ranks)):
+        last = int(np.flatnonzero(mean_ranks - mean_ranks[first] < difference)[-1])
         if last > first and (not groups or last > groups[-1][1]):
             groups.append((first, last))
     return groups
@@ -89,12 +90,12 @@ def attainment_surfaces(case: Case) -> Figure:
     columns = min(len(surfaces), 3)
     rows = -(-len(surfaces) // columns)
     figure, axes = new_figure(f"{case.name}: empirical attainment", rows, columns, (max(3.0 * columns, 5.2), 0.8 + 3.1 * rows),)
-    corners = np.concatenate([points for levels in surfaces.values() for points in levels.values()])
+    all_points = np.concatenate([points for levels in surfaces.values() for points in levels.values()])
     for axis, (algorithm, levels) in zip(axes.flat, surfaces.items(), strict=False):
-        ends = np.array([np.min(corners[:, i]) if goal.maximised else np.max(corners[:, i]) for i, goal in enumerate(goals)])
+        worst_values = np.array([np.min(all_points[:, i]) if goal.maximised else np.max(all_points[:, i]) for i, goal in enumerate(goals)])
         for i, (level, points) in enumerate(levels.items()):
-            label = {ATTAINED[0]: "half of the runs", ATTAINED[1]: "every run"}.get(level, "the best run somewhere")
-            axis.plot(*_stairs(points, ends).T, color=COLOURS[i % len(COLOURS)], linestyle=("-", "--", "-.")[i % 3], linewidth=1.4,
+            label = {SURFACE_PERCENTAGES[0]: "half of the runs", SURFACE_PERCENTAGES[1]: "every run"}.get(level, "at least one run")
+            axis.plot(*_stairs(points, worst_values).T, color=COLOURS[i % len(COLOURS)], linestyle=("-", "--", "-.")[i % 3], linewidth=1.4,
                       label=label)
         axis.set_title(literal(ALGORITHM_TITLES.get(algorithm, algorithm)), fontsize=FONT)
         axis.set_xlabel(objective_title(goals[0]))
@@ -105,13 +106,13 @@ def attainment_surfaces(case: Case) -> Figure:
     return figure
 
 
-def _stairs(points: FloatArray, ends: FloatArray) -> FloatArray:
-    """The border of the region that the points dominate, from and to the worst values; shape (K, 2)."""
-    order = points[np.argsort(points[:, 0], kind="stable")]
-    if np.sign(ends[0] - np.mean(order[:, 0])) < 0:
-        order = order[::-1]
-    border = [(order[0, 0], ends[1])]
-    for position, (x, y) in enumerate(order):
+def _stairs(points: FloatArray, worst_values: FloatArray) -> FloatArray:
+    """K corners of the border of the region that the points dominate, from worst value to worst value; shape (K, 2)."""
+    staircase = points[np.argsort(points[:, 0], kind="stable")]
+    if np.sign(worst_values[0] - np.mean(staircase[:, 0])) < 0:
+        staircase = staircase[::-1]
+    border = [(staircase[0, 0], worst_values[1])]
+    for position, (x, y) in enumerate(staircase):
         border.append((x, y))
-        border.append((order[position + 1, 0] if position + 1 < len(order) else ends[0], y))
+        border.append((staircase[position + 1, 0] if position + 1 < len(staircase) else worst_values[0], y))
     return np.array(border)

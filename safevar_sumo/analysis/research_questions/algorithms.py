@@ -12,21 +12,21 @@ import pandas as pd
 import scipy
 
 from safevar_sumo.analysis.research_questions.case import Case, Unanswerable
-from safevar_sumo.analysis.research_questions.comparisons import ALPHA, compare_samples, from_other_side
+from safevar_sumo.analysis.research_questions.comparisons import ALPHA, compare_samples, reverse_effect
 from safevar_sumo.analysis.research_questions.indicators import MORE_IS_BETTER, indicators, objectives
 from safevar_sumo.analysis.research_questions.over_runs import holm, series_of_means
 from safevar_sumo.records import FloatArray
 
 PAIR_COLUMNS = ["setting", "algorithm", "other", "metric", "p_value", "p_holm", "effect_size", "magnitude", "n1", "n2", "method"]
 RANK_COLUMNS = ["setting", "metric", "algorithm", "mean_rank", "median", "runs", "statistic", "p_value", "p_holm", "critical_difference"]
-ATTAINED = (50.0, 100.0)
+SURFACE_PERCENTAGES = (50.0, 100.0)
 """Percentages of the runs whose attainment surfaces are computed, in addition to a single run's."""
 
 
 def pairs(case: Case) -> pd.DataFrame:
     """Every pair of algorithms, run against run: indicators and metrics' run means, Mann-Whitney U.
 
-    Columns: `PAIR_COLUMNS`. `effect_size` is A12, turned so that higher values mean that `algorithm` is better than `other`. `p_holm` is
+    Columns: `PAIR_COLUMNS`. `effect_size` is A12, oriented so that higher values mean that `algorithm` is better than `other`. `p_holm` is
     `p_value` corrected by Holm's method for all pairs and metrics of this setting. Undefined values are None.
 
     Raises
@@ -39,7 +39,7 @@ def pairs(case: Case) -> pd.DataFrame:
         for metric, (more_is_better, by_algorithm) in samples.items():
             test = compare_samples(*(by_algorithm[name].dropna() for name in (first, second)))
             rows.append({"setting": case.name, "algorithm": first, "other": second, "metric": metric,
-                         **(test if more_is_better else from_other_side(test))._asdict()})
+                         **(test if more_is_better else reverse_effect(test))._asdict()})
     for row, p in zip(rows, holm([row["p_value"] for row in rows]), strict=True):
         row["p_holm"] = p
     return pd.DataFrame(rows, columns=PAIR_COLUMNS, dtype=object)
@@ -57,24 +57,24 @@ def ranks(case: Case) -> pd.DataFrame:
     Unanswerable
         If there are no runs, or fewer than three algorithms.
     """
-    tests, rows = dict[str, float | None](), list[dict[str, Any]]()
+    p_values, rows = dict[str, float | None](), list[dict[str, Any]]()
     for metric, (more_is_better, by_algorithm) in _samples(case, 3).items():
         blocks = pd.DataFrame(by_algorithm).dropna()
         values = blocks.to_numpy(dtype=float)
-        ranked = scipy.stats.rankdata(-values if more_is_better else values, axis=1)
+        ranks_of_runs = scipy.stats.rankdata(-values if more_is_better else values, axis=1)
         statistic, p = _friedman(values)
-        tests[metric] = p
+        p_values[metric] = p
         rows += [{"setting": case.name, "metric": metric, "algorithm": name, "runs": len(blocks), "statistic": statistic, "p_value": p,
-                  "mean_rank": float(ranked[:, i].mean()) if len(blocks) else None,
+                  "mean_rank": float(ranks_of_runs[:, i].mean()) if len(blocks) else None,
                   "median": float(np.median(values[:, i])) if len(blocks) else None,
                   "critical_difference": critical_difference(len(blocks.columns), len(blocks)) if len(blocks) else None}
                  for i, name in enumerate(blocks.columns)]
-    corrected = dict(zip(tests, holm(list(tests.values())), strict=True))
-    return pd.DataFrame([{**row, "p_holm": corrected[row["metric"]]} for row in rows], columns=RANK_COLUMNS, dtype=object)
+    corrected_p_values = dict(zip(p_values, holm(list(p_values.values())), strict=True))
+    return pd.DataFrame([{**row, "p_holm": corrected_p_values[row["metric"]]} for row in rows], columns=RANK_COLUMNS, dtype=object)
 
 
 def critical_difference(algorithms: int, runs: int, alpha: float = ALPHA) -> float:
-    """Least difference of two distinct mean ranks (Nemenyi 1963): q sqrt(k (k + 1) / (6 N)), q the studentised range over sqrt(2)."""
+    """Least difference of mean ranks that the test distinguishes (Nemenyi 1963): q sqrt(k (k + 1) / (6 N)) for k algorithms and N runs."""
     q = float(scipy.stats.studentized_range.ppf(1 - alpha, algorithms, np.inf)) / np.sqrt(2)
     return float(q * np.sqrt(algorithms * (algorithms + 1) / (6 * runs)))
 
@@ -82,8 +82,8 @@ def critical_difference(algorithms: int, runs: int, alpha: float = ALPHA) -> flo
 def attainment(case: Case) -> dict[str, dict[float, FloatArray]]:
     """Empirical attainment surfaces of the first two objectives, by algorithm and percentage of its runs.
 
-    Points, shape (K, 2), in the objectives' units, sorted by the first objective; the percentage of the runs found settings at least as
-    good as each point (Fonseca, Guerreiro, Lopez-Ibanez, Paquete 2011).
+    A surface is K points, shape (K, 2), in the objectives' units, sorted by the first objective. For each of its points, that percentage
+    of the runs found a setting at least as good (Fonseca, Guerreiro, Lopez-Ibanez, Paquete 2011).
 
     Raises
     ------
@@ -97,9 +97,9 @@ def attainment(case: Case) -> dict[str, dict[float, FloatArray]]:
         fronts = [objectives(case, solutions[solutions["run"] == run])[:, :2] for run in case.runs_of(algorithm)]
         fronts = [front for front in fronts if len(front)]
         if fronts:
-            sets = np.repeat(np.arange(len(fronts)), [len(front) for front in fronts])
-            percentages = sorted({100 / len(fronts), *ATTAINED})
-            points = moocore.eaf(np.concatenate(fronts), sets, percentiles=percentages)
+            run_indices = np.repeat(np.arange(len(fronts)), [len(front) for front in fronts])
+            percentages = sorted({100 / len(fronts), *SURFACE_PERCENTAGES})
+            points = moocore.eaf(np.concatenate(fronts), run_indices, percentiles=percentages)
             levels = np.unique(points[:, 2])
             surfaces[algorithm] = {level: (group := points[points[:, 2] == level, :2])[np.argsort(group[:, 0], kind="stable")] * signs
                                    for level in levels.tolist()}
@@ -108,13 +108,13 @@ def attainment(case: Case) -> dict[str, dict[float, FloatArray]]:
     return surfaces
 
 
-def _samples(case: Case, fewest: int) -> Mapping[str, tuple[bool, dict[str, pd.Series[float]]]]:
-    """For each indicator and metric: whether more is better, and per algorithm a series of its values over the runs."""
+def _samples(case: Case, minimum: int) -> Mapping[str, tuple[bool, dict[str, pd.Series[float]]]]:
+    """For each indicator and metric: whether more is better, and for each algorithm the series of values over the runs."""
     if not case.has_runs:
         case.runs_of(next(iter(case.algorithms), ""))  # raises with the reason
-    if len(case.algorithms) < fewest:
+    if len(case.algorithms) < minimum:
         raise Unanswerable(case.name, f"has finished runs of {len(case.algorithms)} algorithms ({', '.join(case.algorithms) or 'none'})",
-                           f"results of {fewest} algorithms or more")
+                           f"results of {minimum} algorithms or more")
     samples: dict[str, tuple[bool, dict[str, pd.Series[float]]]] = {}
     if len(case.solutions):
         quality = indicators(case).set_index(["algorithm", "run"])
@@ -128,7 +128,7 @@ def _samples(case: Case, fewest: int) -> Mapping[str, tuple[bool, dict[str, pd.S
 
 
 def _friedman(values: FloatArray) -> tuple[float | None, float | None]:
-    """Friedman's statistic and p-value of blocks, shape (N, k); 0 and 1 if nothing differs, None for too few blocks."""
+    """Friedman's statistic and p-value of N runs of k algorithms, shape (N, k); 0 and 1 if all algorithms are equal, None if N < 2."""
     if len(values) < 2:
         return None, None
     if np.all(values == values[:, :1]):

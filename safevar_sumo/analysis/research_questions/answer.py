@@ -8,7 +8,7 @@ from typing import NamedTuple
 import pandas as pd
 
 from safevar_sumo.analysis.research_questions.algorithms import pairs, ranks
-from safevar_sumo.analysis.research_questions.case import NSGA2, Case, Unanswerable, solutions_counted
+from safevar_sumo.analysis.research_questions.case import NSGA2, Case, Unanswerable, counted_solutions
 from safevar_sumo.analysis.research_questions.changes import (
     collisions,
     combinations,
@@ -27,7 +27,7 @@ from safevar_sumo.metrics import SAFEVAR, MetricFacts
 
 Frames = dict[str, pd.DataFrame]
 SAFETY = "rq3.3-safety"
-"""Name of the table with the effect on safety, the footer of the paper's table of RQ3.3; an answer to that question has both."""
+"""Name of the table of effects on safety, the footer of the paper's table of RQ3.3. An answer to RQ3.3 has both tables."""
 
 FRAMES_OF_ONE_CASE: Mapping[str, Callable[[Case], Frames]] = {
     "rq1": lambda case: {"rq1": rq1(case)},
@@ -47,7 +47,7 @@ QUESTIONS = (*FRAMES_OF_ONE_CASE, SAFETY, WEATHER)
 
 
 class Answer(NamedTuple):
-    """The answer to a question: a tidy frame over all cases (empty if no case has an answer), notes on the frame, and its metrics."""
+    """The answer to a question: a tidy frame over all cases (empty if no case has an answer), notes on the frame, and the metrics."""
 
     name: str
     frame: pd.DataFrame
@@ -65,29 +65,29 @@ def answer(cases: Sequence[Case], question: str | None = None) -> list[Answer]:
     """
     if question is not None and question not in QUESTIONS:
         raise unknown("question", f"there is no question {question!r}", question, QUESTIONS)
-    answers, refusals, names = [], [], [case.name for case in cases]
+    answers, all_errors, names = [], [], [case.name for case in cases]
     metrics = tuple({metric.name: metric for case in cases for metric in case.scoring.metrics}.values())
-    everything = (*FRAMES_OF_ONE_CASE, WEATHER)
-    for name in everything if question is None else ("rq3.3" if question == SAFETY else question,):
-        tables, refused = _ask(name, cases)
-        refusals += refused
-        notes = [f"{error.source}: {error.problem}." for error in refused]
+    questions = (*FRAMES_OF_ONE_CASE, WEATHER)
+    for name in questions if question is None else ("rq3.3" if question == SAFETY else question,):
+        tables, errors = _ask(name, cases)
+        all_errors += errors
+        notes = [f"{error.source}: {error.problem}." for error in errors]
         if not tables:
             answers.append(Answer(name, pd.DataFrame(), tuple(notes)))
         for table, frames in tables.items():
             frame = pd.concat(frames, ignore_index=True)
-            answered_cases = {*frame["setting"], *frame["other"]} if name == WEATHER else set(names) - {error.source for error in refused}
+            answered_cases = {*frame["setting"], *frame["other"]} if name == WEATHER else set(names) - {error.source for error in errors}
             case_notes = [note for case in cases if case.name in answered_cases for note in _notes(name, case)]
             answers.append(Answer(table, frame, tuple(dict.fromkeys([*notes, *case_notes])), metrics))
-    if refusals and all(one.frame.empty for one in answers):
-        raise refusals[0]
-    return [one for one in answers if one.name == SAFETY] if question == SAFETY else answers
+    if all_errors and all(reply.frame.empty for reply in answers):
+        raise all_errors[0]
+    return [reply for reply in answers if reply.name == SAFETY] if question == SAFETY else answers
 
 
 def _ask(name: str, cases: Sequence[Case]) -> tuple[dict[str, list[pd.DataFrame]], list[Unanswerable]]:
-    """The frames of a question by table, and the reason for each case that has no frame."""
+    """The frames of a question by table, and an error for each case without a frame."""
     tables: dict[str, list[pd.DataFrame]] = {}
-    refused = []
+    errors = []
     for group in [cases] if name == WEATHER else [[case] for case in cases]:
         try:
             if name == WEATHER:
@@ -97,8 +97,8 @@ def _ask(name: str, cases: Sequence[Case]) -> tuple[dict[str, list[pd.DataFrame]
             for table, frame in frames.items():
                 tables.setdefault(table, []).append(frame)
         except Unanswerable as error:
-            refused.append(error)
-    return tables, refused
+            errors.append(error)
+    return tables, errors
 
 
 def _notes(question: str, case: Case) -> list[str]:
@@ -106,22 +106,22 @@ def _notes(question: str, case: Case) -> list[str]:
     notes = case.remarks
     if question in ("rq1", "rq2"):
         for metric in case.scoring.metrics:
-            rows = solutions_counted(case.solutions, metric)
-            undefined = int(rows[metric.name].isna().sum())
-            if undefined:
-                notes.append(f"{case.name}: {metric.name} is undefined in {undefined} of {len(rows)} solutions and omits them.")
+            rows = counted_solutions(case.solutions, metric)
+            undefined_values = int(rows[metric.name].isna().sum())
+            if undefined_values:
+                notes.append(f"{case.name}: {metric.name} is undefined in {undefined_values} of {len(rows)} solutions, which are omitted.")
     if question == "rq1":
         undefined_metrics = [name for name, value in case.original.items() if pd.isna(value)]
         if undefined_metrics:
-            notes.append(f"{case.name}: the original vehicle's {', '.join(undefined_metrics)} is undefined; nothing is compared with it.")
+            notes.append(f"{case.name}: the original vehicle's {', '.join(undefined_metrics)} is undefined, so that no test uses it.")
     if question in ("rq1-runs", "rq2-runs"):
         notes.append(f"{case.name}: {difference_line(case)}")
     if question == "rq2" and not case.has_runs:
         notes.append(f"{case.name}: igd, igd_plus and hypervolume need runs, which imported solutions do not have.")
     if question == "rq2" and case.has_runs:
-        empty = len(set(case.finished) - set(zip(case.solutions["algorithm"], case.solutions["run"], strict=True)))
-        if empty:
-            notes.append(f"{case.name}: {empty} finished runs found no solution; they have no igd, igd_plus and hypervolume.")
+        empty_runs = len(set(case.finished) - set(zip(case.solutions["algorithm"], case.solutions["run"], strict=True)))
+        if empty_runs:
+            notes.append(f"{case.name}: {empty_runs} finished runs found no solution; they have no igd, igd_plus and hypervolume.")
     if question.startswith("rq3") or question in ("combinations", WEATHER):
         notes.append(f"{case.name}: {len(critical(case))} critical solutions of {len(case.solutions_of(NSGA2))} of {NSGA2}.")
     if question == "combinations" and combinations(case).empty:

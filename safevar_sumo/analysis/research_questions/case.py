@@ -1,4 +1,4 @@
-"""The results of one study as the research questions need them: solutions by algorithm and run, and the original's metrics."""
+"""The results of one study for the research questions: solutions by algorithm and run, and the original vehicle's metrics."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Case:
     original
         The original vehicle's metrics by name; NaN where undefined.
     solutions, evaluations
-        Frames as `safevar_sumo.results.load_runs` gives them.
+        Frames that `safevar_sumo.results.load_runs` returns.
     finished
         Algorithm and number of every finished run.
     scoring
@@ -80,8 +80,8 @@ class Case:
     @property
     def algorithms(self) -> tuple[str, ...]:
         """Algorithms that have solutions or a finished run, in the study's order."""
-        present = {*self.solutions["algorithm"], *(algorithm for algorithm, _ in self.finished)}
-        return tuple(name for name in dict.fromkeys([*self.study.search.labels, *sorted(present)]) if name in present)
+        names = {*self.solutions["algorithm"], *(algorithm for algorithm, _ in self.finished)}
+        return tuple(name for name in dict.fromkeys([*self.study.search.labels, *sorted(names)]) if name in names)
 
     def require_solutions(self) -> None:
         """Raise `Unanswerable` if no run is finished."""
@@ -97,8 +97,8 @@ class Case:
             If the algorithm has no finished run.
         """
         if algorithm not in self.algorithms:
-            present = ", ".join(self.algorithms) or "no algorithm"
-            raise Unanswerable(self.name, f"has no finished run of {algorithm}", f"results of {algorithm} (it has those of {present})")
+            names = ", ".join(self.algorithms) or "no algorithm"
+            raise Unanswerable(self.name, f"has no finished run of {algorithm}", f"results of {algorithm} (it has results of {names})")
         return self.solutions[self.solutions["algorithm"] == algorithm]
 
     def runs_of(self, algorithm: str) -> list[int]:
@@ -118,27 +118,27 @@ class Case:
         """Notes for the readers of every table of this case."""
         lines = []
         if not self.has_runs:
-            lines.append(f"{self.name}: imported solutions, without runs; the original vehicle as published or given.")
+            lines.append(f"{self.name}: imported solutions, without runs; the original vehicle's metrics are published or supplied.")
         else:
             done = Counter(algorithm for algorithm, _ in self.finished)
             planned = self.study.search.runs
-            short = [f"{name} {done[name]} of {planned} runs" for name in self.study.search.labels if done[name] < planned]
-            if short:
-                lines.append(f"{self.name}: unfinished, {', '.join(short)}; tables use the finished runs.")
+            shortfalls = [f"{name} {done[name]} of {planned} runs" for name in self.study.search.labels if done[name] < planned]
+            if shortfalls:
+                lines.append(f"{self.name}: unfinished, {', '.join(shortfalls)}; tables use the finished runs.")
         if self.failures:
             lines.append(f"{self.name}: {len(self.failures)} settings could not be simulated (simulator-error) and are in no result: "
                         f"{'; '.join(failure_lines(self.failures))}. study --retry-failed simulates them again.")
         return lines
 
 
-def solutions_counted(solutions: pd.DataFrame, metric: MetricFacts) -> pd.DataFrame:
+def counted_solutions(solutions: pd.DataFrame, metric: MetricFacts) -> pd.DataFrame:
     """The solutions that count for a metric: for TET and TIT only those without collision (method section 4)."""
     return solutions if metric.over_collisions else solutions[~collided(solutions)]
 
 
 def values(solutions: pd.DataFrame, metric: MetricFacts) -> FloatArray:
     """A metric's defined values over the solutions that count for it."""
-    column = solutions_counted(solutions, metric)[metric.name].to_numpy(dtype=float)
+    column = counted_solutions(solutions, metric)[metric.name].to_numpy(dtype=float)
     return np.asarray(column[~np.isnan(column)])
 
 
@@ -148,27 +148,27 @@ def collided(solutions: pd.DataFrame) -> pd.Series[bool]:
 
 
 def load_cases(directories: Iterable[str | Path]) -> list[Case]:
-    """Read results directories; cases with the same name get their directories as part of their names.
+    """Read results directories; the names of cases with the same name include their directories.
 
     Raises
     ------
     InputError
         If a directory holds no results, is damaged or is given twice.
     """
-    places = [Path(directory) for directory in directories]
-    twice = [place for place, number in Counter(place.resolve() for place in places).items() if number > 1]
-    if twice:
-        raise InputError("directories", f"{twice[0]} is given twice", "each results directory once")
-    cases = [_loaded(place) for place in places]
-    names = Counter(one.name for one in cases)
-    return [replace(one, name=f"{one.name} ({place})") if names[one.name] > 1 else one for one, place in zip(cases, places, strict=True)]
+    paths = [Path(directory) for directory in directories]
+    duplicates = [path for path, number in Counter(path.resolve() for path in paths).items() if number > 1]
+    if duplicates:
+        raise InputError("directories", f"{duplicates[0]} is given twice", "each results directory once")
+    cases = [_load_or_refuse(path) for path in paths]
+    names = Counter(case.name for case in cases)
+    return [replace(case, name=f"{case.name} ({path})") if names[case.name] > 1 else case for case, path in zip(cases, paths, strict=True)]
 
 
-def _loaded(place: Path) -> Case:
+def _load_or_refuse(path: Path) -> Case:
     try:
-        return load_case(place)
+        return load_case(path)
     except (TypeError, ValueError, KeyError, ArithmeticError) as error:
-        raise InputError(place, f"is damaged: {in_one_line(error)}", "an unchanged directory of the command study") from error
+        raise InputError(path, f"is damaged: {in_one_line(error)}", "an unchanged directory of the command study") from error
 
 
 def load_case(directory: Path) -> Case:
@@ -180,7 +180,7 @@ def load_case(directory: Path) -> Case:
         raise invalid(directory / MANIFEST, manifest["study"], error, "study") from None
     original = manifest.get("original")
     if not isinstance(original, dict):
-        raise InputError(directory / MANIFEST, "does not describe the original vehicle", "one written by the command study")
+        raise InputError(directory / MANIFEST, "does not describe the original vehicle", "a manifest of the command study")
     try:
         scoring = msgspec.convert(manifest["scoring"], Scoring) if "scoring" in manifest else SAFEVAR
     except msgspec.ValidationError as error:

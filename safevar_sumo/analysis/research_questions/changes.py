@@ -19,9 +19,9 @@ from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.study import SAFETY_DEGREE
 
 ANY = "any"
-COMBINED = 4
+COMBINATION_SIZE = 4
 """Number of changed characteristics in the combinations that are counted."""
-SHOWN = 3
+COMBINATIONS_SHOWN = 3
 """Number of the most frequent combinations that are shown."""
 
 
@@ -40,14 +40,14 @@ def critical(case: Case) -> pd.DataFrame:
 
 
 def changes(case: Case, solutions: pd.DataFrame) -> FloatArray:
-    """v'' - v of every characteristic in its unit, shape (M, n)."""
+    """Changes v'' - v of M solutions in n characteristics, in the characteristic's unit, shape (M, n)."""
     return np.asarray(solutions[list(case.characteristics.names)].to_numpy(dtype=float) - case.characteristics.original)
 
 
-def by_number(case: Case, changed: FloatArray) -> dict[str, BoolArray]:
+def by_number(case: Case, deltas: FloatArray) -> dict[str, BoolArray]:
     """Whether solutions have j characteristics changed, for j = "1".."n" and "any"."""
-    number = np.count_nonzero(changed, axis=1)
-    return {**{str(j): number == j for j in range(1, len(case.characteristics) + 1)}, ANY: np.ones(len(changed), dtype=bool)}
+    number = np.count_nonzero(deltas, axis=1)
+    return {**{str(j): number == j for j in range(1, len(case.characteristics) + 1)}, ANY: np.ones(len(deltas), dtype=bool)}
 
 
 def rq31(case: Case) -> pd.DataFrame:
@@ -65,29 +65,29 @@ def rq32(case: Case) -> pd.DataFrame:
     Columns setting, characteristic, j ("1".."n", "any"), percent (None without such a solution), rank (only for
     j = "any"; ties share the better rank and the next one is skipped).
     """
-    changed = changes(case, critical(case))
-    times = np.count_nonzero(changed, axis=0)
+    deltas = changes(case, critical(case))
+    change_counts = np.count_nonzero(deltas, axis=0)
     rows = []
     for i, member in enumerate(case.characteristics):
-        for j, chosen in by_number(case, changed).items():
-            percent = 100 * float(np.mean(changed[chosen, i] != 0)) if chosen.any() else None
-            rank = 1 + int(np.count_nonzero(times > times[i])) if j == ANY and len(changed) else None
+        for j, mask in by_number(case, deltas).items():
+            percent = 100 * float(np.mean(deltas[mask, i] != 0)) if mask.any() else None
+            rank = 1 + int(np.count_nonzero(change_counts > change_counts[i])) if j == ANY and len(deltas) else None
             rows.append((case.name, member.name, j, percent, rank))
     return pd.DataFrame(rows, columns=["setting", "characteristic", "j", "percent", "rank"], dtype=object)
 
 
 def rq33(case: Case) -> pd.DataFrame:
-    """Size of the changes, increases and decreases apart, in the critical solutions with j characteristics changed.
+    """Size of increases and of decreases in the critical solutions with j characteristics changed.
 
     Columns setting, characteristic, direction, j ("1".."n", "any"), pc (mean of |v - v''| / v, a fraction), delta (mean
     signed change in the characteristic's unit), n (number of changes); pc and delta are None where n is 0.
     """
-    changed = changes(case, critical(case))
+    deltas = changes(case, critical(case))
     rows = []
     for i, member in enumerate(case.characteristics):
         for direction, sign in (("increase", 1), ("decrease", -1)):
-            for j, chosen in by_number(case, changed).items():
-                delta = changed[chosen, i]
+            for j, mask in by_number(case, deltas).items():
+                delta = deltas[mask, i]
                 delta = delta[np.sign(delta) == sign]
                 mean = float(np.mean(delta)) if delta.size else None
                 pc = None if mean is None else abs(mean / member.original)
@@ -99,26 +99,26 @@ def rq33_safety(case: Case) -> pd.DataFrame:
     """Effect of the critical solutions with j characteristics changed on safety: the footer of RQ3.3's table.
 
     Columns setting, quantity, j, value, percent (of the original's value), n; value is None where n is 0. Quantities:
-    avgSD_mD, mean reduction of the distance, without collisions [m]; avgSD_cS, mean speed of the collisions [m/s], no
+    avgSD_mD, mean reduction of the distance, without collisions [m]; avgSD_cS, mean speed of the collisions [m/s], without
     percent; TET [s] and TIT [s^2], mean increase, without collisions; aveDece, mean decrease, over all [m/s^2].
     """
     solutions = critical(case)
-    crash = collided(solutions).to_numpy()
+    has_collided = collided(solutions).to_numpy()
     sd, tet, tit, dece = (solutions[name].to_numpy(dtype=float) for name in (SAFETY_DEGREE, "tet", "tit", "ave_dece"))
     original = case.original
     quantities = {
-        "avgSD_mD": (np.where(crash, np.nan, original[SAFETY_DEGREE] - sd), original[SAFETY_DEGREE]),
-        "avgSD_cS": (np.where(crash, -sd, np.nan), np.nan),
-        "TET": (np.where(crash, np.nan, tet - original["tet"]), original["tet"]),
-        "TIT": (np.where(crash, np.nan, tit - original["tit"]), original["tit"]),
+        "avgSD_mD": (np.where(has_collided, np.nan, original[SAFETY_DEGREE] - sd), original[SAFETY_DEGREE]),
+        "avgSD_cS": (np.where(has_collided, -sd, np.nan), np.nan),
+        "TET": (np.where(has_collided, np.nan, tet - original["tet"]), original["tet"]),
+        "TIT": (np.where(has_collided, np.nan, tit - original["tit"]), original["tit"]),
         "aveDece": (original["ave_dece"] - dece, original["ave_dece"])}
     rows = []
     for quantity, (difference, reference) in quantities.items():
-        for j, chosen in by_number(case, changes(case, solutions)).items():
-            counted = difference[chosen & ~np.isnan(difference)]
-            mean = float(np.mean(counted)) if counted.size else None
+        for j, mask in by_number(case, changes(case, solutions)).items():
+            sample = difference[mask & ~np.isnan(difference)]
+            mean = float(np.mean(sample)) if sample.size else None
             percent = None if mean is None or np.isnan(reference) or reference == 0 else 100 * mean / abs(reference)
-            rows.append((case.name, quantity, j, mean, percent, counted.size))
+            rows.append((case.name, quantity, j, mean, percent, sample.size))
     return pd.DataFrame(rows, columns=["setting", "quantity", "j", "value", "percent", "n"], dtype=object)
 
 
@@ -143,31 +143,31 @@ def combinations(case: Case) -> pd.DataFrame:
     """The most frequent combinations among the critical solutions with exactly four characteristics changed.
 
     Columns setting, rank (ties share the better one), characteristics (a list), percent of those solutions; no row
-    where there is no such solution. Of combinations that are equally frequent, those whose characteristics stand
-    earlier in the study come first.
+    where there is no such solution. Of combinations that are equally frequent, those with the earlier
+    characteristics in the study come first.
     """
-    changed = changes(case, critical(case)) != 0
-    of_four = changed[np.count_nonzero(changed, axis=1) == COMBINED]
-    counted = Counter(tuple(np.flatnonzero(row).tolist()) for row in of_four)
-    ordered = sorted(counted.items(), key=lambda item: (-item[1], item[0]))[:SHOWN]
+    is_changed = changes(case, critical(case)) != 0
+    masks = is_changed[np.count_nonzero(is_changed, axis=1) == COMBINATION_SIZE]
+    counts = Counter(tuple(np.flatnonzero(row).tolist()) for row in masks)
+    ranking = sorted(counts.items(), key=lambda item: (-item[1], item[0]))[:COMBINATIONS_SHOWN]
     names = case.characteristics.names
-    rows = [(case.name, 1 + sum(other > number for other in counted.values()), [names[i] for i in members], 100 * number / len(of_four))
-            for members, number in ordered]
+    rows = [(case.name, 1 + sum(other > number for other in counts.values()), [names[i] for i in members], 100 * number / len(masks))
+            for members, number in ranking]
     return pd.DataFrame(rows, columns=["setting", "rank", "characteristics", "percent"])
 
 
 def weather_pairs(cases: Sequence[Case]) -> list[tuple[Case, Case]]:
-    """Pairs of cases that differ only in the weather and the ADS's reaction to it, the clearer first (by friction, sight, delays).
+    """Pairs of cases that differ only in the weather and the ADS's reaction to it, clearer weather first (by friction, visibility, delays).
 
     Raises
     ------
     Unanswerable
         If there is no such pair.
     """
-    pairs = [(one, other) for one, other in permutations(cases, 2)
-             if _without_weather(one) == _without_weather(other) and _clearness(one) > _clearness(other)]
+    pairs = [(clear, wet) for clear, wet in permutations(cases, 2)
+             if _without_weather(clear) == _without_weather(wet) and _clearness(clear) > _clearness(wet)]
     if not pairs:
-        raise Unanswerable(", ".join(one.name for one in cases), "two cases are needed that differ in the weather alone",
+        raise Unanswerable(", ".join(clear.name for clear in cases), "two cases are needed that differ in the weather alone",
                            "results such as those of sun and rain")
     return pairs
 
@@ -175,43 +175,43 @@ def weather_pairs(cases: Sequence[Case]) -> list[tuple[Case, Case]]:
 def weather(clear: Case, wet: Case) -> pd.DataFrame:
     """One weather against another, characteristic by characteristic, over the critical solutions.
 
-    Columns setting, other, characteristic, percent and percent_other (share of the critical solutions in which it is
-    changed), difference (the other's minus the first's), rank and rank_other, and the mean signed change in its unit:
+    Columns setting, other, characteristic, percent and percent_other (share of the critical solutions that change
+    it), difference (percent_other - percent), rank and rank_other, and the mean signed change in the characteristic's unit:
     increase, increase_other, decrease, decrease_other.
     """
-    sides = []
+    tables = []
     for case in (clear, wet):
         share, size = rq32(case), rq33(case)
-        side = share[share["j"] == ANY].set_index("characteristic")[["percent", "rank"]]
+        columns_of_case = share[share["j"] == ANY].set_index("characteristic")[["percent", "rank"]]
         for direction in ("increase", "decrease"):
             group = size[(size["j"] == ANY) & (size["direction"] == direction)]
-            side[direction] = group.set_index("characteristic")["delta"]
-        sides.append(side)
-    both = sides[0].join(sides[1].add_suffix("_other"))
-    difference = [None if a is None or b is None else b - a for a, b in zip(both["percent"], both["percent_other"], strict=True)]
-    both.insert(0, "difference", pd.Series(difference, index=both.index, dtype=object))
-    both.insert(0, "other", wet.name)
-    both.insert(0, "setting", clear.name)
+            columns_of_case[direction] = group.set_index("characteristic")["delta"]
+        tables.append(columns_of_case)
+    table = tables[0].join(tables[1].add_suffix("_other"))
+    difference = [None if a is None or b is None else b - a for a, b in zip(table["percent"], table["percent_other"], strict=True)]
+    table.insert(0, "difference", pd.Series(difference, index=table.index, dtype=object))
+    table.insert(0, "other", wet.name)
+    table.insert(0, "setting", clear.name)
     columns = ["setting", "other", "characteristic", "percent", "percent_other", "difference", "rank", "rank_other",
                "increase", "increase_other", "decrease", "decrease_other"]
-    return both.reset_index()[columns]
+    return table.reset_index()[columns]
 
 
 def effects(case: Case) -> pd.DataFrame:
-    """Every change in every critical solution; columns setting, characteristic, change (signed, in its unit)."""
-    changed = changes(case, critical(case))
+    """Every change in every critical solution; columns setting, characteristic, change (signed, in the characteristic's unit)."""
+    deltas = changes(case, critical(case))
     parts = [pd.DataFrame({"setting": case.name, "characteristic": name, "change": column[column != 0]})
-             for name, column in zip(case.characteristics.names, changed.T, strict=True)]
+             for name, column in zip(case.characteristics.names, deltas.T, strict=True)]
     return pd.concat(parts, ignore_index=True)
 
 
 def _clearness(case: Case) -> tuple[float, float, float]:
     weather = case.weather
-    late = [float(case.study.ads.parameters.get(name, 0.0)) for name in REACTIONS]
-    return weather.road_friction, weather.visibility, -weather.recognition_delay - sum(late)
+    reaction_delays = [float(case.study.ads.parameters.get(name, 0.0)) for name in REACTIONS]
+    return weather.road_friction, weather.visibility, -weather.recognition_delay - sum(reaction_delays)
 
 
 def _without_weather(case: Case) -> tuple[object, ...]:
     study = case.study
-    others = {name: value for name, value in study.ads.parameters.items() if name not in REACTIONS}
-    return study.scenario, study.vehicle, replace(study.ads, parameters=others), study.metrics
+    parameters = {name: value for name, value in study.ads.parameters.items() if name not in REACTIONS}
+    return study.scenario, study.vehicle, replace(study.ads, parameters=parameters), study.metrics

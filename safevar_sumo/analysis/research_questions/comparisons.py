@@ -18,13 +18,13 @@ from safevar_sumo.records import FloatArray
 
 ALPHA = 0.01
 """A p-value below this level is significant."""
-EXACT_UP_TO = 8
-"""Without ties, p is exact if one sample is at most this large; else it is the normal approximation."""
-EXACT = "Mann-Whitney U, two-sided, exact"
-ASYMPTOTIC = "Mann-Whitney U, two-sided, normal approximation with corrections for ties and continuity"
+EXACT_SAMPLE_SIZE = 8
+"""Without ties, the p-value is exact if one sample has at most this many values; otherwise it is a normal approximation."""
+EXACT_TEST = "Mann-Whitney U, two-sided, exact"
+ASYMPTOTIC_TEST = "Mann-Whitney U, two-sided, normal approximation with corrections for ties and continuity"
 MAGNITUDES = ((0.714, "large"), (0.638, "medium"), (0.556, "small"))
 """Kitchenham's magnitudes: the least max(A12, 1 - A12) for each."""
-NOTABLE = ("medium", "large")
+NOTABLE_MAGNITUDES = ("medium", "large")
 
 
 class TwoSampleTest(NamedTuple):
@@ -54,17 +54,17 @@ def compare_samples(x: ArrayLike, y: ArrayLike) -> TwoSampleTest:
         raise InputError("Mann-Whitney U", "a value is NaN", "samples without undefined values")
     if not first.size or not second.size:
         return TwoSampleTest(None, None, None, first.size, second.size, None)
-    both = np.concatenate([first, second])
-    exact = min(first.size, second.size) <= EXACT_UP_TO and np.unique(both).size == both.size
-    test = scipy.stats.mannwhitneyu(first, second, alternative="two-sided", method="exact" if exact else "asymptotic")
+    pooled = np.concatenate([first, second])
+    is_exact = min(first.size, second.size) <= EXACT_SAMPLE_SIZE and np.unique(pooled).size == pooled.size
+    test = scipy.stats.mannwhitneyu(first, second, alternative="two-sided", method="exact" if is_exact else "asymptotic")
     a12 = float(test.statistic) / (first.size * second.size)
-    return TwoSampleTest(float(test.pvalue), a12, magnitude(a12), first.size, second.size, EXACT if exact else ASYMPTOTIC)
+    return TwoSampleTest(float(test.pvalue), a12, magnitude(a12), first.size, second.size, EXACT_TEST if is_exact else ASYMPTOTIC_TEST)
 
 
 def magnitude(effect_size: float) -> str:
     """The magnitude of an effect size, by Kitchenham's intervals."""
     distance = round(max(effect_size, 1 - effect_size), 12)
-    return next((name for least, name in MAGNITUDES if distance >= least), "negligible")
+    return next((name for limit, name in MAGNITUDES if distance >= limit), "negligible")
 
 
 RQ1_COLUMNS = ["setting", "algorithm", "metric", "p_value", "effect_size", "magnitude", "n1", "n2", "method", "mean", "original"]
@@ -73,7 +73,7 @@ RQ1_COLUMNS = ["setting", "algorithm", "metric", "p_value", "effect_size", "magn
 def rq1(case: Case) -> pd.DataFrame:
     """Every algorithm's solutions against the original's value, repeated to the sample's size, metric by metric.
 
-    Columns: `RQ1_COLUMNS`. `effect_size` is A12, turned so that smaller values mean that the algorithm's solutions are
+    Columns: `RQ1_COLUMNS`. `effect_size` is A12, oriented so that smaller values mean that the algorithm's solutions are
     more unsafe; `mean` is the mean over the algorithm's solutions, `original` the original vehicle's value. Undefined values are None.
 
     Raises
@@ -87,25 +87,25 @@ def rq1(case: Case) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=RQ1_COLUMNS, dtype=object)
 
 
-Sample = Callable[[str, MetricFacts], FloatArray]
-"""An algorithm's values of a metric, shape (N,)."""
+SampleFunction = Callable[[str, MetricFacts], FloatArray]
+"""Returns an algorithm's N values of a metric, shape (N,)."""
 
 
-def rq1_rows(case: Case, sample_of: Sample, test: Callable[[FloatArray, float], TwoSampleTest]) -> list[dict[str, Any]]:
-    """A row for each algorithm and metric: the test of its sample against the original's value, turned as in `rq1`."""
+def rq1_rows(case: Case, sample_of: SampleFunction, test: Callable[[FloatArray, float], TwoSampleTest]) -> list[dict[str, Any]]:
+    """A row for each algorithm and metric: the test of its sample against the original's value, oriented as in `rq1`."""
     rows = []
     for algorithm in case.algorithms:
         for metric in case.scoring.metrics:
             sample, original = sample_of(algorithm, metric), case.original[metric.name]
             result = test(sample, original)
             rows.append({"setting": case.name, "algorithm": algorithm, "metric": metric.name,
-                         **(from_other_side(result) if metric.more_is_unsafe else result)._asdict(), "runs": len(sample),
+                         **(reverse_effect(result) if metric.more_is_unsafe else result)._asdict(), "runs": len(sample),
                          "mean": float(np.mean(sample)) if sample.size else None, "original": None if np.isnan(original) else original})
     return rows
 
 
-def from_other_side(test: TwoSampleTest) -> TwoSampleTest:
-    """The same comparison with the effect size of the other sample, A21 = 1 - A12."""
+def reverse_effect(test: TwoSampleTest) -> TwoSampleTest:
+    """The same test with the effect size of the second sample against the first, 1 - A12."""
     effect = None if test.effect_size is None else 1 - test.effect_size
     return test if effect is None else test._replace(effect_size=effect, magnitude=magnitude(effect))
 
@@ -116,7 +116,7 @@ RQ2_COLUMNS = ["setting", "baseline", "metric", "p_value", "effect_size", "magni
 def rq2(case: Case) -> pd.DataFrame:
     """NSGA-II against every other algorithm: its runs' indicators, then its pooled solutions' metrics.
 
-    Columns: `RQ2_COLUMNS`. `effect_size` is A12, turned so that higher values mean that NSGA-II is better: a better front,
+    Columns: `RQ2_COLUMNS`. `effect_size` is A12, oriented so that higher values mean that NSGA-II is better: a better front,
     more unsafe solutions. `n1` counts NSGA-II's values, `n2` the baseline's. Undefined values are None, as are the
     indicators of imported solutions, which belong to no run.
 
@@ -127,13 +127,13 @@ def rq2(case: Case) -> pd.DataFrame:
     """
     case.solutions_of(NSGA2)  # raises Unanswerable if there are none
     if all(name == NSGA2 for name in case.algorithms):
-        raise Unanswerable(case.name, f"has finished runs of {NSGA2} alone", "results of another algorithm to compare with, such as rs")
+        raise Unanswerable(case.name, f"only {NSGA2} has finished runs", "results of another algorithm to compare with, such as rs")
     rows = rq2_rows(case, lambda algorithm, metric: values(case.solutions_of(algorithm), metric))
     return pd.DataFrame(rows, columns=RQ2_COLUMNS, dtype=object)
 
 
-def rq2_rows(case: Case, sample_of: Sample) -> list[dict[str, Any]]:
-    """Rows for each other algorithm: its runs' indicators, and its samples of the metrics, against NSGA-II's, turned as in `rq2`."""
+def rq2_rows(case: Case, sample_of: SampleFunction) -> list[dict[str, Any]]:
+    """Rows for each other algorithm: its runs' indicators and its samples of the metrics against those of NSGA-II, oriented as in `rq2`."""
     quality = indicators(case) if case.has_runs and len(case.solutions) else None
     rows = []
     for baseline in (name for name in case.algorithms if name != NSGA2):
@@ -144,5 +144,5 @@ def rq2_rows(case: Case, sample_of: Sample) -> list[dict[str, Any]]:
         tests += [(metric.name, not metric.more_is_unsafe, compare_samples(*(sample_of(algorithm, metric) for algorithm in pair)))
                   for metric in case.scoring.metrics]
         rows += [{"setting": case.name, "baseline": baseline, "metric": name,
-                  **(from_other_side(test) if smaller_is_better else test)._asdict()} for name, smaller_is_better, test in tests]
+                  **(reverse_effect(test) if smaller_is_better else test)._asdict()} for name, smaller_is_better, test in tests]
     return rows

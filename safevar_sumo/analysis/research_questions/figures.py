@@ -26,7 +26,7 @@ INCREASE, DECREASE = COLOURS[1], COLOURS[0]
 OBJECTIVE_TITLES = {"f_safe": "f_safe: safety degree [m, -m/s]", "f_diff": "f_diff: largest change [fraction of the original]",
                     "f_num_diff": "f_numDiff: characteristics changed"}
 LONG_NAME = 28
-"""Number of letters that fit above a small axis."""
+"""Number of letters of a name that fit above a small axis."""
 PANELS = 3
 """Number of panels in a row."""
 BINS = 24
@@ -52,15 +52,15 @@ def number_of_changes(cases: Sequence[Case]) -> Figure:
         axis.set_xlabel("characteristics changed")
         axis.set_ylabel(f"critical solutions per run\n({group['run'].nunique()} runs)")
         axis.set_title(literal(case.name) if len(cases) > 1 else "", fontsize=FONT)
-        _whole_numbers(axis.yaxis)
-    return _spaced(figure)
+        _set_integer_ticks(axis.yaxis)
+    return _with_space(figure)
 
 
 def changed_characteristics(case: Case) -> Figure:
     """RQ3.2 as a heat map: the share of critical solutions with j changed characteristics in which each characteristic is changed."""
     import seaborn as sns
 
-    _number_critical(case)
+    _critical_count(case)
     shares = rq32(case)
     order = shares[shares["j"] == ANY].sort_values("rank", kind="stable")["characteristic"]
     grid = shares.pivot(index="characteristic", columns="j", values="percent").astype(float)
@@ -69,20 +69,20 @@ def changed_characteristics(case: Case) -> Figure:
     sns.heatmap(grid, ax=axis, cmap="cividis", vmin=0, vmax=100, annot=True, fmt=".0f", annot_kws={"fontsize": 7}, linewidths=0.5,
                 cbar_kws={"label": "critical solutions\nin which it is changed [%]"})
     axis.grid(visible=False)
-    colours = axis.collections[0].colorbar.ax
-    colours.tick_params(labelsize=FONT)
-    colours.yaxis.label.set_size(FONT)
+    colour_bar = axis.collections[0].colorbar.ax
+    colour_bar.tick_params(labelsize=FONT)
+    colour_bar.yaxis.label.set_size(FONT)
     axis.set_xlabel("number of characteristics changed (empty: no such solution)")
     axis.set_ylabel("characteristic, most frequent first")
     axis.tick_params(axis="both", length=0, rotation=0)
-    return _spaced(figure)
+    return _with_space(figure)
 
 
 def sizes_of_changes(case: Case) -> Figure:
     """The distribution of each characteristic's signed changes in the critical solutions."""
     import seaborn as sns
 
-    total = _number_critical(case)
+    total = _critical_count(case)
     changes = effects(case)
     members = case.characteristics.members
     figure, axes = panels(f"{case.name}: changes in critical solutions", len(members), 4, (2.25, 1.85), least_width=9.0, above=1.0)
@@ -102,17 +102,17 @@ def sizes_of_changes(case: Case) -> Figure:
         axis.set_xlabel(f"change [{as_formula(member.unit)}]", fontsize=FONT)
         axis.set_ylabel("")
         axis.locator_params(axis="x", nbins=3, steps=[1, 2, 5, 10])
-        _whole_numbers(axis.yaxis, 4)
-    figure.supylabel(f"how many of {total} critical solutions", fontsize=9)
+        _set_integer_ticks(axis.yaxis, 4)
+    figure.supylabel(f"number of critical solutions (of {total})", fontsize=9)
     figure.supxlabel("orange, right of 0: increases; blue, left of 0: decreases; titles count them;\n"
                      "each axis spans the characteristic's domain", fontsize=FONT)
-    return _spaced(figure)
+    return _with_space(figure)
 
 
 def pareto_fronts(case: Case) -> Figure:
     """The non-dominated solutions of all runs of each algorithm together, for every pair of objectives.
 
-    Each panel also shows the original vehicle; solutions on the dashed line or left of it are collisions.
+    Each panel also shows the original vehicle; solutions on the dashed line or to its left are collisions.
 
     Raises
     ------
@@ -120,12 +120,12 @@ def pareto_fronts(case: Case) -> Figure:
         If there is no solution.
     """
     goals = case.scoring.objectives
-    scales = [one.sign for one in goals]
+    signs = [goal.sign for goal in goals]
     fronts = {}
     for algorithm in case.algorithms:
         points = objectives(case, case.solutions_of(algorithm))
         if len(points):
-            fronts[algorithm] = nondominated(points) * scales
+            fronts[algorithm] = nondominated(points) * signs
     if not fronts:
         raise Unanswerable(case.name, "has no solution", "results with at least one finished run")
     pairs = list(combinations(range(len(goals)), 2))
@@ -133,7 +133,7 @@ def pareto_fronts(case: Case) -> Figure:
     columns = len(pairs) // rows
     figure, axes = new_figure(f"{case.name}: non-dominated solutions of each algorithm, all runs together", rows, columns,
                            (max(3.2 * columns, 5), 3.7 * rows))
-    original = [_original_value(case, one) for one in goals]
+    original = [_original_value(case, goal) for goal in goals]
     for axis, (first, second) in zip(axes.flat, pairs, strict=True):
         for i, (algorithm, points) in enumerate(fronts.items()):
             axis.plot(points[:, first], points[:, second], linestyle="", marker=MARKERS[i % len(MARKERS)], markersize=4, alpha=0.6,
@@ -141,11 +141,11 @@ def pareto_fronts(case: Case) -> Figure:
         if not np.isnan([original[first], original[second]]).any():
             axis.plot(original[first], original[second], linestyle="", marker="*", markersize=9, color="black", label="original vehicle")
         if goals[first] == F_SAFE:
-            axis.axvline(0, color="black", linewidth=0.8, linestyle="--", label="collision: 0 and left of it")
+            axis.axvline(0, color="black", linewidth=0.8, linestyle="--", label="collision: 0 or less")
         axis.set_xlabel(objective_title(goals[first]))
         axis.set_ylabel(objective_title(goals[second]))
     legend_below(figure, axes.flat[0])
-    return _spaced(figure)
+    return _with_space(figure)
 
 
 def objective_title(objective: Objective) -> str:
@@ -164,21 +164,21 @@ def hypervolume_growth(case: Case) -> Figure:
     growth = convergence(case)
     figure, ((axis,),) = new_figure(f"{case.name}: convergence", 1, 1, (6.4, 4.0))
     for i, (algorithm, group) in enumerate(growth.groupby("algorithm", sort=False)):
-        over = group.groupby("evaluations")["hypervolume"].agg(["min", "median", "max"])
+        statistics = group.groupby("evaluations")["hypervolume"].agg(["min", "median", "max"])
         colour = COLOURS[i % len(COLOURS)]
-        axis.fill_between(over.index, over["min"], over["max"], color=colour, alpha=0.12, linewidth=0)
+        axis.fill_between(statistics.index, statistics["min"], statistics["max"], color=colour, alpha=0.12, linewidth=0)
         for edge in ("min", "max"):
-            axis.plot(over.index, over[edge], color=colour, linestyle=DASHES[i % len(DASHES)], linewidth=0.6)
-        axis.plot(over.index, over["median"], color=colour, linestyle=DASHES[i % len(DASHES)], linewidth=1.8,
+            axis.plot(statistics.index, statistics[edge], color=colour, linestyle=DASHES[i % len(DASHES)], linewidth=0.6)
+        axis.plot(statistics.index, statistics["median"], color=colour, linestyle=DASHES[i % len(DASHES)], linewidth=1.8,
                   label=f"{_title(str(algorithm))} ({group['run'].nunique()} runs)")
     axis.set_xlabel("evaluations")
     axis.set_ylabel(f"normalised hypervolume of all settings so far\n"
                     f"(thick: median, thin: range over runs; reference point {REFERENCE_COORDINATE:g})")
     legend_below(figure, axis)
-    return _spaced(figure)
+    return _with_space(figure)
 
 
-def _spaced(figure: Figure) -> Figure:
+def _with_space(figure: Figure) -> Figure:
     """The figure, with space between its axes."""
     figure.set_layout_engine("constrained", w_pad=0.1)
     return figure
@@ -189,7 +189,7 @@ def legend_below(figure: Figure, axis: Axes) -> None:
     figure.legend(handles, labels, loc="outside lower center", ncols=min(len(labels), 3), frameon=False, fontsize=FONT)
 
 
-def _number_critical(case: Case) -> int:
+def _critical_count(case: Case) -> int:
     """Number of critical solutions; raises Unanswerable if there are none."""
     number = len(critical(case))
     if not number:
@@ -197,7 +197,7 @@ def _number_critical(case: Case) -> int:
     return number
 
 
-def _whole_numbers(axis: object, steps: int = 6) -> None:
+def _set_integer_ticks(axis: object, steps: int = 6) -> None:
     from matplotlib.ticker import MaxNLocator
 
     axis.set_major_locator(MaxNLocator(steps, integer=True, min_n_ticks=1))  # type: ignore[attr-defined]

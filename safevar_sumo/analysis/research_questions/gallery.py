@@ -22,8 +22,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 FORMATS = ("png", "pdf", "svg")
-LEAST_RANKED = 3
-"""Minimum number of algorithms for a figure of ranks; for two, the test of the pair says all."""
+LEAST_ALGORITHMS = 3
+"""Minimum number of algorithms for a figure of ranks; for two, the test of the pair suffices."""
 FIGURES_OF_ALL_CASES: Mapping[str, Callable[[Sequence[Case]], Figure]] = {"rq3.1-number-of-changes": number_of_changes}
 FIGURES_OF_ONE_CASE: Mapping[str, Callable[[Case], Figure]] = {
     "rq3.2-changed-characteristics": changed_characteristics,
@@ -36,43 +36,43 @@ FIGURES_OF_ONE_CASE: Mapping[str, Callable[[Case], Figure]] = {
 
 
 def draw(cases: Sequence[Case]) -> tuple[dict[str, Figure], list[str]]:
-    """Every figure of the cases by name, and the reasons for missing ones; with several cases, a figure's name begins with its case's.
+    """Every figure of the cases by name, and the reasons for missing figures; with several cases, names start with the case's name.
 
     Raises
     ------
     Unanswerable
         If no figure can be drawn.
     """
-    figures, refused = {}, []
-    alone = len(cases) == 1
-    for name, of_all in FIGURES_OF_ALL_CASES.items():
-        answerable, errors = _answerable(cases)
-        refused += errors
-        if answerable:
-            figures[name] = of_all(answerable)
+    figures, all_errors = {}, []
+    is_single = len(cases) == 1
+    for name, draw_cases in FIGURES_OF_ALL_CASES.items():
+        answerable_cases, errors = _answerable_cases(cases)
+        all_errors += errors
+        if answerable_cases:
+            figures[name] = draw_cases(answerable_cases)
     for case in cases:
         for name, draw_figure in FIGURES_OF_ONE_CASE.items():
-            if draw_figure is critical_differences and len(case.algorithms) < LEAST_RANKED:
+            if draw_figure is critical_differences and len(case.algorithms) < LEAST_ALGORITHMS:
                 continue
             try:
-                figures[name if alone else f"{case.name}-{name}"] = draw_figure(case)
+                figures[name if is_single else f"{case.name}-{name}"] = draw_figure(case)
             except Unanswerable as error:
-                refused.append(error)
+                all_errors.append(error)
     if not figures:
-        raise refused[0]
-    return figures, list(dict.fromkeys(f"{error.source}: {error.problem}" for error in refused))
+        raise all_errors[0]
+    return figures, list(dict.fromkeys(f"{error.source}: {error.problem}" for error in all_errors))
 
 
-def _answerable(cases: Sequence[Case]) -> tuple[list[Case], list[Unanswerable]]:
+def _answerable_cases(cases: Sequence[Case]) -> tuple[list[Case], list[Unanswerable]]:
     """The cases that have an answer to RQ3.1, and the errors of the others."""
-    answerable, errors = [], []
+    answerable_cases, errors = [], []
     for case in cases:
         try:
             rq31(case)
-            answerable.append(case)
+            answerable_cases.append(case)
         except Unanswerable as error:
             errors.append(error)
-    return answerable, errors
+    return answerable_cases, errors
 
 
 def draw_all(cases: Sequence[Case], directory: Path, kind: str) -> tuple[list[Path], list[str]]:
@@ -83,14 +83,14 @@ def draw_all(cases: Sequence[Case], directory: Path, kind: str) -> tuple[list[Pa
     InputError
         If the directory cannot be written, or no figure can be drawn.
     """
-    figures, missing = draw(cases)
-    written = []
+    figures, reasons = draw(cases)
+    files = []
     for name, figure in figures.items():
         path = directory / f"{_file_name(f'{cases[0].name}-{name}' if len(cases) == 1 else name)}.{kind}"
         directory.mkdir(parents=True, exist_ok=True)
         save(figure, path)
-        written.append(path)
-    return written, missing
+        files.append(path)
+    return files, reasons
 
 
 def _file_name(name: str) -> str:

@@ -1,4 +1,4 @@
-"""Quality of a run's front: IGD on the objectives as they are, IGD+ and hypervolume on normalised ones (method section 7)."""
+"""Quality of a run's front: IGD on the objectives in their units, IGD+ and hypervolume on normalised objectives (method section 7)."""
 
 from __future__ import annotations
 
@@ -26,23 +26,23 @@ def titles_of(metrics: Iterable[MetricFacts]) -> dict[str, str]:
 
 
 def nondominated(points: FloatArray) -> FloatArray:
-    """The distinct non-dominated points for minimisation, shape (M, m)."""
-    return np.asarray(moocore.filter_dominated(_checked(points, "the set of points")))
+    """The M distinct non-dominated points for minimisation of m objectives, shape (M, m)."""
+    return np.asarray(moocore.filter_dominated(_check_points(points, "the set of points")))
 
 
 def igd(front: FloatArray, reference: FloatArray) -> float:
     """Mean Euclidean distance from each point of the reference front to the nearest point of `front`."""
-    return float(moocore.igd(_checked(front, "the front"), ref=_checked(reference, "the reference front")))
+    return float(moocore.igd(_check_points(front, "the front"), ref=_check_points(reference, "the reference front")))
 
 
 def igd_plus(front: FloatArray, reference: FloatArray) -> float:
     """IGD with distances that count only the objectives in which `front` is worse."""
-    return float(moocore.igd_plus(_checked(front, "the front"), ref=_checked(reference, "the reference front")))
+    return float(moocore.igd_plus(_check_points(front, "the front"), ref=_check_points(reference, "the reference front")))
 
 
 def hypervolume(front: FloatArray, worst: float = REFERENCE_COORDINATE) -> float:
     """The volume between `front` and the point (worst, ..., worst)."""
-    points = _checked(front, "the front")
+    points = _check_points(front, "the front")
     return float(moocore.hypervolume(points, ref=np.full(points.shape[1], worst)))
 
 
@@ -63,7 +63,7 @@ class Scale(NamedTuple):
 
 
 def objectives(case: Case, frame: pd.DataFrame) -> FloatArray:
-    """The objectives of the rows that have all of them, each to be minimised, shape (M, objectives)."""
+    """The objectives, each to be minimised, of the M rows that have all of them; shape (M, objectives)."""
     points = _values(case, frame)
     return np.asarray(points[np.isfinite(points).all(axis=1)])
 
@@ -105,15 +105,15 @@ def indicators(case: Case) -> pd.DataFrame:
     for algorithm, run in runs:
         front = objectives(case, by_run[algorithm, run]) if (algorithm, run) in by_run else np.zeros((0, 0))
         if len(front):
-            scaled = scale.normalised(front)
-            rows.append((algorithm, run, igd(front, reference), igd_plus(scaled, scaled_reference), hypervolume(scaled)))
+            scaled_front = scale.normalised(front)
+            rows.append((algorithm, run, igd(front, reference), igd_plus(scaled_front, scaled_reference), hypervolume(scaled_front)))
     return pd.DataFrame(rows, columns=["algorithm", "run", *MORE_IS_BETTER])
 
 
 def convergence(case: Case, points: int = 50) -> pd.DataFrame:
     """The hypervolume of each run's settings after a number of evaluations; columns algorithm, run, evaluations, hypervolume.
 
-    A run that ended early keeps its last hypervolume; it is 0 while all settings lie beyond the reference point.
+    A run that ended early keeps its last hypervolume; a hypervolume is 0 while all settings lie beyond the reference point.
 
     Raises
     ------
@@ -133,20 +133,20 @@ def convergence(case: Case, points: int = 50) -> pd.DataFrame:
 
 
 def _growth(case: Case, evaluations: pd.DataFrame, scale: Scale, grid: np.ndarray) -> list[float]:
-    """Hypervolume of the first k evaluations for every k of the grid."""
-    scaled = scale.normalised(_values(case, evaluations))
-    defined = np.isfinite(scaled).all(axis=1)
-    scaled, places = scaled[defined], evaluations["evaluation"].to_numpy()[defined]
-    ends = np.searchsorted(places, grid, side="left")
-    front, volumes = np.zeros((0, scaled.shape[1])), []
+    """Hypervolume of the first k evaluations, for every k of the grid."""
+    scaled_points = scale.normalised(_values(case, evaluations))
+    is_defined = np.isfinite(scaled_points).all(axis=1)
+    scaled_points, numbers = scaled_points[is_defined], evaluations["evaluation"].to_numpy()[is_defined]
+    ends = np.searchsorted(numbers, grid, side="left")
+    front, volumes = np.zeros((0, scaled_points.shape[1])), []
     for start, end in zip([0, *ends[:-1]], ends, strict=True):
-        front = np.concatenate([front, scaled[start:end]])
+        front = np.concatenate([front, scaled_points[start:end]])
         front = nondominated(front) if len(front) else front
         volumes.append(hypervolume(front) if len(front) else 0.0)
     return volumes
 
 
-def _checked(points: FloatArray, name: str) -> FloatArray:
+def _check_points(points: FloatArray, name: str) -> FloatArray:
     """Refuse empty sets and undefined points, for which indicators would return their best value."""
     array = np.asarray(points, dtype=float)
     if array.ndim != 2 or not array.size:

@@ -1,4 +1,4 @@
-"""Answers laid out as tables of text, in full or in the paper's layout: headings, number formats, bold cells. `tables.py` renders them."""
+"""Lays answers out as tables of text, in full or in the paper's layout: headings, number formats, bold cells. `tables.py` renders them."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ import pandas as pd
 from safevar_sumo.analysis.research_questions.answer import SAFETY, Answer
 from safevar_sumo.analysis.research_questions.case import ALGORITHM_TITLES
 from safevar_sumo.analysis.research_questions.changes import ANY
-from safevar_sumo.analysis.research_questions.comparisons import ALPHA, ASYMPTOTIC, EXACT, NOTABLE
+from safevar_sumo.analysis.research_questions.comparisons import ALPHA, ASYMPTOTIC_TEST, EXACT_TEST, NOTABLE_MAGNITUDES
 from safevar_sumo.analysis.research_questions.indicators import titles_of
-from safevar_sumo.analysis.research_questions.over_runs import ASYMPTOTIC_SIGNED, EXACT_SIGNED
+from safevar_sumo.analysis.research_questions.over_runs import ASYMPTOTIC_SIGNED_TEST, EXACT_SIGNED_TEST
 from safevar_sumo.metrics import MetricFacts
 
 UNDEFINED = "-"
@@ -23,17 +23,17 @@ SAFETY_UNITS = {"avgSD_mD": "avgSD_mD [m]", "avgSD_cS": "avgSD_cS [m/s]", "TET":
                 "aveDece": "aveDece [m/s^2]"}
 PAPER_NUMBERS = ("2", "3", "4", "5", "6")
 """The numbers of changed characteristics in the paper's table of RQ3.3."""
-HOLM = f"bold or *: p < {ALPHA:g} after Holm"
+HOLM_LEGEND = f"bold or *: p < {ALPHA:g} after Holm"
 BOLD_NOTE = f"Bold (or *): p < {ALPHA:g}; A12 also of medium or large magnitude."
 HOLM_NOTE = f"Bold (or *): p < {ALPHA:g} after Holm's correction for all tests of a setting's RQ1 and RQ2."
 CELL_NOTE = f"Cells: p / A12; bold (or *) where p < {ALPHA:g} and A12 is of medium or large magnitude."
 TITLES = {
     "rq1": "RQ1: solutions against the original vehicle",
     "rq2": "RQ2: NSGA-II against the other algorithms",
-    "rq1-runs": f"RQ1 over runs: run means against the original vehicle ({HOLM})",
-    "rq2-runs": f"RQ2 over runs: NSGA-II's runs against those of the other algorithms ({HOLM})",
-    "rq2-pairs": f"RQ2 for every pair of algorithms, over runs ({HOLM})",
-    "rq2-ranks": f"RQ2: ranks of the algorithms over runs (1 is best; {HOLM})",
+    "rq1-runs": f"RQ1 over runs: run means against the original vehicle ({HOLM_LEGEND})",
+    "rq2-runs": f"RQ2 over runs: NSGA-II's runs against those of the other algorithms ({HOLM_LEGEND})",
+    "rq2-pairs": f"RQ2 for every pair of algorithms, over runs ({HOLM_LEGEND})",
+    "rq2-ranks": f"RQ2: ranks of the algorithms over runs (1 is best; {HOLM_LEGEND})",
     "rq3.1": "RQ3.1: number of changed characteristics",
     "rq3.2": "RQ3.2: % of critical solutions in which a characteristic is changed",
     "rq3.3": "RQ3.3: size of changes",
@@ -84,16 +84,16 @@ def pivoted(title: str, frame: pd.DataFrame, labels: Sequence[str], cells: Calla
     """
     blocks = list(dict.fromkeys(frame[over]))
     keys = list(zip(*(frame[label] for label in labels), strict=True))
-    by_place = {(key, row[over]): cells(row) for key, row in zip(keys, frame.to_dict("records"), strict=True)}
-    empty = (UNDEFINED,) * (len(heads) or 1)
-    rows = [(*((names or {}).get(label, label) for label in key), *(cell for block in blocks for cell in by_place.get((key, block), empty)))
+    cells_at = {(key, row[over]): cells(row) for key, row in zip(keys, frame.to_dict("records"), strict=True)}
+    gaps = (UNDEFINED,) * (len(heads) or 1)
+    rows = [(*((names or {}).get(label, label) for label in key), *(cell for block in blocks for cell in cells_at.get((key, block), gaps)))
             for key in dict.fromkeys(keys)]
     spans = tuple((block, len(heads)) for block in blocks) if heads else ()
     return Table(title, (*labels, *(tuple(heads) * len(blocks) or blocks)), rows, len(labels), spans, tuple(notes))
 
 
-def by_setting(layout: Callable[[str, pd.DataFrame], list[Table]]) -> Callable[[Answer], list[Table]]:
-    """A layout that makes the tables of each setting from its rows."""
+def layout_by_setting(layout: Callable[[str, pd.DataFrame], list[Table]]) -> Callable[[Answer], list[Table]]:
+    """A layout that makes tables for each setting from the rows of that setting."""
     return lambda answer: [table for case, group in answer.frame.groupby("setting", sort=False) for table in layout(str(case), group)]
 
 
@@ -103,44 +103,47 @@ def units_note(metrics: Iterable[MetricFacts]) -> str:
 
 
 def non_collision_note(metrics: Iterable[MetricFacts]) -> str:
-    """A note on the solutions that each metric is taken over."""
+    """A note on the solutions over which each metric is taken."""
     titles: dict[bool, list[str]] = {False: [], True: []}
     for metric in metrics:
         titles[metric.over_collisions].append(metric.title)
-    without, over_all = (" and ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names) for names in titles.values())
-    return f"{without} over solutions without collision, {over_all} over all." if without else f"{over_all} over all solutions."
+    safe_titles, other_titles = (" and ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)
+                                 for names in titles.values())
+    if not safe_titles:
+        return f"{other_titles} over all solutions."
+    return f"{safe_titles} over solutions without collision, {other_titles} over all."
 
 
-def _names(answer: Answer) -> dict[str, str]:
+def _titles(answer: Answer) -> dict[str, str]:
     return {**ALGORITHM_TITLES, **titles_of(answer.metrics)}
 
 
 def _tests(answer: Answer, group_column: str, sizes: tuple[str, ...], notes: tuple[str, ...]) -> Table:
-    """P-values (with Holm's correction too if the answer is over runs) and effect sizes; one block of columns per case."""
+    """P-values (also with Holm's correction if the answer is over runs) and effect sizes; one block of columns per case."""
     frame, methods = answer.frame, set(answer.frame["method"])
-    corrected = "p_holm" in frame
-    marks = {} if corrected else {EXACT: "e"}
+    has_holm = "p_holm" in frame
+    marks = {} if has_holm else {EXACT_TEST: "e"}
     method_notes = [f"p{f' with {marks[method]}' if method in marks else ''}: {method}."
-                    for method in (EXACT_SIGNED, ASYMPTOTIC_SIGNED, ASYMPTOTIC, EXACT) if method in methods]
+                    for method in (EXACT_SIGNED_TEST, ASYMPTOTIC_SIGNED_TEST, ASYMPTOTIC_TEST, EXACT_TEST) if method in methods]
     return pivoted(TITLES[answer.name], frame, (group_column, "metric"), lambda row: _test_cells(row, sizes, marks),
-                   ("p", *(("p Holm",) if corrected else ()), "A12", "magnitude", *sizes), names=_names(answer),
-                   notes=(*method_notes, *notes, HOLM_NOTE if corrected else BOLD_NOTE))
+                   ("p", *(("p Holm",) if has_holm else ()), "A12", "magnitude", *sizes), names=_titles(answer),
+                   notes=(*method_notes, *notes, HOLM_NOTE if has_holm else BOLD_NOTE))
 
 
 def _test_cells(row: Row, sizes: Sequence[str] = (), marks: Mapping[str, str] = MappingProxyType({})) -> tuple[str, ...]:
-    """P-value, with a mark for its method, and with Holm's correction if the row has it; effect size, magnitude, sizes of the samples."""
-    corrected = "p_holm" in row
+    """P-value with a mark for its method, Holm's p-value if the row has one, effect size, magnitude, sizes of the samples."""
+    has_holm = "p_holm" in row
     if pd.isna(row["p_value"]):
-        return (UNDEFINED,) * (3 + corrected + len(sizes))
-    significant = row["p_holm" if corrected else "p_value"] < ALPHA
+        return (UNDEFINED,) * (3 + has_holm + len(sizes))
+    is_significant = row["p_holm" if has_holm else "p_value"] < ALPHA
     p = p_value(row["p_value"]) + marks.get(row["method"], "")
-    effect = _bold(f"{row['effect_size']:.3f}", significant and (corrected or row["magnitude"] in NOTABLE))
-    tests = (p, _bold(p_value(row["p_holm"]), significant)) if corrected else (_bold(p, significant),)
+    effect = _bold(f"{row['effect_size']:.3f}", is_significant and (has_holm or row["magnitude"] in NOTABLE_MAGNITUDES))
+    tests = (p, _bold(p_value(row["p_holm"]), is_significant)) if has_holm else (_bold(p, is_significant),)
     return (*tests, effect, row["magnitude"], *(str(row[size]) for size in sizes))
 
 
 def _rq1(answer: Answer) -> list[Table]:
-    frame, metrics, names = answer.frame, answer.metrics, _names(answer)
+    frame, metrics, names = answer.frame, answer.metrics, _titles(answer)
     sizes = ("n1", "n2") if frame["setting"].nunique() == 1 else ()
     test = _tests(answer, "algorithm", sizes, (
         "A12 below 0.5: the algorithm's solutions are more unsafe than the original vehicle,",
@@ -178,21 +181,21 @@ def _rq2_pairs(answer: Answer) -> list[Table]:
     notes = ("One value for each run; A12 above 0.5: the first is better (a better front, more unsafe solutions).",
              non_collision_note(answer.metrics), "Holm's correction is for all pairs and metrics of a setting.")
     return [pivoted(TITLES["rq2-pairs"], answer.frame, ("algorithm", "other", "metric"), _test_cells, ("p", "p Holm", "A12", "magnitude"),
-                    names=_names(answer), notes=notes)]
+                    names=_titles(answer), notes=notes)]
 
 
 def _rq2_ranks(answer: Answer) -> list[Table]:
     """Mean ranks, one column per algorithm and one table per case."""
-    names, tables = _names(answer), []
+    names, tables = _titles(answer), []
     for case, group in answer.frame.groupby("setting", sort=False):
         algorithms = list(dict.fromkeys(group["algorithm"]))
         rows: list[tuple[str, ...]] = []
         for metric, part in group.groupby("metric", sort=False):
             first = part.iloc[0]
-            significant = not pd.isna(first["p_holm"]) and first["p_holm"] < ALPHA
+            is_significant = not pd.isna(first["p_holm"]) and first["p_holm"] < ALPHA
             p, holm = (UNDEFINED if pd.isna(first[name]) else p_value(first[name]) for name in ("p_value", "p_holm"))
             rows.append((names.get(str(metric), str(metric)), *(_number(rank, ".2f") for rank in part["mean_rank"]),
-                         _number(first["critical_difference"], ".2f"), p, _bold(holm, significant), str(first["runs"])))
+                         _number(first["critical_difference"], ".2f"), p, _bold(holm, is_significant), str(first["runs"])))
         heads = ("metric", *(names.get(name, name) for name in algorithms), "critical difference", "p", "p Holm", "runs")
         tables.append(Table(f"{TITLES['rq2-ranks']}: {case}", heads, rows, 1, notes=(
             "p: Friedman's test; runs with the same number form a block. Holm's correction is for all metrics of a setting.",
@@ -224,24 +227,24 @@ def _rq32(answer: Answer) -> list[Table]:
 
 
 def _rq33(case: str, group: pd.DataFrame) -> list[Table]:
-    labels, forms = ("characteristic", "direction"), {"pc": ".1%", "delta": "+.3g"}
-    few = group[group["j"].isin(PAPER_NUMBERS)]
+    labels, specs = ("characteristic", "direction"), {"pc": ".1%", "delta": "+.3g"}
+    paper_rows = group[group["j"].isin(PAPER_NUMBERS)]
     return [
-        pivoted(f"{TITLES['rq3.3']}, 2 to 6 changed: {case}", few.assign(j="j = " + few["j"]), labels,
-                lambda row: [_number(row[name], form) for name, form in forms.items()], ("PC", "delta"), over="j",
+        pivoted(f"{TITLES['rq3.3']}, 2 to 6 changed: {case}", paper_rows.assign(j="j = " + paper_rows["j"]), labels,
+                lambda row: [_number(row[name], spec) for name, spec in specs.items()], ("PC", "delta"), over="j",
                 notes=("PC: mean of |v - v''| / v; delta: mean signed change in the characteristic's unit.",)),
-        *(pivoted(f"RQ3.3: {title}, any number changed: {case}", group, labels, _column(name, forms[name]), over="j")
+        *(pivoted(f"RQ3.3: {title}, any number changed: {case}", group, labels, _column(name, specs[name]), over="j")
           for title, name in (("PC", "pc"), ("delta", "delta")))]
 
 
-def _column(name: str, form: str) -> Callable[[Row], tuple[str]]:
+def _column(name: str, spec: str) -> Callable[[Row], tuple[str]]:
     """Cells that show one column of a frame."""
-    return lambda row: (_number(row[name], form),)
+    return lambda row: (_number(row[name], spec),)
 
 
 def _safety(case: str, group: pd.DataFrame) -> list[Table]:
-    values, shares = (pivoted("", group, ("quantity",), _column(name, form), over="j")
-                      for name, form in (("value", ".2f"), ("percent", ".1f")))
+    values, shares = (pivoted("", group, ("quantity",), _column(name, spec), over="j")
+                      for name, spec in (("value", ".2f"), ("percent", ".1f")))
     rows = []
     for (name, *cells), (_, *percent) in zip(values.rows, shares.rows, strict=True):
         rows.append((SAFETY_UNITS[name], *cells))
@@ -268,7 +271,7 @@ def _combinations(answer: Answer) -> list[Table]:
 def _weather(answer: Answer) -> list[Table]:
     tables = []
     for (case, other), group in answer.frame.groupby(["setting", "other"], sort=False):
-        rows = [(row["characteristic"], *(_number(row[name], form) for name, form in WEATHER_COLUMNS.items()))
+        rows = [(row["characteristic"], *(_number(row[name], spec) for name, spec in WEATHER_COLUMNS.items()))
                 for row in group.to_dict("records")]
         tables.append(Table(f"{TITLES['weather']}: {case} against {other}",
                             ("characteristic", str(case), str(other), "diff.", *(str(case), str(other)) * 3), rows, 1,
@@ -279,13 +282,13 @@ def _weather(answer: Answer) -> list[Table]:
 
 def _paper_tests(answer: Answer, group_column: str, note: str) -> list[Table]:
     """A row for each case and algorithm, a column for each metric."""
-    names = _names(answer)
+    names = _titles(answer)
 
     def cells(row: Row) -> tuple[str]:
         if pd.isna(row["p_value"]):
             return (UNDEFINED,)
         cell = f"{p_value(row['p_value'])} / {row['effect_size']:.3f}"
-        return (_bold(cell, row["p_value"] < ALPHA and row["magnitude"] in NOTABLE),)
+        return (_bold(cell, row["p_value"] < ALPHA and row["magnitude"] in NOTABLE_MAGNITUDES),)
 
     table = pivoted(TITLES[answer.name], answer.frame, ("setting", group_column), cells, over="metric", names=ALGORITHM_TITLES,
                     notes=(CELL_NOTE, note))
@@ -303,12 +306,12 @@ def _paper_combinations(answer: Answer) -> list[Table]:
                   ("Percent of the critical solutions with exactly four characteristics changed; #: rank.",))]
 
 
-def _bold(cell: str, stands_out: bool) -> str:
-    return Bold(cell) if stands_out else cell
+def _bold(cell: str, is_bold: bool) -> str:
+    return Bold(cell) if is_bold else cell
 
 
-def _number(value: Any, form: str) -> str:
-    return UNDEFINED if value is None or pd.isna(value) else format(int(value) if form == "d" else float(value), form)
+def _number(value: Any, spec: str) -> str:
+    return UNDEFINED if value is None or pd.isna(value) else format(int(value) if spec == "d" else float(value), spec)
 
 
 def p_value(value: float) -> str:
@@ -317,8 +320,8 @@ def p_value(value: float) -> str:
 
 LAYOUTS: Layouts = {
     "rq1": _rq1, "rq2": _rq2, "rq1-runs": _rq1_runs, "rq2-runs": _rq2_runs,
-    "rq2-pairs": _rq2_pairs, "rq2-ranks": _rq2_ranks, "rq3.1": _rq31, "rq3.2": _rq32, "rq3.3": by_setting(_rq33),
-    SAFETY: by_setting(_safety), "collisions": _collisions, "combinations": _combinations, "weather": _weather}
+    "rq2-pairs": _rq2_pairs, "rq2-ranks": _rq2_ranks, "rq3.1": _rq31, "rq3.2": _rq32, "rq3.3": layout_by_setting(_rq33),
+    SAFETY: layout_by_setting(_safety), "collisions": _collisions, "combinations": _combinations, "weather": _weather}
 PAPER: Layouts = {
     **LAYOUTS, "combinations": _paper_combinations,
     "rq1": lambda answer: _paper_tests(answer, "algorithm",

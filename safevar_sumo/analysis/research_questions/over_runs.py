@@ -1,4 +1,4 @@
-"""RQ1 and RQ2 over runs: one mean for each run, so that the values of a test are independent; p-values corrected for the number of tests.
+"""RQ1 and RQ2 over runs: one mean for each run, so that a test's values are independent; Holm's correction for the number of tests.
 
 The paper pools the solutions of all runs and repeats the original's value to the sample's size. Solutions of one run resemble each
 other, and a repeated value is no sample: p-values become too small. Here each run contributes one value.
@@ -14,7 +14,7 @@ import numpy as np
 import pandas as pd
 import scipy
 
-from safevar_sumo.analysis.research_questions.case import ALGORITHM_TITLES, NSGA2, Case, Unanswerable, solutions_counted
+from safevar_sumo.analysis.research_questions.case import ALGORITHM_TITLES, NSGA2, Case, Unanswerable, counted_solutions
 from safevar_sumo.analysis.research_questions.comparisons import ALPHA, TwoSampleTest, magnitude, rq1, rq1_rows, rq2, rq2_rows
 from safevar_sumo.analysis.research_questions.indicators import titles_of
 from safevar_sumo.metrics import MetricFacts
@@ -22,9 +22,9 @@ from safevar_sumo.records import FloatArray
 
 RQ1_COLUMNS = ["setting", "algorithm", "metric", "p_value", "p_holm", "effect_size", "magnitude", "runs", "method", "mean", "original"]
 RQ2_COLUMNS = ["setting", "baseline", "metric", "p_value", "p_holm", "effect_size", "magnitude", "n1", "n2", "method"]
-EXACT_SIGNED = "Wilcoxon signed-rank, two-sided, exact"
-ASYMPTOTIC_SIGNED = "Wilcoxon signed-rank, two-sided, normal approximation with correction for continuity"
-EXACT_UP_TO = 50
+EXACT_SIGNED_TEST = "Wilcoxon signed-rank, two-sided, exact"
+ASYMPTOTIC_SIGNED_TEST = "Wilcoxon signed-rank, two-sided, normal approximation with correction for continuity"
+EXACT_RUNS = 50
 """Without ties, the signed-rank test is exact for up to this many runs."""
 
 
@@ -32,7 +32,7 @@ def rq1_runs(case: Case) -> pd.DataFrame:
     """Every algorithm's run means against the original's value, metric by metric: Wilcoxon's signed-rank test.
 
     Columns: `RQ1_COLUMNS`. `effect_size` is the share of runs whose mean is greater than the original's value, plus half the share of
-    equal ones (A12 against one value), turned so that smaller values mean more unsafe runs. `mean` is the mean of the run means.
+    equal ones (A12 against one value), oriented so that smaller values mean more unsafe runs. `mean` is the mean of the run means.
     `p_holm` is `p_value` corrected by Holm's method for all tests of RQ1 and RQ2 of this setting. Undefined values are None.
 
     Raises
@@ -40,20 +40,20 @@ def rq1_runs(case: Case) -> pd.DataFrame:
     Unanswerable
         If the solutions belong to no run, or no run is finished.
     """
-    return _corrected(case)[0]
+    return _corrected_frames(case)[0]
 
 
 def rq2_runs(case: Case) -> pd.DataFrame:
     """NSGA-II's runs against those of every other algorithm: indicators and metrics' run means, Mann-Whitney U.
 
-    Columns: `RQ2_COLUMNS`. `effect_size` is A12, turned as in `rq2`; `n1` and `n2` count runs; `p_holm` as in `rq1_runs`.
+    Columns: `RQ2_COLUMNS`. `effect_size` is A12, oriented as in `rq2`; `n1` and `n2` count runs; `p_holm` as in `rq1_runs`.
 
     Raises
     ------
     Unanswerable
         If the solutions belong to no run, or NSGA-II or every other algorithm is missing.
     """
-    frame = _corrected(case)[1]
+    frame = _corrected_frames(case)[1]
     if frame is None:
         rq2(case)  # raises with the reason
         raise Unanswerable(case.name, "has no runs to compare", "results of nsga2 and another algorithm")
@@ -61,19 +61,19 @@ def rq2_runs(case: Case) -> pd.DataFrame:
 
 
 def holm(p_values: Sequence[float | None]) -> list[float | None]:
-    """P-values corrected by Holm's step-down method (Holm 1979); None stays None and is no test."""
-    order = sorted((p, place) for place, p in enumerate(p_values) if p is not None)
-    corrected, highest = list(p_values), 0.0
-    for rank, (p, place) in enumerate(order):
-        highest = max(highest, min(1.0, p * (len(order) - rank)))
-        corrected[place] = highest
-    return corrected
+    """P-values corrected by Holm's step-down method (Holm 1979); None stays None and does not count as a test."""
+    order = sorted((p, index) for index, p in enumerate(p_values) if p is not None)
+    corrected_p_values, maximum = list(p_values), 0.0
+    for rank, (p, index) in enumerate(order):
+        maximum = max(maximum, min(1.0, p * (len(order) - rank)))
+        corrected_p_values[index] = maximum
+    return corrected_p_values
 
 
 def signed_rank(sample: FloatArray, value: float) -> TwoSampleTest:
     """Compare independent values, shape (N,), with one value: Wilcoxon's test, and the share of greater values (A12).
 
-    Values equal to `value` are dropped from the test (as Wilcoxon did) and count half in the effect size.
+    The test drops values equal to `value` (as Wilcoxon did); the effect size counts them by half.
     """
     if not sample.size or np.isnan(value):
         return TwoSampleTest(None, None, None, len(sample), 0, None)
@@ -81,10 +81,11 @@ def signed_rank(sample: FloatArray, value: float) -> TwoSampleTest:
     sizes = np.abs(difference[difference != 0])
     effect = float(np.mean(difference > 0) + np.mean(difference == 0) / 2)
     if not sizes.size:
-        return TwoSampleTest(1.0, effect, magnitude(effect), len(sample), 1, EXACT_SIGNED)
-    exact = np.unique(sizes).size == len(sample) <= EXACT_UP_TO
-    test = scipy.stats.wilcoxon(difference, alternative="two-sided", correction=not exact, method="exact" if exact else "approx")
-    return TwoSampleTest(float(test.pvalue), effect, magnitude(effect), len(sample), 1, EXACT_SIGNED if exact else ASYMPTOTIC_SIGNED)
+        return TwoSampleTest(1.0, effect, magnitude(effect), len(sample), 1, EXACT_SIGNED_TEST)
+    is_exact = np.unique(sizes).size == len(sample) <= EXACT_RUNS
+    test = scipy.stats.wilcoxon(difference, alternative="two-sided", correction=not is_exact, method="exact" if is_exact else "approx")
+    method = EXACT_SIGNED_TEST if is_exact else ASYMPTOTIC_SIGNED_TEST
+    return TwoSampleTest(float(test.pvalue), effect, magnitude(effect), len(sample), 1, method)
 
 
 def fewest_runs(question: str) -> int:
@@ -93,9 +94,9 @@ def fewest_runs(question: str) -> int:
 
 
 def difference_line(case: Case) -> str:
-    """One line: the tests that are significant (p < ALPHA) for the paper's pooled solutions but not over runs, or only over runs.
+    """One line: the tests that are significant (p < ALPHA) only for the paper's pooled solutions, or only over runs.
 
-    Such as "... RQ2 SafeFuzzer TET loses its star (p 3.8e-4 to 0.059, 0.23 after Holm)".
+    Example: "... RQ2 SafeFuzzer TET loses its star (p 3.8e-4 to 0.059, 0.23 after Holm)".
 
     Raises
     ------
@@ -103,31 +104,31 @@ def difference_line(case: Case) -> str:
         As `rq1_runs`.
     """
     titles = titles_of(case.scoring.metrics)
-    first, second = _corrected(case)
-    sides = [("RQ1", "algorithm", rq1(case), first), *([] if second is None else [("RQ2", "baseline", rq2(case), second)])]
-    changes, number = [], 0
-    for question, group_column, paper, runs in sides:
-        for old, new in zip(paper.to_dict("records"), runs.to_dict("records"), strict=True):
-            before, after = old["p_value"], new["p_holm"]
-            number += after is not None
-            if before is None or after is None or (before < ALPHA) == (after < ALPHA):
+    rq1_frame, rq2_frame = _corrected_frames(case)
+    comparisons = [("RQ1", "algorithm", rq1(case), rq1_frame), *([] if rq2_frame is None else [("RQ2", "baseline", rq2(case), rq2_frame)])]
+    changes, tests = [], 0
+    for question, group_column, pooled_frame, runs in comparisons:
+        for pooled_row, runs_row in zip(pooled_frame.to_dict("records"), runs.to_dict("records"), strict=True):
+            pooled_p, runs_p = pooled_row["p_value"], runs_row["p_holm"]
+            tests += runs_p is not None
+            if pooled_p is None or runs_p is None or (pooled_p < ALPHA) == (runs_p < ALPHA):
                 continue
-            name = ALGORITHM_TITLES.get(old[group_column], old[group_column])
-            verb = "loses" if before < ALPHA else "gains"
-            changes.append(f"{question} {name} {titles[old['metric']]} {verb} its star (p {_p(before)} to {_p(new['p_value'])}, "
-                           f"{_p(after)} after Holm)")
-    return (f"One value for each run and Holm's correction for {number} tests, instead of the paper's pooled solutions: "
+            name = ALGORITHM_TITLES.get(pooled_row[group_column], pooled_row[group_column])
+            verb = "loses" if pooled_p < ALPHA else "gains"
+            changes.append(f"{question} {name} {titles[pooled_row['metric']]} {verb} its star (p {_rounded(pooled_p)} to "
+                           f"{_rounded(runs_row['p_value'])}, {_rounded(runs_p)} after Holm)")
+    return (f"One value for each run and Holm's correction for {tests} tests, instead of the paper's pooled solutions: "
             f"{'; '.join(changes) or 'the same tests are significant'}.")
 
 
 def summary_lines(case: Case) -> list[str]:
-    """Lines on RQ1 and RQ2 for the end of a study: effect sizes over runs, an asterisk for significant ones, and `difference_line`.
+    """Lines on RQ1 and RQ2 for the end of a study: effect sizes over runs, significant ones with an asterisk, and `difference_line`.
 
     A line says so if there are too few runs for a significant difference.
     """
     titles = titles_of(case.scoring.metrics)
     lines, any_testable = [], False
-    for question, frame_of, group_column, meaning in SUMMARISED:
+    for question, frame_of, group_column, meaning in SUMMARY_ROWS:
         try:
             frame = frame_of(case)
         except Unanswerable as error:
@@ -136,41 +137,41 @@ def summary_lines(case: Case) -> list[str]:
         lines.append(f"{question} over runs: {meaning}; * p < {ALPHA:g} after Holm's correction")
         for name, group in frame.groupby(group_column, sort=False):
             rows = group.to_dict("records")
-            defined = [row for row in rows if row["effect_size"] is not None]
-            few = [titles[row["metric"]] for row in defined if min(row.get("runs", np.inf), row.get("n1", np.inf), row.get("n2", np.inf))
-                   < fewest_runs(question)]
-            any_testable = any_testable or len(few) < len(defined)
-            subject = "" if len(few) == len(defined) else f"{', '.join(few)}: "
-            note = f"; {subject}too few runs for a test ({fewest_runs(question)} are needed)" if few else ""
+            defined_rows = [row for row in rows if row["effect_size"] is not None]
+            untestable = [titles[row["metric"]] for row in defined_rows
+                          if min(row.get(size, np.inf) for size in ("runs", "n1", "n2")) < fewest_runs(question)]
+            any_testable = any_testable or len(untestable) < len(defined_rows)
+            subject = "" if len(untestable) == len(defined_rows) else f"{', '.join(untestable)}: "
+            note = f"; {subject}too few runs for a test ({fewest_runs(question)} are needed)" if untestable else ""
             effects = ", ".join(f"{titles[row['metric']]} " + ("-" if row["effect_size"] is None or row["p_holm"] is None else
                                 f"{row['effect_size']:.2f}{'*' if row['p_holm'] < ALPHA else ''}") for row in rows)
             lines.append(f"  {ALGORITHM_TITLES.get(str(name), name)}: {effects}{note}")
     return [*lines, difference_line(case)] if any_testable else lines
 
 
-SUMMARISED = (("RQ1", rq1_runs, "algorithm", "A12 below 0.5: the runs are more unsafe than the original vehicle"),
-         ("RQ2", rq2_runs, "baseline", "A12 above 0.5: NSGA-II is better"))
+SUMMARY_ROWS = (("RQ1", rq1_runs, "algorithm", "A12 below 0.5: the runs are more unsafe than the original vehicle"),
+                ("RQ2", rq2_runs, "baseline", "A12 above 0.5: NSGA-II is better"))
 
 
-def _p(value: float) -> str:
+def _rounded(value: float) -> str:
     return f"{value:.1e}".replace("e-0", "e-") if value < 0.001 else f"{value:.2g}"
 
 
-def _corrected(case: Case) -> tuple[pd.DataFrame, pd.DataFrame | None]:
-    """The frames of RQ1 and RQ2 over runs, with p-values corrected as one family; None for RQ2 if it has no answer."""
+def _corrected_frames(case: Case) -> tuple[pd.DataFrame, pd.DataFrame | None]:
+    """The frames of RQ1 and RQ2 over runs, with p-values corrected as one family; None if RQ2 has no answer."""
     case.require_solutions()
     means = partial(run_means, case)
-    first = rq1_rows(case, means, signed_rank)
+    tests_of_rq1 = rq1_rows(case, means, signed_rank)
     has_rq2 = NSGA2 in case.algorithms and len(case.algorithms) > 1
-    second = rq2_rows(case, means) if has_rq2 else []
-    for row, p in zip([*first, *second], holm([row["p_value"] for row in [*first, *second]]), strict=True):
+    tests_of_rq2 = rq2_rows(case, means) if has_rq2 else []
+    for row, p in zip([*tests_of_rq1, *tests_of_rq2], holm([row["p_value"] for row in [*tests_of_rq1, *tests_of_rq2]]), strict=True):
         row["p_holm"] = p
-    return (pd.DataFrame(first, columns=RQ1_COLUMNS, dtype=object),
-            pd.DataFrame(second, columns=RQ2_COLUMNS, dtype=object) if has_rq2 else None)
+    return (pd.DataFrame(tests_of_rq1, columns=RQ1_COLUMNS, dtype=object),
+            pd.DataFrame(tests_of_rq2, columns=RQ2_COLUMNS, dtype=object) if has_rq2 else None)
 
 
 def run_means(case: Case, algorithm: str, metric: MetricFacts) -> FloatArray:
-    """A metric's mean over the solutions for which it is defined, for each finished run that has such solutions; shape (runs,).
+    """A metric's mean over the solutions with a defined value, for each finished run that has such solutions; shape (runs,).
 
     Raises
     ------
@@ -182,7 +183,7 @@ def run_means(case: Case, algorithm: str, metric: MetricFacts) -> FloatArray:
 
 def series_of_means(case: Case, algorithm: str, metric: MetricFacts) -> pd.Series[float]:
     """The means of `run_means`, indexed by the number of the run."""
-    numbers, solutions = case.runs_of(algorithm), solutions_counted(case.solutions_of(algorithm), metric)
+    numbers, solutions = case.runs_of(algorithm), counted_solutions(case.solutions_of(algorithm), metric)
     runs, column = solutions["run"].to_numpy(), solutions[metric.name].to_numpy(dtype=float)
     defined = ~np.isnan(column)
     samples = {run: column[defined & (runs == run)] for run in numbers}

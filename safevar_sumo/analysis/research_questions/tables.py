@@ -23,8 +23,8 @@ _LATEX = {
     "\N{SUPERSCRIPT TWO}": r"\textsuperscript{2}", "\N{SUPERSCRIPT THREE}": r"\textsuperscript{3}",
     "\N{MIDDLE DOT}": r"\textperiodcentered{}", MINUS: r"\textminus{}"}
 """LaTeX code for LaTeX's special characters, and for some characters that occur in units."""
-_LAST_PLAIN = "\N{LATIN SMALL LETTER Z WITH CARON}"
-"""LaTeX's T1 fonts have nearly every letter up to this one."""
+_LAST_LETTER = "\N{LATIN SMALL LETTER Z WITH CARON}"
+"""Last letter of the range that LaTeX's T1 fonts cover almost completely."""
 LATEX_NEEDS = r"% In the preamble: \usepackage[T1]{fontenc} \usepackage{textcomp} \usepackage{booktabs} \usepackage{graphicx}"
 
 
@@ -34,12 +34,12 @@ def text(answers: Sequence[Answer], layouts: Layouts = LAYOUTS) -> str:
 
 
 def markdown(answers: Sequence[Answer], layouts: Layouts = LAYOUTS) -> str:
-    """Markdown tables; a heading that spans several columns is repeated in the heading of each."""
+    """Markdown tables; a heading that spans several columns is repeated in each column's heading."""
     return "\n".join(_markdown(table) for answer in answers for table in lay_out(answer, layouts))
 
 
 def latex(answers: Sequence[Answer], layouts: Layouts = LAYOUTS) -> str:
-    r"""Booktabs tables for `\input`, each with a label: `tab:rq1`, and `tab:rq1-2` for the second of an answer."""
+    r"""Booktabs tables for `\input`, each with a label: `tab:rq1`, and `tab:rq1-2` for an answer's second table."""
     tables = [_latex(table, f"{answer.name}-{i}" if i > 1 else answer.name)
               for answer in answers for i, table in enumerate(lay_out(answer, layouts), 1)]
     return "\n".join([LATEX_NEEDS, *tables])
@@ -59,20 +59,20 @@ def csv(answers: Sequence[Answer]) -> str:
 
 def as_json(answers: Sequence[Answer]) -> str:
     """One list of records; with several tables, each record names its table under "table"."""
-    several = len(answers) > 1
-    rows = [{"table": answer.name, **row} if several else row for answer in answers for row in records(answer.frame)]
+    has_several = len(answers) > 1
+    rows = [{"table": answer.name, **row} if has_several else row for answer in answers for row in records(answer.frame)]
     return json.dumps(rows, indent=2, allow_nan=False) + "\n"
 
 
 def records(frame: pd.DataFrame) -> list[dict[str, Any]]:
-    """The rows of a frame as plain values; undefined ones are None, and a missing rank has no key."""
-    rows = [{str(name): _plain(value) for name, value in row.items()} for row in frame.to_dict("records")]
+    """The rows of a frame as plain values; undefined values are None, and a missing rank has no key."""
+    rows = [{str(name): _plain_value(value) for name, value in row.items()} for row in frame.to_dict("records")]
     return [{name: value for name, value in row.items() if not (name == "rank" and value is None)} for row in rows]
 
 
 LAYOUTS_BY_NAME: Mapping[str, Layouts] = {"full": LAYOUTS, "paper": PAPER}
 FORMATS_WITH_LAYOUT: Mapping[str, Callable[..., str]] = {"text": text, "markdown": markdown, "latex": latex}
-"""Formats for readers, whose functions take a layout; the other formats hold the frames."""
+"""Formats for human readers, whose functions take a layout; the other formats hold the frames."""
 FORMATS: Mapping[str, Callable[..., str]] = {**FORMATS_WITH_LAYOUT, "csv": csv, "json": as_json}
 ENDINGS = {"text": "txt", "markdown": "md", "latex": "tex", "csv": "csv", "json": "json"}
 
@@ -82,14 +82,14 @@ def _text(table: Table) -> str:
             for row in table.rows]
     heads = tuple(f"{head} " if i >= table.labels else head for i, head in enumerate(table.heads))
     widths = [max(len(cell) for cell in column) for column in zip(heads, *rows, strict=True)]
-    for (span, number), start in zip(table.spans, _starts(table), strict=True):
-        missing = len(span) - (sum(widths[start:start + number]) + 2 * (number - 1))
-        widths[start] += max(missing, 0)
+    for (span, number), start in zip(table.spans, _span_starts(table), strict=True):
+        extra_width = len(span) - (sum(widths[start:start + number]) + 2 * (number - 1))
+        widths[start] += max(extra_width, 0)
     lines = [table.title, ""]
     if table.spans:
         blocks = [" " * (sum(widths[:table.labels]) + 2 * (table.labels - 1))]
         blocks += [span.center(sum(widths[start:start + number]) + 2 * (number - 1), " ")
-                   for (span, number), start in zip(table.spans, _starts(table), strict=True)]
+                   for (span, number), start in zip(table.spans, _span_starts(table), strict=True)]
         lines.append("  ".join(blocks).rstrip())
     if heads:
         lines += [_aligned(heads, widths, table.labels), "-" * (sum(widths) + 2 * (len(widths) - 1))]
@@ -104,21 +104,21 @@ def _aligned(cells: Sequence[str], widths: Sequence[int], labels: int) -> str:
 
 def _markdown(table: Table) -> str:
     heads = list(table.heads)
-    for (span, number), start in zip(table.spans, _starts(table), strict=True):
+    for (span, number), start in zip(table.spans, _span_starts(table), strict=True):
         if len(table.spans) > 1 or heads[start] in table.spans[0][0]:
             heads[start:start + number] = [f"{span}: {head}" for head in heads[start:start + number]]
-    lines = [f"**{_escaped_for_markdown(table.title)}**", ""]
+    lines = [f"**{_markdown_text(table.title)}**", ""]
     if heads:
         rule = [":---" if i < table.labels else "---:" for i in range(len(heads))]
-        cells = [[f"**{_escaped_for_markdown(cell)}**" if isinstance(cell, Bold) else _escaped_for_markdown(cell) for cell in row]
+        cells = [[f"**{_markdown_text(cell)}**" if isinstance(cell, Bold) else _markdown_text(cell) for cell in row]
                  for row in table.rows]
-        lines += [f"| {' | '.join(row)} |" for row in ([_escaped_for_markdown(head) for head in heads], rule, *cells)] + [""]
-    return "\n".join([*lines, *(f"{_escaped_for_markdown(note)}  " for note in table.notes), ""])
+        lines += [f"| {' | '.join(row)} |" for row in ([_markdown_text(head) for head in heads], rule, *cells)] + [""]
+    return "\n".join([*lines, *(f"{_markdown_text(note)}  " for note in table.notes), ""])
 
 
-def _escaped_for_markdown(plain: str) -> str:
+def _markdown_text(source: str) -> str:
     """Plain text as Markdown, with Markdown's special characters escaped."""
-    return re.sub(r"([\\`*_|<>\[\]~^#$])", r"\\\1", plain.replace("\n", " "))
+    return re.sub(r"([\\`*_|<>\[\]~^#$])", r"\\\1", source.replace("\n", " "))
 
 
 def _latex(table: Table, label: str) -> str:
@@ -134,7 +134,8 @@ def _tabular(table: Table) -> list[str]:
     lines = [rf"\begin{{tabular}}{{{columns}}}", r"\toprule"]
     if table.spans:
         spans = [rf"\multicolumn{{{number}}}{{c}}{{{escaped_for_latex(span)}}}" for span, number in table.spans]
-        rules = [rf"\cmidrule(lr){{{start + 1}-{start + number}}}" for (_, number), start in zip(table.spans, _starts(table), strict=True)]
+        rules = [rf"\cmidrule(lr){{{start + 1}-{start + number}}}"
+                 for (_, number), start in zip(table.spans, _span_starts(table), strict=True)]
         lines += [" & ".join([""] * table.labels + spans).strip() + r" \\", "".join(rules)]
     lines += [" & ".join(escaped_for_latex(head) for head in table.heads) + r" \\", r"\midrule"]
     cells = [[rf"\textbf{{{escaped_for_latex(cell)}}}" if isinstance(cell, Bold) else escaped_for_latex(cell) for cell in row]
@@ -143,9 +144,9 @@ def _tabular(table: Table) -> list[str]:
     return [*lines, r"\bottomrule", r"\end{tabular}%"]
 
 
-def escaped_for_latex(plain: str) -> str:
+def escaped_for_latex(source: str) -> str:
     """Plain text as LaTeX; a character that LaTeX's fonts may lack becomes its code point."""
-    powers = re.split(r"\^(-?\d+)", re.sub(r"(?<![\w)^-])-(?=\.?\d)", MINUS, " ".join(plain.split())))
+    powers = re.split(r"\^(-?\d+)", re.sub(r"(?<![\w)^-])-(?=\.?\d)", MINUS, " ".join(source.split())))
     text = "".join(rf"\textsuperscript{{{''.join(map(_letter, part.replace('-', MINUS)))}}}" if i % 2 else "".join(map(_letter, part))
                     for i, part in enumerate(powers))
     return text.replace("--", "-{}-")
@@ -154,16 +155,16 @@ def escaped_for_latex(plain: str) -> str:
 def _letter(character: str) -> str:
     if character in _LATEX:
         return _LATEX[character]
-    is_plain = character.isascii() or (character.isalpha() and character <= _LAST_PLAIN)
+    is_plain = character.isascii() or (character.isalpha() and character <= _LAST_LETTER)
     return character if is_plain else f"U+{ord(character):04X}"
 
 
-def _starts(table: Table) -> list[int]:
+def _span_starts(table: Table) -> list[int]:
     """The first column under each spanning heading."""
-    return [table.labels + before for before in accumulate([number for _, number in table.spans[:-1]], initial=0)] if table.spans else []
+    return [table.labels + offset for offset in accumulate([number for _, number in table.spans[:-1]], initial=0)] if table.spans else []
 
 
-def _plain(value: Any) -> Any:
+def _plain_value(value: Any) -> Any:
     if isinstance(value, list | str) or value is None:
         return value
     if pd.isna(value):

@@ -1,4 +1,4 @@
-"""How likely is an unsafe outcome when vehicles vary as a study says, and which characteristic decides?
+"""How likely is an unsafe outcome when vehicles vary as a study specifies, and which characteristic decides?
 
 The options and the function of the library are defined here, so that a command's help can be shown without loading the computation.
 """
@@ -25,7 +25,7 @@ METHODS = ("auto", "monte_carlo", "subset_simulation", "cross_entropy")
 
 @dataclass(frozen=True, kw_only=True)
 class RiskOptions(Options):
-    """How a risk is estimated."""
+    """Options for the estimate of a risk."""
 
     question: ClassVar[str] = "risk"
     samples: int = option(10_000, "Maximum number of vehicles that plain Monte Carlo samples.", kind=int, low=1, high=100_000_000,

@@ -1,4 +1,4 @@
-"""Samples vehicles as a study says they vary, and estimates how likely an unsafe outcome is and which characteristic decides."""
+"""Samples vehicles that vary as a study specifies; estimates how likely an unsafe outcome is and which characteristic decides."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ import scipy
 from safevar_sumo.analysis.evaluator import Evaluator, Progress, clopper_pearson, open_evaluator, silent
 from safevar_sumo.analysis.risk import RiskOptions
 from safevar_sumo.analysis.risk.rare import (
-    ENOUGH,
-    PILOT,
+    ENOUGH_FAILURES,
+    PILOT_VEHICLES,
     RARE_BELOW,
     Estimate,
     PlateauError,
@@ -38,7 +38,7 @@ Quantile = Callable[[FloatArray], FloatArray]
 
 
 class VariationModel:
-    """How the characteristics of a study vary.
+    """The random variation of a study's characteristics.
 
     Parameters
     ----------
@@ -58,20 +58,20 @@ class VariationModel:
         self._factor = self._cholesky(study.correlations)
 
     @property
-    def correlated(self) -> bool:
+    def is_correlated(self) -> bool:
         return self._factor is not None
 
     def settings(self, probabilities: FloatArray) -> FloatArray:
-        """Settings at independent points of the unit cube, shape (N, n); the settings are correlated as the study says."""
+        """Settings at N independent points of the unit cube, shape (N, n); the settings are correlated as the study specifies."""
         if self._factor is not None:
-            return self.of_normal(scipy.stats.norm.ppf(probabilities))
-        return self._of(probabilities)
+            return self.settings_of_normal(scipy.stats.norm.ppf(probabilities))
+        return self._settings_at(probabilities)
 
-    def of_normal(self, points: FloatArray) -> FloatArray:
-        """Settings at points of standard normal space, shape (N, n), correlated as the study says."""
-        return self._of(scipy.stats.norm.cdf(points if self._factor is None else points @ self._factor.T))
+    def settings_of_normal(self, points: FloatArray) -> FloatArray:
+        """Settings at N points of standard normal space, shape (N, n), correlated as the study specifies."""
+        return self._settings_at(scipy.stats.norm.cdf(points if self._factor is None else points @ self._factor.T))
 
-    def _of(self, probabilities: FloatArray) -> FloatArray:
+    def _settings_at(self, probabilities: FloatArray) -> FloatArray:
         columns = [quantile(column) for quantile, column in zip(self._quantiles, probabilities.T, strict=True)]
         return np.clip(np.stack(columns, axis=1), self._members.lower, self._members.upper)
 
@@ -98,7 +98,7 @@ class VariationModel:
                 return lambda p: np.exp(logarithm.ppf(p))
 
     def _cholesky(self, correlations: Sequence[Correlation]) -> FloatArray | None:
-        """The factor that makes independent normal variables correlated; None without correlations."""
+        """The Cholesky factor that correlates independent normal variables; None without correlations."""
         if not correlations:
             return None
         names = self._members.names
@@ -109,7 +109,7 @@ class VariationModel:
         try:
             return np.asarray(np.linalg.cholesky(matrix), dtype=float)
         except np.linalg.LinAlgError:
-            pairs = ", ".join(f"{' and '.join(one.between)} {one.value:g}" for one in correlations)
+            pairs = ", ".join(f"{' and '.join(correlation.between)} {correlation.value:g}" for correlation in correlations)
             raise InputError(self._source, f"correlations contradict each other: {pairs}", "a positive definite matrix") from None
 
 
@@ -126,28 +126,28 @@ FLEET = 1000
 
 
 def fleet_probability(probability: float, vehicles: int) -> float:
-    """Probability that at least one of independent vehicles is unsafe, 1 - (1 - p)^N."""
+    """Probability that at least one of N independent vehicles is unsafe, 1 - (1 - p)^N."""
     return float(-np.expm1(vehicles * np.log1p(-probability))) if probability < 1 else 1.0
 
 
 CHUNK = 1000
 """Samples between two checks of the interval's width."""
 LARGEST_CHUNK = 50_000
-"""Samples of one evaluation where `width` is not given; bounds the memory of a process."""
+"""Samples of one evaluation if no `width` is requested; bounds the memory of a process."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Risk:
-    """Probability of an unsafe outcome, with its interval (Clopper and Pearson's of plain Monte Carlo), and Sobol indices.
+    """Probability of an unsafe outcome with its interval (for plain Monte Carlo by Clopper and Pearson), and Sobol indices.
 
     Attributes
     ----------
     samples, failures
-        Number of vehicles that were simulated, and of unsafe ones among them; `errors` counts those that could not be simulated.
+        Number of simulated vehicles, and of unsafe vehicles among them; `errors` counts vehicles that could not be simulated.
     method
         "monte_carlo", "subset_simulation" or "cross_entropy".
     simulations
-        Number of simulations for the estimate; those for the sensitivities are not counted.
+        Number of simulations for the estimate, without the simulations for the sensitivities.
     coefficient_of_variation
         Standard error divided by the probability; NaN if no vehicle was unsafe.
     design_point
@@ -155,8 +155,8 @@ class Risk:
     remark
         Failures that the estimate may have missed, or the reason for its method; may be empty.
     sensitivity, sensitivity_of_unsafe
-        The two frames of `sensitivities`; None if characteristics are correlated or bound by constraints: then Sobol indices are
-        not defined.
+        The two frames of `sensitivities`; None if characteristics are correlated or bound by constraints, because Sobol
+        indices are then undefined.
     """
 
     study: Study
@@ -200,9 +200,9 @@ class Risk:
             "design_point": self.design_point, "remark": self.remark}
 
     def to_frame(self) -> pd.DataFrame:
-        """Sensitivity of the safety degree and of being unsafe, one row per output and characteristic; empty if correlated.
+        """Sensitivity of the safety degree and of the unsafe outcome, one row per output and characteristic; empty if correlated.
 
-        Columns: `output` (safety_degree or unsafe), and those of `sensitivities`.
+        Columns: `output` (safety_degree or unsafe), and the columns of `sensitivities`.
         """
         frames = {SAFETY_DEGREE: self.sensitivity, "unsafe": self.sensitivity_of_unsafe}
         tables = [frame.assign(output=name) for name, frame in frames.items() if frame is not None]
@@ -216,7 +216,7 @@ class Risk:
 
 def estimate_risk(study: Study, options: RiskOptions, *, pool: Pool | None = None, jobs: int | None = None,
                   progress: Progress = silent) -> Risk:
-    """Estimate the probability of an unsafe outcome. The filter of small changes is not applied: vehicles vary, no search changes them.
+    """Estimate the probability of an unsafe outcome. The filter of small changes is not applied, as no search changes vehicles.
 
     Raises
     ------
@@ -229,15 +229,15 @@ def estimate_risk(study: Study, options: RiskOptions, *, pool: Pool | None = Non
     with open_evaluator(study, pool, jobs, progress) as evaluator:
         unsafe = evaluator.criterion(options.unsafe)
         simulated_before = evaluator.simulated
-        response = Response(evaluator, model.of_normal, unsafe)
+        response = Response(evaluator, model.settings_of_normal, unsafe)
         counts = _draw_vehicles(evaluator, model, unsafe, options, response)
         if isinstance(counts, Estimate):
-            estimate, method = counts, _method(options)
+            estimate, method = counts, _rare_method(options)
         else:
             estimate, method = counts.estimate(options.confidence), "monte_carlo"
-        no_indices = model.correlated or bool(evaluator.region) or options.is_for_rare
-        degree_indices, unsafe_indices = (None, None) if no_indices else sensitivities(evaluator, model, unsafe, options.confidence)
-    point = None if estimate.design_point is None else model.of_normal(estimate.design_point[np.newaxis])[0]
+        lacks_indices = model.is_correlated or bool(evaluator.region) or options.is_for_rare
+        degree_indices, unsafe_indices = (None, None) if lacks_indices else sensitivities(evaluator, model, unsafe, options.confidence)
+    point = None if estimate.design_point is None else model.settings_of_normal(estimate.design_point[np.newaxis])[0]
     return Risk(
         study=study, unsafe=unsafe, samples=estimate.simulations - estimate.errors, failures=estimate.failures, errors=estimate.errors,
         confidence=options.confidence, sensitivity=degree_indices, sensitivity_of_unsafe=unsafe_indices, probability=estimate.probability,
@@ -248,22 +248,22 @@ def estimate_risk(study: Study, options: RiskOptions, *, pool: Pool | None = Non
 
 @dataclass(kw_only=True)
 class _Counts:
-    """Counts of plain Monte Carlo."""
+    """Number of simulated vehicles, failures and errors of plain Monte Carlo."""
 
-    count: int = 0
+    vehicles: int = 0
     failures: int = 0
     errors: int = 0
     remark: str = ""
 
     def estimate(self, confidence: float) -> Estimate:
-        share = self.failures / self.count
+        share = self.failures / self.vehicles
         variation = float(np.sqrt((1 - share) / self.failures)) if self.failures else float("nan")
-        return Estimate(probability=share, variation=variation, interval=clopper_pearson(self.failures, self.count, confidence),
-                        failures=self.failures, errors=self.errors, simulations=self.count + self.errors, design_point=None,
+        return Estimate(probability=share, variation=variation, interval=clopper_pearson(self.failures, self.vehicles, confidence),
+                        failures=self.failures, errors=self.errors, simulations=self.vehicles + self.errors, design_point=None,
                         remark=self.remark)
 
 
-def _method(options: RiskOptions) -> str:
+def _rare_method(options: RiskOptions) -> str:
     return options.method if options.method == "cross_entropy" else "subset_simulation"
 
 
@@ -275,44 +275,44 @@ def _draw_vehicles(evaluator: Evaluator, model: VariationModel, unsafe: Unsafe, 
     if options.is_for_rare and evaluator.region:
         counts.remark = "the study has constraints, which only plain Monte Carlo supports"
     if options.is_for_rare:
-        openturns()  # raises at once if it is missing
-    requested = max(options.samples, PILOT) if options.is_for_rare else options.samples
-    while counts.count + counts.errors < requested:
-        chunk = PILOT if is_pilot else CHUNK if options.width is not None else LARGEST_CHUNK
-        drawn = counts.count + counts.errors
-        number = min(chunk, requested - drawn)
+        openturns()  # raises if the module is missing
+    requested = max(options.samples, PILOT_VEHICLES) if options.is_for_rare else options.samples
+    while counts.vehicles + counts.errors < requested:
+        chunk = PILOT_VEHICLES if is_pilot else CHUNK if options.width is not None else LARGEST_CHUNK
+        offset = counts.vehicles + counts.errors
+        number = min(chunk, requested - offset)
         probabilities = rng.random((number, len(evaluator.characteristics))) if is_pilot else None
         settings = _feasible_vehicles(evaluator, model, number, rng) if probabilities is None else model.settings(probabilities)
-        evaluations = evaluator.evaluate(settings, "vehicles as they vary", drawn, requested)
-        valid = int(np.count_nonzero(evaluations.valid))
-        counts.count, counts.errors = counts.count + valid, counts.errors + number - valid
+        evaluations = evaluator.evaluate(settings, "vehicles as they vary", offset, requested)
+        valid_vehicles = int(np.count_nonzero(evaluations.valid))
+        counts.vehicles, counts.errors = counts.vehicles + valid_vehicles, counts.errors + number - valid_vehicles
         counts.failures += int(np.count_nonzero(unsafe.of(evaluations)))
         if probabilities is not None:
             is_pilot = False
             values = response.take(scipy.stats.norm.ppf(probabilities), evaluations)
-            is_frequent = not options.is_for_rare and counts.failures * (requested / number) >= ENOUGH
-            if valid and counts.failures < RARE_BELOW * valid and not is_frequent:
-                estimate = _rare(response, values, options, counts, evaluator.study.search.seed)
+            is_frequent = not options.is_for_rare and counts.failures * (requested / number) >= ENOUGH_FAILURES
+            if valid_vehicles and counts.failures < RARE_BELOW * valid_vehicles and not is_frequent:
+                estimate = _rare_estimate(response, values, options, counts, evaluator.study.search.seed)
                 if estimate is not None:
                     return estimate
             elif options.is_for_rare:
-                counts.remark = f"more than {RARE_BELOW:g} of {valid} vehicles are unsafe: plain Monte Carlo is used"
-        low, high = clopper_pearson(counts.failures, counts.count, options.confidence) if counts.count else (0.0, 1.0)
+                counts.remark = f"more than {RARE_BELOW:g} of {valid_vehicles} vehicles are unsafe: plain Monte Carlo is used"
+        low, high = clopper_pearson(counts.failures, counts.vehicles, options.confidence) if counts.vehicles else (0.0, 1.0)
         if options.width is not None and high - low <= options.width:
             break
-    if not counts.count:
+    if not counts.vehicles:
         raise SimulationError(f"study {evaluator.study.name!r}: none of {counts.errors} vehicles could be simulated")
     return counts
 
 
 def _may_be_rare(options: RiskOptions) -> bool:
-    return options.is_for_rare or (options.method == "auto" and options.width is None and options.samples >= 2 * PILOT)
+    return options.is_for_rare or (options.method == "auto" and options.width is None and options.samples >= 2 * PILOT_VEHICLES)
 
 
-def _rare(response: Response, values: FloatArray, options: RiskOptions, counts: _Counts, seed: int) -> Estimate | None:
-    """The estimate by a method for rare failures; None if plain Monte Carlo has to go on, for the reason in the remark."""
+def _rare_estimate(response: Response, values: FloatArray, options: RiskOptions, counts: _Counts, seed: int) -> Estimate | None:
+    """The estimate by a method for rare failures; None if plain Monte Carlo has to continue; the remark has the reason."""
     if is_plateau(values):
-        counts.remark = ("the response is a plateau: most vehicles nearest to failing have the same safety degree, so that methods for "
+        counts.remark = ("the response is a plateau: most vehicles nearest to failure have the same safety degree, so that methods for "
                         "rare failures cannot approach failures; plain Monte Carlo is used")
         return None
     if not options.is_for_rare and find_spec("openturns") is None:
@@ -320,9 +320,9 @@ def _rare(response: Response, values: FloatArray, options: RiskOptions, counts: 
                         "vehicles for rare failures")
         return None
     try:
-        return estimate_rare(response, _method(options), options.confidence, seed)
+        return estimate_rare(response, _rare_method(options), options.confidence, seed)
     except PlateauError:
-        counts.remark = "the response is a plateau before failures, which no method for rare failures crosses; plain Monte Carlo is used"
+        counts.remark = "the response is a plateau before failures, which methods for rare failures cannot cross; plain Monte Carlo is used"
         return None
 
 
@@ -335,16 +335,16 @@ def _feasible_vehicles(evaluator: Evaluator, model: VariationModel, number: int,
     return settings
 
 
-BASE = 512
-"""Number of base points of Saltelli's design, which has n + 2 settings for each."""
-LEAST_FOR_INDICES = 100
-"""Minimum number of unsafe, and of safe, settings in the design for Sobol indices of being unsafe."""
+BASE_POINTS = 512
+"""Number of base points of Saltelli's design, which has n + 2 settings for each base point."""
+LEAST_OUTCOMES = 100
+"""Minimum number of unsafe settings, and of safe settings, in the design for Sobol indices of unsafe outcomes."""
 RESAMPLES = 200
 """Number of bootstrap samples for the intervals."""
 
 
 def sensitivities(evaluator: Evaluator, model: VariationModel, unsafe: Unsafe, confidence: float) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """Sensitivity of the safety degree, and of being unsafe.
+    """Sensitivity of the safety degree, and of the unsafe outcome.
 
     Returns
     -------
@@ -357,26 +357,26 @@ def sensitivities(evaluator: Evaluator, model: VariationModel, unsafe: Unsafe, c
 
     seed, names = evaluator.study.search.seed % 2**32, evaluator.characteristics.names
     problem = {"num_vars": len(names), "names": list(names), "bounds": [[0.0, 1.0]] * len(names)}
-    points = sobol.sample(problem, BASE, calc_second_order=False, seed=seed)
+    points = sobol.sample(problem, BASE_POINTS, calc_second_order=False, seed=seed)
     evaluations = evaluator.evaluate(model.settings(np.asarray(points)), "what decides")
     degree = np.where(evaluations.valid, evaluations.f_safe, np.nan)
     is_unsafe = np.where(evaluations.valid, unsafe.of(evaluations).astype(float), np.nan)
-    if min(np.count_nonzero(is_unsafe == outcome) for outcome in (0, 1)) < LEAST_FOR_INDICES:
+    if min(np.count_nonzero(is_unsafe == outcome) for outcome in (0, 1)) < LEAST_OUTCOMES:
         is_unsafe[:] = np.nan
     return _indices(problem, degree, confidence, seed), _indices(problem, is_unsafe, confidence, seed)
 
 
 def _indices(problem: dict[str, Any], output: FloatArray, confidence: float, seed: int) -> pd.DataFrame:
-    """Sobol indices of an output over the design; omits base points at which the output is undefined for any setting."""
+    """Sobol indices of an output over the design, without base points at which the output is undefined for any setting."""
     from SALib.analyze import sobol
 
-    blocks = output.reshape(BASE, -1)
-    complete = blocks[np.isfinite(blocks).all(axis=1)].ravel()
+    blocks = output.reshape(BASE_POINTS, -1)
+    outputs = blocks[np.isfinite(blocks).all(axis=1)].ravel()
     names = problem["names"]
-    if not complete.size or np.ptp(complete) == 0:
+    if not outputs.size or np.ptp(outputs) == 0:
         indices = {name: np.full(len(names), np.nan) for name in ("S1", "ST", "S1_conf", "ST_conf")}
     else:
-        indices = sobol.analyze(problem, complete, calc_second_order=False, num_resamples=RESAMPLES, conf_level=confidence, seed=seed)
+        indices = sobol.analyze(problem, outputs, calc_second_order=False, num_resamples=RESAMPLES, conf_level=confidence, seed=seed)
     frame = pd.DataFrame({"characteristic": names, "first_order": indices["S1"], "total": indices["ST"]})
     for name, key in (("first_order", "S1"), ("total", "ST")):
         for end, sign in (("lower", -1), ("upper", 1)):

@@ -21,51 +21,51 @@ from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray
 
 RARE_BELOW = 1e-2
-"""Probability above which plain Monte Carlo is as good."""
-PILOT = 1000
+"""Probability above which plain Monte Carlo is as efficient."""
+PILOT_VEHICLES = 1000
 """Number of vehicles first drawn by plain Monte Carlo, whose outcomes decide the method."""
-ENOUGH = 100
+ENOUGH_FAILURES = 100
 """Plain Monte Carlo is kept if, at the pilot's rate, all requested vehicles would have at least this many failures."""
-SHARE = 0.1
-"""p0: share of a level's vehicles, those nearest to failing, from which the next level starts."""
-LEVEL = 1000
-"""N: number of vehicles of a level. A block has p0 N vehicles, so that no vehicle continues from one in its own block."""
-REPEATS, REPEATS_OF_RARER = 4, 8
-"""Number of independent repeats for probabilities down to `RARER`, and below it."""
-RARER = 3e-4
+LEVEL_SHARE = 0.1
+"""p0: share of a level's vehicles (those nearest to failure) from which the next level starts."""
+LEVEL_SIZE = 1000
+"""N: number of vehicles of a level. A block has p0 N vehicles, so that no vehicle continues from another vehicle of its block."""
+REPEATS, VERY_RARE_REPEATS = 4, 8
+"""Number of independent repeats for probabilities of at least `VERY_RARE_BELOW`, and for lower probabilities."""
+VERY_RARE_BELOW = 3e-4
 INFLATION = 1.3
-"""Factor on OpenTURNS' coefficient of variation, which takes the levels of a subset simulation for independent of each other: over 240
+"""Factor on OpenTURNS' coefficient of variation, which assumes that the levels of a subset simulation are independent: over 240
 repeats of linear limit states of 1e-3 to 1e-6 in 5 to 12 dimensions the observed coefficients are 1.1 to 1.3 times as large."""
-PRIOR = 3
+PRIOR_DEGREES = 3
 """Degrees of freedom of the interval in addition to the number of repeats, for the information in OpenTURNS' own estimates."""
-SMALLEST = 1e-10
+MIN_PROBABILITY = 1e-10
 """Probability at which a subset simulation gives up."""
-WIDTH = 2.0
-"""Width of the uniform proposals of its Markov chains."""
-SAFE = 1e6
-"""Response where the safety degree is undefined or the simulation failed: as far from failing as possible."""
-EDGE = 1e-9
+PROPOSAL_WIDTH = 2.0
+"""Width of the uniform proposals of a subset simulation's Markov chains."""
+SAFE_RESPONSE = 1e6
+"""Response where the safety degree is undefined or the simulation failed; it stands for the greatest distance from failure."""
+MIN_RESPONSE = 1e-9
 """Smallest absolute value of a response, so that its sign always shows whether the vehicle is unsafe."""
-TIED = 0.5
-"""The response is a plateau if at least this share of the vehicles nearest to failing have the same one."""
-SEGMENT = 9
-"""Number of points evaluated between two failures."""
-COMPARED = 14
+PLATEAU_SHARE = 0.5
+"""The response is a plateau if at least this share of the vehicles nearest to failure have the same response."""
+PATH_POINTS = 9
+"""Number of points evaluated on the straight path between two failures."""
+COMPARED_FAILURES = 14
 """Maximum number of failures that are compared pairwise."""
-AROUND = 100
+SEARCH_SETTINGS = 100
 """Number of settings around the design point in each round of its search."""
-ROUNDS = 4
-Model = Callable[[FloatArray], FloatArray]
-"""From points in standard normal space to settings."""
+SEARCH_ROUNDS = 4
+SettingsFunction = Callable[[FloatArray], FloatArray]
+"""Turns points of standard normal space into settings."""
 
 
 class PlateauError(Exception):
-    """The response does not show which vehicles are nearer to failing."""
+    """The response does not show which vehicles are nearer to failure."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Estimate:
-    """A probability, its coefficient of variation and interval, the most probable failure in standard normal space, and remarks."""
+    """A probability, its coefficient of variation and interval, the most probable failure in standard normal space, and a remark."""
 
     probability: float
     variation: float
@@ -78,21 +78,21 @@ class Estimate:
 
 
 class Response:
-    """The response g(u), below 0 where a vehicle is unsafe; counts simulations and remembers failures."""
+    """The response g(u), below 0 where a vehicle is unsafe. Counts simulations and stores failures."""
 
-    def __init__(self, evaluator: Evaluator, settings_of: Model, unsafe: Unsafe) -> None:
+    def __init__(self, evaluator: Evaluator, settings_of: SettingsFunction, unsafe: Unsafe) -> None:
         self._evaluator, self._settings_of, self._unsafe = evaluator, settings_of, unsafe
         self.dimensions = len(evaluator.characteristics)
-        self.simulations = self.errors = self.failed = 0
+        self.simulations = self.errors = self.failure_count = 0
         self.stage = "rare failures"
         self.expected = 1
-        self._points: list[FloatArray] = []
+        self._failure_points: list[FloatArray] = []
         """Failures, shape (k, n) each."""
 
     @property
     def failures(self) -> FloatArray:
         """Distinct unsafe points, shape (k, n)."""
-        return np.unique(np.concatenate([np.zeros((0, self.dimensions)), *self._points]), axis=0)
+        return np.unique(np.concatenate([np.zeros((0, self.dimensions)), *self._failure_points]), axis=0)
 
     def __call__(self, points: Any) -> FloatArray:
         """The response at points, shape (N, n)."""
@@ -101,40 +101,40 @@ class Response:
         return self.take(array, evaluations)
 
     def take(self, points: FloatArray, evaluations: Evaluations) -> FloatArray:
-        """The response of points with known evaluations, which are counted and remembered."""
+        """The response of points with known evaluations, which are counted; failures are stored."""
         unsafe = self._unsafe.of(evaluations)
         margin = self._unsafe.margin(evaluations)
-        margin = np.where(evaluations.valid & ~np.isnan(margin), margin, SAFE)
+        margin = np.where(evaluations.valid & ~np.isnan(margin), margin, SAFE_RESPONSE)
         self.simulations += len(points)
         self.errors += int(np.count_nonzero(~evaluations.valid))
-        self.failed += int(np.count_nonzero(unsafe))
-        self._points.append(points[unsafe])
-        return np.where(unsafe, np.minimum(margin, -EDGE), np.maximum(margin, EDGE))
+        self.failure_count += int(np.count_nonzero(unsafe))
+        self._failure_points.append(points[unsafe])
+        return np.where(unsafe, np.minimum(margin, -MIN_RESPONSE), np.maximum(margin, MIN_RESPONSE))
 
 
 def openturns() -> Any:
-    """OpenTURNS, without messages of its own.
+    """The module openturns, with its messages switched off.
 
     Raises
     ------
     InputError
-        If it is not installed.
+        If OpenTURNS is not installed.
     """
     try:
         import openturns
     except ImportError:
-        legal = "pip install 'safevar_sumo[rare]'; or --method monte_carlo"
-        raise InputError("--rare or --method", "OpenTURNS is not installed", legal) from None
+        remedy = "pip install 'safevar_sumo[rare]'; or --method monte_carlo"
+        raise InputError("--rare or --method", "OpenTURNS is not installed", remedy) from None
     openturns.Log.Show(openturns.Log.NONE)
     return openturns
 
 
 def is_plateau(values: FloatArray) -> bool:
-    """Whether the share p0 of the values, those nearest to failing, is mostly one value."""
-    nearest = np.sort(values[values > 0])[:max(int(SHARE * len(values)), 2)]
+    """Whether the values nearest to failure, a share p0, mostly equal each other."""
+    nearest = np.sort(values[values > 0])[:max(int(LEVEL_SHARE * len(values)), 2)]
     if not len(nearest):
         return False
-    return bool(np.count_nonzero(nearest == nearest[-1]) >= TIED * len(nearest) or nearest[-1] >= SAFE)
+    return bool(np.count_nonzero(nearest == nearest[-1]) >= PLATEAU_SHARE * len(nearest) or nearest[-1] >= SAFE_RESPONSE)
 
 
 def estimate_rare(response: Response, method: str, confidence: float, seed: int) -> Estimate:
@@ -148,35 +148,36 @@ def estimate_rare(response: Response, method: str, confidence: float, seed: int)
     Raises
     ------
     PlateauError
-        If the response does not show which vehicles are nearer to failing.
+        If the response does not show which vehicles are nearer to failure.
     """
-    run = _subset if method == "subset_simulation" else _cross_entropy
+    run = _subset_simulation if method == "subset_simulation" else _cross_entropy
     probabilities, variations, thresholds = [], [], list[float]()
-    repeats, number = REPEATS, 0
-    response.expected = response.simulations + 4 * REPEATS * LEVEL
-    with _generator_restored():
-        while number < repeats:
-            response.stage = f"rare failures, repeat {number + 1} of {repeats}"
-            probability, variation, thresholds = run(response, (seed + 7919 * number) % 2**31)
+    repeats, repeat = REPEATS, 0
+    response.expected = response.simulations + 4 * REPEATS * LEVEL_SIZE
+    with _restore_generator():
+        while repeat < repeats:
+            response.stage = f"rare failures, repeat {repeat + 1} of {repeats}"
+            probability, variation, thresholds = run(response, (seed + 7919 * repeat) % 2**31)
             probabilities.append(probability)
             variations.append(variation)
-            number += 1
-            if number == REPEATS and method == "subset_simulation" and np.mean(probabilities) < RARER:
-                repeats = REPEATS_OF_RARER
+            repeat += 1
+            if repeat == REPEATS and method == "subset_simulation" and np.mean(probabilities) < VERY_RARE_BELOW:
+                repeats = VERY_RARE_REPEATS
                 response.expected = response.simulations * repeats // REPEATS
     mean = float(np.mean(probabilities))
     if mean <= 0:
-        return Estimate(probability=0.0, variation=math.nan, interval=(0.0, SMALLEST), failures=response.failed, errors=response.errors,
-                        simulations=response.simulations, design_point=None,
+        return Estimate(probability=0.0, variation=math.nan, interval=(0.0, MIN_PROBABILITY), failures=response.failure_count,
+                        errors=response.errors, simulations=response.simulations, design_point=None,
                         remark="no failure was found: either there is none, or the response does not lead to it")
     spread = float(np.std(probabilities, ddof=1)) / mean / math.sqrt(repeats)
     variation = max(spread, INFLATION * math.sqrt(float(np.mean(np.square(variations))) / repeats))
-    quantile = float(scipy.stats.t.ppf((1 + confidence) / 2, repeats + PRIOR))
+    quantile = float(scipy.stats.t.ppf((1 + confidence) / 2, repeats + PRIOR_DEGREES))
     factor = math.exp(quantile * math.sqrt(math.log1p(variation**2)))
     rng = np.random.default_rng(seed)
     remark = _remark_on_islands(response, thresholds, rng)
-    return Estimate(probability=mean, variation=variation, interval=(mean / factor, min(mean * factor, 1.0)), failures=response.failed,
-                    errors=response.errors, design_point=_design_point(response, rng), remark=remark, simulations=response.simulations)
+    return Estimate(probability=mean, variation=variation, interval=(mean / factor, min(mean * factor, 1.0)),
+                    failures=response.failure_count, errors=response.errors, design_point=_design_point(response, rng), remark=remark,
+                    simulations=response.simulations)
 
 
 def _event(ot: Any, response: Callable[[Any], FloatArray], dimensions: int) -> Any:
@@ -185,8 +186,8 @@ def _event(ot: Any, response: Callable[[Any], FloatArray], dimensions: int) -> A
 
 
 @contextmanager
-def _generator_restored() -> Iterator[None]:
-    """Restores the state of OpenTURNS' random generator, of which there is one for the whole process."""
+def _restore_generator() -> Iterator[None]:
+    """Restore the state of OpenTURNS' random generator, which the whole process shares."""
     generator = openturns().RandomGenerator
     state = generator.GetState()
     try:
@@ -195,30 +196,30 @@ def _generator_restored() -> Iterator[None]:
         generator.SetState(state)
 
 
-def _subset(response: Response, seed: int) -> tuple[float, float, list[float]]:
+def _subset_simulation(response: Response, seed: int) -> tuple[float, float, list[float]]:
     """Probability, coefficient of variation and thresholds of a subset simulation."""
-    ot, stuck = openturns(), [False]
-    algorithm = ot.SubsetSampling(_event(ot, response, response.dimensions), WIDTH, SHARE)
-    algorithm.setBlockSize(round(SHARE * LEVEL))
-    algorithm.setMaximumOuterSampling(round(1 / SHARE))
+    ot, stop_flag = openturns(), [False]
+    algorithm = ot.SubsetSampling(_event(ot, response, response.dimensions), PROPOSAL_WIDTH, LEVEL_SHARE)
+    algorithm.setBlockSize(round(LEVEL_SHARE * LEVEL_SIZE))
+    algorithm.setMaximumOuterSampling(round(1 / LEVEL_SHARE))
     algorithm.setMaximumCoefficientOfVariation(-1.0)
-    algorithm.setMinimumProbability(SMALLEST)
+    algorithm.setMinimumProbability(MIN_PROBABILITY)
 
-    def is_stuck() -> bool:
+    def level_stagnates() -> bool:
         thresholds = list(algorithm.getThresholdPerStep())
-        stuck[0] = len(thresholds) > 1 and thresholds[-1] > 0 and thresholds[-1] == thresholds[-2]
-        return stuck[0]
+        stop_flag[0] = len(thresholds) > 1 and thresholds[-1] > 0 and thresholds[-1] == thresholds[-2]
+        return stop_flag[0]
 
-    algorithm.setStopCallback(is_stuck)
+    algorithm.setStopCallback(level_stagnates)
     ot.RandomGenerator.SetSeed(seed)
     try:
         algorithm.run()
-    except TypeError as error:  # its estimate of a level's variance, a difference, can fall below 0
+    except TypeError as error:  # OpenTURNS estimates a level's variance as a difference, which can fall below 0
         if "variance estimate" not in str(error):
             raise
-        return _subset(response, seed + 1)
+        return _subset_simulation(response, seed + 1)
     thresholds = [float(value) for value in algorithm.getThresholdPerStep()]
-    if stuck[0]:
+    if stop_flag[0]:
         raise PlateauError
     if thresholds[-1] > 0:
         return 0.0, 0.0, thresholds
@@ -227,10 +228,10 @@ def _subset(response: Response, seed: int) -> tuple[float, float, list[float]]:
 
 
 def _cross_entropy(response: Response, seed: int) -> tuple[float, float, list[float]]:
-    """As `_subset`, by cross-entropy importance sampling with one normal distribution of independent components."""
+    """As `_subset_simulation`, by cross-entropy importance sampling with one normal distribution of independent components."""
     ot = openturns()
-    algorithm = ot.StandardSpaceCrossEntropyImportanceSampling(_event(ot, response, response.dimensions), 2 * SHARE)
-    algorithm.setBlockSize(LEVEL)
+    algorithm = ot.StandardSpaceCrossEntropyImportanceSampling(_event(ot, response, response.dimensions), 2 * LEVEL_SHARE)
+    algorithm.setBlockSize(LEVEL_SIZE)
     algorithm.setMaximumOuterSampling(1)
     algorithm.setMaximumCoefficientOfVariation(-1.0)
     ot.RandomGenerator.SetSeed(seed)
@@ -241,50 +242,51 @@ def _cross_entropy(response: Response, seed: int) -> tuple[float, float, list[fl
 
 
 def _remark_on_islands(response: Response, thresholds: list[float], rng: np.random.Generator) -> str:
-    """Remark on islands of failures with safe settings between them; straight paths within an island stay near to failing."""
+    """Remark on islands of failures with safe settings between them; straight paths within an island stay near failure."""
     failures = response.failures
     if len(failures) < 2:
         return ""
-    chosen = _apart(failures[rng.permutation(len(failures))[:2000]])
-    first, second = np.triu_indices(len(chosen), 1)
-    shares = np.linspace(0, 1, SEGMENT + 2)[1:-1]
-    between = chosen[first, np.newaxis] * (1 - shares[:, np.newaxis]) + chosen[second, np.newaxis] * shares[:, np.newaxis]
+    nodes = _distant_points(failures[rng.permutation(len(failures))[:2000]])
+    first, second = np.triu_indices(len(nodes), 1)
+    shares = np.linspace(0, 1, PATH_POINTS + 2)[1:-1]
+    paths = nodes[first, np.newaxis] * (1 - shares[:, np.newaxis]) + nodes[second, np.newaxis] * shares[:, np.newaxis]
     response.stage = "paths between failures"
-    highest = response(between.reshape(-1, response.dimensions)).reshape(len(first), SEGMENT).max(axis=1)
-    above = [value for value in thresholds if value > 0]
-    limit = above[len(above) // 2] if above else 0.0
-    joined = np.eye(len(chosen), dtype=bool)
-    joined[first, second] = joined[second, first] = highest <= limit
-    number, _ = scipy.sparse.csgraph.connected_components(joined)
+    peaks = response(paths.reshape(-1, response.dimensions)).reshape(len(first), PATH_POINTS).max(axis=1)
+    levels = [value for value in thresholds if value > 0]
+    limit = levels[len(levels) // 2] if levels else 0.0
+    links = np.eye(len(nodes), dtype=bool)
+    links[first, second] = links[second, first] = peaks <= limit
+    number, _ = scipy.sparse.csgraph.connected_components(links)
     if number < 2:
         return ""
     return (f"failures lie on {number} islands with safe settings between them, and this method may have missed others; "
             "--method monte_carlo misses none, with many samples")
 
 
-def _apart(points: FloatArray) -> FloatArray:
-    """Points far from each other: each is the farthest from all chosen before it."""
-    chosen = [int(np.argmin(np.linalg.norm(points, axis=1)))]
-    distance = np.linalg.norm(points - points[chosen[0]], axis=1)
-    while len(chosen) < min(COMPARED, len(points)):
-        chosen.append(int(np.argmax(distance)))
-        distance = np.minimum(distance, np.linalg.norm(points - points[chosen[-1]], axis=1))
-    return points[chosen]
+def _distant_points(points: FloatArray) -> FloatArray:
+    """Points far from each other: each has the largest distance from all previously chosen points."""
+    indices = [int(np.argmin(np.linalg.norm(points, axis=1)))]
+    distance = np.linalg.norm(points - points[indices[0]], axis=1)
+    while len(indices) < min(COMPARED_FAILURES, len(points)):
+        indices.append(int(np.argmax(distance)))
+        distance = np.minimum(distance, np.linalg.norm(points - points[indices[-1]], axis=1))
+    return points[indices]
 
 
 def _design_point(response: Response, rng: np.random.Generator) -> FloatArray | None:
-    """The failure nearest to the origin: searched from the nearest known one, towards the origin and around it in ever smaller steps."""
+    """The failure nearest to the origin, searched between the nearest known failure and the origin, and around that failure."""
     if not len(response.failures):
         return None
-    best, response.stage = _nearest(response.failures), "most probable failure"
-    for number in range(ROUNDS):
-        towards = best * np.linspace(0.5, 1.0, AROUND)[:, np.newaxis]
-        around = best * (1 - 0.05 * rng.random((AROUND, 1))) + rng.normal(size=(AROUND, response.dimensions)) * 0.4 / 2**number
-        for points in (towards, around):
+    nearest, response.stage = _nearest_point(response.failures), "most probable failure"
+    for number in range(SEARCH_ROUNDS):
+        inner_points = nearest * np.linspace(0.5, 1.0, SEARCH_SETTINGS)[:, np.newaxis]
+        random_points = (nearest * (1 - 0.05 * rng.random((SEARCH_SETTINGS, 1)))
+                         + rng.normal(size=(SEARCH_SETTINGS, response.dimensions)) * 0.4 / 2**number)
+        for points in (inner_points, random_points):
             unsafe: BoolArray = response(points) < 0
-            best = _nearest(np.vstack([best, points[unsafe]]))
-    return best
+            nearest = _nearest_point(np.vstack([nearest, points[unsafe]]))
+    return nearest
 
 
-def _nearest(points: FloatArray) -> FloatArray:
+def _nearest_point(points: FloatArray) -> FloatArray:
     return np.asarray(points[np.argmin(np.linalg.norm(points, axis=1))])

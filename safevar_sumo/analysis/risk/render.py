@@ -25,15 +25,15 @@ def print_risk(console: Console, result: Risk) -> None:
     """Print the probability with its interval, how vehicles vary, and which characteristics decide."""
     low, high = result.interval
     print_text(console, result.study.title)
-    drawn = "" if result.method == "monte_carlo" else f", drawn by {result.method.replace('_', ' ')}"
-    print_text(console, f"Unsafe: {result.unsafe}. {result.failures} of {result.samples} vehicles{drawn}.")
-    name = "Share of the domain that is unsafe:" if result.of_domain else "Probability"
-    print_text(console, f"{name} {result.probability:.4g}, with {result.confidence:.0%} confidence from {low:.4g} to {high:.4g}.")
+    sampling = "" if result.method == "monte_carlo" else f", drawn by {result.method.replace('_', ' ')}"
+    print_text(console, f"Unsafe: {result.unsafe}. {result.failures} of {result.samples} vehicles{sampling}.")
+    label = "Share of the domain that is unsafe:" if result.of_domain else "Probability"
+    print_text(console, f"{label} {result.probability:.4g}, with {result.confidence:.0%} confidence from {low:.4g} to {high:.4g}.")
     if result.remark:
         print_text(console, f"note: {result.remark}.")
     if result.design_point is not None:
-        values = ", ".join(f"{one.name} = {one.text(result.design_point[one.name])}{one.suffix}"
-                           for one in CharacteristicSet.of(result.study.vehicle.characteristics))
+        values = ", ".join(f"{member.name} = {member.text(result.design_point[member.name])}{member.suffix}"
+                           for member in CharacteristicSet.of(result.study.vehicle.characteristics))
         print_text(console, f"The most probable failure: {values}.")
     if not result.of_domain and 0 < result.probability < RARE_BELOW:
         print_text(console, f"Of {FLEET:,} vehicles that vary independently at least one is unsafe with probability "
@@ -46,10 +46,10 @@ def print_risk(console: Console, result: Risk) -> None:
         return
     table = WholeTable("characteristic", right=("SD: alone", "in all", "unsafe: alone", "in all"),
                        title="What decides: share of the variance")
-    second = result.sensitivity_of_unsafe.set_index("characteristic")
+    unsafe_indices = result.sensitivity_of_unsafe.set_index("characteristic")
     for row in result.sensitivity.sort_values("total", ascending=False, kind="stable").to_dict("records"):
-        other = second.loc[row["characteristic"]]
-        table.add_row(row["characteristic"], *(_index(one, name) for one in (row, other) for name in ("first_order", "total")))
+        unsafe_row = unsafe_indices.loc[row["characteristic"]]
+        table.add_row(row["characteristic"], *(_index(indices, name) for indices in (row, unsafe_row) for name in ("first_order", "total")))
     console.print(table)
     if result.sensitivity_of_unsafe["total"].isna().all():
         print_text(console, "Too few settings are unsafe, or safe, for indices of being unsafe; see those of the safety degree.")
@@ -61,9 +61,9 @@ def print_risk(console: Console, result: Risk) -> None:
 def _how_vehicles_vary(study: Study) -> str:
     """How vehicles vary, in a sentence."""
     laws = [f"{name} {law.__struct_config__.tag}" for name, law in study.variation.items() if law != Uniform()]
-    correlated = ", ".join(f"{' with '.join(one.between)} {one.value:g}" for one in study.correlations)
-    varied = f"as the study says: {'; '.join(laws)}; the others uniformly" if laws else "uniformly over the whole domain"
-    return f"They vary {varied}{f', correlated: {correlated}' if correlated else ''}."
+    pairs = ", ".join(f"{' with '.join(correlation.between)} {correlation.value:g}" for correlation in study.correlations)
+    manner = f"as the study specifies: {'; '.join(laws)}; the others uniformly" if laws else "uniformly over the whole domain"
+    return f"They vary {manner}{f', correlated: {pairs}' if pairs else ''}."
 
 
 def _index(row: object, name: str) -> str:
@@ -72,12 +72,12 @@ def _index(row: object, name: str) -> str:
 
 
 def sensitivity_figure(result: Risk) -> Figure:
-    """First-order and total Sobol indices of every characteristic with intervals: one panel for the safety degree, one for being unsafe.
+    """First-order and total Sobol indices of every characteristic with intervals: one panel for the safety degree, one for unsafe outcomes.
 
     Raises
     ------
     InputError
-        If characteristics are correlated or bound by constraints, so that there are no indices.
+        If characteristics are correlated or bound by constraints, so that indices are undefined.
     """
     if result.sensitivity is None or result.sensitivity_of_unsafe is None:
         raise InputError("correlations", "there are no sensitivity indices of characteristics that are correlated or bound by constraints",
