@@ -1,8 +1,8 @@
-"""Carries out a study: many runs at once, with a journal for each, on a pool of workers.
+"""Carries out a study: many runs at once on a pool of workers, each run with its journal.
 
-A search is a generator that knows nothing of this. Its run answers requests from its journal and memory, has new settings
-evaluated, journals their evaluations and sends them in: a resumed run is a replayed one. New settings of all runs are gathered
-into batches for a pool: a lost worker costs a batch, and no result depends on the worker or the other settings in a batch.
+A search is a generator that requests evaluations of settings. The run of the search looks each setting up in its journal and memory,
+has new settings evaluated, journals the evaluations and sends them to the search; a resumed run replays its journal. Batches gather new
+settings of all runs for the pool: a lost worker costs a batch, and no result depends on the worker or on other settings in the batch.
 """
 
 from safevar_sumo.campaign.campaign import Campaign, run_campaign

@@ -1,4 +1,4 @@
-"""Many runs at once over one pool, each with its journal."""
+"""Many runs at once on one pool, each run with its journal."""
 
 from __future__ import annotations
 
@@ -29,15 +29,15 @@ from safevar_sumo.workers.isolation import check_code
 from safevar_sumo.workers.retrying import RetryingPool
 
 JOURNALS_AT_ONCE = 8
-"""Number of journals written at the same time: each append is synced to the disk before its run goes on."""
+"""Number of journals written at the same time: a run waits until the disk has its evaluations."""
 
 
 class Campaign(NamedTuple):
-    """Results of a study's runs: the original vehicle's evaluation and the solutions of every finished run.
+    """Results of the runs of a study: the evaluation of the original vehicle, and the solutions of each finished run.
 
-    `failures` are settings that could not be simulated; another process works on `busy` runs; `scoring` holds the metrics and
-    objectives; `collisions` counts the distinct settings of each finished run that collided, `invalid_tests` those that left the
-    tolerance of a test's speed.
+    `failures` are settings that could not be simulated. `busy` are runs that another process carries out. `collisions` is the number
+    of distinct settings of each finished run that collided, `invalid_tests` the number of those that left the speed tolerance of a
+    test. `scoring` holds the metrics and objectives.
     """
 
     original: Evaluations
@@ -62,20 +62,20 @@ def run_campaign(study: Study, keys: Iterable[RunKey], results: ResultsDirectory
     pool
         Computes batches.
     batch
-        Maximum number of settings per batch, gathered from several runs.
+        Maximum number of settings of several runs in a batch.
     engine
-        What moves the vehicles; results from recorded scenes are verified in SUMO before a run counts as finished.
+        What moves the vehicles; before a run is finished, results from recorded scenes are verified in SUMO.
     retry_failed
-        Whether settings that could not be simulated before are tried again.
+        Whether to simulate settings again that failed before.
 
     Raises
     ------
     SafevarError
-        If a journal cannot be written or the study itself is at fault.
+        If a journal cannot be written, or the study is at fault.
     """
     characteristics = CharacteristicSet.of(study.vehicle.characteristics)
-    retrying, work = RetryingPool(pool, study, results.note), packed(study, results.inputs, engine=engine)
-    original = _original(study, work, characteristics, results, retrying, observer)
+    retrying_pool, work = RetryingPool(pool, study, results.note), packed(study, results.inputs, engine=engine)
+    original = _original(study, work, characteristics, results, retrying_pool, observer)
     if not original.valid[0]:
         raise InputError(study.source, "the original vehicle leaves the tolerance of a test's speed before the ADS acts "
                          "(invalid-test): nothing can be compared with it", "tests whose speed the vehicle can hold")
@@ -85,16 +85,16 @@ def run_campaign(study: Study, keys: Iterable[RunKey], results: ResultsDirectory
     problem = Problem(characteristics=characteristics, original=original, evaluations=study.search.evaluations,
                       population=study.search.population, scoring=results.scoring, region=region_of(study))
     campaign = Campaign(original, {}, [], [], {}, {}, results.scoring)
-    waiting, runs = deque(keys), set[Run]()
+    keys_left, runs = deque(keys), set[Run]()
 
     def begin_search(key: RunKey) -> Search:
         return search_of(key, study, problem, results.note)
 
-    batcher = Batcher(retrying, work, batch or LARGEST_WORLD)
-    verification = Verification(study, results, retrying, begin_search, engine, observer)
+    batcher = Batcher(retrying_pool, work, batch or LARGEST_WORLD)
+    verification = Verification(study, results, retrying_pool, begin_search, engine, observer)
 
     def advance(run: Run) -> None:
-        """Advance a run as far as its known evaluations allow, then queue its missing settings."""
+        """Advance a run as far as its known evaluations allow, then queue the missing settings, verify the run or finish it."""
         if not run.advance():
             batcher.add(run, run.missing)
         elif run.finished or not verification.begin(run):
@@ -110,9 +110,9 @@ def run_campaign(study: Study, keys: Iterable[RunKey], results: ResultsDirectory
 
     journalling = ThreadPoolExecutor(JOURNALS_AT_ONCE, thread_name_prefix="journal")
     try:
-        while waiting or runs:
-            while waiting and len(runs) < batcher.runs_wanted(study.search.population):
-                key = waiting.popleft()
+        while keys_left or runs:
+            while keys_left and len(runs) < batcher.runs_wanted(study.search.population):
+                key = keys_left.popleft()
                 try:
                     journal = results.journal(str(key))
                 except JournalBusy:
@@ -146,20 +146,20 @@ def _take(share: tuple[Run, Evaluations]) -> bool:
 
 def _original(study: Study, work: bytes, characteristics: CharacteristicSet, results: ResultsDirectory, pool: RetryingPool,
               observer: Observer) -> Evaluations:
-    """The original vehicle's evaluation, simulated once; raises if that fails, or if models mix settings up."""
-    def simulated() -> Evaluations:
+    """The evaluation of the original vehicle, from its journal or simulated; raises if it fails, or if models mix settings up."""
+    def simulate() -> Evaluations:
         return awaited(pool.submit(work, characteristics.original[np.newaxis], must_succeed=True))
 
     try:
         journal = results.journal(ORIGINAL)
-    except JournalBusy:  # another process, of a job array say, is about to write the same
-        return simulated()
+    except JournalBusy:  # another process, such as a job of an array, writes this journal
+        return simulate()
     try:
         if journal.cut:
             observer.warned(f"{journal.path}: the last {journal.cut} bytes were torn; what they held is simulated again")
         if journal.content.evaluations is not None:
             return journal.content.evaluations
-        evaluations = simulated()
+        evaluations = simulate()
         for remark in check_code(study, results.inputs, pool):
             observer.warned(remark)
         journal.append([0], evaluations)

@@ -1,4 +1,4 @@
-"""Estimate of a campaign's cost, measured by a short probe."""
+"""Estimate of the cost of a campaign, from a short measurement."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from safevar_sumo.workers.retrying import RetryingPool
 PROBE_BATCHES = 4
 """Number of batches per worker in the measurement."""
 NUMBERS_BESIDE_METRICS = 4
-"""A journal keeps f_diff, f_num_diff, the collision's speed and a position and outcome with the metrics of a setting."""
+"""Numbers in a journal besides the metrics of a setting: f_diff, f_num_diff, collision speed, and position with outcome."""
 
 
 class Forecast(NamedTuple):
-    """Largest number of evaluations, evaluations per second, and largest numbers of seconds and bytes of a campaign."""
+    """Upper limits for a campaign: evaluations, `seconds` and `size` of the results [bytes]; `rate` are evaluations per second."""
 
     evaluations: int
     rate: float
@@ -32,22 +32,22 @@ class Forecast(NamedTuple):
 
 
 def forecast(study: Study, runs: int, pool: Pool, batch: int = LARGEST_WORLD, engine: Engine = Engine.LIBSUMO) -> Forecast:
-    """The largest cost of `runs` runs, estimated by a short probe of the pool that will carry them out."""
+    """Upper limits for a number of runs, from a short measurement of the pool that will carry out the runs."""
     characteristics, size = CharacteristicSet.of(study.vehicle.characteristics), min(batch, max(runs, 1) * study.search.population)
-    retrying, work, rng = RetryingPool(pool, study), packed(study, engine=engine), np.random.default_rng(study.search.seed)
+    retrying_pool, work, rng = RetryingPool(pool, study), packed(study, engine=engine), np.random.default_rng(study.search.seed)
 
     def probe(number: int) -> float:
-        """Seconds that `number` batches on every worker take."""
+        """Time for a number of batches on every worker [s]."""
         start = time.perf_counter()
-        drawn = [characteristics.filter(rng.uniform(characteristics.lower, characteristics.upper, (size, len(characteristics))))
-                 for _ in range(number * pool.workers)]
-        for future in [retrying.submit(work, settings) for settings in drawn]:
+        batches = [characteristics.filter(rng.uniform(characteristics.lower, characteristics.upper, (size, len(characteristics))))
+                   for _ in range(number * pool.workers)]
+        for future in [retrying_pool.submit(work, settings) for settings in batches]:
             awaited(future)
         return time.perf_counter() - start
 
-    awaited(retrying.submit(work, characteristics.original[np.newaxis], must_succeed=True))
+    awaited(retrying_pool.submit(work, characteristics.original[np.newaxis], must_succeed=True))
     probe(1)  # starts the workers and builds the network
     rate = PROBE_BATCHES * pool.workers * size / probe(PROBE_BATCHES)
     evaluations = runs * study.search.evaluations
-    row = 8 * (len(characteristics) + len(METRICS) + NUMBERS_BESIDE_METRICS)
-    return Forecast(evaluations, rate, evaluations / rate, evaluations * row)
+    row_size = 8 * (len(characteristics) + len(METRICS) + NUMBERS_BESIDE_METRICS)
+    return Forecast(evaluations, rate, evaluations / rate, evaluations * row_size)

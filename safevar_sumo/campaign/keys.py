@@ -15,7 +15,7 @@ from safevar_sumo.study import SearchTable, Study
 
 
 class RunKey(NamedTuple):
-    """One run of one algorithm; runs are numbered from 0."""
+    """One run of an algorithm; the number `run` counts from 0."""
 
     algorithm: str
     run: int
@@ -30,12 +30,12 @@ def all_runs(study: Study) -> list[RunKey]:
 
 
 def algorithm_of(label: str, study: Study) -> Algorithm:
-    """An algorithm by its label in results, with the study's parameters.
+    """An algorithm by its label in results, with its parameters from the study.
 
     Raises
     ------
     InputError
-        If there is no such algorithm, it does not meet its contract, or does not take its parameters.
+        If no algorithm has this label, or the algorithm does not meet its contract or does not take its parameters.
     """
     source, search = study.source, study.search
     name, key = search.labels.get(label, label), f"search.{label}"
@@ -57,7 +57,7 @@ def algorithm_of(label: str, study: Study) -> Algorithm:
 
 
 def read_by_algorithms(study: Study) -> Files:
-    """Digests of files that a study's algorithms from outside read while they are loaded and instantiated, in this process."""
+    """Digests of files that algorithms from outside read while this process loads and instantiates them."""
     packages = _packages(study)
     if not packages:
         return {}
@@ -69,10 +69,10 @@ def read_by_algorithms(study: Study) -> Files:
 
 
 def search_of(key: RunKey, study: Study, problem: Problem, note: Callable[[Files], None]) -> Search:
-    """The search of a run; calls `note` after every step with the files that an algorithm from outside has read."""
+    """The search of a run; after each step, calls `note` with the files that an algorithm from outside has read."""
     packages, rng, ended = _packages(study), run_generator(study, key), False
     search: Search | None = None
-    answer: Any = None  # starts a generator
+    answer: Any = None  # None starts a generator
     while True:
         with noted_reading() as reading:
             try:
@@ -93,7 +93,7 @@ def _packages(study: Study) -> list[str]:
 
 
 def algorithm_member(name: str, study: Study) -> Member:
-    """An algorithm of a study by its name."""
+    """The class of an algorithm, by its name in a study."""
     lookup = Lookup(study.source, study.origin.places)
     return lookup.class_of(ALGORITHMS, name, "search.algorithms", ALGORITHM_CONTRACT)
 

@@ -12,30 +12,30 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.records import Evaluations, FloatArray, Outcome
 from safevar_sumo.results import SPARE, Failure, Journal
 from safevar_sumo.search import Search
-from safevar_sumo.workers.batches import VERIFIED
+from safevar_sumo.workers.batches import VERIFIED_SETTINGS
 
-BY_CHANCE = 10
-"""Number of randomly chosen evaluations of a run that are simulated again. A study of 30 runs shows an error in 1 % of its evaluations
-with a probability of 1 - 0.99^300 = 95 %."""
+RANDOM_SAMPLES = 10
+"""Number of random evaluations of a run that are simulated again. 30 runs then reveal an error in 1 % of the evaluations with a
+probability of 1 - 0.99^300 = 95 %."""
 
-FAILED = Outcome.SIMULATOR_ERROR.value
+FAILURE = Outcome.SIMULATOR_ERROR.value
 
 
 class Observer(Protocol):
     """Receives the progress of a campaign."""
 
     def evaluated(self, key: RunKey, evaluations: Evaluations, simulated: int) -> None:
-        """A population of a run is evaluated: `simulated` settings of it now, the others from journal or memory."""
+        """A population of a run is evaluated: `simulated` of its settings by simulation, the others from journal or memory."""
 
     def finished(self, key: RunKey, asked: int) -> None:
-        """A run is over, after `asked` evaluations."""
+        """A run is finished, with `asked` requested evaluations."""
 
     def warned(self, message: str) -> None:
-        """Something has happened that the user should know."""
+        """A warning for the user."""
 
 
-class _Known(NamedTuple):
-    """A setting's `position` in the run (`SPARE` if the search has not requested it), and its `row` in `evaluations`."""
+class _KnownSetting(NamedTuple):
+    """The `position` of a setting in the run (`SPARE` until the search requests it), and its `row` in `evaluations`."""
 
     position: int
     evaluations: Evaluations
@@ -50,7 +50,7 @@ class Run:
     budget
         Number of evaluations that the search may request.
     retry
-        Whether settings that could not be simulated are tried again.
+        Whether to simulate settings again that failed before.
 
     Attributes
     ----------
@@ -62,11 +62,11 @@ class Run:
 
     def __init__(self, key: RunKey, search: Search, journal: Journal, observer: Observer, budget: int, *, retry: bool = False) -> None:
         self.key, self._search, self._journal, self._observer, self._budget = key, search, journal, observer, budget
-        self._known: dict[bytes, _Known] = {}
-        self._occupied: set[int] = set()
-        """Positions in the run that have an evaluation."""
+        self._known: dict[bytes, _KnownSetting] = {}
+        self._positions_done: set[int] = set()
+        """Positions in the run with an evaluation."""
         self._requested = 0
-        """Number of settings requested before the present request."""
+        """Number of settings in all earlier requests."""
         self._settings: FloatArray = np.empty((0, 0))
         self._positions: dict[bytes, int] = {}
         """Position in the run of each setting of the present request."""
@@ -90,10 +90,10 @@ class Run:
     def failures(self) -> list[Failure]:
         """Settings of this run that could not be simulated."""
         return [Failure(self.key.algorithm, self.key.run, position, evaluations.reason(row))
-                for position, evaluations, row in self._requests() if evaluations.outcome[row] == FAILED]
+                for position, evaluations, row in self._requests() if evaluations.outcome[row] == FAILURE]
 
-    def _requests(self) -> list[_Known]:
-        """The evaluations of the distinct settings that this run requested, in their order."""
+    def _requests(self) -> list[_KnownSetting]:
+        """The distinct settings that this run requested, by position."""
         return sorted((entry for entry in self._known.values() if 0 <= entry.position < self._budget), key=lambda entry: entry.position)
 
     @property
@@ -103,20 +103,20 @@ class Run:
 
     @property
     def invalid_tests(self) -> int:
-        """Number of distinct requested settings that left the tolerance of a test's speed."""
+        """Number of distinct requested settings that left the speed tolerance of a test."""
         return self._number_of(Outcome.INVALID_TEST)
 
     def _number_of(self, outcome: Outcome) -> int:
-        value = outcome.value  # comparisons with the member itself are slow in numpy
+        value = outcome.value  # numpy compares enum members slowly
         return sum(evaluations.outcome[row] == value for position, evaluations, row in self._known.values()
                    if 0 <= position < self._budget)
 
     def advance(self) -> bool:
-        """Answer the search as long as all requested evaluations are known; returns whether it has ended."""
-        done = self._journal.content.result(self._budget)
-        if done is not None:
-            self.result = self._journal.content.by_position(done.positions)
-            self._requested, self.finished = done.asked, True
+        """Answer the search as long as all requested evaluations are known; returns whether the search has ended."""
+        stored_result = self._journal.content.result(self._budget)
+        if stored_result is not None:
+            self.result = self._journal.content.by_position(stored_result.positions)
+            self._requested, self.finished = stored_result.asked, True
             evaluations = self._journal.content.within(self._budget)
             if evaluations is not None:
                 self._observer.evaluated(self.key, evaluations, 0)
@@ -125,7 +125,7 @@ class Run:
             self._note_request(next(self._search))
         while self._positions.keys() <= self._known.keys():
             self._store_spares()
-            evaluations = self._recalled(self._settings)
+            evaluations = self._evaluations_of(self._settings)
             self._observer.evaluated(self.key, evaluations, self._simulated)
             self._requested, self._simulated = self._requested + len(evaluations), 0
             try:
@@ -136,33 +136,33 @@ class Run:
         return False
 
     def samples(self, rng: np.random.Generator) -> list[Evaluations]:
-        """The most severe evaluation, which users will look at, the last one, to which most state may have leaked, and random others."""
-        scored = [entry for entry in self._requests() if entry.evaluations.valid[entry.row]]
-        if not scored:
+        """The worst evaluation (users will look at it), the last (most state may have leaked into it), and random evaluations."""
+        entries = [entry for entry in self._requests() if entry.evaluations.valid[entry.row]]
+        if not entries:
             return []
-        severe = min(scored, key=lambda entry: np.nan_to_num(entry.evaluations.f_safe[entry.row], nan=np.inf))
-        by_chance = [scored[i] for i in rng.permutation(len(scored))[:BY_CHANCE].tolist()]
-        chosen = {entry.position: entry for entry in (severe, scored[-1], *by_chance)}
-        return [evaluations.take([row]) for _, evaluations, row in chosen.values()]
+        worst_entry = min(entries, key=lambda entry: np.nan_to_num(entry.evaluations.f_safe[entry.row], nan=np.inf))
+        random_entries = [entries[i] for i in rng.permutation(len(entries))[:RANDOM_SAMPLES].tolist()]
+        sample = {entry.position: entry for entry in (worst_entry, entries[-1], *random_entries)}
+        return [evaluations.take([row]) for _, evaluations, row in sample.values()]
 
     def solutions_and_others(self, rng: np.random.Generator) -> Evaluations:
-        """The evaluations to verify in SUMO itself: all solutions, and `VERIFIED` random others."""
+        """The evaluations to verify in SUMO: all solutions, and `VERIFIED_SETTINGS` random other settings."""
         solutions = {setting.tobytes() for setting in self.result.settings}
-        settings = [entry.evaluations.settings[entry.row] for entry in self._requests() if entry.evaluations.outcome[entry.row] != FAILED]
-        chosen = [setting for setting in settings if setting.tobytes() in solutions]
-        others = [setting for setting in settings if setting.tobytes() not in solutions]
-        chosen += [others[i] for i in rng.permutation(len(others))[:VERIFIED].tolist()]
-        return self._recalled(np.array(chosen)) if chosen else self.result.take([])
+        settings = [entry.evaluations.settings[entry.row] for entry in self._requests() if entry.evaluations.outcome[entry.row] != FAILURE]
+        sample = [setting for setting in settings if setting.tobytes() in solutions]
+        other_settings = [setting for setting in settings if setting.tobytes() not in solutions]
+        sample += [other_settings[i] for i in rng.permutation(len(other_settings))[:VERIFIED_SETTINGS].tolist()]
+        return self._evaluations_of(np.array(sample)) if sample else self.result.take([])
 
     def is_repeated_by(self, search: Search) -> bool:
-        """Whether a search with this run's evaluations requests the same settings at the same positions and returns the same solutions."""
+        """Whether a search with the evaluations of this run requests the same settings in the same order, with the same solutions."""
         settings, requested, positions = next(search), 0, dict[bytes, int]()
         while all(setting.tobytes() in self._known for setting in settings):
             for i, setting in enumerate(settings):
                 positions.setdefault(setting.tobytes(), requested + i)
             requested += len(settings)
             try:
-                settings = search.send(self._recalled(settings))
+                settings = search.send(self._evaluations_of(settings))
             except StopIteration as end:
                 expected = {key: entry.position for key, entry in self._known.items() if 0 <= entry.position < self._budget}
                 return positions == expected and np.array_equal(end.value.settings, self.result.settings)
@@ -177,7 +177,7 @@ class Run:
         self._observer.finished(self.key, self._requested)
 
     def take(self, evaluations: Evaluations) -> bool:
-        """Journal and remember a computed batch; returns whether nothing is missing any more."""
+        """Journal and remember new evaluations; returns whether all requested settings are known."""
         self._store(evaluations)
         self._simulated += len(evaluations)
         return self._positions.keys() <= self._known.keys()
@@ -193,25 +193,25 @@ class Run:
             self._positions.setdefault(setting.tobytes(), self._requested + i)
 
     def _store_spares(self) -> None:
-        """Journal the positions of evaluations that were known before the search requested them."""
+        """Journal the positions of settings whose evaluations were known before the search requested them."""
         spares = [position - self._requested for key, position in self._positions.items() if self._known[key].position == SPARE]
         if spares:
-            self._store(self._recalled(self._settings[spares]))
+            self._store(self._evaluations_of(self._settings[spares]))
 
     def _store(self, evaluations: Evaluations) -> None:
         """Journal and remember evaluations of the present request."""
         positions = [self._positions[setting.tobytes()] for setting in evaluations.settings]
-        if not self._occupied.isdisjoint(positions):
+        if not self._positions_done.isdisjoint(positions):
             raise InputError(self._journal.path, "holds other settings than this search requests", "another --out")
         self._journal.append(positions, evaluations)
         self._remember(positions, evaluations)
 
     def _remember(self, positions: list[int], evaluations: Evaluations) -> None:
-        self._occupied.update(position for position in positions if position != SPARE)
+        self._positions_done.update(position for position in positions if position != SPARE)
         for row, position in enumerate(positions):
-            self._known[evaluations.settings[row].tobytes()] = _Known(position, evaluations, row)
+            self._known[evaluations.settings[row].tobytes()] = _KnownSetting(position, evaluations, row)
 
-    def _recalled(self, settings: FloatArray) -> Evaluations:
+    def _evaluations_of(self, settings: FloatArray) -> Evaluations:
         """The evaluations of known settings, in their order."""
         entries = [self._known[setting.tobytes()] for setting in settings]
         batches = list({id(evaluations): evaluations for _, evaluations, _ in entries}.values())

@@ -1,4 +1,4 @@
-"""Re-simulates parts of a run: in SUMO itself if it drove in recorded scenes, and alone if other people's code took part in it."""
+"""Re-simulates settings of a run: in SUMO, if they drove in recorded scenes; and one by one, if code from outside took part."""
 
 from __future__ import annotations
 
@@ -22,34 +22,34 @@ from safevar_sumo.sumo.matrix import LARGEST_WORLD
 from safevar_sumo.workers.evaluation import packed
 from safevar_sumo.workers.identity import networks_of
 from safevar_sumo.workers.isolation import refuse_difference, refuse_unlike_sumo
-from safevar_sumo.workers.retrying import RetryingPool, reproducing
+from safevar_sumo.workers.retrying import RetryingPool, reproduction_command
 
 LEGAL = ("requests that depend only on the run's problem, evaluations and `rng`: nothing kept in a class or a module between runs, no "
          "clock, no random numbers of its own")
 
 
 class Verification:
-    """Ended runs whose settings are simulated again: first alone with other people's models loaded afresh, then in SUMO."""
+    """Simulates settings of ended runs again: first one by one, with code from outside reloaded; then in SUMO."""
 
     def __init__(self, study: Study, results: ResultsDirectory, pool: RetryingPool, begin_search: Callable[[RunKey], Search],
                  engine: Engine, observer: Observer) -> None:
         self._study, self._pool, self._begin_search, self._observer = study, pool, begin_search, observer
-        self._alone = packed(study, results.inputs, engine=engine, afresh=True) if foreign_names(study) else b""
+        self._single_work = packed(study, results.inputs, engine=engine, afresh=True) if foreign_names(study) else b""
         self._is_recorded = engine is Engine.RECORDED
         self._sumo_study = driven_in_sumo(study, assemble(study).weather)
         inputs = results.inputs if self._sumo_study is study else {**results.inputs, "network": networks_of(assemble(self._sumo_study))}
         self._in_sumo = Batcher(pool, packed(self._sumo_study, inputs, engine=Engine.LIBSUMO), LARGEST_WORLD)
-        self._leaks: dict[Future[Evaluations], tuple[Run, Evaluations]] = {}
+        self._leak_checks: dict[Future[Evaluations], tuple[Run, Evaluations]] = {}
         self._unverified: dict[Run, tuple[Evaluations, int]] = {}
-        """By run: the evaluations that SUMO verifies, and the number of those still missing from SUMO."""
+        """By run: the evaluations to verify in SUMO, and the number of settings that SUMO has not simulated yet."""
 
     @property
     def under_way(self) -> list[Future[Evaluations]]:
         """Batches that are being computed."""
-        return [*self._leaks, *self._in_sumo.under_way]
+        return [*self._leak_checks, *self._in_sumo.under_way]
 
     def send(self) -> None:
-        """Send the batches for SUMO that pay now."""
+        """Send batches for SUMO; see `Batcher.send`."""
         self._in_sumo.send()
 
     def begin(self, run: Run) -> bool:
@@ -58,70 +58,70 @@ class Verification:
         Raises
         ------
         ForeignError
-            If it is the last run of an algorithm from outside, and its repetition, alone and loaded afresh, requests other settings.
+            If the last run of an algorithm from outside requests other settings when the reloaded algorithm repeats it.
         """
         self._refuse_unrepeatable(run)
         rng = run_generator(self._study, run.key._replace(algorithm=f"recheck {run.key.algorithm}"))
-        for expected in run.samples(rng) if self._alone else ():
-            self._leaks[self._pool.submit(self._alone, expected.settings)] = run, expected
+        for expected in run.samples(rng) if self._single_work else ():
+            self._leak_checks[self._pool.submit(self._single_work, expected.settings)] = run, expected
         return self._awaits_leaks(run) or self._begin_in_sumo(run)
 
     def _begin_in_sumo(self, run: Run) -> bool:
-        """Begin to verify a run in SUMO, once nothing leaks between its settings; returns whether there are any to verify."""
+        """Begin to verify a run in SUMO; returns whether there are settings to verify."""
         rng = run_generator(self._study, run.key._replace(algorithm=f"verify {run.key.algorithm}"))
         expected = run.solutions_and_others(rng) if self._is_recorded else None
         if not expected:
             return False
-        if self._sumo_study is not self._study:  # SUMO drives settings in a few of a rating's cells
+        if self._sumo_study is not self._study:  # of a rating, only a few cells are driven in SUMO
             expected = evaluate(assemble(self._sumo_study), expected.settings)
         self._unverified[run] = expected, len(expected)
         self._in_sumo.add(run, expected.settings)
         return True
 
     def _awaits_leaks(self, run: Run) -> bool:
-        """Whether settings of a run are still being simulated alone."""
-        return any(run is other for other, _ in self._leaks.values())
+        """Whether single settings of a run are still under way."""
+        return any(run is checked_run for checked_run, _ in self._leak_checks.values())
 
     def _verify(self, run: Run, in_sumo: Evaluations) -> bool:
-        """Compare evaluations from SUMO with a run's; returns whether these were the last ones."""
-        expected, missing = self._unverified.pop(run)
+        """Compare evaluations from SUMO with those of a run; returns whether the run is verified completely."""
+        expected, number_left = self._unverified.pop(run)
         rows = {row.tobytes(): i for i, row in enumerate(expected.settings)}
         refuse_unlike_sumo(self._study, expected.take([rows[row.tobytes()] for row in in_sumo.settings]), in_sumo)
         failed = np.flatnonzero(in_sumo.failed).tolist()
         if failed:
             self._observer.warned(f"run {run.key}: {len(failed)} of {len(expected)} settings could not be verified in SUMO: "
                                   f"{in_sumo.reason(failed[0])}")
-        if missing > len(in_sumo):
-            self._unverified[run] = expected, missing - len(in_sumo)
+        if number_left > len(in_sumo):
+            self._unverified[run] = expected, number_left - len(in_sumo)
         return run not in self._unverified
 
     def _refuse_unrepeatable(self, run: Run) -> None:
-        name = self._from_outside(run.key)
+        name = self._outside_name(run.key)
         if name and run.key.run == self._study.search.runs - 1:
             forget_foreign()
             if not run.is_repeated_by(self._begin_search(run.key)):
-                raise self._unrepeatable(name, run.key)
+                raise self._repetition_error(name, run.key)
 
-    def _from_outside(self, key: RunKey) -> str:
-        """The name of a run's algorithm in the study if it comes from outside, else ""."""
+    def _outside_name(self, key: RunKey) -> str:
+        """The name of the algorithm of a run if it comes from outside, else ""."""
         name = self._study.search.labels.get(key.algorithm, "")
         return name if ":" in name else ""
 
-    def _unrepeatable(self, name: str, key: RunKey) -> ForeignError:
+    def _repetition_error(self, name: str, key: RunKey) -> ForeignError:
         problem = f"search.algorithms: {name!r} requests other settings when run {key.run} is repeated alone"
         return ForeignError(f"study {self._study.name!r}", problem, LEGAL)
 
-    def take(self, done: Future[Evaluations]) -> list[Run]:
-        """Compare a computed batch; returns the runs that are verified with it.
+    def take(self, batch: Future[Evaluations]) -> list[Run]:
+        """Compare a computed batch with the runs; returns the runs whose verification it completes.
 
         Raises
         ------
         InputError
-            If a setting's result differs alone, or in SUMO.
+            If a setting has another result by itself, or in SUMO.
         """
-        if done in self._in_sumo.under_way:
-            return [run for run, in_sumo in self._in_sumo.take(done) if self._verify(run, in_sumo)]
-        run, expected = self._leaks.pop(done)
-        reproduction = reproducing(self._study, expected.settings[0])
-        refuse_difference(self._study, {f"in run {run.key}": expected, "alone": done.result()}, reproduction)
+        if batch in self._in_sumo.under_way:
+            return [run for run, in_sumo in self._in_sumo.take(batch) if self._verify(run, in_sumo)]
+        run, expected = self._leak_checks.pop(batch)
+        command = reproduction_command(self._study, expected.settings[0])
+        refuse_difference(self._study, {f"in run {run.key}": expected, "alone": batch.result()}, command)
         return [] if self._awaits_leaks(run) or self._begin_in_sumo(run) else [run]

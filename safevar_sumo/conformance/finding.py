@@ -1,4 +1,4 @@
-"""Findings of a check, and the time limit of an author's code."""
+"""Findings of a check, and the time limit for an author's code."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ ADVICE: Mapping[str, str] = {
     "speed": "compute all vehicles at once with arrays; load files in `__init__`",
     "picklable": "give functions a name at the top of the module; open files, sockets and locks in `start`, not in `__init__`",
 }
-"""Advice on the findings of every check."""
+"""Advice by check."""
 REFUSED = ("contract", "units", "determinism", "state", "batch", "inputs", "finite")
-"""Checks whose failure makes results wrong, so that a study does not begin. The failure of another check is a warning."""
+"""Checks whose failure makes results wrong: the study does not begin. A failure of any other check is a warning."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Finding:
-    """A failed check: the line at fault, the expected and the actual result, and advice."""
+    """A failed check, with the line at fault, the expected and the actual result, and advice."""
 
     check: str
     file: str
@@ -47,7 +47,7 @@ class Finding:
 
 @dataclass(kw_only=True)
 class Report:
-    """The findings on a subject; `key` is its key and name in a study, `remarks` state assumptions, `speed` is a sentence."""
+    """The findings on a subject. `key` is its key and name in a study, `remarks` state assumptions, `speed` describes its speed."""
 
     subject: str
     kind: str
@@ -62,48 +62,48 @@ class Report:
         return not self.findings
 
     def to_dict(self) -> dict[str, Any]:
-        """The JSON of `check`."""
-        return {"subject": self.subject, "kind": self.kind, "passed": self.passed, "findings": [asdict(one) for one in self.findings],
+        """The JSON output of the command `check`."""
+        return {"subject": self.subject, "kind": self.kind, "passed": self.passed, "findings": list(map(asdict, self.findings)),
                 "seconds": round(self.seconds, 3)}
 
 
 class TakesTooLong(BaseException):
-    """Raised inside an author's code that does not return; no `except Exception` swallows it."""
+    """An author's code does not return. Raised inside this code, whose `except Exception` cannot catch it."""
 
 
 def load_factor() -> float:
-    """Processes per core that want to run, at least 1: the factor by which everything takes longer."""
+    """Number of runnable processes per core, at least 1: the factor by which the load of the machine slows everything down."""
     load = os.getloadavg()[0] if hasattr(os, "getloadavg") else 1.0
     return max(1.0, load / (os.cpu_count() or 1))
 
 
 TICKS = 10
-"""Parts of a time limit, after each of which it is checked what is under way."""
+"""Number of parts of a time limit; at the end of a part, a handler checks whether a module is being imported."""
 
 
 @contextmanager
 def time_limit(seconds: float) -> Iterator[None]:
-    """Raise `TakesTooLong` in a block that would take longer on an idle machine; no effect outside the main thread and on Windows.
+    """Raise `TakesTooLong` in a block that would take longer than `seconds` on an idle machine.
 
-    Time does not count while a module is imported: an author's own, or a library that this loads when it first runs.
+    The import of modules does not count. The limit has no effect outside the main thread and on Windows.
     """
     if threading.current_thread() is not threading.main_thread() or not hasattr(signal, "setitimer"):
         yield
         return
-    left = TICKS
+    ticks_left = TICKS
 
     def tick(_: int, frame: FrameType | None) -> None:
-        nonlocal left
+        nonlocal ticks_left
         while frame is not None and frame.f_code.co_filename != "<frozen importlib._bootstrap>":
             frame = frame.f_back
-        left -= frame is None
-        if not left:
+        ticks_left -= frame is None
+        if not ticks_left:
             raise TakesTooLong
 
-    before = signal.signal(signal.SIGALRM, tick)
+    previous_handler = signal.signal(signal.SIGALRM, tick)
     signal.setitimer(signal.ITIMER_REAL, *[seconds * load_factor() / TICKS] * 2)
     try:
         yield
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0)
-        signal.signal(signal.SIGALRM, before)
+        signal.signal(signal.SIGALRM, previous_handler)

@@ -1,4 +1,4 @@
-"""Probes of metrics, objectives and search algorithms; and the probes of every kind."""
+"""Probes of metrics, objectives and search algorithms; and the probes for every kind of subject."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from safevar_sumo.vehicles import CharacteristicSet, foreign_change
 
 
 class MetricProbe(Probe):
-    """A metric of runs with and without collisions."""
+    """Applies a metric to runs with and without collisions."""
 
     methods = ("function",)
     number = 24
@@ -33,7 +33,7 @@ class MetricProbe(Probe):
         super().__init__(subject)
         self._runs = _runs_of(subject.study)
 
-    def fresh(self) -> Any:
+    def load(self) -> Any:
         forget_foreign()
         return foreign_metric(loaded_again(self.subject), guard_of(self.subject))
 
@@ -53,23 +53,23 @@ class MetricProbe(Probe):
             yield NoReaction((), "other values for other drives", f"{values[0]:g} for all of {self.number} drives")
 
     def cost(self, model: Any, seconds: float) -> tuple[float, str]:
-        ours = timed(lambda: METRICS["tet"](self._runs, self.subject.study.metrics))
-        return cost_of(seconds, ours, "tet", self.number, len(self._runs.trace.time))
+        reference = timed(lambda: METRICS["tet"](self._runs, self.subject.study.metrics))
+        return cost_of(seconds, reference, "tet", self.number, len(self._runs.trace.time))
 
 
 def _runs_of(study: Study) -> SimulationRuns:
-    """Runs of 24 vehicles in a study, every fourth of them with full throttle all the time."""
-    plain = msgspec.structs.replace(study, metrics=msgspec.structs.replace(study.metrics, also=[]),
-                                    search=msgspec.structs.replace(study.search, objectives=["safety_degree", "f_diff"]))
-    system = assemble(plain)
+    """Runs of 24 vehicles in a study; every fourth vehicle gives full throttle all the time."""
+    plain_study = msgspec.structs.replace(study, metrics=msgspec.structs.replace(study.metrics, also=[]),
+                                          search=msgspec.structs.replace(study.search, objectives=["safety_degree", "f_diff"]))
+    system = assemble(plain_study)
     members = system.characteristics
     settings = members.lower + np.random.default_rng(0).random((MetricProbe.number, len(members))) * (members.upper - members.lower)
     settings[0] = members.original
-    return drive_all(replace(system, ads=_Reckless(system.ads), matrix=()), settings)
+    return drive_all(replace(system, ads=_RecklessAds(system.ads), matrix=()), settings)
 
 
-class _Reckless:
-    """An ADS whose every fourth vehicle gives full throttle instead."""
+class _RecklessAds:
+    """An ADS with full throttle in every fourth vehicle."""
 
     def __init__(self, ads: Ads) -> None:
         self._ads = ads
@@ -84,7 +84,7 @@ class _Reckless:
 
 
 class ObjectiveProbe(Probe):
-    """A measure of change at the original and at the corners of the domains."""
+    """Applies a measure of change to the original setting and to the corners of the domains."""
 
     methods = ("function",)
 
@@ -94,7 +94,7 @@ class ObjectiveProbe(Probe):
         self._settings = self._members.filter(corners(self._members))
         self.number = len(self._settings)
 
-    def fresh(self) -> Any:
+    def load(self) -> Any:
         forget_foreign()
         return foreign_change(loaded_again(self.subject), guard_of(self.subject))
 
@@ -108,7 +108,7 @@ class ObjectiveProbe(Probe):
 
 
 class AlgorithmProbe(Probe):
-    """A search of a smooth function; the settings that it requests take the place of vehicles."""
+    """Searches a smooth function with an algorithm; the requested settings take the place of vehicles."""
 
     methods = ("search",)
     number = 1
@@ -124,7 +124,7 @@ class AlgorithmProbe(Probe):
                                 evaluations=min(study.search.evaluations, self.EVALUATIONS),
                                 population=min(study.search.population, self.POPULATION), scoring=self._scoring)
 
-    def fresh(self) -> Any:
+    def load(self) -> Any:
         forget_foreign()
         return self._instance()
 
@@ -137,7 +137,7 @@ class AlgorithmProbe(Probe):
         return GuardedAlgorithm(instance_of(member, parameters, subject.key, f"search.{subject.name}", "check"), guard_of(subject))
 
     def run(self, model: Any, rows: Rows, seed: int = 1) -> Outputs:
-        """All settings that a run requests, and its solutions."""
+        """All settings that a run requests, and the solutions of the run."""
         search = model.search(self._problem, np.random.default_rng(seed))
         requested, answer = list[FloatArray](), None
         while True:
@@ -149,13 +149,13 @@ class AlgorithmProbe(Probe):
             requested.append(settings)
             answer = self._scored(settings)
 
-    def again(self, model: Any, rows: Rows) -> Outputs:
+    def repeat(self, model: Any, rows: Rows) -> Outputs:
         forget_foreign()
         self.run(self._instance(), rows, seed=2)
         return self.run(self._instance(), rows)
 
     def _scored(self, settings: FloatArray) -> Evaluations:
-        """Evaluations with a safety degree that falls towards the upper ends of the domains, and below 0 on a collision."""
+        """Evaluations whose safety degree falls towards the upper ends of the domains; below 0 it is a collision."""
         members = self._characteristics
         share = (settings - members.lower) / (members.upper - members.lower)
         degree = 1.0 - np.add.accumulate(share, axis=1)[:, -1] / len(members) * 1.5
@@ -169,8 +169,8 @@ class AlgorithmProbe(Probe):
             f_num_diff=members.number_changed(settings))
 
     def reactions(self, model: Any, outputs: Outputs) -> Iterator[NoReaction]:
-        other = self.run(model, np.arange(1), seed=2)
-        if np.array_equal(outputs["settings requested"], other["settings requested"]):
+        other_outputs = self.run(model, np.arange(1), seed=2)
+        if np.array_equal(outputs["settings requested"], other_outputs["settings requested"]):
             yield NoReaction(("search",), "other settings with other random numbers `rng`", "the same settings in every run")
         if not outputs["settings returned"].size:
             yield NoReaction(("search",), "a result: settings that the run was sent evaluations of",

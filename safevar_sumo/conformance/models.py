@@ -1,4 +1,4 @@
-"""Probes of driving systems and vehicles, and of whole studies: vehicles whose results must not depend on how they are grouped."""
+"""Probes of driving systems, vehicles and whole studies. The result of a vehicle must not depend on the grouping of vehicles."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ STEPS = 100
 
 
 class _Traffic(NamedTuple):
-    """Encounters of N vehicles with somebody, arrays of shape (T, N)."""
+    """Encounters of N vehicles with an obstacle in T steps, arrays of shape (T, N)."""
 
     speed: FloatArray
     gap: FloatArray
@@ -35,32 +35,33 @@ class _Traffic(NamedTuple):
     obstacle_speed: FloatArray
 
 
-# Speed [m/s], gap [m], lateral offset [m], lateral speed [m/s], obstacle's speed [m/s], and the time from which it is detected [s].
+# Speed [m/s], gap [m], lateral offset [m], lateral speed [m/s], speed of the obstacle [m/s], and start of its detection [s].
 ENCOUNTERS = np.array([
     *((speed, 3.0 * speed, 0.0, 0.0, 0.0, 0.0) for speed in (5.0, 10.0, 15.0, 20.0, 25.0, 8.0)),
     (5.0, 15.0, -4.0, 1.5, 0.0, 0.0), (10.0, 25.0, -6.0, 2.2, 0.0, 0.3),
     (10.0, 30.0, 0.0, 0.0, 0.0, 99.0), (0.0, 30.0, 0.0, 0.0, 0.0, 99.0), (0.0, 30.0, 0.0, 0.0, 0.0, 0.0), (0.0, 0.5, 0.0, 0.0, 0.0, 0.0),
     (15.0, 30.0, 0.0, 0.0, 10.0, 0.0), (10.0, 40.0, 0.0, 0.0, -5.0, 0.0), (10.0, 30.0, 10.0, 0.0, 0.0, 0.0),
     (12.0, 30.0, 0.0, 0.0, 0.0, 1.5)])
-COURSE, FREE = slice(0, 6), 8
-"""Encounters on a collision course; and the free road that is otherwise like the second of them."""
+COLLISION_COURSE, FREE_ROAD = slice(0, 6), 8
+"""Indices of encounters on a collision course, and of a free road with the speed of the second encounter."""
 
 
 def _traffic() -> _Traffic:
     """Vehicles that hold their speed for half of the time and then brake with 4 m/s^2."""
-    speed0, gap0, lateral0, lateral_speed, obstacle, since = (column[np.newaxis] for column in ENCOUNTERS.T)
+    speed0, gap0, lateral0, lateral_speed, obstacle, start = (column[np.newaxis] for column in ENCOUNTERS.T)
     times = np.arange(STEPS)[:, np.newaxis] * STEP
     speed = np.maximum(speed0 - 4.0 * np.maximum(times - STEPS * STEP / 2, 0.0), 0.0)
-    driven = np.vstack([np.zeros((1, len(ENCOUNTERS))), np.cumsum(speed[:-1] * STEP, axis=0)])
-    detected = times >= since
+    distance = np.vstack([np.zeros((1, len(ENCOUNTERS))), np.cumsum(speed[:-1] * STEP, axis=0)])
+    is_detected = times >= start
     shape = speed.shape
-    return _Traffic(speed, np.where(detected, gap0 + obstacle * times - driven, np.inf), np.where(detected, speed - obstacle, 0.0),
-                    np.where(detected, lateral0 + lateral_speed * times, np.inf), np.where(detected, lateral_speed, 0.0) + np.zeros(shape),
-                    np.where(detected, obstacle, 0.0) + np.zeros(shape))
+    return _Traffic(speed, np.where(is_detected, gap0 + obstacle * times - distance, np.inf), np.where(is_detected, speed - obstacle, 0.0),
+                    np.where(is_detected, lateral0 + lateral_speed * times, np.inf),
+                    np.where(is_detected, lateral_speed, 0.0) + np.zeros(shape),
+                    np.where(is_detected, obstacle, 0.0) + np.zeros(shape))
 
 
 class AdsProbe(Probe):
-    """An ADS in many encounters."""
+    """Drives with an ADS in many encounters."""
 
     methods = ("drive", "start")
     number = len(ENCOUNTERS)
@@ -70,7 +71,7 @@ class AdsProbe(Probe):
         self._nominal: Nominal
         self._traffic = _traffic()
 
-    def fresh(self) -> Ads:
+    def load(self) -> Ads:
         system = self.system()
         self._nominal = system.nominal
         self._nominal.tables()
@@ -89,10 +90,10 @@ class AdsProbe(Probe):
 
     def reactions(self, model: Ads, outputs: Outputs) -> Iterator[NoReaction]:
         brake, throttle = outputs["brake"], outputs["throttle"]
-        if not brake[:, COURSE].any():
+        if not brake[:, COLLISION_COURSE].any():
             yield NoReaction(("drive",), "a brake pedal above 0 at some time before an obstacle that stands in its way",
                            f"never brakes, at 5 to 25 m/s with {STEPS * STEP:g} s to look on")
-        elif np.ptp(brake[:, 1]) == 0 and all(np.array_equal(pedal[:, 1], pedal[:, FREE]) for pedal in (throttle, brake)):
+        elif np.ptp(brake[:, 1]) == 0 and all(np.array_equal(pedal[:, 1], pedal[:, FREE_ROAD]) for pedal in (throttle, brake)):
             yield NoReaction(("drive",), "other pedals before an obstacle than on a free road", "the same with an obstacle and without")
 
     def cost(self, model: Ads, seconds: float) -> tuple[float, str]:
@@ -100,11 +101,11 @@ class AdsProbe(Probe):
 
 
 class VehicleProbe(Probe):
-    """A vehicle accelerates, coasts and brakes, with the corners of every characteristic's domain."""
+    """Accelerates, coasts and brakes with a vehicle, at the corners of the domains."""
 
     methods = ("advance", "sense", "prepare", "at_rest", "sumo_type", "at_speed")
     PHASES = ((1.0, 0.0, 40), (0.3, 0.0, 5), (0.0, 0.0, 5), (0.0, 0.2, 5), (0.5, 0.5, 5), (0.0, 1.0, 30), (0.0, 0.0, 2))
-    """Throttle, brake, and number of steps."""
+    """Throttle, brake, and number of steps of each phase."""
     STEP = 0.1  # s
 
     def __init__(self, subject: Subject) -> None:
@@ -113,7 +114,7 @@ class VehicleProbe(Probe):
         self.settings = corners(self._members)
         self.number = len(self.settings)
 
-    def fresh(self) -> Any:
+    def load(self) -> Any:
         vehicle = self.system().vehicle
         return GuardedVehicle(vehicle, guard_of(self.subject)) if self.subject.is_ours else vehicle
 
@@ -121,7 +122,7 @@ class VehicleProbe(Probe):
         n, outputs = len(rows), dict[str, list[np.ndarray]]()
         values = dict(zip(self._members.names, np.ascontiguousarray(self.settings[rows].T), strict=True))
         slope = slope_of(np.full(n, 5.0)) if model.takes_slope else LEVEL
-        for surface in ((1.0, self.STEP), (0.5, self.STEP, slope, np.ones(n, dtype=bool))):  # dry and level; wet and, if it can be, steep
+        for surface in ((1.0, self.STEP), (0.5, self.STEP, slope, np.ones(n, dtype=bool))):  # dry and level; wet and, if possible, steep
             prepared = model.prepare(values, *surface)
             for name, column in zip(model.sumo_type(prepared)._fields, model.sumo_type(prepared), strict=True):
                 outputs.setdefault(f"{name} of sumo_type", []).append(column)
@@ -151,11 +152,11 @@ class VehicleProbe(Probe):
 
     def reactions(self, model: Any, outputs: Outputs) -> Iterator[NoReaction]:
         start = 5 if model.can_start_moving else 0
-        speed, braked = outputs["speed"][start:, 0], start + sum(steps for *_, steps in self.PHASES[:5])
-        fastest = outputs["speed"][start + self.PHASES[0][2] - 1, 0]
-        if not fastest > 0:
-            yield NoReaction(("advance",), "a speed above 0 after 4 s of full throttle", f"the original vehicle goes {fastest:g} m/s")
-        elif not speed[braked - start + self.PHASES[5][2] - 1] < speed[braked - start - 1]:
+        speed, braking_end = outputs["speed"][start:, 0], start + sum(steps for *_, steps in self.PHASES[:5])
+        top_speed = outputs["speed"][start + self.PHASES[0][2] - 1, 0]
+        if not top_speed > 0:
+            yield NoReaction(("advance",), "a speed above 0 after 4 s of full throttle", f"the original vehicle goes {top_speed:g} m/s")
+        elif not speed[braking_end - start + self.PHASES[5][2] - 1] < speed[braking_end - start - 1]:
             yield NoReaction(("advance",), "a lower speed after 3 s of full brake", "the original vehicle does not slow down")
         for column, name in enumerate(self._members.names):
             lower, upper = 5 + 2 * column, 6 + 2 * column
@@ -165,11 +166,11 @@ class VehicleProbe(Probe):
 
     def cost(self, model: Any, seconds: float) -> tuple[float, str]:
         steps = 2 * sum(phase[-1] for phase in self.PHASES) + 10 * model.can_start_moving
-        return cost_of(seconds, timed(lambda: _drive_ours(self.number, steps)), "sumo", self.number, steps)
+        return cost_of(seconds, timed(lambda: _drive_example(self.number, steps)), "sumo", self.number, steps)
 
 
-def _drive_ours(n: int, steps: int) -> None:
-    """Drive n vehicles of this package's simplest model."""
+def _drive_example(n: int, steps: int) -> None:
+    """Drive n vehicles of the simplest shipped model."""
     values = {"mass": 1500.0, "accel": 3.0, "decel": 8.0, "maxSpeed": 40.0, "tau": 0.1, "sensorRange": 100.0, "reactionTime": 0.1,
               "brakeDelay": 0.1, "brakeGain": 1.0}
     vehicle = SumoVehicle()
@@ -183,7 +184,7 @@ def _drive_ours(n: int, steps: int) -> None:
 
 
 class StudyProbe(Probe):
-    """Simulations of the subject's study: the original vehicle and corners of the domains."""
+    """Simulates the subject's study with the original vehicle and with corners of the domains."""
 
     methods = ("observe", "encounter", "begin", "step", "drive", "advance")
     number = 5
@@ -193,7 +194,7 @@ class StudyProbe(Probe):
         members = CharacteristicSet.of(subject.study.vehicle.characteristics)
         self.settings = members.filter(corners(members)[:5])
 
-    def fresh(self) -> System:
+    def load(self) -> System:
         return self.system()
 
     def run(self, model: System, rows: Rows) -> Outputs:
@@ -205,24 +206,24 @@ class StudyProbe(Probe):
             return
         runs = drive_all(replace(model, matrix=()), self.settings[:1])
         gap, speed = runs.trace.gap[:, 0], runs.trace.speed[:, 0]
-        near = np.isfinite(gap)
+        is_detected = np.isfinite(gap)
         if self.subject.kind == "traci":
             if outputs["outcome"][0] == "never-moved":
                 yield NoReaction(("step",), "a command to move: setSpeed, slowDown or setAcceleration", "the vehicle never moves")
             elif outputs["outcome"][0] == "collision" and not runs.trace.brake.any():
                 yield NoReaction(("step",), "a brake pedal above 0 at some time before somebody in its way", "never brakes, and collides")
             return
-        if not near.any():
+        if not is_detected.any():
             yield NoReaction(("observe",), "a finite gap to somebody at some time", "a gap that is infinite all the time")
-        elif speed.max() > 1 and np.ptp(gap[near]) == 0:
-            yield NoReaction(("observe",), "a gap that shrinks as the vehicle drives", f"a gap of {gap[near][0]:g} m all the time")
+        elif speed.max() > 1 and np.ptp(gap[is_detected]) == 0:
+            yield NoReaction(("observe",), "a gap that shrinks as the vehicle drives", f"a gap of {gap[is_detected][0]:g} m all the time")
         elif not (runs.encounter.in_conflict & runs.trace.active).any():
             yield NoReaction(("encounter",), "in_conflict true at some time, so that metrics are defined", "in_conflict is always false")
         if not reason_for_sumo(model) and not self.subject.is_ours:
             yield from self._reacting_actors(model, outputs)
 
     def _reacting_actors(self, model: System, outputs: Outputs) -> Iterator[NoReaction]:
-        """Actors that react although the scenario says that they do not: SUMO itself then gives other results."""
+        """A finding if actors react although the scenario denies it: SUMO itself then gives other results."""
         in_sumo = evaluate(model, self.settings, Engine.LIBSUMO)
         for name, values in {"outcome": in_sumo.outcome, **in_sumo.metrics}.items():
             if not (np.array_equal(outputs[name], values) if values.dtype.kind == "U" else

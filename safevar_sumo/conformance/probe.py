@@ -1,4 +1,4 @@
-"""A probe: the situations that a subject is tried in; and the functions that all probes use."""
+"""The base class of probes, which try a subject in several situations; and functions that several probes use."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from safevar_sumo.vehicles import CharacteristicSet
 
 Rows = npt.NDArray[np.intp]
 Outputs = Mapping[str, np.ndarray]
-"""Results by name; the last axis is that of the vehicles."""
+"""Results by name; the last axis runs over the vehicles."""
 POINTS = 2
-"""Number of points of a matrix at which a study is tried."""
+"""Approximate number of points of a matrix at which a study is tried."""
 
 
 class NoReaction(NamedTuple):
-    """A missing reaction of a subject; `methods` are those that should react."""
+    """A missing reaction of a subject; `methods` names the methods that should react."""
 
     methods: tuple[str, ...]
     expected: str
@@ -35,7 +35,7 @@ class NoReaction(NamedTuple):
 
 
 class Probe(ABC):
-    """Situations for `number` vehicles; `methods` are the subject's methods that are called."""
+    """Tries a subject with `number` vehicles; `methods` names the methods of the subject that a run calls."""
 
     methods: tuple[str, ...] = ()
     number: int
@@ -44,34 +44,34 @@ class Probe(ABC):
         self.subject = subject
 
     def system(self) -> System:
-        """The system of the subject's study, with all foreign modules loaded anew."""
+        """The system of the subject's study, with all foreign modules reloaded."""
         forget_foreign()
         system = assemble(self.subject.study, self.subject.study.source)
         return replace(system, matrix=system.matrix[::max(len(system.matrix) // POINTS, 1)], rater=None)
 
     @abstractmethod
-    def fresh(self) -> Any:
-        """The subject, loaded anew."""
+    def load(self) -> Any:
+        """The subject, reloaded."""
 
     @abstractmethod
     def run(self, model: Any, rows: Rows) -> Outputs:
-        """Results of some of the vehicles, in that order."""
+        """Results of the vehicles `rows`, in this order."""
 
-    def again(self, model: Any, rows: Rows) -> Outputs:
-        """The same results again, from a subject that has run before."""
+    def repeat(self, model: Any, rows: Rows) -> Outputs:
+        """The results of a second run of the subject."""
         return self.run(model, rows)
 
     def reactions(self, model: Any, outputs: Outputs) -> Iterator[NoReaction]:
-        """The reactions that are missing."""
+        """The missing reactions."""
         yield from ()
 
     def cost(self, model: Any, seconds: float) -> tuple[float, str]:
-        """Time per vehicle and step [s] of a run that took `seconds`, and a sentence on it."""
+        """Time per vehicle and step [s] of a run that took `seconds`, and a sentence on this time."""
         return 0.0, ""
 
 
 def loaded_again(subject: Subject) -> Any:
-    """The class, function or record, from its module as it is loaded now."""
+    """The class, function or record of a subject, from the module as it is loaded now."""
     if subject.is_ours or subject.member.file:
         return subject.member.target
     with importable():
@@ -90,15 +90,15 @@ def timed(run: Callable[[], Any]) -> float:
 
 
 def cost_of(seconds: float, reference: float, example: str, vehicles: int, steps: int) -> tuple[float, str]:
-    """Time per vehicle and step [s] of a run that took `seconds`, and a sentence that compares it with the example's `reference` [s]."""
-    own, ours = seconds / (vehicles * steps), reference / (vehicles * steps)
-    return own, f"{own * 1e6:.2g} microseconds per vehicle and step, {vehicles} at once; ours ({example}) takes {ours * 1e6:.2g}"
+    """Time per vehicle and step [s] of a run that took `seconds`, and a sentence that compares it with `example` (`reference` s)."""
+    cost, example_cost = seconds / (vehicles * steps), reference / (vehicles * steps)
+    return cost, f"{cost * 1e6:.2g} microseconds per vehicle and step, {vehicles} at once; ours ({example}) takes {example_cost * 1e6:.2g}"
 
 
 def corners(members: CharacteristicSet) -> FloatArray:
-    """The original, the corners of all domains together, both ends of every domain alone, and corners drawn at random."""
-    lower, upper, number = members.lower, members.upper, np.arange(len(members))
-    together = [members.original, lower, upper, np.where(number % 2, lower, upper), np.where(number % 2, upper, lower)]
-    alone = [np.where(number == i, end, members.original) for i in number for end in (lower, upper)]
-    drawn = np.where(np.random.default_rng(0).random((24, len(members))) < 0.5, lower, upper)
-    return np.array([*together, *alone, *drawn])
+    """The original, four corners of all domains, both ends of each domain with all else original, and 24 random corners."""
+    lower, upper, indices = members.lower, members.upper, np.arange(len(members))
+    common_corners = [members.original, lower, upper, np.where(indices % 2, lower, upper), np.where(indices % 2, upper, lower)]
+    single_ends = [np.where(indices == i, end, members.original) for i in indices for end in (lower, upper)]
+    random_corners = np.where(np.random.default_rng(0).random((24, len(members))) < 0.5, lower, upper)
+    return np.array([*common_corners, *single_ends, *random_corners])

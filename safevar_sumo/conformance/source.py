@@ -1,4 +1,4 @@
-"""An author's source code: the line that ran last, the line that raised, and lines that look like the cause of a defect."""
+"""An author's source code: the last line that returned, the line that raised, and lines that may cause a defect."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from safevar_sumo.plugins import Member
 
 
 class Source:
-    """An author's code: its file, and the line that returned last.
+    """An author's source file, and the last line in it that returned.
 
     Parameters
     ----------
@@ -41,40 +41,40 @@ class Source:
 
     @contextmanager
     def watched(self) -> Iterator[None]:
-        """A context that remembers the last line of the author's code that returned."""
-        before = sys.getprofile()
+        """A context that notes the last line of the author's code that returned."""
+        previous = sys.getprofile()
         sys.setprofile(self._note)
         try:
             yield
         finally:
-            sys.setprofile(before)
+            sys.setprofile(previous)
 
     def _note(self, frame: FrameType, event: str, _: Any) -> None:
         if event != "return":
             return
         code = frame.f_code
-        if self._is_authors(code):
+        if self._is_own_code(code):
             self._last = code.co_filename, frame.f_lineno
 
-    def _is_authors(self, code: CodeType) -> bool:
+    def _is_own_code(self, code: CodeType) -> bool:
         if code not in self._of_author:
             self._of_author[code] = code.co_filename.startswith(self._folder) and "site-packages" not in code.co_filename
         return self._of_author[code]
 
     def of_error(self, error: BaseException) -> tuple[str, int]:
-        """The innermost line of the author's code that an exception passed through; else the line that returned last."""
+        """The innermost line of the author's code that raised an exception; else the last line that returned."""
         if self._is_fmu:
             return self.definition()
-        one: BaseException | None = error
-        while one is not None:
-            frame, place = one.__traceback__, None
+        exception: BaseException | None = error
+        while exception is not None:
+            frame, location = exception.__traceback__, None
             while frame is not None:
-                if self._is_authors(frame.tb_frame.f_code):
-                    place = frame.tb_frame.f_code.co_filename, frame.tb_lineno
+                if self._is_own_code(frame.tb_frame.f_code):
+                    location = frame.tb_frame.f_code.co_filename, frame.tb_lineno
                 frame = frame.tb_next
-            if place is not None and not isinstance(one, InputError):
-                return place
-            one = one.__cause__ or one.__context__
+            if location is not None and not isinstance(exception, InputError):
+                return location
+            exception = exception.__cause__ or exception.__context__
         return self._last or self.definition()
 
     @property
@@ -82,7 +82,7 @@ class Source:
         return self._last or self.definition()
 
     def definition(self, *methods: str) -> tuple[str, int]:
-        """The line of the first of these methods that exists, else of the subject itself; line 1 of an FMU."""
+        """The line that defines the first existing method of `methods`, or else the subject; line 1 of an FMU."""
         if self._is_fmu:
             return self.file, 1
         for name in methods:
@@ -96,12 +96,12 @@ class Source:
             return self.file, 1
 
     def line_of_text(self, pattern: str) -> tuple[str, int] | None:
-        """The first line of the file that holds a pattern."""
+        """The first line of the file that matches a pattern."""
         text = _text(self.file).splitlines()
         return next(((self.file, number) for number, line in enumerate(text, 1) if re.search(pattern, line)), None)
 
     def suspect(self, check: str) -> tuple[str, int] | None:
-        """The line of the file that looks like the cause of a difference; None if no line does."""
+        """The first line of the file that may cause a failure of `check`; None without such a line."""
         if self._is_fmu:
             return None
         try:
@@ -120,25 +120,25 @@ def _text(file: str) -> str:
         return ""
 
 
-RANDOM = re.compile(r"(^|\.)(random|randint|uniform|gauss|normal|choice|shuffle|urandom|uuid\d|token_\w+|time|time_ns|perf_counter|"
-                    r"perf_counter_ns|monotonic|monotonic_ns|process_time|now|today|utcnow|getpid|default_rng|id)$")
-OVER_VEHICLES = ("mean", "sum", "max", "min", "std", "var", "median", "average", "any", "all", "cumsum", "sort", "argsort", "argmax",
-                 "argmin", "linspace", "arange", "percentile", "quantile", "ptp", "prod", "dot", "norm", "accumulate", "roll", "unique")
-MUTATORS = ("append", "add", "update", "setdefault", "extend", "insert", "pop", "remove", "clear", "popleft", "appendleft")
+RANDOM_CALLS = re.compile(r"(^|\.)(random|randint|uniform|gauss|normal|choice|shuffle|urandom|uuid\d|token_\w+|time|time_ns|perf_counter|"
+                          r"perf_counter_ns|monotonic|monotonic_ns|process_time|now|today|utcnow|getpid|default_rng|id)$")
+REDUCTIONS = ("mean", "sum", "max", "min", "std", "var", "median", "average", "any", "all", "cumsum", "sort", "argsort", "argmax",
+              "argmin", "linspace", "arange", "percentile", "quantile", "ptp", "prod", "dot", "norm", "accumulate", "roll", "unique")
+MUTATING_METHODS = ("append", "add", "update", "setdefault", "extend", "insert", "pop", "remove", "clear", "popleft", "appendleft")
 
 
 def _part_of(tree: ast.Module, name: str) -> ast.Module:
-    """The parts of a module that a class or function of that name uses: classes and functions that it names, and all assignments."""
-    defined = {node.name: node for node in tree.body if isinstance(node, ast.ClassDef | ast.FunctionDef)}
-    used, waiting = set[str](), [name]
-    while waiting:
-        one = waiting.pop()
-        if one in defined and one not in used:
-            used.add(one)
-            waiting += [node.id for node in ast.walk(defined[one]) if isinstance(node, ast.Name)]
-    if not used:
+    """The classes and functions of a module that the class or function `name` uses, and all other statements of the module."""
+    definitions = {node.name: node for node in tree.body if isinstance(node, ast.ClassDef | ast.FunctionDef)}
+    used_names, names_left = set[str](), [name]
+    while names_left:
+        used_name = names_left.pop()
+        if used_name in definitions and used_name not in used_names:
+            used_names.add(used_name)
+            names_left += [node.id for node in ast.walk(definitions[used_name]) if isinstance(node, ast.Name)]
+    if not used_names:
         return tree
-    return ast.Module([node for node in tree.body if getattr(node, "name", "") in used or not isinstance(
+    return ast.Module([node for node in tree.body if getattr(node, "name", "") in used_names or not isinstance(
         node, ast.ClassDef | ast.FunctionDef)], [])
 
 
@@ -152,48 +152,48 @@ def _calls(function: ast.FunctionDef) -> Iterator[tuple[str, int]]:
 
 
 def _random_lines(tree: ast.AST) -> Iterator[int]:
-    """Lines that call random numbers or clocks, except the `rng` of an algorithm."""
+    """Lines that draw random numbers or read clocks; draws from the `rng` of an algorithm do not count."""
     yield from (line for function in _functions(tree) for name, line in _calls(function)
-                if RANDOM.search(name) and not name.startswith(("rng.", "problem.", "self.rng.")))
+                if RANDOM_CALLS.search(name) and not name.startswith(("rng.", "problem.", "self.rng.")))
 
 
 def _batch_lines(tree: ast.AST) -> Iterator[int]:
     """Lines that reduce over vehicles, or depend on the number of vehicles."""
     yield from (line for function in _functions(tree) if function.name != "__init__" for name, line in _calls(function)
-                if name.rpartition(".")[2] in OVER_VEHICLES)
+                if name.rpartition(".")[2] in REDUCTIONS)
 
 
 def _state_lines(tree: ast.AST) -> Iterator[int]:
-    """Lines that assign to classes or modules, or to models in methods that do not begin a run."""
+    """Lines that assign to classes, to modules or, outside methods that begin a run, to models."""
     classes = [node for node in ast.walk(tree) if isinstance(node, ast.ClassDef)]
-    owners = {one.name for one in classes} | {"cls", "type(self)", "self.__class__"}
-    shared = {target.id for body in (getattr(tree, "body", []), *(one.body for one in classes)) for node in body
-              if isinstance(node, ast.Assign | ast.AnnAssign)
-              for target in (node.targets if isinstance(node, ast.Assign) else [node.target]) if isinstance(target, ast.Name)}
-    scalar = {id(one) for one in classes if any("ScalarAds" in ast.unparse(base) for base in one.bases)}
+    owners = {class_def.name for class_def in classes} | {"cls", "type(self)", "self.__class__"}
+    shared_names = {target.id for body in (getattr(tree, "body", []), *(class_def.body for class_def in classes)) for node in body
+                    if isinstance(node, ast.Assign | ast.AnnAssign)
+                    for target in (node.targets if isinstance(node, ast.Assign) else [node.target]) if isinstance(target, ast.Name)}
+    scalar_classes = {id(class_def) for class_def in classes if any("ScalarAds" in ast.unparse(base) for base in class_def.bases)}
     for function in _functions(tree):
-        declared = {name for node in ast.walk(function) if isinstance(node, ast.Global | ast.Nonlocal) for name in node.names}
+        outer_names = {name for node in ast.walk(function) if isinstance(node, ast.Global | ast.Nonlocal) for name in node.names}
         for default in [*function.args.defaults, *filter(None, function.args.kw_defaults)]:
             if isinstance(default, ast.List | ast.Dict | ast.Set):
                 yield function.lineno
-        own = next((one for one in classes if function in one.body), None)
-        begins = function.name in ("__init__", "__post_init__", "start") or (own is not None and (id(own) in scalar or any(
-            isinstance(node, ast.FunctionDef) and node.name == "step" for node in own.body)))
+        owner = next((class_def for class_def in classes if function in class_def.body), None)
+        begins_run = function.name in ("__init__", "__post_init__", "start") or (owner is not None and (id(owner) in scalar_classes or any(
+            isinstance(node, ast.FunctionDef) and node.name == "step" for node in owner.body)))
         for node in ast.walk(function):
             targets = node.targets if isinstance(node, ast.Assign) else [node.target] if isinstance(node, ast.AugAssign) else []
             for target in targets:
                 base: ast.expr = target.value if isinstance(target, ast.Attribute | ast.Subscript) else target
                 text = ast.unparse(base)
-                if text in owners or (isinstance(target, ast.Name) and target.id in declared) \
-                        or (isinstance(target, ast.Subscript) and text.rpartition(".")[2] in shared) \
-                        or (isinstance(target, ast.Attribute) and text == "self" and not begins):
+                if text in owners or (isinstance(target, ast.Name) and target.id in outer_names) \
+                        or (isinstance(target, ast.Subscript) and text.rpartition(".")[2] in shared_names) \
+                        or (isinstance(target, ast.Attribute) and text == "self" and not begins_run):
                     yield target.lineno
-            if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.func.attr in MUTATORS:
+            if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.func.attr in MUTATING_METHODS:
                 receiver = ast.unparse(node.func.value)
-                if receiver.rpartition(".")[2] in shared or (receiver.startswith("self.") and not begins) or receiver in owners:
+                if receiver.rpartition(".")[2] in shared_names or (receiver.startswith("self.") and not begins_run) or receiver in owners:
                     yield node.lineno
             if isinstance(node, ast.Call) and ast.unparse(node.func) in ("next", "setattr") and node.args \
-                    and ast.unparse(node.args[0]) in shared | owners:
+                    and ast.unparse(node.args[0]) in shared_names | owners:
                 yield node.lineno
 
 

@@ -22,12 +22,12 @@ from safevar_sumo.errors import ForeignError, InputError
 from safevar_sumo.plugins import guard_process_state
 from safevar_sumo.study import Study, load_study, study_names
 
-LONGEST = 6.0
-"""Time that a run of a probe may take, imports aside, before the subject counts as hung [s]."""
-SLOWEST = 1e-3
-"""Time per vehicle and step above which a subject is slow [s]: a run of 1,000 simulations then takes minutes."""
-ALONE = 2
-"""Number of vehicles that are tried alone."""
+RUN_LIMIT = 6.0
+"""Longest time of a run of a probe, without imports [s]; after it the subject counts as hung."""
+COST_LIMIT = 1e-3
+"""Time per vehicle and step above which a subject counts as slow [s]: 1,000 simulations then take minutes."""
+SINGLES = 2
+"""Number of vehicles that are also run alone."""
 BASES = {"ads": "ads/base.py", "vehicle": "vehicles/base.py", "scenario": "scenarios/base.py", "metric": "metrics/base.py",
          "objective": "vehicles/characteristics.py", "algorithm": "search/base.py", "traci": "sumo/traci_controller.py"}
 
@@ -38,9 +38,9 @@ def check(name: str, study: str | None = None) -> Report:
     Parameters
     ----------
     name
-        `package.module:Name`, the name of something shipped, or a study's name or path.
+        `package.module:Name`, the name of a shipped subject, or the name or path of a study.
     study
-        A study to try a subject in.
+        The study to try a subject in.
 
     Raises
     ------
@@ -50,9 +50,9 @@ def check(name: str, study: str | None = None) -> Report:
     start = time.perf_counter()
     if ":" not in name and (name in study_names() or name.endswith(".toml")):
         report = Report(subject=name, kind="study")
-        for one in checks_of(load_study(name)):
-            report.findings += one.findings
-            report.remarks += [f"{one.kind} {one.subject}: {remark}" for remark in (*one.remarks, one.speed) if remark]
+        for part in checks_of(load_study(name)):
+            report.findings += part.findings
+            report.remarks += [f"{part.kind} {part.subject}: {remark}" for remark in (*part.remarks, part.speed) if remark]
     else:
         report = checked(subject_of(name, study))
     report.seconds = time.perf_counter() - start
@@ -60,41 +60,42 @@ def check(name: str, study: str | None = None) -> Report:
 
 
 def checks_of(study: Study, *, foreign: bool = False) -> Iterator[Report]:
-    """Check everything that a study names, or only code from outside (`foreign`); simulate the study only once. Raises as `checked`."""
+    """Check all subjects that a study names, or only code from outside (`foreign`). Raises as `checked`; simulates the study once."""
     subjects = [subject for subject in subjects_of(study) if not (foreign and subject.is_ours)]
     order = ("traci", "scenario", "ads", "vehicle")
-    models = sorted((one for one in subjects if one.kind in order), key=lambda one: (one.is_ours, order.index(one.kind)))
+    models = sorted((subject for subject in subjects if subject.kind in order),
+                    key=lambda subject: (subject.is_ours, order.index(subject.kind)))
     for subject in subjects:
         yield checked(subject, simulated=subject in models[:1])
 
 
 def refuse_defects(study: Study) -> list[str]:
-    """Check the code from outside that a study names; returns the findings that do not make results wrong.
+    """Check the code from outside that a study names; returns the warnings.
 
     Raises
     ------
     ForeignError
-        Naming the first finding that makes results wrong, with file, line and advice.
+        With file, line and advice of the first finding that makes results wrong.
     """
     remarks = []
     for report in checks_of(study, foreign=True):
         for finding in report.findings:
-            place = f"{finding.file}:{finding.line}"
-            problem = f"{report.key} {finding.got}{'' if place in finding.got else f' ({place})'}"
+            location = f"{finding.file}:{finding.line}"
+            problem = f"{report.key} {finding.got}{'' if location in finding.got else f' ({location})'}"
             if finding.check in REFUSED:
-                again = f"python -m safevar_sumo check {shlex.quote(study.origin.called or study.name)}"
-                raise ForeignError(study.source, f"{problem}; again by: {again}", f"{finding.expected}; {finding.advice}")
+                command = f"python -m safevar_sumo check {shlex.quote(study.origin.called or study.name)}"
+                raise ForeignError(study.source, f"{problem}; again by: {command}", f"{finding.expected}; {finding.advice}")
             remarks.append(f"{problem}; expected: {finding.expected}")
     return remarks
 
 
 def checked(subject: Subject, *, simulated: bool = True) -> Report:
-    """Check one subject, with `simulated` also in simulations of its study.
+    """Check one subject; with `simulated`, simulate its study too.
 
     Raises
     ------
     InputError
-        If it cannot be tried: it does not take its parameters, or its study cannot be assembled.
+        If the subject does not take its parameters, or its study cannot be assembled.
     """
     report = Report(subject=subject.name, kind=subject.kind, key=subject.key, remarks=list(subject.remarks))
     start, suite = time.perf_counter(), _Suite(subject, simulated)
@@ -108,7 +109,7 @@ ADVICE_ON_FMUS = {
     "determinism": "let the FMU draw nothing at random and ask no clock", "state": "let its reset bring everything back to its start",
     "batch": "let its instances share nothing", "finite": "limit what the FMU divides by; a max of an input limits infinite gaps",
     "reaction": "look at the table of inputs and outputs, and at units and signs"}
-"""Advice on findings in an FMU, in place of advice on code."""
+"""Advice on findings in an FMU by check, in place of `ADVICE`."""
 
 
 class _Suite:
@@ -118,39 +119,39 @@ class _Suite:
         self.speed, self._seconds = "", 0.0
 
     def findings(self) -> Iterator[Finding]:
-        """The subject's defects; the first probe with findings is the last one."""
+        """The findings on the subject; no probe runs after a probe with findings."""
         got, expected = violation(self._subject)
         if got:
-            yield self._finding("contract", got, expected, self._source.definition(*_named(got)))
+            yield self._finding("contract", got, expected, self._source.definition(*_method_names(got)))
             return
         number = 0
         for probe_type in self._probes:
-            for finding in self._probed(probe_type):
+            for finding in self._defects(probe_type):
                 number += 1
                 yield finding
             if number:
                 break
-        yield from self._picklable()
+        yield from self._pickling_findings()
 
-    def _probed(self, probe_type: type[Probe]) -> Iterator[Finding]:
+    def _defects(self, probe_type: type[Probe]) -> Iterator[Finding]:
         try:
             with np.errstate(all="ignore"):
                 probe = probe_type(self._subject)
-                with self._source.watched(), time_limit(LONGEST):
-                    model = probe.fresh()
+                with self._source.watched(), time_limit(RUN_LIMIT):
+                    model = probe.load()
                     outputs = probe.run(model, np.arange(probe.number))
                 findings = list(self._differences(probe, model, outputs))
                 if not findings:
-                    with self._source.watched(), time_limit(LONGEST):
-                        findings = [self._finding("reaction", one.got, one.expected, self._source.definition(*one.methods))
-                                 for one in probe.reactions(model, outputs)]
-                    findings += self._slow(probe, model)
+                    with self._source.watched(), time_limit(RUN_LIMIT):
+                        findings = [self._finding("reaction", reaction.got, reaction.expected, self._source.definition(*reaction.methods))
+                                 for reaction in probe.reactions(model, outputs)]
+                    findings += self._cost_findings(probe, model)
             yield from findings
         except ForeignError as error:
             yield self._of_error(error)
         except TakesTooLong as error:
-            place = self._source.of_error(error)
-            yield self._finding("speed", f"does not come back within {LONGEST:g} s", "microseconds per vehicle and step", place)
+            location = self._source.of_error(error)
+            yield self._finding("speed", f"does not come back within {RUN_LIMIT:g} s", "microseconds per vehicle and step", location)
         except InputError as error:
             if self._subject.kind == "vehicle" and "vehicle.characteristics" in error.problem:
                 yield self._finding("units", error.problem, error.legal, self._source.line_of_text(r"\bUNITS\b") or self._source.last)
@@ -162,44 +163,44 @@ class _Suite:
                 raise
 
     def _differences(self, probe: Probe, model: Any, outputs: Outputs) -> Iterator[Finding]:
-        """The first way of grouping vehicles that gives other results than all vehicles together."""
+        """A finding for the first repetition, or grouping of vehicles, with other results than the first run of all vehicles."""
         rows = np.arange(probe.number)
-        place = _difference(outputs, probe.run(probe.fresh(), rows), rows)
-        if place:
-            yield self._differing("determinism", probe, f"{place} when the run is repeated", "the same, to the bit")
+        difference = _difference(outputs, probe.run(probe.load(), rows), rows)
+        if difference:
+            yield self._difference_finding("determinism", probe, f"{difference} when the run is repeated", "the same, to the bit")
             return
-        second: dict[str, Outputs] = {}
-        self._seconds = timed(lambda: second.update(outputs=probe.again(model, rows)))
-        place = _difference(outputs, second["outputs"], rows)
-        if place:
-            yield self._differing("state", probe, f"{place} in a second run", "the same as in the first run, to the bit")
+        repetition: dict[str, Outputs] = {}
+        self._seconds = timed(lambda: repetition.update(outputs=probe.repeat(model, rows)))
+        difference = _difference(outputs, repetition["outputs"], rows)
+        if difference:
+            yield self._difference_finding("state", probe, f"{difference} in a second run", "the same as in the first run, to the bit")
             return
         if probe.number == 1:
             return
-        ways: dict[str, list[Rows]] = {"in another order": [rows[::-1]], "in two halves": np.array_split(rows, 2),
-                                       "alone": [rows[i:i + 1] for i in np.linspace(0, len(rows) - 1, ALONE).astype(int)]}
-        for way, groups in ways.items():
+        groupings: dict[str, list[Rows]] = {"in another order": [rows[::-1]], "in two halves": np.array_split(rows, 2),
+                                            "alone": [rows[i:i + 1] for i in np.linspace(0, len(rows) - 1, SINGLES).astype(int)]}
+        for grouping, groups in groupings.items():
             for group in groups:
-                place = _difference({name: values[..., group] for name, values in outputs.items()}, probe.run(model, group), group)
-                if place:
+                difference = _difference({name: values[..., group] for name, values in outputs.items()}, probe.run(model, group), group)
+                if difference:
                     check = "batch" if self._source.suspect("batch") or not self._source.suspect("state") else "state"
-                    yield self._differing(check, probe, f"{place} {way}", "the same as all together, to the bit")
+                    yield self._difference_finding(check, probe, f"{difference} {grouping}", "the same as all together, to the bit")
                     return
 
-    def _differing(self, check: str, probe: Probe, got: str, expected: str) -> Finding:
-        place = self._source.suspect(check) or self._source.definition(*probe.methods)
-        return self._finding(check, got, expected, place)
+    def _difference_finding(self, check: str, probe: Probe, got: str, expected: str) -> Finding:
+        location = self._source.suspect(check) or self._source.definition(*probe.methods)
+        return self._finding(check, got, expected, location)
 
-    def _slow(self, probe: Probe, model: Any) -> Iterator[Finding]:
+    def _cost_findings(self, probe: Probe, model: Any) -> Iterator[Finding]:
         seconds, sentence = probe.cost(model, self._seconds)
         self.speed = self.speed or sentence
-        slowest = SLOWEST * (10 if self._subject.kind == "traci" else 1)  # SUMO's own time counts there
-        if seconds > slowest:
-            yield self._finding("speed", sentence, f"below {slowest * 1e6:g} microseconds per vehicle and step",
+        limit = COST_LIMIT * (10 if self._subject.kind == "traci" else 1)  # this includes the time of SUMO
+        if seconds > limit:
+            yield self._finding("speed", sentence, f"below {limit * 1e6:g} microseconds per vehicle and step",
                                 self._source.definition(*probe.methods))
 
-    def _picklable(self) -> Iterator[Finding]:
-        """Pickle the object as for a worker process: a class by its name, an instance by its contents, a record with its function."""
+    def _pickling_findings(self) -> Iterator[Finding]:
+        """A finding if the object cannot be pickled for a worker process; a metric or objective is pickled as its function."""
         if self._subject.member.file:
             return  # an FMU is sent as a file
         subject = loaded_again(self._subject)
@@ -208,54 +209,56 @@ class _Suite:
             try:
                 payload = subject(**self._subject.parameters)
             except Exception:
-                payload = subject  # the probes have tried instances with the study's parameters
+                payload = subject  # the probes have instantiated it with parameters
         if getattr(payload, "function", None) is not None and self._subject.kind in ("metric", "objective"):
             payload = payload.function
         try:
             pickle.dumps(payload)
         except Exception as error:
             problem = f"{type(error).__name__}: {str(error).splitlines()[0] if str(error) else ''}"
-            place = self._source.definition("__init__") if isinstance(subject, type) else self._source.definition()
-            yield self._finding("picklable", problem, "an object that pickle can send to a worker process", place)
+            location = self._source.definition("__init__") if isinstance(subject, type) else self._source.definition()
+            yield self._finding("picklable", problem, "an object that pickle can send to a worker process", location)
 
     def _of_error(self, error: ForeignError) -> Finding:
         """The finding for an error that a guard raised."""
         text = error.problem.removeprefix(f"{self._subject.key} ")
-        if "returned" in text:  # the finding's own line is that of the return
+        if "returned" in text:  # the finding has the line already
             text = re.sub(r" \([^()]*:\d+\)$", "", text)
-        no_number = any(f"= {value} from" in text for value in ("nan", "inf", "-inf")) if "returned" in text else any(
+        is_not_finite = any(f"= {value} from" in text for value in ("nan", "inf", "-inf")) if "returned" in text else any(
             name in text for name in ("ZeroDivisionError", "OverflowError", "FloatingPointError", "math domain"))
-        check = "inputs" if "read-only" in text else "finite" if no_number else "contract"
+        check = "inputs" if "read-only" in text else "finite" if is_not_finite else "contract"
         expected = error.legal or "no exception"
         if check == "inputs":
             expected = "arguments that stay as they are"
         return self._finding(check, text, expected, self._source.of_error(error))
 
-    def _finding(self, check: str, got: str, expected: str, place: tuple[str, int]) -> Finding:
+    def _finding(self, check: str, got: str, expected: str, location: tuple[str, int]) -> Finding:
         advice = ADVICE[check].format(base=BASES[self._subject.kind])
         if self._subject.member.file:
             advice = ADVICE_ON_FMUS.get(check, "see the tutorial on FMUs")
         elif check == "contract" and self._subject.kind == "ads" and isinstance(self._subject.member.target, type) \
                 and not issubclass(self._subject.member.target, ScalarAds):
             advice += "; an ADS for one vehicle derives from safevar_sumo.ads.ScalarAds"
-        return Finding(check=check, file=place[0], line=place[1], expected=expected, got=got, advice=advice)
+        return Finding(check=check, file=location[0], line=location[1], expected=expected, got=got, advice=advice)
 
 
-def _named(problem: str) -> tuple[str, ...]:
-    """The method that a violation of the contract names."""
+def _method_names(problem: str) -> tuple[str, ...]:
+    """The names of methods in a violation of the contract."""
     words = problem.replace("(", " ").split()
     return tuple(words[i + 1] for i, word in enumerate(words[:-1]) if word in ("method", "has"))
 
 
-def _difference(one: Outputs, other: Outputs, rows: Rows) -> str:
-    """The first result that differs, its vehicle and both values; "" if all are equal to the bit."""
-    for name, values in one.items():
-        others = other[name]
-        if values.shape != others.shape:
-            return f"{name} has shape {others.shape}, not {values.shape},"
-        same = values == others if values.dtype.kind == "U" else (values == others) | (np.isnan(values) & np.isnan(others))
-        if not same.all():
-            place = tuple(np.argwhere(~same)[0])
-            return f"{name} of vehicle {rows[place[-1]]} is {others[place]} instead of {values[place]}"
+def _difference(outputs: Outputs, other_outputs: Outputs, rows: Rows) -> str:
+    """The first result that differs, with its vehicle and both values; "" if all results are equal to the bit."""
+    for name, values in outputs.items():
+        other_values = other_outputs[name]
+        if values.shape != other_values.shape:
+            return f"{name} has shape {other_values.shape}, not {values.shape},"
+        is_same = values == other_values
+        if values.dtype.kind != "U":
+            is_same |= np.isnan(values) & np.isnan(other_values)
+        if not is_same.all():
+            index = tuple(np.argwhere(~is_same)[0])
+            return f"{name} of vehicle {rows[index[-1]]} is {other_values[index]} instead of {values[index]}"
     return ""
 

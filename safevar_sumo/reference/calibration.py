@@ -1,4 +1,4 @@
-"""Fit one study, or several together, to published data."""
+"""Fits of one study, or of several studies together, to published data."""
 
 from __future__ import annotations
 
@@ -16,28 +16,28 @@ from safevar_sumo.reference.effects import error_beyond_spread
 from safevar_sumo.reference.fit_result import Calibration
 from safevar_sumo.reference.fit_space import FitSpace, FittedStudy
 from safevar_sumo.reference.loss import MAX_LOSS
-from safevar_sumo.reference.parameters import Free, free_parameters
+from safevar_sumo.reference.parameters import FittedParameter, free_parameters
 from safevar_sumo.reference.profiles import Profiles
 from safevar_sumo.reference.rows import COLUMNS, ReferenceData
-from safevar_sumo.reference.search import Together, TrialSearch
+from safevar_sumo.reference.search import StudyGroup, TrialSearch
 from safevar_sumo.reference.validation import Agreement, agreement
 from safevar_sumo.study import SAFETY_DEGREE, Study
 from safevar_sumo.vehicles import CharacteristicSet
 from safevar_sumo.workers.batches import evaluate_all
 from safevar_sumo.workers.evaluation import Pool
 
-NEAR = 0.02
-"""Initial standard deviation of a search around known values, as a share of the bounds' width."""
-REFINEMENT = 3
-"""A search around known values has a population this many times smaller: it need not find a valley, and learns once a generation."""
+START_DEVIATION = 0.02
+"""Initial standard deviation of a search that begins at known values, as a share of the bounds' width."""
+POPULATION_DIVISOR = 3
+"""Factor by which the population of a search from known values is smaller: the search adapts once a generation, and need not explore."""
 STAGES = (64, 16)
-"""Percentages of the trials from scratch that fit the first study alone, and then the others' own parameters; the rest fit all."""
-MILLIMETRES = 3
+"""Percentages of the trials of a fit from scratch: for the first study, then for parameters of the other studies; the rest fit all."""
+ERROR_DECIMALS = 3
 """Decimals of a study's model error [m]."""
 
 
 class FitSubject(NamedTuple):
-    """A study and the data that it is fitted to, by name."""
+    """A study, and the reference data that it is fitted to, by name."""
 
     study: Study
     references: Mapping[str, ReferenceData]
@@ -49,113 +49,117 @@ def calibrate(study: Study, references: Mapping[str, ReferenceData], pool: Pool,
     return calibrate_together([FitSubject(study, references)], pool, lambda loss, best: done(loss, best[0]), from_scratch=from_scratch)[0]
 
 
-def calibrate_together(subjects: Sequence[FitSubject], pool: Pool, done: Callable[[float, Together], None] = lambda loss, best: None, *,
+def calibrate_together(subjects: Sequence[FitSubject], pool: Pool, done: Callable[[float, StudyGroup], None] = lambda loss, best: None, *,
                        from_scratch: bool = False) -> list[Calibration]:
-    """Fit by CMA-ES (Hansen 2016), as the studies' tables [fit] say; trials, seed, starts and population are the first study's.
+    """Fit studies by CMA-ES (Hansen 2016), as their tables [fit] say; the first study sets trials, seed, starts and population.
 
     Parameters
     ----------
     subjects
-        Studies with their data; without data, only the original vehicle's values count.
+        Studies with their data; a study without data is fitted to the original vehicle's published values alone.
     done
-        Called after every trial with the lowest loss so far, and the studies that have it.
+        Called after every trial with the lowest loss so far, and the studies with this loss.
     from_scratch
-        Ignore the studies' own values of the free parameters: start only at random places.
+        Start only at random places, and ignore the values that the studies give to the free parameters.
 
     Raises
     ------
     InputError
-        If no study has free parameters, one of them cannot be fitted, or a study has nothing to fit it to.
+        If no study has free parameters, a parameter cannot be fitted, or a study has neither data nor published values.
     SimulationError
-        If the studies cannot be simulated with their own values.
+        If the studies cannot be simulated with the values in their files.
     """
     studies = tuple(subject.study for subject in subjects)
     if not any(study.calibration for study in studies):
         raise InputError(studies[0].source, "has no table [calibration]", "the free parameters with bounds, unit and meaning")
     for subject in subjects:
         _check(subject)
-    fit, free = studies[0].fit, free_parameters(studies)
+    fit, parameters = studies[0].fit, free_parameters(studies)
     if from_scratch and not fit.starts:
         raise InputError(studies[0].source, "fit.starts = 0", "at least 1 for a fit from scratch")
-    used, held_back = [], []
+    fit_data, test_data = [], []
     for study, references in subjects:
-        rows = {name: np.arange(len(data.settings)) % study.fit.hold_out == study.fit.hold_out - 1 for name, data in references.items()}
-        used.append({name: data.take(~rows[name]) for name, data in references.items()})
-        held_back.append({name: data.take(rows[name]) for name, data in references.items()})
+        is_test = {name: np.arange(len(data.settings)) % study.fit.hold_out == study.fit.hold_out - 1 for name, data in references.items()}
+        fit_data.append({name: data.take(~is_test[name]) for name, data in references.items()})
+        test_data.append({name: data.take(is_test[name]) for name, data in references.items()})
     start, trials, rng = studies, fit.trials, np.random.default_rng(fit.seed)
-    if staged := from_scratch and (len(studies) > 1 or fit.thinning > 1):
-        start, trials = _by_stages(subjects, free, used, pool, rng, done)
-    space = FitSpace(free, [FittedStudy(study, data, pool) for study, data in zip(start, used, strict=True)])
+    if has_stages := from_scratch and (len(studies) > 1 or fit.thinning > 1):
+        start, trials = _fit_in_stages(subjects, parameters, fit_data, pool, rng, done)
+    space = FitSpace(parameters, [FittedStudy(study, data, pool) for study, data in zip(start, fit_data, strict=True)])
     search = TrialSearch(space, fit.population, trials, done, fit.alike)
     if not from_scratch and search.try_studies([studies])[0] >= MAX_LOSS:
         names = " and ".join(f"study {study.name!r}" for study in studies)
         raise SimulationError(f"{names} cannot be simulated with {'its' if len(studies) == 1 else 'their'} own values")
-    searches = [] if staged else search.from_random_places(_first_of_key(free), fit.starts, fit.screened, fit.width, rng)
-    if staged or not from_scratch:
-        searches.append(search.begin(space.shares(start), NEAR, fit.seed + 1, _refining_population(fit.population, len(free))))
+    searches = [] if has_stages else search.from_random_places(_first_indices(parameters), fit.starts, fit.screened, fit.width, rng)
+    if has_stages or not from_scratch:
+        population = _refining_population(fit.population, len(parameters))
+        searches.append(search.begin(space.shares(start), START_DEVIATION, fit.seed + 1, population))
     search.race(searches)
     assert search.best is not None, "there is at least one trial"
-    reached, results = [one.lowest for one in searches if one.lowest < np.inf], []
-    profiles = Profiles.of(free, space, search, space.shares(search.best))
+    lowest_losses, results = [run.lowest for run in searches if run.lowest < np.inf], []
+    profiles = Profiles.of(parameters, space, search, space.shares(search.best))
     for k, best in enumerate(search.best):
-        parameters = [one for one in free if k in one.studies]
+        study_parameters = [parameter for parameter in parameters if k in parameter.studies]
         best = msgspec.structs.replace(best, spread=profiles.spread(k))
-        beyond = {SAFETY_DEGREE: round(error_beyond_spread(best, used[k]), MILLIMETRES)} if used[k] else {}
-        best = msgspec.structs.replace(best, model_error=beyond)
+        error = {SAFETY_DEGREE: round(error_beyond_spread(best, fit_data[k]), ERROR_DECIMALS)} if fit_data[k] else {}
+        best = msgspec.structs.replace(best, model_error=error)
         results.append(Calibration(
-            {one.key: value_of(best, one.key) for one in parameters}, best, search.loss, reached, _agreements(best, used[k], pool),
-            _agreements(best, held_back[k], pool), {one.key: one.bounds for one in parameters}, fit,
+            {parameter.key: value_of(best, parameter.key) for parameter in study_parameters}, best, search.loss, lowest_losses,
+            _agreements(best, fit_data[k], pool), _agreements(best, test_data[k], pool),
+            {parameter.key: parameter.bounds for parameter in study_parameters}, fit,
             tuple(study.name for study in studies if study is not studies[k]),
-            frozenset(one.key for one in parameters if len(one.studies) > 1),
-            {one.key: profiles.interval(i) for i, one in enumerate(free) if k in one.studies}, profiles))
+            frozenset(parameter.key for parameter in study_parameters if len(parameter.studies) > 1),
+            {parameter.key: profiles.interval(i) for i, parameter in enumerate(parameters) if k in parameter.studies}, profiles))
     return results
 
 
 def _refining_population(population: int, parameters: int) -> int:
-    """A population `REFINEMENT` times smaller, but not below the usual one of CMA-ES (Hansen 2016)."""
-    return min(population, max(population // REFINEMENT, 4 + int(3 * math.log(parameters))))
+    """A population `POPULATION_DIVISOR` times smaller, but at least the default population of CMA-ES (Hansen 2016)."""
+    return min(population, max(population // POPULATION_DIVISOR, 4 + int(3 * math.log(parameters))))
 
 
-def _first_of_key(free: Sequence[Free]) -> list[int]:
-    """For each parameter, the first one with its key: studies' own values start at one place, for they describe one model."""
-    keys = [one.key for one in free]
+def _first_indices(parameters: Sequence[FittedParameter]) -> list[int]:
+    """For each parameter, the index of the first parameter with the same key, as both describe one model and start at one value."""
+    keys = [parameter.key for parameter in parameters]
     return [keys.index(key) for key in keys]
 
 
-def _by_stages(subjects: Sequence[FitSubject], free: Sequence[Free], used: Sequence[Mapping[str, ReferenceData]], pool: Pool,
-               rng: np.random.Generator, done: Callable[[float, Together], None]) -> tuple[Together, int]:
-    """Fit, on thinned rows, the first study from random places, then the others' own parameters; also returns the trials left."""
+def _fit_in_stages(subjects: Sequence[FitSubject], parameters: Sequence[FittedParameter], fit_data: Sequence[Mapping[str, ReferenceData]],
+                   pool: Pool, rng: np.random.Generator, done: Callable[[float, StudyGroup], None]) -> tuple[StudyGroup, int]:
+    """Fit the first study from random places, then the parameters of other studies, on thinned rows; also returns the trials left."""
     studies = tuple(subject.study for subject in subjects)
     fit, trials_left = studies[0].fit, studies[0].fit.trials
-    first = [one._replace(studies=(0,)) for one in free if 0 in one.studies]
-    others = [one._replace(studies=tuple(k - 1 for k in one.studies)) for one in free if 0 not in one.studies]
-    for parameters, indices, share in zip((first, others), ([0], list(range(1, len(studies)))), STAGES, strict=True):
-        trials = fit.trials * share // 100
-        if parameters and trials:
-            thinned = [{name: _thinned(data, fit.thinning) for name, data in used[k].items()} for k in indices]
-            space = FitSpace(parameters, [FittedStudy(studies[k], data, pool) for k, data in zip(indices, thinned, strict=True)])
-            search = TrialSearch(space, fit.population, trials, partial(_done_with_some, done, studies, indices))
-            search.race(search.from_random_places(_first_of_key(parameters), fit.starts, fit.screened, fit.width, rng))
+    first_parameters = [parameter._replace(studies=(0,)) for parameter in parameters if 0 in parameter.studies]
+    other_parameters = [parameter._replace(studies=tuple(k - 1 for k in parameter.studies))
+                        for parameter in parameters if 0 not in parameter.studies]
+    stages = zip((first_parameters, other_parameters), ([0], list(range(1, len(studies)))), STAGES, strict=True)
+    for stage_parameters, indices, percentage in stages:
+        trials = fit.trials * percentage // 100
+        if stage_parameters and trials:
+            thinned_data = [{name: _thin(data, fit.thinning) for name, data in fit_data[k].items()} for k in indices]
+            space = FitSpace(stage_parameters, [FittedStudy(studies[k], data, pool) for k, data in zip(indices, thinned_data, strict=True)])
+            search = TrialSearch(space, fit.population, trials, partial(_report_on_stage, done, studies, indices))
+            search.race(search.from_random_places(_first_indices(stage_parameters), fit.starts, fit.screened, fit.width, rng))
             assert search.best is not None, "there is at least one trial"
-            studies, trials_left = _replaced(studies, indices, search.best), trials_left - trials
-            values = [(one, value_of(studies[0], one.key)) for one in free if 0 in one.studies]
-            studies = tuple(with_values(study, {one.key: value for one, value in values if k in one.studies})
+            studies, trials_left = _with_replacements(studies, indices, search.best), trials_left - trials
+            values = [(parameter, value_of(studies[0], parameter.key)) for parameter in parameters if 0 in parameter.studies]
+            studies = tuple(with_values(study, {parameter.key: value for parameter, value in values if k in parameter.studies})
                             for k, study in enumerate(studies))
     return studies, trials_left
 
 
-def _done_with_some(done: Callable[[float, Together], None], studies: Together, indices: Sequence[int], loss: float,
-                    best: Together) -> None:
-    done(loss, _replaced(studies, indices, best))
+def _report_on_stage(done: Callable[[float, StudyGroup], None], studies: StudyGroup, indices: Sequence[int], loss: float,
+                     best: StudyGroup) -> None:
+    done(loss, _with_replacements(studies, indices, best))
 
 
-def _replaced(studies: Together, indices: Sequence[int], replacements: Together) -> Together:
-    """Studies with those at some indices replaced."""
+def _with_replacements(studies: StudyGroup, indices: Sequence[int], replacements: StudyGroup) -> StudyGroup:
+    """The studies, with replacements at some indices."""
     return tuple(replacements[indices.index(k)] if k in indices else study for k, study in enumerate(studies))
 
 
-def _thinned(data: ReferenceData, thinning: int) -> ReferenceData:
-    """Every `thinning`-th row in the order of the safety degree, so that the few rows are distributed as all rows are."""
+def _thin(data: ReferenceData, thinning: int) -> ReferenceData:
+    """Every `thinning`-th row in the order of the safety degree, which keeps the distribution of the safety degree."""
     rows = np.zeros(len(data.settings), dtype=bool)
     rows[np.argsort(data.metrics[SAFETY_DEGREE], kind="stable")[thinning // 2::thinning]] = True
     return data.take(rows)
@@ -172,9 +176,9 @@ def _check(subject: FitSubject) -> None:
 
 def _agreements(study: Study, references: Mapping[str, ReferenceData], pool: Pool) -> dict[str, Agreement]:
     characteristics = CharacteristicSet.of(study.vehicle.characteristics)
-    parts = {}
+    agreements = {}
     for name, data in references.items():
         evaluations = evaluate_all(study, np.concatenate([characteristics.original[np.newaxis], data.settings]), pool)
-        here = evaluations.take(np.arange(1, len(evaluations)))
-        parts[name] = agreement(data, here, study, evaluations.take([0]))
-    return parts
+        simulated_rows = evaluations.take(np.arange(1, len(evaluations)))
+        agreements[name] = agreement(data, simulated_rows, study, evaluations.take([0]))
+    return agreements

@@ -1,4 +1,4 @@
-"""Effects of the characteristics on the safety degree, in a reference and here; rows that the model's uncertainty covers."""
+"""Effects of characteristics on the safety degree, in a reference and here; and the rows within the uncertainty of the model."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from safevar_sumo.study import SAFETY_DEGREE, Study
 from safevar_sumo.vehicles import CharacteristicSet
 
 SHARE, LEAST = 0.2, 0.1
-"""Effects agree if they differ by at most this share of the published effect, or by at most this many metres."""
+"""Two effects agree if they differ by at most `SHARE` of the published effect, or by at most `LEAST` metres."""
 ROWS_EACH = 10
 """Minimum number of rows for each coefficient of a regression."""
 
 
 class Effect(NamedTuple):
-    """Effect of a characteristic on the safety degree over its whole domain [m], in the reference and here; None if undefined."""
+    """Change of the safety degree over the whole domain of a characteristic [m], in the reference and here; None if undefined."""
 
     name: str
     reference: float | None
@@ -29,17 +29,17 @@ class Effect(NamedTuple):
 
     @property
     def agrees(self) -> bool | None:
-        """Whether the effect here is near enough to the published one."""
+        """Whether the effect here agrees with the published effect; None if one of them is undefined."""
         if self.reference is None or self.here is None:
             return None
         return abs(self.here - self.reference) <= max(LEAST, SHARE * abs(self.reference))
 
 
 class Regression(NamedTuple):
-    """Linear regression of values on all characteristics, for the same settings each time.
+    """Linear regression on all n characteristics, for fixed settings and any values of them.
 
-    `shares` are the settings' differences from the original in widths of the domains, shape (rows, n); `varies` tells which
-    characteristics vary, shape (n,); `slopes_of` maps values to the slopes of those, shape (k, rows), None for too few rows.
+    `shares` are the changes of the settings as shares of the domains, shape (rows, n). `varies` is true for the k characteristics that
+    the settings vary, shape (n,). `slopes_of` maps values to k slopes, shape (k, rows); None for too few rows.
     """
 
     shares: FloatArray
@@ -55,11 +55,11 @@ class Regression(NamedTuple):
     def _on(cls, shares: FloatArray) -> Regression:
         varies = np.asarray(np.ptp(shares, axis=0) > 0) if len(shares) else np.zeros(shares.shape[1], dtype=bool)
         design = np.column_stack([np.ones(len(shares)), shares[:, varies]])
-        enough = len(shares) >= ROWS_EACH * design.shape[1]
-        return cls(shares, varies, np.linalg.pinv(design)[1:] if enough else None)
+        has_enough_rows = len(shares) >= ROWS_EACH * design.shape[1]
+        return cls(shares, varies, np.linalg.pinv(design)[1:] if has_enough_rows else None)
 
     def effects(self, values: FloatArray) -> FloatArray:
-        """Slopes over the whole domains, shape (n,), in the unit of `values`, shape (rows,); NaN if undefined."""
+        """Change of `values`, shape (rows,), over each whole domain, shape (n,), in their unit; NaN if undefined."""
         defined = np.isfinite(values)
         if not defined.all():
             return Regression._on(self.shares[defined]).effects(values[defined])
@@ -69,19 +69,20 @@ class Regression(NamedTuple):
         return effects
 
 
-def effects_of(data: ReferenceData, here: Evaluations, characteristics: CharacteristicSet) -> list[Effect]:
-    """The effects of all characteristics, in the study's order."""
+def effects_of(data: ReferenceData, evaluations: Evaluations, characteristics: CharacteristicSet) -> list[Effect]:
+    """The effects of all characteristics, in the order of the study."""
     regression = Regression.over(data.settings, characteristics)
-    effects = (regression.effects(values) for values in (data.metrics[SAFETY_DEGREE], here.f_safe))
+    effect_columns = (regression.effects(values) for values in (data.metrics[SAFETY_DEGREE], evaluations.f_safe))
     return [Effect(name, *(finite_or_none(value) for value in pair))
-            for name, *pair in zip(characteristics.names, *effects, strict=True)]
+            for name, *pair in zip(characteristics.names, *effect_columns, strict=True)]
 
 
 class Coverage(NamedTuple):
-    """Numbers of parameter sets and rows, and the share of rows within the band of the sets' predictions and of repeats.
+    """Share of the published rows that lie within the band of the model's predictions.
 
-    `held_back` is the share of the rows that the fit did not use, `width` the band's median width [m], `needed` how much wider on each
-    side the band must be to cover 90 % of the rows held back [m].
+    `sets` and `rows` are numbers of parameter sets and rows; `all_rows` and `held_back` are shares of all rows, and of those that the fit
+    did not use; `width` is the median width of the band [m]; `needed` is the margin on each side with which the band would cover 90 % of
+    the rows held back [m].
     """
 
     sets: int
@@ -92,7 +93,7 @@ class Coverage(NamedTuple):
     needed: float
 
     def to_dict(self) -> dict[str, float]:
-        """As plain values."""
+        """The fields by name."""
         return self._asdict()
 
     def __str__(self) -> str:
@@ -102,7 +103,7 @@ class Coverage(NamedTuple):
 
 
 def covered_by_spread(data: ReferenceData, study: Study) -> Coverage:
-    """The published rows within the band of the model's own uncertainty.
+    """The share of published rows within the band of the model's uncertainty.
 
     Raises
     ------
@@ -112,34 +113,35 @@ def covered_by_spread(data: ReferenceData, study: Study) -> Coverage:
     evaluations = evaluations_of_sets(study, data.settings)
     lower, upper = band_of(study, evaluations)
     published = data.metrics[SAFETY_DEGREE]
-    outside = _outside(published, lower, upper)
+    distances = _outside(published, lower, upper)
     held_back = np.arange(len(published)) % study.fit.hold_out == study.fit.hold_out - 1
-    chosen = held_back if held_back.any() else np.ones(len(published), dtype=bool)
-    return Coverage(len(evaluations), len(published), float(np.mean(outside == 0)), float(np.mean(outside[chosen] == 0)),
-                    float(np.median(upper - lower)), float(np.quantile(outside[chosen], BAND)))
+    rows = held_back if held_back.any() else np.ones(len(published), dtype=bool)
+    return Coverage(len(evaluations), len(published), float(np.mean(distances == 0)), float(np.mean(distances[rows] == 0)),
+                    float(np.median(upper - lower)), float(np.quantile(distances[rows], BAND)))
 
 
 def _outside(values: FloatArray, lower: FloatArray, upper: FloatArray) -> FloatArray:
-    """Distance of values from a band; zero inside it."""
+    """Distance of values from a band; 0 inside the band."""
     return np.asarray(np.maximum(np.maximum(lower - values, values - upper), 0.0))
 
 
 def error_beyond_spread(study: Study, references: Mapping[str, ReferenceData]) -> float:
-    """How much wider on each side a band must be to hold `BAND` of new rows [m per domain's width from the original].
+    """Margin on each side with which the band holds the share `BAND` of new rows [m per domain width of distance from the original].
 
-    Split conformal prediction (Lei et al. 2018), with a row's distance from the band over its `distance` as score; files weigh alike.
+    The method is split conformal prediction (Lei et al. 2018). The score of a row is its distance from the band, divided by its distance
+    from the original setting. All files have the same weight.
     """
-    bare = msgspec.structs.replace(study, model_error={})
+    study_without_error = msgspec.structs.replace(study, model_error={})
     scores, weights = [], []
     for data in references.values():
         distances, published = distance_from_original(study, data.settings), data.metrics[SAFETY_DEGREE]
-        used = (distances > 0) & np.isfinite(published)
-        if used.any():
-            lower, upper = band_of(bare, evaluations_of_sets(bare, data.settings[used]))
-            scores.append(_outside(published[used], lower, upper) / distances[used])
+        is_usable = (distances > 0) & np.isfinite(published)
+        if is_usable.any():
+            lower, upper = band_of(study_without_error, evaluations_of_sets(study_without_error, data.settings[is_usable]))
+            scores.append(_outside(published[is_usable], lower, upper) / distances[is_usable])
             weights.append(np.full(len(scores[-1]), 1 / len(scores[-1])))
     if not scores:
         return 0.0
     all_scores = np.concatenate(scores)
-    share = min(1.0, BAND * (1 + 1 / len(all_scores)))  # the new row counts too
+    share = min(1.0, BAND * (1 + 1 / len(all_scores)))  # + 1 for the new row
     return float(np.quantile(all_scores, share, weights=np.concatenate(weights), method="inverted_cdf"))

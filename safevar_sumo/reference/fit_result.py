@@ -1,4 +1,4 @@
-"""The result of a fit, and its description for people and for the head of a study file."""
+"""The result of a fit, and its description, which becomes the comment at the head of a study file."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from safevar_sumo.reference.validation import Agreement
 from safevar_sumo.study import SAFETY_DEGREE, FitTable, FreeParameter, Study
 
 EDGE = 0.01
-"""A value nearer to a bound than this share of the bounds' width lies on its bound."""
+"""A value lies on a bound if its distance from the bound is at most this share of the bounds' width."""
 
 
 class Calibration(NamedTuple):
-    """Fitted values and bounds by parameter, the study with these values, their loss, and agreement with both parts of each reference.
+    """Fitted values and bounds by parameter, the study with these values, its loss, and its agreement with each reference.
 
-    `reached` is the lowest loss of each search; the last search starts at the studies' own values, except in a fit from scratch.
-    `together` names the studies that were fitted with this one, `shared` the parameters that it shares with one of them,
-    `search` is the table [fit] that set trials, seed and starts, `intervals` are the least and the greatest value of each
-    parameter that fit as well, `profiles` are the losses of the trials.
+    `used` is the agreement with the rows that the fit used, `held_back` with the other rows. `reached` holds the lowest loss of each
+    search; the last search starts at the values in the study files, except in a fit from scratch. `search` is the table [fit] that set
+    trials, seed and starts. `together` names the other studies of the fit, `shared` the parameters that this study shares with them.
+    `intervals` hold the least and greatest value of each parameter that fit as well as the best.
     """
 
     values: dict[str, float]
@@ -47,12 +47,12 @@ class Calibration(NamedTuple):
 
     @property
     def loss_line(self) -> str:
-        """The lowest loss, and the lowest loss of each search, if any."""
-        reached = ", ".join(f"{loss:.4f}" for loss in self.reached)
-        return f"Loss {self.loss:.4f}" + (f"; lowest loss of each search: {reached}" if reached else "")
+        """A sentence with the lowest loss, and with the lowest loss of each search."""
+        losses = ", ".join(f"{loss:.4f}" for loss in self.reached)
+        return f"Loss {self.loss:.4f}" + (f"; lowest loss of each search: {losses}" if losses else "")
 
     def comment(self, study: Study, references: Mapping[str, ReferenceData], *, from_scratch: bool) -> str:
-        """The fit in words: data with fingerprints, search, loss, agreement on both parts, shared parameters, values on a bound."""
+        """The fit in words: search, data with fingerprints, shared parameters, loss, agreement, and values on a bound."""
         fit = self.search
         start = "its own values" + (f" and {fit.starts} random places" if fit.starts else "")
         start = "random places only" if from_scratch else start
@@ -61,11 +61,11 @@ class Calibration(NamedTuple):
             for name in self.used]
         rows = f" and to all but every {_ordinal(study.fit.hold_out)} row of" if references else "."
         together = f" together with {' and '.join(map(repr, self.together))}" if self.together else ""
-        own = [name for name in self.values if name not in self.shared]
+        own_names = [name for name in self.values if name not in self.shared]
         return "\n".join([
             f"Study {study.name!r}, calibrated{together} by CMA-ES ({fit.trials} trials, seed {fit.seed}, from {start})",
             f"to the original vehicle's published values{rows}", *(_data_line(name, data) for name, data in references.items()),
-            *([f"Parameters of its own: {', '.join(own) or 'none'}; it shares the others."] if self.together else []),
+            *([f"Parameters of its own: {', '.join(own_names) or 'none'}; it shares the others."] if self.together else []),
             f"{self.loss_line}.", *parts,
             *(f"{name} lies on its bound." for name in self.on_a_bound)])
 
@@ -85,5 +85,5 @@ def _rho(result: Agreement) -> str:
 
 
 def fitted_as(study: Study, fitted: Study) -> Study:
-    """The fitted study under a name of its own, so that nobody takes it for the study that it was fitted from."""
+    """The fitted study under the name `STUDY-calibrated`, so that it cannot be mistaken for the study before the fit."""
     return msgspec.structs.replace(fitted, name=f"{study.name}-calibrated")

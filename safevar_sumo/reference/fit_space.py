@@ -1,4 +1,4 @@
-"""The space of the free parameters of studies that are fitted together, and the loss at every place in it."""
+"""The space of the free parameters of studies that are fitted together, and the loss at each place in the space."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ import numpy as np
 from safevar_sumo.analysis.parameters import value_of, with_values
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.reference.loss import MAX_LOSS, ReferenceLoss, original_loss
-from safevar_sumo.reference.parameters import Free
+from safevar_sumo.reference.parameters import FittedParameter
 from safevar_sumo.reference.rows import ReferenceData
-from safevar_sumo.reference.search import Together
+from safevar_sumo.reference.search import StudyGroup
 from safevar_sumo.study import Study
 from safevar_sumo.sumo import Engine, settings_per_batch
 from safevar_sumo.sumo.system import assemble
@@ -25,12 +25,12 @@ from safevar_sumo.workers.retrying import RetryingPool
 
 
 class FitSpace:
-    """Studies with the values of their free parameters at a place in the unit cube of the bounds, and their losses."""
+    """Maps places in the unit cube of the bounds to studies with the parameter values of the place, and to their losses."""
 
-    def __init__(self, free: Sequence[Free], fitted: Sequence[FittedStudy]) -> None:
-        self._free, self._fitted = free, fitted
-        self._lower, self._upper = np.array([(one.bounds.lower, one.bounds.upper) for one in free]).T
-        self._log = np.array([one.bounds.log for one in free])
+    def __init__(self, parameters: Sequence[FittedParameter], fits: Sequence[FittedStudy]) -> None:
+        self._parameters, self._fits = parameters, fits
+        self._lower, self._upper = np.array([(parameter.bounds.lower, parameter.bounds.upper) for parameter in parameters]).T
+        self._log = np.array([parameter.bounds.log for parameter in parameters])
         self._start, self._width = self._scaled(self._lower), self._scaled(self._upper) - self._scaled(self._lower)
 
     def _scaled(self, values: FloatArray) -> FloatArray:
@@ -41,21 +41,22 @@ class FitSpace:
         scaled = self._start + np.asarray(shares) * self._width
         return np.asarray(np.clip(np.exp(scaled, out=scaled.copy(), where=self._log), self._lower, self._upper))
 
-    def at(self, shares: FloatArray) -> Together:
+    def at(self, shares: FloatArray) -> StudyGroup:
         """The studies at a place in the unit cube of the bounds."""
         values = self.values(shares).tolist()
         return tuple(
-            with_values(one.study, {free.key: value for free, value in zip(self._free, values, strict=True) if k in free.studies})
-            for k, one in enumerate(self._fitted))
+            with_values(fit.study, {parameter.key: value for parameter, value in zip(self._parameters, values, strict=True)
+                                    if k in parameter.studies})
+            for k, fit in enumerate(self._fits))
 
-    def shares(self, studies: Together) -> FloatArray:
-        """Where studies lie in the unit cube of the bounds."""
-        values = np.array([value_of(studies[free.studies[0]], free.key) for free in self._free])
+    def shares(self, studies: StudyGroup) -> FloatArray:
+        """The place of studies in the unit cube of the bounds."""
+        values = np.array([value_of(studies[parameter.studies[0]], parameter.key) for parameter in self._parameters])
         return np.asarray(np.clip((self._scaled(values) - self._start) / self._width, 0, 1))
 
-    def losses(self, studies: Sequence[Together]) -> list[float]:
-        submitted = [[one.submit(study) for one, study in zip(self._fitted, together, strict=True)] for together in studies]
-        return [float(np.mean([one.loss(parts) for one, parts in zip(self._fitted, batches, strict=True)])) for batches in submitted]
+    def losses(self, studies: Sequence[StudyGroup]) -> list[float]:
+        futures = [[fit.submit(study) for fit, study in zip(self._fits, group, strict=True)] for group in studies]
+        return [float(np.mean([fit.loss(parts) for fit, parts in zip(self._fits, batches, strict=True)])) for batches in futures]
 
 
 class FittedStudy:
@@ -68,7 +69,7 @@ class FittedStudy:
         self._inputs, self._pool = inputs_of(study, pool), RetryingPool(pool, study)
         settings = [self._characteristics.original[np.newaxis], *(data.settings for data in references.values())]
         self._settings, self._row_of = np.unique(np.concatenate(settings), axis=0, return_inverse=True)
-        batches = max(1, round(len(self._settings) / settings_per_batch(assemble(study), Engine.RECORDED)))  # larger ones cost less
+        batches = max(1, round(len(self._settings) / settings_per_batch(assemble(study), Engine.RECORDED)))  # larger batches cost less
         self._size = math.ceil(len(self._settings) / batches)
 
     def submit(self, study: Study) -> list[Future[Evaluations]]:
@@ -76,10 +77,10 @@ class FittedStudy:
         return [self._pool.submit(work, self._settings[start:start + size]) for start in range(0, len(self._settings), size)]
 
     def loss(self, parts: Sequence[Future[Evaluations]]) -> float:
-        unique = Evaluations.concatenate([awaited(part) for part in parts])
-        if not unique.valid.all():
+        distinct_evaluations = Evaluations.concatenate([awaited(part) for part in parts])
+        if not distinct_evaluations.valid.all():
             return MAX_LOSS
-        evaluations = unique.take(self._row_of.ravel())
+        evaluations = distinct_evaluations.take(self._row_of.ravel())
         loss = original_loss(evaluations.take([0]), self.study.published, self.study.fit)
         row = 1
         for rows, reference_loss in self._references:

@@ -1,4 +1,4 @@
-"""The loss of a study: its disagreement with published data (see `FitTable`)."""
+"""The loss of a study: a number for its disagreement with published data. The table [fit] (`FitTable`) weights the parts."""
 
 from __future__ import annotations
 
@@ -15,33 +15,34 @@ from safevar_sumo.study import SAFETY_DEGREE, FitTable, Study
 from safevar_sumo.vehicles import CharacteristicSet
 
 MAX_LOSS = 1e5
-"""Largest loss of a reference; also the loss of a study that cannot be simulated."""
+"""Largest loss of a study in one reference. A study that cannot be simulated has this loss too."""
 MAX_DEVIATION = 10.0
-"""Largest deviation of the original vehicle's values [tolerances]; also that of an undefined value."""
+"""Largest deviation of a value of the original vehicle, as a multiple of the tolerance. An undefined value has this deviation too."""
 
 
 def original_loss(original: Evaluations, published: Mapping[str, float], fit: FitTable) -> float:
-    """Mean deviation of the original vehicle's values from the published ones beyond the tolerance, weighted by metric.
+    """Mean excess of the original vehicle's deviations from the published values over the tolerance, weighted by metric.
 
-    Deviations within the tolerance cost nothing (Vapnik 1995): this is one vehicle, simulated once, and the rows of similar vehicles
-    tell more about it.
+    Deviations within the tolerance cost nothing (Vapnik 1995): the published values come from a single simulation of the original
+    vehicle, and the many rows of similar vehicles are stronger evidence.
     """
-    deviations = [fit.weights.get(name, 0.0) * _beyond(original.metrics[name][0] / value - 1, fit.tolerance)
+    deviations = [fit.weights.get(name, 0.0) * _excess(original.metrics[name][0] / value - 1, fit.tolerance)
                   for name, value in published.items() if name in METRICS]
     return fit.original * float(np.mean(deviations)) if deviations else 0.0
 
 
-def _beyond(deviation: float, tolerance: float) -> float:
-    """How far a relative deviation lies beyond the tolerance [half tolerances]."""
-    in_tolerances = min(abs(deviation) / tolerance, MAX_DEVIATION) if np.isfinite(deviation) else MAX_DEVIATION
-    return 2 * max(in_tolerances - 1, 0.0)
+def _excess(deviation: float, tolerance: float) -> float:
+    """Excess of a relative deviation over the tolerance, in units of half a tolerance; 0 within the tolerance."""
+    tolerances = min(abs(deviation) / tolerance, MAX_DEVIATION) if np.isfinite(deviation) else MAX_DEVIATION
+    return 2 * max(tolerances - 1, 0.0)
 
 
 class ReferenceLoss:
-    """The loss of a study beside one reference: missing rank correlation and absolute errors, weighted by metric, differing effects, and
-    differing collisions.
+    """The loss of a study in comparison with one reference.
 
-    Errors are in standard deviations of repeats of one setting in the reference, or, if unknown, of the reference's values.
+    The loss adds four parts: 1 minus the rank correlation and the mean absolute error, both weighted by metric; differences between
+    the effects of characteristics; and the share of rows that collide on one side only. The unit of errors is the standard deviation of
+    repeats of one setting in the reference or, if the study does not give it, of all values in the reference.
     """
 
     def __init__(self, data: ReferenceData, study: Study) -> None:
@@ -53,15 +54,16 @@ class ReferenceLoss:
         self._regression = Regression.over(data.settings, CharacteristicSet.of(study.vehicle.characteristics))
         self._effects = self._regression.effects(data.metrics[SAFETY_DEGREE])
 
-    def of(self, here: Evaluations) -> float:
-        """The loss of evaluations of the reference's settings."""
-        fit, loss, result = self._study.fit, 0.0, agreement(self._data, here, self._study, here)
+    def of(self, evaluations: Evaluations) -> float:
+        """The loss, from evaluations of the settings of the reference."""
+        fit, loss = self._study.fit, 0.0
+        result = agreement(self._data, evaluations, self._study, original=evaluations)  # no result of the original is read below
         for name, unit in self._units.items():
             rho, error = result.spearman[name], result.mean_absolute_error[name]
             loss += fit.weights[name] * (fit.rank * (1 - (rho or 0.0)) + (np.inf if error is None else error) / unit)
             if name == SAFETY_DEGREE and fit.effects:
-                differences = np.nan_to_num(self._regression.effects(here.f_safe) - self._effects)
+                differences = np.nan_to_num(self._regression.effects(evaluations.f_safe) - self._effects)
                 loss += fit.effects * float(np.mean(np.abs(differences))) / unit
         collisions = result.collisions
-        differing = collisions["reference"] + collisions["here"] - 2 * collisions["both"]
-        return min(loss, MAX_LOSS) + fit.collisions * differing / max(result.rows, 1)
+        difference = collisions["reference"] + collisions["here"] - 2 * collisions["both"]
+        return min(loss, MAX_LOSS) + fit.collisions * difference / max(result.rows, 1)

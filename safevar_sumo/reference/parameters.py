@@ -1,4 +1,4 @@
-"""Free parameters of studies that are fitted together: a study's own, or shared by several."""
+"""Free parameters of studies that are fitted together. One study has a parameter alone, or several studies share it."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from safevar_sumo.study import FreeParameter, Study
 from safevar_sumo.sumo.system import models_of
 
 
-class Free(NamedTuple):
+class FittedParameter(NamedTuple):
     """A free parameter: its key, the indices of the studies that take its value, and its bounds."""
 
     key: str
@@ -19,40 +19,40 @@ class Free(NamedTuple):
     bounds: FreeParameter
 
     def label(self, studies: Sequence[Study]) -> str:
-        """The key; after the names of its studies if not all of them share it."""
+        """The key; if not all studies share the parameter, `STUDY, STUDY: KEY` with the names of those that do."""
         return self.key if len(self.studies) == len(studies) else f"{', '.join(studies[k].name for k in self.studies)}: {self.key}"
 
 
-def free_parameters(studies: Sequence[Study]) -> list[Free]:
+def free_parameters(studies: Sequence[Study]) -> list[FittedParameter]:
     """The free parameters of studies that are fitted together.
 
-    All studies that give a parameter the same value share it, except a study whose table marks it as `own`. A study that gives it
-    another value, or none, does not take part.
+    Studies that give a parameter the same value share the parameter, except studies whose table [calibration] marks it as `own`.
+    A study with another value, or without the parameter, does not take part.
 
     Raises
     ------
     InputError
-        If a declared parameter cannot be fitted, or its value is outside its bounds.
+        If a parameter of a table [calibration] cannot be fitted, or its value lies outside its bounds.
     """
-    free: list[Free] = []
+    parameters: list[FittedParameter] = []
     for index, study in enumerate(studies):
         for key, bounds in study.calibration.items():
-            if any(key == one.key and index in one.studies for one in free):
+            if any(key == parameter.key and index in parameter.studies for parameter in parameters):
                 continue
             value = value_of(study, key)
             if not bounds.lower <= value <= bounds.upper:
                 legal = f"a value in its bounds, [{bounds.lower:g}, {bounds.upper:g}]"
                 raise InputError(study.source, f"{key} = {value}", legal)
             check_bounds(study, key, bounds)
-            others = () if bounds.own else (k for k, other in enumerate(studies) if k > index and _shares(other, key, value))
-            free.append(Free(key, (index, *others), bounds))
-    return free
+            sharers = (k for k, sharer in enumerate(studies) if k > index and not bounds.own and _is_shared_by(sharer, key, value))
+            parameters.append(FittedParameter(key, (index, *sharers), bounds))
+    return parameters
 
 
-def _shares(study: Study, key: str, value: float) -> bool:
-    """Whether a study shares a parameter to which another study gives `value`."""
-    declared = study.calibration.get(key)
-    if declared is not None and declared.own:
+def _is_shared_by(study: Study, key: str, value: float) -> bool:
+    """Whether a study shares a parameter that has `value` in another study."""
+    declaration = study.calibration.get(key)
+    if declaration is not None and declaration.own:
         return False
     try:
         return value_of(study, key) == value
@@ -61,7 +61,7 @@ def _shares(study: Study, key: str, value: float) -> bool:
 
 
 def check_bounds(study: Study, name: str, bounds: FreeParameter) -> None:
-    """Refuse bounds that the models do not accept: a search goes that far."""
+    """Refuse bounds whose ends the models do not accept: the search may try both ends."""
     if bounds.log and bounds.lower <= 0:
         raise InputError(study.source, f"calibration.{name!r} has log = true and lower = {bounds.lower:g}",
                          "a lower bound above 0")

@@ -1,4 +1,4 @@
-"""Uncertainty of fitted parameters: profiles of the loss over a search's trials, and sets of values that fit as well as the best."""
+"""Uncertainty of fitted parameters: the losses of trials by parameter, and sets of values that fit as well as the best."""
 
 from __future__ import annotations
 
@@ -10,75 +10,75 @@ import numpy as np
 
 from safevar_sumo.analysis.figures import save
 from safevar_sumo.records import FloatArray
-from safevar_sumo.reference.parameters import Free
+from safevar_sumo.reference.parameters import FittedParameter
 from safevar_sumo.reference.search import TrialSearch
 from safevar_sumo.study import Study
 
 SETS = 20
-"""Maximum number of sets of values in a spread, including the best."""
+"""Maximum number of parameter sets in a table [spread], including the best set."""
 DIGITS = 6
-"""Significant digits of a spread's values."""
+"""Significant digits of values in a table [spread]."""
 
 
 class ParameterSpace(Protocol):
-    """Maps shares of the bounds, each in [0, 1], to values."""
+    """Maps places in the unit cube of the parameters' bounds to values."""
 
     def values(self, shares: FloatArray) -> FloatArray: ...
 
 
 class Profiles(NamedTuple):
-    """Trials of a fit.
+    """Trials of a fit whose loss is near the lowest loss.
 
     Attributes
     ----------
-    free
-        The parameters.
+    parameters
+        The fitted parameters.
     losses, values
-        Losses of the trials near the lowest loss, shape (K,), and their values, shape (K, parameters); the best first.
+        Losses of the K trials, shape (K,), and their parameter values, shape (K, parameters). The best trial comes first.
     sets
-        Rows of up to `SETS` trials that fit as well as the best and are as far apart as possible; the best first.
+        Indices of up to `SETS` trials that fit as well as the best and lie as far apart as possible. The best trial comes first.
     limit
         The loss up to which a trial fits as well as the best.
     """
 
-    free: Sequence[Free]
+    parameters: Sequence[FittedParameter]
     losses: FloatArray
     values: FloatArray
     sets: list[int]
     limit: float
 
     @classmethod
-    def of(cls, free: Sequence[Free], bounds: ParameterSpace, search: TrialSearch, best: FloatArray) -> Profiles:
-        """The profiles of a finished search, whose best trial lies at `best`."""
+    def of(cls, parameters: Sequence[FittedParameter], bounds: ParameterSpace, search: TrialSearch, best: FloatArray) -> Profiles:
+        """The profiles of a finished search with its best trial at the place `best`."""
         limit = search.loss * (1 + search.alike)
-        near = sorted((one for one in search.kept if search.loss < one[0]), key=lambda one: one[0])
-        losses = np.array([search.loss, *(loss for loss, _ in near)])
-        shares = np.array([best, *(share for _, share in near)])
-        return cls(free, losses, bounds.values(shares), _apart(shares[losses <= limit]), limit)
+        trials = sorted((trial for trial in search.kept if search.loss < trial[0]), key=lambda trial: trial[0])
+        losses = np.array([search.loss, *(loss for loss, _ in trials)])
+        shares = np.array([best, *(share for _, share in trials)])
+        return cls(parameters, losses, bounds.values(shares), _distant_rows(shares[losses <= limit]), limit)
 
     def spread(self, study: int) -> dict[str, list[float]]:
-        """The sets that fit as well as the best, in the form of a study's table [spread]."""
-        return {free.key: [float(f"{value:.{DIGITS}g}") for value in self.values[self.sets, k]]
-                for k, free in enumerate(self.free) if study in free.studies}
+        """Values of each parameter of the study with this index, one for each of the `sets`: the table [spread]."""
+        return {parameter.key: [float(f"{value:.{DIGITS}g}") for value in self.values[self.sets, k]]
+                for k, parameter in enumerate(self.parameters) if study in parameter.studies}
 
     def interval(self, k: int) -> tuple[float, float]:
-        """Least and greatest value of a parameter among all trials that fit as well as the best."""
+        """Least and greatest value of parameter k in the trials that fit as well as the best."""
         values = self.values[self.losses <= self.limit, k]
         return float(values.min()), float(values.max())
 
 
-def _apart(shares: FloatArray) -> list[int]:
-    """Rows that are as far apart as possible, beginning with the first (farthest-point sampling)."""
-    chosen = [0]
-    nearest = np.linalg.norm(shares - shares[0], axis=1)
-    while len(chosen) < min(SETS, len(shares)) and nearest.max() > 0:
-        chosen.append(int(np.argmax(nearest)))
-        nearest = np.minimum(nearest, np.linalg.norm(shares - shares[chosen[-1]], axis=1))
-    return chosen
+def _distant_rows(shares: FloatArray) -> list[int]:
+    """Indices of trials that lie as far apart as possible, from the first trial on (farthest-point sampling)."""
+    rows = [0]
+    distances = np.linalg.norm(shares - shares[0], axis=1)
+    while len(rows) < min(SETS, len(shares)) and distances.max() > 0:
+        rows.append(int(np.argmax(distances)))
+        distances = np.minimum(distances, np.linalg.norm(shares - shares[rows[-1]], axis=1))
+    return rows
 
 
 def plot_profiles(path: Path, profiles: Profiles, studies: Sequence[Study]) -> None:
-    """Draw the loss against every parameter: each trial a dot, those that fit as well as the best in colour, the interval a band.
+    """Draw the loss over each parameter: a dot for each trial, in colour if it fits as well as the best, and a band for the interval.
 
     Raises
     ------
@@ -92,21 +92,21 @@ def plot_profiles(path: Path, profiles: Profiles, studies: Sequence[Study]) -> N
     import seaborn as sns
 
     columns = 4
-    rows = -(-len(profiles.free) // columns)
+    rows = -(-len(profiles.parameters) // columns)
     with sns.axes_style("whitegrid"), plt.rc_context({"font.size": 9}):
         figure, axes = plt.subplots(rows, columns, figsize=(11, 1.7 * rows + 0.6), layout="constrained", squeeze=False, sharey=True)
-        fits = profiles.losses <= profiles.limit
+        is_as_good = profiles.losses <= profiles.limit
         for k, axis in enumerate(axes.flat):
-            if k >= len(profiles.free):
+            if k >= len(profiles.parameters):
                 axis.set_axis_off()
                 continue
-            free, values = profiles.free[k], profiles.values[:, k]
+            parameter, values = profiles.parameters[k], profiles.values[:, k]
             axis.axvspan(*profiles.interval(k), color="#0072b2", alpha=0.12, linewidth=0)
-            axis.scatter(values[~fits], profiles.losses[~fits], s=3, alpha=0.25, color="#808080", linewidths=0)
-            axis.scatter(values[fits], profiles.losses[fits], s=5, alpha=0.6, color="#0072b2", linewidths=0)
+            axis.scatter(values[~is_as_good], profiles.losses[~is_as_good], s=3, alpha=0.25, color="#808080", linewidths=0)
+            axis.scatter(values[is_as_good], profiles.losses[is_as_good], s=5, alpha=0.6, color="#0072b2", linewidths=0)
             axis.axvline(values[0], color="black", linewidth=0.8, linestyle="--")
-            key = free.label(studies).replace("vehicle.parameters.", "").replace("ads.parameters.", "")
-            axis.set_xlabel(key + ("" if free.bounds.unit == "-" else f" [{free.bounds.unit}]"))
+            key = parameter.label(studies).replace("vehicle.parameters.", "").replace("ads.parameters.", "")
+            axis.set_xlabel(key + ("" if parameter.bounds.unit == "-" else f" [{parameter.bounds.unit}]"))
             if k % columns == 0:
                 axis.set_ylabel("loss")
         figure.suptitle(f"Loss of {' and '.join(study.name for study in studies)} over each parameter; band: fits as well as the best")

@@ -30,14 +30,15 @@ from safevar_sumo.reference.rows import ReferenceData
 from safevar_sumo.study import SAFETY_DEGREE
 
 NEIGHBOURS = 5
+"""Number of published rows that a solution is compared with."""
 
 
 class Nearness(NamedTuple):
-    """Solutions of one algorithm and the published rows nearest to each.
+    """The solutions of one algorithm, compared with the five published rows nearest to each solution.
 
-    Distances are Euclidean in widths of the domains, medians over the five nearest: `distance` from solutions to
-    published rows, `distance_published` between published rows. Safety degrees are means [m, -m/s]; `also_collide` is the share
-    of collisions among the rows nearest to solutions that collide.
+    Distances are Euclidean in widths of the domains, and medians: `distance` from solutions to published rows, `distance_published`
+    between published rows. Safety degrees are means [m, -m/s]. `also_collide` is the share of collisions among the published rows
+    nearest to colliding solutions.
     """
 
     setting: str
@@ -52,26 +53,26 @@ class Nearness(NamedTuple):
 
 
 def nearness(case: Case, references: Sequence[ReferenceData]) -> list[Nearness]:
-    """Compare each algorithm's solutions with the nearest rows of the references, which must have the study's vehicle."""
+    """Compare the solutions of each algorithm with the nearest rows of the references, which must be data of the same vehicle."""
     domains = case.characteristics
     width = domains.upper - domains.lower
-    rows = np.concatenate([data.settings for data in references]) / width
+    scaled_rows = np.concatenate([data.settings for data in references]) / width
     safety = np.concatenate([data.metrics[SAFETY_DEGREE] for data in references])
-    tree, number = scipy.spatial.cKDTree(rows), min(NEIGHBOURS, len(rows))
-    published_distances = tree.query(rows, number + 1)[0][:, 1:] if len(rows) > number else np.full((1, 1), np.nan)
-    near = []
+    tree, number = scipy.spatial.cKDTree(scaled_rows), min(NEIGHBOURS, len(scaled_rows))
+    published_distances = tree.query(scaled_rows, number + 1)[0][:, 1:] if len(scaled_rows) > number else np.full((1, 1), np.nan)
+    results = []
     for algorithm in case.algorithms:
         solutions = case.solutions_of(algorithm)
         if solutions.empty:
             continue
-        places: FloatArray = solutions[list(domains.names)].to_numpy(dtype=float) / width
-        distance, nearest = (np.reshape(part, (len(places), number)) for part in tree.query(places, number))
-        hit = collided(solutions).to_numpy()
-        near.append(Nearness(
+        scaled_solutions: FloatArray = solutions[list(domains.names)].to_numpy(dtype=float) / width
+        distance, nearest = (np.reshape(part, (len(scaled_solutions), number)) for part in tree.query(scaled_solutions, number))
+        is_collision = collided(solutions).to_numpy()
+        results.append(Nearness(
             case.name, algorithm, len(solutions), float(np.median(distance)), float(np.median(published_distances)),
-            float(np.nanmean(solutions[SAFETY_DEGREE])), float(safety[nearest].mean()), int(hit.sum()),
-            float((safety[nearest[hit]] <= 0).mean()) if hit.any() else None))
-    return near
+            float(np.nanmean(solutions[SAFETY_DEGREE])), float(safety[nearest].mean()), int(is_collision.sum()),
+            float((safety[nearest[is_collision]] <= 0).mean()) if is_collision.any() else None))
+    return results
 
 
 COUNTED = {HOLDS: "hold", DIRECTION: "hold in direction", DIFFERS: "differ", OPEN: "cannot be decided"}
@@ -84,30 +85,30 @@ TITLES = {
 
 
 
-def replication(pairs: Pairs, near: Sequence[Nearness]) -> str:
+def replication(pairs: Pairs, comparisons: Sequence[Nearness]) -> str:
     """The page, as Markdown."""
     tables = compared_tables(pairs)
     verdicts = conclusions(tables)
     parts = [_head(pairs, verdicts), _conclusions(verdicts)]
-    if near:
-        parts.append(_nearest_rows(near))
+    if comparisons:
+        parts.append(_nearest_rows(comparisons))
     return "\n".join([*parts, "## Cell beside cell\n", *(_side_by_side(table) for table in tables)])
 
 
 def _head(pairs: Pairs, verdicts: Sequence[Conclusion]) -> str:
-    counts = Counter(one.verdict for one in verdicts)
+    counts = Counter(conclusion.verdict for conclusion in verdicts)
     summary = ", ".join(f"{counts[verdict]} {words}" for verdict, words in COUNTED.items())
     lines = ["# Does the published study replicate?", "", f"Of {len(verdicts)} conclusions: {summary}.", ""]
-    for here, published in zip(pairs.here, pairs.published, strict=True):
-        sizes = f"{_solutions(here.solutions)} here, {_solutions(published.solutions)} published"
-        lines.append(f"- {here.study.title} ({here.study.name}): {sizes}.")
+    for case, published_case in zip(pairs.here, pairs.published, strict=True):
+        sizes = f"{_solutions(case.solutions)} here, {_solutions(published_case.solutions)} published"
+        lines.append(f"- {case.study.title} ({case.study.name}): {sizes}.")
     lines += [f"- {name}: results here, none published given." for name in pairs.only_here]
     lines += [f"- {name}: published results given, none here." for name in pairs.only_published]
-    for here, published in zip(pairs.here, pairs.published, strict=True):
-        for side, present, absent in ((PUBLISHED, here, published), (HERE, published, here)):
-            for name in [name for name in present.algorithms if name not in absent.algorithms]:
+    for case, published_case in zip(pairs.here, pairs.published, strict=True):
+        for side, full_case, other_case in ((PUBLISHED, case, published_case), (HERE, published_case, case)):
+            for name in [name for name in full_case.algorithms if name not in other_case.algorithms]:
                 effect = "; RQ2, RQ3 and the weathers need them and are not compared" if name == NSGA2 else ""
-                lines.append(f"- {here.study.name}: no solutions of {name} {side}{effect}.")
+                lines.append(f"- {case.study.name}: no solutions of {name} {side}{effect}.")
     lines += [f"- {note}" for case in pairs.here for note in case.remarks]
     return "\n".join([*lines, ""])
 
@@ -117,15 +118,14 @@ def _solutions(frame: pd.DataFrame) -> str:
 
 
 def _conclusions(verdicts: Sequence[Conclusion]) -> str:
-    rows = [(one.question, one.setting, one.words, f"*{one.verdict}*", one.why) for one in verdicts]
+    rows = [(question, setting, words, f"*{verdict}*", why) for question, setting, words, verdict, why in verdicts]
     return "\n".join(["## Conclusions", "", "Conclusions of the published results, and whether they hold here. The rules:", "",
                       *(f"- {rule}" for rule in RULES), "",
                       _markdown(("question", "setting", "published conclusion", "here", "why"), rows), ""])
 
 
-def _nearest_rows(near: Sequence[Nearness]) -> str:
-    rows = [(one.setting, one.algorithm, one.solutions, one.distance, one.distance_published, one.safety_here, one.safety_published,
-             one.collisions, None if one.also_collide is None else 100 * one.also_collide) for one in near]
+def _nearest_rows(comparisons: Sequence[Nearness]) -> str:
+    rows = [(*values, None if also_collide is None else 100 * also_collide) for *values, also_collide in comparisons]
     heads = ("setting", "algorithm", "solutions", "distance to published rows", "distance among published rows", "mean SD here",
              "mean SD published", "collisions here", "published rows next to them that collide [%]")
     return "\n".join([

@@ -1,6 +1,6 @@
-"""The published package's CSV format: settings before the filter, with the reference simulators' measurements.
+"""The CSV format of the published package: settings before the filter, with measurements in the reference simulators.
 
-One row is one solution: the characteristics, then `MaxPercentage`, `SaftyDegree` (sic), `numbers`, `TIT`, `TET` and,
+A row holds one solution: the characteristics, then `MaxPercentage`, `SaftyDegree` (sic), `numbers`, `TIT`, `TET` and,
 in most files, `Dece`. There is no run column.
 """
 
@@ -27,12 +27,12 @@ from safevar_sumo.vehicles import CharacteristicSet
 
 COLUMNS = {SAFETY_DEGREE: "SaftyDegree", "tet": "TET", "tit": "TIT", "ave_dece": "Dece"}
 RANGES = {SAFETY_DEGREE: (-300.0, 1e4), "tet": (0.0, 1e4), "tit": (0.0, 1e5), "ave_dece": (-300.0, 300.0)}
-"""Values beyond those of any road vehicle: m or -m/s, s, s^2, m/s^2 of either sign."""
-OPTIONAL = "ave_dece"
+"""Accepted values, wider than those of any road vehicle: m or -m/s; s; s^2; m/s^2 of either sign."""
+OPTIONAL_METRIC = "ave_dece"
 ALIASES = {"dampratezeroce": "dampratezerotce", "dampratezerocd": "dampratezerotcd", "wheelradius": "radius"}
-"""Characteristics whose names in the package's files differ from its paper's; in lower case, without underscores."""
+"""Names of characteristics in the files of the package -> names in its paper; in lower case, without underscores."""
 SHARE_DECIMALS = 3
-"""Decimals to which the package rounds a change's share of the domain before comparing the share with beta."""
+"""Decimals to which the package rounds the ratio of change to domain width before it compares the ratio with beta."""
 
 
 class ReferenceData(NamedTuple):
@@ -41,11 +41,11 @@ class ReferenceData(NamedTuple):
     Attributes
     ----------
     settings
-        Filtered as the package does; shape (M, n), table units.
+        M settings of n characteristics after the filter of the package; shape (M, n), units of the study's table.
     metrics
-        Name -> values, shape (M,); NaN where undefined: TET and TIT of a collision, a column that is missing.
+        Name -> values, shape (M,). TET and TIT of a collision are NaN, and so are metrics without a column.
     skipped
-        Number of rows left out because a value was outside its domain.
+        Number of rows left out because a value lies outside its domain.
     fingerprint
         SHA-256 of the file's bytes.
     """
@@ -60,7 +60,7 @@ class ReferenceData(NamedTuple):
         return np.asarray(self.metrics[SAFETY_DEGREE] <= 0)
 
     def take(self, rows: BoolArray) -> ReferenceData:
-        """The data of some rows."""
+        """The data in the rows of a mask."""
         return self._replace(settings=self.settings[rows], metrics={name: values[rows] for name, values in self.metrics.items()})
 
 
@@ -70,39 +70,39 @@ def read_reference(path: Path, characteristics: CharacteristicSet) -> ReferenceD
     Raises
     ------
     InputError
-        If the file cannot be read, lacks a column or a row, or has a cell that is no number or out of range; names file, row and column.
+        With file, row and column, if the file cannot be read, lacks a column or rows, or has a cell without a number in range.
     """
     content = _content(path)
     table = _table(path, content)
     columns = _characteristic_columns(path, table, characteristics)
-    required = [*columns, *(column for name, column in COLUMNS.items() if name != OPTIONAL or column in table)]
-    missing = [column for column in required if column not in table]
-    if missing:
-        raise InputError(path, f"lacks the columns {', '.join(missing)}", "the format of the published package")
+    required = [*columns, *(column for name, column in COLUMNS.items() if name != OPTIONAL_METRIC or column in table)]
+    missing_columns = [column for column in required if column not in table]
+    if missing_columns:
+        raise InputError(path, f"lacks the columns {', '.join(missing_columns)}", "the format of the published package")
     ranges = {column: RANGES[name] for name, column in COLUMNS.items()}
     numbers = {column: _numbers(path, table, column, *ranges.get(column, ())) for column in required}
     settings = np.stack([numbers[column] for column in columns], axis=1)
-    inside = np.all((settings >= characteristics.lower) & (settings <= characteristics.upper), axis=1)
-    if not inside.any():
+    is_in_domain = np.all((settings >= characteristics.lower) & (settings <= characteristics.upper), axis=1)
+    if not is_in_domain.any():
         raise InputError(path, "has no row whose values are all in the domains of the study", "a file of this study's vehicle")
-    undefined = np.full(len(table), np.nan)
-    metrics = {name: numbers.get(column, undefined)[inside] for name, column in COLUMNS.items()}
-    collided = metrics[SAFETY_DEGREE] <= 0
+    no_values = np.full(len(table), np.nan)
+    metrics = {name: numbers.get(column, no_values)[is_in_domain] for name, column in COLUMNS.items()}
+    is_collision = metrics[SAFETY_DEGREE] <= 0
     metrics["ave_dece"] = np.abs(metrics["ave_dece"])
-    metrics["tet"], metrics["tit"] = (np.where(collided, np.nan, metrics[name]) for name in ("tet", "tit"))
-    return ReferenceData(package_filter(characteristics, settings[inside]), metrics, int(np.count_nonzero(~inside)),
+    metrics["tet"], metrics["tit"] = (np.where(is_collision, np.nan, metrics[name]) for name in ("tet", "tit"))
+    return ReferenceData(package_filter(characteristics, settings[is_in_domain]), metrics, int(np.count_nonzero(~is_in_domain)),
                          sha256(content).hexdigest())
 
 
 def package_filter(characteristics: CharacteristicSet, settings: FloatArray) -> FloatArray:
-    """The package's filter: it keeps a change whose share of the domain, rounded to three decimals, is at least beta."""
+    """The filter of the package, which keeps a change if its share of the domain, rounded to three decimals, is at least beta."""
     width = characteristics.upper - characteristics.lower
     share = np.round(np.abs(settings - characteristics.original) / width, SHARE_DECIMALS)
     return np.where(share >= characteristics.threshold / width - 1e-12, settings, characteristics.original)
 
 
 def _content(path: Path) -> bytes:
-    """A file's bytes, read once, for a pipe cannot be read again."""
+    """The bytes of a file, which is read once: a pipe cannot be read again."""
     try:
         refuse_other_than_file(path, streams=True)
         with open(path, "rb") as file:
@@ -112,7 +112,7 @@ def _content(path: Path) -> bytes:
 
 
 def _table(path: Path, content: bytes) -> pd.DataFrame:
-    """The file's rows as text, without empty lines; the index is the line number minus two."""
+    """The rows of a file as text, without empty lines. The index is the line number minus two."""
     try:
         text = content.decode("utf-8-sig")
         header = [name.strip() for name in next(csv.reader(io.StringIO(text, newline="")), [])]
@@ -138,41 +138,42 @@ def _table(path: Path, content: bytes) -> pd.DataFrame:
     return table
 
 
-def _plain(name: str) -> str:
+def _plain_name(name: str) -> str:
     key = name.strip().replace("_", "").lower()
     return ALIASES.get(key, key)
 
 
 def _characteristic_columns(path: Path, table: pd.DataFrame, characteristics: CharacteristicSet) -> list[str]:
-    """The file's columns of the characteristics, in the study's order."""
+    """The columns of the characteristics, in the order of the study."""
     by_plain_name: dict[str, str] = {}
     for column in map(str, table.columns):
-        if _plain(column) in by_plain_name:
-            raise InputError(path, f"has two columns of one name, {by_plain_name[_plain(column)]!r} and {column!r}", "each column once")
-        by_plain_name[_plain(column)] = column
-    missing = [name for name in characteristics.names if _plain(name) not in by_plain_name]
-    if missing:
-        raise InputError(path, f"lacks the columns {', '.join(missing)}", f"all of {', '.join(characteristics.names)}")
-    return [by_plain_name[_plain(name)] for name in characteristics.names]
+        name = _plain_name(column)
+        if name in by_plain_name:
+            raise InputError(path, f"has two columns of one name, {by_plain_name[name]!r} and {column!r}", "each column once")
+        by_plain_name[name] = column
+    missing_names = [name for name in characteristics.names if _plain_name(name) not in by_plain_name]
+    if missing_names:
+        raise InputError(path, f"lacks the columns {', '.join(missing_names)}", f"all of {', '.join(characteristics.names)}")
+    return [by_plain_name[_plain_name(name)] for name in characteristics.names]
 
 
 def _numbers(path: Path, table: pd.DataFrame, column: str, lowest: float = -np.inf, highest: float = np.inf) -> FloatArray:
     values = pd.to_numeric(table[column], errors="coerce").to_numpy(dtype=float)
-    invalid = np.flatnonzero(~(np.isfinite(values) & (values >= lowest) & (values <= highest)))
-    if invalid.size:
-        cell = table[column].iloc[invalid[0]]
-        problem = f"row {table.index[invalid[0]] + 2}, column {column} " + (f"= {cell!r}" if cell.strip() else "is empty")
+    invalid_rows = np.flatnonzero(~(np.isfinite(values) & (values >= lowest) & (values <= highest)))
+    if invalid_rows.size:
+        cell = table[column].iloc[invalid_rows[0]]
+        problem = f"row {table.index[invalid_rows[0]] + 2}, column {column} " + (f"= {cell!r}" if cell.strip() else "is empty")
         raise InputError(path, problem, "a finite number" if lowest == -np.inf else f"a number in [{lowest:g}, {highest:g}]")
     return np.asarray(values)
 
 
-SHORT = {short: metric.name for metric in METRICS.values() for short in (metric.name, metric.title.lower())}
-"""Metrics by the names that a command accepts."""
+METRIC_NAMES = {short: metric.name for metric in METRICS.values() for short in (metric.name, metric.title.lower())}
+"""Names of metrics by each name that a command accepts."""
 ORIGINAL_FORM = "sd=NUMBER,tet=NUMBER,tit=NUMBER,ave_dece=NUMBER"
 
 
 def evaluations_of(data: ReferenceData, characteristics: CharacteristicSet) -> Evaluations:
-    """Reference rows as evaluations; f_diff and f_numDiff are those of the filtered settings (method section 3)."""
+    """Reference rows as evaluations, with f_diff and f_numDiff of the filtered settings (method section 3)."""
     return Evaluations(
         settings=data.settings, outcome=np.where(data.collided, str(Outcome.COLLISION), UNKNOWN),
         collision_speed=np.where(data.collided, -data.metrics[SAFETY_DEGREE], np.nan), metrics=data.metrics,
@@ -180,12 +181,12 @@ def evaluations_of(data: ReferenceData, characteristics: CharacteristicSet) -> E
 
 
 def original_metrics(text: str | None, published: Mapping[str, float]) -> dict[str, float | None]:
-    """The original vehicle's metrics, as given (sd=2.7,tet=1.2,...) or else as published; None where neither has a value.
+    """Metrics of the original vehicle: those in `text` (sd=2.7,tet=1.2,...), else the published ones; None without a value.
 
     Raises
     ------
     InputError
-        If `text` has another form, or neither has a safety degree.
+        If `text` has another form, or there is no safety degree.
     """
     original: dict[str, float | None] = {name: published.get(name) for name in METRICS}
     for part in text.split(",") if text is not None else ():
@@ -194,10 +195,10 @@ def original_metrics(text: str | None, published: Mapping[str, float]) -> dict[s
             value = float(number)
         except ValueError:
             value = np.nan
-        lowest, highest = RANGES.get(SHORT.get(name, ""), (np.inf, -np.inf))
+        lowest, highest = RANGES.get(METRIC_NAMES.get(name, ""), (np.inf, -np.inf))
         if not lowest <= value <= highest:
             raise InputError("original", f"{part!r} in {text!r}", f"{ORIGINAL_FORM}, each in the metric's range")
-        original[SHORT[name]] = value
+        original[METRIC_NAMES[name]] = value
     if original[SAFETY_DEGREE] is None:
         raise InputError("original", "the study has no published values of the original vehicle", ORIGINAL_FORM)
     return original

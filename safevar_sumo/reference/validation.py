@@ -26,37 +26,37 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 BINS = 8
-"""Number of bins, with equally many rows, of a characteristic's values in the figure."""
-FLIP = 2.0
-"""An outcome is undecided if its safety degree is at most this many standard deviations (of repeats) from 0, the collision."""
+"""Number of bins of values in the figure; each bin holds about as many rows."""
+SCATTER_WIDTH = 2.0
+"""An outcome is undecided if its safety degree is at most this number of standard deviations of repeats away from 0, the collision."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Agreement:
-    """Comparison of simulated with reference values; None where there is nothing to compare.
+    """Comparison of simulated values with reference values; None if there are no values to compare.
 
     Attributes
     ----------
     rows
         Number of settings.
     spearman, mean_absolute_error, bias
-        By metric: rank correlation; mean |here - reference| and mean here - reference in the metric's unit.
-        TET and TIT over settings without collision on either side.
+        By metric: rank correlation; mean |here - reference|; mean here - reference, both in the unit of the metric.
+        TET and TIT are compared over settings without a collision on either side.
     collisions
-        Number of collisions in the reference, here, and in both.
+        Number of settings that collide in the reference, here, and in both.
     original
-        By metric: the original vehicle's value in the reference and here.
+        By metric: the value of the original vehicle in the reference and here.
     precision, recall
-        Share of the collisions here that the reference has too, and of the reference's collisions that happen here too.
+        Share of the collisions here that the reference has too; share of the reference collisions that happen here too.
     collision_speed
-        Mean over the collisions of both sides, in the reference and here [m/s].
+        Mean over the settings that collide on both sides, in the reference and here [m/s].
     in_repeats
         By metric: mean absolute error divided by the standard deviation of repeats of one setting in the reference.
     undecided
-        Number of settings that collide only in the reference or only here, and how many of these may be scatter between repeats: their
-        safety degree in the reference or here is at most two standard deviations from a collision.
+        Number of settings that collide on one side only; and the number of these that may be scatter between repeats, because the safety
+        degree in the reference or here is at most two standard deviations from a collision.
     by_predicted
-        Bins of equally many settings by their safety degree here: ends, number of settings, and mean error [m].
+        Bins of settings by their safety degree here: lowest and highest safety degree, number of settings, and mean error [m].
     """
 
     rows: int
@@ -73,21 +73,22 @@ class Agreement:
     by_predicted: list[dict[str, float | None]]
 
     def to_dict(self) -> dict[str, Any]:
-        """As plain values, under the attributes' names."""
+        """The attributes by name."""
         return asdict(self)
 
 
-def agreement(reference: ReferenceData, here: Evaluations, study: Study, original: Evaluations) -> Agreement:
-    """Compare row by row; the original vehicle's reference values and the repeatability are the study's, where it has them."""
-    both = {name: _both(reference, here, name) for name in reference.metrics}
-    differences = {name: here.metrics[name][rows] - reference.metrics[name][rows] for name, rows in both.items()}
+def agreement(reference: ReferenceData, evaluations: Evaluations, study: Study, original: Evaluations) -> Agreement:
+    """Compare row by row. The study gives the published values of the original vehicle, and the scatter of repeats, if it has them."""
+    rows_of = {name: _is_defined(reference, evaluations, name) for name in reference.metrics}
+    differences = {name: evaluations.metrics[name][rows] - reference.metrics[name][rows] for name, rows in rows_of.items()}
     errors = {name: _mean(np.abs(values)) for name, values in differences.items()}
-    collided = reference.collided & here.collided
-    counts = {"reference": int(np.count_nonzero(reference.collided)), "here": int(np.count_nonzero(here.collided)),
-              "both": int(np.count_nonzero(collided))}
+    collide = reference.collided & evaluations.collided
+    counts = {"reference": int(np.count_nonzero(reference.collided)), "here": int(np.count_nonzero(evaluations.collided)),
+              "both": int(np.count_nonzero(collide))}
     return Agreement(
-        rows=len(here),
-        spearman={name: rank_correlation(reference.metrics[name][rows], here.metrics[name][rows]) for name, rows in both.items()},
+        rows=len(evaluations),
+        spearman={name: rank_correlation(reference.metrics[name][rows], evaluations.metrics[name][rows])
+                  for name, rows in rows_of.items()},
         mean_absolute_error=errors,
         bias={name: _mean(values) for name, values in differences.items()},
         collisions=counts,
@@ -95,36 +96,37 @@ def agreement(reference: ReferenceData, here: Evaluations, study: Study, origina
                   for name, values in original.metrics.items()},
         precision=counts["both"] / counts["here"] if counts["here"] else None,
         recall=counts["both"] / counts["reference"] if counts["reference"] else None,
-        collision_speed={"reference": _mean(-reference.metrics[SAFETY_DEGREE][collided]), "here": _mean(here.collision_speed[collided])},
-        in_repeats={name: _in_repeats(error, study.repeatability.get(name)) for name, error in errors.items()},
-        undecided=_undecided(reference, here, study.repeatability.get(SAFETY_DEGREE)),
-        by_predicted=_by_predicted(here.f_safe, here.f_safe - reference.metrics[SAFETY_DEGREE]))
+        collision_speed={"reference": _mean(-reference.metrics[SAFETY_DEGREE][collide]),
+                         "here": _mean(evaluations.collision_speed[collide])},
+        in_repeats={name: _error_in_repeats(error, study.repeatability.get(name)) for name, error in errors.items()},
+        undecided=_undecided_numbers(reference, evaluations, study.repeatability.get(SAFETY_DEGREE)),
+        by_predicted=_error_by_bin(evaluations.f_safe, evaluations.f_safe - reference.metrics[SAFETY_DEGREE]))
 
 
-def may_be_either(reference: ReferenceData, here: Evaluations, repeatability: float) -> BoolArray:
-    """Which settings collide only in the reference or only here, though repeats of them may do either."""
-    nearest = np.minimum(np.abs(reference.metrics[SAFETY_DEGREE]), np.abs(here.f_safe))
-    return np.asarray((reference.collided != here.collided) & (nearest <= FLIP * repeatability))
+def may_be_scatter(reference: ReferenceData, evaluations: Evaluations, repeatability: float) -> BoolArray:
+    """Settings that collide on one side only, although their repeats may end either way; a mask."""
+    distance = np.minimum(np.abs(reference.metrics[SAFETY_DEGREE]), np.abs(evaluations.f_safe))
+    return np.asarray((reference.collided != evaluations.collided) & (distance <= SCATTER_WIDTH * repeatability))
 
 
-def _undecided(reference: ReferenceData, here: Evaluations, repeatability: float | None) -> dict[str, int | None]:
-    within = None if repeatability is None else int(np.count_nonzero(may_be_either(reference, here, repeatability)))
-    return {"differ": int(np.count_nonzero(reference.collided != here.collided)), "within_repeats": within}
+def _undecided_numbers(reference: ReferenceData, evaluations: Evaluations, repeatability: float | None) -> dict[str, int | None]:
+    number = None if repeatability is None else int(np.count_nonzero(may_be_scatter(reference, evaluations, repeatability)))
+    return {"differ": int(np.count_nonzero(reference.collided != evaluations.collided)), "within_repeats": number}
 
 
-def _in_repeats(error: float | None, repeatability: float | None) -> float | None:
+def _error_in_repeats(error: float | None, repeatability: float | None) -> float | None:
     return None if error is None or repeatability is None else error / repeatability
 
 
-def _by_predicted(predicted: FloatArray, error: FloatArray) -> list[dict[str, float | None]]:
-    defined = ~np.isnan(predicted) & ~np.isnan(error)
+def _error_by_bin(predicted: FloatArray, error: FloatArray) -> list[dict[str, float | None]]:
+    is_defined = ~np.isnan(predicted) & ~np.isnan(error)
     return [{"lowest": float(predicted[rows].min()), "highest": float(predicted[rows].max()), "rows": len(rows),
              "bias": float(error[rows].mean())}
-            for rows in _bins(np.where(defined, predicted, np.nan))]
+            for rows in _bins(np.where(is_defined, predicted, np.nan))]
 
 
 def _bins(values: FloatArray) -> list[npt.NDArray[np.intp]]:
-    """Rows of equally full bins of the values that are defined; equal values share a bin."""
+    """Indices of defined values, in bins of about equal size; equal values share a bin."""
     defined = values[~np.isnan(values)]
     if not defined.size:
         return []
@@ -134,27 +136,27 @@ def _bins(values: FloatArray) -> list[npt.NDArray[np.intp]]:
     return [rows for rows in bins if rows.size]
 
 
-def rank_correlation(one: FloatArray, other: FloatArray) -> float | None:
-    """Spearman's rho; None for fewer than two rows or where one side is constant."""
-    if len(one) < 2 or np.ptp(one) == 0 or np.ptp(other) == 0:
+def rank_correlation(values: FloatArray, other_values: FloatArray) -> float | None:
+    """Spearman's rho; None for fewer than two values or if all values of one side are equal."""
+    if len(values) < 2 or np.ptp(values) == 0 or np.ptp(other_values) == 0:
         return None
-    return float(np.corrcoef(scipy.stats.rankdata(one), scipy.stats.rankdata(other))[0, 1])
+    return float(np.corrcoef(scipy.stats.rankdata(values), scipy.stats.rankdata(other_values))[0, 1])
 
 
-def _both(reference: ReferenceData, here: Evaluations, metric: str) -> BoolArray:
-    """Where a metric is defined on both sides."""
-    return np.asarray(~np.isnan(reference.metrics[metric]) & ~np.isnan(here.metrics[metric]))
+def _is_defined(reference: ReferenceData, evaluations: Evaluations, metric: str) -> BoolArray:
+    """Whether a metric is defined on both sides, by row."""
+    return np.asarray(~np.isnan(reference.metrics[metric]) & ~np.isnan(evaluations.metrics[metric]))
 
 
 def _mean(values: FloatArray) -> float | None:
     return float(np.mean(values)) if values.size else None
 
 
-def plot_agreement(path: Path, title: str, characteristics: CharacteristicSet, reference: ReferenceData, here: Evaluations,
+def plot_agreement(path: Path, title: str, characteristics: CharacteristicSet, reference: ReferenceData, evaluations: Evaluations,
                    repeatability: float | None = None) -> None:
-    """Draw simulated against reference values, and errors against simulated values; those of the safety degree by characteristic.
+    """Draw simulated over reference values, errors over simulated values, and errors of the safety degree over each characteristic.
 
-    A ring marks a setting that collides on one side only, though its repeats may do either.
+    A ring marks a setting that collides on one side only, although its repeats may end either way.
 
     Raises
     ------
@@ -164,21 +166,21 @@ def plot_agreement(path: Path, title: str, characteristics: CharacteristicSet, r
     columns = 4
     rows = 2 + -(-len(characteristics) // columns)
     figure, axes = new_figure(title, rows, columns, (12, 2.4 * rows + 0.8), gridspec_kw={"height_ratios": [1.5] + [1] * (rows - 1)})
-    either = np.zeros(len(here), dtype=bool) if repeatability is None else may_be_either(reference, here, repeatability)
-    for axis, below, metric in zip(axes[0], axes[1], reference.metrics, strict=False):
-        _scatter(axis, metric, reference, here, either)
-        _error_by(below, here.metrics[metric], here.metrics[metric] - reference.metrics[metric])
-        below.set_xlabel(f"here: {_label(metric)}")
-        below.set_ylabel("mean error")
-    error = here.metrics[SAFETY_DEGREE] - reference.metrics[SAFETY_DEGREE]
+    undecided = np.zeros(len(evaluations), dtype=bool) if repeatability is None else may_be_scatter(reference, evaluations, repeatability)
+    for axis, error_axis, metric in zip(axes[0], axes[1], reference.metrics, strict=False):
+        _scatter(axis, metric, reference, evaluations, undecided)
+        _error_by(error_axis, evaluations.metrics[metric], evaluations.metrics[metric] - reference.metrics[metric])
+        error_axis.set_xlabel(f"here: {_label(metric)}")
+        error_axis.set_ylabel("mean error")
+    error = evaluations.metrics[SAFETY_DEGREE] - reference.metrics[SAFETY_DEGREE]
     lowest, highest = [], []
     for i, axis in enumerate(axes[2:].flat):
         if i >= len(characteristics):
             axis.set_axis_off()
             continue
-        low, high = _error_by(axis, here.settings[:, i], error)
-        lowest.append(low)
-        highest.append(high)
+        lowest_here, highest_here = _error_by(axis, evaluations.settings[:, i], error)
+        lowest.append(lowest_here)
+        highest.append(highest_here)
         member = characteristics.members[i]
         axis.set_xlabel(member.name + ("" if member.unit == "-" else f" [{as_formula(member.unit)}]"))
     margin = 0.1 * (max(highest) - min(lowest)) + 1e-6
@@ -193,15 +195,16 @@ def _label(metric: str) -> str:
     return f"{METRICS[metric].title} [{as_formula(METRICS[metric].unit)}]"
 
 
-def _scatter(axis: Axes, metric: str, reference: ReferenceData, here: Evaluations, either: BoolArray) -> None:
-    rows = _both(reference, here, metric)
-    collided = (reference.collided | here.collided)[rows]
-    x, y = reference.metrics[metric][rows], here.metrics[metric][rows]
-    axis.scatter(x[~collided], y[~collided], s=6, alpha=0.35, color="#0072b2", linewidths=0, label="no collision")
-    if collided.any():
-        axis.scatter(x[collided], y[collided], s=14, alpha=0.7, color="#d55e00", marker="x", linewidths=0.8, label="collision, either side")
-        if either[rows].any():
-            axis.scatter(x[either[rows]], y[either[rows]], s=40, facecolors="none", edgecolors="black", linewidths=0.6,
+def _scatter(axis: Axes, metric: str, reference: ReferenceData, evaluations: Evaluations, undecided: BoolArray) -> None:
+    rows = _is_defined(reference, evaluations, metric)
+    is_collision = (reference.collided | evaluations.collided)[rows]
+    x, y = reference.metrics[metric][rows], evaluations.metrics[metric][rows]
+    axis.scatter(x[~is_collision], y[~is_collision], s=6, alpha=0.35, color="#0072b2", linewidths=0, label="no collision")
+    if is_collision.any():
+        axis.scatter(x[is_collision], y[is_collision], s=14, alpha=0.7, color="#d55e00", marker="x", linewidths=0.8,
+                     label="collision, either side")
+        if undecided[rows].any():
+            axis.scatter(x[undecided[rows]], y[undecided[rows]], s=40, facecolors="none", edgecolors="black", linewidths=0.6,
                          label="repeats may do either")
         axis.legend(loc="upper left", fontsize=7, frameon=True)
     if x.size:
@@ -215,7 +218,7 @@ def _scatter(axis: Axes, metric: str, reference: ReferenceData, here: Evaluation
 
 
 def _error_by(axis: Axes, values: FloatArray, error: FloatArray) -> tuple[float, float]:
-    """Draw the mean error and its quartiles over bins of a characteristic; returns the lowest and highest value drawn."""
+    """Draw the mean error and the quartiles of the error over bins of `values`; return the lowest and highest value drawn."""
     bins = _bins(np.where(np.isnan(error), np.nan, values))
     if not bins:
         return 0.0, 0.0
@@ -230,7 +233,7 @@ def _error_by(axis: Axes, values: FloatArray, error: FloatArray) -> tuple[float,
 
 TOTALS = Path(__file__).with_name("published.toml")
 HEADER = "Agreement of studies with published data: totals, no row of it. `validate STUDY FILE --totals THIS_FILE` writes an entry."
-COMPARED = ("scenario", "vehicle", "ads", "weather", "metrics", "step_length", "matrix")
+SIMULATION_KEYS = ("scenario", "vehicle", "ads", "weather", "metrics", "step_length", "matrix")
 """Keys of a study on which the metrics of a simulated setting depend."""
 
 
@@ -271,7 +274,7 @@ class Totals:
 
 
 def quoted(study: Study) -> list[Totals]:
-    """The known agreement of a study with published data: entries of the shipped studies that simulate the same."""
+    """Shipped totals that hold for a study: those of shipped studies with the same `SIMULATION_KEYS`."""
     names = {name for name in _read(TOTALS) if name in study_names() and _simulation(load_study(name)) == _simulation(study)}
     return [_totals(name, file, entry) for name, files in _read(TOTALS).items() if name in names for file, entry in files.items()]
 
@@ -282,7 +285,7 @@ def keep_totals(path: Path, study: Study, file: str, result: Agreement) -> None:
     Raises
     ------
     InputError
-        If the file holds something else or cannot be written.
+        If the file holds anything but totals, or cannot be written.
     """
     totals = _read(path) if path.exists() else {}
     entry = {"rows": result.rows, "spearman": _rounded(result.spearman), "mean_absolute_error": _rounded(result.mean_absolute_error),
@@ -315,4 +318,4 @@ def _totals(study: str, file: str, entry: Mapping[str, Any]) -> Totals:
 
 def _simulation(study: Study) -> dict[str, Any]:
     keys = evaluation_keys(study)
-    return {name: keys.get(name) for name in COMPARED}
+    return {name: keys.get(name) for name in SIMULATION_KEYS}

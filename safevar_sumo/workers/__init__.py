@@ -1,1 +1,1 @@
-"""Where batches are computed: processes of this machine, or a cluster."""
+"""Computation of batches, in processes of this machine or on a cluster."""

@@ -26,11 +26,11 @@ from safevar_sumo.workers.interrupts import interrupts_noted
 ADDRESS = re.compile(r"[a-z]+://[^\s/]+:\d+/?")
 CERTIFICATES = "for tls:// certificates in Dask's configuration: distributed.comm.tls.ca-file and .client.cert, .client.key"
 CONNECT_TIMEOUT = 10.0
-"""How long an address may take to answer [s]."""
+"""Longest time for the scheduler to answer [s]."""
 SECONDS_BETWEEN_COUNTS = 5.0
-VERSIONED = ("safevar_sumo", "libsumo", "numpy")
+VERSIONED_PACKAGES = ("safevar_sumo", "libsumo", "numpy")
 """Packages that must have the same version here and on every worker."""
-_one_at_a_time = threading.Lock()
+_libsumo_lock = threading.Lock()
 
 
 @contextmanager
@@ -42,12 +42,12 @@ def cluster_pool(address: str, time_limit: float) -> Iterator[ClusterPool]:
     address
         Address of the scheduler.
     time_limit
-        Time limit of a batch [s]; a worker that takes longer is stopped.
+        Time limit of a batch [s]; a worker that exceeds it is stopped.
 
     Raises
     ------
     InputError
-        If the extra is not installed or nobody answers at the address.
+        If the extra `cluster` is not installed, or the scheduler does not answer.
     """
     try:
         from distributed import Client
@@ -72,7 +72,7 @@ def cluster_pool(address: str, time_limit: float) -> Iterator[ClusterPool]:
 
 
 class ClusterPool:
-    """Computes batches on a Dask cluster, which itself repeats the batch of a dead worker."""
+    """Computes batches on a Dask cluster; Dask repeats the batch of a dead worker."""
 
     def __init__(self, client: Any, time_limit: float) -> None:
         self._executor = client.get_executor(pure=False)
@@ -81,7 +81,7 @@ class ClusterPool:
 
     @property
     def workers(self) -> int:
-        """Number of worker processes, refreshed every few seconds; each computes one batch at a time."""
+        """Number of worker processes, counted every few seconds; each process computes one batch at a time."""
         now = time.monotonic()
         if now - self._counted > SECONDS_BETWEEN_COUNTS:
             try:
@@ -94,19 +94,19 @@ class ClusterPool:
     def submit(self, study: bytes, settings: FloatArray) -> Future[Evaluations]:
         future: Future[Evaluations] = Future()
         try:
-            dask_future = self._executor.submit(_evaluate_within, self._time_limit, _versions(), study, settings)
+            dask_future = self._executor.submit(_evaluate_in_time, self._time_limit, _versions(), study, settings)
         except RuntimeError as error:
             raise PoolLostError(f"the cluster does not answer any more: {error}") from None
-        dask_future.add_done_callback(lambda done: _hand_on(done, future))
+        dask_future.add_done_callback(lambda source: _hand_on(source, future))
         return future
 
 
-def _evaluate_within(time_limit: float, versions: dict[str, str], study: bytes, settings: FloatArray) -> Evaluations:
-    """Evaluate one batch at a time in a worker (a process has one libsumo); end the worker if it hangs."""
+def _evaluate_in_time(time_limit: float, versions: dict[str, str], study: bytes, settings: FloatArray) -> Evaluations:
+    """Evaluate a batch in a worker, one at a time because a process has one libsumo; end a worker that hangs."""
     if _versions() != versions:
         raise PoolLostError(f"a worker of the cluster has other versions: {_versions()} there, {versions} here")
-    with _one_at_a_time, open(os.devnull, "w") as nowhere:
-        faulthandler.dump_traceback_later(time_limit, exit=True, file=nowhere)
+    with _libsumo_lock, open(os.devnull, "w") as null_file:
+        faulthandler.dump_traceback_later(time_limit, exit=True, file=null_file)
         try:
             return evaluate_batch(study, settings)
         finally:
@@ -115,19 +115,19 @@ def _evaluate_within(time_limit: float, versions: dict[str, str], study: bytes, 
 
 @cache
 def _versions() -> dict[str, str]:
-    return {**{name: version(name) for name in VERSIONED}, "results": str(RESULTS)}
+    return {**{name: version(name) for name in VERSIONED_PACKAGES}, "results": str(RESULTS)}
 
 
-def _hand_on(done: Future[Evaluations], future: Future[Evaluations]) -> None:
+def _hand_on(dask_future: Future[Evaluations], future: Future[Evaluations]) -> None:
     from distributed import KilledWorker
 
-    if done.cancelled():
+    if dask_future.cancelled():
         future.set_exception(PoolLostError("the cluster does not answer any more"))
         return
-    error = done.exception()
+    error = dask_future.exception()
     if isinstance(error, KilledWorker):
         future.set_exception(WorkerLostError(f"workers of the cluster died: {error}"))
     elif error is not None:
         future.set_exception(error)
     else:
-        future.set_result(done.result())
+        future.set_result(dask_future.result())

@@ -1,4 +1,4 @@
-"""Evaluation of a batch, a pure function that any process of any machine may run, and the protocol of the pools that run it."""
+"""Evaluation of a batch: a pure function for any process on any machine, and the protocol of the pools that run this function."""
 
 from __future__ import annotations
 
@@ -20,33 +20,33 @@ from safevar_sumo.sumo.matrix import evaluate, in_cells
 from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.workers.identity import Inputs, networks_of
 
-SHARED = ("network", "sources")
+SHARED_LAYERS = ("network", "sources")
 """Layers of a study's identity that must be the same on every worker."""
 
 
 class WorkerLostError(SafevarError):
-    """The process that computed a batch died or was stopped for taking too long."""
+    """The process that computed a batch died, or exceeded the time limit and was stopped."""
 
 
 class PoolLostError(SafevarError):
-    """The pool can compute nothing any more: every further attempt would fail, too."""
+    """The pool cannot compute any more batches."""
 
 
 class Pool(Protocol):
-    """Computes batches somewhere; futures fail with `WorkerLostError`, `PoolLostError` or the batch's own error."""
+    """Computes batches; a future may fail with `WorkerLostError`, `PoolLostError` or an error of the batch."""
 
     @property
     def workers(self) -> int:
         """Number of batches that are computed at the same time."""
 
     def submit(self, study: bytes, settings: FloatArray) -> Future[Evaluations]:
-        """Evaluate filtered settings, shape (k, n), of a packed study."""
+        """Evaluate k filtered settings of n characteristics, shape (k, n), of a packed study."""
 
 
 class _Work(msgspec.Struct, frozen=True):
-    """A study packed for a worker, with the digests of the files that it depends on, and the way to evaluate its settings.
+    """A study for a worker, with digests of the files that its results depend on, and the way to evaluate its settings.
 
-    With `check` the worker checks the study's code from outside instead.
+    With `check` the worker checks the code from outside instead; see `packed` for the other fields.
     """
 
     study: Study
@@ -67,81 +67,81 @@ class _Mode(msgspec.Struct, frozen=True):
 
 def packed(study: Study, inputs: Mapping[str, Any] | None = None, *, engine: Engine = Engine.RECORDED, afresh: bool = False,
            check: bool = False, cells: tuple[int, int] | None = None) -> bytes:
-    """A study packed for a worker.
+    """A study, packed for a worker as bytes.
 
     Parameters
     ----------
     inputs
-        Layers of the study's identity by name: a worker with other files computes nothing, and reports the files that other
-        people's code reads and `sources` lacks. By default the networks as they are now.
+        Layers of the study's identity by name; by default the present networks. A worker refuses to compute with other files, and
+        reports files that code from outside reads and `sources` lacks.
     engine
         What moves the vehicles.
     afresh
-        Whether models are loaded anew, without anything that earlier batches left in their modules and classes.
+        Whether models are reloaded, which removes all state of earlier batches from their modules and classes.
     check
-        Whether a batch checks the code from outside instead; its `reasons` are remarks on that code.
+        Whether the worker checks the code from outside instead; the `reasons` of the result are remarks on this code.
     cells
-        (k, n): for a rated study, results in the k-th of n parts of the cells, instead of points for all cells.
+        (k, n): for a rated study, results in part k of n parts of the cells, instead of points for all cells.
     """
     if inputs is None:
         inputs = {"network": networks_of(assemble(study))}
-    return msgspec.msgpack.encode(_Work(study, {layer: dict(inputs[layer]) for layer in SHARED if layer in inputs}, engine, afresh,
+    return msgspec.msgpack.encode(_Work(study, {layer: dict(inputs[layer]) for layer in SHARED_LAYERS if layer in inputs}, engine, afresh,
                                         check, cells))
 
 
 def evaluate_batch(work: bytes, settings: FloatArray) -> Evaluations:
-    """The function that a worker runs: (study, settings) -> evaluations.
+    """Evaluate settings, shape (k, n), of a packed study; a worker runs this function.
 
     Raises
     ------
     InputError
-        If the study's files are not those that the campaign began with.
+        If files of the study have changed since the campaign began.
     """
     mode = msgspec.msgpack.decode(work, type=_Mode)
     if mode.check:
-        from safevar_sumo.conformance import refuse_defects  # it loads the searches, which a simulation does not need
+        from safevar_sumo.conformance import refuse_defects  # slow to import, and rarely needed
 
         remarks = refuse_defects(msgspec.msgpack.decode(work, type=_Work).study)
         return replace(Evaluations.none(settings.shape[1], METRICS), reasons={remark.encode(): remark for remark in remarks})
     if mode.afresh:
         forget_foreign()
-        assembled = _assembled.__wrapped__
+        assembler = _task_and_system.__wrapped__
     else:
-        assembled = _assembled
+        assembler = _task_and_system
     with noted_reading() as reading:
         cells = mode.cells
-        task, system = assembled(work if cells is None else _in_all_cells(work))
-        _refuse_changes(task.inputs, system)
+        task, system = assembler(work if cells is None else _work_for_all_cells(work))
+        _refuse_changed_networks(task.inputs, system)
         evaluations = evaluate(system, settings, task.engine) if cells is None else in_cells(system, settings, cells, task.engine)
-    _refuse_changes(task.inputs, system)
-    return replace(evaluations, files=_unknown(task, digests(reading.files(foreign_packages(task.study)), task.study.origin.places)))
+    _refuse_changed_networks(task.inputs, system)
+    return replace(evaluations, files=_unknown_files(task, digests(reading.files(foreign_packages(task.study)), task.study.origin.places)))
 
 
-def _in_all_cells(work: bytes) -> bytes:
-    """The same work for all cells, so that the parts of the cells share a system."""
+def _work_for_all_cells(work: bytes) -> bytes:
+    """The work without `cells`: all parts of the cells then share one cached system."""
     return msgspec.msgpack.encode(msgspec.structs.replace(msgspec.msgpack.decode(work, type=_Work), cells=None))
 
 
 @lru_cache(maxsize=4)
-def _assembled(work: bytes) -> tuple[_Work, System]:
-    """The unpacked work, and the system that its study names; loaded code stays, even if its files change."""
+def _task_and_system(work: bytes) -> tuple[_Work, System]:
+    """The unpacked work and the system of its study. Both are cached, even if source files change."""
     task = msgspec.msgpack.decode(work, type=_Work)
     return task, assemble(task.study)
 
 
-def _refuse_changes(expected: Inputs, system: System) -> None:
+def _refuse_changed_networks(expected: Inputs, system: System) -> None:
     if "network" in expected:
-        _refuse(changed_files(expected["network"], networks_of(system)))
+        _refuse_changed_files(changed_files(expected["network"], networks_of(system)))
 
 
-def _unknown(task: _Work, files: Files) -> Files:
-    """The files that the study did not begin with; refuses files that have changed since it began."""
+def _unknown_files(task: _Work, files: Files) -> Files:
+    """The files that were not known when the study began; refuses known files that have changed."""
     sources = task.inputs.get("sources", {})
-    _refuse([name for name, digest in files.items() if sources.get(name, digest) != digest])
+    _refuse_changed_files([name for name, digest in files.items() if sources.get(name, digest) != digest])
     return {name: digest for name, digest in files.items() if name not in sources}
 
 
-def _refuse(files: list[str]) -> None:
+def _refuse_changed_files(files: list[str]) -> None:
     if files:
         raise InputError(files[0], "is not the file that this study began with: it was changed meanwhile, or a worker has another one",
                          "the file as it was, and the same command; or another --out")

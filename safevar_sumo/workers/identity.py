@@ -1,4 +1,4 @@
-"""The identity of a study: the inputs of its results besides its file."""
+"""The identity of a study: all inputs of its results except the study file."""
 
 from __future__ import annotations
 
@@ -23,18 +23,19 @@ Inputs = dict[str, dict[str, str]]
 EXPONENTS = (1 / 21, 1 / 20, -21.0, 21.0)
 """Exponents of the powers that NSGA-II's operators compute (distribution index 20)."""
 POWERS = 2000
+"""Number of bases for each exponent."""
 
 
 def identity_of(study: Study, system: System, sources: Mapping[str, str] = MappingProxyType({})) -> dict[str, Any]:
-    """The layers of a manifest besides the study: plain values, the same in every process and for every worker.
+    """The layers of a manifest except the study: plain values that are the same in every process.
 
-    `resolved` are the study's tables with models' defaults and the weather's numbers, `network` and `sources` digests by file,
-    `results` the number of the package's results, `platform` the properties of the machine on which the last bit of a result may depend.
+    `resolved` are the tables of the study with all defaults of models and all numbers of the weather; `network` and `sources` are digests
+    by file; `results` is the version of the results; `platform` are properties of the machine that may affect the last bit of a result.
 
     Parameters
     ----------
     sources
-        Digests of the files that other people's code reads: see `safevar_sumo.workers.sources_of`.
+        Digests of the files that code from outside reads: see `safevar_sumo.workers.batches.digests_of_sources`.
     """
     resolved = evaluation_keys(study)
     for table, model in (("vehicle", system.vehicle), ("ads", system.ads), ("scenario", system.scenario)):
@@ -49,7 +50,7 @@ def identity_of(study: Study, system: System, sources: Mapping[str, str] = Mappi
 
 
 def networks_of(system: System) -> dict[str, str]:
-    """Digests of the files of all networks that settings are simulated on."""
+    """Digests of the files of all networks in the simulations."""
     folders = list(dict.fromkeys(point.scenario.network for point in system.points))
     if len(folders) == 1:
         return network_files(folders[0])
@@ -62,6 +63,6 @@ def _platform() -> dict[str, str]:
 
 
 def powers_digest() -> str:
-    """Digest of powers, which mathematical libraries round differently; all other operations are exact in IEEE 754."""
+    """Digest of powers: only these depend on the mathematical library; IEEE 754 determines all other operations."""
     bases = [(number + 0.5) / POWERS * 2 for number in range(POWERS)]
     return sha256(repr([[base ** exponent for base in bases] for exponent in EXPONENTS]).encode()).hexdigest()[:DIGITS]

@@ -1,7 +1,7 @@
-"""Ctrl-C while a pool works: noted at once, raised where the main thread waits for a result, never while a lock is held.
+"""Ctrl-C while a pool works: noted at once, but raised only where the main thread waits for a result and holds no lock.
 
-An interrupt anywhere inside `concurrent.futures` may leave a lock behind that a worker's thread then waits for, for ever,
-and one while a pool is closed would leave workers behind.
+An interrupt inside `concurrent.futures` may leave a lock behind for which the thread of a worker waits for ever. An interrupt while a
+pool closes would leave worker processes behind.
 """
 
 from __future__ import annotations
@@ -17,50 +17,50 @@ from safevar_sumo.records import Evaluations
 
 SECONDS_BETWEEN_LOOKS = 0.2
 """Longest time for which Ctrl-C goes unnoticed [s]."""
-_pressed = threading.Event()
+_interrupt = threading.Event()
 
 
 @contextmanager
 def interrupts_noted() -> Iterator[None]:
-    """Within the context only `first_of` and `result_of` raise Ctrl-C; one that is still pending is raised at the end."""
+    """A context in which only `first_of` and `awaited` raise Ctrl-C; its end raises a pending Ctrl-C."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    _pressed.clear()
-    before = signal.signal(signal.SIGINT, lambda *_: _pressed.set())
+    _interrupt.clear()
+    previous_handler = signal.signal(signal.SIGINT, lambda *_: _interrupt.set())
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, signal.default_int_handler if before is None else before)
+        signal.signal(signal.SIGINT, signal.default_int_handler if previous_handler is None else previous_handler)
     _raise_if_pressed()
 
 
 def first_of(futures: Iterable[Future[Evaluations]]) -> set[Future[Evaluations]]:
-    """Wait until a future is done, and return all that are; an empty set if there are no futures."""
+    """Wait until a future is done, and return all futures that are done; an empty set if there are no futures."""
     while True:
-        done, not_done = wait(futures, timeout=SECONDS_BETWEEN_LOOKS, return_when=FIRST_COMPLETED)
+        done, waiting_futures = wait(futures, timeout=SECONDS_BETWEEN_LOOKS, return_when=FIRST_COMPLETED)
         _raise_if_pressed()
-        if done or not not_done:
+        if done or not waiting_futures:
             return done
 
 
 def awaited(future: Future[Evaluations]) -> Evaluations:
-    """Wait for a future's result; raises its error."""
+    """The result of a future, or its error, once the future is done."""
     first_of([future])
     return future.result()
 
 
 def _raise_if_pressed() -> None:
-    if _pressed.is_set():
-        _pressed.clear()
+    if _interrupt.is_set():
+        _interrupt.clear()
         raise KeyboardInterrupt
 
 
 def leave_interrupts_to_the_caller() -> None:
-    """Block Ctrl-C, which reaches all processes of a terminal, in this thread: processes that it starts then never see it."""
-    if sys.platform == "win32":  # there are no signal masks: a process ignores interrupts once it serves
+    """Block Ctrl-C in this thread and, because the mask is inherited, in the processes that the thread starts."""
+    if sys.platform == "win32":  # without signal masks; `_serve` ignores interrupts
         return
     from multiprocessing import resource_tracker
 
-    resource_tracker.ensure_running()  # its start would unblock interrupts
+    resource_tracker.ensure_running()  # a later start would unblock interrupts
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})

@@ -1,4 +1,4 @@
-"""Batches in worker processes of this machine: processes that share nothing, each with a thread that waits for it."""
+"""Computation of batches in worker processes of this machine."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ from safevar_sumo.workers.evaluation import PoolLostError, WorkerLostError, eval
 from safevar_sumo.workers.interrupts import interrupts_noted, leave_interrupts_to_the_caller
 
 START_LIMIT = 120.0
-"""How long a worker process may take until it is ready for its first batch [s]."""
-STARTS = 5
-"""Number of workers in a row that may die before they are ready; no batch is to blame for that."""
-_starting = threading.Lock()
+"""Longest time until a worker process is ready for its first batch [s]."""
+START_ATTEMPTS = 5
+"""Number of workers in a row that may die before they are ready, which is never the fault of a batch."""
+_start_lock = threading.Lock()
 
 
 def available_cores() -> int:
@@ -35,14 +35,14 @@ def available_cores() -> int:
 
 @contextmanager
 def local_pool(jobs: int, time_limit: float) -> Iterator[LocalPool]:
-    """A pool of worker processes, started when they are first needed; they end with the block.
+    """A pool whose worker processes start when they are first needed, and end with the context.
 
     Parameters
     ----------
     jobs
         Number of worker processes.
     time_limit
-        Time limit of a batch [s]; a worker that takes longer is stopped.
+        Time limit of a batch [s]; a worker that exceeds it is stopped.
     """
     with interrupts_noted():
         pool = LocalPool(jobs, time_limit)
@@ -53,16 +53,16 @@ def local_pool(jobs: int, time_limit: float) -> Iterator[LocalPool]:
 
 
 class LocalPool:
-    """Computes batches in processes, each with a thread of this process that waits for it.
+    """Computes batches in processes. For each process, a thread of this process waits for answers.
 
-    Workers share nothing, no queue and no lock: so one may die or be killed at any moment without harm to another.
+    Workers share no queue and no lock: a worker may die at any moment without harm to the others.
     """
 
     def __init__(self, jobs: int, time_limit: float) -> None:
         self.workers, self._time_limit = jobs, time_limit
         self._threads = ThreadPoolExecutor(jobs, thread_name_prefix="worker", initializer=leave_interrupts_to_the_caller)
-        self._of_thread = threading.local()
-        self._living: set[_Worker] = set()
+        self._thread_data = threading.local()
+        self._live_workers: set[_Worker] = set()
         self._closed = False
 
     def submit(self, study: bytes, settings: FloatArray) -> Future[Evaluations]:
@@ -72,49 +72,49 @@ class LocalPool:
             raise PoolLostError("the worker processes are closed down") from None
 
     def close(self) -> None:
-        """Drop batches that are not computed yet and end all workers."""
+        """Drop waiting batches and end all workers."""
         self._closed = True
         self._threads.shutdown(wait=False, cancel_futures=True)
-        while self._living:
-            for worker in list(self._living):
+        while self._live_workers:
+            for worker in list(self._live_workers):
                 self._end(worker)
         self._threads.shutdown()
 
     def _compute(self, study: bytes, settings: FloatArray) -> Evaluations:
-        worker: _Worker | None = getattr(self._of_thread, "worker", None)
+        worker: _Worker | None = getattr(self._thread_data, "worker", None)
         if worker is None or not worker.alive:
-            worker = self._of_thread.worker = self._started()
+            worker = self._thread_data.worker = self._new_worker()
         try:
             return worker.compute(study, settings, self._time_limit)
         except WorkerLostError:
             self._end(worker)
-            self._of_thread.worker = None
+            self._thread_data.worker = None
             raise
 
-    def _started(self) -> _Worker:
-        for _ in range(STARTS):
+    def _new_worker(self) -> _Worker:
+        for _ in range(START_ATTEMPTS):
             if self._closed:
                 raise PoolLostError("the worker processes are closed down")
             worker = _Worker()
-            self._living.add(worker)
+            self._live_workers.add(worker)
             if self._closed:
                 worker.end()
             try:
                 worker.wait_until_ready()
             except WorkerLostError as error:
                 self._end(worker)
-                lost = error
+                cause = error
             else:
                 return worker
-        raise PoolLostError(f"no worker process starts: {lost}")
+        raise PoolLostError(f"no worker process starts: {cause}")
 
     def _end(self, worker: _Worker) -> None:
         worker.end()
-        self._living.discard(worker)
+        self._live_workers.discard(worker)
 
 
 class _Worker:
-    """A process and the pipe to it. It is spawned: libsumo must not be forked."""
+    """A process and the pipe to it. The process is spawned, because libsumo must not be forked."""
 
     def __init__(self) -> None:
         context = multiprocessing.get_context("spawn")
@@ -132,12 +132,12 @@ class _Worker:
         return self._process.is_alive()
 
     def wait_until_ready(self) -> None:
-        """Wait for the process's first message; raises WorkerLostError if it never comes."""
+        """Wait for the first message of the process; raises WorkerLostError without a message."""
         self._receive(START_LIMIT, "start")
 
     def compute(self, study: bytes, settings: FloatArray, time_limit: float) -> Evaluations:
-        """Compute a batch; raises its error, or WorkerLostError."""
-        with suppress(OSError):  # a dead worker shows when its answer does not come
+        """Compute a batch; raises the error of the batch, or WorkerLostError."""
+        with suppress(OSError):  # `_receive` notices a dead worker
             self._pipe.send((study, settings))
         answer = self._receive(time_limit, "simulation")
         if isinstance(answer, Exception):
@@ -155,15 +155,15 @@ class _Worker:
         raise WorkerLostError(f"the worker process died (exit code {self._process.exitcode})")
 
     def end(self) -> None:
-        """Kill the process; whoever waits for its answer learns that it died."""
+        """Kill the process; a thread in `_receive` then raises WorkerLostError."""
         self._process.kill()
         self._process.join()
 
 
 @contextmanager
 def _without_main() -> Iterator[None]:
-    """A spawned process runs the caller's main module again: a script would need `if __name__ == "__main__"`. Ours needs no main module."""
-    with _starting:
+    """Hide the main module, which a spawned process would run again; scripts then need no `if __name__ == "__main__"`."""
+    with _start_lock:
         main = sys.modules["__main__"]
         sys.modules["__main__"] = ModuleType("__main__")
         try:
@@ -173,7 +173,7 @@ def _without_main() -> Iterator[None]:
 
 
 def _serve(pipe: connection.Connection[Any, Any], folders: list[str]) -> None:
-    """The main function of a worker process: answer batches until the other end of the pipe is closed."""
+    """The main function of a worker process, which answers batches until the other end of the pipe is closed."""
     inherit_reachable(folders)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_the_caller, daemon=True).start()
@@ -197,7 +197,7 @@ def _answer(study: bytes, settings: FloatArray) -> Evaluations | Exception:
 
 
 def _end_with_the_caller() -> None:
-    """End this process with its caller: a worker that hangs in a simulation would outlive a killed one."""
+    """End this process with its caller. Otherwise a worker that hangs in a simulation would outlive a killed caller."""
     caller = multiprocessing.parent_process()
     assert caller is not None
     caller.join()

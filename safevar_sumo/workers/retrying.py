@@ -1,7 +1,7 @@
-"""A pool that retries a failed batch: as a whole, then in ever smaller parts, then without the setting that fails alone.
+"""A pool that retries a failed batch: first the whole batch, then smaller and smaller parts, down to the setting that fails.
 
-A setting that repeatedly fails alone in SUMO, while the original vehicle can be simulated, gets the outcome `simulator-error`. Faults of
-the environment (disk, network files, memory) and of a user's own code end the study; the same command later resumes it.
+A setting that fails again by itself, while the original vehicle can be simulated, gets the outcome `simulator-error`. Faults of the
+environment (disk, network files, memory) and of code from outside end the study; the same command resumes it later.
 """
 
 from __future__ import annotations
@@ -22,19 +22,19 @@ from safevar_sumo.study import Study, foreign_names
 from safevar_sumo.vehicles import CharacteristicSet
 from safevar_sumo.workers.evaluation import Pool, PoolLostError, WorkerLostError
 
-Then = Callable[[Evaluations | None, BaseException | None], None]
+BatchCallback = Callable[[Evaluations | None, BaseException | None], None]
 """Callback for a finished batch, with its evaluations or its error."""
 ATTEMPTS = 2
-"""Attempts for a whole batch, and for a single setting: another process may have killed the worker."""
+"""Number of attempts for a whole batch, and for a single setting in a part: another process may have killed the worker."""
 PARTS = 8
-"""Parts into which a failing batch is split: one fatal setting among 200 costs five time limits."""
-AGAIN = "; again by: "
+"""Number of parts of a failing batch: with 8, one fatal setting among 200 costs five time limits."""
+COMMAND_PREFIX = "; again by: "
 FAILURES_IN_A_ROW = 20
 """Number of failing settings in a row that count as a fault of the study."""
 
 
 class RetryingPool:
-    """Evaluates settings that fail alone as `simulator-error`; too many in a row are an error.
+    """Gives settings that fail by themselves the outcome `simulator-error`; too many in a row are an error.
 
     Parameters
     ----------
@@ -43,11 +43,11 @@ class RetryingPool:
     study
         The study of the settings.
     note
-        Called with files that code from outside reads and that were not known when the study began; may refuse them.
+        Called with files that code from outside reads and the study did not know; may raise an error.
     """
 
     def __init__(self, pool: Pool, study: Study, note: Callable[[Mapping[str, str]], None] = lambda files: None) -> None:
-        self._pool, self._study, self._note, self._in_a_row = pool, study, note, 0
+        self._pool, self._study, self._note, self._failures = pool, study, note, 0
         self._characteristics, self._foreign = CharacteristicSet.of(study.vehicle.characteristics), foreign_names(study)
 
     @property
@@ -56,16 +56,16 @@ class RetryingPool:
         return self._pool.workers
 
     def submit(self, study: bytes, settings: FloatArray, *, must_succeed: bool = False) -> Future[Evaluations]:
-        """Evaluate filtered settings, shape (k, n); with `must_succeed` a failure is an error, not an outcome."""
+        """Evaluate k filtered settings of n characteristics, shape (k, n); with `must_succeed` a failure is an error, not an outcome."""
         result: Future[Evaluations] = Future()
-        alone = len(settings) == 1 and not must_succeed
-        self._attempt(study, settings, 2 * ATTEMPTS if alone else ATTEMPTS, result, must_succeed)
+        is_single = len(settings) == 1 and not must_succeed
+        self._attempt(study, settings, 2 * ATTEMPTS if is_single else ATTEMPTS, result, must_succeed)
         return result
 
     def _attempt(self, study: bytes, settings: FloatArray, attempts: int, result: Future[Evaluations], must_succeed: bool) -> None:
         def done(evaluations: Evaluations | None, error: BaseException | None) -> None:
             if evaluations is not None:
-                self._in_a_row = 0
+                self._failures = 0
                 result.set_result(evaluations)
             elif isinstance(error, ForeignError):
                 self._locate(study, settings, error, result)
@@ -86,26 +86,26 @@ class RetryingPool:
 
         self._compute(study, settings, done)
 
-    def _compute(self, study: bytes, settings: FloatArray, then: Then) -> None:
-        """Compute a batch once; call `then` with its evaluations or its error."""
+    def _compute(self, study: bytes, settings: FloatArray, callback: BatchCallback) -> None:
+        """Compute a batch once; call `callback` with the evaluations or the error."""
         def done(attempt: Future[Evaluations]) -> None:
             error = PoolLostError("the batch was cancelled") if attempt.cancelled() else attempt.exception()
             if error is None and attempt.result().files:
                 try:
                     self._note(attempt.result().files)
-                except SafevarError as refused:
-                    error = refused
-            then(attempt.result() if error is None else None, error)
+                except SafevarError as refusal:
+                    error = refusal
+            callback(attempt.result() if error is None else None, error)
 
         try:
             attempt = self._pool.submit(study, settings)
         except PoolLostError as error:
-            then(None, error)
+            callback(None, error)
         else:
             attempt.add_done_callback(done)
 
     def _split(self, study: bytes, settings: FloatArray, result: Future[Evaluations]) -> None:
-        """Split a failing batch; parts that fail again are split further."""
+        """Split a failing batch into parts; a part that fails is split again."""
         parts = np.array_split(settings, min(PARTS, len(settings)))
         results: dict[int, Evaluations] = {}
         lock = threading.Lock()
@@ -128,29 +128,29 @@ class RetryingPool:
                 self._attempt(study, rows, ATTEMPTS if len(rows) == 1 else 1, part, must_succeed=False)
 
     def _give_up(self, study: bytes, setting: FloatArray, error: SafevarError, result: Future[Evaluations]) -> None:
-        """Give a setting the outcome `simulator-error` if it still fails after the original vehicle has been simulated."""
-        def then_again(evaluations: Evaluations | None, repeated: BaseException | None) -> None:
+        """Give a setting the outcome `simulator-error` if it fails once more after a simulation of the original vehicle."""
+        def repetition_done(evaluations: Evaluations | None, last_error: BaseException | None) -> None:
             if evaluations is not None:
                 result.set_result(evaluations)
-            elif isinstance(repeated, SimulationError | WorkerLostError):
-                self._in_a_row += 1
-                if self._in_a_row >= FAILURES_IN_A_ROW:
-                    result.set_exception(repeated)
+            elif isinstance(last_error, SimulationError | WorkerLostError):
+                self._failures += 1
+                if self._failures >= FAILURES_IN_A_ROW:
+                    result.set_exception(last_error)
                 else:
-                    result.set_result(self._failed(setting, repeated))
+                    result.set_result(self._failed_evaluation(setting, last_error))
             else:
-                result.set_exception(repeated)
+                result.set_exception(last_error)
 
         def original_done(evaluations: Evaluations | None, fault: BaseException | None) -> None:
             if evaluations is not None:
-                self._compute(study, setting, then_again)
+                self._compute(study, setting, repetition_done)
             else:
                 result.set_exception(EnvironmentFault(f"{error}; the original vehicle cannot be simulated either: {fault}")
                                    if isinstance(fault, SimulationError | WorkerLostError) else fault)
 
         self._compute(study, self._characteristics.original[np.newaxis], original_done)
 
-    def _failed(self, setting: FloatArray, error: SafevarError) -> Evaluations:
+    def _failed_evaluation(self, setting: FloatArray, error: SafevarError) -> Evaluations:
         undefined = np.full(1, np.nan)
         return Evaluations(
             settings=setting, outcome=np.array([Outcome.SIMULATOR_ERROR.value], dtype="U16"), collision_speed=undefined,
@@ -158,40 +158,40 @@ class RetryingPool:
             f_num_diff=self._characteristics.number_changed(setting), reasons={setting[0].tobytes(): " ".join(str(error).split())})
 
     def _locate(self, study: bytes, settings: FloatArray, error: ForeignError, result: Future[Evaluations]) -> None:
-        """Find the setting on which a user's code fails, by bisection, and name the command that reproduces it."""
+        """Find, by bisection, the setting on which code from outside fails; add the command that reproduces the error."""
         if len(settings) == 1:
             result.set_exception(self._with_command(error, settings))
             return
         halves = settings[:len(settings) // 2], settings[len(settings) // 2:]
 
-        def second_done(_: Evaluations | None, located: BaseException | None) -> None:
-            if isinstance(located, ForeignError):
-                self._locate(study, halves[1], located, result)
+        def second_done(_: Evaluations | None, part_error: BaseException | None) -> None:
+            if isinstance(part_error, ForeignError):
+                self._locate(study, halves[1], part_error, result)
             else:
                 result.set_exception(error)
 
-        def first_done(_: Evaluations | None, located: BaseException | None) -> None:
-            if isinstance(located, ForeignError):
-                self._locate(study, halves[0], located, result)
+        def first_done(_: Evaluations | None, part_error: BaseException | None) -> None:
+            if isinstance(part_error, ForeignError):
+                self._locate(study, halves[0], part_error, result)
             else:
                 self._compute(study, halves[1], second_done)
 
         self._compute(study, halves[0], first_done)
 
     def _worker_lost_in_foreign_code(self, error: WorkerLostError) -> ForeignError:
-        """The error for a worker that repeatedly ends or hangs while it runs a user's code."""
+        """The error for workers that repeatedly end or hang in code from outside."""
         problem = f"{error}, again and again, with {' and '.join(self._foreign)} in it; a dead process cannot report file and line"
         return ForeignError(f"study {self._study.name!r}", problem)
 
     def _with_command(self, error: ForeignError, setting: FloatArray) -> ForeignError:
-        """The error with a command that reproduces it, unless it names one."""
-        if AGAIN in error.problem:
+        """The error, with a command that reproduces it if the error has no command yet."""
+        if COMMAND_PREFIX in error.problem:
             return error
-        return ForeignError(error.source, f"{error.problem}{AGAIN}{reproducing(self._study, setting[0])}", error.legal)
+        return ForeignError(error.source, f"{error.problem}{COMMAND_PREFIX}{reproduction_command(self._study, setting[0])}", error.legal)
 
 
-def reproducing(study: Study, setting: FloatArray) -> str:
-    """The command that simulates a setting, shape (n,), again."""
+def reproduction_command(study: Study, setting: FloatArray) -> str:
+    """The command that simulates a setting of n characteristics, shape (n,)."""
     changes = [f"--set {member.name}={value!r}"
                for member, value in zip(CharacteristicSet.of(study.vehicle.characteristics), setting.tolist(), strict=True)
                if value != member.original]

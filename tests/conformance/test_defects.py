@@ -154,7 +154,7 @@ DEFECTS = {
 def test_a_planted_defect_is_named_with_file_and_line(name: str, in_tmp: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     defect = DEFECTS[name]
     if name == "ads hangs":
-        monkeypatch.setattr(suite, "LONGEST", 1.0)
+        monkeypatch.setattr(suite, "RUN_LIMIT", 1.0)
     (in_tmp / "mine.py").write_text(defect.module)
     if defect.kind == "vehicle":
         (in_tmp / "mine.toml").write_text(VEHICLE_STUDY)
@@ -172,7 +172,7 @@ def test_a_planted_defect_is_named_with_file_and_line(name: str, in_tmp: Path, m
 
 @pytest.mark.slow
 def test_the_time_limit_begins_after_a_module_and_its_library_are_imported(in_tmp: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(suite, "LONGEST", limit := 1.0)
+    monkeypatch.setattr(suite, "RUN_LIMIT", limit := 1.0)
     monkeypatch.setattr(finding, "load_factor", lambda: 1.0)
     slow = f"import time\ntime.sleep({1.2 * limit})\n"
     (in_tmp / "library.py").write_text(slow)

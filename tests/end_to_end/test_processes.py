@@ -267,4 +267,4 @@ def test_an_encrypted_scheduler_needs_certificates_from_the_configuration() -> N
 
 def test_a_worker_with_other_versions_computes_nothing() -> None:
     with pytest.raises(cluster.PoolLostError, match=r"1\.20\.0"):
-        cluster._evaluate_within(9.0, {"libsumo": "1.20.0"}, b"", np.zeros((1, 12)))
+        cluster._evaluate_in_time(9.0, {"libsumo": "1.20.0"}, b"", np.zeros((1, 12)))

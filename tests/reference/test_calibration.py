@@ -12,11 +12,11 @@ import pytest
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import Evaluations, FloatArray, Outcome
 from safevar_sumo.reference import FitSubject, ReferenceData, calibrate, calibrate_together, with_values
-from safevar_sumo.reference.calibration import _refining_population, _thinned
+from safevar_sumo.reference.calibration import _refining_population, _thin
 from safevar_sumo.reference.effects import Effect, Regression, covered_by_spread, error_beyond_spread
 from safevar_sumo.reference.fit_space import FitSpace
 from safevar_sumo.reference.loss import ReferenceLoss, original_loss
-from safevar_sumo.reference.parameters import Free, free_parameters, value_of
+from safevar_sumo.reference.parameters import FittedParameter, free_parameters, value_of
 from safevar_sumo.reference.profiles import Profiles
 from safevar_sumo.reference.search import TrialSearch
 from safevar_sumo.study import FitTable, FreeParameter, Study, load_study
@@ -109,7 +109,8 @@ def test_from_scratch_the_first_study_is_fitted_alone_then_what_the_others_have_
 
 def test_a_search_by_logarithm_has_the_geometric_mean_in_the_middle_and_stays_in_its_bounds() -> None:
     bounds = FreeParameter(lower=0.3, upper=30.0, unit="m", meaning="gap", log=True)
-    trial = FitSpace([Free(GAP, (0,), bounds), Free(HESITATION, (0,), msgspec.structs.replace(bounds, log=False))], [])
+    linear = msgspec.structs.replace(bounds, log=False)
+    trial = FitSpace([FittedParameter(GAP, (0,), bounds), FittedParameter(HESITATION, (0,), linear)], [])
     assert trial.values(np.array([[0.5, 0.5], [0.75, 0.0]])) == pytest.approx(np.array([[3.0, 15.15], [3 * 10**0.5, 0.3]]))
     assert trial.values(np.ones(2)).max() <= 30.0
     study = msgspec.structs.replace(mine(1.0), calibration={GAP: msgspec.structs.replace(bounds, lower=0.0)})
@@ -119,8 +120,8 @@ def test_a_search_by_logarithm_has_the_geometric_mean_in_the_middle_and_stays_in
 
 def test_few_rows_are_spread_as_all_are(data: ReferenceData) -> None:
     order = data._replace(metrics={"safety_degree": np.random.default_rng(1).permutation(24).astype(float)})
-    assert sorted(_thinned(order, 5).metrics["safety_degree"]) == [2, 7, 12, 17, 22]
-    assert _thinned(order, 1).metrics["safety_degree"].tolist() == order.metrics["safety_degree"].tolist()
+    assert sorted(_thin(order, 5).metrics["safety_degree"]) == [2, 7, 12, 17, 22]
+    assert _thin(order, 1).metrics["safety_degree"].tolist() == order.metrics["safety_degree"].tolist()
 
 
 def with_hesitation(study: Study, hesitation: float) -> Study:
@@ -262,7 +263,7 @@ def test_searches_begin_at_the_best_of_many_places_with_what_is_the_same_at_one_
     assert all(place[2] == place[0] for place in screened)
     second = sorted(screened, key=lambda place: float(((place - 0.2) ** 2).sum() + (place[0] > 0.5)))[1]
     assert bowl.places[-1] == pytest.approx(second, abs=1e-6)
-    assert search.left == 149
+    assert search.trials_left == 149
 
 
 def test_the_models_error_covers_nine_tenths_of_rows_each_file_counted_alike(data: ReferenceData) -> None:
@@ -286,7 +287,7 @@ def test_no_trial_is_lost_and_none_too_many(starts: int, trials: int) -> None:
     searches = [search.begin(np.full(2, 0.9), 0.3, seed) for seed in range(1, starts + 1)]
     search.race(searches)
     assert bowl.tried == trials == len(losses)
-    assert search.left == 0
+    assert search.trials_left == 0
     assert losses == sorted(losses, reverse=True)
 
 
@@ -312,7 +313,7 @@ def test_what_fits_as_well_is_an_interval_and_sets_that_are_far_apart() -> None:
     search.race([search.begin(np.array([place, 0.6]), 0.3, 3) for place in (0.3, 0.5)])
     assert search.best is not None
     bounds = FreeParameter(lower=0, upper=1, unit="-", meaning="place")
-    profiles = Profiles.of([Free("a", (0,), bounds), Free("b", (1,), bounds)], basin, search, np.asarray(search.best))
+    profiles = Profiles.of([FittedParameter("a", (0,), bounds), FittedParameter("b", (1,), bounds)], basin, search, np.asarray(search.best))
     for (low, high), whole in ((profiles.interval(0), 0.4), (profiles.interval(1), 4.0)):
         assert 0 <= low < 0.3 * whole, "no more than what is as good, and most of it"
         assert 0.7 * whole < high <= whole
