@@ -52,7 +52,7 @@ def tables(*results: Results | str | Path, question: str | None = None) -> Table
     Returns
     -------
     Tables
-        Frames by name; their columns are those of the functions in `safevar_sumo.analysis`.
+        Frames by name; the functions in `safevar_sumo.analysis` describe the columns.
 
     Raises
     ------
