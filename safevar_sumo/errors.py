@@ -62,17 +62,17 @@ def warn(message: str) -> None:
     warnings.warn(message, stacklevel=level)
 
 
-LONGEST_MESSAGE = 500
+MAX_MESSAGE_LENGTH = 500
 """Largest number of characters of somebody else's message in an error."""
 
 
 def in_one_line(error: BaseException) -> str:
-    """The class of an error and its message, up to `LONGEST_MESSAGE` characters, even if `str(error)` fails."""
+    """The class of an error and its message, up to `MAX_MESSAGE_LENGTH` characters, even if `str(error)` fails."""
     try:
         message = " ".join(str(error).split())
     except Exception:
         message = ""
-    excerpt = message if len(message) <= LONGEST_MESSAGE else f"{message[:LONGEST_MESSAGE]}..."
+    excerpt = message if len(message) <= MAX_MESSAGE_LENGTH else f"{message[:MAX_MESSAGE_LENGTH]}..."
     return f"{type(error).__name__}: {excerpt}" if excerpt else type(error).__name__
 
 

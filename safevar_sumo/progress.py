@@ -89,19 +89,19 @@ class _Tally:
             self._timed_simulations += simulated
             self._timed_evaluations += len(evaluations)
         self.done += len(evaluations)
-        evaluated, collided = self._by_run.get(key, (0, set()))
-        previous_count = len(collided)
-        collided.update(setting.tobytes() for setting in evaluations.settings[evaluations.collided])
-        self._by_run[key] = evaluated + len(evaluations), collided
-        self._collisions += len(collided) - previous_count
+        evaluation_count, colliding_settings = self._by_run.get(key, (0, set()))
+        previous_count = len(colliding_settings)
+        colliding_settings.update(setting.tobytes() for setting in evaluations.settings[evaluations.collided])
+        self._by_run[key] = evaluation_count + len(evaluations), colliding_settings
+        self._collisions += len(colliding_settings) - previous_count
         if evaluations.valid.any():
             self._lowest_degree = min(self._lowest_degree, float(np.min(evaluations.f_safe[evaluations.valid])))
 
     def close_run(self, key: RunKey, asked: int) -> None:
         """Count a run as finished after `asked` evaluations, which may be fewer than its budget."""
-        evaluated, _ = self._by_run.pop(key, (0, set()))
+        evaluation_count, _ = self._by_run.pop(key, (0, set()))
         self._finished_runs += 1
-        self.done += asked - evaluated
+        self.done += asked - evaluation_count
         self.total -= self._evaluations - asked
 
     def text(self, width: int | None = None) -> str:

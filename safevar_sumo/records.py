@@ -247,8 +247,8 @@ class SimulationRuns:
         gap_closes = (gap > -TOUCH) & np.isfinite(gap) & (gap_after <= 0) & (first_speed > 0)
         distance = np.where(gap_closes, np.maximum(gap, 0.0), 0.0)
         squared_speed = first_speed * first_speed + 2 * (end_speed - first_speed) / trace.step * distance
-        lowest, highest = np.minimum(first_speed, end_speed), np.maximum(first_speed, end_speed)
-        at_contact = np.minimum(np.maximum(np.sqrt(np.maximum(squared_speed, 0.0)), lowest), highest)
+        min_speed, max_speed = np.minimum(first_speed, end_speed), np.maximum(first_speed, end_speed)
+        at_contact = np.minimum(np.maximum(np.sqrt(np.maximum(squared_speed, 0.0)), min_speed), max_speed)
         at_end_of_step = self.collision_speed - obstacle_speed[last_sample, columns]
         return np.asarray(np.where(gap_closes & ~np.isnan(self.collision_speed), at_contact, at_end_of_step))
 
@@ -341,9 +341,9 @@ class Evaluations:
     @classmethod
     def none(cls, n: int, metrics: Iterable[str]) -> Evaluations:
         """Empty evaluations, for settings of `n` characteristics."""
-        empty = np.zeros(0)
-        return cls(settings=np.zeros((0, n)), outcome=np.zeros(0, dtype="U16"), collision_speed=empty,
-                   metrics=dict.fromkeys(metrics, empty), f_diff=empty, f_num_diff=empty)
+        empty_array = np.zeros(0)
+        return cls(settings=np.zeros((0, n)), outcome=np.zeros(0, dtype="U16"), collision_speed=empty_array,
+                   metrics=dict.fromkeys(metrics, empty_array), f_diff=empty_array, f_num_diff=empty_array)
 
     @classmethod
     def concatenate(cls, parts: Sequence[Evaluations]) -> Evaluations:

@@ -84,8 +84,8 @@ def figures(*results: Results | str | Path) -> Figures:
     """
     from safevar_sumo.analysis.research_questions.gallery import draw
 
-    drawn, lacking = draw(_cases(results))
-    result = Figures(drawn)
+    figures_by_name, lacking = draw(_cases(results))
+    result = Figures(figures_by_name)
     result.lacking = tuple(lacking)
     return result
 

@@ -136,9 +136,9 @@ class Simulation:
     @property
     def units(self) -> dict[str, str]:
         """The unit of every number of `to_dict`, by its name."""
-        measured = {metric.name: metric.unit for metric in self.scoring.metrics}
-        measured |= {objective.name: objective.unit for objective in self.scoring.objectives if objective.name in self.metrics}
-        return {"collision_speed": "m/s", **measured, "f_safe": "m, or -m/s", "f_diff": "fraction", "f_num_diff": "characteristics"}
+        units_of_metrics = {metric.name: metric.unit for metric in self.scoring.metrics}
+        units_of_metrics |= {objective.name: objective.unit for objective in self.scoring.objectives if objective.name in self.metrics}
+        return {"collision_speed": "m/s", **units_of_metrics, "f_safe": "m, or -m/s", "f_diff": "fraction", "f_num_diff": "characteristics"}
 
     @cached_property
     def trace(self) -> pd.DataFrame:
@@ -225,7 +225,8 @@ def _simulate_one(study: Study, system: System, requested: FloatArray, setting: 
 
 
 def _put_back(system: System, requested: FloatArray, setting: FloatArray) -> dict[str, float]:
-    return {name: float(value) for name, value, used in zip(system.characteristics.names, requested, setting, strict=True) if value != used}
+    values = zip(system.characteristics.names, requested, setting, strict=True)
+    return {name: float(requested_value) for name, requested_value, filtered_value in values if requested_value != filtered_value}
 
 
 SETTINGS_FORMAT = ("a list of mappings such as [{'mass': 2500}], a pandas.DataFrame with a column for each characteristic that is changed, "

@@ -32,7 +32,7 @@ COLUMNS = (164, 250, 340, 450)
 """Left edges of the columns of text [pixels]."""
 PANEL = 62
 """Height of the text above the road [pixels]."""
-GROUND, ROAD, SEAM, PATH, WHITE, INK, FAINT = "#eef0ec", "#9aa1a9", "#e8eaec", "#cfd3cf", "#ffffff", "#1d2329", "#5d666f"
+GROUND, ROAD, SEAM, PATH, WHITE, INK, PALE_INK = "#eef0ec", "#9aa1a9", "#e8eaec", "#cfd3cf", "#ffffff", "#1d2329", "#5d666f"
 VEHICLES = {ORIGINAL: "#0072b2", CHANGED: "#d55e00"}
 OTHER_ACTOR, PERSON, BRAKE = "#3f464d", "#1d2329", "#e60000"
 STRIPE = 0.5
@@ -77,7 +77,7 @@ class _Canvas:
     def _pixels(self, points: FloatArray, sample: int) -> Points:
         view = self._scene.view
         grid = OVERSAMPLING / self._scale  # the camera moves by whole pixels, so that the road stays sharp
-        x, y = points[:, 0] - np.round(view.left[sample] / grid) * grid, points[:, 1] - view.bottom
+        x, y = points[:, 0] - np.round(view.left_ends[sample] / grid) * grid, points[:, 1] - view.bottom
         return list(zip((x * self._scale).tolist(), (self._size[1] - y * self._scale).tolist(), strict=True))
 
     def _scale_marks(self, draw: ImageDraw, sample: int) -> None:
@@ -85,8 +85,8 @@ class _Canvas:
         view = self._scene.view
         for mark in self._scene.marks(sample):
             (x, y), = self._pixels(np.array([[mark, view.bottom]]), sample)
-            draw.line((x, y - 12 * OVERSAMPLING, x, y), fill=FAINT, width=OVERSAMPLING)
-            self._word(draw, (round(x / OVERSAMPLING) + 4, round(y / OVERSAMPLING) - 16), f"{mark:g} m", FAINT, 12)
+            draw.line((x, y - 12 * OVERSAMPLING, x, y), fill=PALE_INK, width=OVERSAMPLING)
+            self._word(draw, (round(x / OVERSAMPLING) + 4, round(y / OVERSAMPLING) - 16), f"{mark:g} m", PALE_INK, 12)
 
     def _lane(self, draw: ImageDraw, lane: LaneLine, sample: int) -> None:
         if lane.kind == "area":
@@ -115,12 +115,12 @@ class _Canvas:
         opacity = "99" if body.is_vut and body.row == ORIGINAL and len(self._scene.moments) > 1 else "e6"
         draw.polygon(self._pixels(corners, sample), fill=colour + opacity, outline=colour, width=2 * OVERSAMPLING)
         window = corners[[0, 1]] * [[0.72], [0.72]] + corners[[3, 2]] * 0.28
-        back = corners[[0, 1]] * 0.56 + corners[[3, 2]] * 0.44
-        draw.polygon(self._pixels(np.concatenate([window, back[::-1]]), sample), fill="#ffffff90")
+        rear_edge = corners[[0, 1]] * 0.56 + corners[[3, 2]] * 0.44
+        draw.polygon(self._pixels(np.concatenate([window, rear_edge[::-1]]), sample), fill="#ffffff90")
         if body.is_vut and self._brakes(body.row, sample):
-            for inner, outer in ((3, 2), (2, 3)):
-                side = corners[outer] - corners[inner]
-                light = np.array([corners[inner], corners[inner] + 0.3 * side])
+            for corner, opposite_corner in ((3, 2), (2, 3)):
+                side = corners[opposite_corner] - corners[corner]
+                light = np.array([corners[corner], corners[corner] + 0.3 * side])
                 forward = (corners[0] - corners[3]) / body.length * 0.28
                 draw.polygon(self._pixels(np.concatenate([light, light[::-1] + forward]), sample), fill=BRAKE)
 
@@ -136,8 +136,8 @@ class _Canvas:
             moments = self._scene.moments[row]
             run_sample = min(sample, moments.end)
             gap = trace.gap[run_sample, row]
-            finished = sample >= (moments.end if moments.nearest is None else moments.nearest)
-            state = self._scene.comparison.verdict(row) if finished else "brakes" if self._brakes(row, run_sample) else ""
+            is_finished = sample >= (moments.end if moments.nearest is None else moments.nearest)
+            state = self._scene.comparison.verdict(row) if is_finished else "brakes" if self._brakes(row, run_sample) else ""
             y = 8 + 26 * row
             draw.rectangle((OVERSAMPLING * 132, OVERSAMPLING * (y + 3), OVERSAMPLING * 154, OVERSAMPLING * (y + 17)), fill=VEHICLES[row])
             gap_text = f"gap {max(gap, 0):.1f} m" if np.isfinite(gap) else ""
@@ -172,7 +172,7 @@ SECONDS_PER_FRAME = 0.1
 LAST_FRAME = 2.0
 """Duration of the last frame [s]."""
 COLOURS = 64
-LARGEST_GIF = 1_000_000
+MAX_GIF_SIZE = 1_000_000
 """Size above which a gif gets fewer frames [bytes]."""
 
 
@@ -200,9 +200,9 @@ def check_animation(path: Path) -> None:
 
 
 def _gif(scene: FlatScene, path: Path) -> None:
-    """Write as many frames as `LARGEST_GIF` allows."""
+    """Write as many frames as `MAX_GIF_SIZE` allows."""
     stride = max(1, round(SECONDS_PER_FRAME / scene.step))
-    while len(content := _gif_of(scene, stride)) > LARGEST_GIF and stride < scene.length:
+    while len(content := _gif_of(scene, stride)) > MAX_GIF_SIZE and stride < scene.length:
         stride *= 2
     path.write_bytes(content)
 

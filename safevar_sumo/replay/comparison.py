@@ -164,7 +164,8 @@ def compare_setting(study: Study, system: System, setting: FloatArray) -> Compar
     return Comparison(title=study.title + "".join(names[:1]), characteristics=system.characteristics,
                       ttc_threshold=system.metrics.ttc_threshold, network=staged(worst_system.scenario).folder,
                       evaluations=score(worst_system, settings, recording.runs),
-                      film=replace(recording, runs=_up_to_impacts(recording.runs)), objectives=_further_objectives(worst_system.measuring))
+                      film=replace(recording, runs=_with_pedals_before_impacts(recording.runs)),
+                      objectives=_further_objectives(worst_system.measuring))
 
 
 def _further_objectives(measuring: Measuring) -> tuple[MetricFacts, ...]:
@@ -173,7 +174,7 @@ def _further_objectives(measuring: Measuring) -> tuple[MetricFacts, ...]:
     return tuple(metric for metric in measuring.scoring.metrics if metric.name in objectives - {*METRICS, RATING_POINTS.name})
 
 
-def _up_to_impacts(runs: SimulationRuns) -> SimulationRuns:
+def _with_pedals_before_impacts(runs: SimulationRuns) -> SimulationRuns:
     """Runs with the pedals of the sample before an impact also at the impact, where a command has no effect any more."""
     trace = runs.trace
     throttle, brake = trace.throttle.copy(), trace.brake.copy()

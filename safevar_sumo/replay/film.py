@@ -47,7 +47,7 @@ class ActorTrack(NamedTuple):
 class Film:
     """N simulations seen from above.
 
-    `tracks` holds the tracks of actors by name; `last` is the last sample of every simulation, shape (N,): later samples are
+    `tracks` holds the tracks of actors by name; `last_samples` holds the last sample of every simulation, shape (N,): later samples are
     meaningless, as SUMO continues with the rest of the batch.
     """
 
@@ -56,7 +56,7 @@ class Film:
     road: tuple[LaneLine, ...]
 
     @property
-    def last(self) -> np.ndarray:
+    def last_samples(self) -> np.ndarray:
         active = self.runs.trace.active
         return np.asarray(len(active) - 1 - np.argmax(active[::-1], axis=0))
 

@@ -104,10 +104,10 @@ def _show(window: Window, scene: FlatScene, sample: int, layout: _Layout) -> Non
         frame = _frame(scene, sample) + offset
         corners.append(frame)
         words = f"{comparison.name(row)} ({COLOUR_NAMES[row]}): {film.runs.trace.speed[run_sample, row]:.1f} m/s"
-        finished = sample >= (scene.moments[row].end if scene.moments[row].nearest is None else int(scene.moments[row].nearest or 0))
+        is_finished = sample >= (scene.moments[row].end if scene.moments[row].nearest is None else int(scene.moments[row].nearest or 0))
         middle = frame.mean(axis=0)
         window.write(f"legend.{row}", float(middle[0]), float(frame[:, 1].min()) + LEGEND_HEIGHT,
-                     f"{words}, {comparison.verdict(row)}" if finished else f"{words}, {sample * scene.step:.2f} s")
+                     f"{words}, {comparison.verdict(row)}" if is_finished else f"{words}, {sample * scene.step:.2f} s")
     all_corners = np.concatenate(corners)
     window.look(*(float(value) for value in (*all_corners.min(axis=0), *all_corners.max(axis=0))))
     window.show(poses)
@@ -119,7 +119,7 @@ def _frame(scene: FlatScene, sample: int) -> np.ndarray:
     heading = np.deg2rad(90 - track.angle[0, 0])
     forward, leftward = np.array([np.cos(heading), np.sin(heading)]), np.array([-np.sin(heading), np.cos(heading)])
     start = np.array([track.x[0, 0], track.y[0, 0]])
-    return np.array([start + forward * x + leftward * y for x in (view.left[sample], view.left[sample] + view.width)
+    return np.array([start + forward * x + leftward * y for x in (view.left_ends[sample], view.left_ends[sample] + view.width)
                      for y in (view.bottom, view.bottom + view.height)])
 
 

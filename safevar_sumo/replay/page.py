@@ -50,8 +50,8 @@ def player_data(scene: FlatScene) -> dict[str, Any]:
     view, key_sample = scene.view, scene.key_sample
     runs = [_drive(scene, row) for row in scene.comparison.rows]
     bodies = sorted(scene.bodies, key=lambda body: (body.is_vut, body.row))
-    left = _numbers(view.left)
-    box = {"left": left, "top": round(-view.bottom - view.height, DECIMALS), "width": round(view.width, DECIMALS),
+    left_ends = _numbers(view.left_ends)
+    box = {"left": left_ends, "top": round(-view.bottom - view.height, DECIMALS), "width": round(view.width, DECIMALS),
            "height": round(view.height, DECIMALS)}
     common_data = {"step": scene.step, "length": scene.length, "key": key_sample, "view": box, "drives": runs}
     return {
@@ -59,8 +59,8 @@ def player_data(scene: FlatScene) -> dict[str, Any]:
         "description": _description(scene), "moments": _moments(scene), "bottom": round(-view.bottom, DECIMALS),
         "letters": round(view.width / TEXT_HEIGHTS, DECIMALS),
         "road": [_lane(lane) for kind in ("area", "path", "road", "crossing") for lane in scene.road if lane.kind == kind],
-        "ticks": list(range(int(np.floor(view.left.min() / MARK_DISTANCE)) * MARK_DISTANCE,
-                            int(view.left.max() + view.width) + MARK_DISTANCE, MARK_DISTANCE)),
+        "ticks": list(range(int(np.floor(view.left_ends.min() / MARK_DISTANCE)) * MARK_DISTANCE,
+                            int(view.left_ends.max() + view.width) + MARK_DISTANCE, MARK_DISTANCE)),
         "bodies": [_still_body(body, scene) for body in bodies],
         "played": {**common_data, "bodies": [_moving_body(body) for body in bodies]}}
 

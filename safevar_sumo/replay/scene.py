@@ -55,7 +55,7 @@ class FlatBody(NamedTuple):
 class View(NamedTuple):
     """The part of the road that is shown: its left end at every sample, shape (T,), its lower end, and its size [m]."""
 
-    left: FloatArray
+    left_ends: FloatArray
     bottom: float
     width: float
     height: float
@@ -81,7 +81,7 @@ class FlatScene:
 
     def marks(self, sample: int) -> list[int]:
         """The marks in view, by their distance from the start [m]."""
-        left = float(self.view.left[sample])
+        left = float(self.view.left_ends[sample])
         return list(range(math.ceil(left / MARK_DISTANCE) * MARK_DISTANCE, math.floor(left + self.view.width) + 1, MARK_DISTANCE))
 
 
@@ -112,7 +112,7 @@ def _body(name: str, track: ActorTrack, row: int, end: int, length: int, to_scen
 
 def _is_near(film: Film, name: str, row: int) -> bool:
     """Whether an actor ever comes near the vehicle under test."""
-    track, vut, end = film.tracks[name], film.tracks[VUT], film.last[row] + 1
+    track, vut, end = film.tracks[name], film.tracks[VUT], film.last_samples[row] + 1
     distance = np.hypot(track.x[:end, row] - vut.x[:end, row], track.y[:end, row] - vut.y[:end, row])
     return bool(np.any(distance < MAX_DISTANCE + track.length))
 
@@ -121,7 +121,7 @@ def _is_duplicate(comparison: Comparison, name: str, row: int) -> bool:
     """Whether the changed vehicle's copy of an actor is always at the same position, so that only this copy is drawn."""
     if row == CHANGED or len(comparison.rows) == 1:
         return False
-    track, end = comparison.film.tracks[name], int(comparison.film.last.min()) + 1
+    track, end = comparison.film.tracks[name], int(comparison.film.last_samples.min()) + 1
     offset = np.hypot(track.x[:end, 0] - track.x[:end, CHANGED], track.y[:end, 0] - track.y[:end, CHANGED])
     return _is_near(comparison.film, name, CHANGED) and bool(np.all((offset < MAX_OFFSET) | np.isnan(offset)))
 

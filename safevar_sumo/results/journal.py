@@ -151,8 +151,8 @@ def content_of(frames: list[JournalFrame]) -> Content:
         elif isinstance(frame, Result):
             results[frame.budget] = frame
         elif isinstance(frame, Retry) and batches:
-            positions, remaining = _without_failures(positions, Evaluations.concatenate(batches))
-            batches, results = [remaining], {}
+            positions, remaining_evaluations = _without_failures(positions, Evaluations.concatenate(batches))
+            batches, results = [remaining_evaluations], {}
     return Content(positions, Evaluations.concatenate(batches) if positions else None, results)
 
 

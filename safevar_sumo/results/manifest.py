@@ -19,10 +19,10 @@ READABLE_FORMATS = (2, FORMAT)
 RESULTS = 2
 """Version number of the package's results, raised whenever they change (enforced by tests/golden)."""
 PACKAGES = ("safevar_sumo", "libsumo", "eclipse-sumo", "deap", "numpy")
-WITHOUT_EFFECT_ON_RESULTS = ("title", "published", "repeatability", "fit", "calibration", "spread", "model_error", "variation",
+KEYS_WITHOUT_EFFECT_ON_RESULTS = ("title", "published", "repeatability", "fit", "calibration", "spread", "model_error", "variation",
                           "correlations")
 """Keys of a study that change no result."""
-WITHOUT_EFFECT_ON_EVALUATIONS = ("runs", "algorithms", "evaluations", "time_limit")
+KEYS_WITHOUT_EFFECT_ON_EVALUATIONS = ("runs", "algorithms", "evaluations", "time_limit")
 """Keys of a study's search table that change no evaluation, but decide which evaluations there are."""
 LAYERS = {
     "resolved": "the same study and options", "network": "the network's file as it was", "sources": "the file as it was",
@@ -63,8 +63,8 @@ def evaluation_keys(study: Study) -> dict[str, Any]:
         del tables["rating"]  # results from before ratings existed have no such table
     if study.matrix is not None and not study.matrix.protocol:
         del tables["matrix"]["protocol"]
-    search = {key: value for key, value in tables["search"].items() if key not in WITHOUT_EFFECT_ON_EVALUATIONS}
-    return {**{key: value for key, value in tables.items() if key not in WITHOUT_EFFECT_ON_RESULTS}, "search": search}
+    search = {key: value for key, value in tables["search"].items() if key not in KEYS_WITHOUT_EFFECT_ON_EVALUATIONS}
+    return {**{key: value for key, value in tables.items() if key not in KEYS_WITHOUT_EFFECT_ON_RESULTS}, "search": search}
 
 
 def owner_digest(manifest: Mapping[str, Any]) -> str:
@@ -75,12 +75,12 @@ def owner_digest(manifest: Mapping[str, Any]) -> str:
     return _digest([{**manifest["study"], "search": search}, manifest["versions"], manifest.get("network")])
 
 
-def difference(stored: Mapping[str, Any], new: Mapping[str, Any]) -> tuple[str, str]:
+def difference(stored_manifest: Mapping[str, Any], new_manifest: Mapping[str, Any]) -> tuple[str, str]:
     """The first difference of two manifests that may change results, and its remedy; two empty texts if there is no difference."""
-    if stored.get("format") != FORMAT:
-        return f"version {stored['versions'].get('safevar_sumo')} wrote them", "that version"
+    if stored_manifest.get("format") != FORMAT:
+        return f"version {stored_manifest['versions'].get('safevar_sumo')} wrote them", "that version"
     for layer, remedy in LAYERS.items():
-        for text in _differences(layer, stored.get(layer, {}), new.get(layer, {})):
+        for text in _differences(layer, stored_manifest.get(layer, {}), new_manifest.get(layer, {})):
             return text, remedy
     return "", ""
 
@@ -178,21 +178,21 @@ def refuse_edited_table(file: Path, manifest: Mapping[str, Any], remedy: str) ->
 
 def _differences(layer: str, stored: Any, new: Any) -> Iterator[str]:
     """All differences between a layer of two manifests, in words."""
-    for key, before, now in _changed_values(stored, new):
+    for key, old_value, new_value in _changed_values(stored, new):
         if layer in LAYERS_OF_FILES:
-            yield f"{key} {'no longer exists' if now is None else 'is new' if before is None else 'has changed since'}"
+            yield f"{key} {'no longer exists' if new_value is None else 'is new' if old_value is None else 'has changed since'}"
         else:
             name = f"version of {key}" if layer == "versions" else key or "the version of the package's results"
-            yield f"{name} was {before!r} and is {now!r} now"
+            yield f"{name} was {old_value!r} and is {new_value!r} now"
 
 
-def _changed_values(stored: Any, new: Any, key: str = "") -> Iterator[tuple[str, Any, Any]]:
+def _changed_values(first: Any, second: Any, key: str = "") -> Iterator[tuple[str, Any, Any]]:
     """The innermost keys at which two values differ, with the first and the second value; 2 and 2.0 are different."""
-    if isinstance(stored, dict) and isinstance(new, dict):
-        for name in sorted({*stored, *new}):
-            yield from _changed_values(stored.get(name), new.get(name), f"{key}.{name}" if key else name)
-    elif json.dumps(stored, sort_keys=True) != json.dumps(new, sort_keys=True):
-        yield key, stored, new
+    if isinstance(first, dict) and isinstance(second, dict):
+        for name in sorted({*first, *second}):
+            yield from _changed_values(first.get(name), second.get(name), f"{key}.{name}" if key else name)
+    elif json.dumps(first, sort_keys=True) != json.dumps(second, sort_keys=True):
+        yield key, first, second
 
 
 def comparable_inputs(stored: Mapping[str, Any], present_files: Mapping[str, str], late_files: Mapping[str, str], places: Sequence[str]

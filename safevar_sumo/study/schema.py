@@ -15,7 +15,7 @@ from safevar_sumo.shipped import STUDIES
 from safevar_sumo.study.constraints import Constraint
 from safevar_sumo.study.variation import Correlation, Distribution
 
-Positive = Annotated[float, Meta(gt=0, le=1e6)]
+PositiveNumber = Annotated[float, Meta(gt=0, le=1e6)]
 PositiveInt = Annotated[int, Meta(ge=1, le=10_000_000)]
 OwnStep = Annotated[float, Meta(ge=1e-6, le=10)]
 Weight = Annotated[float, Meta(ge=0, le=1e6)]
@@ -45,7 +45,7 @@ class CharacteristicTable(Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     original: float
     lower: float
     upper: float
-    weight: Positive = 1.0
+    weight: PositiveNumber = 1.0
     meaning: Annotated[str, Meta(max_length=MAX_DESCRIPTION_LENGTH)] = ""
     counterpart: Annotated[str, Meta(max_length=MAX_DESCRIPTION_LENGTH)] = ""
 
@@ -109,8 +109,8 @@ class MetricsTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     `also` names further metrics: metrics of the package, such as `max_jerk`, or your own metrics as `package.module:Name`.
     """
 
-    ttc_threshold: Positive
-    sampling_interval: Positive | None = None
+    ttc_threshold: PositiveNumber
+    sampling_interval: PositiveNumber | None = None
     also: list[str] = []
 
 
@@ -249,8 +249,8 @@ class Study(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     `constraints` are conditions that the characteristics of one vehicle satisfy together.
     """
 
-    # A new key that changes no result of a campaign also belongs in WITHOUT_EFFECT_ON_RESULTS of results/manifest.py. Any other new key
-    # becomes part of the identity of results: let `evaluation_keys` there omit its default, so that older results keep their identity.
+    # A new key that changes no result of a campaign also belongs in KEYS_WITHOUT_EFFECT_ON_RESULTS of results/manifest.py. Any other new
+    # key becomes part of the identity of results: let `evaluation_keys` there omit its default, so that older results keep their identity.
     name: Annotated[str, Meta(pattern=NAME)]
     title: str
     scenario: ModelTable
