@@ -7,7 +7,7 @@ import sys
 
 
 def main() -> None:
-    """Run the program. It is loaded here and not above, because every worker process loads this module too."""
+    """Run the program, whose import stands here and not above because every worker process loads this module too."""
     if sys.version_info < (3, 11):  # noqa: UP036
         _fail(f"needs Python 3.11 or newer; this is {'.'.join(map(str, sys.version_info[:3]))}", 1)
     _put_installed_modules_first()
@@ -31,7 +31,7 @@ def _fail(message: str, code: int) -> None:
 
 
 def _put_installed_modules_first() -> None:
-    """A `numpy.py` in the working directory, which `python -m` looks into first, is not numpy: here nor in a worker process."""
+    """Move the working directory, which `python -m` puts first, to the end of the path: a `numpy.py` there must not replace numpy."""
     if sys.path[0] in ("", os.getcwd()):
         sys.path.append(sys.path.pop(0))
     os.environ.setdefault("PYTHONSAFEPATH", "1")

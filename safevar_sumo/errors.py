@@ -19,7 +19,7 @@ class SafevarError(Exception):
 
 
 class InputError(SafevarError):
-    """The user gave a value that cannot be used.
+    """The user gave a value that this package cannot use.
 
     Parameters
     ----------
@@ -28,7 +28,7 @@ class InputError(SafevarError):
     problem
         The key and the value, and what is wrong with them.
     legal
-        The values that are accepted.
+        The expected values.
     """
 
     exit_code = 2
@@ -62,18 +62,18 @@ def warn(message: str) -> None:
     warnings.warn(message, stacklevel=level)
 
 
-LONGEST_MESSAGE = 500
+MAX_MESSAGE_LENGTH = 500
 """Largest number of characters of somebody else's message in an error."""
 
 
 def in_one_line(error: BaseException) -> str:
-    """The class of an error and its message, up to `LONGEST_MESSAGE` characters, even if `str(error)` fails."""
+    """The class of an error and its message, up to `MAX_MESSAGE_LENGTH` characters, even if `str(error)` fails."""
     try:
         message = " ".join(str(error).split())
     except Exception:
         message = ""
-    cut = message if len(message) <= LONGEST_MESSAGE else f"{message[:LONGEST_MESSAGE]}..."
-    return f"{type(error).__name__}: {cut}" if cut else type(error).__name__
+    excerpt = message if len(message) <= MAX_MESSAGE_LENGTH else f"{message[:MAX_MESSAGE_LENGTH]}..."
+    return f"{type(error).__name__}: {excerpt}" if excerpt else type(error).__name__
 
 
 def unknown(source: object, problem: str, name: object, names: Iterable[str], otherwise: str = "") -> InputError:
@@ -95,10 +95,10 @@ def unknown(source: object, problem: str, name: object, names: Iterable[str], ot
 
 
 def did_you_mean(name: object, names: Iterable[str]) -> str:
-    """`; did you mean 'rain'?` with the nearest name, upper and lower case ignored; empty if no name is near."""
+    """The text `; did you mean 'rain'?` with the name nearest in spelling, ignoring case; empty if no name is similar."""
     by_lower = {option.lower(): option for option in names}
-    near = get_close_matches(str(name).lower(), by_lower, n=1)
-    return f"; did you mean {by_lower[near[0]]!r}?" if near else ""
+    matches = get_close_matches(str(name).lower(), by_lower, n=1)
+    return f"; did you mean {by_lower[matches[0]]!r}?" if matches else ""
 
 
 def one_of(names: Iterable[str]) -> str:

@@ -1,4 +1,4 @@
-"""Progress: bars on a terminal, a line every half minute elsewhere."""
+"""Progress of a study: a bar on a terminal, or else a line every half minute."""
 
 from __future__ import annotations
 
@@ -25,16 +25,16 @@ MIN_TEXT_WIDTH = 26
 
 
 class CampaignProgress:
-    """One bar for the whole study on a terminal, a line every half minute elsewhere: throughput, time left, collisions."""
+    """One bar for the whole study on a terminal, or else a line every half minute: throughput, time left, collisions."""
 
     def __init__(self, console: Console, study: Study, keys: list[RunKey], quiet: bool) -> None:
         self._console, self._quiet, self._name = console, quiet, study.name
-        shown = console.is_terminal and not quiet
+        has_bar = console.is_terminal and not quiet
         self._text_width = console.width - len(study.name) - 1
         bar = [BarColumn(bar_width=BAR_WIDTH)] if self._text_width - BAR_WIDTH - 1 >= MIN_TEXT_WIDTH else []
         self._text_width -= len(bar) * (BAR_WIDTH + 1)
         self._bar = Progress(TextColumn("{task.description}", markup=False), *bar, TextColumn("{task.fields[summary]}", markup=False),
-                             console=console, disable=not shown)
+                             console=console, disable=not has_bar)
         self._tally = _Tally(len(keys), study.search.evaluations)
         self._task = self._bar.add_task(study.name, total=self._tally.total, summary="waiting")
         self._last_line = time.monotonic()
@@ -74,72 +74,72 @@ class _Tally:
     def __init__(self, runs: int, evaluations: int) -> None:
         self.done, self.total = 0, runs * evaluations
         self._evaluations, self._runs = evaluations, runs
-        self._finished = self._simulated = self._evaluated = self._collisions = 0
-        self._best = np.inf
-        self._first: float | None = None
-        self._last = 0.0
-        self._by_run: dict[RunKey, tuple[int, set[bytes]]] = {}  # evaluations, and settings that collide
+        self._finished_runs = self._timed_simulations = self._timed_evaluations = self._collisions = 0
+        self._lowest_degree = np.inf
+        self._start_time: float | None = None
+        self._last_time = 0.0
+        self._by_run: dict[RunKey, tuple[int, set[bytes]]] = {}  # number of evaluations, and settings that collide
 
     def add(self, key: RunKey, evaluations: Evaluations, simulated: int) -> None:
         """Count evaluations of a run; a setting that collides counts once per run, as in `status`."""
-        self._last = time.monotonic()
-        if simulated and self._first is None:
-            self._first = self._last  # the first batch includes the start of the workers: it does not count
+        self._last_time = time.monotonic()
+        if simulated and self._start_time is None:
+            self._start_time = self._last_time  # the first batch does not count, as it includes the start of the workers
         elif simulated:
-            self._simulated += simulated
-            self._evaluated += len(evaluations)
+            self._timed_simulations += simulated
+            self._timed_evaluations += len(evaluations)
         self.done += len(evaluations)
-        evaluated, collided = self._by_run.get(key, (0, set()))
-        before = len(collided)
-        collided.update(setting.tobytes() for setting in evaluations.settings[evaluations.collided])
-        self._by_run[key] = evaluated + len(evaluations), collided
-        self._collisions += len(collided) - before
+        evaluation_count, colliding_settings = self._by_run.get(key, (0, set()))
+        previous_count = len(colliding_settings)
+        colliding_settings.update(setting.tobytes() for setting in evaluations.settings[evaluations.collided])
+        self._by_run[key] = evaluation_count + len(evaluations), colliding_settings
+        self._collisions += len(colliding_settings) - previous_count
         if evaluations.valid.any():
-            self._best = min(self._best, float(np.min(evaluations.f_safe[evaluations.valid])))
+            self._lowest_degree = min(self._lowest_degree, float(np.min(evaluations.f_safe[evaluations.valid])))
 
     def close_run(self, key: RunKey, asked: int) -> None:
         """Count a run as finished after `asked` evaluations, which may be fewer than its budget."""
-        evaluated, _ = self._by_run.pop(key, (0, set()))
-        self._finished += 1
-        self.done += asked - evaluated
+        evaluation_count, _ = self._by_run.pop(key, (0, set()))
+        self._finished_runs += 1
+        self.done += asked - evaluation_count
         self.total -= self._evaluations - asked
 
     def text(self, width: int | None = None) -> str:
         """The progress in at most `width` characters; the most important parts come first."""
-        collisions = [] if np.isinf(self._best) else [f"{self._collisions} collisions"]
-        best = [] if np.isinf(self._best) else [f"best SD {self._best:.2f}"]
-        rate = [f"{self._simulated / self._seconds:.0f}/s"] if self._simulated and self._seconds >= SETTLING_TIME else []
+        collisions = [] if np.isinf(self._lowest_degree) else [f"{self._collisions} collisions"]
+        best = [] if np.isinf(self._lowest_degree) else [f"best SD {self._lowest_degree:.2f}"]
+        rate = [f"{self._timed_simulations / self._seconds:.0f}/s"] if self._timed_simulations and self._seconds >= SETTLING_TIME else []
         text = ""
-        for part in (*rate, self._time_left(), *collisions, f"runs {self._finished}/{self._runs}", *best):
-            longer = f"{text}, {part}" if text else part
-            if width is not None and len(longer) > width:
+        for part in (*rate, self._time_left(), *collisions, f"runs {self._finished_runs}/{self._runs}", *best):
+            extended_text = f"{text}, {part}" if text else part
+            if width is not None and len(extended_text) > width:
                 break
-            text = longer
+            text = extended_text
         return text
 
     @property
     def _seconds(self) -> float:
-        return 0.0 if self._first is None else self._last - self._first
+        return 0.0 if self._start_time is None else self._last_time - self._start_time
 
     def _time_left(self) -> str:
         """Hours, minutes and seconds at the throughput of all runs together, after `SETTLING_TIME`."""
         if self.done >= self.total:
             return "0:00:00 left"
-        if not self._evaluated or self._seconds < SETTLING_TIME:
+        if not self._timed_evaluations or self._seconds < SETTLING_TIME:
             return "time left not known yet"
-        return f"{timedelta(seconds=round((self.total - self.done) * self._seconds / self._evaluated))} left"
+        return f"{timedelta(seconds=round((self.total - self.done) * self._seconds / self._timed_evaluations))} left"
 
 
 @contextmanager
-def counting_bar(console: Console, what: str, total: int) -> Iterator[Callable[[int], None]]:
+def counting_bar(console: Console, label: str, total: int) -> Iterator[Callable[[int], None]]:
     """Show a bar that counts up to `total`; yields the function that adds to the count."""
     done = 0
     with stages(console) as show:
-        show(what, done, total)
+        show(label, done, total)
 
         def add(number: int) -> None:
             nonlocal done
             done += number
-            show(what, done, total)
+            show(label, done, total)
 
         yield add

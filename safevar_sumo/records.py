@@ -17,15 +17,15 @@ BoolArray = npt.NDArray[np.bool_]
 IntArray = npt.NDArray[np.int_]
 
 STANDSTILL = 1e-3
-"""Below this speed a vehicle counts as standing [m/s] (method section 4)."""
+"""Speed below which a vehicle counts as standing [m/s] (method section 4)."""
 KMH_PER_MS = 3.6
 """km/h per m/s."""
 GRAVITY = 9.81
 """Acceleration of gravity [m/s^2]."""
 TIME_ROUNDING = 1e-9
-"""Sums of time steps that differ by less are the same time [s]."""
+"""Difference below which two sums of time steps are the same time [s]."""
 TOUCH = 2e-3
-"""Bodies that overlap by less may only touch: SUMO ignores an overlap of a millimetre [m]."""
+"""Overlap below which bodies may only touch, as SUMO ignores an overlap of a millimetre [m]."""
 TIME_DECIMALS = 9
 """Decimals to which sums of time steps are rounded: 0.15 s, not 0.15000000000000002 s."""
 
@@ -52,7 +52,7 @@ for _constant in (ZERO, EVERYWHERE):
 
 
 def finite_or_none(value: float) -> float | None:
-    """A value as JSON holds it: undefined (NaN) is None."""
+    """A value for JSON, which has no NaN: an undefined value becomes None."""
     return None if np.isnan(value) else float(value)
 
 
@@ -86,10 +86,10 @@ class Command(NamedTuple):
 
 
 class PedalTables(NamedTuple):
-    """How the original vehicle's pedals act on a dry road, at `speeds` [m/s].
+    """The effect of the original vehicle's pedals on a dry road, at `speeds` [m/s].
 
-    Acceleration at `full_throttle` and deceleration when `coasting` [m/s^2]; `braking` is the deceleration that the brake adds per
-    unit of pedal, far from the limit of the tyres [m/s^2].
+    `full_throttle` is the acceleration at full throttle, `coasting` the deceleration without pedals [m/s^2]; `braking` is the
+    deceleration that the brake adds per unit of pedal, far from the limit of the tyres [m/s^2].
     """
 
     speeds: FloatArray
@@ -101,8 +101,8 @@ class PedalTables(NamedTuple):
 class Nominal(NamedTuple):
     """The original vehicle on a dry road: all that an ADS knows of the vehicle.
 
-    `mass` [kg], `accel`, `decel` [m/s^2] and `max_speed` [m/s] are those of its SUMO type; `actuator_lag` [s] is the time constant
-    with which its wheels follow the pedals (`tau` of its SUMO type). `tables` drives the vehicle when it is first needed, and returns
+    `mass` [kg], `accel`, `decel` [m/s^2] and `max_speed` [m/s] are values of its SUMO type; `actuator_lag` [s] is the time constant
+    with which its wheels follow the pedals (`tau` of its SUMO type). `tables` drives the vehicle on its first call, and returns
     `speeds`, `full_throttle`, `coasting` and `braking`.
     """
 
@@ -136,10 +136,10 @@ class Nominal(NamedTuple):
 
 
 class Encounter(NamedTuple):
-    """The geometry of N vehicles and their obstacle; shape (T, N).
+    """The geometry of N vehicles and their obstacle at T samples; shape (T, N).
 
     The safety degree uses `separation`, the time to collision `distance` and `closing_speed`
-    [m, m, m/s]; both only while `in_conflict`.
+    [m, m, m/s]; both metrics count only samples `in_conflict`.
     """
 
     separation: FloatArray
@@ -152,7 +152,7 @@ class Encounter(NamedTuple):
 class Trace:
     """T samples of N vehicles, `step` seconds apart; arrays of shape (T, N), `time` (T,).
 
-    A vehicle's samples count while `active`; later samples are meaningless, for SUMO goes on with the rest of the batch.
+    A vehicle's samples count while `active`; later samples are meaningless, as SUMO continues with the rest of the batch.
     `vehicle_length`, `position` along the path, `gap` and `lateral` in m, speeds in m/s, `throttle` and `brake` as commanded,
     `pedal` is the brake pedal's position; `obstacle_speed` is the obstacle's speed along the vehicle's path.
     """
@@ -174,15 +174,15 @@ class Trace:
 
     def of(self, vehicles: slice) -> Trace:
         """The trace of some of the vehicles."""
-        columns = {one.name: getattr(self, one.name) for one in fields(self)}
-        return replace(self, **{name: values[:, vehicles] for name, values in columns.items() if np.ndim(values) == 2})
+        arrays = {item.name: getattr(self, item.name) for item in fields(self)}
+        return replace(self, **{name: values[:, vehicles] for name, values in arrays.items() if np.ndim(values) == 2})
 
 
 class Contact(NamedTuple):
-    """Where the first contact on each of N vehicles was, shape (N,).
+    """The position of the first contact on each of N vehicles, shape (N,).
 
-    `side` is one of `SIDES`, empty without a contact. `place` is where the obstacle's middle was [% of the vehicle's width from the side
-    on which `lateral` is negative, or of its length from the front], within 0 to 100, NaN without a contact.
+    `side` is one of `SIDES`, empty without a contact. `place` is the position of the obstacle's middle [% of the vehicle's width from the
+    side on which `lateral` is negative, or of its length from the front], within 0 to 100, NaN without a contact.
     """
 
     side: npt.NDArray[np.str_]
@@ -215,22 +215,22 @@ class SimulationRuns:
 
     def of(self, vehicles: slice) -> SimulationRuns:
         """The runs of some of the vehicles."""
-        def some(values: np.ndarray) -> np.ndarray:
+        def selection(values: np.ndarray) -> np.ndarray:
             return values[vehicles] if values.ndim else values
 
         return SimulationRuns(
             trace=self.trace.of(vehicles), encounter=Encounter._make(values[:, vehicles] for values in self.encounter),
             outcome=self.outcome[vehicles], collision_speed=self.collision_speed[vehicles],
-            contact=Contact._make(map(some, self.contact)), test_speed_error=some(self.test_speed_error),
-            warning_ttc=some(self.warning_ttc))
+            contact=Contact._make(map(selection, self.contact)), test_speed_error=selection(self.test_speed_error),
+            warning_ttc=selection(self.warning_ttc))
 
     def nearest(self, column: int) -> int | None:
-        """The sample at which one vehicle's obstacle is nearest, on a collision that of the impact; None if it is never in conflict."""
+        """The sample of the impact or, without a collision, of the smallest separation in conflict; None if there is no such sample."""
         active = self.trace.active[:, column]
         if np.isfinite(self.collision_speed[column]):
             return int(np.flatnonzero(active)[-1])
-        counted = active & self.encounter.in_conflict[:, column]
-        return int(np.argmin(np.where(counted, self.encounter.separation[:, column], np.inf))) if counted.any() else None
+        in_conflict = active & self.encounter.in_conflict[:, column]
+        return int(np.argmin(np.where(in_conflict, self.encounter.separation[:, column], np.inf))) if in_conflict.any() else None
 
     @property
     def relative_speed(self) -> FloatArray:
@@ -240,19 +240,21 @@ class SimulationRuns:
         `collision_speed` holds only the speed at the end of the step, which counts where no gap closes.
         """
         trace, columns = self.trace, np.arange(len(self.collision_speed))
-        last = len(trace.time) - 1 - np.argmax(trace.active[::-1], axis=0)
+        last_sample = len(trace.time) - 1 - np.argmax(trace.active[::-1], axis=0)
         obstacle_speed = np.broadcast_to(trace.obstacle_speed, trace.speed.shape)
-        (before, after), (gap, gap_after) = (([values[np.maximum(last - 1, 0), columns], values[last, columns]])
+        (first_speed, end_speed), (gap, gap_after) = (([values[np.maximum(last_sample - 1, 0), columns], values[last_sample, columns]])
                                         for values in (trace.speed - obstacle_speed, trace.gap))
-        closes = (gap > -TOUCH) & np.isfinite(gap) & (gap_after <= 0) & (before > 0)
-        squared = before * before + 2 * (after - before) / trace.step * np.where(closes, np.maximum(gap, 0.0), 0.0)
-        at_contact = np.minimum(np.maximum(np.sqrt(np.maximum(squared, 0.0)), np.minimum(before, after)), np.maximum(before, after))
-        at_end_of_step = self.collision_speed - obstacle_speed[last, columns]
-        return np.asarray(np.where(closes & ~np.isnan(self.collision_speed), at_contact, at_end_of_step))
+        gap_closes = (gap > -TOUCH) & np.isfinite(gap) & (gap_after <= 0) & (first_speed > 0)
+        distance = np.where(gap_closes, np.maximum(gap, 0.0), 0.0)
+        squared_speed = first_speed * first_speed + 2 * (end_speed - first_speed) / trace.step * distance
+        min_speed, max_speed = np.minimum(first_speed, end_speed), np.maximum(first_speed, end_speed)
+        at_contact = np.minimum(np.maximum(np.sqrt(np.maximum(squared_speed, 0.0)), min_speed), max_speed)
+        at_end_of_step = self.collision_speed - obstacle_speed[last_sample, columns]
+        return np.asarray(np.where(gap_closes & ~np.isnan(self.collision_speed), at_contact, at_end_of_step))
 
 
 class CellResults(NamedTuple):
-    """Results of M vehicles in every cell of a rating, shape (M, cells).
+    """Results of M vehicles in every cell of a rating, shape (M, number of cells).
 
     `impact` is the relative speed of the collision [km/h], NaN without one; `warning` the true time to collision at the warning [s],
     NaN without one; `valid` is false where the test could not be driven.
@@ -268,12 +270,12 @@ class CellResults(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Evaluations:
-    """M evaluated settings: what was simulated, how it ended, metrics and objectives.
+    """M evaluated settings with their outcomes, metrics and objectives.
 
     `settings` has shape (M, n) and holds the filtered values in their table units; all other arrays have shape (M,).
-    `metrics` holds `safevar_sumo.metrics.METRICS` and the study's further ones; an undefined value is NaN.
+    `metrics` holds `safevar_sumo.metrics.METRICS` and the study's further metrics; an undefined value is NaN.
     `collision_speed` is in m/s, `f_diff` a fraction, `f_num_diff` a count. `reasons` says, by the bytes of a
-    setting, why it could not be simulated. `files` are digests, by name, of files that user code
+    setting, why the setting could not be simulated. `files` are digests, by name, of files that user code
     read for the first time in a batch; they belong to the batch, not to its rows. `cells` are a rating's results, None without a rating.
     """
 
@@ -339,19 +341,19 @@ class Evaluations:
     @classmethod
     def none(cls, n: int, metrics: Iterable[str]) -> Evaluations:
         """Empty evaluations, for settings of `n` characteristics."""
-        empty = np.zeros(0)
-        return cls(settings=np.zeros((0, n)), outcome=np.zeros(0, dtype="U16"), collision_speed=empty,
-                   metrics=dict.fromkeys(metrics, empty), f_diff=empty, f_num_diff=empty)
+        empty_array = np.zeros(0)
+        return cls(settings=np.zeros((0, n)), outcome=np.zeros(0, dtype="U16"), collision_speed=empty_array,
+                   metrics=dict.fromkeys(metrics, empty_array), f_diff=empty_array, f_num_diff=empty_array)
 
     @classmethod
     def concatenate(cls, parts: Sequence[Evaluations]) -> Evaluations:
-        """Join evaluations in order; a metric that is missing in one of them is undefined there."""
-        def joined(name: str) -> np.ndarray:
+        """Join evaluations in order; a metric that a part lacks is undefined in its rows."""
+        def join(name: str) -> np.ndarray:
             return np.concatenate([getattr(part, name) for part in parts])
 
         return cls(
-            settings=joined("settings"), outcome=joined("outcome"), collision_speed=joined("collision_speed"),
+            settings=join("settings"), outcome=join("outcome"), collision_speed=join("collision_speed"),
             metrics={name: np.concatenate([part.metrics.get(name, np.full(len(part), np.nan)) for part in parts])
                      for name in dict.fromkeys(name for part in parts for name in part.metrics)},
-            f_diff=joined("f_diff"), f_num_diff=joined("f_num_diff"),
+            f_diff=join("f_diff"), f_num_diff=join("f_num_diff"),
             reasons={setting: reason for part in parts for setting, reason in part.reasons.items()})

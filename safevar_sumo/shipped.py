@@ -10,9 +10,9 @@ RUN = "python -m safevar_sumo"
 
 
 def _folder(name: str) -> Path:
-    """A data folder: inside the installed package, or beside the package in a checkout."""
-    inside = PACKAGE / name
-    return inside if inside.is_dir() else PACKAGE.parent / name
+    """A data folder: in the installed package, or beside the package in a checkout."""
+    installed_folder = PACKAGE / name
+    return installed_folder if installed_folder.is_dir() else PACKAGE.parent / name
 
 
 STUDIES = _folder("studies")

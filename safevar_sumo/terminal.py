@@ -20,12 +20,12 @@ from safevar_sumo.vehicles import Characteristic
 class WholeTable(Table):
     """A table of plain text whose first column, the names, is not broken within words; other cells wrap.
 
-    Columns with the heads `left` hold text, those with the heads `right` numbers. Text is shown as it is, without markup.
+    Columns with `text_heads` hold text, columns with the heads `right` numbers. Text is shown unchanged, without markup.
     """
 
-    def __init__(self, *left: str, right: Iterable[str] = (), title: str = "", **options: Any) -> None:
+    def __init__(self, *text_heads: str, right: Iterable[str] = (), title: str = "", **options: Any) -> None:
         super().__init__(title=plain(title) if title else None, title_justify="left", **options)
-        for head in left:
+        for head in text_heads:
             self.add_column(Text(head))
         for head in right:
             self.add_column(Text(head), justify="right")
@@ -37,18 +37,18 @@ class WholeTable(Table):
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         for column in self.columns:
             column.overflow = "fold"
-        wide = options.update(width=1_000_000)
-        excess = Measurement.get(console, wide, self).maximum - options.max_width
+        wide_options = options.update(width=1_000_000)
+        excess = Measurement.get(console, wide_options, self).maximum - options.max_width
         if excess > 0:
-            first = self.columns[0]
-            cells = [Measurement.get(console, wide, cell) for cell in (first.header, *first.cells)]
-            longest_word, natural = (max(sizes) for sizes in zip(*cells, strict=True))
-            first.width = max(longest_word, natural - excess)
+            name_column = self.columns[0]
+            cells = [Measurement.get(console, wide_options, cell) for cell in (name_column.header, *name_column.cells)]
+            longest_word, full_width = (max(sizes) for sizes in zip(*cells, strict=True))
+            name_column.width = max(longest_word, full_width - excess)
         yield from super().__rich_console__(console, options)
 
 
 def plain(text: object, style: str = "") -> Text:
-    """Printable text for rich: other white space becomes a space, any other character a question mark."""
+    """Printable text for rich: white space becomes a space, any other unprintable character a question mark."""
     return Text("".join(letter if letter.isprintable() else " " if letter.isspace() else "?" for letter in str(text)), style)
 
 
@@ -69,9 +69,9 @@ def print_meanings(console: Console, members: Iterable[Characteristic]) -> None:
 
 def print_constraints(console: Console, study: Study) -> None:
     """Print the constraints that all settings satisfy, if the study has any."""
-    rows = study.vehicle.characteristics
+    characteristics = study.vehicle.characteristics
     if study.constraints:
-        conditions = "; ".join(f"{one.quantity} {one.legal(rows)}" for one in study.constraints)
+        conditions = "; ".join(f"{constraint.quantity} {constraint.legal(characteristics)}" for constraint in study.constraints)
         print_text(console, f"Only settings that satisfy the study's constraints: {conditions}.")
 
 
@@ -90,7 +90,7 @@ StageProgress = Callable[[str, int, int], None]
 
 @contextmanager
 def stages(console: Console) -> Iterator[StageProgress]:
-    """Show a bar on a terminal, a line every half minute elsewhere; yields the function that reports progress."""
+    """Show a bar on a terminal, or else a line every half minute; yields the function that reports progress."""
     columns = (TextColumn("{task.description}", markup=False), BarColumn(bar_width=20), MofNCompleteColumn(), TimeRemainingColumn())
     last_line = time.monotonic()
     with Progress(*columns, console=console, disable=not console.is_terminal) as bar:

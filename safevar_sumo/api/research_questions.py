@@ -52,7 +52,7 @@ def tables(*results: Results | str | Path, question: str | None = None) -> Table
     Returns
     -------
     Tables
-        Frames by name; their columns are those of the functions in `safevar_sumo.analysis`.
+        Frames by name; the functions in `safevar_sumo.analysis` describe the columns.
 
     Raises
     ------
@@ -84,8 +84,8 @@ def figures(*results: Results | str | Path) -> Figures:
     """
     from safevar_sumo.analysis.research_questions.gallery import draw
 
-    drawn, lacking = draw(_cases(results))
-    result = Figures(drawn)
+    figures_by_name, lacking = draw(_cases(results))
+    result = Figures(figures_by_name)
     result.lacking = tuple(lacking)
     return result
 

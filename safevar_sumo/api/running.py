@@ -47,12 +47,12 @@ def run(study: StudyLike, out: str | Path | None = None, *, jobs: int | None = N
     cluster
         Compute on the workers of the Dask scheduler at this address instead.
     pool
-        Pool that simulates, instead of worker processes of its own or a cluster.
+        Pool that simulates, in place of new worker processes or a cluster.
     progress
         True for a bar on the terminal; a function called with the study's name, the number of evaluations done, and their maximum
         number; or an `Observer`.
     only
-        Only these runs, as (algorithm, number from 0); the results are complete once every run is finished.
+        The only runs to carry out, as (algorithm, number from 0); the results are complete once every run is finished.
     batch
         Maximum number of settings per batch, gathered from several runs; never changes a result.
     engine
@@ -68,12 +68,12 @@ def run(study: StudyLike, out: str | Path | None = None, *, jobs: int | None = N
     SafevarError
         If nothing can be computed, a file cannot be written, or another process works on one of the runs.
     """
-    chosen, system = load_for_search(study)
-    keys = all_runs(chosen) if only is None else [RunKey(*key) for key in only]
-    directory = Path(out) if out is not None else Path("results") / chosen.name
-    pool_context = nullcontext(pool) if pool is not None else open_pool(chosen, jobs, cluster)
-    with pool_context as workers, _observer(progress, chosen, keys) as observer:
-        carry_out_runs(chosen, system, keys, directory, workers, observer, batch, engine, retry_failed=retry_failed)
+    loaded_study, system = load_for_search(study)
+    keys = all_runs(loaded_study) if only is None else [RunKey(*key) for key in only]
+    directory = Path(out) if out is not None else Path("results") / loaded_study.name
+    pool_context = nullcontext(pool) if pool is not None else open_pool(loaded_study, jobs, cluster)
+    with pool_context as workers, _observer(progress, loaded_study, keys) as observer:
+        carry_out_runs(loaded_study, system, keys, directory, workers, observer, batch, engine, retry_failed=retry_failed)
     return load(directory)
 
 
@@ -85,10 +85,10 @@ def load_for_search(study: StudyLike, source: str = "") -> tuple[Study, System]:
     InputError
         If one of its names or parameters cannot be used.
     """
-    chosen, system = load_and_assemble(study, source)
-    for name in chosen.search.labels:
-        algorithm_of(name, chosen)
-    return chosen, system
+    loaded_study, system = load_and_assemble(study, source)
+    for name in loaded_study.search.labels:
+        algorithm_of(name, loaded_study)
+    return loaded_study, system
 
 
 def carry_out_runs(study: Study, system: System, keys: list[RunKey], directory: Path, pool: Pool, observer: Observer,
@@ -98,23 +98,23 @@ def carry_out_runs(study: Study, system: System, keys: list[RunKey], directory: 
     Raises
     ------
     SafevarError
-        If another process works on one of the runs, or as `run_campaign`.
+        If another process works on one of the runs, or `run_campaign` raises it.
     """
     sources = {**digests_of_sources(study, pool), **read_by_algorithms(study)}
     results = ResultsDirectory(directory, study, identity_of(study, system, sources), system.measuring.scoring)
-    used, reason = engine_for(system, engine)
-    results.manifest["engine"] = {"name": ENGINES[used], "reason": reason}
-    campaign = run_campaign(study, keys, results, pool, observer, batch or settings_per_batch(system, used), engine=used,
+    engine_used, reason = engine_for(system, engine)
+    results.manifest["engine"] = {"name": ENGINES[engine_used], "reason": reason}
+    campaign = run_campaign(study, keys, results, pool, observer, batch or settings_per_batch(system, engine_used), engine=engine_used,
                             retry_failed=retry_failed)
     if campaign.busy:
-        raise SafevarError(f"another process works on {', '.join(map(str, campaign.busy))}: run the same again later to finish the study")
+        raise SafevarError(f"another process works on {', '.join(map(str, campaign.busy))}: run the study again later to finish it")
     if keys == all_runs(study):
         results.finish(campaign.solutions)
     return campaign
 
 
 def engine_for(system: System, name: str) -> tuple[Engine, str]:
-    """The engine that moves a system's vehicles, and why; raises InputError for an unknown engine."""
+    """The engine that moves a system's vehicles, and the reason for its choice; raises InputError for an unknown engine."""
     if name not in ENGINES.values():
         raise InputError("--engine", repr(name), one_of(ENGINES.values()))
     if name == ENGINES[Engine.LIBSUMO]:
@@ -135,24 +135,24 @@ def _observer(progress: bool | Progress | Observer, study: Study, keys: list[Run
         return CampaignProgress(Console(stderr=True), study, keys, quiet=False)
     if progress is False:
         return nullcontext(NullObserver())
-    return nullcontext(CallingObserver(progress, study, keys) if callable(progress) else progress)
+    return nullcontext(CallbackObserver(progress, study, keys) if callable(progress) else progress)
 
 
 class NullObserver:
-    """Shows nothing; warnings are Python's."""
+    """Shows no progress; passes warnings to Python's `warnings`."""
 
     def evaluated(self, key: RunKey, evaluations: Evaluations, simulated: int) -> None:
-        """A population is evaluated."""
+        """Take note that a population was evaluated."""
 
     def finished(self, key: RunKey, asked: int) -> None:
-        """A run is over."""
+        """Take note that a run is finished."""
 
     def warned(self, message: str) -> None:
-        """The campaign warns."""
+        """Pass on a warning of the campaign."""
         warn(message)
 
 
-class CallingObserver(NullObserver):
+class CallbackObserver(NullObserver):
     """Calls a function with the study's name, the number of evaluations done, and their maximum number."""
 
     def __init__(self, progress: Progress, study: Study, keys: list[RunKey]) -> None:
@@ -161,6 +161,6 @@ class CallingObserver(NullObserver):
         progress(self._name, 0, self._total)
 
     def evaluated(self, key: RunKey, evaluations: Evaluations, simulated: int) -> None:
-        """A population is evaluated."""
+        """Take note that a population was evaluated."""
         self._done += len(evaluations)
         self._progress(self._name, self._done, self._total)

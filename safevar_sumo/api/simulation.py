@@ -33,8 +33,8 @@ if TYPE_CHECKING:
     from safevar_sumo.workers.evaluation import Pool
 
 
-SEEN_HEADS = {"speed": "seen speed [m/s]", "gap": "seen gap [m]", "closing_speed": "seen closing speed [m/s]",
-              "lateral": "seen lateral [m]", "lateral_speed": "seen lateral speed [m/s]"}
+OBSERVATION_HEADS = {"speed": "seen speed [m/s]", "gap": "seen gap [m]", "closing_speed": "seen closing speed [m/s]",
+                     "lateral": "seen lateral [m]", "lateral_speed": "seen lateral speed [m/s]"}
 
 
 class RecordingAds:
@@ -56,8 +56,9 @@ class RecordingAds:
 def trace_frame(runs: SimulationRuns, recording: RecordingAds) -> pd.DataFrame:
     """One row per step of the only vehicle while its simulation counts.
 
-    Columns hold where the obstacle was (`gap` along the vehicle's path, `lateral` from the middle of its lane) and where the ADS saw
-    it. `ttc` is empty while no gap closes or the vehicle stands, `gap` while there is no obstacle ahead.
+    The columns `gap` (along the vehicle's path) and `lateral` (from the middle of its lane) hold the obstacle's true position, the columns
+    that begin with "seen" the values that the ADS observed. `ttc` is empty while no gap closes or the vehicle stands, `gap` while no
+    obstacle is ahead.
     """
     import pandas as pd  # takes longer to load than the simulation
 
@@ -70,10 +71,10 @@ def trace_frame(runs: SimulationRuns, recording: RecordingAds) -> pd.DataFrame:
         "ttc [s]": ttc[:, 0], "throttle [-]": trace.throttle[:, 0], "brake [-]": trace.brake[:, 0],
         "gear [-]": trace.gear[:, 0], "lateral [m]": trace.lateral[:, 0], "lateral speed [m/s]": trace.lateral_speed[:, 0]}
     frame = pd.DataFrame({name: values[active] for name, values in columns.items()})
-    seen = pd.DataFrame([{"time [s]": round(float(observation.time), TIME_DECIMALS),
-                          **{head: float(getattr(observation, name)[0]) for name, head in SEEN_HEADS.items()}}
-                         for observation in recording.observations])
-    return frame.merge(seen, how="left", on="time [s]").replace([np.inf, -np.inf], np.nan)
+    observed = pd.DataFrame([{"time [s]": round(float(observation.time), TIME_DECIMALS),
+                              **{head: float(getattr(observation, name)[0]) for name, head in OBSERVATION_HEADS.items()}}
+                             for observation in recording.observations])
+    return frame.merge(observed, how="left", on="time [s]").replace([np.inf, -np.inf], np.nan)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,7 +86,7 @@ class Simulation:
     study
         The study that the setting was simulated in.
     setting
-        The simulated values: every characteristic in its table unit, after the filter.
+        The simulated value of every characteristic in its table unit, after the filter.
     put_back
         Requested values that the filter put back to the original, by name.
     evaluation
@@ -93,9 +94,9 @@ class Simulation:
     runs
         The trajectory and outcome, of one vehicle.
     scoring
-        The metrics, and the objectives that a search would minimise.
+        The metrics, and the objectives that a search of the study minimises.
     original
-        The simulation of the original vehicle in the same study; the original's own is itself.
+        The simulation of the original vehicle in the same study; for the original vehicle, the simulation itself.
     """
 
     study: Study
@@ -135,9 +136,9 @@ class Simulation:
     @property
     def units(self) -> dict[str, str]:
         """The unit of every number of `to_dict`, by its name."""
-        measured = {metric.name: metric.unit for metric in self.scoring.metrics}
-        measured |= {objective.name: objective.unit for objective in self.scoring.objectives if objective.name in self.metrics}
-        return {"collision_speed": "m/s", **measured, "f_safe": "m, or -m/s", "f_diff": "fraction", "f_num_diff": "characteristics"}
+        units_of_metrics = {metric.name: metric.unit for metric in self.scoring.metrics}
+        units_of_metrics |= {objective.name: objective.unit for objective in self.scoring.objectives if objective.name in self.metrics}
+        return {"collision_speed": "m/s", **units_of_metrics, "f_safe": "m, or -m/s", "f_diff": "fraction", "f_num_diff": "characteristics"}
 
     @cached_property
     def trace(self) -> pd.DataFrame:
@@ -149,8 +150,8 @@ class Simulation:
         """How the simulation ended, in words."""
         if self.outcome is Outcome.COLLISION:
             return f"collides at {self.collision_speed:.2f} m/s"
-        least = self.metrics[SAFETY_DEGREE]
-        return ENDS[self.outcome] + ("" if np.isnan(least) else f", with a safety degree of {least:.2f} m")
+        safety_degree = self.metrics[SAFETY_DEGREE]
+        return ENDS[self.outcome] + ("" if np.isnan(safety_degree) else f", with a safety degree of {safety_degree:.2f} m")
 
     def to_dict(self) -> dict[str, Any]:
         """The JSON of `simulate`: plain values, None where undefined."""
@@ -185,12 +186,12 @@ def simulate(study: StudyLike, changes: Mapping[str, float] | None = None, *, fi
     SimulationError
         If SUMO fails.
     """
-    chosen, system = load_and_assemble(study)
-    return simulate_with_original(chosen, system, changed_setting(system, changes, filtered, beyond), filtered=filtered, gui=gui)
+    loaded_study, system = load_and_assemble(study)
+    return simulate_with_original(loaded_study, system, changed_setting(system, changes, filtered, beyond), filtered=filtered, gui=gui)
 
 
 def changed_setting(system: System, changes: Mapping[str, float] | None, filtered: bool, beyond: bool) -> FloatArray:
-    """The setting with these changes, shape (n,), not filtered; raises InputError if it is illegal or, once filtered, infeasible."""
+    """The setting with these changes, shape (n,), before the filter; raises InputError if it is illegal or, once filtered, infeasible."""
     setting = system.characteristics.setting(changes or {}, "changes", beyond=beyond)
     if not beyond:
         system.check_feasible(setting[np.newaxis], "changes", filtered=filtered)
@@ -208,27 +209,28 @@ def simulate_with_original(study: Study, system: System, requested: FloatArray, 
 
 
 def load_and_assemble(study: StudyLike, source: str = "") -> tuple[Study, System]:
-    """Load a study and assemble its system; errors name it `source`, by default as the caller named it."""
-    chosen = load_study(study)
-    return chosen, assemble(chosen, source or (str(study) if isinstance(study, str | Path) else ""))
+    """Load a study and assemble its system; errors name the study `source`, by default as the caller named it."""
+    loaded_study = load_study(study)
+    return loaded_study, assemble(loaded_study, source or (str(study) if isinstance(study, str | Path) else ""))
 
 
 def _simulate_one(study: Study, system: System, requested: FloatArray, setting: FloatArray, engine: Engine = Engine.LIBSUMO) -> Simulation:
     recording = RecordingAds(system.ads)
-    rows = setting[np.newaxis]
-    runs = drive(replace(at_worst(system, rows), ads=recording), rows, engine)  # in SUMO itself
+    settings = setting[np.newaxis]
+    runs = drive(replace(at_worst(system, settings), ads=recording), settings, engine)  # in SUMO itself
     return Simulation(
         study=study, setting=dict(zip(system.characteristics.names, setting.tolist(), strict=True)),
-        put_back=_put_back(system, requested, setting), evaluation=score(system, rows, runs), runs=runs,
+        put_back=_put_back(system, requested, setting), evaluation=score(system, settings, runs), runs=runs,
         scoring=system.measuring.scoring, _recording=recording)
 
 
 def _put_back(system: System, requested: FloatArray, setting: FloatArray) -> dict[str, float]:
-    return {name: float(value) for name, value, used in zip(system.characteristics.names, requested, setting, strict=True) if value != used}
+    values = zip(system.characteristics.names, requested, setting, strict=True)
+    return {name: float(requested_value) for name, requested_value, filtered_value in values if requested_value != filtered_value}
 
 
-LEGAL = ("a list of mappings such as [{'mass': 2500}], a pandas.DataFrame with a column for each characteristic that is changed, "
-         "or an array of numbers, shape (M, n)")
+SETTINGS_FORMAT = ("a list of mappings such as [{'mass': 2500}], a pandas.DataFrame with a column for each characteristic that is changed, "
+                   "or an array of numbers, shape (M, n)")
 
 
 def evaluate(study: StudyLike, settings: pd.DataFrame | Sequence[Mapping[str, float | None]] | npt.ArrayLike, *, filtered: bool = True,
@@ -240,15 +242,15 @@ def evaluate(study: StudyLike, settings: pd.DataFrame | Sequence[Mapping[str, fl
     study
         A study, or anything that `load_study` accepts.
     settings
-        A mapping for each setting with the changed characteristics, or a frame with a column for each of them; a missing value
-        (no key, None or NaN) means the original's. Or an array of shape (M, n), n characteristics in the study's order, without
-        missing values. All in the characteristics' table units.
+        M settings: a mapping for each setting with the changed characteristics, or a frame with a column for each of them, where a
+        missing value (no key, None or NaN) means the original's value; or an array of shape (M, n) without missing values, with the n
+        characteristics in the study's order. Values are in the characteristics' table units.
     filtered
         Put changes that are smaller than their thresholds back to the original, as every search does.
     beyond
         Also accept values outside the domains, and settings that violate the study's constraints.
     pool
-        Pool that simulates, instead of worker processes of its own.
+        Pool that simulates, in place of new worker processes.
     jobs
         Worker processes, by default one for each core.
     progress
@@ -260,7 +262,7 @@ def evaluate(study: StudyLike, settings: pd.DataFrame | Sequence[Mapping[str, fl
         One row per setting, in the order of `settings` and with the index of a frame: the characteristics as simulated, f_safe [m or -m/s],
         f_diff [fraction], f_num_diff, the metrics in their units (NaN where undefined), collision_speed [m/s], outcome.
         A setting that cannot be simulated has the outcome simulator-error, a setting that leaves a test's speed before the driving
-        system acts invalid-test: both are neither failure nor success, and have no metrics.
+        system acts has the outcome invalid-test. Both have no metrics, and count neither as failures nor as successes.
 
     Raises
     ------
@@ -269,27 +271,27 @@ def evaluate(study: StudyLike, settings: pd.DataFrame | Sequence[Mapping[str, fl
     SafevarError
         If nothing can be simulated.
     """
-    chosen, system = load_and_assemble(study)
+    loaded_study, system = load_and_assemble(study)
     characteristics = system.characteristics
     requested, index = _table(settings, characteristics)
     _check(requested, characteristics, beyond)
     if not beyond:
         system.check_feasible(requested, "settings", filtered=filtered)
-    rows = characteristics.filter(requested) if filtered else requested
+    simulated_settings = characteristics.filter(requested) if filtered else requested
     with shown(progress) as report:
-        evaluations = evaluate_settings(chosen, rows, pool, jobs, report)
+        evaluations = evaluate_settings(loaded_study, simulated_settings, pool, jobs, report)
     frame = evaluations_frame(characteristics.names, [(("", 0), evaluations)]).drop(columns=["algorithm", "run"])
     frame.insert(len(frame.columns) - 1, "collision_speed", evaluations.collision_speed)
     return frame.set_axis(index)
 
 
-def evaluate_settings(study: Study, rows: FloatArray, pool: Pool | None = None, jobs: int | None = None,
+def evaluate_settings(study: Study, settings: FloatArray, pool: Pool | None = None, jobs: int | None = None,
                       progress: Progress | None = None) -> Evaluations:
     """Simulate settings, shape (M, n), in worker processes, including settings that violate the study's constraints."""
     from safevar_sumo.analysis.evaluator import open_evaluator, silent
 
     with open_evaluator(study, pool, jobs, progress or silent) as evaluator:
-        return evaluator.evaluate(rows, "settings", anywhere=True)
+        return evaluator.evaluate(settings, "settings", anywhere=True)
 
 
 def _table(settings: Any, characteristics: CharacteristicSet) -> tuple[FloatArray, Any]:
@@ -297,7 +299,7 @@ def _table(settings: Any, characteristics: CharacteristicSet) -> tuple[FloatArra
     import pandas as pd
 
     names = list(characteristics.names)
-    if isinstance(settings, Sequence) and not isinstance(settings, str) and all(isinstance(one, Mapping) for one in settings):
+    if isinstance(settings, Sequence) and not isinstance(settings, str) and all(isinstance(setting, Mapping) for setting in settings):
         settings = pd.DataFrame(list(settings), index=range(len(settings)))
     if isinstance(settings, pd.DataFrame):
         for name in settings.columns:
@@ -311,7 +313,7 @@ def _table(settings: Any, characteristics: CharacteristicSet) -> tuple[FloatArra
             table[name] = values.where(values.notna(), table[name])
         return _numbers(table), settings.index
     if isinstance(settings, Mapping):
-        raise InputError("settings", f"is a {type(settings).__name__}", LEGAL)
+        raise InputError("settings", f"is a {type(settings).__name__}", SETTINGS_FORMAT)
     array = _numbers(settings)
     if array.ndim != 2 or array.shape[1] != len(names):
         raise InputError("settings", f"an array of shape {array.shape}", f"shape (M, {len(names)}): {', '.join(names)}")
@@ -322,10 +324,11 @@ def _numbers(settings: Any) -> FloatArray:
     try:
         return np.array(settings, dtype=float)
     except (TypeError, ValueError) as error:
-        raise InputError("settings", str(error), LEGAL) from None
+        raise InputError("settings", str(error), SETTINGS_FORMAT) from None
 
 
 def _check(requested: FloatArray, characteristics: CharacteristicSet, beyond: bool) -> None:
-    legal = np.column_stack([member.is_legal(values, beyond=beyond) for member, values in zip(characteristics, requested.T, strict=True)])
-    for row, column in np.argwhere(~legal)[:1]:
+    is_legal = np.column_stack([member.is_legal(values, beyond=beyond)
+                                for member, values in zip(characteristics, requested.T, strict=True)])
+    for row, column in np.argwhere(~is_legal)[:1]:
         characteristics.members[column].check(float(requested[row, column]), f"settings, row {row}", beyond=beyond)

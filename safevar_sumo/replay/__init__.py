@@ -1,1 +1,1 @@
-"""Show a changed vehicle beside the original: as figure, as animation and in sumo-gui."""
+"""A changed vehicle beside the original: as a figure, as an animation, and in sumo-gui."""

@@ -1,4 +1,4 @@
-"""A comparison as an animation: gif, mp4 or HTML page; and the frames of gif and mp4."""
+"""Animations of a comparison as gif, mp4 or HTML page, and the frames of gif and mp4."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ Points = list[tuple[float, float]]
 WIDTH = 880
 """Width of a frame [pixels]."""
 OVERSAMPLING = 2
-"""Frames are drawn larger by this factor and then reduced, for smooth edges."""
+"""Factor by which frames are drawn larger and then reduced, for smooth edges."""
 COLUMNS = (164, 250, 340, 450)
 """Left edges of the columns of text [pixels]."""
 PANEL = 62
 """Height of the text above the road [pixels]."""
-GROUND, ROAD, SEAM, PATH, WHITE, INK, FAINT = "#eef0ec", "#9aa1a9", "#e8eaec", "#cfd3cf", "#ffffff", "#1d2329", "#5d666f"
+GROUND, ROAD, SEAM, PATH, WHITE, INK, PALE_INK = "#eef0ec", "#9aa1a9", "#e8eaec", "#cfd3cf", "#ffffff", "#1d2329", "#5d666f"
 VEHICLES = {ORIGINAL: "#0072b2", CHANGED: "#d55e00"}
-OTHER, PERSON, BRAKE = "#3f464d", "#1d2329", "#e60000"
+OTHER_ACTOR, PERSON, BRAKE = "#3f464d", "#1d2329", "#e60000"
 STRIPE = 0.5
 """Length of a crossing's stripes, and of the space between them [m]."""
 
@@ -63,11 +63,11 @@ class _Canvas:
             for lane in self._scene.road:
                 if lane.kind == kind:
                     self._lane(draw, lane, sample)
-        present = [body for body in self._scene.bodies if not np.isnan(body.x[sample])]
-        for body in sorted(present, key=lambda body: (body.is_vut, body.row)):
+        visible_bodies = [body for body in self._scene.bodies if not np.isnan(body.x[sample])]
+        for body in sorted(visible_bodies, key=lambda body: (body.is_vut, body.row)):
             self._body(draw, body, sample)
-        for body in present:
-            if body.is_vut and body.row == ORIGINAL:  # its outline again, over a changed vehicle that hides it
+        for body in visible_bodies:
+            if body.is_vut and body.row == ORIGINAL:  # draw its outline again, over a changed vehicle that hides it
                 draw.polygon(self._pixels(body.corners(sample), sample), outline=VEHICLES[ORIGINAL], width=2 * OVERSAMPLING)
         self._scale_marks(draw, sample)
         draw.rectangle((0, 0, self._size[0], OVERSAMPLING * PANEL), fill=WHITE)
@@ -76,17 +76,17 @@ class _Canvas:
 
     def _pixels(self, points: FloatArray, sample: int) -> Points:
         view = self._scene.view
-        grid = OVERSAMPLING / self._scale  # a following camera moves by whole pixels, so that the road stays sharp
-        x, y = points[:, 0] - np.round(view.left[sample] / grid) * grid, points[:, 1] - view.bottom
+        grid = OVERSAMPLING / self._scale  # the camera moves by whole pixels, so that the road stays sharp
+        x, y = points[:, 0] - np.round(view.left_ends[sample] / grid) * grid, points[:, 1] - view.bottom
         return list(zip((x * self._scale).tolist(), (self._size[1] - y * self._scale).tolist(), strict=True))
 
     def _scale_marks(self, draw: ImageDraw, sample: int) -> None:
-        """Draw a mark every ten metres from where the front bumper starts."""
+        """Draw a mark every ten metres from the start of the front bumper."""
         view = self._scene.view
         for mark in self._scene.marks(sample):
             (x, y), = self._pixels(np.array([[mark, view.bottom]]), sample)
-            draw.line((x, y - 12 * OVERSAMPLING, x, y), fill=FAINT, width=OVERSAMPLING)
-            self._word(draw, (round(x / OVERSAMPLING) + 4, round(y / OVERSAMPLING) - 16), f"{mark:g} m", FAINT, 12)
+            draw.line((x, y - 12 * OVERSAMPLING, x, y), fill=PALE_INK, width=OVERSAMPLING)
+            self._word(draw, (round(x / OVERSAMPLING) + 4, round(y / OVERSAMPLING) - 16), f"{mark:g} m", PALE_INK, 12)
 
     def _lane(self, draw: ImageDraw, lane: LaneLine, sample: int) -> None:
         if lane.kind == "area":
@@ -110,17 +110,17 @@ class _Canvas:
             (x, y), = self._pixels(np.array([[body.x[sample], body.y[sample]]]), sample)
             draw.ellipse((x - radius, y - radius, x + radius, y + radius), fill=PERSON, outline=WHITE, width=OVERSAMPLING)
             return
-        colour = VEHICLES[body.row] if body.is_vut else OTHER
+        colour = VEHICLES[body.row] if body.is_vut else OTHER_ACTOR
         corners = body.corners(sample)
         opacity = "99" if body.is_vut and body.row == ORIGINAL and len(self._scene.moments) > 1 else "e6"
         draw.polygon(self._pixels(corners, sample), fill=colour + opacity, outline=colour, width=2 * OVERSAMPLING)
         window = corners[[0, 1]] * [[0.72], [0.72]] + corners[[3, 2]] * 0.28
-        back = corners[[0, 1]] * 0.56 + corners[[3, 2]] * 0.44
-        draw.polygon(self._pixels(np.concatenate([window, back[::-1]]), sample), fill="#ffffff90")
+        rear_edge = corners[[0, 1]] * 0.56 + corners[[3, 2]] * 0.44
+        draw.polygon(self._pixels(np.concatenate([window, rear_edge[::-1]]), sample), fill="#ffffff90")
         if body.is_vut and self._brakes(body.row, sample):
-            for inner, outer in ((3, 2), (2, 3)):
-                side = corners[outer] - corners[inner]
-                light = np.array([corners[inner], corners[inner] + 0.3 * side])
+            for corner, opposite_corner in ((3, 2), (2, 3)):
+                side = corners[opposite_corner] - corners[corner]
+                light = np.array([corners[corner], corners[corner] + 0.3 * side])
                 forward = (corners[0] - corners[3]) / body.length * 0.28
                 draw.polygon(self._pixels(np.concatenate([light, light[::-1] + forward]), sample), fill=BRAKE)
 
@@ -134,36 +134,37 @@ class _Canvas:
         self._word(draw, (12, 14), f"{sample * self._scene.step:.2f} s", INK, 26)
         for row in self._scene.comparison.rows:
             moments = self._scene.moments[row]
-            at = min(sample, moments.end)
-            gap = trace.gap[at, row]
-            finished = sample >= (moments.end if moments.nearest is None else moments.nearest)
-            state = self._scene.comparison.verdict(row) if finished else "brakes" if self._brakes(row, at) else ""
+            run_sample = min(sample, moments.end)
+            gap = trace.gap[run_sample, row]
+            is_finished = sample >= (moments.end if moments.nearest is None else moments.nearest)
+            state = self._scene.comparison.verdict(row) if is_finished else "brakes" if self._brakes(row, run_sample) else ""
             y = 8 + 26 * row
             draw.rectangle((OVERSAMPLING * 132, OVERSAMPLING * (y + 3), OVERSAMPLING * 154, OVERSAMPLING * (y + 17)), fill=VEHICLES[row])
             gap_text = f"gap {max(gap, 0):.1f} m" if np.isfinite(gap) else ""
-            words = (self._scene.comparison.name(row), f"{trace.speed[at, row]:.1f} m/s", gap_text, state)
+            words = (self._scene.comparison.name(row), f"{trace.speed[run_sample, row]:.1f} m/s", gap_text, state)
             for x, word in zip(COLUMNS, words, strict=True):
                 self._word(draw, (x, y), word, INK, 17)
 
-    def _word(self, draw: ImageDraw, place: tuple[int, int], text: str, colour: str, size: int) -> None:
+    def _word(self, draw: ImageDraw, position: tuple[int, int], text: str, colour: str, size: int) -> None:
         from PIL import ImageFont
 
-        draw.text((OVERSAMPLING * place[0], OVERSAMPLING * place[1]), text, fill=colour, font=ImageFont.load_default(OVERSAMPLING * size))
+        x, y = position
+        draw.text((OVERSAMPLING * x, OVERSAMPLING * y), text, fill=colour, font=ImageFont.load_default(OVERSAMPLING * size))
 
 
 def quad(start: FloatArray, end: FloatArray, width: float) -> FloatArray:
     """A straight strip from start to end, shape (4, 2)."""
-    along = end - start
-    side = np.array([-along[1], along[0]]) / (np.hypot(*along) or 1.0) * width / 2
+    direction = end - start
+    side = np.array([-direction[1], direction[0]]) / (np.hypot(*direction) or 1.0) * width / 2
     return np.array([start + side, end + side, end - side, start - side])
 
 
 def stripes(lane: LaneLine) -> Iterator[FloatArray]:
     """The stripes of a crossing, each of shape (4, 2)."""
     for start, end in pairwise(lane.line):
-        along = (end - start) / (np.hypot(*(end - start)) or 1.0)
-        for place in np.arange(STRIPE / 2, np.hypot(*(end - start)) - STRIPE, 2 * STRIPE):
-            yield quad(start + along * place, start + along * (place + STRIPE), lane.width)
+        direction = (end - start) / (np.hypot(*(end - start)) or 1.0)
+        for distance in np.arange(STRIPE / 2, np.hypot(*(end - start)) - STRIPE, 2 * STRIPE):
+            yield quad(start + direction * distance, start + direction * (distance + STRIPE), lane.width)
 
 
 SECONDS_PER_FRAME = 0.1
@@ -171,8 +172,8 @@ SECONDS_PER_FRAME = 0.1
 LAST_FRAME = 2.0
 """Duration of the last frame [s]."""
 COLOURS = 64
-LARGEST_GIF = 1_000_000
-"""A larger gif gets fewer frames [bytes]."""
+MAX_GIF_SIZE = 1_000_000
+"""Size above which a gif gets fewer frames [bytes]."""
 
 
 def animate(comparison: Comparison, path: Path) -> None:
@@ -199,9 +200,9 @@ def check_animation(path: Path) -> None:
 
 
 def _gif(scene: FlatScene, path: Path) -> None:
-    """Write as many frames as `LARGEST_GIF` allows."""
+    """Write as many frames as `MAX_GIF_SIZE` allows."""
     stride = max(1, round(SECONDS_PER_FRAME / scene.step))
-    while len(content := _gif_of(scene, stride)) > LARGEST_GIF and stride < scene.length:
+    while len(content := _gif_of(scene, stride)) > MAX_GIF_SIZE and stride < scene.length:
         stride *= 2
     path.write_bytes(content)
 
@@ -225,13 +226,13 @@ def _film(scene: FlatScene, path: Path) -> None:
     command = [_ffmpeg(), "-y", "-loglevel", "error", "-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}",
                "-r", f"{1 / scene.step:.6g}", "-i", "-", "-threads", "1", "-c:v", "libx264", "-pix_fmt", "yuv420p", "-crf", "26",
                "-movflags", "+faststart", "-fflags", "+bitexact", "-flags:v", "+bitexact", "-map_metadata", "-1", str(path)]
-    done = subprocess.run(command, input=b"".join(frame.tobytes() for frame in frames), capture_output=True, check=False)
-    if done.returncode != 0:
-        raise SafevarError(f"{path}: ffmpeg failed: {(done.stderr.decode(errors='replace').strip() or 'no message').splitlines()[-1]}")
+    process = subprocess.run(command, input=b"".join(frame.tobytes() for frame in frames), capture_output=True, check=False)
+    if process.returncode != 0:
+        raise SafevarError(f"{path}: ffmpeg failed: {(process.stderr.decode(errors='replace').strip() or 'no message').splitlines()[-1]}")
 
 
 def _ffmpeg() -> str:
-    """The ffmpeg program: the one on the PATH, or that of the package imageio-ffmpeg."""
+    """The path of ffmpeg: on the PATH, or else in the package imageio-ffmpeg."""
     program = shutil.which("ffmpeg")
     if program is not None:
         return program

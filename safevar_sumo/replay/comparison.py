@@ -1,4 +1,4 @@
-"""A changed vehicle beside the original: braking, nearest moment and end of each run, and when their speeds diverge."""
+"""A changed vehicle beside the original: when each begins to brake, is nearest and ends, and when their speeds diverge."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ from safevar_sumo.sumo.staging import staged
 from safevar_sumo.sumo.system import Measuring, System
 from safevar_sumo.vehicles import CharacteristicSet
 
-DIVERGED = 0.1
-"""Two vehicles have diverged when their speeds differ by more [m/s]."""
+MIN_DIVERGENCE = 0.1
+"""Difference in speed above which two vehicles have diverged [m/s]."""
 
 
 class Moments(NamedTuple):
     """Indices of a run's samples; None where there is no such moment.
 
-    `brake`: it begins to brake for the obstacle; `nearest`: the obstacle is nearest (the impact, on a collision); `end`: the
-    run's last sample.
+    `brake`: the vehicle begins to brake for the obstacle; `nearest`: the obstacle is nearest (the impact, on a collision); `end`: the last
+    sample of the run.
     """
 
     brake: int | None
@@ -47,9 +47,9 @@ def moments(runs: SimulationRuns, row: int) -> Moments:
 def divergence(runs: SimulationRuns, first: int = 0, second: int = 1) -> int | None:
     """The first sample at which the speeds of two of N runs have diverged, None if they never do."""
     trace = runs.trace
-    both = trace.active[:, first] & trace.active[:, second]
-    diverged = np.flatnonzero(both & (np.abs(trace.speed[:, first] - trace.speed[:, second]) > DIVERGED))
-    return int(diverged[0]) if diverged.size else None
+    is_active = trace.active[:, first] & trace.active[:, second]
+    samples = np.flatnonzero(is_active & (np.abs(trace.speed[:, first] - trace.speed[:, second]) > MIN_DIVERGENCE))
+    return int(samples[0]) if samples.size else None
 
 
 ORIGINAL, CHANGED = 0, 1
@@ -60,8 +60,8 @@ ORIGINAL, CHANGED = 0, 1
 class Comparison:
     """Runs of the original vehicle (row 0) and of a changed one (row 1; missing if nothing is changed).
 
-    `title` is the study's, `network` the scenario's, with the lanes that its parameters make; `evaluations` and `film` have one row for
-    each vehicle. `objectives` are metrics beyond the paper's that the study optimises.
+    `title` is the study's title, `network` the scenario's network with the lanes that the scenario's parameters define; `evaluations` and
+    `film` have one row for each vehicle. `objectives` are metrics that the study optimises besides the paper's metrics.
     """
 
     title: str
@@ -87,16 +87,16 @@ class Comparison:
         return changes_in_words(self.characteristics, self.evaluations.settings[CHANGED])
 
     def verdict(self, row: int) -> str:
-        """How a run ended, in words: collides at 3.9 m/s, or stops with 2.22 m to spare."""
+        """The end of a run in words: "collides at 3.9 m/s", or "stops with 2.22 m to spare"."""
         runs = self.film.runs
         if not math.isnan(runs.collision_speed[row]):
             return f"collides at {runs.collision_speed[row]:.1f} m/s"
         nearest = moments(runs, row).nearest
-        word = ENDS[Outcome(str(runs.outcome[row]))]
+        ending = ENDS[Outcome(str(runs.outcome[row]))]
         if nearest is not None and runs.outcome[row] == Outcome.STOPPED:
-            word = f"{word} with {runs.trace.gap[nearest, row]:.2f} m to spare"
+            ending = f"{ending} with {runs.trace.gap[nearest, row]:.2f} m to spare"
         values = [(metric, self.evaluations.metrics[metric.name][row]) for metric in self.objectives]
-        return ", ".join([word, *(f"{metric.title} {value:.1f} {metric.unit}" for metric, value in values if np.isfinite(value))])
+        return ", ".join([ending, *(f"{metric.title} {value:.1f} {metric.unit}" for metric, value in values if np.isfinite(value))])
 
 
 def changes_in_words(characteristics: CharacteristicSet, setting: FloatArray) -> list[str]:
@@ -107,7 +107,7 @@ def changes_in_words(characteristics: CharacteristicSet, setting: FloatArray) ->
 
 
 def number(value: float) -> str:
-    """A number with four significant digits; a larger one with all digits before the point."""
+    """A number with four significant digits; a number from 10,000 on with all digits before the point."""
     return f"{value:.0f}" if 1e4 <= abs(value) < 1e15 else f"{value:.4g}"
 
 
@@ -142,9 +142,9 @@ def compare(study: StudyLike, changes: Mapping[str, float] | None = None, *, fil
     SimulationError
         If SUMO fails.
     """
-    chosen, system = load_and_assemble(study)
+    loaded_study, system = load_and_assemble(study)
     setting = changed_setting(system, changes, filtered, beyond)
-    return compare_setting(chosen, system, system.characteristics.filter(setting) if filtered else setting)
+    return compare_setting(loaded_study, system, system.characteristics.filter(setting) if filtered else setting)
 
 
 def compare_setting(study: Study, system: System, setting: FloatArray) -> Comparison:
@@ -153,27 +153,29 @@ def compare_setting(study: Study, system: System, setting: FloatArray) -> Compar
     Raises
     ------
     SimulationError, InputError
-        As `simulate`.
+        If `simulate` raises it.
     """
     original = system.characteristics.original
     settings = np.stack([original]) if np.array_equal(original, setting) else np.stack([original, setting])
-    worst = at_worst(system, settings)
-    names = [f" ({point.name})" for point in system.matrix if (point.scenario, point.weather) == (worst.scenario, worst.weather)]
-    recording = film(worst, settings)
+    worst_system = at_worst(system, settings)
+    names = [f" ({point.name})" for point in system.matrix
+             if (point.scenario, point.weather) == (worst_system.scenario, worst_system.weather)]
+    recording = film(worst_system, settings)
     return Comparison(title=study.title + "".join(names[:1]), characteristics=system.characteristics,
-                      ttc_threshold=system.metrics.ttc_threshold, network=staged(worst.scenario).folder,
-                      evaluations=score(worst, settings, recording.runs),
-                      film=replace(recording, runs=_up_to_impacts(recording.runs)), objectives=_further_objectives(worst.measuring))
+                      ttc_threshold=system.metrics.ttc_threshold, network=staged(worst_system.scenario).folder,
+                      evaluations=score(worst_system, settings, recording.runs),
+                      film=replace(recording, runs=_with_pedals_before_impacts(recording.runs)),
+                      objectives=_further_objectives(worst_system.measuring))
 
 
 def _further_objectives(measuring: Measuring) -> tuple[MetricFacts, ...]:
-    """Objectives beyond the paper's that one run has; the points of a rating belong to all its cells."""
+    """Objectives of one run besides the paper's; without the points of a rating, which belong to all cells together."""
     objectives = {objective.name for objective in measuring.scoring.objectives}
     return tuple(metric for metric in measuring.scoring.metrics if metric.name in objectives - {*METRICS, RATING_POINTS.name})
 
 
-def _up_to_impacts(runs: SimulationRuns) -> SimulationRuns:
-    """Runs with the pedals of the sample before as those at an impact: a command at the impact has no effect any more."""
+def _with_pedals_before_impacts(runs: SimulationRuns) -> SimulationRuns:
+    """Runs with the pedals of the sample before an impact also at the impact, where a command has no effect any more."""
     trace = runs.trace
     throttle, brake = trace.throttle.copy(), trace.brake.copy()
     for row in np.flatnonzero(~np.isnan(runs.collision_speed)).tolist():

@@ -20,11 +20,11 @@ COLOURS = {ORIGINAL: "#0072b2", CHANGED: "#d55e00"}
 """Okabe and Ito's blue and vermillion."""
 DASHES: Mapping[int, Literal["-", "--"]] = {ORIGINAL: "-", CHANGED: "--"}
 BRAKING, NEAREST, IMPACT = "v", "o", "X"
-SHOWN_TTC = 6.0
-"""Longest time to collision that is drawn [s]."""
+MAX_TTC = 6.0
+"""Largest time to collision that is drawn [s]."""
 FONT = 9
-LINE = 118
-"""Characters in a line of the heading."""
+LINE_LENGTH = 118
+"""Length of a line of the heading [characters]."""
 
 
 def draw_comparison(comparison: Comparison) -> Figure:
@@ -41,7 +41,7 @@ def draw_comparison(comparison: Comparison) -> Figure:
         _speed(axes[0], comparison, row)
         _gap(axes[1], comparison, row)
         _pedals(axes[2], comparison, row)
-        _line(axes[3], comparison, row, np.where(ttc[:, row] <= SHOWN_TTC, ttc[:, row], np.nan))
+        _line(axes[3], comparison, row, np.where(ttc[:, row] <= MAX_TTC, ttc[:, row], np.nan))
     axes[0].set_ylabel("speed [m/s]")
     axes[1].set_ylabel("gap to the obstacle [m]")
     axes[2].set_ylabel("brake     |     throttle")
@@ -64,14 +64,14 @@ def draw_comparison(comparison: Comparison) -> Figure:
 
 
 def _end_time(comparison: Comparison) -> float:
-    """Time at which the last of the vehicles is nearest or comes to rest [s]."""
+    """Time at which the last vehicle is nearest or comes to rest [s]."""
     runs = comparison.film.runs
-    ends = [at for row in comparison.rows for at in (moments(runs, row).nearest, _comes_to_rest(runs, row)) if at is not None]
+    ends = [sample for row in comparison.rows for sample in (moments(runs, row).nearest, _last_motion(runs, row)) if sample is not None]
     return float(runs.trace.time[min(max(ends) + 1, len(runs.trace.time) - 1)])
 
 
-def _comes_to_rest(runs: SimulationRuns, row: int) -> int:
-    """The last sample of a run in which the vehicle moves; 0 if it never does."""
+def _last_motion(runs: SimulationRuns, row: int) -> int:
+    """The last sample of a run in which the vehicle moves; 0 if it never moves."""
     return int(np.flatnonzero(runs.trace.active[:, row] & (runs.trace.speed[:, row] > STANDSTILL)).max(initial=0))
 
 
@@ -79,8 +79,8 @@ def _legend(figure: Figure, comparison: Comparison) -> None:
     """Draw the legend: vehicles and marks."""
     from matplotlib.lines import Line2D
 
-    hit = bool(np.isfinite(comparison.film.runs.collision_speed).any())
-    marks = {"begins to brake": BRAKING, "nearest": NEAREST, **({"impact": IMPACT} if hit else {})}
+    has_impact = bool(np.isfinite(comparison.film.runs.collision_speed).any())
+    marks = {"begins to brake": BRAKING, "nearest": NEAREST, **({"impact": IMPACT} if has_impact else {})}
     entries = [Line2D([], [], color=COLOURS[row], linestyle=DASHES[row], label=f"{comparison.name(row)} vehicle: {comparison.verdict(row)}")
                for row in comparison.rows]
     entries += [Line2D([], [], color="0.35", marker=mark, linestyle="", markersize=7, label=label) for label, mark in marks.items()]
@@ -97,32 +97,32 @@ def _line(axis: Axes, comparison: Comparison, row: int, values: FloatArray) -> N
     axis.plot(time, values[:end], color=COLOURS[row], linestyle=DASHES[row], linewidth=1.6, zorder=3 + row)
 
 
-def _mark(axis: Axes, row: int, place: tuple[float, float], mark: str, text: str = "", *, is_speed: bool = False) -> None:
-    """Draw a mark on a line; the original's is larger, so that it shows below the changed vehicle's, and has its text above."""
-    axis.plot(*place, marker=mark, color=COLOURS[row], markersize=12 - 4 * row + 2 * (mark == IMPACT), linestyle="", zorder=6 + row,
+def _mark(axis: Axes, row: int, point: tuple[float, float], mark: str, text: str = "", *, is_speed: bool = False) -> None:
+    """Draw a mark on a line; the original's mark is larger, so that it shows below the changed vehicle's mark, and has its text above."""
+    axis.plot(*point, marker=mark, color=COLOURS[row], markersize=12 - 4 * row + 2 * (mark == IMPACT), linestyle="", zorder=6 + row,
               markeredgecolor="white")
     offset, side = ((3, 7), "left") if is_speed else ((0, 9 if row == ORIGINAL else -17), "center")
-    axis.annotate(text, place, xytext=offset, textcoords="offset points", color=COLOURS[row], fontweight="bold", ha=side)
+    axis.annotate(text, point, xytext=offset, textcoords="offset points", color=COLOURS[row], fontweight="bold", ha=side)
 
 
 def _speed(axis: Axes, comparison: Comparison, row: int) -> None:
-    trace, at = comparison.film.runs.trace, moments(comparison.film.runs, row)
+    trace, key_moments = comparison.film.runs.trace, moments(comparison.film.runs, row)
     _line(axis, comparison, row, trace.speed[:, row])
-    if at.brake is not None:
-        _mark(axis, row, (trace.time[at.brake], trace.speed[at.brake, row]), BRAKING)
-    hit = float(comparison.film.runs.collision_speed[row])
-    if not np.isnan(hit):
-        _mark(axis, row, (trace.time[at.end], hit), IMPACT, f"{hit:.1f} m/s", is_speed=True)
+    if key_moments.brake is not None:
+        _mark(axis, row, (trace.time[key_moments.brake], trace.speed[key_moments.brake, row]), BRAKING)
+    impact_speed = float(comparison.film.runs.collision_speed[row])
+    if not np.isnan(impact_speed):
+        _mark(axis, row, (trace.time[key_moments.end], impact_speed), IMPACT, f"{impact_speed:.1f} m/s", is_speed=True)
 
 
 def _gap(axis: Axes, comparison: Comparison, row: int) -> None:
     runs = comparison.film.runs
-    gap, at = np.where(np.isfinite(runs.trace.gap[:, row]), runs.trace.gap[:, row], np.nan), moments(runs, row)
+    gap, key_moments = np.where(np.isfinite(runs.trace.gap[:, row]), runs.trace.gap[:, row], np.nan), moments(runs, row)
     _line(axis, comparison, row, gap)
-    if at.nearest is not None and not np.isnan(gap[at.nearest]):
-        hit = not np.isnan(runs.collision_speed[row])
-        text = "impact" if hit else f"{gap[at.nearest]:.2f} m"
-        _mark(axis, row, (runs.trace.time[at.nearest], gap[at.nearest]), IMPACT if hit else NEAREST, text)
+    if key_moments.nearest is not None and not np.isnan(gap[key_moments.nearest]):
+        has_impact = not np.isnan(runs.collision_speed[row])
+        text = "impact" if has_impact else f"{gap[key_moments.nearest]:.2f} m"
+        _mark(axis, row, (runs.trace.time[key_moments.nearest], gap[key_moments.nearest]), IMPACT if has_impact else NEAREST, text)
 
 
 def _pedals(axis: Axes, comparison: Comparison, row: int) -> None:
@@ -139,11 +139,11 @@ def _mark_divergence(axes: np.ndarray, comparison: Comparison) -> None:
 
 def _heading(figure: Figure, comparison: Comparison) -> None:
     """Draw the study's title and, below it, the changes; lines break only between changes."""
-    lines = textwrap.wrap(comparison.title, LINE)
+    lines = textwrap.wrap(comparison.title, LINE_LENGTH)
     line = "changed:" if comparison.changes else "the original vehicle"
     for i, change in enumerate(comparison.changes):
         part = f" {change}{',' if i < len(comparison.changes) - 1 else ''}"
-        if len(line) + len(part) > LINE:
+        if len(line) + len(part) > LINE_LENGTH:
             lines.append(line)
             line = part.strip()
         else:

@@ -19,7 +19,7 @@ from safevar_sumo.sumo.world import SumoWorld
 
 
 class LaneLine(NamedTuple):
-    """A lane of SUMO: its middle line, shape (P, 2), and width [m]; an area's `line` is its outline, its width 0.
+    """A lane of SUMO: its middle line of P points, shape (P, 2), and width [m]; an area has its outline as `line` and the width 0.
 
     `kind` is road, path (only for persons), crossing or area (for persons, between paths).
     """
@@ -30,9 +30,9 @@ class LaneLine(NamedTuple):
 
 
 class ActorTrack(NamedTuple):
-    """Where one actor was: front bumper of a vehicle or middle of a person [m], heading clockwise from north [degrees].
+    """The track of one actor: front bumper of a vehicle or middle of a person [m], heading clockwise from north [degrees].
 
-    Arrays of shape (T, N), NaN while the actor was absent; `length` and `width` in m.
+    Arrays of shape (T, N) for T samples of N simulations, NaN while the actor was absent; `length` and `width` in m.
     """
 
     is_person: bool
@@ -47,8 +47,8 @@ class ActorTrack(NamedTuple):
 class Film:
     """N simulations seen from above.
 
-    `tracks` are the actors' by name; `last` is the last sample of every simulation, shape (N,): later samples are
-    meaningless, for SUMO goes on with the rest of the batch.
+    `tracks` holds the tracks of actors by name; `last_samples` holds the last sample of every simulation, shape (N,): later samples are
+    meaningless, as SUMO continues with the rest of the batch.
     """
 
     runs: SimulationRuns
@@ -56,20 +56,20 @@ class Film:
     road: tuple[LaneLine, ...]
 
     @property
-    def last(self) -> np.ndarray:
+    def last_samples(self) -> np.ndarray:
         active = self.runs.trace.active
         return np.asarray(len(active) - 1 - np.argmax(active[::-1], axis=0))
 
 
 def film(system: System, settings: FloatArray) -> Film:
-    """Simulate settings, shape (N, n), as `simulate` does, and record the positions of all actors.
+    """Simulate N settings of n characteristics, shape (N, n), and record the positions of all actors.
 
     In a matrix all settings are simulated at the worst point of the last setting.
 
     Raises
     ------
     SimulationError, InputError
-        As `simulate`.
+        If `simulate` raises it.
     """
     camera, system = _Camera(len(settings)), at_worst(system, settings)
     runs = simulate(system, settings, watch=camera.record)
@@ -99,8 +99,8 @@ class _Camera:
                 by_name[name] = ActorTrack(*self._measures[actor], *(np.full((len(self._frames), self._n), np.nan) for _ in range(3)))
             for sample, frame in enumerate(self._frames):
                 if actor in frame:
-                    for row, value in zip(by_name[name][3:], frame[actor], strict=True):
-                        row[sample, copy] = value
+                    for array, value in zip(by_name[name][3:], frame[actor], strict=True):
+                        array[sample, copy] = value
         return by_name
 
 

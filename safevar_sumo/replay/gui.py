@@ -1,4 +1,4 @@
-"""A comparison in sumo-gui: the original's road above, the changed vehicle's below, both at the same time."""
+"""A comparison in sumo-gui: the original's road above and the changed vehicle's road below, at the same time."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ from pathlib import Path
 
 import numpy as np
 
-from safevar_sumo.replay.animation import OTHER, PERSON, VEHICLES, quad, stripes
+from safevar_sumo.replay.animation import OTHER_ACTOR, PERSON, VEHICLES, quad, stripes
 from safevar_sumo.replay.comparison import CHANGED, ORIGINAL, Comparison
 from safevar_sumo.replay.film import LaneLine
 from safevar_sumo.replay.scene import FlatScene, flat_scene_of
-from safevar_sumo.replay.window import Colour, Place, Window, open_window
+from safevar_sumo.replay.window import ActorPose, Colour, Window, open_window
 from safevar_sumo.scenarios import VUT
 
-NAMES = {ORIGINAL: "blue", CHANGED: "orange"}
-REST = 2.0
+COLOUR_NAMES = {ORIGINAL: "blue", CHANGED: "orange"}
+PAUSE = 2.0
 """Pause at the nearest moment and at the end [s]."""
 SPACE = 5.0
 """Space between the two roads [m]."""
@@ -25,25 +25,25 @@ LEGEND_HEIGHT = 1.8
 """Height of the legend above the lower edge of the view [m]."""
 
 
-def show_in_gui(comparison: Comparison, network: str | None = None, *, slower: float = 1.0, rest: float = REST,
+def show_in_gui(comparison: Comparison, network: str | None = None, *, slower: float = 1.0, rest: float = PAUSE,
                 pictures: Path | None = None) -> None:
     """Play a comparison in SUMO's own window, with pauses at the nearest moments and at the end.
 
     Parameters
     ----------
     network
-        The network to play it on, by default the comparison's own.
+        The network of the window, by default the comparison's network.
     slower
         Factor by which to play slower than real time.
     rest
         Duration of each pause [s].
     pictures
-        Folder for pictures of the window at every pause, if any.
+        Folder for pictures of the window at every pause; no pictures by default.
 
     Raises
     ------
     InputError, SimulationError
-        As `replay.window.open_window`.
+        If `replay.window.open_window` raises it.
     """
     scene = flat_scene_of(comparison)
     layout = _Layout(scene)
@@ -63,17 +63,17 @@ def show_in_gui(comparison: Comparison, network: str | None = None, *, slower: f
 
 
 class _Layout:
-    """Where the roads lie in the window: the changed vehicle's below the original's, by the height of the view."""
+    """Positions of the roads in the window: the changed vehicle's road lies below the original's road by the height of the view."""
 
     def __init__(self, scene: FlatScene) -> None:
-        self._below = scene.view.height + SPACE
+        self._road_distance = scene.view.height + SPACE
         track = scene.comparison.film.tracks[VUT]
         heading = np.deg2rad(90 - track.angle[0, 0])
         self._side = np.array([np.sin(heading), -np.cos(heading)])
 
     def offset(self, row: int) -> np.ndarray:
         """Offset of a row's road, shape (2,) [m]."""
-        return self._side * self._below * (row == CHANGED)
+        return self._side * self._road_distance * (row == CHANGED)
 
 
 def _add_row(window: Window, scene: FlatScene, row: int, layout: _Layout) -> None:
@@ -84,41 +84,42 @@ def _add_row(window: Window, scene: FlatScene, row: int, layout: _Layout) -> Non
             for j, points in enumerate(_areas(lane)):
                 window.paint(f"road.{i}.{j}", _points(points + layout.offset(row)), _colour_of(lane), 2 if lane.kind == "crossing" else 0)
     for name, track in film.tracks.items():
-        colour = _rgba(VEHICLES[row] if name == VUT else PERSON if track.is_person else OTHER)
+        colour = _rgba(VEHICLES[row] if name == VUT else PERSON if track.is_person else OTHER_ACTOR)
         window.add(_id(row, name), track.is_person, track.length, track.width, colour)
 
 
 def _show(window: Window, scene: FlatScene, sample: int, layout: _Layout) -> None:
-    """Show one sample: the camera, the actors' places, the legend."""
-    comparison, places = scene.comparison, []
+    """Show one sample: the camera, the actors' poses, the legend."""
+    comparison, poses = scene.comparison, []
     film = comparison.film
     corners = []
     for row in comparison.rows:
-        offset, at = layout.offset(row), min(sample, scene.moments[row].end)
+        offset, run_sample = layout.offset(row), min(sample, scene.moments[row].end)
         for name, track in film.tracks.items():
-            x, y = float(track.x[at, row]), float(track.y[at, row])
+            x, y = float(track.x[run_sample, row]), float(track.y[run_sample, row])
             if not np.isnan(x):
-                brakes = name == VUT and bool(film.runs.trace.brake[at, row] > 0)
-                places.append(Place(_id(row, name), x + float(offset[0]), y + float(offset[1]), float(track.angle[at, row]), brakes))
+                brakes = name == VUT and bool(film.runs.trace.brake[run_sample, row] > 0)
+                angle = float(track.angle[run_sample, row])
+                poses.append(ActorPose(_id(row, name), x + float(offset[0]), y + float(offset[1]), angle, brakes))
         frame = _frame(scene, sample) + offset
         corners.append(frame)
-        words = f"{comparison.name(row)} ({NAMES[row]}): {film.runs.trace.speed[at, row]:.1f} m/s"
-        finished = sample >= (scene.moments[row].end if scene.moments[row].nearest is None else int(scene.moments[row].nearest or 0))
+        words = f"{comparison.name(row)} ({COLOUR_NAMES[row]}): {film.runs.trace.speed[run_sample, row]:.1f} m/s"
+        is_finished = sample >= (scene.moments[row].end if scene.moments[row].nearest is None else int(scene.moments[row].nearest or 0))
         middle = frame.mean(axis=0)
         window.write(f"legend.{row}", float(middle[0]), float(frame[:, 1].min()) + LEGEND_HEIGHT,
-                     f"{words}, {comparison.verdict(row)}" if finished else f"{words}, {sample * scene.step:.2f} s")
+                     f"{words}, {comparison.verdict(row)}" if is_finished else f"{words}, {sample * scene.step:.2f} s")
     all_corners = np.concatenate(corners)
     window.look(*(float(value) for value in (*all_corners.min(axis=0), *all_corners.max(axis=0))))
-    window.show(places)
+    window.show(poses)
 
 
 def _frame(scene: FlatScene, sample: int) -> np.ndarray:
     """The corners of a scene's view, in the film's plane; shape (4, 2)."""
     view, track = scene.view, scene.comparison.film.tracks[VUT]
     heading = np.deg2rad(90 - track.angle[0, 0])
-    along, left = np.array([np.cos(heading), np.sin(heading)]), np.array([-np.sin(heading), np.cos(heading)])
+    forward, leftward = np.array([np.cos(heading), np.sin(heading)]), np.array([-np.sin(heading), np.cos(heading)])
     start = np.array([track.x[0, 0], track.y[0, 0]])
-    return np.array([start + along * x + left * y for x in (view.left[sample], view.left[sample] + view.width)
+    return np.array([start + forward * x + leftward * y for x in (view.left_ends[sample], view.left_ends[sample] + view.width)
                      for y in (view.bottom, view.bottom + view.height)])
 
 

@@ -16,9 +16,9 @@ if TYPE_CHECKING:
     from jinja2 import Environment
 
 WEB = Path(__file__).parent / "web"
-LETTERS = 65
-"""Width of the scene [heights of the text]."""
-CENTIMETRES = 2
+TEXT_HEIGHTS = 65
+"""Width of a scene [heights of its text]."""
+DECIMALS = 2
 """Decimals of a position [m]; a heading has one decimal [degrees]."""
 
 
@@ -31,7 +31,7 @@ def player_parts() -> dict[str, str]:
 
 
 def environment(*folders: Path) -> Environment:
-    """The templates of these folders and of the player; they escape all values."""
+    """The environment of these folders' templates and the player's, which escape all values."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
     return Environment(loader=FileSystemLoader([*folders, WEB]), autoescape=True, undefined=StrictUndefined, trim_blocks=True,
@@ -47,22 +47,22 @@ def animation_page(scene: FlatScene) -> str:
 
 def player_data(scene: FlatScene) -> dict[str, Any]:
     """The data of the template `player`: the still picture, and under `played` the data of the script. y points down."""
-    view, key = scene.view, scene.key_sample
+    view, key_sample = scene.view, scene.key_sample
     runs = [_drive(scene, row) for row in scene.comparison.rows]
     bodies = sorted(scene.bodies, key=lambda body: (body.is_vut, body.row))
-    left = _numbers(view.left)
-    box = {"left": left, "top": round(-view.bottom - view.height, CENTIMETRES), "width": round(view.width, CENTIMETRES),
-           "height": round(view.height, CENTIMETRES)}
-    shared = {"step": scene.step, "length": scene.length, "key": key, "view": box, "drives": runs}
+    left_ends = _numbers(view.left_ends)
+    box = {"left": left_ends, "top": round(-view.bottom - view.height, DECIMALS), "width": round(view.width, DECIMALS),
+           "height": round(view.height, DECIMALS)}
+    common_data = {"step": scene.step, "length": scene.length, "key": key_sample, "view": box, "drives": runs}
     return {
-        **shared,
-        "description": _description(scene), "moments": _moments(scene), "bottom": round(-view.bottom, CENTIMETRES),
-        "letters": round(view.width / LETTERS, CENTIMETRES),
+        **common_data,
+        "description": _description(scene), "moments": _moments(scene), "bottom": round(-view.bottom, DECIMALS),
+        "letters": round(view.width / TEXT_HEIGHTS, DECIMALS),
         "road": [_lane(lane) for kind in ("area", "path", "road", "crossing") for lane in scene.road if lane.kind == kind],
-        "ticks": list(range(int(np.floor(view.left.min() / MARK_DISTANCE)) * MARK_DISTANCE,
-                            int(view.left.max() + view.width) + MARK_DISTANCE, MARK_DISTANCE)),
-        "bodies": [_still(body, scene) for body in bodies],
-        "played": {**shared, "bodies": [_moving(body) for body in bodies]}}
+        "ticks": list(range(int(np.floor(view.left_ends.min() / MARK_DISTANCE)) * MARK_DISTANCE,
+                            int(view.left_ends.max() + view.width) + MARK_DISTANCE, MARK_DISTANCE)),
+        "bodies": [_still_body(body, scene) for body in bodies],
+        "played": {**common_data, "bodies": [_moving_body(body) for body in bodies]}}
 
 
 def _description(scene: FlatScene) -> str:
@@ -80,8 +80,8 @@ def _moments(scene: FlatScene) -> list[dict[str, Any]]:
         if moments.brake is not None:
             jumps.append({"name": f"{name} brakes", "sample": moments.brake})
         if moments.nearest is not None:
-            hit = not np.isnan(scene.comparison.film.runs.collision_speed[row])
-            jumps.append({"name": f"{name} {'collides' if hit else 'is nearest'}", "sample": moments.nearest})
+            is_impact = not np.isnan(scene.comparison.film.runs.collision_speed[row])
+            jumps.append({"name": f"{name} {'collides' if is_impact else 'is nearest'}", "sample": moments.nearest})
     return sorted(jumps, key=lambda moment: moment["sample"])
 
 
@@ -89,8 +89,8 @@ def _drive(scene: FlatScene, row: int) -> dict[str, Any]:
     trace, moments = scene.comparison.film.runs.trace, scene.moments[row]
     samples = slice(0, moments.end + 1)
     return {"name": scene.comparison.name(row), "verdict": scene.comparison.verdict(row), "end": moments.end,
-            "nearest": moments.end if moments.nearest is None else moments.nearest, "speed": _list(trace.speed[samples, row]),
-            "gap": _list(trace.gap[samples, row]), "brakes": (trace.brake[samples, row] > 0).astype(int).tolist()}
+            "nearest": moments.end if moments.nearest is None else moments.nearest, "speed": _rounded_list(trace.speed[samples, row]),
+            "gap": _rounded_list(trace.gap[samples, row]), "brakes": (trace.brake[samples, row] > 0).astype(int).tolist()}
 
 
 def _lane(lane: Any) -> dict[str, Any]:
@@ -98,29 +98,29 @@ def _lane(lane: Any) -> dict[str, Any]:
             "points": " ".join(f"{x:.2f},{-y:.2f}" for x, y in lane.line.tolist())}
 
 
-def _moving(body: FlatBody) -> dict[str, Any]:
+def _moving_body(body: FlatBody) -> dict[str, Any]:
     degrees = -np.rad2deg(np.unwrap(body.heading)) if np.isfinite(body.heading).all() else -np.rad2deg(body.heading)
     return {"drive": body.row if body.is_vut else None, "x": _numbers(body.x), "y": _numbers(-body.y), "heading": _numbers(degrees, 1)}
 
 
-def _still(body: FlatBody, scene: FlatScene) -> dict[str, Any]:
-    """One body at the key moment."""
-    key = scene.key_sample
-    x, y, heading = (_list(values[key:key + 1])[0] for values in (body.x, -body.y, -np.rad2deg(body.heading)))
-    look = {ORIGINAL: "original", CHANGED: "changed"}[body.row] if body.is_vut else "other"
-    brake = scene.comparison.film.runs.trace.brake[min(key, scene.moments[body.row].end), body.row]
-    return {"name": body.name, "person": body.is_person, "length": body.length, "width": body.width, "look": look,
+def _still_body(body: FlatBody, scene: FlatScene) -> dict[str, Any]:
+    """One body at the key sample."""
+    key_sample = scene.key_sample
+    x, y, heading = (_rounded_list(values[key_sample:key_sample + 1])[0] for values in (body.x, -body.y, -np.rad2deg(body.heading)))
+    style = {ORIGINAL: "original", CHANGED: "changed"}[body.row] if body.is_vut else "other"
+    brake = scene.comparison.film.runs.trace.brake[min(key_sample, scene.moments[body.row].end), body.row]
+    return {"name": body.name, "person": body.is_person, "length": body.length, "width": body.width, "look": style,
             "title": f"{scene.comparison.name(body.row)} vehicle" if body.is_vut else body.name,
             "radius": max(body.length, body.width) / 2, "drive": body.row if body.is_vut else None,
             "brakes_key": body.is_vut and brake > 0, "x_key": x, "y_key": y, "heading_key": heading}
 
 
-def _list(values: FloatArray, decimals: int = CENTIMETRES) -> list[float | None]:
+def _rounded_list(values: FloatArray, decimals: int = DECIMALS) -> list[float | None]:
     """Rounded numbers for JSON; null for an undefined number."""
     return [round(value, decimals) + 0.0 if np.isfinite(value) else None for value in values.tolist()]
 
 
-def _numbers(values: FloatArray, decimals: int = CENTIMETRES) -> list[float | None] | float | None:
-    """Rounded numbers, or a single one if all are the same."""
-    numbers = _list(values, decimals)
+def _numbers(values: FloatArray, decimals: int = DECIMALS) -> list[float | None] | float | None:
+    """Rounded numbers, or a single number if all are equal."""
+    numbers = _rounded_list(values, decimals)
     return numbers[0] if len(set(numbers)) == 1 else numbers

@@ -1,4 +1,4 @@
-"""A comparison as a flat scene: turned so that the vehicle under test starts to the right, in metres."""
+"""A comparison as a flat scene in metres, turned so that the vehicle under test starts towards the right."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from safevar_sumo.replay.film import ActorTrack, Film, LaneLine
 from safevar_sumo.scenarios import VUT
 
 SEAM_WIDTH = 0.12
-"""Width of the line drawn between two lanes [m]."""
+"""Width of the line between two lanes [m]."""
 MARGIN = 4.0
 """Free space around the actors [m]."""
 MIN_HEIGHT = 11.0
 """Smallest height of a view [m]."""
-WIDEST = 75.0
-"""A scene up to this long is shown whole; in a longer one the camera follows the vehicles [m]."""
-FOLLOWED = 48.0
+MAX_LENGTH = 75.0
+"""Length up to which a scene is shown whole; in a longer scene the camera follows the vehicles [m]."""
+CAMERA_LENGTH = 48.0
 """Length of road that a following camera shows [m]."""
-NEAR = 30.0
-"""Actors that never come nearer to the vehicle under test are not shown [m]."""
+MAX_DISTANCE = 30.0
+"""Distance to the vehicle under test beyond which actors are not shown [m]."""
 MARK_DISTANCE = 10
 """Distance between two marks beside the road [m]."""
-SAME = 0.05
+MAX_OFFSET = 0.05
 """Distance below which two copies of an actor are drawn as one [m]."""
 
 
@@ -46,16 +46,16 @@ class FlatBody(NamedTuple):
 
     def corners(self, sample: int) -> FloatArray:
         """The outline of a vehicle, shape (4, 2): front left, front right, rear right, rear left."""
-        along = np.array([np.cos(self.heading[sample]), np.sin(self.heading[sample])])
-        side, front = np.array([-along[1], along[0]]) * self.width / 2, np.array([self.x[sample], self.y[sample]])
-        rear = front - along * self.length
+        direction = np.array([np.cos(self.heading[sample]), np.sin(self.heading[sample])])
+        side, front = np.array([-direction[1], direction[0]]) * self.width / 2, np.array([self.x[sample], self.y[sample]])
+        rear = front - direction * self.length
         return np.array([front + side, front - side, rear - side, rear + side])
 
 
 class View(NamedTuple):
     """The part of the road that is shown: its left end at every sample, shape (T,), its lower end, and its size [m]."""
 
-    left: FloatArray
+    left_ends: FloatArray
     bottom: float
     width: float
     height: float
@@ -75,13 +75,13 @@ class FlatScene:
 
     @property
     def key_sample(self) -> int:
-        """The sample that a still picture shows: where the changed vehicle, or else the original, is nearest."""
+        """The sample that a still picture shows: the moment at which the changed vehicle, or else the original, is nearest."""
         last = self.moments[-1]
         return last.nearest if last.nearest is not None else last.end
 
     def marks(self, sample: int) -> list[int]:
         """The marks in view, by their distance from the start [m]."""
-        left = float(self.view.left[sample])
+        left = float(self.view.left_ends[sample])
         return list(range(math.ceil(left / MARK_DISTANCE) * MARK_DISTANCE, math.floor(left + self.view.width) + 1, MARK_DISTANCE))
 
 
@@ -93,7 +93,7 @@ def flat_scene_of(comparison: Comparison) -> FlatScene:
     to_scene = np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
     start = np.array([vut.x[0, 0], vut.y[0, 0]])
     all_moments = tuple(moments(film.runs, row) for row in comparison.rows)
-    length = max(one.end for one in all_moments) + 1
+    length = max(run_moments.end for run_moments in all_moments) + 1
     bodies = tuple(_body(name, track, row, all_moments[row].end, length, to_scene, start, turn)
                    for name, track in film.tracks.items() for row in comparison.rows
                    if name == VUT or (_is_near(film, name, row) and not _is_duplicate(comparison, name, row)))
@@ -103,38 +103,38 @@ def flat_scene_of(comparison: Comparison) -> FlatScene:
 
 
 def _body(name: str, track: ActorTrack, row: int, end: int, length: int, to_scene: FloatArray, start: FloatArray, turn: float) -> FlatBody:
-    """An actor until its simulation ends; afterwards it stays where it is."""
-    until = np.minimum(np.arange(length), end)
-    x, y = to_scene @ (np.stack([track.x[until, row], track.y[until, row]]) - start[:, np.newaxis])
+    """An actor until its simulation ends; afterwards the actor stays in place."""
+    samples = np.minimum(np.arange(length), end)
+    x, y = to_scene @ (np.stack([track.x[samples, row], track.y[samples, row]]) - start[:, np.newaxis])
     return FlatBody(name, row, name == VUT, track.is_person, track.length, track.width, x, y,
-                np.deg2rad(90 - track.angle[until, row]) - turn)
+                np.deg2rad(90 - track.angle[samples, row]) - turn)
 
 
 def _is_near(film: Film, name: str, row: int) -> bool:
     """Whether an actor ever comes near the vehicle under test."""
-    track, vut, end = film.tracks[name], film.tracks[VUT], film.last[row] + 1
+    track, vut, end = film.tracks[name], film.tracks[VUT], film.last_samples[row] + 1
     distance = np.hypot(track.x[:end, row] - vut.x[:end, row], track.y[:end, row] - vut.y[:end, row])
-    return bool(np.any(distance < NEAR + track.length))
+    return bool(np.any(distance < MAX_DISTANCE + track.length))
 
 
 def _is_duplicate(comparison: Comparison, name: str, row: int) -> bool:
-    """Whether the changed vehicle's copy of an actor is always at the same place, and drawn instead."""
+    """Whether the changed vehicle's copy of an actor is always at the same position, so that only this copy is drawn."""
     if row == CHANGED or len(comparison.rows) == 1:
         return False
-    track, end = comparison.film.tracks[name], int(comparison.film.last.min()) + 1
-    apart = np.hypot(track.x[:end, 0] - track.x[:end, CHANGED], track.y[:end, 0] - track.y[:end, CHANGED])
-    return _is_near(comparison.film, name, CHANGED) and bool(np.all((apart < SAME) | np.isnan(apart)))
+    track, end = comparison.film.tracks[name], int(comparison.film.last_samples.min()) + 1
+    offset = np.hypot(track.x[:end, 0] - track.x[:end, CHANGED], track.y[:end, 0] - track.y[:end, CHANGED])
+    return _is_near(comparison.film, name, CHANGED) and bool(np.all((offset < MAX_OFFSET) | np.isnan(offset)))
 
 
 def _view(bodies: tuple[FlatBody, ...], length: int) -> View:
     """The whole road or, in a long scene, the view of a camera that follows the vehicles."""
-    low = min(float(np.nanmin(body.x)) - body.length for body in bodies) - MARGIN / 2
-    high = max(float(np.nanmax(body.x)) + (0 if body.is_vut else body.length) for body in bodies) + MARGIN
+    left_end = min(float(np.nanmin(body.x)) - body.length for body in bodies) - MARGIN / 2
+    right_end = max(float(np.nanmax(body.x)) + (0 if body.is_vut else body.length) for body in bodies) + MARGIN
     sides = [side for body in bodies for side in (np.nanmin(body.y) - body.width / 2, np.nanmax(body.y) + body.width / 2)]
     bottom, top = float(min(sides)) - MARGIN / 2, float(max(sides)) + MARGIN / 2
-    missing = max(0.0, MIN_HEIGHT - (top - bottom)) / 2
-    if high - low <= WIDEST:
-        return View(np.full(length, low), bottom - missing, high - low, top - bottom + 2 * missing)
+    padding = max(0.0, MIN_HEIGHT - (top - bottom)) / 2
+    if right_end - left_end <= MAX_LENGTH:
+        return View(np.full(length, left_end), bottom - padding, right_end - left_end, top - bottom + 2 * padding)
     front = np.mean([body.x for body in bodies if body.is_vut], axis=0)
-    left = np.clip(front - FOLLOWED * 0.45, low, max(low, high - FOLLOWED))
-    return View(left, bottom - missing, FOLLOWED, top - bottom + 2 * missing)
+    left = np.clip(front - CAMERA_LENGTH * 0.45, left_end, max(left_end, right_end - CAMERA_LENGTH))
+    return View(left, bottom - padding, CAMERA_LENGTH, top - bottom + 2 * padding)

@@ -1,4 +1,4 @@
-"""A film played in sumo-gui: SUMO draws vehicles and persons on its network, at their recorded places."""
+"""A film played in sumo-gui: SUMO draws vehicles and persons on its network, at their recorded positions."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from safevar_sumo.sumo.network import copied_network
 
 BRAKE_LIGHT = 8
 """Signal of a vehicle (TraCI, "change vehicle state": bit 3)."""
-ANYWHERE = 2
-"""Value of keepRoute that allows places beside every road (TraCI, "move to XY")."""
+ANY_POSITION = 2
+"""Value of keepRoute that allows positions beside every road (TraCI, "move to XY")."""
 VIEW = "View #0"
 TEXT_SIZE = 85
 SETTINGS = """<viewsettings>
@@ -39,8 +39,8 @@ Colour = tuple[int, int, int, int]
 Points = Sequence[tuple[float, float]]
 
 
-class Place(NamedTuple):
-    """Where an actor is: front bumper or person [m], heading clockwise from north [degrees], and whether it brakes."""
+class ActorPose(NamedTuple):
+    """Pose of an actor: front bumper or person [m], heading clockwise from north [degrees], and whether the actor brakes."""
 
     name: str
     x: float
@@ -50,7 +50,7 @@ class Place(NamedTuple):
 
 
 class Window:
-    """Controls sumo-gui; made by `open_window`. Every actor is a vehicle there, persons only have another shape."""
+    """Controls sumo-gui; made by `open_window`. Every actor is a vehicle in sumo-gui; persons only have another shape."""
 
     def __init__(self, api: Any) -> None:
         self._api = api
@@ -58,7 +58,7 @@ class Window:
         api.route.add("route", [api.lane.getEdgeID(lane)])
 
     def add(self, name: str, is_person: bool, length: float, width: float, colour: Colour) -> None:
-        """Add an actor of this size [m]; `show` places it."""
+        """Add an actor of this size [m]; `show` moves it."""
         self._api.vehicletype.copy("DEFAULT_VEHTYPE", name)
         self._api.vehicletype.setShapeClass(name, "pedestrian" if is_person else "evehicle")
         self._api.vehicletype.setLength(name, max(length, width) if is_person else length)
@@ -74,7 +74,7 @@ class Window:
         self._api.polygon.add(name, list(points), colour, fill=True, layer=layer)
 
     def write(self, name: str, x: float, y: float, words: str) -> None:
-        """Write words at a place; a second call changes words and place."""
+        """Write words at a position; a second call changes words and position."""
         if name in self._api.poi.getIDList():
             self._api.poi.setPosition(name, x, y)
         else:
@@ -85,11 +85,11 @@ class Window:
         """Show this part of the plane [m]."""
         self._api.gui.setBoundary(VIEW, left, bottom, right, top)
 
-    def show(self, places: Sequence[Place]) -> None:
-        """Move all actors to their places."""
-        for place in places:
-            self._api.vehicle.moveToXY(place.name, "", 0, place.x, place.y, place.angle, keepRoute=ANYWHERE)
-            self._api.vehicle.setSignals(place.name, BRAKE_LIGHT if place.brakes else 0)
+    def show(self, poses: Sequence[ActorPose]) -> None:
+        """Move all actors to their poses."""
+        for pose in poses:
+            self._api.vehicle.moveToXY(pose.name, "", 0, pose.x, pose.y, pose.angle, keepRoute=ANY_POSITION)
+            self._api.vehicle.setSignals(pose.name, BRAKE_LIGHT if pose.brakes else 0)
         self._api.simulationStep()
 
     def picture(self, path: Path) -> None:

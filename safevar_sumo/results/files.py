@@ -1,4 +1,4 @@
-"""Files of a results directory: their names, contents and writers; files that are written whole or not at all; notes beside journals."""
+"""The files of a results directory: their names, contents and writers, and functions that write a whole file or nothing."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from safevar_sumo.study import Study, refuse_other_than_file
 MANIFEST, SOLUTIONS, RUNS, ANSWERS = "manifest.json", "solutions.csv", "runs", "answers"
 ORIGINAL = "original"
 """Name of the original vehicle's journal; the study that writes it first owns the directory."""
-PLACES, LATER = "places.json", "read-*.json"
+FOLDERS_FILE, READ_FILES = "places.json", "read-*.json"
 
 
 class ResultsFile(NamedTuple):
@@ -36,11 +36,12 @@ FILES = (
     ResultsFile(f"{RUNS}/*-*.journal", "every evaluation of the run ALGORITHM-NN, from which an interrupted study continues",
                 "`study` after each batch"),
     ResultsFile(f"{RUNS}/{ORIGINAL}.journal", "the original vehicle's evaluation", "`study` before its first run"),
-    ResultsFile(f"{RUNS}/{PLACES}", "folders of your own code and files, relative to the directory", "`study` before its first run"),
-    ResultsFile(f"{RUNS}/{LATER}", "a file that your own code read in the middle of a study, with its digest", "`study` after each batch"),
+    ResultsFile(f"{RUNS}/{FOLDERS_FILE}", "folders of your own code and files, relative to the directory", "`study` before its first run"),
+    ResultsFile(f"{RUNS}/{READ_FILES}", "a file that your own code read in the middle of a study, with its digest",
+                "`study` after each batch"),
     ResultsFile(f"{ANSWERS}/*.json", "results that `report` computed; reused for the same results, options and program; safe to delete",
                 "`report`"))
-"""Every file of a results directory; the manual's list is made from them."""
+"""Every file of a results directory; the manual lists them."""
 
 
 def journal_file(directory: Path, run: str) -> Path:
@@ -66,9 +67,9 @@ def make_directory(path: Path) -> None:
 
 def make_durable(path: Path) -> None:
     """Make a directory and those above it, and sync them to the disk."""
-    missing = [folder for folder in (path, *path.parents) if not folder.is_dir()]
+    new_folders = [folder for folder in (path, *path.parents) if not folder.is_dir()]
     path.mkdir(parents=True, exist_ok=True)
-    for folder in missing:
+    for folder in new_folders:
         sync_directory(folder.parent)
 
 
@@ -80,70 +81,71 @@ def write_whole(path: Path, text: str) -> None:
     SafevarError
         If the file cannot be written.
     """
-    temporary = path.parent / f".{path.name}.{secrets.token_hex(4)}.tmp"
+    temporary_file = path.parent / f".{path.name}.{secrets.token_hex(4)}.tmp"
     try:
         refuse_other_than_file(path)
         try:
-            with open(temporary, "x", encoding="utf-8", newline="") as file:
+            with open(temporary_file, "x", encoding="utf-8", newline="") as file:
                 file.write(text)
                 file.flush()
                 os.fsync(file.fileno())
-            os.replace(temporary, path)
+            os.replace(temporary_file, path)
         except BaseException:
-            temporary.unlink(missing_ok=True)
+            temporary_file.unlink(missing_ok=True)
             raise
         sync_directory(path.parent)
     except OSError as error:
-        raise SafevarError(f"{path}: cannot be written: {error.strerror}; what was written before stays valid") from None
+        raise SafevarError(f"{path}: cannot be written: {error.strerror}; earlier data stays valid") from None
 
 
 def sync_directory(path: Path) -> None:
-    """Sync a directory to the disk, on systems that can."""
+    """Sync a directory to the disk, on systems that support it."""
     if not hasattr(os, "O_DIRECTORY"):
         return
-    handle = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
+    descriptor = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
     try:
-        os.fsync(handle)
+        os.fsync(descriptor)
     except OSError as error:
         if error.errno not in (errno.EINVAL, errno.ENOTSUP):
             raise
     finally:
-        os.close(handle)
+        os.close(descriptor)
 
 
 def write_places(directory: Path, study: Study) -> None:
     """Write the folders of a study's files, relative to the directory; the manifest does not depend on them."""
     if study.origin.places:
         make_durable(directory / RUNS)
-        write_whole(directory / RUNS / PLACES, json.dumps([_relative(place, directory.resolve()) for place in study.origin.places]) + "\n")
+        folders = [_relative_path(folder, directory.resolve()) for folder in study.origin.places]
+        write_whole(directory / RUNS / FOLDERS_FILE, json.dumps(folders) + "\n")
 
 
 def places_of(directory: Path) -> tuple[str, ...]:
-    """Folders of the plug-ins and files of a directory's study: the study's own if they exist, then the directory's two parents."""
-    own = [os.path.abspath(directory.resolve() / place) for place in _read(directory / RUNS / PLACES, [])]
-    return tuple(dict.fromkeys([*filter(os.path.isdir, own), *map(str, directory.resolve().parents[:2])]))
+    """Folders of the plug-ins and files of a directory's study: the recorded folders that exist, then the directory's two parents."""
+    folders = [os.path.abspath(directory.resolve() / folder) for folder in _read(directory / RUNS / FOLDERS_FILE, [])]
+    return tuple(dict.fromkeys([*filter(os.path.isdir, folders), *map(str, directory.resolve().parents[:2])]))
 
 
 def note_later_file(directory: Path, name: str, digest: str) -> None:
-    """Note a file that was read after the study began, in a JSON file of its own, because several processes may write notes."""
+    """Record a file that was read after the study began, in a separate JSON file, because several processes may record files."""
     make_durable(directory / RUNS)
-    write_whole(directory / RUNS / LATER.replace("*", sha256(name.encode()).hexdigest()[:DIGITS]), json.dumps({name: digest}) + "\n")
+    write_whole(directory / RUNS / READ_FILES.replace("*", sha256(name.encode()).hexdigest()[:DIGITS]), json.dumps({name: digest}) + "\n")
 
 
 def later_files(directory: Path) -> Files:
-    """Digests of files, by name, that were read after the study began."""
-    return {name: digest for path in sorted((directory / RUNS).glob(LATER)) for name, digest in _read(path, {}).items()}
+    """Digests, by file name, of the files that were read after the study began."""
+    return {name: digest for path in sorted((directory / RUNS).glob(READ_FILES)) for name, digest in _read(path, {}).items()}
 
 
-def _relative(place: str, directory: Path) -> str:
+def _relative_path(folder: str, directory: Path) -> str:
     try:
-        return os.path.relpath(place, directory)
+        return os.path.relpath(folder, directory)
     except ValueError:  # on another drive
-        return place
+        return folder
 
 
 def _read(path: Path, default: Any) -> Any:
-    """A JSON file of this package beside the journals; the default if it is missing or damaged."""
+    """The content of a JSON file beside the journals; the default if the file is missing or damaged."""
     try:
         return json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):

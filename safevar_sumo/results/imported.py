@@ -1,4 +1,4 @@
-"""Imported results: a results directory of solutions from elsewhere, without runs and evaluations."""
+"""Imported results: a results directory of solutions from another program, without runs and evaluations."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ def write_imported(path: Path, study: Study, solutions: Mapping[str, Evaluations
     Parameters
     ----------
     path
-        The directory, made if it does not exist; solutions of other algorithms from an earlier import of the same study stay.
+        The directory, made if it does not exist. It keeps solutions of other algorithms from an earlier import of the same study.
     solutions
         Solutions by algorithm.
     original
-        The original vehicle's metrics, by name; None keeps those of an earlier import.
+        The original vehicle's metrics, by name; None keeps the metrics of an earlier import.
     files
         Name of the solutions' file, by algorithm.
 
@@ -48,24 +48,24 @@ def write_imported(path: Path, study: Study, solutions: Mapping[str, Evaluations
 
     make_directory(path)
     tables, names = tables_of(study), tuple(study.vehicle.characteristics)
-    earlier = _earlier(path, tables)
+    earlier_manifest = _earlier_manifest(path, tables)
     frame = solutions_frame(names, [((name, 0), evaluations) for name, evaluations in solutions.items()]).drop(columns="run")
-    if earlier:
-        refuse_edited_table(path / SOLUTIONS, earlier, "the file as it was, or another directory")
-        present = read_imported(path, names)
-        frame = pd.concat([present[~present["algorithm"].isin(list(solutions))], frame], ignore_index=True)
+    if earlier_manifest:
+        refuse_edited_table(path / SOLUTIONS, earlier_manifest, "the file as it was, or another directory")
+        stored = read_imported(path, names)
+        frame = pd.concat([stored[~stored["algorithm"].isin(list(solutions))], frame], ignore_index=True)
         frame = frame.sort_values(["algorithm", "f_safe", "f_diff", "f_num_diff", *names], kind="stable", ignore_index=True)
     text = frame.to_csv(index=False, lineterminator="\n")
     manifest: dict[str, Any] = {
-        "format": FORMAT, "study": tables, "imported": {"files": {**earlier.get("imported", {}).get("files", {}), **files}},
+        "format": FORMAT, "study": tables, "imported": {"files": {**earlier_manifest.get("imported", {}).get("files", {}), **files}},
         "versions": {"safevar_sumo": version("safevar_sumo")},
-        "original": dict(earlier.get("original", {}) if original is None else original),
+        "original": dict(earlier_manifest.get("original", {}) if original is None else original),
         DIGESTS: {SOLUTIONS: digest_of_table(text)}}
     write_whole(path / SOLUTIONS, text)
     write_manifest(path, manifest)
 
 
-def _earlier(path: Path, study: dict[str, Any]) -> dict[str, Any]:
+def _earlier_manifest(path: Path, study: dict[str, Any]) -> dict[str, Any]:
     """The manifest of an earlier import of the study; empty if there is none."""
     if not (path / RUNS).exists() and not (path / MANIFEST).exists():
         return {}
@@ -89,16 +89,17 @@ def read_imported(path: Path, characteristics: tuple[str, ...]) -> pd.DataFrame:
     import pandas as pd
 
     file = path / SOLUTIONS
-    numbers = [*characteristics, "f_safe", "f_diff", "f_num_diff", *METRICS]
+    numeric_columns = [*characteristics, "f_safe", "f_diff", "f_num_diff", *METRICS]
     refuse_other_than_file(file)
     try:
-        frame = pd.read_csv(file, dtype=str, keep_default_na=False)[["algorithm", *numbers, "outcome"]]
-        table = frame.replace({name: {"": "nan"} for name in numbers}).astype(dict.fromkeys(numbers, float))
+        frame = pd.read_csv(file, dtype=str, keep_default_na=False)[["algorithm", *numeric_columns, "outcome"]]
+        table = frame.replace({name: {"": "nan"} for name in numeric_columns}).astype(dict.fromkeys(numeric_columns, float))
     except OSError as error:
         raise InputError(file, f"cannot be read: {error.strerror or error}", "what the command import has written") from None
     except (KeyError, ValueError) as error:
         raise InputError(file, f"is damaged: {str(error).splitlines()[0]}", "what the command import has written") from None
-    required = [name for name in numbers if name not in METRICS]
-    if not np.isfinite(table[required].to_numpy()).all():
-        raise InputError(file, f"is damaged: no number in one of the columns {', '.join(required)}", "what the command import has written")
+    required_columns = [name for name in numeric_columns if name not in METRICS]
+    if not np.isfinite(table[required_columns].to_numpy()).all():
+        raise InputError(file, f"is damaged: no number in one of the columns {', '.join(required_columns)}",
+                         "what the command import has written")
     return table.astype({"f_num_diff": int})

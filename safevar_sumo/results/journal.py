@@ -1,4 +1,4 @@
-"""The journal of one run: every evaluated batch, appended and synced before the search goes on.
+"""The journal of one run: every evaluated batch, appended and synced before the search continues.
 
 A journal is a file of frames: magic, length and CRC-32 of a payload, then the payload in MessagePack. The first frame names the
 journal's study and run, the last frame of a finished run its result. A torn tail, left by a kill or a full disk, is cut off;
@@ -26,7 +26,7 @@ from safevar_sumo.results.files import make_durable, sync_directory
 from safevar_sumo.study import refuse_other_than_file
 
 FORMAT = 2
-READABLE = (1, FORMAT)
+READABLE_FORMATS = (1, FORMAT)
 MAGIC = b"SVJ\n"
 HEAD = struct.Struct("<4sII")
 OUTCOMES = {
@@ -34,13 +34,13 @@ OUTCOMES = {
     Outcome.INVALID_TEST: 6, Outcome.INFEASIBLE: 7}
 """Codes of outcomes in journals; a code never changes its meaning."""
 _OUTCOME_OF = {code: outcome.value for outcome, code in OUTCOMES.items()}
-BESIDE_METRICS = ("collision_speed", "f_diff", "f_num_diff")
+OTHER_COLUMNS = ("collision_speed", "f_diff", "f_num_diff")
 SPARE = -1
 """Position of an evaluation that the search has not requested (again)."""
 
 
 class Owner(msgspec.Struct, frozen=True, tag="owner"):
-    """The digest of the study's identity, and the run's name."""
+    """The owner of a journal: the digest of the study's identity, and the run's name."""
 
     format: int
     study: str
@@ -48,7 +48,7 @@ class Owner(msgspec.Struct, frozen=True, tag="owner"):
 
 
 class Batch(msgspec.Struct, frozen=True, tag="batch", omit_defaults=True):
-    """Evaluations; `positions` (int32) are their places in the run's order, `numbers` columns of float64, `reasons` by failed row."""
+    """Evaluations: their `positions` in the run (int32), `numbers` as columns of float64, and the `reasons` of failed rows by row."""
 
     positions: bytes
     outcome: bytes
@@ -58,7 +58,7 @@ class Batch(msgspec.Struct, frozen=True, tag="batch", omit_defaults=True):
 
 
 class Result(msgspec.Struct, frozen=True, tag="result", omit_defaults=True):
-    """The result of a run with a `budget` of evaluations (0 in format 1), by their positions; `asked` is the number of its requests."""
+    """Solutions of a run by `positions` of their evaluations; the run requested `asked` of `budget` evaluations (0 in format 1)."""
 
     positions: list[int]
     asked: int
@@ -66,26 +66,26 @@ class Result(msgspec.Struct, frozen=True, tag="result", omit_defaults=True):
 
 
 class Retry(msgspec.Struct, frozen=True, tag="retry"):
-    """Discards the failed evaluations so far; evaluations after the first failed one become spare."""
+    """Discards all earlier failed evaluations; evaluations after the first failure become `SPARE`."""
 
 
 JournalFrame = Owner | Batch | Result | Retry
 
 
 class Content(NamedTuple):
-    """The contents of a journal: evaluations (None if there is none), their positions, results by budget, and the bytes of a torn tail."""
+    """The contents of a journal: evaluations (or None), their positions, results by budget, and the size of a torn tail [bytes]."""
 
     positions: list[int]
     evaluations: Evaluations | None
     results: Mapping[int, Result]
-    torn: int = 0
+    tail_size: int = 0
 
     def result(self, budget: int) -> Result | None:
         """The result of the run with a budget of evaluations; None if it is unfinished."""
         return self.results.get(budget, self.results.get(0))
 
     def by_position(self, positions: list[int]) -> Evaluations:
-        """The evaluations at some positions."""
+        """The evaluations at `positions`, in this order."""
         assert self.evaluations is not None
         row_of = {position: row for row, position in enumerate(self.positions)}
         return self.evaluations.take([row_of[position] for position in positions])
@@ -97,10 +97,10 @@ class Content(NamedTuple):
         return self.evaluations.take(np.array([0 <= position < budget for position in self.positions], dtype=bool))
 
 
-NOTHING = Content([], None, {})
+EMPTY_CONTENT = Content([], None, {})
 
 
-def encoded(frame: JournalFrame) -> bytes:
+def bytes_of(frame: JournalFrame) -> bytes:
     """A frame's bytes."""
     payload = msgspec.msgpack.encode(frame)
     return HEAD.pack(MAGIC, len(payload), zlib.crc32(payload)) + payload
@@ -108,29 +108,29 @@ def encoded(frame: JournalFrame) -> bytes:
 
 def batch_of(positions: list[int], evaluations: Evaluations) -> Batch:
     """The frame of a batch."""
-    numbers = {**{name: getattr(evaluations, name) for name in BESIDE_METRICS}, **evaluations.metrics}
+    numbers = {**{name: getattr(evaluations, name) for name in OTHER_COLUMNS}, **evaluations.metrics}
     reasons = {row: evaluations.reasons[setting.tobytes()] for row, setting in enumerate(evaluations.settings)
                if setting.tobytes() in evaluations.reasons}
     return Batch(
-        positions=np.array(positions, dtype="<i4").tobytes(), outcome=bytes(OUTCOMES[one] for one in evaluations.outcome.tolist()),
+        positions=np.array(positions, dtype="<i4").tobytes(), outcome=bytes(OUTCOMES[outcome] for outcome in evaluations.outcome.tolist()),
         settings=evaluations.settings.astype("<f8").tobytes(),
         numbers={name: values.astype("<f8").tobytes() for name, values in numbers.items()}, reasons=reasons)
 
 
 def read_frames(data: bytes, path: Path) -> tuple[list[JournalFrame], int]:
-    """All intact frames, and the end of the last one.
+    """All intact frames, and the offset at which the last frame ends.
 
     Raises
     ------
     InputError
-        If a frame is damaged and intact ones follow it.
+        If a frame is damaged and intact frames follow it.
     """
     frames: list[JournalFrame] = []
     offset = 0
     while offset < len(data):
         frame, end = _frame_at(data, offset, path)
         if frame is None:
-            if any(_frame_at(data, later.start(), path)[0] is not None for later in re.compile(MAGIC).finditer(data, offset + 1)):
+            if any(_frame_at(data, match.start(), path)[0] is not None for match in re.compile(MAGIC).finditer(data, offset + 1)):
                 raise InputError(path, f"is damaged at byte {offset}, and intact frames follow",
                                  "restore the file, or remove it to simulate the run again")
             break
@@ -147,21 +147,22 @@ def content_of(frames: list[JournalFrame]) -> Content:
     for frame in frames:
         if isinstance(frame, Batch):
             positions += np.frombuffer(frame.positions, dtype="<i4").tolist()
-            batches.append(_unpacked(frame))
+            batches.append(_evaluations_of(frame))
         elif isinstance(frame, Result):
             results[frame.budget] = frame
         elif isinstance(frame, Retry) and batches:
-            positions, kept = _without_failures(positions, Evaluations.concatenate(batches))
-            batches, results = [kept], {}
+            positions, remaining_evaluations = _without_failures(positions, Evaluations.concatenate(batches))
+            batches, results = [remaining_evaluations], {}
     return Content(positions, Evaluations.concatenate(batches) if positions else None, results)
 
 
 def _without_failures(positions: list[int], evaluations: Evaluations) -> tuple[list[int], Evaluations]:
-    """Positions and evaluations of a run that simulates its failed settings again."""
-    simulated = ~evaluations.failed
-    first = min((position for position, valid in zip(positions, simulated, strict=True) if not valid), default=max(positions) + 1)
-    kept = [position if position < first else SPARE for position, valid in zip(positions, simulated, strict=True) if valid]
-    return kept, evaluations.take(simulated)
+    """Positions and evaluations that a run keeps when its failed settings are simulated again."""
+    successes = ~evaluations.failed
+    rows = list(zip(positions, successes, strict=True))
+    first_failure = min((position for position, success in rows if not success), default=max(positions) + 1)
+    new_positions = [position if position < first_failure else SPARE for position, success in rows if success]
+    return new_positions, evaluations.take(successes)
 
 
 def _frame_at(data: bytes, offset: int, path: Path) -> tuple[JournalFrame | None, int]:
@@ -177,9 +178,9 @@ def _frame_at(data: bytes, offset: int, path: Path) -> tuple[JournalFrame | None
         raise InputError(path, f"holds at byte {offset} a frame of another version: {error}", "the version that wrote it") from None
 
 
-def _unpacked(batch: Batch) -> Evaluations:
+def _evaluations_of(batch: Batch) -> Evaluations:
     numbers = {name: _floats(values) for name, values in batch.numbers.items()}
-    speed, f_diff, f_num_diff = (numbers.pop(name) for name in BESIDE_METRICS)
+    speed, f_diff, f_num_diff = (numbers.pop(name) for name in OTHER_COLUMNS)
     outcome = np.array([_OUTCOME_OF[code] for code in batch.outcome], dtype="U16")
     settings = _floats(batch.settings).reshape(len(outcome), -1)
     reasons = {settings[row].tobytes(): reason for row, reason in batch.reasons.items()}
@@ -201,14 +202,14 @@ class Journal:
     Parameters
     ----------
     path
-        The file, made if it does not exist. A journal without evaluations changes its owner.
+        The file, made if it does not exist. A journal without evaluations passes to this owner.
     study, run
         Owner of the journal.
 
     Attributes
     ----------
     content
-        Its contents when it was opened.
+        The journal's contents when it was opened.
     cut
         Number of bytes of a torn tail that were cut off.
 
@@ -217,17 +218,17 @@ class Journal:
     JournalBusy
         If another live process works on the run.
     InputError
-        If it belongs to another study or is damaged before its tail; names file and offset.
+        If the journal belongs to another study or is damaged before its tail; the error names file and offset.
     """
 
     def __init__(self, path: Path, study: str, run: str) -> None:
         self.path, self.cut = path, 0
-        self._file = _opened(path)
+        self._file = _open_and_lock(path)
         try:
             self.content = self._read(Owner(format=FORMAT, study=study, run=run))
         except OSError as error:
             self.close()
-            raise SafevarError(f"{path}: cannot be read: {error.strerror}; what was written before stays valid") from None
+            raise SafevarError(f"{path}: cannot be read: {error.strerror}; earlier data stays valid") from None
         except BaseException:
             self.close()
             raise
@@ -258,7 +259,7 @@ class Journal:
             raise InputError(self.path, "is no journal", "another --out")
         if frames and frames[0] != owner:
             if any(isinstance(frame, Batch) for frame in frames):
-                raise _not_of(self.path, frames[0], owner, "another --out")
+                raise _owner_error(self.path, frames[0], owner, "another --out")
             frames, end, size = [], 0, 0
             self._cut_at(0)
         if end < size:
@@ -272,18 +273,18 @@ class Journal:
     def _write(self, frame: JournalFrame) -> None:
         start = self._file.tell()
         try:
-            rest = memoryview(encoded(frame))
-            while rest:
-                rest = rest[self._file.write(rest):]
+            remainder = memoryview(bytes_of(frame))
+            while remainder:
+                remainder = remainder[self._file.write(remainder):]
             os.fsync(self._file.fileno())
             if not self.path.exists():
                 raise OSError(errno.ENOENT, "the file is gone")
         except OSError as error:
             self._undo(start)
-            raise SafevarError(f"{self.path}: cannot be written: {error.strerror}; what was written before stays valid") from None
+            raise SafevarError(f"{self.path}: cannot be written: {error.strerror}; earlier data stays valid") from None
 
     def _undo(self, start: int) -> None:
-        """Cut a half-written frame off again; if that fails too, the next reader does it."""
+        """Cut off a half-written frame; if that fails too, the next reader cuts it off."""
         try:
             self._cut_at(start)
         except OSError:
@@ -300,27 +301,27 @@ def read_journal(path: Path, study: str, run: str) -> Content:
     Raises
     ------
     InputError
-        If it cannot be read, is damaged, or belongs to another study or run.
+        If the journal cannot be read, is damaged, or belongs to another study or run.
     """
-    frames, torn = _frames_of(path)
-    if frames and not (isinstance(frames[0], Owner) and frames[0].format in READABLE):
+    frames, tail_size = _frames_of(path)
+    if frames and not (isinstance(frames[0], Owner) and frames[0].format in READABLE_FORMATS):
         raise InputError(path, "is of a format that this version does not read", "the version that wrote it")
     owner = Owner(format=FORMAT, study=study, run=run)
-    if frames and frames[0] not in [msgspec.structs.replace(owner, format=number) for number in READABLE]:
-        raise _not_of(path, frames[0], owner, "the journals of this study alone")
-    return content_of(frames)._replace(torn=torn)
+    if frames and frames[0] not in [msgspec.structs.replace(owner, format=number) for number in READABLE_FORMATS]:
+        raise _owner_error(path, frames[0], owner, "only journals of this study")
+    return content_of(frames)._replace(tail_size=tail_size)
 
 
-def _not_of(path: Path, frame: JournalFrame, owner: Owner, legal: str) -> InputError:
+def _owner_error(path: Path, frame: JournalFrame, owner: Owner, expected: str) -> InputError:
     """The error for a journal that begins with another frame than its owner."""
     if isinstance(frame, Owner) and frame.study == owner.study and frame.run != owner.run:
         problem = f"is the journal of run {frame.run}, not of {owner.run}: was it renamed or swapped?"
         return InputError(path, problem, f"the journal of {owner.run}")
-    return InputError(path, "belongs to another study or version", legal)
+    return InputError(path, "belongs to another study or version", expected)
 
 
 def owner_of(path: Path) -> str | None:
-    """The study of a journal that another process has opened; None until that process has written it."""
+    """The digest of a journal's study; None until the process that opened the journal has written its owner."""
     frames, _ = _frames_of(path)
     return frames[0].study if frames and isinstance(frames[0], Owner) else None
 
@@ -336,7 +337,7 @@ def _frames_of(path: Path) -> tuple[list[JournalFrame], int]:
         raise InputError(path, f"cannot be read: {error.strerror}") from None
 
 
-def _opened(path: Path) -> IO[bytes]:
+def _open_and_lock(path: Path) -> IO[bytes]:
     try:
         refuse_other_than_file(path)
         make_durable(path.parent)

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 class Failure(NamedTuple):
-    """A setting that could not be simulated: its algorithm and run, its place in the run, and why."""
+    """A setting that could not be simulated: its algorithm, run and position in the run, and the reason."""
 
     algorithm: str
     run: int
@@ -33,7 +33,7 @@ class Failure(NamedTuple):
 
 
 def failure_lines(failures: Sequence[Failure]) -> list[str]:
-    """A line for every reason of failures: the first failure with it, and the number of others."""
+    """A line for each distinct reason: the first failure with this reason, and the number of further failures."""
     reasons: dict[str, list[Failure]] = {}
     for failure in failures:
         reasons.setdefault(failure.reason, []).append(failure)
@@ -48,8 +48,8 @@ class StoredResults(NamedTuple):
     manifest
         The study as run, versions, seed, the original vehicle's evaluation.
     evaluations
-        One row per simulated setting of every run, in the order first requested; columns of
-        `safevar_sumo.results.evaluations_frame`, and `evaluation`, the place in that order from 0.
+        One row per simulated setting of every run, in the order of the first requests; columns of
+        `safevar_sumo.results.evaluations_frame`, and `evaluation`, the position in that order from 0.
     solutions
         One row per solution of every finished run; the same columns except `evaluation`. Imported solutions belong to no run.
     finished
@@ -83,8 +83,8 @@ class RunStatus(NamedTuple):
 class Status(NamedTuple):
     """Progress of a study.
 
-    `budget` is the largest number of evaluations of a run, `points` are (f_safe, f_diff, f_num_diff) of all settings so far, shape
-    (M, 3), `remarks` tell what is wrong with the directory.
+    `budget` is the largest number of evaluations of a run, `points` are (f_safe, f_diff, f_num_diff) of all M settings so far, shape
+    (M, 3), `remarks` name problems of the directory.
     """
 
     study: str
@@ -116,81 +116,83 @@ class Status(NamedTuple):
 
 
 class _Search(NamedTuple):
-    """The runs of a manifest's study, the evaluations of each, and the study's characteristics."""
+    """The search of a manifest's study: its runs, the budget of each run [evaluations], and the characteristics."""
 
     runs: list[tuple[str, int]]
     budget: int
     characteristics: tuple[str, ...]
 
 
-def _search_of(place: Path, manifest: Mapping[str, Any]) -> _Search:
+def _search_of(folder: Path, manifest: Mapping[str, Any]) -> _Search:
     try:
         search = manifest["study"]["search"]
         runs = [(name, run) for name in dict.fromkeys(map(label_of, search["algorithms"])) for run in range(search["runs"])]
         return _Search(runs, int(search["evaluations"]), tuple(manifest["study"]["vehicle"]["characteristics"]))
     except (KeyError, TypeError, ValueError):
-        raise InputError(place / MANIFEST, "has no characteristics or no search", "what the command study has written") from None
+        raise InputError(folder / MANIFEST, "has no characteristics or no search", "what the command study has written") from None
 
 
-def _journals(place: Path, manifest: Mapping[str, Any], runs: Sequence[tuple[str, int]]) -> Iterator[tuple[str, int, Content | None]]:
+def _journals(folder: Path, manifest: Mapping[str, Any], runs: Sequence[tuple[str, int]]) -> Iterator[tuple[str, int, Content | None]]:
     """Algorithm, run and journal of every run; None for a run without a journal."""
     owner = owner_digest(manifest)
     for algorithm, run in runs:
-        path = journal_file(place, f"{algorithm}-{run:02d}")
+        path = journal_file(folder, f"{algorithm}-{run:02d}")
         yield algorithm, run, read_journal(path, owner, path.stem) if path.exists() else None
 
 
 def load_runs(directory: str | Path) -> StoredResults:
-    """Read the runs and evaluations of a results directory's study, which may be unfinished; warns of torn runs.
+    """Read the runs and evaluations of a results directory's study, which may be unfinished; warns of torn journals.
 
     Raises
     ------
     InputError
         If the directory holds no results, or a file in it is damaged, was edited or belongs to another study.
     """
-    place = Path(directory)
-    manifest = read_manifest(place)
-    search = _search_of(place, manifest)
-    again = "the same import again" if "imported" in manifest else "the same study again, which writes it from the journals"
-    refuse_edited_table(place / SOLUTIONS, manifest, f"the file as it was, or {again}")
+    folder = Path(directory)
+    manifest = read_manifest(folder)
+    search = _search_of(folder, manifest)
+    remedy = "the same import again" if "imported" in manifest else "the same study again, which writes it from the journals"
+    refuse_edited_table(folder / SOLUTIONS, manifest, f"the file as it was, or {remedy}")
     if "imported" in manifest:
         no_evaluations = evaluations_frame(search.characteristics, []).assign(evaluation=0)
-        return StoredResults(manifest, no_evaluations, read_imported(place, search.characteristics))
-    evaluated, solved, positions, failures = [], [], [], []
-    for algorithm, run, content in _journals(place, manifest, search.runs):
-        if content is not None and content.torn and content.result(search.budget) is None:
-            warn(f"{journal_file(place, f'{algorithm}-{run:02d}')}: the last {content.torn} bytes are torn, so the run is left out; "
-                 "running the same study again simulates what they held")
+        return StoredResults(manifest, no_evaluations, read_imported(folder, search.characteristics))
+    evaluations_of_runs, solutions_of_runs, positions, failures = [], [], [], []
+    for algorithm, run, content in _journals(folder, manifest, search.runs):
+        if content is not None and content.tail_size and content.result(search.budget) is None:
+            warn(f"{journal_file(folder, f'{algorithm}-{run:02d}')}: the last {content.tail_size} bytes are torn, so the run is left out; "
+                 "running the same study again simulates the lost evaluations")
         if content is None or content.evaluations is None:
             continue
         order = sorted((position, row) for row, position in enumerate(content.positions) if 0 <= position < search.budget)
         evaluations = content.evaluations.take([row for _, row in order])
-        evaluated.append(((algorithm, run), evaluations))
+        evaluations_of_runs.append(((algorithm, run), evaluations))
         positions += [position for position, _ in order]
         failures += [Failure(algorithm, run, order[row][0], evaluations.reason(row)) for row in np.flatnonzero(evaluations.failed).tolist()]
         result = content.result(search.budget)
         if result is not None:
-            solved.append(((algorithm, run), content.by_position(result.positions)))
-    frame = evaluations_frame(search.characteristics, evaluated)
+            solutions_of_runs.append(((algorithm, run), content.by_position(result.positions)))
+    frame = evaluations_frame(search.characteristics, evaluations_of_runs)
     frame.insert(2, "evaluation", positions)
-    return StoredResults(manifest, frame, solutions_frame(search.characteristics, solved), tuple(key for key, _ in solved), tuple(failures))
+    solutions = solutions_frame(search.characteristics, solutions_of_runs)
+    return StoredResults(manifest, frame, solutions, tuple(key for key, _ in solutions_of_runs), tuple(failures))
 
 
 def status(directory: str | Path) -> Status:
-    """Progress of the study in a results directory, whether a process works on it or not; nothing is locked or written.
+    """Progress of the study in a results directory; a process may be running the study, as nothing is locked or written.
 
     Raises
     ------
     InputError
-        If it is no results directory, holds imported solutions, or a journal is damaged or belongs to another study.
+        If the directory holds no results or imported solutions, or a journal is damaged or belongs to another study.
     """
-    place = Path(directory)
-    manifest = read_manifest(place)
+    folder = Path(directory)
+    manifest = read_manifest(folder)
     if "imported" in manifest:
-        raise InputError(place, "holds imported solutions, which have no runs", "results of the command study")
-    search = _search_of(place, manifest)
-    runs = [_progress(*journal, search.budget) for journal in _journals(place, manifest, search.runs)]
-    remarks = [f"{place / SOLUTIONS} was edited: it does not hold what was computed"] if is_edited(place / SOLUTIONS, manifest) else []
+        raise InputError(folder, "holds imported solutions, which have no runs", "results of the command study")
+    search = _search_of(folder, manifest)
+    runs = [_progress(*journal, search.budget) for journal in _journals(folder, manifest, search.runs)]
+    table = folder / SOLUTIONS
+    remarks = [f"{table} was edited: it no longer holds the computed solutions"] if is_edited(table, manifest) else []
     return Status(str(manifest["study"].get("name")), str(manifest["study"].get("title")), search.budget, tuple(run for run, _ in runs),
                   np.concatenate([points for _, points in runs]), tuple(remarks))
 
@@ -200,8 +202,8 @@ def _progress(algorithm: str, run: int, content: Content | None, budget: int) ->
     evaluations = content.within(budget) if content is not None else None
     if content is None or evaluations is None:
         return RunStatus(algorithm, run, "waiting" if content is None else "begun", 0, 0, 0, None), np.zeros((0, 3))
-    valid = evaluations.take(evaluations.valid)
+    valid_evaluations = evaluations.take(evaluations.valid)
     state = "finished" if content.result(budget) is not None else "begun"
-    best = float(np.min(valid.f_safe)) if len(valid) else None
+    best = float(np.min(valid_evaluations.f_safe)) if len(valid_evaluations) else None
     return (RunStatus(algorithm, run, state, len(evaluations), int(np.count_nonzero(evaluations.collided)),
-                      int(np.count_nonzero(evaluations.failed)), best), valid.objectives)
+                      int(np.count_nonzero(evaluations.failed)), best), valid_evaluations.objectives)

@@ -12,59 +12,59 @@ from typing import Any
 from safevar_sumo.errors import InputError
 from safevar_sumo.plugins import Files, digest_of, located
 from safevar_sumo.results.files import MANIFEST, write_whole
-from safevar_sumo.study import WORDS, RatingTable, Study, refuse_other_than_file, tables_of
+from safevar_sumo.study import DESCRIPTION_KEYS, RatingTable, Study, refuse_other_than_file, tables_of
 
 FORMAT = 3
-READABLE = (2, FORMAT)
+READABLE_FORMATS = (2, FORMAT)
 RESULTS = 2
 """Version number of the package's results, raised whenever they change (enforced by tests/golden)."""
-VERSIONED = ("safevar_sumo", "libsumo", "eclipse-sumo", "deap", "numpy")
-WITHOUT_EFFECT_ON_RESULTS = ("title", "published", "repeatability", "fit", "calibration", "spread", "model_error", "variation",
+PACKAGES = ("safevar_sumo", "libsumo", "eclipse-sumo", "deap", "numpy")
+KEYS_WITHOUT_EFFECT_ON_RESULTS = ("title", "published", "repeatability", "fit", "calibration", "spread", "model_error", "variation",
                           "correlations")
 """Keys of a study that change no result."""
-WITHOUT_EFFECT_ON_EVALUATIONS = ("runs", "algorithms", "evaluations", "time_limit")
+KEYS_WITHOUT_EFFECT_ON_EVALUATIONS = ("runs", "algorithms", "evaluations", "time_limit")
 """Keys of a study's search table that change no evaluation, but decide which evaluations there are."""
 LAYERS = {
     "resolved": "the same study and options", "network": "the network's file as it was", "sources": "the file as it was",
     "results": "that version", "versions": "those versions", "platform": "such a machine"}
-"""Inputs that results depend on. The texts complete "expected: another --out, or ..." where one has changed."""
+"""Inputs that results depend on, each with the remedy if it has changed; an error adds the remedy to "expected: another --out, or "."""
 LAYERS_OF_FILES = ("network", "sources")
 """Layers that hold a digest for each file."""
 LAYERS_OF_FORMAT_2 = ("resolved", "network", "sources", "code", "versions", "platform")
 """Layers in format 2, which had digests of the package's own files in place of `RESULTS`."""
 SIMULATORS = ("libsumo", "eclipse-sumo")
-"""Versions on which a single simulation depends."""
+"""Packages on whose versions a single simulation depends."""
 DIGESTS = "digests"
-"""Key of the digests of the directory's own files: of its table, and of all of the manifest but this key."""
+"""Key of the digests of the table of solutions and of the manifest, the latter without this key."""
 
 
 def manifest_of(study: Study, identity: Mapping[str, Any]) -> dict[str, Any]:
-    """The manifest of a study, without the original vehicle.
+    """The manifest of a study, without the original vehicle's evaluation.
 
     Parameters
     ----------
     study
         The study as it is run.
     identity
-        Everything but the study file that the results depend on, by `LAYERS`; see `safevar_sumo.workers.identity.identity_of`.
+        Inputs of the results besides the study file, by `LAYERS`; see `safevar_sumo.workers.identity.identity_of`.
     """
     return {
         "format": FORMAT, "study": tables_of(study), "seed": study.search.seed, "resolved": evaluation_keys(study), **identity,
-        "versions": {name: version(name) for name in VERSIONED}}
+        "versions": {name: version(name) for name in PACKAGES}}
 
 
 def evaluation_keys(study: Study) -> dict[str, Any]:
     """Study keys that affect evaluations."""
-    everything: dict[str, Any] = tables_of(study)
-    for characteristic in everything["vehicle"]["characteristics"].values():
-        for key in WORDS:
+    tables: dict[str, Any] = tables_of(study)
+    for characteristic in tables["vehicle"]["characteristics"].values():
+        for key in DESCRIPTION_KEYS:
             del characteristic[key]
     if study.rating == RatingTable():
-        del everything["rating"]  # results from before ratings existed have no such table
+        del tables["rating"]  # results from before ratings existed have no such table
     if study.matrix is not None and not study.matrix.protocol:
-        del everything["matrix"]["protocol"]
-    search = {key: value for key, value in everything["search"].items() if key not in WITHOUT_EFFECT_ON_EVALUATIONS}
-    return {**{key: value for key, value in everything.items() if key not in WITHOUT_EFFECT_ON_RESULTS}, "search": search}
+        del tables["matrix"]["protocol"]
+    search = {key: value for key, value in tables["search"].items() if key not in KEYS_WITHOUT_EFFECT_ON_EVALUATIONS}
+    return {**{key: value for key, value in tables.items() if key not in KEYS_WITHOUT_EFFECT_ON_RESULTS}, "search": search}
 
 
 def owner_digest(manifest: Mapping[str, Any]) -> str:
@@ -75,13 +75,13 @@ def owner_digest(manifest: Mapping[str, Any]) -> str:
     return _digest([{**manifest["study"], "search": search}, manifest["versions"], manifest.get("network")])
 
 
-def difference(stored: Mapping[str, Any], new: Mapping[str, Any]) -> tuple[str, str]:
-    """The first difference of two manifests that may change results, and the way back; two empty texts if there is none."""
-    if stored.get("format") != FORMAT:
-        return f"version {stored['versions'].get('safevar_sumo')} wrote them", "that version"
-    for layer, way_back in LAYERS.items():
-        for text in _differences(layer, stored.get(layer, {}), new.get(layer, {})):
-            return text, way_back
+def difference(stored_manifest: Mapping[str, Any], new_manifest: Mapping[str, Any]) -> tuple[str, str]:
+    """The first difference of two manifests that may change results, and its remedy; two empty texts if there is no difference."""
+    if stored_manifest.get("format") != FORMAT:
+        return f"version {stored_manifest['versions'].get('safevar_sumo')} wrote them", "that version"
+    for layer, remedy in LAYERS.items():
+        for text in _differences(layer, stored_manifest.get(layer, {}), new_manifest.get(layer, {})):
+            return text, remedy
     return "", ""
 
 
@@ -106,11 +106,11 @@ def extent_of(manifest: Mapping[str, Any]) -> Any:
 
 
 def write_manifest(directory: Path, manifest: Mapping[str, Any]) -> None:
-    """Write a manifest with a digest of itself, so that an edit shows."""
+    """Write a manifest with a digest of itself, so that edits are detected."""
     digests = {name: digest for name, digest in manifest.get(DIGESTS, {}).items() if name != MANIFEST}
-    sealed = {**manifest, DIGESTS: digests}
-    sealed[DIGESTS] = {**digests, MANIFEST: _digest(sealed)}
-    write_whole(directory / MANIFEST, json.dumps(sealed, indent=2, allow_nan=False) + "\n")
+    signed_manifest = {**manifest, DIGESTS: digests}
+    signed_manifest[DIGESTS] = {**digests, MANIFEST: _digest(signed_manifest)}
+    write_whole(directory / MANIFEST, json.dumps(signed_manifest, indent=2, allow_nan=False) + "\n")
 
 
 def read_manifest(directory: Path) -> dict[str, Any]:
@@ -122,27 +122,27 @@ def read_manifest(directory: Path) -> dict[str, Any]:
         If there is no manifest, or its file is something else or was edited.
     """
     file = directory / MANIFEST
-    legal = "a directory written by the command study"
+    expected = "a directory written by the command study"
     try:
         refuse_other_than_file(file)
         manifest = json.loads(file.read_text(encoding="utf-8", errors="replace"))
-        readable = isinstance(manifest["study"], dict) and isinstance(manifest["versions"], dict) \
-            and manifest.get("format", FORMAT) in READABLE and isinstance(manifest.get(DIGESTS, {}), dict)
+        is_readable = isinstance(manifest["study"], dict) and isinstance(manifest["versions"], dict) \
+            and manifest.get("format", FORMAT) in READABLE_FORMATS and isinstance(manifest.get(DIGESTS, {}), dict)
     except FileNotFoundError:
-        meant = Path("results") / directory.name
-        hint = f"; did you mean {meant}?" if meant != directory and (meant / MANIFEST).is_file() else ""
-        raise InputError(directory, f"is no results directory: there is no {MANIFEST}{hint}", legal) from None
+        likely_path = Path("results") / directory.name
+        hint = f"; did you mean {likely_path}?" if likely_path != directory and (likely_path / MANIFEST).is_file() else ""
+        raise InputError(directory, f"is no results directory: there is no {MANIFEST}{hint}", expected) from None
     except OSError as error:
         raise InputError(file, f"cannot be read: {error.strerror}") from None
     except json.JSONDecodeError as error:
         raise InputError(file, f"is torn or was edited, line {error.lineno} is no JSON: {error.msg}",
                          "the file as it was, or no file: the same command then writes it again") from None
     except (ValueError, KeyError, TypeError, RecursionError):
-        readable = False
-    if not readable:
-        raise InputError(file, "is not a manifest of this version of the program", legal)
+        is_readable = False
+    if not is_readable:
+        raise InputError(file, "is not a manifest of this version of the program", expected)
     digests = dict(manifest.get(DIGESTS, {}))
-    digest = digests.pop(MANIFEST, None)  # versions up to 0.2.0 wrote none
+    digest = digests.pop(MANIFEST, None)  # versions up to 0.2.0 wrote no digest
     if digest is not None and digest != _digest({**manifest, DIGESTS: digests}):
         raise InputError(file, "was edited; restore it, or remove it and run the same command again, which writes it anew")
     return dict(manifest)
@@ -154,7 +154,7 @@ def digest_of_table(text: str) -> str:
 
 
 def is_edited(file: Path, manifest: Mapping[str, Any]) -> bool:
-    """Whether a table differs from the written one; False if the manifest has no digest of it.
+    """Whether a table was changed after it was written; False if the manifest has no digest of the table.
 
     Raises
     ------
@@ -170,45 +170,45 @@ def is_edited(file: Path, manifest: Mapping[str, Any]) -> bool:
         raise InputError(file, f"cannot be read: {error.strerror or error}") from None
 
 
-def refuse_edited_table(file: Path, manifest: Mapping[str, Any], way_back: str) -> None:
-    """Refuse a table for which `is_edited` holds; `way_back` tells the user what to do about it."""
+def refuse_edited_table(file: Path, manifest: Mapping[str, Any], remedy: str) -> None:
+    """Refuse a table for which `is_edited` holds; `remedy` names what the user can do."""
     if is_edited(file, manifest):
-        raise InputError(file, "was edited: it does not hold what was computed", way_back)
+        raise InputError(file, "was edited: it no longer holds the computed solutions", remedy)
 
 
 def _differences(layer: str, stored: Any, new: Any) -> Iterator[str]:
     """All differences between a layer of two manifests, in words."""
-    for key, before, now in _changed_values(stored, new):
+    for key, old_value, new_value in _changed_values(stored, new):
         if layer in LAYERS_OF_FILES:
-            yield f"{key} {'no longer exists' if now is None else 'is new' if before is None else 'has changed since'}"
+            yield f"{key} {'no longer exists' if new_value is None else 'is new' if old_value is None else 'has changed since'}"
         else:
             name = f"version of {key}" if layer == "versions" else key or "the version of the package's results"
-            yield f"{name} was {before!r} and is {now!r} now"
+            yield f"{name} was {old_value!r} and is {new_value!r} now"
 
 
-def _changed_values(stored: Any, new: Any, key: str = "") -> Iterator[tuple[str, Any, Any]]:
+def _changed_values(first: Any, second: Any, key: str = "") -> Iterator[tuple[str, Any, Any]]:
     """The innermost keys at which two values differ, with the first and the second value; 2 and 2.0 are different."""
-    if isinstance(stored, dict) and isinstance(new, dict):
-        for name in sorted({*stored, *new}):
-            yield from _changed_values(stored.get(name), new.get(name), f"{key}.{name}" if key else name)
-    elif json.dumps(stored, sort_keys=True) != json.dumps(new, sort_keys=True):
-        yield key, stored, new
+    if isinstance(first, dict) and isinstance(second, dict):
+        for name in sorted({*first, *second}):
+            yield from _changed_values(first.get(name), second.get(name), f"{key}.{name}" if key else name)
+    elif json.dumps(first, sort_keys=True) != json.dumps(second, sort_keys=True):
+        yield key, first, second
 
 
-def comparable_inputs(stored: Mapping[str, Any], now: Mapping[str, str], later: Mapping[str, str], places: Sequence[str]
+def comparable_inputs(stored: Mapping[str, Any], present_files: Mapping[str, str], late_files: Mapping[str, str], places: Sequence[str]
                   ) -> tuple[dict[str, Any], Files]:
-    """A stored manifest and the files that its study reads now, ready to be compared.
+    """A stored manifest and the files that its study reads now, prepared for their comparison.
 
-    Files that were read after the study began are omitted from both. One that has changed is in both; a missing one is in the
-    manifest alone.
+    Both omit a file that was first read after the study began, unless the file has changed since. If such a file is missing now,
+    only the manifest holds it.
     """
-    at_start, at_present = dict(stored.get("sources", {})), dict(now)
-    for name, digest in later.items():
-        if name not in at_start:
-            present = at_present.pop(name, None) or digest_of(located(name, places))
-            if present != digest:
-                at_start[name], at_present[name] = digest, present
-    return {**stored, "sources": at_start}, {name: digest for name, digest in at_present.items() if digest}
+    stored_digests, present_digests = dict(stored.get("sources", {})), dict(present_files)
+    for name, digest in late_files.items():
+        if name not in stored_digests:
+            digest_now = present_digests.pop(name, None) or digest_of(located(name, places))
+            if digest_now != digest:
+                stored_digests[name], present_digests[name] = digest, digest_now
+    return {**stored, "sources": stored_digests}, {name: digest for name, digest in present_digests.items() if digest}
 
 
 def _digest(value: Any) -> str:

@@ -10,13 +10,13 @@ from safevar_sumo.metrics import RATING_POINTS, Unsafe
 if TYPE_CHECKING:
     import pandas as pd
 
-LEGAL = "ALGORITHM:RUN:N, the N-th row of that run in solutions.csv, from 0"
+HANDLE_FORMAT = "ALGORITHM:RUN:N, the N-th row of that run in solutions.csv, from 0"
 
 
 class SolutionId(NamedTuple):
     """One solution: the `row`-th of a run's solutions in the order of solutions.csv, from 0.
 
-    Imported solutions belong to no run; theirs count as run 0.
+    Imported solutions belong to no run; their run number is 0.
     """
 
     algorithm: str
@@ -35,10 +35,10 @@ class SolutionId(NamedTuple):
         InputError
             If the text is no handle.
         """
-        algorithm, _, rest = text.partition(":")
-        run, _, row = rest.partition(":")
+        algorithm, _, remainder = text.partition(":")
+        run, _, row = remainder.partition(":")
         if not (algorithm and all(number.isascii() and number.isdecimal() and len(number) < 10 for number in (run, row))):
-            raise InputError(source, repr(text), LEGAL)
+            raise InputError(source, repr(text), HANDLE_FORMAT)
         return cls(algorithm, int(run), int(row))
 
 
@@ -46,10 +46,9 @@ def handles(solutions: pd.DataFrame) -> list[SolutionId]:
     """The handle of every row of a frame of solutions, as `safevar_sumo.results.load_runs` gives it."""
     import pandas as pd
 
-    run = solutions["run"] if "run" in solutions else pd.Series(0, index=solutions.index)
-    row = solutions.groupby([solutions["algorithm"], run], sort=False).cumcount()
-    return [SolutionId(str(algorithm), int(number), int(place))
-            for algorithm, number, place in zip(solutions["algorithm"], run, row, strict=True)]
+    runs = solutions["run"] if "run" in solutions else pd.Series(0, index=solutions.index)
+    rows = solutions.groupby([solutions["algorithm"], runs], sort=False).cumcount()
+    return [SolutionId(str(algorithm), int(run), int(row)) for algorithm, run, row in zip(solutions["algorithm"], runs, rows, strict=True)]
 
 
 def position_of(solutions: pd.DataFrame, handle: SolutionId, source: object = "solution") -> int:
@@ -63,13 +62,13 @@ def position_of(solutions: pd.DataFrame, handle: SolutionId, source: object = "s
     all_handles = handles(solutions)
     if handle in all_handles:
         return all_handles.index(handle)
-    last = {(other.algorithm, other.run): other.row for other in all_handles}
-    if (handle.algorithm, handle.run) in last:
-        legal = f"N from 0 to {last[handle.algorithm, handle.run]}"
+    last_rows = {(other.algorithm, other.run): other.row for other in all_handles}
+    if (handle.algorithm, handle.run) in last_rows:
+        expected = f"N from 0 to {last_rows[handle.algorithm, handle.run]}"
     else:
-        runs = [f"{algorithm}:{run}" for algorithm, run in last]
-        legal = f"a run with solutions: {', '.join(runs[:6])}{', ...' if len(runs) > 6 else ''}" if runs else "results with a solution"
-    raise InputError(source, f"there is no solution {handle}", legal)
+        runs = [f"{algorithm}:{run}" for algorithm, run in last_rows]
+        expected = f"a run with solutions: {', '.join(runs[:6])}{', ...' if len(runs) > 6 else ''}" if runs else "results with a solution"
+    raise InputError(source, f"there is no solution {handle}", expected)
 
 
 CHOICES = {
@@ -82,12 +81,12 @@ CHOICES = {
 
 
 def chosen_handle(solutions: pd.DataFrame, unsafe: Unsafe, choice: str, source: object) -> SolutionId:
-    """The most severe of all solutions, or the unsafe one with the fewest or the smallest changes.
+    """The handle of the most severe solution, or of the unsafe solution that is first in the order of another choice.
 
     Parameters
     ----------
     unsafe
-        The criterion.
+        The criterion for unsafe.
     choice
         A name of `CHOICES`.
 
@@ -96,10 +95,10 @@ def chosen_handle(solutions: pd.DataFrame, unsafe: Unsafe, choice: str, source: 
     InputError
         If there is no such solution.
     """
-    named = solutions.assign(handle=list(map(str, handles(solutions))))
-    candidates = named if choice == "most_severe" else named[unsafe.rows(named)]
+    table = solutions.assign(handle=list(map(str, handles(solutions))))
+    candidates = table if choice == "most_severe" else table[unsafe.rows(table)]
     if candidates.empty:
-        if named.empty:
+        if table.empty:
             raise InputError(source, "these results hold no solution", "results with a solution")
         raise InputError(source, "these results hold no unsafe solution", "the most severe one, or a solution by its handle")
     return SolutionId.parse(candidates.sort_values(CHOICES[choice], kind="stable")["handle"].iloc[0], source)

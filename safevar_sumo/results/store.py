@@ -1,4 +1,4 @@
-"""The results directory that a study writes, with the same bytes for the same study and seed; and tables of evaluations and solutions."""
+"""The results directory of a study, with the same bytes for the same study and seed, and tables of evaluations and solutions."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 SECONDS_TO_CLAIM = 10.0
-"""How long another process may take to write the owner into a new journal [s]."""
+"""Time within which another process writes the owner into a new journal [s]."""
 
 
 class ResultsDirectory:
@@ -73,16 +73,16 @@ class ResultsDirectory:
         if scoring != SAFEVAR:
             self.manifest["scoring"] = msgspec.to_builtins(scoring)
         make_directory(path)
-        self._known: dict[str, str] = dict(self.manifest.get("sources", {}))
+        self._digests: dict[str, str] = dict(self.manifest.get("sources", {}))
         self._refuse_another_study()
 
     @property
     def inputs(self) -> dict[str, Any]:
-        """Digests of the files that all workers must share, by layer: the study's files, and those read later."""
-        return {"network": self.manifest.get("network", {}), "sources": self._known}
+        """Digests, by layer, of the files that all workers must share; `sources` include files that were read after the study began."""
+        return {"network": self.manifest.get("network", {}), "sources": self._digests}
 
     def note(self, files: Mapping[str, str]) -> None:
-        """Record files that code from outside has read since the study began; call it before journalling results based on them.
+        """Record files that user code has read since the study began; call this before results based on these files are journalled.
 
         Raises
         ------
@@ -90,13 +90,13 @@ class ResultsDirectory:
             If a file has changed since it was first read.
         """
         for name, digest in files.items():
-            recorded = self._known.get(name) or later_files(self.path).get(name, digest)
-            if recorded != digest:
+            stored_digest = self._digests.get(name) or later_files(self.path).get(name, digest)
+            if stored_digest != digest:
                 raise InputError(name, "is not the file that this study began with: it was changed meanwhile",
                                  "the file as it was, and the same command; or another --out")
-            if name not in self._known:
+            if name not in self._digests:
                 note_later_file(self.path, name, digest)
-                self._known[name] = digest
+                self._digests[name] = digest
 
     def journal(self, run: str) -> Journal:
         """Open and lock the journal of a run, such as nsga2-03."""
@@ -110,13 +110,13 @@ class ResultsDirectory:
     def begin(self, original: Evaluations) -> None:
         """Write the manifest with the original vehicle's evaluation; remove solutions of other runs."""
         manifest = {**self.manifest, "original": record(original, 0)}
-        earlier = read_manifest(self.path) if (self.path / MANIFEST).exists() else manifest
-        outdated = extent_of(earlier) != extent_of(manifest)
-        if not outdated and DIGESTS in earlier:
-            manifest[DIGESTS] = earlier[DIGESTS]
+        earlier_manifest = read_manifest(self.path) if (self.path / MANIFEST).exists() else manifest
+        is_outdated = extent_of(earlier_manifest) != extent_of(manifest)
+        if not is_outdated and DIGESTS in earlier_manifest:
+            manifest[DIGESTS] = earlier_manifest[DIGESTS]
         write_manifest(self.path, manifest)
         write_places(self.path, self._study)
-        if outdated:
+        if is_outdated:
             self._remove(self.path / SOLUTIONS)
 
     def finish(self, solutions: Mapping[Any, Evaluations]) -> None:
@@ -128,25 +128,26 @@ class ResultsDirectory:
 
     def _refuse_another_study(self) -> None:
         if not (self.path / MANIFEST).exists():
-            others = sorted(name for path in self.path.iterdir() if (name := path.name) not in (RUNS, SOLUTIONS) and name[0] != ".")
-            if others and not (self.path / RUNS).exists():  # if there are journals, their owner decides whose directory this is
-                raise InputError("out", f"{self.path} holds other files: {others[0]}", "an empty directory, or one of this study")
+            other_files = sorted(name for path in self.path.iterdir() if (name := path.name) not in (RUNS, SOLUTIONS) and name[0] != ".")
+            if other_files and not (self.path / RUNS).exists():  # if there are journals, their owner decides whose directory this is
+                raise InputError("out", f"{self.path} holds other files: {other_files[0]}", "an empty directory, or one of this study")
             return
-        stored, later = read_manifest(self.path), later_files(self.path)
-        if "imported" not in stored and later:
-            stored, self.manifest["sources"] = comparable_inputs(stored, self._known, later, self._study.origin.places)
-        text, way_back = ("they are imported", "") if "imported" in stored else difference(stored, self.manifest)
-        self._known = {**self.manifest.get("sources", {}), **later}
-        if text:
-            legal = f"another --out, or {way_back}" if way_back else "another --out"
-            raise InputError(self.path, f"holds results of another study: {text}", legal)
+        stored_manifest, late_files = read_manifest(self.path), later_files(self.path)
+        if "imported" not in stored_manifest and late_files:
+            folders = self._study.origin.places
+            stored_manifest, self.manifest["sources"] = comparable_inputs(stored_manifest, self._digests, late_files, folders)
+        problem, remedy = ("they are imported", "") if "imported" in stored_manifest else difference(stored_manifest, self.manifest)
+        self._digests = {**self.manifest.get("sources", {}), **late_files}
+        if problem:
+            expected = f"another --out, or {remedy}" if remedy else "another --out"
+            raise InputError(self.path, f"holds results of another study: {problem}", expected)
 
     def _refuse_another_owner(self, path: Path) -> None:
         """Wait until the process that holds a journal has written its owner; refuse another study."""
-        end = time.monotonic() + SECONDS_TO_CLAIM
-        while (its_owner := owner_of(path)) is None and time.monotonic() < end:
+        deadline = time.monotonic() + SECONDS_TO_CLAIM
+        while (owner := owner_of(path)) is None and time.monotonic() < deadline:
             time.sleep(SECONDS_TO_CLAIM / 1000)
-        if its_owner != owner_digest(self.manifest):
+        if owner != owner_digest(self.manifest):
             raise InputError(self.path, "is in use by another study that is running now", "another --out")
 
     def _remove(self, path: Path) -> None:

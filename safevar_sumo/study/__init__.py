@@ -4,9 +4,9 @@ from safevar_sumo.errors import refuse_other_than_file
 from safevar_sumo.study.constraints import Constraint
 from safevar_sumo.study.file import check_writable, load_study, of_today, write_study
 from safevar_sumo.study.schema import (
+    DESCRIPTION_KEYS,
     OBJECTIVES,
     SAFETY_DEGREE,
-    WORDS,
     CharacteristicTable,
     FitTable,
     FreeParameter,
@@ -32,7 +32,7 @@ from safevar_sumo.study.schema import (
 from safevar_sumo.study.validation import converted, invalid
 
 __all__ = [
-    "OBJECTIVES", "SAFETY_DEGREE", "WORDS", "CharacteristicTable", "Constraint", "FitTable", "FreeParameter", "MatrixTable",
+    "DESCRIPTION_KEYS", "OBJECTIVES", "SAFETY_DEGREE", "CharacteristicTable", "Constraint", "FitTable", "FreeParameter", "MatrixTable",
     "MatrixTest", "MetricsTable", "ModelTable", "Origin", "RatingTable", "SearchTable", "Study", "StudyLike", "VehicleTable", "Weather",
     "check_writable", "converted", "fmus_of", "foreign_names", "foreign_packages", "invalid", "label_of", "load_study", "of_today",
     "refuse_other_than_file", "study_names", "study_path", "tables_of", "write_study"]

@@ -1,4 +1,4 @@
-"""The constraints of a study, which the characteristics of one vehicle satisfy together, and their checks."""
+"""The constraints of a study: conditions on several characteristics of a vehicle, and their validation."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from safevar_sumo.errors import InputError, one_of, unknown
 if TYPE_CHECKING:
     from safevar_sumo.study.schema import CharacteristicTable
 
-LONGEST = 400
+MAX_MEANING_LENGTH = 400
 """Largest number of characters of a constraint's meaning."""
 
 
 class Constraint(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A quantity of several characteristics with its bounds `at_least` and `at_most`.
+    """The bounds `at_least` and `at_most` of a quantity that depends on several characteristics.
 
-    The quantity is either `sum`, the characteristics in their units times these weights, or `function`, `package.module:Name` of a
-    function that takes {name: array of shape (N,)} and returns such an array. `unit` is the unit of the quantity and its bounds: one of the
-    characteristics', or "-"; optional if all characteristics of the sum have the same one. `meaning` explains the constraint, with its
-    source.
+    The quantity is either a weighted sum, where `sum` holds a weight for each characteristic in its unit, or the result of `function`.
+    A function is named `package.module:Name`; it takes {name: array of shape (N,)} for N settings and returns an array of shape (N,).
+    `unit`, the unit of the quantity and its bounds, is the unit of a characteristic or "-"; it may be omitted if all characteristics of
+    the sum have the same unit. `meaning` explains the constraint and names its source.
     """
 
     sum: dict[str, float] = {}
@@ -31,7 +31,7 @@ class Constraint(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     at_least: float | None = None
     at_most: float | None = None
     unit: str | None = None
-    meaning: Annotated[str, Meta(max_length=LONGEST)] = ""
+    meaning: Annotated[str, Meta(max_length=MAX_MEANING_LENGTH)] = ""
 
     @property
     def quantity(self) -> str:
@@ -42,44 +42,46 @@ class Constraint(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
                  for name, weight in self.sum.items()]
         return re.sub("^- ", "-", " ".join(terms).removeprefix("+ "))
 
-    def unit_of(self, rows: Mapping[str, CharacteristicTable]) -> str:
-        """The unit of the quantity."""
-        units = {rows[name].unit for name in self.sum if name in rows}
+    def unit_of(self, table: Mapping[str, CharacteristicTable]) -> str:
+        """The unit of the quantity; `table` holds the vehicle's characteristics."""
+        units = {table[name].unit for name in self.sum if name in table}
         return self.unit if self.unit is not None else next(iter(units), "-")
 
-    def legal(self, rows: Mapping[str, CharacteristicTable]) -> str:
+    def legal(self, table: Mapping[str, CharacteristicTable]) -> str:
         """The bounds in words."""
-        unit = "" if self.unit_of(rows) == "-" else f" {self.unit_of(rows)}"
-        ends = {"at least": self.at_least, "at most": self.at_most}
-        return " and ".join(f"{word} {value:g}{unit}" for word, value in ends.items() if value is not None)
+        unit = "" if self.unit_of(table) == "-" else f" {self.unit_of(table)}"
+        bounds = {"at least": self.at_least, "at most": self.at_most}
+        return " and ".join(f"{word} {value:g}{unit}" for word, value in bounds.items() if value is not None)
 
 
-def constraint_mistakes(source: object, rows: Mapping[str, CharacteristicTable], constraints: Sequence[Constraint]) -> Iterator[InputError]:
-    """Constraints that name unknown characteristics, add different units or have no bounds."""
-    for number, one in enumerate(constraints):
+def constraint_mistakes(source: object, table: Mapping[str, CharacteristicTable], conditions: Sequence[Constraint]) -> Iterator[InputError]:
+    """Errors for constraints that name unknown characteristics, add quantities of different units, or have no bounds."""
+    for number, constraint in enumerate(conditions):
         key = f"constraints[{number}]"
-        if bool(one.sum) == bool(one.function):
-            yield InputError(source, f"{key}: {'both sum and function' if one.sum else 'neither sum nor function'}", "one of them")
-        for name, weight in one.sum.items():
-            if name not in rows:
-                yield unknown(source, f"{key}.sum.{name}: there is no such characteristic", name, rows)
+        if bool(constraint.sum) == bool(constraint.function):
+            yield InputError(source, f"{key}: {'both sum and function' if constraint.sum else 'neither sum nor function'}", "one of them")
+        for name, weight in constraint.sum.items():
+            if name not in table:
+                yield unknown(source, f"{key}.sum.{name}: there is no such characteristic", name, table)
             if weight == 0:
                 yield InputError(source, f"{key}.sum.{name} = 0", "a number other than 0")
-        if one.at_least is None and one.at_most is None:
+        if constraint.at_least is None and constraint.at_most is None:
             yield InputError(source, f"{key}: neither at_least nor at_most", "one of them, or both")
-        elif one.at_least is not None and one.at_most is not None and one.at_least > one.at_most:
-            yield InputError(source, f"{key}: at_least = {one.at_least:g} and at_most = {one.at_most:g}", "at_least <= at_most")
-        yield from _unit_mistakes(source, key, one, rows)
+        elif constraint.at_least is not None and constraint.at_most is not None and constraint.at_least > constraint.at_most:
+            yield InputError(source, f"{key}: at_least = {constraint.at_least:g} and at_most = {constraint.at_most:g}",
+                             "at_least <= at_most")
+        yield from _unit_mistakes(source, key, constraint, table)
 
 
-def _unit_mistakes(source: object, key: str, one: Constraint, rows: Mapping[str, CharacteristicTable]) -> Iterator[InputError]:
-    units = dict.fromkeys(rows[name].unit for name in one.sum if name in rows)
-    legal = list(dict.fromkeys(["-", *(row.unit for row in rows.values())]))
-    if one.unit is None and len(units) > 1:
-        members = ", ".join(f"{name} [{rows[name].unit}]" for name in one.sum if name in rows)
-        yield InputError(source, f"{key}.sum adds {members}", "characteristics of one unit; or converting weights, with unit = "
-                         f"{one_of(legal)}")
-    elif one.unit is not None and len(units) == 1 and one.unit not in (*units, "-"):
-        yield InputError(source, f"{key}.unit = {one.unit!r}", f"{next(iter(units))!r}, the unit of {' and '.join(one.sum)}, or '-'")
-    elif one.unit is not None and one.unit not in legal:
-        yield unknown(source, f"{key}.unit = {one.unit!r} is no unit of this study", one.unit, legal)
+def _unit_mistakes(source: object, key: str, constraint: Constraint, table: Mapping[str, CharacteristicTable]) -> Iterator[InputError]:
+    units = dict.fromkeys(table[name].unit for name in constraint.sum if name in table)
+    known_units = list(dict.fromkeys(["-", *(row.unit for row in table.values())]))
+    if constraint.unit is None and len(units) > 1:
+        members = ", ".join(f"{name} [{table[name].unit}]" for name in constraint.sum if name in table)
+        yield InputError(source, f"{key}.sum adds {members}", "characteristics of the same unit, or weights that convert units, and "
+                         f"unit = {one_of(known_units)}")
+    elif constraint.unit is not None and len(units) == 1 and constraint.unit not in (*units, "-"):
+        yield InputError(source, f"{key}.unit = {constraint.unit!r}",
+                         f"{next(iter(units))!r}, the unit of {' and '.join(constraint.sum)}, or '-'")
+    elif constraint.unit is not None and constraint.unit not in known_units:
+        yield unknown(source, f"{key}.unit = {constraint.unit!r} is no unit of this study", constraint.unit, known_units)

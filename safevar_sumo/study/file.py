@@ -1,4 +1,4 @@
-"""Reading study files strictly, with the studies that they extend, and writing them."""
+"""Strict reading of study files, with the studies that they extend, and writing of study files."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ import tomli_w
 from safevar_sumo.errors import InputError, refuse_other_than_file
 from safevar_sumo.shipped import STUDIES
 from safevar_sumo.study.schema import NAME, Origin, SearchTable, Study, StudyLike, is_file, study_path, tables_of
-from safevar_sumo.study.validation import converted, implausible, refuse, unusable
+from safevar_sumo.study.validation import contradictions, converted, refuse, unusable_values
 
-REPLACED = ("calibration", "published", "repeatability", "spread", "model_error")
+WHOLE_TABLES = ("calibration", "published", "repeatability", "spread", "model_error")
 """Tables that a study inherits as a whole or not at all."""
-OF_ONE_SYSTEM = ("title", "published", "repeatability")
-"""Keys that hold for one vehicle, ADS, scenario, network, weather and matrix; a study with another one does not inherit them."""
+SYSTEM_KEYS = ("title", "published", "repeatability")
+"""Keys for one combination of vehicle, ADS, scenario, network, weather and matrix; a study with another one does not inherit them."""
 
 
-class _Raw(NamedTuple):
+class _RawStudy(NamedTuple):
     """Unchecked tables of a study, and their origin."""
 
     source: object
@@ -38,39 +38,39 @@ def load_study(study: StudyLike, **changes: Any) -> Study:
     study
         The study's name, the path of its file, its tables as in a file, or a study to change.
     changes
-        Keys that override the study's, table by table as in a file that extends it:
+        Keys that override keys of the study, table by table, as in a file that extends the study:
         `weather="fog"`, `search={"runs": 2}`.
 
     Raises
     ------
     InputError
-        Naming file, key, value and what is expected.
+        If the study cannot be used; the error names file, key, value and expected values.
     """
-    raw = _raw(study)
-    return _checked(_overridden(raw, changes, raw.source) if changes else raw)
+    raw = _raw_study(study)
+    return _checked_study(_with_overrides(raw, changes, raw.source) if changes else raw)
 
 
-def _raw(study: StudyLike) -> _Raw:
+def _raw_study(study: StudyLike) -> _RawStudy:
     if isinstance(study, Study):
-        return _Raw(study.source, without_nulls(tables_of(study)), study.origin)
+        return _RawStudy(study.source, without_nulls(tables_of(study)), study.origin)
     if isinstance(study, Mapping):
-        return _extended(_Raw("study", dict(study)), Path("."), ())
-    return _read(study_path(str(study)), seen=())
+        return _with_base(_RawStudy("study", dict(study)), Path("."), ())
+    return _read(study_path(str(study)), visited_paths=())
 
 
-def _checked(raw: _Raw) -> Study:
-    refuse(unusable(raw.source, raw.tables))
+def _checked_study(raw: _RawStudy) -> Study:
+    refuse(unusable_values(raw.source, raw.tables))
     tables = _with_fmu(raw, of_today(raw.tables))
     remarks = raw.origin.remarks
     if tables.get("ads") != raw.tables.get("ads"):
         remarks = (*remarks, f"{raw.source}: weather.hesitation is read as ads.parameters.hesitation")
     study = converted(raw.source, _with_algorithms(tables), Study)
-    refuse(implausible(raw.source, study))
+    refuse(contradictions(raw.source, study))
     return msgspec.structs.replace(study, origin=msgspec.structs.replace(raw.origin, remarks=remarks))
 
 
 def of_today(tables: dict[str, Any]) -> dict[str, Any]:
-    """Tables of any earlier version in the present form: `hesitation`, once the weather's, is a parameter of the driving system."""
+    """Tables of any earlier version in the present form: `weather.hesitation` becomes a parameter of the driving system."""
     weather, ads = tables.get("weather"), tables.get("ads")
     if not (isinstance(weather, dict) and "hesitation" in weather and isinstance(ads, dict)):
         return tables
@@ -81,37 +81,39 @@ def of_today(tables: dict[str, Any]) -> dict[str, Any]:
     return tables
 
 
-def _with_fmu(raw: _Raw, tables: dict[str, Any]) -> dict[str, Any]:
+def _with_fmu(raw: _RawStudy, tables: dict[str, Any]) -> dict[str, Any]:
     """A study's tables, with rows of characteristics completed from the parameters that the vehicle's FMU declares."""
     vehicle = tables.get("vehicle")
     if not isinstance(vehicle, dict) or vehicle.get("kind") != "fmu" or not isinstance(model := vehicle.get("model"), str):
         return tables
-    stated, fixed = vehicle.get("characteristics", {}), vehicle.get("parameters", {})
-    if not isinstance(stated, dict) or not isinstance(fixed, dict) or not all(isinstance(row, dict) for row in stated.values()):
+    stated_rows, parameters = vehicle.get("characteristics", {}), vehicle.get("parameters", {})
+    if not (isinstance(stated_rows, dict) and isinstance(parameters, dict) and all(isinstance(row, dict) for row in stated_rows.values())):
         return tables
     from safevar_sumo.fmu.description import description_of, file_of  # only a study with an FMU needs FMPy
 
-    complete = stated and all({"unit", "original", "lower", "upper"} <= row.keys() for row in stated.values())
-    if complete and not file_of(model, raw.origin.places):
-        return tables  # results without their FMU can be read
-    declared = description_of(model, raw.origin.places, str(raw.source), "vehicle.model")
-    rows = {**declared.rows(fixed), **{name: {**declared.row(name, str(row.get("unit", ""))), **row} for name, row in stated.items()}}
+    is_complete = stated_rows and all({"unit", "original", "lower", "upper"} <= row.keys() for row in stated_rows.values())
+    if is_complete and not file_of(model, raw.origin.places):
+        return tables  # so results can be read without their FMU
+    description = description_of(model, raw.origin.places, str(raw.source), "vehicle.model")
+    rows = {**description.rows(parameters),
+            **{name: {**description.row(name, str(row.get("unit", ""))), **row} for name, row in stated_rows.items()}}
     return {**tables, "vehicle": {**vehicle, "characteristics": rows}}
 
 
-def _with_algorithms(raw: dict[str, Any]) -> dict[str, Any]:
+def _with_algorithms(tables: dict[str, Any]) -> dict[str, Any]:
     """Move the tables of algorithms, such as [search.nsga2], to `search.parameters`."""
-    search = raw.get("search")
+    search = tables.get("search")
     if not isinstance(search, dict) or not isinstance(search.get("parameters", {}), dict):
-        return raw
-    of_algorithms = {key: value for key, value in search.items() if isinstance(value, dict) and key not in SearchTable.__struct_fields__}
-    others = {key: value for key, value in search.items() if key not in of_algorithms}
-    return {**raw, "search": {**others, "parameters": {**others.get("parameters", {}), **of_algorithms}}} if of_algorithms else raw
+        return tables
+    algorithm_tables = {key: value for key, value in search.items() if isinstance(value, dict) and key not in SearchTable.__struct_fields__}
+    other_keys = {key: value for key, value in search.items() if key not in algorithm_tables}
+    parameters = {**other_keys.get("parameters", {}), **algorithm_tables}
+    return {**tables, "search": {**other_keys, "parameters": parameters}} if algorithm_tables else tables
 
 
-def _read(path: Path, seen: tuple[Path, ...]) -> _Raw:
-    """Read a TOML file and the study that it `extends`; its own keys override table by table."""
-    if path in seen:
+def _read(path: Path, visited_paths: tuple[Path, ...]) -> _RawStudy:
+    """Read a TOML file and the study that it `extends`; the file's own keys override table by table."""
+    if path in visited_paths:
         raise InputError(path, f"extends = {path.stem!r} leads back to this file", "a study that does not extend this one")
     try:
         tables = tomllib.loads(path.read_text(encoding="utf-8-sig"))
@@ -126,12 +128,12 @@ def _read(path: Path, seen: tuple[Path, ...]) -> _Raw:
     except OSError as error:
         raise InputError(path, f"cannot be read: {error.strerror}") from None
     places = () if path.parent == STUDIES else (str(path.resolve().parent),)
-    return _extended(_Raw(path, tables, Origin(called=str(path) if places else "", places=places)), path, seen)
+    return _with_base(_RawStudy(path, tables, Origin(called=str(path) if places else "", places=places)), path, visited_paths)
 
 
-def _extended(raw: _Raw, path: Path, seen: tuple[Path, ...]) -> _Raw:
-    """The tables of the study that `raw` extends, overridden by those of `raw`, with the folders of both."""
-    refuse(unusable(raw.source, raw.tables))
+def _with_base(raw: _RawStudy, path: Path, visited_paths: tuple[Path, ...]) -> _RawStudy:
+    """The tables of the study that `raw` extends, overridden by the tables of `raw`, with the folders of both studies."""
+    refuse(unusable_values(raw.source, raw.tables))
     tables = dict(raw.tables)
     base = tables.pop("extends", None)
     if base is None:
@@ -140,37 +142,38 @@ def _extended(raw: _Raw, path: Path, seen: tuple[Path, ...]) -> _Raw:
         raise InputError(raw.source, f"extends = {base!r}", "the name or path of a study")
     if "name" not in tables and re.fullmatch(NAME, path.stem):
         tables["name"] = path.stem
-    beside = path.parent / base
+    sibling = path.parent / base
     try:
-        base_path = beside if is_file(beside) else study_path(base)
+        base_path = sibling if is_file(sibling) else study_path(base)
     except InputError as error:
         raise InputError(raw.source, f"extends = {base!r}: {error.problem}", error.legal) from None
-    extended = _read(base_path, (*seen, path))
-    merged = _overridden(extended, tables, raw.source)
-    places = tuple(dict.fromkeys((*raw.origin.places, *extended.origin.places)))
-    remarks = () if path.parent == STUDIES else merged.origin.remarks  # shipped studies leave keys out on purpose
-    return merged._replace(origin=msgspec.structs.replace(merged.origin, called=raw.origin.called, places=places, remarks=remarks))
+    base_study = _read(base_path, (*visited_paths, path))
+    result = _with_overrides(base_study, tables, raw.source)
+    places = tuple(dict.fromkeys((*raw.origin.places, *base_study.origin.places)))
+    remarks = () if path.parent == STUDIES else result.origin.remarks  # shipped studies leave keys out on purpose
+    return result._replace(origin=msgspec.structs.replace(result.origin, called=raw.origin.called, places=places, remarks=remarks))
 
 
-def _overridden(base: _Raw, overrides: Mapping[str, Any], source: object) -> _Raw:
-    """Override a study's tables; another system does not inherit the keys `OF_ONE_SYSTEM`."""
+def _with_overrides(base: _RawStudy, overrides: Mapping[str, Any], source: object) -> _RawStudy:
+    """Override a study's tables; a study of another system does not inherit `SYSTEM_KEYS`."""
     tables = _merged(base.tables, overrides)
-    other = [key for key in ("weather", "vehicle", "ads", "scenario", "matrix") if _kind(tables.get(key)) != _kind(base.tables.get(key))]
+    changed_keys = [key for key in ("weather", "vehicle", "ads", "scenario", "matrix")
+                    if _kind(tables.get(key)) != _kind(base.tables.get(key))]
     remarks = base.origin.remarks
-    if other:
-        dropped = [key for key in OF_ONE_SYSTEM[:2] if key in base.tables and key not in overrides]
-        tables = {**{key: value for key, value in tables.items() if key not in OF_ONE_SYSTEM}, "title": tables.get("name", ""),
-                  **{key: overrides[key] for key in OF_ONE_SYSTEM if key in overrides}}
-        if "vehicle" in other or "ads" in other:  # both are about their parameters
+    if changed_keys:
+        omitted_keys = [key for key in SYSTEM_KEYS[:2] if key in base.tables and key not in overrides]
+        tables = {**{key: value for key, value in tables.items() if key not in SYSTEM_KEYS}, "title": tables.get("name", ""),
+                  **{key: overrides[key] for key in SYSTEM_KEYS if key in overrides}}
+        if "vehicle" in changed_keys or "ads" in changed_keys:  # spread and model_error concern their parameters
             tables = {key: value for key, value in tables.items() if key in overrides or key not in ("spread", "model_error")}
-        if dropped:
-            remarks = (*remarks, f"{source}: has another {' and another '.join(other)} than study {base.tables.get('name')!r}, so it does "
-                                 f"not inherit that study's {' and '.join(f'[{key}]' for key in dropped)}")
-    return _Raw(source, tables, msgspec.structs.replace(base.origin, remarks=remarks))
+        if omitted_keys:
+            remarks = (*remarks, f"{source}: has another {' and another '.join(changed_keys)} than study {base.tables.get('name')!r}, so "
+                                 f"it does not inherit that study's {' and '.join(f'[{key}]' for key in omitted_keys)}")
+    return _RawStudy(source, tables, msgspec.structs.replace(base.origin, remarks=remarks))
 
 
 def _kind(table: object) -> object:
-    """The model and network of a table, or the weather or matrix itself."""
+    """The model and network that a table names; a weather or matrix as it is."""
     if not isinstance(table, dict):
         return table
     parameters = table.get("parameters")
@@ -178,18 +181,18 @@ def _kind(table: object) -> object:
 
 
 def _merged(base: Mapping[str, Any], overrides: Mapping[str, Any]) -> dict[str, Any]:
-    """Override `base` by `overrides`; another `model` or `distribution`, and the tables `REPLACED`, replace a whole table."""
+    """Override `base` by `overrides`; another `model` or `distribution`, and the tables `WHOLE_TABLES`, replace a whole table."""
     result = dict(base)
     for key, value in overrides.items():
         result[key] = _merged(base[key], value) if _refines(key, base.get(key), value) else value
     return result
 
 
-def _refines(key: str, old: object, new: object) -> bool:
-    """Whether a new table changes single keys of the old one."""
-    if key in REPLACED or not (isinstance(old, dict) and isinstance(new, dict)):
+def _refines(key: str, base_value: object, override: object) -> bool:
+    """Whether an override changes single keys of the table that it overrides."""
+    if key in WHOLE_TABLES or not (isinstance(base_value, dict) and isinstance(override, dict)):
         return False
-    return all(new.get(kind, old.get(kind)) == old.get(kind) for kind in ("model", "distribution"))
+    return all(override.get(kind, base_value.get(kind)) == base_value.get(kind) for kind in ("model", "distribution"))
 
 
 def without_nulls(raw: Any) -> Any:
@@ -198,7 +201,7 @@ def without_nulls(raw: Any) -> Any:
 
 
 def write_study(path: Path, study: Study, comment: str) -> None:
-    """Write a complete study file that begins with a comment; the study takes the file's name if that is a legal one.
+    """Write a complete study file that begins with a comment; the study takes the file's name if that is a legal name of a study.
 
     Raises
     ------
@@ -208,8 +211,8 @@ def write_study(path: Path, study: Study, comment: str) -> None:
     if re.fullmatch(NAME, path.stem):
         study = msgspec.structs.replace(study, name=path.stem)
     tables = {name: value for name, value in without_nulls(tables_of(study)).items() if value != {}}
-    printable = ("".join(character if character.isprintable() else "?" for character in line) for line in comment.splitlines())
-    text = "".join(f"# {line}".rstrip() + "\n" for line in printable) + "\n" + tomli_w.dumps(tables)
+    lines = ("".join(character if character.isprintable() else "?" for character in line) for line in comment.splitlines())
+    text = "".join(f"# {line}".rstrip() + "\n" for line in lines) + "\n" + tomli_w.dumps(tables)
     try:
         path.write_text(text, encoding="utf-8")
     except OSError as error:

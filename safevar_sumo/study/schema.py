@@ -15,7 +15,7 @@ from safevar_sumo.shipped import STUDIES
 from safevar_sumo.study.constraints import Constraint
 from safevar_sumo.study.variation import Correlation, Distribution
 
-Positive = Annotated[float, Meta(gt=0, le=1e6)]
+PositiveNumber = Annotated[float, Meta(gt=0, le=1e6)]
 PositiveInt = Annotated[int, Meta(ge=1, le=10_000_000)]
 OwnStep = Annotated[float, Meta(ge=1e-6, le=10)]
 Weight = Annotated[float, Meta(ge=0, le=1e6)]
@@ -23,19 +23,19 @@ Seed = Annotated[int, Meta(ge=0, le=2**63 - 1)]
 Parameters = dict[str, Any]
 NAME = r"^[A-Za-z0-9][A-Za-z0-9_.-]*\Z"
 SAFETY_DEGREE: Final = "safety_degree"
-"""Column and key of that metric."""
+"""Column and key of the metric."""
 OBJECTIVES = (SAFETY_DEGREE, "f_diff", "f_num_diff")
 """Objectives of the published study."""
-LONGEST_WORDS = 200
+MAX_DESCRIPTION_LENGTH = 200
 """Largest number of characters of a characteristic's description."""
-OF_FMUS = ("kind", "inputs", "outputs", "sensors", "sumo_type", "step")
+FMU_KEYS = ("kind", "inputs", "outputs", "sensors", "sumo_type", "step")
 """Keys of models that only FMUs have."""
-WORDS = ("meaning", "counterpart")
-"""Keys of a characteristic for people to read; no result depends on them."""
+DESCRIPTION_KEYS = ("meaning", "counterpart")
+"""Keys that describe a characteristic to people; no result depends on them."""
 
 
 class CharacteristicTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """One row of the characteristics table; the quantities are in `unit`, a change counts `weight` times in f_diff.
+    """One row of the characteristics table; its values are in `unit`, and f_diff multiplies its change by `weight`.
 
     `meaning` describes the characteristic and begins with a short name (up to the first comma or bracket); `counterpart` is the part
     of a real vehicle that sets it.
@@ -45,16 +45,17 @@ class CharacteristicTable(Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     original: float
     lower: float
     upper: float
-    weight: Positive = 1.0
-    meaning: Annotated[str, Meta(max_length=LONGEST_WORDS)] = ""
-    counterpart: Annotated[str, Meta(max_length=LONGEST_WORDS)] = ""
+    weight: PositiveNumber = 1.0
+    meaning: Annotated[str, Meta(max_length=MAX_DESCRIPTION_LENGTH)] = ""
+    counterpart: Annotated[str, Meta(max_length=MAX_DESCRIPTION_LENGTH)] = ""
 
 
 class ModelTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A model by its name, or by `package.module:Name`, and its parameters.
 
     An ADS of the kind `traci` is a controller written for SUMO's TraCI; an ADS of the kind `fmu` is an FMU, named by its path: `inputs`
-    and `outputs` are its variables by the quantity they receive or return, `step` [s] is its own step, by default the declared one.
+    and `outputs` are the FMU's variables by the quantity they receive or return; `step` [s] is the FMU's time step, by default the declared
+    step.
     """
 
     model: str
@@ -69,8 +70,8 @@ class VehicleTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     """The vehicle under test: its model, the model's parameters, and the characteristics that vary.
 
     A vehicle of the kind `fmu` is an FMU, named by its path, with `inputs`, `outputs` and `step` as for an ADS. Its parameters are the
-    characteristics, whose rows need to state only what the FMU does not declare. `sensors` and `sumo_type` are characteristics or
-    numbers, by properties of the sensors and of the vehicle; `sumo_type` may also name the FMU's variables.
+    characteristics, whose rows state only what the FMU does not declare. `sensors` and `sumo_type` map properties of the sensors and of
+    SUMO's vehicle type to a characteristic or a number; `sumo_type` may also name variables of the FMU.
     """
 
     model: str
@@ -87,9 +88,9 @@ class VehicleTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
 class Weather(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Weather as data: its effects on the road and on the sensors.
 
-    `road_friction` and `visibility` are factors on the dry, clear case [-]; on a `wet` road worn treads lose further friction.
-    `recognition_delay` is the additional time that the sensors need to recognise a road user [s], for every ADS; an ADS's own reaction
-    is among its parameters. `light` is a label without an effect of its own.
+    `road_friction` and `visibility` are factors relative to the dry, clear case [-]; on a `wet` road worn treads lose further friction.
+    `recognition_delay` is the additional time that the sensors need to recognise a road user [s], for every ADS; the reaction time
+    of an ADS is one of its parameters. `light` is a label without effect.
     """
 
     name: str
@@ -105,19 +106,19 @@ class MetricsTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
 
     `ttc_threshold` is TTC* [s]; `sampling_interval` [s] is the time between two samples that
     TET, TIT and aveDece are computed from (a whole multiple of the simulation's step; by default the step).
-    `also` names further metrics: of the package, such as `max_jerk`, or your own as `package.module:Name`.
+    `also` names further metrics: metrics of the package, such as `max_jerk`, or your own metrics as `package.module:Name`.
     """
 
-    ttc_threshold: Positive
-    sampling_interval: Positive | None = None
+    ttc_threshold: PositiveNumber
+    sampling_interval: PositiveNumber | None = None
     also: list[str] = []
 
 
 class SearchTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The search: `runs` runs of every algorithm, each with `evaluations` simulations.
 
-    A batch of simulations longer than `time_limit` [s] counts as hung. `objectives` are minimised, a metric in its unsafe direction.
-    `parameters` of algorithms are given by label; a file has them in tables such as [search.nsga2].
+    A batch of simulations longer than `time_limit` [s] counts as hung. The search minimises `objectives`, and drives metrics in their
+    unsafe direction. `parameters` hold the parameters of algorithms by label; a file has them in tables such as [search.nsga2].
     """
 
     algorithms: Annotated[list[str], Meta(min_length=1)]
@@ -131,7 +132,7 @@ class SearchTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
 
     @property
     def labels(self) -> dict[str, str]:
-        """Names of the algorithms in the study, by their labels in results (see `label_of`)."""
+        """Names of the study's algorithms by their labels in results (see `label_of`)."""
         return {label_of(name): name for name in self.algorithms}
 
 
@@ -141,9 +142,10 @@ def label_of(algorithm: str) -> str:
 
 
 class MatrixTest(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A test of a matrix: its scenario at every combination of the values in `over`, in each of the weathers.
+    """A test of a matrix: a scenario at every combination of the values in `over`, in each of the `weathers`.
 
-    `parameters` are added to those of the study's scenario; with another `model` they stand alone. A weather is a name or a table.
+    `parameters` are added to those of the study's scenario; with another `model`, only they apply. A weather is a name or a
+    table.
     """
 
     name: Annotated[str, Meta(min_length=1)]
@@ -154,7 +156,7 @@ class MatrixTest(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
 
 class RatingTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A manufacturer's claims for a rating: by test, robustness layers that cannot be simulated here, such as glare."""
+    """A manufacturer's `claims` for a rating: for each test, the robustness layers that cannot be simulated here, such as glare."""
 
     claims: dict[str, list[str]] = {}
 
@@ -162,7 +164,7 @@ class RatingTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
 class MatrixTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Several scenario points in which every setting is simulated: `tests`, or all cells of a `protocol`, which then rates every setting.
 
-    `aggregate` combines their safety degrees: the worst counts. (A mean would average distances with minus the speeds of collisions.)
+    `aggregate` combines the points' safety degrees: the worst counts. (A mean would average distances with minus the speeds of collisions.)
     """
 
     tests: list[MatrixTest] = []
@@ -173,8 +175,8 @@ class MatrixTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
 class FreeParameter(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A parameter to calibrate: its bounds in `unit`, and its meaning.
 
-    Studies that are fitted together share the parameter if they give it the same value, unless it is a study's `own`. The search
-    measures its distances as differences, with `log` as ratios: for rates and other positive quantities of unknown magnitude.
+    Studies that are fitted together share the parameter if they give it the same value, unless the parameter is a study's `own`. The
+    search measures distances of values as differences, or with `log` as ratios, for positive quantities of unknown magnitude.
     """
 
     lower: float
@@ -188,8 +190,8 @@ class FreeParameter(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
 class Origin(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The files of a study; results do not depend on them.
 
-    `called` is its path on the command line, if its name is not enough; `places` are the folders of its file and of the files that it
-    extends, where its plug-ins are looked up first; `remarks` are for the user.
+    `called` is the study's path on the command line, if its name is not enough; `places` are the folders of its file and of the files that
+    it extends, where plug-ins are looked up first; `remarks` are for the user.
     """
 
     called: str = ""
@@ -201,15 +203,15 @@ class FitTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """How free parameters are fitted: the weights in the loss, the rows used, and the starts of the search.
 
     The loss is `original` * mean_m(w_m 2 max(miss / (`tolerance` * published) - 1, 0)) of the original vehicle + mean over the files of
-    sum_m(w_m (`rank` (1 - rho) + mean |error| / unit)) + `effects` * mean_c |difference of the safety degree's linear effects over the
-    domain of characteristic c| / unit + `collisions` * share of rows that collide on one side alone. w_m are `weights` by metric; a unit
-    is the study's repeatability or, where it is not known, the standard deviation of the data. Studies that
-    are fitted together have the mean of their losses. One of every `hold_out` rows is not used for the fit, only reported.
-    Sets of parameters whose loss is within the share `alike` of the lowest one fit equally well: they become the study's `spread`.
+    sum_m(w_m (`rank` (1 - rho_m) + mean |error| / unit)) + `effects` * mean_c |difference of the safety degree's linear effects over the
+    domain of characteristic c| / unit + `collisions` * share of rows that collide on one side only. For a metric m, w_m is the weight
+    in `weights` and rho_m the rank correlation; a unit is the study's repeatability or, if unknown, the standard deviation of the data.
+    The loss of studies that are fitted together is the mean of their losses. One of every `hold_out` rows is only reported, not fitted.
+    Sets of parameters whose loss is within the share `alike` of the lowest loss fit equally well: they become the study's `spread`.
     `trials` sets of parameters are tried, in generations of `population`: in a race of searches from the study's own values and from
     `starts` random places in the bounds; the worse half gives up after every round. With `screened`, the random places are the best of
-    that many, but at most a quarter of the trials is spent on that. A search from a random place begins with a standard deviation of
-    `width` of the bounds; one around known values has a third of the `population`. `seed` is the seed of all random numbers. From
+    `screened` places, but at most a quarter of the trials evaluates these. A search from a random place begins with a standard deviation of
+    `width` of the bounds; a search around known values has a third of the `population`. `seed` is the seed of all random numbers. From
     scratch, studies that are fitted together are searched in stages: first the first study alone, then the other studies' own
     parameters, finally all parameters from there. All stages but the last use one row in `thinning`.
     """
@@ -235,20 +237,20 @@ class FitTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 class Study(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A complete study, as in its TOML file; `load_study` reads one.
 
-    `matrix` are the scenario points in which it is simulated, if there are several;
+    `matrix` are the scenario points in which the study is simulated, if there are several;
     `rating` are the user's claims for a rating;
-    `step_length` is the simulation's time step [s], by default the one of the network's options;
-    `published` are the original vehicle's metrics in the published study, by name, as far as they are known;
+    `step_length` is the simulation's time step [s], by default the time step in the network's options;
+    `published` are the original vehicle's metrics in the published study, by name, as far as known;
     `repeatability` are standard deviations of repeats of one setting in the published study;
     `calibration` are the free parameters by their keys in the file, such as `ads.parameters.corridor`, `fit` states how they are fitted,
-    `spread` are sets of their values that fit the published data equally well, a list for each parameter, the study's own set first;
+    `spread` are sets of their values that fit the published data equally well, a list for each parameter, the study's own value first;
     `model_error` is the model's further error, by metric, for a vehicle that is a whole domain away from the original;
     `variation` and `correlations` state how characteristics vary in the world, by name: uniformly by default;
     `constraints` are conditions that the characteristics of one vehicle satisfy together.
     """
 
-    # A new key that changes no result of a campaign also belongs in WITHOUT_EFFECT_ON_RESULTS of results/manifest.py. Any other new key
-    # becomes part of the identity of results: let `evaluation_keys` there omit its default, so that older results keep their identity.
+    # A new key that changes no result of a campaign also belongs in KEYS_WITHOUT_EFFECT_ON_RESULTS of results/manifest.py. Any other new
+    # key becomes part of the identity of results: let `evaluation_keys` there omit its default, so that older results keep their identity.
     name: Annotated[str, Meta(pattern=NAME)]
     title: str
     scenario: ModelTable
@@ -285,8 +287,8 @@ def tables_of(study: Study) -> dict[str, Any]:
         del tables["constraints"]  # results from before constraints existed keep their bytes
     for name in ("vehicle", "ads", "scenario"):
         if tables[name].get("kind") != "fmu":
-            kept = () if name == "vehicle" else ("kind",)
-            tables[name] = {key: value for key, value in tables[name].items() if key not in OF_FMUS or key in kept}
+            kept_keys = () if name == "vehicle" else ("kind",)
+            tables[name] = {key: value for key, value in tables[name].items() if key not in FMU_KEYS or key in kept_keys}
     return tables
 
 
@@ -323,7 +325,7 @@ def study_path(study: str) -> Path:
 
 
 def foreign_names(study: Study) -> list[str]:
-    """The parts of a study that code from outside computes, such as `ads.model = 'my_ads:Careful'`."""
+    """The keys of a study that name user code, such as `ads.model = 'my_ads:Careful'`."""
     return [f"{key} = {name!r}" for key, name in (*_foreign(study), *fmus_of(study))]
 
 
@@ -333,19 +335,20 @@ def fmus_of(study: Study) -> list[tuple[str, str]]:
 
 
 def foreign_packages(study: Study) -> list[str]:
-    """The top-level packages of a study's code from outside."""
+    """The top-level packages of a study's user code."""
     return sorted({name.partition(":")[0].partition(".")[0] for _, name in _foreign(study)})
 
 
 def _foreign(study: Study) -> list[tuple[str, str]]:
-    """Keys and names of a study's code from outside."""
+    """Keys and names of a study's user code."""
     tests = [] if study.matrix is None else [test.model for test in study.matrix.tests]
-    named = {"vehicle.model": [study.vehicle.model], "ads.model": [study.ads.model], "scenario.model": [study.scenario.model, *tests],
-             "metrics.also": study.metrics.also, "search.objectives": study.search.objectives}
-    functions = [one.function for one in study.constraints]
-    named["constraints.function"] = [name for name in functions if name]
+    names_by_key = {"vehicle.model": [study.vehicle.model], "ads.model": [study.ads.model],
+                    "scenario.model": [study.scenario.model, *tests], "metrics.also": study.metrics.also,
+                    "search.objectives": study.search.objectives}
+    functions = [constraint.function for constraint in study.constraints]
+    names_by_key["constraints.function"] = [name for name in functions if name]
     fmus = fmus_of(study)
-    return [(key, name) for key, names in named.items() for name in dict.fromkeys(names) if ":" in name and (key, name) not in fmus]
+    return [(key, name) for key, names in names_by_key.items() for name in dict.fromkeys(names) if ":" in name and (key, name) not in fmus]
 
 
 def is_file(path: Path) -> bool:

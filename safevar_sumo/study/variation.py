@@ -14,9 +14,9 @@ from safevar_sumo.errors import InputError, unknown
 if TYPE_CHECKING:
     from safevar_sumo.study.schema import CharacteristicTable
 
-WIDEST = 100
-"""Largest standard deviation of a normal law cut off at the domain, in widths of the domain. A wider law differs from the uniform one by
-less than 1/20,000, and its quantiles lose precision."""
+MAX_WIDTHS = 100
+"""Largest standard deviation of a normal distribution truncated to the domain [widths of the domain]. A wider distribution differs from the
+uniform one by less than 1/20,000, and its quantiles lose precision."""
 
 
 class Uniform(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="distribution", tag="uniform"):
@@ -69,45 +69,47 @@ class Correlation(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
 
 def variation_mistakes(source: object, rows: Mapping[str, CharacteristicTable], variation: Mapping[str, Distribution],
                        correlations: Sequence[Correlation]) -> Iterator[InputError]:
-    """Distributions and correlations that do not fit the characteristics' domains, or each other."""
-    for name, law in variation.items():
+    """Errors for distributions and correlations that do not fit the characteristics' domains, or each other."""
+    for name, distribution in variation.items():
         if name in rows:
-            yield from _law_mistakes(source, f"variation.{name}", rows[name], law)
+            yield from _distribution_mistakes(source, f"variation.{name}", rows[name], distribution)
         else:
             yield unknown(source, f"variation.{name}: there is no such characteristic", name, rows)
     yield from _correlation_mistakes(source, list(rows), correlations)
 
 
-def _law_mistakes(source: object, key: str, row: CharacteristicTable, law: Distribution) -> Iterator[InputError]:
+def _distribution_mistakes(source: object, key: str, row: CharacteristicTable, distribution: Distribution) -> Iterator[InputError]:
     low, high, unit = row.lower, row.upper, "" if row.unit == "-" else f" {row.unit}"
-    for field, value in msgspec.structs.asdict(law).items():
+    for field, value in msgspec.structs.asdict(distribution).items():
         if field not in ("deviation", "sigma") and value is not None and not low <= value <= high:
             yield InputError(source, f"{key}.{field} = {value:g}", f"a number in [{low:g}, {high:g}]{unit}")
-    if isinstance(law, Uniform | Triangular):
-        lower, upper = low if law.lower is None else law.lower, high if law.upper is None else law.upper
+    if isinstance(distribution, Uniform | Triangular):
+        lower, upper = low if distribution.lower is None else distribution.lower, high if distribution.upper is None else distribution.upper
         if lower >= upper:
             yield InputError(source, f"{key}: lower = {lower:g} and upper = {upper:g}", "lower < upper")
-        elif isinstance(law, Triangular) and not lower <= (mode := row.original if law.mode is None else law.mode) <= upper:
+        elif isinstance(distribution, Triangular) and not (
+                lower <= (mode := row.original if distribution.mode is None else distribution.mode) <= upper):
             yield InputError(source, f"{key}.mode = {mode:g}", f"a number in [{lower:g}, {upper:g}]{unit}")
-    elif isinstance(law, Lognormal) and low <= 0:
-        yield InputError(source, f"{key}: lognormal, with a domain from {low:g} on", "a domain above 0")
-    elif isinstance(law, Normal | Lognormal) and high > low:
-        field, width = ("deviation", high - low) if isinstance(law, Normal) else ("sigma", math.log(high / low))
-        if (deviation := getattr(law, field)) > WIDEST * width:
-            yield InputError(source, f"{key}.{field} = {deviation:g}", f"at most {WIDEST * width:g}, {WIDEST} times the domain's width; "
+    elif isinstance(distribution, Lognormal) and low <= 0:
+        yield InputError(source, f"{key}: lognormal, with a domain that begins at {low:g}", "a domain above 0")
+    elif isinstance(distribution, Normal | Lognormal) and high > low:
+        field, width = ("deviation", high - low) if isinstance(distribution, Normal) else ("sigma", math.log(high / low))
+        if (deviation := getattr(distribution, field)) > MAX_WIDTHS * width:
+            yield InputError(source, f"{key}.{field} = {deviation:g}",
+                             f"at most {MAX_WIDTHS * width:g}, {MAX_WIDTHS} times the domain's width; "
                              "for more take distribution = \"uniform\"")
 
 
 def _correlation_mistakes(source: object, names: Sequence[str], correlations: Sequence[Correlation]) -> Iterator[InputError]:
     values: dict[frozenset[str], float] = {}
     for correlation in correlations:
-        between, pair = correlation.between, frozenset(correlation.between)
-        unknown_names = [name for name in between if name not in names]
+        members, pair = correlation.between, frozenset(correlation.between)
+        unknown_names = [name for name in members if name not in names]
         if unknown_names:
             yield unknown(source, f"correlations.between: there is no characteristic {unknown_names[0]!r}", unknown_names[0], names)
         elif len(pair) == 1:
-            yield InputError(source, f"correlations.between = {list(between)}", "two different characteristics")
+            yield InputError(source, f"correlations.between = {list(members)}", "two different characteristics")
         elif pair in values:
-            yield InputError(source, f"correlations: {between[0]} and {between[1]} are given twice, "
+            yield InputError(source, f"correlations: {members[0]} and {members[1]} are given twice, "
                              f"with {values[pair]:g} and {correlation.value:g}", "each pair once")
         values.setdefault(pair, correlation.value)

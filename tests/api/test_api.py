@@ -1,4 +1,4 @@
-"""The library as others use it: `import safevar_sumo as sv`."""
+"""The library as users call it: `import safevar_sumo as sv`."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from safevar_sumo.vehicles import CharacteristicSet
 
 @pytest.fixture(scope="module")
 def results(tmp_path_factory: pytest.TempPathFactory) -> sv.Results:
-    """A study searched through the library, which shows nothing."""
+    """Results of a study that the library searched without output."""
     return sv.run("smoke", tmp_path_factory.mktemp("api") / "out", jobs=1)
 
 
@@ -55,7 +55,7 @@ def test_a_study_needs_no_file() -> None:
     assert sv.simulate(mine).study.name == "other"
 
 
-def test_simulate_tells_of_the_setting_and_of_the_original_beside_it() -> None:
+def test_simulate_returns_the_setting_and_the_original_beside_it() -> None:
     result = sv.simulate("rain", {"tireFric": 1.5, "mass": 2410.0})
     assert result.setting["tireFric"] == 1.5
     assert result.put_back == {"mass": 2410.0}
@@ -69,20 +69,20 @@ def test_simulate_tells_of_the_setting_and_of_the_original_beside_it() -> None:
 
 
 @pytest.mark.parametrize("value", ["+8%", "heavy", None, [2500.0]])
-def test_what_is_no_number_is_refused(value: object) -> None:
+def test_a_value_that_is_no_number_is_refused(value: object) -> None:
     with pytest.raises(sv.InputError, match=r"^changes: mass = .*\nexpected: a number in \[2040, 2700\] kg"):
         sv.simulate("rain", {"mass": value})  # type: ignore[dict-item]
 
 
 @pytest.mark.parametrize("value", [0.0, -5.0, 1e300])
-def test_what_no_vehicle_can_have_is_not_beyond_the_domain_but_refused(value: float) -> None:
+def test_a_value_that_no_vehicle_can_have_is_refused_even_with_beyond(value: float) -> None:
     with pytest.raises(sv.InputError, match=r"mass = .*\nexpected: a finite number above 0, up to 2.7e\+06 kg"):
         sv.simulate("sun", {"mass": value}, beyond=True)
     with pytest.raises(sv.InputError, match=r"mass = .*\nexpected: a finite number above 0"):
         sv.evaluate("sun", pd.DataFrame({"mass": [2500.0, value]}), beyond=True)
 
 
-def test_physics_that_break_down_are_told_and_do_not_pass_for_a_vehicle_that_stands() -> None:
+def test_undefined_physics_are_reported_and_not_taken_for_a_standing_vehicle() -> None:
     system = assemble(sv.load_study("smoke"))
     settings = system.characteristics.original[np.newaxis].copy()
     settings[0, system.characteristics.names.index("radius")] = 1e200
@@ -117,7 +117,7 @@ def test_a_value_that_is_missing_is_the_originals() -> None:
 
 
 def test_the_functions_share_one_convention_and_its_types_are_public() -> None:
-    """Every argument is documented where it stands, every class of a signature is a name of the package."""
+    """Every argument is documented in its function, every class of a signature is a name of the package."""
     several = [sv.run, sv.evaluate, sv.explain, sv.tolerance, sv.risk, sv.rules, report.report]
     others = ["None", "str", "int", "float", "bool", "Path", "Sequence", "Mapping", "tuple", "list", "pd", "DataFrame", "npt", "ArrayLike"]
     for function in (*several, sv.simulate, sv.compare, sv.load, sv.tables, sv.figures):
@@ -153,12 +153,12 @@ def test_a_report_of_results_is_a_page(results: sv.Results, tmp_path: Path) -> N
     ({"mass": [2500.0]}, "a dict\nexpected: a list of mappings"), ([{"mass": 2500.0}, {"weight": 1.0}], "weight"),
     (pd.DataFrame({"mass": [2404.0, 9999.0]}), "row 1: mass = 9999"), (np.full((1, 17), np.nan), "shape|= nan"),
 ])
-def test_settings_that_cannot_be_used_are_told_before_any_is_simulated(settings: object, expected: str) -> None:
+def test_unusable_settings_are_reported_before_any_simulation(settings: object, expected: str) -> None:
     with pytest.raises(sv.InputError, match=expected):
         sv.evaluate("sun", settings)  # type: ignore[arg-type]
 
 
-def test_run_leaves_what_load_reads(results: sv.Results) -> None:
+def test_load_reads_the_results_of_run(results: sv.Results) -> None:
     again = sv.load(results.directory)
     pd.testing.assert_frame_equal(again.solutions, results.solutions)
     assert tables_of(again.study) == tables_of(load_study("smoke"))
@@ -192,7 +192,7 @@ def test_a_script_needs_no_main_guard(in_tmp: Path) -> None:
 
 
 @pytest.mark.slow
-def test_the_trace_in_a_matrix_is_of_the_point_where_the_vehicle_comes_off_worst() -> None:
+def test_the_trace_in_a_matrix_is_that_of_the_worst_point() -> None:
     study = load_study("euro_ncap_pedestrian")
     system = assemble(study)
     points = at_every_point(system, system.characteristics.original[np.newaxis])

@@ -1,4 +1,4 @@
-"""Animations: what they show is where everybody was, true to scale; small, the same twice, and text stays text."""
+"""Animations: actors are drawn at their positions to scale; files are small and reproducible, and text is escaped."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def where(picture: Image.Image, colour: str) -> tuple[np.ndarray, np.ndarray]:
     return np.nonzero(np.abs(pixels - wanted).max(axis=2) < 26)
 
 
-def test_both_vehicles_are_where_they_were_to_scale(crash: Comparison) -> None:
+def test_both_vehicles_are_drawn_at_their_positions_to_scale(crash: Comparison) -> None:
     scene = flat_scene_of(crash)
     picture = next(frames_of(scene, scene.length))  # the start: the changed vehicle stands on the original's place
     scale = WIDTH / scene.view.width
@@ -45,7 +45,7 @@ def test_both_vehicles_are_where_they_were_to_scale(crash: Comparison) -> None:
     end = list(frames_of(scene, scene.length))[-1]
     for row, body in enumerate(one for one in scene.bodies if one.is_vut):
         _, columns = where(end, VEHICLES[row])
-        assert columns.max() == pytest.approx((body.x[-1] - scene.view.left[-1]) * scale, abs=4)
+        assert columns.max() == pytest.approx((body.x[-1] - scene.view.left_ends[-1]) * scale, abs=4)
 
 
 @pytest.mark.parametrize("angle", [37.0, 180.0, 271.0])
@@ -91,7 +91,7 @@ def test_the_page_holds_every_place_to_the_centimetre(crash: Comparison) -> None
     vuts = [body for body in data["bodies"] if body["drive"] is not None]
     for shown, body in zip(vuts, [one for one in scene.bodies if one.is_vut], strict=True):
         assert np.allclose(shown["x"], body.x, atol=0.0051)
-    assert [drive["end"] for drive in data["drives"]] == crash.film.last.tolist()
+    assert [drive["end"] for drive in data["drives"]] == crash.film.last_samples.tolist()
 
 
 def test_text_of_a_study_stays_text(crash: Comparison) -> None:

@@ -1,4 +1,4 @@
-"""What a results directory holds is simulated again as it was found, and seen from above."""
+"""Replays: solutions of a results directory are simulated again with the same results, and seen from above."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def test_the_most_severe_the_smallest_and_the_fewest(flag: str, column: str, sli
     assert output[column] == frame[frame["outcome"] == "collision"][column].min()
 
 
-def test_a_row_that_was_not_found_here_is_told(slippery: Path, case: Case) -> None:
+def test_a_replay_that_differs_from_its_row_is_reported(slippery: Path, case: Case) -> None:
     comparison = compare_setting(case.study, assemble(case.study), case.characteristics.original)
     result = differences(comparison.evaluations, {"safety_degree": 1.0, "tet": np.nan, "outcome": "collision"})
     assert [one.split(" is ")[0] for one in result] == ["the outcome", "safety_degree", "tet"]
@@ -89,7 +89,7 @@ def test_a_film_shows_what_is_simulated(study: str) -> None:
     assert np.array_equal(vut.x, result.runs.trace.position)
     assert vut.length == result.runs.trace.vehicle_length
     assert not np.isnan(vut.y).any()
-    for row, end in enumerate(result.last):
+    for row, end in enumerate(result.last_samples):
         assert result.runs.trace.active[end, row]
         assert not result.runs.trace.active[end + 1:, row].any()
 
@@ -127,12 +127,12 @@ def comparison(slippery: Path) -> Comparison:
     return compare_setting(case.study, assemble(case.study), case.solutions[list(case.characteristics.names)].to_numpy()[0])
 
 
-def test_it_draws_both_drives_as_far_as_they_go(comparison: Comparison) -> None:
+def test_the_figure_draws_both_drives_until_their_ends(comparison: Comparison) -> None:
     figure = draw_comparison(comparison)
     trace = comparison.film.runs.trace
     for axis, values in zip(figure.axes, (trace.speed, trace.gap, trace.throttle - trace.brake), strict=False):
         for row, line in zip(comparison.rows, axis.lines[:1] + [one for one in axis.lines[1:] if len(one.get_xdata()) > 9], strict=False):
-            end = comparison.film.last[row] + 1
+            end = comparison.film.last_samples[row] + 1
             assert list(line.get_xdata()) == list(trace.time[:end])
             assert list(line.get_ydata()) == list(values[:end, row])
     assert [axis.get_ylabel() for axis in figure.axes] == [
@@ -145,7 +145,7 @@ def test_it_draws_both_drives_as_far_as_they_go(comparison: Comparison) -> None:
         assert change in heading
 
 
-def test_its_words_stand_within_their_axes_and_on_nothing_else(comparison: Comparison) -> None:
+def test_the_words_of_the_figure_lie_within_their_axes_and_overlap_nothing(comparison: Comparison) -> None:
     figure = draw_comparison(comparison)
     figure.canvas.draw()
     for axis in figure.axes[:2]:
@@ -160,14 +160,14 @@ def test_its_words_stand_within_their_axes_and_on_nothing_else(comparison: Compa
 
 
 def test_at_an_impact_the_pedals_are_those_that_were_in_force() -> None:
-    """AEB lets go of the brake once the gap is gone, which is after the collision."""
+    """AEB releases the brake once there is no gap, which is after the collision."""
     study = study_at(load_study("euro_ncap_pedestrian"), "CPLA, speed 60, clear", "point")
     system = assemble(study)
     setting = system.characteristics.original.copy()
     for name, value in (("tireFric", 1.0), ("mass", 2600.0)):
         setting[system.characteristics.names.index(name)] = value
     shown, runs = compare_setting(study, system, setting), simulate(system, setting[np.newaxis])
-    trace, end = shown.film.runs.trace, shown.film.last[-1]
+    trace, end = shown.film.runs.trace, shown.film.last_samples[-1]
     assert shown.verdict(1).startswith("collides")
     assert runs.trace.brake[end, 0] == 0
     assert trace.brake[end, 1] == trace.brake[end - 1, 1] == runs.trace.brake[end - 1, 0] == 1
@@ -184,7 +184,7 @@ def test_the_same_bytes_twice(kind: str, comparison: Comparison, tmp_path: Path)
 
 @pytest.fixture
 def screen(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """A virtual screen of its own; `SAFEVAR_BROWSER` says that one must be there."""
+    """A separate virtual screen; `SAFEVAR_BROWSER` demands that there is one."""
     if shutil.which("Xvfb") is None and not os.environ.get("SAFEVAR_BROWSER"):
         pytest.skip("Xvfb is not installed")
     reading, writing = os.pipe()
@@ -232,7 +232,7 @@ def test_without_a_display_it_is_refused(slippery: Path, monkeypatch: pytest.Mon
         show_in_gui(comparison, system.scenario.network)
 
 
-def test_a_run_is_told_with_the_comfort_that_its_study_searches() -> None:
+def test_a_verdict_names_the_comfort_that_the_study_optimises() -> None:
     study = load_study("comfort")
     system = assemble(study)
     comparison = compare_setting(study, system, system.characteristics.setting({"mass": 2105.0, "maxBrakeTorque": 1360.0}, "it"))

@@ -1,4 +1,4 @@
-"""A run's journal: what it gives back after whatever happened to it."""
+"""A run's journal: its contents after truncation, damage, a full disk and a killed process."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ in_one_folder = settings(suppress_health_check=[HealthCheck.function_scoped_fixt
 
 
 def batch(number: int) -> Evaluations:
-    """Rows that tell by their values which they are; one is a collision, one failed."""
+    """Rows that their values identify; one is a collision, one failed."""
     values = np.arange(ROWS) + 10.0 * number
     outcome = np.array(["stopped", "collision", "simulator-error"])
     metrics = {name: np.where(outcome == "simulator-error", np.nan, values + i / 7) for i, name in enumerate(("safety_degree", "tet"))}
@@ -41,7 +41,7 @@ def places(number: int) -> list[int]:
 
 
 def write(path: Path, batches: int = BATCHES, finished: bool = True) -> list[int]:
-    """Write a journal anew; returns where its frames end."""
+    """Write a new journal; returns the offsets at which its frames end."""
     path.unlink(missing_ok=True)
     ends = []
     journal = Journal(path, "study", "nsga2-00")
@@ -63,7 +63,7 @@ def same(one: Evaluations, other: Evaluations) -> bool:
 
 
 def holds_the_first(batches: int, content: Content) -> bool:
-    """Whether exactly what was written first is there."""
+    """Whether the journal holds exactly the first batches."""
     positions, evaluations, *_ = content
     if not batches:
         return positions == [] and evaluations is None
@@ -71,7 +71,7 @@ def holds_the_first(batches: int, content: Content) -> bool:
     return evaluations is not None and positions == list(range(ROWS * batches)) and same(evaluations, expected)
 
 
-def test_what_was_written_is_read(tmp_path: Path) -> None:
+def test_a_journal_returns_its_evaluations(tmp_path: Path) -> None:
     path = tmp_path / "runs" / "a.journal"
     write(path)
     journal = Journal(path, "study", "nsga2-00")
@@ -91,7 +91,7 @@ def test_what_was_written_is_read(tmp_path: Path) -> None:
 @pytest.mark.slow
 @in_one_folder
 @given(st.data())
-def test_any_truncation_loads_what_was_whole_and_goes_on(tmp_path: Path, data: st.DataObject) -> None:
+def test_a_truncated_journal_loads_its_whole_frames_and_continues(tmp_path: Path, data: st.DataObject) -> None:
     path = tmp_path / "a.journal"
     ends = write(path)
     left = data.draw(st.integers(0, ends[-1] - 1))
@@ -110,7 +110,7 @@ def test_any_truncation_loads_what_was_whole_and_goes_on(tmp_path: Path, data: s
 
 @in_one_folder
 @given(st.data())
-def test_any_changed_byte_is_a_cut_tail_or_an_error_that_tells_where(tmp_path: Path, data: st.DataObject) -> None:
+def test_a_changed_byte_is_cut_with_the_tail_or_is_an_error_with_its_offset(tmp_path: Path, data: st.DataObject) -> None:
     path = tmp_path / "a.journal"
     ends = write(path)
     content = bytearray(path.read_bytes())
@@ -141,7 +141,7 @@ def test_a_journal_of_another_study_or_run_is_refused(tmp_path: Path, opened: Ca
         opened(tmp_path / "a.journal", study, run)
 
 
-def test_a_run_has_one_owner_and_a_dead_ones_lock_is_gone(tmp_path: Path) -> None:
+def test_a_run_has_one_owner_and_the_lock_ends_with_the_process(tmp_path: Path) -> None:
     path = tmp_path / "a.journal"
     code = f"from safevar_sumo.results import Journal\nfrom pathlib import Path\nJ = Journal(Path({str(path)!r}), 'study', 'nsga2-00')\n"
     code += "print('locked', flush=True)\nimport time\ntime.sleep(60)\n"
@@ -156,7 +156,7 @@ def test_a_run_has_one_owner_and_a_dead_ones_lock_is_gone(tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize("written", [0, 7, 40])
-def test_a_full_disk_leaves_what_was_there_and_can_go_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, written: int) -> None:
+def test_a_full_disk_leaves_an_intact_journal_that_continues(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, written: int) -> None:
     path = tmp_path / "a.journal"
     end = write(path, batches=2, finished=False)[-1]
     journal = Journal(path, "study", "nsga2-00")
@@ -189,7 +189,7 @@ def test_a_full_disk_leaves_what_was_there_and_can_go_on(tmp_path: Path, monkeyp
     assert holds_the_first(3, content)
 
 
-def test_a_reason_is_kept_with_its_setting_and_costs_others_nothing(tmp_path: Path) -> None:
+def test_a_reason_is_stored_with_its_setting_and_adds_nothing_to_other_batches(tmp_path: Path) -> None:
     failed = batch(0)
     result = dataclasses.replace(failed, reasons={failed.settings[2].tobytes(): "SUMO failed: it said so"})
     sizes = []
@@ -205,7 +205,7 @@ def test_a_reason_is_kept_with_its_setting_and_costs_others_nothing(tmp_path: Pa
     assert sizes[1] > sizes[0]
 
 
-def test_what_comes_after_a_failure_is_spare_once_it_is_tried_again(tmp_path: Path) -> None:
+def test_evaluations_after_a_failure_are_spare_after_a_retry(tmp_path: Path) -> None:
     path = tmp_path / "a.journal"
     write(path, batches=2)
     journal = Journal(path, "study", "nsga2-00")
@@ -218,7 +218,7 @@ def test_what_comes_after_a_failure_is_spare_once_it_is_tried_again(tmp_path: Pa
     journal.close()
 
 
-def test_a_journal_without_evaluations_belongs_to_whoever_comes(tmp_path: Path) -> None:
+def test_a_journal_without_evaluations_passes_to_the_next_owner(tmp_path: Path) -> None:
     Journal(tmp_path / "a.journal", "study", "nsga2-00").close()
     taken_over = Journal(tmp_path / "a.journal", "other", "nsga2-00")
     taken_over.close()
@@ -228,7 +228,7 @@ def test_a_journal_without_evaluations_belongs_to_whoever_comes(tmp_path: Path) 
         read_journal(tmp_path / "a.journal", "study", "nsga2-00")
 
 
-def test_what_is_no_journal_is_refused_and_left_alone(tmp_path: Path) -> None:
+def test_a_file_that_is_no_journal_is_refused_and_not_changed(tmp_path: Path) -> None:
     path = tmp_path / "a.journal"
     path.write_text("my notes")
     with pytest.raises(InputError, match="is no journal"):

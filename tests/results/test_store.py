@@ -1,4 +1,4 @@
-"""A results directory: its bytes, its columns, and what it refuses."""
+"""A results directory: its bytes, its columns, and its errors."""
 
 from __future__ import annotations
 
@@ -81,14 +81,14 @@ def test_solutions_have_the_promised_columns_in_a_fixed_order() -> None:
     pd.testing.assert_frame_equal(frame, solutions_frame(NAMES, reversed(result.items())))
 
 
-def test_what_is_undefined_stays_undefined() -> None:
+def test_undefined_values_stay_undefined() -> None:
     assert record(evaluations(-1.5), 0) == {
         "outcome": "collision", "collision": True, "collision_speed": 1.5, "safety_degree": -1.5, "tet": None, "tit": None,
         "ave_dece": 5.0, "f_safe": -1.5, "f_diff": 0.5, "f_num_diff": 2}
     assert "nan" not in solutions_frame(NAMES, [(("nsga2", 0), evaluations(-1.5))]).to_csv()
 
 
-def test_the_manifest_tells_study_versions_and_original(tmp_path: Path, study: Study) -> None:
+def test_the_manifest_holds_study_versions_and_original(tmp_path: Path, study: Study) -> None:
     written(tmp_path / "new" / "out", study)
     manifest = json.loads((tmp_path / "new" / "out" / "manifest.json").read_text())
     assert manifest["study"] == tables_of(study)
@@ -108,7 +108,7 @@ def test_results_of_another_study_are_not_overwritten(tmp_path: Path, study: Stu
         ResultsDirectory(tmp_path, load_study("native"))
 
 
-def test_the_file_that_has_changed_is_named_and_the_two_ways_on(tmp_path: Path, study: Study) -> None:
+def test_the_error_names_the_changed_file_and_both_remedies(tmp_path: Path, study: Study) -> None:
     ResultsDirectory(tmp_path, study, {"sources": {"my_ads.py": "abc", "my_map.py": "def"}}).begin(evaluations(2.5))
     with pytest.raises(InputError) as caught:
         ResultsDirectory(tmp_path, study, {"sources": {"my_ads.py": "abc", "my_map.py": "012"}})
@@ -118,7 +118,7 @@ def test_the_file_that_has_changed_is_named_and_the_two_ways_on(tmp_path: Path, 
         ResultsDirectory(tmp_path, study, {"sources": {"my_ads.py": "abc"}})
 
 
-def test_what_changes_no_result_locks_nobody_out(tmp_path: Path, study: Study) -> None:
+def test_a_change_without_effect_on_results_is_accepted(tmp_path: Path, study: Study) -> None:
     written(tmp_path, study)
     for other in (msgspec.structs.replace(study, title="Another title", published={}, calibration={}),
                   with_search(study, time_limit=7, runs=3, evaluations=900),
@@ -141,7 +141,7 @@ def test_a_folder_that_holds_other_things_is_refused(tmp_path: Path, study: Stud
     assert sorted(path.name for path in tmp_path.iterdir()) == ["thesis.tex"]
 
 
-def test_a_directory_belongs_to_who_comes_first(tmp_path: Path, study: Study) -> None:
+def test_a_directory_belongs_to_its_first_study(tmp_path: Path, study: Study) -> None:
     first = ResultsDirectory(tmp_path, study)
     second, same = ResultsDirectory(tmp_path, with_search(study, seed=2)), ResultsDirectory(tmp_path, study)
     journal = first.journal("original")
@@ -162,7 +162,7 @@ def test_a_file_that_is_no_manifest_is_refused(tmp_path: Path, study: Study, tex
         ResultsDirectory(tmp_path, study)
 
 
-def test_a_failed_write_leaves_what_was_there(tmp_path: Path, study: Study, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_failed_write_leaves_the_file_unchanged(tmp_path: Path, study: Study, monkeypatch: pytest.MonkeyPatch) -> None:
     directory = written(tmp_path, study)
     before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
 
@@ -177,7 +177,7 @@ def test_a_failed_write_leaves_what_was_there(tmp_path: Path, study: Study, monk
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
-def test_what_is_simulated_now_hangs_on_files_and_the_number_of_results_not_on_keys_that_came_later() -> None:
+def test_simulations_depend_on_files_and_the_number_of_results_but_not_on_new_keys() -> None:
     stored = {"format": FORMAT, "resolved": {"a": 1}, "network": {}, "sources": {"x.py": "0"}, "results": 1, "versions": {"numpy": "1"}}
     assert differences_now(stored, {**stored, "resolved": {"a": 1, "b": False}, "versions": {"numpy": "2"}}) == []
     assert differences_now(stored, {**stored, "resolved": {"a": 2}, "sources": {}, "results": 2}) == [
@@ -197,13 +197,13 @@ def test_rows_count_within_their_run() -> None:
 
 @pytest.mark.parametrize("text", [
     "", "nsga2", "nsga2:0", "nsga2:0:", ":0:0", "nsga2:-1:0", "nsga2:0:0:0", "nsga2:0:x", "nsga2:0:" + "9" * 30])
-def test_what_is_no_handle_is_refused(text: str) -> None:
+def test_a_text_that_is_no_handle_is_refused(text: str) -> None:
     with pytest.raises(InputError, match="ALGORITHM:RUN:N"):
         SolutionId.parse(text)
 
 
 @pytest.mark.parametrize(("handle", "legal"), [("nsga2:0:2", "0 to 1"), ("nsga2:1:0", "nsga2:0, nsga2:3, rs:0"), ("sf:0:0", "nsga2:0")])
-def test_a_solution_that_is_not_there_is_told_with_what_is(handle: str, legal: str) -> None:
+def test_the_error_for_a_missing_solution_names_the_present_ones(handle: str, legal: str) -> None:
     with pytest.raises(InputError) as refused:
         position_of(FRAME, SolutionId.parse(handle))
     assert handle in str(refused.value)
@@ -255,7 +255,7 @@ def test_the_format_that_is_written_now_is_stored_here() -> None:
 @pytest.mark.parametrize(("stored", "expected"), [
     ("format-1", r"version 0\.[12]\.0 wrote them"), ("format-2", r"version 0\.2\.0 wrote them"),
     ("format-3", "holds results of another study")])
-def test_stored_results_are_not_gone_on_with_by_other_code(stored: str, expected: str, tmp_path: Path) -> None:
+def test_other_code_does_not_continue_stored_results(stored: str, expected: str, tmp_path: Path) -> None:
     shutil.copytree(STORED / stored, tmp_path / "out")
     study = load_study("smoke", search={"algorithms": ["nsga2", "rs"], "evaluations": 10})
     with pytest.raises(InputError, match=expected):
@@ -295,7 +295,7 @@ def contents(place: Path) -> dict[str, tuple[bytes, int]]:
     return {str(path): (path.read_bytes(), path.stat().st_mtime_ns) for path in sorted(place.rglob("*")) if path.is_file()}
 
 
-def test_a_finished_study_is_told_as_its_journals_hold_it(slippery: Path) -> None:
+def test_the_status_of_a_finished_study_agrees_with_its_journals(slippery: Path) -> None:
     assert sv.status is status
     before = contents(slippery)
     result, (case,) = status(slippery), load_cases([slippery])
@@ -330,7 +330,7 @@ def test_a_study_under_way(slippery: Path, tmp_path: Path) -> None:
     assert "collisions" in "".join(lines), "no word is cut in two"
 
 
-def test_who_reads_results_is_told_of_a_torn_run(slippery: Path, tmp_path: Path) -> None:
+def test_reading_a_torn_run_warns(slippery: Path, tmp_path: Path) -> None:
     shutil.copytree(slippery, tmp_path / "it")
     journal = tmp_path / "it/runs/nsga2-00.journal"
     journal.write_bytes(journal.read_bytes()[:-7])
@@ -348,7 +348,7 @@ def test_watching_ends_with_the_study_and_json_is_json(slippery: Path) -> None:
     assert np.isfinite(output["runs"][0]["best"])
 
 
-def test_an_edited_table_is_told(slippery: Path, tmp_path: Path) -> None:
+def test_an_edited_table_is_reported(slippery: Path, tmp_path: Path) -> None:
     shutil.copytree(slippery, tmp_path / "it")
     file = tmp_path / "it/solutions.csv"
     file.write_text(file.read_text().replace("nsga2,0,", "nsga2,1,", 1))

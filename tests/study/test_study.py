@@ -1,4 +1,4 @@
-"""Study files are read strictly: every error names file, key, value and what is legal."""
+"""Study files are read strictly: every error names file, key, value and the expected values."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def test_the_published_settings_are_searched_as_published() -> None:
 REACTS = {"recognition_delay", "hesitation", "brake_gap", "brake_gap_per_speed", "brake_place", "brake_gap_before", "brake_gap_past"}
 
 
-def test_rain_differs_from_sun_in_weather_and_in_how_late_its_driver_reacts_alone() -> None:
+def test_rain_differs_from_sun_only_in_weather_and_reaction_of_its_driver() -> None:
     sun, rain = load_study("sun"), load_study("rain")
     assert rain.weather != sun.weather
     assert {name: value for name, value in rain.ads.parameters.items() if sun.ads.parameters.get(name) != value}.keys() == REACTS
@@ -115,7 +115,7 @@ def test_a_bad_study_is_refused_with_file_key_and_value(tmp_path: Path, old: str
     ("extends = 3\n", "extends"),
     (f"[ads.parameters.{'.'.join(['deep'] * 1500)}]\nx = 1", "ads is nested too deeply\nexpected: at most 32 tables"),
 ])
-def test_what_nobody_can_use_is_refused_by_its_key(text: str, expected: str, tmp_path: Path) -> None:
+def test_an_unusable_value_is_refused_by_its_key(text: str, expected: str, tmp_path: Path) -> None:
     path = tmp_path / "mine.toml"
     path.write_text(text if text.startswith("extends") else f'extends = "smoke"\nname = "mine"\n{text}\n')
     with pytest.raises(InputError) as caught:
@@ -125,7 +125,7 @@ def test_what_nobody_can_use_is_refused_by_its_key(text: str, expected: str, tmp
     assert len(str(caught.value)) < 1000
 
 
-def test_all_mistakes_of_a_file_are_told_at_once(tmp_path: Path) -> None:
+def test_all_mistakes_of_a_file_are_reported_at_once(tmp_path: Path) -> None:
     path = tmp_path / "mine.toml"
     path.write_text('extends = "smoke"\nname = "mine"\n[search]\nruns = 0\npopulation = "x"\nseeds = 1\n'
                     "[vehicle.characteristics.mass]\nunit = 3\n")
@@ -165,7 +165,7 @@ def test_a_written_study_is_called_as_its_file(tmp_path: Path) -> None:
     ("nope.toml", "there is no study or file 'nope.toml'"), (".", "is no regular file but a directory"),
     ("LOOP", "cannot be read: Too many levels of symbolic links"),
 ])
-def test_a_base_that_cannot_be_read_is_named_with_the_file_and_the_key(tmp_path: Path, base: str, reason: str) -> None:
+def test_an_unreadable_base_is_named_with_file_and_key(tmp_path: Path, base: str, reason: str) -> None:
     loop = tmp_path / "loop.toml"
     loop.symlink_to(loop)
     base = str(loop) if base == "LOOP" else base
