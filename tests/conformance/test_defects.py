@@ -258,10 +258,10 @@ def test_an_authors_test_class_has_a_test_for_each_check(in_tmp: Path) -> None:
     class TestMine(testing.AdsChecks):
         subject = "mine:Mine"
 
-    for name in testing.ALL:
+    for name in testing.CHECK_NAMES:
         if name == "reaction":
             with pytest.raises(AssertionError, match="never brakes"):
                 TestMine().test_check(name)
         else:
             TestMine().test_check(name)
-    assert TestMine.test_check.pytestmark[0].args == ("name", testing.ALL)  # type: ignore[attr-defined]
+    assert TestMine.test_check.pytestmark[0].args == ("check_name", testing.CHECK_NAMES)  # type: ignore[attr-defined]
