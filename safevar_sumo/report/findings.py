@@ -194,12 +194,12 @@ def _select_handles(data: ReportInput, failures: Sequence[FailureEntry]) -> list
         return []
     choices = FIRST_CHOICES if any(data.unsafe_solutions) else FIRST_CHOICES[-1:]
     selection = [*map(data.chosen, choices), *(failure.handle for failure in failures if failure.handle)]
-    best = non_dominated([row for row, is_unsafe in zip(data.solutions.values(), data.unsafe_solutions, strict=True) if is_unsafe])
+    best = front_of([row for row, is_unsafe in zip(data.solutions.values(), data.unsafe_solutions, strict=True) if is_unsafe])
     selection += [best[index]["handle"] for index in evenly_spaced(len(best), MAX_REPLAYS)]
     return list(dict.fromkeys(selection))[:max(MAX_REPLAYS, len(choices) + len(failures))]
 
 
-def non_dominated(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+def front_of(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """The solutions that no other solution dominates in the three objectives; one solution for each point."""
     if not rows:
         return []

@@ -25,7 +25,7 @@ from safevar_sumo.errors import InputError, did_you_mean, warn
 from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.replay.comparison import raised
 from safevar_sumo.replay.page import environment, player_parts
-from safevar_sumo.report.findings import causes, evenly_spaced, explanations_of, necessity_chart, no_opinion, non_dominated, replays
+from safevar_sumo.report.findings import causes, evenly_spaced, explanations_of, front_of, necessity_chart, no_opinion, replays
 from safevar_sumo.report.input import ReportInput, read_inputs
 from safevar_sumo.report.limits import LIMITS
 from safevar_sumo.report.rated import rated_study_page
@@ -87,7 +87,7 @@ def _data_url(figure: Figure) -> str:
 def front(data: ReportInput, handles: Sequence[str]) -> Markup:
     """A chart of non-dominated solutions by largest change and safety degree; those of `handles` link to their replays."""
     rows = [row for row in data.solutions.values() if not np.isnan([row["f_safe"], row["f_diff"]]).any()]
-    best = non_dominated(rows)
+    best = front_of(rows)
     selection = [best[index] for index in evenly_spaced(len(best), MAX_DOTS)] + [row for row in rows if row["handle"] in handles]
     dots = {row["handle"]: _dot(data, row, row["handle"] in handles) for row in selection}
     return scatter(f"{data.case.name}: safety degree over the largest change of the solutions that no other solution beats",
@@ -141,13 +141,13 @@ def _rerun_command(study: Study, out: str, directory: Path) -> str:
 WEB = Path(__file__).parent / "web"
 SECTIONS = {
     "verdict": "Verdict",
-    "tested": "What was tested_system",
+    "tested": "What was tested",
     "causes": "Causes",
     "tolerance": "Tolerances",
     "risk": "Share of unsafe vehicles",
     "rules": "Failure regions",
     "questions": "Research questions",
-    "trust": "What was not tested_system, and how far to trust it",
+    "trust": "What was not tested, and how far to trust it",
     "reproduce": "How to reproduce every number",
 }
 """Headings of the sections in order, by the names that `--only` accepts."""

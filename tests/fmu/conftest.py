@@ -1,4 +1,4 @@
-"""FMUs made once for all tests, and studies that use them."""
+"""FMUs, exported once for all tests, and studies that use them."""
 
 from __future__ import annotations
 
@@ -88,13 +88,13 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def small(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., System]:
-    """The system of an FMU that does something within a gap of 25 m, with the study's table changed; `edit` changes the FMU's file."""
+    """The system of an FMU that executes `then` within a gap of 25 m; `table` replaces keys of [ads], `edit` changes the FMU's file."""
     monkeypatch.chdir(tmp_path)
 
     def system(then: str = "self.pedal = 1.0", table: str = "", edit: Callable[[Path], object] = lambda fmu: None, time_limit: float = 300,
                options: dict[str, str] | None = None) -> System:
-        made = exported(SMALL.format(then=then), tmp_path, "small", **options or {})
-        edit(made)
+        fmu = exported(SMALL.format(then=then), tmp_path, "small", **options or {})
+        edit(fmu)
         (tmp_path / "small.toml").write_text(f"""
 extends = "native"
 name = "small"

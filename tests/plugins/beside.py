@@ -1,4 +1,4 @@
-"""What tests write beside a study file."""
+"""User code and tables that tests write beside a study file."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A study file with a module of its own beside it, in a folder that is not the working directory."""
+"""A study file and its module in one folder, which is not the working directory."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from tests.plugins.beside import ADS, Mine
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Where study and module lie; the working directory is another, empty one."""
+    """The folder of study and module; the working directory is another folder, which is empty."""
     (tmp_path / "elsewhere").mkdir()
     (tmp_path / "study").mkdir()
     monkeypatch.chdir(tmp_path / "elsewhere")
@@ -22,7 +22,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.fixture
 def mine(folder: Path) -> Mine:
-    """Write mine.py and mine.toml, which extends smoke, and put the system together."""
+    """Write mine.py and mine.toml, which extends smoke, and assemble the system."""
     def result(module: str, table: str = ADS) -> System:
         (folder / "mine.py").write_text(module)
         (folder / "mine.toml").write_text(f'extends = "smoke"\nname = "mine"\n{table}')

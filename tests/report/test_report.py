@@ -39,7 +39,7 @@ from safevar_sumo.scenarios import Point
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.workers import local
 from tests.analysis.known_regions import Plant
-from tests.in_process import Here
+from tests.in_process import InlinePool
 
 
 class Outline(HTMLParser):
@@ -102,7 +102,7 @@ def never_again(few_samples: None, monkeypatch: pytest.MonkeyPatch) -> None:
         raise AssertionError("asked twice")
 
     monkeypatch.setattr(findings, "explain", ask)
-    monkeypatch.setattr(Here, "submit", ask)
+    monkeypatch.setattr(InlinePool, "submit", ask)
 
 
 @pytest.mark.slow
@@ -360,7 +360,7 @@ def test_what_comes_from_outside_is_called_by_its_name_once(slippery: Path) -> N
     points = [Point(scenario, data.case.weather)]  # type: ignore[arg-type]
     others: Any = SimpleNamespace(case=dataclasses.replace(data.case, study=study), manifest=data.manifest, problem="", point="",
                                   system=SimpleNamespace(points=points, matrix=(), vehicle=None))
-    result = what.tested(others)
+    result = what.tested_system(others)
     assert "Driving system: my_controller:Pilot. Scenario: pedestrian_crossing (" in result.subject
     assert "NSGA-II (1 run)" in result.search
     assert not result.tags

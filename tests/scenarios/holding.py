@@ -1,4 +1,4 @@
-"""A driver who does nothing: what a vehicle meets that nobody brakes."""
+"""A driving system that keeps the pedals, so that tests see what a vehicle meets without a reaction."""
 
 from __future__ import annotations
 
@@ -33,13 +33,13 @@ class Hold:
 
 
 def driven(scenario: Scenario, ads: Any = None, settings: FloatArray | None = None, system: System = CARLA) -> SimulationRuns:
-    """The original vehicle of CARLA, or settings, in a scenario; held at its speed unless an ADS is given."""
+    """Simulate the original vehicle of CARLA, or settings, in a scenario; an ADS holds the pedals unless another ADS is given."""
     system = replace(system, scenario=scenario, ads=ads or Hold())
     return simulate(system, system.characteristics.original[np.newaxis] if settings is None else settings)
 
 
 def at_contact(run: SimulationRuns, values: FloatArray, vehicle: int = 0) -> float:
-    """A value when the bumper reaches the obstacle, linear between the two samples around it."""
+    """A value at the time when the bumper reaches the obstacle, interpolated between the two nearest samples."""
     gap = run.trace.gap[:, vehicle]
     after = int(np.argmax(gap <= 1e-9))
     share = gap[after - 1] / (gap[after - 1] - gap[after])

@@ -1,4 +1,4 @@
-"""Vehicles driven open loop: pedals over time in, states out."""
+"""Drive vehicles open loop: pedals over time give states over time."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Pedals = Callable[[float], tuple[Any, Any]]
 
 
 class Drive(NamedTuple):
-    """States of N vehicles at times 0, step, 2 step, ...; speeds (T, N) and travelled distances (T, N)."""
+    """States of N vehicles at T times 0, step, 2 step, ... [s]; speeds [m/s] and travelled distances [m] have shape (T, N)."""
 
     prepared: Any
     states: list[Any]
@@ -40,7 +40,7 @@ class Drive(NamedTuple):
 
 def drive(model: str, settings: np.ndarray, pedals: Pedals, duration: float, step: float = STEP, road: float = 1.0,
           rolling: float = 0.0, grade: float = 0.0, wet: bool = False) -> Drive:
-    """Drive settings, shape (N, n); pedals(t) -> (throttle, brake), for all or by vehicle. `rolling` is the speed at the start."""
+    """Drive settings, shape (N, n); pedals(t) -> (throttle, brake), for all or by vehicle. `rolling` is the initial speed [m/s]."""
     system = SYSTEMS[model]
     values = dict(zip(system.characteristics.names, np.ascontiguousarray(settings.T), strict=True))
     prepared = system.vehicle.prepare(values, road, step, slope_of(np.full(len(settings), grade)), wet)
@@ -53,7 +53,7 @@ def drive(model: str, settings: np.ndarray, pedals: Pedals, duration: float, ste
 
 
 def _rolling(state: Any, prepared: Any, speed: float) -> Any:
-    """The vehicle at rest, set rolling without slip; its gear stays what it was."""
+    """Give a vehicle at rest a speed, without slip and in the same gear."""
     wheels = {"wheel_speed": speed / prepared.radius} if hasattr(state, "wheel_speed") else {}
     return state._replace(speed=state.speed + speed, **wheels)
 
@@ -63,7 +63,7 @@ def original(model: str, n: int = 1) -> np.ndarray:
 
 
 def ends(model: str, name: str, points: int = 5) -> np.ndarray:
-    """The original vehicle with one characteristic moved across its domain, in `points` settings."""
+    """`points` settings of the original vehicle with one characteristic spread over its domain."""
     characteristics = SYSTEMS[model].characteristics
     settings, column = original(model, points), characteristics.names.index(name)
     settings[:, column] = np.linspace(characteristics.lower[column], characteristics.upper[column], points)
