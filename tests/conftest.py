@@ -1,4 +1,4 @@
-"""Systems and results that many tests share; a cache folder and a working directory of their own; pools that compute in this process."""
+"""Fixtures for many tests: systems, results, an own cache folder and working directory, and pools that compute in this process."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.study import load_study, study_names
 from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.workers import local
-from tests.in_process import Here, searched
+from tests.in_process import InlinePool, searched
 
 collect_ignore = [] if os.name == "posix" else ["workers/test_local_pool.py", "end_to_end/test_processes.py"]
-"""Tests that kill, stop and interrupt processes as POSIX has it."""
+"""Tests that send POSIX signals to processes; other systems skip them."""
 
 hypothesis.settings.register_profile("default", deadline=None, derandomize=True)
 hypothesis.settings.load_profile("default")
-os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # the programs that tests start need not compile the package each time
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # so that programs started by tests need not compile the package each time
 WORKER_PROCESSES = local.LocalPool
 SLIPPERY = """
 extends = "smoke"
@@ -46,25 +46,25 @@ runs = 1
 
 @pytest.fixture(scope="session", autouse=True)
 def _own_cache_and_pools_of_this_process(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """Networks are built anew for every session of tests, once for all processes that share it; commands start no worker processes."""
+    """Each session of tests builds its own networks, once for all of its processes; commands start no worker processes."""
     session = tmp_path_factory.getbasetemp()
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_CACHE_HOME", str((session.parent if "PYTEST_XDIST_WORKER" in os.environ else session) / "cache"))
-        patch.setattr(local, "LocalPool", Here)
+        patch.setattr(local, "LocalPool", InlinePool)
         yield
 
 
 @pytest.fixture
 def worker_processes(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Pools start worker processes, as a user's do."""
+    """Let pools start worker processes, as for a user."""
     monkeypatch.setattr(local, "LocalPool", WORKER_PROCESSES)
 
 
 @pytest.fixture(params=[name for name in study_names() if not is_rated(load_study(name))])
 def any_system(request: pytest.FixtureRequest) -> System:
-    """The system of every study that comes with the package, one after the other, but for one that is rated in thousands of cells."""
+    """The system of each shipped study in turn, except a study that is rated in thousands of cells."""
     system = assemble(load_study(request.param))
-    return replace(system, matrix=system.matrix[::30])  # of a long matrix some points
+    return replace(system, matrix=system.matrix[::30])  # only some points of a long matrix
 
 
 @pytest.fixture
@@ -89,5 +89,5 @@ def slippery(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def explained(slippery: Path) -> Explained:
-    """The failures of those results, explained."""
-    return explain_failures(load_cases([slippery])[0], ExplainOptions(top=3), pool=Here())
+    """Explanations of the failures in the results `slippery`."""
+    return explain_failures(load_cases([slippery])[0], ExplainOptions(top=3), pool=InlinePool())

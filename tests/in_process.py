@@ -1,4 +1,4 @@
-"""A campaign's surroundings in this process: a pool that computes at once, an observer that nobody hears, commands as typed."""
+"""Campaigns and commands in this process: a pool that computes at once, an observer without output, commands as users type them."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ from safevar_sumo.workers.evaluation import evaluate_batch
 from safevar_sumo.workers.identity import identity_of
 
 
-class Here:
-    """A pool that computes in this process, at once; takes what a pool of worker processes takes."""
+class InlinePool:
+    """A pool that computes in this process, at once; it has the interface of a pool of worker processes."""
 
     workers = 1
 
@@ -40,8 +40,8 @@ class Here:
     def close(self) -> None: ...
 
 
-class Silent:
-    """An observer that nobody hears."""
+class SilentObserver:
+    """An observer that ignores all reports."""
 
     def evaluated(self, *_: object) -> None: ...
     def finished(self, *_: object) -> None: ...
@@ -49,42 +49,42 @@ class Silent:
 
 
 def searched(study: Study, out: Path) -> Path:
-    """Carry a study out in this process; returns its results directory, `out`."""
+    """Search a study in this process; returns its results directory, `out`."""
     results = ResultsDirectory(out, study, identity_of(study, assemble(study)))
-    results.finish(run_campaign(study, all_runs(study), results, Here(), Silent()).solutions)
+    results.finish(run_campaign(study, all_runs(study), results, InlinePool(), SilentObserver()).solutions)
     return out
 
 
-class Done(NamedTuple):
-    """What a command printed."""
+class CommandOutput(NamedTuple):
+    """The text that a command printed."""
 
     stdout: str
     stderr: str
 
 
-def run(*arguments: str, expect: int = 0) -> Done:
-    """Run a command as typed; its exit code must be the one expected. Modules of a test's own folder are forgotten again."""
+def run(*arguments: str, expect: int = 0) -> CommandOutput:
+    """Run a command as a user types it; its exit code must be `expect`. Afterwards, unload modules that it took from the test's folder."""
     out, err, code = io.StringIO(), io.StringIO(), None
-    before = set(sys.modules)
+    loaded_modules = set(sys.modules)
     with redirect_stdout(out), redirect_stderr(err), pytest.MonkeyPatch.context() as patch:
         patch.setattr(sys, "argv", ["safevar-sumo", *arguments])
-        patch.setattr(os, "_exit", sys.exit)  # which the program calls where a thread is left: this process is to live on
+        patch.setattr(os, "_exit", sys.exit)  # the program calls it if a thread still runs; this process must continue
         try:
             main()
         except SystemExit as end:
             code = end.code
-    for name in set(sys.modules) - before:
+    for name in set(sys.modules) - loaded_modules:
         file = str(getattr(sys.modules[name], "__file__", None) or "")
         if file.startswith(os.getcwd()) and not file.startswith(sys.prefix):
             del sys.modules[name]
     assert code == expect, f"{code}\n{out.getvalue()}\n{err.getvalue()}"
-    return Done(out.getvalue(), err.getvalue())
+    return CommandOutput(out.getvalue(), err.getvalue())
 
 
 def refused(*arguments: str, message: tuple[str, ...]) -> None:
-    """The command ends with exit code 2 and, warnings apart, one or two lines that tell all of `message`, or a line for each mistake."""
-    done = run(*arguments, expect=2)
+    """The command must end with exit code 2 and print, warnings apart, all of `message` in one or two lines, or a line for each mistake."""
+    output = run(*arguments, expect=2)
     for part in message:
-        assert part in done.stderr, done.stderr
-    lines = [line for line in done.stderr.strip().splitlines() if not line.startswith("warning: ")]
-    assert len(lines) <= 2 or lines[0].endswith("mistakes"), done.stderr
+        assert part in output.stderr, output.stderr
+    lines = [line for line in output.stderr.strip().splitlines() if not line.startswith("warning: ")]
+    assert len(lines) <= 2 or lines[0].endswith("mistakes"), output.stderr

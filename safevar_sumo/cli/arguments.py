@@ -1,4 +1,4 @@
-"""Values that people type: checks of output files, changes of characteristics, numbers in a range; and shell completion."""
+"""Check what users type: output files, changes of characteristics, numbers in a range; complete it in the shell."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ def check_output(path: Path, flag: str, endings: tuple[str, ...]) -> None:
     Raises
     ------
     InputError
-        Names the flag and the legal endings.
+        Names the flag and the accepted endings.
     """
     if path.suffix.lower() not in endings:
         raise InputError(flag, str(path), f"a file that ends in {', '.join(endings)}")
     check_writable(path, flag)
 
 
-def refuse_inputs(path: Path, flag: str, *inputs: str | Path) -> None:
+def refuse_overwriting(path: Path, flag: str, *inputs: str | Path) -> None:
     """Refuse to overwrite an input of the command: a file, or a file of a results directory.
 
     Raises
@@ -49,8 +49,8 @@ def refuse_inputs(path: Path, flag: str, *inputs: str | Path) -> None:
             raise InputError(flag, f"{path} is an input of the command", "another file")
 
 
-class Within(click.FloatRange):
-    """A range of numbers that refuses NaN."""
+class NumberRange(click.FloatRange):
+    """Type of an option whose number must lie in a range; refuses NaN, too."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         """Return the number if it is within the range."""
@@ -61,62 +61,62 @@ class Within(click.FloatRange):
 
 
 NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
-SIGNED = re.compile(r"[+-](?:\d+\.?\d*|\.\d+)")
-SHARE = re.compile(rf"({SIGNED.pattern})%")
+SIGNED_NUMBER = re.compile(r"[+-](?:\d+\.?\d*|\.\d+)")
+PERCENTAGE = re.compile(rf"({SIGNED_NUMBER.pattern})%")
 SWEEP = re.compile(rf"({NUMBER})\.\.({NUMBER})(?::(\d{{1,6}}))?")
 DEFAULT_SWEEP_LENGTH = 11
-"""Number of values of a sweep that gives none."""
+"""Number of values of a sweep without `:NUMBER`."""
 MAX_SETTINGS = 10_000
-"""Maximum number of settings of all sweeps together."""
-ONE_VALUE = "one value for each: NAME=VALUE in the characteristic's unit, or NAME=+10% of the original"
-LEGAL = "NAME=VALUE in the characteristic's unit, NAME=+10% of the original, or NAME=FROM..TO, NAME=FROM..TO:NUMBER"
+"""Maximum number of settings that all --set together may produce."""
+SINGLE_VALUE_FORMS = "one value for each: NAME=VALUE in the characteristic's unit, or NAME=+10% of the original"
+CHANGE_FORMS = "NAME=VALUE in the characteristic's unit, NAME=+10% of the original, or NAME=FROM..TO, NAME=FROM..TO:NUMBER"
 
 
 def read_changes(changes: tuple[str, ...], characteristics: CharacteristicSet, beyond: bool, *, single: bool = False
                  ) -> dict[str, list[float]]:
-    """The values of each named characteristic; `single`: no sweeps, and errors do not suggest --beyond.
+    """Parse --set; returns the values of each named characteristic. `single` refuses sweeps, and its errors do not suggest --beyond.
 
     Raises
     ------
     InputError
-        If a change has another form, a name is unknown or given twice, or a value is outside its domain.
+        If a change cannot be parsed, a name is unknown or given twice, or a value is outside its domain.
     """
     values_by_name: dict[str, list[float]] = {}
-    legal = ONE_VALUE if single else LEGAL
+    forms = SINGLE_VALUE_FORMS if single else CHANGE_FORMS
     for change in changes:
         name, equals, text = (part.strip() for part in change.partition("="))
         if not equals:
-            raise InputError("--set", repr(change), legal)
+            raise InputError("--set", repr(change), forms)
         if name in values_by_name:
             raise InputError("--set", f"{name} is set twice", "each characteristic once")
         if name not in characteristics.names:
             raise unknown("--set", f"there is no characteristic {name!r}", name, characteristics.names)
-        member = characteristics.members[characteristics.names.index(name)]
-        values_by_name[name] = _values(change, text, member.original, legal)
+        characteristic = characteristics.members[characteristics.names.index(name)]
+        values_by_name[name] = _parse_values(change, text, characteristic.original, forms)
         if single and len(values_by_name[name]) > 1:
-            raise InputError("--set", f"{change!r} is a sweep", legal)
+            raise InputError("--set", f"{change!r} is a sweep", forms)
         for value in values_by_name[name]:
-            hint = f", or {name}={text}% of the original" if SIGNED.fullmatch(text) else ""
-            member.check(value, "--set", beyond=beyond, otherwise=hint, switch="" if single else "--beyond")
+            hint = f", or {name}={text}% of the original" if SIGNED_NUMBER.fullmatch(text) else ""
+            characteristic.check(value, "--set", beyond=beyond, otherwise=hint, switch="" if single else "--beyond")
     if np.prod([len(values) for values in values_by_name.values()], dtype=float) > MAX_SETTINGS:
         raise InputError("--set", f"{' '.join(changes)}: more than {MAX_SETTINGS} settings", "shorter sweeps, FROM..TO:NUMBER")
     return values_by_name
 
 
 def settings_of(changes: dict[str, list[float]], base: FloatArray, characteristics: CharacteristicSet) -> FloatArray:
-    """`base`, shape (n,), with every combination of the values; shape (M, n)."""
+    """Settings, shape (M, n): `base`, shape (n,), with each of the M combinations of the values in turn."""
     columns = [characteristics.names.index(name) for name in changes]
-    rows = []
+    settings = []
     for values in product(*changes.values()):
-        row = base.copy()
-        row[columns] = values
-        rows.append(row)
-    return np.array(rows)
+        setting = base.copy()
+        setting[columns] = values
+        settings.append(setting)
+    return np.array(settings)
 
 
-def _values(change: str, text: str, original: float, legal: str) -> list[float]:
-    if share := SHARE.fullmatch(text):
-        return [original + abs(original) * float(share[1]) / 100]
+def _parse_values(change: str, text: str, original: float, forms: str) -> list[float]:
+    if percentage := PERCENTAGE.fullmatch(text):
+        return [original + abs(original) * float(percentage[1]) / 100]
     if sweep := SWEEP.fullmatch(text):
         number = int(sweep[3] or DEFAULT_SWEEP_LENGTH)
         if number < 2:
@@ -124,23 +124,23 @@ def _values(change: str, text: str, original: float, legal: str) -> list[float]:
         return np.linspace(float(sweep[1]), float(sweep[2]), number).tolist()  # type: ignore[no-any-return]
     if re.fullmatch(NUMBER, text):
         return [float(text)]
-    raise InputError("--set", repr(change), legal)
+    raise InputError("--set", repr(change), forms)
 
 
 def complete_study(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:
-    """Names of studies, and files or directories."""
+    """Complete names of studies, files and directories."""
     names = [CompletionItem(name) for name in study_names() if name.startswith(incomplete)]
     return [*names, CompletionItem(incomplete, type="file")]
 
 
 def complete_changes(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:
-    """`NAME=` for each characteristic of the study named earlier in the command line, with its domain as help."""
-    study = str(ctx.params.get("study") or next(iter(ctx.args), ""))  # while --set is incomplete, click has not parsed what follows
+    """Complete `NAME=` for each characteristic of the study named earlier in the command line, with its domain as help."""
+    study = str(ctx.params.get("study") or next(iter(ctx.args), ""))  # while --set is incomplete, click has not parsed the rest
     if not study or Path(study).is_dir():
         return []
     try:
         characteristics = load_study(study).vehicle.characteristics
     except SafevarError:
         return []
-    return [CompletionItem(f"{name}=", help=f"{row.lower:g} to {row.upper:g}" + (f" {row.unit}" if row.unit != "-" else ""))
-            for name, row in characteristics.items() if name.startswith(incomplete)]
+    return [CompletionItem(f"{name}=", help=f"{table.lower:g} to {table.upper:g}" + (f" {table.unit}" if table.unit != "-" else ""))
+            for name, table in characteristics.items() if name.startswith(incomplete)]

@@ -1,4 +1,4 @@
-"""The command list: studies, models, weathers, algorithms, metrics and objectives."""
+"""The command `list`, which shows studies, models, weathers, algorithms, metrics and objectives."""
 
 from __future__ import annotations
 
@@ -32,23 +32,23 @@ def list_command(as_json: bool) -> None:
 
 
 def _catalogue(studies: list[Study]) -> dict[str, Any]:
-    vehicles: dict[str, list[dict[str, Any]]] = {}
+    characteristics: dict[str, list[dict[str, Any]]] = {}
     for study in studies:
-        vehicles.setdefault(study.vehicle.model, [
-            {"name": member.name, "unit": member.unit, "original": member.original, "lower": member.lower, "upper": member.upper,
-             "threshold": member.threshold, "meaning": member.meaning, "counterpart": member.counterpart}
-            for member in CharacteristicSet.of(study.vehicle.characteristics)])
+        characteristics.setdefault(study.vehicle.model, [
+            {"name": row.name, "unit": row.unit, "original": row.original, "lower": row.lower, "upper": row.upper,
+             "threshold": row.threshold, "meaning": row.meaning, "counterpart": row.counterpart}
+            for row in CharacteristicSet.of(study.vehicle.characteristics)])
     return {
         "studies": [{"name": study.name, "title": study.title, "vehicle": study.vehicle.model, "ads": study.ads.model,
                      "scenario": study.scenario.model, "weather": _weather_name(study)} for study in studies],
-        "vehicles": [{"name": name, "characteristics": vehicles.get(name, [])} for name in VEHICLES],
-        "ads": [_described(name, cls) for name, cls in ADS.items()],
-        "scenarios": [_described(name, cls) for name, cls in SCENARIOS.items()],
+        "vehicles": [{"name": name, "characteristics": characteristics.get(name, [])} for name in VEHICLES],
+        "ads": [_name_and_description(name, cls) for name, cls in ADS.items()],
+        "scenarios": [_name_and_description(name, cls) for name, cls in SCENARIOS.items()],
         "weathers": [msgspec.to_builtins(weather) for weather in WEATHERS.values()],
-        "algorithms": [_described(name, cls) for name, cls in ALGORITHMS.items()],
+        "algorithms": [_name_and_description(name, cls) for name, cls in ALGORITHMS.items()],
         "metrics": [{"name": name, "description": metric.description} for name, metric in {**METRICS, **FURTHER}.items()],
         "objectives": [
-            *({"name": name, "description": f"The metric {metric.name}, as unsafe as possible."} for name, metric in OBJECTIVES.items()),
+            *({"name": name, "description": f"The search drives {metric.name} to unsafe values."} for name, metric in OBJECTIVES.items()),
             *({"name": change.name, "description": f"{change.title.capitalize()} [{change.unit}]."} for change in CHANGES.values()),
             {"name": RATING_POINTS.name, "description": f"Only in studies that a protocol rates: {RATING_POINTS.description}"}],
     }
@@ -58,29 +58,29 @@ def _weather_name(study: Study) -> str:
     return study.weather if isinstance(study.weather, str) else study.weather.name
 
 
-def _described(name: str, model: Callable[..., Any]) -> dict[str, str]:
+def _name_and_description(name: str, model: Callable[..., Any]) -> dict[str, str]:
     """The name of a model, and the first line of its docstring."""
     return {"name": name, "description": (model.__doc__ or "").strip().partition("\n")[0]}
 
 
 def _print_catalogue(console: Console, studies: list[Study]) -> None:
     catalogue = _catalogue(studies)
-    study_rows = [(name, title, ", ".join(parts)) for name, title, *parts in map(dict.values, catalogue["studies"])]
+    study_rows = [(name, title, ", ".join(models)) for name, title, *models in map(dict.values, catalogue["studies"])]
     print_names(console, "Studies", study_rows, ("name", "title", "vehicle, ADS, scenario, weather"))
-    members: dict[str, CharacteristicSet] = {}
+    sets_by_vehicle: dict[str, CharacteristicSet] = {}
     for study in studies:
-        members.setdefault(study.vehicle.model, CharacteristicSet.of(study.vehicle.characteristics))
+        sets_by_vehicle.setdefault(study.vehicle.model, CharacteristicSet.of(study.vehicle.characteristics))
     for vehicle in catalogue["vehicles"]:
         rows = [(row["name"], row["unit"], *(f"{row[key]:g}" for key in ("original", "lower", "upper", "threshold")))
                 for row in vehicle["characteristics"]]
         heads = ("characteristic", "unit", "original", "lower", "upper", "threshold")
         print_names(console, f"Vehicle {vehicle['name']}", rows, heads)
-        if vehicle["name"] in members:
-            print_meanings(console, members[vehicle["name"]])
-    numbers = ("road_friction", "visibility", "recognition_delay")
-    weathers = [(row["name"], *(f"{row[key]:g}" for key in numbers), row["light"], "wet" if row["wet"] else "dry")
+        if vehicle["name"] in sets_by_vehicle:
+            print_meanings(console, sets_by_vehicle[vehicle["name"]])
+    number_keys = ("road_friction", "visibility", "recognition_delay")
+    weather_rows = [(row["name"], *(f"{row[key]:g}" for key in number_keys), row["light"], "wet" if row["wet"] else "dry")
                 for row in catalogue["weathers"]]
-    print_names(console, "Weathers", weathers, ("name", "friction", "sight", "delay, s", "light", "road"))
+    print_names(console, "Weathers", weather_rows, ("name", "friction", "visibility", "recognition\ndelay, s", "light", "road"))
     for title, key in (("ADSs", "ads"), ("Scenarios", "scenarios"), ("Algorithms", "algorithms"), ("Metrics", "metrics"),
-                       ("Objectives (every metric can be one, too)", "objectives")):
+                       ("Objectives (every metric can also be an objective)", "objectives")):
         print_names(console, title, [(row["name"], row["description"]) for row in catalogue[key]], ("name", "description"))

@@ -1,4 +1,4 @@
-"""The command check: checks the user's own code."""
+"""The command `check`, which tests users' own code."""
 
 from __future__ import annotations
 

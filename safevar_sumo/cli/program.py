@@ -1,4 +1,4 @@
-"""The program that all commands belong to, and its exit codes."""
+"""The program, its commands, its errors and its exit codes."""
 
 from __future__ import annotations
 
@@ -41,40 +41,40 @@ COMMANDS = {
     "replicate": ("reference", "Compare whole studies with published ones: tables, and which conclusions hold."),
     "calibrate": ("reference", "Fit a study's free parameters to reference data."),
 }
-"""Commands in the order of the help, each with its module in this folder and its sentence in the help."""
+"""Module in this folder and sentence in the help of each command, in the order of the help."""
 
 
-class OneOfEach(click.Command):
-    """A command that refuses an empty value, an option given twice, and two options that exclude each other, instead of using the last."""
+class StrictCommand(click.Command):
+    """A command that refuses an empty value, a repeated option, and options that exclude each other; click would use the last."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         if not ctx.resilient_parsing:
             try:
-                values, _, order = self.make_parser(ctx).parse_args(list(args))
+                values, _, options = self.make_parser(ctx).parse_args(list(args))
             except click.UsageError as error:
                 error.ctx = ctx
                 raise
             flags: dict[str, str] = {}
-            for option in order:
-                given = values[str(option.name)]
-                if given == "" or (isinstance(given, list | tuple) and "" in given):
+            for option in options:
+                value = values[str(option.name)]
+                if value == "" or (isinstance(value, list | tuple) and "" in value):
                     raise InputError(option.opts[-1] if isinstance(option, click.Option) else option.human_readable_name,
                                      "'' is empty", "a value")
                 if not isinstance(option, click.Option) or option.multiple or option.name is None:
                     continue
-                flag, earlier = option.opts[-1], flags.get(option.name)
-                if earlier not in (None, flag):
-                    raise InputError(flag, f"{earlier} is given too", "one of them")
-                if earlier == flag and not option.is_flag:
-                    raise InputError(flag, f"is given twice, the last time as {values[option.name]!r}", "one value")
+                flag, earlier_flag = option.opts[-1], flags.get(option.name)
+                if earlier_flag not in (None, flag):
+                    raise InputError(flag, f"{earlier_flag} is given too", "one of them")
+                if earlier_flag == flag and not option.is_flag:
+                    raise InputError(flag, f"is given twice, the last time as {value!r}", "one value")
                 flags[option.name] = flag
         return super().parse_args(ctx, args)
 
 
 class LazyCommands(click.Group):
-    """Loads a command's module only when the command is called, for the other modules take long to load."""
+    """Loads a command's module only when the command is called, since modules take long to load."""
 
-    command_class = OneOfEach
+    command_class = StrictCommand
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         return list(COMMANDS)
@@ -129,7 +129,7 @@ def main() -> None:
         _fail("interrupted", INTERRUPTED)
     except click.exceptions.NoArgsIsHelpError as error:
         error.show()
-        _leave(error.exit_code)
+        _exit_program(error.exit_code)
     except click.ClickException as error:
         _fail(_in_two_lines(error), error.exit_code)
     except SafevarError as error:
@@ -137,16 +137,16 @@ def main() -> None:
     except KeyboardInterrupt:
         _fail("interrupted", INTERRUPTED)
     except BrokenPipeError:
-        _drop_output()
-        _leave(1)
+        _discard_output()
+        _exit_program(1)
     except OSError as error:
-        _drop_output()
+        _discard_output()
         _fail(f"{error.strerror or error}{f': {error.filename}' if error.filename else ''}", 1)
-    _leave(code if isinstance(code, int) else 0)
+    _exit_program(code if isinstance(code, int) else 0)
 
 
 def _in_two_lines(error: click.ClickException) -> str:
-    """One of click's own errors in the form of this program's errors."""
+    """An error of click in the form of this program's errors."""
     context = error.ctx if isinstance(error, click.UsageError) else None
     command = context.command_path if context is not None else "safevar-sumo"
     return f"{' '.join(error.format_message().split())}\nexpected: see {command} --help"
@@ -154,59 +154,59 @@ def _in_two_lines(error: click.ClickException) -> str:
 
 def _show_warning(message: Warning | str, category: type[Warning], filename: str, lineno: int, file: TextIO | None = None,
                   line: str | None = None) -> None:
-    """Show a warning without the place in the code that it comes from."""
+    """Show a warning without its file and line."""
     click.echo(f"warning: {message}", err=True)
 
 
 @contextmanager
 def _exit_on_interrupt() -> Iterator[None]:
     """End the program on Ctrl-C while modules load: compiled modules would swallow the exception."""
-    def leave(*_: object) -> None:
+    def exit_at_once(*_: object) -> None:
         os.write(2, b"safevar-sumo: interrupted\n")
         os._exit(INTERRUPTED)
 
     in_main_thread = threading.current_thread() is threading.main_thread()
-    before = signal.signal(signal.SIGINT, leave) if in_main_thread else None
+    previous_handler = signal.signal(signal.SIGINT, exit_at_once) if in_main_thread else None
     try:
         yield
     finally:
         if in_main_thread:
-            signal.signal(signal.SIGINT, signal.default_int_handler if before is None else before)
+            signal.signal(signal.SIGINT, signal.default_int_handler if previous_handler is None else previous_handler)
 
 
 def _ensure_standard_streams() -> None:
-    """Open standard streams that the caller has closed, so that no file gets their numbers."""
-    while (handle := os.open(os.devnull, os.O_RDWR)) <= 2:
-        os.set_inheritable(handle, True)
-    os.close(handle)
+    """Open standard streams that the caller has closed, so that no file takes their descriptors."""
+    while (descriptor := os.open(os.devnull, os.O_RDWR)) <= 2:
+        os.set_inheritable(descriptor, True)
+    os.close(descriptor)
     sys.stdout = sys.stdout or open(os.devnull, "w")  # noqa: SIM115
     sys.stderr = sys.stderr or open(os.devnull, "w")  # noqa: SIM115
 
 
-def _drop_output() -> None:
-    """Discard output after the reader of a pipe has gone; the interpreter must not flush it again."""
+def _discard_output() -> None:
+    """Discard output after the reader of a pipe has closed it, so that the interpreter does not flush it again."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _fail(message: str, code: int) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # another Ctrl-C must change neither exit code nor message
     click.echo(f"safevar-sumo: {message}", err=True)
-    _leave(code)
+    _exit_program(code)
 
 
-def _leave(code: int) -> NoReturn:
-    """End the program even if user code has left threads running. Threads of executors end after their task, for which Python waits."""
-    running = [thread.name for thread in threading.enumerate()
+def _exit_program(code: int) -> NoReturn:
+    """End the program even while threads of user code run. Python waits for the tasks of executors, then their threads end."""
+    thread_names = [thread.name for thread in threading.enumerate()
                if thread is not threading.current_thread() and not thread.daemon and thread not in _threads_queues]
-    if running:
-        click.echo(f"note: threads still running, ended now: {', '.join(running)}", err=True)
+    if thread_names:
+        click.echo(f"note: threads still running, ended now: {', '.join(thread_names)}", err=True)
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(code)
     sys.exit(code)
 
 
-def print_remarks(study: Study, others: Iterable[str] = ()) -> None:
+def print_remarks(study: Study, further_remarks: Iterable[str] = ()) -> None:
     """Print the remarks on a study, such as a key that has no effect, to standard error."""
-    for remark in (*study.origin.remarks, *others):
+    for remark in (*study.origin.remarks, *further_remarks):
         click.echo(f"note: {remark}", err=True)

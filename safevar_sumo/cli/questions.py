@@ -20,10 +20,10 @@ from safevar_sumo.cli.arguments import PICTURES, check_output
 from safevar_sumo.cli.program import commands
 from safevar_sumo.cli.target import (
     CommandFunction,
+    as_it_is_now_option,
     flags_of,
     jobs_option,
     json_option,
-    now_option,
     point_option,
     results_or_study,
     study_at_point,
@@ -33,12 +33,13 @@ from safevar_sumo.results import make_directory, write_whole
 from safevar_sumo.terminal import stages
 
 
-def question(options: type[Options], metavar: str, *extra: Callable[[CommandFunction], CommandFunction]
+def question(options: type[Options], metavar: str, *more: Callable[[CommandFunction], CommandFunction]
              ) -> Callable[[CommandFunction], click.Command]:
-    """Decorator for the command of a question: flags of its options, flags that all questions share, and `extra` decorators."""
+    """Decorator of a question's command: adds flags for its options, flags that all questions share, and `more` decorators."""
     def add(command: CommandFunction) -> click.Command:
         decorators: list[Callable[[CommandFunction], CommandFunction]] = [
-            click.argument("place", metavar=metavar), flags_of(options), point_option, now_option, jobs_option, json_option, *extra]
+            click.argument("source", metavar=metavar), flags_of(options), point_option, as_it_is_now_option, jobs_option, json_option,
+            *more]
         for decorator in reversed(decorators):
             command = decorator(command)
         return commands.command(name=options.question)(command)
@@ -46,8 +47,8 @@ def question(options: type[Options], metavar: str, *extra: Callable[[CommandFunc
     return add
 
 
-def _answer(compute: Callable[..., Any], subject: Any, options: Options, jobs: int | None) -> Any:
-    """Compute the result while a bar on the terminal shows the progress."""
+def _compute(compute: Callable[..., Any], subject: Any, options: Options, jobs: int | None) -> Any:
+    """Compute a result; a bar on the terminal shows the progress."""
     with stages(Console(stderr=True)) as progress:
         return compute(subject, options, jobs=jobs, progress=progress)
 
@@ -62,20 +63,20 @@ def _plot_option(help_text: str) -> Callable[[CommandFunction], CommandFunction]
 
 @question(ExplainOptions, "DIR|STUDY", click.option("--full", is_flag=True, help="Print every explanation in full, not only the answer."),
           click.option("--out", type=click.Path(path_type=Path), metavar="DIR", help="Write causes.json, causes.csv and a figure there."))
-def explain(place: str, full: bool, point: str | None, jobs: int | None, as_json: bool, out: Path | None, **values: Any) -> None:
+def explain(source: str, full: bool, point: str | None, jobs: int | None, as_json: bool, out: Path | None, **values: Any) -> None:
     """Explain failures of results in DIR, or across the domain of STUDY: which changes cause them, how small a change is enough, why."""
     from safevar_sumo.analysis.explain.compute import explain_failures
     from safevar_sumo.analysis.explain.render import necessity_figure, print_explained
     from safevar_sumo.analysis.figures import save
 
-    source = results_or_study(place, point)
+    subject = results_or_study(source, point)
     if out is not None:
         make_directory(out)
-    result = _answer(explain_failures, source, ExplainOptions(**values), jobs)
+    result = _compute(explain_failures, subject, ExplainOptions(**values), jobs)
     if as_json:
         click.echo(_json(result))
     else:
-        print_explained(Console(), place, result, point or "", full=full)
+        print_explained(Console(), source, result, point or "", full=full)
     if out is not None:
         write_whole(out / "causes.json", _json(result) + "\n")
         write_whole(out / "causes.csv", result.to_frame().to_csv(index=False, lineterminator="\n"))
@@ -83,14 +84,14 @@ def explain(place: str, full: bool, point: str | None, jobs: int | None, as_json
         click.echo(f"Causes: {out}", err=as_json)
 
 
-@question(OpinionOptions, "DIR", click.argument("more", nargs=-1, metavar=""))
-def opinion(place: str, more: tuple[str, ...], point: str | None, jobs: int | None, as_json: bool, **values: Any) -> None:
+@question(OpinionOptions, "DIR", click.argument("handles", nargs=-1, metavar=""))
+def opinion(source: str, handles: tuple[str, ...], point: str | None, jobs: int | None, as_json: bool, **values: Any) -> None:
     """Have another vehicle model confirm or contradict the minimal causes of failures of results in DIR."""
     from safevar_sumo.analysis.opinion.compute import ask_for_opinions
     from safevar_sumo.analysis.opinion.render import print_opinions
 
-    options = OpinionOptions(**{**values, "solutions": (*values["solutions"], *more)})
-    result = _answer(ask_for_opinions, results_or_study(place, point, results_only=True), options, jobs)
+    options = OpinionOptions(**{**values, "solutions": (*values["solutions"], *handles)})
+    result = _compute(ask_for_opinions, results_or_study(source, point, results_only=True), options, jobs)
     if not as_json:
         print_opinions(Console(), result)
         return
@@ -101,43 +102,43 @@ def opinion(place: str, more: tuple[str, ...], point: str | None, jobs: int | No
 
 @question(ToleranceOptions, "STUDY|DIR",
           _plot_option("Draw the profiles to this file: png, pdf or svg; with --pairs, the worst pairs to a second file beside it."))
-def tolerance(place: str, point: str | None, jobs: int | None, as_json: bool, plot: Path | None, **values: Any) -> None:
+def tolerance(source: str, point: str | None, jobs: int | None, as_json: bool, plot: Path | None, **values: Any) -> None:
     """Find how far each characteristic of STUDY may go: alone, in pairs, and all together."""
     from safevar_sumo.analysis.figures import save
     from safevar_sumo.analysis.tolerance.compute import find_tolerances
     from safevar_sumo.analysis.tolerance.render import pairs_figure, print_tolerance, profiles_figure
 
-    options, study = ToleranceOptions(**values), study_at_point(place, point)
-    second = None if plot is None else plot.with_stem(f"{plot.stem}-pairs")
-    for path in (plot, second if options.pairs else None):
+    options, study = ToleranceOptions(**values), study_at_point(source, point)
+    pairs_plot = None if plot is None else plot.with_stem(f"{plot.stem}-pairs")
+    for path in (plot, pairs_plot if options.pairs else None):
         if path is not None:
             check_output(path, "--plot", PICTURES)
-    result = _answer(find_tolerances, study, options, jobs)
+    result = _compute(find_tolerances, study, options, jobs)
     if as_json:
         click.echo(_json(result))
     else:
         print_tolerance(Console(), result)
-    if plot is not None and second is not None:
+    if plot is not None and pairs_plot is not None:
         save(profiles_figure(result), plot, "--plot")
         if result.pairs:
-            save(pairs_figure(result), second, "--plot")
+            save(pairs_figure(result), pairs_plot, "--plot")
 
 
 @question(RiskOptions, "STUDY|DIR", _plot_option("Draw the sensitivity indices to this file: png, pdf or svg."))
-def risk(place: str, point: str | None, jobs: int | None, as_json: bool, plot: Path | None, **values: Any) -> None:
+def risk(source: str, point: str | None, jobs: int | None, as_json: bool, plot: Path | None, **values: Any) -> None:
     """Estimate how likely an unsafe outcome is if vehicles vary as [variation] of STUDY says, and which characteristics decide it."""
     from safevar_sumo.analysis.figures import save
     from safevar_sumo.analysis.risk.compute import estimate_risk
     from safevar_sumo.analysis.risk.render import print_risk, sensitivity_figure
 
-    options, study = RiskOptions(**values), study_at_point(place, point)
+    options, study = RiskOptions(**values), study_at_point(source, point)
     if plot is not None:
         check_output(plot, "--plot", PICTURES)
         if study.correlations:
             raise InputError("--plot", "sensitivity indices of correlated characteristics are not defined", "a study without correlations")
         if options.is_for_rare:
             raise InputError("--plot", "a method for rare failures computes no sensitivity indices to draw", "--method auto")
-    result = _answer(estimate_risk, study, options, jobs)
+    result = _compute(estimate_risk, study, options, jobs)
     if study.correlations:
         click.echo("note: no sensitivity indices: they are not defined for correlated characteristics", err=True)
     if result.errors:
@@ -151,11 +152,11 @@ def risk(place: str, point: str | None, jobs: int | None, as_json: bool, plot: P
 
 
 @question(RulesOptions, "STUDY|DIR")
-def rules(place: str, point: str | None, jobs: int | None, as_json: bool, **values: Any) -> None:
+def rules(source: str, point: str | None, jobs: int | None, as_json: bool, **values: Any) -> None:
     """Find rules, in physical units, that describe the unsafe settings of STUDY, from evenly spread settings instead of a search."""
     from safevar_sumo.analysis.rules.compute import find_rules, print_rules
 
-    result = _answer(find_rules, study_at_point(place, point), RulesOptions(**values), jobs)
+    result = _compute(find_rules, study_at_point(source, point), RulesOptions(**values), jobs)
     if not as_json:
         print_rules(Console(), result)
         return

@@ -1,4 +1,4 @@
-"""The command rating: Euro NCAP points of a vehicle and of one variant, as tables, JSON, a picture and the official spreadsheet."""
+"""The command `rating`: Euro NCAP points of a vehicle and of a variant, as tables, JSON, a picture and the official spreadsheet."""
 
 from __future__ import annotations
 
@@ -12,45 +12,45 @@ from rich.console import Console
 from safevar_sumo.analysis.rating import RatingOptions
 from safevar_sumo.cli.arguments import PICTURES, check_output, read_changes
 from safevar_sumo.cli.program import commands
-from safevar_sumo.cli.target import flags_of, jobs_option, json_option, now_option, results_or_study
+from safevar_sumo.cli.target import as_it_is_now_option, flags_of, jobs_option, json_option, results_or_study
 from safevar_sumo.errors import InputError
 from safevar_sumo.study import Study
 from safevar_sumo.terminal import stages
 from safevar_sumo.vehicles import CharacteristicSet
 
-SHEET = (".xlsx",)
+SPREADSHEETS = (".xlsx",)
 FILE = click.Path(path_type=Path)
 
 
 @commands.command(name="rating")
-@click.argument("place", metavar="STUDY|DIR")
+@click.argument("source", metavar="STUDY|DIR")
 @flags_of(RatingOptions)
 @click.option("--matrix", is_flag=True, help="Print every matrix: speed by impact location, with the colours of the cells.")
 @click.option("--plot", type=FILE, metavar="FILE", help="Draw the matrices to this file: png, pdf or svg.")
-@click.option("--xlsx", type=FILE, metavar="FILE", help="Write the official spreadsheet with the predictions of the variant, else of the "
-                                                       "original, to this file; needs --template or --preprocessed.")
+@click.option("--xlsx", type=FILE, metavar="FILE", help="Write the official spreadsheet with the predictions of the variant, if any, else "
+                                                       "of the original, to this file; needs --template or --preprocessed.")
 @click.option("--template", type=FILE, metavar="FILE", help="Output of the official calculator's generate-template: ca_template.xlsx.")
 @click.option("--preprocessed", type=FILE, metavar="FILE", help="Output of the calculator's preprocess: its verification sheets are "
                                                                "filled with simulated results, in --xlsx, or with --force in this file.")
 @click.option("--force", is_flag=True, help="Overwrite existing files.")
-@now_option
+@as_it_is_now_option
 @jobs_option
 @json_option
-def rating(place: str, changes: tuple[str, ...], solution: str | None, matrix: bool, plot: Path | None, xlsx: Path | None,
+def rating(source: str, changes: tuple[str, ...], solution: str | None, matrix: bool, plot: Path | None, xlsx: Path | None,
            template: Path | None, preprocessed: Path | None, force: bool, jobs: int | None, as_json: bool) -> None:
-    """Rate the vehicle of STUDY as Euro NCAP does in 2026, and one variant beside it: points, colours, robustness layers."""
+    """Rate the vehicle of STUDY as Euro NCAP does in 2026, and one variant: points, colours, robustness layers."""
     from safevar_sumo.analysis.figures import save
     from safevar_sumo.analysis.rating.compute import rate_variant, remarks
     from safevar_sumo.analysis.rating.render import matrices_figure, print_matrices, print_rating
 
-    subject = results_or_study(place)
+    subject = results_or_study(source)
     options = RatingOptions(changes=_changes(subject if isinstance(subject, Study) else subject.study, changes), solution=solution)
     if force and xlsx is None and preprocessed is None and plot is None:
         raise InputError("--force", "there is no file to overwrite", "together with --xlsx, --preprocessed or --plot")
     if plot is not None:
         check_output(plot, "--plot", PICTURES)
         _refuse_existing(plot, "--plot", force)
-    book = _workbook(xlsx, template, preprocessed, force)
+    spreadsheet = _open_spreadsheet(xlsx, template, preprocessed, force)
     with stages(Console(stderr=True)) as progress:
         result = rate_variant(subject, options, jobs=jobs, progress=progress)
     for remark in remarks(result):
@@ -63,14 +63,14 @@ def rating(place: str, changes: tuple[str, ...], solution: str | None, matrix: b
         print_matrices(Console(), result)
     if plot is not None:
         save(matrices_figure(result), plot, "--plot")
-    if book is not None:
-        rated = result.variant or result.original
-        book.fill(rated)
-        click.echo(f"Spreadsheet of {rated.name}: {book.output}", err=True)
+    if spreadsheet is not None:
+        vehicle = result.variant or result.original
+        spreadsheet.fill(vehicle)
+        click.echo(f"Spreadsheet of {vehicle.name}: {spreadsheet.output}", err=True)
 
 
 def _changes(study: Study, changes: tuple[str, ...]) -> dict[str, float]:
-    """The value of each changed characteristic."""
+    """Parse --set; returns the value of each changed characteristic."""
     values = read_changes(changes, CharacteristicSet.of(study.vehicle.characteristics), False, single=True)
     return {name: value for name, (value,) in values.items()}
 
@@ -80,12 +80,12 @@ def _refuse_existing(path: Path, flag: str, force: bool) -> None:
         raise InputError(flag, f"{path} exists", "another file, or --force")
 
 
-def _workbook(xlsx: Path | None, template: Path | None, preprocessed: Path | None, force: bool) -> Any:
+def _open_spreadsheet(xlsx: Path | None, template: Path | None, preprocessed: Path | None, force: bool) -> Any:
     """The spreadsheet to fill, read and checked before any simulation; None without --xlsx and --preprocessed."""
     if template is not None and preprocessed is not None:
-        raise InputError("--template", "--preprocessed is given too", "one of them: --preprocessed holds the template's sheets already")
-    source = template if template is not None else preprocessed
-    if source is None:
+        raise InputError("--template", "--preprocessed is given too", "one of them: --preprocessed already holds the template's sheets")
+    sheets = template if template is not None else preprocessed
+    if sheets is None:
         if xlsx is not None:
             raise InputError("--xlsx", f"{xlsx} needs the official template; to make it: pip install 'euroncap-rating-2026', then "
                                        "euroncap_rating_2026 crash_avoidance generate-template",
@@ -93,12 +93,12 @@ def _workbook(xlsx: Path | None, template: Path | None, preprocessed: Path | Non
         return None
     if template is not None and xlsx is None:
         raise InputError("--template", "there is no --xlsx to write to", "--xlsx FILE")
-    output = xlsx if xlsx is not None else source
+    output = xlsx if xlsx is not None else sheets
     flag = "--xlsx" if xlsx is not None else "--preprocessed"
     _refuse_existing(output, flag, force)
-    check_output(output, flag, SHEET)
+    check_output(output, flag, SPREADSHEETS)
     try:
         from safevar_sumo.analysis.rating.workbook import Preprocessed, Template
     except ModuleNotFoundError:
         raise InputError(flag, "openpyxl is not installed", "pip install 'safevar_sumo[rating]'") from None
-    return (Preprocessed if template is None else Template)(source, output)
+    return (Preprocessed if template is None else Template)(sheets, output)

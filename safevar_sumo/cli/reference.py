@@ -1,4 +1,4 @@
-"""Commands that compare studies with published data: validate, calibrate, import, replicate; and the text that they print."""
+"""Commands that compare studies with published data (validate, calibrate, import, replicate), and the text that they print."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ import numpy as np
 from rich.console import Console
 
 from safevar_sumo.analysis.research_questions.case import Case, load_cases
-from safevar_sumo.cli.arguments import PICTURES, check_output, complete_study, refuse_inputs
-from safevar_sumo.cli.program import OneOfEach, commands, print_remarks
+from safevar_sumo.cli.arguments import PICTURES, check_output, complete_study, refuse_overwriting
+from safevar_sumo.cli.program import StrictCommand, commands, print_remarks
 from safevar_sumo.cli.target import jobs_option
 from safevar_sumo.errors import InputError, SimulationError
 from safevar_sumo.metrics import METRICS
@@ -58,41 +58,41 @@ from safevar_sumo.workers.local import available_cores, local_pool
 @click.option("--plot", type=click.Path(path_type=Path), metavar="FILE.png", help="Plot simulated against reference values.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 @click.option("--totals", type=click.Path(path_type=Path), metavar="FILE.toml",
-              help="Also save rank correlations, errors and counts of collisions there, without any row of the data.")
-@click.option("--effects", "with_effects", is_flag=True, help="Compare the characteristics' linear effects with the reference's.")
+              help="Also save rank correlations, errors and counts of collisions to this file, without any row of the data.")
+@click.option("--effects", "with_effects", is_flag=True, help="Compare the characteristics' linear effects here and in the reference.")
 @click.option("--spread", "with_spread", is_flag=True, help="Count the published values within the spread of the model and of repeats.")
 def validate(study: str, reference: Path, jobs: int | None, plot: Path | None, as_json: bool, totals: Path | None,
              with_effects: bool, with_spread: bool) -> None:
     """Compare STUDY with settings and metrics in the published package's CSV format."""
-    chosen = load_study(study)
-    print_remarks(chosen)
-    system = assemble(chosen, study)
+    loaded_study = load_study(study)
+    print_remarks(loaded_study)
+    system = assemble(loaded_study, study)
     if plot is not None:
         check_output(plot, "--plot", PICTURES)
     if totals is not None:
         check_output(totals, "--totals", (".toml",))
-    data = _read(reference, system.characteristics)
+    data = _read_rows(reference, system.characteristics)
     settings = np.concatenate([system.characteristics.original[np.newaxis], data.settings])
-    with (local_pool(jobs or available_cores(), chosen.search.time_limit) as pool,
-          counting_bar(Console(stderr=True), "settings", len(np.unique(settings, axis=0))) as done):
-        evaluations = evaluate_all(chosen, settings, pool, done)
-    data, here = _simulated_rows(reference, data, evaluations.take(np.arange(1, len(settings))))
+    with (local_pool(jobs or available_cores(), loaded_study.search.time_limit) as pool,
+          counting_bar(Console(stderr=True), "settings", len(np.unique(settings, axis=0))) as count_settings):
+        evaluations = evaluate_all(loaded_study, settings, pool, count_settings)
+    data, rows = _simulated_rows(reference, data, evaluations.take(np.arange(1, len(settings))))
     if not evaluations.valid[0]:
         raise SimulationError(f"study {study!r} cannot be simulated with the original vehicle")
-    result = agreement(data, here, chosen, evaluations.take([0]))
+    result = agreement(data, rows, loaded_study, evaluations.take([0]))
     if plot is not None:
-        plot_agreement(plot, f"{chosen.title}\nagainst {reference.name}", system.characteristics, data, here,
-                       chosen.repeatability.get(SAFETY_DEGREE))
+        plot_agreement(plot, f"{loaded_study.title}\nagainst {reference.name}", system.characteristics, data, rows,
+                       loaded_study.repeatability.get(SAFETY_DEGREE))
     if totals is not None:
-        keep_totals(totals, chosen, reference.name, result)
-    effects = effects_of(data, here, system.characteristics) if with_effects else []
-    coverage = covered_by_spread(data, chosen) if with_spread else None
+        keep_totals(totals, loaded_study, reference.name, result)
+    effects = effects_of(data, rows, system.characteristics) if with_effects else []
+    coverage = covered_by_spread(data, loaded_study) if with_spread else None
     if as_json:
-        rows = {effect.name: {"reference": effect.reference, "here": effect.here, "agrees": effect.agrees} for effect in effects}
-        extra = {**({"effects": rows} if with_effects else {}), **({"spread": coverage.to_dict()} if coverage is not None else {})}
-        click.echo(json.dumps({**result.to_dict(), **extra}, indent=2, allow_nan=False))
+        by_name = {effect.name: {"reference": effect.reference, "here": effect.here, "agrees": effect.agrees} for effect in effects}
+        extras = {**({"effects": by_name} if with_effects else {}), **({"spread": coverage.to_dict()} if coverage is not None else {})}
+        click.echo(json.dumps({**result.to_dict(), **extras}, indent=2, allow_nan=False))
     else:
-        print_agreement(Console(), chosen, result)
+        print_agreement(Console(), loaded_study, result)
         if with_effects:
             print_effects(Console(), effects)
         if coverage is not None:
@@ -101,34 +101,33 @@ def validate(study: str, reference: Path, jobs: int | None, plot: Path | None, a
 
 @commands.command(name="calibrate")
 @click.argument("study", shell_complete=complete_study)
-@click.argument("others", nargs=-1, metavar="[STUDY]... [[STUDY=]REFERENCE.csv]...")
+@click.argument("words", nargs=-1, metavar="[STUDY]... [[STUDY=]REFERENCE.csv]...")
 @click.option("--trials", type=click.IntRange(min=1), help="Number of parameter sets to try.  [default: the first study's]")
 @click.option("--seed", type=click.IntRange(min=0, max=2**31), help="Seed of the search.  [default: the first study's]")
-@click.option("--starts", type=click.IntRange(min=0, max=1000), help="Additional random starts.  [default: the first study's]")
-@click.option("--from-scratch", is_flag=True, help="Start only from random points, without the studies' own values.")
+@click.option("--starts", type=click.IntRange(min=0, max=1000), help="Number of additional random starts.  [default: the first study's]")
+@click.option("--from-scratch", is_flag=True, help="Start only from random points, not from the values in the studies.")
 @jobs_option
 @click.option("--plot", type=click.Path(path_type=Path), metavar="FILE.png", help="Draw the loss over every parameter.")
 @click.option("--out", type=click.Path(path_type=Path), metavar="FILE.toml",
               help="Study file to write; for several studies, the directory for their files.  [default: STUDY-calibrated.toml]")
-def calibrate_command(study: str, others: tuple[str, ...], trials: int | None, seed: int | None, starts: int | None,
+def calibrate_command(study: str, words: tuple[str, ...], trials: int | None, seed: int | None, starts: int | None,
                       from_scratch: bool, jobs: int | None, plot: Path | None, out: Path | None) -> None:
-    """Fit the parameters that STUDY declares under [calibration] to published values and to rows of reference files, as [fit] says.
+    """Fit the parameters under [calibration] of STUDY to published values and to rows of reference files, as [fit] says.
 
     Several studies are fitted together: they share each parameter to which they give the same value, unless [calibration] marks it as
-    a study's own. STUDY=FILE.csv assigns a reference file to a study; otherwise the file's name must begin with the study's.
+    a study's own. STUDY=FILE.csv assigns a reference file to a study; otherwise the file's name must begin with the study's name.
     """
-    names = [study, *(word for word in others if _is_study(word))]
-    files = [word for word in others if not _is_study(word)]
+    names = [study, *(word for word in words if _is_study(word))]
+    files = [word for word in words if not _is_study(word)]
     fit_options = {name: value for name, value in (("trials", trials), ("seed", seed), ("starts", starts)) if value is not None}
-    loaded = [load_study(name) for name in names]
-    chosen = [msgspec.structs.replace(one, fit=msgspec.structs.replace(one.fit, **fit_options)) for one in loaded]
-    systems = [assemble(one, name) for one, name in zip(chosen, names, strict=True)]
-    if len({one.name for one in chosen}) < len(chosen):
-        raise InputError("STUDY", f"two studies are called {chosen[0].name!r}", "studies of different names")
-    targets = _targets(chosen, out)
+    studies = [msgspec.structs.replace(item, fit=msgspec.structs.replace(item.fit, **fit_options)) for item in map(load_study, names)]
+    systems = [assemble(item, name) for item, name in zip(studies, names, strict=True)]
+    if len({item.name for item in studies}) < len(studies):
+        raise InputError("STUDY", f"two studies are called {studies[0].name!r}", "studies of different names")
+    targets = _targets(studies, out)
     if plot is not None:
         check_output(plot, "--plot", PICTURES)
-    owners = [_owner(file, chosen) for file in files]
+    owners = [_owner(file, studies) for file in files]
     for source in (*map(Path, names), *(path for _, path in owners)):
         for target in targets:
             if target.exists() and source.exists() and target.samefile(source):
@@ -137,36 +136,37 @@ def calibrate_command(study: str, others: tuple[str, ...], trials: int | None, s
         check_writable(target)
     if len({path.name for _, path in owners}) < len(owners):
         raise InputError("REFERENCE.csv", "two files have the same name", "files of different names")
-    data = [{path.name: _read(path, system.characteristics) for owner, path in owners if owner == k} for k, system in enumerate(systems)]
-    done, lowest, best = 0, np.inf, tuple(chosen)
-    count = chosen[0].fit.trials
+    data = [{path.name: _read_rows(path, system.characteristics) for owner, path in owners if owner == k}
+            for k, system in enumerate(systems)]
+    trials_done, least_loss, best_studies = 0, np.inf, tuple(studies)
+    max_trials = studies[0].fit.trials
     try:
-        with (local_pool(jobs or available_cores(), max(one.search.time_limit for one in chosen)) as pool,
-              stages(Console(stderr=True)) as show):
-            show("trials", 0, count)
+        with (local_pool(jobs or available_cores(), max(item.search.time_limit for item in studies)) as pool,
+              stages(Console(stderr=True)) as show_progress):
+            show_progress("trials", 0, max_trials)
 
-            def after_trial(loss: float, so_far: Study | tuple[Study, ...]) -> None:
-                nonlocal done, lowest, best
-                done, lowest, best = done + 1, loss, so_far if isinstance(so_far, tuple) else (so_far,)
-                show(f"trials, lowest loss {loss:.4f}", done, count)
+            def after_trial(loss: float, best: Study | tuple[Study, ...]) -> None:
+                nonlocal trials_done, least_loss, best_studies
+                trials_done, least_loss, best_studies = trials_done + 1, loss, best if isinstance(best, tuple) else (best,)
+                show_progress(f"trials, lowest loss {loss:.4f}", trials_done, max_trials)
 
-            if len(chosen) == 1:
-                calibrations = [calibrate(chosen[0], data[0], pool, after_trial, from_scratch=from_scratch)]
+            if len(studies) == 1:
+                calibrations = [calibrate(studies[0], data[0], pool, after_trial, from_scratch=from_scratch)]
             else:
-                subjects = [FitSubject(one, references) for one, references in zip(chosen, data, strict=True)]
+                subjects = [FitSubject(item, references) for item, references in zip(studies, data, strict=True)]
                 calibrations = calibrate_together(subjects, pool, after_trial, from_scratch=from_scratch)
     except KeyboardInterrupt:
-        if done:
-            comment = f"Best of {done} of {count} trials, then interrupted (seed {chosen[0].fit.seed}). Loss {lowest:.4f}."
-            for one, fitted, target in zip(chosen, best, targets, strict=True):
-                write_study(target, fitted_as(one, fitted), comment)
-            click.echo(f"interrupted: the best of {done} trials is in {', '.join(map(str, targets))}", err=True)
+        if trials_done:
+            comment = f"Best of {trials_done} of {max_trials} trials, then interrupted (seed {studies[0].fit.seed}). Loss {least_loss:.4f}."
+            for item, best_study, target in zip(studies, best_studies, targets, strict=True):
+                write_study(target, fitted_as(item, best_study), comment)
+            click.echo(f"interrupted: the best of {trials_done} trials is in {', '.join(map(str, targets))}", err=True)
         raise
     if plot is not None and calibrations[0].profiles is not None:
-        plot_profiles(plot, calibrations[0].profiles, chosen)
-    for one, calibration, references, target in zip(chosen, calibrations, data, targets, strict=True):
-        print_calibration(Console(), one, calibration)
-        write_study(target, fitted_as(one, calibration.study), calibration.comment(one, references, from_scratch=from_scratch))
+        plot_profiles(plot, calibrations[0].profiles, studies)
+    for item, calibration, references, target in zip(studies, calibrations, data, targets, strict=True):
+        print_calibration(Console(), item, calibration)
+        write_study(target, fitted_as(item, calibration.study), calibration.comment(item, references, from_scratch=from_scratch))
         Console().print(f"Study file: {target}", soft_wrap=True)
 
 
@@ -187,17 +187,17 @@ def _targets(studies: Sequence[Study], out: Path | None) -> list[Path]:
 def _owner(word: str, studies: Sequence[Study]) -> tuple[int, Path]:
     """Index of the study that a reference file belongs to, and the file's path."""
     names = [study.name for study in studies]
-    name, _, place = word.partition("=")
-    if place and name in names and not Path(word).exists():
-        return names.index(name), Path(place)
+    name, _, file = word.partition("=")
+    if file and name in names and not Path(word).exists():
+        return names.index(name), Path(file)
     path = Path(word)
     if len(names) == 1:
         return 0, path
-    matching = [name for name in names if path.name.startswith(name)]
-    if not matching:
-        legal = "STUDY=FILE.csv, or a file name that begins with the study's name"
-        raise InputError("REFERENCE.csv", f"{word} may belong to any of {', '.join(names)}", legal)
-    return names.index(max(matching, key=len)), path
+    candidates = [name for name in names if path.name.startswith(name)]
+    if not candidates:
+        expected = "STUDY=FILE.csv, or a file name that begins with the study's name"
+        raise InputError("REFERENCE.csv", f"{word} may belong to any of {', '.join(names)}", expected)
+    return names.index(max(candidates, key=len)), path
 
 
 @commands.command(name="import")
@@ -210,42 +210,42 @@ def _owner(word: str, studies: Sequence[Study]) -> tuple[int, Path]:
               help="The original vehicle's metrics.  [default: those published for STUDY]")
 def import_command(study: str, out: Path, original: str | None, **paths: Path | None) -> None:
     """Import published CSV solutions of STUDY as a results directory, or add another algorithm's solutions to it."""
-    chosen = load_study(study)
+    loaded_study = load_study(study)
     files = {algorithm: path for algorithm, path in paths.items() if path is not None}
     if not files:
         raise InputError("import", "no file is given", "at least one of --nsga2, --rs, --safe-fuzzer")
-    adds = original is None and (out / MANIFEST).exists()
-    metrics = None if adds else original_metrics(original, chosen.published)
-    characteristics = CharacteristicSet.of(chosen.vehicle.characteristics)
+    adds_to_results = original is None and (out / MANIFEST).exists()
+    metrics = None if adds_to_results else original_metrics(original, loaded_study.published)
+    characteristics = CharacteristicSet.of(loaded_study.vehicle.characteristics)
     solutions = {}
     for algorithm, path in files.items():
-        solutions[algorithm] = evaluations_of(_read(path, characteristics), characteristics)
-    write_imported(out, chosen, solutions, metrics, {algorithm: path.name for algorithm, path in files.items()})
+        solutions[algorithm] = evaluations_of(_read_rows(path, characteristics), characteristics)
+    write_imported(out, loaded_study, solutions, metrics, {algorithm: path.name for algorithm, path in files.items()})
     click.echo(f"Results: {out}, {', '.join(f'{len(rows)} solutions of {name}' for name, rows in solutions.items())}")
 
 
-def _read(path: Path, characteristics: CharacteristicSet) -> ReferenceData:
+def _read_rows(path: Path, characteristics: CharacteristicSet) -> ReferenceData:
     data = read_reference(path, characteristics)
     if data.skipped:
         click.echo(f"warning: {path}: {data.skipped} rows with values outside the domains are left out", err=True)
     return data
 
 
-def _simulated_rows(path: Path, data: ReferenceData, here: Evaluations) -> tuple[ReferenceData, Evaluations]:
-    """The rows that could be simulated."""
-    valid = here.valid
+def _simulated_rows(path: Path, data: ReferenceData, evaluations: Evaluations) -> tuple[ReferenceData, Evaluations]:
+    """The rows of a reference file that could be simulated, and their evaluations."""
+    valid = evaluations.valid
     if not valid.any():
         raise SimulationError(f"{path}: none of its {len(valid)} rows could be simulated")
     if not valid.all():
         click.echo(f"warning: {path}: {np.count_nonzero(~valid)} rows could not be simulated and are left out", err=True)
-    return data.take(valid), here.take(valid)
+    return data.take(valid), evaluations.take(valid)
 
 
-SEVERAL = ("--published", "--reference")
-"""Options whose values are all words up to the next option."""
+MULTIVALUE_FLAGS = ("--published", "--reference")
+"""Flags that take all words up to the next flag as values."""
 
 
-class _TakesSeveral(OneOfEach):
+class _MultivalueCommand(StrictCommand):
     """Reads `--published A B` as `--published A --published B`."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
@@ -253,14 +253,14 @@ class _TakesSeveral(OneOfEach):
         flag = None
         for word in args:
             if word.startswith("-"):
-                flag = word if word in SEVERAL else None
+                flag = word if word in MULTIVALUE_FLAGS else None
                 words += [] if flag else [word]
             else:
                 words += [flag, word] if flag else [word]
         return super().parse_args(ctx, words)
 
 
-@commands.command(cls=_TakesSeveral)
+@commands.command(cls=_MultivalueCommand)
 @click.argument("directories", nargs=-1, required=True, metavar="DIR...")
 @click.option("--published", "published", multiple=True, required=True, metavar="DIR...", help="Imported results (command import).")
 @click.option("--out", type=click.Path(path_type=Path), metavar="FILE.md", help="Write the page to this file.")
@@ -269,7 +269,7 @@ class _TakesSeveral(OneOfEach):
 def replicate(directories: tuple[str, ...], published: tuple[str, ...], out: Path | None, references: tuple[str, ...]) -> None:
     """Compare the results DIR... with published ones: tables side by side, and whether each conclusion holds."""
     if out is not None:
-        refuse_inputs(out, "--out", *directories, *published, *references)
+        refuse_overwriting(out, "--out", *directories, *published, *references)
         check_writable(out)
     for directory in published:
         if Path(directory).resolve() in [Path(other).resolve() for other in directories]:
@@ -284,23 +284,23 @@ def replicate(directories: tuple[str, ...], published: tuple[str, ...], out: Pat
 
 
 def _nearness(cases: Sequence[Case], references: Sequence[str]) -> list[Nearness]:
-    """Compare solutions with the nearest published rows, for the case that each file belongs to."""
+    """Compare the solutions of each case with the nearest rows of its published files."""
     rows: dict[str, list[ReferenceData]] = {}
     for reference in references:
-        name, _, place = reference.rpartition("=")
+        name, _, file = reference.rpartition("=")
         candidates = [case for case in cases if name in ("", case.study.name)]
-        rows_by_case = _rows_by_case(Path(place), candidates) if candidates else {}
+        rows_by_case = _rows_by_case(Path(file), candidates) if candidates else {}
         if len(rows_by_case) != 1:
             relation = "may belong to any of" if rows_by_case else "belongs to none of"
             names = ", ".join(rows_by_case or (case.study.name for case in cases))
             raise InputError("--reference", f"{reference} {relation} {names}", "STUDY=FILE.csv")
         for case, data in rows_by_case.items():
             rows.setdefault(case, []).append(data)
-    return [one for case in cases if case.name in rows for one in nearness(case, rows[case.name])]
+    return [result for case in cases if case.name in rows for result in nearness(case, rows[case.name])]
 
 
 def _rows_by_case(path: Path, cases: Sequence[Case]) -> dict[str, ReferenceData]:
-    """The rows of a file, for every case whose characteristics the file has."""
+    """The rows of a file for each case, by name, if the file has the characteristics of the case."""
     rows: dict[str, ReferenceData] = {}
     for case in cases:
         try:
@@ -316,20 +316,20 @@ def print_agreement(console: Console, study: Study, result: Agreement) -> None:
     table = WholeTable("", right=("Spearman's rho", "mean abs. error", "error / scatter", "bias", "original, reference", "original, here"),
                        title=f"{study.title}: {result.rows} rows")
     for name in result.spearman:
-        head = METRICS[name].heading
+        heading = METRICS[name].heading
         numbers = (result.spearman[name], result.mean_absolute_error[name], result.in_repeats[name], result.bias[name],
                    *result.original[name].values())
-        table.add_row(head, *("-" if number is None else f"{number:.3f}" for number in numbers))
+        table.add_row(heading, *("-" if number is None else f"{number:.3f}" for number in numbers))
     console.print(table)
     collisions = result.collisions
     console.print(f"Collisions: {collisions['reference']} in the reference, {collisions['here']} here, {collisions['both']} in both: "
-                  f"precision {_number(result.precision)}, recall {_number(result.recall)}; their mean speed is "
-                  f"{_number(result.collision_speed['reference'])} m/s in the reference, "
-                  f"{_number(result.collision_speed['here'])} m/s here.")
+                  f"precision {_decimals(result.precision)}, recall {_decimals(result.recall)}; their mean speed is "
+                  f"{_decimals(result.collision_speed['reference'])} m/s in the reference, "
+                  f"{_decimals(result.collision_speed['here'])} m/s here.")
     if result.undecided["within_repeats"] is not None:
         console.print(f"Of {result.undecided['differ']} settings that collide only in the reference or only here, "
-                      f"{result.undecided['within_repeats']} may do either within the scatter of repeats.")
-    bins = ", ".join(f"{part['lowest']:.2f} to {part['highest']:.2f}: {part['bias']:+.2f}" for part in result.by_predicted)
+                      f"{result.undecided['within_repeats']} may collide or not within the scatter of repeats.")
+    bins = ", ".join(f"{entry['lowest']:.2f} to {entry['highest']:.2f}: {entry['bias']:+.2f}" for entry in result.by_predicted)
     console.print(f"Mean error by the safety degree here: {bins}.", markup=False)
 
 
@@ -343,25 +343,26 @@ def print_effects(console: Console, effects: Sequence[Effect]) -> None:
     console.print(table)
 
 
-def _number(value: float | None) -> str:
+def _decimals(value: float | None) -> str:
     return "-" if value is None else f"{value:.2f}"
 
 
 def print_calibration(console: Console, study: Study, result: Calibration) -> None:
-    """Print the fitted values, and how well they agree with the rows used and with the rows held back."""
+    """Print the fitted values, and their agreement with the rows used and with the rows held back."""
     table = WholeTable("parameter", "unit", right=("fitted", "equal fit from", "equal fit to", "lower", "upper"), title=study.title)
     for name, value in result.values.items():
-        row = result.bounds[name]
+        bound = result.bounds[name]
         shared = f" (shared with {', '.join(result.together)})" if name in result.shared else ""
-        table.add_row(name + shared, row.unit, *(f"{number:.5g}" for number in (value, *result.intervals[name], row.lower, row.upper)))
+        numbers = (value, *result.intervals[name], bound.lower, bound.upper)
+        table.add_row(name + shared, bound.unit, *(f"{number:.5g}" for number in numbers))
     console.print(table)
     for name in result.used:
         comparison = WholeTable("", right=("Spearman's rho", "mean abs. error", "bias"), title=f"{name}: rows used / held back")
         agreements = (result.used[name], result.held_back[name])
         for metric in agreements[0].spearman:
-            head = METRICS[metric].heading
-            comparison.add_row(head, *(
-                " / ".join("-" if number is None else f"{number:.3f}" for number in (getattr(one, quantity)[metric] for one in agreements))
+            heading = METRICS[metric].heading
+            comparison.add_row(heading, *(
+                " / ".join("-" if number is None else f"{number:.3f}" for number in (getattr(fit, quantity)[metric] for fit in agreements))
                 for quantity in ("spearman", "mean_absolute_error", "bias")))
         console.print(comparison)
     for name in result.on_a_bound:

@@ -16,12 +16,12 @@ from safevar_sumo.analysis.research_questions.gallery import draw_all
 from safevar_sumo.analysis.research_questions.tables import ENDINGS, FORMATS, FORMATS_WITH_LAYOUT, LAYOUTS_BY_NAME
 from safevar_sumo.cli.arguments import check_output
 from safevar_sumo.cli.program import commands
-from safevar_sumo.cli.target import as_it_is_now, jobs_option, now_option, point_option
+from safevar_sumo.cli.target import as_it_is_now, as_it_is_now_option, jobs_option, point_option
 from safevar_sumo.errors import InputError
 from safevar_sumo.results import make_directory, write_whole
 
-WITHOUT_NOTES = ("csv", "json")
-"""Formats that hold only numbers; notes go to standard error."""
+FORMATS_WITHOUT_NOTES = ("csv", "json")
+"""Formats of tables without notes; notes go to standard error."""
 
 
 @commands.command()
@@ -29,7 +29,7 @@ WITHOUT_NOTES = ("csv", "json")
 @click.option("--rq", "question", type=click.Choice(QUESTIONS), help="Answer only this question.")
 @click.option("--format", "kind", type=click.Choice(list(FORMATS)), default="text", show_default=True, help="Format of the tables.")
 @click.option("--layout", type=click.Choice(list(LAYOUTS_BY_NAME)), default="full", show_default=True,
-              help="Everything, or RQ1, RQ2 and the combinations laid out as in the paper.")
+              help="Everything, or only RQ1, RQ2 and the combinations, laid out as in the paper.")
 @click.option("--out", type=click.Path(path_type=Path), metavar="DIR", help="Write each table to a file in this directory.")
 def tables(directories: tuple[str, ...], question: str | None, kind: str, layout: str, out: Path | None) -> None:
     """Answer the research questions as tables, from the results directories DIR..., one for each case."""
@@ -37,17 +37,18 @@ def tables(directories: tuple[str, ...], question: str | None, kind: str, layout
         raise InputError("--layout", f"{layout!r}, but --format {kind} has no layout", f"--format {', '.join(FORMATS_WITH_LAYOUT)}")
     write = partial(FORMATS_WITH_LAYOUT[kind], layouts=LAYOUTS_BY_NAME[layout]) if kind in FORMATS_WITH_LAYOUT else FORMATS[kind]
     answers = answer(load_cases(directories), question)
-    if kind in WITHOUT_NOTES:
-        _warn(list(dict.fromkeys(note for one in answers for note in one.notes)))
+    if kind in FORMATS_WITHOUT_NOTES:
+        _print_notes(list(dict.fromkeys(note for table in answers for note in table.notes)))
     if out is not None:
         make_directory(out)
-        for one in answers:
-            if not one.frame.empty:
-                write_whole(out / f"{one.name}.{ENDINGS[kind]}", write([one]))
+        for table in answers:
+            if not table.frame.empty:
+                write_whole(out / f"{table.name}.{ENDINGS[kind]}", write([table]))
         click.echo(f"Tables: {out}")
         return
-    shown = [one for one in answers if one.name == question] if question is not None and kind in WITHOUT_NOTES else answers
-    click.echo(write(shown), nl=False)
+    if question is not None and kind in FORMATS_WITHOUT_NOTES:
+        answers = [table for table in answers if table.name == question]
+    click.echo(write(answers), nl=False)
 
 
 @commands.command()
@@ -58,15 +59,15 @@ def figures(directories: tuple[str, ...], out: Path, kind: str) -> None:
     """Draw the figures of the results directories DIR..., one file for each figure and case."""
     cases = load_cases(directories)
     make_directory(out)
-    written, missing = draw_all(cases, out, kind)
-    _warn([*(remark for case in cases for remark in case.remarks), *missing])
-    for path in written:
+    paths, notes = draw_all(cases, out, kind)
+    _print_notes([*(remark for case in cases for remark in case.remarks), *notes])
+    for path in paths:
         click.echo(str(path))
 
 
-def _warn(messages: list[str]) -> None:
-    for message in messages:
-        click.echo(f"note: {message}", err=True)
+def _print_notes(notes: list[str]) -> None:
+    for note in notes:
+        click.echo(f"note: {note}", err=True)
 
 
 @commands.command()
@@ -75,7 +76,7 @@ def _warn(messages: list[str]) -> None:
               help="File to write the page to.")
 @click.option("--only", metavar="SECTION,...", help="Only these sections, separated by commas: tested, verdict, causes, ...")
 @point_option
-@now_option
+@as_it_is_now_option
 @jobs_option
 def report(directories: tuple[str, ...], out: Path, only: str | None, point: str | None, jobs: int | None) -> None:
     """Write one self-contained page about the results directories DIR...: verdict, causes, replays, tables, figures."""

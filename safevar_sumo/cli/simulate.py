@@ -1,4 +1,4 @@
-"""The command simulate: simulates a study once or, in a sweep, many times, and prints the results."""
+"""The command `simulate`, which simulates a study once or, in a sweep, many times, and prints the results."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from safevar_sumo.analysis.words import question_command
 from safevar_sumo.api.simulation import Simulation, evaluate_settings, simulate_with_original
 from safevar_sumo.cli.arguments import (
     PICTURES,
-    Within,
+    NumberRange,
     check_output,
     complete_changes,
     complete_study,
     read_changes,
-    refuse_inputs,
+    refuse_overwriting,
     settings_of,
 )
 from safevar_sumo.cli.program import commands
-from safevar_sumo.cli.target import CommandTarget, now_option, replay_options, target_of
+from safevar_sumo.cli.target import CommandTarget, as_it_is_now_option, replay_options, target_of
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import KMH_PER_MS, Evaluations, FloatArray, Outcome
@@ -52,82 +52,83 @@ FILE = click.Path(path_type=Path)
 @click.option("--plot", type=FILE, metavar="FILE", help="Draw the simulation beside the original vehicle's to this file: png, pdf or svg.")
 @click.option("--animate", type=FILE, metavar="FILE", help="Animate both simulations, seen from above, in this file: gif, mp4 or html.")
 @click.option("--gui", is_flag=True, help="Show both simulations in sumo-gui, each on its own road.")
-@click.option("--slower", type=Within(0.01, 1000), default=1.0, show_default=True, metavar="TIMES",
+@click.option("--slower", type=NumberRange(0.01, 1000), default=1.0, show_default=True, metavar="TIMES",
               help="How many times slower than real time --gui plays.")
-@now_option
+@as_it_is_now_option
 @click.option("--point", metavar="NAME", help="Only this point of the study's matrix.")
 @click.option("--spread", is_flag=True, help="Add the vehicle model's own uncertainty: other parameters that fit published data as well.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 def simulate_command(study: str, solution: str | None, choice: str | None, changes: tuple[str, ...], no_filter: bool, beyond: bool,
-                     trace: Path | None, point: str | None, spread: bool, as_json: bool, **replay: Any) -> None:
+                     trace: Path | None, point: str | None, spread: bool, as_json: bool, **replay_outputs: Any) -> None:
     """Simulate STUDY once, or a solution of the results directory DIR with the study as recorded there."""
-    target, replays = target_of(study, solution, choice), Replays(**replay)
+    target, replays = target_of(study, solution, choice), Replays(**replay_outputs)
     system = assemble(target.study, target.source)
     if point is not None:
         system = named_point(system, point, "--point")
     values_by_name = read_changes(changes, system.characteristics, beyond)
     base = system.characteristics.original if target.setting is None else target.setting
-    requested = settings_of(values_by_name, base, system.characteristics)
+    requested_settings = settings_of(values_by_name, base, system.characteristics)
     if not beyond and changes:
-        system.check_feasible(requested, "--set", filtered=not no_filter, switch="--beyond")
+        system.check_feasible(requested_settings, "--set", filtered=not no_filter, switch="--beyond")
     _check_outputs(study, trace, replays)
     if any(len(values) > 1 for values in values_by_name.values()):
-        if trace is not None or replays.requested or spread:
-            legal = "one value for each with --trace, --plot, --animate, --gui or --spread"
-            raise InputError("--set", f"{' '.join(changes)} is a sweep", legal)
-        _sweep(target, system, requested, tuple(values_by_name), not no_filter, as_json)
+        if trace is not None or replays.are_requested or spread:
+            expected = "one value for each with --trace, --plot, --animate, --gui or --spread"
+            raise InputError("--set", f"{' '.join(changes)} is a sweep", expected)
+        _simulate_sweep(target, system, requested_settings, tuple(values_by_name), not no_filter, as_json)
         return
     parameter_sets = studies_of_sets(target.study) if spread else []
-    simulation = simulate_with_original(target.study, system, requested[0], filtered=not no_filter)
-    if target.recorded is not None and not changes:
+    simulation = simulate_with_original(target.study, system, requested_settings[0], filtered=not no_filter)
+    if target.row is not None and not changes:
         _warn_of_differences(target, simulation)
     if trace is not None:
         _write_trace(trace, simulation)
-    if replays.requested:
+    if replays.are_requested:
         replays.show(target.study, system, simulation.evaluation.settings[0])
-    rows = np.stack([simulation.evaluation.settings[0], system.characteristics.original])
-    spreads = model_spreads(target.study, rows, point or "") if parameter_sets else []
+    settings = np.stack([simulation.evaluation.settings[0], system.characteristics.original])
+    spreads = model_spreads(target.study, settings, point or "") if parameter_sets else []
     _print_results(target, system, simulation, spreads, as_json)
 
 
 def _check_outputs(study: str, trace: Path | None, replays: Replays) -> None:
     if trace is not None:
-        refuse_inputs(trace, "--trace", study)
+        refuse_overwriting(trace, "--trace", study)
         check_writable(trace, "--trace")
     replays.check(study)
     if trace is not None and trace.resolve() in replays.files:
         raise InputError("--trace", f"{trace} is what --plot or --animate writes", "another file")
 
 
-def _sweep(target: CommandTarget, system: System, requested: FloatArray, names: tuple[str, ...], filtered: bool, as_json: bool) -> None:
-    settings = system.characteristics.filter(requested) if filtered else requested
+def _simulate_sweep(target: CommandTarget, system: System, requests: FloatArray, names: tuple[str, ...], filtered: bool,
+                    as_json: bool) -> None:
+    settings = system.characteristics.filter(requests) if filtered else requests
     evaluations = evaluate_settings(target.study, np.concatenate([system.characteristics.original[np.newaxis], settings]))
-    original, rows = evaluations.take([0]), evaluations.take(np.arange(1, len(evaluations)))
+    original, variants = evaluations.take([0]), evaluations.take(np.arange(1, len(evaluations)))
     if as_json:
-        records = [{"study": target.study.name, "vcs": dict(zip(system.characteristics.names, rows.settings[row].tolist(), strict=True)),
-                 **record(rows, row)} for row in range(len(rows))]
+        values = [dict(zip(system.characteristics.names, setting, strict=True)) for setting in variants.settings.tolist()]
+        records = [{"study": target.study.name, "vcs": values[row], **record(variants, row)} for row in range(len(variants))]
         click.echo(json.dumps(records, indent=2, allow_nan=False))
     else:
-        print_sweep(Console(), target.study, names, original, rows)
-    put_back = int(np.count_nonzero((settings != requested).any(axis=1)))
-    if put_back:
-        click.echo(f"note: in {put_back} of {len(requested)} settings the filter undid changes that are too small; --no-filter keeps them",
+        print_sweep(Console(), target.study, names, original, variants)
+    reset_count = int(np.count_nonzero((settings != requests).any(axis=1)))
+    if reset_count:
+        click.echo(f"note: in {reset_count} of {len(requests)} settings the filter reset small changes; --no-filter keeps them",
                    err=True)
 
 
 def _print_results(target: CommandTarget, system: System, simulation: Simulation, spreads: Sequence[ModelSpread], as_json: bool) -> None:
-    points = at_every_point(system, simulation.evaluation.settings) if system.matrix and (as_json or system.rater is None) else []
+    at_points = at_every_point(system, simulation.evaluation.settings) if system.matrix and (as_json or system.rater is None) else []
     if as_json:
-        replayed = {} if target.handle is None else {"solution": str(target.handle)}
-        matrix = {"points": [point_record(one) for one in points]} if points else {}
+        solution = {} if target.handle is None else {"solution": str(target.handle)}
+        matrix = {"points": [point_record(result) for result in at_points]} if at_points else {}
         spread = {"spread": {**spreads[0].to_dict(), "original": spreads[1].to_dict()}} if spreads else {}
-        click.echo(json.dumps({**simulation.to_dict(), **replayed, **matrix, **spread}, indent=2, allow_nan=False))
+        click.echo(json.dumps({**simulation.to_dict(), **solution, **matrix, **spread}, indent=2, allow_nan=False))
     else:
         print_simulation(Console(), simulation)
         for vehicle, model_spread in zip(("the simulated vehicle", "the original"), spreads, strict=False):
             print_text(Console(), f"The vehicle model's own uncertainty, {vehicle}: {model_spread}.")
         if system.rater is None:
-            print_matrix(Console(), points)
+            print_matrix(Console(), at_points)
         else:
             print_text(Console(), f"{len(system.matrix)} cells and variations: {question_command('rating', target.source)} --matrix")
         if types := tags(system.points):
@@ -136,7 +137,7 @@ def _print_results(target: CommandTarget, system: System, simulation: Simulation
     for remark in dict.fromkeys([*remarks, *system.remarks, *vehicle_remarks(system)]):
         click.echo(f"note: {remark}", err=True)
     for name, value in simulation.put_back.items():
-        click.echo(f"note: {name} = {value:g} is so near the original that the filter put {simulation.setting[name]:g} back; "
+        click.echo(f"note: {name} = {value:g} is so near the original that the filter reset it to {simulation.setting[name]:g}; "
                    "--no-filter keeps it", err=True)
 
 
@@ -144,13 +145,13 @@ def _warn_of_differences(target: CommandTarget, simulation: Simulation) -> None:
     """Warn where a replay differs from the recorded solution."""
     from safevar_sumo.replay.comparison import differences
 
-    assert target.recorded is not None
-    for difference in differences(simulation.evaluation, target.recorded):
+    assert target.row is not None
+    for difference in differences(simulation.evaluation, target.row):
         click.echo(f"warning: {target.handle} of {target.source}: {difference}; other versions or code than in the study?", err=True)
 
 
 def _write_trace(path: Path, simulation: Simulation) -> None:
-    """Write one row per time step, units in the header."""
+    """Write one row per time step; the header gives the units."""
     try:
         with path.open("w", encoding="utf-8", newline="") as file:
             simulation.trace.to_csv(file, index=False, lineterminator="\n")
@@ -159,7 +160,7 @@ def _write_trace(path: Path, simulation: Simulation) -> None:
 
 
 class Replays(NamedTuple):
-    """The figure, animation and window that a command is to show."""
+    """The figure, animation and window of a replay: files to write, or None, and options of the window."""
 
     plot: Path | None
     animate: Path | None
@@ -167,7 +168,7 @@ class Replays(NamedTuple):
     slower: float = 1.0
 
     @property
-    def requested(self) -> bool:
+    def are_requested(self) -> bool:
         return self.plot is not None or self.animate is not None or self.gui
 
     @property
@@ -176,16 +177,16 @@ class Replays(NamedTuple):
         return [path.resolve() for path in (self.plot, self.animate) if path is not None]
 
     def check(self, study: str) -> None:
-        """Refuse a file that cannot be written or is an input of `study`, before any simulation; raises InputError."""
+        """Before any simulation, refuse a file that cannot be written or is an input of `study`; raises InputError."""
         if self.slower != 1 and not self.gui:
             raise InputError("--slower", f"{self.slower:g} without --gui", "together with --gui")
         if self.plot is not None:
-            refuse_inputs(self.plot, "--plot", study)
+            refuse_overwriting(self.plot, "--plot", study)
             check_output(self.plot, "--plot", PICTURES)
         if self.animate is not None:
             from safevar_sumo.replay.animation import ANIMATIONS, check_animation
 
-            refuse_inputs(self.animate, "--animate", study)
+            refuse_overwriting(self.animate, "--animate", study)
             check_output(self.animate, "--animate", tuple(ANIMATIONS))
             check_animation(self.animate)
 
@@ -209,8 +210,8 @@ class Replays(NamedTuple):
 def print_simulation(console: Console, simulation: Simulation) -> None:
     """Print a setting beside the original vehicle: its values, outcome, metrics and objectives, and a verdict."""
     _print_setting(console, simulation)
-    members = CharacteristicSet.of(simulation.study.vehicle.characteristics)
-    print_meanings(console, [member for member in members if simulation.setting[member.name] != member.original])
+    characteristics = CharacteristicSet.of(simulation.study.vehicle.characteristics)
+    print_meanings(console, [member for member in characteristics if simulation.setting[member.name] != member.original])
     records = (simulation.original.to_dict(), simulation.to_dict())
     table = WholeTable("result", "unit", right=("original", "simulated"))
     table.add_row("outcome", "", *(record["outcome"] for record in records))
@@ -227,8 +228,8 @@ def _print_setting(console: Console, simulation: Simulation) -> None:
     for member in CharacteristicSet.of(simulation.study.vehicle.characteristics):
         value = simulation.setting[member.name]
         changed = value != member.original
-        note = f"{value:g}" + ("" if member.lower <= value <= member.upper else " (beyond)")
-        table.add_row(member.name, member.unit, f"{member.original:g}", note, style="bold" if changed else None)
+        value_text = f"{value:g}" + ("" if member.lower <= value <= member.upper else " (beyond)")
+        table.add_row(member.name, member.unit, f"{member.original:g}", value_text, style="bold" if changed else None)
     console.print(table)
 
 
@@ -242,7 +243,7 @@ def _compared_with_original(simulation: Simulation) -> str:
 
 
 def print_sweep(console: Console, study: Study, names: Sequence[str], original: Evaluations, variants: Evaluations) -> None:
-    """Print a row for each setting, after the original vehicle's, with its values of the named characteristics."""
+    """Print a row for the original vehicle and for each variant: values of the named characteristics, outcome and metrics."""
     characteristics = CharacteristicSet.of(study.vehicle.characteristics)
     columns = [characteristics.names.index(name) for name in names]
     units = [characteristics.members[column].unit for column in columns]
@@ -257,49 +258,50 @@ def print_sweep(console: Console, study: Study, names: Sequence[str], original: 
             table.add_row(*(f"{evaluations.settings[row, column]:g}" for column in columns), str(evaluations.outcome[row]),
                           *("-" if np.isnan(value) else f"{value:.3f}" for value in metrics), end_section=evaluations is original)
     console.print(table)
-    print_text(console, "First row: the original vehicle. SD: least distance in m, or minus the collision's speed in m/s.")
+    print_text(console, "First row: the original vehicle. SD: least distance in m, or minus the collision speed in m/s.")
 
 
-BANDS = ((5.0, "green"), (15.0, "yellow"), (25.0, "dark_orange"), (35.0, "orange4"))
-"""Each colour applies below its relative impact speed [km/h], red above all: the bands of Euro NCAP's car-to-car AEB tests."""
-POINTS_NAMED = 6
-"""Maximum number of failing points that are named."""
-ROW, COLUMN = "speed", "impact_location"
+COLOUR_BANDS = ((5.0, "green"), (15.0, "yellow"), (25.0, "dark_orange"), (35.0, "orange4"))
+"""Upper limits of the relative impact speed [km/h] and their colours, from Euro NCAP's car-to-car AEB tests; above them: red."""
+MAX_POINTS_NAMED = 6
+"""Maximum number of failing points that the summary names."""
+ROW_DIMENSION, COLUMN_DIMENSION = "speed", "impact_location"
 
 
 def print_matrix(console: Console, results: Sequence[AtPoint], row: int = 0) -> None:
-    """Print a table for each test and weather, speed by impact location; other dimensions have rows of their own."""
-    records = [point_record(one, row) for one in results]
+    """Print a table for each test and weather: rows are speeds and other dimensions, columns are impact locations."""
+    records = [point_record(result, row) for result in results]
     tables: dict[tuple[str, str], list[tuple[dict[str, Any], dict[str, Any]]]] = {}
-    for one, result in zip(results, records, strict=True):
-        place = dict(one.point.place)
-        tables.setdefault((place.pop("test"), place.pop("weather")), []).append((place, result))
-    for (test, weather), points in tables.items():
-        _print_table(console, f"{test}, {weather}", points)
+    for result, result_record in zip(results, records, strict=True):
+        coordinates = dict(result.point.place)
+        tables.setdefault((coordinates.pop("test"), coordinates.pop("weather")), []).append((coordinates, result_record))
+    for (test, weather), cells in tables.items():
+        _print_table(console, f"{test}, {weather}", cells)
     if records:
-        hit = [result["point"] for result in records if result["impact_speed"] is not None]
-        first = "; ".join(hit[:POINTS_NAMED]) + (f" and {len(hit) - POINTS_NAMED} more" if len(hit) > POINTS_NAMED else "")
-        summary = f"{len(hit)} of {len(records)} points fail{': ' + first if hit else ''}."
+        collision_points = [result["point"] for result in records if result["impact_speed"] is not None]
+        rest = f" and {len(collision_points) - MAX_POINTS_NAMED} more" if len(collision_points) > MAX_POINTS_NAMED else ""
+        names = "; ".join(collision_points[:MAX_POINTS_NAMED]) + rest
+        summary = f"{len(collision_points)} of {len(records)} points fail{': ' + names if collision_points else ''}."
         invalid = sum(result["outcome"] == Outcome.INVALID_TEST for result in records)
         if invalid:
             summary += f" {invalid} are invalid tests: the vehicle leaves the tolerance of the test's speed before the ADS acts."
         print_text(console, summary)
 
 
-def _print_table(console: Console, title: str, points: Sequence[tuple[dict[str, Any], dict[str, Any]]]) -> None:
-    columns = list(dict.fromkeys(place.get(COLUMN) for place, _ in points))
+def _print_table(console: Console, title: str, results: Sequence[tuple[dict[str, Any], dict[str, Any]]]) -> None:
+    columns = list(dict.fromkeys(coordinates.get(COLUMN_DIMENSION) for coordinates, _ in results))
     table = WholeTable("speed", right=("" if column is None else f"{column:g} %" for column in columns), title=title)
     cells: dict[str, dict[Any, Text]] = {}
-    for place, result in points:
-        cells.setdefault(_row(place), {})[place.get(COLUMN)] = _cell(result)
+    for coordinates, result in results:
+        cells.setdefault(_row_name(coordinates), {})[coordinates.get(COLUMN_DIMENSION)] = _cell(result)
     for name, by_column in cells.items():
         table.add_row(name, *(by_column.get(column, Text("")) for column in columns))
     console.print(table)
 
 
-def _row(place: dict[str, Any]) -> str:
-    speed = [f"{place[ROW]:g} km/h"] if ROW in place else []
-    return ", ".join([*speed, *(f"{name} {value}" for name, value in place.items() if name not in (ROW, COLUMN))])
+def _row_name(coordinates: dict[str, Any]) -> str:
+    speed = [f"{coordinates[ROW_DIMENSION]:g} km/h"] if ROW_DIMENSION in coordinates else []
+    return ", ".join([*speed, *(f"{name} {value}" for name, value in coordinates.items() if name not in (ROW_DIMENSION, COLUMN_DIMENSION))])
 
 
 def _cell(result: dict[str, Any]) -> Text:
@@ -308,6 +310,6 @@ def _cell(result: dict[str, Any]) -> Text:
     if result["impact_speed"] is None:
         contact = f", {result['contact']['side']} side touched" if "contact" in result else ""
         return Text("avoided" + contact if result["outcome"] in (Outcome.STOPPED, Outcome.PASSED) else result["outcome"], "green")
-    relative = (result["relative_impact_speed"] or 0.0) * KMH_PER_MS
-    colour = next((colour for below, colour in BANDS if relative < below), "red")
+    relative_speed = (result["relative_impact_speed"] or 0.0) * KMH_PER_MS
+    colour = next((colour for limit, colour in COLOUR_BANDS if relative_speed < limit), "red")
     return Text(f"{result['impact_speed'] * KMH_PER_MS:.1f} km/h", colour)

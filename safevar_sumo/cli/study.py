@@ -19,7 +19,7 @@ from rich.text import Text
 from safevar_sumo.analysis.research_questions.indicators import nondominated
 from safevar_sumo.api.running import ENGINES, carry_out_runs, engine_for, load_for_search, open_pool
 from safevar_sumo.campaign import Campaign, Forecast, RunKey, all_runs, forecast
-from safevar_sumo.cli.arguments import Within, complete_study
+from safevar_sumo.cli.arguments import NumberRange, complete_study
 from safevar_sumo.cli.program import commands, print_remarks
 from safevar_sumo.cli.target import jobs_option
 from safevar_sumo.errors import InputError
@@ -41,10 +41,10 @@ from safevar_sumo.workers.evaluation import Pool
 @click.option("--algorithms", help="Algorithms, separated by commas.")
 @click.option("--seed", type=click.IntRange(min=0, max=2**63 - 1), help="Seed of the whole study.")
 @click.option("--batch", type=click.IntRange(1, 10_000),
-              help="Maximum settings per batch, gathered from several runs; never changes a result.  [default: the fastest]")
+              help="Maximum settings per batch, gathered from several runs; does not change results.  [default: the fastest]")
 @click.option("--engine", type=click.Choice(list(ENGINES.values())), default=ENGINES[Engine.RECORDED], show_default=True,
-              help="What moves the vehicles. recorded: numpy in a scene that SUMO has played once, if no actor reacts to them, verified "
-                   "in SUMO; sumo: always SUMO.")
+              help="What moves the vehicles. recorded: numpy, in a scene that SUMO has played once, if no actor reacts to the vehicles; "
+                   "results are verified in SUMO. sumo: always SUMO.")
 @click.option("--out", type=click.Path(path_type=Path), help="Directory of the results.  [default: results/STUDY]")
 @jobs_option
 @click.option("--cluster", metavar="ADDRESS", help="Compute on the workers of this Dask scheduler instead.")
@@ -56,30 +56,31 @@ from safevar_sumo.workers.evaluation import Pool
 def study(study: str, batch: int | None, engine: str, out: Path | None, jobs: int | None, cluster: str | None, only: str | None,
           shard: str | None, retry_failed: bool, quiet: bool, dry_run: bool, **options: Any) -> None:
     """Search STUDY; run the same command again to continue where it stopped."""
-    chosen, system = load_for_search(_with_options(load_study(study), **options), study)
-    print_remarks(chosen, [*system.remarks, *vehicle_remarks(system)])
-    keys = _selected(all_runs(chosen), only, shard)
-    directory = out or Path("results") / chosen.name
-    with open_pool(chosen, jobs, cluster) as pool:
+    loaded_study, system = load_for_search(_with_options(load_study(study), **options), study)
+    print_remarks(loaded_study, [*system.remarks, *vehicle_remarks(system)])
+    keys = _select_runs(all_runs(loaded_study), only, shard)
+    directory = out or Path("results") / loaded_study.name
+    with open_pool(loaded_study, jobs, cluster) as pool:
         if dry_run:
-            used, reason = engine_for(system, engine)
-            size = batch or settings_per_batch(system, used)
-            print_forecast(Console(), chosen, len(keys), forecast(chosen, len(keys), pool, size, used), f"{ENGINES[used]}: {reason}")
+            used_engine, reason = engine_for(system, engine)
+            size = batch or settings_per_batch(system, used_engine)
+            cost = forecast(loaded_study, len(keys), pool, size, used_engine)
+            print_forecast(Console(), loaded_study, len(keys), cost, f"{ENGINES[used_engine]}: {reason}")
             return
         try:
-            with CampaignProgress(Console(stderr=True), chosen, keys, quiet) as progress:
-                campaign = carry_out_runs(chosen, system, keys, directory, pool, progress, batch, engine, retry_failed=retry_failed)
+            with CampaignProgress(Console(stderr=True), loaded_study, keys, quiet) as progress:
+                campaign = carry_out_runs(loaded_study, system, keys, directory, pool, progress, batch, engine, retry_failed=retry_failed)
         except KeyboardInterrupt:
             click.echo(f"finished evaluations are kept in {directory}: run the same command again to continue", err=True)
             raise
         if not quiet:
-            print_summary(Console(), chosen, campaign, directory, pool)
+            print_summary(Console(), loaded_study, campaign, directory, pool)
     if not quiet:
         print_text(Console(), f"Results: {directory}")
 
 
 def _with_options(study: Study, algorithms: str | None, **numbers: int | None) -> Study:
-    """The study with a command's options in place of its own search table."""
+    """The study with its search table changed by the command's options."""
     changes: dict[str, Any] = {name: value for name, value in numbers.items() if value is not None}
     if algorithms is not None:
         names = [name.strip() for name in algorithms.split(",")]
@@ -87,7 +88,7 @@ def _with_options(study: Study, algorithms: str | None, **numbers: int | None) -
     return msgspec.structs.replace(study, search=msgspec.structs.replace(study.search, **changes))
 
 
-def _selected(keys: list[RunKey], only: str | None, shard: str | None) -> list[RunKey]:
+def _select_runs(keys: list[RunKey], only: str | None, shard: str | None) -> list[RunKey]:
     """The runs that --only and --shard select."""
     if only is not None:
         algorithm, _, run = only.rpartition(":")
@@ -95,25 +96,25 @@ def _selected(keys: list[RunKey], only: str | None, shard: str | None) -> list[R
         if not keys:
             raise InputError("--only", repr(only), "ALGORITHM:RUN, an algorithm of the study and a run from 0 to less than --runs")
     if shard is not None:
-        first, _, number = shard.partition("/")
-        if not (first.isdecimal() and number.isdecimal() and len(number) < 10 and len(first) < 10 and 1 <= int(first) <= int(number)):
+        k, _, n = shard.partition("/")
+        if not (k.isdecimal() and n.isdecimal() and len(n) < 10 and len(k) < 10 and 1 <= int(k) <= int(n)):
             raise InputError("--shard", repr(shard), "K/N, with K in 1..N")
-        keys = keys[int(first) - 1::int(number)]
+        keys = keys[int(k) - 1::int(n)]
     return keys
 
 
 @commands.command()
 @click.argument("directory", metavar="DIR")
 @click.option("--watch", is_flag=True, help="Keep showing progress until the study is finished.")
-@click.option("--every", type=Within(0.1, 86400), default=2.0, show_default=True, metavar="SECONDS",
+@click.option("--every", type=NumberRange(0.1, 86400), default=2.0, show_default=True, metavar="SECONDS",
               help="Interval of --watch.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON; with --watch, a line at every interval.")
 def status(directory: str, watch: bool, every: float, as_json: bool) -> None:
     """Show the progress of the study in DIR, without disturbing it: runs, front, collisions, time left."""
     from safevar_sumo.results import status as read_status
 
-    progress, start = read_status(directory), time.monotonic()
-    first = progress
+    progress, start_time = read_status(directory), time.monotonic()
+    start_share = progress.share
     for remark in progress.remarks:
         click.echo(remark, err=True)
     if as_json:
@@ -130,7 +131,7 @@ def status(directory: str, watch: bool, every: float, as_json: bool) -> None:
         while not progress.finished:
             time.sleep(every)
             progress = read_status(directory)
-            live.update(status_view(progress, (progress.share - first.share) / (time.monotonic() - start)), refresh=True)
+            live.update(status_view(progress, (progress.share - start_share) / (time.monotonic() - start_time)), refresh=True)
 
 
 SAFETY_NOTE = "SD: least distance in m, or minus the collision's speed in m/s.\nTET, TIT: over solutions without collision."
@@ -151,10 +152,10 @@ def print_forecast(console: Console, study: Study, runs: int, cost: Forecast, en
 
 
 def print_summary(console: Console, study: Study, campaign: Campaign, directory: Path, pool: Pool) -> None:
-    """Print the answer, a table of the algorithms' solutions and the original, the most critical setting, and RQ1 and RQ2 in brief."""
+    """Print the answer, a table of the original and of each algorithm's solutions, the most critical setting, and RQ1 and RQ2 in brief."""
     from safevar_sumo.analysis.explain.summary import lead
     from safevar_sumo.analysis.research_questions.case import case_of
-    from safevar_sumo.analysis.research_questions.over_runs import summary_lines  # takes longer to load than all the rest
+    from safevar_sumo.analysis.research_questions.over_runs import summary_lines  # loads more slowly than all other modules
 
     names = tuple(study.vehicle.characteristics)
     solutions = solutions_frame(names, campaign.solutions.items())
@@ -163,16 +164,16 @@ def print_summary(console: Console, study: Study, campaign: Campaign, directory:
             print_text(console, line)
     by_vehicle = {"original vehicle": campaign.original}
     for algorithm in study.search.labels:
-        group = [solutions_of_run for key, solutions_of_run in campaign.solutions.items() if key.algorithm == algorithm]
-        if group:
-            by_vehicle[algorithm] = Evaluations.concatenate(group)
+        solutions_of_runs = [solutions_of_run for key, solutions_of_run in campaign.solutions.items() if key.algorithm == algorithm]
+        if solutions_of_runs:
+            by_vehicle[algorithm] = Evaluations.concatenate(solutions_of_runs)
     table = WholeTable("", right=by_vehicle, title=study.title)
-    table.add_row("solutions", "-", *(str(len(one)) for one in list(by_vehicle.values())[1:]))
-    table.add_row("solutions that collide", *(str(int(np.count_nonzero(one.collided))) for one in by_vehicle.values()))
+    table.add_row("solutions", "-", *(str(len(rows)) for rows in list(by_vehicle.values())[1:]))
+    table.add_row("solutions that collide", *(str(int(np.count_nonzero(rows.collided))) for rows in by_vehicle.values()))
     collisions = [sum(number for key, number in campaign.collisions.items() if key.algorithm == name) for name in list(by_vehicle)[1:]]
     table.add_row("collisions simulated", *map(str, [int(campaign.original.collided[0]), *collisions]))
     for metric in campaign.scoring.metrics:
-        table.add_row(f"mean {metric.heading}", *(_mean(one.metrics[metric.name]) for one in by_vehicle.values()))
+        table.add_row(f"mean {metric.heading}", *(_mean(rows.metrics[metric.name]) for rows in by_vehicle.values()))
     console.print(table)
     console.print(SAFETY_NOTE)
     if campaign.failures:
@@ -192,56 +193,55 @@ def print_summary(console: Console, study: Study, campaign: Campaign, directory:
 
 
 def _mean(values: FloatArray) -> str:
-    defined = values[~np.isnan(values)]
-    return f"{np.mean(defined):.2f}" if defined.size else "-"
+    defined_values = values[~np.isnan(values)]
+    return f"{np.mean(defined_values):.2f}" if defined_values.size else "-"
 
 
 def _print_most_critical(console: Console, study: Study, campaign: Campaign) -> None:
     if not any(map(len, campaign.solutions.values())):
         console.print("No solution.")
         return
-    pooled = Evaluations.concatenate(list(campaign.solutions.values()))
+    solutions = Evaluations.concatenate(list(campaign.solutions.values()))
     characteristics = CharacteristicSet.of(study.vehicle.characteristics)
-    worst = pooled.take([int(np.lexsort((pooled.f_diff, pooled.f_num_diff, pooled.f_safe))[0])])
+    most_critical = solutions.take([int(np.lexsort((solutions.f_diff, solutions.f_num_diff, solutions.f_safe))[0])])
     changes = [
         f"{member.name} {member.original:g} -> {value:.6g} {'' if member.unit == '-' else member.unit}".rstrip()
-        for member, value in zip(characteristics, worst.settings[0].tolist(), strict=True) if value != member.original]
-    console.print(f"Most critical setting: SD {worst.f_safe[0]:.2f} ({worst.outcome[0]}), "
+        for member, value in zip(characteristics, most_critical.settings[0].tolist(), strict=True) if value != member.original]
+    console.print(f"Most critical setting: SD {most_critical.f_safe[0]:.2f} ({most_critical.outcome[0]}), "
                   f"the original's {campaign.original.f_safe[0]:.2f} ({campaign.original.outcome[0]}). Its changes:")
     for change in changes or ["no change"]:
         console.print(f"  {change}")
 
 
-POINTS_SHOWN = 5
-"""Maximum number of points of the front that are shown."""
-RUNS_SHOWN = 12
-"""Maximum number of runs under way that are named."""
+MAX_FRONT_ROWS = 5
+"""Maximum number of rows in the table of the front."""
+MAX_RUNS_NAMED = 12
+"""Maximum number of runs under way that the view names."""
 
 
 def status_view(progress: Status, rate: float | None) -> RenderableType:
-    """A study's runs by algorithm and the front so far; `rate` is the share of all work done per second, None if unknown."""
+    """The study's runs by algorithm and its front so far; `rate` is the share of all work that is done per second, None if unknown."""
     table = WholeTable("algorithm", right=("runs", "under\nway", "simulated", "collisions", "simulator\nerrors", "best\nSD"),
                        title=progress.title)
     for algorithm in dict.fromkeys(run.algorithm for run in progress.runs):
-        group = [run for run in progress.runs if run.algorithm == algorithm]
-        table.add_row(algorithm, *_counts(group))
-    return Group(table, Text(_under_way(progress)), Text(_time_left(progress, rate)), _front(progress))
+        table.add_row(algorithm, *_counts([run for run in progress.runs if run.algorithm == algorithm]))
+    return Group(table, Text(_list_runs(progress)), Text(_remaining_time(progress, rate)), _front(progress))
 
 
 def _counts(runs: list[RunStatus]) -> list[str]:
-    best = [run.best for run in runs if run.best is not None]
+    degrees = [run.best for run in runs if run.best is not None]
     return [f"{sum(run.state == 'finished' for run in runs)}/{len(runs)}", str(sum(run.state == "begun" for run in runs)),
             str(sum(run.simulated for run in runs)), str(sum(run.collisions for run in runs)),
-            str(sum(run.simulator_errors for run in runs)), f"{min(best):.2f}" if best else "-"]
+            str(sum(run.simulator_errors for run in runs)), f"{min(degrees):.2f}" if degrees else "-"]
 
 
-def _under_way(progress: Status) -> str:
-    begun = [f"{run.algorithm}:{run.run} {run.simulated}/{progress.budget}" for run in progress.runs if run.state == "begun"]
-    more = f" and {len(begun) - RUNS_SHOWN} more" if len(begun) > RUNS_SHOWN else ""
-    return f"Under way: {', '.join(begun[:RUNS_SHOWN])}{more}" if begun else ""
+def _list_runs(progress: Status) -> str:
+    runs = [f"{run.algorithm}:{run.run} {run.simulated}/{progress.budget}" for run in progress.runs if run.state == "begun"]
+    rest = f" and {len(runs) - MAX_RUNS_NAMED} more" if len(runs) > MAX_RUNS_NAMED else ""
+    return f"Under way: {', '.join(runs[:MAX_RUNS_NAMED])}{rest}" if runs else ""
 
 
-def _time_left(progress: Status, rate: float | None) -> str:
+def _remaining_time(progress: Status, rate: float | None) -> str:
     if progress.finished:
         return "Finished."
     if not rate:
@@ -250,13 +250,13 @@ def _time_left(progress: Status, rate: float | None) -> str:
 
 
 def _front(progress: Status) -> RenderableType:
-    """A table of the most severe non-dominated points."""
+    """A table of the most severe non-dominated settings."""
     if not len(progress.points):
         return Text("Nothing simulated yet.")
     front = nondominated(progress.points)
     front = front[front[:, 0].argsort(kind="stable")]
     table = WholeTable(right=("safety degree [m, -m/s]", "f_diff [fraction]", "changed"),
                        title=f"Front so far: {len(front)} points, the most severe ones")
-    for f_safe, f_diff, number in front[:POINTS_SHOWN].tolist():
+    for f_safe, f_diff, number in front[:MAX_FRONT_ROWS].tolist():
         table.add_row(f"{f_safe:.2f}", f"{f_diff:.3f}", f"{number:.0f}")
     return table

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import click
 
 from safevar_sumo.analysis.options import Option, Options
-from safevar_sumo.cli.arguments import Within
+from safevar_sumo.cli.arguments import NumberRange
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import FloatArray
 from safevar_sumo.results import UNKNOWN, SolutionId, chosen_handle, position_of
@@ -24,17 +24,17 @@ CommandFunction = Callable[..., Any]
 
 
 class CommandTarget(NamedTuple):
-    """A study, its name in errors, and the solution of its results to replay, if any: handle, setting, row."""
+    """A study, its name in errors, and the solution of its results to replay, if any: handle, setting, row of the results."""
 
     study: Study
     source: str
     handle: SolutionId | None = None
     setting: FloatArray | None = None
-    recorded: dict[str, Any] | None = None
+    row: dict[str, Any] | None = None
 
 
 def replay_options(command: CommandFunction) -> CommandFunction:
-    """The options that choose a solution of a results directory."""
+    """Add the options that choose a solution of a results directory."""
     for option in (
             click.option("--smallest", "choice", flag_value="smallest", help="Replay the unsafe solution with the smallest changes."),
             click.option("--fewest", "choice", flag_value="fewest", help="Replay the unsafe solution with the fewest changes."),
@@ -44,7 +44,7 @@ def replay_options(command: CommandFunction) -> CommandFunction:
     return command
 
 
-def target_of(place: str, solution: str | None, choice: str | None) -> CommandTarget:
+def target_of(source: str, solution: str | None, choice: str | None) -> CommandTarget:
     """Load the subject of a command: a study by name or path, or a results directory.
 
     Raises
@@ -55,39 +55,39 @@ def target_of(place: str, solution: str | None, choice: str | None) -> CommandTa
     if solution is not None and choice is not None:
         raise InputError("--solution", f"{solution!r} and --{choice.replace('_', '-')} both choose a solution", "one of them")
     if solution is None and choice is None:
-        return CommandTarget(study_at_point(place), place)
-    case = results_or_study(place, results_only=True)
+        return CommandTarget(study_at_point(source), source)
+    case = results_or_study(source, results_only=True)
     assert not isinstance(case, Study)
-    named = None if solution is None else SolutionId.parse(solution)
-    handle = named or chosen_handle(case.solutions, case.unsafe, str(choice), place)
+    requested_handle = None if solution is None else SolutionId.parse(solution)
+    handle = requested_handle or chosen_handle(case.solutions, case.unsafe, str(choice), source)
     row = case.solutions.iloc[position_of(case.solutions, handle)]
     setting = row[list(case.characteristics.names)].to_numpy(dtype=float)
-    return CommandTarget(case.study, place, handle, setting, {str(name): value for name, value in row.items()})
+    return CommandTarget(case.study, source, handle, setting, {str(name): value for name, value in row.items()})
 
 
 jobs_option = click.option("--jobs", type=click.IntRange(1, 1024), help="Worker processes.  [default: the cores of this machine]")
 point_option = click.option("--point", metavar="NAME", help="Only this point of the study's matrix.")
 json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
-AS_IT_IS_NOW = "safevar_sumo.as_it_is_now"
-"""Key of the flag --as-it-is-now in a command's context, for every function that reads a results directory."""
+AS_IT_IS_NOW_KEY = "safevar_sumo.as_it_is_now"
+"""Key of the flag --as-it-is-now in a command's context; functions that read results directories look it up."""
 
 
-def _keep(context: click.Context, _option: click.Parameter, value: bool) -> None:
-    context.meta[AS_IT_IS_NOW] = value
+def _store_flag(context: click.Context, _option: click.Parameter, value: bool) -> None:
+    context.meta[AS_IT_IS_NOW_KEY] = value
 
 
-now_option = click.option(
-    "--as-it-is-now", is_flag=True, expose_value=False, callback=_keep,
-    help="If results were computed with other files or versions, simulate with the present ones, and say so.")
+as_it_is_now_option = click.option(
+    "--as-it-is-now", is_flag=True, expose_value=False, callback=_store_flag,
+    help="If results were computed with other files or versions, simulate with the present ones and say so.")
 
 
 def as_it_is_now() -> bool:
-    """Whether the running command has the flag --as-it-is-now."""
-    return bool(click.get_current_context().meta.get(AS_IT_IS_NOW))
+    """Whether the user gave the flag --as-it-is-now."""
+    return bool(click.get_current_context().meta.get(AS_IT_IS_NOW_KEY))
 
 
 def flags_of(question: type[Options]) -> Callable[[CommandFunction], CommandFunction]:
-    """Add the flags of a question's options; `question(**keywords)` makes the record from the command's keywords."""
+    """Add the flags of a question's options; `question(**keywords)` makes the options from the command's keywords."""
     def add(command: CommandFunction) -> CommandFunction:
         for field in reversed(fields(question)):
             command = _flag(question.flags()[field.name], field.name, field.default, question.described()[field.name])(command)
@@ -101,50 +101,50 @@ def _flag(flag: str, name: str, default: Any, option: Option) -> Callable[[Comma
         return click.option(flag, name, is_flag=True, default=default, help=option.help)
     if option.form != "one":
         return click.option(flag, name, multiple=option.form == "repeated", metavar=option.metavar, help=option.help,
-                            callback=lambda _context, _option, value: _names(value) if option.form == "commas" else value)
-    (low_open, high_open), show_default = option.is_open, default is not None
+                            callback=lambda _context, _option, value: _split_names(value) if option.form == "commas" else value)
+    (low_is_open, high_is_open), show_default = option.is_open, default is not None
     kind: click.ParamType[Any] = click.STRING
     if option.kind is int:
         kind = click.IntRange(option.low, option.high)  # type: ignore[arg-type]
     elif option.kind is float:
-        kind = Within(option.low, option.high, min_open=low_open, max_open=high_open)
+        kind = NumberRange(option.low, option.high, min_open=low_is_open, max_open=high_is_open)
     return click.option(flag, name, type=kind, default=default, show_default=show_default, metavar=option.metavar, help=option.help)
 
 
-def _names(text: str | None) -> tuple[str, ...] | None:
-    """Names separated by commas."""
+def _split_names(text: str | None) -> tuple[str, ...] | None:
+    """Split names at commas."""
     return None if text is None else tuple(name.strip() for name in text.split(","))
 
 
-def results_or_study(place: str, point: str | None = None, *, results_only: bool = False) -> Study | Case:
-    """The case in a results directory, or unless `results_only` a study by name or path; at `point` of its matrix if given.
+def results_or_study(source: str, point: str | None = None, *, results_only: bool = False) -> Study | Case:
+    """Load a results directory or, unless `results_only`, a study by name or path; `point` restricts it to a point of its matrix.
 
     Raises
     ------
     InputError
-        If `place` is neither, or has no such point.
+        If there is no such study or results directory, or it has no such point.
     """
     from safevar_sumo.analysis.subject import study_or_case
 
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", UserWarning)
-        source = study_or_case(place, as_it_is_now=as_it_is_now(), results_only=results_only)
+        subject = study_or_case(source, as_it_is_now=as_it_is_now(), results_only=results_only)
     for warning in caught:
         click.echo(f"warning: {warning.message}", err=True)
     if point is None:
-        return source
-    if isinstance(source, Study):
-        return _at(source, point)
-    return replace(source, study=_at(source.study, point), solutions=source.solutions.assign(outcome=UNKNOWN))
+        return subject
+    if isinstance(subject, Study):
+        return _restrict(subject, point)
+    return replace(subject, study=_restrict(subject.study, point), solutions=subject.solutions.assign(outcome=UNKNOWN))
 
 
-def _at(study: Study, point: str) -> Study:
+def _restrict(study: Study, point: str) -> Study:
     from safevar_sumo.sumo.matrix import study_at
 
     return study_at(study, point, "--point")
 
 
-def study_at_point(place: str, point: str | None = None) -> Study:
-    """The named study, or the study that a results directory records; raises as `results_or_study`."""
-    source = results_or_study(place, point)
-    return source if isinstance(source, Study) else source.study
+def study_at_point(source: str, point: str | None = None) -> Study:
+    """Load a study, or the study recorded in a results directory; raises the errors of `results_or_study`."""
+    subject = results_or_study(source, point)
+    return subject if isinstance(subject, Study) else subject.study

@@ -1,4 +1,4 @@
-"""One page about a study's findings. The package is callable: `safevar_sumo.report(...)`."""
+"""Make a page about the findings of studies. The package is callable: `safevar_sumo.report(...)`."""
 
 from __future__ import annotations
 
@@ -28,15 +28,15 @@ def report(*results: Results | str | Path, out: str | Path | None = None, only: 
     out
         File to write the page to, if any.
     only
-        Names of `SECTIONS`, such as "verdict"; all of them by default.
+        Names of sections from `SECTIONS`, such as "verdict"; all sections by default.
     point
-        Name of a point of the study's matrix to report on alone, without the research questions, which are about whole studies.
+        Name of a point of the study's matrix: the page is about this point only, without the research questions, which need whole studies.
     jobs
         Worker processes for simulations, by default one for each core.
     progress
         True for a bar on the terminal, or a function called with the stage, the amount done, and the total amount.
     as_it_is_now
-        If results were computed with other files or versions, simulate with the present ones; the page says so.
+        If results were computed with other files or versions, simulate with the present ones; the page then says so.
 
     Returns
     -------
@@ -46,16 +46,16 @@ def report(*results: Results | str | Path, out: str | Path | None = None, only: 
     Warns
     -----
     UserWarning
-        If a solution, simulated again, differs from the results; with `as_it_is_now`, for everything that has changed.
+        If a new simulation of a solution differs from the results; with `as_it_is_now`, for each change of a file or version.
 
     Raises
     ------
     InputError
         If a directory holds no results, there is no such section or point, or the file cannot be written.
     """
-    directories = [item.directory if isinstance(item, Results) else item for item in results]
-    with shown(progress) as show:
-        page = make_report(directories, only, jobs, show, point=point, as_it_is_now=as_it_is_now)
+    directories = [source.directory if isinstance(source, Results) else source for source in results]
+    with shown(progress) as show_progress:
+        page = make_report(directories, only, jobs, show_progress, point=point, as_it_is_now=as_it_is_now)
     if out is not None:
         write_whole(Path(out), page)
     return page

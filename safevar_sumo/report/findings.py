@@ -1,4 +1,4 @@
-"""Minimal causes of failures, and selected solutions, each with its replay."""
+"""The section on causes: minimal causes of failures and selected solutions, with their replays."""
 
 from __future__ import annotations
 
@@ -17,27 +17,27 @@ from safevar_sumo.analysis.opinion.compute import JudgedCause, opinions_of, seco
 from safevar_sumo.analysis.research_questions.indicators import nondominated
 from safevar_sumo.errors import InputError
 from safevar_sumo.replay.comparison import differences, number, raised, spaced
-from safevar_sumo.report.input import ChangeRow, FailingPlaces, ReportInput, stored_answer
-from safevar_sumo.report.svg import Bar, rows
+from safevar_sumo.report.input import ChangeRow, FailingPoints, ReportInput, stored_answer
+from safevar_sumo.report.svg import Bar, bar_chart
 
-CAUSES = 6
+MAX_CAUSES = 6
 """Maximum number of minimal causes in a report."""
-REPLAYS = 10
-"""Maximum number of solutions with a replay in a report, unless explained failures are more."""
-FIRST = ("fewest", "smallest", "most_severe")
-"""Choices that are shown first."""
+MAX_REPLAYS = 10
+"""Maximum number of solutions with a replay in a report, unless there are more explained failures."""
+FIRST_CHOICES = ("fewest", "smallest", "most_severe")
+"""Choices of the first solutions on the page."""
 OBJECTIVES = ["f_safe", "f_diff", "f_num_diff"]
 
 
 class Explanations(NamedTuple):
-    """The answer of `explain`: the failures that matter, and the shares of all analysed failures."""
+    """The answer of `explain`: the most important failures, and a summary of all analysed failures."""
 
     failures: list[FailureEntry]
     summary: SummaryEntry
 
 
 class CauseRow(NamedTuple):
-    """A change of a cause: characteristic, its short and long description, and its values with their unit."""
+    """A change in a cause: the characteristic, its short and long description, and three values with their unit."""
 
     name: str
     short: str
@@ -57,9 +57,9 @@ class SecondOpinion(msgspec.Struct, frozen=True):
 class CauseSection(NamedTuple):
     """A cause on the page.
 
-    `end` tells how its run ends; scaled to `fraction` all changes are still unsafe, `below` is the state just below. `handle` is that of a
-    failure with this cause, `whole` the anchor of its replay; `because` and `robustness` describe the whole failure, `alone` is the
-    robustness of the cause by itself, empty if it is not known.
+    `end` says how the vehicle with this cause ends. All changes scaled to `fraction` are still unsafe; `state_below` is the state just
+    below. `handle` names a failure with this cause, `replay_anchor` its replay; `reason` and `robustness` describe this failure.
+    `cause_robustness` is the robustness of the cause by itself, empty if unknown.
     """
 
     title: str
@@ -67,19 +67,19 @@ class CauseSection(NamedTuple):
     rows: list[CauseRow]
     end: str
     fraction: float
-    below: str
-    where: FailingPlaces | None
+    state_below: str
+    failing: FailingPoints | None
     replay: dict[str, Any]
     handle: str
-    whole: str
-    because: str
+    replay_anchor: str
+    reason: str
     robustness: str
-    alone: str
+    cause_robustness: str
     opinion: SecondOpinion | None
 
 
 class Replay(NamedTuple):
-    """A solution on the page, with its `replay` if the study can be simulated; `differences` are those from the results."""
+    """A solution on the page, with its `replay` if the study can be simulated; `differences` separate a new simulation from the results."""
 
     handle: str
     anchor: str
@@ -88,21 +88,21 @@ class Replay(NamedTuple):
     f_diff: float
     f_num_diff: int
     changes: list[ChangeRow]
-    open: bool
-    where: FailingPlaces | None = None
+    is_open: bool
+    failing: FailingPoints | None = None
     replay: dict[str, Any] | None = None
     differences: Sequence[str] = ()
 
 
-def explanations(data: ReportInput, jobs: int | None, progress: Progress) -> Explanations:
-    """The failures that matter with their explanations, computed once for these results."""
-    *failures, last = stored_answer(data, "explain", lambda: explain(
+def explanations_of(data: ReportInput, jobs: int | None, progress: Progress) -> Explanations:
+    """Explain the most important failures, once for these results."""
+    *failures, summary = stored_answer(data, "explain", lambda: explain(
         data.case, data.options["explain"], jobs=jobs, progress=progress).to_dict())
-    return Explanations(msgspec.convert(failures, list[FailureEntry]), msgspec.convert(last["summary"], SummaryEntry))
+    return Explanations(msgspec.convert(failures, list[FailureEntry]), msgspec.convert(summary["summary"], SummaryEntry))
 
 
 def necessity_chart(summary: SummaryEntry, data: ReportInput) -> Markup | None:
-    """A chart of how often failures change each characteristic, and how often they need the change."""
+    """A chart of how often failures change each characteristic, and how often they need this change."""
     changed, necessary = summary.changed, summary.necessary
     names = sorted((name for name in necessary if changed.get(name)), key=lambda name: (-necessary[name], -changed[name], name))
     if not names:
@@ -112,28 +112,28 @@ def necessity_chart(summary: SummaryEntry, data: ReportInput) -> Markup | None:
     ends = [("", f"needed {necessary[name]:.0%}{_interval(*summary.necessary_interval[name])}, changed {changed[name]:.0%}")
             for name in names]
     description = f"{data.case.name}: how often a characteristic is needed for a failure, beside how often it is changed"
-    return rows(description, names, bars, [None] * len(names), ends)
+    return bar_chart(description, names, bars, [None] * len(names), ends)
 
 
 def _interval(low: float, high: float) -> str:
-    """A sample's 95 % interval; empty if all failures were analysed."""
+    """The 95 % interval of a share, in a text; empty if all failures were analysed."""
     return f" ({low:.0%} to {high:.0%})" if low < high else ""
 
 
 def causes(failures: Sequence[FailureEntry], data: ReportInput) -> list[CauseSection]:
-    """The distinct minimal causes with replays, in the order of the number and size of their changes."""
-    distinct: dict[tuple[str, ...], tuple[CauseEntry, FailureEntry]] = {}
+    """Minimal causes with replays, one for each set of characteristics, ordered by number and size of their changes."""
+    smallest: dict[tuple[str, ...], tuple[CauseEntry, FailureEntry]] = {}
     for failure in failures:
         for cause in failure.minimal_causes:
             key = tuple(cause.changes)
-            if key and (key not in distinct or _size(data, cause) < _size(data, distinct[key][0])):
-                distinct[key] = cause, failure
-    ordered = sorted(distinct.values(), key=lambda entry: _size(data, entry[0]))[:CAUSES]
-    if not ordered:
+            if key and (key not in smallest or _size(data, cause) < _size(data, smallest[key][0])):
+                smallest[key] = cause, failure
+    selection = sorted(smallest.values(), key=lambda entry: _size(data, entry[0]))[:MAX_CAUSES]
+    if not selection:
         return []
-    data.simulate_again([data.setting_with(cause.changes) for cause, _ in ordered])
-    opinions = [None] * len(ordered) if no_opinion(data) else _opinions(data, ordered)
-    return [_section(data, number, *entry, opinion) for number, (entry, opinion) in enumerate(zip(ordered, opinions, strict=True), 1)]
+    data.simulate_again([data.setting_with(cause.changes) for cause, _ in selection])
+    opinions = [None] * len(selection) if no_opinion(data) else _opinions(data, selection)
+    return [_section(data, number, *entry, opinion) for number, (entry, opinion) in enumerate(zip(selection, opinions, strict=True), 1)]
 
 
 def no_opinion(data: ReportInput) -> str:
@@ -145,9 +145,9 @@ def no_opinion(data: ReportInput) -> str:
     return ""
 
 
-def _opinions(data: ReportInput, ordered: Sequence[tuple[CauseEntry, FailureEntry]]) -> list[SecondOpinion]:
-    """The second vehicle model's opinion on each cause, computed once for these results."""
-    causes = [JudgedCause(failure.handle or None, cause.changes, cause.fraction) for cause, failure in ordered]
+def _opinions(data: ReportInput, selection: Sequence[tuple[CauseEntry, FailureEntry]]) -> list[SecondOpinion]:
+    """Ask the second vehicle model for its opinion on each cause, once for these results."""
+    causes = [JudgedCause(failure.handle or None, cause.changes, cause.fraction) for cause, failure in selection]
     opinions = stored_answer(data, "opinion", lambda: opinions_of(data.case.study, causes, data.case.unsafe).to_dict())
     return msgspec.convert(opinions, list[SecondOpinion])
 
@@ -157,49 +157,50 @@ def _size(data: ReportInput, cause: CauseEntry) -> tuple[int, float]:
     return len(cause.changes), float(data.case.characteristics.largest_change(setting[np.newaxis])[0])
 
 
-def _section(data: ReportInput, place: int, cause: CauseEntry, failure: FailureEntry, opinion: SecondOpinion | None) -> CauseSection:
-    """A cause on the page; `place` is its number, from 1."""
+def _section(data: ReportInput, rank: int, cause: CauseEntry, failure: FailureEntry, opinion: SecondOpinion | None) -> CauseSection:
+    """A cause on the page; `rank` counts causes from 1."""
     setting = data.setting_with(cause.changes)
     members = {member.name: member for member in data.case.characteristics}
-    table = [CauseRow(name, members[name].short_name, members[name].words, *(
-        f"{number(shown)}{spaced(members[name].unit)}" for shown in (members[name].original, value, cause.boundary[name])))
+    change_rows = [CauseRow(name, members[name].short_name, members[name].words, *(
+        f"{number(quantity)}{spaced(members[name].unit)}" for quantity in (members[name].original, value, cause.boundary[name])))
         for name, value in cause.changes.items()]
     comparison = data.compared(setting)
     return CauseSection(
-        title=f"Cause {place}: {', '.join(cause.changes)}", anchor=data.anchor("cause", place), rows=table,
-        end=comparison.verdict(comparison.rows[-1]), fraction=cause.fraction, below=cause.end, where=data.where(setting),
-        replay=data.replay(setting), handle=failure.handle, whole=data.anchor("replay", failure.handle), because=raised(failure.because),
-        robustness=in_words(failure.robustness), alone="" if cause.robustness is None else in_words(cause.robustness), opinion=opinion)
+        title=f"Cause {rank}: {', '.join(cause.changes)}", anchor=data.anchor("cause", rank), rows=change_rows,
+        end=comparison.verdict(comparison.rows[-1]), fraction=cause.fraction, state_below=cause.end, failing=data.failing_points(setting),
+        replay=data.replay(setting), handle=failure.handle, replay_anchor=data.anchor("replay", failure.handle),
+        reason=raised(failure.because), robustness=in_words(failure.robustness),
+        cause_robustness="" if cause.robustness is None else in_words(cause.robustness), opinion=opinion)
 
 
-def replays(data: ReportInput, explained: Explanations | None) -> list[Replay]:
-    """The solutions with a replay: the choices of `FIRST`, explained ones, and non-dominated unsafe ones."""
-    entries, handles = [], _chosen(data, explained.failures if explained else [])
+def replays(data: ReportInput, explanations: Explanations | None) -> list[Replay]:
+    """The solutions with a replay: `FIRST_CHOICES`, explained solutions, and non-dominated unsafe solutions."""
+    entries, handles = [], _select_handles(data, explanations.failures if explanations else [])
     if data.system is not None and handles:
         data.simulate_again([data.setting_of(handle) for handle in handles])
-    for place, handle in enumerate(handles):
+    for rank, handle in enumerate(handles):
         row, setting = data.solutions[handle], data.setting_of(handle)
         entry = Replay(handle, data.anchor("replay", handle), row["outcome"], row["f_safe"], row["f_diff"], row["f_num_diff"],
-                       data.changes(setting), open=place == 0 and not (explained and explained.failures))
+                       data.changes(setting), is_open=rank == 0 and not (explanations and explanations.failures))
         entries.append(entry if data.system is None else entry._replace(
-            replay=data.replay(setting), where=data.where(setting),
+            replay=data.replay(setting), failing=data.failing_points(setting),
             differences=differences(data.simulate_again([setting])[0].evaluation, row)))
     return sorted(entries, key=lambda entry: (entry.f_safe, entry.handle))
 
 
-def _chosen(data: ReportInput, failures: Sequence[FailureEntry]) -> list[str]:
-    """Handles of the solutions with a replay, each once."""
+def _select_handles(data: ReportInput, failures: Sequence[FailureEntry]) -> list[str]:
+    """Handles of the solutions with a replay, without repetition."""
     if data.case.solutions.empty:
         return []
-    choices = FIRST if any(data.unsafe_solutions) else FIRST[-1:]
-    chosen = [*map(data.chosen, choices), *(failure.handle for failure in failures if failure.handle)]
-    best = best_of([row for row, is_unsafe in zip(data.solutions.values(), data.unsafe_solutions, strict=True) if is_unsafe])
-    chosen += [best[index]["handle"] for index in evenly_spaced(len(best), REPLAYS)]
-    return list(dict.fromkeys(chosen))[:max(REPLAYS, len(choices) + len(failures))]
+    choices = FIRST_CHOICES if any(data.unsafe_solutions) else FIRST_CHOICES[-1:]
+    selection = [*map(data.chosen, choices), *(failure.handle for failure in failures if failure.handle)]
+    best = front_of([row for row, is_unsafe in zip(data.solutions.values(), data.unsafe_solutions, strict=True) if is_unsafe])
+    selection += [best[index]["handle"] for index in evenly_spaced(len(best), MAX_REPLAYS)]
+    return list(dict.fromkeys(selection))[:max(MAX_REPLAYS, len(choices) + len(failures))]
 
 
-def best_of(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """The solutions that no other dominates in the three objectives, each point once."""
+def front_of(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """The solutions that no other solution dominates in the three objectives; one solution for each point."""
     if not rows:
         return []
     points = np.array([[row[name] for name in OBJECTIVES] for row in rows], dtype=float)
@@ -208,6 +209,6 @@ def best_of(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     return list(by_point.values())
 
 
-def evenly_spaced(number: int, most: int) -> list[int]:
-    """At most `most` evenly spaced indices of `number` items."""
-    return sorted({round(index) for index in np.linspace(0, number - 1, min(number, most)).tolist()})
+def evenly_spaced(number: int, limit: int) -> list[int]:
+    """Evenly spaced indices of `number` items, at most `limit`."""
+    return sorted({round(index) for index in np.linspace(0, number - 1, min(number, limit)).tolist()})

@@ -1,4 +1,4 @@
-"""The input of a report: one study's results, replays and stored answers; and the table of the points at which a setting fails."""
+"""The input of a report: results, replays and stored answers of a study; and the table of the points at which a setting fails."""
 
 from __future__ import annotations
 
@@ -35,8 +35,8 @@ from safevar_sumo.sumo.matrix import aggregated, at_every_point, evaluate, study
 from safevar_sumo.sumo.system import System, assemble
 
 
-class FailingPlaces(NamedTuple):
-    """A table of the tests that fail: a sentence, the columns' heads, and rows of a name and a cell for each head."""
+class FailingPoints(NamedTuple):
+    """A table of the failing points: a sentence, the heads of the columns, and rows with a name and a cell for each head."""
 
     summary: str
     heads: list[str]
@@ -44,7 +44,7 @@ class FailingPlaces(NamedTuple):
 
 
 class ChangeRow(NamedTuple):
-    """A change from the original: both values in a text, and the short and the long description of the characteristic, if any."""
+    """A change from the original: both values in a text, and the short and the long description of the characteristic, or empty texts."""
 
     text: str
     short: str
@@ -55,33 +55,34 @@ SPEED, LOCATION = "speed", "impact_location"
 AVOIDED, FAILS = "–", "fails"  # noqa: RUF001
 
 
-def failing_places(matrix: Sequence[Point], failing: Collection[str]) -> FailingPlaces:
-    """A table of the tests that fail: tests and weathers down, speeds across, impact locations in the cells.
+def failing_table(matrix: Sequence[Point], failing: Collection[str]) -> FailingPoints:
+    """Make a table of the failing points: a row for each test and weather, a column for each speed, impact locations in the cells.
 
     Parameters
     ----------
     matrix
-        All points.
+        All points of the matrix.
     failing
         Names of the failing points.
 
     Returns
     -------
-    FailingPlaces
-        A cell without a test is empty.
+    FailingPoints
+        Cells without a test are empty.
     """
-    places = [(point.name in failing, dict(point.place)) for point in matrix]
-    speeds = sorted({place[SPEED] for _, place in places if SPEED in place})
+    points = [(point.name in failing, dict(point.place)) for point in matrix]
+    speeds = sorted({coordinates[SPEED] for _, coordinates in points if SPEED in coordinates})
     rows: dict[str, dict[Any, list[str]]] = {}
-    for fails, place in places:
-        speed, location = place.pop(SPEED, None), place.pop(LOCATION, None)
-        name = ", ".join([str(place.pop("test", "")), str(place.pop("weather", "")), *(f"{key} {value}" for key, value in place.items())])
+    for fails, coordinates in points:
+        speed, location = coordinates.pop(SPEED, None), coordinates.pop(LOCATION, None)
+        test, weather = str(coordinates.pop("test", "")), str(coordinates.pop("weather", ""))
+        name = ", ".join([test, weather, *(f"{key} {value}" for key, value in coordinates.items())])
         cell = rows.setdefault(name, {}).setdefault(speed, [])
         if fails:
             cell.append(FAILS if location is None else f"{location:g} %")
     columns = [*speeds, *([None] if any(None in cells for cells in rows.values()) else [])]
     has_location = any(LOCATION in dict(point.place) for point in matrix if point.name in failing)
-    return FailingPlaces(
+    return FailingPoints(
         summary=f"Fails at {len(failing)} of {len(matrix)} points.{' Percentages are impact locations.' if has_location else ''}",
         heads=["" if speed is None else f"{speed:g} km/h" for speed in columns],
         rows=[(name, [", ".join(cells[speed]) or AVOIDED if speed in cells else "" for speed in columns])
@@ -89,11 +90,11 @@ def failing_places(matrix: Sequence[Point], failing: Collection[str]) -> Failing
 
 
 SAMPLES = 4000
-"""Number of samples for the report's risk and rules."""
+"""Number of samples in the sections on risk and rules."""
 
 
 class Resimulation(NamedTuple):
-    """A recorded setting simulated again: its evaluation now, and the points of the matrix at which it is unsafe."""
+    """A new simulation of a recorded setting: its evaluation, and the points of the matrix at which the setting is unsafe."""
 
     evaluation: Evaluations
     points: tuple[str, ...]
@@ -103,9 +104,9 @@ class Resimulation(NamedTuple):
 class ReportInput:
     """One study of a report.
 
-    `directory` holds its results, `number` counts the studies from 1. `system` is None if the study cannot be simulated here; `problem`
-    says why. `point` is the only point of the matrix that the page is about, empty for the whole study. `changed` lists the files and
-    versions that have changed since the results were computed.
+    `directory` holds the results, `number` counts studies from 1. `system` is None if the study cannot be simulated here; `problem`
+    says why. `point` names the only point of the matrix that the page is about; it is empty for the whole study. `changed` lists the
+    files and versions that have changed since the results were computed.
     """
 
     number: int
@@ -121,9 +122,9 @@ class ReportInput:
 
     @cached_property
     def solutions(self) -> dict[str, dict[str, Any]]:
-        """The rows of the solutions by their handles; each row holds its handle too."""
-        named = zip(handles(self.case.solutions), self.case.solutions.to_dict("records"), strict=True)
-        return {str(handle): {**{str(name): value for name, value in row.items()}, "handle": str(handle)} for handle, row in named}
+        """Rows of the solutions by handle; each row also holds its handle."""
+        pairs = zip(handles(self.case.solutions), self.case.solutions.to_dict("records"), strict=True)
+        return {str(handle): {**{str(name): value for name, value in row.items()}, "handle": str(handle)} for handle, row in pairs}
 
     @cached_property
     def unsafe_solutions(self) -> list[bool]:
@@ -147,13 +148,13 @@ class ReportInput:
         return setting
 
     def changes(self, setting: FloatArray) -> list[ChangeRow]:
-        """The changes from the original."""
+        """A setting's changes from the original."""
         members = [member for member, value in zip(self.case.characteristics, setting.tolist(), strict=True) if value != member.original]
         texts = changes_in_words(self.case.characteristics, setting)
         return [ChangeRow(text, member.short_name, member.words) for member, text in zip(members, texts, strict=True)]
 
     def compared(self, setting: FloatArray) -> Comparison:
-        """The comparison of a setting with the original vehicle, simulated once."""
+        """Compare a setting with the original vehicle; simulates each setting once."""
         assert self.system is not None
         key = setting.tobytes()
         if key not in self._compared:
@@ -161,19 +162,19 @@ class ReportInput:
         return self._compared[key]
 
     def simulate_again(self, settings: Sequence[FloatArray]) -> list[Resimulation]:
-        """Simulate recorded settings again, all in one batch, each once; the page warns where results differ."""
+        """Simulate recorded settings again, each once and all in one batch; the page warns where results differ."""
         assert self.system is not None
-        new = {setting.tobytes(): setting for setting in settings if setting.tobytes() not in self._simulated_again}
-        if new:
-            at_points = at_every_point(self.system, np.stack(list(new.values())))
+        batch = {setting.tobytes(): setting for setting in settings if setting.tobytes() not in self._simulated_again}
+        if batch:
+            at_points = at_every_point(self.system, np.stack(list(batch.values())))
             evaluations, points = aggregated(at_points), unsafe_points_of(self.system, at_points, self.case.unsafe)
-            for row, key in enumerate(new):
+            for row, key in enumerate(batch):
                 self._simulated_again[key] = Resimulation(evaluations.take([row]), points[row])
         return [self._simulated_again[setting.tobytes()] for setting in settings]
 
     @cached_property
     def options(self) -> dict[str, Any]:
-        """The options of every question for the page: smaller samples than the commands' defaults, one criterion for all."""
+        """Options of every question for the page: smaller samples than the commands' defaults, and one criterion for all questions."""
         unsafe = None if self.case.solutions.empty else str(self.case.unsafe)
         all_options: tuple[Options, ...] = (
             ExplainOptions(unsafe=unsafe, limit=12_000), OpinionOptions(unsafe=unsafe), ToleranceOptions(unsafe=unsafe),
@@ -182,21 +183,21 @@ class ReportInput:
 
     @property
     def original_fails(self) -> bool:
-        """Whether the original vehicle itself collides: then no change causes anything."""
+        """Whether the original vehicle itself collides; if so, no change is a cause."""
         return self.case.original[SAFETY_DEGREE] < 0
 
-    def where(self, setting: FloatArray) -> FailingPlaces | None:
+    def failing_points(self, setting: FloatArray) -> FailingPoints | None:
         """The points of the matrix at which a setting fails; None without a matrix, or if the page is about one point."""
         if self.system is None or not self.system.matrix or self.point:
             return None
-        return failing_places(self.system.matrix, self.simulate_again([setting])[0].points)
+        return failing_table(self.system.matrix, self.simulate_again([setting])[0].points)
 
     def replay(self, setting: FloatArray) -> dict[str, Any]:
-        """A setting's animation, as the template `player` takes it."""
+        """A setting's animation, in the form that the template `player` takes."""
         return player_data(flat_scene_of(self.compared(setting)))
 
     def anchor(self, *parts: object) -> str:
-        """The anchor of a part of the page that belongs to this study."""
+        """The HTML anchor of a part of this study's section."""
         words = "-".join(str(part) for part in ("study", self.number, *parts))
         return "".join(letter if letter.isascii() and letter.isalnum() else "-" for letter in words)
 
@@ -230,49 +231,49 @@ def read_inputs(directories: Iterable[str | Path], point: str | None = None, *, 
 
 
 def _at_point(case: Case, point: str) -> Case:
-    """A case whose solutions and original are simulated again at one point of the study's matrix."""
+    """The case with its solutions and original vehicle simulated again at one point of the study's matrix."""
     study = study_at(case.study, point, "--point")
     system = assemble(study)
     settings = np.concatenate([case.characteristics.original[np.newaxis], case.solutions[list(case.characteristics.names)].to_numpy(float)])
-    now = evaluate(system, settings)
-    measured = {"f_safe": now.f_safe, **now.metrics, "outcome": now.outcome}
+    evaluations = evaluate(system, settings)
+    columns = {"f_safe": evaluations.f_safe, **evaluations.metrics, "outcome": evaluations.outcome}
     scoring = system.measuring.scoring
-    solutions = case.solutions.drop(columns=[metric.name for metric in case.scoring.metrics if metric.name not in now.metrics])
-    original = {metric.name: float(now.metrics[metric.name][0]) for metric in scoring.metrics}
+    solutions = case.solutions.drop(columns=[metric.name for metric in case.scoring.metrics if metric.name not in evaluations.metrics])
+    original = {metric.name: float(evaluations.metrics[metric.name][0]) for metric in scoring.metrics}
     return replace(case, study=study, scoring=scoring, original=original,
-                   solutions=solutions.assign(**{name: values[1:] for name, values in measured.items()}))
+                   solutions=solutions.assign(**{name: values[1:] for name, values in columns.items()}))
 
 
 def stored_answer(data: ReportInput, name: str, compute: Callable[[], Any]) -> Any:
-    """The result of `compute` as plain values, read from the results directory if it was computed before.
+    """The result of `compute` as plain values; read from the results directory if it was computed before.
 
-    The result is not stored if the directory cannot be written, or if the code that computes it has no identity.
+    The result is not stored if the directory cannot be written, or if the code that computes the result has no identity.
     """
     if data.changed or ("imported" in data.manifest and foreign_names(data.case.study)):
         return json.loads(json.dumps(compute(), allow_nan=False))
     suffix = f"-{data.anchor(data.point)}" if data.point else ""
-    file, identity = data.directory / ANSWERS / f"{name}{suffix}.json", _identity(data, name)
+    file, identity = data.directory / ANSWERS / f"{name}{suffix}.json", _digest(data, name)
     try:
         refuse_other_than_file(file)
         content = json.loads(file.read_text(encoding="utf-8"))
         if content["identity"] == identity:
             return content["value"]
     except (OSError, ValueError, KeyError, TypeError):
-        pass  # never computed, or not by this package: compute it now
+        pass  # never computed, or computed by another version of the package: compute it now
     text = json.dumps({"identity": identity, "value": compute()}, indent=1, allow_nan=False) + "\n"
     try:
         file.parent.mkdir(exist_ok=True)
         write_whole(file, text)
     except (OSError, SafevarError):
-        pass  # results on a read-only disk get their report too
+        pass  # results on a read-only disk get a report, too
     return json.loads(text)["value"]
 
 
-def _identity(data: ReportInput, name: str) -> str:
-    """Digest of all that an answer depends on: the results, the options, the package's code."""
+def _digest(data: ReportInput, name: str) -> str:
+    """Digest of everything that an answer depends on: the results, the options, the package's code."""
     digest = sha256(_package().encode())
-    for name_of_file in (MANIFEST, SOLUTIONS):
-        file = data.directory / name_of_file
+    for file_name in (MANIFEST, SOLUTIONS):
+        file = data.directory / file_name
         content = file.read_bytes() if file.is_file() else b""
         digest.update(len(content).to_bytes(8, "big") + content)
     parts = [data.case.finished, data.point, data.options.get(name, data.case.study.spread)]
@@ -282,7 +283,7 @@ def _identity(data: ReportInput, name: str) -> str:
 
 @cache
 def _package() -> str:
-    """Identity of all of the package's code, for answers depend on more of the code than results do."""
+    """Identity of the whole package's code, since answers depend on more code than results do."""
     files = sorted(PACKAGE.rglob("*.py"))
     return repr([version("safevar_sumo"), RESULTS, [(file.relative_to(PACKAGE).as_posix(), sha256(file.read_bytes()).hexdigest())
                                                     for file in files]])

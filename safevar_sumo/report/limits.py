@@ -1,4 +1,4 @@
-"""The sections on tolerances, on the probability of a failure, and on the regions of failures."""
+"""The sections on tolerances, the probability of a failure, and the regions of failures."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from safevar_sumo.analysis.tolerance.compute import find_tolerances
 from safevar_sumo.analysis.words import number_of
 from safevar_sumo.replay.comparison import number, raised, spaced
 from safevar_sumo.report.input import ReportInput, stored_answer
-from safevar_sumo.report.svg import Bar, rows
+from safevar_sumo.report.svg import Bar, bar_chart
 from safevar_sumo.vehicles import Characteristic
 
 Section = dict[str, Any]
 
 
 def tolerance(data: ReportInput, jobs: int | None, progress: Progress) -> Section:
-    """Every characteristic's safe interval alone, as bars over its domain, and the factor for all together."""
+    """The safe interval of each characteristic alone, as bars over its domain, and the safe factor of all characteristics together."""
     def compute() -> Section:
         tolerances = find_tolerances(data.case.study, data.options["tolerance"], jobs=jobs, progress=progress)
         return {**tolerances.to_dict(), "verdict": tolerances.verdict}
@@ -31,7 +31,7 @@ def tolerance(data: ReportInput, jobs: int | None, progress: Progress) -> Sectio
 
 
 def risk(data: ReportInput, jobs: int | None, progress: Progress) -> Section:
-    """The probability of a failure with its interval, and the characteristics that decide it, as bars."""
+    """The probability of a failure with its interval, and as bars the characteristics that decide whether a vehicle fails."""
     def compute() -> Section:
         return estimate_risk(data.case.study, data.options["risk"], jobs=jobs, progress=progress).to_dict()
 
@@ -44,14 +44,14 @@ def risk(data: ReportInput, jobs: int | None, progress: Progress) -> Section:
 
 
 def rules(data: ReportInput, jobs: int | None, progress: Progress) -> Section:
-    """Rules in words, with density and coverage on vehicles that were not used to find them."""
+    """Rules in words, with their density and coverage among vehicles that were not used to find the rules."""
     def compute() -> Section:
         regions = find_rules(data.case.study, data.options["rules"], jobs=jobs, progress=progress)
         significant = [rule for rule in regions.rules if rule.is_denser_than(regions.unsafe_share)]
         words = [raised(rule_in_words(rule, data.case.characteristics, regions.unsafe)) for rule in significant]
-        dropped = number_of(len(regions.rules) - len(significant), "rule")
+        omitted_rules = number_of(len(regions.rules) - len(significant), "rule")
         remark = regions.remark if len(significant) == len(regions.rules) else (
-            f"Left out: {dropped} that may be chance with so few vehicles; the command rules simulates more.")
+            f"Left out: {omitted_rules} that may be chance with so few vehicles; the command rules simulates more.")
         return {"words": words, "samples": regions.samples, "share": regions.unsafe_share, "remark": remark, "unsafe": str(regions.unsafe)}
 
     result: Section = stored_answer(data, "rules", compute)
@@ -59,9 +59,9 @@ def rules(data: ReportInput, jobs: int | None, progress: Progress) -> Section:
 
 
 INDICES = {"first_order": "alone", "total": "with others"}
-"""Names of the Sobol indices beside a bar."""
+"""Sobol indices, and their names beside a bar."""
 LIMITS: Mapping[str, Callable[[ReportInput, int | None, Progress], Section]] = {"tolerance": tolerance, "risk": risk, "rules": rules}
-"""The sections about the whole domain, by name."""
+"""Functions that compute the sections about the whole domain, by name."""
 
 
 def _bars(data: ReportInput, scans: list[Section]) -> Markup:
@@ -74,24 +74,24 @@ def _bars(data: ReportInput, scans: list[Section]) -> Markup:
         names.append(member.name)
         bars.append([*safe_bars, *(_bar(member, interval, "unsafe") for interval in unsafe),
                      *(_bar(member, interval, "weak", "could not be simulated") for interval in scan["not_simulated"])])
-        marks.append(_place(member, member.original))
+        marks.append(_position(member, member.original))
         ends.append((f"{number(member.lower)}{spaced(member.unit)}", f"{number(member.upper)}{spaced(member.unit)}"))
     description = f"{data.case.name}: where each characteristic alone is safe and where it is unsafe; a mark at the original"
-    return rows(description, names, bars, marks, ends)
+    return bar_chart(description, names, bars, marks, ends)
 
 
-def _bar(member: Characteristic, interval: Sequence[float], look: str, state: str = "") -> Bar:
+def _bar(member: Characteristic, interval: Sequence[float], css_class: str, state: str = "") -> Bar:
     low, high = interval
-    words = f"{member.name} from {number(low)} to {number(high)}{spaced(member.unit)}: {state or look}"
-    return Bar(_place(member, low), _place(member, high), look, words)
+    words = f"{member.name} from {number(low)} to {number(high)}{spaced(member.unit)}: {state or css_class}"
+    return Bar(_position(member, low), _position(member, high), css_class, words)
 
 
-def _index_bar(name: str, index: float, look: str, kind: str) -> Bar:
-    return Bar(0, min(max(index, 0.0), 1.0), look, f"{name}: {index:.0%} {kind}")
+def _index_bar(name: str, index: float, css_class: str, kind: str) -> Bar:
+    return Bar(0, min(max(index, 0.0), 1.0), css_class, f"{name}: {index:.0%} {kind}")
 
 
 def _percent(share: float | None, interval: Sequence[float | None]) -> str:
-    """An estimated share with half of its interval, such as `41 % ± 7`; an estimate just below 0 is 0."""
+    """An estimated share with half the width of its interval, such as `41 % ± 7`; an estimate just below 0 is shown as 0."""
     if share is None:
         return "-"
     low, high = interval
@@ -99,19 +99,19 @@ def _percent(share: float | None, interval: Sequence[float | None]) -> str:
     return f"{100 * (round(share, 2) + 0.0):.0f} %{error}"
 
 
-def _place(member: Characteristic, value: float) -> float:
-    """The place of a value in its domain, from 0 to 1."""
+def _position(member: Characteristic, value: float) -> float:
+    """The position of a value in its domain, from 0 to 1."""
     return (value - member.lower) / (member.upper - member.lower)
 
 
 def _sensitivity(data: ReportInput, sensitivity: list[Section]) -> Markup | None:
-    defined = [one for one in sensitivity if one["total"] is not None]
-    ordered = sorted(defined, key=lambda one: (-one["total"], one["characteristic"]))
-    if not ordered:
+    entries = sorted((entry for entry in sensitivity if entry["total"] is not None),
+                     key=lambda entry: (-entry["total"], entry["characteristic"]))
+    if not entries:
         return None
-    bars = [[_index_bar(one["characteristic"], one["total"], "weak", "together with others"),
-             _index_bar(one["characteristic"], one["first_order"] or 0.0, "safe", "alone")] for one in ordered]
-    return rows(f"{data.case.name}: share of the safety degree's variance that each characteristic explains",
-                [one["characteristic"] for one in ordered], bars, [None] * len(ordered),
-                [("", ", ".join(f"{words} {_percent(one[index], one[f'{index}_interval'])}" for index, words in INDICES.items()))
-                 for one in ordered])
+    bars = [[_index_bar(entry["characteristic"], entry["total"], "weak", "together with others"),
+             _index_bar(entry["characteristic"], entry["first_order"] or 0.0, "safe", "alone")] for entry in entries]
+    return bar_chart(f"{data.case.name}: share of the safety degree's variance that each characteristic explains",
+                [entry["characteristic"] for entry in entries], bars, [None] * len(entries),
+                [("", ", ".join(f"{words} {_percent(entry[index], entry[f'{index}_interval'])}" for index, words in INDICES.items()))
+                 for entry in entries])

@@ -1,4 +1,4 @@
-"""The page: its sections, its research questions, the commands that reproduce its numbers, and the template."""
+"""The page of a report: its sections, research questions, and the commands that reproduce its numbers."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ from safevar_sumo.errors import InputError, did_you_mean, warn
 from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.replay.comparison import raised
 from safevar_sumo.replay.page import environment, player_parts
-from safevar_sumo.report.findings import best_of, causes, evenly_spaced, explanations, necessity_chart, no_opinion, replays
+from safevar_sumo.report.findings import causes, evenly_spaced, explanations_of, front_of, necessity_chart, no_opinion, replays
 from safevar_sumo.report.input import ReportInput, read_inputs
 from safevar_sumo.report.limits import LIMITS
 from safevar_sumo.report.rated import rated_study_page
 from safevar_sumo.report.svg import Dot, scatter
-from safevar_sumo.report.verdict import tested, trust, verdict
+from safevar_sumo.report.verdict import tested_system, trust, verdict
 from safevar_sumo.shipped import RUN
 from safevar_sumo.study import Study, load_study, study_names
 
@@ -38,22 +38,22 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 DIGITS = re.compile(r"(\d\.\d\d)\d+")
-"""A number in a picture with more digits than anybody can see."""
-DOTS = 150
+"""Numbers of a picture with more decimals than a screen can show."""
+MAX_DOTS = 150
 """Maximum number of points in a scatter chart."""
-TEXT = {"svg.fonttype": "none", "svg.hashsalt": "safevar_sumo", "font.family": ["sans-serif"]}
+SVG_STYLE = {"svg.fonttype": "none", "svg.hashsalt": "safevar_sumo", "font.family": ["sans-serif"]}
 
 
 def tables(cases: Sequence[Case]) -> list[dict[str, Any]]:
-    """Every table for the template; a table with the reason where no question can be answered."""
+    """All tables for the template; if no question can be answered, a table with the reason."""
     try:
         answers = answer(cases)
     except Unanswerable as error:
         return [{"title": "RQ1 to RQ3", "heads": (), "spans": (), "rows": [], "labels": 0, "notes": [f"{error.source}: {error.problem}."]}]
-    return [_plain(table) for one in answers for table in lay_out(one)]
+    return [_table_data(table) for question_table in answers for table in lay_out(question_table)]
 
 
-def _plain(table: Table) -> dict[str, Any]:
+def _table_data(table: Table) -> dict[str, Any]:
     rows = [[{"text": raised(str(cell)), "bold": isinstance(cell, Bold)} for cell in row] for row in table.rows]
     spans = [("", table.labels), *((raised(name), width) for name, width in table.spans)] if table.spans else []
     heads, notes = ([raised(text) for text in texts] for texts in (table.heads, table.notes))
@@ -61,12 +61,12 @@ def _plain(table: Table) -> dict[str, Any]:
 
 
 def figures(cases: Sequence[Case]) -> list[dict[str, str]]:
-    """Every figure as a picture embedded in the page."""
+    """All figures as pictures to embed in the page."""
     try:
-        drawn, _ = draw(cases)
+        figures_by_name, _ = draw(cases)
     except Unanswerable:
         return []
-    return [{"name": name, "alt": _alt_text(figure), "source": _inline(figure)} for name, figure in drawn.items()]
+    return [{"name": name, "alt": _alt_text(figure), "source": _data_url(figure)} for name, figure in figures_by_name.items()]
 
 
 def _alt_text(figure: Figure) -> str:
@@ -74,59 +74,59 @@ def _alt_text(figure: Figure) -> str:
     return f"{figure.get_suptitle()}: {axis.get_ylabel() or 'values'} over {axis.get_xlabel() or 'characteristics'}".replace("\n", " ")
 
 
-def _inline(figure: Figure) -> str:
+def _data_url(figure: Figure) -> str:
     import matplotlib
 
     buffer = BytesIO()
-    with matplotlib.rc_context(TEXT):  # type: ignore[arg-type]
+    with matplotlib.rc_context(SVG_STYLE):  # type: ignore[arg-type]
         figure.savefig(buffer, format="svg", metadata={"Date": None})
     picture = DIGITS.sub(r"\1", buffer.getvalue().decode())
     return "data:image/svg+xml," + quote(picture, safe=" =:/;,()'!?@&+$*")
 
 
-def front(data: ReportInput, replayed: Sequence[str]) -> Markup:
-    """A chart of the non-dominated solutions by largest change and safety degree, with links to the replays of `replayed` handles."""
+def front(data: ReportInput, handles: Sequence[str]) -> Markup:
+    """A chart of non-dominated solutions by largest change and safety degree; those of `handles` link to their replays."""
     rows = [row for row in data.solutions.values() if not np.isnan([row["f_safe"], row["f_diff"]]).any()]
-    best = best_of(rows)
-    chosen = [best[index] for index in evenly_spaced(len(best), DOTS)] + [row for row in rows if row["handle"] in replayed]
-    dots = {row["handle"]: _dot(data, row, row["handle"] in replayed) for row in chosen}
-    return scatter(f"{data.case.name}: safety degree over the largest change of the solutions that no other beats",
+    best = front_of(rows)
+    selection = [best[index] for index in evenly_spaced(len(best), MAX_DOTS)] + [row for row in rows if row["handle"] in handles]
+    dots = {row["handle"]: _dot(data, row, row["handle"] in handles) for row in selection}
+    return scatter(f"{data.case.name}: safety degree over the largest change of the solutions that no other solution beats",
                    list(dots.values()), "largest change [% of the original]", "safety degree [m, or -m/s]", 0.0, "collision below")
 
 
-def _dot(data: ReportInput, row: dict[Any, Any], is_replayed: bool) -> Dot:
+def _dot(data: ReportInput, row: dict[Any, Any], has_replay: bool) -> Dot:
     words = (f"{row['handle']}: {row['outcome']}, safety degree {row['f_safe']:.2f}, largest change {row['f_diff']:.0%}, "
              f"{row['f_num_diff']} changed")
-    look = "hit" if row["outcome"] == "collision" else "miss"
-    return Dot(100 * row["f_diff"], row["f_safe"], words, look, data.anchor("replay", row["handle"]) if is_replayed else "")
+    css_class = "hit" if row["outcome"] == "collision" else "miss"
+    return Dot(100 * row["f_diff"], row["f_safe"], words, css_class, data.anchor("replay", row["handle"]) if has_replay else "")
 
 
 def reproduce(inputs: Sequence[ReportInput], parts: Sequence[str]) -> list[dict[str, str]]:
-    """Commands that reproduce the numbers of this page."""
-    places = " ".join(shlex.quote(str(data.directory)) for data in inputs)
+    """Commands that reproduce the numbers of the page; `parts` are the questions whose answers the page shows."""
+    directories = " ".join(shlex.quote(str(data.directory)) for data in inputs)
     commands = []
     for data in inputs:
-        place, study = shlex.quote(str(data.directory)), data.case.study
-        now = " --as-it-is-now" if data.changed else ""
+        directory, study = shlex.quote(str(data.directory)), data.case.study
+        flag = " --as-it-is-now" if data.changed else ""
         if data.case.has_runs:
             commands.append({"what": f"The study {study.name}, as its manifest.json records it, into another directory",
                              "command": _rerun_command(study, f"{data.directory}-again", data.directory)})
         questions = [*parts, *(["opinion"] if "explain" in parts and data.system is not None and not no_opinion(data) else [])]
-        commands += [{"what": f"The part {part}", "command": data.options[part].command_line(str(data.directory), data.point) + now}
+        commands += [{"what": f"The part {part}", "command": data.options[part].command_line(str(data.directory), data.point) + flag}
                      for part in questions]
         if data.point:
             continue
         commands.append({"what": "A replay, with figure and animation",
-                         "command": f"{RUN} simulate {place} --most-severe --plot it.png --animate it.html{now}"})
+                         "command": f"{RUN} simulate {directory} --most-severe --plot it.png --animate it.html{flag}"})
     if any(data.point for data in inputs):
         return commands
-    commands.append({"what": "The tables of RQ1 to RQ3", "command": f"{RUN} tables {places}"})
-    commands.append({"what": "The figures", "command": f"{RUN} figures {places} --out figures"})
+    commands.append({"what": "The tables of RQ1 to RQ3", "command": f"{RUN} tables {directories}"})
+    commands.append({"what": "The figures", "command": f"{RUN} figures {directories} --out figures"})
     return commands
 
 
-def _rerun_command(study: Study, out: str, place: Path) -> str:
-    """The command that runs a study again: `study` with options for a shipped study, else a call with the recorded study."""
+def _rerun_command(study: Study, out: str, directory: Path) -> str:
+    """The command that runs a study again: `study` with options for a shipped study, else a call of `run` with the recorded study."""
     search = study.search
     if study.name in study_names():
         options = {name: getattr(search, name) for name in ("seed", "runs", "evaluations", "algorithms")}
@@ -134,7 +134,7 @@ def _rerun_command(study: Study, out: str, place: Path) -> str:
         if msgspec.structs.replace(shipped, search=msgspec.structs.replace(shipped.search, **options), origin=study.origin) == study:
             flags = {**options, "algorithms": shlex.quote(",".join(search.algorithms)), "out": shlex.quote(out)}
             return " ".join([f"{RUN} study {study.name}", *(f"--{name} {value}" for name, value in flags.items())])
-    script = f"import safevar_sumo as sv; sv.run(sv.load({json.dumps(str(place))}).study, out={json.dumps(out)}, progress=True)"
+    script = f"import safevar_sumo as sv; sv.run(sv.load({json.dumps(str(directory))}).study, out={json.dumps(out)}, progress=True)"
     return f"python -c {shlex.quote(script)}"
 
 
@@ -150,24 +150,25 @@ SECTIONS = {
     "trust": "What was not tested, and how far to trust it",
     "reproduce": "How to reproduce every number",
 }
-"""The sections of a report in their order, by the names that `--only` accepts."""
+"""Headings of the sections in order, by the names that `--only` accepts."""
 
 
 PARTS = {"causes": "explain", **{name: name for name in LIMITS}}
-"""Sections that need simulations, each with the command that computes it alone."""
+"""Commands that compute the sections that need simulations, by section."""
 
 
 def make_report(directories: Iterable[str | Path], only: Sequence[str] = (), jobs: int | None = None, progress: Progress = silent,
                 *, point: str | None = None, as_it_is_now: bool = False) -> str:
-    """The page about results in directories; parameters, warnings and errors are those of `safevar_sumo.report`."""
-    unknown = [name for name in only if name not in SECTIONS]
-    if unknown:
-        raise InputError("only", f"there is no section {unknown[0]!r}{did_you_mean(unknown[0], SECTIONS)}", f"some of {','.join(SECTIONS)}")
-    wanted = [name for name in SECTIONS if not only or name in only]
+    """Make the page about results in directories; parameters, warnings and errors are those of `safevar_sumo.report`."""
+    unknown_names = [name for name in only if name not in SECTIONS]
+    if unknown_names:
+        raise InputError("only", f"there is no section {unknown_names[0]!r}{did_you_mean(unknown_names[0], SECTIONS)}",
+                         f"some of {','.join(SECTIONS)}")
+    sections = [name for name in SECTIONS if not only or name in only]
     if point is not None:
         if "questions" in only:
             raise InputError("only", "the research questions are about whole studies", "sections other than questions with --point")
-        wanted = [name for name in wanted if name != "questions"]
+        sections = [name for name in sections if name != "questions"]
     inputs = read_inputs(directories, point, as_it_is_now=as_it_is_now)
     for data in inputs:
         for change in data.changed:
@@ -179,47 +180,47 @@ def make_report(directories: Iterable[str | Path], only: Sequence[str] = (), job
         return environment(WEB).get_template("rated.html.j2").render(
             title=f"Euro NCAP rating: {', '.join(data.case.name for data in inputs)}", css=_web_file("report.css"),
             studies=[rated_study_page(data, jobs, progress) for data in inputs]) + "\n"
-    cases = [data.case for data in inputs] if "questions" in wanted else []
-    with ThreadPoolExecutor(1) as beside:  # this process only waits while workers simulate, and nothing else in it draws
-        questions = beside.submit(lambda: (tables(cases), figures(cases)) if cases else ([], []))
-        studies = [_study(data, wanted, jobs, progress) for data in inputs]
+    cases = [data.case for data in inputs] if "questions" in sections else []
+    with ThreadPoolExecutor(1) as drawing_thread:  # meanwhile this process only waits for workers, and nothing else in it draws
+        questions = drawing_thread.submit(lambda: (tables(cases), figures(cases)) if cases else ([], []))
+        studies = [_study(data, sections, jobs, progress) for data in inputs]
         progress("tables and figures", 0, 1)
         answers, pictures = questions.result()
     page = environment(WEB).get_template("report.html.j2").render(
-        title=f"Safety report: {', '.join(data.case.name for data in inputs)}", sections={name: SECTIONS[name] for name in wanted},
+        title=f"Safety report: {', '.join(data.case.name for data in inputs)}", sections={name: SECTIONS[name] for name in sections},
         studies=studies, tables=answers, figures=pictures,
-        commands=reproduce(inputs, [PARTS[name] for name in PARTS if name in wanted]) if "reproduce" in wanted else [],
+        commands=reproduce(inputs, [PARTS[name] for name in PARTS if name in sections]) if "reproduce" in sections else [],
         takes_simulations=list(PARTS), player=player_parts(), css=_web_file("report.css"), js=_web_file("report.js"))
     progress("tables and figures", 1, 1)
     return page + "\n"
 
 
-def _study(data: ReportInput, wanted: Sequence[str], jobs: int | None, show: Progress) -> Mapping[str, Any]:
-    """The data of one study for every wanted section."""
+def _study(data: ReportInput, sections: Sequence[str], jobs: int | None, show: Progress) -> Mapping[str, Any]:
+    """The data of one study for the given sections."""
     def progress(stage: str, done: int, total: int) -> None:
         show(f"{data.case.name}: {stage}", done, total)
 
-    explained = explanations(data, jobs, progress) if "causes" in wanted and data.system is not None else None
+    explanations = explanations_of(data, jobs, progress) if "causes" in sections and data.system is not None else None
     limits = {name: make(data, jobs, progress) for name, make in LIMITS.items()
-              if name in wanted and data.system is not None}
+              if name in sections and data.system is not None}
     progress("replays", 0, 1)
-    replayed = replays(data, explained) if "causes" in wanted else []
-    sections: dict[str, Callable[[], Any]] = {
-        "tested": lambda: tested(data),
-        "verdict": lambda: verdict(data, explained, limits.get("tolerance")),
-        "causes": lambda: causes(explained.failures if explained else [], data),
+    solutions = replays(data, explanations) if "causes" in sections else []
+    functions: dict[str, Callable[[], Any]] = {
+        "tested": lambda: tested_system(data),
+        "verdict": lambda: verdict(data, explanations, limits.get("tolerance")),
+        "causes": lambda: causes(explanations.failures if explanations else [], data),
         "no_opinion": lambda: "" if data.system is None else no_opinion(data),
-        "necessity": lambda: necessity_chart(explained.summary, data) if explained else None,
-        "trust": lambda: trust(data, explained)}
-    different = [solution.handle for solution in replayed if solution.differences]
-    if different:
-        warn(f"{data.directory}: simulated again with different results: {', '.join(different)}; other versions or code than in the study?")
-    return {"name": data.case.name, "title": data.case.study.title, "anchor": data.anchor(), "replays": replayed,
-            "different": different,
+        "necessity": lambda: necessity_chart(explanations.summary, data) if explanations else None,
+        "trust": lambda: trust(data, explanations)}
+    handles = [solution.handle for solution in solutions if solution.differences]
+    if handles:
+        warn(f"{data.directory}: simulated again with different results: {', '.join(handles)}; other versions or code than in the study?")
+    return {"name": data.case.name, "title": data.case.study.title, "anchor": data.anchor(), "replays": solutions,
+            "different": handles,
             "problem": data.problem, "changed": data.changed, "original_fails": data.original_fails,
-            "front": front(data, [solution.handle for solution in replayed]) if replayed else None,
-            **limits, **{name: make() for name, make in sections.items()
-                         if name in wanted or (name in ("necessity", "no_opinion") and "causes" in wanted)}}
+            "front": front(data, [solution.handle for solution in solutions]) if solutions else None,
+            **limits, **{name: make() for name, make in functions.items()
+                         if name in sections or (name in ("necessity", "no_opinion") and "causes" in sections)}}
 
 
 def _web_file(name: str) -> Markup:

@@ -1,4 +1,4 @@
-"""The page about results of a rated study: matrices of the original beside those of a worn vehicle, and the points lost by test."""
+"""The page about a rated study: matrices and points of the original vehicle and of a worn vehicle, and the points lost by test."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ from safevar_sumo.results import chosen_handle, position_of
 from safevar_sumo.vehicles import CharacteristicSet
 
 CHOICE = "fewest"
-"""The solution beside the original: it loses a point with the fewest changes."""
+"""Choice of the solution beside the original: the fewest changes that lose a point."""
 
 
 def rated_study_page(data: ReportInput, jobs: int | None, progress: Progress) -> dict[str, Any]:
-    """The data of one study for the page; its vehicles are simulated in all cells."""
+    """The data of one study for the page; simulates the vehicles in all cells."""
     case, variants, handle = data.case, dict[str, np.ndarray](), None
     if case.unsafe.rows(case.solutions).any():
         handle = chosen_handle(case.solutions, case.unsafe, CHOICE, data.directory)
@@ -41,20 +41,20 @@ def rated_study_page(data: ReportInput, jobs: int | None, progress: Progress) ->
     rating_command = RatingOptions(solution=None if handle is None else str(handle)).command_line(str(data.directory))
     return {"title": case.study.title, "sentence": rating_in_words(rating), "notes": remarks(rating), "points": _points(rating),
             "lost": [(test_in_words(test), f"{lost:.2f}") for test, lost in lost_by_test(rating)], "turned": turned_in_words(rating),
-            "picture": picture(rating), "names": [variant.name for variant in rating.variants], "open": not_simulated(rating),
+            "picture": picture(rating), "names": [variant.name for variant in rating.variants], "not_simulated": not_simulated(rating),
             "commands": [rating_command, *(question_command(question, str(data.directory)) for question in ("tolerance", "explain"))]}
 
 
 def _points(rating: Rating) -> Sequence[tuple[str, Sequence[str], str]]:
-    """Rows of a test, the points of every vehicle, and the points to earn."""
+    """Rows of texts: a test, the points of each vehicle, and the points available."""
     rows = [(tests[0].block.name, [f"{test.total:.2f}" for test in tests], f"{sum(tests[0].block.points):g}")
             for tests in zip(*(variant.tests for variant in rating.variants), strict=True)]
-    possible = sum(sum(block.points) for block in rating.protocol.blocks)
-    return [*rows, ("all", [f"{variant.points:.2f}" for variant in rating.variants], f"{possible:g}")]
+    available = sum(sum(block.points) for block in rating.protocol.blocks)
+    return [*rows, ("all", [f"{variant.points:.2f}" for variant in rating.variants], f"{available:g}")]
 
 
 def picture(rating: Rating) -> Markup:
-    """The matrices as SVG to embed in the page; the same rating gives the same bytes."""
+    """The matrices as SVG to embed in the page; equal ratings give equal bytes."""
     import matplotlib
 
     file = io.StringIO()

@@ -1,4 +1,4 @@
-"""Made-up studies name no vehicle model that has their characteristics: they travel to their pool by name alone."""
+"""Made-up studies reach their pool only by name, since no vehicle model has their characteristics."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Studies made up for tests: characteristics from 0 to 10 around an original of 5, and a plant whose unsafe region is known."""
+"""Made-up studies for tests: characteristics from 0 to 10 with an original of 5, and a pool whose unsafe region is known."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def made_up_study(n: int) -> Study:
 
 
 class Plant:
-    """A pool in which settings of a region collide at 1 m/s, those of `failing` fail, and all others keep the distance of `degree`."""
+    """A pool in which settings in `region` collide at 1 m/s, settings in `failing` fail, and all others have the safety degree `degree`."""
 
     workers = 1
 

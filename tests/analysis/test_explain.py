@@ -44,7 +44,7 @@ from safevar_sumo.study import load_study
 from safevar_sumo.sumo import assemble, evaluate
 from safevar_sumo.vehicles import CharacteristicSet
 from tests.analysis.known_regions import ORIGINAL, Plant, box, everywhere, made_up_evaluator, made_up_study, two_islands
-from tests.in_process import Here
+from tests.in_process import InlinePool
 
 
 @pytest.fixture(scope="module")
@@ -56,7 +56,7 @@ def collides(case: Case, settings: list[dict[str, float]]) -> list[bool]:
     members = case.characteristics
     rows = np.array([members.setting(values, "test") for values in settings])
     assert (members.filter(rows) == rows).all(), "a value that the filter takes for no change"
-    return list(Evaluator(case.study, Here()).evaluate(rows, "afresh").collided)
+    return list(Evaluator(case.study, InlinePool()).evaluate(rows, "afresh").collided)
 
 
 @pytest.mark.slow
@@ -124,7 +124,7 @@ def test_the_failure_to_lead_with_is_the_smallest_that_is_not_borderline(case: C
     settings = crashes[list(case.characteristics.names)].to_numpy()
     place = next(i for i, setting in enumerate(settings) if setting.tolist() == list(robust.setting.values()))
     if place:
-        evaluator = Evaluator(case.study, Here())
+        evaluator = Evaluator(case.study, InlinePool())
         assert max(one.share for one in robustness(evaluator, settings[:place], 0.05, explained.unsafe)) < 0.8
 
 
@@ -132,10 +132,10 @@ def test_the_failure_to_lead_with_is_the_smallest_that_is_not_borderline(case: C
 def test_a_named_solution_is_explained_whatever_it_is(case: Case) -> None:
     safe = case.solutions["f_safe"].idxmax()
     handle = str(handles(case.solutions)[safe])
-    (one,) = explain_failures(case, ExplainOptions(solutions=(handle,), unsafe="collision"), pool=Here()).explanations
+    (one,) = explain_failures(case, ExplainOptions(solutions=(handle,), unsafe="collision"), pool=InlinePool()).explanations
     assert (str(one.handle), one.causes, one.reasons) == (handle, (), ("asked for",))
     with pytest.raises(InputError, match="nsga2:7:0"):
-        explain_failures(case, ExplainOptions(solutions=("nsga2:7:0",)), pool=Here())
+        explain_failures(case, ExplainOptions(solutions=("nsga2:7:0",)), pool=InlinePool())
 
 
 def test_nothing_unsafe_is_an_answer(slippery: Path) -> None:
@@ -200,8 +200,8 @@ def assert_tells_a_manager(paragraph: str, explained: Explained) -> None:
 
 @pytest.mark.slow
 def test_the_summary_of_a_study_leads_with_the_answer(case: Case, explained: Explained) -> None:
-    original = Evaluator(case.study, Here()).original()
-    paragraph, first, *others, more = lead(case.study, case.solutions, original, Here(), "my results")
+    original = Evaluator(case.study, InlinePool()).original()
+    paragraph, first, *others, more = lead(case.study, case.solutions, original, InlinePool(), "my results")
     crashes = int((case.solutions["outcome"] == "collision").sum())
     assert_tells_a_manager(paragraph, explained)
     assert first == f"{crashes} of {len(case.solutions)} solutions collide."
@@ -209,7 +209,7 @@ def test_the_summary_of_a_study_leads_with_the_answer(case: Case, explained: Exp
     assert all(" These changes alone cause it: " in line for line in others)
     safe = case.solutions[case.solutions["f_safe"] > 2]
     assert more == "Why, and how far: python -m safevar_sumo explain 'my results'"
-    nothing, more = lead(case.study, safe, original, Here(), "out")
+    nothing, more = lead(case.study, safe, original, InlinePool(), "out")
     assert nothing.startswith(f"Nothing unsafe found in {len(safe)} solutions")
     assert more == "How far each characteristic may go: python -m safevar_sumo tolerance out"
 

@@ -21,7 +21,7 @@ from safevar_sumo.results import solutions_frame
 from safevar_sumo.study import ModelTable, load_study
 from safevar_sumo.sumo.matrix import evaluate, simulate
 from safevar_sumo.sumo.system import System, assemble
-from tests.in_process import Here
+from tests.in_process import InlinePool
 
 STUDY = load_study("euro_ncap_pedestrian")
 BLIND = ModelTable(model="aeb", parameters={"reach": 3.0})
@@ -32,7 +32,7 @@ ORIGINAL = np.array([one.original for one in STUDY.vehicle.characteristics.value
 def evaluator(**parameters: object) -> Evaluator:
     """A short-sighted driving system in one scenario."""
     scenario = ModelTable(model="crossing", parameters=parameters)
-    return Evaluator(msgspec.structs.replace(STUDY, matrix=None, ads=BLIND, scenario=scenario), Here())
+    return Evaluator(msgspec.structs.replace(STUDY, matrix=None, ads=BLIND, scenario=scenario), InlinePool())
 
 
 def vehicle(brakes: float = 1.0, max_rpm: float = 1.0) -> FloatArray:
@@ -89,7 +89,7 @@ def test_in_a_matrix_the_worst_point_counts() -> None:
     tests = [msgspec.structs.replace(one, over={}, parameters={**one.parameters, "speed": speeds[one.name]}, weathers=[])
              for one in STUDY.matrix.tests if one.name in speeds]
     study = msgspec.structs.replace(STUDY, ads=BLIND, matrix=msgspec.structs.replace(STUDY.matrix, tests=tests))
-    assert preventable_by(Evaluator(study, Here()), vehicle()[np.newaxis]) == [PreventableBy.FULL_BRAKING]
+    assert preventable_by(Evaluator(study, InlinePool()), vehicle()[np.newaxis]) == [PreventableBy.FULL_BRAKING]
 
 
 TESTS = [{"name": "CPLA", "model": "along", "over": {"speed": [20, 40]}, "weathers": ["clear", "night"]},
@@ -142,5 +142,5 @@ def test_the_summary_of_a_matrix_asks_why_at_the_worst_point_alone(system: Syste
     study = load_study("euro_ncap_pedestrian", matrix={"tests": TESTS})
     solutions = solutions_frame(system.characteristics.names, [(("nsga2", 0), evaluate(system, weak))])
     original = evaluate(system, system.characteristics.original[np.newaxis])
-    more = lead(study, solutions, original, Here(), "out")[-1]
+    more = lead(study, solutions, original, InlinePool(), "out")[-1]
     assert more.endswith(f": python -m safevar_sumo explain out --point '{failure.because.point}'")

@@ -1,4 +1,4 @@
-"""The study whose runs are driven."""
+"""The study that the tests of campaigns search."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A campaign over pools whose evaluations are formulas."""
+"""Campaigns over pools that evaluate settings by a formula."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ SUN = CharacteristicSet.of(load_study("sun").vehicle.characteristics)
 
 
 def evaluated(settings: np.ndarray) -> Evaluations:
-    """The safer, the nearer to the original; what only the sum over a row tells."""
+    """Settings are safer the nearer they are to the original, measured by the sum of all relative changes."""
     share = (settings - SUN.original) / (SUN.upper - SUN.lower)
     safety = 3.0 - 4.0 * np.add.accumulate(np.abs(share), axis=1)[:, -1]
     collided = safety <= 0
@@ -32,18 +32,18 @@ def evaluated(settings: np.ndarray) -> Evaluations:
 
 
 class FormulaPool:
-    """Answers in the order of submission, or `shuffled` by threads; breaks down after `lasts` batches."""
+    """Answers in the order of submission or, if `shuffled`, in the order of threads; fails after `limit` batches."""
 
-    def __init__(self, workers: int = 1, lasts: int | None = None, shuffled: bool = False) -> None:
-        self.workers, self._lasts = workers, lasts
+    def __init__(self, workers: int = 1, limit: int | None = None, shuffled: bool = False) -> None:
+        self.workers, self._limit = workers, limit
         self.simulated: list[bytes] = []
         self._threads = ThreadPoolExecutor(4) if shuffled else None
 
     def submit(self, study: bytes, settings: np.ndarray) -> Future[Evaluations]:
-        if self._lasts is not None:
-            if not self._lasts:
+        if self._limit is not None:
+            if not self._limit:
                 raise PoolLostError("broken down")
-            self._lasts -= 1
+            self._limit -= 1
         self.simulated += [row.tobytes() for row in settings]
         if self._threads:
             return self._threads.submit(evaluated, settings)
@@ -52,8 +52,8 @@ class FormulaPool:
         return future
 
 
-class Told:
-    """Keeps what an observer is told."""
+class EventLog:
+    """An observer that records all reports."""
 
     def __init__(self) -> None:
         self.simulated = self.asked = 0
@@ -76,8 +76,8 @@ def with_search(study: Study, **changes: object) -> Study:
 
 
 def carried_out(study: Study, path: Path, pool: FormulaPool | None = None, keys: Iterable[RunKey] | None = None,
-                batch: int | None = None) -> tuple[Campaign, Told]:
-    observer = Told()
+                batch: int | None = None) -> tuple[Campaign, EventLog]:
+    observer = EventLog()
     results = ResultsDirectory(path, study)
     campaign = run_campaign(study, all_runs(study) if keys is None else keys, results, pool or FormulaPool(), observer, batch)
     results.finish(campaign.solutions)

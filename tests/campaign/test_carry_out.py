@@ -24,7 +24,7 @@ from safevar_sumo.results.journal import read_journal
 from safevar_sumo.search import Search
 from safevar_sumo.study import Study, tables_of
 from safevar_sumo.workers.evaluation import PoolLostError, WorkerLostError
-from tests.campaign.formulas import SUN, FormulaPool, Told, carried_out, evaluated, solutions, with_search
+from tests.campaign.formulas import SUN, EventLog, FormulaPool, carried_out, evaluated, solutions, with_search
 
 
 @pytest.mark.slow
@@ -93,8 +93,8 @@ def test_an_original_vehicle_that_collides_is_told(study: Study, tmp_path: Path)
 def test_a_campaign_that_breaks_down_anywhere_is_resumed_where_it_was(study: Study, tmp_path: Path) -> None:
     whole = FormulaPool()
     carried_out(study, tmp_path / "whole", whole)
-    for lasts in (1, 2, 3, 7, 20, 41):
-        out, first, second = tmp_path / str(lasts), FormulaPool(lasts=lasts), FormulaPool()
+    for limit in (1, 2, 3, 7, 20, 41):
+        out, first, second = tmp_path / str(limit), FormulaPool(limit=limit), FormulaPool()
         with pytest.raises(PoolLostError, match="broken down"):
             carried_out(study, out, first, batch=study.search.population)
         carried_out(study, out, second)
@@ -107,7 +107,7 @@ def test_a_campaign_that_breaks_down_anywhere_is_resumed_where_it_was(study: Stu
 def test_a_finished_campaign_answers_without_simulating(study: Study, tmp_path: Path) -> None:
     first, observer = carried_out(study, tmp_path)
     before = solutions(tmp_path)
-    again, observer_again = carried_out(study, tmp_path, FormulaPool(lasts=0))
+    again, observer_again = carried_out(study, tmp_path, FormulaPool(limit=0))
     assert solutions(tmp_path) == before
     assert again.failures == first.failures == []
     assert observer_again.simulated == 0
@@ -126,7 +126,7 @@ def test_more_runs_extend_and_fewer_leave_out(study: Study, tmp_path: Path) -> N
 @pytest.mark.parametrize("key", [RunKey("nsga2", 1), RunKey("rs", 0), RunKey("safe_fuzzer", 1)])
 def test_a_run_alone_is_the_same_as_in_the_whole(study: Study, tmp_path: Path, key: RunKey) -> None:
     campaign, _ = carried_out(study, tmp_path / "whole")
-    alone = run_campaign(study, [key], ResultsDirectory(tmp_path / "alone", study), FormulaPool(), Told())
+    alone = run_campaign(study, [key], ResultsDirectory(tmp_path / "alone", study), FormulaPool(), EventLog())
     assert list(alone.solutions) == [key]
     assert np.array_equal(alone.solutions[key].settings, campaign.solutions[key].settings)
     assert np.array_equal(alone.solutions[key].objectives, campaign.solutions[key].objectives)
@@ -136,7 +136,7 @@ def test_a_run_in_other_hands_is_left_to_them(study: Study, tmp_path: Path) -> N
     carried_out(study, tmp_path / "whole")
     results = ResultsDirectory(tmp_path / "out", study)
     theirs = [results.journal("rs-01"), results.journal("original")]
-    campaign = run_campaign(study, all_runs(study), results, FormulaPool(), Told())
+    campaign = run_campaign(study, all_runs(study), results, FormulaPool(), EventLog())
     assert campaign.busy == [RunKey("rs", 1)]
     assert set(campaign.solutions) == set(all_runs(study)) - {RunKey("rs", 1)}
     for journal in theirs:
@@ -159,7 +159,7 @@ def test_more_or_fewer_evaluations_go_on_and_end_as_if_there_had_never_been_othe
     pd.testing.assert_frame_equal(results.evaluations, fresh.evaluations)
     pd.testing.assert_frame_equal(results.solutions, fresh.solutions)
     assert len(set(pools[0].simulated)) + len(set(pools[1].simulated)) == len(set(pools[0].simulated) | set(pools[1].simulated))
-    carried_out(first, tmp_path / "out", FormulaPool(lasts=0))
+    carried_out(first, tmp_path / "out", FormulaPool(limit=0))
 
 
 def test_every_evaluation_is_read_in_the_order_in_which_it_was_asked_for(study: Study, tmp_path: Path) -> None:
@@ -214,7 +214,7 @@ def test_a_setting_that_is_asked_for_twice_stands_where_it_was_asked_for_first(t
     def twice() -> Search:
         return (yield settings).take([0])
 
-    run = Run(RunKey("nsga2", 0), twice(), Journal(tmp_path / "a.journal", "study", "nsga2-00"), Told(), budget=3)
+    run = Run(RunKey("nsga2", 0), twice(), Journal(tmp_path / "a.journal", "study", "nsga2-00"), EventLog(), budget=3)
     assert not run.advance()
     assert run.take(evaluated(run.missing))
     run.advance()
@@ -241,12 +241,12 @@ def test_failures_are_counted_kept_out_and_not_met_again(study: Study, tmp_path:
     assert np.array_equal(failed, frame["tireFric"] < 1.3)
     assert not (load_runs(tmp_path).solutions["tireFric"] < 1.3).any()
     before = solutions(tmp_path)
-    again, _ = carried_out(study, tmp_path, FormulaPool(lasts=0))
+    again, _ = carried_out(study, tmp_path, FormulaPool(limit=0))
     assert again.failures == campaign.failures
     assert solutions(tmp_path) == before
     for path in (tmp_path / "runs").glob("*-*.journal"):
         path.write_bytes(path.read_bytes()[:-3])
-    again, _ = carried_out(study, tmp_path, FormulaPool(lasts=0))
+    again, _ = carried_out(study, tmp_path, FormulaPool(limit=0))
     assert again.failures == campaign.failures
     assert solutions(tmp_path) == before
 
@@ -268,9 +268,9 @@ def test_failed_settings_are_tried_again_when_that_is_asked_for(study: Study, tm
     assert list(results.failures) == failed.failures != []
     assert {one.reason for one in failed.failures} == {"SUMO failed: it has its day off"}
     with pytest.raises(PoolLostError):  # a retry that breaks down is gone on with
-        run_campaign(study, all_runs(study), ResultsDirectory(tmp_path / "out", study), FormulaPool(lasts=7), Told(), retry_failed=True)
+        run_campaign(study, all_runs(study), ResultsDirectory(tmp_path / "out", study), FormulaPool(limit=7), EventLog(), retry_failed=True)
     pool = FormulaPool()
-    campaign = run_campaign(study, all_runs(study), ResultsDirectory(tmp_path / "out", study), pool, Told(), retry_failed=True)
+    campaign = run_campaign(study, all_runs(study), ResultsDirectory(tmp_path / "out", study), pool, EventLog(), retry_failed=True)
     ResultsDirectory(tmp_path / "out", study).finish(campaign.solutions)
     carried_out(study, tmp_path / "whole")
     assert campaign.failures == []

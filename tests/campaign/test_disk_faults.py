@@ -15,7 +15,7 @@ from safevar_sumo.campaign import all_runs, run_campaign
 from safevar_sumo.errors import SafevarError
 from safevar_sumo.results import ResultsDirectory, files, journal, load_runs
 from safevar_sumo.study import Study, load_study
-from tests.campaign.formulas import FormulaPool, Told
+from tests.campaign.formulas import EventLog, FormulaPool
 
 KINDS = (errno.EIO, errno.ENOSPC, errno.EINTR, 0)
 """Errors that a step fails with; 0 is a write of half of what was to be written, and no error elsewhere."""
@@ -82,7 +82,7 @@ def tiny() -> Study:
 
 def carried_out(study: Study, path: Path) -> bytes:
     results = ResultsDirectory(path, study)
-    results.finish(run_campaign(study, all_runs(study), results, FormulaPool(), Told()).solutions)
+    results.finish(run_campaign(study, all_runs(study), results, FormulaPool(), EventLog()).solutions)
     return (path / "solutions.csv").read_bytes()
 
 

@@ -163,7 +163,7 @@ def test_every_name_of_the_list_can_be_read_and_typed(monkeypatch: pytest.Monkey
     monkeypatch.setitem(catalogue.VEHICLES, "in_no_study", catalogue.VEHICLES["sumo"])
     output = CliRunner(env={"COLUMNS": "80"}).invoke(commands, ["list"], catch_exceptions=False).stdout
     assert "Vehicle in_no_study" in output, "a vehicle without a study has no characteristics to explain"
-    assert "┃ name            ┃ friction ┃ sight ┃ delay, s ┃ light ┃ road ┃" in output
+    assert "┃ name            ┃ friction ┃ visibility ┃ delay, s    ┃ light ┃ road ┃" in output
     assert "…" not in output
     for name in ("f_safe", "f_comfort", "f_diff", "rating_points"):
         assert f"│ {name} " in output.partition("Objectives")[2]

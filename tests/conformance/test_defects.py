@@ -14,7 +14,7 @@ from safevar_sumo.conformance import KINDS, check, checked, finding, subject_of,
 from safevar_sumo.study import load_study, study_names
 from safevar_sumo.workers.isolation import check_code
 from safevar_sumo.workers.retrying import RetryingPool
-from tests.in_process import Here, run
+from tests.in_process import InlinePool, run
 
 SCALAR = """import random
 import time
@@ -243,7 +243,7 @@ def test_everything_that_a_study_names_is_checked_and_remembered(in_tmp: Path) -
     study = load_study("six/mine.toml")
     assert {one.name for one in subjects_of(study)} == {
         "my_vehicle:Cart", "my_ads:Careful", "my_scenario:Wall", "my_metrics:JERK", "my_objective:MEAN", "nsga2", "my_search:Halving"}
-    pool = RetryingPool(Here(), study)
+    pool = RetryingPool(InlinePool(), study)
     assert check_code(study, {"sources": {"my_ads.py": "1"}}, pool) == []
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(pool, "submit", lambda *_, **__: pytest.fail("checked again"))

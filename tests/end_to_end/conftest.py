@@ -1,4 +1,4 @@
-"""No command outlives its test, however that ended; a small study and its results are there for all."""
+"""Fixtures of a small study and its results; no command outlives its test, however the test ends."""
 
 from __future__ import annotations
 
@@ -30,20 +30,20 @@ def _nothing_left_running() -> Iterator[None]:
 
 @pytest.fixture
 def small(in_tmp: Path) -> None:
-    """The file of the small study, in an empty working directory."""
+    """Write the file of the small study to an empty working directory."""
     Path("small.toml").write_text(processes.STUDY)
 
 
 @pytest.fixture(scope="session")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The results of the small study; nobody changes them."""
-    place = tmp_path_factory.mktemp("whole")
-    (place / "small.toml").write_text(processes.STUDY)
-    return searched(load_study(str(place / "small.toml")), place / "out")
+    """Results of the small study; no test may change them."""
+    folder = tmp_path_factory.mktemp("whole")
+    (folder / "small.toml").write_text(processes.STUDY)
+    return searched(load_study(str(folder / "small.toml")), folder / "out")
 
 
 @pytest.fixture
 def copied(small: None, whole: Path) -> Path:
-    """Those results, to be spoilt."""
+    """A copy of these results that a test may change."""
     shutil.copytree(whole, "out")
     return Path("out")

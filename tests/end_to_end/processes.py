@@ -1,4 +1,4 @@
-"""A small study of three algorithms, in this process or in processes of its own: started, watched, killed."""
+"""A small study of three algorithms, in this process or in other processes that tests start, watch and kill."""
 
 from __future__ import annotations
 
@@ -21,28 +21,28 @@ name = "small"
 algorithms = ["nsga2", "rs", "safe_fuzzer"]
 evaluations = 150
 """
-WAIT = 60.0
+TIMEOUT = 60.0  # s
 running: list[subprocess.Popen[str]] = []
-"""What a test has started."""
+"""Processes that a test has started."""
 
 
 def started(*arguments: str, **options: object) -> subprocess.Popen[str]:
-    """A command in a process group of its own, as a shell starts it."""
+    """Start a command in its own process group, as a shell does."""
     running.append(subprocess.Popen([sys.executable, "-m", "safevar_sumo", *arguments], stdout=subprocess.PIPE,  # type: ignore[call-overload]
                                     stderr=subprocess.PIPE, text=True, start_new_session=True, **options))
     return running[-1]
 
 
 def until(condition: Callable[[], bool], process: subprocess.Popen[str] | None = None) -> None:
-    """Wait for a condition, or for the end of the process that is to bring it about."""
-    end = time.monotonic() + WAIT
+    """Wait for a condition, or for the end of the process that should fulfil it."""
+    deadline = time.monotonic() + TIMEOUT
     while not condition() and (process is None or process.poll() is None):
-        assert time.monotonic() < end, "waited in vain"
+        assert time.monotonic() < deadline, "the condition was not fulfilled in time"
         time.sleep(0.01)
 
 
 def written(out: Path) -> int:
-    """How many bytes the journals of the runs have."""
+    """Number of bytes in the journals of the runs."""
     return sum(path.stat().st_size for path in out.glob("runs/*-*.journal"))
 
 
@@ -55,20 +55,20 @@ def workers_of(process: subprocess.Popen[str]) -> list[psutil.Process]:
 
 
 def left_of_group(process: subprocess.Popen[str]) -> list[str]:
-    """What still lives of a command's process group."""
-    left: list[str] = []
-    for one in psutil.process_iter() if os.name == "posix" else ():
+    """Command lines of the processes in a command's process group that still run."""
+    command_lines: list[str] = []
+    for member in psutil.process_iter() if os.name == "posix" else ():
         try:
-            if os.getpgid(one.pid) == process.pid and one.status() != psutil.STATUS_ZOMBIE:
-                left.append(" ".join(one.cmdline()))
+            if os.getpgid(member.pid) == process.pid and member.status() != psutil.STATUS_ZOMBIE:
+                command_lines.append(" ".join(member.cmdline()))
         except (psutil.Error, ProcessLookupError):
             continue
-    return left
+    return command_lines
 
 
 def ended(process: subprocess.Popen[str], expect: int) -> str:
-    """Wait for a command's end; returns what it told on stderr."""
-    output, errors = process.communicate(timeout=WAIT)
+    """Wait for a command's end; returns its text on stderr."""
+    output, errors = process.communicate(timeout=TIMEOUT)
     assert process.returncode == expect, f"{process.returncode}\n{output}\n{errors}"
     assert "Traceback" not in output + errors, errors
     until(lambda: not left_of_group(process))
@@ -76,13 +76,13 @@ def ended(process: subprocess.Popen[str], expect: int) -> str:
 
 
 def killed(process: subprocess.Popen[str]) -> None:
-    """kill -9."""
+    """Kill a process with SIGKILL."""
     process.send_signal(signal.SIGKILL)
-    process.communicate(timeout=WAIT)
+    process.communicate(timeout=TIMEOUT)
 
 
 def study(*arguments: str, expect: int = 0) -> str:
-    """Carry the small study out in this process, without a summary; returns what it prints on stderr."""
+    """Search the small study in this process, without a summary; returns the text on stderr."""
     return run("study", "small.toml", "--quiet", *arguments, expect=expect).stderr
 
 

@@ -1,4 +1,4 @@
-"""FMUs made once for all tests, and studies that use them."""
+"""FMUs, exported once for all tests, and studies that use them."""
 
 from __future__ import annotations
 
@@ -93,8 +93,8 @@ def small(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Syst
 
     def system(then: str = "self.pedal = 1.0", table: str = "", edit: Callable[[Path], object] = lambda fmu: None, time_limit: float = 300,
                options: dict[str, str] | None = None) -> System:
-        made = exported(SMALL.format(then=then), tmp_path, "small", **options or {})
-        edit(made)
+        fmu = exported(SMALL.format(then=then), tmp_path, "small", **options or {})
+        edit(fmu)
         (tmp_path / "small.toml").write_text(f"""
 extends = "native"
 name = "small"

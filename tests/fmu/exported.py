@@ -1,4 +1,4 @@
-"""FMUs for tests: sources of slaves, exported by pythonfmu and pythonfmu3, and FMUs with another model description."""
+"""FMUs for tests: sources of slaves that pythonfmu and pythonfmu3 export, and FMUs with an edited model description."""
 
 from __future__ import annotations
 
@@ -104,7 +104,7 @@ from pythonfmu import Fmi2Causality, Fmi2Slave, Fmi2Variability, Real
 
 
 class Small(Fmi2Slave):
-    """Counts its steps; does what is asked for at a gap."""
+    """Counts its steps; executes a statement within a gap."""
 
     def __init__(self, **kwargs):
         super().__init__(**kwargs)
@@ -126,7 +126,7 @@ from pythonfmu import Fmi2Causality, Fmi2Slave, Fmi2Variability, Real
 
 
 class Cart(Fmi2Slave):
-    """Accelerates and brakes by so much per pedal."""
+    """Accelerates and brakes in proportion to its pedals."""
 
     def __init__(self, **kwargs):
         super().__init__(**kwargs)
@@ -146,7 +146,7 @@ from pythonfmu3 import Fmi3Causality, Fmi3Slave, Fmi3Variability, Float64, Unit
 
 
 class Third(Fmi3Slave):
-    """Wishes for a twentieth of its speed in km/h, and brakes within `where` millimetres."""
+    """Asks for a twentieth of its speed [km/h] as a percentage, and for 100 % within `where` millimetres."""
 
     def __init__(self, **kwargs):
         super().__init__(**kwargs)
@@ -165,22 +165,22 @@ class Third(Fmi3Slave):
 
 
 def exported(source: str, folder: Path, name: str, *, third: bool = False, **options: str) -> Path:
-    """The FMU of a slave."""
+    """Export a slave; returns its FMU."""
     file = folder / f"{name}_source.py"
     file.write_text(source)
     (FmuBuilder3 if third else FmuBuilder).build_FMU(file, dest=folder, **options)
-    (made,) = (path for path in folder.glob("*.fmu") if path.stem in source)
-    return made
+    (fmu,) = (path for path in folder.glob("*.fmu") if path.stem in source)
+    return fmu
 
 
 def aeb(nominal: Nominal) -> str:
-    """The source of the shipped AEB, that knows the original vehicle."""
+    """The source of the shipped AEB with the data of the original vehicle."""
     tables = nominal.tables()
-    return AEB.format(facts=tuple(nominal[:5]), tables=[one.tolist() for one in tables[:3]], braking=tables.braking, seen=SEEN)
+    return AEB.format(facts=tuple(nominal[:5]), tables=[table.tolist() for table in tables[:3]], braking=tables.braking, seen=SEEN)
 
 
 def changed(fmu: Path, into: Path, edit: Callable[[str], str], keep: Callable[[str], bool] = lambda name: True) -> Path:
-    """An FMU with an edited model description, without some files."""
+    """Write an FMU with an edited model description and only the files to `keep`."""
     with zipfile.ZipFile(fmu) as old, zipfile.ZipFile(into, "w") as new:
         for name in filter(keep, old.namelist()):
             content = old.read(name)

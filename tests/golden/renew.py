@@ -1,6 +1,6 @@
-"""The originals of the shipped studies and small searches of them, computed in this process; run as a program, renews golden.json.
+"""Results of shipped studies: the original vehicle and a small search, computed in this process. As a program: renews golden.json.
 
-Every entry has rounded values that a person can compare, `why` it is kept, and digests of the same values to the last bit.
+Each entry has rounded values that a person can compare, the reason for the entry (`why`), and digests of the exact values.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ WHY = {
     "lgsvl": "another vehicle model, driving system and scenario: a lead vehicle stands",
     "native": "SUMO's own car-following model with modelled sensors and actuators",
     "smoke": "the study that a user runs first"}
-"""Every study, and what would go unseen without its entry."""
+"""Studies, each with the reason for its entry."""
 FILE = Path(__file__).with_name("golden.json")
 
 
 def small(name: str) -> Study:
-    """A shipped study with a search of a second."""
+    """A shipped study with a search that takes a second."""
     study = load_study(name)
     search = msgspec.structs.replace(study.search, algorithms=["nsga2", "rs", "safe_fuzzer"], population=10, evaluations=40, runs=1)
     return msgspec.structs.replace(study, search=search)
@@ -50,16 +50,16 @@ def computed(name: str) -> dict[str, Any]:
 
 
 def _of_algorithm(rows: pd.DataFrame, original: dict[str, float]) -> dict[str, Any]:
-    """How many solutions there are and collide, and the most severe one: its objectives and its changes."""
-    worst = rows.sort_values(CHOICES["most_severe"], kind="stable").iloc[0]
-    severe = {name: float(worst[name]) for name in CHOICES["most_severe"]}
-    severe |= {name: float(worst[name]) for name, value in original.items() if worst[name] != value}
-    return {"number": len(rows), "collisions": int((rows["outcome"] == "collision").sum()), "most_severe": _rounded(severe),
+    """The numbers of solutions and of collisions, and the most severe solution: its objectives and its changes."""
+    most_severe = rows.sort_values(CHOICES["most_severe"], kind="stable").iloc[0]
+    values = {name: float(most_severe[name]) for name in CHOICES["most_severe"]}
+    values |= {name: float(most_severe[name]) for name, value in original.items() if most_severe[name] != value}
+    return {"number": len(rows), "collisions": int((rows["outcome"] == "collision").sum()), "most_severe": _rounded(values),
             "digest": _digest(rows.to_csv(index=False, lineterminator="\n"))}
 
 
 def _rounded(values: dict[str, Any]) -> dict[str, Any]:
-    """Five digits: enough to see by how much a value has changed."""
+    """Round numbers to five digits, enough to see how much a value has changed."""
     return {name: float(f"{value:.5g}") if isinstance(value, float) else value for name, value in values.items()}
 
 

@@ -17,7 +17,7 @@ from safevar_sumo.results import load_runs
 from safevar_sumo.shipped import NETWORKS
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.system import assemble
-from tests.in_process import Here, run
+from tests.in_process import InlinePool, run
 from tests.plugins.beside import SCALAR, Mine
 
 ADS = ("import numpy as np\n\n\nclass Mine:\n    def start(self, n, nominal, step):\n        return 0\n\n"
@@ -85,7 +85,7 @@ def test_a_class_that_remembers_what_only_a_rare_setting_does(mine: Mine, folder
     study = load_study(str(folder / "mine.toml"), search={"algorithms": ["nsga2"], "evaluations": 60, "runs": 1})
     for _ in range(2):  # the same command again does not get by either
         with pytest.raises(ForeignError, match=r"in run nsga2-00 and [\d.]+ alone; again by: python -m safevar_sumo simulate") as caught:
-            carry_out_runs(study, system, all_runs(study), tmp_path / "out", Here(), NullObserver(), 7)
+            carry_out_runs(study, system, all_runs(study), tmp_path / "out", InlinePool(), NullObserver(), 7)
         assert "ads.model = 'mine:Mine' a result depends on what else is simulated" in str(caught.value)
     assert not (tmp_path / "out/solutions.csv").exists()
 
@@ -111,7 +111,7 @@ def test_an_algorithm_whose_runs_learn_from_each_other(own: str, shared: bool, m
     study = load_study(str(folder / "mine.toml"))
 
     def searched() -> object:
-        return carry_out_runs(study, system, all_runs(study), tmp_path / "out", Here(), NullObserver(), None)
+        return carry_out_runs(study, system, all_runs(study), tmp_path / "out", InlinePool(), NullObserver(), None)
 
     if shared:
         with pytest.raises(ForeignError, match=r"'mine:Mine' settings requested .* in a second run .*mine.py:9"):
@@ -146,7 +146,7 @@ def test_a_class_that_makes_every_twelfth_vehicle_safer(mine: Mine, folder: Path
     system = mine(SAFER)
     study = load_study(str(folder / "mine.toml"), search={"algorithms": ["rs"], "evaluations": 100, "runs": 2})
     with pytest.raises(ForeignError, match=r"ads.model = 'mine:Mine' (a result depends on what else is simulated|.* in another order)"):
-        carry_out_runs(study, system, all_runs(study), tmp_path / "out", Here(), NullObserver(), None)
+        carry_out_runs(study, system, all_runs(study), tmp_path / "out", InlinePool(), NullObserver(), None)
 
 
 CLOCK = """
@@ -168,7 +168,7 @@ def test_an_algorithm_that_draws_from_the_clock(mine: Mine, folder: Path, tmp_pa
     system = mine(CLOCK, '[search]\nalgorithms = ["mine:Mine"]\nevaluations = 20\nruns = 1\n')
     study = load_study(str(folder / "mine.toml"))
     with pytest.raises(ForeignError, match=r"'mine:Mine' settings requested .* when the run is repeated .*mine.py:10"):
-        carry_out_runs(study, system, all_runs(study), tmp_path / "out", Here(), NullObserver(), None)
+        carry_out_runs(study, system, all_runs(study), tmp_path / "out", InlinePool(), NullObserver(), None)
 
 
 GREEDY = """
@@ -195,7 +195,7 @@ def test_an_algorithm_that_changes_its_problem_or_asks_for_nothing(module: str, 
     system = mine(module, '[search]\nalgorithms = ["mine:Mine"]\nevaluations = 10\nruns = 1\n')
     study = load_study(str(folder / "mine.toml"))
     with pytest.raises(ForeignError, match=problem):
-        carry_out_runs(study, system, all_runs(study), tmp_path / "out", Here(), NullObserver(), None)
+        carry_out_runs(study, system, all_runs(study), tmp_path / "out", InlinePool(), NullObserver(), None)
 
 
 @pytest.fixture

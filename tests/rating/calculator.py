@@ -1,4 +1,4 @@
-"""Euro NCAP's official calculator, in a separate environment: it needs another version of pandas than this package."""
+"""Euro NCAP's own calculator, in a separate environment, since it needs another version of pandas than this package."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ import openpyxl
 
 from safevar_sumo.protocol import EURO_NCAP_2026, protocol_of
 
-GIVEN = "SAFEVAR_CALCULATOR"
-"""Environment variable with the folder of an environment in which the calculator is installed."""
+ENVIRONMENT = "SAFEVAR_CALCULATOR"
+"""Environment variable that names the folder of an environment with the calculator."""
 
 
 class Calculator:
-    """The program, as it is typed."""
+    """The calculator's command line."""
 
     def __init__(self, folder: Path) -> None:
         self.python = folder / ("Scripts" if os.name == "nt" else "bin") / "python"
@@ -25,19 +25,21 @@ class Calculator:
 
     @classmethod
     def built(cls, folder: Path) -> Calculator:
-        """From PyPI, in the version that the protocol's data was derived from."""
-        if os.environ.get(GIVEN):
-            return cls(Path(os.environ[GIVEN]))
+        """Install the calculator from PyPI, in the version from which the protocol's data was derived."""
+        if os.environ.get(ENVIRONMENT):
+            return cls(Path(os.environ[ENVIRONMENT]))
         venv.create(folder, with_pip=True)
-        one = cls(folder)
+        calculator = cls(folder)
         version = protocol_of(EURO_NCAP_2026).calculator
-        subprocess.run([one.python, "-m", "pip", "install", "-q", f"euroncap-rating-2026=={version}", "pandas<3"], check=True, timeout=900)
-        return one
+        packages = [f"euroncap-rating-2026=={version}", "pandas<3"]
+        subprocess.run([calculator.python, "-m", "pip", "install", "-q", *packages], check=True, timeout=900)
+        return calculator
 
     def run(self, command: str, place: Path, *options: str) -> str:
-        done = subprocess.run([self._program, "crash_avoidance", command, *options], cwd=place, capture_output=True, text=True, timeout=300)
-        assert done.returncode == 0, done.stdout + done.stderr
-        return done.stdout
+        arguments = [self._program, "crash_avoidance", command, *options]
+        process = subprocess.run(arguments, cwd=place, capture_output=True, text=True, timeout=300)
+        assert process.returncode == 0, process.stdout + process.stderr
+        return process.stdout
 
     def template(self, place: Path) -> Path:
         self.run("generate-template", place)
@@ -48,20 +50,20 @@ class Calculator:
         self.run("preprocess", place, "-i", str(predicted), "-o", str(place))
         return place / "ca_preprocessed_template.xlsx"
 
-    def scored(self, filled: Path, place: Path) -> Scored:
+    def scored(self, filled: Path, place: Path) -> CalculatorScores:
         place.mkdir()
-        said = self.run("compute-score", place, "-i", str(filled), "-o", str(place))
-        assert "Warning" not in said, said
-        return Scored(next(place.glob("*.xlsx")))
+        output = self.run("compute-score", place, "-i", str(filled), "-o", str(place))
+        assert "Warning" not in output, output
+        return CalculatorScores(next(place.glob("*.xlsx")))
 
     def derived(self) -> str:
-        """The protocol's data, derived anew."""
+        """Derive the protocol's data again."""
         script = Path(__file__).with_name("derive.py")
         return subprocess.run([self.python, script], capture_output=True, text=True, check=True, timeout=300).stdout
 
 
-class Scored:
-    """The calculator's results for a spreadsheet: points by test, and the rows that it verified."""
+class CalculatorScores:
+    """The calculator's scores of a spreadsheet: points by test, and the verified rows."""
 
     def __init__(self, path: Path) -> None:
         book = openpyxl.load_workbook(path)

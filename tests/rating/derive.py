@@ -1,4 +1,4 @@
-"""Derives `safevar_sumo/protocol/euro_ncap_2026.toml` from the official calculator; runs in an environment that has it.
+"""Derive `safevar_sumo/protocol/euro_ncap_2026.toml` from the official calculator, in an environment that has the calculator.
 
 `python tests/rating/derive.py > safevar_sumo/protocol/euro_ncap_2026.toml` after `pip install euroncap-rating-2026 'pandas<3'`.
 """
@@ -28,20 +28,20 @@ def quoted(values: object) -> str:
 
 def block(sheet, frame, name: str) -> list[str]:
     """A matrix of a prediction sheet as TOML."""
-    place = matrix_processing.get_matrix_indices(frame, name)
+    extent = matrix_processing.get_matrix_indices(frame, name)
     # A choice of function is taken as AEB up to CCRs and CMRs, where AEB is assessed either way, and as FCW for CPLA and CBLA.
-    top, left, n_rows, n_columns = place["start_row"] + 2, place["start_col"] + 1, place["n_rows"], place["n_cols"]
+    top, left, n_rows, n_columns = extent["start_row"] + 2, extent["start_col"] + 1, extent["n_rows"], extent["n_cols"]
     headings = {sheet.cell(top - 2, column).value: column for column in range(2, left + 1)}
     test, _, light = name.partition(" ")
-    along = "impact_location" if "Impact location" in [sheet.cell(top - 2, c).value for c in range(1, left + 1)] else "target_speed"
+    column_key = "impact_location" if "Impact location" in [sheet.cell(top - 2, c).value for c in range(1, left + 1)] else "target_speed"
     columns = [sheet.cell(top - 1, left + k).value for k in range(n_columns)]
-    columns = [round(100 * value) for value in columns] if along == "impact_location" else [number(value) for value in columns]
+    columns = [round(100 * value) for value in columns] if column_key == "impact_location" else [number(value) for value in columns]
     points = {(p.row, p.col): p for p in matrix_processing.get_test_matrix(frame, name, KEY)}
     rows = []
     for k in range(n_rows):
         function = sheet.cell(top + k, headings["Function"]).value if "Function" in headings else "AEB"
         speeds = f"vut = {number(sheet.cell(top + k, 1).value)}"
-        if along == "impact_location":
+        if column_key == "impact_location":
             speeds += f", target = {number(sheet.cell(top + k, headings['Target speed']).value)}"
         mask = "".join(MASK[points[k, j].test_range] if (k, j) in points else "-" for j in range(n_columns))
         rows.append(f'  {{ {speeds}, ranges = "{mask}"{"" if function else ", choice = true"} }},')
@@ -51,7 +51,7 @@ def block(sheet, frame, name: str) -> list[str]:
         f'sheet = "{sheet.title}"', f'label = "A{top - 2}"', f'first = "{sheet.cell(top, left).coordinate}"',
         *([f'function = "{sheet.cell(top, headings["Function"]).column_letter}"'] if "Function" in headings else []),
         f"points = [{', '.join(f'{total[kind] or 0:g}' for kind in ('Standard', 'Extended', 'Robustness'))}]",
-        f"{along}s = {quoted(columns)}", "rows = [", *rows, "]"]
+        f"{column_key}s = {quoted(columns)}", "rows = [", *rows, "]"]
 
 
 def criterion(name: str) -> str:
@@ -59,15 +59,15 @@ def criterion(name: str) -> str:
 
 
 def bands(test: str, attributes: dict[str, str], colours: list[str]) -> str:
-    """Upper ends of the colours of a measured value, found by asking the calculator at every hundredth: those after the first one."""
-    asked = []
+    """Lower limits of the colours of a measured value, from the colours that the calculator gives at each hundredth."""
+    limits = []
     for hundredth in range(6001):
         point = matrix_processing.TestPoint(0, 0, common.PredictionColor.GREY, matrix_processing.TestRange.STANDARD, attributes)
         colour = matrix_processing.ComputedTestPoint(point, test, hundredth / 100).measured_color.value
-        if not asked or asked[-1][0] != colour:
-            asked.append((colour, hundredth / 100))
-    assert [colour for colour, _ in asked] == [colour for colour in colours if colour in dict(asked)]
-    return "{ " + ", ".join(f"{colour} = {start:g}" for colour, start in asked) + " }"
+        if not limits or limits[-1][0] != colour:
+            limits.append((colour, hundredth / 100))
+    assert [colour for colour, _ in limits] == [colour for colour in colours if colour in dict(limits)]
+    return "{ " + ", ".join(f"{colour} = {start:g}" for colour, start in limits) + " }"
 
 
 def main() -> None:
@@ -96,24 +96,24 @@ def main() -> None:
         name = row[4] or name  # noqa: F821
         scenario.setdefault(name, []).append(row[7])
     lines += [f'"{name}" = [{", ".join(f"{value:g}" for value in [*points, 0, 0][:3])}]' for name, points in scenario.items()]
-    subs = data_model.STAGE_SUBELEMENT_TO_LOADCASES["FC"]
-    simulated = []
-    for part, names in subs.items():
+    tests_by_part = data_model.STAGE_SUBELEMENT_TO_LOADCASES["FC"]
+    simulated_tests = []
+    for part, names in tests_by_part.items():
         for name in names:
             test = data_model.SUBTEST_TO_TEST_DICT.get(name, name)
             if test not in NOT_SIMULATED:
                 lines += block(book[f"FC - {part} pred."], frames[f"FC - {part} pred."], name)
-                simulated.append((test, part))
-    for test, part in dict.fromkeys(simulated):
+                simulated_tests.append((test, part))
+    for test, part in dict.fromkeys(simulated_tests):
         sheet = book[f"FC - {part} robust. pred."]
         column = next(cell.column for cell in sheet[1] if cell.value == test)
         for row in range(2, sheet.max_row + 1):
             cell, layer = sheet.cell(row, column), sheet.cell(row, 2).value
             if cell.fill.fill_type and cell.fill.fgColor.tint:
-                known = robustness_layer.ROBUSTNESS_LAYER_TO_VERIFICATION_CONDITION
-                found = next((known[one].get(test, []) for one in known if one.value == layer), [])
-                found = [found] if isinstance(found, tuple) else found
-                conditions = [f'{{ condition = "{text}", criterion = "{kind.value}" }}' for text, kind in found]
+                conditions_by_layer = robustness_layer.ROBUSTNESS_LAYER_TO_VERIFICATION_CONDITION
+                pairs = next((conditions_by_layer[key].get(test, []) for key in conditions_by_layer if key.value == layer), [])
+                pairs = [pairs] if isinstance(pairs, tuple) else pairs
+                conditions = [f'{{ condition = "{text}", criterion = "{kind.value}" }}' for text, kind in pairs]
                 lines += ["", "[[layers]]", f'test = "{test}"', f'layer = "{layer}"', f'sheet = "{sheet.title}"',
                           f'cell = "{cell.coordinate}"', f"conditions = [{', '.join(conditions)}]"]
     print("\n".join(lines))

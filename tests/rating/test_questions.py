@@ -31,13 +31,13 @@ from safevar_sumo.report.rated import picture
 from safevar_sumo.results import record, solutions_frame
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.system import assemble
-from tests.in_process import Here
+from tests.in_process import InlinePool
 
 STUDY = load_study("euro_ncap_rating")
 WHOLE = protocol_of(EURO_NCAP_2026)
 
 
-class TwoWorkers(Here):
+class TwoWorkers(InlinePool):
     """A pool in this process that splits a rating's cells for two workers."""
 
     workers = 2

@@ -22,7 +22,7 @@ from safevar_sumo.reference.search import TrialSearch
 from safevar_sumo.study import FitTable, FreeParameter, Study, load_study
 from safevar_sumo.sumo.matrix import evaluate
 from safevar_sumo.sumo.system import assemble
-from tests.in_process import Here
+from tests.in_process import InlinePool
 
 GAP = "ads.parameters.brake_gap"
 
@@ -46,7 +46,7 @@ def mine(gap: float, **fit: object) -> Study:
 @pytest.mark.slow
 def test_a_fit_from_scratch_finds_the_truth_and_forgets_what_the_study_says(data: ReferenceData) -> None:
     truth = load_study("sun").ads.parameters["brake_gap"]
-    fits = [calibrate(mine(gap, starts=1, trials=36), {"mine": data}, Here(), from_scratch=True) for gap in (0.4, 1.5)]
+    fits = [calibrate(mine(gap, starts=1, trials=36), {"mine": data}, InlinePool(), from_scratch=True) for gap in (0.4, 1.5)]
     assert fits[0].values == fits[1].values == {GAP: pytest.approx(truth, rel=0.05)}
     assert fits[0].reached == [fits[0].loss]
     assert (fits[0].used["mine"].rows, fits[0].held_back["mine"].rows) == (12, 12)
@@ -55,16 +55,16 @@ def test_a_fit_from_scratch_finds_the_truth_and_forgets_what_the_study_says(data
 def test_what_counts_for_nothing_in_the_study_costs_nothing(data: ReferenceData) -> None:
     """With all weights zero but that of the original vehicle, the rows have no part in the loss."""
     study = mine(1.1, trials=1, rank=0.0, collisions=0.0, weights={"tet": 0.0})
-    assert calibrate(study, {"mine": data}, Here()).loss == 0.0
+    assert calibrate(study, {"mine": data}, InlinePool()).loss == 0.0
     alone = mine(1.1, trials=1, original=2.0)
-    assert calibrate(alone, {}, Here()).loss == pytest.approx(2 * calibrate(mine(1.1, trials=1), {}, Here()).loss)
+    assert calibrate(alone, {}, InlinePool()).loss == pytest.approx(2 * calibrate(mine(1.1, trials=1), {}, InlinePool()).loss)
 
 
 def test_a_fit_is_refused_that_could_not_mean_anything(data: ReferenceData) -> None:
     with pytest.raises(InputError, match=r"fit\.starts = 0"):
-        calibrate(mine(1.0), {"mine": data}, Here(), from_scratch=True)
+        calibrate(mine(1.0), {"mine": data}, InlinePool(), from_scratch=True)
     with pytest.raises(InputError, match=r"fit\.weights\.speed is no metric"):
-        calibrate(mine(1.0, weights={"speed": 1.0}), {"mine": data}, Here())
+        calibrate(mine(1.0, weights={"speed": 1.0}), {"mine": data}, InlinePool())
 
 
 HESITATION = "ads.parameters.hesitation"
@@ -80,7 +80,7 @@ def test_studies_that_are_fitted_together_share_what_is_not_their_own(data: Refe
     settings = data.settings
     there = dict(evaluate(assemble(with_hesitation(load_study("sun"), 0.2)), settings).metrics)
     subjects = [FitSubject(sun, {"mine": data}), FitSubject(late, {"theirs": ReferenceData(settings, there, 0)})]
-    dry, wet = calibrate_together(subjects, Here())
+    dry, wet = calibrate_together(subjects, InlinePool())
     assert dry.values[GAP] == wet.values[GAP] == pytest.approx(truth, rel=0.05)
     assert wet.values[HESITATION] == pytest.approx(0.2, abs=0.04)
     assert set(dry.values) == {GAP}
@@ -97,7 +97,7 @@ def test_from_scratch_the_first_study_is_fitted_alone_then_what_the_others_have_
     there = dict(evaluate(assemble(with_hesitation(load_study("sun"), 0.2)), data.settings).metrics)
     subjects = [FitSubject(sun, {"mine": data}), FitSubject(late, {"theirs": ReferenceData(data.settings, there, 0)})]
     steps = list[tuple[float, float, float]]()
-    dry, wet = calibrate_together(subjects, Here(), lambda loss, best: steps.append(
+    dry, wet = calibrate_together(subjects, InlinePool(), lambda loss, best: steps.append(
         (value_of(best[0], GAP), value_of(best[1], GAP), value_of(best[1], HESITATION))), from_scratch=True)
     assert len(steps) == 100
     assert {(theirs, hesitation) for _, theirs, hesitation in steps[:64]} == {(0.4 * truth, 0.1)}, "nothing of the others"

@@ -28,7 +28,7 @@ from safevar_sumo.report import SECTIONS, findings, make_report
 from safevar_sumo.report import input as report_input
 from safevar_sumo.report import verdict as what
 from safevar_sumo.report.findings import Explanations
-from safevar_sumo.report.input import AVOIDED, failing_places, stored_answer
+from safevar_sumo.report.input import AVOIDED, failing_table, stored_answer
 from safevar_sumo.report.limits import LIMITS, _percent
 from safevar_sumo.report.page import PARTS, read_inputs
 from safevar_sumo.report.svg import Dot, scatter
@@ -39,7 +39,7 @@ from safevar_sumo.scenarios import Point
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.workers import local
 from tests.analysis.known_regions import Plant
-from tests.in_process import Here
+from tests.in_process import InlinePool
 
 
 class Outline(HTMLParser):
@@ -102,7 +102,7 @@ def never_again(few_samples: None, monkeypatch: pytest.MonkeyPatch) -> None:
         raise AssertionError("asked twice")
 
     monkeypatch.setattr(findings, "explain", ask)
-    monkeypatch.setattr(Here, "submit", ask)
+    monkeypatch.setattr(InlinePool, "submit", ask)
 
 
 @pytest.mark.slow
@@ -311,16 +311,16 @@ def test_tests_and_weathers_stand_down_and_speeds_across() -> None:
                 for speed in (10, 20, 30) for at in (25, 50)),
               point("along 30", test="along", speed=30, weather="clear"), point("along 40", test="along", speed=40, weather="clear"),
               point("safe 10", test="safe", speed=10, weather="clear")]
-    result = failing_places(matrix, ("near 20 50", "near 30 25", "near 30 50", "along 40"))
+    result = failing_table(matrix, ("near 20 50", "near 30 25", "near 30 50", "along 40"))
     assert result.summary == "Fails at 4 of 9 points. Percentages are impact locations."
     assert result.heads == ["10 km/h", "20 km/h", "30 km/h", "40 km/h"]
     assert dict(result.rows) == {"near, night": [AVOIDED, "50 %", "25 %, 50 %", ""], "along, clear": ["", "", AVOIDED, "fails"]}
 
 
 def test_a_matrix_of_something_else_than_speeds_has_a_table_too() -> None:
-    result = failing_places([point("a", test="a", weather="fog", slope=0.1), point("b", test="b", weather="fog")], ["a"])
+    result = failing_table([point("a", test="a", weather="fog", slope=0.1), point("b", test="b", weather="fog")], ["a"])
     assert (result.heads, result.rows) == ([""], [("a, fog, slope 0.1", ["fails"])])
-    assert failing_places([point("b", test="b", weather="fog")], []).rows == []
+    assert failing_table([point("b", test="b", weather="fog")], []).rows == []
 
 
 def test_a_study_that_cannot_be_simulated_has_its_page(slippery: Path, tmp_path: Path) -> None:
@@ -360,7 +360,7 @@ def test_what_comes_from_outside_is_called_by_its_name_once(slippery: Path) -> N
     points = [Point(scenario, data.case.weather)]  # type: ignore[arg-type]
     others: Any = SimpleNamespace(case=dataclasses.replace(data.case, study=study), manifest=data.manifest, problem="", point="",
                                   system=SimpleNamespace(points=points, matrix=(), vehicle=None))
-    result = what.tested(others)
+    result = what.tested_system(others)
     assert "Driving system: my_controller:Pilot. Scenario: pedestrian_crossing (" in result.subject
     assert "NSGA-II (1 run)" in result.search
     assert not result.tags

@@ -1,4 +1,4 @@
-"""Settings made up for tests: three characteristics, values that one can compute by hand."""
+"""Made-up cases for tests: three characteristics, and values that a person can compute by hand."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def frame(rows: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
 def made_up(*rows: Mapping[str, Any], original: Mapping[str, Any] = ORIGINAL, study: Study | None = None,
             evaluations: Sequence[Mapping[str, Any]] = (), finished: Sequence[tuple[str, int]] | None = None,
             has_runs: bool = True) -> Case:
-    """A setting of these solutions; its finished runs are those that have one, if nothing else is said."""
+    """A case with these solutions; unless `finished` is given, the finished runs are those with a solution."""
     done = list(dict.fromkeys((one["algorithm"], one["run"]) for one in rows)) if finished is None else finished
     seen = frame(evaluations)
     seen.insert(2, "evaluation", [one["evaluation"] for one in evaluations])

@@ -17,9 +17,9 @@ Evaluate = Callable[[CharacteristicSet, np.ndarray], Evaluations]
 
 
 def evaluated(characteristics: CharacteristicSet, settings: np.ndarray, safety: np.ndarray) -> Evaluations:
-    nothing = np.full(len(settings), np.nan)
+    undefined = np.full(len(settings), np.nan)
     return Evaluations(
-        settings=settings, outcome=np.full(len(settings), Outcome.STOPPED.value, dtype="U16"), collision_speed=nothing,
+        settings=settings, outcome=np.full(len(settings), Outcome.STOPPED.value, dtype="U16"), collision_speed=undefined,
         metrics={"safety_degree": safety}, f_diff=characteristics.largest_change(settings),
         f_num_diff=characteristics.number_changed(settings))
 
@@ -39,11 +39,11 @@ def begun(name: str, seed: int, evaluations: int, characteristics: Characteristi
 
 def searched(name: str, seed: int, evaluations: int, characteristics: CharacteristicSet = SUN,
              evaluate: Evaluate = sphere, algorithm: Algorithm | None = None) -> tuple[Evaluations, list[np.ndarray]]:
-    """Run an algorithm to its end; returns its result and all populations that it asked for."""
+    """Run an algorithm to its end; returns its result and all populations that it requested."""
     search = begun(name, seed, evaluations, characteristics, algorithm)
-    asked = [next(search)]
+    populations = [next(search)]
     while True:
         try:
-            asked.append(search.send(evaluate(characteristics, asked[-1])))
+            populations.append(search.send(evaluate(characteristics, populations[-1])))
         except StopIteration as end:
-            return end.value, asked
+            return end.value, populations

@@ -1,4 +1,4 @@
-"""Vehicles driven open loop: pedals over time in, states out."""
+"""Drive vehicles open loop: pedals over time give states over time."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Pedals = Callable[[float], tuple[Any, Any]]
 
 
 class Drive(NamedTuple):
-    """States of N vehicles at times 0, step, 2 step, ...; speeds (T, N) and travelled distances (T, N)."""
+    """States of N vehicles at T times 0, step, 2 step, ... [s]; speeds [m/s] and travelled distances [m] have shape (T, N)."""
 
     prepared: Any
     states: list[Any]
@@ -63,7 +63,7 @@ def original(model: str, n: int = 1) -> np.ndarray:
 
 
 def ends(model: str, name: str, points: int = 5) -> np.ndarray:
-    """The original vehicle with one characteristic moved across its domain, in `points` settings."""
+    """`points` settings of the original vehicle with one characteristic spread over its domain."""
     characteristics = SYSTEMS[model].characteristics
     settings, column = original(model, points), characteristics.names.index(name)
     settings[:, column] = np.linspace(characteristics.lower[column], characteristics.upper[column], points)

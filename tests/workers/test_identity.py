@@ -19,7 +19,7 @@ from safevar_sumo.vehicles import CharacteristicSet
 from safevar_sumo.workers.batches import digests_of_sources
 from safevar_sumo.workers.evaluation import evaluate_batch, packed
 from safevar_sumo.workers.identity import identity_of, networks_of, powers_digest
-from tests.in_process import Here
+from tests.in_process import InlinePool
 
 
 def test_names_and_defaults_are_resolved_to_numbers() -> None:
@@ -117,7 +117,7 @@ def place(in_tmp: Path) -> Path:
 
 
 def read(place: Path) -> dict[str, str]:
-    return digests_of_sources(load_study(place / "mine.toml"), Here())
+    return digests_of_sources(load_study(place / "mine.toml"), InlinePool())
 
 
 def test_what_is_read_while_models_are_loaded_made_and_first_run_counts_wherever_the_command_is_started(

@@ -11,27 +11,31 @@ for (const table of document.querySelectorAll("table.sortable")) {
       return Number.isNaN(number) ? text : number;
     };
     button.addEventListener("click", () => {
-      const up = head.getAttribute("aria-sort") !== "ascending";
-      heads.forEach((one) => one.removeAttribute("aria-sort"));
-      head.setAttribute("aria-sort", up ? "ascending" : "descending");
+      const ascending = head.getAttribute("aria-sort") !== "ascending";
+      heads.forEach((other) => other.removeAttribute("aria-sort"));
+      head.setAttribute("aria-sort", ascending ? "ascending" : "descending");
       const compare = (a, b) => (typeof a === typeof b ? (a < b ? -1 : a > b ? 1 : 0) : typeof a === "number" ? -1 : 1);
-      [...body.rows].sort((one, other) => (up ? 1 : -1) * compare(value(one), value(other))).forEach((row) => body.append(row));
+      [...body.rows].sort((a, b) => (ascending ? 1 : -1) * compare(value(a), value(b))).forEach((row) => body.append(row));
     });
   });
 }
-function open() {
+function openTarget() {
   const target = location.hash.length > 1 && document.getElementById(decodeURIComponent(location.hash.slice(1)));
   if (!target) return;
-  for (let one = target; one; one = one.parentElement) if (one.tagName === "DETAILS") one.open = true;
+  for (let element = target; element; element = element.parentElement) if (element.tagName === "DETAILS") element.open = true;
   target.scrollIntoView();
 }
-addEventListener("hashchange", open);
+addEventListener("hashchange", openTarget);
 document.addEventListener("click", (event) => {
   const row = event.target.closest("tr[data-opens]"), link = event.target.closest("a[href^='#']");
-  if (link && link.getAttribute("href") === location.hash) open();
-  if (row && !event.target.closest("a")) { if (location.hash === `#${row.dataset.opens}`) open(); else location.hash = row.dataset.opens; }
+  if (link && link.getAttribute("href") === location.hash) openTarget();
+  if (!row || event.target.closest("a")) return;
+  if (location.hash === `#${row.dataset.opens}`) openTarget(); else location.hash = row.dataset.opens;
 });
-let closed = [];
-addEventListener("beforeprint", () => { closed = [...document.querySelectorAll("details:not([open])")]; closed.forEach((one) => { one.open = true; }); });
-addEventListener("afterprint", () => closed.forEach((one) => { one.open = false; }));
-open();
+let closedDetails = [];
+addEventListener("beforeprint", () => {
+  closedDetails = [...document.querySelectorAll("details:not([open])")];
+  closedDetails.forEach((details) => { details.open = true; });
+});
+addEventListener("afterprint", () => closedDetails.forEach((details) => { details.open = false; }));
+openTarget();

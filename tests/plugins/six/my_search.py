@@ -4,7 +4,7 @@ from safevar_sumo.records import Evaluations
 
 
 class Halving:
-    """Random settings, then ever nearer to the original ones."""
+    """Random settings, ever nearer to the original setting."""
 
     def __init__(self, factor=0.5):
         self.factor = factor

@@ -13,7 +13,7 @@ class State(NamedTuple):
 
 
 class Cart:
-    """Accelerates and brakes by so much per pedal, the brake by more the lighter it is."""
+    """Accelerates and brakes in proportion to its pedals; a lighter cart brakes harder."""
 
     UNITS = {"mass": "kg", "power": "m/s^2", "grip": "m/s^2"}  # noqa: RUF012
 
