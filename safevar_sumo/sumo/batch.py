@@ -202,8 +202,7 @@ class _Warnings:
 class _Log:
     """T samples of N runs in arrays of shape (T, N), and positions of the vehicles on SUMO's plane, shape (T, N, 2)."""
 
-    _NAMES = ("speed", "gap", "lateral", "lateral_speed", "throttle", "brake", "gear", "active", "obstacle_speed",
-                "pedal")
+    _NAMES = ("speed", "gap", "lateral", "lateral_speed", "throttle", "brake", "gear", "active", "obstacle_speed", "pedal")
 
     def __init__(self, n: int, length: int, frame: Frame) -> None:
         self.length, self._frame = length, frame

@@ -23,8 +23,7 @@ ROAD_IDS: Ids = {
 SHARED_ELEMENTS = ("location", "type", "prohibition")
 """Elements of a built network that all copies share; SUMO ignores prohibitions, as junctions contain them."""
 DEMAND_IDS: Ids = {
-    "vType": ("id",), "route": ("id", "edges"), "vehicle": ("id", "type", "route", "via"),
-    "trip": ("id", "type", "from", "to", "via"),
+    "vType": ("id",), "route": ("id", "edges"), "vehicle": ("id", "type", "route", "via"), "trip": ("id", "type", "from", "to", "via"),
     "flow": ("id", "type", "route", "from", "to", "via"),
     "person": ("id", "type"), "personFlow": ("id", "type"), "walk": ("edges", "route", "from", "to"),
     "personTrip": ("from", "to", "via", "vTypes"),
