@@ -73,7 +73,7 @@ class MetricChecks(Checks, kind="metric"):
 
 
 class ObjectiveChecks(Checks, kind="objective"):
-    """All checks of a measure of change."""
+    """All checks of an objective that measures changes, such as f_diff."""
 
 
 class AlgorithmChecks(Checks, kind="algorithm"):

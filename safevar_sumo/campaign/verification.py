@@ -1,4 +1,4 @@
-"""Re-simulates settings of a run: in SUMO, if they drove in recorded scenes; and one by one, if code from outside took part."""
+"""Simulates settings of a run again: one by one if the study has user code, then in SUMO if the run used recorded scenes."""
 
 from __future__ import annotations
 
@@ -34,19 +34,20 @@ class Verification:
     def __init__(self, study: Study, results: ResultsDirectory, pool: RetryingPool, begin_search: Callable[[RunKey], Search],
                  engine: Engine, observer: Observer) -> None:
         self._study, self._pool, self._begin_search, self._observer = study, pool, begin_search, observer
-        self._single_work = packed(study, results.inputs, engine=engine, afresh=True) if foreign_names(study) else b""
+        self._isolated_work = packed(study, results.inputs, engine=engine, afresh=True) if foreign_names(study) else b""
         self._is_recorded = engine is Engine.RECORDED
         self._sumo_study = driven_in_sumo(study, assemble(study).weather)
         inputs = results.inputs if self._sumo_study is study else {**results.inputs, "network": networks_of(assemble(self._sumo_study))}
         self._in_sumo = Batcher(pool, packed(self._sumo_study, inputs, engine=Engine.LIBSUMO), LARGEST_WORLD)
-        self._leak_checks: dict[Future[Evaluations], tuple[Run, Evaluations]] = {}
+        self._isolated_checks: dict[Future[Evaluations], tuple[Run, Evaluations]] = {}
+        """By batch of one setting: the run, and the setting's evaluation in that run."""
         self._unverified: dict[Run, tuple[Evaluations, int]] = {}
         """By run: the evaluations to verify in SUMO, and the number of settings that SUMO has not simulated yet."""
 
     @property
     def under_way(self) -> list[Future[Evaluations]]:
         """Batches that are being computed."""
-        return [*self._leak_checks, *self._in_sumo.under_way]
+        return [*self._isolated_checks, *self._in_sumo.under_way]
 
     def send(self) -> None:
         """Send batches for SUMO; see `Batcher.send`."""
@@ -62,9 +63,9 @@ class Verification:
         """
         self._refuse_unrepeatable(run)
         rng = run_generator(self._study, run.key._replace(algorithm=f"recheck {run.key.algorithm}"))
-        for expected in run.samples(rng) if self._single_work else ():
-            self._leak_checks[self._pool.submit(self._single_work, expected.settings)] = run, expected
-        return self._awaits_leaks(run) or self._begin_in_sumo(run)
+        for expected in run.samples(rng) if self._isolated_work else ():
+            self._isolated_checks[self._pool.submit(self._isolated_work, expected.settings)] = run, expected
+        return self._awaits_isolated_checks(run) or self._begin_in_sumo(run)
 
     def _begin_in_sumo(self, run: Run) -> bool:
         """Begin to verify a run in SUMO; returns whether there are settings to verify."""
@@ -72,15 +73,15 @@ class Verification:
         expected = run.solutions_and_others(rng) if self._is_recorded else None
         if not expected:
             return False
-        if self._sumo_study is not self._study:  # of a rating, only a few cells are driven in SUMO
+        if self._sumo_study is not self._study:  # SUMO repeats only a few cells of a rating, so these cells need values to compare with
             expected = evaluate(assemble(self._sumo_study), expected.settings)
         self._unverified[run] = expected, len(expected)
         self._in_sumo.add(run, expected.settings)
         return True
 
-    def _awaits_leaks(self, run: Run) -> bool:
+    def _awaits_isolated_checks(self, run: Run) -> bool:
         """Whether single settings of a run are still under way."""
-        return any(run is checked_run for checked_run, _ in self._leak_checks.values())
+        return any(run is checked_run for checked_run, _ in self._isolated_checks.values())
 
     def _verify(self, run: Run, in_sumo: Evaluations) -> bool:
         """Compare evaluations from SUMO with those of a run; returns whether the run is verified completely."""
@@ -121,7 +122,7 @@ class Verification:
         """
         if batch in self._in_sumo.under_way:
             return [run for run, in_sumo in self._in_sumo.take(batch) if self._verify(run, in_sumo)]
-        run, expected = self._leak_checks.pop(batch)
+        run, expected = self._isolated_checks.pop(batch)
         command = reproduction_command(self._study, expected.settings[0])
         refuse_difference(self._study, {f"in run {run.key}": expected, "alone": batch.result()}, command)
-        return [] if self._awaits_leaks(run) or self._begin_in_sumo(run) else [run]
+        return [] if self._awaits_isolated_checks(run) or self._begin_in_sumo(run) else [run]

@@ -14,14 +14,14 @@ from typing import Any
 ADVICE: Mapping[str, str] = {
     "contract": "return what the base class documents: see `safevar_sumo/{base}` and the tutorials",
     "units": "give the study's table and UNITS the same names and units",
-    "determinism": "draw nothing at random (an algorithm: from `rng` alone) and ask no clock",
+    "determinism": "draw nothing at random (an algorithm: from `rng` alone) and do not read the clock",
     "state": "keep what a vehicle remembers in the memory that is handed on, or in the instance of that vehicle: nothing in a class, a "
              "module or a model from one run to the next",
     "batch": "compute element i of a result from element i of the arguments alone: no mean, sum or maximum over the vehicles, no place in "
              "the batch",
     "inputs": "work on a copy: `values = values.copy()`, or make a new array",
     "finite": "guard divisions and roots where the domain ends: `np.maximum(value, smallest)`; infinite gaps mean that nobody is in sight",
-    "reaction": "see that the quantity that should decide is read at all, with its sign and unit",
+    "reaction": "check that the code reads the quantity that it should react to, with the right sign and unit",
     "speed": "compute all vehicles at once with arrays; load files in `__init__`",
     "picklable": "give functions a name at the top of the module; open files, sockets and locks in `start`, not in `__init__`",
 }
@@ -68,7 +68,7 @@ class Report:
 
 
 class TakesTooLong(BaseException):
-    """An author's code does not return. Raised inside this code, whose `except Exception` cannot catch it."""
+    """User code exceeds its time limit. The error is raised inside that code, so it is no `Exception`, which the code may catch."""
 
 
 def load_factor() -> float:
@@ -78,7 +78,7 @@ def load_factor() -> float:
 
 
 TICKS = 10
-"""Number of parts of a time limit; at the end of a part, a handler checks whether a module is being imported."""
+"""A time limit is divided into this many parts; parts that end during an import do not count."""
 
 
 @contextmanager

@@ -32,8 +32,8 @@ _KNOWN_MODULES = {__name__.partition(".")[0], *sys.stdlib_module_names}
 class Member(NamedTuple):
     """The class or record that a name in a study stands for.
 
-    For a member from outside this package, `guard` calls the member, `module` is the name of its module, and `folder` the folder of
-    the module's top package; otherwise None and "". An FMU is a `file`, simulated by a class of this package.
+    For user code, `guard` calls the member, `module` is the name of its module, and `folder` the folder of the module's top package. For
+    a member of this package, they are None and "". For an FMU, `file` is its path and `target` the class that simulates it.
     """
 
     target: Any
@@ -93,7 +93,7 @@ class Lookup(NamedTuple):
     def class_of(self, members: Mapping[str, Any], name: str, key: str, *contracts: Contract, otherwise: str = "") -> Member:
         """A class by name; a class from outside must meet the first contract that applies to it.
 
-        `otherwise` describes expected values that are no classes.
+        `otherwise` names further expected values, which are no classes.
         """
         member = self.find(members, name, key)
         contract = next(contract for contract in contracts if contract.applies_to(member.target))
@@ -139,7 +139,7 @@ class Lookup(NamedTuple):
         if place:
             self._refuse_installed_name(top, place, guard)
         before = set(sys.modules)
-        writes_bytecode, sys.dont_write_bytecode = sys.dont_write_bytecode, True
+        dont_write_bytecode, sys.dont_write_bytecode = sys.dont_write_bytecode, True
         try:
             module = guard._replace(folder=place).call("import", importlib.import_module, name)
         except ForeignError as error:
@@ -147,7 +147,7 @@ class Lookup(NamedTuple):
             expected = f"a module in {' or '.join(dict.fromkeys(places))}, or an installed one"
             raise ForeignError(self.source, problem, expected) from error
         finally:
-            sys.dont_write_bytecode = writes_bytecode
+            sys.dont_write_bytecode = dont_write_bytecode
             remember(set(sys.modules) - before, places)
         return module, place or _folder_of(sys.modules[top])
 
@@ -183,7 +183,7 @@ def _folder_of(module: ModuleType) -> str:
 
 
 def make_reachable(places: Iterable[str]) -> None:
-    """Let modules import from `places` and the working directory; installed modules come first."""
+    """Let modules import from `places` and the working directory; folders before the working directory in Python's path come first."""
     sys.path[:] = [place for place in sys.path if place not in _added_folders]
     _added_folders[:] = [place for place in dict.fromkeys((*places, os.getcwd())) if place not in sys.path]
     indices = [i for i, place in enumerate(sys.path) if place in ("", os.getcwd())]
@@ -305,7 +305,7 @@ class OwnModules:
         self._modules: dict[str, ModuleType] = {}
 
     def load(self) -> Any:
-        """The member from its own copy of the module; call it `inside`."""
+        """The member from its own copy of the module; call this method within the context `inside`."""
         return getattr(importlib.import_module(self._member.module), self._attribute)
 
     @contextmanager
@@ -313,11 +313,11 @@ class OwnModules:
         """A context in which imports find these copies; a module imported for the first time is added to them."""
         shared = self._remove()
         sys.modules.update(self._modules)
-        number, writes_bytecode, sys.dont_write_bytecode = len(sys.modules), sys.dont_write_bytecode, True
+        number, dont_write_bytecode, sys.dont_write_bytecode = len(sys.modules), sys.dont_write_bytecode, True
         try:
             yield
         finally:
-            sys.dont_write_bytecode = writes_bytecode
+            sys.dont_write_bytecode = dont_write_bytecode
             if len(sys.modules) != number:
                 remember(sys.modules.keys() - self._other_names, self._places)
             self._modules = self._remove()

@@ -132,7 +132,7 @@ RULES = (
     f"Directions of changes (RQ3.3): *{HOLDS}* if at least {100 * HOLDING_SHARE:.0f} % of the characteristics that lean to one direction "
     f"in the published results (by {100 * LEAST_LEAN:.0f} % of their changes) lean to it here, "
     f"*{DIRECTION}* from {100 * DIRECTION_SHARE:.0f} %.",
-    f"Shares and means (collisions, safety): *{HOLDS}* within a factor of {FACTOR:g}, *{DIRECTION}* if both are above zero.",
+    f"Shares and means (collisions, safety): *{HOLDS}* within a factor of {FACTOR:g}, *{DIRECTION}* if both have the same sign.",
     f"Combinations: *{HOLDS}* if the most frequent one is the same, *{DIRECTION}* if it is among the combinations shown on the other "
     "side, or shares three of its four characteristics with the most frequent published one.")
 

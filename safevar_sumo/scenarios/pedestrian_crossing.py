@@ -35,7 +35,7 @@ class PedestrianCrossing(Struct, frozen=True, kw_only=True, forbid_unknown_field
     Parameters
     ----------
     duration
-        Length of a run [s].
+        Duration of a simulation [s].
     turns_after
         Distance past the middle of the lane at which the pedestrian turns round [m]; None if the pedestrian walks on.
     lane_width

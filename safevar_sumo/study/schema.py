@@ -29,7 +29,7 @@ OBJECTIVES = (SAFETY_DEGREE, "f_diff", "f_num_diff")
 MAX_DESCRIPTION_LENGTH = 200
 """Largest number of characters of a characteristic's description."""
 FMU_KEYS = ("kind", "inputs", "outputs", "sensors", "sumo_type", "step")
-"""Keys of models that only FMUs have."""
+"""Keys of a model's table that only an FMU's table has; `kind` is also a key of an ADS."""
 DESCRIPTION_KEYS = ("meaning", "counterpart")
 """Keys that describe a characteristic to people; no result depends on them."""
 
@@ -144,8 +144,8 @@ def label_of(algorithm: str) -> str:
 class MatrixTest(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A test of a matrix: a scenario at every combination of the values in `over`, in each of the `weathers`.
 
-    `parameters` are added to those of the study's scenario; with another `model`, only they apply. A weather is a name or a
-    table.
+    `parameters` are added to those of the study's scenario; a test with a `model` of its own has only its own parameters. A weather is a
+    name or a table.
     """
 
     name: Annotated[str, Meta(min_length=1)]
@@ -164,7 +164,7 @@ class RatingTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
 class MatrixTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Several scenario points in which every setting is simulated: `tests`, or all cells of a `protocol`, which then rates every setting.
 
-    `aggregate` combines the points' safety degrees: the worst counts. (A mean would average distances with minus the speeds of collisions.)
+    `aggregate` combines the points' safety degrees: `worst` takes the lowest one. (`mean` would average distances with negative speeds.)
     """
 
     tests: list[MatrixTest] = []
@@ -175,7 +175,7 @@ class MatrixTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
 class FreeParameter(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A parameter to calibrate: its bounds in `unit`, and its meaning.
 
-    Studies that are fitted together share the parameter if they give it the same value, unless the parameter is a study's `own`. The
+    Studies that are fitted together share one fitted value if their files state the same value; with `own`, a study has its own. The
     search measures distances of values as differences, or with `log` as ratios, for positive quantities of unknown magnitude.
     """
 
@@ -190,8 +190,8 @@ class FreeParameter(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
 class Origin(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The files of a study; results do not depend on them.
 
-    `called` is the study's path on the command line, if its name is not enough; `places` are the folders of its file and of the files that
-    it extends, where plug-ins are looked up first; `remarks` are for the user.
+    `called` is the study's path as given on the command line, empty if the study was given by its name; `places` are the folders of its
+    file and of the files that it extends, where plug-ins are looked up first; `remarks` are for the user.
     """
 
     called: str = ""
@@ -202,18 +202,19 @@ class Origin(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 class FitTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """How free parameters are fitted: the weights in the loss, the rows used, and the starts of the search.
 
-    The loss is `original` * mean_m(w_m 2 max(miss / (`tolerance` * published) - 1, 0)) of the original vehicle + mean over the files of
-    sum_m(w_m (`rank` (1 - rho_m) + mean |error| / unit)) + `effects` * mean_c |difference of the safety degree's linear effects over the
-    domain of characteristic c| / unit + `collisions` * share of rows that collide on one side only. For a metric m, w_m is the weight
-    in `weights` and rho_m the rank correlation; a unit is the study's repeatability or, if unknown, the standard deviation of the data.
-    The loss of studies that are fitted together is the mean of their losses. One of every `hold_out` rows is only reported, not fitted.
-    Sets of parameters whose loss is within the share `alike` of the lowest loss fit equally well: they become the study's `spread`.
-    `trials` sets of parameters are tried, in generations of `population`: in a race of searches from the study's own values and from
-    `starts` random places in the bounds; the worse half gives up after every round. With `screened`, the random places are the best of
-    `screened` places, but at most a quarter of the trials evaluates these. A search from a random place begins with a standard deviation of
-    `width` of the bounds; a search around known values has a third of the `population`. `seed` is the seed of all random numbers. From
-    scratch, studies that are fitted together are searched in stages: first the first study alone, then the other studies' own
-    parameters, finally all parameters from there. All stages but the last use one row in `thinning`.
+    The loss is `original` * mean_m(w_m 2 max(miss / (`tolerance` * published) - 1, 0)), miss being |value - published| of the original
+    vehicle, + mean over the files of published data of sum_m(w_m (`rank` (1 - rho_m) + mean |error| / unit)) + `effects` * mean_c
+    |difference of the safety degree's linear effects over the domain of characteristic c| / unit + `collisions` * share of rows that
+    collide on one side only. For a metric m, w_m is the weight in `weights` and rho_m the rank correlation; a unit is the study's
+    repeatability or, if unknown, the standard deviation of the data. The loss of studies that are fitted together is the mean of their
+    losses. One of every `hold_out` rows is only reported, not fitted. Sets of parameters whose loss is within the share `alike` of the
+    lowest loss fit equally well: they become the study's `spread`. `trials` sets of parameters are tried, in generations of `population`:
+    in a race of searches from the study's own values and from `starts` random places in the bounds; the worse half gives up after every
+    round. With `screened`, the random places are the best of `screened` places, but at most a quarter of the trials is spent on them. A
+    search from a random place begins with a standard deviation of `width` of the bounds; a search around known values has a third of the
+    `population`. `seed` is the seed of all random numbers. A fit from scratch of several studies has three stages: the first study alone;
+    the other studies' own parameters; all parameters, beginning at the values of the first two stages. All stages but the last use one row
+    in `thinning`.
     """
 
     trials: PositiveInt = 1200
@@ -244,7 +245,7 @@ class Study(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     `repeatability` are standard deviations of repeats of one setting in the published study;
     `calibration` are the free parameters by their keys in the file, such as `ads.parameters.corridor`, `fit` states how they are fitted,
     `spread` are sets of their values that fit the published data equally well, a list for each parameter, the study's own value first;
-    `model_error` is the model's further error, by metric, for a vehicle that is a whole domain away from the original;
+    `model_error` is the model's further error, by metric, for a vehicle that differs from the original by the full width of a domain;
     `variation` and `correlations` state how characteristics vary in the world, by name: uniformly by default;
     `constraints` are conditions that the characteristics of one vehicle satisfy together.
     """
@@ -280,11 +281,11 @@ class Study(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
 
 def tables_of(study: Study) -> dict[str, Any]:
-    """A study as plain tables, without its origin."""
+    """A study as plain tables, without its origin and without keys that it does not use."""
     tables: dict[str, Any] = msgspec.to_builtins(study)
     del tables["origin"]
     if not study.constraints:
-        del tables["constraints"]  # results from before constraints existed keep their bytes
+        del tables["constraints"]  # so that results from before constraints existed stay the same bytes
     for name in ("vehicle", "ads", "scenario"):
         if tables[name].get("kind") != "fmu":
             kept_keys = () if name == "vehicle" else ("kind",)
