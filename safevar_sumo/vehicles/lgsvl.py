@@ -58,7 +58,7 @@ class _Prepared(NamedTuple):
     engine_share: FloatArray
     mass: FloatArray
     weight: FloatArray  # load on the road [N]
-    body_mass: FloatArray
+    body: FloatArray
     slope_deceleration: float | FloatArray  # by the slope, g sin(angle) [m/s^2]
     slope_loss: FloatArray  # speed lost to the slope in a substep [m/s]
     standstill: FloatArray
@@ -132,14 +132,14 @@ class Lgsvl(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         prepared = _Prepared(
             step=np.array(step), substep=np.array(substep), pedal_share=np.array(step / (step + self.pedal_lag)),
             engine_share=np.array(RPM_RATE * substep / (1 + RPM_RATE * substep)), mass=c["mass"], weight=c["mass"] * slope.down,
-            body_mass=c["mass"] + self.wheel_mass_share * WHEELS * c["wheelMass"], slope_deceleration=slope.back,
+            body=c["mass"] + self.wheel_mass_share * WHEELS * c["wheelMass"], slope_deceleration=slope.back,
             slope_loss=np.asarray(slope.back * substep), standstill=HOLD_SPEED, radius=c["radius"],
             pull_by_stiffness=substep * c["radius"], inertia=inertia, damping=damping,
             damped_inertia=inertia + substep * damping, brake_torque=WHEELS * c["maxBrakeTorque"], motor_torque=c["maxMotorTorque"],
             least_rpm=c["minRpm"], largest_rpm=c["maxRpm"], steering=c["maxSteeringAngle"] * RADIANS, rolling_drag=c["tireDragCoeff"],
             shift_time=c["shiftTime"], slip_limit=c["tractionControlSlipLimit"], traction_change=np.array(TRACTION_RATE * substep),
             friction=np.asarray(FRICTION * road_friction))
-        creep_speed = _rim_at(prepared, np.zeros_like(prepared.mass), np.abs(prepared.body_mass * prepared.slope_deceleration))
+        creep_speed = _rim_at(prepared, np.zeros_like(prepared.mass), np.abs(prepared.body * prepared.slope_deceleration))
         return prepared._replace(standstill=HOLD_SPEED + creep_speed)
 
     def sumo_type(self, prepared: _Prepared) -> SumoType:
@@ -167,7 +167,7 @@ class Lgsvl(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         The vehicle keeps its lane without error; the gearbox has shifted up to the gear for this speed.
         """
         p, zeros = prepared, np.zeros_like(prepared.mass)
-        force = (AIR_DRAG * speed + p.rolling_drag) * speed + p.body_mass * p.slope_deceleration
+        force = (AIR_DRAG * speed + p.rolling_drag) * speed + p.body * p.slope_deceleration
         rim = _rim_at(p, speed, force)
         wheel_speed = rim / p.radius
         gear = zeros + 1
@@ -251,11 +251,11 @@ def _roll(p: _Prepared, s: LgsvlState, gearing: FloatArray, cornering_drag: Floa
 
     stiffness = _tyre_stiffness(p, s.speed, rim, slip_speed)
     pull = p.pull_by_stiffness * stiffness
-    damped_mass = p.body_mass + h * (stiffness + AIR_DRAG * s.speed + p.rolling_drag + cornering_drag)
+    damped_mass = p.body + h * (stiffness + AIR_DRAG * s.speed + p.rolling_drag + cornering_drag)
     slope_speed = s.speed - p.slope_loss
-    wheel_momentum = p.inertia * s.wheel_speed + h * (drive - s.brake * p.brake_torque) + pull * p.body_mass * slope_speed / damped_mass
+    wheel_momentum = p.inertia * s.wheel_speed + h * (drive - s.brake * p.brake_torque) + pull * p.body * slope_speed / damped_mass
     wheel_speed = np.maximum(wheel_momentum, ZERO) / (p.damped_inertia + pull * p.radius - pull * pull / damped_mass)
-    speed = np.maximum((p.body_mass * slope_speed + pull * wheel_speed) / damped_mass, ZERO)
+    speed = np.maximum((p.body * slope_speed + pull * wheel_speed) / damped_mass, ZERO)
     held = (wheel_speed <= ZERO) & (speed < p.standstill)
     if np.count_nonzero(held):
         speed[held] = ZERO

@@ -26,7 +26,7 @@ class _Prepared(NamedTuple):
     reaction_time: FloatArray
     brake_delay: FloatArray
     brake_gain: FloatArray
-    pull: float | FloatArray  # deceleration by the slope
+    back: float | FloatArray  # deceleration by the slope
 
 
 class SumoState(NamedTuple):
@@ -69,7 +69,7 @@ class SumoVehicle(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
             grip=self.tyre_friction * road_friction * slope.down, max_speed=c["maxSpeed"], actuator_lag=c["tau"],
             sensor_range=c["sensorRange"],
             reaction_time=c["reactionTime"], brake_delay=c["brakeDelay"], brake_gain=c["brakeGain"],
-            pull=slope.back)
+            back=slope.back)
 
     def sumo_type(self, prepared: _Prepared) -> SumoType:
         p = prepared
@@ -84,9 +84,9 @@ class SumoVehicle(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     def at_speed(self, prepared: _Prepared, speed: FloatArray) -> SumoState:
         """The pedals balance the slope, the only resistance; on a level road they are released."""
         p, rest = prepared, self.at_rest(prepared)
-        brake = np.minimum(np.maximum(-p.pull / (p.brake_gain * p.decel), 0.0), 1.0)
-        throttle = np.minimum(np.maximum(p.pull / p.accel, 0.0), 1.0)
-        return rest._replace(speed=speed, acceleration=rest.acceleration + p.pull, throttle=throttle, brake=brake,
+        brake = np.minimum(np.maximum(-p.back / (p.brake_gain * p.decel), 0.0), 1.0)
+        throttle = np.minimum(np.maximum(p.back / p.accel, 0.0), 1.0)
+        return rest._replace(speed=speed, acceleration=rest.acceleration + p.back, throttle=throttle, brake=brake,
                              brake_commands=rest.brake_commands + brake)
 
     def sensors(self, prepared: _Prepared) -> Sensors:
@@ -107,7 +107,7 @@ class SumoVehicle(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
         acceleration = state.acceleration + (target - state.acceleration) * (p.step / (p.actuator_lag + p.step))
         # Braking ends a remaining positive acceleration at once.
         acceleration = np.where(brake > 0, np.minimum(acceleration, 0.0), acceleration)
-        speed = np.minimum(np.maximum(state.speed + (acceleration - p.pull) * p.step, 0.0), np.maximum(p.max_speed, state.speed))
+        speed = np.minimum(np.maximum(state.speed + (acceleration - p.back) * p.step, 0.0), np.maximum(p.max_speed, state.speed))
         return state._replace(
-            speed=speed, acceleration=(speed - state.speed) / p.step + p.pull, throttle=np.where(brake > 0, 0.0, command.throttle),
+            speed=speed, acceleration=(speed - state.speed) / p.step + p.back, throttle=np.where(brake > 0, 0.0, command.throttle),
             brake=brake, brake_commands=commands)

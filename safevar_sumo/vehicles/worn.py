@@ -27,12 +27,12 @@ class _Prepared(NamedTuple):
 
     step: float
     mass: FloatArray
-    drive_acceleration: FloatArray
-    brake_deceleration: FloatArray
+    drive: FloatArray
+    brake: FloatArray
     grip: FloatArray
     front_load: FloatArray
     rear_load: FloatArray
-    brake_lag: FloatArray
+    response: FloatArray
     sensor_range: FloatArray
     latency: FloatArray
     slope: Slope
@@ -101,26 +101,26 @@ class WornVehicle(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
         centre = (self.kerb_mass * self.kerb_centre + c["payload"] * c["payloadCentre"]) / mass / self.wheelbase
         grip_share = np.where(wet, 1 - self.tread_loss * _share_of_loss(np.maximum(c["treadDepth"], 0.0)), 1.0)
         return _Prepared(
-            step=step, mass=mass, drive_acceleration=self.drive_force / mass,
-            brake_deceleration=c["brakeTorque"] * (self.brake_force / mass), grip=self.tyre_friction * road_friction * grip_share,
-            front_load=1 - centre, rear_load=centre, brake_lag=c["brakeResponse"], sensor_range=c["sensorRange"],
+            step=step, mass=mass, drive=self.drive_force / mass,
+            brake=c["brakeTorque"] * (self.brake_force / mass), grip=self.tyre_friction * road_friction * grip_share,
+            front_load=1 - centre, rear_load=centre, response=c["brakeResponse"], sensor_range=c["sensorRange"],
             latency=c["sensorLatency"], slope=slope)
 
     def sumo_type(self, prepared: _Prepared) -> SumoType:
         p = prepared
         decel = self._deceleration(p, np.ones_like(p.mass))
-        return SumoType(mass=p.mass, accel=np.minimum(p.drive_acceleration, p.grip * p.slope.down), decel=decel,
-                        max_speed=np.full_like(p.mass, self.max_speed), tau=p.brake_lag + p.step)
+        return SumoType(mass=p.mass, accel=np.minimum(p.drive, p.grip * p.slope.down), decel=decel,
+                        max_speed=np.full_like(p.mass, self.max_speed), tau=p.response + p.step)
 
     def at_rest(self, prepared: _Prepared) -> WornState:
         zeros = np.zeros_like(prepared.mass)
-        return WornState(zeros, zeros, zeros, zeros + 1, None, history(float(np.max(prepared.brake_lag)), prepared.step, zeros))
+        return WornState(zeros, zeros, zeros, zeros + 1, None, history(float(np.max(prepared.response)), prepared.step, zeros))
 
     def at_speed(self, prepared: _Prepared, speed: FloatArray) -> WornState:
         """The pedals balance the slope, the only resistance; on a level road they are released."""
         p, rest = prepared, self.at_rest(prepared)
-        brake = np.minimum(np.maximum(-p.slope.back / p.brake_deceleration, 0.0), 1.0)
-        throttle = np.minimum(np.maximum(p.slope.back / p.drive_acceleration, 0.0), 1.0)
+        brake = np.minimum(np.maximum(-p.slope.back / p.brake, 0.0), 1.0)
+        throttle = np.minimum(np.maximum(p.slope.back / p.drive, 0.0), 1.0)
         return rest._replace(speed=speed, throttle=throttle, brake=brake, brake_commands=rest.brake_commands + brake)
 
     def sensors(self, prepared: _Prepared) -> Sensors:
@@ -134,15 +134,15 @@ class WornVehicle(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     def advance(self, prepared: _Prepared, state: WornState, command: Command) -> WornState:
         p = prepared
         commands = remembered(state.brake_commands, command.brake)
-        brake = delayed(commands, p.brake_lag, p.step)
-        drive = np.minimum(command.throttle * p.drive_acceleration, p.grip * p.slope.down)
+        brake = delayed(commands, p.response, p.step)
+        drive = np.minimum(command.throttle * p.drive, p.grip * p.slope.down)
         acceleration = np.where(brake > 0, -self._deceleration(p, brake), drive)
         speed = np.minimum(np.maximum(state.speed + (acceleration - p.slope.back) * p.step, 0.0), np.maximum(self.max_speed, state.speed))
         return state._replace(speed=speed, throttle=np.where(brake > 0, 0.0, command.throttle), brake=brake, brake_commands=commands)
 
     def _deceleration(self, p: _Prepared, pedal: FloatArray) -> FloatArray:
         """Deceleration by the brakes of both axles together [m/s^2]."""
-        demand, lever = pedal * p.brake_deceleration, p.grip * (self.centre_height / self.wheelbase)
+        demand, lever = pedal * p.brake, p.grip * (self.centre_height / self.wheelbase)
         rear_limit = (self.front_share * demand + p.grip * p.slope.down * p.rear_load) / (1 + lever)
         front_limit = ((1 - self.front_share) * demand + p.grip * p.slope.down * p.front_load) / (1 - lever)
         return np.minimum(np.minimum(demand, p.grip * p.slope.down), np.minimum(rear_limit, front_limit))

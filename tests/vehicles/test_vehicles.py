@@ -36,7 +36,7 @@ def kinetic_energy(model: str, run: Drive) -> np.ndarray:
         wheels_and_engine = [p.wheel_inertia * s.wheel_speed**2 + ENGINE_INERTIA * s.engine_speed**2 for s in states]
         return np.stack([(p.mass * s.speed**2 + spins) / 2 for s, spins in zip(states, wheels_and_engine, strict=True)])
     if isinstance(SYSTEMS[model].vehicle, Lgsvl):
-        return np.stack([(p.body_mass * s.speed**2 + p.inertia * s.wheel_speed**2) / 2 for s in states])
+        return np.stack([(p.body * s.speed**2 + p.inertia * s.wheel_speed**2) / 2 for s in states])
     return np.stack([p.mass * s.speed**2 / 2 for s in states])
 
 

@@ -42,7 +42,7 @@ def stopping_distance(tread: float, wet: bool = True) -> float:
 def test_two_axles_brake_together_and_none_beyond_the_friction_of_its_load(road: float, changes: dict[str, float]) -> None:
     """Expected: the bisection of m a = sum of min(share F, mu N(a)); the load N moves forward with the deceleration a."""
     p = prepared(road, **changes)
-    mass, mu, force = float(p.mass[0]), float(p.grip[0]), float(p.brake_deceleration[0] * p.mass[0])
+    mass, mu, force = float(p.mass[0]), float(p.grip[0]), float(p.brake[0] * p.mass[0])
     values = {**HEALTHY, **changes}
     centre = (CAR.kerb_mass * CAR.kerb_centre + values["payload"] * values["payloadCentre"]) / mass
 
