@@ -1,0 +1,93 @@
+"""What makes a changed vehicle brake worse than the original: the distance it loses, in parts."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from safevar_sumo.analysis.explain.braking_comparison import BrakingComparison, compare_braking, sentence, summary_of
+from safevar_sumo.records import Encounter, Outcome, SimulationRuns, Trace
+
+STEP, OBSTACLE = 0.002, 20.0
+
+
+def drive_of(*vehicles: tuple[float, float, float, float]) -> SimulationRuns:
+    """Vehicles of (speed, gap at which the brake is commanded, delay, deceleration) towards an obstacle at 20 m."""
+    time = np.arange(0, 8, STEP)
+    columns = []
+    for v, gap, delay, deceleration in vehicles:
+        begins = (OBSTACLE - gap) / v
+        braking = np.maximum(time - begins - delay, 0.0)
+        speed = np.maximum(v - deceleration * braking, 0.0)
+        braking = np.minimum(braking, v / deceleration)
+        place = np.where(time < begins + delay, v * time, v * (begins + delay) + v * braking - deceleration * braking**2 / 2)
+        columns.append((speed, place, np.where(time >= begins, 1.0, 0.0), np.where(time >= begins + delay, 1.0, 0.0)))
+    speed, place, brake, pedal = (np.stack(part, axis=1) for part in zip(*columns, strict=True))
+    hit = place >= OBSTACLE
+    collision_speed = np.where(hit.any(axis=0), speed[np.argmax(hit, axis=0), np.arange(len(vehicles))], np.nan)
+    active = np.cumsum(hit, axis=0) <= 1
+    nothing, throttle = np.zeros_like(speed), np.zeros_like(speed)
+    trace = Trace(step=STEP, vehicle_length=5.0, time=time, position=place, speed=speed, gap=OBSTACLE - place, lateral=nothing,
+                  lateral_speed=nothing, throttle=throttle, brake=brake, gear=nothing, active=active, pedal=pedal)
+    outcome = np.where(np.isnan(collision_speed), Outcome.STOPPED.value, Outcome.COLLISION.value)
+    return SimulationRuns(trace=trace, encounter=Encounter(trace.gap, trace.gap, speed, trace.gap > 0), outcome=outcome,
+                  collision_speed=collision_speed)
+
+
+def compared(one: tuple[float, float, float, float], other: tuple[float, float, float, float]) -> BrakingComparison:
+    runs = drive_of(one, other)
+    return compare_braking(*(summary_of(runs, column, 1.0) for column in (0, 1)))
+
+
+SAME = (10.0, 15.0, 0.2, 6.0)
+
+
+@pytest.mark.parametrize(("other", "part", "lost"), [
+    ((10.0, 13.5, 0.2, 6.0), "place", 1.5),
+    ((10.0, 15.0, 0.4, 6.0), "delay", 10 * 0.2),
+    ((10.0, 15.0, 0.2, 5.0), "deceleration", 100 / 10 - 100 / 12),
+    ((11.0, 15.0, 0.2, 6.0), "speed", 1 * 0.2 + (121 - 100) / 12),
+    ((10.0, 15.0, 0.2, 3.5), "deceleration", 100 / 7 - 100 / 12),  # which hits
+    ((8.0, 15.0, 0.2, 6.0), "speed", -2 * 0.2 - (100 - 64) / 12)])  # which gains
+def test_one_difference_is_one_part(other: tuple[float, float, float, float], part: str, lost: float) -> None:
+    comparison = compared(SAME, other)
+    assert comparison.parts[part] == pytest.approx(lost, abs=0.05)
+    assert all(abs(value) < 0.05 for name, value in comparison.parts.items() if name != part)
+
+
+def test_an_overshooting_cruise_control_does_not_brake_for_the_obstacle() -> None:
+    """Two overshoot; the throttle ends that, or a brake that fades until the hazard. The last one does nothing else before it collides."""
+    runs = drive_of(SAME, SAME, SAME, (10.0, -5.0, 0.2, 6.0))
+    runs.trace.brake[50:150, 1:3] = 0.5
+    runs.trace.throttle[150:200, 1] = 0.1
+    runs.trace.brake[150:250, 2:] = 0.01
+    plain, overshot, settling, unbraked = (summary_of(runs, column, 1.0).braking for column in range(4))
+    assert overshot == settling == plain
+    assert plain is not None
+    assert plain.time == pytest.approx(0.5)
+    assert unbraked is None
+
+
+def test_pulses_are_one_braking() -> None:
+    """The brake is let go for a tenth of a second at 95 % of the speed, and at a quarter of it."""
+    runs = drive_of(SAME, SAME)
+    for share in (0.95, 0.25):
+        at = int(np.argmax(runs.trace.speed[:, 1] < share * 10))
+        runs.trace.brake[at:at + 50, 1] = 0.0
+    assert summary_of(runs, 1, 1.0).braking == summary_of(runs, 0, 1.0).braking is not None
+
+
+def test_a_creeping_deceleration_is_no_late_pedal() -> None:
+    """Both pedals are down 0.1 s after the command; one vehicle decelerates with 6 m/s^2 at once, the other comes to 6 within a second."""
+    runs = drive_of((10.0, 15.0, 0.1, 6.0), (10.0, 15.0, 0.1, 6.0))
+    time, begins = runs.trace.time, 0.5
+    rises = np.clip(time - begins - 0.1, 0.0, None)
+    slower = 10 - np.where(rises < 1, 3 * rises**2, 3 + 6 * (rises - 1))
+    runs.trace.speed[:, 1] = np.maximum(slower, 0.0)
+    runs.trace.position[1:, 1] = np.cumsum((runs.trace.speed[1:, 1] + runs.trace.speed[:-1, 1]) / 2) * STEP
+    runs.trace.gap[:, 1] = OBSTACLE - runs.trace.position[:, 1]
+    comparison = compare_braking(*(summary_of(runs, column, 1.0) for column in (0, 1)))
+    assert comparison.parts["delay"] == 0
+    assert comparison.parts["deceleration"] == pytest.approx(comparison.lost)
+    assert "later" not in sentence(comparison)
+    assert "brakes more weakly" in sentence(comparison)
