@@ -32,8 +32,8 @@ from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.results import ResultsDirectory
 from safevar_sumo.study import Study, load_study
 from safevar_sumo.sumo.engine import Engine
-from safevar_sumo.sumo.matrix import LARGEST_BATCH, simulate
-from safevar_sumo.sumo.staging import staged
+from safevar_sumo.sumo.matrix import MAX_VEHICLES, simulate
+from safevar_sumo.sumo.staging import stage_network
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet
 from safevar_sumo.workers.cluster import cluster_pool
@@ -101,12 +101,12 @@ def drawn(study: Study, n: int, seed: int = 1) -> FloatArray:
 def campaign(study: Study, opened: AbstractContextManager[Pool]) -> Cost:
     """Carry out a study in a pool that is at work already."""
     with tempfile.TemporaryDirectory() as folder, opened as pool:
-        for future in [pool.submit(packed(study), drawn(study, LARGEST_BATCH)) for _ in range(4 * pool.workers)]:
+        for future in [pool.submit(packed(study), drawn(study, MAX_VEHICLES)) for _ in range(4 * pool.workers)]:
             future.result()
         recording = Recording(pool)
         before = processors()
         results = ResultsDirectory(Path(folder), study, identity_of(study, assemble(study)))
-        clock = clock_seconds(lambda: run_campaign(study, all_runs(study), results, recording, Silent(), LARGEST_BATCH,
+        clock = clock_seconds(lambda: run_campaign(study, all_runs(study), results, recording, Silent(), MAX_VEHICLES,
                                                    engine=Engine.RECORDED))
         return Cost(clock, processors() - before, recording.batches)
 
@@ -137,7 +137,7 @@ def floor(study: Study) -> float:
     """Processor seconds that bare libsumo takes to load and step the network for one setting of a population."""
     system, n = assemble(study), study.search.population
     steps = len(simulate(system, drawn(study, n)).trace.time)
-    network = staged(system.points[0].scenario).folder
+    network = stage_network(system.points[0].scenario).folder
     return float(np.median([bare(network, n, steps)[0] for _ in range(9)])) / n
 
 

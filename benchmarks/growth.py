@@ -15,7 +15,7 @@ from campaign import drawn
 from measuring import Record, print_records
 
 from safevar_sumo.study import Study, load_study
-from safevar_sumo.sumo.matrix import LARGEST_BATCH
+from safevar_sumo.sumo.matrix import MAX_VEHICLES
 from safevar_sumo.workers.evaluation import packed
 from safevar_sumo.workers.local import local_pool
 
@@ -27,19 +27,19 @@ def records_of(study: Study, evaluations: int) -> Iterator[Record]:
     """Measure the first and the last `FIRST` evaluations of one worker, and its memory after both."""
     work, spans = packed(study), []
     with local_pool(1, study.search.time_limit) as pool:
-        pool.submit(work, drawn(study, LARGEST_BATCH)).result()
+        pool.submit(work, drawn(study, MAX_VEHICLES)).result()
         worker = next(child for child in psutil.Process().children() if "spawn_main" in " ".join(child.cmdline()))
         first = 0
         for done in range(0, evaluations, FIRST):
             before = sum(worker.cpu_times()[:2])
-            for batch in range(FIRST // LARGEST_BATCH):
-                pool.submit(work, drawn(study, LARGEST_BATCH, seed=done + batch)).result()
+            for batch in range(FIRST // MAX_VEHICLES):
+                pool.submit(work, drawn(study, MAX_VEHICLES, seed=done + batch)).result()
             spans.append(sum(worker.cpu_times()[:2]) - before)
             first = first or worker.memory_info().rss
         last = worker.memory_info().rss
-    yield Record(study.name, "growth_time", LARGEST_BATCH, spans[-1] / spans[0])
-    yield Record(study.name, "growth_memory", LARGEST_BATCH, last / first)
-    yield Record(study.name, "growth_mebibytes", LARGEST_BATCH, (last - first) / 2**20)
+    yield Record(study.name, "growth_time", MAX_VEHICLES, spans[-1] / spans[0])
+    yield Record(study.name, "growth_memory", MAX_VEHICLES, last / first)
+    yield Record(study.name, "growth_mebibytes", MAX_VEHICLES, (last - first) / 2**20)
 
 
 if __name__ == "__main__":

@@ -12,7 +12,7 @@ from safevar_sumo.analysis.parameters import value_of, with_values
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import Evaluations, FloatArray, finite_or_none
 from safevar_sumo.study import SAFETY_DEGREE, Study
-from safevar_sumo.sumo.matrix import evaluate, named_point
+from safevar_sumo.sumo.matrix import evaluate, system_at_point
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet
 
@@ -97,7 +97,7 @@ def band(safety_degrees: FloatArray, repeatability: float, error: FloatArray | f
 def evaluations_of_sets(study: Study, settings: FloatArray, point: str = "") -> list[Evaluations]:
     """Evaluate settings, shape (M, n), in this process with each parameter set, first with the study's values."""
     systems = [assemble(variant) for variant in studies_of_sets(study)]
-    return [evaluate(named_point(system, point, "point") if point else system, settings) for system in systems]
+    return [evaluate(system_at_point(system, point, "point") if point else system, settings) for system in systems]
 
 
 def studies_of_sets(study: Study) -> list[Study]:

@@ -21,7 +21,7 @@ from safevar_sumo.analysis.evaluator import Evaluator, clopper_pearson
 from safevar_sumo.analysis.words import number_of
 from safevar_sumo.records import FloatArray
 from safevar_sumo.study import ModelTable, Study
-from safevar_sumo.sumo.matrix import at_every_point, simulate, study_at, worst_points
+from safevar_sumo.sumo.matrix import simulate, simulate_all_points, study_at, worst_points
 from safevar_sumo.sumo.system import System, assemble
 
 LIMIT = 20_000
@@ -138,7 +138,7 @@ def _worst_points(evaluator: Evaluator, system: System, settings: FloatArray) ->
     if system.matrix:
         for start in range(0, len(settings), SETTINGS_PER_CALL):
             evaluator.progress("worst points of the collisions", start, len(settings))
-            worst[start:start + SETTINGS_PER_CALL] = worst_points(at_every_point(system, settings[start:start + SETTINGS_PER_CALL]))
+            worst[start:start + SETTINGS_PER_CALL] = worst_points(simulate_all_points(system, settings[start:start + SETTINGS_PER_CALL]))
     return worst
 
 

@@ -20,8 +20,8 @@ from safevar_sumo.results import evaluations_frame, record
 from safevar_sumo.study import SAFETY_DEGREE, Study, StudyLike, load_study
 from safevar_sumo.sumo.batch import score
 from safevar_sumo.sumo.engine import Engine
-from safevar_sumo.sumo.matrix import at_worst
 from safevar_sumo.sumo.matrix import simulate as drive
+from safevar_sumo.sumo.matrix import system_at_worst_point
 from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.terminal import shown
 from safevar_sumo.vehicles import CharacteristicSet
@@ -217,7 +217,7 @@ def load_and_assemble(study: StudyLike, source: str = "") -> tuple[Study, System
 def _simulate_one(study: Study, system: System, requested: FloatArray, setting: FloatArray, engine: Engine = Engine.LIBSUMO) -> Simulation:
     recording = RecordingAds(system.ads)
     settings = setting[np.newaxis]
-    runs = drive(replace(at_worst(system, settings), ads=recording), settings, engine)  # in SUMO itself
+    runs = drive(replace(system_at_worst_point(system, settings), ads=recording), settings, engine)  # in SUMO itself
     return Simulation(
         study=study, setting=dict(zip(system.characteristics.names, setting.tolist(), strict=True)),
         put_back=_put_back(system, requested, setting), evaluation=score(system, settings, runs), runs=runs,

@@ -21,7 +21,7 @@ from safevar_sumo.results import ORIGINAL, Failure, JournalBusy, ResultsDirector
 from safevar_sumo.search import Problem, Search
 from safevar_sumo.study import Study
 from safevar_sumo.sumo import Engine
-from safevar_sumo.sumo.matrix import LARGEST_WORLD
+from safevar_sumo.sumo.matrix import MAX_COPIES
 from safevar_sumo.vehicles import CharacteristicSet, region_of
 from safevar_sumo.workers.evaluation import Pool, packed
 from safevar_sumo.workers.interrupts import awaited, first_of
@@ -90,7 +90,7 @@ def run_campaign(study: Study, keys: Iterable[RunKey], results: ResultsDirectory
     def begin_search(key: RunKey) -> Search:
         return search_of(key, study, problem, results.note)
 
-    batcher = Batcher(retrying_pool, work, batch or LARGEST_WORLD)
+    batcher = Batcher(retrying_pool, work, batch or MAX_COPIES)
     verification = Verification(study, results, retrying_pool, begin_search, engine, observer)
 
     def advance(run: Run) -> None:

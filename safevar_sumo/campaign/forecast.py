@@ -10,7 +10,7 @@ import numpy as np
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.study import Study
 from safevar_sumo.sumo import Engine
-from safevar_sumo.sumo.matrix import LARGEST_WORLD
+from safevar_sumo.sumo.matrix import MAX_COPIES
 from safevar_sumo.vehicles import CharacteristicSet
 from safevar_sumo.workers.evaluation import Pool, packed
 from safevar_sumo.workers.interrupts import awaited
@@ -31,7 +31,7 @@ class Forecast(NamedTuple):
     size: int
 
 
-def forecast(study: Study, runs: int, pool: Pool, batch: int = LARGEST_WORLD, engine: Engine = Engine.LIBSUMO) -> Forecast:
+def forecast(study: Study, runs: int, pool: Pool, batch: int = MAX_COPIES, engine: Engine = Engine.LIBSUMO) -> Forecast:
     """Upper limits for a number of runs, from a short measurement of the pool that will carry out the runs."""
     characteristics, size = CharacteristicSet.of(study.vehicle.characteristics), min(batch, max(runs, 1) * study.search.population)
     retrying_pool, work, rng = RetryingPool(pool, study), packed(study, engine=engine), np.random.default_rng(study.search.seed)

@@ -18,7 +18,7 @@ from safevar_sumo.results import ResultsDirectory
 from safevar_sumo.search import Search
 from safevar_sumo.study import Study, foreign_names
 from safevar_sumo.sumo import Engine, assemble, evaluate
-from safevar_sumo.sumo.matrix import LARGEST_WORLD
+from safevar_sumo.sumo.matrix import MAX_COPIES
 from safevar_sumo.workers.evaluation import packed
 from safevar_sumo.workers.identity import networks_of
 from safevar_sumo.workers.isolation import refuse_difference, refuse_unlike_sumo
@@ -38,7 +38,7 @@ class Verification:
         self._is_recorded = engine is Engine.RECORDED
         self._sumo_study = driven_in_sumo(study, assemble(study).weather)
         inputs = results.inputs if self._sumo_study is study else {**results.inputs, "network": networks_of(assemble(self._sumo_study))}
-        self._in_sumo = Batcher(pool, packed(self._sumo_study, inputs, engine=Engine.LIBSUMO), LARGEST_WORLD)
+        self._in_sumo = Batcher(pool, packed(self._sumo_study, inputs, engine=Engine.LIBSUMO), MAX_COPIES)
         self._isolated_checks: dict[Future[Evaluations], tuple[Run, Evaluations]] = {}
         """By batch of one setting: the run, and the setting's evaluation in that run."""
         self._unverified: dict[Run, tuple[Evaluations, int]] = {}

@@ -31,9 +31,9 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import KMH_PER_MS, Evaluations, FloatArray, Outcome
 from safevar_sumo.results import record
-from safevar_sumo.scenarios import tags
+from safevar_sumo.scenarios import pre_crash_sentence
 from safevar_sumo.study import SAFETY_DEGREE, Study, check_writable
-from safevar_sumo.sumo.matrix import AtPoint, at_every_point, named_point, point_record, remarks_of, vehicle_remarks
+from safevar_sumo.sumo.matrix import PointResult, point_record, remarks_of, simulate_all_points, system_at_point, vehicle_remarks
 from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.terminal import WholeTable, print_meanings, print_text
 from safevar_sumo.vehicles import CharacteristicSet
@@ -64,7 +64,7 @@ def simulate_command(study: str, solution: str | None, choice: str | None, chang
     target, replays = target_of(study, solution, choice), Replays(**replay_outputs)
     system = assemble(target.study, target.source)
     if point is not None:
-        system = named_point(system, point, "--point")
+        system = system_at_point(system, point, "--point")
     values_by_name = read_changes(changes, system.characteristics, beyond)
     base = system.characteristics.original if target.setting is None else target.setting
     requested_settings = settings_of(values_by_name, base, system.characteristics)
@@ -117,7 +117,7 @@ def _simulate_sweep(target: CommandTarget, system: System, requests: FloatArray,
 
 
 def _print_results(target: CommandTarget, system: System, simulation: Simulation, spreads: Sequence[ModelSpread], as_json: bool) -> None:
-    at_points = at_every_point(system, simulation.evaluation.settings) if system.matrix and (as_json or system.rater is None) else []
+    at_points = simulate_all_points(system, simulation.evaluation.settings) if system.matrix and (as_json or system.rater is None) else []
     if as_json:
         solution = {} if target.handle is None else {"solution": str(target.handle)}
         matrix = {"points": [point_record(result) for result in at_points]} if at_points else {}
@@ -131,7 +131,7 @@ def _print_results(target: CommandTarget, system: System, simulation: Simulation
             print_matrix(Console(), at_points)
         else:
             print_text(Console(), f"{len(system.matrix)} cells and variations: {question_command('rating', target.source)} --matrix")
-        if types := tags(system.points):
+        if types := pre_crash_sentence(system.points):
             print_text(Console(), types)
     remarks = [remark for point in system.points for remark in remarks_of(point.scenario)]
     for remark in dict.fromkeys([*remarks, *system.remarks, *vehicle_remarks(system)]):
@@ -268,12 +268,12 @@ MAX_POINTS_NAMED = 6
 ROW_DIMENSION, COLUMN_DIMENSION = "speed", "impact_location"
 
 
-def print_matrix(console: Console, results: Sequence[AtPoint], row: int = 0) -> None:
+def print_matrix(console: Console, results: Sequence[PointResult], row: int = 0) -> None:
     """Print a table for each test and weather: rows are speeds and other dimensions, columns are impact locations."""
     records = [point_record(result, row) for result in results]
     tables: dict[tuple[str, str], list[tuple[dict[str, Any], dict[str, Any]]]] = {}
     for result, result_record in zip(results, records, strict=True):
-        coordinates = dict(result.point.place)
+        coordinates = dict(result.point.parameters)
         tables.setdefault((coordinates.pop("test"), coordinates.pop("weather")), []).append((coordinates, result_record))
     for (test, weather), cells in tables.items():
         _print_table(console, f"{test}, {weather}", cells)

@@ -20,7 +20,7 @@ from safevar_sumo.search import ALGORITHMS, GuardedAlgorithm, Problem
 from safevar_sumo.study import Study
 from safevar_sumo.sumo.batch import drive_all
 from safevar_sumo.sumo.system import assemble
-from safevar_sumo.vehicles import CharacteristicSet, foreign_change
+from safevar_sumo.vehicles import CharacteristicSet, guard_change
 
 
 class MetricProbe(Probe):
@@ -96,7 +96,7 @@ class ObjectiveProbe(Probe):
 
     def load(self) -> Any:
         forget_foreign()
-        return foreign_change(loaded_again(self.subject), guard_of(self.subject))
+        return guard_change(loaded_again(self.subject), guard_of(self.subject))
 
     def run(self, model: Any, rows: Rows) -> Outputs:
         return {"values": model.function(self._settings[rows], self._members)}

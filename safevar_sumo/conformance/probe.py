@@ -16,7 +16,7 @@ from safevar_sumo.conformance.subject import Subject
 from safevar_sumo.plugins import Guard, Lookup, forget_foreign
 from safevar_sumo.records import FloatArray
 from safevar_sumo.sumo.system import System, assemble
-from safevar_sumo.sumo.traci_module import importable
+from safevar_sumo.sumo.traci_module import substitute_traci
 from safevar_sumo.vehicles import CharacteristicSet
 
 Rows = npt.NDArray[np.intp]
@@ -74,7 +74,7 @@ def loaded_again(subject: Subject) -> Any:
     """The class, function or record of a subject, from the module as it is loaded now."""
     if subject.is_ours or subject.member.file:
         return subject.member.target
-    with importable():
+    with substitute_traci():
         return Lookup("check", subject.study.origin.places).find({}, subject.name, subject.key).target
 
 

@@ -20,7 +20,7 @@ from safevar_sumo.plugins import Contract, Guard, Lookup, Member
 from safevar_sumo.scenarios import SCENARIO_CONTRACT, SCENARIOS
 from safevar_sumo.search import ALGORITHM_CONTRACT, ALGORITHMS
 from safevar_sumo.study import CharacteristicTable, MatrixTest, ModelTable, Study, fmus_of, load_study, study_names
-from safevar_sumo.sumo.traci_module import importable
+from safevar_sumo.sumo.traci_module import substitute_traci
 from safevar_sumo.vehicles import CHANGES, VEHICLE_CONTRACT, VEHICLES, Change, FmuVehicle
 
 KINDS: Mapping[str, Mapping[str, Any]] = {
@@ -90,7 +90,7 @@ def subject_of(name: str, study: str | None = None) -> Subject:
         names = [*study_names(), *OBJECTIVES, *(member for members in KINDS.values() for member in members)]
         raise unknown("check", f"there is nothing called {name!r}", name, names, ", package.module:Name, or the path of a study file")
     places = () if given_study is None else given_study.origin.places
-    with importable():
+    with substitute_traci():
         member = Lookup("check", places).find({}, name, "SUBJECT")
     studies_nearby = [] if given_study else list(_studies_beside(name, member.folder))
     trial_study = given_study or (studies_nearby[0] if studies_nearby else None)
@@ -130,7 +130,7 @@ def subjects_of(study: Study) -> Iterator[Subject]:
             if name in names_done or is_metric_name:
                 continue
             names_done.add(name)
-            with importable():
+            with substitute_traci():
                 member = lookup.find(CHANGES if kind == "objective" else KINDS[kind], name, KEYS.get(kind, f"{kind}.model"))
             subject_kind = "metric" if isinstance(member.target, Metric) else kind
             yield Subject(name, subject_kind, member, study, _parameters(study, subject_kind, name))

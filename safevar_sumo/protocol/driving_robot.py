@@ -53,15 +53,15 @@ class DrivingRobot:
         self.error = np.where(self.tested, 0.0, np.nan)
         """Deviation from the test speed [m/s] that was largest relative to the tolerance while the robot drove; NaN without a test."""
 
-    def drive(self, command: Command, state: Any, open_: BoolArray) -> tuple[Command, Any]:
+    def drive(self, command: Command, state: Any, is_open: BoolArray) -> tuple[Command, Any]:
         """The command of the robot while it drives, otherwise of the system; and the state, with the gear held while the robot drives.
 
-        `open_` marks the runs that are not over: only their speeds are compared with the tolerance.
+        `is_open` marks the runs that are not over: only their speeds are compared with the tolerance.
         """
         if not self._has_tests:
             return command, state
         error = np.where(self._drives, state.speed - self._target, 0.0)
-        self.error = np.where(open_ & (_share(error) > _share(self.error)), error, self.error)
+        self.error = np.where(is_open & (_share(error) > _share(self.error)), error, self.error)
         self._has_braked |= command.brake > self._least_brake
         system_pedal = command.throttle - command.brake
         self._highest_pedal = np.maximum(self._highest_pedal, system_pedal)

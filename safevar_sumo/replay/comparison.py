@@ -18,8 +18,8 @@ from safevar_sumo.replay.film import Film, film
 from safevar_sumo.results import UNKNOWN
 from safevar_sumo.study import Study, StudyLike
 from safevar_sumo.sumo.batch import score
-from safevar_sumo.sumo.matrix import at_worst
-from safevar_sumo.sumo.staging import staged
+from safevar_sumo.sumo.matrix import system_at_worst_point
+from safevar_sumo.sumo.staging import stage_network
 from safevar_sumo.sumo.system import Measuring, System
 from safevar_sumo.vehicles import CharacteristicSet
 
@@ -157,12 +157,12 @@ def compare_setting(study: Study, system: System, setting: FloatArray) -> Compar
     """
     original = system.characteristics.original
     settings = np.stack([original]) if np.array_equal(original, setting) else np.stack([original, setting])
-    worst_system = at_worst(system, settings)
+    worst_system = system_at_worst_point(system, settings)
     names = [f" ({point.name})" for point in system.matrix
              if (point.scenario, point.weather) == (worst_system.scenario, worst_system.weather)]
     recording = film(worst_system, settings)
     return Comparison(title=study.title + "".join(names[:1]), characteristics=system.characteristics,
-                      ttc_threshold=system.metrics.ttc_threshold, network=staged(worst_system.scenario).folder,
+                      ttc_threshold=system.metrics.ttc_threshold, network=stage_network(worst_system.scenario).folder,
                       evaluations=score(worst_system, settings, recording.runs),
                       film=replace(recording, runs=_with_pedals_before_impacts(recording.runs)),
                       objectives=_further_objectives(worst_system.measuring))

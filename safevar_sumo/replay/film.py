@@ -11,9 +11,9 @@ import numpy as np
 
 from safevar_sumo.records import FloatArray, SimulationRuns
 from safevar_sumo.sumo.copies import copy_and_name
-from safevar_sumo.sumo.matrix import at_worst, simulate
+from safevar_sumo.sumo.matrix import simulate, system_at_worst_point
 from safevar_sumo.sumo.network import built_network
-from safevar_sumo.sumo.staging import staged
+from safevar_sumo.sumo.staging import stage_network
 from safevar_sumo.sumo.system import System
 from safevar_sumo.sumo.world import SumoWorld
 
@@ -71,9 +71,9 @@ def film(system: System, settings: FloatArray) -> Film:
     SimulationError, InputError
         If `simulate` raises it.
     """
-    camera, system = _Camera(len(settings)), at_worst(system, settings)
+    camera, system = _Camera(len(settings)), system_at_worst_point(system, settings)
     runs = simulate(system, settings, watch=camera.record)
-    return Film(runs=runs, tracks=camera.tracks(), road=road_of(staged(system.scenario).folder))
+    return Film(runs=runs, tracks=camera.tracks(), road=road_of(stage_network(system.scenario).folder))
 
 
 class _Camera:
@@ -85,9 +85,9 @@ class _Camera:
         self._measures: dict[str, tuple[bool, float, float]] = {}
 
     def record(self, world: SumoWorld) -> None:
-        frame = world.whereabouts()
+        frame = world.actor_poses()
         for name in frame.keys() - self._measures.keys():
-            self._measures[name] = world.measures(name)
+            self._measures[name] = world.actor_size(name)
         self._frames.append(frame)
 
     def tracks(self) -> dict[str, ActorTrack]:

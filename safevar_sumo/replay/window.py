@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from safevar_sumo.errors import SimulationError
-from safevar_sumo.sumo.engine import Engine, binary, engine_api, start_engine, stop_engine
+from safevar_sumo.sumo.engine import Engine, engine_api, program_path, start_engine, stop_engine
 from safevar_sumo.sumo.network import copied_network
 
 BRAKE_LIGHT = 8
@@ -118,7 +118,7 @@ def open_window(network: str, step: float, width: int = 1200, height: int = 700)
                    "--no-warnings", "true", "--window-size", f"{width},{height}", "--time-to-teleport", "-1",
                    "--xml-validation", "never", "--xml-validation.net", "never"]
         try:
-            start_engine(api, Engine.GUI, [binary(Engine.GUI), *command])
+            start_engine(api, Engine.GUI, [program_path(Engine.GUI), *command])
             yield Window(api)
         except (api.TraCIException, api.FatalTraCIError) as error:
             raise SimulationError(f"sumo-gui failed: {str(error).strip() or 'its window was closed'}") from None

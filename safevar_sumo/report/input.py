@@ -31,7 +31,7 @@ from safevar_sumo.results import ANSWERS, MANIFEST, RESULTS, SOLUTIONS, chosen_h
 from safevar_sumo.scenarios import Point
 from safevar_sumo.shipped import PACKAGE
 from safevar_sumo.study import SAFETY_DEGREE, foreign_names, refuse_other_than_file
-from safevar_sumo.sumo.matrix import aggregated, at_every_point, evaluate, study_at
+from safevar_sumo.sumo.matrix import evaluate, evaluations_at_worst_points, simulate_all_points, study_at
 from safevar_sumo.sumo.system import System, assemble
 
 
@@ -70,7 +70,7 @@ def failing_table(matrix: Sequence[Point], failing: Collection[str]) -> FailingP
     FailingPoints
         Cells without a test are empty.
     """
-    points = [(point.name in failing, dict(point.place)) for point in matrix]
+    points = [(point.name in failing, dict(point.parameters)) for point in matrix]
     speeds = sorted({coordinates[SPEED] for _, coordinates in points if SPEED in coordinates})
     rows: dict[str, dict[Any, list[str]]] = {}
     for fails, coordinates in points:
@@ -81,7 +81,7 @@ def failing_table(matrix: Sequence[Point], failing: Collection[str]) -> FailingP
         if fails:
             cell.append(FAILS if location is None else f"{location:g} %")
     columns = [*speeds, *([None] if any(None in cells for cells in rows.values()) else [])]
-    has_location = any(LOCATION in dict(point.place) for point in matrix if point.name in failing)
+    has_location = any(LOCATION in dict(point.parameters) for point in matrix if point.name in failing)
     return FailingPoints(
         summary=f"Fails at {len(failing)} of {len(matrix)} points.{' Percentages are impact locations.' if has_location else ''}",
         heads=["" if speed is None else f"{speed:g} km/h" for speed in columns],
@@ -166,8 +166,8 @@ class ReportInput:
         assert self.system is not None
         batch = {setting.tobytes(): setting for setting in settings if setting.tobytes() not in self._simulated_again}
         if batch:
-            at_points = at_every_point(self.system, np.stack(list(batch.values())))
-            evaluations, points = aggregated(at_points), unsafe_points_of(self.system, at_points, self.case.unsafe)
+            at_points = simulate_all_points(self.system, np.stack(list(batch.values())))
+            evaluations, points = evaluations_at_worst_points(at_points), unsafe_points_of(self.system, at_points, self.case.unsafe)
             for row, key in enumerate(batch):
                 self._simulated_again[key] = Resimulation(evaluations.take([row]), points[row])
         return [self._simulated_again[setting.tobytes()] for setting in settings]

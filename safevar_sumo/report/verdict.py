@@ -23,7 +23,7 @@ from safevar_sumo.reference import Totals, quoted
 from safevar_sumo.replay.comparison import number, raised
 from safevar_sumo.report.findings import FIRST_CHOICES, Explanations
 from safevar_sumo.report.input import ChangeRow, FailingPoints, ReportInput, stored_answer
-from safevar_sumo.scenarios import SCENARIOS, Point, tags
+from safevar_sumo.scenarios import SCENARIOS, Point, pre_crash_sentence
 from safevar_sumo.study import SAFETY_DEGREE
 from safevar_sumo.sumo.matrix import vehicle_remarks
 from safevar_sumo.vehicles import VEHICLES
@@ -47,7 +47,7 @@ def tested_system(data: ReportInput) -> TestedSystem:
                 f"({number_of(len(case.characteristics), 'varied characteristic')}). "
                 f"Driving system: {_name_and_sentence(ADS, study.ads.model)}. "
                 f"Scenario: {_name_and_sentence(SCENARIOS, study.scenario.model)}; {_conditions(data)}.",
-        tags="" if data.system is None else tags(data.system.points), search=_search(data),
+        tags="" if data.system is None else pre_crash_sentence(data.system.points), search=_search(data),
         characteristics=[
             (member.name, "" if member.unit == "-" else raised(member.unit),
              *map(number, (member.original, member.lower, member.upper, member.threshold)), member.words)
@@ -69,7 +69,7 @@ def _tests(points: Sequence[Point]) -> list[str]:
     """Each test of a matrix, with the number of points and their weathers."""
     weathers_by_test: dict[str, list[str]] = {}
     for point in points:
-        weathers_by_test.setdefault(str(dict(point.place)["test"]), []).append(point.weather.name)
+        weathers_by_test.setdefault(str(dict(point.parameters)["test"]), []).append(point.weather.name)
     return [f"{test} ({len(weathers)}, {' and '.join(dict.fromkeys(weathers))})" for test, weathers in weathers_by_test.items()]
 
 

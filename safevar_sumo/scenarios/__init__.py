@@ -15,7 +15,7 @@ from safevar_sumo.scenarios.base import (
     Scenario,
     Scene,
     World,
-    tags,
+    pre_crash_sentence,
     weather_of,
 )
 from safevar_sumo.scenarios.car_to_car import CarToCar
@@ -33,4 +33,4 @@ SCENARIOS: Mapping[str, type[Any]] = {
 
 __all__ = [
     "SCENARIOS", "SCENARIO_CONTRACT", "VUT", "WEATHERS", "GuardedScenario", "Lane", "Point", "PreCrash", "Scenario", "Scene", "World",
-    "tags", "weather_of"]
+    "pre_crash_sentence", "weather_of"]

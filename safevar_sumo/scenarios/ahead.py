@@ -30,7 +30,7 @@ from safevar_sumo.scenarios.euro_ncap import (
     target_type,
 )
 from safevar_sumo.scenarios.frame import Frame
-from safevar_sumo.scenarios.target import Course, Target, TargetTest, Times, value_at
+from safevar_sumo.scenarios.target import EncounterConstants, Target, TargetTest, Times, value_at
 
 ROAD_LANE = "road_0"
 START_POSITION = 50.0
@@ -90,9 +90,10 @@ class TargetAhead(NamedTuple):
         return start, {**parked, "vType[@id='target']": target_type(self.target), "vehicle[@id='target']": {
             "type": self.target, "route": "beyond", "departPos": repr(FRONT_POSITION), "departPosLat": "0", "departSpeed": "0"}}
 
-    def meeting(self, world: World) -> _MeetingAhead:
-        """How the vehicle meets the target in a run."""
-        return _MeetingAhead(Frame.of(world.lane(VUT_LANE if self._is_rotated else ROAD_LANE)), Course(follows=True), self, self._depth)
+    def motion(self, world: World) -> _MotionAhead:
+        """The motion of the target in a run."""
+        frame = Frame.of(world.lane(VUT_LANE if self._is_rotated else ROAD_LANE))
+        return _MotionAhead(frame, EncounterConstants(follows=True), self, self._depth)
 
     @property
     def _is_rotated(self) -> bool:
@@ -114,11 +115,11 @@ class TargetAhead(NamedTuple):
         return front[0] - _first_contact([corners[0], corners[1], corners[3], corners[2]], self.vut.width / 2)
 
 
-class _MeetingAhead(NamedTuple):
-    """A meeting with a target whose first point of contact is `depth` metres behind the target's front; see `Meeting`."""
+class _MotionAhead(NamedTuple):
+    """The motion of a target whose first point of contact is `depth` metres behind its front; see `TargetMotion`."""
 
     frame: Frame
-    course: Course
+    constants: EncounterConstants
     target_ahead: TargetAhead
     depth: float
 
@@ -185,8 +186,8 @@ class TargetAheadTest(TargetTest, frozen=True, kw_only=True, forbid_unknown_fiel
         """The vehicle at its speed, and the target."""
         return self._target_ahead.actors(self.test_speed, roads)
 
-    def _meeting(self, world: World) -> _MeetingAhead:
-        return self._target_ahead.meeting(world)
+    def _motion(self, world: World) -> _MotionAhead:
+        return self._target_ahead.motion(world)
 
     def encounter(self, trace: Trace) -> Encounter:
         """Distance from the front bumper to the target's body; TTC is this distance over the difference of speeds."""

@@ -1,4 +1,4 @@
-"""The contract of a scenario (its actors and the geometry of the encounter), and checks of scenarios from outside the package."""
+"""The contract of a scenario (its actors and the geometry of the encounter), and the guard of a user's scenario."""
 
 from __future__ import annotations
 
@@ -38,14 +38,14 @@ class Lane(NamedTuple):
 
 
 class BentLane(Lane):
-    """A lane that is not straight; `bend` is the largest distance of its centre line from the straight line between its ends [m]."""
+    """A lane that is not straight; `bend` is the largest distance between its centre line and the line between its ends [m]."""
 
     name: str
     bend: float
 
 
 def lane_through(name: str, points: Sequence[Coordinates]) -> Lane:
-    """The lane `name` whose centre line goes through these points [m]."""
+    """The lane `name`, whose centre line goes through these points [m]; a `BentLane` if they are not on one line."""
     (x, y), (to_x, to_y) = points[0], points[-1]
     length = math.hypot(to_x - x, to_y - y)
     deviations = [abs((to_x - x) * (at_y - y) - (to_y - y) * (at_x - x)) / length if length else math.hypot(at_x - x, at_y - y)
@@ -134,23 +134,23 @@ class Scenario(Protocol):
         """Prepare a run, before the first step; returns the memory for `observe`."""
 
     def observe(self, world: World, step: float, memory: Any) -> tuple[Scene, Any]:
-        """The obstacle now, `step` seconds after the last call, and the memory; also controls actors that SUMO does not move."""
+        """The obstacle now, `step` seconds after the last call, and the new memory; may also command the actors."""
 
     def encounter(self, trace: Trace) -> Encounter:
         """The geometry that the metrics are computed from."""
 
 
 class Point(NamedTuple):
-    """A scenario in a weather; `name` is its name in the study, `place` holds the parameters that distinguish it from other points."""
+    """A scenario in a weather; `name` is its name in the study, `parameters` distinguish it from the study's other points."""
 
     scenario: Scenario
     weather: Weather
     name: str = ""
-    place: tuple[tuple[str, Any], ...] = ()
+    parameters: tuple[tuple[str, Any], ...] = ()
 
 
-_CATALOGUE = tomllib.loads(Path(__file__).with_name("weather.toml").read_text(encoding="utf-8"))
-WEATHERS = {name: msgspec.convert({"name": name, **row}, Weather) for name, row in _CATALOGUE.items()}
+_WEATHER_TABLES = tomllib.loads(Path(__file__).with_name("weather.toml").read_text(encoding="utf-8"))
+WEATHERS = {name: msgspec.convert({"name": name, **table}, Weather) for name, table in _WEATHER_TABLES.items()}
 """Weathers by name, from weather.toml beside this module."""
 
 
@@ -187,8 +187,8 @@ def pre_crash_of(scenario: Any) -> str:
     return str(getattr(scenario, "pre_crash", ""))
 
 
-def tags(points: Iterable[Point]) -> str:
-    """A sentence with the pre-crash types and light of some points; "" if no scenario has a type."""
+def pre_crash_sentence(points: Iterable[Point]) -> str:
+    """A sentence that lists the pre-crash types and the light of points; "" if no scenario has a type."""
     points = tuple(points)
     types = dict.fromkeys(filter(None, (pre_crash_of(point.scenario) for point in points)))
     light = " and ".join(dict.fromkeys(f"by {point.weather.light}" for point in points))
@@ -203,7 +203,7 @@ MAX_TEST_SPEED = 100.0
 
 
 class GuardedScenario:
-    """A scenario from outside the package: it gets read-only copies, and this class checks its results."""
+    """Guards a user's scenario: passes read-only copies to it, and checks its results."""
 
     def __init__(self, scenario: Any, guard: Guard) -> None:
         self._scenario, self._guard = scenario, guard
@@ -270,7 +270,7 @@ class GuardedScenario:
 
 
 class _ReadOnlyWorld:
-    """A world that has only the methods of the contract `World` and returns read-only results."""
+    """A world with only the methods of the contract `World`, which return read-only copies."""
 
     def __init__(self, world: World) -> None:
         self._world = world

@@ -32,7 +32,7 @@ from safevar_sumo.scenarios.euro_ncap import (
     lateral_of,
 )
 from safevar_sumo.scenarios.frame import Frame
-from safevar_sumo.scenarios.target import PARKED_GAP, Course, Target, TargetTest, Times, value_at
+from safevar_sumo.scenarios.target import PARKED_GAP, EncounterConstants, Target, TargetTest, Times, value_at
 
 KERB_LANE = "kerb_0"
 PARKED_LENGTH = {"parked_small": 4.25, "parked_large": 4.5}
@@ -123,11 +123,11 @@ class _Start(NamedTuple):
         return cls(mover, direction, direction.extent(BODIES[target]), sign * impact_lateral, distance, time, profile)
 
 
-class _CrossingMeeting(NamedTuple):
-    """A meeting with a target whose path crosses the vehicle's lane at the position `path` [m]; see `Meeting`."""
+class _CrossingMotion(NamedTuple):
+    """The motion of a target whose path crosses the vehicle's lane at the position `path` [m]; see `TargetMotion`."""
 
     frame: Frame
-    course: Course
+    constants: EncounterConstants
     path: float
     start: _Start
     vut_width: float
@@ -267,19 +267,20 @@ class Crossing(TargetTest, frozen=True, kw_only=True, forbid_unknown_fields=True
         if not self.parameter("hidden"):
             return {f"vehicle[@id='{car}']": None for car in PARKED_LENGTH}
         start, left = frame.lane_coordinates(roads.lane(KERB_LANE).start)
-        changes, end, across = dict[str, dict[str, str]](), path - PARKED_GAP - start, self._parked_side - PARKED_WIDTH / 2 - left
+        changes, end, across = dict[str, dict[str, str]](), path - PARKED_GAP - start, self._parked_edge - PARKED_WIDTH / 2 - left
         for car, length in PARKED_LENGTH.items():
             changes[f"vehicle[@id='{car}']"] = {"departPos": repr(end), "departPosLat": repr(across)}
             changes[f"vehicle[@id='{car}']/stop"] = {"endPos": repr(end)}
             end -= length + PARKED_GAP
         return changes
 
-    def _meeting(self, world: World) -> _CrossingMeeting:
+    def _motion(self, world: World) -> _CrossingMotion:
         frame, start = Frame.of(world.lane(VUT_LANE)), _Start.of(self)
-        course = Course(past=-start.extent.length - self.vut_length)
+        constants = EncounterConstants(passed_gap=-start.extent.length - self.vut_length)
         if self.parameter("hidden"):
-            course = course._replace(hidden=True, to_middle=start.extent.length / 2, setback=self.sensor_setback, kerb=-self._parked_side)
-        return _CrossingMeeting(frame, course, start.mover.path(frame, world, start.impact_left), start, self.vut_width)
+            constants = constants._replace(hidden=True, to_middle=start.extent.length / 2, setback=self.sensor_setback,
+                                           parked_offset=-self._parked_edge)
+        return _CrossingMotion(frame, constants, start.mover.path(frame, world, start.impact_left), start, self.vut_width)
 
     def encounter(self, trace: Trace) -> Encounter:
         """Distance between the vehicle's front and the target's body, along and across the lane; TTC from its rate of change."""
@@ -297,8 +298,8 @@ class Crossing(TargetTest, frozen=True, kw_only=True, forbid_unknown_fields=True
             and self.heading == 0 and self.start_share == 1
 
     @property
-    def _parked_side(self) -> float:
-        """Position of the sides of the parked cars that face the lane, to the left of the lane's middle [m]."""
+    def _parked_edge(self) -> float:
+        """Lateral position of the parked cars' sides that face the lane, to the left of its middle [m]."""
         return -self.vut_width / 2 - PARKED_GAP
 
     def parameter(self, name: str) -> Any:

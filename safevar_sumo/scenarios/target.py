@@ -1,6 +1,6 @@
-"""A target that does not react, and vehicles that meet the target: the common part of Euro NCAP's scenarios.
+"""A target that does not react to the vehicles under test: the common part of Euro NCAP's scenarios.
 
-The motion of the target does not depend on the vehicles: for a recorded scene it is computed once, at all samples, for thousands of
+As the target's motion does not depend on the vehicles, it is computed once per recorded scene, at all samples, for thousands of
 vehicles.
 """
 
@@ -17,7 +17,7 @@ from safevar_sumo.scenarios.base import VUT, Scene, World
 from safevar_sumo.scenarios.frame import Frame
 
 APPROACH_SPEED = 0.5
-"""Closing speed from which on a vehicle approaches a target ahead [m/s]; it avoids the target if it is later no longer faster."""
+"""Closing speed above which a vehicle approaches a target ahead [m/s]; if it is later no longer faster, it has avoided the target."""
 PARKED_GAP = 1.0
 """Gap between vehicle and parked cars, between the nearer car's front and the target's path, and between the two cars [m]."""
 Times = float | Sequence[float]
@@ -39,38 +39,38 @@ class Target(NamedTuple):
     ahead: Any = 0.0
 
 
-class Course(NamedTuple):
-    """Constants of a run: numbers, or arrays of shape (N,).
+class EncounterConstants(NamedTuple):
+    """Quantities that are constant during a run: numbers, or arrays of shape (N,).
 
-    A vehicle is past the target when the gap is below `past` [m]. A vehicle that `follows` the target cannot pass: it has avoided the
-    target once it has approached and is no longer faster. Parked cars hide a `hidden` target. Distances [m]: `to_middle` from the
-    target's edge to its middle, `setback` from the sensors to the front bumper, `kerb` from the lane's middle to the parked cars' sides.
+    A vehicle has passed the target when the gap is below `passed_gap` [m]. A vehicle that `follows` the target cannot pass: it has avoided
+    the target once it has approached and is no longer faster. Parked cars hide a `hidden` target. Distances [m]: `to_middle` from the
+    target's edge to its middle, `setback` from the sensors to the front bumper, `parked_offset` from the lane's middle to the parked cars.
     """
 
-    past: Any = -np.inf
+    passed_gap: Any = -np.inf
     follows: Any = False
     hidden: Any = False
     to_middle: Any = 0.0
     setback: Any = 0.0
-    kerb: Any = 0.0
+    parked_offset: Any = 0.0
 
 
-class Meeting(Protocol):
-    """How vehicles meet a target in a run: the target's motion, and the constants of the run."""
+class TargetMotion(Protocol):
+    """The motion of a target in a run, relative to the vehicles' lane."""
 
     @property
     def frame(self) -> Frame:
         """Frame of the vehicles' lane."""
 
     @property
-    def course(self) -> Course:
-        """Constants of the run."""
+    def constants(self) -> EncounterConstants:
+        """The constants of the encounter with this target."""
 
     def begin(self, world: World) -> float:
         """Set the target's initial speed; returns this speed [m/s]."""
 
     def positions(self, world: World) -> FloatArray:
-        """Positions of the target's front; shape (N, 2) [m]."""
+        """Positions of the target's front in SUMO; shape (N, 2) [m]."""
 
     def target(self, positions: FloatArray, times: Times) -> Target:
         """The target with its front at `positions`, shape (M, 2) [m], at one time or at M times; without its lateral speed."""
@@ -83,9 +83,9 @@ class Meeting(Protocol):
 
 
 class Memory(NamedTuple):
-    """The meeting; the target's last lateral position [m]; step number; the speed set last [m/s]; which vehicles have approached."""
+    """The target's motion, last lateral position [m], and speed set last [m/s]; the number of samples; which vehicles have approached."""
 
-    meeting: Meeting
+    motion: TargetMotion
     lateral: FloatArray
     sample: int
     speed: float
@@ -98,54 +98,55 @@ class TargetTest(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     reactive_actors = False
 
     def begin(self, world: World) -> Memory:
-        meeting = self._meeting(world)
-        speed = meeting.begin(world)
-        lateral = meeting.target(meeting.positions(world), 0.0).lateral
-        return Memory(meeting, lateral, 0, speed, np.zeros(len(lateral), dtype=bool))
+        motion = self._motion(world)
+        speed = motion.begin(world)
+        lateral = motion.target(motion.positions(world), 0.0).lateral
+        return Memory(motion, lateral, 0, speed, np.zeros(len(lateral), dtype=bool))
 
     def observe(self, world: World, step: float, memory: Memory) -> tuple[Scene, Memory]:
-        meeting = memory.meeting
-        target = meeting.target(meeting.positions(world), memory.sample * step)
+        motion = memory.motion
+        target = motion.target(motion.positions(world), memory.sample * step)
         target = target._replace(lateral_speed=(target.lateral - memory.lateral) / step)
-        front = meeting.frame.along(world.vehicle_positions(VUT))
-        scene, approached = scene_of(meeting.course, target, front, world.speeds(), memory.approached)
+        front = motion.frame.along(world.vehicle_positions(VUT))
+        scene, approached = scene_of(motion.constants, target, front, world.speeds(), memory.approached)
         return scene, self.move(world, step, memory)._replace(lateral=target.lateral, approached=approached)
 
     def move(self, world: World, step: float, memory: Memory) -> Memory:
         """Set the target's next speed, as `observe` does, without computing the scene."""
-        speed = memory.meeting.next_speed(memory.sample, step)
+        speed = memory.motion.next_speed(memory.sample, step)
         if speed != memory.speed:
-            memory.meeting.set_speed(world, speed)
+            memory.motion.set_speed(world, speed)
         return memory._replace(sample=memory.sample + 1, speed=speed)
 
-    def at_all_samples(self, world: World, samples: World, step: float) -> tuple[Meeting, Target]:
-        """The meeting in a recorded scene, and the target at all T samples; the world `samples` has the T samples as its N copies."""
-        meeting = self._meeting(world)
-        positions = meeting.positions(samples)
-        target = meeting.target(positions, [sample * step for sample in range(len(positions))])
+    def at_all_samples(self, world: World, samples: World, step: float) -> tuple[TargetMotion, Target]:
+        """The target's motion in a recorded scene, and the target at its T samples, which the world `samples` holds as T copies."""
+        motion = self._motion(world)
+        positions = motion.positions(samples)
+        target = motion.target(positions, [sample * step for sample in range(len(positions))])
         previous = np.concatenate([target.lateral[:1], target.lateral[:-1]])
-        return meeting, target._replace(lateral_speed=(target.lateral - previous) / step)
+        return motion, target._replace(lateral_speed=(target.lateral - previous) / step)
 
-    def _meeting(self, world: World) -> Meeting:
+    def _motion(self, world: World) -> TargetMotion:
         raise NotImplementedError
 
 
-def scene_of(course: Course, target: Target, front: FloatArray, speed: FloatArray, approached: BoolArray) -> tuple[Scene, BoolArray]:
+def scene_of(constants: EncounterConstants, target: Target, front: FloatArray, speed: FloatArray,
+             approached: BoolArray) -> tuple[Scene, BoolArray]:
     """The scene of N vehicles by the position of their fronts along the lane [m] and their speed [m/s], and which have approached."""
     gap, zeros = target.edge - front, np.zeros_like(front)
-    over = np.asarray(target.has_left | (gap < course.past))
-    if course.follows is not False:
+    over = np.asarray(target.has_left | (gap < constants.passed_gap))
+    if constants.follows is not False:
         approached = approached | (speed - target.speed > APPROACH_SPEED)
-        over = over | course.follows & approached & (speed <= target.speed)
-    visible = EVERYWHERE if course.hidden is False else _visible(course, target, gap)
+        over = over | constants.follows & approached & (speed <= target.speed)
+    visible = EVERYWHERE if constants.hidden is False else _visible(constants, target, gap)
     return Scene(gap, zeros + target.lateral, zeros + target.lateral_speed, over, zeros + target.speed, visible), approached
 
 
-def _visible(course: Course, target: Target, gap: FloatArray) -> BoolArray:
+def _visible(constants: EncounterConstants, target: Target, gap: FloatArray) -> BoolArray:
     """Whether the line from the sensors to the target's middle clears the front corner of the nearer parked car; shape (N,)."""
-    distance = gap + course.to_middle + course.setback
+    distance = gap + constants.to_middle + constants.setback
     corner = distance - target.ahead - PARKED_GAP
-    return np.asarray(~np.asarray(course.hidden) | (corner <= 0) | (-target.lateral * corner < course.kerb * distance))
+    return np.asarray(~np.asarray(constants.hidden) | (corner <= 0) | (-target.lateral * corner < constants.parked_offset * distance))
 
 
 def value_at(times: Times, function: Callable[[float], float]) -> Any:

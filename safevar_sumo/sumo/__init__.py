@@ -3,17 +3,17 @@
 from safevar_sumo.sumo.batch import reason_for_sumo, score
 from safevar_sumo.sumo.engine import Engine
 from safevar_sumo.sumo.matrix import (
-    AtPoint,
-    aggregated,
-    at_every_point,
-    at_worst,
+    PointResult,
     evaluate,
-    named_point,
+    evaluations_at_worst_points,
     point_record,
     remarks_of,
     settings_per_batch,
     simulate,
+    simulate_all_points,
     study_at,
+    system_at_point,
+    system_at_worst_point,
     vehicle_remarks,
     worst_points,
 )
@@ -21,6 +21,6 @@ from safevar_sumo.sumo.network import network_files, network_fingerprint
 from safevar_sumo.sumo.system import System, assemble, models_of
 
 __all__ = [
-    "AtPoint", "Engine", "System", "aggregated", "assemble", "at_every_point", "at_worst", "evaluate", "models_of", "named_point",
-    "network_files", "network_fingerprint", "point_record", "reason_for_sumo", "remarks_of", "score", "settings_per_batch", "simulate",
-    "study_at", "vehicle_remarks", "worst_points"]
+    "Engine", "PointResult", "System", "assemble", "evaluate", "evaluations_at_worst_points", "models_of", "network_files",
+    "network_fingerprint", "point_record", "reason_for_sumo", "remarks_of", "score", "settings_per_batch", "simulate",
+    "simulate_all_points", "study_at", "system_at_point", "system_at_worst_point", "vehicle_remarks", "worst_points"]

@@ -20,8 +20,8 @@ from safevar_sumo.sumo.engine import Engine, open_world
 from safevar_sumo.sumo.network import copied_network
 from safevar_sumo.sumo.perception import PointBatch
 from safevar_sumo.sumo.recorded_world import RecordedWorld
-from safevar_sumo.sumo.recording import Recording, recorded_scenes
-from safevar_sumo.sumo.staging import staged
+from safevar_sumo.sumo.recording import Recording, record_scenes
+from safevar_sumo.sumo.staging import stage_network
 from safevar_sumo.sumo.system import System
 from safevar_sumo.sumo.traci_controller import TraciController
 from safevar_sumo.sumo.world import INSERTION_DECELERATION, SumoWorld
@@ -51,7 +51,7 @@ def reason_for_sumo(system: System) -> str:
     """The reason why a system is simulated in SUMO, in one copy of the network per vehicle; "" if recorded scenes suffice."""
     if isinstance(system.ads, TraciController):
         return "a controller written for TraCI reads the running simulation"
-    scenes = recorded_scenes([point.scenario for point in system.points], step_options(system))
+    scenes = record_scenes([point.scenario for point in system.points], step_options(system))
     return next((scene for scene in scenes if isinstance(scene, str)), "")
 
 
@@ -73,12 +73,12 @@ def drive_all(system: System, settings: FloatArray, engine: Engine = Engine.RECO
     scenarios, options = [point.scenario for point in system.points], (*step_options(system), *options)
     if engine is Engine.RECORDED:
         if watch is None and not reason_for_sumo(system):
-            scenes = recorded_scenes(scenarios, options)
+            scenes = record_scenes(scenarios, options)
             world = RecordedWorld([scene for scene in scenes if isinstance(scene, Recording)], len(settings))
             return drive(system, np.tile(settings, (len(system.points), 1)), world)
         engine = Engine.LIBSUMO
     (scenario,) = scenarios
-    with open_world(copied_network(staged(scenario).folder, len(settings)), len(settings), engine, options) as sumo_world:
+    with open_world(copied_network(stage_network(scenario).folder, len(settings)), len(settings), engine, options) as sumo_world:
         return drive(system, settings, sumo_world, watch)
 
 
@@ -91,7 +91,7 @@ def step_options(system: System) -> tuple[str, ...]:
 def drive(system: System, settings: FloatArray, world: SumoWorld | RecordedWorld, watch: Watcher | None = None) -> SimulationRuns:
     """Simulate vehicles in an open world that has not taken its first step; see `drive_all`.
 
-    With K points, `settings` has K equal parts, and part k drives at point k.
+    With K points, `settings` holds K groups of equal size, and group k drives at point k.
     """
     guards = [member.guard for member in system.members if member.guard is not None]
     with guard_process_state(guards[0].source if guards else "", [guard.name for guard in guards]):
@@ -101,58 +101,60 @@ def drive(system: System, settings: FloatArray, world: SumoWorld | RecordedWorld
 def _simulate(system: System, settings: FloatArray, world: Any, watch: Watcher | None) -> SimulationRuns:
     vehicle, step, n = system.vehicle, world.step_length, len(settings)
     characteristics = dict(zip(system.characteristics.names, np.ascontiguousarray(settings.T), strict=True))
-    prepared = vehicle.prepare(characteristics, _road_friction(system.points, n), step, *_surface(system.points, n))
+    prepared = vehicle.prepare(characteristics, _road_friction(system.points, n), step, *_road_arguments(system.points, n))
     types = vehicle.sumo_type(prepared)
     world.set_types(types._replace(decel=np.maximum(types.decel, INSERTION_DECELERATION)))
     world.depart()
     world.set_decelerations(types.decel)
-    length, frame = world.vehicle_length(VUT), Frame.through_origin(Lane(*world.lane_of(VUT)))
+    vehicle_length, frame = world.vehicle_length(VUT), Frame.through_origin(Lane(*world.lane_of(VUT)))
 
     state = at_start(vehicle, prepared, world.speeds())
-    if isinstance(system.ads, TraciController):  # other ADSs do not read the world, but get observations
-        world.sensors = _sensors(system, prepared, n)
+    if isinstance(system.ads, TraciController):  # other ADSs get observations instead of reading the world
+        world.sensors = _sensors_in_weather(system, prepared, n)
     driver = system.ads.start(n, system.nominal, step)
     batch = PointBatch(system.points, world, n)
     log = _Log(n, int(batch.last_step.max()) + 1, frame)
-    verdict, robot = _Outcomes(n), DrivingRobot(system.points, vehicle, prepared, state, step)
-    contacts, warnings = Contacts(n, robot.tested), _Warnings(system.ads, n)
+    outcomes, robot = _Outcomes(n), DrivingRobot(system.points, vehicle, prepared, state, step)
+    contacts, warnings = Contacts(n, robot.tested), _FirstWarnings(system.ads, n)
     for sample in range(log.length):
         if watch is not None:
             watch(world)
         speed = world.speeds()
-        scene = batch.scene(verdict.open)
-        active = verdict.judge(speed, scene.over, contacts.collisions(world, verdict.open, scene), last=sample >= batch.last_step)
+        scene = batch.scene(outcomes.is_open)
+        collisions = contacts.record_collisions(world, outcomes.is_open, scene)
+        active = outcomes.judge(speed, scene.over, collisions, last=sample >= batch.last_step)
         observation = batch.observe(sample * step, speed, scene)._replace(throttle=state.throttle, brake=state.brake)
         observation, state = vehicle.sense(prepared, state, observation)
         command, driver = system.ads.drive(observation, driver)
-        warnings.update(driver, speed, scene, verdict.open)
-        command, state = robot.drive(command, state, verdict.open)
+        warnings.update(driver, speed, scene, outcomes.is_open)
+        command, state = robot.drive(command, state, outcomes.is_open)
         log.write(sample, position=world.vehicle_positions(VUT), speed=speed, gap=scene.gap, lateral=scene.lateral,
                   lateral_speed=scene.lateral_speed, throttle=command.throttle, brake=command.brake, gear=state.gear, active=active,
                   obstacle_speed=scene.obstacle_speed, pedal=state.brake)
-        if not np.count_nonzero(verdict.open):
+        if not np.count_nonzero(outcomes.is_open):
             break
         if watch is None:
-            world.leave(verdict.ended_copies)
+            world.end_runs(outcomes.ended_copies)
         state = vehicle.advance(prepared, state, command)
         _check_finite(state.speed, settings, system.characteristics)
-        world.advance(np.where(verdict.open, state.speed, 0.0))
-    trace = log.trace(sample + 1, step, length)
+        world.advance(np.where(outcomes.is_open, state.speed, 0.0))
+    trace = log.trace(sample + 1, step, vehicle_length)
     return SimulationRuns(
-        trace=trace, encounter=batch.encounter(trace), outcome=np.where(robot.invalid, Outcome.INVALID_TEST, verdict.outcome()),
-        collision_speed=np.where(robot.invalid, np.nan, verdict.collision_speed), contact=contacts.contact(),
+        trace=trace, encounter=batch.encounter(trace), outcome=np.where(robot.invalid, Outcome.INVALID_TEST, outcomes.final()),
+        collision_speed=np.where(robot.invalid, np.nan, outcomes.collision_speed), contact=contacts.first_contacts(),
         test_speed_error=robot.error, warning_ttc=warnings.time_to_collision)
 
 
 def _check_finite(speed: FloatArray, settings: FloatArray, characteristics: CharacteristicSet) -> None:
-    """Refuse speeds that are not finite: SUMO would use 0 instead, and a vehicle whose model diverged would appear to stand.
+    """Refuse speeds that are not finite: SUMO would replace them by 0, and a vehicle whose model diverged would appear to stand.
 
     The error replaces numpy's overflow warnings, which name neither a characteristic nor a value.
     """
     if np.count_nonzero(np.isfinite(speed)) < len(speed):
         copy = np.flatnonzero(~np.isfinite(speed))[0]
-        values = ", ".join(f"{member.name} = {value:g}" for member, value in zip(characteristics, settings[copy], strict=True)
-                           if value != member.original) or "the original's values"
+        changes = [f"{characteristic.name} = {value:g}" for characteristic, value in zip(characteristics, settings[copy], strict=True)
+                   if value != characteristic.original]
+        values = ", ".join(changes) or "the original's values"
         raise InputError("vehicle", f"its speed is {speed[copy]} with {values}", "values that the model can compute with")
 
 
@@ -162,17 +164,17 @@ def _road_friction(points: Sequence[Point], n: int) -> Any:
     return factors[0] if len(set(factors)) == 1 else np.repeat(factors, n // len(points))
 
 
-def _surface(points: Sequence[Point], n: int) -> list[Any]:
-    """Slope and wetness of the roads at the n vehicles, as further arguments of `Vehicle.prepare`.
+def _road_arguments(points: Sequence[Point], n: int) -> list[Any]:
+    """Slope and wetness of the roads of n vehicles, as arguments of `Vehicle.prepare`; none if all roads are level and dry.
 
-    The list is empty if all roads are level and dry, because not every vehicle model accepts these arguments.
+    Not every vehicle model accepts these arguments.
     """
     grades, wetness = [getattr(point.scenario, "grade", 0.0) for point in points], [point.weather.wet for point in points]
     slope = slope_of(np.repeat(grades, n // len(points))) if any(grades) else LEVEL
     return [slope, np.repeat(wetness, n // len(points))] if any(wetness) else [slope] if any(grades) else []
 
 
-def _sensors(system: System, prepared: Any, n: int) -> Sensors:
+def _sensors_in_weather(system: System, prepared: Any, n: int) -> Sensors:
     """The vehicles' sensors: each point's weather adds its recognition delay and scales the range by its visibility."""
     method = getattr(system.vehicle, "sensors", None)
     sensors = (None if method is None else method(prepared)) or Sensors.perfect(n)
@@ -182,19 +184,19 @@ def _sensors(system: System, prepared: Any, n: int) -> Sensors:
     return Sensors(sensors.latency + delay, sensors.reach * visibility, sensors.scale)
 
 
-class _Warnings:
-    """The times to collision at which N drivers are first warned [s], NaN if never; an ADS without `warns` never warns."""
+class _FirstWarnings:
+    """The times to collision at which the ADSs of N vehicles first warn the driver [s]; NaN if an ADS never does, or lacks `warns`."""
 
     def __init__(self, ads: Any, n: int) -> None:
         self._warns = getattr(ads, "warns", None)
         self.time_to_collision = np.full(n, np.nan)
 
-    def update(self, memory: Any, speed: FloatArray, scene: Scene, open_: BoolArray) -> None:
+    def update(self, memory: Any, speed: FloatArray, scene: Scene, is_open: BoolArray) -> None:
         """Process one sample; `scene` holds the true position of the obstacle, not the sensed position."""
         if self._warns is None:
             return
         closing_speed = speed - scene.obstacle_speed
-        is_first = self._warns(memory) & open_ & np.isnan(self.time_to_collision) & (closing_speed > 0)
+        is_first = self._warns(memory) & is_open & np.isnan(self.time_to_collision) & (closing_speed > 0)
         if is_first.any():
             self.time_to_collision = np.where(is_first, scene.gap / closing_speed, self.time_to_collision)
 
@@ -221,10 +223,10 @@ class _Log:
 
 
 class _Outcomes:
-    """Outcomes of N runs (method section 4): `open` is true where an outcome can change; `ended_copies` ended in this step."""
+    """Outcomes of N runs (method section 4): `is_open` is true where an outcome can change; `ended_copies` ended in this step."""
 
     def __init__(self, n: int) -> None:
-        self.open = np.ones(n, dtype=bool)
+        self.is_open = np.ones(n, dtype=bool)
         self.ended_copies: list[int] = []
         self.collision_speed = np.full(n, np.nan)
         self._has_moved = np.zeros(n, dtype=bool)
@@ -232,23 +234,23 @@ class _Outcomes:
         self._is_over = np.zeros(n, dtype=bool)
 
     def judge(self, speed: FloatArray, over: BoolArray, collisions: dict[int, float], *, last: BoolArray | bool) -> BoolArray:
-        """Process one sample; returns for which vehicles it belongs to the run."""
-        was_open, active = self.open.copy(), self.open & ~over
+        """Process one sample; returns which vehicles' runs it belongs to."""
+        was_open, active = self.is_open.copy(), self.is_open & ~over
         for copy, collision_speed in collisions.items():
-            if self.open[copy]:
+            if self.is_open[copy]:
                 self.collision_speed[copy] = collision_speed
-                active[copy], self.open[copy] = True, False
+                active[copy], self.is_open[copy] = True, False
         is_standing = speed <= STANDSTILL
-        self._has_stopped |= self.open & self._has_moved & is_standing
-        self._has_moved |= self.open & ~is_standing
-        self._is_over |= self.open & over
-        self.open &= ~over & ~np.asarray(last)
-        self.ended_copies = (was_open & ~self.open).nonzero()[0].tolist()
+        self._has_stopped |= self.is_open & self._has_moved & is_standing
+        self._has_moved |= self.is_open & ~is_standing
+        self._is_over |= self.is_open & over
+        self.is_open &= ~over & ~np.asarray(last)
+        self.ended_copies = (was_open & ~self.is_open).nonzero()[0].tolist()
         return active
 
-    def outcome(self) -> npt.NDArray[np.str_]:
+    def final(self) -> npt.NDArray[np.str_]:
         """The outcomes of all runs, once no run is open."""
-        outcome = np.full(len(self.open), Outcome.TIMEOUT.value, dtype="U16")
+        outcome = np.full(len(self.is_open), Outcome.TIMEOUT.value, dtype="U16")
         outcome[self._is_over] = Outcome.PASSED
         outcome[self._has_stopped] = Outcome.STOPPED
         outcome[~self._has_moved] = Outcome.NEVER_MOVED

@@ -1,4 +1,4 @@
-"""Built files in the user's cache folder; they are named by their sources, written atomically and checked before use."""
+"""Built files in the user's cache folder: named by their sources, written atomically and checked before use."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from safevar_sumo.errors import EnvironmentFault
 CHECKSUM_ENDING = ".sha256"
 
 
-def cached(folder: str, name: str, build: Callable[[Path], None]) -> Path:
+def ensure_cached(folder: str, name: str, build: Callable[[Path], None]) -> Path:
     """The path of a file in the cache; the file is built if it is missing or damaged.
 
     Parameters

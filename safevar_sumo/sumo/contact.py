@@ -16,7 +16,7 @@ FRONT, LEFT, RIGHT, REAR = "front", "left", "right", "rear"
 
 
 class Touch(NamedTuple):
-    """The first touches of M vehicles: the side, the time since then [s], and how far the other's middle is behind the front [m]."""
+    """First touches of M vehicles: side, time since then [s], and how far the other body's middle was behind the vehicle's front [m]."""
 
     side: npt.NDArray[np.str_]
     age: FloatArray
@@ -27,35 +27,34 @@ class Contacts:
     """First contacts of N vehicles; for `tested` vehicles only contacts of the front are collisions, as in a Euro NCAP test."""
 
     def __init__(self, n: int, tested: BoolArray) -> None:
-        self._is_tested, self._side, self._place = tested, np.full(n, "", dtype="U5"), np.full(n, np.nan)
+        self._is_tested, self._side, self._position_on_side = tested, np.full(n, "", dtype="U5"), np.full(n, np.nan)
 
-    def collisions(self, world: Any, open_: BoolArray, scene: Scene) -> dict[int, float]:
-        """Process one sample; returns the speeds [m/s] of the vehicles of open runs that collide, by copy."""
-        speeds = world.collisions(open_)
+    def record_collisions(self, world: Any, is_open: BoolArray, scene: Scene) -> dict[int, float]:
+        """Process one sample; returns the speeds [m/s] of the vehicles of open runs that collide, by vehicle number."""
+        speeds = world.collisions(is_open)
         new_copies = [copy for copy in speeds if not self._side[copy]]
         if new_copies:
             own, other = world.bodies(new_copies)
-            self._add(new_copies, own, other, scene)
+            self._locate(new_copies, own, other, scene)
         return {copy: speed for copy, speed in speeds.items() if not self._is_tested[copy] or self._side[copy] == FRONT}
 
-    def _add(self, copies: Sequence[int], own: Body, other: Body, scene: Scene) -> None:
-        touch = touches(own, other)
+    def _locate(self, copies: Sequence[int], own: Body, other: Body, scene: Scene) -> None:
+        touch = find_touches(own, other)
         self._side[copies] = touch.side
         lateral = scene.lateral[copies] - np.broadcast_to(scene.lateral_speed, scene.lateral.shape)[copies] * touch.age
         share = np.where(np.isin(touch.side, (FRONT, REAR)), lateral / own.width + 0.5, touch.front_distance / own.length)
-        self._place[copies] = 100 * np.minimum(np.maximum(share, 0.0), 1.0)
+        self._position_on_side[copies] = 100 * np.minimum(np.maximum(share, 0.0), 1.0)
 
-    def contact(self) -> Contact:
-        """The first contact of every vehicle."""
-        return Contact(self._side, self._place)
+    def first_contacts(self) -> Contact:
+        return Contact(self._side, self._position_on_side)
 
 
-def touches(own: Body, other: Body) -> Touch:
-    """The first touches of M pairs of overlapping bodies, whose velocities are taken to be constant.
+def find_touches(own: Body, other: Body) -> Touch:
+    """The first touches of M pairs of overlapping bodies, if their velocities were constant.
 
     Along the vehicle, two bodies have the joint half extent r = (l + l' |cos| + w' |sin|) / 2 (across it: w instead of l, sin and cos
     exchanged). If their middles are x apart and approach each other at v, the overlap began (r - |x|) / v ago. The bodies touched in the
-    direction in which the overlap began last; if they approach in neither direction, in the direction of the smaller overlap.
+    direction in which the overlap began last, or in that of the smaller overlap if they approach in neither direction.
     """
     across = np.stack([-own.along[:, 1], own.along[:, 0]], axis=1)
     to_other = other.middle - own.middle

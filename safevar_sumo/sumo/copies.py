@@ -11,10 +11,10 @@ from pathlib import Path
 
 from safevar_sumo.errors import InputError
 
-Ids = Mapping[str, tuple[str, ...]]
+IdAttributes = Mapping[str, tuple[str, ...]]
 """Attributes that contain ids, by element; an attribute may contain several ids, separated by spaces."""
 
-ROAD_IDS: Ids = {
+ROAD_IDS: IdAttributes = {
     "edge": ("id", "from", "to", "crossingEdges", "bidi"), "lane": ("id",), "neigh": ("lane",), "stopOffset": (),
     "tlLogic": ("id",), "phase": (), "junction": ("id", "incLanes", "intLanes"), "request": (),
     "connection": ("from", "to", "via", "tl"), "roundabout": ("nodes", "edges"), "param": (),
@@ -22,7 +22,7 @@ ROAD_IDS: Ids = {
 """Elements of a built network, with their attributes that contain ids."""
 SHARED_ELEMENTS = ("location", "type", "prohibition")
 """Elements of a built network that all copies share; SUMO ignores prohibitions, as junctions contain them."""
-DEMAND_IDS: Ids = {
+DEMAND_IDS: IdAttributes = {
     "vType": ("id",), "route": ("id", "edges"), "vehicle": ("id", "type", "route", "via"), "trip": ("id", "type", "from", "to", "via"),
     "flow": ("id", "type", "route", "from", "to", "via"),
     "person": ("id", "type"), "personFlow": ("id", "type"), "walk": ("edges", "route", "from", "to"),
@@ -34,7 +34,7 @@ SIGNAL_PARAMETERS = re.compile(
     r"(max|min|detector)-gap|passing-time|show-detectors|freq|(jam|inactive)-threshold|coordinated|cycleTime|cycleOffset|link(Max|Min)Dur:\d+"
     r"|minTimeLoss|detectorRange|ring[12]|barrier2?Phases|coordinate-mode|whetherOutputState|fixForceOff|controllerType|total-cycle-length")
 """Parameters of a traffic light that refer to no detectors or files."""
-_COPY = "\x01"
+_COPY_PLACEHOLDER = "\x01"
 """Placeholder for the number of a copy; XML cannot contain this character."""
 
 
@@ -65,19 +65,19 @@ def parse_xml(source: Path) -> ElementTree.Element:
 
 
 def write_roads(root: ElementTree.Element, n: int, file: Path) -> None:
-    """Write N copies of a built network, kind by kind: SUMO requires edges before junctions, and junctions before connections."""
-    parts = []
+    """Write N copies of a built network, tag by tag: SUMO requires edges before junctions, and junctions before connections."""
+    blocks = []
     for tag, children in groupby(root, key=lambda child: child.tag):
-        elements = "".join(_text(child, {} if tag in SHARED_ELEMENTS else ROAD_IDS) for child in children)
-        parts.append(elements if tag in SHARED_ELEMENTS else _repeat(elements, n))
-    _write(root, parts, file)
+        elements = "".join(_marked_xml(child, {} if tag in SHARED_ELEMENTS else ROAD_IDS) for child in children)
+        blocks += [elements] if tag in SHARED_ELEMENTS else [elements.replace(_COPY_PLACEHOLDER, str(copy)) for copy in range(n)]
+    _write(root, blocks, file)
 
 
 def write_demand(original: ElementTree.Element, n: int, file: Path) -> None:
     """Write N copies of traffic in the order of departure: SUMO drops actors that come too late in the file."""
-    texts = [(time, _text(child, DEMAND_IDS)) for child, time in _departures(original)]
+    texts = [(time, _marked_xml(child, DEMAND_IDS)) for child, time in _departures(original)]
     copies = sorted(((time, copy, text) for copy in range(n) for time, text in texts), key=lambda entry: entry[0])
-    _write(original, [text.replace(_COPY, str(copy)) for _, copy, text in copies], file)
+    _write(original, [text.replace(_COPY_PLACEHOLDER, str(copy)) for _, copy, text in copies], file)
 
 
 def check_roads(root: ElementTree.Element, file: Path) -> None:
@@ -115,27 +115,27 @@ def _departures(root: ElementTree.Element) -> Iterable[tuple[ElementTree.Element
         if child.tag in ("vType", "route"):
             yield child, -1.0
         else:
-            time = seconds(child.get("depart", child.get("begin", ""))) or time
+            time = parse_seconds(child.get("depart", child.get("begin", ""))) or time
             yield child, time
 
 
-def seconds(text: str) -> float | None:
+def parse_seconds(text: str) -> float | None:
     """Convert a time in SUMO's format, seconds or [days:]hours:minutes:seconds, into seconds; None if the text is no time."""
     try:
-        total, parts = 0.0, text.split(":")
-        for factor, part in zip((86400, 3600, 60, 1)[-len(parts):], parts, strict=True):
-            total += factor * float(part)
+        total, fields = 0.0, text.split(":")
+        for factor, field in zip((86400, 3600, 60, 1)[-len(fields):], fields, strict=True):
+            total += factor * float(field)
     except ValueError:
         return None
     return total if math.isfinite(total) else None
 
 
-def _text(element: ElementTree.Element, ids: Ids) -> str:
+def _marked_xml(element: ElementTree.Element, ids: IdAttributes) -> str:
     return ElementTree.tostring(_mark_ids(element, ids), encoding="unicode")
 
 
-def _mark_ids(element: ElementTree.Element, ids: Ids) -> ElementTree.Element:
-    attributes = {name: " ".join(copied_id(_COPY, id_) for id_ in value.split()) if name in ids.get(element.tag, ()) else value
+def _mark_ids(element: ElementTree.Element, ids: IdAttributes) -> ElementTree.Element:
+    attributes = {name: " ".join(copied_id(_COPY_PLACEHOLDER, id_) for id_ in value.split()) if name in ids.get(element.tag, ()) else value
                   for name, value in element.attrib.items()}
     result = ElementTree.Element(element.tag, attributes)
     result.text, result.tail = element.text, element.tail
@@ -143,12 +143,8 @@ def _mark_ids(element: ElementTree.Element, ids: Ids) -> ElementTree.Element:
     return result
 
 
-def _repeat(text: str, n: int) -> str:
-    return "".join(text.replace(_COPY, str(copy)) for copy in range(n))
-
-
-def _write(root: ElementTree.Element, parts: Sequence[str], file: Path) -> None:
+def _write(root: ElementTree.Element, blocks: Sequence[str], file: Path) -> None:
     attributes = {name: value for name, value in root.attrib.items() if not name.startswith("{")}
     empty_text = ElementTree.tostring(ElementTree.Element(root.tag, attributes), encoding="unicode", short_empty_elements=False)
     head, _, tail = empty_text.rpartition("</")
-    file.write_text(f"<?xml version='1.0' encoding='utf-8'?>\n{head}{''.join(parts)}</{tail}", encoding="utf-8")
+    file.write_text(f"<?xml version='1.0' encoding='utf-8'?>\n{head}{''.join(blocks)}</{tail}", encoding="utf-8")

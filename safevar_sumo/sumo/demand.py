@@ -9,7 +9,7 @@ from pathlib import Path
 
 from safevar_sumo.errors import InputError, one_of
 from safevar_sumo.scenarios import VUT
-from safevar_sumo.sumo.copies import DEMAND_IDS, seconds
+from safevar_sumo.sumo.copies import DEMAND_IDS, parse_seconds
 
 MAX_SLOPE = 0.005
 """Largest difference in height on a road that counts as level, per length [-]."""
@@ -46,10 +46,10 @@ def edges_of_vut(root: ElementTree.Element) -> list[str]:
 
 
 def _edges_of(actor: ElementTree.Element, routes: dict[str, ElementTree.Element]) -> list[str]:
-    """The edges that the file names for an actor, the start first."""
-    for part in (actor.find("route"), routes.get(actor.get("route", "")), actor, actor.find("walk"), actor.find("personTrip")):
-        if part is not None:
-            edges = " ".join(part.get(name, "") for name in ("edges", "from", "via", "to")).split()
+    """The edges that the traffic file names for an actor, in driving order."""
+    for element in (actor.find("route"), routes.get(actor.get("route", "")), actor, actor.find("walk"), actor.find("personTrip")):
+        if element is not None:
+            edges = " ".join(element.get(name, "") for name in ("edges", "from", "via", "to")).split()
             if edges:
                 return edges
     return []
@@ -84,10 +84,10 @@ def is_number(text: str) -> bool:
     return True
 
 
-_ACTORS = ("vehicle", "trip", "flow", "person", "personFlow")
+_ACTOR_TAGS = ("vehicle", "trip", "flow", "person", "personFlow")
 _VEHICLE_CHILDREN, _PERSON_CHILDREN = ("route", "stop", "param"), ("walk", "personTrip", "stop", "param")
-CHILDREN: Mapping[str, tuple[str, ...]] = {
-    "routes": ("vType", "route", *_ACTORS), "vType": ("param",), "route": ("stop", "param"), "vehicle": _VEHICLE_CHILDREN,
+LEGAL_CHILDREN: Mapping[str, tuple[str, ...]] = {
+    "routes": ("vType", "route", *_ACTOR_TAGS), "vType": ("param",), "route": ("stop", "param"), "vehicle": _VEHICLE_CHILDREN,
     "trip": ("stop", "param"), "flow": _VEHICLE_CHILDREN, "person": _PERSON_CHILDREN, "personFlow": _PERSON_CHILDREN,
     "walk": ("param",), "personTrip": ("param",), "stop": ("param",), "param": (),
 }
@@ -105,7 +105,7 @@ DETERMINISTIC_MODELS = frozenset({"IDM", "IDMM", "ACC", "CACC"})
 """Car-following models that are random unless sigma is 0, and models that are never random."""
 
 SETTING_ATTRIBUTES = ("mass", "accel", "decel", "emergencyDecel", "apparentDecel", "maxSpeed", "tau")
-"""Attributes of the tested vehicle's type whose values the vehicle model replaces by values of the setting."""
+"""Attributes of the type of the vehicle under test that the vehicle model replaces by values of the setting."""
 DRIVER_ATTRIBUTES = re.compile("carFollowModel|speedFactor|speedDev|sigma.*|desiredMaxSpeed|impatience|laneChangeModel|lc[A-Z].*|jm[A-Z].*"
                              "|actionStepLength|startupDelay|delta|stepping|minGapLat|maxSpeedLat|latAlignment")
 """Attributes of SUMO's own driver."""
@@ -123,8 +123,8 @@ def check_demand(root: ElementTree.Element, file: Path, roads: ElementTree.Eleme
         raise InputError(file, f"is a {root.tag!r}", "the traffic of a network, <routes>")
     for parent in root.iter():
         for element in parent:
-            if element.tag not in CHILDREN[parent.tag]:
-                raise InputError(file, f"{_label(parent)} has a {element.tag!r}", one_of(CHILDREN[parent.tag]) or "nothing")
+            if element.tag not in LEGAL_CHILDREN[parent.tag]:
+                raise InputError(file, f"{_label(parent)} has a {element.tag!r}", one_of(LEGAL_CHILDREN[parent.tag]) or "nothing")
             _check_element(element, file)
     _check_ids(root, file, roads)
     _check_vut(root, file)
@@ -145,16 +145,16 @@ def _check_element(element: ElementTree.Element, file: Path) -> None:
             raise InputError(file, f"{_label(element)}: {name} = {value!r} draws at random", "the same in every copy of the network")
     if element.tag == "param" and DEVICE_PARAMETERS.fullmatch(element.get("key", "")):
         raise InputError(file, f"param {element.get('key')!r} gives a device", "no devices: they write files, or draw at random")
-    if element.tag in _ACTORS and seconds(element.get("depart", element.get("begin", "0"))) is None:
+    if element.tag in _ACTOR_TAGS and parse_seconds(element.get("depart", element.get("begin", "0"))) is None:
         raise InputError(file, f"{_label(element)}: depart = {element.get('depart', element.get('begin'))!r}", "a time [s]")
-    if element.tag in _ACTORS and not is_number(element.get("speedFactor", "1")):
+    if element.tag in _ACTOR_TAGS and not is_number(element.get("speedFactor", "1")):
         raise InputError(file, f"{_label(element)}: speedFactor = {element.get('speedFactor')!r}", "a number")
 
 
 def _check_ids(root: ElementTree.Element, file: Path, roads: ElementTree.Element) -> None:
-    types, routes = (_unique_ids(root, kinds, file) for kinds in (("vType",), ("route",)))
-    for kinds in (("vehicle", "trip", "flow"), ("person", "personFlow")):
-        _unique_ids(root, kinds, file)
+    types, routes = (_unique_ids(root, tags, file) for tags in (("vType",), ("route",)))
+    for tags in (("vehicle", "trip", "flow"), ("person", "personFlow")):
+        _unique_ids(root, tags, file)
     edges = {edge.get("id", "") for edge in roads.iter("edge")}
     names = {"type": types, "vTypes": types, "route": routes, "edges": edges, "from": edges, "to": edges, "via": edges, "edge": edges,
              "lane": {lane.get("id", "") for lane in roads.iter("lane")}}
@@ -162,18 +162,18 @@ def _check_ids(root: ElementTree.Element, file: Path, roads: ElementTree.Element
         for name in DEMAND_IDS.get(element.tag, ()):
             for reference in element.get(name, "").split():
                 if name in names and reference not in names[name]:
-                    raise InputError(file, f"{_label(element)}: {name} = {reference!r} does not exist", _one_of_names(names[name]))
+                    raise InputError(file, f"{_label(element)}: {name} = {reference!r} does not exist", _list_names(names[name]))
 
 
-def _one_of_names(names: set[str]) -> str:
+def _list_names(names: set[str]) -> str:
     visible_names = sorted(name for name in names if not name.startswith(":"))
     return f"one of {', '.join(visible_names[:12])}{', ...' if len(visible_names) > 12 else ''}" if visible_names else "one that is defined"
 
 
-def _unique_ids(root: ElementTree.Element, kinds: tuple[str, ...], file: Path) -> set[str]:
+def _unique_ids(root: ElementTree.Element, tags: tuple[str, ...], file: Path) -> set[str]:
     names: set[str] = set()
     for element in root:
-        if element.tag in kinds:
+        if element.tag in tags:
             name = element.get("id", "")
             if not name or name in names or name.split() != [name]:
                 raise InputError(file, f"{element.tag} has the id {name!r}", "a unique id without spaces")
@@ -188,10 +188,10 @@ def _check_vut(root: ElementTree.Element, file: Path) -> None:
         raise InputError(file, f"has no vehicle {VUT!r}", f'<vehicle id="{VUT}" type="{VUT}" depart="0" ...>, the vehicle under test')
     if vut.get("type") != VUT:
         raise InputError(file, f"vehicle {VUT!r}: type = {vut.get('type')!r}", f"{VUT!r}, a vType that each setting changes")
-    if seconds(vut.get("depart", "")) != 0:
+    if parse_seconds(vut.get("depart", "")) != 0:
         raise InputError(file, f"vehicle {VUT!r}: depart = {vut.get('depart')!r}", "0")
     routes = [route for route in root if route.tag == "route" and route.get("id") == vut.get("route")]
-    if any(part.find(".//stop") is not None for part in (vut, *routes)):
+    if any(element.find(".//stop") is not None for element in (vut, *routes)):
         raise InputError(file, f"vehicle {VUT!r} has a stop", "none: its ADS drives it")
     for element in root:
         if element is not vut and element.get("type") == VUT:
@@ -199,10 +199,10 @@ def _check_vut(root: ElementTree.Element, file: Path) -> None:
 
 
 def _check_randomness(root: ElementTree.Element, file: Path, options: Mapping[str, str]) -> None:
-    """Refuse random numbers in SUMO: they differ between copies, so that a result would depend on its batch."""
-    types = {kind.get("id", ""): kind for kind in root if kind.tag == "vType"}
+    """Refuse traffic in which SUMO draws random numbers: they differ between copies, so a result would depend on its batch."""
+    types = {element.get("id", ""): element for element in root if element.tag == "vType"}
     for actor in root:
-        if actor.tag in _ACTORS and actor.get("id") != VUT:
+        if actor.tag in _ACTOR_TAGS and actor.get("id") != VUT:
             if actor.get("type", "") not in types:
                 raise InputError(file, f"{_label(actor)} has no type, and SUMO's default draws at random",
                                  'a vType with speedDev="0" and sigma="0"')
@@ -214,17 +214,18 @@ def _check_randomness(root: ElementTree.Element, file: Path, options: Mapping[st
         raise InputError(file.with_name("scenario.sumocfg"), f"persons dawdle at random: pedestrian.striping.dawdling = {dawdling}", "0")
 
 
-def _random_parameters(kind: ElementTree.Element, actor: ElementTree.Element, options: Mapping[str, str]) -> Iterator[tuple[str, str]]:
-    deviation = kind.get("speedDev", options.get("default.speeddev"))
-    if not is_number(kind.get("speedFactor", "1")):
-        yield f"speedFactor = {kind.get('speedFactor')!r}", "a number"
+def _random_parameters(vehicle_type: ElementTree.Element, actor: ElementTree.Element,
+                       options: Mapping[str, str]) -> Iterator[tuple[str, str]]:
+    deviation = vehicle_type.get("speedDev", options.get("default.speeddev"))
+    if not is_number(vehicle_type.get("speedFactor", "1")):
+        yield f"speedFactor = {vehicle_type.get('speedFactor')!r}", "a number"
     if not is_number(actor.get("speedFactor", "")) and not _is_zero(deviation or "0.1"):
         yield f"speedDev = {deviation or 'SUMO default 0.1'}", 'speedDev="0"'
     if actor.tag in ("person", "personFlow"):
         return
-    model = kind.get("carFollowModel", options.get("default.carfollowmodel", "Krauss"))
-    if model in SIGMA_MODELS and not _is_zero(kind.get("sigma", "0.5")):
-        yield f"sigma = {kind.get('sigma', 'SUMO default 0.5')}", 'sigma="0"'
+    model = vehicle_type.get("carFollowModel", options.get("default.carfollowmodel", "Krauss"))
+    if model in SIGMA_MODELS and not _is_zero(vehicle_type.get("sigma", "0.5")):
+        yield f"sigma = {vehicle_type.get('sigma', 'SUMO default 0.5')}", 'sigma="0"'
     elif model not in SIGMA_MODELS | DETERMINISTIC_MODELS:
         yield f"carFollowModel = {model!r}", one_of(SIGMA_MODELS | DETERMINISTIC_MODELS)
 
@@ -233,7 +234,7 @@ def _is_zero(text: str) -> bool:
     return is_number(text) and float(text) == 0
 
 
-def unused_attributes(root: ElementTree.Element, roads: ElementTree.Element, max_speed: float, *, sumo_drives: bool) -> list[str]:
+def unused_attribute_remarks(root: ElementTree.Element, roads: ElementTree.Element, max_speed: float, *, sumo_drives: bool) -> list[str]:
     """Remarks on a network's attributes of the vehicle under test that the simulation does not use.
 
     Parameters
@@ -253,8 +254,8 @@ def unused_attributes(root: ElementTree.Element, roads: ElementTree.Element, max
     if slow_lanes:
         attributes.append(f"the speed limit of lane {slow_lanes[0].get('id')!r} ({float(slow_lanes[0].get('speed', 'nan')):g} m/s)"
                          f"{f' and of {len(slow_lanes) - 1} more' if len(slow_lanes) > 1 else ''}")
-    driver = "the study's vehicle and ADS determine how it drives"
-    return [f"not used of vehicle {VUT!r}: {', '.join(dict.fromkeys(attributes))}; {driver}"] if attributes else []
+    reason = "the study's vehicle and ADS determine how it drives"
+    return [f"not used of vehicle {VUT!r}: {', '.join(dict.fromkeys(attributes))}; {reason}"] if attributes else []
 
 
 def _has_no_effect(name: str, value: str) -> bool:

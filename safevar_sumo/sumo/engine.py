@@ -24,8 +24,8 @@ CONNECTION_ATTEMPTS = 15
 
 
 class Engine(StrEnum):
-    """The program that moves the vehicles: numpy in recorded scenes (SUMO in this process if an actor may react to the vehicles), or
-    SUMO in this process, in another process, or in another process with a window.
+    """What moves the vehicles: numpy in recorded scenes (SUMO in this process if an actor may react to the vehicles), or SUMO in this
+    process, in another process, or in another process with a window.
     """
 
     RECORDED = "recorded"
@@ -67,13 +67,12 @@ def sumo_command(engine: Engine, files: CopiedNetwork) -> list[str]:
     """The command line that starts SUMO on copies of a network."""
     window = ["--start", "true", "--quit-on-end", "true", "--window-size", "1200,700"] if engine is Engine.GUI else []
     return [
-        binary(engine), "-c", str(files.options), "-n", str(files.network), "-r", str(files.traffic),
+        program_path(engine), "-c", str(files.options), "-n", str(files.network), "-r", str(files.traffic),
         "--no-step-log", "true", "--no-warnings", "true", "--xml-validation", "never", "--xml-validation.net", "never",
         "--xml-validation.routes", "never", *window]
 
 
 def start_engine(api: Any, engine: Engine, command: list[str]) -> None:
-    """Start an engine with a command line."""
     if engine is Engine.LIBSUMO:
         try:
             api.start(command)
@@ -87,8 +86,8 @@ def start_engine(api: Any, engine: Engine, command: list[str]) -> None:
         api.start(command, numRetries=CONNECTION_ATTEMPTS)
 
 
-def binary(engine: Engine) -> str:
-    """The path of the program that an engine runs."""
+def program_path(engine: Engine) -> str:
+    """Path of the SUMO program of an engine."""
     if engine is Engine.LIBSUMO:
         return "sumo"
     import sumo

@@ -22,14 +22,14 @@ from safevar_sumo.study import SAFETY_DEGREE, Study
 from safevar_sumo.sumo.batch import Watcher, drive_all, reason_for_sumo, score, step_options
 from safevar_sumo.sumo.engine import Engine
 from safevar_sumo.sumo.network import lanes_of
-from safevar_sumo.sumo.recording import Recording, recorded_scenes
+from safevar_sumo.sumo.recording import Recording, record_scenes
 from safevar_sumo.sumo.system import System, assemble
 
-LARGEST_WORLD = 200
-"""Largest number of copies of a network in one simulation; more copies exceed the processor's caches, and each costs more time."""
-LARGEST_BATCH = 2000
+MAX_COPIES = 200
+"""Largest number of copies of a network in one simulation; beyond it, the processor's caches overflow and each copy costs more time."""
+MAX_VEHICLES = 2000
 """Largest number of vehicles in recorded scenes at once; 200 steps of these vehicles take about 100 MB."""
-LARGEST_ROADS = 100_000
+MAX_LANES = 100_000
 """Largest number of lanes in all copies of one simulation; loading more lanes takes minutes and gigabytes."""
 N_SIMILAR_POINTS = 4
 """Number of similar points that the error about an unknown point lists."""
@@ -42,7 +42,7 @@ class PointEvaluations(NamedTuple):
     evaluations: Evaluations
 
 
-class AtPoint(NamedTuple):
+class PointResult(NamedTuple):
     """Simulation runs and evaluations of N settings at one point of a study."""
 
     point: Point
@@ -50,20 +50,20 @@ class AtPoint(NamedTuple):
     runs: SimulationRuns
 
 
-def point_record(result: AtPoint, row: int = 0) -> dict[str, Any]:
+def point_record(result: PointResult, row: int = 0) -> dict[str, Any]:
     """Plain values of one setting at one point; a value is None if it is undefined.
 
-    The point and the outcome; impact speeds [m/s]; the largest deviation from the test speed before the ADS acted [km/h]; the time to
-    collision at the first warning [s]; the side of the contact, and its place along that side [%].
+    Keys: the point and the outcome; impact speeds [m/s]; the largest deviation from the test speed before the ADS acted [km/h]; the time to
+    collision at the first warning [s]; the side of the contact, and the position along that side [%].
     """
     evaluations, relative_speed = result.evaluations, result.runs.relative_speed
-    numbers = {"impact_speed": evaluations.collision_speed[row], "relative_impact_speed": relative_speed[row],
+    values = {"impact_speed": evaluations.collision_speed[row], "relative_impact_speed": relative_speed[row],
                SAFETY_DEGREE: evaluations.f_safe[row],
                "test_speed_error": np.broadcast_to(result.runs.test_speed_error, relative_speed.shape)[row] / KMH,
                "warning_ttc": np.broadcast_to(result.runs.warning_ttc, relative_speed.shape)[row]}
-    side, place = (np.broadcast_to(values, relative_speed.shape)[row] for values in result.runs.contact)
-    return {"point": result.point.name, **dict(result.point.place), "outcome": str(evaluations.outcome[row]),
-            **{name: finite_or_none(value) for name, value in numbers.items()},
+    side, place = (np.broadcast_to(column, relative_speed.shape)[row] for column in result.runs.contact)
+    return {"point": result.point.name, **dict(result.point.parameters), "outcome": str(evaluations.outcome[row]),
+            **{name: finite_or_none(value) for name, value in values.items()},
             **({"contact": {"side": str(side), "place": float(place)}} if side else {})}
 
 
@@ -94,31 +94,31 @@ def evaluate(system: System, settings: FloatArray, engine: Engine = Engine.RECOR
     setting i at its worst point.
     """
     size = _batch_size(system, engine)
-    parts = [settings[start:start + size] for start in range(0, len(settings), size)] or [settings]
-    evaluations = [_evaluate_part(system, part, engine) for part in parts]
+    batches = [settings[start:start + size] for start in range(0, len(settings), size)] or [settings]
+    evaluations = [_evaluate_batch(system, batch, engine) for batch in batches]
     return evaluations[0] if len(evaluations) == 1 else Evaluations.concatenate(evaluations)
 
 
-def _evaluate_part(system: System, settings: FloatArray, engine: Engine) -> Evaluations:
+def _evaluate_batch(system: System, settings: FloatArray, engine: Engine) -> Evaluations:
     if system.rater is not None:
-        return rated_settings(system, settings, engine)[0]
+        return rate_settings(system, settings, engine)[0]
     if system.matrix:
-        return aggregated(at_every_point(system, settings, engine))
+        return evaluations_at_worst_points(simulate_all_points(system, settings, engine))
     return score(system, settings, simulate(system, settings, engine))
 
 
-def rated_settings(system: System, settings: FloatArray, engine: Engine = Engine.RECORDED) -> tuple[Evaluations, CellResults]:
-    """Settings, shape (N, n), in all cells of a protocol: their evaluations with rating points, and their results in every cell.
+def rate_settings(system: System, settings: FloatArray, engine: Engine = Engine.RECORDED) -> tuple[Evaluations, CellResults]:
+    """Simulate settings, shape (N, n), in all cells of a protocol: their evaluations with rating points, and their results in every cell.
 
     Traces are dropped, as they would take gigabytes.
     """
     scored, columns = dict[str, PointEvaluations](), dict[str, Any]()
-    for group in _groups(system, settings, engine):
+    for group in _simulate_groups(system, settings, engine):
         for result in group:
             name = result.point.name
             scored[name], columns[name] = PointEvaluations(result.point, result.evaluations), cell_columns(result.runs)
     cells = joined_cells([columns[point.name] for point in system.points])
-    evaluations = aggregated([scored[point.name] for point in system.points])
+    evaluations = evaluations_at_worst_points([scored[point.name] for point in system.points])
     if system.rater is None:  # the system has only some of the protocol's cells
         return evaluations, cells
     return replace(evaluations, metrics={**evaluations.metrics, RATING_POINTS.name: system.rater.points(cells).total}), cells
@@ -128,18 +128,18 @@ def in_cells(system: System, settings: FloatArray, part: tuple[int, int], engine
     """Evaluations, including `cells`, of settings, shape (N, n), in the k-th of m parts of a protocol's cells; `part` is (k, m)."""
     assert system.rater is not None
     points = tuple(system.matrix[number] for number in part_of(system.rater.protocol, *part))
-    evaluations, cells = rated_settings(replace(system, matrix=points, rater=None), settings, engine)
+    evaluations, cells = rate_settings(replace(system, matrix=points, rater=None), settings, engine)
     return replace(evaluations, cells=cells)
 
 
 def settings_per_batch(system: System, engine: Engine) -> int:
     """Number of settings in an efficient batch."""
-    return max(largest_batch(system) // len(system.points), LARGEST_WORLD) if _is_recorded(system, engine) else LARGEST_WORLD
+    return max(largest_batch(system) // len(system.points), MAX_COPIES) if _is_recorded(system, engine) else MAX_COPIES
 
 
 def largest_batch(system: System) -> int:
     """Largest number of vehicles in one batch; it is smaller if each vehicle has its own instance of an FMU."""
-    return min(LARGEST_BATCH, *(getattr(model, "most_vehicles", LARGEST_BATCH) for model in (system.vehicle, system.ads)))
+    return min(MAX_VEHICLES, *(getattr(model, "most_vehicles", MAX_VEHICLES) for model in (system.vehicle, system.ads)))
 
 
 def _is_recorded(system: System, engine: Engine) -> bool:
@@ -152,15 +152,15 @@ def _batch_size(system: System, engine: Engine) -> int:
     if _is_recorded(system, engine):
         return largest_batch(system)
     lanes = max(lanes_of(network) for network in {point.scenario.network for point in system.points})
-    return min(max(LARGEST_ROADS // max(lanes, 1), 1), LARGEST_WORLD, largest_batch(system))
+    return min(max(MAX_LANES // max(lanes, 1), 1), MAX_COPIES, largest_batch(system))
 
 
-def aggregated(at_points: Sequence[AtPoint | PointEvaluations]) -> Evaluations:
+def evaluations_at_worst_points(at_points: Sequence[PointResult | PointEvaluations]) -> Evaluations:
     """The evaluations of N settings, each at its worst point."""
     settings = at_points[0].evaluations.settings
-    numbers, columns = worst_points(at_points), np.arange(len(settings))
+    point_numbers, columns = worst_points(at_points), np.arange(len(settings))
     evaluations = Evaluations.concatenate([result.evaluations for result in at_points])
-    return evaluations.take(numbers * len(settings) + columns)
+    return evaluations.take(point_numbers * len(settings) + columns)
 
 
 def simulate(system: System, settings: FloatArray, engine: Engine = Engine.RECORDED, options: tuple[str, ...] = (),
@@ -173,55 +173,56 @@ def simulate(system: System, settings: FloatArray, engine: Engine = Engine.RECOR
     if not system.matrix:
         return drive_all(system, settings, engine, options, watch)
     if watch is not None or engine is Engine.GUI:
-        return drive_all(at_worst(system, settings), settings, engine, options, watch)
-    at_points = at_every_point(system, settings, engine, options)
-    return _selected_runs([result.runs for result in at_points], worst_points(at_points))
+        return drive_all(system_at_worst_point(system, settings), settings, engine, options, watch)
+    at_points = simulate_all_points(system, settings, engine, options)
+    return _select_runs([result.runs for result in at_points], worst_points(at_points))
 
 
-def at_every_point(system: System, settings: FloatArray, engine: Engine = Engine.RECORDED, options: tuple[str, ...] = ()) -> list[AtPoint]:
-    """Settings, shape (N, n), at every point, in the points' order; raises the errors of `drive_all`."""
-    by_name = {result.point.name: result for group in _groups(system, settings, engine, options) for result in group}
+def simulate_all_points(system: System, settings: FloatArray, engine: Engine = Engine.RECORDED,
+                        options: tuple[str, ...] = ()) -> list[PointResult]:
+    """Simulate settings, shape (N, n), at every point; results are in the points' order. Raises the errors of `drive_all`."""
+    by_name = {result.point.name: result for group in _simulate_groups(system, settings, engine, options) for result in group}
     return [by_name[point.name] for point in system.points]
 
 
-def _groups(system: System, settings: FloatArray, engine: Engine, options: tuple[str, ...] = ()) -> Iterator[list[AtPoint]]:
+def _simulate_groups(system: System, settings: FloatArray, engine: Engine, options: tuple[str, ...] = ()) -> Iterator[list[PointResult]]:
     """Yield the results of settings at every point, in groups of points that share a simulation."""
     n = len(settings)
     groups: Iterable[tuple[Point, ...]] = ((point,) for point in system.points)
     if _is_recorded(system, engine):
-        groups = _point_groups(system.points, largest_batch(system) // max(n, 1), (*step_options(system), *options))
+        groups = _group_points(system.points, largest_batch(system) // max(n, 1), (*step_options(system), *options))
     for points in groups:
         runs = drive_all(replace(system, matrix=points), settings, engine, options)
         evaluations = score(system, np.tile(settings, (len(points), 1)), runs)
-        yield [AtPoint(point, evaluations.take(np.arange(start, start + n)), runs.of(slice(start, start + n)))
+        yield [PointResult(point, evaluations.take(np.arange(start, start + n)), runs.of(slice(start, start + n)))
                for point, start in zip(points, range(0, len(points) * n, n), strict=True)]
 
 
-def at_worst(system: System, settings: FloatArray) -> System:
+def system_at_worst_point(system: System, settings: FloatArray) -> System:
     """The system at the worst point of the last setting."""
     if not system.matrix:
         return system
-    return system.at(system.points[worst_points(at_every_point(system, settings[-1:]))[0]])
+    return system.at(system.points[worst_points(simulate_all_points(system, settings[-1:]))[0]])
 
 
-def named_point(system: System, name: str, source: object) -> System:
+def system_at_point(system: System, name: str, source: object) -> System:
     """The system at a named point of a matrix; raises the errors of `study_at`."""
-    return system.at(_point(system, name, source))
+    return system.at(_find_point(system, name, source))
 
 
-def _point(system: System, name: str, source: object) -> Point:
+def _find_point(system: System, name: str, source: object) -> Point:
     points = {point.name: point for point in system.matrix}
     if name not in points:
-        raise InputError(source, repr(name), _similar_points(name, list(points)))
+        raise InputError(source, repr(name), _list_similar_points(name, list(points)))
     return points[name]
 
 
-def _similar_points(name: str, names: Sequence[str]) -> str:
-    """Points similar to an unknown name: first by the number of parts in common, then by similarity of the text."""
+def _list_similar_points(name: str, names: Sequence[str]) -> str:
+    """Points similar to an unknown name, sorted by the number of words between commas that they share, then by similarity of the text."""
     if not names:
         return "a study with a matrix"
-    parts = {part.strip() for part in name.split(",")}
-    points = sorted(names, key=lambda point: (-len(parts & set(point.split(", "))), -SequenceMatcher(None, point, name).ratio()))
+    words = {word.strip() for word in name.split(",")}
+    points = sorted(names, key=lambda point: (-len(words & set(point.split(", "))), -SequenceMatcher(None, point, name).ratio()))
     legal = "; ".join(points[:N_SIMILAR_POINTS])
     return legal if len(names) <= N_SIMILAR_POINTS else f"one of {len(names)} points, the most similar: {legal}"
 
@@ -235,29 +236,29 @@ def study_at(study: Study, name: str, source: object) -> Study:
         If no point has this name.
     """
     system = assemble(study)
-    place = dict(_point(system, name, source).place)
+    parameters = dict(_find_point(system, name, source).parameters)
     assert study.matrix is not None
     if system.rater is not None:
         return in_some_cells(study, system.weather, [[point.name for point in system.matrix].index(name)])
-    title, weather = place.pop("test"), place.pop("weather")
-    test = next(row for row in study.matrix.tests
-                if row.name == title and row.over.keys() == place.keys() and all(value in row.over[key] for key, value in place.items()))
-    reduced_test = replace_in(test, over={key: [value] for key, value in place.items()}, weathers=[weather] if test.weathers else [])
+    title, weather = parameters.pop("test"), parameters.pop("weather")
+    test = next(test for test in study.matrix.tests if test.name == title and test.over.keys() == parameters.keys()
+                and all(value in test.over[key] for key, value in parameters.items()))
+    reduced_test = replace_in(test, over={key: [value] for key, value in parameters.items()}, weathers=[weather] if test.weathers else [])
     return replace_in(study, matrix=replace_in(study.matrix, tests=[reduced_test]))
 
 
-def _point_groups(points: Sequence[Point], size: int, options: Sequence[str]) -> Iterator[tuple[Point, ...]]:
-    """Groups of at most `size` points whose recorded scenes are on one road, sorted by duration."""
+def _group_points(points: Sequence[Point], size: int, options: Sequence[str]) -> Iterator[tuple[Point, ...]]:
+    """Yield groups of at most `size` points whose recorded scenes may share a batch, sorted by duration."""
     groups: dict[Hashable, list[Point]] = {}
-    for point, scene in zip(points, recorded_scenes([point.scenario for point in points], options), strict=True):
-        groups.setdefault(scene.road if isinstance(scene, Recording) else "", []).append(point)
+    for point, scene in zip(points, record_scenes([point.scenario for point in points], options), strict=True):
+        groups.setdefault(scene.batch_key if isinstance(scene, Recording) else "", []).append(point)
     for group in groups.values():
         group.sort(key=lambda point: point.scenario.duration)
         for start in range(0, len(group), max(size, 1)):
             yield tuple(group[start:start + max(size, 1)])
 
 
-def worst_points(at_points: Sequence[AtPoint | PointEvaluations]) -> npt.NDArray[np.intp]:
+def worst_points(at_points: Sequence[PointResult | PointEvaluations]) -> npt.NDArray[np.intp]:
     """For every setting, the number of the point with the least safety degree; of equal points, the first by name.
 
     A collision in a valid test always counts. Without a collision, a point with an invalid test counts as the worst, because such a test
@@ -273,8 +274,8 @@ def worst_points(at_points: Sequence[AtPoint | PointEvaluations]) -> npt.NDArray
     return np.asarray(np.array(order)[np.argmin(safety_degrees, axis=0)])
 
 
-def _selected_runs(runs_at_points: Sequence[SimulationRuns], point_numbers: npt.NDArray[np.intp]) -> SimulationRuns:
-    """Every vehicle's run at the point with its number; shorter runs repeat their last sample, which is marked as inactive."""
+def _select_runs(runs_at_points: Sequence[SimulationRuns], point_numbers: npt.NDArray[np.intp]) -> SimulationRuns:
+    """Every vehicle's run at its own point; shorter runs repeat their last sample, which is marked as inactive."""
     length, columns = max(len(runs.trace.time) for runs in runs_at_points), np.arange(len(point_numbers))
 
     def select_samples(values: Sequence[np.ndarray]) -> np.ndarray:

@@ -19,13 +19,13 @@ from typing import NamedTuple
 
 from safevar_sumo.errors import EnvironmentFault, InputError
 from safevar_sumo.sumo import copies
-from safevar_sumo.sumo.cache import cached
+from safevar_sumo.sumo.cache import ensure_cached
 from safevar_sumo.sumo.copies import check_roads, parse_xml, write_demand, write_roads
-from safevar_sumo.sumo.demand import check_demand, unused_attributes
+from safevar_sumo.sumo.demand import check_demand, unused_attribute_remarks
 from safevar_sumo.sumo.sources import OPTIONS_FILE, TRAFFIC_FILE, Sources, check_options, is_shipped, options_of, sources_of
 
 NETWORK_FILE = "network.net.xml"
-LOAD_MARK = "tried.txt"
+LOAD_MARK_FILE = "tried.txt"
 RECIPE_OPTIONS = ("--xml-validation", "never")
 """Options of netconvert for every network."""
 
@@ -50,30 +50,30 @@ def copied_network(folder: str, n: int) -> CopiedNetwork:
     """
     sources = sources_of(folder)
     size = round_up(n)
-    roads = cached(_cache_folder(sources, size, sources.road_files), NETWORK_FILE, partial(_copy_roads, sources, size))
-    traffic = cached(_cache_folder(sources, n, (TRAFFIC_FILE,)), TRAFFIC_FILE, partial(_copy_demand, sources, n))
+    roads = ensure_cached(_cache_folder(sources, size, sources.road_files), NETWORK_FILE, partial(_copy_roads, sources, size))
+    traffic = ensure_cached(_cache_folder(sources, n, (TRAFFIC_FILE,)), TRAFFIC_FILE, partial(_copy_demand, sources, n))
     return CopiedNetwork(roads, traffic, sources.folder / OPTIONS_FILE)
 
 
 def built_network(folder: str) -> Path:
     """The file of the original network, which netconvert or the user built; raises the errors of `copied_network`."""
-    return _built(sources_of(folder))
+    return _build_if_needed(sources_of(folder))
 
 
 def try_network(folder: str) -> None:
-    """Load a network with its options and traffic in SUMO, unless it has been loaded before; raises the errors of `copied_network`."""
+    """Load a network with its options and traffic in SUMO, unless SUMO has loaded it before; raises the errors of `copied_network`."""
     sources = sources_of(folder)
-    cached(_cache_folder(sources, 0, sources.files), LOAD_MARK, partial(_try_all, sources, _built(sources)))
+    ensure_cached(_cache_folder(sources, 0, sources.files), LOAD_MARK_FILE, partial(_try_traffic, sources, _build_if_needed(sources)))
 
 
 def lanes_of(folder: str) -> int:
-    """Number of lanes of a network, including lanes on junctions; raises the errors of `copied_network`."""
+    """Number of lanes of a network, junctions included; raises the errors of `copied_network`."""
     file = built_network(folder)
-    return _lanes(file, file.stat().st_mtime_ns)
+    return _count_lanes(file, file.stat().st_mtime_ns)
 
 
 @cache
-def _lanes(file: Path, modification_time: int) -> int:
+def _count_lanes(file: Path, modification_time: int) -> int:
     return file.read_bytes().count(b"<lane ")
 
 
@@ -114,7 +114,7 @@ def _cache_folder(sources: Sources, n: int, files: Sequence[str]) -> str:
 
 @cache
 def _digest(contents: tuple[bytes, ...], build_options: str) -> str:
-    """A digest of all that determines copies: contents of sources, options of the build, netconvert and its recipe, and our code."""
+    """A digest of all that determines copies: sources, options of the build, netconvert's version and recipe, and this package's code."""
     code = b"".join(Path(str(module)).read_bytes() for module in (__file__, copies.__file__))
     digest = hashlib.sha256(f"{build_options} {netconvert_version()} {RECIPE_OPTIONS}".encode() + code)
     for content in contents:
@@ -123,27 +123,27 @@ def _digest(contents: tuple[bytes, ...], build_options: str) -> str:
 
 
 def _copy_roads(sources: Sources, n: int, into: Path) -> None:
-    write_roads(_checked_roads(_built(sources)), n, into / NETWORK_FILE)
+    write_roads(_read_roads(_build_if_needed(sources)), n, into / NETWORK_FILE)
 
 
 def _copy_demand(sources: Sources, n: int, into: Path) -> None:
     write_demand(parse_xml(sources.folder / TRAFFIC_FILE), n, into / TRAFFIC_FILE)
 
 
-def _built(sources: Sources) -> Path:
+def _build_if_needed(sources: Sources) -> Path:
     if sources.network_file:
-        cached(_cache_folder(sources, 0, sources.road_files), LOAD_MARK, partial(_try, sources))
+        ensure_cached(_cache_folder(sources, 0, sources.road_files), LOAD_MARK_FILE, partial(_try_roads, sources))
         return sources.folder / sources.network_file
-    return cached(_cache_folder(sources, 0, sources.road_files), NETWORK_FILE, partial(_build, sources))
+    return ensure_cached(_cache_folder(sources, 0, sources.road_files), NETWORK_FILE, partial(_build, sources))
 
 
-def _checked_roads(file: Path) -> ElementTree.Element:
+def _read_roads(file: Path) -> ElementTree.Element:
     root = parse_xml(file)
     check_roads(root, file)
     return root
 
 
-def _run(sources: Sources, program: str, *arguments: str) -> tuple[int, str]:
+def _run_program(sources: Sources, program: str, *arguments: str) -> tuple[int, str]:
     """Run a program of SUMO in a network's folder; return its exit code and error messages."""
     import sumo
 
@@ -153,23 +153,23 @@ def _run(sources: Sources, program: str, *arguments: str) -> tuple[int, str]:
     return process.returncode, " ".join(lines).removeprefix("Error: ")[:500]
 
 
-def _try(sources: Sources, into: Path) -> None:
-    """Load a network that the user built; a separate SUMO process does so, as some broken networks crash SUMO."""
-    _checked_roads(sources.folder / sources.network_file)
-    code, errors = _run(sources, "sumo", "-n", sources.network_file, "--no-step-log", "true", "--end", "0")
+def _try_roads(sources: Sources, into: Path) -> None:
+    """Load a network that the user built in a separate SUMO process, as some broken networks crash SUMO."""
+    _read_roads(sources.folder / sources.network_file)
+    code, errors = _run_program(sources, "sumo", "-n", sources.network_file, "--no-step-log", "true", "--end", "0")
     if code != 0:
         raise InputError(sources.folder / sources.network_file, f"SUMO cannot load it: {errors or f'it dies with exit code {code}'}",
                          "a network of SUMO")
-    (into / LOAD_MARK).write_text("SUMO loads it.\n", encoding="ascii")
+    (into / LOAD_MARK_FILE).write_text("SUMO loads it.\n", encoding="ascii")
 
 
-def _try_all(sources: Sources, network_file: Path, into: Path) -> None:
-    code, errors = _run(sources, "sumo", "-c", OPTIONS_FILE, "-n", str(network_file.absolute()), "-r", TRAFFIC_FILE, "--begin", "0",
+def _try_traffic(sources: Sources, network_file: Path, into: Path) -> None:
+    code, errors = _run_program(sources, "sumo", "-c", OPTIONS_FILE, "-n", str(network_file.absolute()), "-r", TRAFFIC_FILE, "--begin", "0",
                         "--end", "0", "--no-step-log", "true")
     if code != 0 or errors:
         raise InputError(sources.folder, f"SUMO refuses {OPTIONS_FILE} or {TRAFFIC_FILE}: {errors or f'it dies with exit code {code}'}",
                          "options and traffic that SUMO loads without an error")
-    (into / LOAD_MARK).write_text("SUMO loads it.\n", encoding="ascii")
+    (into / LOAD_MARK_FILE).write_text("SUMO loads it.\n", encoding="ascii")
 
 
 def _build(sources: Sources, into: Path) -> None:
@@ -178,7 +178,7 @@ def _build(sources: Sources, into: Path) -> None:
         command += [f"--{option}", ",".join(names)]
     for option, value in sources.options:
         command += [f"--{option}", value]
-    code, errors = _run(sources, "netconvert", *command, "-o", str(into / NETWORK_FILE))
+    code, errors = _run_program(sources, "netconvert", *command, "-o", str(into / NETWORK_FILE))
     if code != 0:
         if code < 0 or not errors or ("Could not" in errors and "output" in errors) or "bad_alloc" in errors:
             raise EnvironmentFault(f"{sources.folder}: netconvert fails: {errors or f'exit code {code}'}")
@@ -197,7 +197,7 @@ def _drop_header(file: Path) -> None:
 
 
 SHORTEST_STEP, LONGEST_STEP = 0.001, 1.0
-"""SUMO's shortest time step, and the longest step that leaves a vehicle time to react [s]."""
+"""SUMO's shortest time step, and the longest step in which a vehicle can still react in time [s]."""
 POSITIVE_NUMBERS: Mapping[str, tuple[str, ...]] = {
     "vType": ("length", "width", "height", "maxSpeed", "accel", "decel", "mass"),
     "edge": ("length", "width", "speed"), "lane": ("length", "width", "speed"),
@@ -205,7 +205,7 @@ POSITIVE_NUMBERS: Mapping[str, tuple[str, ...]] = {
 NON_NEGATIVE_NUMBERS: Mapping[str, tuple[str, ...]] = {"vType": ("minGap", "tau", "actionStepLength"), "walk": ("speed",)}
 """Attributes, by element, that must be positive, and attributes that must not be negative."""
 UNSET_VALUE = "-1"
-"""Value of an attribute in netconvert's sources that is not set."""
+"""Value that marks an attribute in netconvert's sources as not set."""
 
 
 def check_network(network: str) -> None:
@@ -218,7 +218,7 @@ def check_network(network: str) -> None:
     EnvironmentFault
         If netconvert fails for reasons outside the network.
     """
-    _check(network, network_fingerprint(network))
+    _check_files(network, network_fingerprint(network))
 
 
 def network_remarks(network: str, max_speed: float, *, sumo_drives: bool) -> list[str]:
@@ -227,11 +227,11 @@ def network_remarks(network: str, max_speed: float, *, sumo_drives: bool) -> lis
         return []
     file = sources_of(network).folder / TRAFFIC_FILE
     roots = parse_xml(file), parse_xml(built_network(network))
-    return [f"{file}: {remark}" for remark in unused_attributes(*roots, max_speed, sumo_drives=sumo_drives)]
+    return [f"{file}: {remark}" for remark in unused_attribute_remarks(*roots, max_speed, sumo_drives=sumo_drives)]
 
 
 @lru_cache(maxsize=1000)
-def _check(network: str, fingerprint: str) -> None:
+def _check_files(network: str, fingerprint: str) -> None:
     sources = sources_of(network)
     check_options(sources.folder / OPTIONS_FILE)
     _check_step(sources.folder / OPTIONS_FILE)
@@ -252,20 +252,20 @@ def _check(network: str, fingerprint: str) -> None:
 
 
 def _check_edits(sources: Sources, built_text: str) -> None:
-    """Refuse a network that netedit changed without changing the network's sources."""
+    """Refuse a network that was edited in netedit while its sources were not."""
     file = sources.folder / (sources.output_file or NETWORK_FILE)
     names = sources.road_files
     if sources.network_file or not file.is_file() or any((sources.folder / name).stat().st_mtime >= file.stat().st_mtime for name in names):
         return
-    head, _, net = file.read_text(encoding="utf-8", errors="replace").partition("<net ")
-    if "netedit" in head and f"<net {net}".strip() != built_text.strip():
+    header, _, network = file.read_text(encoding="utf-8", errors="replace").partition("<net ")
+    if "netedit" in header and f"<net {network}".strip() != built_text.strip():
         raise InputError(file, f"was saved by netedit after {', '.join(names)}, which build another network",
                          "plain XML saved from netedit, too; or a folder without those files, to use the network as it is")
 
 
 def _check_step(file: Path) -> None:
     step = options_of(file).get("step-length", "1")
-    if not SHORTEST_STEP <= _number(step) <= LONGEST_STEP:
+    if not SHORTEST_STEP <= _parse_number(step) <= LONGEST_STEP:
         raise InputError(file, f"step-length = {step!r}", f"a number from {SHORTEST_STEP:g} to {LONGEST_STEP:g} [s]")
 
 
@@ -275,13 +275,13 @@ def _check_numbers(root: ElementTree.Element, file: Path, unset_value: str = "")
         for names, positive, legal in ((POSITIVE_NUMBERS, True, "a number above 0"), (NON_NEGATIVE_NUMBERS, False, "a number from 0 on")):
             for name in names.get(element.tag, ()):
                 text = element.get(name, unset_value)
-                if text == unset_value or (number := _number(text)) > 0 or (number == 0 and not positive):
+                if text == unset_value or (number := _parse_number(text)) > 0 or (number == 0 and not positive):
                     continue
                 label = f"{element.tag} {element.get('id')!r}" if "id" in element.attrib else element.tag
                 raise InputError(file, f"{label}: {name} = {text!r}", legal)
 
 
-def _number(text: str) -> float:
+def _parse_number(text: str) -> float:
     """The number in a text, or -infinity if the text is no finite number."""
     try:
         number = float(text)

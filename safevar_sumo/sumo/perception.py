@@ -12,8 +12,8 @@ from safevar_sumo.records import EVERYWHERE, BoolArray, Encounter, FloatArray, O
 from safevar_sumo.scenarios import Point
 from safevar_sumo.scenarios.base import Scene
 from safevar_sumo.study import Weather
-from safevar_sumo.sumo.meetings import Meetings
 from safevar_sumo.sumo.recorded_world import RecordedWorld
+from safevar_sumo.sumo.target_observer import TargetObserver
 from safevar_sumo.sumo.world import begin
 
 OCCLUDED_VALUES = np.array([[np.inf], [np.inf], [0.0], [0.0]])
@@ -40,48 +40,49 @@ RecordT = TypeVar("RecordT", Scene, Observation)
 
 
 class PointBatch:
-    """A batch of vehicles in K equal parts; part k drives in the scenario and weather of point k."""
+    """A batch of K groups of vehicles, all of the same size; group k drives in the scenario and weather of point k."""
 
     def __init__(self, points: Sequence[Point], world: Any, n: int) -> None:
-        self._size = size = n // len(points)
+        self._group_size = size = n // len(points)
         self._points, self._step = points, world.step_length
-        self._rows = [slice(k * size, (k + 1) * size) for k in range(len(points))]
+        self._groups = [slice(k * size, (k + 1) * size) for k in range(len(points))]
         self._is_recorded, self._scenes, self._memories = isinstance(world, RecordedWorld), list[Scene](), list[Any]()
-        self._worlds = world.scenes if self._is_recorded else [world]
+        self._worlds = world.slices if self._is_recorded else [world]
         weathers = [point.weather for point in points]
         self._perceptions = [(Perception(weather, self._step), np.repeat([other == weather for other in weathers], size).nonzero()[0])
                              for k, weather in enumerate(weathers) if weather not in weathers[:k]]
-        self._order = np.argsort(np.concatenate([rows for _, rows in self._perceptions]))
+        self._vehicle_order = np.argsort(np.concatenate([vehicles for _, vehicles in self._perceptions]))
         self.last_step = np.repeat([round(point.scenario.duration / self._step) for point in points], size)
-        self._meetings = Meetings.of([point.scenario for point in points], world, size) if self._is_recorded else None
-        if self._meetings is None:
+        self._target_observer = TargetObserver.of([point.scenario for point in points], world, size) if self._is_recorded else None
+        if self._target_observer is None:
             self._memories = [begin(point.scenario, scenario_world) for point, scenario_world in zip(points, self._worlds, strict=True)]
 
-    def scene(self, open_: BoolArray) -> Scene:
-        """The scene of all vehicles now; a part of a recorded world whose runs have all ended keeps its last scene."""
-        if self._meetings is not None:
-            return self._meetings.observe(open_)
+    def scene(self, is_open: BoolArray) -> Scene:
+        """The scene of all vehicles now; in recorded scenes, a group whose runs have all ended keeps its last scene."""
+        if self._target_observer is not None:
+            return self._target_observer.observe(is_open)
         for k, (point, world) in enumerate(zip(self._points, self._worlds, strict=True)):
-            if not self._is_recorded or k >= len(self._scenes) or np.count_nonzero(open_[self._rows[k]]):
+            if not self._is_recorded or k >= len(self._scenes) or np.count_nonzero(is_open[self._groups[k]]):
                 scene, self._memories[k] = point.scenario.observe(world, self._step, self._memories[k])
                 self._scenes[k:k + 1] = [scene]
-        return self._scenes[0] if len(self._scenes) == 1 else _join(self._scenes, [self._size] * len(self._scenes))
+        return self._scenes[0] if len(self._scenes) == 1 else _join(self._scenes, [self._group_size] * len(self._scenes))
 
     def observe(self, time: float, speed: FloatArray, scene: Scene) -> Observation:
-        """The observations of all vehicles."""
         if len(self._perceptions) == 1:
-            return self._perceptions[0][0].observe(time, speed, scene)
-        observations = [perception.observe(time, speed[rows], Scene._make(values[rows] if values.ndim else values for values in scene))
-                        for perception, rows in self._perceptions]
-        joined = _join(observations, [len(rows) for _, rows in self._perceptions])
-        return Observation._make(np.asarray(values)[self._order] if np.ndim(values) else values for values in joined)
+            ((perception, _),) = self._perceptions
+            return perception.observe(time, speed, scene)
+        observations = [
+            perception.observe(time, speed[vehicles], Scene._make(values[vehicles] if values.ndim else values for values in scene))
+            for perception, vehicles in self._perceptions]
+        joined = _join(observations, [len(vehicles) for _, vehicles in self._perceptions])
+        return Observation._make(np.asarray(values)[self._vehicle_order] if np.ndim(values) else values for values in joined)
 
     def encounter(self, trace: Trace) -> Encounter:
-        """The encounters' geometry, from which the metrics are computed."""
+        """The geometry of all encounters, from which the metrics are computed."""
         if len(self._points) == 1:
             return self._points[0].scenario.encounter(trace)
-        parts = [point.scenario.encounter(trace.of(rows)) for point, rows in zip(self._points, self._rows, strict=True)]
-        return Encounter(*(np.concatenate(columns, axis=1) for columns in zip(*parts, strict=True)))
+        encounters = [point.scenario.encounter(trace.of(group)) for point, group in zip(self._points, self._groups, strict=True)]
+        return Encounter(*(np.concatenate(columns, axis=1) for columns in zip(*encounters, strict=True)))
 
 
 def _join(records: Sequence[RecordT], sizes: Sequence[int]) -> RecordT:
@@ -89,7 +90,7 @@ def _join(records: Sequence[RecordT], sizes: Sequence[int]) -> RecordT:
     return type(records[0])._make(_concatenate(column, sizes) for column in zip(*records, strict=True))
 
 
-def _concatenate(parts: Sequence[Any], sizes: Sequence[int]) -> Any:
-    if np.ndim(parts[0]) == 0 and all(part is parts[0] for part in parts):
-        return parts[0]
-    return np.concatenate([part if np.ndim(part) else np.full(size, part) for part, size in zip(parts, sizes, strict=True)])
+def _concatenate(columns: Sequence[Any], sizes: Sequence[int]) -> Any:
+    if np.ndim(columns[0]) == 0 and all(column is columns[0] for column in columns):
+        return columns[0]
+    return np.concatenate([column if np.ndim(column) else np.full(size, column) for column, size in zip(columns, sizes, strict=True)])

@@ -18,15 +18,15 @@ from msgspec import msgpack, to_builtins
 from safevar_sumo.records import FloatArray
 from safevar_sumo.scenarios import VUT, GuardedScenario, Scenario
 from safevar_sumo.scenarios.target import TargetTest
-from safevar_sumo.sumo.cache import cached
+from safevar_sumo.sumo.cache import ensure_cached
 from safevar_sumo.sumo.copies import copied_id, copy_and_name
 from safevar_sumo.sumo.engine import Engine, open_world
 from safevar_sumo.sumo.network import copied_network, netconvert_version
 from safevar_sumo.sumo.sources import is_shipped
-from safevar_sumo.sumo.staging import all_staged
+from safevar_sumo.sumo.staging import stage_networks
 from safevar_sumo.sumo.world import SumoWorld, begin, direction_of
 
-MAX_SCENES = 4000
+MAX_RECORDINGS = 4000
 """Largest number of recorded scenes that a process keeps; a scene of ten seconds takes about ten kilobytes."""
 SCENES_FILE = "scenes.msgpack"
 EXTENT_MARGIN = 0.01
@@ -53,10 +53,10 @@ class Track(NamedTuple):
     width: float
 
 
-class Way(NamedTuple):
-    """The L straight lanes that the vehicle under test follows, in order; columns of shape (L,) or (L, 2) [m].
+class LaneSequence(NamedTuple):
+    """The L lanes that the vehicle under test follows, in order, which form a straight line; columns of shape (L,) or (L, 2) [m].
 
-    A lane's shape leads from `first` along `vector`. SUMO counts positions on a lane from 0 to `end`; `stretch` is `shape_length` / `end`.
+    A lane leads from `first` along `vector`. SUMO counts positions on a lane from 0 to `end`; `stretch` is `shape_length` / `end`.
     """
 
     first: FloatArray
@@ -65,9 +65,9 @@ class Way(NamedTuple):
     stretch: FloatArray
     shape_length: FloatArray
 
-    def at(self, lane: Any) -> Way:
+    def at(self, lane: Any) -> LaneSequence:
         """The current lanes of N vehicles, given by lane number; columns of length N."""
-        return Way._make(column[lane] for column in self)
+        return LaneSequence._make(column[lane] for column in self)
 
     def positions(self, lane_position: FloatArray) -> FloatArray:
         """Coordinates of the front bumpers, shape (N, 2) [m], of vehicles at positions on their lanes, shape (N,) [m]."""
@@ -77,9 +77,9 @@ class Way(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Recording:
-    """A scene in which the vehicle under test departs at position `start` on its `way` [m], at `speed` [m/s].
+    """A recorded scene: the vehicle under test departs at position `start` on the first lane of its `way` [m], at `speed` [m/s].
 
-    `extents`, shape (2, T, A): at step t, the vehicle is beside actor a while its front is between these coordinates along the way [m].
+    `extents`, shape (2, T, A): at step t, the vehicle is beside actor a while its front is between these coordinates `along` the lanes [m].
     """
 
     step_length: float
@@ -87,7 +87,7 @@ class Recording:
     speed: float
     length: float
     width: float
-    way: Way
+    way: LaneSequence
     along: FloatArray
     lanes: dict[str, tuple[tuple[float, float], ...]]
     lane_of: dict[str, str]
@@ -95,13 +95,13 @@ class Recording:
     extents: FloatArray
 
     @property
-    def road(self) -> tuple[Hashable, ...]:
-        """A key: vehicles in scenes with the same key may share a batch."""
+    def batch_key(self) -> tuple[Hashable, ...]:
+        """Vehicles in scenes with the same key may share a batch."""
         return self.step_length, self.length, self.width, self.along.tobytes(), *(column.tobytes() for column in self.way)
 
 
-def recorded_scenes(scenarios: Sequence[Scenario], options: Sequence[str]) -> list[Recording | str]:
-    """Each scenario's recorded scene, played with additional options of SUMO, or the reason why the scenario must be simulated in SUMO.
+def record_scenes(scenarios: Sequence[Scenario], options: Sequence[str]) -> list[Recording | str]:
+    """Each scenario's scene, played with additional options of SUMO and recorded, or the reason why SUMO must simulate the scenario.
 
     SUMO plays a scene once per process; scenes of shipped scenarios are also kept in the user's cache folder.
 
@@ -112,14 +112,14 @@ def recorded_scenes(scenarios: Sequence[Scenario], options: Sequence[str]) -> li
     """
     reasons = [_reason_for_sumo(scenario) for scenario in scenarios]
     recordable = [scenario for scenario, reason in zip(scenarios, reasons, strict=True) if not reason]
-    folders = {(scenario, network.fingerprint, tuple(options)): network.folder
-               for scenario, network in zip(recordable, all_staged(recordable), strict=True)}
-    new_folders = {key: folder for key, folder in folders.items() if key not in _scenes}
+    folders = {_Key(scenario, network.fingerprint, tuple(options)): network.folder
+               for scenario, network in zip(recordable, stage_networks(recordable), strict=True)}
+    new_folders = {key: folder for key, folder in folders.items() if key not in _recordings}
     if new_folders:
-        for old_key in [key for key in _scenes if key not in folders][:max(len(_scenes) + len(new_folders) - MAX_SCENES, 0)]:
-            del _scenes[old_key]
-        _scenes.update(zip(new_folders, _scenes_of(new_folders), strict=True))
-    scenes = {key[0]: _scenes[key] for key in folders}
+        for old_key in [key for key in _recordings if key not in folders][:max(len(_recordings) + len(new_folders) - MAX_RECORDINGS, 0)]:
+            del _recordings[old_key]
+        _recordings.update(zip(new_folders, _recordings_of(new_folders), strict=True))
+    scenes = {key.scenario: _recordings[key] for key in folders}
     return [reason or scenes[scenario] for scenario, reason in zip(scenarios, reasons, strict=True)]
 
 
@@ -131,24 +131,30 @@ def _reason_for_sumo(scenario: Scenario) -> str:
     return ""
 
 
-_Key = tuple[Scenario, str, tuple[str, ...]]
-"""A scenario, the fingerprint of its network and traffic, and additional options of SUMO."""
-_scenes: dict[_Key, Recording | str] = {}
+class _Key(NamedTuple):
+    """A scenario, the fingerprint of its network and traffic, and additional options of SUMO."""
+
+    scenario: Any
+    fingerprint: str
+    options: tuple[str, ...]
+
+
+_recordings: dict[_Key, Recording | str] = {}
 """The scenes that this process keeps, or the reasons why scenes cannot be recorded."""
 
 
-def _scenes_of(folders: Mapping[_Key, str]) -> list[Recording | str]:
+def _recordings_of(folders: Mapping[_Key, str]) -> list[Recording | str]:
     """The scenes of keys with network folders, read from the cache or played by SUMO."""
     def play() -> list[Recording | str]:
-        return [_play(scenario, folder, options) for (scenario, _, options), folder in folders.items()]
+        return [_play(key.scenario, folder, key.options) for key, folder in folders.items()]
 
-    if any(isinstance(scenario, GuardedScenario) for scenario, *_ in folders):
+    if any(isinstance(key.scenario, GuardedScenario) for key in folders):
         return play()
     digest = sha256(_code_bytes() + repr([(type(scenario).__name__, to_builtins(scenario), *rest) for scenario, *rest in folders]).encode())
     def build(folder: Path) -> None:
         (folder / SCENES_FILE).write_bytes(msgpack.encode(play(), enc_hook=_packed_array))
 
-    file = cached(f"scenes-{digest.hexdigest()[:16]}", SCENES_FILE, build)
+    file = ensure_cached(f"scenes-{digest.hexdigest()[:16]}", SCENES_FILE, build)
     return msgpack.decode(file.read_bytes(), type=list[Recording | str], dec_hook=_unpacked_array)
 
 
@@ -181,41 +187,41 @@ def _play(scenario: Any, folder: str, options: tuple[str, ...]) -> Recording | s
 
 def _record(scenario: Scenario, world: SumoWorld) -> Recording:
     api, vut, step = world.api, copied_id(0, VUT), world.step_length
-    way, along = _way_of(api, vut)
+    lane_sequence, along = _lane_sequence_of(api, vut)
     start, speed = float(api.vehicle.getLanePosition(vut)), float(api.vehicle.getSpeed(vut))
     lane_of = {name: copy_and_name(api.vehicle.getLaneID(id_))[1] for id_, name in _ids_in_first_copy(api.vehicle.getIDList())}
     lanes = {name: tuple((float(x), float(y)) for x, y in api.lane.getShape(id_)) for id_, name in _ids_in_first_copy(api.lane.getIDList())}
     length = round(scenario.duration / step) + 1
-    states, sizes, memory = dict[str, FloatArray](), dict[str, tuple[bool, float, float]](), begin(scenario, world)
+    samples, sizes, memory = dict[str, FloatArray](), dict[str, tuple[bool, float, float]](), begin(scenario, world)
     for sample in range(length):
-        for kind in (api.vehicle, api.person):
-            for id_, name in _ids_in_first_copy(kind.getIDList()):
+        for domain in (api.vehicle, api.person):
+            for id_, name in _ids_in_first_copy(domain.getIDList()):
                 if name == VUT:
                     continue
-                if name not in states:
-                    states[name] = np.full((length, 4), np.nan)
-                    sizes[name] = kind is api.person, float(kind.getLength(id_)), float(kind.getWidth(id_))
-                states[name][sample] = *kind.getPosition(id_), kind.getAngle(id_), kind.getSpeed(id_)
+                if name not in samples:
+                    samples[name] = np.full((length, 4), np.nan)
+                    sizes[name] = domain is api.person, float(domain.getLength(id_)), float(domain.getWidth(id_))
+                samples[name][sample] = *domain.getPosition(id_), domain.getAngle(id_), domain.getSpeed(id_)
         if sample < length - 1:
             memory = scenario.move(world, step, memory) if isinstance(scenario, TargetTest) else scenario.observe(world, step, memory)[1]
             world.advance(np.zeros(1))
-    tracks = {name: Track(rows[:, :2].copy(), rows[:, 2].copy(), rows[:, 3].copy(), *sizes[name]) for name, rows in states.items()}
-    own_length = world.vehicle_length(VUT)
+    tracks = {name: Track(rows[:, :2].copy(), rows[:, 2].copy(), rows[:, 3].copy(), *sizes[name]) for name, rows in samples.items()}
+    vut_length = world.vehicle_length(VUT)
     extents = np.full((2, length, len(tracks)), np.nan)
-    for number, track in enumerate(tracks.values()):
-        extents[:, :, number] = _extent(track, along, own_length)
+    for actor, track in enumerate(tracks.values()):
+        extents[:, :, actor] = _extent_beside(track, along, vut_length)
     return Recording(
-        step_length=step, start=start, speed=speed, length=own_length, width=world.vehicle_width(VUT), way=way,
+        step_length=step, start=start, speed=speed, length=vut_length, width=world.vehicle_width(VUT), way=lane_sequence,
         along=along, lanes=lanes, lane_of=lane_of, tracks=tracks, extents=extents)
 
 
-def _extent(track: Track, along: FloatArray, own_length: float) -> FloatArray:
-    """Coordinates between which a vehicle's front is while the vehicle is beside an actor, with a margin; shape (2, T) [m]."""
+def _extent_beside(track: Track, along: FloatArray, vut_length: float) -> FloatArray:
+    """First and last coordinate of a vehicle's front while the vehicle is beside an actor, with a margin; shape (2, T) [m]."""
     angle = np.radians(track.angle)  # clockwise from north
     cosine, sine = along @ np.array([np.sin(angle), np.cos(angle)]), along @ np.array([np.cos(angle), -np.sin(angle)])
     middle = track.position @ along - cosine * (track.length / 2)
     half_extent = (np.abs(cosine) * track.length + np.abs(sine) * track.width) / 2 + EXTENT_MARGIN
-    return np.array([middle - half_extent, middle + half_extent + own_length])
+    return np.array([middle - half_extent, middle + half_extent + vut_length])
 
 
 def _ids_in_first_copy(ids: Iterable[str]) -> Iterator[tuple[str, str]]:
@@ -226,7 +232,7 @@ def _ids_in_first_copy(ids: Iterable[str]) -> Iterator[tuple[str, str]]:
             yield id_, name
 
 
-def _way_of(api: Any, vut: str) -> tuple[Way, FloatArray]:
+def _lane_sequence_of(api: Any, vut: str) -> tuple[LaneSequence, FloatArray]:
     """The lanes of the rest of a vehicle's route, and their common direction.
 
     Raises
@@ -257,4 +263,4 @@ def _way_of(api: Any, vut: str) -> tuple[Way, FloatArray]:
     if np.abs(direction - direction[0]).max() > 1e-6 or np.abs(starts[1:] - ends[:-1]).max(initial=0.0) > 1e-6:
         raise UnrecordableError("the lanes of the vehicle under test do not form a straight line")
     stretch = np.maximum(shape_length, POSITION_EPS) / lengths
-    return Way(starts, vector, lengths, stretch, shape_length), direction_of(api.vehicle.getAngle(vut))
+    return LaneSequence(starts, vector, lengths, stretch, shape_length), direction_of(api.vehicle.getAngle(vut))

@@ -1,4 +1,4 @@
-"""Files and options in a network's folder: no option may write files, open sockets, use random numbers or read other folders."""
+"""Files and options in a network's folder. Options must not write files, open sockets, use random numbers or read other folders."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import NamedTuple
 from safevar_sumo.errors import InputError, did_you_mean
 from safevar_sumo.shipped import NETWORKS
 
-SECTIONS = frozenset({
+CONFIGURATION_SECTIONS = frozenset({
     "configuration", "input", "time", "processing", "report", "gui_only", "random_number", "routing", "output", "projection",
     "building_defaults", "tls_building", "ramp_guessing", "edge_removal", "unregulated_nodes", "junctions", "pedestrian", "bicycle",
     "railway", "formats"})
@@ -31,7 +31,7 @@ NETCONVERT_OPTIONS = re.compile(
 """Legal options of netconvert: they determine how netconvert builds the network from the sources."""
 SOURCE_OPTIONS = ("sumo-net-file", "osm-files", "opendrive-files", "node-files", "edge-files", "connection-files", "type-files",
            "tllogic-files", "polygon-files")
-"""Options of netconvert whose values are names of source files."""
+"""Options of netconvert that name source files."""
 IGNORED_OPTIONS = re.compile(r"output-file|verbose|print-options|no-warnings|aggregate-warnings|xml-validation(\.net)?|write-license"
                              r"|write-metadata|log\.(timestamps|processid)|human-readable-time")
 """Options of netconvert that are ignored, because they do not affect the network; safevar sets the output file."""
@@ -56,7 +56,7 @@ def options_of(file: Path) -> dict[str, str]:
             if element.tag in options:
                 raise InputError(file, f"sets {element.tag!r} twice", "each option once")
             options[element.tag] = element.attrib["value"].strip()
-        elif element is not root and element.tag not in SECTIONS:
+        elif element is not root and element.tag not in CONFIGURATION_SECTIONS:
             raise InputError(file, f"sets SUMO's option {element.tag!r} without value=", f'<{element.tag} value="..."/>')
     return options
 
@@ -75,7 +75,7 @@ def check_options(file: Path) -> None:
             raise InputError(file, f"sets SUMO's option {name!r}", "options that write no file, open no socket and draw nothing at random, "
                              "such as step-length, collision.* and pedestrian.*")
     for name in ("net-file", "gui-settings-file"):
-        own_files(file, name, options.get(name, ""))
+        local_files(file, name, options.get(name, ""))
     if options.get("route-files", TRAFFIC_FILE) != TRAFFIC_FILE:
         raise InputError(file, f"route-files = {options['route-files']!r}", f"{TRAFFIC_FILE}, all traffic in one file")
 
@@ -92,7 +92,7 @@ def recipe_of(file: Path) -> tuple[dict[str, tuple[str, ...]], dict[str, str], s
     recipe = options_of(file)
     for name, value in recipe.items():
         if name in SOURCE_OPTIONS:
-            sources[name] = own_files(file, name, value)
+            sources[name] = local_files(file, name, value)
         elif NETCONVERT_OPTIONS.fullmatch(name):
             options[name] = value
         elif not IGNORED_OPTIONS.fullmatch(name):
@@ -101,7 +101,7 @@ def recipe_of(file: Path) -> tuple[dict[str, tuple[str, ...]], dict[str, str], s
     return sources, options, recipe.get("output-file", "")
 
 
-def own_files(file: Path, name: str, value: str) -> tuple[str, ...]:
+def local_files(file: Path, name: str, value: str) -> tuple[str, ...]:
     """The files that an option names; they must be in the folder of the configuration.
 
     Raises
@@ -144,17 +144,16 @@ class Sources(NamedTuple):
 
     @property
     def road_files(self) -> tuple[str, ...]:
-        """The source files of the network itself."""
+        """The source files of the network without its traffic."""
         names = (self.network_file, *(name for _, option_names in self.plain_files for name in option_names), self.recipe)
         return tuple(name for name in names if name)
 
     @property
     def files(self) -> tuple[str, ...]:
-        """All files that are used."""
+        """Road files, traffic and SUMO's options."""
         return (*self.road_files, TRAFFIC_FILE, OPTIONS_FILE)
 
     def contents(self, *names: str) -> tuple[bytes, ...]:
-        """Contents of the named files."""
         return tuple((self.folder / name).read_bytes() for name in names)
 
 
@@ -168,7 +167,7 @@ def sources_of(network: str) -> Sources:
     """
     path = NETWORKS / network if is_shipped(network) else Path(network)
     if is_network(path):
-        sources = _folder_sources(path, _listing(path)) if path.is_dir() else Sources(path.parent, network_file=path.name)
+        sources = _folder_sources(path, _list_files(path)) if path.is_dir() else Sources(path.parent, network_file=path.name)
         if "," in str(sources.folder.absolute()):
             raise InputError(sources.folder, "has a comma in its path, at which SUMO splits file names", "a path without commas")
         for name in (TRAFFIC_FILE, OPTIONS_FILE):
@@ -186,14 +185,14 @@ def is_shipped(network: str) -> bool:
 
 
 def is_network(path: Path) -> bool:
-    """Whether a path can be a network: a folder or a built network."""
+    """Whether a path is a folder or a built network."""
     try:
         return path.is_dir() or (path.name.endswith(NETWORK_ENDING) and path.is_file())
     except OSError:  # for example, a name is too long
         return False
 
 
-def _listing(folder: Path) -> tuple[tuple[str, int, int], ...]:
+def _list_files(folder: Path) -> tuple[tuple[str, int, int], ...]:
     """Names, modification times and sizes of the files in a folder."""
     with os.scandir(folder) as entries:
         return tuple(sorted((entry.name, entry.stat().st_mtime_ns, entry.stat().st_size) for entry in entries if entry.is_file()))

@@ -21,14 +21,14 @@ from safevar_sumo.sumo.network import NETWORK_FILE, built_network, network_finge
 from safevar_sumo.sumo.sources import OPTIONS_FILE, TRAFFIC_FILE, Sources, options_of, sources_of
 
 
-class Staged(NamedTuple):
+class StagedNetwork(NamedTuple):
     """The folder of a network with a scenario's lanes and traffic, and a digest of the network's content."""
 
     folder: str
     fingerprint: str
 
 
-def staged(scenario: Scenario) -> Staged:
+def stage_network(scenario: Scenario) -> StagedNetwork:
     """The scenario's network, with lanes and traffic changed by the scenario's parameters.
 
     Raises
@@ -36,21 +36,21 @@ def staged(scenario: Scenario) -> Staged:
     InputError
         If the parameters are impossible, or change an element that the network or the traffic file lacks.
     """
-    return all_staged([scenario])[0]
+    return stage_networks([scenario])[0]
 
 
-def all_staged(scenarios: Sequence[Scenario]) -> list[Staged]:
+def stage_networks(scenarios: Sequence[Scenario]) -> list[StagedNetwork]:
     """The networks of several scenarios, whose files are read once per network; raises the errors of `staged`."""
     fingerprints = {name: network_fingerprint(name) for name in {scenario.network for scenario in scenarios}}
-    def stage(scenario: Any) -> Staged:
+    def stage(scenario: Any) -> StagedNetwork:
         may_vary = isinstance(scenario, GuardedScenario)  # a user's scenario may return different changes in each call
-        return (_staged.__wrapped__ if may_vary else _staged)(scenario, fingerprints[scenario.network])
+        return (_stage.__wrapped__ if may_vary else _stage)(scenario, fingerprints[scenario.network])
 
     return [stage(scenario) for scenario in scenarios]
 
 
 @lru_cache(maxsize=10_000)
-def _staged(scenario: Any, fingerprint: str) -> Staged:
+def _stage(scenario: Any, fingerprint: str) -> StagedNetwork:
     """The staged network; `fingerprint` makes the contents of the network's files part of the cache key."""
     folder = scenario.network
     lanes, actors = (getattr(scenario, name, None) for name in ("lanes", "actors"))
@@ -58,7 +58,7 @@ def _staged(scenario: Any, fingerprint: str) -> Staged:
         folder = str(_change_lanes(sources_of(folder), built_network(folder), changes))
     if actors is not None and (changes := actors(_BuiltRoads(folder))):
         folder = str(_change_traffic(sources_of(folder), changes))
-    return Staged(folder, fingerprint if folder == scenario.network else network_fingerprint(folder))
+    return StagedNetwork(folder, fingerprint if folder == scenario.network else network_fingerprint(folder))
 
 
 class _BuiltRoads:
@@ -75,37 +75,37 @@ class _BuiltRoads:
     @cached_property
     def _lanes(self) -> dict[str, Lane]:
         network = built_network(self._network)
-        return _shapes(network, network.read_bytes())
+        return _read_lanes(network, network.read_bytes())
 
 
 @lru_cache(maxsize=100)
-def _shapes(network: Path, content: bytes) -> dict[str, Lane]:
-    shapes = {}
+def _read_lanes(network: Path, content: bytes) -> dict[str, Lane]:
+    lanes = {}
     for lane in ElementTree.fromstring(content).iter("lane"):
-        points = [(float(x), float(y)) for x, y in (point.split(",")[:2] for point in lane.attrib["shape"].split())]
-        shapes[lane.attrib["id"]] = lane_through(lane.attrib["id"], points)
-    return shapes
+        coordinates = [(float(x), float(y)) for x, y in (point.split(",")[:2] for point in lane.attrib["shape"].split())]
+        lanes[lane.attrib["id"]] = lane_through(lane.attrib["id"], coordinates)
+    return lanes
 
 
 def _change_lanes(sources: Sources, network_file: Path, changes: XmlChanges) -> Path:
     """A copy of a built network with changes to its lanes."""
-    files = {NETWORK_FILE: ElementTree.tostring(_changed_xml(network_file, changes)), **_files(sources, TRAFFIC_FILE, OPTIONS_FILE)}
-    return _store(sources.folder.name, tuple(files.items()))
+    files = {NETWORK_FILE: ElementTree.tostring(_change_xml(network_file, changes)), **_read_files(sources, TRAFFIC_FILE, OPTIONS_FILE)}
+    return _store_network(sources.folder.name, tuple(files.items()))
 
 
 def _change_traffic(sources: Sources, changes: XmlChanges) -> Path:
     """A copy of a network, or of its sources, with changes to its traffic."""
-    files = _files(sources, *sources.files) | {TRAFFIC_FILE: ElementTree.tostring(_changed_xml(sources.folder / TRAFFIC_FILE, changes))}
-    return _store(sources.folder.name, tuple(files.items())) / sources.network_file
+    files = _read_files(sources, *sources.files) | {TRAFFIC_FILE: ElementTree.tostring(_change_xml(sources.folder / TRAFFIC_FILE, changes))}
+    return _store_network(sources.folder.name, tuple(files.items())) / sources.network_file
 
 
-def _files(sources: Sources, *names: str) -> dict[str, bytes]:
+def _read_files(sources: Sources, *names: str) -> dict[str, bytes]:
     """Contents of the named files of a network, and of its settings of sumo-gui."""
     gui_settings = options_of(sources.folder / OPTIONS_FILE).get("gui-settings-file", "")
     return {name: (sources.folder / name).read_bytes() for name in (*names, gui_settings) if (sources.folder / name).is_file()}
 
 
-def _changed_xml(file: Path, changes: XmlChanges) -> ElementTree.Element:
+def _change_xml(file: Path, changes: XmlChanges) -> ElementTree.Element:
     root = parse_xml(file)
     for path, attributes in changes.items():
         elements = root.findall(path)
@@ -120,7 +120,7 @@ def _changed_xml(file: Path, changes: XmlChanges) -> ElementTree.Element:
 
 
 @lru_cache(maxsize=1000)
-def _store(name: str, files: tuple[tuple[str, bytes], ...]) -> Path:
+def _store_network(name: str, files: tuple[tuple[str, bytes], ...]) -> Path:
     digest = hashlib.sha256(repr(files).encode()).hexdigest()
     target = platformdirs.user_cache_path("safevar_sumo") / "staged" / digest[:16] / (name or "network")
     if not target.is_dir():

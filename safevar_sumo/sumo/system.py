@@ -28,7 +28,7 @@ from safevar_sumo.study import MatrixTest, MetricsTable, ModelTable, Study, Vehi
 from safevar_sumo.sumo.network import check_network, network_remarks
 from safevar_sumo.sumo.sources import is_network, is_shipped
 from safevar_sumo.sumo.traci_controller import TraciController
-from safevar_sumo.sumo.traci_module import importable
+from safevar_sumo.sumo.traci_module import substitute_traci
 from safevar_sumo.vehicles import (
     CHANGES,
     VEHICLE_CONTRACT,
@@ -40,18 +40,18 @@ from safevar_sumo.vehicles import (
     GuardedVehicle,
     Vehicle,
     calibration_drive,
-    foreign_change,
+    guard_change,
     region_of,
 )
 
-COLUMNS = (
+RESULT_COLUMNS = (
     "algorithm", "run", "evaluation", "outcome", "handle", "collision", "collision_speed", "setting", "f_safe", "f_diff", "f_num_diff")
 """Names of result columns, which no characteristic or metric may use."""
 OBJECTIVES_KEY = "search.objectives"
 
 
 class Measuring(NamedTuple):
-    """Metrics and additional measures of change by column, the objectives, and the members that are not shipped."""
+    """Metrics and additional measures of change by column; the objectives; and the members that contain user code."""
 
     metrics: Mapping[str, Metric]
     changes: Mapping[str, Change]
@@ -69,10 +69,10 @@ def measuring_of(study: Study, lookup: Lookup) -> Measuring:
     """
     metrics, members = {**METRICS, **({RATING_POINTS.name: RATING_POINTS} if is_rated(study) else {})}, list[Member]()
     default_metrics = dict(metrics)
-    changes = {name: change for name, change in CHANGES.items() if name not in COLUMNS}
+    changes = {name: change for name, change in CHANGES.items() if name not in RESULT_COLUMNS}
     by_name: dict[str, Metric | Change] = {}
 
-    def add(name: str, key: str) -> Metric | Change:
+    def look_up(name: str, key: str) -> Metric | Change:
         if name in by_name:
             return by_name[name]
         shipped = {**default_metrics, **FURTHER, **({**CHANGES, **BY_OBJECTIVE} if key == OBJECTIVES_KEY else {})}
@@ -83,8 +83,8 @@ def measuring_of(study: Study, lookup: Lookup) -> Measuring:
             return member.target  # type: ignore[no-any-return]
         members.append(member)
         is_change = isinstance(member.target, Change) and key == OBJECTIVES_KEY
-        record = foreign_change(member.target, member.guard) if is_change else foreign_metric(member.target, member.guard)
-        if record.name in (*COLUMNS, *metrics, *FURTHER, *changes, *study.vehicle.characteristics):
+        record = guard_change(member.target, member.guard) if is_change else foreign_metric(member.target, member.guard)
+        if record.name in (*RESULT_COLUMNS, *metrics, *FURTHER, *changes, *study.vehicle.characteristics):
             raise InputError(lookup.source, f"{key} = {name!r}: the name {record.name!r} is taken", "a unique name")
         if isinstance(record, Change):
             changes[record.name] = record
@@ -94,15 +94,15 @@ def measuring_of(study: Study, lookup: Lookup) -> Measuring:
         return record
 
     for name in study.metrics.also:
-        add(name, "metrics.also")
+        look_up(name, "metrics.also")
     names = [BY_OBJECTIVE[name].name if name in BY_OBJECTIVE else name for name in study.search.objectives]
-    objectives = [_objective(add(name, OBJECTIVES_KEY)) for name in names]
+    objectives = [_objective_of(look_up(name, OBJECTIVES_KEY)) for name in names]
     _check_duplicates(objectives, lookup.source)
     scoring = Scoring(metrics=tuple(metric.facts for metric in metrics.values()), objectives=tuple(objectives))
     return Measuring(metrics, changes, scoring, tuple(members))
 
 
-def _objective(record: Metric | Change) -> Objective:
+def _objective_of(record: Metric | Change) -> Objective:
     if isinstance(record, Metric):
         return Objective.of(record)
     return Objective(name=record.name, title=record.title, unit=record.unit)
@@ -130,10 +130,10 @@ class Models(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class System:
-    """The parts of a simulation.
+    """A study's models, points, metrics and constraints, ready to simulate.
 
     `step_length` [s] is None if the network determines the time step; `rater` rates results in the matrix of a protocol; `metrics` contains
-    thresholds, and `measuring` the metrics that are computed with them; `members` define all models and metrics.
+    thresholds, and `measuring` the metrics that are computed with them; `members` define all models, metrics and constraints.
     """
 
     characteristics: CharacteristicSet
@@ -160,19 +160,19 @@ class System:
         return replace(self, scenario=point.scenario, weather=point.weather, matrix=(), rater=None)
 
     def check_feasible(self, settings: FloatArray, source: object, *, filtered: bool, switch: str = "beyond=True") -> None:
-        """Refuse settings, shape (M, n), that violate a constraint of the study; raises the errors of `FeasibleRegion.check`."""
+        """Refuse settings, shape (M, n), that violate a constraint; raises the errors of `FeasibleRegion.check`."""
         self.region.check(self.characteristics.filter(settings) if filtered else settings, source, otherwise=f", or any with {switch}")
 
     @property
     def remarks(self) -> list[str]:
-        """Remarks on parts of networks and weathers that are not used or have no effect."""
-        in_traci = isinstance(self.ads, TraciController)
+        """Remarks for the user on parts of networks and weathers that are not used or have no effect."""
+        uses_traci = isinstance(self.ads, TraciController)
         fmu_remarks = [remark for model in (self.vehicle, self.ads) for remark in getattr(model, "remarks", ())]
         networks = dict.fromkeys(point.scenario.network for point in self.points)
-        remarks = [remark for network in networks for remark in network_remarks(network, self.nominal.max_speed, sumo_drives=in_traci)]
+        remarks = [remark for network in networks for remark in network_remarks(network, self.nominal.max_speed, sumo_drives=uses_traci)]
         remarks += fmu_remarks
         visibilities = {point.weather.name: point.weather.visibility for point in self.points if point.weather.visibility != 1}
-        if in_traci and not self._has_limited_range():
+        if uses_traci and not self._has_limited_range():
             remarks += [f"weather {name!r}: visibility = {value:g} has no effect: the vehicle has no sensor range, so a controller written "
                       "for TraCI sees everything" for name, value in visibilities.items()]
         if not any(getattr(self.ads, name, 0.0) for name in REACTIONS):
@@ -189,7 +189,7 @@ class System:
 
 
 def _equals_clear(weather: Weather) -> bool:
-    """Whether a weather differs from clear weather in its name only."""
+    """Whether a weather has the effects of clear weather under another name."""
     clear = WEATHERS["clear"]
     return weather.name != clear.name and weather.light == clear.light and msgspec.structs.replace(weather, name=clear.name) == clear
 
@@ -209,43 +209,46 @@ def assemble(study: Study, source: str = "") -> System:
 
 def _assemble(study: Study, source: str) -> System:
     models = models_of(study, source)
-    _check_units(study, models.vehicle, models.members[0].guard is None, source)
+    is_shipped_vehicle = models.members[0].guard is None
+    _check_units(study, models.vehicle, is_shipped_vehicle, source)
     measuring = measuring_of(study, Lookup(source, study.origin.places))
     for name in study.published:
         if name not in measuring.metrics:
             raise unknown(source, f"published.{name} is no metric", name, measuring.metrics)
     rater = rater_of(study, source)
-    matrix = _matrix(study if rater is None else rated(study, models.weather), source)
+    matrix = _matrix_points(study if rater is None else rated(study, models.weather), source)
     for network in dict.fromkeys(scenario.network for scenario in (models.scenario, *(point.scenario for point in matrix))):
         check_network(network)
     region = region_of(study, source)
     characteristics = region.characteristics
     nominal = calibration_drive(models.vehicle, characteristics)
     if isinstance(models.ads, TraciController) and isinstance(models.vehicle, GuardedVehicle):
-        ends = np.stack([characteristics.original, characteristics.lower, characteristics.upper])
-        models.vehicle.refuse_unknown_sensors(dict(zip(characteristics.names, np.ascontiguousarray(ends.T), strict=True)))
-    if models.members[0].guard is not None:
+        extremes = np.stack([characteristics.original, characteristics.lower, characteristics.upper])
+        models.vehicle.refuse_unknown_sensors(dict(zip(characteristics.names, np.ascontiguousarray(extremes.T), strict=True)))
+    if not is_shipped_vehicle:
         nominal.tables()  # so that errors of a user's vehicle do not depend on the ADS
     return System(
         characteristics=characteristics, vehicle=models.vehicle, ads=models.ads, scenario=models.scenario, weather=models.weather,
         metrics=study.metrics, nominal=nominal, members=(*models.members, *measuring.members, *region.members),
-        measuring=measuring, region=region,
-        step_length=study.step_length, matrix=matrix, rater=rater)
+        measuring=measuring, region=region, step_length=study.step_length, matrix=matrix, rater=rater)
 
 
 def models_of(study: Study, source: str) -> Models:
     """The study's models with their parameters; raises the errors of `assemble`."""
-    lookup, limit = Lookup(source, study.origin.places), min(study.search.time_limit / 2, LONGEST)  # less than the time limit of a batch
-    vehicle, ads, scenario = _vehicle(study.vehicle, lookup, limit), _ads(study.ads, lookup, limit), _scenario(study.scenario, lookup)
-    return Models(vehicle[0], ads[0], scenario[0], weather_of(study.weather, source), (vehicle[1], ads[1], scenario[1]))
+    lookup = Lookup(source, study.origin.places)
+    time_limit = min(study.search.time_limit / 2, LONGEST)  # less than the time limit of a batch
+    vehicle, vehicle_member = _create_vehicle(study.vehicle, lookup, time_limit)
+    ads, ads_member = _create_ads(study.ads, lookup, time_limit)
+    scenario, scenario_member = _create_scenario(study.scenario, lookup)
+    return Models(vehicle, ads, scenario, weather_of(study.weather, source), (vehicle_member, ads_member, scenario_member))
 
 
-def _traci_controller(choice: ModelTable, lookup: Lookup) -> tuple[Ads, Member]:
+def _create_traci_controller(table: ModelTable, lookup: Lookup) -> tuple[Ads, Member]:
     """The ADS of a controller written for TraCI: a function `step(traci, vehicle_id)` or a class with that method."""
-    name = f"ads.model = {choice.model!r}"
-    with importable():
-        member = lookup.find({}, choice.model, "ads.model")
-        controller, parameters = member.target, lookup.with_paths(member, choice.parameters, "ads.parameters")
+    name = f"ads.model = {table.model!r}"
+    with substitute_traci():
+        member = lookup.find({}, table.model, "ads.model")
+        controller, parameters = member.target, lookup.with_paths(member, table.parameters, "ads.parameters")
         if not callable(getattr(controller, "step", None) if inspect.isclass(controller) else controller):
             raise InputError(lookup.source, f"{name} has no step", CONTROLLER_FORMS)
         if not inspect.isclass(controller):
@@ -258,18 +261,18 @@ def _traci_controller(choice: ModelTable, lookup: Lookup) -> tuple[Ads, Member]:
             return instance_of(member._replace(target=target), parameters, name, "ads.parameters", lookup.source)
 
         controller_of(controller)
-    places, attribute = [*lookup.places, os.getcwd()], choice.model.partition(":")[2]
-    modules = partial(OwnModules, member, attribute, places, set())
+    folders, attribute = [*lookup.places, os.getcwd()], table.model.partition(":")[2]
+    modules = partial(OwnModules, member, attribute, folders, set())
     return TraciController(modules, controller_of, member.guard or Guard(lookup.source, name)), member
 
 
-def _matrix(study: Study, source: str) -> tuple[Point, ...]:
+def _matrix_points(study: Study, source: str) -> tuple[Point, ...]:
     """The points of a study's matrix; raises an error if several points share a name."""
     points = [] if study.matrix is None else [point for test in study.matrix.tests for point in _points_of(test, study, source)]
     counts = Counter(point.name for point in points)
-    for name, number in counts.items():
-        if number > 1:
-            raise InputError(source, f"matrix.tests: {number} points are {name!r}", "unique names of tests, and each value once")
+    for name, count in counts.items():
+        if count > 1:
+            raise InputError(source, f"matrix.tests: {count} points are {name!r}", "unique names of tests, and each value once")
     return tuple(points)
 
 
@@ -280,23 +283,23 @@ def _points_of(test: MatrixTest, study: Study, source: str) -> Iterator[Point]:
     weathers: list[str | Weather] = list(test.weathers) or [study.weather]
     for values in product(*test.over.values()):
         over = dict(zip(test.over, values, strict=True))
-        scenario, _ = _scenario(ModelTable(model=test.model or study.scenario.model, parameters={**base, **over}), lookup)
+        scenario, _ = _create_scenario(ModelTable(model=test.model or study.scenario.model, parameters={**base, **over}), lookup)
         for choice in weathers:
             weather = weather_of(choice, lookup.source)
-            place = {"test": test.name, **over, "weather": weather.name}
+            parameters = {"test": test.name, **over, "weather": weather.name}
             name = ", ".join([test.name, *(f"{key} {value}" for key, value in over.items()), weather.name])
-            yield Point(scenario, weather, name, tuple(place.items()))
+            yield Point(scenario, weather, name, tuple(parameters.items()))
 
 
-def _locate_network(scenario: Any, places: Sequence[str]) -> Any:
+def _locate_network(scenario: Any, search_folders: Sequence[str]) -> Any:
     """The scenario with the path of its network, if the network is not shipped but is a folder or file beside the study.
 
     A folder with sources has priority, because a results directory beside the study may have the same name.
     """
-    folder = scenario.network
-    paths = [path for place in places if is_network(path := Path(place, folder))]
-    network = str(next((path for path in paths if path.is_file() or any(path.glob("*.xml"))), paths[0] if paths else folder))
-    if network == folder or is_shipped(folder):
+    name = scenario.network
+    paths = [path for folder in search_folders if is_network(path := Path(folder, name))]
+    network = str(next((path for path in paths if path.is_file() or any(path.glob("*.xml"))), paths[0] if paths else name))
+    if network == name or is_shipped(name):
         return scenario
     if isinstance(scenario, msgspec.Struct):
         return msgspec.structs.replace(scenario, network=network)
@@ -304,56 +307,57 @@ def _locate_network(scenario: Any, places: Sequence[str]) -> Any:
     return scenario
 
 
-def _check_units(study: Study, vehicle: Vehicle, is_shipped_model: bool, source: str) -> None:
+def _check_units(study: Study, vehicle: Vehicle, is_shipped_vehicle: bool, source: str) -> None:
     table, units = study.vehicle.characteristics, vehicle.UNITS
     for name in table:
-        if name in COLUMNS:
-            raise InputError(source, f"vehicle.characteristics.{name}: the name is a column of results", f"none of {', '.join(COLUMNS)}")
+        if name in RESULT_COLUMNS:
+            raise InputError(source, f"vehicle.characteristics.{name}: the name is a column of results",
+                             f"none of {', '.join(RESULT_COLUMNS)}")
         if name not in units:
             raise unknown(source, f"vehicle.characteristics.{name}: {study.vehicle.model} has no such characteristic", name, units)
         if table[name].unit != units[name]:
             raise InputError(source, f"vehicle.characteristics.{name}.unit = {table[name].unit!r}", repr(units[name]))
-        if is_shipped_model and table[name].lower <= 0:
+        if is_shipped_vehicle and table[name].lower <= 0:
             raise InputError(source, f"vehicle.characteristics.{name}.lower = {table[name].lower}", "a value above 0")
     for name in units:
         if name not in table:
             raise InputError(source, f"vehicle.characteristics.{name} is missing", f"all of {', '.join(units)}")
 
 
-def _vehicle(choice: VehicleTable, lookup: Lookup, limit: float) -> tuple[Vehicle, Member]:
-    if choice.kind == "fmu":
-        guard = Guard(lookup.source, f"vehicle.model = {choice.model!r}")
-        table = {**msgspec.structs.asdict(choice), "parameters": lookup.with_paths(Member(FmuVehicle, guard), choice.parameters,
-                                                                                   "vehicle.parameters")}
-        units = {name: row.unit for name, row in choice.characteristics.items()}
-        description = description_of(choice.model, lookup.places, lookup.source, "vehicle.model")
-        return FmuVehicle(description, units, table, guard, limit), Member(FmuVehicle, guard, file=description.path)
-    member = lookup.class_of(VEHICLES, choice.model, "vehicle.model", VEHICLE_CONTRACT)
-    parameters = lookup.with_paths(member, choice.parameters, "vehicle.parameters")
-    vehicle = instance_of(member, parameters, f"vehicle.model = {choice.model!r}", "vehicle.parameters", lookup.source)
+def _create_vehicle(table: VehicleTable, lookup: Lookup, time_limit: float) -> tuple[Vehicle, Member]:
+    if table.kind == "fmu":
+        guard = Guard(lookup.source, f"vehicle.model = {table.model!r}")
+        fmu_table = {**msgspec.structs.asdict(table),
+                     "parameters": lookup.with_paths(Member(FmuVehicle, guard), table.parameters, "vehicle.parameters")}
+        units = {name: row.unit for name, row in table.characteristics.items()}
+        description = description_of(table.model, lookup.places, lookup.source, "vehicle.model")
+        return FmuVehicle(description, units, fmu_table, guard, time_limit), Member(FmuVehicle, guard, file=description.path)
+    member = lookup.class_of(VEHICLES, table.model, "vehicle.model", VEHICLE_CONTRACT)
+    parameters = lookup.with_paths(member, table.parameters, "vehicle.parameters")
+    vehicle = instance_of(member, parameters, f"vehicle.model = {table.model!r}", "vehicle.parameters", lookup.source)
     return (vehicle if member.guard is None else GuardedVehicle(vehicle, member.guard)), member
 
 
-def _scenario(choice: ModelTable, lookup: Lookup) -> tuple[Scenario, Member]:
-    member = lookup.class_of(SCENARIOS, choice.model, "scenario.model", SCENARIO_CONTRACT)
-    parameters = lookup.with_paths(member, choice.parameters, "scenario.parameters")
-    scenario = instance_of(member, parameters, f"scenario.model = {choice.model!r}", "scenario.parameters", lookup.source)
+def _create_scenario(table: ModelTable, lookup: Lookup) -> tuple[Scenario, Member]:
+    member = lookup.class_of(SCENARIOS, table.model, "scenario.model", SCENARIO_CONTRACT)
+    parameters = lookup.with_paths(member, table.parameters, "scenario.parameters")
+    scenario = instance_of(member, parameters, f"scenario.model = {table.model!r}", "scenario.parameters", lookup.source)
     return _locate_network(scenario if member.guard is None else GuardedScenario(scenario, member.guard), lookup.places), member
 
 
-def _ads(choice: ModelTable, lookup: Lookup, limit: float) -> tuple[Ads, Member]:
-    if choice.kind == "traci":
-        return _traci_controller(choice, lookup)
-    if choice.kind == "fmu":
-        guard = Guard(lookup.source, f"ads.model = {choice.model!r}")
-        parameters = lookup.with_paths(Member(FmuAds, guard), choice.parameters, "ads.parameters")
-        description = description_of(choice.model, lookup.places, lookup.source, "ads.model")
-        ads = FmuAds(description, choice.inputs, choice.outputs, parameters, choice.step, guard, limit)
+def _create_ads(table: ModelTable, lookup: Lookup, time_limit: float) -> tuple[Ads, Member]:
+    if table.kind == "traci":
+        return _create_traci_controller(table, lookup)
+    if table.kind == "fmu":
+        guard = Guard(lookup.source, f"ads.model = {table.model!r}")
+        parameters = lookup.with_paths(Member(FmuAds, guard), table.parameters, "ads.parameters")
+        description = description_of(table.model, lookup.places, lookup.source, "ads.model")
+        ads = FmuAds(description, table.inputs, table.outputs, parameters, table.step, guard, time_limit)
         return ads, Member(FmuAds, guard, file=description.path)
-    member = lookup.class_of(ADS, choice.model, "ads.model", SCALAR_ADS_CONTRACT, ADS_CONTRACT,
+    member = lookup.class_of(ADS, table.model, "ads.model", SCALAR_ADS_CONTRACT, ADS_CONTRACT,
                              otherwise=f'with ads.kind = "traci" {CONTROLLER_FORMS}')
-    name = f"ads.model = {choice.model!r}"
-    parameters = lookup.with_paths(member, choice.parameters, "ads.parameters")
+    name = f"ads.model = {table.model!r}"
+    parameters = lookup.with_paths(member, table.parameters, "ads.parameters")
     make = partial(instance_of, member, parameters, name, "ads.parameters", lookup.source)
     driver = make()  # also for a ScalarAds, so that wrong parameters raise errors here
     if issubclass(member.target, ScalarAds):

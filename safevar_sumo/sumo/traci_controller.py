@@ -16,8 +16,8 @@ from safevar_sumo.ads.driver import Trim, pedals, trim
 from safevar_sumo.plugins import Guard, OwnModules
 from safevar_sumo.records import Command, Nominal, Observation
 from safevar_sumo.scenarios import VUT
-from safevar_sumo.sumo.sensing import Sensing
-from safevar_sumo.sumo.traci_module import Subscriptions, driven_vehicle, importable, traci_module
+from safevar_sumo.sumo.sensing import SensedTraffic
+from safevar_sumo.sumo.traci_module import Subscriptions, bind_traci, substitute_traci, traci_module
 from safevar_sumo.sumo.traci_view import TraciView
 from safevar_sumo.sumo.world import current_world
 from safevar_sumo.vehicles import SumoType
@@ -40,19 +40,19 @@ class TraciController:
     def start(self, n: int, nominal: Nominal, step: float) -> _Memory:
         world = current_world()
         world.set_types(SumoType(*(np.full(n, getattr(nominal, name)) for name in SumoType._fields)))
-        names, sensing = world.names(), Sensing(world, step)
-        views = [TraciView(world, copy, names, sensing, nominal, step) for copy in range(n)]
-        sensing.record_step()
-        with importable():
+        names, traffic = world.names(), SensedTraffic(world, step)
+        views = [TraciView(world, copy, names, traffic, nominal, step) for copy in range(n)]
+        traffic.record_step()
+        with substitute_traci():
             drivers = [_Driver(view, self._modules(), self._controller_of, self._guard) for view in views]
-        return _Memory(nominal, sensing, drivers, None)
+        return _Memory(nominal, traffic, drivers, None)
 
     def drive(self, seen: Observation, memory: _Memory) -> tuple[Command, _Memory]:
         initial_trim = trim(memory.nominal, seen) if memory.initial_trim is None else memory.initial_trim
         accelerations = np.zeros(len(memory.drivers))
         if memory.initial_trim is not None:  # `start` recorded the first step
-            memory.sensing.record_step()
-        with importable():
+            memory.traffic.record_step()
+        with substitute_traci():
             for i, driver in enumerate(memory.drivers):
                 if driver.view.on_the_road:
                     accelerations[i] = driver.step(seen.time, float(seen.speed[i]))
@@ -60,10 +60,10 @@ class TraciController:
 
 
 class _Memory(NamedTuple):
-    """The original vehicle, the sensing of all vehicles, each vehicle's driver, and the trim at the first observation."""
+    """The original vehicle, the traffic that the vehicles sense, each vehicle's driver, and the trim at the first observation."""
 
     nominal: Nominal
-    sensing: Sensing
+    traffic: SensedTraffic
     drivers: list[_Driver]
     initial_trim: Trim | None
 
@@ -87,7 +87,7 @@ class _Driver:
         return self.view.commanded_speed.acceleration(speed, time, self.view.speed_of_sumo(speed))
 
     def _call(self, method: str, function: Callable[..., Any]) -> None:
-        with self._modules.inside(), driven_vehicle(self.view, self._subscriptions):
+        with self._modules.inside(), bind_traci(self.view, self._subscriptions):
             self._guard.call(method, function, traci_module(), VUT)
         if self.view.last_error is not None:  # the controller caught the error and continued
             raise self._guard.failed(method, self.view.last_error)

@@ -1,4 +1,4 @@
-"""TraCI and its subscriptions for controllers: `import traci` in any module refers to the vehicle that is being driven."""
+"""Substitutes for traci and libsumo, whose functions refer to the vehicle that a controller drives; and TraCI's subscriptions."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ DEFAULT_VARIABLES = ("VAR_ROAD_ID", "VAR_LANEPOSITION")
 
 
 class Subscriptions:
-    """A controller's subscriptions; a variable's result is the value that its function returns, as the sensors report it."""
+    """A controller's subscriptions; each variable has the value that its function returns, as the sensors report it."""
 
     def __init__(self, view: TraciView) -> None:
         self._view = view
@@ -52,18 +52,18 @@ class Subscriptions:
         return None
 
     def _subscribe(self, domain: str, actor: str, variables: Any = None, begin: float = 0, end: float = 0, parameters: Any = None) -> None:
-        self._subscriptions[domain, actor] = _variables(domain, variables, parameters)
+        self._subscriptions[domain, actor] = _requested_variables(domain, variables, parameters)
 
     def _subscribe_to_leader(self, domain: str, actor: str, dist: float = 0.0, begin: float = 0, end: float = 0) -> None:
         self._subscriptions[domain, actor] = {_constant("VAR_LEADER"): (dist,)}
 
     def _subscribe_around(self, domain: str, actor: str, around: int, dist: float, variables: Any = None, begin: float = 0, end: float = 0,
                           parameters: Any = None) -> None:
-        kinds = {_constant(name): kind for name, kind in CONTEXT_DOMAINS.items()}
-        if domain != "vehicle" or around not in kinds:
+        domains = {_constant(name): other_domain for name, other_domain in CONTEXT_DOMAINS.items()}
+        if domain != "vehicle" or around not in domains:
             raise InputError(f"traci.{domain}.subscribeContext", f"around {actor!r}, domain = {around!r}",
                              f"vehicles or persons around a vehicle: {', '.join(CONTEXT_DOMAINS)}")
-        self._context_subscriptions[domain, actor] = kinds[around], dist, _variables(kinds[around], variables, parameters)
+        self._context_subscriptions[domain, actor] = domains[around], dist, _requested_variables(domains[around], variables, parameters)
 
     def _unsubscribe(self, domain: str, actor: str = "") -> None:
         self._subscriptions.pop((domain, actor), None)
@@ -73,15 +73,16 @@ class Subscriptions:
 
     def _results(self, domain: str) -> dict[str, dict[int, Any]]:
         actors = self._view.call(domain, "getIDList", (), {}) if domain in CONTEXT_DOMAINS.values() else None
-        return {actor: self._values(domain, actor, variables) for (kind, actor), variables in self._subscriptions.items()
-                if kind == domain and (actors is None or actor in actors)}
+        return {actor: self._values(domain, actor, variables) for (other_domain, actor), variables in self._subscriptions.items()
+                if other_domain == domain and (actors is None or actor in actors)}
 
     def _context_results(self, domain: str) -> dict[str, dict[str, dict[int, Any]]]:
         results = {}
-        for (centre_domain, actor), (kind, dist, variables) in self._context_subscriptions.items():
+        for (centre_domain, actor), (other_domain, dist, variables) in self._context_subscriptions.items():
             if centre_domain == domain and actor in self._view.call(domain, "getIDList", (), {}):
-                results[actor] = {other: self._values(kind, other, variables) for other in self._view.call(kind, "getIDList", (), {})
-                              if self._distance((domain, actor), (kind, other)) <= dist}
+                others = self._view.call(other_domain, "getIDList", (), {})
+                results[actor] = {other: self._values(other_domain, other, variables) for other in others
+                              if self._distance((domain, actor), (other_domain, other)) <= dist}
         return results
 
     def _distance(self, *actors: tuple[str, str]) -> float:
@@ -94,7 +95,7 @@ class Subscriptions:
                 for variable, arguments in variables.items()}
 
 
-def _variables(domain: str, requested: Any, parameters: Any) -> dict[int, tuple[Any, ...]]:
+def _requested_variables(domain: str, requested: Any, parameters: Any) -> dict[int, tuple[Any, ...]]:
     """The requested variables, each with the arguments of its function after the actor's id."""
     names_by_constant = {_constant(name): name for name in VARIABLES}
     default = ("VAR_TIME",) if domain == "simulation" else DEFAULT_VARIABLES
@@ -115,8 +116,8 @@ _driven_vehicles: list[tuple[TraciView, Subscriptions]] = []
 
 
 @contextmanager
-def driven_vehicle(view: TraciView, subscriptions: Subscriptions) -> Iterator[None]:
-    """Context in which TraCI refers to this vehicle."""
+def bind_traci(view: TraciView, subscriptions: Subscriptions) -> Iterator[None]:
+    """Context in which TraCI's functions refer to this vehicle."""
     _driven_vehicles.append((view, subscriptions))
     try:
         yield
@@ -125,7 +126,7 @@ def driven_vehicle(view: TraciView, subscriptions: Subscriptions) -> Iterator[No
 
 
 @contextmanager
-def importable() -> Iterator[None]:
+def substitute_traci() -> Iterator[None]:
     """Context in which `import traci` and `import libsumo` import the substitutes for controllers."""
     real_traci()
     modules = {name: sys.modules.get(name) for name in ("traci", "libsumo")}
@@ -161,7 +162,7 @@ class _Module(ModuleType):
         real = getattr(self._real, name)
         if hasattr(real, "subscribe") or name in ("simulation", "gui"):
             return _Domain(name, real)
-        return real if isinstance(real, type | ModuleType) or not callable(real) else _function("", name)
+        return real if isinstance(real, type | ModuleType) or not callable(real) else _make_function("", name)
 
 
 class _Domain:
@@ -172,11 +173,11 @@ class _Domain:
 
     def __getattr__(self, name: str) -> Any:
         member = getattr(self._real, name)
-        return _function(self._name, name) if callable(member) and not isinstance(member, type) else member
+        return _make_function(self._name, name) if callable(member) and not isinstance(member, type) else member
 
 
 @cache
-def _function(domain: str, name: str) -> Callable[..., Any]:
+def _make_function(domain: str, name: str) -> Callable[..., Any]:
     def function(*arguments: Any, **named: Any) -> Any:
         if not _driven_vehicles:
             raise InputError(f"traci.{domain}.{name}".replace("..", "."), "is called while no vehicle is driven",

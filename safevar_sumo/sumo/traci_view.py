@@ -1,4 +1,4 @@
-"""TraCI for one controller: it shows one copy of the network, with the traffic file's ids, and other actors through sensors."""
+"""TraCI as one controller sees it: one copy of the network, with the traffic file's ids, and other actors through sensors."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ from safevar_sumo.records import Nominal
 from safevar_sumo.scenarios import VUT
 from safevar_sumo.sumo.copies import copied_id
 from safevar_sumo.sumo.engine import Engine, engine_api
-from safevar_sumo.sumo.sensing import SENSED_FUNCTIONS, Sensing
+from safevar_sumo.sumo.sensing import SENSED_FUNCTIONS, SensedTraffic
 from safevar_sumo.sumo.world import SumoWorld
 
 COMMANDS: Mapping[str, tuple[str, ...]] = {
     "setSpeed": ("speed",), "slowDown": ("speed", "duration"), "setAcceleration": ("acceleration", "duration"), "setAccel": ("accel",),
     "setDecel": ("decel",), "setMaxSpeed": ("speed",), "setSpeedMode": ("mode",)}
-"""The commands that a controller may give, and the commands' numeric arguments."""
+"""The commands that a controller may give, each with its numeric arguments."""
 EXPECTED_CALLS = "a controller reads and commands in its step"
 SUMO_CONTROL = -1.0
-"""Value of a commanded speed or speed mode that gives control back to SUMO's own driver."""
+"""Value of a speed or speed mode with which a command returns control to SUMO's own driver."""
 QUERY_FUNCTIONS = re.compile("(get|is|has|find|convert|couldChangeLane).*")
 DISPLAY_FUNCTIONS = ("setColor", "highlight")
 STEP_FUNCTIONS = ("simulationStep", "simulationStepLegacy", "executeMove", "step")
@@ -47,17 +47,17 @@ UNSENSED_ROAD_FUNCTIONS = re.compile("getLastStep.*|getWaitingTime|getTraveltime
 """Functions that return values of other actors that no sensor of the vehicle measures."""
 MEASURED_VALUES = "getLeader, getIDList, and positions, speeds, angles and lanes of vehicles and persons: these pass the sensors"
 INVALID_NUMBER = -1073741824
-"""SUMO's value for a property of an actor that is not on the road."""
+"""Value that SUMO returns for a property of an actor that is not on the road."""
 
 
 class CommandedSpeed:
     """A controller's commands, and the acceleration that results from them under SUMO's speed modes."""
 
-    SAFE_SPEED, OWN_ACCELERATION, OWN_DECELERATION, USUAL_MODE, LARGEST_MODE = 1, 2, 4, 31, 127
+    LIMIT_TO_SAFE_SPEED, LIMIT_ACCELERATION, LIMIT_DECELERATION, DEFAULT_MODE, LARGEST_MODE = 1, 2, 4, 31, 127
 
     def __init__(self, nominal: Nominal, step: float) -> None:
         self._step = step
-        self._accel, self._decel, self._max_speed, self._mode = nominal.accel, nominal.decel, np.inf, self.USUAL_MODE
+        self._accel, self._decel, self._max_speed, self._mode = nominal.accel, nominal.decel, np.inf, self.DEFAULT_MODE
         self._speed: float | None = None
         self._end_time, self._speed_rate = -1.0, 0.0
 
@@ -78,7 +78,7 @@ class CommandedSpeed:
         elif name == "setAcceleration":
             self._speed, self._end_time, self._speed_rate = None, time + numbers[1], numbers[0]
         elif name == "setSpeedMode":
-            self._mode = self.USUAL_MODE if numbers[0] == SUMO_CONTROL else int(numbers[0])
+            self._mode = self.DEFAULT_MODE if numbers[0] == SUMO_CONTROL else int(numbers[0])
         else:
             setattr(self, {"setAccel": "_accel", "setDecel": "_decel", "setMaxSpeed": "_max_speed"}[name], numbers[0])
 
@@ -87,8 +87,8 @@ class CommandedSpeed:
             number = float(value)
         except (TypeError, ValueError):
             number = math.nan
-        gives_back = number == SUMO_CONTROL and name in ("setSpeed", "setSpeedMode")
-        is_legal = math.isfinite(number) and (number >= 0 or argument == "acceleration" or gives_back)
+        returns_control = number == SUMO_CONTROL and name in ("setSpeed", "setSpeedMode")
+        is_legal = math.isfinite(number) and (number >= 0 or argument == "acceleration" or returns_control)
         legal = "a finite number" if argument == "acceleration" else "a finite number from 0 on"
         if name == "setSpeedMode":
             is_legal, legal = is_legal and number == int(number) <= self.LARGEST_MODE, f"a whole number from 0 to {self.LARGEST_MODE}"
@@ -98,20 +98,20 @@ class CommandedSpeed:
         return number
 
     def acceleration(self, speed: float, time: float, sumo_speed: float) -> float:
-        """The acceleration that the commands result in [m/s^2]; SUMO's own driver would choose `sumo_speed` next [m/s]."""
-        goal = speed + self._speed_rate * self._step if time < self._end_time else sumo_speed if self._speed is None else self._speed
-        if self._mode & self.SAFE_SPEED:
-            goal = min(goal, max(sumo_speed, speed - self._decel * self._step) if goal > sumo_speed else goal)
-        acceleration = (min(goal, self._max_speed) - speed) / self._step
-        acceleration = min(acceleration, self._accel) if self._mode & self.OWN_ACCELERATION else acceleration
-        return max(acceleration, -self._decel) if self._mode & self.OWN_DECELERATION else acceleration
+        """The acceleration that results from the commands [m/s^2]; SUMO's own driver would choose `sumo_speed` next [m/s]."""
+        next_speed = speed + self._speed_rate * self._step if time < self._end_time else sumo_speed if self._speed is None else self._speed
+        if self._mode & self.LIMIT_TO_SAFE_SPEED:
+            next_speed = min(next_speed, max(sumo_speed, speed - self._decel * self._step) if next_speed > sumo_speed else next_speed)
+        acceleration = (min(next_speed, self._max_speed) - speed) / self._step
+        acceleration = min(acceleration, self._accel) if self._mode & self.LIMIT_ACCELERATION else acceleration
+        return max(acceleration, -self._decel) if self._mode & self.LIMIT_DECELERATION else acceleration
 
 
 class TraciView:
     """TraCI's functions for one vehicle, with the ids of the traffic file."""
 
-    def __init__(self, world: SumoWorld, copy: int, names: frozenset[str], sensing: Sensing, nominal: Nominal, step: float) -> None:
-        self._world, self._copy, self._names, self._sensing, self._decel = world, copy, names, sensing, nominal.decel
+    def __init__(self, world: SumoWorld, copy: int, names: frozenset[str], traffic: SensedTraffic, nominal: Nominal, step: float) -> None:
+        self._world, self._copy, self._names, self._traffic, self._decel = world, copy, names, traffic, nominal.decel
         self._vut = copied_id(copy, VUT)
         self.commanded_speed, self.time = CommandedSpeed(nominal, step), 0.0
         self.last_error: InputError | None = None
@@ -119,18 +119,17 @@ class TraciView:
 
     @property
     def on_the_road(self) -> bool:
-        """Whether the vehicle is still on the road."""
         return not self._world.has_left(self._vut)
 
     def speed_of_sumo(self, speed: float) -> float:
         """Speed that SUMO's own driver, with the original vehicle's type, would choose next for road and leader [m/s]."""
-        vehicle, vut, look = self._world.api.vehicle, self._vut, self._sensing.sensed_look(self._copy)
+        vehicle, vut, snapshot = self._world.api.vehicle, self._vut, self._traffic.snapshot(self._copy)
         free_speed = min(speed + vehicle.getAccel(vut) * self._world.step_length, vehicle.getAllowedSpeed(vut))
-        if look.leader is None:
+        if snapshot.leader is None:
             return float(free_speed)
-        name, gap = look.leader
+        name, gap = snapshot.leader
         leader = copied_id(self._copy, name)
-        leader_speed = look.vehicle[name]["getSpeed"]
+        leader_speed = snapshot.vehicle[name]["getSpeed"]
         return float(min(free_speed, vehicle.getFollowSpeed(vut, speed, gap, leader_speed, vehicle.getDecel(leader), leader)))
 
     def call(self, domain: str, name: str, arguments: tuple[Any, ...], named: Mapping[str, Any]) -> Any:
@@ -178,7 +177,7 @@ class TraciView:
         elif domain == "simulation" and name in ("getTime", "getCurrentTime"):
             return self.time if name == "getTime" else round(self.time * 1000)
         elif domain == "simulation" and name == "getMinExpectedNumber":
-            return sum(len(self._ids(kind)) for kind in SENSED_FUNCTIONS)
+            return sum(len(self._ids(actors)) for actors in SENSED_FUNCTIONS)
         if unsensed_functions is not None and unsensed_functions.fullmatch(name):
             raise InputError(full_name, "returns values of other actors that no sensor of the vehicle measures", MEASURED_VALUES)
         if name == "getIDCount":
@@ -204,7 +203,7 @@ class TraciView:
             return ids if name == "getIDList" else len(ids)
         if domain == "vehicle" and arguments[:1] == (VUT,):
             return self._leader(*arguments[1:]) if name == "getLeader" else NotImplemented
-        actors = self._sensing.sensed_look(self._copy).actors(domain)
+        actors = self._traffic.snapshot(self._copy).actors(domain)
         if not arguments or VISIBLE_PROPERTIES.fullmatch(name):
             return NotImplemented
         if name not in SENSED_FUNCTIONS[domain]:
@@ -215,29 +214,28 @@ class TraciView:
         return _invalid_value(self._sumo_value(domain, name, arguments))
 
     def _ids(self, domain: str) -> tuple[str, ...]:
-        return (*((VUT,) if domain == "vehicle" else ()), *self._sensing.sensed_look(self._copy).actors(domain))
+        return (*((VUT,) if domain == "vehicle" else ()), *self._traffic.snapshot(self._copy).actors(domain))
 
     def _leader(self, dist: float = 100.0) -> tuple[str, float] | None:
         """The leader and the gap to it minus the vehicle's minGap, if at most `dist` [m]; a `dist` of 0 means the stopping distance."""
         speed = float(self._world.api.vehicle.getSpeed(self._vut))
-        leader = self._sensing.sensed_look(self._copy).leader
+        leader = self._traffic.snapshot(self._copy).leader
         return leader if leader and leader[1] <= (dist or speed**2 / (2 * self._decel)) else None
 
     def _actors_on_road(self, domain: str, name: str, road: str) -> Any:
         """Actors on a lane or edge, or their number, as the sensors report them."""
-        look, function = self._sensing.sensed_look(self._copy), "getLaneID" if domain == "lane" else "getRoadID"
-        actors = look.person if name == "getLastStepPersonIDs" else {VUT: look.own_values, **look.vehicle}
+        snapshot, function = self._traffic.snapshot(self._copy), "getLaneID" if domain == "lane" else "getRoadID"
+        actors = snapshot.person if name == "getLastStepPersonIDs" else {VUT: snapshot.own_values, **snapshot.vehicle}
         names = tuple(actor for actor, values in actors.items() if values.get(function) == copied_id(self._copy, road))
         return len(names) if name == "getLastStepVehicleNumber" else names
 
     def _sumo_value(self, domain: str, name: str, arguments: tuple[Any, ...]) -> Any:
-        """The value from SUMO itself."""
         function = getattr(getattr(self._world.api, domain), name)
         return self._to_original_ids(function(*(self._to_copied_ids(argument) for argument in arguments)))
 
     def _to_copied_ids(self, value: Any) -> Any:
-        look = self._sensing.sensed_look(self._copy)
-        if isinstance(value, str) and (value in self._names or value in look.vehicle or value in look.person):
+        snapshot = self._traffic.snapshot(self._copy)
+        if isinstance(value, str) and (value in self._names or value in snapshot.vehicle or value in snapshot.person):
             return copied_id(self._copy, value)
         return type(value)(map(self._to_copied_ids, value)) if type(value) in (list, tuple) else value
 
@@ -268,7 +266,7 @@ class TraciView:
 
 
 def _invalid_value(value: Any) -> Any:
-    """SUMO's invalid value of the same type."""
+    """The value of this type that SUMO returns for an actor that is not on the road."""
     if isinstance(value, tuple):
         return tuple(map(_invalid_value, value))
     return "" if isinstance(value, str) else type(value)(INVALID_NUMBER)

@@ -18,9 +18,9 @@ from safevar_sumo.sumo.copies import copied_id, copy_and_name
 from safevar_sumo.vehicles import Sensors, SumoType
 
 INSERTION_DECELERATION = 9.0
-"""Deceleration at insertion [m/s^2]: SUMO inserts only vehicles that could stop before every obstacle ahead."""
+"""Least deceleration of a vehicle while it is inserted [m/s^2]: SUMO inserts only vehicles that could stop before every obstacle."""
 MAX_DEPARTURE_SPEED = 200.0
-"""Highest speed at which a vehicle may depart in a recorded scene [m/s]."""
+"""Highest speed at which a vehicle may depart while a scene is recorded [m/s]."""
 # TraCI "set speed mode", bit 5: SUMO obeys every speed that is set, and its vehicle yields to nobody on a junction.
 SPEED_MODE = 32
 # TraCI "set lane change mode": the vehicle never changes lanes.
@@ -28,7 +28,7 @@ LANE_CHANGE_MODE = 0
 
 
 class Body(NamedTuple):
-    """A vehicle or person as a rectangle, or M of them in columns; `along`, the direction, is a unit vector; units are m and m/s."""
+    """A vehicle or person as a rectangle, or M of them in columns [m, m/s]; `along`, the direction, is a unit vector."""
 
     middle: FloatArray
     along: FloatArray
@@ -52,8 +52,8 @@ class SumoWorld:
 
     def __init__(self, api: Any, n: int, *, watched: bool = False) -> None:
         self._api, self.n = api, n
-        self._set_speed, self._get_speed = _function(api, "vehicle", "setSpeed"), _function(api, "vehicle", "getSpeed")
-        self._vehicle_position, self._person_position = _function(api, "vehicle", "getPosition"), _function(api, "person", "getPosition")
+        self._set_speed, self._get_speed = _api_function(api, "vehicle", "setSpeed"), _api_function(api, "vehicle", "getSpeed")
+        self._vehicle_position, self._person_position = (_api_function(api, domain, "getPosition") for domain in ("vehicle", "person"))
         self._last_speeds, self._last_positions = np.zeros(n), np.zeros((n, 2))
         """Speeds and positions of vehicles under test that have left the road."""
         self._speeds_now: FloatArray | None = None
@@ -62,14 +62,14 @@ class SumoWorld:
         self._ids: dict[str, list[str]] = {}
         self._positions: dict[str, FloatArray] = {}
         self._copy_of = {name: copy for copy, name in enumerate(self.ids(VUT))}
-        self._driving_copies, self._driving_rows = dict(self._copy_of), np.arange(len(self._copy_of))
-        """Copies whose vehicle under test is on the road: by the vehicle's id, and as an array."""
-        self._commanded_speeds = np.full(len(self._driving_rows), np.nan)
+        self._driving_copies, self._driving_numbers = dict(self._copy_of), np.arange(len(self._copy_of))
+        """Numbers of the copies whose vehicle under test is on the road: by the vehicle's id, and as an array."""
+        self._commanded_speeds = np.full(len(self._driving_numbers), np.nan)
         """Last speeds commanded to the vehicles under test [m/s]."""
         self.step_length: float = api.simulation.getDeltaT()
         self._pause = self.step_length if watched else 0.0
         self.sensors = Sensors.perfect(n)
-        """The vehicles' sensors in their weather, for ADSs that read the world themselves."""
+        """The vehicles' sensors in their weather, for ADSs that read the world instead of getting observations."""
 
     def ids(self, name: str) -> list[str]:
         """The ids of an actor in its copies."""
@@ -78,7 +78,6 @@ class SumoWorld:
         return self._ids[name]
 
     def set_types(self, types: SumoType) -> None:
-        """Set the SUMO vehicle types of the vehicles under test."""
         vehicletype = self._api.vehicletype
         columns = (values.tolist() for values in (types.mass, types.accel, types.max_speed, types.tau))
         for name, mass, accel, max_speed, tau in zip(self.ids(VUT), *columns, strict=True):
@@ -121,7 +120,7 @@ class SumoWorld:
     def advance(self, speeds: FloatArray) -> None:
         """Simulate one step, in which the vehicles under test reach `speeds` [m/s]."""
         set_speed, names = self._set_speed, self.ids(VUT)
-        changed_copies = self._driving_rows[(speeds != self._commanded_speeds)[self._driving_rows]]
+        changed_copies = self._driving_numbers[(speeds != self._commanded_speeds)[self._driving_numbers]]
         for copy, speed in zip(changed_copies.tolist(), speeds[changed_copies].tolist(), strict=True):
             set_speed(names[copy], speed)
         self._commanded_speeds = speeds
@@ -131,10 +130,10 @@ class SumoWorld:
         if self._pause:
             time.sleep(self._pause)
 
-    def collisions(self, open_: BoolArray) -> dict[int, float]:
+    def collisions(self, is_open: BoolArray) -> dict[int, float]:
         """Speeds [m/s] of the vehicles under test of open runs that collide in this step, by copy.
 
-        On a junction SUMO calls the vehicle that must yield the collider (`MSLane::detectCollisions`): either may be tested.
+        On a junction SUMO's collider is the vehicle that must yield (`MSLane::detectCollisions`): the vehicle under test may be either.
         """
         self._struck_ids, speeds = {}, dict[int, float]()
         for collision in self._api.simulation.getCollisions():
@@ -142,7 +141,7 @@ class SumoWorld:
             if collision.type == "junction":
                 pairs.append((collision.victim, collision.victimSpeed, collision.collider))
             for name, speed, other in pairs:
-                if (copy := self._copy_of.get(name)) is not None and open_[copy]:
+                if (copy := self._copy_of.get(name)) is not None and is_open[copy]:
                     speeds[copy], self._struck_ids[copy] = speed, other
         return speeds
 
@@ -152,25 +151,25 @@ class SumoWorld:
                 Body.columns([self._body_of(self._struck_ids[copy]) for copy in copies]))
 
     def _body_of(self, name: str) -> Body:
-        kind = self._api.person if name in self._api.person.getIDList() else self._api.vehicle
-        return Body.behind(np.array(kind.getPosition(name)), direction_of(kind.getAngle(name)), kind.getLength(name),
-                           kind.getWidth(name), kind.getSpeed(name))
+        domain = self._api.person if name in self._api.person.getIDList() else self._api.vehicle
+        return Body.behind(np.array(domain.getPosition(name)), direction_of(domain.getAngle(name)), domain.getLength(name),
+                           domain.getWidth(name), domain.getSpeed(name))
 
-    def leave(self, copies: Sequence[int]) -> None:
-        """Remove vehicles whose runs have ended from SUMO's simulation, and keep their last positions and speeds."""
+    def end_runs(self, copies: Sequence[int]) -> None:
+        """Remove vehicles whose runs end from SUMO's simulation, and keep their last positions and speeds."""
         if not copies:
             return
         self._last_speeds[copies], self._last_positions[copies] = self.speeds()[copies], self.vehicle_positions(VUT)[copies]
         for name in [self.ids(VUT)[copy] for copy in copies]:
             self._api.vehicle.remove(name)
             del self._driving_copies[name]
-        self._driving_rows = np.array([*self._driving_copies.values()], dtype=np.intp)
+        self._driving_numbers = np.array([*self._driving_copies.values()], dtype=np.intp)
 
     def speeds(self) -> FloatArray:
         """Speeds of the vehicles under test in this step [m/s]; repeated calls return the same array."""
         if self._speeds_now is None:
             self._speeds_now = self._last_speeds.copy()
-            self._speeds_now[self._driving_rows] = [*map(self._get_speed, self._driving_copies)]
+            self._speeds_now[self._driving_numbers] = [*map(self._get_speed, self._driving_copies)]
         return self._speeds_now
 
     def vehicle_positions(self, actor: str) -> FloatArray:
@@ -186,7 +185,7 @@ class SumoWorld:
             positions = np.fromiter(chain.from_iterable(map(position, names)), float, 2 * len(names)).reshape(-1, 2)
             if len(names) < self.n:
                 positions, new_positions = self._last_positions.copy(), positions
-                positions[self._driving_rows] = new_positions
+                positions[self._driving_numbers] = new_positions
             self._positions[actor] = positions
         return self._positions[actor]
 
@@ -207,19 +206,19 @@ class SumoWorld:
     def names(self) -> frozenset[str]:
         """Names of vehicles, persons, roads and types in the original network."""
         api = self._api
-        kinds = (api.vehicle, api.person, api.edge, api.lane, api.route, api.vehicletype, api.junction)
-        return frozenset(name.removeprefix(":").partition(".")[2] for kind in kinds for name in kind.getIDList())
+        domains = (api.vehicle, api.person, api.edge, api.lane, api.route, api.vehicletype, api.junction)
+        return frozenset(name.removeprefix(":").partition(".")[2] for domain in domains for name in domain.getIDList())
 
-    def whereabouts(self) -> dict[str, tuple[float, float, float]]:
+    def actor_poses(self) -> dict[str, tuple[float, float, float]]:
         """x and y of the front bumper or person [m], and heading clockwise from north [degrees], of all actors on the road, by id."""
-        kinds = (self._api.vehicle, self._api.person)
-        return {name: (*kind.getPosition(name), kind.getAngle(name)) for kind in kinds for name in kind.getIDList()}
+        domains = (self._api.vehicle, self._api.person)
+        return {name: (*domain.getPosition(name), domain.getAngle(name)) for domain in domains for name in domain.getIDList()}
 
-    def measures(self, name: str) -> tuple[bool, float, float]:
+    def actor_size(self, name: str) -> tuple[bool, float, float]:
         """Whether an actor is a person, and its length and width [m]."""
         is_person = name in self._api.person.getIDList()
-        kind = self._api.person if is_person else self._api.vehicle
-        return is_person, kind.getLength(name), kind.getWidth(name)
+        domain = self._api.person if is_person else self._api.vehicle
+        return is_person, domain.getLength(name), domain.getWidth(name)
 
     def vehicle_length(self, actor: str) -> float:
         return float(self._api.vehicle.getLength(self.ids(actor)[0]))
@@ -277,7 +276,6 @@ _current_world: SumoWorld | None = None
 
 
 def current_world() -> SumoWorld:
-    """The world that this process simulates."""
     assert _current_world is not None
     return _current_world
 
@@ -287,7 +285,7 @@ def direction_of(angle: float) -> FloatArray:
     return np.array([math.sin(math.radians(angle)), math.cos(math.radians(angle))])
 
 
-def _function(api: Any, domain: str, name: str) -> Callable[..., Any]:
+def _api_function(api: Any, domain: str, name: str) -> Callable[..., Any]:
     """A function of traci, or one of libsumo without its Python wrapper, which takes as long as the function itself."""
     compiled = getattr(api, "_libsumo", None)
     return getattr(getattr(api, domain), name) if compiled is None else getattr(compiled, f"{domain}_{name}")  # type: ignore[no-any-return]

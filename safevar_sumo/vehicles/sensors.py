@@ -13,7 +13,7 @@ LONGEST_DELAY = 3600.0
 """Longest delay [s]."""
 
 
-def history(longest_delay: float, step: float, sample: FloatArray) -> FloatArray:
+def start_history(longest_delay: float, step: float, sample: FloatArray) -> FloatArray:
     """A history for delays up to `longest_delay` [s], filled with a first sample of shape (..., N); the newest sample comes first.
 
     Raises
@@ -27,12 +27,12 @@ def history(longest_delay: float, step: float, sample: FloatArray) -> FloatArray
     return np.repeat(sample[np.newaxis], length, axis=0)
 
 
-def remembered(past: FloatArray, sample: FloatArray) -> FloatArray:
+def extend_history(past: FloatArray, sample: FloatArray) -> FloatArray:
     """The history with a new sample at its front and the oldest one dropped."""
     return np.concatenate([sample[np.newaxis], past[:-1]])
 
 
-def delayed(past: FloatArray, delay: FloatArray, step: float) -> FloatArray:
+def delay_signal(past: FloatArray, delay: FloatArray, step: float) -> FloatArray:
     """The signal of vehicle i `delay[i]` seconds ago, interpolated linearly; shape (..., N)."""
     age = delay / step
     whole_steps = np.floor(age)
@@ -66,8 +66,8 @@ def sensed_observation(seen: Observation, past: FloatArray | None, latency: Floa
     """The observation `latency` [s] ago, without obstacles beyond `reach` [m] times the visibility; also the history for the next call."""
     obstacle_speed = np.broadcast_to(seen.obstacle_speed, seen.gap.shape)
     sample = np.stack([seen.gap, seen.closing_speed, seen.lateral, seen.lateral_speed, obstacle_speed])
-    past = history(float(np.max(latency)), step, sample) if past is None else remembered(past, sample)
-    gap, closing_speed, lateral, lateral_speed, obstacle_speed = delayed(past, latency, step)
+    past = start_history(float(np.max(latency)), step, sample) if past is None else extend_history(past, sample)
+    gap, closing_speed, lateral, lateral_speed, obstacle_speed = delay_signal(past, latency, step)
     detected = gap <= reach * seen.visibility
     return seen._replace(gap=np.where(detected, gap, np.inf), closing_speed=closing_speed, lateral=lateral,
                          lateral_speed=lateral_speed, obstacle_speed=obstacle_speed), past

@@ -9,7 +9,7 @@ from msgspec import Meta, Struct
 
 from safevar_sumo.records import BoolArray, Command, FloatArray, Observation
 from safevar_sumo.vehicles.base import LEVEL, Characteristics, Slope, SumoType
-from safevar_sumo.vehicles.sensors import Sensors, delayed, history, remembered, sensed_observation
+from safevar_sumo.vehicles.sensors import Sensors, delay_signal, extend_history, sensed_observation, start_history
 
 
 class _Prepared(NamedTuple):
@@ -78,7 +78,7 @@ class SumoVehicle(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
 
     def at_rest(self, prepared: _Prepared) -> SumoState:
         zeros = np.zeros_like(prepared.mass)
-        commands = history(float(np.max(prepared.brake_delay)), prepared.step, zeros)
+        commands = start_history(float(np.max(prepared.brake_delay)), prepared.step, zeros)
         return SumoState(zeros, zeros, zeros, zeros, zeros + 1, None, commands)
 
     def at_speed(self, prepared: _Prepared, speed: FloatArray) -> SumoState:
@@ -100,8 +100,8 @@ class SumoVehicle(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     def advance(self, prepared: _Prepared, state: SumoState, command: Command) -> SumoState:
         """The wheels follow the pedals with the actuator lag T: dv/dt = a - g sin(slope), da/dt = (target - a) / T."""
         p = prepared
-        commands = remembered(state.brake_commands, command.brake)
-        brake = delayed(commands, p.brake_delay, p.step)
+        commands = extend_history(state.brake_commands, command.brake)
+        brake = delay_signal(commands, p.brake_delay, p.step)
         target = np.where(brake > 0, -brake * p.brake_gain * p.decel, command.throttle * p.accel)
         target = np.minimum(np.maximum(target, -p.grip), p.grip)
         acceleration = state.acceleration + (target - state.acceleration) * (p.step / (p.actuator_lag + p.step))

@@ -9,7 +9,7 @@ from msgspec import Meta, Struct
 
 from safevar_sumo.records import BoolArray, Command, FloatArray, Observation
 from safevar_sumo.vehicles.base import LEVEL, Characteristics, Slope, SumoType
-from safevar_sumo.vehicles.sensors import Sensors, delayed, history, remembered, sensed_observation
+from safevar_sumo.vehicles.sensors import Sensors, delay_signal, extend_history, sensed_observation, start_history
 
 DEEP_TREAD, HALF_WORN_TREAD, LEGAL_TREAD = 6.7, 3.0, 1.6
 """Tread depths with published stopping distances [mm]; the last depth is the legal minimum in Europe."""
@@ -114,7 +114,7 @@ class WornVehicle(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
 
     def at_rest(self, prepared: _Prepared) -> WornState:
         zeros = np.zeros_like(prepared.mass)
-        return WornState(zeros, zeros, zeros, zeros + 1, None, history(float(np.max(prepared.response)), prepared.step, zeros))
+        return WornState(zeros, zeros, zeros, zeros + 1, None, start_history(float(np.max(prepared.response)), prepared.step, zeros))
 
     def at_speed(self, prepared: _Prepared, speed: FloatArray) -> WornState:
         """The pedals balance the slope, the only resistance; on a level road they are released."""
@@ -133,8 +133,8 @@ class WornVehicle(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
 
     def advance(self, prepared: _Prepared, state: WornState, command: Command) -> WornState:
         p = prepared
-        commands = remembered(state.brake_commands, command.brake)
-        brake = delayed(commands, p.response, p.step)
+        commands = extend_history(state.brake_commands, command.brake)
+        brake = delay_signal(commands, p.response, p.step)
         drive = np.minimum(command.throttle * p.drive, p.grip * p.slope.down)
         acceleration = np.where(brake > 0, -self._deceleration(p, brake), drive)
         speed = np.minimum(np.maximum(state.speed + (acceleration - p.slope.back) * p.step, 0.0), np.maximum(self.max_speed, state.speed))

@@ -17,7 +17,7 @@ import pytest
 import safevar_sumo as sv
 from safevar_sumo import report
 from safevar_sumo.study import load_study, tables_of
-from safevar_sumo.sumo.matrix import at_every_point, simulate, study_at, worst_points
+from safevar_sumo.sumo.matrix import simulate, simulate_all_points, study_at, worst_points
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet
 
@@ -195,7 +195,7 @@ def test_a_script_needs_no_main_guard(in_tmp: Path) -> None:
 def test_the_trace_in_a_matrix_is_that_of_the_worst_point() -> None:
     study = load_study("euro_ncap_pedestrian")
     system = assemble(study)
-    points = at_every_point(system, system.characteristics.original[np.newaxis])
+    points = simulate_all_points(system, system.characteristics.original[np.newaxis])
     worst = points[worst_points(points)[0]].point.name
     assert worst != points[-1].point.name  # the last one that is driven
     alone = sv.simulate(study_at(study, worst, "the test")).trace

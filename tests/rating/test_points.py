@@ -25,7 +25,7 @@ from safevar_sumo.protocol.rater import by_night
 from safevar_sumo.records import CellResults
 from safevar_sumo.scenarios import WEATHERS
 from safevar_sumo.study import load_study
-from safevar_sumo.sumo.matrix import at_every_point, evaluate, in_cells, study_at
+from safevar_sumo.sumo.matrix import evaluate, in_cells, simulate_all_points, study_at
 from safevar_sumo.sumo.system import assemble
 
 PROTOCOL = protocol_of(EURO_NCAP_2026)
@@ -145,7 +145,7 @@ def test_a_cell_has_equal_results_alone_and_in_any_batch() -> None:
     points = [system.matrix[number] for number in numbers_]
     assert [point.name.rpartition(", ")[0] for point in points] == [CELLS[number].name for number in numbers_]
     for column, point in enumerate(points):
-        (alone,) = at_every_point(assemble(study_at(study, point.name, "")), settings_[::-1])
+        (alone,) = simulate_all_points(assemble(study_at(study, point.name, "")), settings_[::-1])
         np.testing.assert_array_equal(found.cells.impact[:, column], alone.runs.relative_speed[::-1] * 3.6)
         np.testing.assert_array_equal(found.cells.warning[:, column], np.broadcast_to(alone.runs.warning_ttc, 2)[::-1])
 

@@ -9,7 +9,7 @@ from safevar_sumo.records import Trace
 from safevar_sumo.scenarios import Lane
 from safevar_sumo.scenarios.lead_vehicle_stopped import LeadVehicleStopped
 from safevar_sumo.scenarios.pedestrian_crossing import PedestrianCrossing
-from safevar_sumo.scenarios.target import Course, Target, scene_of
+from safevar_sumo.scenarios.target import EncounterConstants, Target, scene_of
 
 STEP, LENGTH, LANE, PATH, WIDTH = 0.05, 5.0, 14.0, 40.0, 0.5
 
@@ -94,7 +94,7 @@ def test_a_vehicle_has_avoided_a_target_ahead_once_it_has_approached_at_half_a_m
         faster: float, avoids: bool) -> None:
     target, approached, over = Target(np.array([30.0]), np.zeros(1), speed=5.0), np.zeros(1, dtype=bool), []
     for speed in (5.0, 5.0 + faster, 5.1, 5.0):
-        scene, approached = scene_of(Course(follows=True), target, np.zeros(1), np.array([speed]), approached)
+        scene, approached = scene_of(EncounterConstants(follows=True), target, np.zeros(1), np.array([speed]), approached)
         over.append(bool(scene.over[0]))
     assert over == [False, False, False, avoids], "who keeps its distance from the start has not avoided anything"
 

@@ -16,7 +16,7 @@ from safevar_sumo.records import Outcome
 from safevar_sumo.scenarios import WEATHERS, Along, CarToCar, Crossing, Point
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo import Engine
-from safevar_sumo.sumo.matrix import at_every_point, simulate
+from safevar_sumo.sumo.matrix import simulate, simulate_all_points
 from safevar_sumo.sumo.system import assemble
 from tests.scenarios.holding import CARLA, NATIVE, Hold, at_contact, driven
 
@@ -140,7 +140,7 @@ def edge_cells() -> Iterator[Cell]:
 def check(cells: list[Cell]) -> None:
     points = tuple(Point(cell.scenario, WEATHERS["clear"], str(k)) for k, cell in enumerate(cells))
     system = replace(CARLA, ads=Hold(), matrix=points)
-    for cell, there in zip(cells, at_every_point(system, system.characteristics.original[np.newaxis]), strict=True):
+    for cell, there in zip(cells, simulate_all_points(system, system.characteristics.original[np.newaxis]), strict=True):
         run, scenario = there.runs, cell.scenario
         assert run.outcome[0] == Outcome.COLLISION, scenario
         assert set(run.contact.side) == {"front"}, scenario
@@ -175,7 +175,7 @@ def test_other_targets_are_hit_in_a_recorded_scene_as_in_sumo_to_the_last_bit(sc
     brakes_at = np.append(np.random.default_rng(4).uniform(arrival - 3, arrival + 0.3, n - 1), 99.0)
     system = replace(CARLA, ads=Hold(brakes_at), matrix=(Point(scenario, WEATHERS["clear"]),))
     settings = np.repeat(system.characteristics.original[np.newaxis], n, axis=0)
-    (here,), (there,) = (at_every_point(system, settings, engine) for engine in (Engine.RECORDED, Engine.LIBSUMO))
+    (here,), (there,) = (simulate_all_points(system, settings, engine) for engine in (Engine.RECORDED, Engine.LIBSUMO))
     assert here.runs.outcome.tolist() == there.runs.outcome.tolist()
     assert set(here.runs.outcome) > {Outcome.COLLISION}
     for name in ("collision_speed", "relative_speed", "warning_ttc"):

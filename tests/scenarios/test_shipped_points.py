@@ -10,12 +10,12 @@ import pytest
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import Outcome, SimulationRuns
-from safevar_sumo.scenarios import Crossing, tags
+from safevar_sumo.scenarios import Crossing, pre_crash_sentence
 from safevar_sumo.scenarios.along import Along
 from safevar_sumo.scenarios.car_to_car import CarToCar
 from safevar_sumo.scenarios.euro_ncap import VUT_WIDTH
 from safevar_sumo.study import load_study
-from safevar_sumo.sumo.matrix import at_every_point
+from safevar_sumo.sumo.matrix import simulate_all_points
 from safevar_sumo.sumo.system import System, assemble
 from tests.scenarios.holding import NATIVE, Hold, at_contact, driven
 
@@ -44,7 +44,7 @@ def test_a_vehicle_that_does_not_brake_hits_the_protocols_impact_location_at_eve
     system = replace(clear(study), ads=Hold())
     domain = system.characteristics
     corners = np.where(np.random.default_rng(7).random((6, len(domain))) < 0.5, domain.lower, domain.upper)
-    for there in at_every_point(system, np.concatenate([domain.original[np.newaxis], corners])):
+    for there in simulate_all_points(system, np.concatenate([domain.original[np.newaxis], corners])):
         scenario, run = there.point.scenario, there.runs
         assert there.evaluations.collided.all(), there.point.name
         assert set(run.contact.side) == {"front"}, there.point.name
@@ -66,7 +66,7 @@ def struck(run: SimulationRuns, width: float) -> float:
 @pytest.mark.parametrize("study", BRAKE)
 def test_the_originals_avoid_every_shipped_point_and_with_half_their_brakes_some_fail(study: str) -> None:
     system = assemble(load_study(study))
-    collided = np.stack([one.evaluations.collided for one in at_every_point(system, original_and_half_its_brakes(study, system))])
+    collided = np.stack([one.evaluations.collided for one in simulate_all_points(system, original_and_half_its_brakes(study, system))])
     assert not collided[:, 0].any()
     assert collided[:, 1].any()
 
@@ -75,7 +75,7 @@ def test_the_worn_cars_matrix_at_its_edges() -> None:
     system = assemble(load_study("wear"))
     edges = tuple(point for point in system.points if point.name in ("CPNCO, speed 40, wet", "CPLA, speed 60, wet"))
     system = replace(system, matrix=edges)
-    collided = [one.evaluations.collided.tolist() for one in at_every_point(system, original_and_half_its_brakes("wear", system))]
+    collided = [one.evaluations.collided.tolist() for one in simulate_all_points(system, original_and_half_its_brakes("wear", system))]
     assert collided == [[False, False], [False, True]]
 
 
@@ -88,7 +88,7 @@ PEDESTRIAN = "pedestrian crash without prior vehicle manoeuvre"
     ("euro_ncap_car_to_car", "lead vehicle stopped; lead vehicle moving at lower constant speed; lead vehicle decelerating; by day"),
 ])
 def test_the_tags_of_the_shipped_studies(study: str, types: str) -> None:
-    assert tags(assemble(load_study(study)).points) == f"NHTSA's pre-crash types: {types}."
+    assert pre_crash_sentence(assemble(load_study(study)).points) == f"NHTSA's pre-crash types: {types}."
 
 
 KMH = 1 / 3.6

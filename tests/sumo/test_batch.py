@@ -74,13 +74,13 @@ def test_sumo_moves_the_vehicle_at_the_speeds_of_the_vehicle_model(any_system: S
 
 def judged(*samples: tuple[float, bool, float | None]) -> tuple[str, list[bool], float]:
     """Outcome, active samples and collision speed of one vehicle; a sample is (speed, encounter has ended, collision speed)."""
-    verdict, active = _Outcomes(1), []
+    outcomes, active = _Outcomes(1), []
     for i, (speed, over, crash) in enumerate(samples):
         collisions = {} if crash is None else {0: crash}
-        verdicts = verdict.judge(np.array([speed]), np.array([over]), collisions, last=i == len(samples) - 1)
+        verdicts = outcomes.judge(np.array([speed]), np.array([over]), collisions, last=i == len(samples) - 1)
         active.append(bool(verdicts[0]))
-    assert not verdict.open.any()
-    return str(verdict.outcome()[0]), active, float(verdict.collision_speed[0])
+    assert not outcomes.is_open.any()
+    return str(outcomes.final()[0]), active, float(outcomes.collision_speed[0])
 
 
 @pytest.mark.parametrize(("samples", "outcome"), [

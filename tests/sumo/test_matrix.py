@@ -17,8 +17,8 @@ from safevar_sumo.scenarios.car_to_car import CarToCar
 from safevar_sumo.study import MatrixTable, MatrixTest, Study, load_study
 from safevar_sumo.sumo import matrix
 from safevar_sumo.sumo.batch import score
-from safevar_sumo.sumo.contact import touches
-from safevar_sumo.sumo.matrix import at_every_point, evaluate, named_point, simulate, vehicle_remarks
+from safevar_sumo.sumo.contact import find_touches
+from safevar_sumo.sumo.matrix import evaluate, simulate, simulate_all_points, system_at_point, vehicle_remarks
 from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.sumo.world import Body
 
@@ -51,7 +51,7 @@ def same(one: Evaluations, other: Evaluations) -> bool:
 @pytest.mark.slow
 def test_the_worst_point_decides_a_settings_result_and_points_do_not_affect_each_other() -> None:
     population = drawn(SYSTEM, 3)
-    points = at_every_point(SYSTEM, population)
+    points = simulate_all_points(SYSTEM, population)
     assert [one.point.name for one in points][:3] == [
         "CPNA, speed 20, impact_location 25, clear", "CPNA, speed 20, impact_location 25, carla_hard_rain",
         "CPNA, speed 20, impact_location 75, clear"]
@@ -72,7 +72,7 @@ def test_results_do_not_depend_on_the_batch_the_order_of_points_or_the_size_of_s
     whole = evaluate(SYSTEM, population)
     assert same(evaluate(SYSTEM, population[1:3]), whole.take([1, 2]))
     assert same(evaluate(assemble(study(TESTS[::-1])), population), whole)
-    monkeypatch.setattr(matrix, "LARGEST_WORLD", 7)
+    monkeypatch.setattr(matrix, "MAX_COPIES", 7)
     assert same(evaluate(SYSTEM, population), whole)
 
 
@@ -82,9 +82,9 @@ def test_a_mean_of_distances_and_speeds_is_refused() -> None:
 
 
 def test_named_point_finds_a_point_and_suggests_similar_names() -> None:
-    assert named_point(SYSTEM, "CPLA, speed 30, clear", "--point").scenario.speed == 30  # type: ignore[attr-defined]
+    assert system_at_point(SYSTEM, "CPLA, speed 30, clear", "--point").scenario.speed == 30  # type: ignore[attr-defined]
     with pytest.raises(InputError, match="CPNCO, speed 40, clear"):
-        named_point(SYSTEM, "CPNCO", "--point")
+        system_at_point(SYSTEM, "CPNCO", "--point")
 
 
 @pytest.mark.parametrize(("tests", "message"), [
@@ -180,7 +180,7 @@ def test_a_setting_with_an_invalid_test_is_neither_safe_nor_unsafe_unless_it_col
     steep = assemble(msgspec.structs.replace(load_study("euro_ncap_car_to_car"), matrix=MatrixTable(tests=tests)))
     steep = replace(steep, vehicle=WEAK.vehicle)
     original = SUN.characteristics.original[np.newaxis]
-    assert [str(one.evaluations.outcome[0]) for one in at_every_point(steep, original)] == ["stopped", "invalid-test"]
+    assert [str(one.evaluations.outcome[0]) for one in simulate_all_points(steep, original)] == ["stopped", "invalid-test"]
     evaluations = evaluate(steep, original)
     assert evaluations.outcome[0] == Outcome.INVALID_TEST
     assert not evaluations.valid[0]
@@ -210,7 +210,7 @@ def test_an_ads_that_releases_the_accelerator_or_brakes_takes_control_of_the_veh
 def test_bodies_touch_at_the_side_where_the_overlap_began_last(
         middle: tuple[float, float], along: tuple[float, float], speed: float, contact: tuple[str, float, float | None]) -> None:
     own, other = Body(np.zeros(2), EAST, 4.0, 2.0, 10.0), Body(np.array(middle), np.array(along), 0.6, 0.4, speed)
-    touch = touches(Body.columns([own]), Body.columns([other]))
+    touch = find_touches(Body.columns([own]), Body.columns([other]))
     assert touch.side == contact[0]
     assert touch.age == pytest.approx(contact[1])
     if contact[2] is not None:

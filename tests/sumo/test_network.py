@@ -130,7 +130,7 @@ def test_legal_traffic_moves_equally_in_every_copy(mine: Path, what: str) -> Non
         seen: set[str] = set()
         for _ in range(60):
             world.api.simulationStep()
-            there = world.whereabouts()
+            there = world.actor_poses()
             first, second = ({name[2:]: place for name, place in there.items() if name.startswith(copy)} for copy in ("0.", "1."))
             assert first == second
             seen |= set(first)

@@ -19,9 +19,9 @@ from safevar_sumo.records import Command, Nominal, Observation, Outcome
 from safevar_sumo.scenarios import SCENARIOS
 from safevar_sumo.shipped import NETWORKS
 from safevar_sumo.study import load_study
-from safevar_sumo.sumo import Engine, at_every_point, reason_for_sumo, recording
+from safevar_sumo.sumo import Engine, reason_for_sumo, recording, simulate_all_points
 from safevar_sumo.sumo.recorded_world import distance_covered
-from safevar_sumo.sumo.recording import recorded_scenes
+from safevar_sumo.sumo.recording import record_scenes
 from safevar_sumo.sumo.system import System, assemble
 
 CLAIM = """
@@ -39,7 +39,8 @@ def assert_same(system: System, number: int, seed: int) -> list[str]:
     settings = characteristics.filter(rng.uniform(characteristics.lower, characteristics.upper, (number, len(characteristics))))
     settings[0] = characteristics.original
     outcomes = []
-    for recorded, copies in zip(*(at_every_point(system, settings, engine) for engine in (Engine.RECORDED, Engine.LIBSUMO)), strict=True):
+    results = (simulate_all_points(system, settings, engine) for engine in (Engine.RECORDED, Engine.LIBSUMO))
+    for recorded, copies in zip(*results, strict=True):
         here, there = recorded.evaluations, copies.evaluations
         assert here.outcome.tolist() == there.outcome.tolist()
         np.testing.assert_array_equal(here.collision_speed, there.collision_speed)
@@ -86,7 +87,7 @@ def test_a_scene_from_the_cache_equals_the_scene_that_sumo_played(monkeypatch: p
 
     def scene() -> str:
         recording._scenes.clear()
-        return repr(recorded_scenes([scenario], ()))
+        return repr(record_scenes([scenario], ()))
 
     played = scene()
     (file,) = tmp_path.glob("networks/scenes-*/scenes.msgpack")
@@ -116,7 +117,7 @@ def test_points_of_different_length_share_a_batch() -> None:
 
 def test_a_shipped_scenario_on_a_users_network_is_simulated_in_sumo() -> None:
     scenario = SCENARIOS["crossing"](network="my_town")
-    (scene,) = recorded_scenes([scenario], ())
+    (scene,) = record_scenes([scenario], ())
     assert "my_town" in str(scene)
 
 

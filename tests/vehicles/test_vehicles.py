@@ -11,7 +11,7 @@ from safevar_sumo.records import Observation
 from safevar_sumo.vehicles import VEHICLES
 from safevar_sumo.vehicles.carla import ENGINE_INERTIA, FINAL_RATIO, GEAR_RATIOS, Carla
 from safevar_sumo.vehicles.lgsvl import Lgsvl
-from safevar_sumo.vehicles.sensors import delayed
+from safevar_sumo.vehicles.sensors import delay_signal
 from tests.vehicles.runs import (
     STEP,
     SYSTEMS,
@@ -189,8 +189,8 @@ def sensed_gaps(name: str) -> np.ndarray:
 
 def test_what_comes_into_sight_is_where_it_is_whatever_was_before() -> None:
     past = np.array([[5.0], [np.inf], [np.inf]])  # newest first
-    assert delayed(past, np.array([0.0]), 0.1).tolist() == [5.0]
-    assert delayed(past, np.array([0.1]), 0.1).tolist() == [np.inf]
+    assert delay_signal(past, np.array([0.0]), 0.1).tolist() == [5.0]
+    assert delay_signal(past, np.array([0.1]), 0.1).tolist() == [np.inf]
 
 
 def test_a_sensor_sees_nothing_beyond_its_range() -> None:

@@ -21,7 +21,7 @@ from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray, finite_or_none
 from safevar_sumo.results import CHOICES, UNKNOWN, SolutionId, handles, position_of
 from safevar_sumo.study import Study
-from safevar_sumo.sumo.matrix import AtPoint, at_every_point, worst_points
+from safevar_sumo.sumo.matrix import PointResult, simulate_all_points, worst_points
 from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.workers.evaluation import Pool
 
@@ -122,7 +122,7 @@ class PointComparison(NamedTuple):
 
 def compare_at_points(system: System, original: FloatArray, settings: FloatArray, unsafe: Unsafe) -> tuple[list[PointComparison], float]:
     """Compare settings, shape (M, n), with the original, shape (1, n); also returns the time step of the simulations [s]."""
-    at_points = at_every_point(system, np.concatenate([original, settings]))
+    at_points = simulate_all_points(system, np.concatenate([original, settings]))
     names, worst = unsafe_points_of(system, at_points, unsafe)[1:], worst_points(at_points)[1:]
     comparisons = []
     for row, (failing, k) in enumerate(zip(names, worst.tolist(), strict=True), 1):
@@ -141,7 +141,7 @@ def compare_at_cells(evaluator: Evaluator, original: FloatArray, settings: Float
     for row in range(1, len(colours)):
         colour_change = colours[row] - colours[0]
         point = system.matrix[int(np.argmax(colour_change))]
-        (at_point,) = at_every_point(system.at(point), np.concatenate([original, settings[row - 1:row]]))
+        (at_point,) = simulate_all_points(system.at(point), np.concatenate([original, settings[row - 1:row]]))
         original_run, changed_run = (summary_of(at_point.runs, column, float(at_point.evaluations.f_safe[column])) for column in (0, 1))
         names = tuple(system.matrix[k].name for k in np.flatnonzero(colour_change).tolist())
         comparisons.append(PointComparison(compare_braking(original_run, changed_run, point.name), names))
@@ -149,7 +149,7 @@ def compare_at_cells(evaluator: Evaluator, original: FloatArray, settings: Float
     return comparisons, step
 
 
-def unsafe_points_of(system: System, at_points: list[AtPoint], unsafe: Unsafe) -> list[tuple[str, ...]]:
+def unsafe_points_of(system: System, at_points: list[PointResult], unsafe: Unsafe) -> list[tuple[str, ...]]:
     """For every setting the names of the matrix's points at which it is unsafe; empty without a matrix."""
     if not system.matrix:
         return [() for _ in at_points[0].evaluations.settings]

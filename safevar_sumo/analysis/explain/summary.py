@@ -22,7 +22,7 @@ from safevar_sumo.results import CHOICES, chosen_handle, handles, position_of, r
 from safevar_sumo.scenarios import Point
 from safevar_sumo.scenarios.base import pre_crash_of
 from safevar_sumo.study import Study
-from safevar_sumo.sumo.matrix import at_every_point, study_at, worst_points
+from safevar_sumo.sumo.matrix import simulate_all_points, study_at, worst_points
 from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.vehicles import CharacteristicSet
 from safevar_sumo.workers.evaluation import Pool
@@ -113,7 +113,7 @@ def _failing_points(study: Study, settings: FloatArray, unsafe: Unsafe) -> tuple
     system = assemble(study)
     if not system.matrix:
         return [""] * len(settings), ""
-    at_points = at_every_point(system, settings)
+    at_points = simulate_all_points(system, settings)
     words = [f" {points_in_words(points, len(system.matrix), limit=3)}" for points in unsafe_points_of(system, at_points, unsafe)]
     return words, at_points[worst_points(at_points)[0]].point.name
 

@@ -17,7 +17,7 @@ from safevar_sumo.records import BoolArray, Command, FloatArray, Observation
 from safevar_sumo.study import Study, load_study
 from safevar_sumo.vehicles import LEVEL, CharacteristicSet, Sensors, Slope, SumoType, Vehicle
 from safevar_sumo.vehicles.base import Characteristics
-from safevar_sumo.vehicles.sensors import delayed, history, remembered
+from safevar_sumo.vehicles.sensors import delay_signal, extend_history, start_history
 
 CREEP_SPEED = 0.01
 """Speed above which the original vehicle's wheel speed is scaled with its speed [m/s]."""
@@ -102,7 +102,7 @@ class SecondVehicle:
                            self._mapping.vehicle.at_speed(prepared.original, speed))
 
     def _state(self, p: _Prepared, speed: FloatArray, vehicle: Any, original: Any) -> SecondState:
-        commands = history(float(np.max(p.parameters.brake_delay)), p.step, original.brake)
+        commands = start_history(float(np.max(p.parameters.brake_delay)), p.step, original.brake)
         return SecondState(speed, original.throttle, original.brake, original.gear, vehicle, original, at_speed(p.parameters.plant, speed),
                            commands)
 
@@ -122,8 +122,8 @@ class SecondVehicle:
     def advance(self, prepared: _Prepared, state: SecondState, command: Command) -> SecondState:
         p, r = prepared, prepared.parameters
         original, drive_torque = self._engine(p, state, command.throttle)
-        commands = remembered(state.brake_commands, command.brake)
-        demand, body, brake = delayed(commands, r.brake_delay, p.step), state.body, state.brake
+        commands = extend_history(state.brake_commands, command.brake)
+        demand, body, brake = delay_signal(commands, r.brake_delay, p.step), state.body, state.brake
         steps = math.ceil(p.step / STEP)
         step = p.step / steps
         response = step / (step + r.brake_lag)
