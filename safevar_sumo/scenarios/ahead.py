@@ -1,4 +1,4 @@
-"""A target ahead in the vehicle's lane: the common part of the scenarios `car_to_car` and `along`."""
+"""A target ahead in the vehicle's lane: what the scenarios `car_to_car` and `along` share."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ from safevar_sumo.scenarios.euro_ncap import (
     BodySize,
     Direction,
     ImpactLocation,
-    lanes_across,
-    lateral_of,
+    change_target_lanes,
+    lateral_offset,
     target_type,
 )
 from safevar_sumo.scenarios.frame import Frame
@@ -40,7 +40,7 @@ FRONT_POSITION = 0.5
 
 
 class TargetAhead(NamedTuple):
-    """A target `gap` metres ahead of the vehicle under test; `speed` maps a time [s] to the target's speed [m/s].
+    """A target `gap` metres ahead of the vehicle under test; the function `speed` maps a time [s] to the target's speed [m/s].
 
     The middle of the target's rear is `offset` metres right of the lane's middle. A standing target may be rotated around that point.
     """
@@ -53,34 +53,34 @@ class TargetAhead(NamedTuple):
     direction: Direction = SAME_DIRECTION
 
     def lanes(self, roads: Roads) -> XmlChanges:
-        """Turn the target's lanes into the direction of a rotated target, whose rear is on the junction and front on the exit lane."""
+        """Turn the lanes into the direction of a rotated target, whose rear is on the junction and whose front is on the exit lane."""
         if not self._is_rotated:
             return {}
         frame, (along, left), length = Frame.of(roads.lane(VUT_LANE)), self.direction, self._body.length
         rear = frame.lane_coordinates(roads.lane(JUNCTION_LANE).start)[0], -self.offset
         entry, exit_ = ((rear[0] + distance * along, rear[1] + distance * left) for distance in (-length, length - FRONT_POSITION))
-        return lanes_across(frame, entry, exit_, self.direction)
+        return change_target_lanes(frame, entry, exit_, self.direction)
 
     def actors(self, speed: float, roads: Roads) -> XmlChanges:
         """The vehicle at `speed` [m/s], and the target ahead of it."""
         if self.gap <= 0:
             raise InputError("scenario.parameters", f"the target begins {-self.gap:.2f} m inside the vehicle", "a target ahead")
-        start, target = self._at_junction(roads) if self._is_rotated else self._in_lane()
+        start, target = self._place_at_junction(roads) if self._is_rotated else self._place_in_lane()
         return {
             "vType[@id='vut']": {"length": repr(self.vut.length), "width": repr(self.vut.width)},
             "vehicle[@id='vut']": {"departPos": repr(start), "departSpeed": repr(speed)},
             **target,
         }
 
-    def _in_lane(self) -> tuple[float, XmlChanges]:
+    def _place_in_lane(self) -> tuple[float, XmlChanges]:
         """The vehicle's start on the straight road [m], and a target in line with the lane."""
-        kind = REPLACED_TYPES.get(self.target, self.target)
-        new_type = {f"vType[@id='{kind}']": target_type(self.target)} if kind != self.target else {}
+        old_type = REPLACED_TYPES.get(self.target, self.target)
+        new_type = {f"vType[@id='{old_type}']": target_type(self.target)} if old_type != self.target else {}
         return START_POSITION, {**new_type, "vehicle[@id='target']": {
             "type": self.target, "departPos": repr(START_POSITION + self.gap + self._body.length), "departPosLat": repr(-self.offset),
             "departSpeed": repr(self.speed(0.0))}}
 
-    def _at_junction(self, roads: Roads) -> tuple[float, XmlChanges]:
+    def _place_at_junction(self, roads: Roads) -> tuple[float, XmlChanges]:
         """The vehicle's start before the junction [m], and a rotated target on it."""
         along, _ = Frame.of(roads.lane(VUT_LANE)).lane_coordinates(roads.lane(EXIT_LANE).start)
         start = along + FRONT_POSITION * self.direction.along - self._depth - self.gap
@@ -112,7 +112,7 @@ class TargetAhead(NamedTuple):
         front = self._body.length * along, self._body.length * left - self.offset
         rear = 0.0, -self.offset
         corners = [(x - sign * left * half, y + sign * along * half) for x, y in (rear, front) for sign in (1, -1)]
-        return front[0] - _first_contact([corners[0], corners[1], corners[3], corners[2]], self.vut.width / 2)
+        return front[0] - _first_contact_position([corners[0], corners[1], corners[3], corners[2]], self.vut.width / 2)
 
 
 class _MotionAhead(NamedTuple):
@@ -143,17 +143,17 @@ class _MotionAhead(NamedTuple):
 
 
 REPLACED_TYPES = {"cyclist": "adult", "motorcyclist": "car"}
-"""By target that has no type in the traffic file: the type that the target replaces."""
+"""Targets without a type in the traffic file, each with the type that it replaces."""
 
 
-def _first_contact(corners: list[Coordinates], half_width: float) -> float:
-    """Position along the lane at which a vehicle of this half width would first touch a body [m].
+def _first_contact_position(corners: list[Coordinates], half_width: float) -> float:
+    """Position along the lane at which a vehicle of this half width first touches a body with these corners [m].
 
-    For a body beside the vehicle's path, the position of the body's rearmost corner.
+    If the body is beside the vehicle's path: the position of its rearmost corner.
     """
     positions = [x for x, y in corners if abs(y) <= half_width]
     for (x, y), (to_x, to_y) in pairwise([*corners, corners[0]]):
-        positions += [x + (to_x - x) * (side - y) / (to_y - y) for side in (-half_width, half_width) if (y - side) * (to_y - side) < 0]
+        positions += [x + (to_x - x) * (edge - y) / (to_y - y) for edge in (-half_width, half_width) if (y - edge) * (to_y - edge) < 0]
     return min(positions or [x for x, _ in corners])
 
 
@@ -203,7 +203,7 @@ class TargetAheadTest(TargetTest, frozen=True, kw_only=True, forbid_unknown_fiel
                                    direction: Direction = SAME_DIRECTION) -> TargetAhead:
         """The target with the middle of its rear at the impact location."""
         vut = BodySize(self.vut_length, self.vut_width)
-        return TargetAhead(target, vut, gap, lateral_of(self.impact_location, self.vut_width), speed, direction)
+        return TargetAhead(target, vut, gap, lateral_offset(self.impact_location, self.vut_width), speed, direction)
 
     @property
     def _target_ahead(self) -> TargetAhead:

@@ -8,25 +8,25 @@ from msgspec import Meta
 
 from safevar_sumo.scenarios.ahead import TargetAhead, TargetAheadTest
 from safevar_sumo.scenarios.base import PreCrash
-from safevar_sumo.scenarios.euro_ncap import KMH, Range, SpeedProfile
+from safevar_sumo.scenarios.euro_ncap import KMH, ProtocolRange, SpeedProfile
 
 IMPACT_LOCATIONS = (50.0, 10.0, 25.0, 75.0, 90.0)
 """Impact locations [% of the width]."""
 
 
-class _Test(NamedTuple):
-    """A row of the protocol's table: target, target speed [km/h], acceleration distance [m], tested speeds and impact locations, type."""
+class _TestRow(NamedTuple):
+    """A row of the protocol's table: target, its speed [km/h] and acceleration distance [m], tested range, pre-crash type."""
 
     target: str
     target_speed: float
     acceleration_distance: float
-    range: Range
+    protocol_range: ProtocolRange
     pre_crash: PreCrash
 
 
 TESTS = {
-    "CPLA": _Test("adult", 5.0, 1.0, Range(10, 80, IMPACT_LOCATIONS), PreCrash.PEDESTRIAN),
-    "CBLA": _Test("cyclist", 15.0, 0.0, Range(20, 80, IMPACT_LOCATIONS), PreCrash.CYCLIST),
+    "CPLA": _TestRow("adult", 5.0, 1.0, ProtocolRange(10, 80, IMPACT_LOCATIONS), PreCrash.PEDESTRIAN),
+    "CBLA": _TestRow("cyclist", 15.0, 0.0, ProtocolRange(20, 80, IMPACT_LOCATIONS), PreCrash.CYCLIST),
 }
 
 
@@ -76,7 +76,7 @@ class Along(TargetAheadTest, frozen=True, kw_only=True):
 
     def remarks(self) -> list[str]:
         """Remarks on parameters outside the protocol."""
-        return TESTS[self.test].range.remarks(self.test, self.speed, self.impact_location, self.grade)
+        return TESTS[self.test].protocol_range.remarks(self.test, self.speed, self.impact_location, self.grade)
 
     @property
     def _target_ahead(self) -> TargetAhead:

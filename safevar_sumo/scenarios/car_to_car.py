@@ -11,7 +11,7 @@ from msgspec.structs import force_setattr
 from safevar_sumo.errors import InputError
 from safevar_sumo.scenarios.ahead import TargetAhead, TargetAheadTest
 from safevar_sumo.scenarios.base import PreCrash
-from safevar_sumo.scenarios.euro_ncap import JUNCTION, KMH, SAME_DIRECTION, Heading, Range
+from safevar_sumo.scenarios.euro_ncap import JUNCTION, KMH, SAME_DIRECTION, Heading, ProtocolRange
 
 CAR_LOCATIONS, MOTORCYCLIST_LOCATIONS = (50.0, 0.0, 25.0, 75.0, 100.0, -25.0, 125.0), (50.0, 10.0, 25.0, 75.0, 90.0)
 """Impact locations [% of the width]."""
@@ -19,24 +19,24 @@ NETWORK = "car_to_car"
 FINAL_SPEED = 2.0
 """Speed at which the braking target stops braking [km/h]."""
 STEADY_SPEED_LIMIT = 80.0
-"""Speed of the vehicle up to which the slower target drives at 20 km/h [km/h]; above, the target is slower by 60 km/h."""
+"""Speed of the vehicle up to which the slower target drives at 20 km/h [km/h]; above it, the target is 60 km/h slower."""
 
 
-class _Test(NamedTuple):
-    """A row of the protocol's table: the target, tested speeds and impact locations, and the time headway at the start [s]."""
+class _TestRow(NamedTuple):
+    """A row of the protocol's table: target, tested speeds and impact locations, time headway at the start [s], pre-crash type."""
 
     target: str
-    range: Range
+    protocol_range: ProtocolRange
     headway: float
     pre_crash: PreCrash
 
 
 TESTS = {
-    "CCRs": _Test("car", Range(10, 80, CAR_LOCATIONS), 5.0, PreCrash.LEAD_STOPPED),
-    "CCRm": _Test("car", Range(30, 130, CAR_LOCATIONS), 5.0, PreCrash.LEAD_SLOWER),
-    "CCRb": _Test("car", Range(30, 130, CAR_LOCATIONS), 1.0, PreCrash.LEAD_DECELERATING),
-    "CMRs": _Test("motorcyclist", Range(10, 80, MOTORCYCLIST_LOCATIONS), 5.0, PreCrash.LEAD_STOPPED),
-    "CMRb": _Test("motorcyclist", Range(30, 130, MOTORCYCLIST_LOCATIONS), 1.0, PreCrash.LEAD_DECELERATING),
+    "CCRs": _TestRow("car", ProtocolRange(10, 80, CAR_LOCATIONS), 5.0, PreCrash.LEAD_STOPPED),
+    "CCRm": _TestRow("car", ProtocolRange(30, 130, CAR_LOCATIONS), 5.0, PreCrash.LEAD_SLOWER),
+    "CCRb": _TestRow("car", ProtocolRange(30, 130, CAR_LOCATIONS), 1.0, PreCrash.LEAD_DECELERATING),
+    "CMRs": _TestRow("motorcyclist", ProtocolRange(10, 80, MOTORCYCLIST_LOCATIONS), 5.0, PreCrash.LEAD_STOPPED),
+    "CMRb": _TestRow("motorcyclist", ProtocolRange(30, 130, MOTORCYCLIST_LOCATIONS), 1.0, PreCrash.LEAD_DECELERATING),
 }
 
 
@@ -98,7 +98,7 @@ class CarToCar(TargetAheadTest, frozen=True, kw_only=True):
 
     def remarks(self) -> list[str]:
         """Remarks on parameters outside the protocol."""
-        return TESTS[self.test].range.remarks(self.test, self.speed, self.impact_location, self.grade)
+        return TESTS[self.test].protocol_range.remarks(self.test, self.speed, self.impact_location, self.grade)
 
     @property
     def _target_ahead(self) -> TargetAhead:
@@ -107,7 +107,7 @@ class CarToCar(TargetAheadTest, frozen=True, kw_only=True):
         return self._target_at_impact_location(TESTS[self.test].target, self._gap, self._speed_at, SAME_DIRECTION.turned(self.heading))
 
     @property
-    def _brakes(self) -> bool:
+    def _target_brakes(self) -> bool:
         return TESTS[self.test].pre_crash == PreCrash.LEAD_DECELERATING
 
     @property
@@ -123,7 +123,7 @@ class CarToCar(TargetAheadTest, frozen=True, kw_only=True):
 
     def _speed_at(self, time: float) -> float:
         initial_speed = self._target_speed
-        if not self._brakes:
+        if not self._target_brakes:
             return initial_speed
         return max(initial_speed - self.target_deceleration * max(time - self.brakes_at, 0.0), min(initial_speed, FINAL_SPEED * KMH))
 
@@ -133,7 +133,7 @@ class CarToCar(TargetAheadTest, frozen=True, kw_only=True):
         The gap closes at a constant speed; with a braking target, first at a rising speed (by b t^2 / 2), then at a constant one.
         """
         closing_speed, gap = self.speed * KMH - self._target_speed, self._gap
-        if not self._brakes:
+        if not self._target_brakes:
             if closing_speed <= 0:
                 raise InputError("scenario.parameters", f"speed = {self.speed:g} km/h never reaches the target", "a slower target")
             return gap / closing_speed
@@ -141,7 +141,7 @@ class CarToCar(TargetAheadTest, frozen=True, kw_only=True):
         if remaining_gap <= 0:
             return gap / closing_speed
         b, speed_lost = self.target_deceleration, self._target_speed - self._speed_at(1e9)
-        distance = (closing_speed + speed_lost / 2) * speed_lost / b
-        if remaining_gap > distance:
-            return self.brakes_at + speed_lost / b + (remaining_gap - distance) / (closing_speed + speed_lost)
+        gap_closed = (closing_speed + speed_lost / 2) * speed_lost / b
+        if remaining_gap > gap_closed:
+            return self.brakes_at + speed_lost / b + (remaining_gap - gap_closed) / (closing_speed + speed_lost)
         return self.brakes_at + (math.sqrt(closing_speed * closing_speed + 2 * b * remaining_gap) - closing_speed) / b

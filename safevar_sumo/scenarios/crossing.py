@@ -26,10 +26,10 @@ from safevar_sumo.scenarios.euro_ncap import (
     Direction,
     Heading,
     ImpactLocation,
-    Range,
+    ProtocolRange,
     SpeedProfile,
-    gap_beside,
-    lateral_of,
+    clear_gap,
+    lateral_offset,
 )
 from safevar_sumo.scenarios.frame import Frame
 from safevar_sumo.scenarios.target import PARKED_GAP, EncounterConstants, Target, TargetTest, Times, value_at
@@ -47,8 +47,8 @@ IMPACT_LOCATIONS = (50.0, 25.0, 75.0, 10.0, 90.0)
 """Impact locations [% of the width]."""
 
 
-class _Test(NamedTuple):
-    """A row of the protocol's table, in km/h and m; without a `lateral_start` the target starts at its full speed."""
+class _TestRow(NamedTuple):
+    """A row of the protocol's table [km/h, m]; without a `lateral_start` the target starts at its full speed."""
 
     side: str
     target: str
@@ -56,25 +56,25 @@ class _Test(NamedTuple):
     lateral_start: float | None
     acceleration_distance: float
     hidden: bool
-    range: Range
+    protocol_range: ProtocolRange
 
 
 TESTS = {
-    "CPFA": _Test("far", "adult", 8.0, 6.0, 1.5, False, Range(10, 60, IMPACT_LOCATIONS)),
-    "CPNA": _Test("near", "adult", 5.0, 4.0, 1.0, False, Range(10, 60, IMPACT_LOCATIONS)),
-    "CPNCO": _Test("near", "child", 5.0, 4.0, 1.0, True, Range(10, 60, IMPACT_LOCATIONS)),
-    "CBNA": _Test("near", "cyclist", 15.0, None, 0.0, False, Range(10, 60, IMPACT_LOCATIONS)),
-    "CBFA": _Test("far", "cyclist", 20.0, None, 0.0, False, Range(10, 60, IMPACT_LOCATIONS)),
-    "CBNAO": _Test("near", "cyclist", 10.0, None, 0.0, True, Range(10, 60, IMPACT_LOCATIONS)),
-    "CCCscp": _Test("near", "car", 40.0, None, 0.0, False, Range(20, 80, (50.0,))),
-    "CMCscp": _Test("near", "motorcyclist", 40.0, None, 0.0, False, Range(20, 80, (50.0,))),
+    "CPFA": _TestRow("far", "adult", 8.0, 6.0, 1.5, False, ProtocolRange(10, 60, IMPACT_LOCATIONS)),
+    "CPNA": _TestRow("near", "adult", 5.0, 4.0, 1.0, False, ProtocolRange(10, 60, IMPACT_LOCATIONS)),
+    "CPNCO": _TestRow("near", "child", 5.0, 4.0, 1.0, True, ProtocolRange(10, 60, IMPACT_LOCATIONS)),
+    "CBNA": _TestRow("near", "cyclist", 15.0, None, 0.0, False, ProtocolRange(10, 60, IMPACT_LOCATIONS)),
+    "CBFA": _TestRow("far", "cyclist", 20.0, None, 0.0, False, ProtocolRange(10, 60, IMPACT_LOCATIONS)),
+    "CBNAO": _TestRow("near", "cyclist", 10.0, None, 0.0, True, ProtocolRange(10, 60, IMPACT_LOCATIONS)),
+    "CCCscp": _TestRow("near", "car", 40.0, None, 0.0, False, ProtocolRange(20, 80, (50.0,))),
+    "CMCscp": _TestRow("near", "motorcyclist", 40.0, None, 0.0, False, ProtocolRange(20, 80, (50.0,))),
 }
 PRE_CRASH = {"adult": PreCrash.PEDESTRIAN, "child": PreCrash.PEDESTRIAN, "cyclist": PreCrash.CYCLIST,
              "motorcyclist": PreCrash.STRAIGHT_PATHS, "car": PreCrash.STRAIGHT_PATHS}
 
 
 class _Start(NamedTuple):
-    """The start of a test.
+    """How a test starts.
 
     Attributes
     ----------
@@ -106,8 +106,8 @@ class _Start(NamedTuple):
             If the target cannot reach the impact location in time.
         """
         target, lateral_start, is_near = test.parameter("target"), test.parameter("lateral_start"), test.parameter("side") == "near"
-        speed, sign, impact_lateral = test.parameter("target_speed") * KMH, 1.0 if is_near else -1.0, lateral_of(
-            test.impact_location, test.vut_width)
+        speed, sign = test.parameter("target_speed") * KMH, 1.0 if is_near else -1.0
+        impact_lateral = lateral_offset(test.impact_location, test.vut_width)
         direction = (FROM_RIGHT if is_near else FROM_LEFT).turned(test.heading)
         if lateral_start is None:
             if test.acceleration_distance is not None:
@@ -118,7 +118,7 @@ class _Start(NamedTuple):
             distance, run_up = (lateral_start + impact_lateral) * test.start_share, test.parameter("acceleration_distance")
             shortest_time = (distance + run_up) / speed
             time = test.time_to_impact or float(max(TIME_TO_IMPACT, math.ceil(shortest_time / ROUNDING_STEP) * ROUNDING_STEP))
-            profile = SpeedProfile.reaching(distance, time, speed, run_up)
+            profile = SpeedProfile.with_arrival(distance, time, speed, run_up)
         mover = PersonMover(target, sign, -lateral_start) if test.is_on_foot else VehicleMover(target, direction)
         return cls(mover, direction, direction.extent(BODIES[target]), sign * impact_lateral, distance, time, profile)
 
@@ -194,7 +194,7 @@ class Crossing(TargetTest, frozen=True, kw_only=True, forbid_unknown_fields=True
     -----
     `lateral` refers to the target's middle, `gap` to the corner or side of its body that is nearest along the lane.
 
-    Where the protocol leaves a choice, this class follows Euro NCAP's calculator (euroncap-rating-2026 5.4.9); `target_speed`,
+    Where the protocol leaves a choice, this class follows Euro NCAP's calculator (euroncap-rating-2026 5.4.9). `target_speed`,
     `start_share` and `heading` express its robustness layers. Assumptions where the calculator leaves a choice too: with every layer
     the target still arrives at the impact location; a faster target starts from the usual position or, if it starts at speed, from
     correspondingly farther away. With a smaller `start_share` a standing target sets off later, and a moving target's run begins when
@@ -242,7 +242,7 @@ class Crossing(TargetTest, frozen=True, kw_only=True, forbid_unknown_fields=True
 
     def remarks(self) -> list[str]:
         """Remarks on parameters outside the protocol."""
-        return TESTS[self.test].range.remarks(self.test, self.speed, self.impact_location, self.grade)
+        return TESTS[self.test].protocol_range.remarks(self.test, self.speed, self.impact_location, self.grade)
 
     def lanes(self, roads: Roads) -> XmlChanges:
         """Changes to the target's lanes: their direction."""
@@ -259,10 +259,10 @@ class Crossing(TargetTest, frozen=True, kw_only=True, forbid_unknown_fields=True
             "vType[@id='vut']": {"length": repr(self.vut_length), "width": repr(self.vut_width)},
             "vehicle[@id='vut']": {"departPos": repr(front), "departSpeed": repr(self.speed * KMH)},
             **start.mover.actors(frame, roads, start.impact_left, start.distance, start.profile),
-            **self._parked(frame, path, roads),
+            **self._parked_cars(frame, path, roads),
         }
 
-    def _parked(self, frame: Frame, path: float, roads: Roads) -> XmlChanges:
+    def _parked_cars(self, frame: Frame, path: float, roads: Roads) -> XmlChanges:
         """The parked cars beside the lane, if any."""
         if not self.parameter("hidden"):
             return {f"vehicle[@id='{car}']": None for car in PARKED_LENGTH}
@@ -285,7 +285,7 @@ class Crossing(TargetTest, frozen=True, kw_only=True, forbid_unknown_fields=True
     def encounter(self, trace: Trace) -> Encounter:
         """Distance between the vehicle's front and the target's body, along and across the lane; TTC from its rate of change."""
         extent = _Start.of(self).extent
-        ahead, across = np.maximum(trace.gap, 0.0), gap_beside(trace.lateral, (self.vut_width + extent.width) / 2)
+        ahead, across = np.maximum(trace.gap, 0.0), clear_gap(trace.lateral, (self.vut_width + extent.width) / 2)
         distance = np.sqrt(ahead * ahead + across * across)
         approach = (trace.speed - trace.obstacle_speed) * ahead - np.sign(trace.lateral) * trace.lateral_speed * across
         return Encounter(separation=distance, distance=distance, closing_speed=approach / np.maximum(distance, 1e-9),
@@ -293,7 +293,7 @@ class Crossing(TargetTest, frozen=True, kw_only=True, forbid_unknown_fields=True
 
     @property
     def is_on_foot(self) -> bool:
-        """Whether the target is a person in SUMO: a pedestrian who crosses at right angles, starting on a footpath."""
+        """Whether the target is a person in SUMO: a pedestrian who crosses at right angles from a footpath."""
         return self.parameter("target") in ("adult", "child") and self.parameter("lateral_start") is not None \
             and self.heading == 0 and self.start_share == 1
 

@@ -1,4 +1,4 @@
-"""How SUMO moves a crossing target: as a person on a footpath if a pedestrian crosses at right angles, otherwise as a vehicle on a lane."""
+"""How SUMO moves a crossing target: a pedestrian who crosses at right angles on a footpath, any other target as a vehicle on a lane."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from safevar_sumo.scenarios.euro_ncap import (
     TARGET,
     Direction,
     SpeedProfile,
-    lanes_across,
+    change_target_lanes,
     target_type,
 )
 from safevar_sumo.scenarios.frame import MAX_SKEW, Frame
@@ -37,7 +37,7 @@ class PersonMover(NamedTuple):
     start: float
 
     def lanes(self, frame: Frame, roads: Roads) -> XmlChanges:
-        """No changes: the pedestrian uses the network's footpath."""
+        """Change nothing: the pedestrian uses the network's footpath."""
         return {}
 
     def path(self, frame: Frame, roads: Roads | World, impact_left: float) -> float:
@@ -79,26 +79,26 @@ class PersonMover(NamedTuple):
     def next_speed(self, profile: SpeedProfile, sample: int, step: float) -> float:
         """Mean speed in the coming step [m/s]."""
         walking_distance = STOP_DISTANCE - self.start
-        begin, end = (min(profile.travelled(k * step), walking_distance) for k in (sample, sample + 1))
-        return (end - begin) / step
+        walked, next_walked = (min(profile.travelled(k * step), walking_distance) for k in (sample, sample + 1))
+        return (next_walked - walked) / step
 
     def set_speed(self, world: World, speed: float) -> None:
         world.walk(PEDESTRIAN, speed)
 
 
 class VehicleMover(NamedTuple):
-    """A target that drives on its lanes across the junction, which lead in the target's direction."""
+    """A target that drives across the junction on lanes that lead in its direction."""
 
     target: str
     direction: Direction
 
     def lanes(self, frame: Frame, roads: Roads) -> XmlChanges:
-        """The target's lanes, rotated around their crossing with the vehicle's lane; no changes for a target from the right."""
+        """Rotate the target's lanes around their crossing with the vehicle's lane; change nothing for a target from the right."""
         if self.direction == FROM_RIGHT:
             return {}
         (along, entry), (_, exit_) = (frame.lane_coordinates(point) for point in roads.lane(JUNCTION_LANE))
         (forward, left), half = self.direction, (exit_ - entry) / 2
-        return lanes_across(frame, (along - half * forward, -half * left), (along + half * forward, half * left), self.direction)
+        return change_target_lanes(frame, (along - half * forward, -half * left), (along + half * forward, half * left), self.direction)
 
     def path(self, frame: Frame, roads: Roads | World, impact_left: float) -> float:
         """Position of the target's middle along the lane when the target is `impact_left` metres to the left of the lane's middle [m]."""
@@ -108,9 +108,10 @@ class VehicleMover(NamedTuple):
     def actors(self, frame: Frame, roads: Roads, impact_left: float, distance: float, profile: SpeedProfile) -> XmlChanges:
         """The target on its lane, `distance` metres before the impact."""
         lane, (forward, left) = roads.lane(ENTRY_LANE), self.direction
-        start = self._along(frame, lane.start)
-        front = (self.path(frame, roads, impact_left) * forward + impact_left * left) - start - distance + BODIES[self.target].length / 2
-        length = self._along(frame, lane.end) - start
+        lane_start = self._along(frame, lane.start)
+        impact = self.path(frame, roads, impact_left) * forward + impact_left * left
+        front = impact - lane_start - distance + BODIES[self.target].length / 2
+        length = self._along(frame, lane.end) - lane_start
         if not 0 < front <= length:
             raise InputError("scenario.parameters", f"the target starts {distance:.2f} m before the impact, where it has no lane",
                              f"a start from {distance - (length - front):.2f} to {distance + front:.2f} m before it")

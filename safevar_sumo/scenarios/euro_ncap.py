@@ -1,4 +1,4 @@
-"""Common parts of scenarios of Euro NCAP's frontal crash avoidance tests (protocol CA-FC, v1.2, July 2026): targets, ranges, directions.
+"""What scenarios of Euro NCAP's frontal crash avoidance tests (protocol CA-FC, v1.2, July 2026) share: targets, ranges, directions.
 
 Speeds are in km/h and impact locations in per cent of the vehicle's width, as in the protocol.
 """
@@ -53,12 +53,12 @@ class Direction(NamedTuple):
     left: float
 
     def turned(self, heading: float) -> Direction:
-        """The direction turned counterclockwise by `heading` [degrees]; rounded, since the last bits of sine and cosine vary by machine."""
+        """The direction turned counterclockwise by `heading` [degrees]; rounded, as the last bits of sine and cosine differ by machine."""
         cosine, sine = (round(function(math.radians(heading)), 12) for function in (math.cos, math.sin))
         return Direction(self.along * cosine - self.left * sine, self.left * cosine + self.along * sine)
 
     def extent(self, body: BodySize) -> BodySize:
-        """Extent of a body along the lane and across it [m]."""
+        """Size along the lane and across it of a body that faces in this direction [m]."""
         along, left = abs(self.along), abs(self.left)
         return BodySize(body.length * along + body.width * left, body.length * left + body.width * along)
 
@@ -67,15 +67,15 @@ SAME_DIRECTION, FROM_RIGHT, FROM_LEFT = Direction(1.0, 0.0), Direction(0.0, 1.0)
 TARGET = "target"
 """Id of the target in every network where it is a vehicle."""
 JUNCTION = "junction"
-"""The network in which a target has lanes apart from the vehicle's, in any direction."""
+"""The network in which a target has lanes of its own, in any direction."""
 VUT_LANE = "approach_0"
 """The vehicle's lane before the junction."""
 ENTRY_LANE, JUNCTION_LANE, EXIT_LANE = "across_0", ":junction_0_0", "across_on_0"
 """The target's lanes: before the junction, on it, and beyond."""
 
 
-def lanes_across(frame: Frame, entry: Coordinates, exit_: Coordinates, direction: Direction, length: float = 300.0) -> XmlChanges:
-    """The target's lanes, straight in a direction: from `entry` to `exit_` on the junction, and `length` metres before and after.
+def change_target_lanes(frame: Frame, entry: Coordinates, exit_: Coordinates, direction: Direction, length: float = 300.0) -> XmlChanges:
+    """Make the target's lanes straight in a direction: from `entry` to `exit_` on the junction, and `length` metres before and after.
 
     Points are given along the vehicle's lane and to its left [m].
     """
@@ -91,8 +91,8 @@ def target_type(target: str) -> dict[str, str]:
     return {"id": target, "length": repr(body.length), "width": repr(body.width), "guiShape": SHAPES[target], "maxSpeed": TARGET_TOP_SPEED}
 
 
-class Range(NamedTuple):
-    """Range of a test in the protocol: lowest and highest speed [km/h], impact locations [% of the width]."""
+class ProtocolRange(NamedTuple):
+    """What the protocol tests in a row: lowest and highest speed [km/h], impact locations [% of the width]."""
 
     slowest: float
     fastest: float
@@ -119,8 +119,8 @@ class SpeedProfile(NamedTuple):
     run_up: float
 
     @classmethod
-    def reaching(cls, distance: float, time: float, speed: float, run_up: float) -> SpeedProfile:
-        """The profile that covers `distance` [m] by `time` [s]; t seconds after `begin`, past the run-up, distance = speed t - run_up."""
+    def with_arrival(cls, distance: float, time: float, speed: float, run_up: float) -> SpeedProfile:
+        """The profile that covers `distance` [m] by `time` [s]: past the run-up, t seconds after `begin`, distance = speed t - run_up."""
         if distance < run_up:
             raise InputError("scenario.parameters", f"acceleration_distance = {run_up:g} m is longer than the distance of {distance:g} m")
         begin = time - (distance + run_up) / speed
@@ -147,11 +147,11 @@ class SpeedProfile(NamedTuple):
         return self.speed * self.speed / (2 * self.run_up) * elapsed
 
 
-def lateral_of(location: float, width: float) -> float:
-    """Offset of an impact location [% of the vehicle's width, from the left] to the right of the front's middle [m]."""
+def lateral_offset(location: float, width: float) -> float:
+    """Distance of an impact location [% of the vehicle's width, from the left] to the right of the front's middle [m]."""
     return (location / 100 - 0.5) * width
 
 
-def gap_beside(distance: FloatArray, half_widths: float) -> FloatArray:
+def clear_gap(distance: FloatArray, half_widths: float) -> FloatArray:
     """Gap between two bodies whose middles are `distance` apart; 0 where they overlap [m]."""
     return np.maximum(np.abs(distance) - half_widths, 0.0)

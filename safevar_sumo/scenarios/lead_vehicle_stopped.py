@@ -34,7 +34,7 @@ class LeadVehicleStopped(Struct, frozen=True, kw_only=True, forbid_unknown_field
 
     Notes
     -----
-    A run ends with a collision or after `duration`: a vehicle that has stopped may start again.
+    A run ends with a collision or after `duration`, as a vehicle that has stopped may start again.
     """
 
     network: str = "lead_vehicle_stopped"

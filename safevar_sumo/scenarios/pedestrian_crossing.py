@@ -18,19 +18,19 @@ CROSSING_LANE = ":crossing_c0_0"
 
 
 class _Memory(NamedTuple):
-    """The frame of the lane; positions of the vehicle's front along the lane at which the conflict begins and ends, last lateral position
-    of the pedestrian [m]; whether the pedestrian has turned round.
+    """The lane's frame; positions of the vehicle's front at which the conflict begins and ends, and the pedestrian's last lateral position
+    [m]; whether the pedestrian has turned round.
     """
 
     frame: Frame
     conflict_point: float
     clear_point: float
     lateral: FloatArray
-    turned: bool
+    has_turned: bool
 
 
 class PedestrianCrossing(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A pedestrian crosses the lane at right angles, turns round and walks back; never reacts to the vehicle.
+    """A pedestrian crosses the lane at right angles, turns round and walks back, without reacting to the vehicle.
 
     Parameters
     ----------
@@ -67,17 +67,17 @@ class PedestrianCrossing(Struct, frozen=True, kw_only=True, forbid_unknown_field
             raise InputError("scenario.parameters.network", f"the pedestrian begins {lateral[0]:.2f} m to the left of the vehicle",
                              "to the right of it, or turns_after = None")
         half_width = world.person_width(PEDESTRIAN) / 2
-        return _Memory(frame, path - half_width, path + half_width + world.vehicle_length(VUT), lateral, turned=False)
+        return _Memory(frame, path - half_width, path + half_width + world.vehicle_length(VUT), lateral, has_turned=False)
 
     def observe(self, world: World, step: float, memory: _Memory) -> tuple[Scene, _Memory]:
-        vehicle = world.vehicle_positions(VUT)
-        lateral = memory.frame.left(world.person_positions(PEDESTRIAN)) - memory.frame.left(vehicle)
+        vehicle_positions = world.vehicle_positions(VUT)
+        lateral = memory.frame.left(world.person_positions(PEDESTRIAN)) - memory.frame.left(vehicle_positions)
         lateral_speed = (lateral - memory.lateral) / step
         goes_past = self.turns_after is not None and lateral[0] + step * lateral_speed[0] > self.turns_after
-        if goes_past and not memory.turned:
+        if goes_past and not memory.has_turned:
             world.turn_back(PEDESTRIAN)
-            memory = memory._replace(turned=True)
-        front = memory.frame.along(vehicle)
+            memory = memory._replace(has_turned=True)
+        front = memory.frame.along(vehicle_positions)
         has_left = (np.abs(lateral) > self.lane_width / 2) & (lateral * lateral_speed > 0)
         has_passed = front > memory.clear_point
         return Scene(memory.conflict_point - front, lateral, lateral_speed, has_left | has_passed), memory._replace(lateral=lateral)

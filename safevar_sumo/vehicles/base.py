@@ -1,4 +1,4 @@
-"""The contract of a vehicle model, slopes, and checks of models from outside."""
+"""The contract of a vehicle model, slopes, and the guard of a user's model."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def slope_of(grade: FloatArray) -> Slope:
 
 
 Characteristics = Mapping[str, FloatArray]
-"""Name -> values of N vehicles in the model's table units, each of shape (N,)."""
+"""Values of N vehicles by characteristic, in the units of the model's table, each of shape (N,)."""
 
 
 class SumoType(NamedTuple):
@@ -67,9 +67,8 @@ class Vehicle(Protocol):
     element i of the arguments, bit for bit. So methods use only + - * / and square roots, comparisons,
     minima and maxima: these operations give the same bits on every machine and for every N.
 
-    Optional: `hold_gear(prepared, state, holds)` returns the state in which the vehicles where `holds`, shape (N,), is true do not change
-    gear (the driving robot of tests at a speed needs it); `FITTED_UP_TO` is the highest speed at which its parameters were identified
-    [m/s].
+    Optional: `hold_gear(prepared, state, holds)` returns the state in which vehicles do not change gear where `holds`, shape (N,), is true
+    (the driving robot of tests at a speed needs it); `FITTED_UP_TO` is the highest speed at which the parameters were identified [m/s].
     """
 
     UNITS: Mapping[str, str]
@@ -92,7 +91,7 @@ class Vehicle(Protocol):
         """The steady state at a speed above 0 [m/s], shape (N,), with the pedals that hold it."""
 
     def sense(self, prepared: Any, state: Any, seen: Observation) -> tuple[Observation, Any]:
-        """An observation through the vehicles' own sensors, and the state after it."""
+        """What the vehicles' sensors report of an observation, and the state after it."""
 
     def advance(self, prepared: Any, state: Any, command: Command) -> Any:
         """The state one simulation step later."""
@@ -104,33 +103,33 @@ def at_start(vehicle: Vehicle, prepared: Any, speed: FloatArray) -> Any:
     if method is not None:
         return method(prepared, speed)
     rest = vehicle.at_rest(prepared)
-    rolls = speed > 0
-    if not rolls.any():
+    is_rolling = speed > 0
+    if not is_rolling.any():
         return rest
-    steady = vehicle.at_speed(prepared, np.where(rolls, speed, 1.0))
-    return steady if rolls.all() else _selected(rolls, steady, rest)
+    steady = vehicle.at_speed(prepared, np.where(is_rolling, speed, 1.0))
+    return steady if is_rolling.all() else _select_state(is_rolling, steady, rest)
 
 
-def _selected(rolls: BoolArray, steady: Any, rest: Any) -> Any:
-    """The state `steady` for vehicles where `rolls` is true, and `rest` for the others; a state may consist of states."""
+def _select_state(is_rolling: BoolArray, steady: Any, rest: Any) -> Any:
+    """The state `steady` of the vehicles that roll, and `rest` of the others; a state may consist of states."""
     if isinstance(steady, tuple):
-        parts = [_selected(rolls, *columns) for columns in zip(steady, rest, strict=True)]
-        return type(steady)(*parts) if hasattr(steady, "_fields") else tuple(parts)
-    return steady if steady is None else np.where(rolls, steady, rest)
+        columns = [_select_state(is_rolling, *states) for states in zip(steady, rest, strict=True)]
+        return type(steady)(*columns) if hasattr(steady, "_fields") else tuple(columns)
+    return steady if steady is None else np.where(is_rolling, steady, rest)
 
 
 VEHICLE_CONTRACT = Contract.of(Vehicle, "a vehicle", optional=("at_speed",))
-FASTEST = 1000.0
+HIGHEST_SPEED = 1000.0
 """Highest speed of a vehicle [m/s]; beyond it a model has diverged."""
-ROUNDING = 1e-9  # relative tolerance of speeds
+SPEED_ROUNDING = 1e-9  # relative tolerance of speeds
 PROBE_STEP = 0.1  # s
-_BOUNDS = {"speed": (0.0, FASTEST), "throttle": (0.0, 1.0), "brake": (0.0, 1.0)}
-_DISTANCES = ("gap", "lateral")
-"""Quantities that are infinite while no obstacle is detected."""
+_LEGAL_RANGES = {"speed": (0.0, HIGHEST_SPEED), "throttle": (0.0, 1.0), "brake": (0.0, 1.0)}
+_MAY_BE_INFINITE = ("gap", "lateral")
+"""Quantities of an observation that are infinite while no obstacle is detected."""
 
 
 class _Prepared(NamedTuple):
-    """The model's own constants, and its SUMO types after the check."""
+    """Number of vehicles, the constants that the user's model returned, and its SUMO types after the check."""
 
     n: int
     constants: Any
@@ -138,7 +137,7 @@ class _Prepared(NamedTuple):
 
 
 class _State(NamedTuple):
-    """The columns of a model's state after the check, and the model's own state."""
+    """The columns of a state after the check, and the state that the user's model returned."""
 
     speed: FloatArray
     throttle: FloatArray
@@ -148,7 +147,7 @@ class _State(NamedTuple):
 
 
 class GuardedVehicle:
-    """Guards a user's own model: passes read-only copies to it, and checks its results."""
+    """Guards a user's model: passes read-only copies to it, and checks its results."""
 
     UNITS: Mapping[str, str]
 
@@ -208,7 +207,7 @@ class GuardedVehicle:
                                              above=name == "scale", infinite=name == "reach") for name in Sensors._fields))
 
     def refuse_unknown_sensors(self, characteristics: Characteristics) -> None:
-        """Refuse a model that changes observations in `sense` but has no method `sensors`: a TraCI controller bypasses `sense`."""
+        """Refuse a model that changes observations in `sense` but has no method `sensors`, because a TraCI controller bypasses `sense`."""
         if hasattr(self.model, "sensors"):
             return
         prepared = self.prepare(characteristics, 1.0, PROBE_STEP)
@@ -229,18 +228,18 @@ class GuardedVehicle:
         values: dict[str, Any] = {}
         for name, value in seen._asdict().items():
             shape = (prepared.n,) if hasattr(value, "shape") else ()
-            numbers = self._guard.numbers("sense", name, self._guard.field("sense", sensed, name), shape, infinite=name in _DISTANCES)
+            numbers = self._guard.numbers("sense", name, self._guard.field("sense", sensed, name), shape, infinite=name in _MAY_BE_INFINITE)
             values[name] = numbers if shape else float(numbers)
         return Observation(**values), self._state("sense", prepared.n, next_state)
 
     def advance(self, prepared: _Prepared, state: _State, command: Command) -> _State:
         result = self._guard.call("advance", self.model.advance, prepared.constants, state.model_state, read_only_copy(command))
         state, max_speed = self._state("advance", prepared.n, result), prepared.types.max_speed
-        for i in np.flatnonzero(state.speed > max_speed * (1 + ROUNDING))[:1]:  # SUMO itself accepts any speed
+        for i in np.flatnonzero(state.speed > max_speed * (1 + SPEED_ROUNDING))[:1]:  # SUMO itself accepts any speed
             raise self._guard.wrong("advance", "speed", float(state.speed[i]), f"up to max_speed = {max_speed[i]:g} of its sumo_type")
         return state
 
     def _state(self, method: str, n: int, model_state: Any) -> _State:
-        columns = {name: self._guard.numbers(method, name, self._guard.field(method, model_state, name), (n,), *_BOUNDS.get(name, ()))
+        columns = {name: self._guard.numbers(method, name, self._guard.field(method, model_state, name), (n,), *_LEGAL_RANGES.get(name, ()))
                 for name in _State._fields[:-1]}
         return _State(**columns, model_state=model_state)

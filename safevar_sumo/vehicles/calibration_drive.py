@@ -1,4 +1,4 @@
-"""The calibration drive of an ADS: the tables of its throttle and brake controller."""
+"""The calibration drive of the original vehicle, for the throttle and brake controller of an ADS."""
 
 from __future__ import annotations
 
@@ -17,21 +17,21 @@ LIGHT_BRAKE = 0.1  # pedal position while braking, far from the limit of the tyr
 
 
 def calibration_drive(vehicle: Vehicle, characteristics: CharacteristicSet) -> Nominal:
-    """The original vehicle on a dry road; the first use of its tables simulates them."""
-    types = vehicle.sumo_type(vehicle.prepare(_original(characteristics), 1.0, STEP))
+    """The original vehicle on a dry road; the drive is simulated when its tables are first used."""
+    types = vehicle.sumo_type(vehicle.prepare(_original_values(characteristics), 1.0, STEP))
     simulate_tables = cache(partial(_simulated_tables, vehicle, characteristics))  # type: ignore[arg-type]
     mass, accel, decel, max_speed, lag = (float(values[0]) for values in types)
     return Nominal(mass=mass, accel=accel, decel=decel, max_speed=max_speed, actuator_lag=lag, tables=simulate_tables)
 
 
-def _original(characteristics: CharacteristicSet) -> dict[str, FloatArray]:
-    return {member.name: np.full(1, float(member.original)) for member in characteristics}
+def _original_values(characteristics: CharacteristicSet) -> dict[str, FloatArray]:
+    return {characteristic.name: np.full(1, float(characteristic.original)) for characteristic in characteristics}
 
 
 @lru_cache(maxsize=4)
 def _simulated_tables(vehicle: Vehicle, characteristics: CharacteristicSet) -> PedalTables:
-    """Accelerate at full throttle to the highest speed; from there, coast in one drive and brake lightly in another."""
-    prepared = vehicle.prepare(_original(characteristics), 1.0, STEP)
+    """Accelerate at full throttle to the highest speed of the tables; from there, coast in one drive and brake lightly in another."""
+    prepared = vehicle.prepare(_original_values(characteristics), 1.0, STEP)
     rest = vehicle.at_rest(prepared)
 
     def drive(state: object, throttle: float, brake: float) -> tuple[list[float], object]:
@@ -49,7 +49,7 @@ def _simulated_tables(vehicle: Vehicle, characteristics: CharacteristicSet) -> P
     coasting = _accelerations(drive(fast_state, 0.0, 0.0)[0][::-1])
     braking = _accelerations(drive(fast_state, 0.0, LIGHT_BRAKE)[0][::-1])
     tables = PedalTables(speeds=SPEEDS, full_throttle=_accelerations(launch), coasting=coasting,
-                    braking=float(np.median(braking - coasting)) / LIGHT_BRAKE)
+                         braking=float(np.median(braking - coasting)) / LIGHT_BRAKE)
     for table in tables[:3]:
         table.flags.writeable = False  # many ADSs read them
     return tables
@@ -60,8 +60,8 @@ def _accelerations(speeds: list[float]) -> FloatArray:
 
     Outside the speeds of the drive, the nearest acceleration holds. A drive at constant speed has acceleration 0.
     """
-    highest = np.maximum.accumulate(np.array(speeds))
-    distinct_speeds, samples = np.unique(highest, return_index=True)
+    rising_speeds = np.maximum.accumulate(np.array(speeds))
+    distinct_speeds, samples = np.unique(rising_speeds, return_index=True)
     grid = SPEEDS[(distinct_speeds[0] <= SPEEDS) & (distinct_speeds[-1] >= SPEEDS)]
     if len(grid) < 2:
         return np.zeros(len(SPEEDS))

@@ -1,8 +1,8 @@
 """LincolnMkz2017 of CARLA 0.9.10: NVIDIA PhysX 3.4, PxVehicleDrive4W, along its path.
 
 The equations and the order of integration come from `PxVehicleUpdate.cpp` and `PxVehicleDefaultTireShader` (PhysX 3.4). One
-equivalent wheel stands for the four. A step computes the tyre force from the slip at its beginning; it then computes engine, clutch
-and wheels implicitly and in closed form, so that the stiff clutch does not limit the step.
+equivalent wheel represents the four. A step computes the tyre force from the slip at its beginning, then engine, clutch and wheels
+implicitly and in closed form, so that the stiff clutch does not limit the step.
 """
 
 from __future__ import annotations
@@ -46,8 +46,8 @@ TYRE_STEPS = 3  # per substep, at every speed; PhysX's number below 5 m/s (setSu
 class _Prepared(NamedTuple):
     """Constants of a run, SI; arrays of shape (N,).
 
-    `throttle_rates` and `brake_rates` are the largest fall and rise of a pedal in a substep. Names in `per_step` mark quantities
-    over the tyre step. In a tyre step the speed changes by `speed_by_force` per unit of force and by `speed_by_air` per unit of
+    `throttle_rates` and `brake_rates` are the largest fall and rise of a pedal in a substep. Quantities with names in `per_step`
+    are divided by the tyre step. In a tyre step the speed changes by `speed_by_force` per unit of force and by `speed_by_air` per unit of
     squared speed; the slope, which pulls with `pull` [N], takes `speed_by_slope`. Below `standstill` the tyres hold a braked vehicle.
     """
 
@@ -239,9 +239,9 @@ class Carla(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         return state._replace(throttle=throttle, brake=brake, since_shift=np.where(shifts_down, p.shift_time, p.shift_latency))
 
     def hold_gear(self, prepared: _Prepared, state: CarlaState, holds: BoolArray) -> CarlaState:
-        """Hold the gear where `holds`, shape (N,), is true, as a selector lever does; after the release the gearbox may shift at once."""
-        free_time = np.where(state.since_shift < 0, prepared.shift_latency, state.since_shift)
-        return state._replace(since_shift=np.where(holds, -np.inf, free_time))
+        """Hold the gear where `holds`, shape (N,), is true, as a selector lever does; once released, the gearbox may shift at once."""
+        since_shift = np.where(state.since_shift < 0, prepared.shift_latency, state.since_shift)
+        return state._replace(since_shift=np.where(holds, -np.inf, since_shift))
 
     def _rim_at(self, p: _Prepared, speed: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Rim speed at which the tyre force balances air drag and slope [m/s], and that force [N]."""
@@ -269,9 +269,9 @@ class Carla(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
             if driveline is None or gear is not s.gear:
                 driveline = _Driveline.of(p, gear)
             s = CarlaState(*self._roll(p, s, driveline, throttle, brake), gear, target, since_shift, throttle, brake)
-        held = (s.brake > p.zeros) & (s.speed < p.standstill)
-        if np.count_nonzero(held):
-            s.speed[held] = s.wheel_speed[held] = ZERO
+        is_held = (s.brake > p.zeros) & (s.speed < p.standstill)
+        if np.count_nonzero(is_held):
+            s.speed[is_held] = s.wheel_speed[is_held] = ZERO
         return s
 
     def _roll(self, p: _Prepared, s: CarlaState, driveline: _Driveline, throttle: FloatArray,
@@ -323,9 +323,9 @@ class Carla(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
     def _torque(self, p: _Prepared, engine_speed: FloatArray) -> FloatArray:
         """Engine torque at full throttle [N m]: linear between the points of the curve; no engine is faster than its limit."""
-        x = engine_speed / p.engine_limit
-        rising_line = TORQUE_IDLE + TORQUE_RISE * x
-        falling_line = TORQUE_PEAK - TORQUE_FALL * (x - PEAK_SPEED)
+        speed_share = engine_speed / p.engine_limit
+        rising_line = TORQUE_IDLE + TORQUE_RISE * speed_share
+        falling_line = TORQUE_PEAK - TORQUE_FALL * (speed_share - PEAK_SPEED)
         torque: FloatArray = p.engine_torque * np.minimum(rising_line, falling_line)
         return torque
 
@@ -337,22 +337,22 @@ def _pedal_position(command: FloatArray, pedal: FloatArray, rates: tuple[FloatAr
 
 
 def _shift(p: _Prepared, s: CarlaState, throttle: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Automatic gearbox: gear, target gear, time since a shift [s]. During a shift the gear is neutral, also before the first gear."""
+    """Automatic gearbox; returns gear, target gear, and time since the last shift began [s]. During a shift the gear is neutral."""
     target, since_shift = s.target_gear, s.since_shift + p.step
-    neutral, ready = s.gear <= NEUTRAL, s.since_shift >= p.shift_latency
-    any_neutral = np.count_nonzero(neutral)
+    is_neutral, is_ready = s.gear <= NEUTRAL, s.since_shift >= p.shift_latency
+    n_neutral = np.count_nonzero(is_neutral)
     # In most steps no vehicle can shift; then numpy has less to compute.
-    sets_off = neutral & (s.gear == target) & (throttle > p.zeros) if any_neutral else neutral
-    high = low = ready
-    if np.count_nonzero(ready):
-        relative = s.engine_speed / p.engine_limit
-        high, low = ready & (relative > p.shift_up), ready & (relative < p.shift_down)
-    if np.count_nonzero(sets_off) or np.count_nonzero(high) or np.count_nonzero(low):
-        up = sets_off | high & (s.gear > NEUTRAL) & (s.gear < TOP_GEAR)
-        down = low & (s.gear > FIRST_GEAR)
+    sets_off = is_neutral & (s.gear == target) & (throttle > p.zeros) if n_neutral else is_neutral
+    is_fast = is_slow = is_ready
+    if np.count_nonzero(is_ready):
+        speed_share = s.engine_speed / p.engine_limit
+        is_fast, is_slow = is_ready & (speed_share > p.shift_up), is_ready & (speed_share < p.shift_down)
+    if np.count_nonzero(sets_off) or np.count_nonzero(is_fast) or np.count_nonzero(is_slow):
+        up = sets_off | is_fast & (s.gear > NEUTRAL) & (s.gear < TOP_GEAR)
+        down = is_slow & (s.gear > FIRST_GEAR)
         target = target + up - down
         since_shift[up | down] = ZERO
-    elif not any_neutral:
+    elif not n_neutral:
         return s.gear, target, since_shift
     gear = np.where((target == s.gear) | (since_shift >= p.shift_end), target, NEUTRAL)
     return gear if np.count_nonzero(gear != s.gear) else s.gear, target, since_shift

@@ -48,9 +48,9 @@ class Characteristic:
 
     @property
     def words(self) -> str:
-        """Meaning and counterpart in one line; empty if the study gives neither."""
-        part = f"counterpart: {self.counterpart}" if self.counterpart else ""
-        return "; ".join(text for text in (self.meaning, part) if text)
+        """Meaning and real-world counterpart in one line; empty if the study gives neither."""
+        counterpart = f"counterpart: {self.counterpart}" if self.counterpart else ""
+        return "; ".join(text for text in (self.meaning, counterpart) if text)
 
     @property
     def threshold(self) -> float:
@@ -59,17 +59,17 @@ class Characteristic:
         return next(share for smallest_width, share in FILTER_SHARES if width >= smallest_width) * width
 
     @property
-    def farthest(self) -> float:
+    def largest_plausible(self) -> float:
         """Largest plausible magnitude of a value beyond the domain."""
         return PLAUSIBLE_MULTIPLE * max(abs(self.lower), abs(self.upper))
 
     def text(self, value: float) -> str:
-        """A value rounded so that one unit of the last digit is at most a quarter of the threshold."""
+        """A value as text, rounded so that one unit of its last digit is at most a quarter of the threshold."""
         return f"{value:.{max(0, math.ceil(-math.log10(self.threshold / 4)))}f}"
 
     @property
     def suffix(self) -> str:
-        """The unit as text behind a number; empty for a pure number."""
+        """The unit as text after a number; empty without a unit."""
         return "" if self.unit == "-" else f" {self.unit}"
 
     def check(self, value: float, source: object, *, beyond: bool = False, otherwise: str = "",
@@ -84,7 +84,7 @@ class Characteristic:
             Naming the value and what is expected.
         """
         if not isinstance(value, Real) or not self.is_legal(value, beyond=beyond):
-            expected = (f"a finite number{' above 0' if self.lower > 0 else ''}, up to {self.farthest:g}" if beyond else
+            expected = (f"a finite number{' above 0' if self.lower > 0 else ''}, up to {self.largest_plausible:g}" if beyond else
                         f"a number in [{self.lower:g}, {self.upper:g}]")
             is_plausible = not beyond and isinstance(value, Real) and self.is_legal(value, beyond=True)
             hint = f", or any with {switch}" if is_plausible and switch else ""
@@ -94,10 +94,10 @@ class Characteristic:
     def is_legal(self, values: Any, *, beyond: bool = False) -> Any:
         """Whether values, a number or an array, are in the domain; with `beyond`, whether they are plausible.
 
-        A plausible magnitude is at most 1000 times the largest of the domain. If the domain is above 0, so is a plausible value.
+        A plausible value has at most 1000 times the largest magnitude in the domain, and is above 0 if the domain is.
         """
         if beyond:
-            return (np.abs(values) <= self.farthest) & ((values > 0) | (self.lower <= 0))
+            return (np.abs(values) <= self.largest_plausible) & ((values > 0) | (self.lower <= 0))
         return (values >= self.lower) & (values <= self.upper)
 
 
@@ -110,7 +110,7 @@ class CharacteristicSet:
     @classmethod
     def of(cls, table: Mapping[str, CharacteristicTable]) -> CharacteristicSet:
         """The characteristics of a study's table, in its order."""
-        return cls(tuple(Characteristic(name=name, **msgspec.structs.asdict(row)) for name, row in table.items()))
+        return cls(tuple(Characteristic(name=name, **msgspec.structs.asdict(entry)) for name, entry in table.items()))
 
     def __len__(self) -> int:
         return len(self.members)
@@ -120,7 +120,7 @@ class CharacteristicSet:
 
     @cached_property
     def names(self) -> tuple[str, ...]:
-        return tuple(member.name for member in self.members)
+        return tuple(characteristic.name for characteristic in self.members)
 
     @cached_property
     def original(self) -> FloatArray:
@@ -144,12 +144,12 @@ class CharacteristicSet:
 
     def _column(self, attribute: str) -> FloatArray:
         """One attribute of all characteristics as a read-only array, shape (n,)."""
-        values = np.array([getattr(member, attribute) for member in self.members], dtype=float)
+        values = np.array([getattr(characteristic, attribute) for characteristic in self.members], dtype=float)
         values.flags.writeable = False
         return values
 
     def filter(self, settings: FloatArray) -> FloatArray:
-        """Reset values that change by no more than their thresholds to the original (method section 2)."""
+        """Reset each value that differs from the original by no more than its threshold (method section 2)."""
         return np.where(np.abs(self.original - settings) > self.threshold, settings, self.original)
 
     def changed(self, filtered: FloatArray) -> BoolArray:

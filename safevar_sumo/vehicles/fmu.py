@@ -12,18 +12,18 @@ from safevar_sumo.fmu import COMMON_UNITS, REAL_TYPES, SI, Description, Fault, F
 from safevar_sumo.plugins import Guard
 from safevar_sumo.records import BoolArray, Command, FloatArray, Observation
 from safevar_sumo.study import CharacteristicTable
-from safevar_sumo.vehicles.base import FASTEST, LEVEL, ROUNDING, Characteristics, Slope, SumoType
+from safevar_sumo.vehicles.base import HIGHEST_SPEED, LEVEL, SPEED_ROUNDING, Characteristics, Slope, SumoType
 from safevar_sumo.vehicles.sensors import Sensors, sensed_observation
 
 PEDALS: Mapping[str, str] = {"throttle": "-", "brake": "-"}
-ROAD: Mapping[str, str] = {"road_friction": "-", "grade": "-", "wet": "-", "initial_speed": "m/s", "step": "s"}
-"""Quantities that are constant during a run: inputs, or parameters that are set at the start. A grade is rise over run."""
+CONSTANTS: Mapping[str, str] = {"road_friction": "-", "grade": "-", "wet": "-", "initial_speed": "m/s", "step": "s"}
+"""Quantities that are constant during a run: inputs of the FMU, or parameters that are set at the start. A grade is rise over run."""
 OUTPUTS: Mapping[str, str] = {"speed": "m/s", "throttle": "-", "brake": "-", "gear": "-"}
 TYPE_UNITS: Mapping[str, str] = {"mass": "kg", "accel": "m/s^2", "decel": "m/s^2", "max_speed": "m/s", "tau": "s"}
 DEFAULT_LAG = 0.1
 """Actuator lag that a driving system assumes if the study gives no `tau` [s]."""
 SENSOR_UNITS: Mapping[str, str] = {"latency": "s", "range": "m"}
-EXPECTED_ENTRIES = {
+LEGAL_ENTRIES = {
     "inputs": "the input for that pedal", "outputs": "the output that holds the speed",
     "sumo_type": "a number in SI units; or a characteristic, or an output or parameter of the FMU"}
 READABLE_CAUSALITIES = ("output", "calculatedParameter", "parameter", "local")
@@ -41,7 +41,7 @@ class _Prepared(NamedTuple):
 
 
 class _State(NamedTuple):
-    """State of N vehicles; `seen` is the history of sensed values, `history` is the history of the FMU instances."""
+    """State of N vehicles; `seen` is the history of observations, `history` that of the FMU instances."""
 
     speed: FloatArray
     throttle: FloatArray
@@ -65,7 +65,7 @@ class FmuVehicle:
     guard
         Checks the results of the FMU.
     limit
-        Longest time that an instance may take for one step [s].
+        Longest time that an FMU instance may take for one step [s].
 
     Raises
     ------
@@ -87,17 +87,17 @@ class FmuVehicle:
                     raise unknown(source, f"vehicle.{key}.{name} = {entry!r}: there is no such characteristic", entry, units,
                                   ", or a number")
                 self._refuse_too_small(table["characteristics"], f"vehicle.{key}.{name}", entry, may_be_0=name == "latency")
-        inputs = ports_of(description, table["inputs"], {**PEDALS, **ROAD}, ("input",), source, "vehicle.inputs", constants=ROAD)
+        inputs = ports_of(description, table["inputs"], {**PEDALS, **CONSTANTS}, ("input",), source, "vehicle.inputs", constants=CONSTANTS)
         outputs = ports_of(description, table["outputs"], OUTPUTS, ("output",), source, "vehicle.outputs")
         for key, entries, required in (("inputs", inputs, PEDALS), ("outputs", outputs, ("speed",)), ("sumo_type", self._type, TYPE_UNITS)):
             for name in required:
                 if name not in entries:
-                    raise InputError(source, f"vehicle.{key}.{name} is missing", EXPECTED_ENTRIES[key])
+                    raise InputError(source, f"vehicle.{key}.{name} is missing", LEGAL_ENTRIES[key])
         self._characteristic_units = {
-            entry: self._units(description, entry, units[entry], unit, f"vehicle.{key}.{name}")
+            entry: self._unit_pair(description, entry, units[entry], unit, f"vehicle.{key}.{name}")
             for key, entries, quantities in (("sensors", self._sensors, SENSOR_UNITS), ("sumo_type", self._type, TYPE_UNITS))
             for name, unit in quantities.items() if isinstance(entry := entries.get(name), str) and entry in units}
-        characteristics = {name: self._characteristic(description, name, unit) for name, unit in units.items()
+        characteristics = {name: self._characteristic_port(description, name, unit) for name, unit in units.items()
                            if name in description.variables or name not in self._sensors.values()}
         for quantity, port in inputs.items():
             if port.variable.name in characteristics:
@@ -115,14 +115,14 @@ class FmuVehicle:
         self.takes_slope, self.can_start_moving = "grade" in inputs, "initial_speed" in inputs
         self._takes_friction = "road_friction" in inputs
 
-    def _refuse_too_small(self, rows: Mapping[str, CharacteristicTable], key: str, entry: str | float, *, may_be_0: bool) -> None:
+    def _refuse_too_small(self, table: Mapping[str, CharacteristicTable], key: str, entry: str | float, *, may_be_0: bool) -> None:
         """Refuse a negative number, or a characteristic with a negative lower end; 0 is legal only with `may_be_0`."""
-        lower = rows[entry].lower if isinstance(entry, str) and entry in rows else entry
+        lower = table[entry].lower if isinstance(entry, str) and entry in table else entry
         if not isinstance(lower, str) and (lower < 0 or (lower == 0 and not may_be_0)):
             problem = f"{key} = {lower:g}" if lower is entry else f"vehicle.characteristics.{entry}.lower = {lower:g}, the value of {key}"
             raise InputError(self._guard.source, problem, "a number of at least 0" if may_be_0 else "a number above 0")
 
-    def _characteristic(self, description: Description, name: str, unit: str) -> Port:
+    def _characteristic_port(self, description: Description, name: str, unit: str) -> Port:
         key = f"vehicle.characteristics.{name}"
         variable = description.variable(name, ("parameter",), self._guard.source, key, REAL_TYPES)
         if unit == (variable.unit_name or unit) or (unit == "-" and variable.unit_name in ("", "1")):
@@ -132,7 +132,7 @@ class FmuVehicle:
             raise InputError(self._guard.source, f"{key}.unit = {unit!r}: the unit is not defined", repr(variable.unit_name))
         return Port(variable, description.unit_for(variable, defined_unit, unit, self._guard.source, f"{key}.unit"), defined_unit)
 
-    def _units(self, description: Description, name: str, unit: str, quantity_unit: str, key: str) -> tuple[Unit, Unit]:
+    def _unit_pair(self, description: Description, name: str, unit: str, quantity_unit: str, key: str) -> tuple[Unit, Unit]:
         """The units of a characteristic that sets a quantity, and of the quantity."""
         defined_unit = description.units.get(unit) or COMMON_UNITS.get(unit)
         if defined_unit is None or not defined_unit.fits(SI[quantity_unit]):
@@ -152,9 +152,9 @@ class FmuVehicle:
         fleet = Fleet(self._instances, n, step, self._communication_step)
         outputs = {}
         if self._reads_type:
-            outputs = dict(zip(self._outputs, self._start(fleet, self._input_array(inputs, characteristics))[0], strict=True))
+            outputs = dict(zip(self._outputs, self._start_fleet(fleet, self._input_array(inputs, characteristics))[0], strict=True))
 
-        def value(entry: str | float, name: str) -> FloatArray:
+        def quantity_values(entry: str | float, name: str) -> FloatArray:
             if not isinstance(entry, str):
                 return zeros + entry
             if entry not in characteristics:
@@ -162,9 +162,9 @@ class FmuVehicle:
             unit, quantity_unit = self._characteristic_units[entry]
             return np.asarray(unit.to(quantity_unit, characteristics[entry]))
 
-        types = SumoType(*(self._guard.numbers("sumo_type", name, value(self._type[name], name), (n,), 0.0, above=True)
+        types = SumoType(*(self._guard.numbers("sumo_type", name, quantity_values(self._type[name], name), (n,), 0.0, above=True)
                            for name in TYPE_UNITS))
-        sensors = Sensors.perfect(n)._replace(**{{"latency": "latency", "range": "reach"}[name]: value(entry, name)
+        sensors = Sensors.perfect(n)._replace(**{{"latency": "latency", "range": "reach"}[name]: quantity_values(entry, name)
                                                  for name, entry in self._sensors.items()})
         return _Prepared(fleet, inputs, characteristics, types, sensors, step)
 
@@ -183,7 +183,7 @@ class FmuVehicle:
             problem = f"{self._guard.name} has no vehicle.inputs.initial_speed, and the traffic puts it onto the road in motion"
             raise ForeignError(self._guard.source, problem, "a variable for the initial speed, or traffic that departs with speed 0")
         inputs = self._input_array({**prepared.inputs, "initial_speed": speed}, prepared.characteristics)
-        outputs, history = self._start(prepared.fleet, inputs)
+        outputs, history = self._start_fleet(prepared.fleet, inputs)
         released = Command(np.zeros_like(speed), np.zeros_like(speed))
         state = self._state(dict(zip(self._outputs, outputs, strict=True)), released, None, history)
         for i in np.flatnonzero(np.abs(state.speed - speed) > 1e-6)[:1]:
@@ -197,19 +197,19 @@ class FmuVehicle:
         """Sensors report the scene as it was one latency ago, and nothing beyond their range times the visibility."""
         if not self._sensors:
             return seen, state
-        sensed, history = sensed_observation(seen, state.seen, prepared.sensors.latency, prepared.sensors.reach, prepared.step)
-        return sensed, state._replace(seen=history)
+        sensed, past = sensed_observation(seen, state.seen, prepared.sensors.latency, prepared.sensors.reach, prepared.step)
+        return sensed, state._replace(seen=past)
 
     def advance(self, prepared: _Prepared, state: _State, command: Command) -> _State:
         inputs = self._input_array({**prepared.inputs, **command._asdict()}, prepared.characteristics)
         try:
             (point_outputs, step_outputs), history = prepared.fleet.advance(state.history, inputs)
         except Fault as fault:
-            raise self._foreign_error(fault) from None
+            raise self._user_code_error(fault) from None
         outputs = dict(zip(self._outputs, point_outputs, strict=True))
         outputs["speed"] = dict(zip(self._outputs, step_outputs, strict=True))["speed"]
         next_state, max_speed = self._state(outputs, command, state.seen, history), prepared.types.max_speed
-        for i in np.flatnonzero(next_state.speed > np.maximum(max_speed, state.speed) * (1 + ROUNDING))[:1]:
+        for i in np.flatnonzero(next_state.speed > np.maximum(max_speed, state.speed) * (1 + SPEED_ROUNDING))[:1]:
             raise self._guard.wrong("doStep", "speed", float(next_state.speed[i]), f"up to vehicle.sumo_type.max_speed = {max_speed[i]:g}")
         return next_state
 
@@ -219,13 +219,13 @@ class FmuVehicle:
         return [] if self._takes_friction else [
             f"{self._guard.name} has no vehicle.inputs.road_friction: weather has no effect on how it accelerates and brakes"]
 
-    def _start(self, fleet: Fleet, inputs: FloatArray) -> tuple[FloatArray, History]:
+    def _start_fleet(self, fleet: Fleet, inputs: FloatArray) -> tuple[FloatArray, History]:
         try:
             return fleet.start(inputs)
         except Fault as fault:
-            raise self._foreign_error(fault) from None
+            raise self._user_code_error(fault) from None
 
-    def _foreign_error(self, fault: Fault) -> ForeignError:
+    def _user_code_error(self, fault: Fault) -> ForeignError:
         return ForeignError(self._guard.source, f"{self._guard.name} {fault}")
 
     def _input_array(self, inputs: Mapping[str, FloatArray], characteristics: Characteristics) -> FloatArray:
@@ -233,8 +233,8 @@ class FmuVehicle:
 
     def _state(self, outputs: Mapping[str, FloatArray], command: Command, seen: FloatArray | None, history: History) -> _State:
         n = command.throttle.shape
-        speed = np.where(np.abs(outputs["speed"]) < ROUNDING, 0.0, outputs["speed"])
+        speed = np.where(np.abs(outputs["speed"]) < SPEED_ROUNDING, 0.0, outputs["speed"])
         values = {"gear": np.ones(n), **command._asdict(), **outputs, "speed": speed}
-        bounds = {"speed": (0.0, FASTEST), "gear": (-np.inf, np.inf)}
+        bounds = {"speed": (0.0, HIGHEST_SPEED), "gear": (-np.inf, np.inf)}
         columns = {name: self._guard.numbers("doStep", name, values[name], n, *bounds.get(name, (0.0, 1.0))) for name in _State._fields[:4]}
         return _State(**columns, seen=seen, history=history)

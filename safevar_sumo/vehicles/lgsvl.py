@@ -1,7 +1,7 @@
 """Lincoln2017MKZ of LGSVL 2021.1: VehicleSMI on Unity's WheelColliders, along its path.
 
 The equations come from the simulator's `VehicleSMI.cs` and from the friction of Unity's WheelCollider. One equivalent wheel
-stands for the four. In a substep, wheel and body form one linear system with the secant stiffness of the tyre. Its implicit
+represents the four. In a substep, wheel and body form one linear system with the secant stiffness of the tyre. Its implicit
 solution has a closed form.
 """
 
@@ -171,8 +171,8 @@ class Lgsvl(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         rim = _rim_at(p, speed, force)
         wheel_speed = rim / p.radius
         gear = zeros + 1
-        for step_ratio in GEAR_RATIOS[:-1]:
-            gear += p.least_rpm + wheel_speed * (step_ratio * FINAL_RATIO * RPM) > SHIFT_UP * p.largest_rpm
+        for lower_ratio in GEAR_RATIOS[:-1]:
+            gear += p.least_rpm + wheel_speed * (lower_ratio * FINAL_RATIO * RPM) > SHIFT_UP * p.largest_rpm
         ratio = GEAR_RATIOS[gear.astype(np.intp) - 1]
         gearing = ratio * FINAL_RATIO
         engine_rpm = p.least_rpm + wheel_speed * gearing * RPM
@@ -191,7 +191,7 @@ class Lgsvl(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     def advance(self, prepared: _Prepared, state: LgsvlState, command: Command) -> LgsvlState:
         p = prepared
         lateral, heading, cornering_drag = self._steer(p, state)
-        state = _after_shift(p, state)._replace(
+        state = _shift(p, state)._replace(
             throttle=state.throttle + (command.throttle - state.throttle) * p.pedal_share,
             brake=state.brake + (command.brake - state.brake) * p.pedal_share, lateral=lateral, heading=heading)
         gearing = _ratio(p, state) * FINAL_RATIO
@@ -212,20 +212,20 @@ class Lgsvl(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         return lateral, heading, p.mass * np.abs(curvature * angle) * s.speed
 
 
-def _after_shift(p: _Prepared, s: LgsvlState) -> LgsvlState:
-    """Automatic gearbox by engine speed; during shiftTime the ratio moves linearly from the old to the new ratio."""
+def _shift(p: _Prepared, s: LgsvlState) -> LgsvlState:
+    """Automatic gearbox by engine speed; for shiftTime after a shift, the ratio moves linearly from the old one to the new one."""
     share = s.engine_rpm / p.largest_rpm
-    ready = s.since_shift >= SHIFT_DELAY
-    up = ready & (share > SHIFT_UP) & (s.gear < LAST_GEAR)
-    down = ready & (share < SHIFT_DOWN) & (s.gear > FIRST_GEAR)
-    changes = up | down
-    if not np.count_nonzero(changes):
+    is_ready = s.since_shift >= SHIFT_DELAY
+    up = is_ready & (share > SHIFT_UP) & (s.gear < LAST_GEAR)
+    down = is_ready & (share < SHIFT_DOWN) & (s.gear > FIRST_GEAR)
+    shifts = up | down
+    if not np.count_nonzero(shifts):
         return s
     gear = s.gear + up - down
     return s._replace(
-        gear=gear, old_ratio=np.where(changes, _ratio(p, s), s.old_ratio),
-        new_ratio=np.where(changes, GEAR_RATIOS[gear.astype(np.intp) - 1], s.new_ratio),
-        since_shift=np.where(changes, ZERO, s.since_shift))
+        gear=gear, old_ratio=np.where(shifts, _ratio(p, s), s.old_ratio),
+        new_ratio=np.where(shifts, GEAR_RATIOS[gear.astype(np.intp) - 1], s.new_ratio),
+        since_shift=np.where(shifts, ZERO, s.since_shift))
 
 
 def _ratio(p: _Prepared, s: LgsvlState) -> FloatArray:
@@ -246,8 +246,8 @@ def _roll(p: _Prepared, s: LgsvlState, gearing: FloatArray, cornering_drag: Floa
 
     rim = p.radius * s.wheel_speed
     slip_speed = rim - s.speed
-    spins = slip_speed > p.slip_limit * np.maximum(rim, LEAST_RIM_SPEED)
-    traction = s.traction_torque + np.where(spins, -p.traction_change, p.traction_change)
+    is_spinning = slip_speed > p.slip_limit * np.maximum(rim, LEAST_RIM_SPEED)
+    traction_torque = s.traction_torque + np.where(is_spinning, -p.traction_change, p.traction_change)
 
     stiffness = _tyre_stiffness(p, s.speed, rim, slip_speed)
     pull = p.pull_by_stiffness * stiffness
@@ -256,19 +256,19 @@ def _roll(p: _Prepared, s: LgsvlState, gearing: FloatArray, cornering_drag: Floa
     wheel_momentum = p.inertia * s.wheel_speed + h * (drive - s.brake * p.brake_torque) + pull * p.body * slope_speed / damped_mass
     wheel_speed = np.maximum(wheel_momentum, ZERO) / (p.damped_inertia + pull * p.radius - pull * pull / damped_mass)
     speed = np.maximum((p.body * slope_speed + pull * wheel_speed) / damped_mass, ZERO)
-    held = (wheel_speed <= ZERO) & (speed < p.standstill)
-    if np.count_nonzero(held):
-        speed[held] = ZERO
+    is_held = (wheel_speed <= ZERO) & (speed < p.standstill)
+    if np.count_nonzero(is_held):
+        speed[is_held] = ZERO
     return s._replace(speed=speed, wheel_speed=wheel_speed, engine_rpm=engine_rpm,
-                      traction_torque=np.minimum(np.maximum(traction, ZERO), p.motor_torque))
+                      traction_torque=np.minimum(np.maximum(traction_torque, ZERO), p.motor_torque))
 
 
 def _torque_share(share: FloatArray) -> FloatArray:
     """Engine torque as a share of the largest, at an engine speed as a share of maxRpm: a parabola below 1, zero from 1 on (assumption)."""
     torque = TORQUE_IDLE + TORQUE_BEND * share * (ONE - share)
-    overspeed = share >= ONE
-    if np.count_nonzero(overspeed):
-        torque[overspeed] = ZERO
+    is_overspeed = share >= ONE
+    if np.count_nonzero(is_overspeed):
+        torque[is_overspeed] = ZERO
     return torque
 
 
@@ -286,9 +286,9 @@ def _tyre_stiffness(p: _Prepared, speed: FloatArray, rim: FloatArray, slip_speed
     denominator = np.maximum(np.maximum(speed, rim), SLIP_FLOOR)
     slip = np.abs(slip_speed) / denominator
     friction = (TWO - slip / PEAK_SLIP) / PEAK_SLIP
-    slides = slip >= PEAK_SLIP
-    if np.count_nonzero(slides):
+    is_sliding = slip >= PEAK_SLIP
+    if np.count_nonzero(is_sliding):
         sliding_share = np.minimum((slip - PEAK_SLIP) / SLIDING_RANGE, ONE)
-        friction = np.where(slides, (ONE - FRICTION_LOSS * sliding_share) / np.maximum(slip, PEAK_SLIP), friction)
+        friction = np.where(is_sliding, (ONE - FRICTION_LOSS * sliding_share) / np.maximum(slip, PEAK_SLIP), friction)
     load = p.weight + DOWNFORCE * speed * speed
     return np.asarray(p.friction * load * friction / denominator)

@@ -16,19 +16,19 @@ from safevar_sumo.study import Constraint, Study
 from safevar_sumo.vehicles.characteristics import CharacteristicSet
 
 SLACK = 1e-9
-"""Tolerance for the violation of a bound, as a share of the range of the quantity in the domains [-]; covers rounding."""
-STEPS_BACK = 64
-"""Number of points that a repair tries between an infeasible setting and the original."""
+"""Tolerated violation of a bound, as a share of the range of the quantity in the domains [-]; covers rounding."""
+N_REPAIR_SHARES = 64
+"""Number of settings that a repair tries between an infeasible setting and the original."""
 REJECTIONS = 1000
 """Maximum number of settings drawn for each feasible setting."""
-PROBES = 512
-"""Number of random settings among which a feasible change is sought, in addition to vertices and ends of the domains."""
-Draw = Callable[[int], FloatArray]
+N_PROBES = 512
+"""Number of random settings among which a feasible change is sought, besides vertices of the region and ends of the domains."""
+DrawSettings = Callable[[int], FloatArray]
 """A function that draws a number of settings."""
 
 
 class _Bounds(NamedTuple):
-    """A constraint as a computation: `quantity` maps settings, shape (N, n), to values, shape (N,); `range` is the range of the values."""
+    """A constraint as a computation: `quantity` maps settings, shape (N, n), to values, shape (N,), in a range of size `range`."""
 
     constraint: Constraint
     condition: str
@@ -39,7 +39,7 @@ class _Bounds(NamedTuple):
     range: float
 
     def excess(self, settings: FloatArray) -> FloatArray:
-        """Violation of the bounds by each setting, as a share of the range of the quantity, shape (N,)."""
+        """By how much each setting violates the bounds, as a share of `range`, shape (N,)."""
         values = self.quantity(settings)
         return np.asarray(np.maximum(np.maximum(self.minimum - values, values - self.maximum), 0.0) / self.range)
 
@@ -88,39 +88,39 @@ class FeasibleRegion:
             for bound in self.bounds:
                 if bound.excess(setting[np.newaxis])[0] > SLACK / len(self.bounds):
                     quantity = f"{bound.constraint.quantity} = {bound.quantity(setting[np.newaxis])[0]:g}{bound.suffix}"
-                    raise InputError(source, f"violates a constraint: {quantity} ({self._values(bound, setting)})",
+                    raise InputError(source, f"violates a constraint: {quantity} ({self._describe_values(bound, setting)})",
                                      bound.condition + otherwise)
 
-    def _values(self, bound: _Bounds, setting: FloatArray) -> str:
-        return ", ".join(f"{member.name} = {value:g}{member.suffix}"
-                         for member, value in zip(self.characteristics, setting, strict=True)
-                         if member.name in bound.constraint.sum
-                         or (bound.constraint.function and value != member.original)) or "the original"
+    def _describe_values(self, bound: _Bounds, setting: FloatArray) -> str:
+        return ", ".join(f"{characteristic.name} = {value:g}{characteristic.suffix}"
+                         for characteristic, value in zip(self.characteristics, setting, strict=True)
+                         if characteristic.name in bound.constraint.sum
+                         or (bound.constraint.function and value != characteristic.original)) or "the original"
 
     def repaired(self, settings: FloatArray, *, filtered: bool = True) -> FloatArray:
         """Settings moved towards the original until they are feasible; if `filtered`, feasible after the filter. Shape (N, n)."""
-        result = settings.copy()
-        infeasible = np.flatnonzero(~self._accepted(settings, filtered))
-        for share in np.arange(STEPS_BACK - 1, -1, -1) / STEPS_BACK:
+        repaired = settings.copy()
+        infeasible = np.flatnonzero(~self._are_accepted(settings, filtered))
+        for share in np.arange(N_REPAIR_SHARES - 1, -1, -1) / N_REPAIR_SHARES:
             if not len(infeasible):
                 break
             original = self.characteristics.original
-            result[infeasible] = original + share * (settings[infeasible] - original)
-            infeasible = infeasible[~self._accepted(result[infeasible], filtered)]
-        return result
+            repaired[infeasible] = original + share * (settings[infeasible] - original)
+            infeasible = infeasible[~self._are_accepted(repaired[infeasible], filtered)]
+        return repaired
 
-    def sampled(self, draw: Draw, number: int, rng: np.random.Generator | None = None, *, filtered: bool = False,
+    def sampled(self, draw: DrawSettings, number: int, rng: np.random.Generator | None = None, *, filtered: bool = False,
                 rejections: int = REJECTIONS) -> FloatArray:
         """The first `number` feasible settings drawn, shape (number, n).
 
-        If `rejections` draws per setting do not suffice, random mixtures of the region's vertices follow; without `rng` the result
-        has fewer settings.
+        If `rejections` draws per setting do not suffice, random mixtures of the region's vertices fill the rest; without `rng`, fewer
+        settings are returned.
         """
         batches, draws = [np.zeros((0, len(self.characteristics)))], 0
         while (shortage := number - sum(map(len, batches))) and draws < rejections * number:
             settings = draw(max(shortage, min(draws, 10_000)))
             draws += len(settings)
-            batches.append(settings[self._accepted(settings, filtered)][:shortage])
+            batches.append(settings[self._are_accepted(settings, filtered)][:shortage])
         if shortage and rng is not None:
             corners = np.concatenate([self.vertices, self.characteristics.original[np.newaxis]])
             mixtures = rng.dirichlet(np.full(len(corners), 0.5), shortage) @ corners
@@ -128,7 +128,7 @@ class FeasibleRegion:
             batches.append(self.repaired(mixtures, filtered=filtered))
         return np.concatenate(batches)
 
-    def _accepted(self, settings: FloatArray, filtered: bool) -> BoolArray:
+    def _are_accepted(self, settings: FloatArray, filtered: bool) -> BoolArray:
         return self.feasible(self.characteristics.filter(settings) if filtered else settings)
 
 
@@ -145,7 +145,7 @@ def region_of(study: Study, source: str = "") -> FeasibleRegion:
     if not study.constraints:
         return FeasibleRegion(characteristics, (), np.zeros((0, len(characteristics))))
     lookup, members = Lookup(source, study.origin.places), list[Member]()
-    bounds = tuple(_bounds(constraint, study, characteristics, lookup, f"constraints[{number}]", members)
+    bounds = tuple(_bounds_of(constraint, study, characteristics, lookup, f"constraints[{number}]", members)
                    for number, constraint in enumerate(study.constraints))
     linear = [(tuple(bound.constraint.sum.get(name, 0.0) for name in characteristics.names), bound.minimum, bound.maximum)
               for bound in bounds if bound.constraint.sum]
@@ -166,7 +166,7 @@ def region_of(study: Study, source: str = "") -> FeasibleRegion:
     return region
 
 
-def _bounds(constraint: Constraint, study: Study, characteristics: CharacteristicSet, lookup: Lookup, key: str,
+def _bounds_of(constraint: Constraint, study: Study, characteristics: CharacteristicSet, lookup: Lookup, key: str,
             members: list[Member]) -> _Bounds:
     minimum = -np.inf if constraint.at_least is None else constraint.at_least
     maximum = np.inf if constraint.at_most is None else constraint.at_most
@@ -199,7 +199,7 @@ def _weighted_sum(settings: FloatArray, weights: Sequence[tuple[int, float]]) ->
 
 
 def _refuse_unreachable(source: str, bound: _Bounds, characteristics: CharacteristicSet) -> None:
-    terms = np.array([[getattr(characteristics, side)[characteristics.names.index(name)] * weight for side in ("lower", "upper")]
+    terms = np.array([[getattr(characteristics, end)[characteristics.names.index(name)] * weight for end in ("lower", "upper")]
                       for name, weight in bound.constraint.sum.items()])
     smallest, largest = (float(extreme(terms, axis=1).sum()) for extreme in (np.min, np.max))
     if largest < bound.minimum or smallest > bound.maximum:
@@ -209,7 +209,7 @@ def _refuse_unreachable(source: str, bound: _Bounds, characteristics: Characteri
 
 @lru_cache(maxsize=16)
 def _vertices(linear: tuple[Any, ...], lower: tuple[float, ...], upper: tuple[float, ...]) -> FloatArray | None:
-    """Two settings per characteristic, with its least and its greatest value under the linear constraints; None if no setting fits."""
+    """For each characteristic, settings with its least and its greatest value under the linear constraints; None if no setting fits."""
     from scipy.optimize import linprog  # loading takes half a second
 
     inequalities = [(sign * np.array(weights), sign * limit) for weights, minimum, maximum in linear
@@ -242,6 +242,6 @@ def _candidates(region: FeasibleRegion) -> Iterator[FloatArray]:
     yield np.concatenate([region.vertices, *(np.where(np.eye(size, dtype=bool), end, original)
                                              for end in (characteristics.lower, characteristics.upper))])
     rng = np.random.default_rng(0)
-    probes = rng.uniform(characteristics.lower, characteristics.upper, (PROBES, size))
-    sparse_probes = np.where(rng.random((PROBES, size)) < 2 / size, probes, original)
+    probes = rng.uniform(characteristics.lower, characteristics.upper, (N_PROBES, size))
+    sparse_probes = np.where(rng.random((N_PROBES, size)) < 2 / size, probes, original)
     yield region.repaired(np.concatenate([probes, sparse_probes]))

@@ -1,4 +1,4 @@
-"""Sensors and delayed signals: a history of samples that every vehicle reads with its own delay."""
+"""Sensors and delayed signals: every vehicle reads a common history of samples with a delay of its own."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ LONGEST_DELAY = 3600.0
 
 
 def start_history(longest_delay: float, step: float, sample: FloatArray) -> FloatArray:
-    """A history for delays up to `longest_delay` [s], filled with a first sample of shape (..., N); the newest sample comes first.
+    """A history for delays up to `longest_delay` [s], filled with the first sample, shape (..., N); the newest sample comes first.
 
     Raises
     ------
@@ -33,7 +33,7 @@ def extend_history(past: FloatArray, sample: FloatArray) -> FloatArray:
 
 
 def delay_signal(past: FloatArray, delay: FloatArray, step: float) -> FloatArray:
-    """The signal of vehicle i `delay[i]` seconds ago, interpolated linearly; shape (..., N)."""
+    """The signal of each vehicle i as it was `delay[i]` seconds ago, interpolated linearly; shape (..., N)."""
     age = delay / step
     whole_steps = np.floor(age)
     share = age - whole_steps
@@ -46,7 +46,7 @@ def delay_signal(past: FloatArray, delay: FloatArray, step: float) -> FloatArray
 
 
 class Sensors(NamedTuple):
-    """Sensors of N vehicles, each of shape (N,): latency [s], range in clear weather [m], factor on distances [-].
+    """Properties of the sensors of N vehicles, each of shape (N,): latency [s], range in clear weather [m], factor on distances [-].
 
     A vehicle's method `sensors(prepared)` returns them; `Vehicle.sense` applies the same sensors to an observation.
     """
@@ -68,6 +68,6 @@ def sensed_observation(seen: Observation, past: FloatArray | None, latency: Floa
     sample = np.stack([seen.gap, seen.closing_speed, seen.lateral, seen.lateral_speed, obstacle_speed])
     past = start_history(float(np.max(latency)), step, sample) if past is None else extend_history(past, sample)
     gap, closing_speed, lateral, lateral_speed, obstacle_speed = delay_signal(past, latency, step)
-    detected = gap <= reach * seen.visibility
-    return seen._replace(gap=np.where(detected, gap, np.inf), closing_speed=closing_speed, lateral=lateral,
+    is_detected = gap <= reach * seen.visibility
+    return seen._replace(gap=np.where(is_detected, gap, np.inf), closing_speed=closing_speed, lateral=lateral,
                          lateral_speed=lateral_speed, obstacle_speed=obstacle_speed), past

@@ -1,4 +1,4 @@
-"""A vehicle with the parameters of a SUMO vType, and the sensors and actuators that its ADS relies on."""
+"""A vehicle with the parameters of a SUMO vType, and with delays of its sensors and actuators."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ class SumoVehicle(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
         target = np.where(brake > 0, -brake * p.brake_gain * p.decel, command.throttle * p.accel)
         target = np.minimum(np.maximum(target, -p.grip), p.grip)
         acceleration = state.acceleration + (target - state.acceleration) * (p.step / (p.actuator_lag + p.step))
-        # Braking ends a remaining positive acceleration at once.
+        # Braking ends a positive acceleration at once, without lag.
         acceleration = np.where(brake > 0, np.minimum(acceleration, 0.0), acceleration)
         speed = np.minimum(np.maximum(state.speed + (acceleration - p.back) * p.step, 0.0), np.maximum(p.max_speed, state.speed))
         return state._replace(

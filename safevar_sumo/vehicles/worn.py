@@ -18,7 +18,7 @@ DEEP_TREAD_RATIO = 1.368
 HALF_WORN_RATIO = 39.9 / 31.7
 """Stopping distance at 1.6 mm over the distance at 3 mm, from 50 mph on a wet road (MIRA for Continental; both in m) [-]."""
 HALF_WORN_LOSS = (1 - HALF_WORN_RATIO / DEEP_TREAD_RATIO) / (1 - 1 / DEEP_TREAD_RATIO)
-"""Loss of friction at 3 mm over the loss at 1.6 mm [-]; friction is proportional to 1 / stopping distance."""
+"""Loss of friction at 3 mm over the loss at 1.6 mm [-], as friction is proportional to 1 / stopping distance."""
 Positive = Annotated[float, Meta(gt=0, le=1e5)]
 
 
@@ -99,7 +99,7 @@ class WornVehicle(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
         c = characteristics
         mass = self.kerb_mass + c["payload"]
         centre = (self.kerb_mass * self.kerb_centre + c["payload"] * c["payloadCentre"]) / mass / self.wheelbase
-        grip_share = np.where(wet, 1 - self.tread_loss * _share_of_loss(np.maximum(c["treadDepth"], 0.0)), 1.0)
+        grip_share = np.where(wet, 1 - self.tread_loss * _loss_share(np.maximum(c["treadDepth"], 0.0)), 1.0)
         return _Prepared(
             step=step, mass=mass, drive=self.drive_force / mass,
             brake=c["brakeTorque"] * (self.brake_force / mass), grip=self.tyre_friction * road_friction * grip_share,
@@ -148,7 +148,7 @@ class WornVehicle(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
         return np.minimum(np.minimum(demand, p.grip * p.slope.down), np.minimum(rear_limit, front_limit))
 
 
-def _share_of_loss(depth: FloatArray) -> FloatArray:
+def _loss_share(depth: FloatArray) -> FloatArray:
     """Loss of friction on a wet road at a tread depth [mm] over the loss at 1.6 mm [-], shape (N,)."""
     loss_to_half_worn = np.minimum(np.maximum((DEEP_TREAD - depth) / (DEEP_TREAD - HALF_WORN_TREAD), 0.0), 1.0)
     loss_beyond_half_worn = np.maximum((HALF_WORN_TREAD - depth) / (HALF_WORN_TREAD - LEGAL_TREAD), 0.0)

@@ -63,7 +63,7 @@ def test_the_pedestrian_moves_as_the_closed_form_says(test: str) -> None:
 @settings(max_examples=40)
 @given(speed=st.floats(1, 5), run_up=st.just(0.0) | st.floats(0.1, 3), rest=st.floats(0.01, 8), time=st.floats(20, 60))
 def test_a_target_arrives_in_time_with_any_speed_profile(speed: float, run_up: float, rest: float, time: float) -> None:
-    profile = SpeedProfile.reaching(run_up + rest, time, speed, run_up)
+    profile = SpeedProfile.with_arrival(run_up + rest, time, speed, run_up)
     assert profile.travelled(time) == pytest.approx(run_up + rest)
     assert profile.travelled(profile.begin) == 0
     if run_up:

@@ -86,7 +86,7 @@ def test_a_scene_from_the_cache_equals_the_scene_that_sumo_played(monkeypatch: p
     scenario = assemble(load_study("sun")).scenario
 
     def scene() -> str:
-        recording._scenes.clear()
+        recording._recordings.clear()
         return repr(record_scenes([scenario], ()))
 
     played = scene()
