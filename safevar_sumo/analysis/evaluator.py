@@ -103,7 +103,7 @@ class Evaluator:
             length += count
             return sobol_design(self.characteristics, length, seed)[length - count:]
 
-        return self.region.sampled(next_settings, number, rng, filtered=filtered, rejections=MAX_REJECTIONS)
+        return self.region.draw_feasible(next_settings, number, rng, filtered=filtered, rejections=MAX_REJECTIONS)
 
     def cells(self, settings: FloatArray, stage: str) -> CellResults:
         """Simulate M settings, shape (M, n), in every cell of a rated study; the workers share the cells.

@@ -38,7 +38,7 @@ class Problem:
         lower, upper = self.characteristics.lower, self.characteristics.upper
         if not self.region:
             return rng.uniform(lower, upper, (number, len(lower)))
-        return self.region.sampled(lambda count: rng.uniform(lower, upper, (count, len(lower))), number, rng, filtered=True)
+        return self.region.draw_feasible(lambda count: rng.uniform(lower, upper, (count, len(lower))), number, rng, filtered=True)
 
     def feasible(self, settings: FloatArray) -> BoolArray:
         """Which settings, shape (k, n), satisfy the study's constraints after the filter; shape (k,)."""

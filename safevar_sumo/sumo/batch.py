@@ -140,7 +140,7 @@ def _simulate(system: System, settings: FloatArray, world: Any, watch: Watcher |
         world.advance(np.where(outcomes.is_open, state.speed, 0.0))
     trace = log.trace(sample + 1, step, vehicle_length)
     return SimulationRuns(
-        trace=trace, encounter=batch.encounter(trace), outcome=np.where(robot.invalid, Outcome.INVALID_TEST, outcomes.final()),
+        trace=trace, encounter=batch.encounter(trace), outcome=np.where(robot.invalid, Outcome.INVALID_TEST, outcomes.classify()),
         collision_speed=np.where(robot.invalid, np.nan, outcomes.collision_speed), contact=contacts.first_contacts(),
         test_speed_error=robot.error, warning_ttc=warnings.time_to_collision)
 
@@ -248,7 +248,7 @@ class _Outcomes:
         self.ended_copies = (was_open & ~self.is_open).nonzero()[0].tolist()
         return active
 
-    def final(self) -> npt.NDArray[np.str_]:
+    def classify(self) -> npt.NDArray[np.str_]:
         """The outcomes of all runs, once no run is open."""
         outcome = np.full(len(self.is_open), Outcome.TIMEOUT.value, dtype="U16")
         outcome[self._is_over] = Outcome.PASSED

@@ -154,7 +154,7 @@ def _run_program(sources: Sources, program: str, *arguments: str) -> tuple[int, 
 
 
 def _try_roads(sources: Sources, into: Path) -> None:
-    """Load a network that the user built in a separate SUMO process, as some broken networks crash SUMO."""
+    """Load a network built by the user, in a separate SUMO process because some broken networks crash SUMO."""
     _read_roads(sources.folder / sources.network_file)
     code, errors = _run_program(sources, "sumo", "-n", sources.network_file, "--no-step-log", "true", "--end", "0")
     if code != 0:

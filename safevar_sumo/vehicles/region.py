@@ -109,8 +109,8 @@ class FeasibleRegion:
             infeasible = infeasible[~self._are_accepted(repaired[infeasible], filtered)]
         return repaired
 
-    def sampled(self, draw: DrawSettings, number: int, rng: np.random.Generator | None = None, *, filtered: bool = False,
-                rejections: int = REJECTIONS) -> FloatArray:
+    def draw_feasible(self, draw: DrawSettings, number: int, rng: np.random.Generator | None = None, *, filtered: bool = False,
+                      rejections: int = REJECTIONS) -> FloatArray:
         """The first `number` feasible settings drawn, shape (number, n).
 
         If `rejections` draws per setting do not suffice, random mixtures of the region's vertices fill the rest; without `rng`, fewer

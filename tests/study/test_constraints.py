@@ -169,7 +169,7 @@ def test_an_equation_leaves_what_satisfies_it() -> None:
     study = constrained({"sum": {"mass": 1.0, "maxBrakeTorque": -2.0}, "unit": "kg", "at_least": -596.0, "at_most": -596.0})
     rng = np.random.default_rng(1)
     region = region_of(study)
-    drawn = region.sampled(lambda some: rng.uniform(SUN.lower, SUN.upper, (some, len(SUN))), 40, rng, filtered=True, rejections=2)
+    drawn = region.draw_feasible(lambda some: rng.uniform(SUN.lower, SUN.upper, (some, len(SUN))), 40, rng, filtered=True, rejections=2)
     filtered = SUN.filter(drawn)
     mass, torque = (filtered[:, SUN.names.index(name)] for name in ("mass", "maxBrakeTorque"))
     assert np.abs(mass - 2 * torque + 596).max() < 1e-5

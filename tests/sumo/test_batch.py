@@ -80,7 +80,7 @@ def judged(*samples: tuple[float, bool, float | None]) -> tuple[str, list[bool],
         verdicts = outcomes.judge(np.array([speed]), np.array([over]), collisions, last=i == len(samples) - 1)
         active.append(bool(verdicts[0]))
     assert not outcomes.is_open.any()
-    return str(outcomes.final()[0]), active, float(outcomes.collision_speed[0])
+    return str(outcomes.classify()[0]), active, float(outcomes.collision_speed[0])
 
 
 @pytest.mark.parametrize(("samples", "outcome"), [

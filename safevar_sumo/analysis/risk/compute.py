@@ -328,7 +328,7 @@ def _rare_estimate(response: Response, values: FloatArray, options: RiskOptions,
 
 def _feasible_vehicles(evaluator: Evaluator, model: VariationModel, number: int, rng: np.random.Generator) -> FloatArray:
     """Random vehicles that satisfy the constraints, shape (number, n)."""
-    settings = evaluator.region.sampled(lambda count: model.settings(rng.random((count, len(evaluator.characteristics)))), number)
+    settings = evaluator.region.draw_feasible(lambda count: model.settings(rng.random((count, len(evaluator.characteristics)))), number)
     if len(settings) < number:
         raise InputError(evaluator.study.source, f"fewer than 1 in {REJECTIONS} random vehicles satisfy the constraints: "
                          f"{evaluator.region}", "a [variation] and [[constraints]] that agree")

@@ -240,7 +240,8 @@ def _settings_in_box(evaluator: Evaluator, columns: Sequence[int], factor: float
 
 def _random_settings(evaluator: Evaluator, columns: Sequence[int], factor: float, number: int, rng: np.random.Generator) -> FloatArray:
     """Feasible settings drawn uniformly in a box; fewer than `number` where hardly any is feasible."""
-    return evaluator.region.sampled(lambda count: _settings_in_box(evaluator, columns, factor, rng.random((count, len(columns)))), number)
+    return evaluator.region.draw_feasible(
+        lambda count: _settings_in_box(evaluator, columns, factor, rng.random((count, len(columns)))), number)
 
 
 def _unsafe_of(evaluator: Evaluator, factor: float, settings: FloatArray, unsafe: Unsafe) -> tuple[FloatArray, int]:
