@@ -37,7 +37,7 @@ MAX_REJECTIONS = 64
 """If fewer than 1 in so many points of the Sobol sequence is feasible, mixtures of the feasible region's vertices replace the points."""
 
 
-def silent(stage: str, done: int, total: int) -> None:
+def show_no_progress(stage: str, done: int, total: int) -> None:
     """Show no progress."""
 
 
@@ -50,20 +50,20 @@ class Evaluator:
         Number of settings simulated so far; of equal settings in one call only one is simulated.
     """
 
-    def __init__(self, study: Study, pool: Pool, progress: Progress = silent) -> None:
+    def __init__(self, study: Study, pool: Pool, progress: Progress = show_no_progress) -> None:
         self.study, self.region = study, region_of(study)
         self.characteristics = self.region.characteristics
         self._pool, self.progress = pool, progress
         self.simulated = 0
 
     def evaluate(self, settings: FloatArray, stage: str, before: int = 0, total: int | None = None, *,
-                 anywhere: bool = False) -> Evaluations:
+                 ignore_constraints: bool = False) -> Evaluations:
         """Evaluate M settings, shape (M, n). Progress is shown for `stage`, in which `before` of `total` settings are already done.
 
-        Settings that violate a constraint of the study are not simulated and get the outcome `infeasible`. If `anywhere` is true, the
-        constraints are ignored.
+        Settings that violate a constraint of the study are not simulated and get the outcome `infeasible`, unless `ignore_constraints`
+        is true.
         """
-        if self.region and not anywhere:
+        if self.region and not ignore_constraints:
             feasible = self.region.feasible(settings)
             if not feasible.all():
                 parts = [self.evaluate(settings[feasible], stage, before, total), self._infeasible_evaluations(settings[~feasible])]
@@ -105,7 +105,7 @@ class Evaluator:
 
         return self.region.sampled(next_settings, number, rng, filtered=filtered, rejections=MAX_REJECTIONS)
 
-    def cells(self, settings: FloatArray, stage: str) -> CellResults:
+    def simulate_cells(self, settings: FloatArray, stage: str) -> CellResults:
         """Simulate M settings, shape (M, n), in every cell of a rated study; the workers share the cells.
 
         Raises
@@ -134,7 +134,7 @@ class Evaluator:
         columns = zip(*(results_by_part[k] for k in range(parts)), strict=True)
         return CellResults._make(np.concatenate(column, axis=1)[:, order] for column in columns)
 
-    def original(self) -> Evaluations:
+    def evaluate_original(self) -> Evaluations:
         """Evaluation of the original vehicle.
 
         Raises
@@ -147,11 +147,11 @@ class Evaluator:
             raise SimulationError(f"study {self.study.name!r} cannot be simulated with the original vehicle: {evaluations.outcome[0]}")
         return evaluations
 
-    def criterion(self, text: str | None, original: Evaluations | None = None) -> Unsafe:
+    def choose_criterion(self, text: str | None, original: Evaluations | None = None) -> Unsafe:
         """The criterion that an option states, or the default criterion; raises what `parse_criterion` and `Unsafe.default_among` raise."""
         if text is not None:
             return self.parse_criterion(text)
-        original = self.original() if original is None else original
+        original = self.evaluate_original() if original is None else original
         if RATING_POINTS.name in original.metrics:
             return Unsafe.default_among(original, original)
         return Unsafe.default_among(self.evaluate(self.feasible_design(CRITERION_SETTINGS), "settings over the whole domain"), original)
@@ -174,7 +174,8 @@ class Evaluator:
 
 
 @contextmanager
-def open_evaluator(study: Study, pool: Pool | None = None, jobs: int | None = None, progress: Progress = silent) -> Iterator[Evaluator]:
+def open_evaluator(study: Study, pool: Pool | None = None, jobs: int | None = None,
+                   progress: Progress = show_no_progress) -> Iterator[Evaluator]:
     """An evaluator that simulates on `pool`; without a pool, on `jobs` new worker processes, by default one for each core.
 
     Raises

@@ -16,7 +16,7 @@ from safevar_sumo.sumo.matrix import evaluate, named_point
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet
 
-BAND = 0.9
+BAND_SHARE = 0.9
 """Share of the predictions that lie in the band."""
 DEVIATIONS = 1.645
 """Half width [standard deviations] of the interval around the mean that holds this share of a normal distribution."""
@@ -53,11 +53,11 @@ class ModelSpread:
         if self.lower is None or self.upper is None:
             return f"no safety degree with any of {self.sets} parameter sets that fit the published data equally well"
         number = "none of them" if not self.collisions else f"{self.collisions} of them"
-        return (f"safety degree {self.lower:.2f} to {self.upper:.2f} ({BAND:.0%} band of {self.sets} parameter sets that fit the published "
-                f"data equally well, of repeats and of the model's error); a collision with {number}")
+        return (f"safety degree {self.lower:.2f} to {self.upper:.2f} ({BAND_SHARE:.0%} band of {self.sets} parameter sets that fit the "
+                f"published data equally well, of repeats and of the model's error); a collision with {number}")
 
 
-def model_spreads(study: Study, settings: FloatArray, point: str = "") -> list[ModelSpread]:
+def compute_model_spreads(study: Study, settings: FloatArray, point: str = "") -> list[ModelSpread]:
     """The model's uncertainty for each of M settings, shape (M, n); the filter is not applied.
 
     In a matrix, all settings are simulated at `point`; if no point is named, each setting at its worst point.
@@ -67,7 +67,7 @@ def model_spreads(study: Study, settings: FloatArray, point: str = "") -> list[M
     InputError
         If the study has no spread, or the spread names a parameter that the study lacks.
     """
-    evaluations = evaluations_of_sets(study, settings, point)
+    evaluations = evaluate_sets(study, settings, point)
     lower, upper = band_of(study, evaluations)
     collisions = np.stack([prediction.collided for prediction in evaluations]).sum(axis=0)
     return [ModelSpread(sets=len(evaluations), lower=finite_or_none(low), upper=finite_or_none(high), collisions=int(count))
@@ -90,11 +90,11 @@ def band(safety_degrees: FloatArray, repeatability: float, error: FloatArray | f
     """Ends, shape (M,) each, of the band of predictions, shape (sets, M); repeats of a simulation and `error` widen it on each side."""
     lower, upper = np.full(safety_degrees.shape[1], np.nan), np.full(safety_degrees.shape[1], np.nan)
     defined = np.isfinite(safety_degrees).any(axis=0)
-    lower[defined], upper[defined] = np.nanquantile(safety_degrees[:, defined], [(1 - BAND) / 2, (1 + BAND) / 2], axis=0)
+    lower[defined], upper[defined] = np.nanquantile(safety_degrees[:, defined], [(1 - BAND_SHARE) / 2, (1 + BAND_SHARE) / 2], axis=0)
     return lower - DEVIATIONS * repeatability - error, upper + DEVIATIONS * repeatability + error
 
 
-def evaluations_of_sets(study: Study, settings: FloatArray, point: str = "") -> list[Evaluations]:
+def evaluate_sets(study: Study, settings: FloatArray, point: str = "") -> list[Evaluations]:
     """Evaluate settings, shape (M, n), in this process with each parameter set, first with the study's values."""
     systems = [assemble(variant) for variant in studies_of_sets(study)]
     return [evaluate(named_point(system, point, "point") if point else system, settings) for system in systems]

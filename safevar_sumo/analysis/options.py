@@ -81,7 +81,7 @@ class Options:
     """The command that asks the question."""
 
     def __post_init__(self) -> None:
-        for name, definition in self.described().items():
+        for name, definition in self.definitions().items():
             value = getattr(self, name)
             if definition.form != "one" and value is not None and not isinstance(value, Mapping):
                 object.__setattr__(self, name, (value,) if isinstance(value, str) else tuple(value))
@@ -92,14 +92,14 @@ class Options:
                     raise InputError(name, repr(value), expected)
 
     @classmethod
-    def described(cls) -> Mapping[str, Option]:
+    def definitions(cls) -> Mapping[str, Option]:
         """Every option by its name."""
         return {item.name: item.metadata["option"] for item in fields(cls)}
 
     @classmethod
     def flags(cls) -> Mapping[str, str]:
         """The flag of every option."""
-        return {name: option.flag or f"--{name.replace('_', '-')}" for name, option in cls.described().items()}
+        return {name: option.flag or f"--{name.replace('_', '-')}" for name, option in cls.definitions().items()}
 
     def command_line(self, place: str, point: str = "") -> str:
         """The command that asks this question about a study or results directory, with a flag for each option off its default."""
@@ -137,10 +137,10 @@ SimulationError
 QuestionFunction = TypeVar("QuestionFunction", bound=Callable[..., Any])
 
 
-def documented(options: type[Options]) -> Callable[[QuestionFunction], QuestionFunction]:
+def document_options(options: type[Options]) -> Callable[[QuestionFunction], QuestionFunction]:
     """Decorator: appends the options and the arguments common to all questions to a docstring, which must end with the first argument."""
     def complete(function: QuestionFunction) -> QuestionFunction:
-        arguments = [f"{name}\n{indent(definition.argument, '    ')}" for name, definition in options.described().items()]
+        arguments = [f"{name}\n{indent(definition.argument, '    ')}" for name, definition in options.definitions().items()]
         function.__doc__ = "\n".join([cleandoc(function.__doc__ or ""), *arguments, COMMON_ARGUMENTS])
         return function
 

@@ -166,7 +166,7 @@ def answer_question(compute: Callable[..., T], subject: Study | Case, options: t
     """Compute the answer to a question; `arguments` are the arguments of the question's function, by name."""
     from safevar_sumo.metrics import Unsafe
 
-    values = {name: arguments[name] for name in options.described()}
+    values = {name: arguments[name] for name in options.definitions()}
     if values.get("unsafe") is not None:
         values["unsafe"] = str(Unsafe.parse(values["unsafe"]))
     with shown(arguments["progress"]) as show:

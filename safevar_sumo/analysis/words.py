@@ -40,7 +40,7 @@ def question_command(question: str, subject: str, point: str = "") -> str:
     return " ".join([RUN, question, quote(subject), *(["--point", quote(point)] if point else [])])
 
 
-def joined(parts: Iterable[str]) -> str:
+def join_phrases(parts: Iterable[str]) -> str:
     """Parts of a sentence: `a, b and c`."""
     *beginning, end = parts
     return f"{', '.join(beginning)} and {end}" if beginning else end

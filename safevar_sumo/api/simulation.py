@@ -288,10 +288,10 @@ def evaluate(study: StudyLike, settings: pd.DataFrame | Sequence[Mapping[str, fl
 def evaluate_settings(study: Study, settings: FloatArray, pool: Pool | None = None, jobs: int | None = None,
                       progress: Progress | None = None) -> Evaluations:
     """Simulate settings, shape (M, n), in worker processes, including settings that violate the study's constraints."""
-    from safevar_sumo.analysis.evaluator import open_evaluator, silent
+    from safevar_sumo.analysis.evaluator import open_evaluator, show_no_progress
 
-    with open_evaluator(study, pool, jobs, progress or silent) as evaluator:
-        return evaluator.evaluate(settings, "settings", anywhere=True)
+    with open_evaluator(study, pool, jobs, progress or show_no_progress) as evaluator:
+        return evaluator.evaluate(settings, "settings", ignore_constraints=True)
 
 
 def _table(settings: Any, characteristics: CharacteristicSet) -> tuple[FloatArray, Any]:

@@ -22,7 +22,7 @@ from safevar_sumo.analysis.explain.causes import (
     RESOLUTION,
     BoundaryState,
     affordable_rows,
-    boundaries,
+    find_boundaries,
     involved_columns,
     minimal_causes,
     necessary_columns,
@@ -31,7 +31,7 @@ from safevar_sumo.analysis.explain.compute import explain_failures
 from safevar_sumo.analysis.explain.necessity import Robustness, distinct_causes, necessity, robustness, smallest_robust_failure
 from safevar_sumo.analysis.explain.render import print_explained
 from safevar_sumo.analysis.explain.result import Explained
-from safevar_sumo.analysis.explain.summary import NUMBERS, DescribedFailure, failures_paragraph, lead
+from safevar_sumo.analysis.explain.summary import NUMBERS, DescribedFailure, failures_paragraph, summarise_failures
 from safevar_sumo.analysis.preventability import Preventability
 from safevar_sumo.analysis.research_questions.case import Case, load_cases
 from safevar_sumo.cli.program import commands
@@ -200,7 +200,7 @@ def assert_tells_a_manager(paragraph: str, explained: Explained) -> None:
 @pytest.mark.slow
 def test_the_summary_of_a_study_leads_with_the_answer(case: Case, explained: Explained) -> None:
     original = Evaluator(case.study, InlinePool()).original()
-    paragraph, first, *others, more = lead(case.study, case.solutions, original, InlinePool(), "my results")
+    paragraph, first, *others, more = summarise_failures(case.study, case.solutions, original, InlinePool(), "my results")
     crashes = int((case.solutions["outcome"] == "collision").sum())
     assert_tells_a_manager(paragraph, explained)
     assert first == f"{crashes} of {len(case.solutions)} solutions collide."
@@ -208,7 +208,7 @@ def test_the_summary_of_a_study_leads_with_the_answer(case: Case, explained: Exp
     assert all(" These changes alone cause it: " in line for line in others)
     safe = case.solutions[case.solutions["f_safe"] > 2]
     assert more == "Why, and how far: python -m safevar_sumo explain 'my results'"
-    nothing, more = lead(case.study, safe, original, InlinePool(), "out")
+    nothing, more = summarise_failures(case.study, safe, original, InlinePool(), "out")
     assert nothing.startswith(f"Nothing unsafe found in {len(safe)} solutions")
     assert more == "How far each characteristic may go: python -m safevar_sumo tolerance out"
 
@@ -239,7 +239,7 @@ def test_all_smallest_unsafe_subsets_and_no_other_whatever_the_outcomes(table: l
 def test_a_boundary_is_the_first_unsafe_place_and_no_island_is_skipped() -> None:
     evaluator = made_up_evaluator(3, two_islands)
     (causes,) = minimal_causes(evaluator, np.array([[9.5, 1.0, 8.0]]), COLLISION)
-    (result,) = boundaries(evaluator, causes, COLLISION)
+    (result,) = find_boundaries(evaluator, causes, COLLISION)
     assert result.fraction == pytest.approx(1.5 / 4.5, abs=2 * RESOLUTION)
     assert result.setting[0] > 6.5 >= result.setting[0] - 2 * RESOLUTION * 4.5
     assert result.single_limits == {0: result.setting[0]}
@@ -249,7 +249,7 @@ def test_a_boundary_is_the_first_unsafe_place_and_no_island_is_skipped() -> None
 def test_nothing_is_shrunk_into_what_the_filter_takes_for_no_change() -> None:
     evaluator = made_up_evaluator(1, lambda settings: settings[:, 0] > ORIGINAL)
     (causes,) = minimal_causes(evaluator, np.array([[9.0]]), COLLISION)
-    (result,) = boundaries(evaluator, causes, COLLISION)
+    (result,) = find_boundaries(evaluator, causes, COLLISION)
     threshold = evaluator.characteristics.threshold[0]
     assert result.setting[0] == pytest.approx(ORIGINAL + threshold, rel=1e-3)
     assert evaluator.characteristics.filter(result.setting)[0] == result.setting[0]
@@ -260,7 +260,7 @@ def test_a_boundary_that_ends_where_nothing_can_be_simulated_says_so() -> None:
     study = made_up_study(1)
     evaluator = Evaluator(study, Plant(study, lambda rows: rows[:, 0] > 7, failing=lambda rows: (rows[:, 0] > 6) & (rows[:, 0] <= 7)))
     (causes,) = minimal_causes(evaluator, np.array([[9.0]]), COLLISION)
-    (result,) = boundaries(evaluator, causes, COLLISION)
+    (result,) = find_boundaries(evaluator, causes, COLLISION)
     assert (result.setting[0], result.end) == (pytest.approx(7, abs=1e-3), BoundaryState.NOT_SIMULATED)
 
 

@@ -13,7 +13,7 @@ from safevar_sumo.ads.competent_driver import CompetentDriver
 from safevar_sumo.analysis.evaluator import Evaluator
 from safevar_sumo.analysis.explain.braking_comparison import sentence
 from safevar_sumo.analysis.explain.compute import PointComparison, compare_at_points, points_in_words
-from safevar_sumo.analysis.explain.summary import lead
+from safevar_sumo.analysis.explain.summary import summarise_failures
 from safevar_sumo.analysis.preventability import PreventableBy, approach, preventability, preventable_by
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import FloatArray
@@ -142,5 +142,5 @@ def test_the_summary_of_a_matrix_asks_why_at_the_worst_point_alone(system: Syste
     study = load_study("euro_ncap_pedestrian", matrix={"tests": TESTS})
     solutions = solutions_frame(system.characteristics.names, [(("nsga2", 0), evaluate(system, weak))])
     original = evaluate(system, system.characteristics.original[np.newaxis])
-    more = lead(study, solutions, original, InlinePool(), "out")[-1]
+    more = summarise_failures(study, solutions, original, InlinePool(), "out")[-1]
     assert more.endswith(f": python -m safevar_sumo explain out --point '{failure.because.point}'")

@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from safevar_sumo.analysis.words import ENDS, joined
+from safevar_sumo.analysis.words import ENDS, join_phrases
 from safevar_sumo.records import STANDSTILL, Outcome, SimulationRuns
 
 PEDAL_SHARE = 0.9
@@ -223,7 +223,7 @@ def sentence(comparison: BrakingComparison, *, full: bool = False) -> str:
     distance = f"{abs(comparison.lost):.2f} m"
     lead = f"Of the {distance} {'lost' if is_lost else 'gained'}" if not full else (
         f"Its margin, the gap at the brake command less the distance needed to stop, is {distance} {'smaller' if is_lost else 'larger'}")
-    return f"{endings} {lead}{without_brake}: {joined(phrases)}."
+    return f"{endings} {lead}{without_brake}: {join_phrases(phrases)}."
 
 
 def _numbers(comparison: BrakingComparison, part: str) -> str:

@@ -123,7 +123,7 @@ class Boundary(NamedTuple):
     at_threshold: int | None = None
 
 
-def boundaries(evaluator: Evaluator, causes: list[MinimalCause], unsafe: Unsafe) -> list[Boundary]:
+def find_boundaries(evaluator: Evaluator, causes: list[MinimalCause], unsafe: Unsafe) -> list[Boundary]:
     """Shrink causes, all changes by a common factor and each change by itself, while they stay unsafe and above the filter's thresholds."""
     all_changes = [(cause, cause.columns) for cause in causes]
     single_changes = [(cause, (column,)) for cause in causes for column in cause.columns]

@@ -7,10 +7,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from safevar_sumo.analysis.evaluator import Evaluator, Progress, open_evaluator, silent
+from safevar_sumo.analysis.evaluator import Evaluator, Progress, open_evaluator, show_no_progress
 from safevar_sumo.analysis.explain import ExplainOptions
 from safevar_sumo.analysis.explain.braking_comparison import BrakingComparison, compare_braking, summary_of
-from safevar_sumo.analysis.explain.causes import MinimalCause, affordable_rows, boundaries, minimal_causes, necessary_columns
+from safevar_sumo.analysis.explain.causes import MinimalCause, affordable_rows, find_boundaries, minimal_causes, necessary_columns
 from safevar_sumo.analysis.explain.necessity import STEP_FACTORS, distinct_causes, key_of, necessity, robustness, smallest_robust_failure
 from safevar_sumo.analysis.explain.result import REASONS, ROBUST, Cause, Explained, Explanation
 from safevar_sumo.analysis.preventability import preventability, preventable_by
@@ -136,7 +136,7 @@ def compare_at_cells(evaluator: Evaluator, original: FloatArray, settings: Float
     """As `compare_at_points`, for a rated study: finds the cells whose colour is worse than the original's; compares in the worst cell."""
     system = assemble(evaluator.study)
     assert system.rater is not None
-    colours = system.rater.points(evaluator.cells(np.concatenate([original, settings]), "cells that turn")).colours.astype(int)
+    colours = system.rater.points(evaluator.simulate_cells(np.concatenate([original, settings]), "cells that turn")).colours.astype(int)
     comparisons, step = list[PointComparison](), 0.0
     for row in range(1, len(colours)):
         colour_change = colours[row] - colours[0]
@@ -185,12 +185,12 @@ class FailureSelection(NamedTuple):
     reasons: Mapping[int, Reasons]
 
 
-def chosen_failures(source: Study | Case, options: ExplainOptions, evaluator: Evaluator) -> FailureSelection:
+def choose_failures(source: Study | Case, options: ExplainOptions, evaluator: Evaluator) -> FailureSelection:
     """Choose the failures that the options name, or the failures that matter; raises what `explain_failures` raises."""
     unsafe = None if options.unsafe is None else evaluator.parse_criterion(options.unsafe)
     named_solutions = [SolutionId.parse(text, "solutions") for text in options.solutions]
     limit = options.limit // len(assemble(evaluator.study).points)
-    original = evaluator.original()
+    original = evaluator.evaluate_original()
     failures = failures_of(source, evaluator, original, named_solutions, unsafe)
     settings, rows = failures.evaluations.settings, failures.rows
     sample = rows if named_solutions else [rows[i] for i in affordable_rows(settings[rows], evaluator, limit)]
@@ -204,7 +204,7 @@ def chosen_failures(source: Study | Case, options: ExplainOptions, evaluator: Ev
 
 
 def explain_failures(source: Study | Case, options: ExplainOptions, *, pool: Pool | None = None, jobs: int | None = None,
-                     progress: Progress = silent) -> Explained:
+                     progress: Progress = show_no_progress) -> Explained:
     """Explain the failures that matter among the solutions of results, or among settings all over a study's domain.
 
     Raises
@@ -214,7 +214,7 @@ def explain_failures(source: Study | Case, options: ExplainOptions, *, pool: Poo
     """
     study = source if isinstance(source, Study) else source.study
     with open_evaluator(study, pool, jobs, progress) as evaluator:
-        original, failures, sample, causes, reasons = chosen_failures(source, options, evaluator)
+        original, failures, sample, causes, reasons = choose_failures(source, options, evaluator)
         settings = failures.evaluations.settings
         explanations = _explanations(failures, evaluator, original, causes, reasons)
         preventable = preventability(evaluator, settings[_avoidable_collisions(study, failures.evaluations)])
@@ -280,7 +280,7 @@ def _explanations(failures: Failures, evaluator: Evaluator, original: Evaluation
     else:
         comparisons, step = compare_at_points(assemble(evaluator.study), original.settings, chosen.settings, failures.unsafe)
         robustnesses = robustness(evaluator, np.array([*chosen.settings, *(cause.setting for cause in all_causes)]), step, failures.unsafe)
-    limits, neighbours = iter(boundaries(evaluator, all_causes, failures.unsafe)), iter(robustnesses[len(rows):])
+    limits, neighbours = iter(find_boundaries(evaluator, all_causes, failures.unsafe)), iter(robustnesses[len(rows):])
     collided = np.flatnonzero(_avoidable_collisions(evaluator.study, chosen))
     driver_classes = dict(zip(collided.tolist(), preventable_by(evaluator, chosen.settings[collided]), strict=True))
     explanations = []

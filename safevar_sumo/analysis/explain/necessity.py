@@ -104,7 +104,7 @@ class Robustness(NamedTuple):
         """A phrase such as `robust: 84 % of the neighbours are unsafe too, but only 53 % with a step of 0.1 s`."""
         step, least_share = min(self.by_step.items(), key=lambda item: item[1])
         disagrees = is_borderline(least_share) and not self.borderline
-        return in_words(self.share) + (f", but only {100 * least_share:.0f} % with a step of {step:g} s" if disagrees else "")
+        return robustness_in_words(self.share) + (f", but only {100 * least_share:.0f} % with a step of {step:g} s" if disagrees else "")
 
 
 def is_borderline(share: float) -> bool:
@@ -112,7 +112,7 @@ def is_borderline(share: float) -> bool:
     return share < BORDERLINE
 
 
-def in_words(share: float) -> str:
+def robustness_in_words(share: float) -> str:
     """A phrase such as `borderline: only 44 % of the neighbours are unsafe too`."""
     return f"{'borderline: only' if is_borderline(share) else 'robust:'} {100 * share:.0f} % of the neighbours are unsafe too"
 

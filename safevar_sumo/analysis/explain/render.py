@@ -14,7 +14,7 @@ from safevar_sumo.analysis.explain.braking_comparison import BrakingComparison, 
 from safevar_sumo.analysis.explain.compute import points_in_words
 from safevar_sumo.analysis.explain.result import REASONS, ROBUST, Cause, Explained, Explanation
 from safevar_sumo.analysis.explain.summary import LABELS, DescribedFailure, failures_paragraph
-from safevar_sumo.analysis.figures import CHANGED, FONT, INVOLVED, NECESSARY, literal, new_figure
+from safevar_sumo.analysis.figures import CHANGED, FONT, INVOLVED, NECESSARY, escape_dollars, new_figure
 from safevar_sumo.analysis.words import decimal, list_of_changes, number_of, question_command, simulate_command
 from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.sumo.system import assemble
@@ -203,7 +203,7 @@ def necessity_figure(result: Explained) -> Figure:
     """How often each characteristic is necessary, beside how often it is changed (as RQ3.2 counts)."""
     frame = result.necessity.iloc[::-1]
     figure, ((axis,),) = new_figure(f"{result.study.name}: changed vs. necessary", 1, 1, (6.4, 1.4 + 0.3 * max(len(frame), 4)))
-    names = [literal(name) for name in frame["characteristic"]]
+    names = [escape_dollars(name) for name in frame["characteristic"]]
     for column, label, colour, height in (
             ("changed", "changed", CHANGED, 0.8), ("involved", "in some minimal cause", INVOLVED, 0.5),
             ("necessary", "necessary: in every minimal cause", NECESSARY, 0.24)):

@@ -14,8 +14,8 @@ from safevar_sumo.analysis.explain.compute import compare_at_points, points_in_w
 from safevar_sumo.analysis.explain.necessity import Robustness, robustness, smallest_robust_failure
 from safevar_sumo.analysis.explain.result import REASONS, ROBUST
 from safevar_sumo.analysis.preventability import Preventability, PreventableBy, preventability
-from safevar_sumo.analysis.rating.summary import rated_lead
-from safevar_sumo.analysis.words import ENDS, joined, list_of_changes, number_of, question_command
+from safevar_sumo.analysis.rating.summary import summarise_rated_study
+from safevar_sumo.analysis.words import ENDS, join_phrases, list_of_changes, number_of, question_command
 from safevar_sumo.metrics import RATING_POINTS, Unsafe
 from safevar_sumo.records import KMH_PER_MS, Evaluations, FloatArray, Outcome, finite_or_none
 from safevar_sumo.results import CHOICES, chosen_handle, handles, position_of, record
@@ -33,7 +33,7 @@ LIMIT = 4000
 """Approximate limit of simulations that search a robust failure at the end of a study; `explain` has a higher limit."""
 
 
-def lead(study: Study, solutions: pd.DataFrame, original: Evaluations, pool: Pool, place: str) -> list[str]:
+def summarise_failures(study: Study, solutions: pd.DataFrame, original: Evaluations, pool: Pool, place: str) -> list[str]:
     """Summarise a study's solutions in lines: first a paragraph for a manager, last the command for the next step.
 
     The criterion is `Unsafe.default`.
@@ -50,7 +50,7 @@ def lead(study: Study, solutions: pd.DataFrame, original: Evaluations, pool: Poo
         The directory of the results.
     """
     if RATING_POINTS.name in original.metrics:
-        return rated_lead(study, solutions, original, place)
+        return summarise_rated_study(study, solutions, original, place)
     if original.collided[0]:
         return ["The original vehicle itself collides: no change is needed."]
     evaluator, degree = Evaluator(study, pool), float(original.f_safe[0])
@@ -84,7 +84,7 @@ def _paragraph(evaluator: Evaluator, solutions: pd.DataFrame, is_unsafe: pd.Seri
     candidates = np.flatnonzero(is_unsafe.to_numpy() & ~solutions.duplicated(list(names)).to_numpy())
     if point:
         evaluator = evaluator.for_study(study_at(evaluator.study, point, point))
-        original = evaluator.original()
+        original = evaluator.evaluate_original()
     system = assemble(evaluator.study)
     evaluations = evaluator.evaluate(solutions.iloc[candidates][list(names)].to_numpy(dtype=float), "unsafe solutions")
     preventable = preventability(evaluator, evaluations.settings[evaluations.collided])
@@ -266,4 +266,4 @@ def _avoided_shares(preventable: Preventability) -> list[str]:
              "only full braking at the first possible moment avoids another {}", PreventableBy.NOBODY: "{} are physically unavoidable"}
     parts = [text.format(f"{100 * (preventable.share(by) or 0.0):.0f} %") for by, text in words.items() if preventable.numbers.get(by)]
     sample = "" if preventable.looked_at == preventable.collisions else f"{preventable.looked_at} drawn at random from "
-    return [f"In the same vehicle, of {sample}{preventable.collisions} collisions, {joined(parts)}."]
+    return [f"In the same vehicle, of {sample}{preventable.collisions} collisions, {join_phrases(parts)}."]

@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 import scipy
 
-from safevar_sumo.analysis.evaluator import Evaluator, Progress, clopper_pearson, open_evaluator, silent
+from safevar_sumo.analysis.evaluator import Evaluator, Progress, clopper_pearson, open_evaluator, show_no_progress
 from safevar_sumo.analysis.risk import RiskOptions
 from safevar_sumo.analysis.risk.rare import (
     ENOUGH_FAILURES,
@@ -121,7 +121,7 @@ def _or_default(value: float | None, default: float) -> float:
     return default if value is None else value
 
 
-FLEET = 1000
+FLEET_VEHICLES = 1000
 """Number of vehicles of the fleet in examples."""
 
 
@@ -215,7 +215,7 @@ class Risk:
 
 
 def estimate_risk(study: Study, options: RiskOptions, *, pool: Pool | None = None, jobs: int | None = None,
-                  progress: Progress = silent) -> Risk:
+                  progress: Progress = show_no_progress) -> Risk:
     """Estimate the probability of an unsafe outcome. The filter of small changes is not applied, as no search changes vehicles.
 
     Raises
@@ -227,7 +227,7 @@ def estimate_risk(study: Study, options: RiskOptions, *, pool: Pool | None = Non
     """
     model = VariationModel(study)
     with open_evaluator(study, pool, jobs, progress) as evaluator:
-        unsafe = evaluator.criterion(options.unsafe)
+        unsafe = evaluator.choose_criterion(options.unsafe)
         simulated_before = evaluator.simulated
         response = Response(evaluator, model.settings_of_normal, unsafe)
         counts = _draw_vehicles(evaluator, model, unsafe, options, response)
@@ -235,7 +235,7 @@ def estimate_risk(study: Study, options: RiskOptions, *, pool: Pool | None = Non
             estimate, method = counts, _rare_method(options)
         else:
             estimate, method = counts.estimate(options.confidence), "monte_carlo"
-        lacks_indices = model.is_correlated or bool(evaluator.region) or options.is_for_rare
+        lacks_indices = model.is_correlated or bool(evaluator.region) or options.requires_rare_method
         degree_indices, unsafe_indices = (None, None) if lacks_indices else sensitivities(evaluator, model, unsafe, options.confidence)
     point = None if estimate.design_point is None else model.settings_of_normal(estimate.design_point[np.newaxis])[0]
     return Risk(
@@ -272,11 +272,11 @@ def _draw_vehicles(evaluator: Evaluator, model: VariationModel, unsafe: Unsafe, 
     """Draw vehicles by plain Monte Carlo; if few of the first `PILOT` are unsafe, switch to a method for rare failures."""
     counts, rng = _Counts(), np.random.default_rng(evaluator.study.search.seed)
     is_pilot = _may_be_rare(options) and not evaluator.region
-    if options.is_for_rare and evaluator.region:
+    if options.requires_rare_method and evaluator.region:
         counts.remark = "the study has constraints, which only plain Monte Carlo supports"
-    if options.is_for_rare:
+    if options.requires_rare_method:
         openturns()  # raises if the module is missing
-    requested = max(options.samples, PILOT_VEHICLES) if options.is_for_rare else options.samples
+    requested = max(options.samples, PILOT_VEHICLES) if options.requires_rare_method else options.samples
     while counts.vehicles + counts.errors < requested:
         chunk = PILOT_VEHICLES if is_pilot else CHUNK if options.width is not None else LARGEST_CHUNK
         offset = counts.vehicles + counts.errors
@@ -290,12 +290,12 @@ def _draw_vehicles(evaluator: Evaluator, model: VariationModel, unsafe: Unsafe, 
         if probabilities is not None:
             is_pilot = False
             values = response.take(scipy.stats.norm.ppf(probabilities), evaluations)
-            is_frequent = not options.is_for_rare and counts.failures * (requested / number) >= ENOUGH_FAILURES
+            is_frequent = not options.requires_rare_method and counts.failures * (requested / number) >= ENOUGH_FAILURES
             if valid_vehicles and counts.failures < RARE_BELOW * valid_vehicles and not is_frequent:
                 estimate = _rare_estimate(response, values, options, counts, evaluator.study.search.seed)
                 if estimate is not None:
                     return estimate
-            elif options.is_for_rare:
+            elif options.requires_rare_method:
                 counts.remark = f"more than {RARE_BELOW:g} of {valid_vehicles} vehicles are unsafe: plain Monte Carlo is used"
         low, high = clopper_pearson(counts.failures, counts.vehicles, options.confidence) if counts.vehicles else (0.0, 1.0)
         if options.width is not None and high - low <= options.width:
@@ -306,7 +306,7 @@ def _draw_vehicles(evaluator: Evaluator, model: VariationModel, unsafe: Unsafe, 
 
 
 def _may_be_rare(options: RiskOptions) -> bool:
-    return options.is_for_rare or (options.method == "auto" and options.width is None and options.samples >= 2 * PILOT_VEHICLES)
+    return options.requires_rare_method or (options.method == "auto" and options.width is None and options.samples >= 2 * PILOT_VEHICLES)
 
 
 def _rare_estimate(response: Response, values: FloatArray, options: RiskOptions, counts: _Counts, seed: int) -> Estimate | None:
@@ -315,7 +315,7 @@ def _rare_estimate(response: Response, values: FloatArray, options: RiskOptions,
         counts.remark = ("the response is a plateau: most vehicles nearest to failure have the same safety degree, so that methods for "
                         "rare failures cannot approach failures; plain Monte Carlo is used")
         return None
-    if not options.is_for_rare and find_spec("openturns") is None:
+    if not options.requires_rare_method and find_spec("openturns") is None:
         counts.remark = ("fewer than 0.01 of the first vehicles are unsafe; pip install 'safevar_sumo[rare]' for a method that needs fewer "
                         "vehicles for rare failures")
         return None

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from rich.console import Console
 
-from safevar_sumo.analysis.figures import CHANGED, FONT, NECESSARY, literal, new_figure
-from safevar_sumo.analysis.risk.compute import FLEET, Risk
+from safevar_sumo.analysis.figures import CHANGED, FONT, NECESSARY, escape_dollars, new_figure
+from safevar_sumo.analysis.risk.compute import FLEET_VEHICLES, Risk
 from safevar_sumo.analysis.risk.rare import RARE_BELOW
 from safevar_sumo.errors import InputError
 from safevar_sumo.study import Study
@@ -36,8 +36,8 @@ def print_risk(console: Console, result: Risk) -> None:
                            for member in CharacteristicSet.of(result.study.vehicle.characteristics))
         print_text(console, f"The most probable failure: {values}.")
     if not result.of_domain and 0 < result.probability < RARE_BELOW:
-        print_text(console, f"Of {FLEET:,} vehicles that vary independently at least one is unsafe with probability "
-                            f"{result.of_fleet(FLEET):.2g}.")
+        print_text(console, f"Of {FLEET_VEHICLES:,} vehicles that vary independently at least one is unsafe with probability "
+                            f"{result.of_fleet(FLEET_VEHICLES):.2g}.")
     if result.of_domain:
         print_text(console, "warning: this is no probability in the field: the study has no [variation] table for how real vehicles vary.")
     print_text(console, _how_vehicles_vary(result.study))
@@ -92,8 +92,8 @@ def sensitivity_figure(result: Risk) -> Figure:
             width = (rows[f"{column}_upper"] - rows[column]).clip(lower=0)
             axis.barh(np.arange(len(names)) + shift, rows[column], height=0.36, color=colour, xerr=width, label=label,
                       error_kw={"elinewidth": 0.8, "ecolor": "black"})
-        axis.set_yticks(np.arange(len(names)), [literal(name) for name in names])
-        axis.set_title(literal(output), fontsize=FONT)
+        axis.set_yticks(np.arange(len(names)), [escape_dollars(name) for name in names])
+        axis.set_title(escape_dollars(output), fontsize=FONT)
         axis.set_xlabel("share of the variance [-]")
         axis.set_xlim(0, 1)
         if rows["total"].isna().all():

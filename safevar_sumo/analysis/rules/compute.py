@@ -16,9 +16,9 @@ import numpy as np
 import pandas as pd
 from rich.console import Console
 
-from safevar_sumo.analysis.evaluator import CONFIDENCE, Evaluator, Progress, clopper_pearson, open_evaluator, silent
+from safevar_sumo.analysis.evaluator import CONFIDENCE, Evaluator, Progress, clopper_pearson, open_evaluator, show_no_progress
 from safevar_sumo.analysis.rules import RulesOptions
-from safevar_sumo.analysis.words import joined
+from safevar_sumo.analysis.words import join_phrases
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray
 from safevar_sumo.study import Study
@@ -116,7 +116,7 @@ class Rules:
 
 
 def find_rules(study: Study, options: RulesOptions, *, pool: Pool | None = None, jobs: int | None = None,
-               progress: Progress = silent) -> Rules:
+               progress: Progress = show_no_progress) -> Rules:
     """Find rules that say where a study is unsafe, from settings spread evenly over the whole domain.
 
     Raises
@@ -126,7 +126,7 @@ def find_rules(study: Study, options: RulesOptions, *, pool: Pool | None = None,
     """
     members = CharacteristicSet.of(study.vehicle.characteristics)
     with open_evaluator(study, pool, jobs, progress) as evaluator:
-        unsafe = evaluator.criterion(options.unsafe)
+        unsafe = evaluator.choose_criterion(options.unsafe)
         training, validation = (_design(evaluator, options.samples // 2, study.search.seed + half) for half in (1, 2))
     is_unsafe, is_unsafe_validation = unsafe.of(training), unsafe.of(validation)
     number = int(np.count_nonzero(is_unsafe))
@@ -268,7 +268,7 @@ def rule_in_words(rule: Rule, characteristics: CharacteristicSet, unsafe: Unsafe
     shares = [f"{word} {share:.0%} ({interval[0]:.0%} to {interval[1]:.0%})" if share is not None and interval is not None else f"{word} -"
               for word, share, interval in ((f"{unsafe.in_words} in", rule.density, rule.density_interval),
                                             ("covers", rule.coverage, rule.coverage_interval))]
-    return f"{joined(conditions) if conditions else 'everywhere'}: {', '.join(shares)}"
+    return f"{join_phrases(conditions) if conditions else 'everywhere'}: {', '.join(shares)}"
 
 
 def _condition(member: Characteristic, low: float | None, high: float | None) -> str:

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
-from safevar_sumo.analysis.evaluator import Evaluator, Progress, open_evaluator, silent
+from safevar_sumo.analysis.evaluator import Evaluator, Progress, open_evaluator, show_no_progress
 from safevar_sumo.analysis.tolerance import ToleranceOptions
 from safevar_sumo.analysis.tolerance.joint import Pair, SafeBox, no_box, planes, safe_box
 from safevar_sumo.errors import InputError, unknown
@@ -208,7 +208,7 @@ class Tolerance:
 
 
 def find_tolerances(study: Study, options: ToleranceOptions, *, pool: Pool | None = None, jobs: int | None = None,
-                    progress: Progress = silent) -> Tolerance:
+                    progress: Progress = show_no_progress) -> Tolerance:
     """Find how far the characteristics of a study may go. The filter is not applied, as the question is about the vehicle.
 
     Raises
@@ -220,8 +220,8 @@ def find_tolerances(study: Study, options: ToleranceOptions, *, pool: Pool | Non
     if options.pairs and len(columns) < 2:
         raise InputError("pairs", "one characteristic makes no pair", "at least two characteristics")
     with open_evaluator(study, pool, jobs, progress) as evaluator:
-        original = evaluator.original()
-        unsafe = evaluator.criterion(options.unsafe, original)
+        original = evaluator.evaluate_original()
+        unsafe = evaluator.choose_criterion(options.unsafe, original)
         scans = scan(evaluator, columns, unsafe)
         pairs = planes(evaluator, columns, unsafe) if options.pairs else None
         has_box = not unsafe.of(original)[0] and not is_rated(study)  # a box of a rated study would take thousands of whole matrices

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from rich.console import Console
 
-from safevar_sumo.analysis.figures import DEGREE, FONT, NECESSARY, UNSAFE, as_formula, literal, panels
+from safevar_sumo.analysis.figures import DEGREE, FONT, NECESSARY, UNSAFE, as_formula, escape_dollars, new_panels
 from safevar_sumo.analysis.tolerance.compute import WHOLE_POINT, OneAtATimeScan, Tolerance
 from safevar_sumo.analysis.tolerance.joint import Pair
 from safevar_sumo.analysis.words import decimal
@@ -115,7 +115,7 @@ def _print_pairs(console: Console, result: Tolerance) -> None:
 def profiles_figure(result: Tolerance) -> Figure:
     """The safety degree over the domain of each characteristic alone; the original is marked, unsafe intervals are shaded."""
     title, column = f"{result.study.name}: one characteristic at a time (unsafe: {result.unsafe})", _column(result)
-    figure, axes = panels(title, len(result.alone), 4, (2.3, 1.75), least_width=4.6, above=1.0)
+    figure, axes = new_panels(title, len(result.alone), 4, (2.3, 1.75), min_width=4.6, title_height=1.0)
     degrees = np.concatenate([scan.profile[column].dropna() for scan in result.alone])
     margin = 0.05 * (np.ptp(degrees) if degrees.size else 0.0) or 0.5
     for axis, scan in zip(axes, result.alone, strict=True):
@@ -144,7 +144,7 @@ def _profile(axis: Axes, scan: OneAtATimeScan, column: str) -> None:
     if column == SAFETY_DEGREE and profile[SAFETY_DEGREE].min() <= 0:
         axis.axhline(0, color="black", linewidth=0.8, linestyle="--")
     axis.set_xlim(member.lower, member.upper)
-    axis.set_title(literal(member.name), fontsize=FONT)
+    axis.set_title(escape_dollars(member.name), fontsize=FONT)
     axis.set_xlabel(f"[{as_formula(member.unit)}]")
     axis.locator_params(axis="x", nbins=4)
 
@@ -162,7 +162,7 @@ def pairs_figure(result: Tolerance, most: int = 6) -> Figure:
     worst = sorted(result.pairs, key=lambda pair: (-pair.unsafe_share, np.nanmin(pair.safety_degree)))[:most]
     degrees = np.concatenate([pair.safety_degree.ravel() for pair in worst])
     title = f"{result.study.name}: the worst pairs (unsafe: {result.unsafe})"
-    figure, axes = panels(title, len(worst), 3, (3.0, 2.4), least_width=4.6, above=1.1)
+    figure, axes = new_panels(title, len(worst), 3, (3.0, 2.4), min_width=4.6, title_height=1.1)
     for axis, pair in zip(axes, worst, strict=True):
         colours = _plane(axis, pair, (float(np.nanmin(degrees)), float(np.nanmax(degrees))))
     bar = figure.colorbar(colours, ax=figure.axes, shrink=0.9)
@@ -182,8 +182,8 @@ def _plane(axis: Axes, pair: Pair, limits: tuple[float, float]) -> QuadMesh:
     axis.plot(first.original, second.original, marker="o", color="white", markeredgecolor="black", markersize=5)
     if pair.nearest is not None:
         axis.plot(*pair.nearest, marker="X", color=UNSAFE, markeredgecolor="white", markersize=7)
-    axis.set_xlabel(f"{literal(first.name)} [{as_formula(first.unit)}]")
-    axis.set_ylabel(f"{literal(second.name)} [{as_formula(second.unit)}]")
+    axis.set_xlabel(f"{escape_dollars(first.name)} [{as_formula(first.unit)}]")
+    axis.set_ylabel(f"{escape_dollars(second.name)} [{as_formula(second.unit)}]")
     axis.set_xlim(first.lower, first.upper)
     axis.set_ylim(second.lower, second.upper)
     axis.grid(visible=False)
