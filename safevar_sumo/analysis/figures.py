@@ -16,13 +16,12 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 DPI = 200
-METADATA: Mapping[str, dict[str, Any]] = {".pdf": {"CreationDate": None}, ".svg": {"Date": None}}
-"""Metadata by file ending; they keep the date out of a picture."""
+PICTURE_METADATA: Mapping[str, dict[str, Any]] = {".pdf": {"CreationDate": None}, ".svg": {"Date": None}}
+"""Metadata by file ending; they keep the date out of the file, so that equal figures have equal bytes."""
 FONT = 8
-DEGREE = "safety degree [m]\n(below 0: minus the collision's speed [m/s])"
-UNSAFE = "#d55e00"
-CHANGED, INVOLVED, NECESSARY = "#bbbbbb", "#56b4e9", "#0072b2"
-"""Grey and two of Okabe and Ito's blues. Their lightness differs, so that a reader can tell them apart in a print without colours."""
+DEGREE_LABEL = "safety degree [m]\n(below 0: minus the collision's speed [m/s])"
+GREY, SKY_BLUE, BLUE, VERMILION = "#bbbbbb", "#56b4e9", "#0072b2", "#d55e00"
+"""Grey and colours of Okabe and Ito. Grey and the two blues differ in lightness, so that they differ in a print without colours too."""
 
 
 def new_figure(title: str, rows: int, columns: int, size: tuple[float, float], **options: Any) -> tuple[Figure, np.ndarray]:
@@ -61,7 +60,7 @@ def save(figure: Figure, path: Path, source: str = "out") -> None:
 
     try:
         with matplotlib.rc_context({"svg.hashsalt": "safevar_sumo"}):
-            figure.savefig(path, dpi=DPI, metadata=METADATA.get(path.suffix.lower()))
+            figure.savefig(path, dpi=DPI, metadata=PICTURE_METADATA.get(path.suffix.lower()))
     except (OSError, ValueError) as error:
         raise InputError(source, f"cannot write {path}: {getattr(error, 'strerror', None) or error}",
                          "a file that ends in .png, .pdf or .svg, in a directory that can be written") from None

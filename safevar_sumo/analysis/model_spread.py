@@ -18,9 +18,9 @@ from safevar_sumo.vehicles import CharacteristicSet
 
 BAND_SHARE = 0.9
 """Share of the predictions that lie in the band."""
-DEVIATIONS = 1.645
-"""Half width [standard deviations] of the interval around the mean that holds this share of a normal distribution."""
-ROUNDING = 1e-5
+HALF_WIDTH = 1.645
+"""Half width [standard deviations] of the interval around the mean that holds `BAND_SHARE` of a normal distribution."""
+ROUNDING_TOLERANCE = 1e-5
 """Relative tolerance within which a parameter's value in the study equals its (rounded) value in the first set of [spread]."""
 
 
@@ -45,16 +45,16 @@ class ModelSpread:
     collisions: int
 
     def to_dict(self) -> dict[str, Any]:
-        """As plain values."""
+        """The fields as plain values."""
         return asdict(self)
 
     def __str__(self) -> str:
-        """One sentence."""
+        """One sentence on the band and the collisions."""
         if self.lower is None or self.upper is None:
             return f"no safety degree with any of {self.sets} parameter sets that fit the published data equally well"
-        number = "none of them" if not self.collisions else f"{self.collisions} of them"
+        collisions = "none of them" if not self.collisions else f"{self.collisions} of them"
         return (f"safety degree {self.lower:.2f} to {self.upper:.2f} ({BAND_SHARE:.0%} band of {self.sets} parameter sets that fit the "
-                f"published data equally well, of repeats and of the model's error); a collision with {number}")
+                f"published data equally well, of repeats and of the model's error); a collision with {collisions}")
 
 
 def compute_model_spreads(study: Study, settings: FloatArray, point: str = "") -> list[ModelSpread]:
@@ -77,7 +77,7 @@ def compute_model_spreads(study: Study, settings: FloatArray, point: str = "") -
 def band_of(study: Study, evaluations: Sequence[Evaluations]) -> tuple[FloatArray, FloatArray]:
     """Lower and upper ends, shape (M,) each, of the sets' predictions for M settings, widened by repeats and the model's error."""
     error = study.model_error.get(SAFETY_DEGREE, 0.0) * distance_from_original(study, evaluations[0].settings)
-    return band(np.stack([prediction.f_safe for prediction in evaluations]), study.repeatability.get(SAFETY_DEGREE, 0.0), error)
+    return prediction_band(np.stack([prediction.f_safe for prediction in evaluations]), study.repeatability.get(SAFETY_DEGREE, 0.0), error)
 
 
 def distance_from_original(study: Study, settings: FloatArray) -> FloatArray:
@@ -86,12 +86,12 @@ def distance_from_original(study: Study, settings: FloatArray) -> FloatArray:
     return np.asarray(np.linalg.norm((settings - characteristics.original) / (characteristics.upper - characteristics.lower), axis=1))
 
 
-def band(safety_degrees: FloatArray, repeatability: float, error: FloatArray | float = 0.0) -> tuple[FloatArray, FloatArray]:
+def prediction_band(safety_degrees: FloatArray, repeatability: float, error: FloatArray | float = 0.0) -> tuple[FloatArray, FloatArray]:
     """Ends, shape (M,) each, of the band of predictions, shape (sets, M); repeats of a simulation and `error` widen it on each side."""
     lower, upper = np.full(safety_degrees.shape[1], np.nan), np.full(safety_degrees.shape[1], np.nan)
     defined = np.isfinite(safety_degrees).any(axis=0)
     lower[defined], upper[defined] = np.nanquantile(safety_degrees[:, defined], [(1 - BAND_SHARE) / 2, (1 + BAND_SHARE) / 2], axis=0)
-    return lower - DEVIATIONS * repeatability - error, upper + DEVIATIONS * repeatability + error
+    return lower - HALF_WIDTH * repeatability - error, upper + HALF_WIDTH * repeatability + error
 
 
 def evaluate_sets(study: Study, settings: FloatArray, point: str = "") -> list[Evaluations]:
@@ -110,6 +110,7 @@ def studies_of_sets(study: Study) -> list[Study]:
     """
     if not study.spread:
         raise InputError(study.source, "has no table [spread]", "a study that `calibrate` has fitted, such as sun or rain")
-    sets = {key: values for key, values in study.spread.items() if np.isclose(value_of(study, key), values[0], rtol=ROUNDING, atol=0)}
+    sets = {key: values for key, values in study.spread.items()
+            if np.isclose(value_of(study, key), values[0], rtol=ROUNDING_TOLERANCE, atol=0)}
     count = len(next(iter(study.spread.values())))
     return [study, *(with_values(study, {key: values[k] for key, values in sets.items()}) for k in range(1, count))]

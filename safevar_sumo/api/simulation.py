@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from safevar_sumo.ads import Ads
-from safevar_sumo.analysis.words import ENDS
+from safevar_sumo.analysis.words import OUTCOME_VERBS
 from safevar_sumo.errors import InputError, unknown
 from safevar_sumo.metrics import Scoring, time_to_collision
 from safevar_sumo.records import STANDSTILL, TIME_DECIMALS, Command, Evaluations, FloatArray, Nominal, Observation, Outcome, SimulationRuns
@@ -151,7 +151,7 @@ class Simulation:
         if self.outcome is Outcome.COLLISION:
             return f"collides at {self.collision_speed:.2f} m/s"
         safety_degree = self.metrics[SAFETY_DEGREE]
-        return ENDS[self.outcome] + ("" if np.isnan(safety_degree) else f", with a safety degree of {safety_degree:.2f} m")
+        return OUTCOME_VERBS[self.outcome] + ("" if np.isnan(safety_degree) else f", with a safety degree of {safety_degree:.2f} m")
 
     def to_dict(self) -> dict[str, Any]:
         """The JSON of `simulate`: plain values, None where undefined."""

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from safevar_sumo.analysis.model_spread import band, compute_model_spreads, studies_of_sets
+from safevar_sumo.analysis.model_spread import compute_model_spreads, prediction_band, studies_of_sets
 from safevar_sumo.errors import InputError
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.matrix import evaluate
@@ -20,7 +20,7 @@ OWN = float(load_study("sun").ads.parameters["brake_gap"])
 
 
 def test_a_band_holds_nine_tenths_of_the_sets_and_of_the_repeats() -> None:
-    lower, upper = band(np.column_stack([np.linspace(0, 1, 101), np.full(101, np.nan)]), 0.1)
+    lower, upper = prediction_band(np.column_stack([np.linspace(0, 1, 101), np.full(101, np.nan)]), 0.1)
     assert (lower[0], upper[0]) == pytest.approx((0.05 - 0.1645, 0.95 + 0.1645))
     assert np.isnan([lower[1], upper[1]]).all()
 

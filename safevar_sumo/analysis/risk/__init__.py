@@ -64,7 +64,7 @@ def risk(study: StudyLike | Results, *, samples: int = RiskOptions.samples, conf
     Parameters
     ----------
     study
-        A study, or results or their directory, which stand for their study.
+        A study; or results or their directory, whose study is examined.
     """
     from safevar_sumo.analysis.risk.compute import estimate_risk
 
