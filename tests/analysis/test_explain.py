@@ -37,7 +37,7 @@ from safevar_sumo.analysis.explain.necessity import (
 )
 from safevar_sumo.analysis.explain.render import print_explained
 from safevar_sumo.analysis.explain.result import Explained
-from safevar_sumo.analysis.explain.summary import NUMBER_WORDS, DescribedFailure, failures_paragraph, summarise_failures
+from safevar_sumo.analysis.explain.summary import NUMBER_WORDS, FailureDescription, failures_paragraph, summarise_failures
 from safevar_sumo.analysis.preventability import Preventability
 from safevar_sumo.analysis.research_questions.case import Case, load_cases
 from safevar_sumo.cli.program import commands
@@ -324,7 +324,7 @@ def test_robustness_in_words_says_where_a_time_step_disagrees() -> None:
 
 def test_the_paragraph_says_how_robust_the_changes_that_suffice_are_by_themselves() -> None:
     system, changes = assemble(load_study("sun")), {"tireFric": 1.04, "radius": 32.05, "mass": 2500.0}
-    finding = DescribedFailure("rs:0:0", changes, "collision", -1.5, Robustness({0.05: 0.98}), 2, Robustness({0.05: 0.44}))
+    finding = FailureDescription("rs:0:0", changes, "collision", -1.5, Robustness({0.05: 0.98}), 2, Robustness({0.05: 0.44}))
     original = evaluate(system, system.characteristics.original[None])
     paragraph = failures_paragraph(system, original, finding, finding, Preventability(numbers={}, collisions=0))
     assert "a collision at 5 km/h (robust: 98 % of" in paragraph.lower()

@@ -124,14 +124,14 @@ def brake_onset(runs: SimulationRuns, column: int) -> int | None:
 
 def summarise_run(runs: SimulationRuns, column: int, safety_degree: float) -> RunSummary:
     """Summary of the run of vehicle `column`."""
-    impact_speed, nearest, onset = float(runs.collision_speed[column]), runs.nearest(column), brake_onset(runs, column)
+    collision_speed, nearest, onset = float(runs.collision_speed[column]), runs.nearest(column), brake_onset(runs, column)
     least_gap, braking = np.nan, None
-    if nearest is not None and np.isnan(impact_speed):
+    if nearest is not None and np.isnan(collision_speed):
         least_gap = float(runs.trace.gap[nearest, column])
     if onset is not None:
         last = int(np.flatnonzero(runs.trace.active[:, column])[-1]) if nearest is None else nearest
         braking = _measure_braking(runs, column, onset, last)
-    return RunSummary(str(runs.outcome[column]), safety_degree, braking, least_gap, impact_speed)
+    return RunSummary(str(runs.outcome[column]), safety_degree, braking, least_gap, collision_speed)
 
 
 def _measure_braking(runs: SimulationRuns, column: int, first: int, last: int) -> Braking | None:

@@ -13,7 +13,7 @@ from safevar_sumo.analysis.evaluator import CONFIDENCE
 from safevar_sumo.analysis.explain.braking_comparison import BrakingComparison, sentence
 from safevar_sumo.analysis.explain.compute import points_in_words
 from safevar_sumo.analysis.explain.result import REASONS, ROBUST, Cause, Explained, Explanation
-from safevar_sumo.analysis.explain.summary import LABELS, DescribedFailure, failures_paragraph
+from safevar_sumo.analysis.explain.summary import LABELS, FailureDescription, failures_paragraph
 from safevar_sumo.analysis.figures import BLUE, FONT, GREY, SKY_BLUE, escape_dollars, new_figure
 from safevar_sumo.analysis.words import list_of_changes, number_of, question_command, simulate_command, two_decimals
 from safevar_sumo.protocol.rater import is_rated
@@ -78,13 +78,14 @@ def _print_answer(console: Console, command_for: CommandFor, result: Explained, 
                       f"{', '.join(common['cause']) or 'none'} ({common['share']:.0%} of the failures).")
 
 
-def _describe(failure: Explanation | None) -> DescribedFailure | None:
+def _describe(failure: Explanation | None) -> FailureDescription | None:
     """The description of a failure for the paragraph; None if the setting is not unsafe."""
     if failure is None or not failure.causes:
         return None
     changes = {name: failure.setting[name] for name in failure.changed}
-    return DescribedFailure(str(failure.handle or "a sampled setting"), changes, failure.outcome, failure.safety_degree, failure.robustness,
-                            len(failure.causes[0].changes), failure.causes[0].neighbours)
+    return FailureDescription(
+        str(failure.handle or "a sampled setting"), changes, failure.outcome, failure.safety_degree, failure.robustness,
+        len(failure.causes[0].changes), failure.causes[0].neighbours)
 
 
 def _most_necessary_in_words(result: Explained, characteristics: CharacteristicSet) -> str:

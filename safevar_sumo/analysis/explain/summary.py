@@ -89,23 +89,23 @@ def _write_paragraph(evaluator: Evaluator, solutions: pd.DataFrame, is_unsafe: p
     system = assemble(evaluator.study)
     evaluations = evaluator.evaluate(solutions.iloc[candidates][list(names)].to_numpy(dtype=float), "unsafe solutions")
     preventable = assess_preventability(evaluator, evaluations.settings[evaluations.collided])
-    failing = np.flatnonzero(unsafe.of(evaluations))
-    failures = evaluations.take(failing)
+    failing_rows = np.flatnonzero(unsafe.of(evaluations))
+    failures = evaluations.take(failing_rows)
     if not len(failures):
         return failures_paragraph(system, original, None, None, preventable)
     step = compare_at_points(system, original.settings, original.settings[:0], unsafe)[1]
-    robust = find_smallest_robust_failure(evaluator, failures, step, unsafe, MAX_SIMULATIONS // len(system.points))
-    fewest = int(np.lexsort([getattr(failures, name) for name in reversed(CHOICES["fewest"])])[0])
-    rows = [fewest] if robust is None else [fewest, robust]
+    robust_row = find_smallest_robust_failure(evaluator, failures, step, unsafe, MAX_SIMULATIONS // len(system.points))
+    fewest_row = int(np.lexsort([getattr(failures, name) for name in reversed(CHOICES["fewest"])])[0])
+    rows = [fewest_row] if robust_row is None else [fewest_row, robust_row]
     descriptions, chosen = [], failures.take(rows)
     causes = find_minimal_causes(evaluator, chosen.settings, unsafe)
     robustnesses = estimate_robustness(evaluator, np.array([*chosen.settings, *(group[0].setting for group in causes)]), step, unsafe)
     for index, row in enumerate(rows):
         changed = np.flatnonzero(evaluator.characteristics.changed(chosen.settings[index]))
         changes = {names[column]: float(chosen.settings[index, column]) for column in changed}
-        name, degree = str(all_handles[candidates[failing[row]]]), finite_or_none(chosen.f_safe[index])
-        descriptions.append(DescribedFailure(name, changes, str(chosen.outcome[index]), degree, robustnesses[index],
-                                             len(causes[index][0].columns), robustnesses[len(rows) + index]))
+        name, degree = str(all_handles[candidates[failing_rows[row]]]), finite_or_none(chosen.f_safe[index])
+        descriptions.append(FailureDescription(name, changes, str(chosen.outcome[index]), degree, robustnesses[index],
+                                               len(causes[index][0].columns), robustnesses[len(rows) + index]))
     return failures_paragraph(system, original, descriptions[0], descriptions[1] if len(descriptions) > 1 else None, preventable)
 
 
@@ -115,8 +115,8 @@ def _find_failing_points(study: Study, settings: FloatArray, unsafe: Unsafe) -> 
     if not system.matrix:
         return [""] * len(settings), ""
     at_points = at_every_point(system, settings)
-    words = [f" {points_in_words(points, len(system.matrix), limit=3)}" for points in unsafe_points_of(system, at_points, unsafe)]
-    return words, at_points[worst_points(at_points)[0]].point.name
+    sentences = [f" {points_in_words(points, len(system.matrix), limit=3)}" for points in unsafe_points_of(system, at_points, unsafe)]
+    return sentences, at_points[worst_points(at_points)[0]].point.name
 
 
 def _cause_in_words(evaluator: Evaluator, causes: list[MinimalCause]) -> str:
@@ -132,11 +132,11 @@ def _cause_in_words(evaluator: Evaluator, causes: list[MinimalCause]) -> str:
 NUMBER_WORDS = ("no", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten", "eleven", "twelve")
 MAX_CHANGES_LISTED = 4
 """Maximum number of changes that are listed, the largest first."""
-CONDITIONS = {"clear": "In clear weather", "wet": "On a wet road", "fog": "In fog", "night": "At night"}
-"""Weathers in words; any other weather is named."""
+WEATHER_PHRASES = {"clear": "In clear weather", "wet": "On a wet road", "fog": "In fog", "night": "At night"}
+"""Weathers as the beginning of a sentence; any other weather is named."""
 
 
-class DescribedFailure(NamedTuple):
+class FailureDescription(NamedTuple):
     """A failure as the paragraph describes it.
 
     Attributes
@@ -149,7 +149,7 @@ class DescribedFailure(NamedTuple):
         Outcome and safety degree [m, or -m/s] of the failure.
     robustness
         Robustness of the failure.
-    needed
+    sufficient
         Number of changes that are enough: the size of the failure's minimal causes.
     cause
         Robustness of the first minimal cause by itself; None if it was not simulated.
@@ -160,11 +160,11 @@ class DescribedFailure(NamedTuple):
     outcome: str
     safety_degree: float | None
     robustness: Robustness
-    needed: int
+    sufficient: int
     cause: Robustness | None = None
 
 
-def failures_paragraph(system: System, original: Evaluations, smallest: DescribedFailure | None, robust: DescribedFailure | None,
+def failures_paragraph(system: System, original: Evaluations, smallest: FailureDescription | None, robust: FailureDescription | None,
                        preventable: Preventability) -> str:
     """The paragraph about a study's failures.
 
@@ -185,7 +185,7 @@ def failures_paragraph(system: System, original: Evaluations, smallest: Describe
     if smallest is None:
         return " ".join([*parts, "Nothing unsafe was found."])
     characteristics = CharacteristicSet(system.characteristics.members)
-    if not smallest.needed:
+    if not smallest.sufficient:
         return " ".join([*parts, "No change is needed for it to be unsafe."])
     words = _failure_in_words(characteristics, smallest)
     parts.append(f"{words[0].upper()}{words[1:]}")
@@ -204,7 +204,7 @@ def _conditions_in_words(system: System) -> str:
 
 def _weather_in_words(point: Point) -> str:
     name = point.weather.name.removeprefix("carla_").replace("_", " ")
-    return CONDITIONS.get(name, f"In {name}")
+    return WEATHER_PHRASES.get(name, f"In {name}")
 
 
 def _original_ending_in_words(system: System, original: Evaluations) -> str:
@@ -218,14 +218,14 @@ def _original_ending_in_words(system: System, original: Evaluations) -> str:
     return f"{OUTCOME_VERBS.get(outcome, outcome)}" + ("" if degree != degree else f" with a safety degree of {degree:.2f} m")
 
 
-def _failure_in_words(characteristics: CharacteristicSet, failure: DescribedFailure) -> str:
+def _failure_in_words(characteristics: CharacteristicSet, failure: FailureDescription) -> str:
     """A sentence such as `a collision at 5 km/h (robust: ...) was found with ten changes: ...; three of them suffice`."""
-    number, needed, effect = len(failure.changes), failure.needed, f"{_outcome_in_words(failure)} ({failure.robustness})"
+    number, sufficient, effect = len(failure.changes), failure.sufficient, f"{_outcome_in_words(failure)} ({failure.robustness})"
     listed = _changes_in_words(characteristics, failure.changes)
-    if needed < number:
+    if sufficient < number:
         cause = "" if failure.cause is None else f" ({failure.cause})"
-        sufficient = f"{_count_in_words(needed)} of them {_verb_suffice(needed)}{cause}"
-        return f"{effect} was found with {_count_in_words(number)} changes: {listed}; {sufficient}."
+        subset = f"{_count_in_words(sufficient)} of them {_verb_suffice(sufficient)}{cause}"
+        return f"{effect} was found with {_count_in_words(number)} changes: {listed}; {subset}."
     return f"{_count_in_words(number)} {'change' if number == 1 else 'changes'} {_verb_suffice(number)} for {effect}: {listed}."
 
 
@@ -237,7 +237,7 @@ def _count_in_words(number: int) -> str:
     return NUMBER_WORDS[number] if number < len(NUMBER_WORDS) else str(number)
 
 
-def _outcome_in_words(failure: DescribedFailure) -> str:
+def _outcome_in_words(failure: FailureDescription) -> str:
     if failure.safety_degree is None:
         return failure.outcome
     if failure.outcome == Outcome.COLLISION:
