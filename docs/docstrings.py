@@ -12,5 +12,5 @@ class WholeDocstrings(Extension):
     """Documents functions by the docstrings that they have once imported: questions complete theirs with their options."""
 
     def on_function(self, *, func: Any, **_: Any) -> None:
-        if func.docstring and any("documented(" in str(one.value) for one in func.decorators):
+        if func.docstring and any("document_options(" in str(one.value) for one in func.decorators):
             func.docstring.value = inspect.getdoc(dynamic_import(func.path)) or ""

@@ -34,10 +34,10 @@ Progress = Callable[[str, int, int], None]
 
 
 MAX_REJECTIONS = 64
-"""If fewer than 1 in so many points of the Sobol sequence is feasible, mixtures of the feasible region's vertices replace the points."""
+"""If fewer than 1 in this many Sobol points is feasible, mixtures of the feasible region's vertices replace the points."""
 
 
-def silent(stage: str, done: int, total: int) -> None:
+def show_no_progress(stage: str, done: int, total: int) -> None:
     """Show no progress."""
 
 
@@ -50,38 +50,38 @@ class Evaluator:
         Number of settings simulated so far; of equal settings in one call only one is simulated.
     """
 
-    def __init__(self, study: Study, pool: Pool, progress: Progress = silent) -> None:
+    def __init__(self, study: Study, pool: Pool, progress: Progress = show_no_progress) -> None:
         self.study, self.region = study, region_of(study)
         self.characteristics = self.region.characteristics
         self._pool, self.progress = pool, progress
         self.simulated = 0
 
-    def evaluate(self, settings: FloatArray, stage: str, before: int = 0, total: int | None = None, *,
-                 anywhere: bool = False) -> Evaluations:
-        """Evaluate M settings, shape (M, n). Progress is shown for `stage`, in which `before` of `total` settings are already done.
+    def evaluate(self, settings: FloatArray, stage: str, done_before: int = 0, total: int | None = None, *,
+                 ignore_constraints: bool = False) -> Evaluations:
+        """Evaluate M settings, shape (M, n). Progress is shown for `stage`; `done_before` of its `total` settings are already done.
 
-        Settings that violate a constraint of the study are not simulated and get the outcome `infeasible`. If `anywhere` is true, the
-        constraints are ignored.
+        Settings that violate a constraint of the study are not simulated and get the outcome `infeasible`, unless `ignore_constraints`
+        is true.
         """
-        if self.region and not anywhere:
+        if self.region and not ignore_constraints:
             feasible = self.region.feasible(settings)
             if not feasible.all():
-                parts = [self.evaluate(settings[feasible], stage, before, total), self._infeasible_evaluations(settings[~feasible])]
+                parts = [self.evaluate(settings[feasible], stage, done_before, total), self._infeasible_evaluations(settings[~feasible])]
                 order = np.argsort(np.argsort(~feasible, kind="stable"), kind="stable")
                 return Evaluations.concatenate(parts).take(order)  # restores the order of the settings
         if not len(settings):
             return Evaluations.none(len(self.characteristics), METRICS)
-        done, number = 0, len(np.unique(settings, axis=0))
-        stage_total = number if total is None else total
-        self.progress(stage, before, stage_total)
+        done, distinct_settings = done_before, len(np.unique(settings, axis=0))
+        stage_total = distinct_settings if total is None else total
+        self.progress(stage, done, stage_total)
 
-        def count(increment: int) -> None:
+        def show_more_done(increment: int) -> None:
             nonlocal done
             done += increment
-            self.progress(stage, before + done, stage_total)
+            self.progress(stage, done, stage_total)
 
-        evaluations = evaluate_all(self.study, settings, self._pool, count)
-        self.simulated += number
+        evaluations = evaluate_all(self.study, settings, self._pool, show_more_done)
+        self.simulated += distinct_settings
         return evaluations
 
     def _infeasible_evaluations(self, settings: FloatArray) -> Evaluations:
@@ -91,21 +91,21 @@ class Evaluator:
             metrics=dict.fromkeys(METRICS, undefined), f_diff=self.characteristics.largest_change(settings),
             f_num_diff=self.characteristics.number_changed(settings))
 
-    def feasible_design(self, number: int, seed: int = 0, *, filtered: bool = False) -> FloatArray:
-        """`number` settings that cover the feasible part of the domain evenly; with `filtered`, the filter leaves them feasible."""
+    def feasible_settings(self, number: int, seed: int = 0, *, filtered: bool = False) -> FloatArray:
+        """`number` settings that cover the feasible part of the domain evenly; with `filtered`, they stay feasible when filtered."""
         if not self.region:
-            return sobol_design(self.characteristics, number, seed)
-        rng, length = np.random.default_rng(seed), 0
+            return sobol_settings(self.characteristics, number, seed)
+        rng, drawn = np.random.default_rng(seed), 0
 
-        def next_settings(count: int) -> FloatArray:
+        def draw_next(count: int) -> FloatArray:
             """The next `count` settings of the Sobol sequence."""
-            nonlocal length
-            length += count
-            return sobol_design(self.characteristics, length, seed)[length - count:]
+            nonlocal drawn
+            drawn += count
+            return sobol_settings(self.characteristics, drawn, seed)[drawn - count:]
 
-        return self.region.draw_feasible(next_settings, number, rng, filtered=filtered, rejections=MAX_REJECTIONS)
+        return self.region.draw_feasible(draw_next, number, rng, filtered=filtered, rejections=MAX_REJECTIONS)
 
-    def cells(self, settings: FloatArray, stage: str) -> CellResults:
+    def simulate_cells(self, settings: FloatArray, stage: str) -> CellResults:
         """Simulate M settings, shape (M, n), in every cell of a rated study; the workers share the cells.
 
         Raises
@@ -115,26 +115,26 @@ class Evaluator:
         """
         rater = rater_of(self.study, self.study.source)
         assert rater is not None
-        number = len(rater.protocol.cells)
-        parts = min(PARTS_PER_WORKER * self._pool.workers, number)
+        cell_count = len(rater.protocol.cells)
+        parts = min(PARTS_PER_WORKER * self._pool.workers, cell_count)
         inputs, pool = inputs_of(self.study, self._pool), RetryingPool(self._pool, self.study)
-        self.progress(stage, 0, number)
-        futures = {pool.submit(packed(self.study, inputs, cells=(k, parts)), settings): k for k in range(parts)}
+        self.progress(stage, 0, cell_count)
+        futures = {pool.submit(packed(self.study, inputs, cells=(part, parts)), settings): part for part in range(parts)}
         results_by_part, done = dict[int, CellResults](), 0
         while len(results_by_part) < parts:
-            for future in first_of([future for future, k in futures.items() if k not in results_by_part]):
+            for future in first_of([future for future, part in futures.items() if part not in results_by_part]):
                 evaluations = future.result()
                 if evaluations.cells is None:
                     raise SimulationError(f"study {self.study.name!r}: a vehicle cannot be simulated: {evaluations.reason(0)}")
                 results_by_part[futures[future]] = evaluations.cells
                 done += evaluations.cells.impact.shape[1]
-                self.progress(stage, done, number)
-        order = np.argsort(np.concatenate([part_of(rater.protocol, k, parts) for k in range(parts)]))
+                self.progress(stage, done, cell_count)
+        order = np.argsort(np.concatenate([part_of(rater.protocol, part, parts) for part in range(parts)]))
         self.simulated += len(settings)
-        columns = zip(*(results_by_part[k] for k in range(parts)), strict=True)
+        columns = zip(*(results_by_part[part] for part in range(parts)), strict=True)
         return CellResults._make(np.concatenate(column, axis=1)[:, order] for column in columns)
 
-    def original(self) -> Evaluations:
+    def evaluate_original(self) -> Evaluations:
         """Evaluation of the original vehicle.
 
         Raises
@@ -147,14 +147,14 @@ class Evaluator:
             raise SimulationError(f"study {self.study.name!r} cannot be simulated with the original vehicle: {evaluations.outcome[0]}")
         return evaluations
 
-    def criterion(self, text: str | None, original: Evaluations | None = None) -> Unsafe:
+    def choose_criterion(self, text: str | None, original: Evaluations | None = None) -> Unsafe:
         """The criterion that an option states, or the default criterion; raises what `parse_criterion` and `Unsafe.default_among` raise."""
         if text is not None:
             return self.parse_criterion(text)
-        original = self.original() if original is None else original
+        original = self.evaluate_original() if original is None else original
         if RATING_POINTS.name in original.metrics:
             return Unsafe.default_among(original, original)
-        return Unsafe.default_among(self.evaluate(self.feasible_design(CRITERION_SETTINGS), "settings over the whole domain"), original)
+        return Unsafe.default_among(self.evaluate(self.feasible_settings(CRITERION_SETTINGS), "settings over the whole domain"), original)
 
     def parse_criterion(self, text: str) -> Unsafe:
         """Parse the criterion that an option states; raises what `Unsafe.parse` raises, and an error for points without a rating."""
@@ -174,7 +174,8 @@ class Evaluator:
 
 
 @contextmanager
-def open_evaluator(study: Study, pool: Pool | None = None, jobs: int | None = None, progress: Progress = silent) -> Iterator[Evaluator]:
+def open_evaluator(study: Study, pool: Pool | None = None, jobs: int | None = None,
+                   progress: Progress = show_no_progress) -> Iterator[Evaluator]:
     """An evaluator that simulates on `pool`; without a pool, on `jobs` new worker processes, by default one for each core.
 
     Raises
@@ -186,8 +187,8 @@ def open_evaluator(study: Study, pool: Pool | None = None, jobs: int | None = No
         yield Evaluator(study, pool, progress)
         return
     assemble(study, study.source)
-    with local_pool(jobs or available_cores(), study.search.time_limit) as local:
-        yield Evaluator(study, local, progress)
+    with local_pool(jobs or available_cores(), study.search.time_limit) as new_pool:
+        yield Evaluator(study, new_pool, progress)
 
 
 def sobol_points(number: int, dimensions: int, seed: int) -> FloatArray:
@@ -198,7 +199,7 @@ def sobol_points(number: int, dimensions: int, seed: int) -> FloatArray:
     return np.asarray(points[:number])
 
 
-def sobol_design(characteristics: CharacteristicSet, number: int, seed: int = 0) -> FloatArray:
+def sobol_settings(characteristics: CharacteristicSet, number: int, seed: int = 0) -> FloatArray:
     """`number` settings that cover the whole domain evenly, shape (number, n), feasible or not."""
     lower, upper = characteristics.lower, characteristics.upper
     return np.asarray(lower + sobol_points(number, len(characteristics), seed) * (upper - lower))

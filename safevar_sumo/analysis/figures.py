@@ -16,13 +16,12 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 DPI = 200
-METADATA: Mapping[str, dict[str, Any]] = {".pdf": {"CreationDate": None}, ".svg": {"Date": None}}
-"""Metadata by file ending; they keep the date out of a picture."""
+PICTURE_METADATA: Mapping[str, dict[str, Any]] = {".pdf": {"CreationDate": None}, ".svg": {"Date": None}}
+"""Metadata by file ending; they keep the date out of the file, so that equal figures have equal bytes."""
 FONT = 8
-DEGREE = "safety degree [m]\n(below 0: minus the collision's speed [m/s])"
-UNSAFE = "#d55e00"
-CHANGED, INVOLVED, NECESSARY = "#bbbbbb", "#56b4e9", "#0072b2"
-"""Grey and two of Okabe and Ito's blues. Their lightness differs, so that a reader can tell them apart in a print without colours."""
+DEGREE_LABEL = "safety degree [m]\n(below 0: minus the collision's speed [m/s])"
+GREY, SKY_BLUE, BLUE, VERMILION = "#bbbbbb", "#56b4e9", "#0072b2", "#d55e00"
+"""Grey and colours of Okabe and Ito. Grey and the two blues differ in lightness, so that they differ in a print without colours too."""
 
 
 def new_figure(title: str, rows: int, columns: int, size: tuple[float, float], **options: Any) -> tuple[Figure, np.ndarray]:
@@ -34,18 +33,16 @@ def new_figure(title: str, rows: int, columns: int, size: tuple[float, float], *
                                                               "xtick.labelsize": FONT, "ytick.labelsize": FONT}]):
         figure = Figure(figsize=size, layout="constrained")
         axes = figure.subplots(rows, columns, squeeze=False, **options)
-    figure.suptitle(literal(title), fontsize=FONT + 2)
+    figure.suptitle(escape_dollars(title), fontsize=FONT + 2)
     return figure, axes
 
 
-def panels(title: str, number: int, across: int, panel: tuple[float, float], least_width: float, above: float) -> tuple[Figure, list[Axes]]:
-    """A figure with `number` panels of the size `panel`, at most `across` of them side by side, and the axes of the panels.
-
-    The figure is at least `least_width` wide, and its title takes the height `above`; all sizes in inches.
-    """
-    columns = min(across, number)
+def new_panels(title: str, number: int, max_columns: int, panel_size: tuple[float, float], min_width: float,
+               title_height: float) -> tuple[Figure, list[Axes]]:
+    """A figure with `number` panels, at most `max_columns` of them side by side, and the axes of the panels; all sizes are in inches."""
+    columns = min(max_columns, number)
     rows = -(-number // columns)
-    figure, axes = new_figure(title, rows, columns, (max(panel[0] * columns, least_width), above + panel[1] * rows))
+    figure, axes = new_figure(title, rows, columns, (max(panel_size[0] * columns, min_width), title_height + panel_size[1] * rows))
     for axis in axes.flat[number:]:
         axis.set_axis_off()
     return figure, list(axes.flat[:number])
@@ -63,17 +60,17 @@ def save(figure: Figure, path: Path, source: str = "out") -> None:
 
     try:
         with matplotlib.rc_context({"svg.hashsalt": "safevar_sumo"}):
-            figure.savefig(path, dpi=DPI, metadata=METADATA.get(path.suffix.lower()))
+            figure.savefig(path, dpi=DPI, metadata=PICTURE_METADATA.get(path.suffix.lower()))
     except (OSError, ValueError) as error:
         raise InputError(source, f"cannot write {path}: {getattr(error, 'strerror', None) or error}",
                          "a file that ends in .png, .pdf or .svg, in a directory that can be written") from None
 
 
-def literal(name: str) -> str:
+def escape_dollars(name: str) -> str:
     """A name with its dollar signs escaped, so that matplotlib does not read a formula in it."""
     return name.replace("$", r"\$")
 
 
 def as_formula(unit: str) -> str:
     """A unit with its powers as superscripts."""
-    return re.sub(r"\^(-?\d+)", r"$^{\1}$", literal(unit))
+    return re.sub(r"\^(-?\d+)", r"$^{\1}$", escape_dollars(unit))

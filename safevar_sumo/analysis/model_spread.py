@@ -16,11 +16,11 @@ from safevar_sumo.sumo.matrix import evaluate, system_at_point
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet
 
-BAND = 0.9
+BAND_SHARE = 0.9
 """Share of the predictions that lie in the band."""
-DEVIATIONS = 1.645
-"""Half width [standard deviations] of the interval around the mean that holds this share of a normal distribution."""
-ROUNDING = 1e-5
+HALF_WIDTH = 1.645
+"""Half width [standard deviations] of the interval around the mean that holds `BAND_SHARE` of a normal distribution."""
+ROUNDING_TOLERANCE = 1e-5
 """Relative tolerance within which a parameter's value in the study equals its (rounded) value in the first set of [spread]."""
 
 
@@ -45,19 +45,19 @@ class ModelSpread:
     collisions: int
 
     def to_dict(self) -> dict[str, Any]:
-        """As plain values."""
+        """The fields as plain values."""
         return asdict(self)
 
     def __str__(self) -> str:
-        """One sentence."""
+        """One sentence on the band and the collisions."""
         if self.lower is None or self.upper is None:
             return f"no safety degree with any of {self.sets} parameter sets that fit the published data equally well"
-        number = "none of them" if not self.collisions else f"{self.collisions} of them"
-        return (f"safety degree {self.lower:.2f} to {self.upper:.2f} ({BAND:.0%} band of {self.sets} parameter sets that fit the published "
-                f"data equally well, of repeats and of the model's error); a collision with {number}")
+        collisions = "none of them" if not self.collisions else f"{self.collisions} of them"
+        return (f"safety degree {self.lower:.2f} to {self.upper:.2f} ({BAND_SHARE:.0%} band of {self.sets} parameter sets that fit the "
+                f"published data equally well, of repeats and of the model's error); a collision with {collisions}")
 
 
-def model_spreads(study: Study, settings: FloatArray, point: str = "") -> list[ModelSpread]:
+def compute_model_spreads(study: Study, settings: FloatArray, point: str = "") -> list[ModelSpread]:
     """The model's uncertainty for each of M settings, shape (M, n); the filter is not applied.
 
     In a matrix, all settings are simulated at `point`; if no point is named, each setting at its worst point.
@@ -67,7 +67,7 @@ def model_spreads(study: Study, settings: FloatArray, point: str = "") -> list[M
     InputError
         If the study has no spread, or the spread names a parameter that the study lacks.
     """
-    evaluations = evaluations_of_sets(study, settings, point)
+    evaluations = evaluate_sets(study, settings, point)
     lower, upper = band_of(study, evaluations)
     collisions = np.stack([prediction.collided for prediction in evaluations]).sum(axis=0)
     return [ModelSpread(sets=len(evaluations), lower=finite_or_none(low), upper=finite_or_none(high), collisions=int(count))
@@ -77,7 +77,7 @@ def model_spreads(study: Study, settings: FloatArray, point: str = "") -> list[M
 def band_of(study: Study, evaluations: Sequence[Evaluations]) -> tuple[FloatArray, FloatArray]:
     """Lower and upper ends, shape (M,) each, of the sets' predictions for M settings, widened by repeats and the model's error."""
     error = study.model_error.get(SAFETY_DEGREE, 0.0) * distance_from_original(study, evaluations[0].settings)
-    return band(np.stack([prediction.f_safe for prediction in evaluations]), study.repeatability.get(SAFETY_DEGREE, 0.0), error)
+    return prediction_band(np.stack([prediction.f_safe for prediction in evaluations]), study.repeatability.get(SAFETY_DEGREE, 0.0), error)
 
 
 def distance_from_original(study: Study, settings: FloatArray) -> FloatArray:
@@ -86,15 +86,15 @@ def distance_from_original(study: Study, settings: FloatArray) -> FloatArray:
     return np.asarray(np.linalg.norm((settings - characteristics.original) / (characteristics.upper - characteristics.lower), axis=1))
 
 
-def band(safety_degrees: FloatArray, repeatability: float, error: FloatArray | float = 0.0) -> tuple[FloatArray, FloatArray]:
+def prediction_band(safety_degrees: FloatArray, repeatability: float, error: FloatArray | float = 0.0) -> tuple[FloatArray, FloatArray]:
     """Ends, shape (M,) each, of the band of predictions, shape (sets, M); repeats of a simulation and `error` widen it on each side."""
     lower, upper = np.full(safety_degrees.shape[1], np.nan), np.full(safety_degrees.shape[1], np.nan)
     defined = np.isfinite(safety_degrees).any(axis=0)
-    lower[defined], upper[defined] = np.nanquantile(safety_degrees[:, defined], [(1 - BAND) / 2, (1 + BAND) / 2], axis=0)
-    return lower - DEVIATIONS * repeatability - error, upper + DEVIATIONS * repeatability + error
+    lower[defined], upper[defined] = np.nanquantile(safety_degrees[:, defined], [(1 - BAND_SHARE) / 2, (1 + BAND_SHARE) / 2], axis=0)
+    return lower - HALF_WIDTH * repeatability - error, upper + HALF_WIDTH * repeatability + error
 
 
-def evaluations_of_sets(study: Study, settings: FloatArray, point: str = "") -> list[Evaluations]:
+def evaluate_sets(study: Study, settings: FloatArray, point: str = "") -> list[Evaluations]:
     """Evaluate settings, shape (M, n), in this process with each parameter set, first with the study's values."""
     systems = [assemble(variant) for variant in studies_of_sets(study)]
     return [evaluate(system_at_point(system, point, "point") if point else system, settings) for system in systems]
@@ -110,6 +110,7 @@ def studies_of_sets(study: Study) -> list[Study]:
     """
     if not study.spread:
         raise InputError(study.source, "has no table [spread]", "a study that `calibrate` has fitted, such as sun or rain")
-    sets = {key: values for key, values in study.spread.items() if np.isclose(value_of(study, key), values[0], rtol=ROUNDING, atol=0)}
+    sets = {key: values for key, values in study.spread.items()
+            if np.isclose(value_of(study, key), values[0], rtol=ROUNDING_TOLERANCE, atol=0)}
     count = len(next(iter(study.spread.values())))
     return [study, *(with_values(study, {key: values[k] for key, values in sets.items()}) for k in range(1, count))]

@@ -39,24 +39,24 @@ class Option(NamedTuple):
     python: str = ""
 
     @property
-    def argument(self) -> str:
+    def argument_text(self) -> str:
         """The option's description in the documentation of the Python function."""
         text = self.python or re.sub(r"\s+\[default: (.*)\]$", r" By default \1.", self.help)
         return fill(re.sub(r"--([a-z]+)", r"`\1`", text), 110, break_on_hyphens=False)
 
-    def refusal(self, value: float) -> str:
-        """The expected range in words if a number is outside the range (NaN always is), else an empty text."""
-        low_holds = self.low is None or (value > self.low if self.is_open[0] else value >= self.low)
-        high_holds = self.high is None or (value < self.high if self.is_open[1] else value <= self.high)
-        if low_holds and high_holds:
+    def expected_range(self, value: float) -> str:
+        """The expected range in words if the value is outside it (NaN always is); empty if the value is inside."""
+        above_low = self.low is None or (value > self.low if self.is_open[0] else value >= self.low)
+        below_high = self.high is None or (value < self.high if self.is_open[1] else value <= self.high)
+        if above_low and below_high:
             return ""
         ends = [f"{'above' if self.is_open[0] else 'at least'} {self.low:,g}"] if self.low is not None else []
         ends += [f"{'below' if self.is_open[1] else 'at most'} {self.high:,g}"] if self.high is not None else []
         return f"a number {' and '.join(ends)}"
 
 
-def option(default: Any, text: str, **how: Any) -> Any:
-    return field(default=default, metadata={"option": Option(text, **how)})
+def option(default: Any, text: str, **properties: Any) -> Any:
+    return field(default=default, metadata={"option": Option(text, **properties)})
 
 
 def unsafe_option() -> Any:
@@ -81,32 +81,32 @@ class Options:
     """The command that asks the question."""
 
     def __post_init__(self) -> None:
-        for name, definition in self.described().items():
+        for name, definition in self.definitions().items():
             value = getattr(self, name)
             if definition.form != "one" and value is not None and not isinstance(value, Mapping):
                 object.__setattr__(self, name, (value,) if isinstance(value, str) else tuple(value))
             if value is not None and definition.kind in (int, float):
                 if isinstance(value, bool) or not isinstance(value, Integral if definition.kind is int else Real):
                     raise InputError(name, repr(value), "a whole number" if definition.kind is int else "a number")
-                if expected := definition.refusal(float(value)):
+                if expected := definition.expected_range(float(value)):
                     raise InputError(name, repr(value), expected)
 
     @classmethod
-    def described(cls) -> Mapping[str, Option]:
+    def definitions(cls) -> Mapping[str, Option]:
         """Every option by its name."""
-        return {item.name: item.metadata["option"] for item in fields(cls)}
+        return {option_field.name: option_field.metadata["option"] for option_field in fields(cls)}
 
     @classmethod
     def flags(cls) -> Mapping[str, str]:
         """The flag of every option."""
-        return {name: option.flag or f"--{name.replace('_', '-')}" for name, option in cls.described().items()}
+        return {name: option.flag or f"--{name.replace('_', '-')}" for name, option in cls.definitions().items()}
 
-    def command_line(self, place: str, point: str = "") -> str:
-        """The command that asks this question about a study or results directory, with a flag for each option off its default."""
-        parts = [RUN, self.question, quote(place)]
-        for item in fields(self):
-            value, flag, definition = getattr(self, item.name), self.flags()[item.name], item.metadata["option"]
-            if value == item.default:
+    def command_line(self, subject: str, point: str = "") -> str:
+        """The command that asks this question about a study or results directory; it has a flag for each option not at its default."""
+        parts = [RUN, self.question, quote(subject)]
+        for option_field in fields(self):
+            value, flag, definition = getattr(self, option_field.name), self.flags()[option_field.name], option_field.metadata["option"]
+            if value == option_field.default:
                 continue
             if isinstance(value, Mapping):
                 value = [f"{key}={number!r}" for key, number in value.items()]
@@ -137,11 +137,11 @@ SimulationError
 QuestionFunction = TypeVar("QuestionFunction", bound=Callable[..., Any])
 
 
-def documented(options: type[Options]) -> Callable[[QuestionFunction], QuestionFunction]:
+def document_options(options: type[Options]) -> Callable[[QuestionFunction], QuestionFunction]:
     """Decorator: appends the options and the arguments common to all questions to a docstring, which must end with the first argument."""
-    def complete(function: QuestionFunction) -> QuestionFunction:
-        arguments = [f"{name}\n{indent(definition.argument, '    ')}" for name, definition in options.described().items()]
+    def append_arguments(function: QuestionFunction) -> QuestionFunction:
+        arguments = [f"{name}\n{indent(definition.argument_text, '    ')}" for name, definition in options.definitions().items()]
         function.__doc__ = "\n".join([cleandoc(function.__doc__ or ""), *arguments, COMMON_ARGUMENTS])
         return function
 
-    return complete
+    return append_arguments

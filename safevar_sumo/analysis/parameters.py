@@ -23,9 +23,9 @@ def with_values(study: Study, values: Mapping[str, float]) -> Study:
     InputError
         If the study lacks a parameter, or a value is not allowed for its parameter.
     """
-    tables = _tables(study)
+    tables = _as_tables(study)
     for name, value in values.items():
-        table, key = _location(study, tables, name)
+        table, key = _locate(study, tables, name)
         table[key] = value
     try:
         return msgspec.convert(tables, Study)
@@ -35,34 +35,34 @@ def with_values(study: Study, values: Mapping[str, float]) -> Study:
 
 def value_of(study: Study, name: str) -> float:
     """The value of a parameter in the study."""
-    table, key = _location(study, _tables(study), name)
+    table, key = _locate(study, _as_tables(study), name)
     return float(table[key])
 
 
-def _tables(study: Study) -> Any:
+def _as_tables(study: Study) -> Any:
     """The study as plain tables; a weather's name is replaced by the weather's table."""
     return msgspec.to_builtins(msgspec.structs.replace(study, weather=weather_of(study.weather, study.source)))
 
 
-def _location(study: Study, tables: Any, name: str) -> tuple[Any, Any]:
-    """The table or list that holds a parameter, and its key or index there."""
-    refusal = InputError(study.source, f"calibration.{name!r} is no parameter of the study",
+def _locate(study: Study, tables: Any, name: str) -> tuple[Any, Any]:
+    """The table or list that holds a parameter, and the parameter's key or index in it."""
+    error = InputError(study.source, f"calibration.{name!r} is no parameter of the study",
                          f"a number that is given under {', '.join(prefix.rstrip('.') for prefix in FITTED_TABLES)}")
     if not name.startswith(FITTED_TABLES):
-        raise refusal
-    *path, end = name.split(".")
+        raise error
+    *path, last = name.split(".")
     table = tables
     try:
         for key in path:
-            table = table[_key(table, key)]
-        key_or_index = _key(table, end)
+            table = table[_key_or_index(table, key)]
+        key_or_index = _key_or_index(table, last)
         if not isinstance(table[key_or_index], int | float):
-            raise refusal
+            raise error
     except (KeyError, IndexError, ValueError, TypeError):
-        raise refusal from None
+        raise error from None
     return table, key_or_index
 
 
-def _key(table: Any, name: str) -> int | str:
+def _key_or_index(table: Any, name: str) -> int | str:
     """The key in a table, or the index in a list; an index has one spelling, so that each parameter has one name."""
     return int(name) if isinstance(table, list) and name == str(int(name)) else name

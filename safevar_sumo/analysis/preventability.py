@@ -24,8 +24,8 @@ from safevar_sumo.study import ModelTable, Study
 from safevar_sumo.sumo.matrix import simulate, simulate_all_points, study_at, worst_points
 from safevar_sumo.sumo.system import System, assemble
 
-LIMIT = 20_000
-"""Approximate limit of simulations for a study's preventability; beyond it only a random sample of the collisions is simulated."""
+MAX_SIMULATIONS = 20_000
+"""Approximate maximum number of simulations for a study's preventability; if all collisions need more, a random sample is simulated."""
 
 SETTINGS_PER_CALL = 20
 """Number of settings simulated in one call at all points of a matrix: enough to fill the batches of simulations."""
@@ -40,7 +40,7 @@ class PreventableBy(StrEnum):
 
 
 class PreventedShares(msgspec.Struct, frozen=True, kw_only=True):
-    """Shares of the simulated collisions by class, None without a collision; `looked_at` is the number of simulated collisions."""
+    """Shares of the simulated collisions by category, None without a collision; `looked_at` is the number of simulated collisions."""
 
     competent_driver: float | None
     full_braking: float | None
@@ -51,12 +51,12 @@ class PreventedShares(msgspec.Struct, frozen=True, kw_only=True):
 
 @dataclass(frozen=True, kw_only=True)
 class Preventability:
-    """Numbers of a study's collisions, or of a random sample of them, by the weakest driver that avoids each collision.
+    """Numbers of a study's collisions, or of a random sample of them, by category: the weakest driver that avoids each collision.
 
     Attributes
     ----------
     numbers
-        Number of simulated collisions of each class; the classes are disjoint.
+        Number of simulated collisions in each category; the categories are disjoint.
     collisions
         Number of distinct collisions of the study, simulated or not.
     """
@@ -70,11 +70,11 @@ class Preventability:
         return sum(self.numbers.values())
 
     def share(self, category: PreventableBy) -> float | None:
-        """The share of one class among the simulated collisions; None if no collision was simulated."""
+        """The share of a category among the simulated collisions; None if no collision was simulated."""
         return self.numbers.get(category, 0) / self.looked_at if self.looked_at else None
 
     def interval(self, category: PreventableBy) -> tuple[float, float] | None:
-        """95 % confidence interval of a class's share in all collisions of the study; None if no collision was simulated.
+        """95 % confidence interval of a category's share in all collisions of the study; None if no collision was simulated.
 
         If all collisions were simulated, the share has no sampling error and the interval is the share itself. For a sample the
         interval is Clopper and Pearson's. It is slightly too wide, as it has no correction for a finite population.
@@ -103,7 +103,7 @@ class Preventability:
         return f"Preventability in the same vehicle ({sample}{number_of(self.collisions, 'collision')}): {', '.join(parts)}."
 
 
-def preventability(evaluator: Evaluator, settings: FloatArray, limit: int = LIMIT) -> Preventability:
+def assess_preventability(evaluator: Evaluator, settings: FloatArray, limit: int = MAX_SIMULATIONS) -> Preventability:
     """Classify collisions, settings of shape (M, n), by the weakest driver that avoids each collision; equal settings count once.
 
     If that takes more than about `limit` simulations, only a random sample is simulated, drawn with the study's seed.
@@ -112,27 +112,27 @@ def preventability(evaluator: Evaluator, settings: FloatArray, limit: int = LIMI
     unique = np.unique(settings, axis=0)
     sample_size = max(limit // (len(PreventableBy) - 1 + len(assemble(evaluator.study).matrix)), 1)
     rows = np.random.default_rng(evaluator.study.search.seed).permutation(len(unique))[:sample_size]
-    return Preventability(numbers=Counter(filter(None, preventable_by(evaluator, unique[rows]))), collisions=len(unique))
+    return Preventability(numbers=Counter(filter(None, classify_collisions(evaluator, unique[rows]))), collisions=len(unique))
 
 
-def preventable_by(evaluator: Evaluator, settings: FloatArray) -> list[PreventableBy | None]:
-    """The class of each collision, settings of shape (M, n); in a matrix, each setting is simulated at its worst point.
+def classify_collisions(evaluator: Evaluator, settings: FloatArray) -> list[PreventableBy | None]:
+    """The category of each collision, settings of shape (M, n); in a matrix, each setting is simulated at its worst point.
 
-    The class is None if the setting cannot be simulated.
+    The category is None if the setting cannot be simulated.
     """
-    classes: list[PreventableBy | None] = [None] * len(settings)
+    categories: list[PreventableBy | None] = [None] * len(settings)
     system = assemble(evaluator.study)
-    worst = _worst_points(evaluator, system, settings)
-    for k in np.unique(worst).tolist():
-        rows = np.flatnonzero(worst == k)
-        point = system.points[k]
+    worst = _find_worst_points(evaluator, system, settings)
+    for point_index in np.unique(worst).tolist():
+        rows = np.flatnonzero(worst == point_index)
+        point = system.points[point_index]
         at_point = evaluator.for_study(study_at(evaluator.study, point.name, point.name) if system.matrix else evaluator.study)
-        for row, category in zip(rows.tolist(), _classes_at_point(at_point, system.at(point), settings[rows]), strict=True):
-            classes[row] = category
-    return classes
+        for row, category in zip(rows.tolist(), _classify_at_point(at_point, system.at(point), settings[rows]), strict=True):
+            categories[row] = category
+    return categories
 
 
-def _worst_points(evaluator: Evaluator, system: System, settings: FloatArray) -> npt.NDArray[np.intp]:
+def _find_worst_points(evaluator: Evaluator, system: System, settings: FloatArray) -> npt.NDArray[np.intp]:
     """Index of the worst point of every setting."""
     worst = np.zeros(len(settings), dtype=np.intp)
     if system.matrix:
@@ -142,25 +142,25 @@ def _worst_points(evaluator: Evaluator, system: System, settings: FloatArray) ->
     return worst
 
 
-def _classes_at_point(evaluator: Evaluator, system: System, settings: FloatArray) -> list[PreventableBy | None]:
-    """Classes of collisions at one point. Full braking is tried only if the competent driver collides, so the classes are disjoint."""
-    parameters = approach(system)
+def _classify_at_point(evaluator: Evaluator, system: System, settings: FloatArray) -> list[PreventableBy | None]:
+    """Categories of collisions at one point. Full braking is tried only if the competent driver collides, so categories are disjoint."""
+    parameters = approach_parameters(system)
     drivers = {name: evaluator.for_study(_study_with_driver(evaluator.study, name, parameters))
                for name in ("competent_driver", "full_braking")}
     competent_driver = drivers["competent_driver"].evaluate(settings, "a competent driver in the same vehicle")
     collisions = np.flatnonzero(competent_driver.collided)
     full_braking = drivers["full_braking"].evaluate(settings[collisions], "full braking in the same vehicle")
-    classes: list[PreventableBy | None] = [PreventableBy.COMPETENT_DRIVER if valid else None for valid in competent_driver.valid]
+    categories: list[PreventableBy | None] = [PreventableBy.COMPETENT_DRIVER if valid else None for valid in competent_driver.valid]
     for row, collided, valid in zip(collisions.tolist(), full_braking.collided, full_braking.valid, strict=True):
-        classes[row] = None if not valid else PreventableBy.NOBODY if collided else PreventableBy.FULL_BRAKING
-    return classes
+        categories[row] = None if not valid else PreventableBy.NOBODY if collided else PreventableBy.FULL_BRAKING
+    return categories
 
 
-def approach(system: System) -> dict[str, Any]:
+def approach_parameters(system: System) -> dict[str, Any]:
     """Parameters with which a reference driver approaches from rest as the driving system does with the original vehicle.
 
     The driver replays the throttle until the driving system first brakes or reaches its peak speed, and holds that speed, so that
-    both are at the same place when the danger begins. If the run begins at speed, the driver keeps that speed.
+    both are at the same position when the danger begins. If the run begins at speed, the driver keeps that speed.
     """
     trace = simulate(system, system.characteristics.original[np.newaxis]).trace
     speed, is_braking = trace.speed[:, 0], trace.brake[:, 0] > 0

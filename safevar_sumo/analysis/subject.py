@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from safevar_sumo.analysis.research_questions.case import Case
 
-MAX_CHANGES = 3
+MAX_CHANGES_NAMED = 3
 """Maximum number of changes that an error names."""
 
 
@@ -153,20 +153,21 @@ def changes_since(directory: Path, case: Case, *, as_it_is_now: bool = False) ->
     manifest, sources = comparable_inputs(manifest, sources, later_files(directory), study.origin.places)
     changes = differences_now(manifest, manifest_of(study, identity_of(study, system, sources)))
     if changes and not as_it_is_now:
-        rest = f" (and {len(changes) - MAX_CHANGES} more)" if len(changes) > MAX_CHANGES else ""
-        raise InputError(directory / MANIFEST, f"{'; '.join(changes[:MAX_CHANGES])}{rest}: new simulations would not match these results",
+        rest = f" (and {len(changes) - MAX_CHANGES_NAMED} more)" if len(changes) > MAX_CHANGES_NAMED else ""
+        named = f"{'; '.join(changes[:MAX_CHANGES_NAMED])}{rest}"
+        raise InputError(directory / MANIFEST, f"{named}: new simulations would not match these results",
                          "the inputs of that time; or --as-it-is-now (as_it_is_now=True) to simulate with the present inputs and a warning")
     return [f"{difference}; simulated as it is now" for difference in changes]
 
 
-T = TypeVar("T")
+Answer = TypeVar("Answer")
 
 
-def answer_question(compute: Callable[..., T], subject: Study | Case, options: type[Options], arguments: Mapping[str, Any]) -> T:
+def answer_question(compute: Callable[..., Answer], subject: Study | Case, options: type[Options], arguments: Mapping[str, Any]) -> Answer:
     """Compute the answer to a question; `arguments` are the arguments of the question's function, by name."""
     from safevar_sumo.metrics import Unsafe
 
-    values = {name: arguments[name] for name in options.described()}
+    values = {name: arguments[name] for name in options.definitions()}
     if values.get("unsafe") is not None:
         values["unsafe"] = str(Unsafe.parse(values["unsafe"]))
     with shown(arguments["progress"]) as show:

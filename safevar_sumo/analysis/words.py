@@ -10,23 +10,27 @@ from safevar_sumo.records import Outcome
 from safevar_sumo.shipped import RUN
 from safevar_sumo.vehicles import Characteristic, CharacteristicSet
 
-ENDS = {
+OUTCOME_VERBS = {
     Outcome.STOPPED: "stops", Outcome.PASSED: "passes", Outcome.TIMEOUT: "is still under way at the end",
     Outcome.NEVER_MOVED: "never moves", Outcome.SIMULATOR_ERROR: "could not be simulated",
     Outcome.INVALID_TEST: "leaves the tolerance of the test's speed", Outcome.INFEASIBLE: "violates a constraint"}
-"""How a run ended, as the verb of a sentence; other words describe a collision, with its speed."""
+"""How a run ended, as the verb of a sentence; a collision is described with its speed instead."""
 
 
 def list_of_changes(characteristics: CharacteristicSet, values: Mapping[str, float]) -> str:
     """The values that differ from the original values, in the order of the study, such as `mass 2404 -> 2600 kg (+8.2 %)`."""
-    changed = [(member, values[member.name]) for member in characteristics if values.get(member.name, member.original) != member.original]
-    return ", ".join(f"{member.name} {member.original:g} -> {member.text(value)}{member.suffix} "
-                     f"({(value - member.original) / abs(member.original):+.1%})" for member, value in changed) or "no change at all"
+    changes = []
+    for characteristic in characteristics:
+        original, value = characteristic.original, values.get(characteristic.name, characteristic.original)
+        if value != original:
+            changes.append(f"{characteristic.name} {original:g} -> {characteristic.text(value)}{characteristic.suffix} "
+                           f"({(value - original) / abs(original):+.1%})")
+    return ", ".join(changes) or "no change at all"
 
 
-def direction(member: Characteristic, value: float) -> str:
+def direction_in_words(characteristic: Characteristic, value: float) -> str:
     """A characteristic and the direction of its change, such as `mass up`."""
-    return f"{member.name} {'up' if value > member.original else 'down'}"
+    return f"{characteristic.name} {'up' if value > characteristic.original else 'down'}"
 
 
 def simulate_command(study: str, values: Mapping[str, float], point: str = "") -> str:
@@ -40,10 +44,10 @@ def question_command(question: str, subject: str, point: str = "") -> str:
     return " ".join([RUN, question, quote(subject), *(["--point", quote(point)] if point else [])])
 
 
-def joined(parts: Iterable[str]) -> str:
-    """Parts of a sentence: `a, b and c`."""
-    *beginning, end = parts
-    return f"{', '.join(beginning)} and {end}" if beginning else end
+def join_phrases(phrases: Iterable[str]) -> str:
+    """Phrases of a sentence as a list: `a, b and c`."""
+    *beginning, last = phrases
+    return f"{', '.join(beginning)} and {last}" if beginning else last
 
 
 def number_of(count: int, noun: str) -> str:
@@ -51,6 +55,6 @@ def number_of(count: int, noun: str) -> str:
     return f"{count} {noun}{'' if count == 1 else 's'}"
 
 
-def decimal(value: float | None) -> str:
+def two_decimals(value: float | None) -> str:
     """Two decimals, never `-0.00`; `-` if undefined."""
     return "-" if value is None or math.isnan(value) else f"{round(value, 2) + 0.0:.2f}"

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from safevar_sumo.ads import Ads
-from safevar_sumo.analysis.words import ENDS
+from safevar_sumo.analysis.words import OUTCOME_VERBS
 from safevar_sumo.errors import InputError, unknown
 from safevar_sumo.metrics import Scoring, time_to_collision
 from safevar_sumo.records import STANDSTILL, TIME_DECIMALS, Command, Evaluations, FloatArray, Nominal, Observation, Outcome, SimulationRuns
@@ -151,7 +151,7 @@ class Simulation:
         if self.outcome is Outcome.COLLISION:
             return f"collides at {self.collision_speed:.2f} m/s"
         safety_degree = self.metrics[SAFETY_DEGREE]
-        return ENDS[self.outcome] + ("" if np.isnan(safety_degree) else f", with a safety degree of {safety_degree:.2f} m")
+        return OUTCOME_VERBS[self.outcome] + ("" if np.isnan(safety_degree) else f", with a safety degree of {safety_degree:.2f} m")
 
     def to_dict(self) -> dict[str, Any]:
         """The JSON of `simulate`: plain values, None where undefined."""
@@ -288,10 +288,10 @@ def evaluate(study: StudyLike, settings: pd.DataFrame | Sequence[Mapping[str, fl
 def evaluate_settings(study: Study, settings: FloatArray, pool: Pool | None = None, jobs: int | None = None,
                       progress: Progress | None = None) -> Evaluations:
     """Simulate settings, shape (M, n), in worker processes, including settings that violate the study's constraints."""
-    from safevar_sumo.analysis.evaluator import open_evaluator, silent
+    from safevar_sumo.analysis.evaluator import open_evaluator, show_no_progress
 
-    with open_evaluator(study, pool, jobs, progress or silent) as evaluator:
-        return evaluator.evaluate(settings, "settings", anywhere=True)
+    with open_evaluator(study, pool, jobs, progress or show_no_progress) as evaluator:
+        return evaluator.evaluate(settings, "settings", ignore_constraints=True)
 
 
 def _table(settings: Any, characteristics: CharacteristicSet) -> tuple[FloatArray, Any]:

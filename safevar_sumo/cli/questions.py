@@ -136,7 +136,7 @@ def risk(source: str, point: str | None, jobs: int | None, as_json: bool, plot: 
         check_output(plot, "--plot", PICTURES)
         if study.correlations:
             raise InputError("--plot", "sensitivity indices of correlated characteristics are not defined", "a study without correlations")
-        if options.is_for_rare:
+        if options.requires_rare_method:
             raise InputError("--plot", "a method for rare failures computes no sensitivity indices to draw", "--method auto")
     result = _compute(estimate_risk, study, options, jobs)
     if study.correlations:

@@ -12,7 +12,7 @@ import numpy as np
 from rich.console import Console
 from rich.text import Text
 
-from safevar_sumo.analysis.model_spread import ModelSpread, model_spreads, studies_of_sets
+from safevar_sumo.analysis.model_spread import ModelSpread, compute_model_spreads, studies_of_sets
 from safevar_sumo.analysis.words import question_command
 from safevar_sumo.api.simulation import Simulation, evaluate_settings, simulate_with_original
 from safevar_sumo.cli.arguments import (
@@ -86,7 +86,7 @@ def simulate_command(study: str, solution: str | None, choice: str | None, chang
     if replays.are_requested:
         replays.show(target.study, system, simulation.evaluation.settings[0])
     settings = np.stack([simulation.evaluation.settings[0], system.characteristics.original])
-    spreads = model_spreads(target.study, settings, point or "") if parameter_sets else []
+    spreads = compute_model_spreads(target.study, settings, point or "") if parameter_sets else []
     _print_results(target, system, simulation, spreads, as_json)
 
 

@@ -153,14 +153,14 @@ def print_forecast(console: Console, study: Study, runs: int, cost: Forecast, en
 
 def print_summary(console: Console, study: Study, campaign: Campaign, directory: Path, pool: Pool) -> None:
     """Print the answer, a table of the original and of each algorithm's solutions, the most critical setting, and RQ1 and RQ2 in brief."""
-    from safevar_sumo.analysis.explain.summary import lead
+    from safevar_sumo.analysis.explain.summary import summarise_failures
     from safevar_sumo.analysis.research_questions.case import case_of
     from safevar_sumo.analysis.research_questions.over_runs import summary_lines  # loads more slowly than all other modules
 
     names = tuple(study.vehicle.characteristics)
     solutions = solutions_frame(names, campaign.solutions.items())
     if len(solutions):
-        for line in lead(study, solutions, campaign.original, pool, str(directory)):
+        for line in summarise_failures(study, solutions, campaign.original, pool, str(directory)):
             print_text(console, line)
     by_vehicle = {"original vehicle": campaign.original}
     for algorithm in study.search.labels:

@@ -90,7 +90,7 @@ def flags_of(question: type[Options]) -> Callable[[CommandFunction], CommandFunc
     """Add the flags of a question's options; `question(**keywords)` makes the options from the command's keywords."""
     def add(command: CommandFunction) -> CommandFunction:
         for field in reversed(fields(question)):
-            command = _flag(question.flags()[field.name], field.name, field.default, question.described()[field.name])(command)
+            command = _flag(question.flags()[field.name], field.name, field.default, question.definitions()[field.name])(command)
         return command
 
     return add

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 
-from safevar_sumo.analysis.model_spread import BAND, band_of, distance_from_original, evaluations_of_sets
+from safevar_sumo.analysis.model_spread import BAND_SHARE, band_of, distance_from_original, evaluate_sets
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray, finite_or_none
 from safevar_sumo.reference.rows import ReferenceData
 from safevar_sumo.study import SAFETY_DEGREE, Study
@@ -97,9 +97,9 @@ class Coverage(NamedTuple):
         return self._asdict()
 
     def __str__(self) -> str:
-        return (f"The {BAND:.0%} band of {self.sets} parameter sets, of repeats and of the model's error is {self.width:.2f} m wide "
+        return (f"The {BAND_SHARE:.0%} band of {self.sets} parameter sets, of repeats and of the model's error is {self.width:.2f} m wide "
                 f"(median) and covers {self.all_rows:.0%} of {self.rows} rows, {self.held_back:.0%} of the rows held back; "
-                f"{self.needed:.2f} m more on each side would cover {BAND:.0%} of the latter.")
+                f"{self.needed:.2f} m more on each side would cover {BAND_SHARE:.0%} of the latter.")
 
 
 def covered_by_spread(data: ReferenceData, study: Study) -> Coverage:
@@ -110,14 +110,14 @@ def covered_by_spread(data: ReferenceData, study: Study) -> Coverage:
     InputError
         If the study has no spread.
     """
-    evaluations = evaluations_of_sets(study, data.settings)
+    evaluations = evaluate_sets(study, data.settings)
     lower, upper = band_of(study, evaluations)
     published = data.metrics[SAFETY_DEGREE]
     distances = _outside(published, lower, upper)
     held_back = np.arange(len(published)) % study.fit.hold_out == study.fit.hold_out - 1
     rows = held_back if held_back.any() else np.ones(len(published), dtype=bool)
     return Coverage(len(evaluations), len(published), float(np.mean(distances == 0)), float(np.mean(distances[rows] == 0)),
-                    float(np.median(upper - lower)), float(np.quantile(distances[rows], BAND)))
+                    float(np.median(upper - lower)), float(np.quantile(distances[rows], BAND_SHARE)))
 
 
 def _outside(values: FloatArray, lower: FloatArray, upper: FloatArray) -> FloatArray:
@@ -126,7 +126,7 @@ def _outside(values: FloatArray, lower: FloatArray, upper: FloatArray) -> FloatA
 
 
 def error_beyond_spread(study: Study, references: Mapping[str, ReferenceData]) -> float:
-    """Margin on each side with which the band holds the share `BAND` of new rows [m per domain width of distance from the original].
+    """Margin on each side with which the band holds the share `BAND_SHARE` of new rows [m per domain width of distance from the original].
 
     The method is split conformal prediction (Lei et al. 2018). The score of a row is its distance from the band, divided by its distance
     from the original setting. All files have the same weight.
@@ -137,11 +137,11 @@ def error_beyond_spread(study: Study, references: Mapping[str, ReferenceData]) -
         distances, published = distance_from_original(study, data.settings), data.metrics[SAFETY_DEGREE]
         is_usable = (distances > 0) & np.isfinite(published)
         if is_usable.any():
-            lower, upper = band_of(study_without_error, evaluations_of_sets(study_without_error, data.settings[is_usable]))
+            lower, upper = band_of(study_without_error, evaluate_sets(study_without_error, data.settings[is_usable]))
             scores.append(_outside(published[is_usable], lower, upper) / distances[is_usable])
             weights.append(np.full(len(scores[-1]), 1 / len(scores[-1])))
     if not scores:
         return 0.0
     all_scores = np.concatenate(scores)
-    share = min(1.0, BAND * (1 + 1 / len(all_scores)))  # + 1 for the new row
+    share = min(1.0, BAND_SHARE * (1 + 1 / len(all_scores)))  # + 1 for the new row
     return float(np.quantile(all_scores, share, weights=np.concatenate(weights), method="inverted_cdf"))

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from safevar_sumo.analysis.explain.braking_comparison import brake_onset
-from safevar_sumo.analysis.words import ENDS
+from safevar_sumo.analysis.words import OUTCOME_VERBS
 from safevar_sumo.api.simulation import changed_setting, load_and_assemble
 from safevar_sumo.metrics import METRICS, RATING_POINTS, MetricFacts
 from safevar_sumo.records import Evaluations, FloatArray, Outcome, SimulationRuns
@@ -92,7 +92,7 @@ class Comparison:
         if not math.isnan(runs.collision_speed[row]):
             return f"collides at {runs.collision_speed[row]:.1f} m/s"
         nearest = moments(runs, row).nearest
-        ending = ENDS[Outcome(str(runs.outcome[row]))]
+        ending = OUTCOME_VERBS[Outcome(str(runs.outcome[row]))]
         if nearest is not None and runs.outcome[row] == Outcome.STOPPED:
             ending = f"{ending} with {runs.trace.gap[nearest, row]:.2f} m to spare"
         values = [(metric, self.evaluations.metrics[metric.name][row]) for metric in self.objectives]

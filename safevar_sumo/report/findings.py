@@ -11,7 +11,7 @@ from markupsafe import Markup
 
 from safevar_sumo.analysis.evaluator import Progress
 from safevar_sumo.analysis.explain.compute import explain_failures as explain
-from safevar_sumo.analysis.explain.necessity import in_words
+from safevar_sumo.analysis.explain.necessity import robustness_in_words
 from safevar_sumo.analysis.explain.result import CauseEntry, FailureEntry, SummaryEntry
 from safevar_sumo.analysis.opinion.compute import JudgedCause, opinions_of, second_system
 from safevar_sumo.analysis.research_questions.indicators import nondominated
@@ -169,8 +169,8 @@ def _section(data: ReportInput, rank: int, cause: CauseEntry, failure: FailureEn
         title=f"Cause {rank}: {', '.join(cause.changes)}", anchor=data.anchor("cause", rank), rows=change_rows,
         end=comparison.verdict(comparison.rows[-1]), fraction=cause.fraction, state_below=cause.end, failing=data.failing_points(setting),
         replay=data.replay(setting), handle=failure.handle, replay_anchor=data.anchor("replay", failure.handle),
-        reason=raised(failure.because), robustness=in_words(failure.robustness),
-        cause_robustness="" if cause.robustness is None else in_words(cause.robustness), opinion=opinion)
+        reason=raised(failure.because), robustness=robustness_in_words(failure.robustness),
+        cause_robustness="" if cause.robustness is None else robustness_in_words(cause.robustness), opinion=opinion)
 
 
 def replays(data: ReportInput, explanations: Explanations | None) -> list[Replay]:

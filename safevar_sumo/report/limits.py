@@ -8,7 +8,7 @@ from typing import Any
 from markupsafe import Markup
 
 from safevar_sumo.analysis.evaluator import Progress
-from safevar_sumo.analysis.risk.compute import FLEET, estimate_risk, fleet_probability
+from safevar_sumo.analysis.risk.compute import FLEET_VEHICLES, estimate_risk, fleet_probability
 from safevar_sumo.analysis.rules.compute import find_rules, rule_in_words
 from safevar_sumo.analysis.tolerance.compute import find_tolerances
 from safevar_sumo.analysis.words import number_of
@@ -38,7 +38,7 @@ def risk(data: ReportInput, jobs: int | None, progress: Progress) -> Section:
     result = stored_answer(data, "risk", compute)
     study = data.case.study
     fleet = {} if not study.variation else {
-        "fleet": {"vehicles": FLEET, "probability": fleet_probability(result["probability"], FLEET)}}
+        "fleet": {"vehicles": FLEET_VEHICLES, "probability": fleet_probability(result["probability"], FLEET_VEHICLES)}}
     return {**result, **fleet, "of_domain": not study.variation, "correlated": bool(study.correlations),
             "chart": _sensitivity(data, result["sensitivity"])}
 

@@ -16,7 +16,7 @@ import msgspec
 import numpy as np
 from markupsafe import Markup
 
-from safevar_sumo.analysis.evaluator import Progress, silent
+from safevar_sumo.analysis.evaluator import Progress, show_no_progress
 from safevar_sumo.analysis.research_questions.answer import answer
 from safevar_sumo.analysis.research_questions.case import Case, Unanswerable
 from safevar_sumo.analysis.research_questions.gallery import draw
@@ -157,7 +157,7 @@ PARTS = {"causes": "explain", **{name: name for name in LIMITS}}
 """Commands that compute the sections that need simulations, by section."""
 
 
-def make_report(directories: Iterable[str | Path], only: Sequence[str] = (), jobs: int | None = None, progress: Progress = silent,
+def make_report(directories: Iterable[str | Path], only: Sequence[str] = (), jobs: int | None = None, progress: Progress = show_no_progress,
                 *, point: str | None = None, as_it_is_now: bool = False) -> str:
     """Make the page about results in directories; parameters, warnings and errors are those of `safevar_sumo.report`."""
     unknown_names = [name for name in only if name not in SECTIONS]

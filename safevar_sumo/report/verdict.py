@@ -11,9 +11,9 @@ import msgspec
 import numpy as np
 
 from safevar_sumo.ads import ADS
-from safevar_sumo.analysis.explain.necessity import BORDERLINE, in_words, is_borderline
+from safevar_sumo.analysis.explain.necessity import BORDERLINE, is_borderline, robustness_in_words
 from safevar_sumo.analysis.explain.result import REASONS, ROBUST, CauseEntry, FailureEntry
-from safevar_sumo.analysis.model_spread import ModelSpread, model_spreads
+from safevar_sumo.analysis.model_spread import ModelSpread, compute_model_spreads
 from safevar_sumo.analysis.preventability import PreventedShares
 from safevar_sumo.analysis.research_questions.case import ALGORITHM_TITLES, collided
 from safevar_sumo.analysis.words import number_of
@@ -234,7 +234,7 @@ def _changes_lead_to(finding: SelectedFailure, outcome: str) -> str:
     if number == needed:
         return f"{number_of(number, 'change')} suffice{'s' if number == 1 else ''} for {outcome}"
     share = finding.cause.robustness if finding.cause else None
-    borderline = "" if share is None or not is_borderline(share) else f", but {in_words(share)}"
+    borderline = "" if share is None or not is_borderline(share) else f", but {robustness_in_words(share)}"
     sufficiency = "" if needed is None else f" ({needed} of them suffice{'s' if needed == 1 else ''} to be unsafe{borderline})"
     return f"{number_of(number, 'change')} lead{'s' if number == 1 else ''} to {outcome}{sufficiency}"
 
@@ -364,7 +364,7 @@ def _spreads(data: ReportInput) -> list[tuple[str, float, ModelSpread]]:
     settings = [case.characteristics.original, *map(data.setting_of, handles)]
 
     def compute() -> list[dict[str, Any]]:
-        return [spread.to_dict() for spread in model_spreads(case.study, np.stack(settings), data.point)]
+        return [spread.to_dict() for spread in compute_model_spreads(case.study, np.stack(settings), data.point)]
 
     spreads = msgspec.convert(stored_answer(data, "spread", compute), list[ModelSpread])
     degrees = [case.original[SAFETY_DEGREE], *(data.solutions[handle]["f_safe"] for handle in handles)]

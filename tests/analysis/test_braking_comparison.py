@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from safevar_sumo.analysis.explain.braking_comparison import BrakingComparison, compare_braking, sentence, summary_of
+from safevar_sumo.analysis.explain.braking_comparison import BrakingComparison, compare_braking, sentence, summarise_run
 from safevar_sumo.records import Encounter, Outcome, SimulationRuns, Trace
 
 STEP, OBSTACLE = 0.002, 20.0
@@ -36,14 +36,14 @@ def drive_of(*vehicles: tuple[float, float, float, float]) -> SimulationRuns:
 
 def compared(one: tuple[float, float, float, float], other: tuple[float, float, float, float]) -> BrakingComparison:
     runs = drive_of(one, other)
-    return compare_braking(*(summary_of(runs, column, 1.0) for column in (0, 1)))
+    return compare_braking(*(summarise_run(runs, column, 1.0) for column in (0, 1)))
 
 
 SAME = (10.0, 15.0, 0.2, 6.0)
 
 
 @pytest.mark.parametrize(("other", "part", "lost"), [
-    ((10.0, 13.5, 0.2, 6.0), "place", 1.5),
+    ((10.0, 13.5, 0.2, 6.0), "gap", 1.5),
     ((10.0, 15.0, 0.4, 6.0), "delay", 10 * 0.2),
     ((10.0, 15.0, 0.2, 5.0), "deceleration", 100 / 10 - 100 / 12),
     ((11.0, 15.0, 0.2, 6.0), "speed", 1 * 0.2 + (121 - 100) / 12),
@@ -61,7 +61,7 @@ def test_an_overshooting_cruise_control_does_not_brake_for_the_obstacle() -> Non
     runs.trace.brake[50:150, 1:3] = 0.5
     runs.trace.throttle[150:200, 1] = 0.1
     runs.trace.brake[150:250, 2:] = 0.01
-    plain, overshot, settling, unbraked = (summary_of(runs, column, 1.0).braking for column in range(4))
+    plain, overshot, settling, unbraked = (summarise_run(runs, column, 1.0).braking for column in range(4))
     assert overshot == settling == plain
     assert plain is not None
     assert plain.time == pytest.approx(0.5)
@@ -74,7 +74,7 @@ def test_pulses_are_one_braking() -> None:
     for share in (0.95, 0.25):
         at = int(np.argmax(runs.trace.speed[:, 1] < share * 10))
         runs.trace.brake[at:at + 50, 1] = 0.0
-    assert summary_of(runs, 1, 1.0).braking == summary_of(runs, 0, 1.0).braking is not None
+    assert summarise_run(runs, 1, 1.0).braking == summarise_run(runs, 0, 1.0).braking is not None
 
 
 def test_a_creeping_deceleration_is_no_late_pedal() -> None:
@@ -86,8 +86,8 @@ def test_a_creeping_deceleration_is_no_late_pedal() -> None:
     runs.trace.speed[:, 1] = np.maximum(slower, 0.0)
     runs.trace.position[1:, 1] = np.cumsum((runs.trace.speed[1:, 1] + runs.trace.speed[:-1, 1]) / 2) * STEP
     runs.trace.gap[:, 1] = OBSTACLE - runs.trace.position[:, 1]
-    comparison = compare_braking(*(summary_of(runs, column, 1.0) for column in (0, 1)))
+    comparison = compare_braking(*(summarise_run(runs, column, 1.0) for column in (0, 1)))
     assert comparison.parts["delay"] == 0
-    assert comparison.parts["deceleration"] == pytest.approx(comparison.lost)
+    assert comparison.parts["deceleration"] == pytest.approx(comparison.lost_distance)
     assert "later" not in sentence(comparison)
     assert "brakes more weakly" in sentence(comparison)

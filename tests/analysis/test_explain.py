@@ -21,17 +21,23 @@ from safevar_sumo.analysis.explain import ExplainOptions
 from safevar_sumo.analysis.explain.causes import (
     RESOLUTION,
     BoundaryState,
-    affordable_rows,
-    boundaries,
+    find_boundaries,
+    find_minimal_causes,
     involved_columns,
-    minimal_causes,
     necessary_columns,
+    select_affordable_rows,
 )
 from safevar_sumo.analysis.explain.compute import explain_failures
-from safevar_sumo.analysis.explain.necessity import Robustness, distinct_causes, necessity, robustness, smallest_robust_failure
+from safevar_sumo.analysis.explain.necessity import (
+    Robustness,
+    count_distinct_causes,
+    estimate_robustness,
+    find_smallest_robust_failure,
+    necessity_frame,
+)
 from safevar_sumo.analysis.explain.render import print_explained
 from safevar_sumo.analysis.explain.result import Explained
-from safevar_sumo.analysis.explain.summary import NUMBERS, DescribedFailure, failures_paragraph, lead
+from safevar_sumo.analysis.explain.summary import NUMBER_WORDS, FailureDescription, failures_paragraph, summarise_failures
 from safevar_sumo.analysis.preventability import Preventability
 from safevar_sumo.analysis.research_questions.case import Case, load_cases
 from safevar_sumo.cli.program import commands
@@ -124,7 +130,7 @@ def test_the_failure_to_lead_with_is_the_smallest_that_is_not_borderline(case: C
     place = next(i for i, setting in enumerate(settings) if setting.tolist() == list(robust.setting.values()))
     if place:
         evaluator = Evaluator(case.study, InlinePool())
-        assert max(one.share for one in robustness(evaluator, settings[:place], 0.05, explained.unsafe)) < 0.8
+        assert max(one.share for one in estimate_robustness(evaluator, settings[:place], 0.05, explained.unsafe)) < 0.8
 
 
 @pytest.mark.slow
@@ -184,7 +190,8 @@ def assert_tells_a_manager(paragraph: str, explained: Explained) -> None:
         needed, number = len(one.causes[0].changes), len(one.changed)
         collision = f"a collision at {-3.6 * (one.safety_degree or 0):.0f} km/h ({share})"
         if needed < number:
-            assert re.search(rf"{re.escape(collision)} was found with {NUMBERS[number]} changes: [^;]*; {NUMBERS[needed]} of them suffice",
+            counts = rf"{NUMBER_WORDS[number]} changes: [^;]*; {NUMBER_WORDS[needed]} of them suffice"
+            assert re.search(rf"{re.escape(collision)} was found with {counts}",
                              paragraph, re.IGNORECASE)
         else:
             assert f"for {collision}: " in paragraph
@@ -200,7 +207,7 @@ def assert_tells_a_manager(paragraph: str, explained: Explained) -> None:
 @pytest.mark.slow
 def test_the_summary_of_a_study_leads_with_the_answer(case: Case, explained: Explained) -> None:
     original = Evaluator(case.study, InlinePool()).original()
-    paragraph, first, *others, more = lead(case.study, case.solutions, original, InlinePool(), "my results")
+    paragraph, first, *others, more = summarise_failures(case.study, case.solutions, original, InlinePool(), "my results")
     crashes = int((case.solutions["outcome"] == "collision").sum())
     assert_tells_a_manager(paragraph, explained)
     assert first == f"{crashes} of {len(case.solutions)} solutions collide."
@@ -208,7 +215,7 @@ def test_the_summary_of_a_study_leads_with_the_answer(case: Case, explained: Exp
     assert all(" These changes alone cause it: " in line for line in others)
     safe = case.solutions[case.solutions["f_safe"] > 2]
     assert more == "Why, and how far: python -m safevar_sumo explain 'my results'"
-    nothing, more = lead(case.study, safe, original, InlinePool(), "out")
+    nothing, more = summarise_failures(case.study, safe, original, InlinePool(), "out")
     assert nothing.startswith(f"Nothing unsafe found in {len(safe)} solutions")
     assert more == "How far each characteristic may go: python -m safevar_sumo tolerance out"
 
@@ -228,7 +235,7 @@ def test_all_smallest_unsafe_subsets_and_no_other_whatever_the_outcomes(table: l
     unsafe = [set(subset) for size in range(len(columns) + 1) for subset in combinations(columns, size)
               if table[sum(1 << column for column in subset)]]
     smallest = [subset for subset in unsafe if len(subset) == min(map(len, unsafe))]
-    (result,) = minimal_causes(made_up_evaluator(5, outcome), setting[np.newaxis], COLLISION)
+    (result,) = find_minimal_causes(made_up_evaluator(5, outcome), setting[np.newaxis], COLLISION)
     assert [set(cause.columns) for cause in result] == smallest
     for cause in result:
         assert not any(set(subset) < set(cause.columns) for subset in unsafe)
@@ -238,8 +245,8 @@ def test_all_smallest_unsafe_subsets_and_no_other_whatever_the_outcomes(table: l
 
 def test_a_boundary_is_the_first_unsafe_place_and_no_island_is_skipped() -> None:
     evaluator = made_up_evaluator(3, two_islands)
-    (causes,) = minimal_causes(evaluator, np.array([[9.5, 1.0, 8.0]]), COLLISION)
-    (result,) = boundaries(evaluator, causes, COLLISION)
+    (causes,) = find_minimal_causes(evaluator, np.array([[9.5, 1.0, 8.0]]), COLLISION)
+    (result,) = find_boundaries(evaluator, causes, COLLISION)
     assert result.fraction == pytest.approx(1.5 / 4.5, abs=2 * RESOLUTION)
     assert result.setting[0] > 6.5 >= result.setting[0] - 2 * RESOLUTION * 4.5
     assert result.single_limits == {0: result.setting[0]}
@@ -248,8 +255,8 @@ def test_a_boundary_is_the_first_unsafe_place_and_no_island_is_skipped() -> None
 
 def test_nothing_is_shrunk_into_what_the_filter_takes_for_no_change() -> None:
     evaluator = made_up_evaluator(1, lambda settings: settings[:, 0] > ORIGINAL)
-    (causes,) = minimal_causes(evaluator, np.array([[9.0]]), COLLISION)
-    (result,) = boundaries(evaluator, causes, COLLISION)
+    (causes,) = find_minimal_causes(evaluator, np.array([[9.0]]), COLLISION)
+    (result,) = find_boundaries(evaluator, causes, COLLISION)
     threshold = evaluator.characteristics.threshold[0]
     assert result.setting[0] == pytest.approx(ORIGINAL + threshold, rel=1e-3)
     assert evaluator.characteristics.filter(result.setting)[0] == result.setting[0]
@@ -259,19 +266,19 @@ def test_nothing_is_shrunk_into_what_the_filter_takes_for_no_change() -> None:
 def test_a_boundary_that_ends_where_nothing_can_be_simulated_says_so() -> None:
     study = made_up_study(1)
     evaluator = Evaluator(study, Plant(study, lambda rows: rows[:, 0] > 7, failing=lambda rows: (rows[:, 0] > 6) & (rows[:, 0] <= 7)))
-    (causes,) = minimal_causes(evaluator, np.array([[9.0]]), COLLISION)
-    (result,) = boundaries(evaluator, causes, COLLISION)
+    (causes,) = find_minimal_causes(evaluator, np.array([[9.0]]), COLLISION)
+    (result,) = find_boundaries(evaluator, causes, COLLISION)
     assert (result.setting[0], result.end) == (pytest.approx(7, abs=1e-3), BoundaryState.NOT_SIMULATED)
 
 
 def test_robust_is_what_its_neighbours_are_too() -> None:
     evaluator = made_up_evaluator(2, box)
     threshold = evaluator.characteristics.threshold[0]
-    deep, edge = robustness(evaluator, np.array([[9.0, 1.0], [7.0, 1.0]]), 0.1, COLLISION)
-    assert deep.by_step == {0.1: 1.0, 0.05: 1.0, 0.2: 1.0}
+    deep, edge = estimate_robustness(evaluator, np.array([[9.0, 1.0], [7.0, 1.0]]), 0.1, COLLISION)
+    assert deep.shares_by_step == {0.1: 1.0, 0.05: 1.0, 0.2: 1.0}
     assert edge.share == pytest.approx(0.5, abs=0.2)
     assert (deep.borderline, edge.borderline) == (False, True)
-    (beyond,) = robustness(evaluator, np.array([[7.0 + 1.01 * threshold, 1.0]]), 0.1, COLLISION)
+    (beyond,) = estimate_robustness(evaluator, np.array([[7.0 + 1.01 * threshold, 1.0]]), 0.1, COLLISION)
     assert beyond.share == 1.0
 
 
@@ -279,35 +286,35 @@ def test_the_smallest_robust_failure_is_the_first_whose_neighbours_are_unsafe_to
     """Largest changes of 40, 70 and 80 %; the first lies at the edge of the box."""
     evaluator = made_up_evaluator(2, box)
     failures = evaluator.evaluate(np.array([[9.0, 1.0], [7.01, 2.99], [8.5, 2.0]]), "failures")
-    assert smallest_robust_failure(evaluator, failures, 0.1, COLLISION, limit=1) == 2
-    assert smallest_robust_failure(evaluator, failures.take([1]), 0.1, COLLISION, limit=1) is None
+    assert find_smallest_robust_failure(evaluator, failures, 0.1, COLLISION, limit=1) == 2
+    assert find_smallest_robust_failure(evaluator, failures.take([1]), 0.1, COLLISION, limit=1) is None
 
 
 def test_necessary_and_changed_over_failures() -> None:
     evaluator = made_up_evaluator(3, lambda settings: box(settings) | (settings[:, 2] > 9))
     settings = np.array([[9.0, 1.0, 5.0], [9.0, 1.0, 8.0], [9.0, 1.0, 9.5]])
-    causes = minimal_causes(evaluator, settings, COLLISION)
-    frame = necessity(evaluator.characteristics, evaluator.characteristics.changed(settings), causes, 3).set_index("characteristic")
+    causes = find_minimal_causes(evaluator, settings, COLLISION)
+    frame = necessity_frame(evaluator.characteristics, evaluator.characteristics.changed(settings), causes, 3).set_index("characteristic")
     assert frame["changed"].to_dict() == pytest.approx({"a": 1, "b": 1, "c": 2 / 3})
     assert frame["necessary"].to_dict() == pytest.approx({"a": 2 / 3, "b": 2 / 3, "c": 1 / 3})
     assert frame["necessary_lower"].equals(frame["necessary"]), "of all failures the shares are exact"
     members = evaluator.characteristics
-    sampled = necessity(members, members.changed(settings), causes, 4).set_index("characteristic").loc["c"]
+    sampled = necessity_frame(members, members.changed(settings), causes, 4).set_index("characteristic").loc["c"]
     ends = [scipy.stats.beta.ppf(q, *shape) for q, shape in ((0.025, (1, 3)), (0.975, (2, 2)))]
     assert sampled[["necessary_lower", "necessary_upper"]].tolist() == pytest.approx(ends), "1 of a sample of 3"
-    distinct = distinct_causes(evaluator.characteristics, causes)
+    distinct = count_distinct_causes(evaluator.characteristics, causes)
     assert list(zip(distinct["cause"], distinct["failures"], strict=True)) == [(("a up", "b down"), 2), (("c up",), 1)]
 
 
 def test_more_failures_than_can_be_afforded_are_sampled_and_always_the_same() -> None:
     evaluator = made_up_evaluator(8, everywhere)
     settings = np.random.default_rng(1).uniform(6, 9, (50, 8))
-    few = affordable_rows(settings, evaluator, 2000)
-    assert few == affordable_rows(settings, evaluator, 2000)
+    few = select_affordable_rows(settings, evaluator, 2000)
+    assert few == select_affordable_rows(settings, evaluator, 2000)
     assert 0 < len(few) < 50
-    assert affordable_rows(settings, evaluator, 10**6) == list(range(50))
+    assert select_affordable_rows(settings, evaluator, 10**6) == list(range(50))
     settings[:, 3:] = ORIGINAL
-    assert len(affordable_rows(settings, evaluator, 70)) == 10, "of three changes no, one and two of them: 1 + 3 + 3 simulations"
+    assert len(select_affordable_rows(settings, evaluator, 70)) == 10, "of three changes no, one and two of them: 1 + 3 + 3 simulations"
 
 
 def test_robustness_in_words_says_where_a_time_step_disagrees() -> None:
@@ -317,7 +324,7 @@ def test_robustness_in_words_says_where_a_time_step_disagrees() -> None:
 
 def test_the_paragraph_says_how_robust_the_changes_that_suffice_are_by_themselves() -> None:
     system, changes = assemble(load_study("sun")), {"tireFric": 1.04, "radius": 32.05, "mass": 2500.0}
-    finding = DescribedFailure("rs:0:0", changes, "collision", -1.5, Robustness({0.05: 0.98}), 2, Robustness({0.05: 0.44}))
+    finding = FailureDescription("rs:0:0", changes, "collision", -1.5, Robustness({0.05: 0.98}), 2, Robustness({0.05: 0.44}))
     original = evaluate(system, system.characteristics.original[None])
     paragraph = failures_paragraph(system, original, finding, finding, Preventability(numbers={}, collisions=0))
     assert "a collision at 5 km/h (robust: 98 % of" in paragraph.lower()

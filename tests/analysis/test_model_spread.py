@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from safevar_sumo.analysis.model_spread import band, model_spreads, studies_of_sets
+from safevar_sumo.analysis.model_spread import compute_model_spreads, prediction_band, studies_of_sets
 from safevar_sumo.errors import InputError
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.matrix import evaluate
@@ -20,7 +20,7 @@ OWN = float(load_study("sun").ads.parameters["brake_gap"])
 
 
 def test_a_band_holds_nine_tenths_of_the_sets_and_of_the_repeats() -> None:
-    lower, upper = band(np.column_stack([np.linspace(0, 1, 101), np.full(101, np.nan)]), 0.1)
+    lower, upper = prediction_band(np.column_stack([np.linspace(0, 1, 101), np.full(101, np.nan)]), 0.1)
     assert (lower[0], upper[0]) == pytest.approx((0.05 - 0.1645, 0.95 + 0.1645))
     assert np.isnan([lower[1], upper[1]]).all()
 
@@ -34,7 +34,8 @@ def test_the_models_error_makes_the_band_wider_with_the_distance_from_the_origin
     for name, share in (("tireFric", -0.75), ("dampRateZeroT_CE", -0.5)):
         i = list(ch.names).index(name)
         settings[1, i] += share * (ch.upper[i] - ch.lower[i])
-    for here, wide, more in zip(model_spreads(bare, settings), model_spreads(study, settings), (0.0, 0.4 * 0.8125**0.5), strict=True):
+    for here, wide, more in zip(compute_model_spreads(bare, settings), compute_model_spreads(study, settings),
+                                (0.0, 0.4 * 0.8125**0.5), strict=True):
         assert here.lower is not None
         assert here.upper is not None
         assert (wide.lower, wide.upper) == pytest.approx((here.lower - more, here.upper + more), abs=1e-9)
@@ -44,7 +45,7 @@ def test_the_sets_are_simulated_one_by_one() -> None:
     study = load_study("sun", spread={GAP: [OWN, OWN - 1, OWN + 1]}, repeatability={"safety_degree": 1e-9}, model_error={})
     setting = assemble(study).characteristics.setting({"tireFric": 1.3}, "a test")[np.newaxis]
     alone = [evaluate(assemble(load_study("sun", ads={"parameters": {"brake_gap": gap}})), setting) for gap in (OWN, OWN - 1, OWN + 1)]
-    (band,) = model_spreads(study, setting)
+    (band,) = compute_model_spreads(study, setting)
     degrees = [float(one.f_safe[0]) for one in alone]
     assert (band.lower, band.upper) == pytest.approx(np.quantile(degrees, [0.05, 0.95]).tolist(), abs=1e-6)
     assert (band.sets, band.collisions) == (3, sum(int(one.collided[0]) for one in alone))

@@ -13,8 +13,8 @@ from safevar_sumo.ads.competent_driver import CompetentDriver
 from safevar_sumo.analysis.evaluator import Evaluator
 from safevar_sumo.analysis.explain.braking_comparison import sentence
 from safevar_sumo.analysis.explain.compute import PointComparison, compare_at_points, points_in_words
-from safevar_sumo.analysis.explain.summary import lead
-from safevar_sumo.analysis.preventability import PreventableBy, approach, preventability, preventable_by
+from safevar_sumo.analysis.explain.summary import summarise_failures
+from safevar_sumo.analysis.preventability import PreventableBy, approach_parameters, assess_preventability, classify_collisions
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import FloatArray
 from safevar_sumo.results import solutions_frame
@@ -44,12 +44,12 @@ def vehicle(brakes: float = 1.0, max_rpm: float = 1.0) -> FloatArray:
 @pytest.mark.slow
 def test_a_competent_driver_avoids_what_a_short_sighted_system_does_not_and_nobody_stops_without_brakes() -> None:
     both = np.stack([vehicle(), vehicle(brakes=0.1)])
-    assert preventable_by(evaluator(test="CPFA", speed=30), both) == [PreventableBy.COMPETENT_DRIVER, PreventableBy.NOBODY]
+    assert classify_collisions(evaluator(test="CPFA", speed=30), both) == [PreventableBy.COMPETENT_DRIVER, PreventableBy.NOBODY]
 
 
 @pytest.mark.slow
 def test_a_child_that_comes_out_late_is_avoided_by_full_braking_alone() -> None:
-    assert preventable_by(evaluator(test="CPNCO", speed=40), vehicle()[np.newaxis]) == [PreventableBy.FULL_BRAKING]
+    assert classify_collisions(evaluator(test="CPNCO", speed=40), vehicle()[np.newaxis]) == [PreventableBy.FULL_BRAKING]
 
 
 @pytest.mark.slow
@@ -57,12 +57,12 @@ def test_shares_are_those_of_all_collisions_and_a_sample_is_random() -> None:
     """Of 60 collisions, the 40 of the lowest engine speeds are the brakeless ones: those that come first when settings are sorted."""
     collisions = np.stack([vehicle(0.1, 1 - (60 - k) / 1e6) for k in range(40)] + [vehicle(1.0, 1 - k / 1e6) for k in range(20)])
     here = evaluator(test="CPFA", speed=30)
-    whole = msgspec.structs.asdict(preventability(here, np.concatenate([collisions, collisions])).shares)
+    whole = msgspec.structs.asdict(assess_preventability(here, np.concatenate([collisions, collisions])).shares)
     assert whole == {"competent_driver": pytest.approx(1 / 3), "full_braking": 0, "nobody": pytest.approx(2 / 3), "looked_at": 60,
                      "interval_competent_driver": [pytest.approx(1 / 3)] * 2}
-    sample = msgspec.structs.asdict(preventability(here, collisions, limit=60).shares)
+    sample = msgspec.structs.asdict(assess_preventability(here, collisions, limit=60).shares)
     assert sample["looked_at"] == 30
-    assert sample == msgspec.structs.asdict(preventability(here, collisions[::-1], limit=60).shares)
+    assert sample == msgspec.structs.asdict(assess_preventability(here, collisions[::-1], limit=60).shares)
     hits = round(sample["competent_driver"] * 30)
     expected = scipy.stats.beta.ppf(0.025, hits, 31 - hits), scipy.stats.beta.ppf(0.975, hits + 1, 30 - hits)
     assert sample["interval_competent_driver"] == pytest.approx(expected)
@@ -74,12 +74,12 @@ def test_reference_drivers_approach_as_the_driving_system_does() -> None:
     """A competent driver sees no danger before the time to collision is 2 s: until then both are at the same place."""
     rain = assemble(load_study("rain"))
     original = rain.characteristics.original[np.newaxis]
-    driver = msgspec.convert(approach(rain), CompetentDriver)
+    driver = msgspec.convert(approach_parameters(rain), CompetentDriver)
     theirs, his = (simulate(one, original).trace for one in (rain, replace(rain, ads=driver)))
     danger = int(np.argmax(theirs.gap[:, 0] < 2 * theirs.speed[:, 0]))
     assert theirs.speed[danger, 0] > 4
     assert np.array_equal(theirs.position[:danger + 1], his.position[:danger + 1])
-    assert approach(assemble(evaluator(test="CPFA", speed=30).study)) == {}
+    assert approach_parameters(assemble(evaluator(test="CPFA", speed=30).study)) == {}
 
 
 @pytest.mark.slow
@@ -89,7 +89,7 @@ def test_in_a_matrix_the_worst_point_counts() -> None:
     tests = [msgspec.structs.replace(one, over={}, parameters={**one.parameters, "speed": speeds[one.name]}, weathers=[])
              for one in STUDY.matrix.tests if one.name in speeds]
     study = msgspec.structs.replace(STUDY, ads=BLIND, matrix=msgspec.structs.replace(STUDY.matrix, tests=tests))
-    assert preventable_by(Evaluator(study, InlinePool()), vehicle()[np.newaxis]) == [PreventableBy.FULL_BRAKING]
+    assert classify_collisions(Evaluator(study, InlinePool()), vehicle()[np.newaxis]) == [PreventableBy.FULL_BRAKING]
 
 
 TESTS = [{"name": "CPLA", "model": "along", "over": {"speed": [20, 40]}, "weathers": ["clear", "night"]},
@@ -142,5 +142,5 @@ def test_the_summary_of_a_matrix_asks_why_at_the_worst_point_alone(system: Syste
     study = load_study("euro_ncap_pedestrian", matrix={"tests": TESTS})
     solutions = solutions_frame(system.characteristics.names, [(("nsga2", 0), evaluate(system, weak))])
     original = evaluate(system, system.characteristics.original[np.newaxis])
-    more = lead(study, solutions, original, InlinePool(), "out")[-1]
+    more = summarise_failures(study, solutions, original, InlinePool(), "out")[-1]
     assert more.endswith(f": python -m safevar_sumo explain out --point '{failure.because.point}'")

@@ -79,7 +79,7 @@ def test_a_printed_command_asks_for_the_same_options(options: Options) -> None:
     command: Any = commands.get_command(None, options.question)  # type: ignore[arg-type]
     given = command.make_context(options.question, typed[4:]).params
     assert given["point"] == "CPNA, night"
-    assert type(options)(**{name: given[name] for name in options.described()}) == options
+    assert type(options)(**{name: given[name] for name in options.definitions()}) == options
     assert len(typed) == 7 + sum(len(value) * 2 if name == "solutions" else 1 if value is True else 2
                                  for name, value in vars(options).items() if value != getattr(type(options), name))
 

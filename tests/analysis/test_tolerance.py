@@ -116,7 +116,7 @@ def test_the_bound_of_the_box_holds_where_every_box_is_as_unsafe(monkeypatch: py
     for seed in range(seeds):
         seeded = msgspec.structs.replace(study, search=msgspec.structs.replace(study.search, seed=seed))
         evaluator = Evaluator(seeded, Plant(seeded, lambda rows: np.log(np.abs(rows[:, 0] - 5) + 1e-99) * 1e6 % 1 < q))
-        result = safe_box.safe_box(evaluator, [0, 1], Unsafe(), np.zeros((0, 2)))
+        result = safe_box.find_safe_box(evaluator, [0, 1], Unsafe(), np.zeros((0, 2)))
         wrong += result.unsafe_at_most < q
     assert 0 < wrong <= 0.05 * seeds
 

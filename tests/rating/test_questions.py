@@ -16,7 +16,7 @@ from safevar_sumo.analysis.evaluator import Evaluator
 from safevar_sumo.analysis.explain import ExplainOptions
 from safevar_sumo.analysis.explain.compute import explain_failures
 from safevar_sumo.analysis.explain.render import print_explained
-from safevar_sumo.analysis.explain.summary import lead
+from safevar_sumo.analysis.explain.summary import summarise_failures
 from safevar_sumo.analysis.rating import RatingOptions, compute
 from safevar_sumo.analysis.rating.render import matrices_figure, print_matrices, print_rating, turned_in_words
 from safevar_sumo.analysis.research_questions.case import case_of
@@ -83,7 +83,7 @@ def test_explain_names_the_cells_that_turn_and_the_summary_the_points_that_are_l
     evaluator = Evaluator(STUDY, TwoWorkers())
     members = evaluator.characteristics
     settings = np.array([members.setting({"brakeTorque": value, "payload": 200.0}, "it") for value in (0.5, 0.6)])
-    original, evaluations = evaluator.original(), evaluator.evaluate(settings, "it")
+    original, evaluations = evaluator.evaluate_original(), evaluator.evaluate(settings, "it")
     case: Any = type("Case", (), {"study": STUDY, "solutions": solutions_frame(members.names, [(("nsga2", 0), evaluations)]),
                                   "characteristics": members})()
     points = float(original.column("rating_points")[0])
@@ -97,7 +97,7 @@ def test_explain_names_the_cells_that_turn_and_the_summary_the_points_that_are_l
     console = Console(record=True, width=120, file=StringIO())
     print_explained(console, "it", result, full=True)
     assert "turn: CCRs" in console.export_text()
-    lines = lead(STUDY, case.solutions, original, TwoWorkers(), "it")
+    lines = summarise_failures(STUDY, case.solutions, original, TwoWorkers(), "it")
     assert f"{points:.2f}" in lines[0]
     assert isinstance(case.solutions, pd.DataFrame)
 
@@ -129,7 +129,7 @@ def test_at_one_cell_a_collision_is_unsafe_and_points_are_no_column() -> None:
     evaluations = evaluator.evaluate(settings, "it")
     solutions = solutions_frame(evaluator.characteristics.names, [(("nsga2", 0), evaluations)])
     scoring = assemble(STUDY).measuring.scoring
-    case = case_of(STUDY, record(evaluator.original(), 0), solutions, pd.DataFrame(), [("nsga2", 0)], scoring=scoring)
+    case = case_of(STUDY, record(evaluator.evaluate_original(), 0), solutions, pd.DataFrame(), [("nsga2", 0)], scoring=scoring)
     assert case.unsafe.points is not None
     here = at_point(case, "CCRs, 80 km/h, 100 %, wet")
     stated = RatingOptions(solution="nsga2:0:1", changes={"payload": 200.0})
@@ -147,4 +147,4 @@ def test_rare_failures_are_approached_by_points_where_points_are_the_criterion()
     evaluations = evaluator.evaluate(evaluator.characteristics.original[np.newaxis], "it")
     points = float(evaluations.column("rating_points")[0])
     response = Response(evaluator, lambda where: where, Unsafe(points=points - 2))
-    assert response.take(evaluations.settings, evaluations) == pytest.approx([2.0])
+    assert response.record(evaluations.settings, evaluations) == pytest.approx([2.0])

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
-from safevar_sumo.analysis.options import Options, documented, option, unsafe_option
+from safevar_sumo.analysis.options import Options, document_options, option, unsafe_option
 from safevar_sumo.analysis.subject import Results, answer_question, study_or_case
 from safevar_sumo.study import StudyLike
 
@@ -36,7 +36,7 @@ class ExplainOptions(Options):
                                  "more, a random sample is analysed.", kind=int, low=1, metavar="N")
 
 
-@documented(ExplainOptions)
+@document_options(ExplainOptions)
 def explain(source: StudyLike | Results, *, solutions: Sequence[str] = ExplainOptions.solutions, unsafe: Criterion | None = None,
             top: int = ExplainOptions.top, limit: int = ExplainOptions.limit, pool: Pool | None = None, jobs: int | None = None,
             progress: bool | Progress = False, as_it_is_now: bool = False) -> Explained:

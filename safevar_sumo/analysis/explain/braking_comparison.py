@@ -7,7 +7,7 @@ is v - e, and the speed falls by d. After t the mean deceleration is a. The stop
 
 and the margin is G - D. A difference of products is split exactly between the two factors,
 x2 y2 - x1 y1 = (x2 - x1) (y1 + y2) / 2 + (y2 - y1) (x1 + x2) / 2. So the margin lost between two runs is a sum of parts,
-each with the sign of one difference: place (G smaller), speed (v larger), delay (t larger), slowing (e and d: less speed
+each with the sign of one difference: gap (G smaller), speed (v larger), delay (t larger), slowing (e and d: less speed
 lost while the pedal moves) and deceleration (a smaller).
 """
 
@@ -17,14 +17,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from safevar_sumo.analysis.words import ENDS, joined
+from safevar_sumo.analysis.words import OUTCOME_VERBS, join_phrases
 from safevar_sumo.records import STANDSTILL, Outcome, SimulationRuns
 
 PEDAL_SHARE = 0.9
 """Share of the brake command at which the brake pedal counts as having followed the command [-]."""
 COAST_DECELERATION = 0.1
 """Deceleration of a vehicle that rolls without a brake [m/s^2]: a rolling resistance of 1 % of its weight."""
-REMAINDER = 0.05
+MAX_OMITTED_REMAINDER = 0.05
 """A sentence leaves out the unexplained part of the lost distance if it is at most this long [m]."""
 CRUISE_SHARE, REGULATION_SHARE = 0.9, 0.05
 """A vehicle cruises from this share of its highest speed; below this share of its largest brake command it only regulates its speed [-]."""
@@ -54,14 +54,14 @@ class Braking(NamedTuple):
     deceleration: float
 
     @property
-    def needed(self) -> float:
+    def stopping_distance(self) -> float:
         """Distance from the command to standstill [m]; the mean deceleration is assumed to continue after the run."""
         return (self.speed - self.mean_speed_lost) * self.delay + (self.speed - self.speed_lost)**2 / (2 * self.deceleration)
 
     @property
     def margin(self) -> float:
         """Gap at the command minus the distance needed [m]."""
-        return self.gap - self.needed
+        return self.gap - self.stopping_distance
 
 
 class RunSummary(NamedTuple):
@@ -78,21 +78,21 @@ class RunSummary(NamedTuple):
 
 
 class BrakingComparison(NamedTuple):
-    """Original and changed vehicle side by side; `parts` [m], which include the remainder, add up to the lost distance.
+    """Runs of the original and of the changed vehicle; the `parts` [m], with the remainder, add up to the lost distance.
 
-    `parts` is empty if one of the vehicles never braked. `point` names the point of a matrix. `slowing` are the distances that the two
-    vehicles save by slowing down while the pedal moves [m].
+    `parts` is empty if one of the vehicles never braked. `point` names the point of a matrix. `saved_distances` are the distances that the
+    two vehicles save by slowing down while the pedal moves [m].
     """
 
     original: RunSummary
     changed: RunSummary
     parts: dict[str, float]
     point: str = ""
-    slowing: tuple[float, float] = (0.0, 0.0)
+    saved_distances: tuple[float, float] = (0.0, 0.0)
 
     @property
-    def lost(self) -> float:
-        """Lost distance [m]."""
+    def lost_distance(self) -> float:
+        """Lost distance, below 0 if distance is gained [m]."""
         return sum(self.parts.values())
 
 
@@ -122,18 +122,19 @@ def brake_onset(runs: SimulationRuns, column: int) -> int | None:
     return onset
 
 
-def summary_of(runs: SimulationRuns, column: int, safety_degree: float) -> RunSummary:
-    """Summary of the run in `column` of N runs."""
-    impact_speed, nearest, onset = float(runs.collision_speed[column]), runs.nearest(column), brake_onset(runs, column)
+def summarise_run(runs: SimulationRuns, column: int, safety_degree: float) -> RunSummary:
+    """Summary of the run of vehicle `column`."""
+    collision_speed, nearest, onset = float(runs.collision_speed[column]), runs.nearest(column), brake_onset(runs, column)
     least_gap, braking = np.nan, None
-    if nearest is not None and np.isnan(impact_speed):
+    if nearest is not None and np.isnan(collision_speed):
         least_gap = float(runs.trace.gap[nearest, column])
     if onset is not None:
-        braking = _braking(runs, column, onset, int(np.flatnonzero(runs.trace.active[:, column])[-1]) if nearest is None else nearest)
-    return RunSummary(str(runs.outcome[column]), safety_degree, braking, least_gap, impact_speed)
+        last = int(np.flatnonzero(runs.trace.active[:, column])[-1]) if nearest is None else nearest
+        braking = _measure_braking(runs, column, onset, last)
+    return RunSummary(str(runs.outcome[column]), safety_degree, braking, least_gap, collision_speed)
 
 
-def _braking(runs: SimulationRuns, column: int, first: int, last: int) -> Braking | None:
+def _measure_braking(runs: SimulationRuns, column: int, first: int, last: int) -> Braking | None:
     """The braking from sample `first` to `last`; None if the vehicle only coasts after the pedal has followed."""
     trace = runs.trace
     speed, position = trace.speed[:last + 1, column], trace.position[:last + 1, column]
@@ -154,10 +155,10 @@ def compare_braking(original: RunSummary, changed: RunSummary, point: str = "") 
     original_braking, changed_braking = original.braking, _braking_to_compare(changed, original)
     if original_braking is None or changed_braking is None:
         return BrakingComparison(original, changed, {}, point)
-    parts, slowing = _parts(original_braking, changed_braking)
-    unexplained = original.least_gap - original_braking.margin, changed.least_gap - changed_braking.margin
-    remainders = [0.0 if np.isnan(value) else value for value in unexplained]
-    return BrakingComparison(original, changed, {**parts, "remainder": remainders[0] - remainders[1]}, point, slowing)
+    parts, saved_distances = _split_lost_margin(original_braking, changed_braking)
+    gap_errors = original.least_gap - original_braking.margin, changed.least_gap - changed_braking.margin
+    remainders = [0.0 if np.isnan(error) else error for error in gap_errors]
+    return BrakingComparison(original, changed, {**parts, "remainder": remainders[0] - remainders[1]}, point, saved_distances)
 
 
 def _braking_to_compare(changed: RunSummary, original: RunSummary) -> Braking | None:
@@ -167,74 +168,74 @@ def _braking_to_compare(changed: RunSummary, original: RunSummary) -> Braking | 
     return original.braking._replace(time=np.nan, gap=0.0, speed=max(changed.collision_speed, original.braking.speed_lost))
 
 
-def _parts(original: Braking, changed: Braking) -> tuple[dict[str, float], tuple[float, float]]:
+def _split_lost_margin(original: Braking, changed: Braking) -> tuple[dict[str, float], tuple[float, float]]:
     """Parts of the lost margin by cause [m], and the distances that the two vehicles save while the pedal moves [m]."""
     mean_delay, mean_inverse = (original.delay + changed.delay) / 2, (1 / original.deceleration + 1 / changed.deceleration) / 2
-    speeds = [braking.speed - braking.speed_lost for braking in (original, changed)]
-    mean_speed = sum(speeds) / 2
+    later_speeds = [braking.speed - braking.speed_lost for braking in (original, changed)]
+    mean_speed = sum(later_speeds) / 2
     delay_speeds = [braking.speed - braking.mean_speed_lost for braking in (original, changed)]
     savings = [braking.mean_speed_lost * mean_delay + braking.speed_lost * mean_speed * mean_inverse for braking in (original, changed)]
     return {
-        "place": original.gap - changed.gap,
+        "gap": original.gap - changed.gap,
         "speed": (changed.speed - original.speed) * (mean_delay + mean_speed * mean_inverse),
         "delay": (changed.delay - original.delay) * sum(delay_speeds) / 2,
         "slowing": savings[0] - savings[1],
-        "deceleration": (1 / changed.deceleration - 1 / original.deceleration) * (speeds[0]**2 + speeds[1]**2) / 4
+        "deceleration": (1 / changed.deceleration - 1 / original.deceleration) * (later_speeds[0]**2 + later_speeds[1]**2) / 4
     }, (savings[0], savings[1])
 
 
 MIN_PART = 0.005
 """Smallest part of a distance that a sentence mentions [m]: half a centimetre."""
-PARTS = {
-    "place": ("it begins to brake nearer", "it begins to brake farther away"), "speed": ("it is faster", "it is slower"),
+PART_PHRASES = {
+    "gap": ("it begins to brake nearer", "it begins to brake farther away"), "speed": ("it is faster", "it is slower"),
     "delay": ("its brake pedal follows later", "its brake pedal follows sooner"),
     "slowing": ("it slows less while the pedal moves", "it slows more while the pedal moves"),
     "deceleration": ("it brakes more weakly", "it brakes harder")}
-"""Words for each part where it costs distance, and where it gains distance."""
+"""Phrases for each part: if it costs distance, and if it gains distance."""
 
 
-def ending(run: RunSummary) -> str:
+def ending_in_words(run: RunSummary) -> str:
     """How a run ended, in words."""
     if run.outcome == Outcome.COLLISION:
         return f"collides at {run.collision_speed:.2f} m/s"
-    end = ENDS.get(Outcome(run.outcome), run.outcome)
+    end = OUTCOME_VERBS.get(Outcome(run.outcome), run.outcome)
     return end if run.safety_degree != run.safety_degree else f"{end}, safety degree {run.safety_degree:.2f} m"
 
 
 def sentence(comparison: BrakingComparison, *, full: bool = False) -> str:
     """Why the changed vehicle is less safe than the original, in one sentence or two; `full` explains what the lost distance is."""
     subject = f"At {comparison.point}: the" if comparison.point else "The"
-    endings = f"{subject} original {ending(comparison.original)}; this one {ending(comparison.changed)}."
+    endings = f"{subject} original {ending_in_words(comparison.original)}; this one {ending_in_words(comparison.changed)}."
     original_braking, changed_braking = comparison.original.braking, comparison.changed.braking
     if original_braking is None and changed_braking is None:
         return f"{endings} Neither of them brakes."
     if not comparison.parts:
         return f"{endings} {'The original' if original_braking is None else 'It'} does not slow down by its brake."
     without_brake = "" if changed_braking is not None else ", without any effect of its brake"
-    loss_word, gain_word = ("", "gained ") if comparison.lost >= 0 else ("lost ", "")
-    parts, is_lost = comparison.parts, comparison.lost >= 0
-    phrases = [f"{abs(parts[name]):.2f} m {loss_word if parts[name] > 0 else gain_word}because {PARTS[name][parts[name] < 0]}"
-               f"{_numbers(comparison, name)}"
-               for name in sorted(PARTS, key=lambda name: -parts[name]) if abs(parts[name]) >= MIN_PART]
-    if abs(parts["remainder"]) > REMAINDER:
+    parts, is_lost = comparison.parts, comparison.lost_distance >= 0
+    loss_word, gain_word = ("", "gained ") if is_lost else ("lost ", "")
+    phrases = [f"{abs(parts[name]):.2f} m {loss_word if parts[name] > 0 else gain_word}because {PART_PHRASES[name][parts[name] < 0]}"
+               f"{_quantities_in_words(comparison, name)}"
+               for name in sorted(PART_PHRASES, key=lambda name: -parts[name]) if abs(parts[name]) >= MIN_PART]
+    if abs(parts["remainder"]) > MAX_OMITTED_REMAINDER:
         phrases.append(f"{parts['remainder']:+.2f} m that this does not explain")
     if not phrases:
         return f"{endings} They brake alike."
-    distance = f"{abs(comparison.lost):.2f} m"
-    lead = f"Of the {distance} {'lost' if is_lost else 'gained'}" if not full else (
+    distance = f"{abs(comparison.lost_distance):.2f} m"
+    introduction = f"Of the {distance} {'lost' if is_lost else 'gained'}" if not full else (
         f"Its margin, the gap at the brake command less the distance needed to stop, is {distance} {'smaller' if is_lost else 'larger'}")
-    return f"{endings} {lead}{without_brake}: {joined(phrases)}."
+    return f"{endings} {introduction}{without_brake}: {join_phrases(phrases)}."
 
 
-def _numbers(comparison: BrakingComparison, part: str) -> str:
+def _quantities_in_words(comparison: BrakingComparison, part: str) -> str:
     """The quantity that explains a part, for the changed vehicle and for the original vehicle."""
     original_braking, changed_braking = comparison.original.braking, comparison.changed.braking
     if original_braking is None or changed_braking is None:
         return ""
-    quantities = {"place": (changed_braking.gap, original_braking.gap, "m before"),
+    quantities = {"gap": (changed_braking.gap, original_braking.gap, "m before"),
                   "speed": (changed_braking.speed, original_braking.speed, "m/s at the command"),
                   "delay": (changed_braking.delay, original_braking.delay, "s after the command"),
-                  "slowing": (comparison.slowing[1], comparison.slowing[0], "m saved"),
+                  "slowing": (comparison.saved_distances[1], comparison.saved_distances[0], "m saved"),
                   "deceleration": (changed_braking.deceleration, original_braking.deceleration, "m/s^2")}
     changed, original, unit = quantities[part]
     decimals = next((digits for digits in range(2, 9) if f"{changed:.{digits}f}" != f"{original:.{digits}f}"), 2)

@@ -18,8 +18,8 @@ from safevar_sumo.analysis.evaluator import Evaluator
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import FloatArray, finite_or_none
 
-CHUNK = 20_000
-"""Maximum number of subsets in memory at the same time."""
+MAX_SUBSETS = 20_000
+"""Maximum number of subsets that are in memory at the same time."""
 
 
 class MinimalCause(NamedTuple):
@@ -41,30 +41,31 @@ class _Subset(NamedTuple):
     columns: tuple[int, ...]
 
 
-def minimal_causes(evaluator: Evaluator, settings: FloatArray, unsafe: Unsafe) -> list[list[MinimalCause]]:
-    """For each of M settings, shape (M, n), all smallest unsafe subsets of its changes; an empty list if no subset is unsafe.
+def find_minimal_causes(evaluator: Evaluator, settings: FloatArray, unsafe: Unsafe) -> list[list[MinimalCause]]:
+    """All smallest unsafe subsets of the changes of each of M settings, shape (M, n); an empty list if no subset is unsafe.
 
     The empty subset counts too: if the original vehicle is unsafe, no change is needed.
     """
     original = evaluator.characteristics.original
-    changes = [tuple(np.flatnonzero(row).tolist()) for row in evaluator.characteristics.changed(settings)]
+    columns_by_row = [tuple(np.flatnonzero(flags).tolist()) for flags in evaluator.characteristics.changed(settings)]
     causes: list[list[MinimalCause]] = [[] for _ in settings]
-    for size in range(max(map(len, changes), default=0) + 1):
-        subsets = [_Subset(row, columns) for row, group in enumerate(changes) if not causes[row]
-                   for columns in combinations(group, size)]
-        for start in range(0, len(subsets), CHUNK):
-            chunk = subsets[start:start + CHUNK]
+    for size in range(max(map(len, columns_by_row), default=0) + 1):
+        subsets = [_Subset(row, columns) for row, changed_columns in enumerate(columns_by_row) if not causes[row]
+                   for columns in combinations(changed_columns, size)]
+        for start in range(0, len(subsets), MAX_SUBSETS):
+            chunk = subsets[start:start + MAX_SUBSETS]
             partial_settings = np.tile(original, (len(chunk), 1))
-            for i, (row, columns) in enumerate(chunk):
-                partial_settings[i, list(columns)] = settings[row, list(columns)]
+            for index, (row, columns) in enumerate(chunk):
+                partial_settings[index, list(columns)] = settings[row, list(columns)]
             evaluations = evaluator.evaluate(partial_settings, f"subsets of {size} changes")
-            for i in np.flatnonzero(unsafe.of(evaluations)).tolist():
-                causes[chunk[i].row].append(
-                    MinimalCause(chunk[i].columns, partial_settings[i], str(evaluations.outcome[i]), finite_or_none(evaluations.f_safe[i])))
+            for index in np.flatnonzero(unsafe.of(evaluations)).tolist():
+                subset, degree = chunk[index], finite_or_none(evaluations.f_safe[index])
+                cause = MinimalCause(subset.columns, partial_settings[index], str(evaluations.outcome[index]), degree)
+                causes[subset.row].append(cause)
     return causes
 
 
-def expected_cost(changes: int) -> int:
+def estimate_subset_count(changes: int) -> int:
     """Estimated number of subsets of the changes that are simulated until the smallest unsafe subsets appear.
 
     The estimate assumes causes with half of the changes, about as in the shipped studies.
@@ -72,9 +73,9 @@ def expected_cost(changes: int) -> int:
     return sum(comb(changes, size) for size in range((changes + 1) // 2 + 1))
 
 
-def affordable_rows(settings: FloatArray, evaluator: Evaluator, limit: int) -> list[int]:
+def select_affordable_rows(settings: FloatArray, evaluator: Evaluator, limit: int) -> list[int]:
     """Rows whose minimal causes together take at most about `limit` simulations: all rows of `settings`, or a random sample."""
-    costs = [expected_cost(int(changes)) for changes in evaluator.characteristics.number_changed(settings)]
+    costs = [estimate_subset_count(int(changes)) for changes in evaluator.characteristics.number_changed(settings)]
     if sum(costs) <= limit:
         return list(range(len(settings)))
     order = np.random.default_rng(evaluator.study.search.seed).permutation(len(settings))
@@ -83,7 +84,7 @@ def affordable_rows(settings: FloatArray, evaluator: Evaluator, limit: int) -> l
 
 
 def necessary_columns(causes: Sequence[MinimalCause]) -> frozenset[int]:
-    """Columns that every minimal cause of a setting contains."""
+    """Columns that all minimal causes of a setting contain."""
     return frozenset.intersection(*(frozenset(cause.columns) for cause in causes)) if causes else frozenset()
 
 
@@ -92,12 +93,12 @@ def involved_columns(causes: Sequence[MinimalCause]) -> frozenset[int]:
     return frozenset(column for cause in causes for column in cause.columns)
 
 
-GRID = 32
-"""Number of settings first simulated on a line. The search finds every unsafe part of the line that is as long as their distance."""
+LINE_SETTINGS = 32
+"""Number of settings first simulated on a line. The search misses no unsafe stretch of the line that is as long as their spacing."""
 PARTS_PER_ROUND = 8
 """Number of parts into which each of `ROUNDS` rounds divides the interval with the boundary."""
 ROUNDS = 3
-RESOLUTION = 1 / (GRID * PARTS_PER_ROUND**ROUNDS)
+RESOLUTION = 1 / (LINE_SETTINGS * PARTS_PER_ROUND**ROUNDS)
 """Accuracy of a boundary, as a share of the line."""
 
 
@@ -123,26 +124,26 @@ class Boundary(NamedTuple):
     at_threshold: int | None = None
 
 
-def boundaries(evaluator: Evaluator, causes: list[MinimalCause], unsafe: Unsafe) -> list[Boundary]:
+def find_boundaries(evaluator: Evaluator, causes: list[MinimalCause], unsafe: Unsafe) -> list[Boundary]:
     """Shrink causes, all changes by a common factor and each change by itself, while they stay unsafe and above the filter's thresholds."""
     all_changes = [(cause, cause.columns) for cause in causes]
     single_changes = [(cause, (column,)) for cause in causes for column in cause.columns]
     lines = [Line.from_original(evaluator, cause, columns) for cause, columns in [*all_changes, *single_changes]]
-    fractions, ends = boundary_shares(evaluator, lines, unsafe)
+    fractions, states = find_boundary_shares(evaluator, lines, unsafe)
     single_shares = iter(zip(lines[len(causes):], fractions[len(causes):], strict=True))
-    result = []
-    for i, cause in enumerate(causes):
+    boundaries = []
+    for cause, line, fraction, state in zip(causes, lines, fractions, states, strict=False):  # the lines of single changes follow
         if not cause.columns:
-            result.append(Boundary(0.0, cause.setting, {}))
+            boundaries.append(Boundary(0.0, cause.setting, {}))
             continue
         single_limits = {}
         for column in cause.columns:
-            line, fraction = next(single_shares)
-            single_limits[column] = float(line.at(np.array([fraction]))[0, column])
-        setting = lines[i].at(fractions[i:i + 1])[0]
-        filtered_column = lines[i].first_filtered(evaluator.characteristics.threshold) if ends[i] == BoundaryState.FILTER else None
-        result.append(Boundary(float(fractions[i]), setting, single_limits, ends[i], filtered_column))
-    return result
+            single_line, single_fraction = next(single_shares)
+            single_limits[column] = float(single_line.settings_at(np.array([single_fraction]))[0, column])
+        setting = line.settings_at(np.array([fraction]))[0]
+        filtered_column = line.first_filtered(evaluator.characteristics.threshold) if state == BoundaryState.FILTER else None
+        boundaries.append(Boundary(float(fraction), setting, single_limits, state, filtered_column))
+    return boundaries
 
 
 class Line(NamedTuple):
@@ -155,42 +156,42 @@ class Line(NamedTuple):
     @classmethod
     def from_original(cls, evaluator: Evaluator, cause: MinimalCause, columns: tuple[int, ...]) -> Line:
         """The line on which some columns of a cause go from their original values to their values in the cause."""
-        members = evaluator.characteristics
+        characteristics = evaluator.characteristics
         indices = list(columns)
         start = cause.setting.copy()
-        start[indices] = members.original[indices]
-        distances = np.abs(cause.setting - members.original)[indices]
-        return cls(start, cause.setting, float(np.max(members.threshold[indices] / distances, initial=0.0)))
+        start[indices] = characteristics.original[indices]
+        distances = np.abs(cause.setting - characteristics.original)[indices]
+        return cls(start, cause.setting, float(np.max(characteristics.threshold[indices] / distances, initial=0.0)))
 
     def first_filtered(self, threshold: FloatArray) -> int:
         """The column whose change first falls to the filter's threshold on the way from `end` to `start`."""
         distance = np.abs(self.end - self.start)
         return int(np.argmax(np.divide(threshold, distance, out=np.zeros_like(distance), where=distance > 0)))
 
-    def at(self, shares: FloatArray) -> FloatArray:
+    def settings_at(self, shares: FloatArray) -> FloatArray:
         """The settings at K shares of the line, shape (K, n)."""
-        part = shares[:, np.newaxis]
-        return np.where(part >= 1, self.end, self.start + part * (self.end - self.start))
+        factors = shares[:, np.newaxis]
+        return np.where(factors >= 1, self.end, self.start + factors * (self.end - self.start))
 
 
-def first_unsafe_shares(evaluator: Evaluator, lines: list[Line], unsafe: Unsafe, stage: str = "boundaries") -> FloatArray:
+def find_first_unsafe_shares(evaluator: Evaluator, lines: list[Line], unsafe: Unsafe, stage: str = "boundaries") -> FloatArray:
     """The first unsafe share of every line, whose end is unsafe; exact to `RESOLUTION` of the line above `lowest`."""
-    return boundary_shares(evaluator, lines, unsafe, stage)[0]
+    return find_boundary_shares(evaluator, lines, unsafe, stage)[0]
 
 
-def boundary_shares(evaluator: Evaluator, lines: list[Line], unsafe: Unsafe,
+def find_boundary_shares(evaluator: Evaluator, lines: list[Line], unsafe: Unsafe,
                     stage: str = "boundaries") -> tuple[FloatArray, list[BoundaryState]]:
-    """The first unsafe share of every line, as `first_unsafe_shares` returns it, and the state just below this share.
+    """The first unsafe share of every line, as `find_first_unsafe_shares`, and what lies just below this share.
 
-    A setting that cannot be simulated is neither safe nor unsafe. If it lies just below the share, the state is `NOT_SIMULATED`.
+    A setting that cannot be simulated is neither safe nor unsafe; just below the share, it gives the state `NOT_SIMULATED`.
     """
     lowest = np.array([line.lowest for line in lines])
     low, high, low_is_valid = lowest, np.ones(len(lines)), np.ones(len(lines), dtype=bool)
-    for parts in (GRID, *(PARTS_PER_ROUND,) * ROUNDS):
+    for parts in (LINE_SETTINGS, *(PARTS_PER_ROUND,) * ROUNDS):
         shares = low[:, np.newaxis] + (high - low)[:, np.newaxis] * np.arange(1, parts + 1) / parts
         shares[:, -1] = high
-        groups = [line.at(group[:-1]) for line, group in zip(lines, shares, strict=True)]
-        inner_settings = np.concatenate(groups) if lines else np.zeros((0, 0))
+        settings_by_line = [line.settings_at(line_shares[:-1]) for line, line_shares in zip(lines, shares, strict=True)]
+        inner_settings = np.concatenate(settings_by_line) if lines else np.zeros((0, 0))
         evaluations = evaluator.evaluate(inner_settings, stage)
         is_unsafe, is_valid = (np.ones(shares.shape, dtype=bool) for _ in range(2))
         is_unsafe[:, :-1] = unsafe.of(evaluations).reshape(len(lines), parts - 1)

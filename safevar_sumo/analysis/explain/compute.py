@@ -7,13 +7,26 @@ from typing import NamedTuple
 
 import numpy as np
 
-from safevar_sumo.analysis.evaluator import Evaluator, Progress, open_evaluator, silent
+from safevar_sumo.analysis.evaluator import Evaluator, Progress, open_evaluator, show_no_progress
 from safevar_sumo.analysis.explain import ExplainOptions
-from safevar_sumo.analysis.explain.braking_comparison import BrakingComparison, compare_braking, summary_of
-from safevar_sumo.analysis.explain.causes import MinimalCause, affordable_rows, boundaries, minimal_causes, necessary_columns
-from safevar_sumo.analysis.explain.necessity import STEP_FACTORS, distinct_causes, key_of, necessity, robustness, smallest_robust_failure
+from safevar_sumo.analysis.explain.braking_comparison import BrakingComparison, compare_braking, summarise_run
+from safevar_sumo.analysis.explain.causes import (
+    MinimalCause,
+    find_boundaries,
+    find_minimal_causes,
+    necessary_columns,
+    select_affordable_rows,
+)
+from safevar_sumo.analysis.explain.necessity import (
+    STEP_FACTORS,
+    cause_key,
+    count_distinct_causes,
+    estimate_robustness,
+    find_smallest_robust_failure,
+    necessity_frame,
+)
 from safevar_sumo.analysis.explain.result import REASONS, ROBUST, Cause, Explained, Explanation
-from safevar_sumo.analysis.preventability import preventability, preventable_by
+from safevar_sumo.analysis.preventability import assess_preventability, classify_collisions
 from safevar_sumo.analysis.research_questions.case import Case
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
@@ -26,11 +39,10 @@ from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.workers.evaluation import Pool
 
 Causes = Mapping[int, list[MinimalCause]]
+"""Minimal causes by row."""
 Reasons = tuple[str, ...]
-
-
 SEARCH_SETTINGS, RATED_SEARCH_SETTINGS = 4096, 64
-"""For a study without results: number of settings over the whole domain among which failures are searched, without and with a rating."""
+"""Number of settings over the whole domain that are searched for failures if there are no results; without and with a rating."""
 
 
 class Failures(NamedTuple):
@@ -62,8 +74,8 @@ class Failures(NamedTuple):
         return self.rows[int(np.lexsort([getattr(candidates, name) for name in reversed(CHOICES[choice])])[0])]
 
 
-def failures_of(source: Study | Case, evaluator: Evaluator, original: Evaluations, named_solutions: Sequence[SolutionId],
-                unsafe: Unsafe | None) -> Failures:
+def find_failures(source: Study | Case, evaluator: Evaluator, original: Evaluations, named_solutions: Sequence[SolutionId],
+                  unsafe: Unsafe | None) -> Failures:
     """Evaluate all solutions of results, or settings all over a study's domain.
 
     Raises
@@ -75,7 +87,7 @@ def failures_of(source: Study | Case, evaluator: Evaluator, original: Evaluation
         if named_solutions:
             raise InputError("solutions", f"{source.name!r} is a study and has no solutions", "a results directory")
         number = RATED_SEARCH_SETTINGS if is_rated(source) else SEARCH_SETTINGS
-        settings = evaluator.characteristics.filter(evaluator.feasible_design(number, source.search.seed, filtered=True))
+        settings = evaluator.characteristics.filter(evaluator.feasible_settings(number, source.search.seed, filtered=True))
         solution_handles: list[SolutionId | None] = [None] * len(settings)
         recorded_outcomes = None
         rows = None
@@ -125,10 +137,11 @@ def compare_at_points(system: System, original: FloatArray, settings: FloatArray
     at_points = simulate_all_points(system, np.concatenate([original, settings]))
     names, worst = unsafe_points_of(system, at_points, unsafe)[1:], worst_points(at_points)[1:]
     comparisons = []
-    for row, (failing, k) in enumerate(zip(names, worst.tolist(), strict=True), 1):
-        at_point = at_points[k]
-        original_run, changed_run = (summary_of(at_point.runs, column, float(at_point.evaluations.f_safe[column])) for column in (0, row))
-        comparisons.append(PointComparison(compare_braking(original_run, changed_run, at_point.point.name), failing))
+    for row, (failing_points, worst_index) in enumerate(zip(names, worst.tolist(), strict=True), 1):
+        at_point = at_points[worst_index]
+        original_run, changed_run = (summarise_run(at_point.runs, column, float(at_point.evaluations.f_safe[column]))
+                                     for column in (0, row))
+        comparisons.append(PointComparison(compare_braking(original_run, changed_run, at_point.point.name), failing_points))
     return comparisons, at_points[0].runs.trace.step
 
 
@@ -136,13 +149,13 @@ def compare_at_cells(evaluator: Evaluator, original: FloatArray, settings: Float
     """As `compare_at_points`, for a rated study: finds the cells whose colour is worse than the original's; compares in the worst cell."""
     system = assemble(evaluator.study)
     assert system.rater is not None
-    colours = system.rater.points(evaluator.cells(np.concatenate([original, settings]), "cells that turn")).colours.astype(int)
+    colours = system.rater.points(evaluator.simulate_cells(np.concatenate([original, settings]), "cells that turn")).colours.astype(int)
     comparisons, step = list[PointComparison](), 0.0
     for row in range(1, len(colours)):
         colour_change = colours[row] - colours[0]
         point = system.matrix[int(np.argmax(colour_change))]
         (at_point,) = simulate_all_points(system.at(point), np.concatenate([original, settings[row - 1:row]]))
-        original_run, changed_run = (summary_of(at_point.runs, column, float(at_point.evaluations.f_safe[column])) for column in (0, 1))
+        original_run, changed_run = (summarise_run(at_point.runs, column, float(at_point.evaluations.f_safe[column])) for column in (0, 1))
         names = tuple(system.matrix[k].name for k in np.flatnonzero(colour_change).tolist())
         comparisons.append(PointComparison(compare_braking(original_run, changed_run, point.name), names))
         step = at_point.runs.trace.step
@@ -150,7 +163,7 @@ def compare_at_cells(evaluator: Evaluator, original: FloatArray, settings: Float
 
 
 def unsafe_points_of(system: System, at_points: list[PointResult], unsafe: Unsafe) -> list[tuple[str, ...]]:
-    """For every setting the names of the matrix's points at which it is unsafe; empty without a matrix."""
+    """Names of the matrix's points at which each setting is unsafe; empty without a matrix."""
     if not system.matrix:
         return [() for _ in at_points[0].evaluations.settings]
     unsafe_at_points = np.stack([unsafe.of(at_point.evaluations) for at_point in at_points])
@@ -185,26 +198,26 @@ class FailureSelection(NamedTuple):
     reasons: Mapping[int, Reasons]
 
 
-def chosen_failures(source: Study | Case, options: ExplainOptions, evaluator: Evaluator) -> FailureSelection:
+def choose_failures(source: Study | Case, options: ExplainOptions, evaluator: Evaluator) -> FailureSelection:
     """Choose the failures that the options name, or the failures that matter; raises what `explain_failures` raises."""
     unsafe = None if options.unsafe is None else evaluator.parse_criterion(options.unsafe)
     named_solutions = [SolutionId.parse(text, "solutions") for text in options.solutions]
     limit = options.limit // len(assemble(evaluator.study).points)
-    original = evaluator.original()
-    failures = failures_of(source, evaluator, original, named_solutions, unsafe)
+    original = evaluator.evaluate_original()
+    failures = find_failures(source, evaluator, original, named_solutions, unsafe)
     settings, rows = failures.evaluations.settings, failures.rows
-    sample = rows if named_solutions else [rows[i] for i in affordable_rows(settings[rows], evaluator, limit)]
-    robust = None if named_solutions or is_rated(evaluator.study) else _robust_row(failures, evaluator, original, limit)
-    reasons = dict.fromkeys(rows[:len(named_solutions)], ("asked for",)) if named_solutions else _choices(failures, robust)
+    sample = rows if named_solutions else [rows[i] for i in select_affordable_rows(settings[rows], evaluator, limit)]
+    robust = None if named_solutions or is_rated(evaluator.study) else _find_robust_row(failures, evaluator, original, limit)
+    reasons = dict.fromkeys(rows[:len(named_solutions)], ("asked for",)) if named_solutions else _reasons_of_choices(failures, robust)
     analysed_rows = sorted({*sample, *reasons})
-    causes = dict(zip(analysed_rows, minimal_causes(evaluator, settings[analysed_rows], failures.unsafe), strict=True))
+    causes = dict(zip(analysed_rows, find_minimal_causes(evaluator, settings[analysed_rows], failures.unsafe), strict=True))
     if not named_solutions:
         reasons = _with_distinct_causes(failures, evaluator, {row: causes[row] for row in sample}, reasons, causes, options.top)
     return FailureSelection(original, failures, sample, causes, reasons)
 
 
 def explain_failures(source: Study | Case, options: ExplainOptions, *, pool: Pool | None = None, jobs: int | None = None,
-                     progress: Progress = silent) -> Explained:
+                     progress: Progress = show_no_progress) -> Explained:
     """Explain the failures that matter among the solutions of results, or among settings all over a study's domain.
 
     Raises
@@ -214,34 +227,34 @@ def explain_failures(source: Study | Case, options: ExplainOptions, *, pool: Poo
     """
     study = source if isinstance(source, Study) else source.study
     with open_evaluator(study, pool, jobs, progress) as evaluator:
-        original, failures, sample, causes, reasons = chosen_failures(source, options, evaluator)
+        original, failures, sample, causes, reasons = choose_failures(source, options, evaluator)
         settings = failures.evaluations.settings
-        explanations = _explanations(failures, evaluator, original, causes, reasons)
-        preventable = preventability(evaluator, settings[_avoidable_collisions(study, failures.evaluations)])
+        explanations = _explain_in_full(failures, evaluator, original, causes, reasons)
+        preventable = assess_preventability(evaluator, settings[_avoidable_collisions(study, failures.evaluations)])
     sample_causes, characteristics = [causes[row] for row in sample], evaluator.characteristics
     changed = characteristics.changed(settings[sample])
     return Explained(
         study=study, unsafe=failures.unsafe, original=original, explanations=explanations,
-        necessity=necessity(characteristics, changed, sample_causes, len(failures.rows)),
-        distinct=distinct_causes(characteristics, sample_causes), looked_at=len(failures.evaluations), failures=len(failures.rows),
+        necessity=necessity_frame(characteristics, changed, sample_causes, len(failures.rows)),
+        distinct=count_distinct_causes(characteristics, sample_causes), looked_at=len(failures.evaluations), failures=len(failures.rows),
         analysed=len(sample), otherwise=failures.deviations, preventability=preventable)
 
 
 def _avoidable_collisions(study: Study, evaluations: Evaluations) -> BoolArray:
-    """Which settings collide and may be avoided by another driver; none in a rated study, where every vehicle collides in some cell."""
+    """Which collisions another driver may avoid; none in a rated study, where every vehicle collides in some cell."""
     return np.asarray(evaluations.collided & (not is_rated(study)))
 
 
-def _robust_row(failures: Failures, evaluator: Evaluator, original: Evaluations, limit: int) -> int | None:
+def _find_robust_row(failures: Failures, evaluator: Evaluator, original: Evaluations, limit: int) -> int | None:
     """Row of the smallest robust failure found within the limit; None without such a failure, or if the original vehicle is unsafe."""
     if not failures.rows or failures.unsafe.of(original)[0]:
         return None
     _, step = compare_at_points(assemble(evaluator.study), original.settings, original.settings[:0], failures.unsafe)
-    row = smallest_robust_failure(evaluator, failures.evaluations.take(failures.rows), step, failures.unsafe, limit)
+    row = find_smallest_robust_failure(evaluator, failures.evaluations.take(failures.rows), step, failures.unsafe, limit)
     return None if row is None else failures.rows[row]
 
 
-def _choices(failures: Failures, robust: int | None) -> dict[int, Reasons]:
+def _reasons_of_choices(failures: Failures, robust: int | None) -> dict[int, Reasons]:
     """Reasons to explain a failure, by its row: smallest robust, fewest changes, most severe, smallest changes."""
     reasons: dict[int, Reasons] = {} if robust is None else {robust: (ROBUST,)}
     for choice in ("fewest", "most_severe", "smallest"):
@@ -252,23 +265,23 @@ def _choices(failures: Failures, robust: int | None) -> dict[int, Reasons]:
 
 
 def _with_distinct_causes(failures: Failures, evaluator: Evaluator, sample: Causes, reasons: Mapping[int, Reasons], causes: Causes,
-                            top: int) -> dict[int, Reasons]:
+                          top: int) -> dict[int, Reasons]:
     """Add, up to `top` failures in all, the simplest failure of each distinct minimal cause that no chosen failure has yet."""
     chosen = dict(list(reasons.items())[:top])
-    keys = {row: {key_of(evaluator.characteristics, cause) for cause in group} for row, group in causes.items()}
-    for key in distinct_causes(evaluator.characteristics, list(sample.values()))["cause"]:
+    keys = {row: {cause_key(evaluator.characteristics, cause) for cause in group} for row, group in causes.items()}
+    for key in count_distinct_causes(evaluator.characteristics, list(sample.values()))["cause"]:
         if len(chosen) >= top:
             break
         if not any(key in keys[row] for row in chosen):
-            group = [row for row in sample if key in keys[row]]
-            simplest = min(group, key=lambda row: (failures.evaluations.f_num_diff[row], failures.evaluations.f_diff[row], row))
+            candidates = [row for row in sample if key in keys[row]]
+            simplest = min(candidates, key=lambda row: (failures.evaluations.f_num_diff[row], failures.evaluations.f_diff[row], row))
             chosen[simplest] = ("a cause of its own",)
     return chosen
 
 
-def _explanations(failures: Failures, evaluator: Evaluator, original: Evaluations, causes: Causes,
-               reasons: Mapping[int, Reasons]) -> tuple[Explanation, ...]:
-    """The chosen failures explained in full."""
+def _explain_in_full(failures: Failures, evaluator: Evaluator, original: Evaluations, causes: Causes,
+                     reasons: Mapping[int, Reasons]) -> tuple[Explanation, ...]:
+    """Explanations of the chosen failures."""
     if not reasons:
         return ()
     rows = list(reasons)
@@ -276,19 +289,20 @@ def _explanations(failures: Failures, evaluator: Evaluator, original: Evaluation
     all_causes = [cause for row in rows for cause in causes[row]]
     if is_rated(evaluator.study):  # each neighbour is simulated in all cells, which takes too long for all causes
         comparisons, step = compare_at_cells(evaluator, original.settings, chosen.settings)
-        robustnesses = robustness(evaluator, chosen.settings, step, failures.unsafe, STEP_FACTORS[:1])
+        robustnesses = estimate_robustness(evaluator, chosen.settings, step, failures.unsafe, STEP_FACTORS[:1])
     else:
         comparisons, step = compare_at_points(assemble(evaluator.study), original.settings, chosen.settings, failures.unsafe)
-        robustnesses = robustness(evaluator, np.array([*chosen.settings, *(cause.setting for cause in all_causes)]), step, failures.unsafe)
-    limits, neighbours = iter(boundaries(evaluator, all_causes, failures.unsafe)), iter(robustnesses[len(rows):])
+        settings = np.array([*chosen.settings, *(cause.setting for cause in all_causes)])
+        robustnesses = estimate_robustness(evaluator, settings, step, failures.unsafe)
+    boundaries, neighbours = iter(find_boundaries(evaluator, all_causes, failures.unsafe)), iter(robustnesses[len(rows):])
     collided = np.flatnonzero(_avoidable_collisions(evaluator.study, chosen))
-    driver_classes = dict(zip(collided.tolist(), preventable_by(evaluator, chosen.settings[collided]), strict=True))
+    categories = dict(zip(collided.tolist(), classify_collisions(evaluator, chosen.settings[collided]), strict=True))
     explanations = []
     for i, row in enumerate(rows):
-        group = []
+        described_causes = []
         for cause in causes[row]:
-            boundary = next(limits)
-            group.append(Cause(
+            boundary = next(boundaries)
+            described_causes.append(Cause(
                 changes={names[column]: float(cause.setting[column]) for column in cause.columns},
                 boundary={names[column]: float(boundary.setting[column]) for column in cause.columns}, fraction=boundary.fraction,
                 alone={names[column]: value for column, value in boundary.single_limits.items()}, outcome=cause.outcome,
@@ -299,7 +313,7 @@ def _explanations(failures: Failures, evaluator: Evaluator, original: Evaluation
             handle=failures.handles[row], reasons=reasons[row], setting=dict(zip(names, chosen.settings[i].tolist(), strict=True)),
             outcome=str(chosen.outcome[i]), safety_degree=finite_or_none(chosen.f_safe[i]),
             changed=tuple(name for name, is_changed in zip(names, changed, strict=True) if is_changed),
-            necessary=tuple(names[column] for column in sorted(necessary_columns(causes[row]))), causes=tuple(group),
+            necessary=tuple(names[column] for column in sorted(necessary_columns(causes[row]))), causes=tuple(described_causes),
             robustness=robustnesses[i], because=comparisons[i].because, points=comparisons[i].points,
-            preventable=str(driver_classes.get(i) or "")))
+            preventable=str(categories.get(i) or "")))
     return tuple(explanations)

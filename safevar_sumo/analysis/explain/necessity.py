@@ -1,4 +1,4 @@
-"""Statistics over many failures: how often each characteristic is changed and how often it is needed, distinct causes, robustness."""
+"""Statistics of many failures: how often each characteristic is changed and needed, distinct minimal causes, and robustness."""
 
 from __future__ import annotations
 
@@ -11,21 +11,21 @@ import pandas as pd
 
 from safevar_sumo.analysis.evaluator import Evaluator, clopper_pearson
 from safevar_sumo.analysis.explain.causes import MinimalCause, involved_columns, necessary_columns
-from safevar_sumo.analysis.words import direction
+from safevar_sumo.analysis.words import direction_in_words
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray
 from safevar_sumo.vehicles import CharacteristicSet
 
-Key = tuple[str, ...]
-"""The changes of a cause with their directions, but without their sizes, such as ('mass up', 'tireFric down')."""
+CauseKey = tuple[str, ...]
+"""The directions of a cause's changes, without their sizes, such as ('mass up', 'tireFric down')."""
 
 
-def key_of(characteristics: CharacteristicSet, cause: MinimalCause) -> Key:
-    return tuple(direction(characteristics.members[column], float(cause.setting[column])) for column in cause.columns)
+def cause_key(characteristics: CharacteristicSet, cause: MinimalCause) -> CauseKey:
+    return tuple(direction_in_words(characteristics.members[column], float(cause.setting[column])) for column in cause.columns)
 
 
-def necessity(characteristics: CharacteristicSet, changed: BoolArray, causes: Sequence[Sequence[MinimalCause]],
-              failures: int) -> pd.DataFrame:
+def necessity_frame(characteristics: CharacteristicSet, changed: BoolArray, causes: Sequence[Sequence[MinimalCause]],
+                    failures: int) -> pd.DataFrame:
     """How often each characteristic is changed, and how often it is needed.
 
     Parameters
@@ -61,7 +61,7 @@ def necessity(characteristics: CharacteristicSet, changed: BoolArray, causes: Se
     return frame.sort_values(["necessary", "involved", "changed"], ascending=False, kind="stable", ignore_index=True)
 
 
-def distinct_causes(characteristics: CharacteristicSet, causes: Sequence[Sequence[MinimalCause]]) -> pd.DataFrame:
+def count_distinct_causes(characteristics: CharacteristicSet, causes: Sequence[Sequence[MinimalCause]]) -> pd.DataFrame:
     """Every distinct minimal cause, most frequent first.
 
     Returns
@@ -70,7 +70,7 @@ def distinct_causes(characteristics: CharacteristicSet, causes: Sequence[Sequenc
         Columns `cause`, a tuple of changes with their directions; `failures`, the number of failures with this cause; `share` of all
         failures.
     """
-    counts = Counter(key for group in causes for key in {key_of(characteristics, cause) for cause in group})
+    counts = Counter(key for group in causes for key in {cause_key(characteristics, cause) for cause in group})
     order = sorted(counts, key=lambda key: (-counts[key], len(key), key))
     return pd.DataFrame({
         "cause": pd.Series(order, dtype=object), "failures": pd.Series([counts[key] for key in order], dtype=int),
@@ -84,17 +84,17 @@ STEP_FACTORS = (1.0, 0.5, 2.0)
 BORDERLINE = 0.8
 """Share of unsafe neighbours below which a failure is called borderline."""
 FAILURES_PER_BATCH = 8
-"""Number of failures simulated at a time, the smallest first."""
+"""Number of failures whose robustness is estimated at a time, the smallest failures first."""
 
 
 class Robustness(NamedTuple):
     """Shares of unsafe outcomes among the neighbours of a setting, by time step [s]."""
 
-    by_step: dict[float, float]
+    shares_by_step: dict[float, float]
 
     @property
     def share(self) -> float:
-        return sum(self.by_step.values()) / len(self.by_step)
+        return sum(self.shares_by_step.values()) / len(self.shares_by_step)
 
     @property
     def borderline(self) -> bool:
@@ -102,9 +102,9 @@ class Robustness(NamedTuple):
 
     def __str__(self) -> str:
         """A phrase such as `robust: 84 % of the neighbours are unsafe too, but only 53 % with a step of 0.1 s`."""
-        step, least_share = min(self.by_step.items(), key=lambda item: item[1])
+        step, least_share = min(self.shares_by_step.items(), key=lambda item: item[1])
         disagrees = is_borderline(least_share) and not self.borderline
-        return in_words(self.share) + (f", but only {100 * least_share:.0f} % with a step of {step:g} s" if disagrees else "")
+        return robustness_in_words(self.share) + (f", but only {100 * least_share:.0f} % with a step of {step:g} s" if disagrees else "")
 
 
 def is_borderline(share: float) -> bool:
@@ -112,40 +112,41 @@ def is_borderline(share: float) -> bool:
     return share < BORDERLINE
 
 
-def in_words(share: float) -> str:
+def robustness_in_words(share: float) -> str:
     """A phrase such as `borderline: only 44 % of the neighbours are unsafe too`."""
     return f"{'borderline: only' if is_borderline(share) else 'robust:'} {100 * share:.0f} % of the neighbours are unsafe too"
 
 
-def robustness(evaluator: Evaluator, settings: FloatArray, step: float, unsafe: Unsafe,
-               factors: Sequence[float] = STEP_FACTORS) -> list[Robustness]:
+def estimate_robustness(evaluator: Evaluator, settings: FloatArray, step: float, unsafe: Unsafe,
+                        factors: Sequence[float] = STEP_FACTORS) -> list[Robustness]:
     """The robustness of each of M settings, shape (M, n).
 
     A setting's neighbours differ from it in each characteristic by at most the filter's threshold. They are simulated without the filter,
     with each of `factors` times the study's time step (`step` seconds). Neighbours that cannot be simulated do not count.
     """
-    members = evaluator.characteristics
-    offsets = np.random.default_rng(evaluator.study.search.seed).uniform(-1, 1, (NEIGHBOURS, len(members))) * members.threshold
-    neighbours = np.clip(settings[:, np.newaxis] + offsets, members.lower, members.upper).reshape(-1, len(members))
+    characteristics = evaluator.characteristics
+    rng = np.random.default_rng(evaluator.study.search.seed)
+    offsets = rng.uniform(-1, 1, (NEIGHBOURS, len(characteristics))) * characteristics.threshold
+    neighbours = np.clip(settings[:, np.newaxis] + offsets, characteristics.lower, characteristics.upper).reshape(-1, len(characteristics))
     shares = {}
     for factor in factors:
         step_evaluator = evaluator if factor == 1 else evaluator.with_step(step * factor)
         evaluations = step_evaluator.evaluate(neighbours, f"neighbours at {step * factor:g} s a step")
         is_unsafe, is_valid = (flags.reshape(len(settings), NEIGHBOURS) for flags in (unsafe.of(evaluations), evaluations.valid))
         shares[step * factor] = (is_unsafe & is_valid).sum(axis=1) / np.maximum(is_valid.sum(axis=1), 1)
-    return [Robustness({step: float(group[row]) for step, group in shares.items()}) for row in range(len(settings))]
+    return [Robustness({step: float(step_shares[row]) for step, step_shares in shares.items()}) for row in range(len(settings))]
 
 
-def smallest_robust_failure(evaluator: Evaluator, failures: Evaluations, step: float, unsafe: Unsafe, limit: int) -> int | None:
-    """The row of the smallest robust failure: with the fewest changes, and among these with the smallest largest change.
+def find_smallest_robust_failure(evaluator: Evaluator, failures: Evaluations, step: float, unsafe: Unsafe, limit: int) -> int | None:
+    """The row of the robust failure with the fewest changes; of several, the one whose largest change is smallest.
 
-    Failures are tried in this order until a failure is robust, or about `limit` simulations are spent; None if no failure was robust.
+    Failures are tried in this order until one is robust, or about `limit` simulations are spent; None if no tried failure is robust.
     """
     order = np.lexsort([failures.f_safe, failures.f_diff, failures.f_num_diff])
-    number = max(FAILURES_PER_BATCH, limit // (NEIGHBOURS * len(STEP_FACTORS)))
-    for start in range(0, min(len(order), number), FAILURES_PER_BATCH):
+    max_failures = max(FAILURES_PER_BATCH, limit // (NEIGHBOURS * len(STEP_FACTORS)))
+    for start in range(0, min(len(order), max_failures), FAILURES_PER_BATCH):
         rows = order[start:start + FAILURES_PER_BATCH]
-        for row, result in zip(rows.tolist(), robustness(evaluator, failures.settings[rows], step, unsafe), strict=True):
-            if not result.borderline:
+        for row, robustness in zip(rows.tolist(), estimate_robustness(evaluator, failures.settings[rows], step, unsafe), strict=True):
+            if not robustness.borderline:
                 return int(row)
     return None

@@ -13,9 +13,9 @@ from safevar_sumo.analysis.evaluator import CONFIDENCE
 from safevar_sumo.analysis.explain.braking_comparison import BrakingComparison, sentence
 from safevar_sumo.analysis.explain.compute import points_in_words
 from safevar_sumo.analysis.explain.result import REASONS, ROBUST, Cause, Explained, Explanation
-from safevar_sumo.analysis.explain.summary import LABELS, DescribedFailure, failures_paragraph
-from safevar_sumo.analysis.figures import CHANGED, FONT, INVOLVED, NECESSARY, literal, new_figure
-from safevar_sumo.analysis.words import decimal, list_of_changes, number_of, question_command, simulate_command
+from safevar_sumo.analysis.explain.summary import LABELS, FailureDescription, failures_paragraph
+from safevar_sumo.analysis.figures import BLUE, FONT, GREY, SKY_BLUE, escape_dollars, new_figure
+from safevar_sumo.analysis.words import list_of_changes, number_of, question_command, simulate_command, two_decimals
 from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.terminal import WholeTable, print_constraints, print_meanings, print_text
@@ -29,83 +29,86 @@ MAX_CAUSES = 3
 MAX_DISTINCT_CAUSES = 10
 MAX_CHARACTERISTICS = 4
 CommandFor = Callable[[Mapping[str, float]], str]
-"""A function that returns the command that simulates changes."""
+"""Returns the command that simulates the given changes."""
 
 
-def print_explained(console: Console, place: str, result: Explained, point: str = "", *, full: bool = False) -> None:
-    """Print the answer in about ten lines; `full` explains every chosen failure. `place` and `point` appear in the printed commands."""
-    members = CharacteristicSet.of(result.study.vehicle.characteristics)
+def print_explained(console: Console, subject: str, result: Explained, point: str = "", *, full: bool = False) -> None:
+    """Print the answer in about ten lines; `full` explains every chosen failure. `subject` and `point` appear in the printed commands."""
+    characteristics = CharacteristicSet.of(result.study.vehicle.characteristics)
     print_text(console, result.study.title)
     print_text(console, f"Unsafe: {result.unsafe}. {number_of(result.failures, 'failure')} among {result.looked_at} different settings.")
     print_constraints(console, result.study)
     if result.otherwise:
         print_text(console, f"note: {number_of(result.otherwise, 'setting')} with another outcome than recorded; another version or code?")
     if not result.explanations:
-        print_text(console, f"Nothing unsafe found. How far each characteristic may go: {question_command('tolerance', place, point)}")
+        print_text(console, f"Nothing unsafe found. How far each characteristic may go: {question_command('tolerance', subject, point)}")
         return
-    command_for: CommandFor = partial(simulate_command, place, point=point)
-    _print_answer(console, command_for, result, members)
+    command_for: CommandFor = partial(simulate_command, subject, point=point)
+    _print_answer(console, command_for, result, characteristics)
     if not full:
         print_text(console, f"{number_of(len(result.explanations), 'failure')} explained in full: "
-                            f"{question_command('explain', place, point)} --full")
+                            f"{question_command('explain', subject, point)} --full")
         return
-    print_text(console, _accuracy(result))
+    print_text(console, _accuracy_in_words(result))
     for failure in result.explanations:
-        _print_explanation(console, command_for, failure, members, result)
+        _print_explanation(console, command_for, failure, characteristics, result)
     if result.preventability.looked_at:
         print_text(console, str(result.preventability))
     _print_statistics(console, result)
 
 
-def _print_answer(console: Console, command_for: CommandFor, result: Explained, members: CharacteristicSet) -> None:
+def _print_answer(console: Console, command_for: CommandFor, result: Explained, characteristics: CharacteristicSet) -> None:
     """Print a paragraph, the reason and the boundary of the first failure, and the most frequent changes and causes."""
     first = result.explanations[0]
     by_reason = {reason: failure for failure in result.explanations for reason in failure.reasons}
     smallest, robust = by_reason.get(REASONS["fewest"], first), by_reason.get(ROBUST)
-    descriptions = _description(smallest), _description(robust)
+    descriptions = _describe(smallest), _describe(robust)
     print_text(console, failures_paragraph(assemble(result.study), result.original, *descriptions, result.preventability))
     name = str(first.handle or "the first setting")
     print_text(console, f"Why {name} fails: {sentence(first.because, full=True)}")
     for cause in [cause for cause in first.causes if cause.changes][:1]:
-        limits = [f"{_full_name(member)} {member.original:g} -> {member.text(cause.boundary[member.name])}{member.suffix}"
-                  for member in members if member.name in cause.boundary]
+        limits = [f"{_full_name(characteristic)} {characteristic.original:g} -> "
+                  f"{characteristic.text(cause.boundary[characteristic.name])}{characteristic.suffix}"
+                  for characteristic in characteristics if characteristic.name in cause.boundary]
         print_text(console, f"How little is enough: {', '.join(limits)}. {command_for(cause.boundary)}")
     if result.analysed and len(result.distinct):
-        print_text(console, f"Necessary most often ({_sample_in_words(result)}): {_most_necessary(result, members)}.")
+        print_text(console, f"Necessary most often ({_sample_in_words(result)}): {_most_necessary_in_words(result, characteristics)}.")
         common = result.distinct.iloc[0]
         print_text(console, f"{number_of(len(result.distinct), 'distinct minimal cause')}; the most frequent: "
                       f"{', '.join(common['cause']) or 'none'} ({common['share']:.0%} of the failures).")
 
 
-def _description(failure: Explanation | None) -> DescribedFailure | None:
+def _describe(failure: Explanation | None) -> FailureDescription | None:
     """The description of a failure for the paragraph; None if the setting is not unsafe."""
     if failure is None or not failure.causes:
         return None
     changes = {name: failure.setting[name] for name in failure.changed}
-    return DescribedFailure(str(failure.handle or "a sampled setting"), changes, failure.outcome, failure.safety_degree, failure.robustness,
-                            len(failure.causes[0].changes), failure.causes[0].neighbours)
+    return FailureDescription(
+        str(failure.handle or "a sampled setting"), changes, failure.outcome, failure.safety_degree, failure.robustness,
+        len(failure.causes[0].changes), failure.causes[0].neighbours)
 
 
-def _most_necessary(result: Explained, members: CharacteristicSet) -> str:
-    full_names = {member.name: _full_name(member) for member in members}
+def _most_necessary_in_words(result: Explained, characteristics: CharacteristicSet) -> str:
+    full_names = {characteristic.name: _full_name(characteristic) for characteristic in characteristics}
     rows = result.necessity[result.necessity["necessary"] > 0].head(MAX_CHARACTERISTICS).to_dict("records")
     return ", ".join(f"{full_names[row['characteristic']]} {_necessary_share(row)}" for row in rows) or "none, causes differ"
 
 
 def _necessary_share(row: Mapping[Any, Any]) -> str:
-    """The share of failures that need a characteristic, for a sample with its interval."""
+    """The share of failures that need a characteristic; with an interval if the failures are a sample."""
     interval = f" ({row['necessary_lower']:.0%} to {row['necessary_upper']:.0%})" if row["necessary_lower"] < row["necessary_upper"] else ""
     return f"{row['necessary']:.0%}{interval}"
 
 
-def _full_name(member: Characteristic) -> str:
-    """The name of a characteristic with its short description."""
-    return member.name if member.short_name == member.name else f"{member.name} ({member.short_name})"
+def _full_name(characteristic: Characteristic) -> str:
+    """A characteristic's name, with its short name if that differs."""
+    name, short_name = characteristic.name, characteristic.short_name
+    return name if short_name == name else f"{name} ({short_name})"
 
 
-def _accuracy(result: Explained) -> str:
+def _accuracy_in_words(result: Explained) -> str:
     """A sentence on the accuracy of safety degrees: the distance that the vehicle covers between two decisions."""
-    step = next(iter(result.explanations[0].robustness.by_step), None)
+    step = next(iter(result.explanations[0].robustness.shares_by_step), None)
     braking = result.explanations[0].because.original.braking
     if step is None or braking is None:
         return ""
@@ -114,16 +117,16 @@ def _accuracy(result: Explained) -> str:
             "a value mean nothing.")
 
 
-def _print_explanation(console: Console, command_for: CommandFor, failure: Explanation, members: CharacteristicSet,
+def _print_explanation(console: Console, command_for: CommandFor, failure: Explanation, characteristics: CharacteristicSet,
                        result: Explained) -> None:
     title = f"{', '.join(LABELS.get(reason, reason) for reason in failure.reasons)}: {failure.handle or 'a sampled setting'}"
     console.rule(escape(title), align="left")
-    ending = f"{failure.outcome}, SD {decimal(failure.safety_degree)} with {number_of(len(failure.changed), 'change')}"
-    print_text(console, f"{ending}: {list_of_changes(members, failure.setting)}")
+    ending = f"{failure.outcome}, SD {two_decimals(failure.safety_degree)} with {number_of(len(failure.changed), 'change')}"
+    print_text(console, f"{ending}: {list_of_changes(characteristics, failure.setting)}")
     if not failure.causes:
         print_text(console, "It is not unsafe.")
     for cause in failure.causes[:MAX_CAUSES]:
-        _print_cause(console, command_for, cause, members)
+        _print_cause(console, command_for, cause, characteristics)
     if len(failure.causes) > MAX_CAUSES:
         print_text(console, f"... and {len(failure.causes) - MAX_CAUSES} more of the same number of changes (--json has all).")
     if len(failure.causes) > 1:
@@ -137,44 +140,45 @@ def _print_explanation(console: Console, command_for: CommandFor, failure: Expla
             print_text(console, points_in_words(failure.points, number, limit=len(failure.points)))
     if failure.preventable:
         print_text(console, f"In the same vehicle: {failure.preventable}.")
-    console.print(_side_by_side(failure.because))
+    console.print(_braking_table(failure.because))
     if failure.causes:
-        shares = ", ".join(f"{share:.0%} at {step:g} s a step" for step, share in failure.robustness.by_step.items())
+        shares = ", ".join(f"{share:.0%} at {step:g} s a step" for step, share in failure.robustness.shares_by_step.items())
         word = "borderline" if failure.robustness.borderline else "robust"
         print_text(console, f"Unsafe neighbours within the filter's thresholds: {shares}; {word} ({failure.robustness.share:.0%}).")
 
 
-def _print_cause(console: Console, command_for: CommandFor, cause: Cause, members: CharacteristicSet) -> None:
+def _print_cause(console: Console, command_for: CommandFor, cause: Cause, characteristics: CharacteristicSet) -> None:
     if not cause.changes:
         print_text(console, "No change is needed: the original vehicle itself is unsafe.")
         return
-    print_text(console, f"Minimal cause: {list_of_changes(members, cause.changes)}: {cause.outcome}, SD {decimal(cause.safety_degree)}")
+    changes = list_of_changes(characteristics, cause.changes)
+    print_text(console, f"Minimal cause: {changes}: {cause.outcome}, SD {two_decimals(cause.safety_degree)}")
     table = WholeTable("characteristic", "unit", right=("original", "here", "limit (all scaled)", "limit (this one only)"))
-    for member in members:
-        if member.name in cause.changes:
-            values = (cause.changes[member.name], cause.boundary[member.name], cause.alone[member.name])
-            table.add_row(member.name, member.unit, f"{member.original:g}", *(member.text(value) for value in values))
+    for characteristic in characteristics:
+        if (name := characteristic.name) in cause.changes:
+            values = (characteristic.text(limits[name]) for limits in (cause.changes, cause.boundary, cause.alone))
+            table.add_row(name, characteristic.unit, f"{characteristic.original:g}", *values)
     console.print(table)
-    print_meanings(console, [member for member in members if member.name in cause.changes])
+    print_meanings(console, [characteristic for characteristic in characteristics if characteristic.name in cause.changes])
     robustness = "" if cause.neighbours is None else f"By themselves, these changes are {cause.neighbours}. "
     print_text(console, f"{cause.limit} {robustness}{command_for(cause.changes)}")
 
 
-def _side_by_side(comparison: BrakingComparison) -> WholeTable:
+def _braking_table(comparison: BrakingComparison) -> WholeTable:
     """Table of the original and the changed vehicle, with the part of the lost distance that each row explains."""
     table = WholeTable("", "unit", right=("original", "changed", "explains, m"))
     parts = comparison.parts
     brakings = comparison.original.braking, comparison.changed.braking
-    rows = (("brakes first at", "s", "time", None), ("distance there", "m", "gap", "place"), ("speed there", "m/s", "speed", "speed"),
+    rows = (("brakes first at", "s", "time", None), ("distance there", "m", "gap", "gap"), ("speed there", "m/s", "speed", "speed"),
             ("until the pedal has followed", "s", "delay", "delay"), ("speed lost meanwhile", "m/s", "speed_lost", "slowing"),
-            ("mean deceleration from then", "m/s^2", "deceleration", "deceleration"), ("distance needed", "m", "needed", None),
+            ("mean deceleration from then", "m/s^2", "deceleration", "deceleration"), ("distance needed", "m", "stopping_distance", None),
             ("distance there - needed", "m", "margin", "all"))
-    for head, unit, field, part in rows:
-        cells = [decimal(getattr(braking, field)) if braking else "-" for braking in brakings]
-        distance = {"all": comparison.lost - parts["remainder"], **parts}[part] if part and parts else None
-        table.add_row(head, unit, *cells, "" if distance is None else decimal(distance))
+    for label, unit, field, part in rows:
+        cells = [two_decimals(getattr(braking, field)) if braking else "-" for braking in brakings]
+        distance = {"all": comparison.lost_distance - parts["remainder"], **parts}[part] if part and parts else None
+        table.add_row(label, unit, *cells, "" if distance is None else two_decimals(distance))
     if parts:
-        table.add_row("not explained", "m", "", "", decimal(parts["remainder"]))
+        table.add_row("not explained", "m", "", "", two_decimals(parts["remainder"]))
     return table
 
 
@@ -203,10 +207,10 @@ def necessity_figure(result: Explained) -> Figure:
     """How often each characteristic is necessary, beside how often it is changed (as RQ3.2 counts)."""
     frame = result.necessity.iloc[::-1]
     figure, ((axis,),) = new_figure(f"{result.study.name}: changed vs. necessary", 1, 1, (6.4, 1.4 + 0.3 * max(len(frame), 4)))
-    names = [literal(name) for name in frame["characteristic"]]
+    names = [escape_dollars(name) for name in frame["characteristic"]]
     for column, label, colour, height in (
-            ("changed", "changed", CHANGED, 0.8), ("involved", "in some minimal cause", INVOLVED, 0.5),
-            ("necessary", "necessary: in every minimal cause", NECESSARY, 0.24)):
+            ("changed", "changed", GREY, 0.8), ("involved", "in some minimal cause", SKY_BLUE, 0.5),
+            ("necessary", "necessary: in every minimal cause", BLUE, 0.24)):
         axis.barh(names, 100 * frame[column], height=height, color=colour, label=label)
     axis.set_xlim(0, 100)
     axis.set_xlabel(f"share of {result.analysed} failures [%]")

@@ -1,4 +1,4 @@
-"""Result records of `explain`, with their JSON and frames."""
+"""The answer of `explain`: its records, their JSON and their frames."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from safevar_sumo.study import SAFETY_DEGREE, Study
 from safevar_sumo.vehicles import CharacteristicSet
 
 ROBUST = "smallest robust"
-"""Reason for the choice of the robust failure with the fewest changes."""
+"""The reason for choosing the robust failure with the fewest changes."""
 REASONS = {"fewest": "fewest changes", "smallest": "smallest changes", "most_severe": "most severe"}
-"""Other reasons for the choice of a failure, by the name of the choice in `CHOICES`; the JSON contains these texts."""
+"""The other reasons for choosing a failure, by the name of the choice in `CHOICES`; the JSON contains these texts."""
 
 
 class CauseEntry(msgspec.Struct, frozen=True, kw_only=True):
@@ -112,20 +112,20 @@ class Cause:
     @property
     def limit(self) -> str:
         """A sentence on the smallest unsafe share of the changes, and on what lies just below this share."""
-        state = {BoundaryState.SAFE: "slightly less is safe",
+        below = {BoundaryState.SAFE: "slightly less is safe",
                  BoundaryState.FILTER: f"with less, the change of {self.at_threshold} falls below the filter's threshold "
                                        "and counts as none",
                  BoundaryState.NOT_SIMULATED: "slightly less could not be simulated"}[self.end]
-        return f"Scaling all changes to {self.fraction:.1%} is still unsafe; {state}."
+        return f"Scaling all changes to {self.fraction:.1%} is still unsafe; {below}."
 
 
 @dataclass(frozen=True, kw_only=True)
 class Explanation:
-    """The explanation of one failure; `handle` is None if the setting is no solution, `reasons` state why the failure was chosen.
+    """The explanation of one failure; `handle` is None if the setting is no solution.
 
-    `safety_degree` is in m, or -m/s. `changed` names the changed characteristics, and `necessary` those that every minimal cause
-    contains. `because` compares the failure with the original. `preventable` is a collision's `PreventableBy`. `points`
-    are the points of a matrix at which the setting is unsafe.
+    `reasons` state why the failure was chosen. `safety_degree` is in m, or -m/s. `necessary` are the `changed` characteristics that every
+    minimal cause contains. `because` compares the failure with the original. `preventable` is the `PreventableBy` of a collision, as
+    text. `points` are the points of a matrix at which the setting is unsafe.
     """
 
     handle: SolutionId | None
@@ -161,7 +161,7 @@ class Explained:
     explanations
         Explanations of the chosen failures.
     necessity, distinct
-        Statistics of all analysed failures, tables of `necessity` and `distinct_causes` in `safevar_sumo.analysis.explain.necessity`.
+        Statistics of all analysed failures: the frames that `necessity_frame` and `count_distinct_causes` return.
     looked_at, failures, analysed
         Numbers of evaluated settings, of failures among these, and of failures that the statistics cover.
     otherwise
@@ -204,13 +204,13 @@ class Explained:
         `whose`, the class `preventable` of the failure, and `points`, separated by semicolons.
         """
         rows = []
-        for i, failure in enumerate(self.explanations):
+        for failure_index, failure in enumerate(self.explanations):
             algorithm, run, index = failure.handle or (None, None, None)
-            for j, cause in enumerate(failure.causes):
-                for member in CharacteristicSet.of(self.study.vehicle.characteristics):
-                    if member.name in cause.changes:
-                        rows.append((i, algorithm, run, index, j, member.name, member.unit, member.original, cause.changes[member.name],
-                                     cause.boundary[member.name], cause.alone[member.name], cause.fraction, cause.outcome,
+            for cause_index, cause in enumerate(failure.causes):
+                for characteristic in CharacteristicSet.of(self.study.vehicle.characteristics):
+                    if (name := characteristic.name) in cause.changes:
+                        rows.append((failure_index, algorithm, run, index, cause_index, name, characteristic.unit, characteristic.original,
+                                     cause.changes[name], cause.boundary[name], cause.alone[name], cause.fraction, cause.outcome,
                                      cause.safety_degree, failure.robustness.share, failure.preventable, "; ".join(failure.points)))
         return pd.DataFrame(rows, columns=["failure", "algorithm", "run", "index", "cause", "characteristic", "unit", "original", "value",
                                            "boundary", "alone", "fraction", "outcome", SAFETY_DEGREE, "robustness", "whose", "points"])

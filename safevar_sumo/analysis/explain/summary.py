@@ -9,13 +9,13 @@ import numpy as np
 import pandas as pd
 
 from safevar_sumo.analysis.evaluator import Evaluator
-from safevar_sumo.analysis.explain.causes import MinimalCause, minimal_causes
+from safevar_sumo.analysis.explain.causes import MinimalCause, find_minimal_causes
 from safevar_sumo.analysis.explain.compute import compare_at_points, points_in_words, unsafe_points_of
-from safevar_sumo.analysis.explain.necessity import Robustness, robustness, smallest_robust_failure
+from safevar_sumo.analysis.explain.necessity import Robustness, estimate_robustness, find_smallest_robust_failure
 from safevar_sumo.analysis.explain.result import REASONS, ROBUST
-from safevar_sumo.analysis.preventability import Preventability, PreventableBy, preventability
-from safevar_sumo.analysis.rating.summary import rated_lead
-from safevar_sumo.analysis.words import ENDS, joined, list_of_changes, number_of, question_command
+from safevar_sumo.analysis.preventability import Preventability, PreventableBy, assess_preventability
+from safevar_sumo.analysis.rating.summary import summarise_rated_study
+from safevar_sumo.analysis.words import OUTCOME_VERBS, join_phrases, list_of_changes, number_of, question_command
 from safevar_sumo.metrics import RATING_POINTS, Unsafe
 from safevar_sumo.records import KMH_PER_MS, Evaluations, FloatArray, Outcome, finite_or_none
 from safevar_sumo.results import CHOICES, chosen_handle, handles, position_of, record
@@ -29,11 +29,11 @@ from safevar_sumo.workers.evaluation import Pool
 
 LABELS = {ROBUST: "robust with the fewest changes", REASONS["smallest"]: "smallest largest change", "a cause of its own": "distinct cause"}
 """Titles of failures by the reason for their choice; any other reason is itself the title."""
-LIMIT = 4000
-"""Approximate limit of simulations that search a robust failure at the end of a study; `explain` has a higher limit."""
+MAX_SIMULATIONS = 4000
+"""Approximate maximum number of simulations that search for a robust failure at the end of a study; `explain` has a higher limit."""
 
 
-def lead(study: Study, solutions: pd.DataFrame, original: Evaluations, pool: Pool, place: str) -> list[str]:
+def summarise_failures(study: Study, solutions: pd.DataFrame, original: Evaluations, pool: Pool, directory: str) -> list[str]:
     """Summarise a study's solutions in lines: first a paragraph for a manager, last the command for the next step.
 
     The criterion is `Unsafe.default`.
@@ -46,11 +46,11 @@ def lead(study: Study, solutions: pd.DataFrame, original: Evaluations, pool: Poo
         The original vehicle's evaluation.
     pool
         Simulates subsets of the solutions' changes.
-    place
+    directory
         The directory of the results.
     """
     if RATING_POINTS.name in original.metrics:
-        return rated_lead(study, solutions, original, place)
+        return summarise_rated_study(study, solutions, original, directory)
     if original.collided[0]:
         return ["The original vehicle itself collides: no change is needed."]
     evaluator, degree = Evaluator(study, pool), float(original.f_safe[0])
@@ -58,68 +58,69 @@ def lead(study: Study, solutions: pd.DataFrame, original: Evaluations, pool: Poo
     unsafe = criterion.rows(solutions)
     if not unsafe.any():
         return [f"Nothing unsafe found in {number_of(len(solutions), 'solution')}: no collision, no SD below half of the original's.",
-                f"How far each characteristic may go: {question_command('tolerance', place)}"]
+                f"How far each characteristic may go: {question_command('tolerance', directory)}"]
     handle_of = {reason: chosen_handle(solutions, criterion, choice, study.name) for choice, reason in REASONS.items()}
     rows = solutions.iloc[[position_of(solutions, handle) for handle in handle_of.values()]]
     settings = rows[list(evaluator.characteristics.names)].to_numpy(dtype=float)
-    causes_of, (failing_points, worst) = minimal_causes(evaluator, settings, criterion), _failing_points(study, settings, criterion)
+    all_causes = find_minimal_causes(evaluator, settings, criterion)
+    failing_points, worst = _find_failing_points(study, settings, criterion)
     number_distinct = len(solutions.drop_duplicates(list(evaluator.characteristics.names)))
     settings_in_words = "" if number_distinct == len(solutions) else f" ({number_distinct} different settings)"
     unsafe_in_words = f"{int(unsafe.sum())} of {number_of(len(solutions), 'solution')}{settings_in_words}"
-    lines = [_paragraph(evaluator, solutions, unsafe, original, criterion, worst),
+    lines = [_write_paragraph(evaluator, solutions, unsafe, original, criterion, worst),
              f"{unsafe_in_words} collide." if criterion.below is None else
              f"No collision. {unsafe_in_words} keep less than half of the original's {degree:.2f} m."]
-    for (reason, handle), row, causes, fails_at in zip(handle_of.items(), rows.to_dict("records"), causes_of, failing_points, strict=True):
+    for (reason, handle), row, causes, fails_at in zip(handle_of.items(), rows.to_dict("records"), all_causes, failing_points, strict=True):
         size = f"{number_of(int(row['f_num_diff']), 'change')} of up to {row['f_diff']:.0%}"
         ending, cause = f"{row['outcome']}, SD {row['f_safe']:.2f}", _cause_in_words(evaluator, causes)
         lines.append(f"{LABELS.get(reason, reason).capitalize()}: {handle}, {ending}, {size}. {cause}{fails_at}")
     at_worst = f"at the worst point of the first (without --point: at all {len(assemble(study).points)}, which takes long)"
-    return [*lines, f"Why, and how far{f', {at_worst}' if worst else ''}: {question_command('explain', place, worst)}"]
+    return [*lines, f"Why, and how far{f', {at_worst}' if worst else ''}: {question_command('explain', directory, worst)}"]
 
 
-def _paragraph(evaluator: Evaluator, solutions: pd.DataFrame, is_unsafe: pd.Series[bool], original: Evaluations, unsafe: Unsafe,
+def _write_paragraph(evaluator: Evaluator, solutions: pd.DataFrame, is_unsafe: pd.Series[bool], original: Evaluations, unsafe: Unsafe,
                point: str) -> str:
     """One paragraph on the unsafe solutions; with `point`, on the solutions that are unsafe at this point of a matrix."""
     names, all_handles = evaluator.characteristics.names, handles(solutions)
     candidates = np.flatnonzero(is_unsafe.to_numpy() & ~solutions.duplicated(list(names)).to_numpy())
     if point:
         evaluator = evaluator.for_study(study_at(evaluator.study, point, point))
-        original = evaluator.original()
+        original = evaluator.evaluate_original()
     system = assemble(evaluator.study)
     evaluations = evaluator.evaluate(solutions.iloc[candidates][list(names)].to_numpy(dtype=float), "unsafe solutions")
-    preventable = preventability(evaluator, evaluations.settings[evaluations.collided])
-    failing = np.flatnonzero(unsafe.of(evaluations))
-    failures = evaluations.take(failing)
+    preventable = assess_preventability(evaluator, evaluations.settings[evaluations.collided])
+    failing_rows = np.flatnonzero(unsafe.of(evaluations))
+    failures = evaluations.take(failing_rows)
     if not len(failures):
         return failures_paragraph(system, original, None, None, preventable)
     step = compare_at_points(system, original.settings, original.settings[:0], unsafe)[1]
-    robust = smallest_robust_failure(evaluator, failures, step, unsafe, LIMIT // len(system.points))
-    fewest = int(np.lexsort([getattr(failures, name) for name in reversed(CHOICES["fewest"])])[0])
-    rows = [fewest] if robust is None else [fewest, robust]
+    robust_row = find_smallest_robust_failure(evaluator, failures, step, unsafe, MAX_SIMULATIONS // len(system.points))
+    fewest_row = int(np.lexsort([getattr(failures, name) for name in reversed(CHOICES["fewest"])])[0])
+    rows = [fewest_row] if robust_row is None else [fewest_row, robust_row]
     descriptions, chosen = [], failures.take(rows)
-    causes = minimal_causes(evaluator, chosen.settings, unsafe)
-    robustnesses = robustness(evaluator, np.array([*chosen.settings, *(group[0].setting for group in causes)]), step, unsafe)
-    for i, row in enumerate(rows):
-        changed = np.flatnonzero(evaluator.characteristics.changed(chosen.settings[i]))
-        changes = {names[column]: float(chosen.settings[i, column]) for column in changed}
-        name, degree = str(all_handles[candidates[failing[row]]]), finite_or_none(chosen.f_safe[i])
-        descriptions.append(DescribedFailure(
-            name, changes, str(chosen.outcome[i]), degree, robustnesses[i], len(causes[i][0].columns), robustnesses[len(rows) + i]))
+    causes = find_minimal_causes(evaluator, chosen.settings, unsafe)
+    robustnesses = estimate_robustness(evaluator, np.array([*chosen.settings, *(group[0].setting for group in causes)]), step, unsafe)
+    for index, row in enumerate(rows):
+        changed = np.flatnonzero(evaluator.characteristics.changed(chosen.settings[index]))
+        changes = {names[column]: float(chosen.settings[index, column]) for column in changed}
+        name, degree = str(all_handles[candidates[failing_rows[row]]]), finite_or_none(chosen.f_safe[index])
+        descriptions.append(FailureDescription(name, changes, str(chosen.outcome[index]), degree, robustnesses[index],
+                                               len(causes[index][0].columns), robustnesses[len(rows) + index]))
     return failures_paragraph(system, original, descriptions[0], descriptions[1] if len(descriptions) > 1 else None, preventable)
 
 
-def _failing_points(study: Study, settings: FloatArray, unsafe: Unsafe) -> tuple[list[str], str]:
-    """For each setting a sentence on the points at which it fails, and the first setting's worst point; empty without a matrix."""
+def _find_failing_points(study: Study, settings: FloatArray, unsafe: Unsafe) -> tuple[list[str], str]:
+    """A sentence for each setting on the points at which it fails, and the worst point of the first setting; empty without a matrix."""
     system = assemble(study)
     if not system.matrix:
         return [""] * len(settings), ""
     at_points = simulate_all_points(system, settings)
-    words = [f" {points_in_words(points, len(system.matrix), limit=3)}" for points in unsafe_points_of(system, at_points, unsafe)]
-    return words, at_points[worst_points(at_points)[0]].point.name
+    sentences = [f" {points_in_words(points, len(system.matrix), limit=3)}" for points in unsafe_points_of(system, at_points, unsafe)]
+    return sentences, at_points[worst_points(at_points)[0]].point.name
 
 
 def _cause_in_words(evaluator: Evaluator, causes: list[MinimalCause]) -> str:
-    """A sentence on the first minimal cause of a setting, and on the number of its other causes."""
+    """A sentence on a setting's first minimal cause and on the number of its other minimal causes."""
     if not causes:
         return "Simulated again, it is not unsafe."
     values = {evaluator.characteristics.names[column]: float(causes[0].setting[column]) for column in causes[0].columns}
@@ -128,14 +129,14 @@ def _cause_in_words(evaluator: Evaluator, causes: list[MinimalCause]) -> str:
     return f"These changes alone cause it: {list_of_changes(evaluator.characteristics, values)}{others}."
 
 
-NUMBERS = ("no", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten", "eleven", "twelve")
+NUMBER_WORDS = ("no", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten", "eleven", "twelve")
 MAX_CHANGES_LISTED = 4
 """Maximum number of changes that are listed, the largest first."""
-CONDITIONS = {"clear": "In clear weather", "wet": "On a wet road", "fog": "In fog", "night": "At night"}
-"""Weathers in words; any other weather is named."""
+WEATHER_PHRASES = {"clear": "In clear weather", "wet": "On a wet road", "fog": "In fog", "night": "At night"}
+"""Weathers as the beginning of a sentence; any other weather is named."""
 
 
-class DescribedFailure(NamedTuple):
+class FailureDescription(NamedTuple):
     """A failure as the paragraph describes it.
 
     Attributes
@@ -148,7 +149,7 @@ class DescribedFailure(NamedTuple):
         Outcome and safety degree [m, or -m/s] of the failure.
     robustness
         Robustness of the failure.
-    needed
+    sufficient
         Number of changes that are enough: the size of the failure's minimal causes.
     cause
         Robustness of the first minimal cause by itself; None if it was not simulated.
@@ -159,12 +160,12 @@ class DescribedFailure(NamedTuple):
     outcome: str
     safety_degree: float | None
     robustness: Robustness
-    needed: int
+    sufficient: int
     cause: Robustness | None = None
 
 
-def failures_paragraph(system: System, original: Evaluations, smallest: DescribedFailure | None, robust: DescribedFailure | None,
-             preventable: Preventability) -> str:
+def failures_paragraph(system: System, original: Evaluations, smallest: FailureDescription | None, robust: FailureDescription | None,
+                       preventable: Preventability) -> str:
     """The paragraph about a study's failures.
 
     Parameters
@@ -180,85 +181,86 @@ def failures_paragraph(system: System, original: Evaluations, smallest: Describe
     preventable
         Shares of the collisions that reference drivers avoid.
     """
-    parts = [f"{_conditions(system)} the original vehicle {_original_ending(system, original)}."]
+    parts = [f"{_conditions_in_words(system)} the original vehicle {_original_ending_in_words(system, original)}."]
     if smallest is None:
         return " ".join([*parts, "Nothing unsafe was found."])
-    members = CharacteristicSet(system.characteristics.members)
-    if not smallest.needed:
+    characteristics = CharacteristicSet(system.characteristics.members)
+    if not smallest.sufficient:
         return " ".join([*parts, "No change is needed for it to be unsafe."])
-    words = _failure_in_words(members, smallest)
+    words = _failure_in_words(characteristics, smallest)
     parts.append(f"{words[0].upper()}{words[1:]}")
     if smallest.robustness.borderline:
         parts.append("None of the failures that were tried is robust." if robust is None else
-                     f"The robust failure with the fewest changes, {robust.name}: {_failure_in_words(members, robust)}")
-    return " ".join([*parts, *_avoided_shares(preventable)])
+                     f"The robust failure with the fewest changes, {robust.name}: {_failure_in_words(characteristics, robust)}")
+    return " ".join([*parts, *_avoided_shares_in_words(preventable)])
 
 
-def _conditions(system: System) -> str:
+def _conditions_in_words(system: System) -> str:
     points = system.points
     if len(points) > 1:
         return f"At the worst of {len(points)} test points"
-    return f"At {points[0].name}," if system.matrix else f"{_weather(points[0])},"
+    return f"At {points[0].name}," if system.matrix else f"{_weather_in_words(points[0])},"
 
 
-def _weather(point: Point) -> str:
+def _weather_in_words(point: Point) -> str:
     name = point.weather.name.removeprefix("carla_").replace("_", " ")
-    return CONDITIONS.get(name, f"In {name}")
+    return WEATHER_PHRASES.get(name, f"In {name}")
 
 
-def _original_ending(system: System, original: Evaluations) -> str:
+def _original_ending_in_words(system: System, original: Evaluations) -> str:
     """How the original vehicle's run ends."""
     degree, outcome = float(original.f_safe[0]), Outcome(str(original.outcome[0]))
     if outcome == Outcome.COLLISION:
-        return f"itself collides, at {_speed(degree)}"
+        return f"itself collides, at {_speed_in_words(degree)}"
     is_pedestrian = all(pre_crash_of(point.scenario).startswith("pedestrian") for point in system.points)
     if outcome == Outcome.STOPPED and is_pedestrian:
         return f"stops {degree:.2f} m short of the pedestrian"
-    return f"{ENDS.get(outcome, outcome)}" + ("" if degree != degree else f" with a safety degree of {degree:.2f} m")
+    return f"{OUTCOME_VERBS.get(outcome, outcome)}" + ("" if degree != degree else f" with a safety degree of {degree:.2f} m")
 
 
-def _failure_in_words(members: CharacteristicSet, failure: DescribedFailure) -> str:
+def _failure_in_words(characteristics: CharacteristicSet, failure: FailureDescription) -> str:
     """A sentence such as `a collision at 5 km/h (robust: ...) was found with ten changes: ...; three of them suffice`."""
-    number, needed, effect = len(failure.changes), failure.needed, f"{_outcome(failure)} ({failure.robustness})"
-    listed = _changes(members, failure.changes)
-    if needed < number:
+    number, sufficient, effect = len(failure.changes), failure.sufficient, f"{_outcome_in_words(failure)} ({failure.robustness})"
+    listed = _changes_in_words(characteristics, failure.changes)
+    if sufficient < number:
         cause = "" if failure.cause is None else f" ({failure.cause})"
-        return f"{effect} was found with {_count(number)} changes: {listed}; {_count(needed)} of them {_suffice(needed)}{cause}."
-    return f"{_count(number)} {'change' if number == 1 else 'changes'} {_suffice(number)} for {effect}: {listed}."
+        subset = f"{_count_in_words(sufficient)} of them {_verb_suffice(sufficient)}{cause}"
+        return f"{effect} was found with {_count_in_words(number)} changes: {listed}; {subset}."
+    return f"{_count_in_words(number)} {'change' if number == 1 else 'changes'} {_verb_suffice(number)} for {effect}: {listed}."
 
 
-def _suffice(number: int) -> str:
+def _verb_suffice(number: int) -> str:
     return "suffices" if number == 1 else "suffice"
 
 
-def _count(number: int) -> str:
-    return NUMBERS[number] if number < len(NUMBERS) else str(number)
+def _count_in_words(number: int) -> str:
+    return NUMBER_WORDS[number] if number < len(NUMBER_WORDS) else str(number)
 
 
-def _outcome(failure: DescribedFailure) -> str:
+def _outcome_in_words(failure: FailureDescription) -> str:
     if failure.safety_degree is None:
         return failure.outcome
     if failure.outcome == Outcome.COLLISION:
-        return f"a collision at {_speed(failure.safety_degree)}"
+        return f"a collision at {_speed_in_words(failure.safety_degree)}"
     return f"a safety degree of only {failure.safety_degree:.2f} m"
 
 
-def _speed(degree: float) -> str:
+def _speed_in_words(degree: float) -> str:
     """The collision speed of a safety degree, in whole km/h or, below 3 km/h, with a decimal."""
     speed = -degree * KMH_PER_MS
     return f"{speed:.{int(speed < 3)}f} km/h"
 
 
-def _changes(members: CharacteristicSet, values: Mapping[str, float]) -> str:
+def _changes_in_words(characteristics: CharacteristicSet, values: Mapping[str, float]) -> str:
     """Short names with changes relative to the original values, the largest change first."""
-    shares = {member.short_name: (values[member.name] - member.original) / abs(member.original) for member in members
-              if member.name in values}
+    shares = {characteristic.short_name: (values[characteristic.name] - characteristic.original) / abs(characteristic.original)
+              for characteristic in characteristics if characteristic.name in values}
     largest = sorted(shares, key=lambda name: -abs(shares[name]))
     parts = [f"{name} {100 * shares[name]:+.0f} %" for name in largest[:MAX_CHANGES_LISTED]]
     return ", ".join(parts) + (f" and {len(shares) - MAX_CHANGES_LISTED} more" if len(shares) > MAX_CHANGES_LISTED else "")
 
 
-def _avoided_shares(preventable: Preventability) -> list[str]:
+def _avoided_shares_in_words(preventable: Preventability) -> list[str]:
     """A sentence on the shares of the collisions that each reference driver avoids; no sentence without a collision."""
     if not preventable.looked_at:
         return []
@@ -266,4 +268,4 @@ def _avoided_shares(preventable: Preventability) -> list[str]:
              "only full braking at the first possible moment avoids another {}", PreventableBy.NOBODY: "{} are physically unavoidable"}
     parts = [text.format(f"{100 * (preventable.share(by) or 0.0):.0f} %") for by, text in words.items() if preventable.numbers.get(by)]
     sample = "" if preventable.looked_at == preventable.collisions else f"{preventable.looked_at} drawn at random from "
-    return [f"In the same vehicle, of {sample}{preventable.collisions} collisions, {joined(parts)}."]
+    return [f"In the same vehicle, of {sample}{preventable.collisions} collisions, {join_phrases(parts)}."]

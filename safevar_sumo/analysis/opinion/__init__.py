@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
-from safevar_sumo.analysis.options import Options, documented, option, unsafe_option
+from safevar_sumo.analysis.options import Options, document_options, option, unsafe_option
 from safevar_sumo.analysis.subject import Results, answer_question, study_or_case
 
 if TYPE_CHECKING:
@@ -37,7 +37,7 @@ class OpinionOptions(Options):
         object.__setattr__(self, "solutions", tuple(dict.fromkeys(handles)))
 
 
-@documented(OpinionOptions)
+@document_options(OpinionOptions)
 def opinion(source: str | Path | Results, *, solutions: Sequence[str] = OpinionOptions.solutions, unsafe: Criterion | None = None,
             pool: Pool | None = None, jobs: int | None = None, progress: bool | Progress = False, as_it_is_now: bool = False) -> Opinions:
     """Drive minimal causes of failures again with another vehicle model: CommonRoad's multi-body vehicle with Pacejka's tyres.

@@ -8,10 +8,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from safevar_sumo.analysis.evaluator import Progress, open_evaluator, silent
+from safevar_sumo.analysis.evaluator import Progress, open_evaluator, show_no_progress
 from safevar_sumo.analysis.explain import ExplainOptions
-from safevar_sumo.analysis.explain.causes import RESOLUTION, boundaries
-from safevar_sumo.analysis.explain.compute import chosen_failures
+from safevar_sumo.analysis.explain.causes import RESOLUTION, find_boundaries
+from safevar_sumo.analysis.explain.compute import choose_failures
 from safevar_sumo.analysis.opinion import OpinionOptions
 from safevar_sumo.analysis.opinion.mapping import VehicleMapping, mapping_of
 from safevar_sumo.analysis.opinion.multi_body import commonroad
@@ -67,13 +67,13 @@ def second_system(study: Study) -> tuple[System, System, VehicleMapping]:
 
 
 def ask_for_opinions(source: Study | Case, options: OpinionOptions, *, pool: Pool | None = None, jobs: int | None = None,
-                     progress: Progress = silent) -> Opinions:
+                     progress: Progress = show_no_progress) -> Opinions:
     """Find the minimal causes of the failures that a report explains, or of named solutions, and let the second model judge them.
 
     Raises
     ------
     InputError
-        As `second_system` and `chosen_failures`, and if `source` is a study, which has no failures yet.
+        As `second_system` and `choose_failures`, and if `source` is a study, which has no failures yet.
     """
     if isinstance(source, Study):
         raise InputError(source.origin.called or source.name, "is a study and has no solutions",
@@ -81,9 +81,9 @@ def ask_for_opinions(source: Study | Case, options: OpinionOptions, *, pool: Poo
     second_system(source.study)
     explain_options = ExplainOptions(solutions=options.solutions, unsafe=options.unsafe, limit=SIMULATION_LIMIT)
     with open_evaluator(source.study, pool, jobs, progress) as evaluator:
-        selection = chosen_failures(source, explain_options, evaluator)
+        selection = choose_failures(source, explain_options, evaluator)
         minimal_causes = [(str(selection.failures.handles[row]), cause) for row in selection.reasons for cause in selection.causes[row]]
-        limits = boundaries(evaluator, [cause for _, cause in minimal_causes], selection.failures.unsafe)
+        limits = find_boundaries(evaluator, [cause for _, cause in minimal_causes], selection.failures.unsafe)
     names = evaluator.characteristics.names
     causes = [JudgedCause(handle, {names[column]: float(cause.setting[column]) for column in cause.columns}, limit.fraction)
               for (handle, cause), limit in zip(minimal_causes, limits, strict=True)]
@@ -92,7 +92,7 @@ def ask_for_opinions(source: Study | Case, options: OpinionOptions, *, pool: Poo
                                                  for row in selection.reasons if not selection.causes[row]))
 
 
-def opinions_of(study: Study, causes: Sequence[JudgedCause], unsafe: Unsafe, progress: Progress = silent) -> Opinions:
+def opinions_of(study: Study, causes: Sequence[JudgedCause], unsafe: Unsafe, progress: Progress = show_no_progress) -> Opinions:
     """The second model's opinions on minimal causes; raises as `second_system`."""
     system, second, mapping = second_system(study)
     members = system.characteristics

@@ -5,7 +5,7 @@ from __future__ import annotations
 from rich.console import Console
 
 from safevar_sumo.analysis.opinion.result import Opinions, OpinionVerdict
-from safevar_sumo.analysis.words import joined, list_of_changes, number_of
+from safevar_sumo.analysis.words import join_phrases, list_of_changes, number_of
 from safevar_sumo.terminal import plain, print_text
 from safevar_sumo.vehicles import CharacteristicSet
 
@@ -32,4 +32,4 @@ def opinion_in_words(result: Opinions) -> str:
     if not result.opinions:
         return "there is no cause to judge."
     parts = [f"{result.count(verdict)} {verdict}" for verdict in OpinionVerdict if result.count(verdict)]
-    return f"of {number_of(len(result.opinions), 'minimal cause')} {joined(parts)}."
+    return f"of {number_of(len(result.opinions), 'minimal cause')} {join_phrases(parts)}."

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import pandas as pd
 
-from safevar_sumo.analysis.words import ENDS
+from safevar_sumo.analysis.words import OUTCOME_VERBS
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import Outcome
 from safevar_sumo.study import SAFETY_DEGREE, Study
@@ -33,7 +33,7 @@ class RunEnd(NamedTuple):
         if self.outcome == Outcome.COLLISION:
             return "a collision" if self.safety_degree is None else f"a collision at {-self.safety_degree:.2f} m/s"
         degree = "" if self.safety_degree is None else f", safety degree {self.safety_degree:.2f} m"
-        return "not driven" if self.outcome is None else f"{ENDS.get(Outcome(self.outcome), self.outcome)}{degree}"
+        return "not driven" if self.outcome is None else f"{OUTCOME_VERBS.get(Outcome(self.outcome), self.outcome)}{degree}"
 
     def to_dict(self) -> dict[str, Any]:
         return {"outcome": self.outcome, SAFETY_DEGREE: self.safety_degree}

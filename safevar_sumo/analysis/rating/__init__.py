@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
-from safevar_sumo.analysis.options import Options, documented, option
+from safevar_sumo.analysis.options import Options, document_options, option
 from safevar_sumo.analysis.subject import Results, answer_question, study_or_case
 from safevar_sumo.study import StudyLike
 
@@ -32,7 +32,7 @@ class RatingOptions(Options):
                                   metavar="ALG:RUN:N")
 
 
-@documented(RatingOptions)
+@document_options(RatingOptions)
 def rating(study: StudyLike | Results, changes: Mapping[str, float] | None = RatingOptions.changes, *,
            solution: str | None = RatingOptions.solution, pool: Pool | None = None, jobs: int | None = None,
            progress: bool | Progress = False, as_it_is_now: bool = False) -> Rating:

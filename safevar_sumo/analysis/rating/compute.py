@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from safevar_sumo.analysis.evaluator import Evaluator, Progress, open_evaluator, silent
+from safevar_sumo.analysis.evaluator import Evaluator, Progress, open_evaluator, show_no_progress
 from safevar_sumo.analysis.rating import RatingOptions
 from safevar_sumo.analysis.research_questions.case import Case
 from safevar_sumo.errors import InputError
@@ -177,7 +177,7 @@ class Rating:
 
 
 def rate_variant(subject: Study | Case, options: RatingOptions, *, pool: Pool | None = None, jobs: int | None = None,
-                 progress: Progress = silent) -> Rating:
+                 progress: Progress = show_no_progress) -> Rating:
     """Rate the original vehicle, and the variant if the options describe one; raises as `rate`.
 
     Raises
@@ -200,7 +200,7 @@ def rate_variant(subject: Study | Case, options: RatingOptions, *, pool: Pool | 
 
 
 def rate(study: Study, settings: Mapping[str, FloatArray], *, pool: Pool | None = None, jobs: int | None = None,
-         progress: Progress = silent) -> Rating:
+         progress: Progress = show_no_progress) -> Rating:
     """Rate a study's original vehicle and variants, given as settings of shape (n,) by name; the filter is not applied.
 
     Raises
@@ -220,7 +220,7 @@ def rate_on(evaluator: Evaluator, settings: Mapping[str, FloatArray]) -> Rating:
     assert rater is not None
     names = CharacteristicSet.of(evaluator.study.vehicle.characteristics).names
     rows = {"original": evaluator.characteristics.original, **settings}
-    cells = evaluator.cells(np.stack(list(rows.values())), "cells and robustness layers")
+    cells = evaluator.simulate_cells(np.stack(list(rows.values())), "cells and robustness layers")
     variants = [RatedVehicle(name=name, setting=dict(zip(names, setting.tolist(), strict=True)), protocol=rater.protocol,
                              cells=cells.of([row]), scored=points_of(rater.protocol, cells.of([row]), rater.claims), claims=rater.claims)
                 for row, (name, setting) in enumerate(rows.items())]

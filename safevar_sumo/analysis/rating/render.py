@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 from rich.console import Console
 from rich.text import Text
 
-from safevar_sumo.analysis.figures import FONT, literal, new_figure
+from safevar_sumo.analysis.figures import FONT, escape_dollars, new_figure
 from safevar_sumo.analysis.rating.compute import RatedTest, RatedVehicle, Rating, max_points
-from safevar_sumo.analysis.words import joined, number_of
+from safevar_sumo.analysis.words import join_phrases, number_of
 from safevar_sumo.protocol import COLOURS, Block
 from safevar_sumo.terminal import WholeTable, print_text
 from safevar_sumo.vehicles import CharacteristicSet
@@ -72,7 +72,7 @@ def turned_in_words(result: Rating) -> list[tuple[str, str]]:
         if not cell.is_varied:
             colours = before or "unknown", after or "unknown"
             tests.setdefault(cell.block.name, {}).setdefault(colours, []).append(f"{cell.vut:g}")
-    return [(test, "; ".join(f"{before} to {after} at {joined(dict.fromkeys(speeds))} km/h ({number_of(len(speeds), 'cell')})"
+    return [(test, "; ".join(f"{before} to {after} at {join_phrases(dict.fromkeys(speeds))} km/h ({number_of(len(speeds), 'cell')})"
                              for (before, after), speeds in groups.items())) for test, groups in tests.items()]
 
 
@@ -94,7 +94,7 @@ def _changes_in_words(result: Rating, variant: RatedVehicle) -> str:
     members = CharacteristicSet.of(result.study.vehicle.characteristics)
     parts = [f"{member.short_name} {float(member.text(variant.setting[member.name])):g}{member.suffix}" for member in members
              if variant.setting[member.name] != member.original]
-    return joined(parts) if parts else "no change at all"
+    return join_phrases(parts) if parts else "no change at all"
 
 
 def _points_table(result: Rating) -> WholeTable:
@@ -216,7 +216,7 @@ def _draw_matrices(axis: Axes, result: Rating, block: Block) -> None:
     names = [f"{row.vut:g}{' FCW' if block.is_warning(k) else ''}" for k, row in enumerate(block.rows)]
     axis.set_yticks([k + 0.5 for k in range(len(names))], names, fontsize=FONT - 2)
     axis.grid(visible=False)
-    axis.set_title(literal(f"{block.name}: {_totals(result, block)} of {sum(block.points):g}"), fontsize=FONT)
+    axis.set_title(escape_dollars(f"{block.name}: {_totals(result, block)} of {sum(block.points):g}"), fontsize=FONT)
 
 
 def _totals(result: Rating, block: Block) -> str:

@@ -17,10 +17,10 @@ TITLES = {"fewest": "Fewest changes that cost a point", "smallest": "Smallest la
           "most_points": "Most points lost"}
 
 
-def rated_lead(study: Study, solutions: pd.DataFrame, original: Evaluations, place: str) -> list[str]:
+def summarise_rated_study(study: Study, solutions: pd.DataFrame, original: Evaluations, place: str) -> list[str]:
     """Lines that summarise the solutions of a rated study; the last line has commands for the next steps.
 
-    Parameters are those of `safevar_sumo.analysis.explain.summary.lead`, which calls this function for rated studies.
+    Parameters are those of `safevar_sumo.analysis.explain.summary.summarise_failures`, which calls this function for rated studies.
     """
     points, name = float(original.column(RATING_POINTS.name)[0]), RATING_POINTS.name
     unsafe = Unsafe.default(record(original, 0), solutions["outcome"])

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from safevar_sumo.analysis.figures import FONT, literal, new_figure
+from safevar_sumo.analysis.figures import FONT, escape_dollars, new_figure
 from safevar_sumo.analysis.research_questions.algorithms import SURFACE_PERCENTAGES, attainment, ranks
 from safevar_sumo.analysis.research_questions.case import ALGORITHM_TITLES, Case, Unanswerable
 from safevar_sumo.analysis.research_questions.comparisons import ALPHA
@@ -55,7 +55,7 @@ def _diagram(axis: Axes, algorithms: list[str], mean_ranks: FloatArray, differen
         height = number - 1 - position
         axis.plot([rank, rank], [height, -0.2], color="black", linewidth=0.8)
         axis.plot(rank, height, marker="o", markersize=4, color="#0072b2")
-        axis.annotate(f"{literal(ALGORITHM_TITLES.get(name, name))} {rank:.2f}", (rank, height), xytext=(6, 0),
+        axis.annotate(f"{escape_dollars(ALGORITHM_TITLES.get(name, name))} {rank:.2f}", (rank, height), xytext=(6, 0),
                       textcoords="offset points", va="center", fontsize=FONT)
     for bar, (first, last) in enumerate(cliques(mean_ranks, difference)):
         axis.plot([mean_ranks[first] - 0.03, mean_ranks[last] + 0.03], [-0.6 - 0.5 * bar] * 2, color="#d55e00", linewidth=3,
@@ -97,7 +97,7 @@ def attainment_surfaces(case: Case) -> Figure:
             label = {SURFACE_PERCENTAGES[0]: "half of the runs", SURFACE_PERCENTAGES[1]: "every run"}.get(level, "at least one run")
             axis.plot(*_stairs(points, worst_values).T, color=COLOURS[i % len(COLOURS)], linestyle=("-", "--", "-.")[i % 3], linewidth=1.4,
                       label=label)
-        axis.set_title(literal(ALGORITHM_TITLES.get(algorithm, algorithm)), fontsize=FONT)
+        axis.set_title(escape_dollars(ALGORITHM_TITLES.get(algorithm, algorithm)), fontsize=FONT)
         axis.set_xlabel(objective_title(goals[0]))
         axis.set_ylabel(objective_title(goals[1]))
     for axis in list(axes.flat)[len(surfaces):]:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from safevar_sumo.analysis.figures import FONT, as_formula, literal, new_figure, panels
+from safevar_sumo.analysis.figures import FONT, as_formula, escape_dollars, new_figure, new_panels
 from safevar_sumo.analysis.research_questions.case import ALGORITHM_TITLES, Case, Unanswerable
 from safevar_sumo.analysis.research_questions.changes import ANY, critical, effects, rq31, rq32
 from safevar_sumo.analysis.research_questions.indicators import REFERENCE_COORDINATE, convergence, nondominated, objectives
@@ -46,12 +46,12 @@ def number_of_changes(cases: Sequence[Case]) -> Figure:
     counts = [rq31(case) for case in cases]
     title = "number of changed characteristics"
     title = f"{cases[0].name}: {title}" if len(cases) == 1 else title
-    figure, axes = panels(title, len(cases), PANELS, (3.9, 3.3), least_width=6.4, above=0.5)
+    figure, axes = new_panels(title, len(cases), PANELS, (3.9, 3.3), min_width=6.4, title_height=0.5)
     for axis, case, group in zip(axes, cases, counts, strict=True):
         sns.boxplot(group, x="j", y="count", ax=axis, color="#56b4e9", linecolor="black", linewidth=0.8, fliersize=3)
         axis.set_xlabel("characteristics changed")
         axis.set_ylabel(f"critical solutions per run\n({group['run'].nunique()} runs)")
-        axis.set_title(literal(case.name) if len(cases) > 1 else "", fontsize=FONT)
+        axis.set_title(escape_dollars(case.name) if len(cases) > 1 else "", fontsize=FONT)
         _set_integer_ticks(axis.yaxis)
     return _with_space(figure)
 
@@ -64,7 +64,7 @@ def changed_characteristics(case: Case) -> Figure:
     shares = rq32(case)
     order = shares[shares["j"] == ANY].sort_values("rank", kind="stable")["characteristic"]
     grid = shares.pivot(index="characteristic", columns="j", values="percent").astype(float)
-    grid = grid.loc[order, list(dict.fromkeys(shares["j"]))].rename(index=literal)
+    grid = grid.loc[order, list(dict.fromkeys(shares["j"]))].rename(index=escape_dollars)
     figure, ((axis,),) = new_figure(f"{case.name}: characteristics changed in critical solutions", 1, 1, (7.6, 1.4 + 0.3 * len(grid)))
     sns.heatmap(grid, ax=axis, cmap="cividis", vmin=0, vmax=100, annot=True, fmt=".0f", annot_kws={"fontsize": 7}, linewidths=0.5,
                 cbar_kws={"label": "critical solutions\nin which it is changed [%]"})
@@ -85,7 +85,7 @@ def sizes_of_changes(case: Case) -> Figure:
     total = _critical_count(case)
     changes = effects(case)
     members = case.characteristics.members
-    figure, axes = panels(f"{case.name}: changes in critical solutions", len(members), 4, (2.25, 1.85), least_width=9.0, above=1.0)
+    figure, axes = new_panels(f"{case.name}: changes in critical solutions", len(members), 4, (2.25, 1.85), min_width=9.0, title_height=1.0)
     for axis, member in zip(axes, members, strict=True):
         change = changes.loc[changes["characteristic"] == member.name, "change"]
         low, high = (float(f"{end - member.original:.9g}") for end in (member.lower, member.upper))
@@ -98,7 +98,7 @@ def sizes_of_changes(case: Case) -> Figure:
         axis.axvline(0, color="black", linewidth=0.8)
         axis.set_xlim(low, high)
         size = min(FONT, FONT * LONG_NAME / len(member.name))
-        axis.set_title(f"{literal(member.name)}\n+{len(sides[INCREASE])}, -{len(sides[DECREASE])}", fontsize=size)
+        axis.set_title(f"{escape_dollars(member.name)}\n+{len(sides[INCREASE])}, -{len(sides[DECREASE])}", fontsize=size)
         axis.set_xlabel(f"change [{as_formula(member.unit)}]", fontsize=FONT)
         axis.set_ylabel("")
         axis.locator_params(axis="x", nbins=3, steps=[1, 2, 5, 10])
@@ -149,7 +149,7 @@ def pareto_fronts(case: Case) -> Figure:
 
 
 def objective_title(objective: Objective) -> str:
-    return OBJECTIVE_TITLES.get(objective.name) or f"{literal(objective.title)} [{as_formula(objective.unit)}]"
+    return OBJECTIVE_TITLES.get(objective.name) or f"{escape_dollars(objective.title)} [{as_formula(objective.unit)}]"
 
 
 def _original_value(case: Case, objective: Objective) -> float:
@@ -204,4 +204,4 @@ def _set_integer_ticks(axis: object, steps: int = 6) -> None:
 
 
 def _title(algorithm: str) -> str:
-    return literal(ALGORITHM_TITLES.get(algorithm, algorithm))
+    return escape_dollars(ALGORITHM_TITLES.get(algorithm, algorithm))

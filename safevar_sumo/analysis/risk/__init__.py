@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
-from safevar_sumo.analysis.options import Options, documented, option, unsafe_option
+from safevar_sumo.analysis.options import Options, document_options, option, unsafe_option
 from safevar_sumo.analysis.subject import Results, answer_question, study_of
 from safevar_sumo.errors import InputError, unknown
 from safevar_sumo.study import StudyLike
@@ -49,12 +49,12 @@ class RiskOptions(Options):
             raise InputError("rare", "cannot be combined with method = 'monte_carlo'", "either rare or method")
 
     @property
-    def is_for_rare(self) -> bool:
+    def requires_rare_method(self) -> bool:
         """Whether a method for rare failures is required, not merely allowed."""
         return self.rare or self.method in ("subset_simulation", "cross_entropy")
 
 
-@documented(RiskOptions)
+@document_options(RiskOptions)
 def risk(study: StudyLike | Results, *, samples: int = RiskOptions.samples, confidence: float = RiskOptions.confidence,
          width: float | None = RiskOptions.width, unsafe: Criterion | None = None, method: str = RiskOptions.method,
          rare: bool = RiskOptions.rare, pool: Pool | None = None, jobs: int | None = None, progress: bool | Progress = False,
@@ -64,7 +64,7 @@ def risk(study: StudyLike | Results, *, samples: int = RiskOptions.samples, conf
     Parameters
     ----------
     study
-        A study, or results or their directory, which stand for their study.
+        A study; or results or their directory, whose study is examined.
     """
     from safevar_sumo.analysis.risk.compute import estimate_risk
 

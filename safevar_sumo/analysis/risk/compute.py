@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 import scipy
 
-from safevar_sumo.analysis.evaluator import Evaluator, Progress, clopper_pearson, open_evaluator, silent
+from safevar_sumo.analysis.evaluator import Evaluator, Progress, clopper_pearson, open_evaluator, show_no_progress
 from safevar_sumo.analysis.risk import RiskOptions
 from safevar_sumo.analysis.risk.rare import (
     ENOUGH_FAILURES,
@@ -22,7 +22,7 @@ from safevar_sumo.analysis.risk.rare import (
     Response,
     estimate_rare,
     is_plateau,
-    openturns,
+    load_openturns,
 )
 from safevar_sumo.errors import InputError, SimulationError
 from safevar_sumo.metrics import Unsafe
@@ -33,7 +33,7 @@ from safevar_sumo.vehicles import Characteristic, CharacteristicSet
 from safevar_sumo.vehicles.region import REJECTIONS
 from safevar_sumo.workers.evaluation import Pool
 
-Quantile = Callable[[FloatArray], FloatArray]
+QuantileFunction = Callable[[FloatArray], FloatArray]
 """Turns probabilities into values in the characteristic's unit."""
 
 
@@ -52,10 +52,11 @@ class VariationModel:
     """
 
     def __init__(self, study: Study) -> None:
-        self._members = CharacteristicSet.of(study.vehicle.characteristics)
+        self._characteristics = CharacteristicSet.of(study.vehicle.characteristics)
         self._source = study.source
-        self._quantiles = [self._quantile(member, study.variation.get(member.name, Uniform())) for member in self._members]
-        self._factor = self._cholesky(study.correlations)
+        self._quantiles = [self._quantile_function(characteristic, study.variation.get(characteristic.name, Uniform()))
+                           for characteristic in self._characteristics]
+        self._factor = self._correlating_factor(study.correlations)
 
     @property
     def is_correlated(self) -> bool:
@@ -73,35 +74,35 @@ class VariationModel:
 
     def _settings_at(self, probabilities: FloatArray) -> FloatArray:
         columns = [quantile(column) for quantile, column in zip(self._quantiles, probabilities.T, strict=True)]
-        return np.clip(np.stack(columns, axis=1), self._members.lower, self._members.upper)
+        return np.clip(np.stack(columns, axis=1), self._characteristics.lower, self._characteristics.upper)
 
-    def _quantile(self, member: Characteristic, law: Distribution) -> Quantile:
-        low, high = member.lower, member.upper
-        match law:
+    def _quantile_function(self, characteristic: Characteristic, distribution: Distribution) -> QuantileFunction:
+        low, high = characteristic.lower, characteristic.upper
+        match distribution:
             case Fixed():
-                value = _or_default(law.value, member.original)
+                value = _or_default(distribution.value, characteristic.original)
                 return lambda p: np.full_like(p, value)
             case Uniform() | Triangular():
-                lower, upper = _or_default(law.lower, low), _or_default(law.upper, high)
-                if isinstance(law, Uniform):
+                lower, upper = _or_default(distribution.lower, low), _or_default(distribution.upper, high)
+                if isinstance(distribution, Uniform):
                     return lambda p: lower + p * (upper - lower)
-                mode = _or_default(law.mode, member.original)
+                mode = _or_default(distribution.mode, characteristic.original)
                 triangle = scipy.stats.triang((mode - lower) / (upper - lower), loc=lower, scale=upper - lower)
                 return lambda p: np.asarray(triangle.ppf(p))
             case Normal():
-                mean = _or_default(law.mean, member.original)
-                normal = _truncated_normal(low, high, mean, law.deviation)
+                mean = _or_default(distribution.mean, characteristic.original)
+                normal = _truncated_normal(low, high, mean, distribution.deviation)
                 return lambda p: np.asarray(normal.ppf(p))
             case Lognormal():
-                log_median = np.log(_or_default(law.median, member.original))
-                logarithm = _truncated_normal(np.log(low), np.log(high), log_median, law.sigma)
+                log_median = np.log(_or_default(distribution.median, characteristic.original))
+                logarithm = _truncated_normal(np.log(low), np.log(high), log_median, distribution.sigma)
                 return lambda p: np.exp(logarithm.ppf(p))
 
-    def _cholesky(self, correlations: Sequence[Correlation]) -> FloatArray | None:
+    def _correlating_factor(self, correlations: Sequence[Correlation]) -> FloatArray | None:
         """The Cholesky factor that correlates independent normal variables; None without correlations."""
         if not correlations:
             return None
-        names = self._members.names
+        names = self._characteristics.names
         matrix = np.eye(len(names))
         for correlation in correlations:
             first, second = (names.index(name) for name in correlation.between)
@@ -121,7 +122,7 @@ def _or_default(value: float | None, default: float) -> float:
     return default if value is None else value
 
 
-FLEET = 1000
+FLEET_VEHICLES = 1000
 """Number of vehicles of the fleet in examples."""
 
 
@@ -130,10 +131,10 @@ def fleet_probability(probability: float, vehicles: int) -> float:
     return float(-np.expm1(vehicles * np.log1p(-probability))) if probability < 1 else 1.0
 
 
-CHUNK = 1000
-"""Samples between two checks of the interval's width."""
-LARGEST_CHUNK = 50_000
-"""Samples of one evaluation if no `width` is requested; bounds the memory of a process."""
+VEHICLES_PER_CHECK = 1000
+"""Number of vehicles drawn between two checks of the interval's width."""
+MAX_VEHICLES_PER_CALL = 50_000
+"""Maximum number of vehicles evaluated in one call if no `width` is requested; bounds the memory of a process."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -143,7 +144,7 @@ class Risk:
     Attributes
     ----------
     samples, failures
-        Number of simulated vehicles, and of unsafe vehicles among them; `errors` counts vehicles that could not be simulated.
+        Number of simulated vehicles, and of unsafe vehicles among them; `errors` is the number of vehicles that could not be simulated.
     method
         "monte_carlo", "subset_simulation" or "cross_entropy".
     simulations
@@ -155,7 +156,7 @@ class Risk:
     remark
         Failures that the estimate may have missed, or the reason for its method; may be empty.
     sensitivity, sensitivity_of_unsafe
-        The two frames of `sensitivities`; None if characteristics are correlated or bound by constraints, because Sobol
+        The two frames of `compute_sensitivities`; None if characteristics are correlated or bound by constraints, because Sobol
         indices are then undefined.
     """
 
@@ -202,7 +203,7 @@ class Risk:
     def to_frame(self) -> pd.DataFrame:
         """Sensitivity of the safety degree and of the unsafe outcome, one row per output and characteristic; empty if correlated.
 
-        Columns: `output` (safety_degree or unsafe), and the columns of `sensitivities`.
+        Columns: `output` (safety_degree or unsafe), and the columns of `compute_sensitivities`.
         """
         frames = {SAFETY_DEGREE: self.sensitivity, "unsafe": self.sensitivity_of_unsafe}
         tables = [frame.assign(output=name) for name, frame in frames.items() if frame is not None]
@@ -215,7 +216,7 @@ class Risk:
 
 
 def estimate_risk(study: Study, options: RiskOptions, *, pool: Pool | None = None, jobs: int | None = None,
-                  progress: Progress = silent) -> Risk:
+                  progress: Progress = show_no_progress) -> Risk:
     """Estimate the probability of an unsafe outcome. The filter of small changes is not applied, as no search changes vehicles.
 
     Raises
@@ -227,7 +228,7 @@ def estimate_risk(study: Study, options: RiskOptions, *, pool: Pool | None = Non
     """
     model = VariationModel(study)
     with open_evaluator(study, pool, jobs, progress) as evaluator:
-        unsafe = evaluator.criterion(options.unsafe)
+        unsafe = evaluator.choose_criterion(options.unsafe)
         simulated_before = evaluator.simulated
         response = Response(evaluator, model.settings_of_normal, unsafe)
         counts = _draw_vehicles(evaluator, model, unsafe, options, response)
@@ -235,20 +236,21 @@ def estimate_risk(study: Study, options: RiskOptions, *, pool: Pool | None = Non
             estimate, method = counts, _rare_method(options)
         else:
             estimate, method = counts.estimate(options.confidence), "monte_carlo"
-        lacks_indices = model.is_correlated or bool(evaluator.region) or options.is_for_rare
-        degree_indices, unsafe_indices = (None, None) if lacks_indices else sensitivities(evaluator, model, unsafe, options.confidence)
-    point = None if estimate.design_point is None else model.settings_of_normal(estimate.design_point[np.newaxis])[0]
+        lacks_indices = model.is_correlated or bool(evaluator.region) or options.requires_rare_method
+        sensitivity, sensitivity_of_unsafe = (
+            (None, None) if lacks_indices else compute_sensitivities(evaluator, model, unsafe, options.confidence))
+    design_setting = None if estimate.design_point is None else model.settings_of_normal(estimate.design_point[np.newaxis])[0]
     return Risk(
         study=study, unsafe=unsafe, samples=estimate.simulations - estimate.errors, failures=estimate.failures, errors=estimate.errors,
-        confidence=options.confidence, sensitivity=degree_indices, sensitivity_of_unsafe=unsafe_indices, probability=estimate.probability,
-        interval=estimate.interval, method=method, simulations=simulated_before + estimate.simulations,
+        confidence=options.confidence, sensitivity=sensitivity, sensitivity_of_unsafe=sensitivity_of_unsafe,
+        probability=estimate.probability, interval=estimate.interval, method=method, simulations=simulated_before + estimate.simulations,
         coefficient_of_variation=estimate.variation, remark=estimate.remark,
-        design_point=None if point is None else dict(zip(evaluator.characteristics.names, point.tolist(), strict=True)))
+        design_point=None if design_setting is None else dict(zip(evaluator.characteristics.names, design_setting.tolist(), strict=True)))
 
 
 @dataclass(kw_only=True)
-class _Counts:
-    """Number of simulated vehicles, failures and errors of plain Monte Carlo."""
+class _VehicleCounts:
+    """Numbers of vehicles that plain Monte Carlo simulated, of failures among them, and of vehicles that could not be simulated."""
 
     vehicles: int = 0
     failures: int = 0
@@ -268,34 +270,34 @@ def _rare_method(options: RiskOptions) -> str:
 
 
 def _draw_vehicles(evaluator: Evaluator, model: VariationModel, unsafe: Unsafe, options: RiskOptions,
-                   response: Response) -> Estimate | _Counts:
-    """Draw vehicles by plain Monte Carlo; if few of the first `PILOT` are unsafe, switch to a method for rare failures."""
-    counts, rng = _Counts(), np.random.default_rng(evaluator.study.search.seed)
-    is_pilot = _may_be_rare(options) and not evaluator.region
-    if options.is_for_rare and evaluator.region:
+                   response: Response) -> Estimate | _VehicleCounts:
+    """Draw vehicles by plain Monte Carlo; if few of the first `PILOT_VEHICLES` are unsafe, switch to a method for rare failures."""
+    counts, rng = _VehicleCounts(), np.random.default_rng(evaluator.study.search.seed)
+    is_pilot = _needs_pilot(options) and not evaluator.region
+    if options.requires_rare_method and evaluator.region:
         counts.remark = "the study has constraints, which only plain Monte Carlo supports"
-    if options.is_for_rare:
-        openturns()  # raises if the module is missing
-    requested = max(options.samples, PILOT_VEHICLES) if options.is_for_rare else options.samples
+    if options.requires_rare_method:
+        load_openturns()  # raises if the module is missing
+    requested = max(options.samples, PILOT_VEHICLES) if options.requires_rare_method else options.samples
     while counts.vehicles + counts.errors < requested:
-        chunk = PILOT_VEHICLES if is_pilot else CHUNK if options.width is not None else LARGEST_CHUNK
+        largest_number = PILOT_VEHICLES if is_pilot else VEHICLES_PER_CHECK if options.width is not None else MAX_VEHICLES_PER_CALL
         offset = counts.vehicles + counts.errors
-        number = min(chunk, requested - offset)
+        number = min(largest_number, requested - offset)
         probabilities = rng.random((number, len(evaluator.characteristics))) if is_pilot else None
-        settings = _feasible_vehicles(evaluator, model, number, rng) if probabilities is None else model.settings(probabilities)
+        settings = _draw_feasible_vehicles(evaluator, model, number, rng) if probabilities is None else model.settings(probabilities)
         evaluations = evaluator.evaluate(settings, "vehicles as they vary", offset, requested)
         valid_vehicles = int(np.count_nonzero(evaluations.valid))
         counts.vehicles, counts.errors = counts.vehicles + valid_vehicles, counts.errors + number - valid_vehicles
         counts.failures += int(np.count_nonzero(unsafe.of(evaluations)))
         if probabilities is not None:
             is_pilot = False
-            values = response.take(scipy.stats.norm.ppf(probabilities), evaluations)
-            is_frequent = not options.is_for_rare and counts.failures * (requested / number) >= ENOUGH_FAILURES
+            responses = response.record(scipy.stats.norm.ppf(probabilities), evaluations)
+            is_frequent = not options.requires_rare_method and counts.failures * (requested / number) >= ENOUGH_FAILURES
             if valid_vehicles and counts.failures < RARE_BELOW * valid_vehicles and not is_frequent:
-                estimate = _rare_estimate(response, values, options, counts, evaluator.study.search.seed)
+                estimate = _try_rare_method(response, responses, options, counts, evaluator.study.search.seed)
                 if estimate is not None:
                     return estimate
-            elif options.is_for_rare:
+            elif options.requires_rare_method:
                 counts.remark = f"more than {RARE_BELOW:g} of {valid_vehicles} vehicles are unsafe: plain Monte Carlo is used"
         low, high = clopper_pearson(counts.failures, counts.vehicles, options.confidence) if counts.vehicles else (0.0, 1.0)
         if options.width is not None and high - low <= options.width:
@@ -305,17 +307,17 @@ def _draw_vehicles(evaluator: Evaluator, model: VariationModel, unsafe: Unsafe, 
     return counts
 
 
-def _may_be_rare(options: RiskOptions) -> bool:
-    return options.is_for_rare or (options.method == "auto" and options.width is None and options.samples >= 2 * PILOT_VEHICLES)
+def _needs_pilot(options: RiskOptions) -> bool:
+    return options.requires_rare_method or (options.method == "auto" and options.width is None and options.samples >= 2 * PILOT_VEHICLES)
 
 
-def _rare_estimate(response: Response, values: FloatArray, options: RiskOptions, counts: _Counts, seed: int) -> Estimate | None:
-    """The estimate by a method for rare failures; None if plain Monte Carlo has to continue; the remark has the reason."""
-    if is_plateau(values):
+def _try_rare_method(response: Response, responses: FloatArray, options: RiskOptions, counts: _VehicleCounts, seed: int) -> Estimate | None:
+    """The estimate by a method for rare failures; None if plain Monte Carlo has to continue, with the reason in `counts.remark`."""
+    if is_plateau(responses):
         counts.remark = ("the response is a plateau: most vehicles nearest to failure have the same safety degree, so that methods for "
                         "rare failures cannot approach failures; plain Monte Carlo is used")
         return None
-    if not options.is_for_rare and find_spec("openturns") is None:
+    if not options.requires_rare_method and find_spec("openturns") is None:
         counts.remark = ("fewer than 0.01 of the first vehicles are unsafe; pip install 'safevar_sumo[rare]' for a method that needs fewer "
                         "vehicles for rare failures")
         return None
@@ -326,7 +328,7 @@ def _rare_estimate(response: Response, values: FloatArray, options: RiskOptions,
         return None
 
 
-def _feasible_vehicles(evaluator: Evaluator, model: VariationModel, number: int, rng: np.random.Generator) -> FloatArray:
+def _draw_feasible_vehicles(evaluator: Evaluator, model: VariationModel, number: int, rng: np.random.Generator) -> FloatArray:
     """Random vehicles that satisfy the constraints, shape (number, n)."""
     settings = evaluator.region.draw_feasible(lambda count: model.settings(rng.random((count, len(evaluator.characteristics)))), number)
     if len(settings) < number:
@@ -337,13 +339,14 @@ def _feasible_vehicles(evaluator: Evaluator, model: VariationModel, number: int,
 
 BASE_POINTS = 512
 """Number of base points of Saltelli's design, which has n + 2 settings for each base point."""
-LEAST_OUTCOMES = 100
+MIN_OUTCOMES = 100
 """Minimum number of unsafe settings, and of safe settings, in the design for Sobol indices of unsafe outcomes."""
-RESAMPLES = 200
+BOOTSTRAP_SAMPLES = 200
 """Number of bootstrap samples for the intervals."""
 
 
-def sensitivities(evaluator: Evaluator, model: VariationModel, unsafe: Unsafe, confidence: float) -> tuple[pd.DataFrame, pd.DataFrame]:
+def compute_sensitivities(evaluator: Evaluator, model: VariationModel, unsafe: Unsafe,
+                          confidence: float) -> tuple[pd.DataFrame, pd.DataFrame]:
     """Sensitivity of the safety degree, and of the unsafe outcome.
 
     Returns
@@ -361,12 +364,12 @@ def sensitivities(evaluator: Evaluator, model: VariationModel, unsafe: Unsafe, c
     evaluations = evaluator.evaluate(model.settings(np.asarray(points)), "what decides")
     degree = np.where(evaluations.valid, evaluations.f_safe, np.nan)
     is_unsafe = np.where(evaluations.valid, unsafe.of(evaluations).astype(float), np.nan)
-    if min(np.count_nonzero(is_unsafe == outcome) for outcome in (0, 1)) < LEAST_OUTCOMES:
+    if min(np.count_nonzero(is_unsafe == outcome) for outcome in (0, 1)) < MIN_OUTCOMES:
         is_unsafe[:] = np.nan
-    return _indices(problem, degree, confidence, seed), _indices(problem, is_unsafe, confidence, seed)
+    return _sobol_indices(problem, degree, confidence, seed), _sobol_indices(problem, is_unsafe, confidence, seed)
 
 
-def _indices(problem: dict[str, Any], output: FloatArray, confidence: float, seed: int) -> pd.DataFrame:
+def _sobol_indices(problem: dict[str, Any], output: FloatArray, confidence: float, seed: int) -> pd.DataFrame:
     """Sobol indices of an output over the design, without base points at which the output is undefined for any setting."""
     from SALib.analyze import sobol
 
@@ -376,7 +379,8 @@ def _indices(problem: dict[str, Any], output: FloatArray, confidence: float, see
     if not outputs.size or np.ptp(outputs) == 0:
         indices = {name: np.full(len(names), np.nan) for name in ("S1", "ST", "S1_conf", "ST_conf")}
     else:
-        indices = sobol.analyze(problem, outputs, calc_second_order=False, num_resamples=RESAMPLES, conf_level=confidence, seed=seed)
+        indices = sobol.analyze(problem, outputs, calc_second_order=False, num_resamples=BOOTSTRAP_SAMPLES, conf_level=confidence,
+                                seed=seed)
     frame = pd.DataFrame({"characteristic": names, "first_order": indices["S1"], "total": indices["ST"]})
     for name, key in (("first_order", "S1"), ("total", "ST")):
         for end, sign in (("lower", -1), ("upper", 1)):

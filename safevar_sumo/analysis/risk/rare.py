@@ -21,7 +21,7 @@ from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray
 
 RARE_BELOW = 1e-2
-"""Probability above which plain Monte Carlo is as efficient."""
+"""Probability from which plain Monte Carlo is as efficient as a method for rare failures."""
 PILOT_VEHICLES = 1000
 """Number of vehicles first drawn by plain Monte Carlo, whose outcomes decide the method."""
 ENOUGH_FAILURES = 100
@@ -34,8 +34,8 @@ REPEATS, VERY_RARE_REPEATS = 4, 8
 """Number of independent repeats for probabilities of at least `VERY_RARE_BELOW`, and for lower probabilities."""
 VERY_RARE_BELOW = 3e-4
 INFLATION = 1.3
-"""Factor on OpenTURNS' coefficient of variation, which assumes that the levels of a subset simulation are independent: over 240
-repeats of linear limit states of 1e-3 to 1e-6 in 5 to 12 dimensions the observed coefficients are 1.1 to 1.3 times as large."""
+"""Factor on OpenTURNS' coefficient of variation, which wrongly assumes that the levels of a subset simulation are independent. In 240
+repeats with linear limit states (probability 1e-3 to 1e-6, 5 to 12 dimensions) the observed coefficients were 1.1 to 1.3 times as large."""
 PRIOR_DEGREES = 3
 """Degrees of freedom of the interval in addition to the number of repeats, for the information in OpenTURNS' own estimates."""
 MIN_PROBABILITY = 1e-10
@@ -78,41 +78,42 @@ class Estimate:
 
 
 class Response:
-    """The response g(u), below 0 where a vehicle is unsafe. Counts simulations and stores failures."""
+    """The response g(u) at a point u of standard normal space, below 0 where the vehicle is unsafe; counts simulations, stores failures."""
 
     def __init__(self, evaluator: Evaluator, settings_of: SettingsFunction, unsafe: Unsafe) -> None:
         self._evaluator, self._settings_of, self._unsafe = evaluator, settings_of, unsafe
         self.dimensions = len(evaluator.characteristics)
         self.simulations = self.errors = self.failure_count = 0
         self.stage = "rare failures"
-        self.expected = 1
+        self.expected_simulations = 1
         self._failure_points: list[FloatArray] = []
-        """Failures, shape (k, n) each."""
+        """Points of unsafe vehicles in each call, shape (k, n) each."""
 
     @property
     def failures(self) -> FloatArray:
-        """Distinct unsafe points, shape (k, n)."""
+        """Distinct points of unsafe vehicles, shape (k, n)."""
         return np.unique(np.concatenate([np.zeros((0, self.dimensions)), *self._failure_points]), axis=0)
 
     def __call__(self, points: Any) -> FloatArray:
         """The response at points, shape (N, n)."""
         array = np.asarray(points, dtype=float).reshape(-1, self.dimensions)
-        evaluations = self._evaluator.evaluate(self._settings_of(array), self.stage, self.simulations, max(self.expected, self.simulations))
-        return self.take(array, evaluations)
+        total = max(self.expected_simulations, self.simulations)
+        evaluations = self._evaluator.evaluate(self._settings_of(array), self.stage, self.simulations, total)
+        return self.record(array, evaluations)
 
-    def take(self, points: FloatArray, evaluations: Evaluations) -> FloatArray:
-        """The response of points with known evaluations, which are counted; failures are stored."""
-        unsafe = self._unsafe.of(evaluations)
+    def record(self, points: FloatArray, evaluations: Evaluations) -> FloatArray:
+        """Count known evaluations of points, store the failures among the points, and return the response."""
+        is_unsafe = self._unsafe.of(evaluations)
         margin = self._unsafe.margin(evaluations)
         margin = np.where(evaluations.valid & ~np.isnan(margin), margin, SAFE_RESPONSE)
         self.simulations += len(points)
         self.errors += int(np.count_nonzero(~evaluations.valid))
-        self.failure_count += int(np.count_nonzero(unsafe))
-        self._failure_points.append(points[unsafe])
-        return np.where(unsafe, np.minimum(margin, -MIN_RESPONSE), np.maximum(margin, MIN_RESPONSE))
+        self.failure_count += int(np.count_nonzero(is_unsafe))
+        self._failure_points.append(points[is_unsafe])
+        return np.where(is_unsafe, np.minimum(margin, -MIN_RESPONSE), np.maximum(margin, MIN_RESPONSE))
 
 
-def openturns() -> Any:
+def load_openturns() -> Any:
     """The module openturns, with its messages switched off.
 
     Raises
@@ -129,9 +130,9 @@ def openturns() -> Any:
     return openturns
 
 
-def is_plateau(values: FloatArray) -> bool:
-    """Whether the values nearest to failure, a share p0, mostly equal each other."""
-    nearest = np.sort(values[values > 0])[:max(int(LEVEL_SHARE * len(values)), 2)]
+def is_plateau(responses: FloatArray) -> bool:
+    """Whether most of the responses nearest to failure (a share p0 of all) equal each other."""
+    nearest = np.sort(responses[responses > 0])[:max(int(LEVEL_SHARE * len(responses)), 2)]
     if not len(nearest):
         return False
     return bool(np.count_nonzero(nearest == nearest[-1]) >= PLATEAU_SHARE * len(nearest) or nearest[-1] >= SAFE_RESPONSE)
@@ -150,20 +151,20 @@ def estimate_rare(response: Response, method: str, confidence: float, seed: int)
     PlateauError
         If the response does not show which vehicles are nearer to failure.
     """
-    run = _subset_simulation if method == "subset_simulation" else _cross_entropy
+    estimate_once = _run_subset_simulation if method == "subset_simulation" else _run_cross_entropy
     probabilities, variations, thresholds = [], [], list[float]()
-    repeats, repeat = REPEATS, 0
-    response.expected = response.simulations + 4 * REPEATS * LEVEL_SIZE
+    repeats, completed = REPEATS, 0
+    response.expected_simulations = response.simulations + 4 * REPEATS * LEVEL_SIZE
     with _restore_generator():
-        while repeat < repeats:
-            response.stage = f"rare failures, repeat {repeat + 1} of {repeats}"
-            probability, variation, thresholds = run(response, (seed + 7919 * repeat) % 2**31)
+        while completed < repeats:
+            response.stage = f"rare failures, repeat {completed + 1} of {repeats}"
+            probability, variation, thresholds = estimate_once(response, (seed + 7919 * completed) % 2**31)
             probabilities.append(probability)
             variations.append(variation)
-            repeat += 1
-            if repeat == REPEATS and method == "subset_simulation" and np.mean(probabilities) < VERY_RARE_BELOW:
+            completed += 1
+            if completed == REPEATS and method == "subset_simulation" and np.mean(probabilities) < VERY_RARE_BELOW:
                 repeats = VERY_RARE_REPEATS
-                response.expected = response.simulations * repeats // REPEATS
+                response.expected_simulations = response.simulations * repeats // REPEATS
     mean = float(np.mean(probabilities))
     if mean <= 0:
         return Estimate(probability=0.0, variation=math.nan, interval=(0.0, MIN_PROBABILITY), failures=response.failure_count,
@@ -176,11 +177,11 @@ def estimate_rare(response: Response, method: str, confidence: float, seed: int)
     rng = np.random.default_rng(seed)
     remark = _remark_on_islands(response, thresholds, rng)
     return Estimate(probability=mean, variation=variation, interval=(mean / factor, min(mean * factor, 1.0)),
-                    failures=response.failure_count, errors=response.errors, design_point=_design_point(response, rng), remark=remark,
+                    failures=response.failure_count, errors=response.errors, design_point=_find_design_point(response, rng), remark=remark,
                     simulations=response.simulations)
 
 
-def _event(ot: Any, response: Callable[[Any], FloatArray], dimensions: int) -> Any:
+def _failure_event(ot: Any, response: Callable[[Any], FloatArray], dimensions: int) -> Any:
     function = ot.PythonFunction(dimensions, 1, func_sample=lambda points: response(points)[:, np.newaxis])
     return ot.ThresholdEvent(ot.CompositeRandomVector(function, ot.RandomVector(ot.Normal(dimensions))), ot.Less(), 0.0)
 
@@ -188,7 +189,7 @@ def _event(ot: Any, response: Callable[[Any], FloatArray], dimensions: int) -> A
 @contextmanager
 def _restore_generator() -> Iterator[None]:
     """Restore the state of OpenTURNS' random generator, which the whole process shares."""
-    generator = openturns().RandomGenerator
+    generator = load_openturns().RandomGenerator
     state = generator.GetState()
     try:
         yield
@@ -196,19 +197,20 @@ def _restore_generator() -> Iterator[None]:
         generator.SetState(state)
 
 
-def _subset_simulation(response: Response, seed: int) -> tuple[float, float, list[float]]:
+def _run_subset_simulation(response: Response, seed: int) -> tuple[float, float, list[float]]:
     """Probability, coefficient of variation and thresholds of a subset simulation."""
-    ot, stop_flag = openturns(), [False]
-    algorithm = ot.SubsetSampling(_event(ot, response, response.dimensions), PROPOSAL_WIDTH, LEVEL_SHARE)
+    ot, is_stagnant = load_openturns(), False
+    algorithm = ot.SubsetSampling(_failure_event(ot, response, response.dimensions), PROPOSAL_WIDTH, LEVEL_SHARE)
     algorithm.setBlockSize(round(LEVEL_SHARE * LEVEL_SIZE))
     algorithm.setMaximumOuterSampling(round(1 / LEVEL_SHARE))
     algorithm.setMaximumCoefficientOfVariation(-1.0)
     algorithm.setMinimumProbability(MIN_PROBABILITY)
 
     def level_stagnates() -> bool:
+        nonlocal is_stagnant
         thresholds = list(algorithm.getThresholdPerStep())
-        stop_flag[0] = len(thresholds) > 1 and thresholds[-1] > 0 and thresholds[-1] == thresholds[-2]
-        return stop_flag[0]
+        is_stagnant = len(thresholds) > 1 and thresholds[-1] > 0 and thresholds[-1] == thresholds[-2]
+        return is_stagnant
 
     algorithm.setStopCallback(level_stagnates)
     ot.RandomGenerator.SetSeed(seed)
@@ -217,9 +219,9 @@ def _subset_simulation(response: Response, seed: int) -> tuple[float, float, lis
     except TypeError as error:  # OpenTURNS estimates a level's variance as a difference, which can fall below 0
         if "variance estimate" not in str(error):
             raise
-        return _subset_simulation(response, seed + 1)
+        return _run_subset_simulation(response, seed + 1)
     thresholds = [float(value) for value in algorithm.getThresholdPerStep()]
-    if stop_flag[0]:
+    if is_stagnant:
         raise PlateauError
     if thresholds[-1] > 0:
         return 0.0, 0.0, thresholds
@@ -227,10 +229,10 @@ def _subset_simulation(response: Response, seed: int) -> tuple[float, float, lis
     return float(result.getProbabilityEstimate()), float(result.getCoefficientOfVariation()), thresholds
 
 
-def _cross_entropy(response: Response, seed: int) -> tuple[float, float, list[float]]:
-    """As `_subset_simulation`, by cross-entropy importance sampling with one normal distribution of independent components."""
-    ot = openturns()
-    algorithm = ot.StandardSpaceCrossEntropyImportanceSampling(_event(ot, response, response.dimensions), 2 * LEVEL_SHARE)
+def _run_cross_entropy(response: Response, seed: int) -> tuple[float, float, list[float]]:
+    """As `_run_subset_simulation`, by cross-entropy importance sampling with one normal distribution of independent components."""
+    ot = load_openturns()
+    algorithm = ot.StandardSpaceCrossEntropyImportanceSampling(_failure_event(ot, response, response.dimensions), 2 * LEVEL_SHARE)
     algorithm.setBlockSize(LEVEL_SIZE)
     algorithm.setMaximumOuterSampling(1)
     algorithm.setMaximumCoefficientOfVariation(-1.0)
@@ -242,11 +244,11 @@ def _cross_entropy(response: Response, seed: int) -> tuple[float, float, list[fl
 
 
 def _remark_on_islands(response: Response, thresholds: list[float], rng: np.random.Generator) -> str:
-    """Remark on islands of failures with safe settings between them; straight paths within an island stay near failure."""
+    """A remark if failures lie on islands with safe settings between them: straight paths between islands do not stay near failure."""
     failures = response.failures
     if len(failures) < 2:
         return ""
-    nodes = _distant_points(failures[rng.permutation(len(failures))[:2000]])
+    nodes = _select_distant_points(failures[rng.permutation(len(failures))[:2000]])
     first, second = np.triu_indices(len(nodes), 1)
     shares = np.linspace(0, 1, PATH_POINTS + 2)[1:-1]
     paths = nodes[first, np.newaxis] * (1 - shares[:, np.newaxis]) + nodes[second, np.newaxis] * shares[:, np.newaxis]
@@ -256,14 +258,14 @@ def _remark_on_islands(response: Response, thresholds: list[float], rng: np.rand
     limit = levels[len(levels) // 2] if levels else 0.0
     links = np.eye(len(nodes), dtype=bool)
     links[first, second] = links[second, first] = peaks <= limit
-    number, _ = scipy.sparse.csgraph.connected_components(links)
-    if number < 2:
+    island_count, _ = scipy.sparse.csgraph.connected_components(links)
+    if island_count < 2:
         return ""
-    return (f"failures lie on {number} islands with safe settings between them, and this method may have missed others; "
+    return (f"failures lie on {island_count} islands with safe settings between them, and this method may have missed others; "
             "--method monte_carlo misses none, with many samples")
 
 
-def _distant_points(points: FloatArray) -> FloatArray:
+def _select_distant_points(points: FloatArray) -> FloatArray:
     """Points far from each other: each has the largest distance from all previously chosen points."""
     indices = [int(np.argmin(np.linalg.norm(points, axis=1)))]
     distance = np.linalg.norm(points - points[indices[0]], axis=1)
@@ -273,18 +275,18 @@ def _distant_points(points: FloatArray) -> FloatArray:
     return points[indices]
 
 
-def _design_point(response: Response, rng: np.random.Generator) -> FloatArray | None:
+def _find_design_point(response: Response, rng: np.random.Generator) -> FloatArray | None:
     """The failure nearest to the origin, searched between the nearest known failure and the origin, and around that failure."""
     if not len(response.failures):
         return None
     nearest, response.stage = _nearest_point(response.failures), "most probable failure"
-    for number in range(SEARCH_ROUNDS):
+    for search_round in range(SEARCH_ROUNDS):
         inner_points = nearest * np.linspace(0.5, 1.0, SEARCH_SETTINGS)[:, np.newaxis]
         random_points = (nearest * (1 - 0.05 * rng.random((SEARCH_SETTINGS, 1)))
-                         + rng.normal(size=(SEARCH_SETTINGS, response.dimensions)) * 0.4 / 2**number)
+                         + rng.normal(size=(SEARCH_SETTINGS, response.dimensions)) * 0.4 / 2**search_round)
         for points in (inner_points, random_points):
-            unsafe: BoolArray = response(points) < 0
-            nearest = _nearest_point(np.vstack([nearest, points[unsafe]]))
+            is_unsafe: BoolArray = response(points) < 0
+            nearest = _nearest_point(np.vstack([nearest, points[is_unsafe]]))
     return nearest
 
 

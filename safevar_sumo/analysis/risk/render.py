@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from rich.console import Console
 
-from safevar_sumo.analysis.figures import CHANGED, FONT, NECESSARY, literal, new_figure
-from safevar_sumo.analysis.risk.compute import FLEET, Risk
+from safevar_sumo.analysis.figures import BLUE, FONT, GREY, escape_dollars, new_figure
+from safevar_sumo.analysis.risk.compute import FLEET_VEHICLES, Risk
 from safevar_sumo.analysis.risk.rare import RARE_BELOW
 from safevar_sumo.errors import InputError
 from safevar_sumo.study import Study
@@ -32,12 +32,12 @@ def print_risk(console: Console, result: Risk) -> None:
     if result.remark:
         print_text(console, f"note: {result.remark}.")
     if result.design_point is not None:
-        values = ", ".join(f"{member.name} = {member.text(result.design_point[member.name])}{member.suffix}"
-                           for member in CharacteristicSet.of(result.study.vehicle.characteristics))
+        values = ", ".join(f"{characteristic.name} = {characteristic.text(result.design_point[characteristic.name])}{characteristic.suffix}"
+                           for characteristic in CharacteristicSet.of(result.study.vehicle.characteristics))
         print_text(console, f"The most probable failure: {values}.")
     if not result.of_domain and 0 < result.probability < RARE_BELOW:
-        print_text(console, f"Of {FLEET:,} vehicles that vary independently at least one is unsafe with probability "
-                            f"{result.of_fleet(FLEET):.2g}.")
+        print_text(console, f"Of {FLEET_VEHICLES:,} vehicles that vary independently at least one is unsafe with probability "
+                            f"{result.of_fleet(FLEET_VEHICLES):.2g}.")
     if result.of_domain:
         print_text(console, "warning: this is no probability in the field: the study has no [variation] table for how real vehicles vary.")
     print_text(console, _how_vehicles_vary(result.study))
@@ -49,7 +49,8 @@ def print_risk(console: Console, result: Risk) -> None:
     unsafe_indices = result.sensitivity_of_unsafe.set_index("characteristic")
     for row in result.sensitivity.sort_values("total", ascending=False, kind="stable").to_dict("records"):
         unsafe_row = unsafe_indices.loc[row["characteristic"]]
-        table.add_row(row["characteristic"], *(_index(indices, name) for indices in (row, unsafe_row) for name in ("first_order", "total")))
+        table.add_row(row["characteristic"], *(_index_in_words(indices, name) for indices in (row, unsafe_row)
+                                               for name in ("first_order", "total")))
     console.print(table)
     if result.sensitivity_of_unsafe["total"].isna().all():
         print_text(console, "Too few settings are unsafe, or safe, for indices of being unsafe; see those of the safety degree.")
@@ -60,13 +61,14 @@ def print_risk(console: Console, result: Risk) -> None:
 
 def _how_vehicles_vary(study: Study) -> str:
     """How vehicles vary, in a sentence."""
-    laws = [f"{name} {law.__struct_config__.tag}" for name, law in study.variation.items() if law != Uniform()]
+    not_uniform = [f"{name} {distribution.__struct_config__.tag}"
+                   for name, distribution in study.variation.items() if distribution != Uniform()]
     pairs = ", ".join(f"{' with '.join(correlation.between)} {correlation.value:g}" for correlation in study.correlations)
-    manner = f"as the study specifies: {'; '.join(laws)}; the others uniformly" if laws else "uniformly over the whole domain"
+    manner = f"as the study specifies: {'; '.join(not_uniform)}; the others uniformly" if not_uniform else "uniformly over the whole domain"
     return f"They vary {manner}{f', correlated: {pairs}' if pairs else ''}."
 
 
-def _index(row: object, name: str) -> str:
+def _index_in_words(row: object, name: str) -> str:
     value, low, high = (float(row[f"{name}{end}"]) for end in ("", "_lower", "_upper"))  # type: ignore[index]
     return "-" if math.isnan(value) else f"{value:.2f} ±{(high - low) / 2:.2f}"
 
@@ -88,12 +90,12 @@ def sensitivity_figure(result: Risk) -> Figure:
     frames = {"safety degree": result.sensitivity, f"unsafe ({result.unsafe})": result.sensitivity_of_unsafe}
     for axis, (output, frame) in zip(axes, frames.items(), strict=True):
         rows = frame.set_index("characteristic").loc[names]
-        for column, label, colour, shift in (("total", "total: with all others", CHANGED, 0.2), ("first_order", "alone", NECESSARY, -0.2)):
+        for column, label, colour, shift in (("total", "total: with all others", GREY, 0.2), ("first_order", "alone", BLUE, -0.2)):
             width = (rows[f"{column}_upper"] - rows[column]).clip(lower=0)
             axis.barh(np.arange(len(names)) + shift, rows[column], height=0.36, color=colour, xerr=width, label=label,
                       error_kw={"elinewidth": 0.8, "ecolor": "black"})
-        axis.set_yticks(np.arange(len(names)), [literal(name) for name in names])
-        axis.set_title(literal(output), fontsize=FONT)
+        axis.set_yticks(np.arange(len(names)), [escape_dollars(name) for name in names])
+        axis.set_title(escape_dollars(output), fontsize=FONT)
         axis.set_xlabel("share of the variance [-]")
         axis.set_xlim(0, 1)
         if rows["total"].isna().all():

@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
-from safevar_sumo.analysis.options import Options, documented, option, unsafe_option
+from safevar_sumo.analysis.options import Options, document_options, option, unsafe_option
 from safevar_sumo.analysis.subject import Results, answer_question, study_of
 from safevar_sumo.study import StudyLike
 
@@ -29,7 +29,7 @@ class RulesOptions(Options):
     unsafe: str | None = unsafe_option()
 
 
-@documented(RulesOptions)
+@document_options(RulesOptions)
 def rules(study: StudyLike | Results, *, samples: int = RulesOptions.samples, unsafe: Criterion | None = None, pool: Pool | None = None,
           jobs: int | None = None, progress: bool | Progress = False, as_it_is_now: bool = False) -> Rules:
     """Find rules in physical units that say where a study is unsafe.

@@ -16,9 +16,9 @@ import numpy as np
 import pandas as pd
 from rich.console import Console
 
-from safevar_sumo.analysis.evaluator import CONFIDENCE, Evaluator, Progress, clopper_pearson, open_evaluator, silent
+from safevar_sumo.analysis.evaluator import CONFIDENCE, Evaluator, Progress, clopper_pearson, open_evaluator, show_no_progress
 from safevar_sumo.analysis.rules import RulesOptions
-from safevar_sumo.analysis.words import joined
+from safevar_sumo.analysis.words import join_phrases
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray
 from safevar_sumo.study import Study
@@ -28,22 +28,24 @@ from safevar_sumo.workers.evaluation import Pool
 
 MIN_SETTINGS = 10
 """Minimum number of unsafe settings, and of safe settings, that rules need."""
-FOLDS, MAX_DEPTH, PRUNINGS = 5, 6, 24
+FOLDS, MAX_DEPTH, MAX_PRUNINGS = 5, 6, 24
 """Number of folds of the cross-validation; maximum depth of the tree; maximum number of prunings compared."""
 MIN_ADDED_SHARE = 0.01
 """Share of the unsafe settings that a rule must cover in addition to the rules before it."""
-DIGITS = 3
+LIMIT_DIGITS = 3
 """Limits are rounded to this many digits of the domain's width."""
 Limits = dict[int, tuple[float | None, float | None]]
-"""Lower and upper limit by column; None if a side is open."""
+"""Lower and upper limit by column; None if there is no such limit."""
 
 
 @dataclass(frozen=True)
 class Rule:
-    """A box of settings, and how dense unsafe settings are in the box; `limits` are lower and upper limits by name, None if a side is open.
+    """A box of settings, and how dense unsafe settings are in it.
 
     Attributes
     ----------
+    limits
+        Lower and upper limit by name; None if there is no such limit.
     inside, unsafe_inside, unsafe_everywhere
         Numbers of validation settings: inside the box, unsafe inside the box, and unsafe in the whole domain.
     """
@@ -116,7 +118,7 @@ class Rules:
 
 
 def find_rules(study: Study, options: RulesOptions, *, pool: Pool | None = None, jobs: int | None = None,
-               progress: Progress = silent) -> Rules:
+               progress: Progress = show_no_progress) -> Rules:
     """Find rules that say where a study is unsafe, from settings spread evenly over the whole domain.
 
     Raises
@@ -124,58 +126,58 @@ def find_rules(study: Study, options: RulesOptions, *, pool: Pool | None = None,
     InputError
         If `unsafe` cannot be used, or the study cannot be assembled.
     """
-    members = CharacteristicSet.of(study.vehicle.characteristics)
+    characteristics = CharacteristicSet.of(study.vehicle.characteristics)
     with open_evaluator(study, pool, jobs, progress) as evaluator:
-        unsafe = evaluator.criterion(options.unsafe)
-        training, validation = (_design(evaluator, options.samples // 2, study.search.seed + half) for half in (1, 2))
+        unsafe = evaluator.choose_criterion(options.unsafe)
+        training, validation = (_evaluate_design(evaluator, options.samples // 2, study.search.seed + half) for half in (1, 2))
     is_unsafe, is_unsafe_validation = unsafe.of(training), unsafe.of(validation)
-    number = int(np.count_nonzero(is_unsafe))
+    unsafe_count = int(np.count_nonzero(is_unsafe))
     remark, boxes = "", list[Limits]()
-    if number == len(is_unsafe) > 0:
+    if unsafe_count == len(is_unsafe) > 0:
         boxes = [{}]
-    elif min(number, len(is_unsafe) - number) < MIN_SETTINGS:
-        remark = (f"{number} of {len(is_unsafe)} settings are unsafe: rules need at least {MIN_SETTINGS} unsafe and as many safe settings "
-                  "(run `rules --samples N` for more)")
+    elif min(unsafe_count, len(is_unsafe) - unsafe_count) < MIN_SETTINGS:
+        remark = (f"{unsafe_count} of {len(is_unsafe)} settings are unsafe: rules need at least {MIN_SETTINGS} unsafe and as many safe "
+                  "settings (run `rules --samples N` for more)")
     else:
-        boxes = _boxes(training.settings, is_unsafe, members)
-    rules = [_validated_rule(limits, validation.settings, is_unsafe_validation, members) for limits in boxes]
+        boxes = _find_boxes(training.settings, is_unsafe, characteristics)
+    rules = [_validate_rule(limits, validation.settings, is_unsafe_validation, characteristics) for limits in boxes]
     return Rules(study=study, unsafe=unsafe, rules=sorted(rules, key=lambda rule: -rule.unsafe_inside), remark=remark,
                  samples=len(training) + len(validation), unsafe_share=float(np.mean(np.concatenate([is_unsafe, is_unsafe_validation]))))
 
 
-def _design(evaluator: Evaluator, number: int, seed: int) -> Evaluations:
+def _evaluate_design(evaluator: Evaluator, number: int, seed: int) -> Evaluations:
     """Evaluations of settings over the whole domain, without the settings that could not be simulated."""
-    evaluations = evaluator.evaluate(evaluator.feasible_design(number, seed), "settings over the whole domain")
+    evaluations = evaluator.evaluate(evaluator.feasible_settings(number, seed), "settings over the whole domain")
     return evaluations.take(evaluations.valid)
 
 
-def _boxes(settings: FloatArray, unsafe: BoolArray, members: CharacteristicSet) -> list[Limits]:
+def _find_boxes(settings: FloatArray, unsafe: BoolArray, characteristics: CharacteristicSet) -> list[Limits]:
     """The distinct boxes that become rules."""
-    tree = _pruned_tree((settings - members.lower) / (members.upper - members.lower), unsafe)
-    leaves = [(_rounded_limits(limits, members), density) for limits, density in _leaves(tree, members)]
+    tree = _fit_pruned_tree((settings - characteristics.lower) / (characteristics.upper - characteristics.lower), unsafe)
+    leaves = [(_round_limits(limits, characteristics), density) for limits, density in _boxes_of_leaves(tree, characteristics)]
     dense_boxes = [limits for limits, density in leaves if density > 0.5] or [max(leaves, key=lambda leaf: leaf[1])[0]]
-    short_boxes = [_without_useless_conditions(limits, settings, unsafe) for limits in dense_boxes]
-    return _ordered_by_coverage(short_boxes, settings, unsafe)
+    simple_boxes = [_drop_useless_conditions(limits, settings, unsafe) for limits in dense_boxes]
+    return _order_by_coverage(simple_boxes, settings, unsafe)
 
 
-def _pruned_tree(shares: FloatArray, unsafe: BoolArray) -> Any:
+def _fit_pruned_tree(inputs: FloatArray, unsafe: BoolArray) -> Any:
     """The smallest tree whose cross-validated Brier score is within a standard error of the best score."""
     from sklearn.model_selection import StratifiedKFold, cross_val_score  # takes a second to load
     from sklearn.tree import DecisionTreeClassifier
 
-    def tree(pruning: float) -> Any:
+    def new_tree(pruning: float) -> Any:
         return DecisionTreeClassifier(max_depth=MAX_DEPTH, min_samples_leaf=MIN_SETTINGS // 2, ccp_alpha=pruning, random_state=0)
 
-    path = np.unique(np.maximum(tree(0.0).cost_complexity_pruning_path(shares, unsafe).ccp_alphas, 0.0))[:-1]
-    prunings = path[np.unique(np.linspace(0, len(path) - 1, PRUNINGS).round().astype(int))] if len(path) else np.zeros(1)
+    path = np.unique(np.maximum(new_tree(0.0).cost_complexity_pruning_path(inputs, unsafe).ccp_alphas, 0.0))[:-1]
+    prunings = path[np.unique(np.linspace(0, len(path) - 1, MAX_PRUNINGS).round().astype(int))] if len(path) else np.zeros(1)
     folds = StratifiedKFold(FOLDS, shuffle=True, random_state=0)
-    scores = np.array([cross_val_score(tree(pruning), shares, unsafe, cv=folds, scoring="neg_brier_score") for pruning in prunings])
+    scores = np.array([cross_val_score(new_tree(pruning), inputs, unsafe, cv=folds, scoring="neg_brier_score") for pruning in prunings])
     means, errors = scores.mean(axis=1), scores.std(axis=1, ddof=1) / math.sqrt(FOLDS)
     best = int(np.argmax(means))
-    return tree(prunings[np.flatnonzero(means >= means[best] - errors[best])[-1]]).fit(shares, unsafe)
+    return new_tree(prunings[np.flatnonzero(means >= means[best] - errors[best])[-1]]).fit(inputs, unsafe)
 
 
-def _leaves(tree: Any, members: CharacteristicSet) -> list[tuple[Limits, float]]:
+def _boxes_of_leaves(tree: Any, characteristics: CharacteristicSet) -> list[tuple[Limits, float]]:
     """The boxes of a tree, each with its share of unsafe settings."""
     nodes, boxes = tree.tree_, []
     stack: list[tuple[int, Limits]] = [(0, {})]
@@ -186,31 +188,31 @@ def _leaves(tree: Any, members: CharacteristicSet) -> list[tuple[Limits, float]]
             boxes.append((limits, float(counts[-1] / counts.sum())))
             continue
         column = int(nodes.feature[node])
-        cut = float(members.lower[column] + nodes.threshold[node] * (members.upper - members.lower)[column])
+        cut = float(characteristics.lower[column] + nodes.threshold[node] * (characteristics.upper - characteristics.lower)[column])
         low, high = limits.get(column, (None, None))
         stack.append((int(nodes.children_left[node]), {**limits, column: (low, cut)}))
         stack.append((int(nodes.children_right[node]), {**limits, column: (cut, high)}))
     return boxes
 
 
-def _rounded_limits(limits: Limits, members: CharacteristicSet) -> Limits:
-    """Limits rounded to `DIGITS` of the domain's width, in the order of the characteristics."""
+def _round_limits(limits: Limits, characteristics: CharacteristicSet) -> Limits:
+    """Limits rounded to `LIMIT_DIGITS` of the domain's width, in the order of the characteristics."""
     def rounded(value: float | None, width: float) -> float | None:
-        return None if value is None else round(value, DIGITS - 1 - math.floor(math.log10(width)))
+        return None if value is None else round(value, LIMIT_DIGITS - 1 - math.floor(math.log10(width)))
 
-    widths = members.upper - members.lower
+    widths = characteristics.upper - characteristics.lower
     return {column: (rounded(limits[column][0], widths[column]), rounded(limits[column][1], widths[column])) for column in sorted(limits)}
 
 
-def _without_useless_conditions(limits: Limits, settings: FloatArray, unsafe: BoolArray) -> Limits:
+def _drop_useless_conditions(limits: Limits, settings: FloatArray, unsafe: BoolArray) -> Limits:
     """Drop conditions while the lower bound of the density does not fall."""
     def least_density(box: Limits) -> float:
-        inside = within(box, settings)
+        inside = is_within(box, settings)
         count = int(np.count_nonzero(inside))
         return clopper_pearson(int(np.count_nonzero(unsafe & inside)), count)[0] if count else 0.0
 
     while limits:
-        candidates = [{column: ends for column, ends in limits.items() if column != condition} for condition in limits]
+        candidates = [{column: ends for column, ends in limits.items() if column != dropped} for dropped in limits]
         best = max(candidates, key=least_density)
         if least_density(best) < least_density(limits):
             break
@@ -218,19 +220,19 @@ def _without_useless_conditions(limits: Limits, settings: FloatArray, unsafe: Bo
     return limits
 
 
-def _ordered_by_coverage(boxes: list[Limits], settings: FloatArray, unsafe: BoolArray) -> list[Limits]:
-    """Boxes in order of coverage, without boxes that add few unsafe settings to the boxes before them; at least one box."""
+def _order_by_coverage(boxes: list[Limits], settings: FloatArray, unsafe: BoolArray) -> list[Limits]:
+    """Order boxes by coverage, and drop boxes that add few unsafe settings to the boxes before them, but not the first box."""
     chosen: list[Limits] = []
     uncovered = unsafe.copy()
-    for limits in sorted(boxes, key=lambda box: -np.count_nonzero(unsafe & within(box, settings))):
-        inside = within(limits, settings)
+    for limits in sorted(boxes, key=lambda box: -np.count_nonzero(unsafe & is_within(box, settings))):
+        inside = is_within(limits, settings)
         if not chosen or np.count_nonzero(uncovered & inside) >= MIN_ADDED_SHARE * np.count_nonzero(unsafe):
             chosen.append(limits)
             uncovered &= ~inside
     return chosen
 
 
-def within(limits: Limits, settings: FloatArray) -> BoolArray:
+def is_within(limits: Limits, settings: FloatArray) -> BoolArray:
     """Whether each of M settings lies within limits; shape (M,)."""
     inside = np.ones(len(settings), dtype=bool)
     for column, (low, high) in limits.items():
@@ -238,16 +240,16 @@ def within(limits: Limits, settings: FloatArray) -> BoolArray:
     return inside
 
 
-def _validated_rule(limits: Limits, settings: FloatArray, unsafe: BoolArray, members: CharacteristicSet) -> Rule:
-    """A rule with its numbers of validation settings."""
-    inside = within(limits, settings)
-    return Rule({members.names[column]: ends for column, ends in limits.items()}, int(np.count_nonzero(inside)),
+def _validate_rule(limits: Limits, settings: FloatArray, unsafe: BoolArray, characteristics: CharacteristicSet) -> Rule:
+    """The rule of a box, with the numbers of validation settings."""
+    inside = is_within(limits, settings)
+    return Rule({characteristics.names[column]: ends for column, ends in limits.items()}, int(np.count_nonzero(inside)),
                 int(np.count_nonzero(inside & unsafe)), int(np.count_nonzero(unsafe)), CONFIDENCE)
 
 
 def print_rules(console: Console, result: Rules) -> None:
-    """Every rule with its density and coverage."""
-    members = CharacteristicSet.of(result.study.vehicle.characteristics)
+    """Print every rule with its density and coverage."""
+    characteristics = CharacteristicSet.of(result.study.vehicle.characteristics)
     print_text(console, result.study.title)
     print_text(console, f"Unsafe: {result.unsafe}; {result.unsafe_share:.2%} of {result.samples} settings all over the domain.")
     print_constraints(console, result.study)
@@ -256,22 +258,24 @@ def print_rules(console: Console, result: Rules) -> None:
     elif not result.rules:
         print_text(console, "Nothing unsafe found.")
     for rule in result.rules:
-        print_text(console, f"- {rule_in_words(rule, members, result.unsafe)}")
+        print_text(console, f"- {rule_in_words(rule, characteristics, result.unsafe)}")
     if result.rules:
-        print_meanings(console, [member for member in members if any(member.name in rule.limits for rule in result.rules)])
+        named = {name for rule in result.rules for name in rule.limits}
+        print_meanings(console, [characteristic for characteristic in characteristics if characteristic.name in named])
         print_text(console, f"Tested on settings that did not form the rules; in brackets {result.rules[0].confidence:.0%} intervals.")
 
 
 def rule_in_words(rule: Rule, characteristics: CharacteristicSet, unsafe: Unsafe) -> str:
     """A rule with its density and coverage: `tireFric below 1.35 and gearSwitchTime above 0.55 s: collides in 92% (..), covers 61%`."""
-    conditions = [_condition(member, *rule.limits[member.name]) for member in characteristics if member.name in rule.limits]
+    conditions = [_condition_in_words(characteristic, *rule.limits[characteristic.name])
+                  for characteristic in characteristics if characteristic.name in rule.limits]
     shares = [f"{word} {share:.0%} ({interval[0]:.0%} to {interval[1]:.0%})" if share is not None and interval is not None else f"{word} -"
               for word, share, interval in ((f"{unsafe.in_words} in", rule.density, rule.density_interval),
                                             ("covers", rule.coverage, rule.coverage_interval))]
-    return f"{joined(conditions) if conditions else 'everywhere'}: {', '.join(shares)}"
+    return f"{join_phrases(conditions) if conditions else 'everywhere'}: {', '.join(shares)}"
 
 
-def _condition(member: Characteristic, low: float | None, high: float | None) -> str:
+def _condition_in_words(characteristic: Characteristic, low: float | None, high: float | None) -> str:
     if low is not None and high is not None:
-        return f"{member.name} from {low:g} to {high:g}{member.suffix}"
-    return f"{member.name} {f'below {high:g}' if low is None else f'above {low:g}'}{member.suffix}"
+        return f"{characteristic.name} from {low:g} to {high:g}{characteristic.suffix}"
+    return f"{characteristic.name} {f'below {high:g}' if low is None else f'above {low:g}'}{characteristic.suffix}"

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
-from safevar_sumo.analysis.options import Options, documented, option, unsafe_option
+from safevar_sumo.analysis.options import Options, document_options, option, unsafe_option
 from safevar_sumo.analysis.subject import Results, answer_question, study_of
 from safevar_sumo.study import StudyLike
 
@@ -32,7 +32,7 @@ class ToleranceOptions(Options):
     pairs: bool = option(False, "Evaluate every pair too.", kind=bool)
 
 
-@documented(ToleranceOptions)
+@document_options(ToleranceOptions)
 def tolerance(study: StudyLike | Results, *, unsafe: Criterion | None = None, characteristics: Sequence[str] | None = None,
               pairs: bool = ToleranceOptions.pairs, pool: Pool | None = None, jobs: int | None = None, progress: bool | Progress = False,
               as_it_is_now: bool = False) -> Tolerance:

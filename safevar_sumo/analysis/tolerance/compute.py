@@ -12,9 +12,9 @@ import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
-from safevar_sumo.analysis.evaluator import Evaluator, Progress, open_evaluator, silent
+from safevar_sumo.analysis.evaluator import Evaluator, Progress, open_evaluator, show_no_progress
 from safevar_sumo.analysis.tolerance import ToleranceOptions
-from safevar_sumo.analysis.tolerance.joint import Pair, SafeBox, no_box, planes, safe_box
+from safevar_sumo.analysis.tolerance.joint import Pair, SafeBox, find_safe_box, no_safe_box, scan_pairs
 from safevar_sumo.errors import InputError, unknown
 from safevar_sumo.metrics import RATING_POINTS, Unsafe
 from safevar_sumo.protocol.rater import is_rated
@@ -23,13 +23,14 @@ from safevar_sumo.study import SAFETY_DEGREE, Study
 from safevar_sumo.vehicles import Characteristic
 from safevar_sumo.workers.evaluation import Pool
 
-VALUES, RATED_VALUES = 201, 33
-"""Number of values over the domain, besides the original value; smaller in a rated study, where each value takes a whole matrix."""
+SCAN_VALUES, RATED_SCAN_VALUES = 201, 33
+"""Number of values over the domain, besides the original value; fewer in a rated study, where each value takes a whole matrix."""
 PARTS_PER_ROUND, ROUNDS, RATED_ROUNDS = 8, 4, 1
-"""A round divides each interval with a change of state into so many parts; number of rounds, and of rounds in a rated study."""
-WHOLE_POINT, POINT_ROUNDING = 1 - 1e-6, 1e-9
-"""A loss of points above the first number counts as a whole point; a loss up to the second number is a rounding error."""
-SAFE, UNSAFE, NOT_SIMULATED, INFEASIBLE = range(4)  # states of a value
+"""Number of parts into which a round divides each interval with a change of state; number of rounds, and of rounds in a rated study."""
+WHOLE_POINT_LOSS, POINT_ROUNDING = 1 - 1e-6, 1e-9
+"""A loss of rating points above the first number counts as a whole point; a loss up to the second number is a rounding error."""
+SAFE_STATE, UNSAFE_STATE, NOT_SIMULATED_STATE, INFEASIBLE_STATE = range(4)
+"""States of a value."""
 Interval = tuple[float, float]
 
 
@@ -47,62 +48,63 @@ class OneAtATimeScan:
     characteristic: Characteristic
     profile: pd.DataFrame
 
-    def _intervals(self, state: int) -> list[pd.DataFrame]:
-        """The parts of the profile in one state, in the order of the values."""
-        runs = groupby(enumerate(_states(self.profile).tolist()), key=lambda item: item[1])
-        return [self.profile.iloc[[index for index, _ in run]] for value, run in runs if value == state]
+    def _sections(self, state: int) -> list[pd.DataFrame]:
+        """The sections of the profile in one state, in the order of the values."""
+        groups = groupby(enumerate(_states(self.profile).tolist()), key=lambda item: item[1])
+        return [self.profile.iloc[[index for index, _ in group]] for group_state, group in groups if group_state == state]
 
     @property
-    def _safe_part(self) -> pd.DataFrame | None:
+    def _safe_section(self) -> pd.DataFrame | None:
         """The safe values around the original."""
-        return next((part for part in self._intervals(SAFE) if (part["value"] == self.characteristic.original).any()), None)
+        return next((section for section in self._sections(SAFE_STATE) if (section["value"] == self.characteristic.original).any()), None)
 
     @property
     def safe(self) -> Interval | None:
         """The safe interval around the original; None if the original itself is unsafe."""
-        return None if self._safe_part is None else _ends(self._safe_part)
+        return None if self._safe_section is None else _interval_of(self._safe_section)
 
     @property
     def margins(self) -> tuple[float | None, float | None]:
         """Safety degrees at the ends of the safe interval [m]."""
-        if self._safe_part is None:
+        if self._safe_section is None:
             return None, None
-        low, high = self._safe_part[SAFETY_DEGREE].iloc[[0, -1]]
+        low, high = self._safe_section[SAFETY_DEGREE].iloc[[0, -1]]
         return finite_or_none(low), finite_or_none(high)
 
     @property
     def unsafe(self) -> list[Interval]:
         """All unsafe intervals, from the first to the last unsafe value of each."""
-        return [_ends(part) for part in self._intervals(UNSAFE)]
+        return [_interval_of(section) for section in self._sections(UNSAFE_STATE)]
 
     @property
     def not_simulated(self) -> list[Interval]:
         """All intervals that could not be simulated, in the form of `unsafe`."""
-        return [_ends(part) for part in self._intervals(NOT_SIMULATED)]
+        return [_interval_of(section) for section in self._sections(NOT_SIMULATED_STATE)]
 
     @property
     def infeasible(self) -> list[Interval]:
         """All intervals that violate a constraint of the study, in the form of `unsafe`."""
-        return [_ends(part) for part in self._intervals(INFEASIBLE)]
+        return [_interval_of(section) for section in self._sections(INFEASIBLE_STATE)]
 
     @property
     def points(self) -> list[tuple[float, float]] | None:
-        """Values in ascending order, each with the vehicle's points at this value; None if the study is not rated."""
+        """Values in ascending order, each with the vehicle's rating points at it; None if the study is not rated."""
         if RATING_POINTS.name not in self.profile:
             return None
         return list(zip(self.profile["value"].tolist(), self.profile[RATING_POINTS.name].tolist(), strict=True))
 
     def first_loss(self, points: float = 0.0) -> float | None:
-        """The value nearest to the original that loses more than `points` points; None if no value does."""
+        """The value nearest to the original that loses more than `points` rating points; None if no value does."""
         kept_points, original = self.points or [], self.characteristic.original
-        full = next((kept for value, kept in kept_points if value == original), math.nan)
-        losses = [value for value, kept in kept_points if full - kept > points + POINT_ROUNDING]
-        return min(losses, key=lambda value: abs(value - original), default=None)
+        original_points = next((kept for value, kept in kept_points if value == original), math.nan)
+        losing_values = [value for value, kept in kept_points if original_points - kept > points + POINT_ROUNDING]
+        return min(losing_values, key=lambda value: abs(value - original), default=None)
 
     def to_dict(self) -> dict[str, Any]:
-        """An entry of `alone` in `tolerance --json`; in a rated study with the points, and the values at which points are first lost."""
+        """An entry of `alone` in `tolerance --json`; in a rated study with points, and the values at which points are first lost."""
         rating_entries = {} if self.points is None else {
-            "points": [list(pair) for pair in self.points], "any_lost": self.first_loss(), "first_point_lost": self.first_loss(WHOLE_POINT)}
+            "points": [list(pair) for pair in self.points], "any_lost": self.first_loss(),
+            "first_point_lost": self.first_loss(WHOLE_POINT_LOSS)}
         return {**rating_entries,
                 "characteristic": self.characteristic.name, "unit": self.characteristic.unit, "original": self.characteristic.original,
                 "safe": None if self.safe is None else list(self.safe), "unsafe": [list(interval) for interval in self.unsafe],
@@ -110,51 +112,53 @@ class OneAtATimeScan:
                 **({"infeasible": [list(interval) for interval in self.infeasible]} if self.infeasible else {})}
 
 
-def _ends(part: pd.DataFrame) -> Interval:
-    return float(part["value"].iloc[0]), float(part["value"].iloc[-1])
+def _interval_of(section: pd.DataFrame) -> Interval:
+    return float(section["value"].iloc[0]), float(section["value"].iloc[-1])
 
 
 def scan(evaluator: Evaluator, columns: Sequence[int], unsafe: Unsafe) -> list[OneAtATimeScan]:
     """Scan the domains of some characteristics, one at a time."""
-    members = evaluator.characteristics.members
-    number, rounds = (RATED_VALUES, RATED_ROUNDS) if is_rated(evaluator.study) else (VALUES, ROUNDS)
-    values = [np.union1d(np.linspace(members[column].lower, members[column].upper, number), members[column].original) for column in columns]
-    profiles = _profiles(evaluator, columns, values, unsafe)
+    scanned = [evaluator.characteristics.members[column] for column in columns]
+    number, rounds = (RATED_SCAN_VALUES, RATED_ROUNDS) if is_rated(evaluator.study) else (SCAN_VALUES, ROUNDS)
+    values = [np.union1d(np.linspace(characteristic.lower, characteristic.upper, number), characteristic.original)
+              for characteristic in scanned]
+    profiles = _evaluate_profiles(evaluator, columns, values, unsafe)
     for _ in range(rounds):
         inner_values = [_values_between_states(profile) for profile in profiles]
         if not any(map(len, inner_values)):
             break
-        inner_profiles = _profiles(evaluator, columns, inner_values, unsafe)
+        inner_profiles = _evaluate_profiles(evaluator, columns, inner_values, unsafe)
         profiles = [pd.concat([profile, inner], ignore_index=True).sort_values("value", ignore_index=True)
                     for profile, inner in zip(profiles, inner_profiles, strict=True)]
-    return [OneAtATimeScan(characteristic=members[column], profile=profile) for column, profile in zip(columns, profiles, strict=True)]
+    return [OneAtATimeScan(characteristic=characteristic, profile=profile)
+            for characteristic, profile in zip(scanned, profiles, strict=True)]
 
 
 def _values_between_states(profile: pd.DataFrame) -> FloatArray:
     """New values between each two neighbouring values of different states."""
     values, states = profile["value"].to_numpy(), _states(profile)
-    changes = np.flatnonzero(states[1:] != states[:-1])
-    inner = values[changes][:, np.newaxis] + np.diff(values)[changes][:, np.newaxis] * np.arange(1, PARTS_PER_ROUND) / PARTS_PER_ROUND
+    rows = np.flatnonzero(states[1:] != states[:-1])
+    inner = values[rows][:, np.newaxis] + np.diff(values)[rows][:, np.newaxis] * np.arange(1, PARTS_PER_ROUND) / PARTS_PER_ROUND
     return np.setdiff1d(inner, values)
 
 
 def _states(profile: pd.DataFrame) -> npt.NDArray[np.int_]:
-    invalid_states = np.where(profile["outcome"] == Outcome.INFEASIBLE, INFEASIBLE, NOT_SIMULATED)
-    return np.where(profile["valid"], np.where(profile["unsafe"], UNSAFE, SAFE), invalid_states)
+    invalid_states = np.where(profile["outcome"] == Outcome.INFEASIBLE, INFEASIBLE_STATE, NOT_SIMULATED_STATE)
+    return np.where(profile["valid"], np.where(profile["unsafe"], UNSAFE_STATE, SAFE_STATE), invalid_states)
 
 
-def _profiles(evaluator: Evaluator, columns: Sequence[int], values: Sequence[FloatArray], unsafe: Unsafe) -> list[pd.DataFrame]:
+def _evaluate_profiles(evaluator: Evaluator, columns: Sequence[int], values: Sequence[FloatArray], unsafe: Unsafe) -> list[pd.DataFrame]:
     """The profile of each characteristic at its `values`."""
-    ends = np.cumsum([len(group) for group in values])
+    ends = np.cumsum([len(column_values) for column_values in values])
     settings = np.tile(evaluator.characteristics.original, (ends[-1], 1))
-    for column, group, end in zip(columns, values, ends, strict=True):
-        settings[end - len(group):end, column] = group
+    for column, column_values, end in zip(columns, values, ends, strict=True):
+        settings[end - len(column_values):end, column] = column_values
     evaluations = evaluator.evaluate(settings, "one characteristic at a time")
     frame = pd.DataFrame({"value": np.concatenate(values), SAFETY_DEGREE: evaluations.f_safe, "outcome": evaluations.outcome,
                           "unsafe": unsafe.of(evaluations), "valid": evaluations.valid})
     if RATING_POINTS.name in evaluations.metrics:
         frame[RATING_POINTS.name] = evaluations.metrics[RATING_POINTS.name]
-    return [frame.iloc[end - len(group):end].reset_index(drop=True) for group, end in zip(values, ends, strict=True)]
+    return [frame.iloc[end - len(column_values):end].reset_index(drop=True) for column_values, end in zip(values, ends, strict=True)]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -172,7 +176,7 @@ class Tolerance:
     def verdict(self) -> str:
         """One sentence on the characteristics and pairs that are unsafe by themselves."""
         single_names = [scan.characteristic.name for scan in self.alone if scan.unsafe]
-        unsafe_pairs = [" with ".join(member.name for member in pair.characteristics) for pair in self.pairs or []
+        unsafe_pairs = [" with ".join(characteristic.name for characteristic in pair.characteristics) for pair in self.pairs or []
                         if pair.nearest is not None]
         if self.unsafe.of(self.original)[0]:
             return "The original vehicle itself is unsafe."
@@ -208,7 +212,7 @@ class Tolerance:
 
 
 def find_tolerances(study: Study, options: ToleranceOptions, *, pool: Pool | None = None, jobs: int | None = None,
-                    progress: Progress = silent) -> Tolerance:
+                    progress: Progress = show_no_progress) -> Tolerance:
     """Find how far the characteristics of a study may go. The filter is not applied, as the question is about the vehicle.
 
     Raises
@@ -216,21 +220,21 @@ def find_tolerances(study: Study, options: ToleranceOptions, *, pool: Pool | Non
     InputError
         If `unsafe` or a name cannot be used, or the study cannot be assembled.
     """
-    columns = _columns(study, options.characteristics)
+    columns = _columns_of(study, options.characteristics)
     if options.pairs and len(columns) < 2:
         raise InputError("pairs", "one characteristic makes no pair", "at least two characteristics")
     with open_evaluator(study, pool, jobs, progress) as evaluator:
-        original = evaluator.original()
-        unsafe = evaluator.criterion(options.unsafe, original)
+        original = evaluator.evaluate_original()
+        unsafe = evaluator.choose_criterion(options.unsafe, original)
         scans = scan(evaluator, columns, unsafe)
-        pairs = planes(evaluator, columns, unsafe) if options.pairs else None
-        has_box = not unsafe.of(original)[0] and not is_rated(study)  # a box of a rated study would take thousands of whole matrices
-        box = (safe_box(evaluator, columns, unsafe, _unsafe_settings(evaluator, scans, pairs or [])) if has_box
-               else no_box(evaluator, columns))
+        pairs = scan_pairs(evaluator, columns, unsafe) if options.pairs else None
+        needs_box = not unsafe.of(original)[0] and not is_rated(study)  # a box of a rated study would take thousands of whole matrices
+        box = (find_safe_box(evaluator, columns, unsafe, _unsafe_settings(evaluator, scans, pairs or [])) if needs_box
+               else no_safe_box(evaluator, columns))
     return Tolerance(study=study, unsafe=unsafe, original=original, alone=scans, pairs=pairs, joint=box)
 
 
-def _columns(study: Study, characteristics: Sequence[str] | None) -> list[int]:
+def _columns_of(study: Study, characteristics: Sequence[str] | None) -> list[int]:
     names, chosen = list(study.vehicle.characteristics), characteristics or ()
     for name in chosen:
         if name not in names:
@@ -243,6 +247,7 @@ def _columns(study: Study, characteristics: Sequence[str] | None) -> list[int]:
 def _unsafe_settings(evaluator: Evaluator, scans: Sequence[OneAtATimeScan], pairs: Sequence[Pair]) -> FloatArray:
     """The K unsafe settings of scans and pairs, shape (K, n)."""
     changes = [{scan.characteristic.name: value} for scan in scans for interval in scan.unsafe for value in interval]
-    changes += [dict(zip((member.name for member in pair.characteristics), pair.nearest, strict=True)) for pair in pairs if pair.nearest]
+    changes += [dict(zip((characteristic.name for characteristic in pair.characteristics), pair.nearest, strict=True))
+                for pair in pairs if pair.nearest]
     original = dict(zip(evaluator.characteristics.names, evaluator.characteristics.original.tolist(), strict=True))
     return np.array([list({**original, **values}.values()) for values in changes]).reshape(-1, len(original))

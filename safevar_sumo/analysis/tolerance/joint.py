@@ -13,18 +13,18 @@ import numpy.typing as npt
 import scipy
 
 from safevar_sumo.analysis.evaluator import CONFIDENCE, Evaluator, sobol_points
-from safevar_sumo.analysis.explain.causes import Line, first_unsafe_shares
+from safevar_sumo.analysis.explain.causes import Line, find_first_unsafe_shares
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.vehicles import Characteristic
 
-SIDE = 21
+GRID_VALUES = 21
 """Number of values of each of the two characteristics, evenly spaced over its domain, ends included."""
-PARTS, ROUNDS, SQUARES = 4, 4, 12
-"""Search for the nearest unsafe setting: parts of a divided square's side, rounds of division (down to a 5120th of the domain), and maximum
-number of squares divided per plane and round."""
+PARTS_PER_SIDE, ROUNDS, MAX_SQUARES = 4, 4, 12
+"""Search for the nearest unsafe setting: number of parts of a divided square's side, of rounds (down to a 5120th of the domain),
+and maximum number of squares divided in a plane in each round."""
 
-_WEIGHT = np.outer(*[np.where(np.isin(np.arange(SIDE), (0, SIDE - 1)), 0.5, 1.0)] * 2)
+_TRAPEZOIDAL_WEIGHTS = np.outer(*[np.where(np.isin(np.arange(GRID_VALUES), (0, GRID_VALUES - 1)), 0.5, 1.0)] * 2)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,10 +34,10 @@ class Pair:
     Attributes
     ----------
     values
-        Values of both characteristics, shape (2, SIDE), each in its unit.
+        Values of both characteristics, shape (2, GRID_VALUES), each in its unit.
     safety_degree, unsafe, valid, infeasible
-        Results on the grid [m, or -m/s], shape (SIDE, SIDE), with the first characteristic on axis 0. A setting that is not valid could
-        not be simulated, or violates a constraint (`infeasible`), and is neither safe nor unsafe.
+        Evaluations on the grid, shape (GRID_VALUES, GRID_VALUES), with the first characteristic on axis 0; safety degrees in m, or -m/s.
+        A setting that is not valid could not be simulated, or violates a constraint (`infeasible`), and is neither safe nor unsafe.
     nearest
         The two values of the unsafe setting that is nearest to the original by distance in domain widths, exact to a 5120th of them; None
         if no setting of the grid is unsafe. Unsafe settings that lie only between safe values of the grid are not found.
@@ -54,50 +54,50 @@ class Pair:
     @property
     def unsafe_share(self) -> float:
         """Unsafe share of the simulated part of the plane, by the trapezoidal rule."""
-        weight = np.sum(_WEIGHT * self.valid)
-        return float(np.sum(_WEIGHT * self.unsafe) / weight) if weight else 0.0
+        weight = np.sum(_TRAPEZOIDAL_WEIGHTS * self.valid)
+        return float(np.sum(_TRAPEZOIDAL_WEIGHTS * self.unsafe) / weight) if weight else 0.0
 
     @property
     def not_simulated_share(self) -> float:
         """Share of the plane that could not be simulated, by the same rule."""
-        return float(np.sum(_WEIGHT * (~self.valid & ~self.infeasible)) / np.sum(_WEIGHT))
+        return float(np.sum(_TRAPEZOIDAL_WEIGHTS * (~self.valid & ~self.infeasible)) / np.sum(_TRAPEZOIDAL_WEIGHTS))
 
     def to_dict(self) -> dict[str, Any]:
         """The entry of `pairs` in `tolerance --json`."""
-        names = [member.name for member in self.characteristics]
+        names = [characteristic.name for characteristic in self.characteristics]
         return {"characteristics": names, "unsafe_share": self.unsafe_share, "not_simulated_share": self.not_simulated_share,
                 "nearest": None if self.nearest is None else dict(zip(names, self.nearest, strict=True))}
 
 
-def planes(evaluator: Evaluator, columns: Sequence[int], unsafe: Unsafe) -> list[Pair]:
+def scan_pairs(evaluator: Evaluator, columns: Sequence[int], unsafe: Unsafe) -> list[Pair]:
     """The plane of every pair of characteristics, with the plane's unsafe setting nearest to the original."""
-    members, original = evaluator.characteristics.members, evaluator.characteristics.original
+    characteristics, original = evaluator.characteristics.members, evaluator.characteristics.original
     chosen = list(combinations(columns, 2))
-    axes = {column: np.linspace(members[column].lower, members[column].upper, SIDE) for column in columns}
-    settings = np.tile(original, (len(chosen), SIDE, SIDE, 1))
-    for group, (first, second) in zip(settings, chosen, strict=True):
-        group[:, :, first], group[:, :, second] = axes[first][:, np.newaxis], axes[second]
+    axes = {column: np.linspace(characteristics[column].lower, characteristics[column].upper, GRID_VALUES) for column in columns}
+    settings = np.tile(original, (len(chosen), GRID_VALUES, GRID_VALUES, 1))
+    for grid, (first, second) in zip(settings, chosen, strict=True):
+        grid[:, :, first], grid[:, :, second] = axes[first][:, np.newaxis], axes[second]
     evaluations = evaluator.evaluate(settings.reshape(-1, len(original)), "two characteristics at a time")
-    shape = (len(chosen), SIDE, SIDE)
+    shape = (len(chosen), GRID_VALUES, GRID_VALUES)
     degrees, valid, infeasible = (values.reshape(shape) for values in (evaluations.f_safe, evaluations.valid, evaluations.infeasible))
     is_unsafe = unsafe.of(evaluations).reshape(shape)
-    nearest = _nearest_unsafe(evaluator, chosen, is_unsafe, unsafe)
-    return [Pair(characteristics=(members[first], members[second]), values=np.stack([axes[first], axes[second]]), safety_degree=degrees[i],
-                 unsafe=is_unsafe[i], valid=valid[i], infeasible=infeasible[i], nearest=nearest.get(i))
-            for i, (first, second) in enumerate(chosen)]
+    nearest = _find_nearest_unsafe(evaluator, chosen, is_unsafe, unsafe)
+    return [Pair(characteristics=(characteristics[first], characteristics[second]), values=np.stack([axes[first], axes[second]]),
+                 safety_degree=degrees[plane], unsafe=is_unsafe[plane], valid=valid[plane], infeasible=infeasible[plane],
+                 nearest=nearest.get(plane)) for plane, (first, second) in enumerate(chosen)]
 
 
-def _nearest_unsafe(evaluator: Evaluator, chosen: Sequence[tuple[int, int]], is_unsafe: BoolArray,
-             unsafe: Unsafe) -> dict[int, tuple[float, float]]:
-    """For every plane with unsafe settings, the unsafe setting nearest to the original; distances are in widths of the domains.
+def _find_nearest_unsafe(evaluator: Evaluator, chosen: Sequence[tuple[int, int]], is_unsafe: BoolArray,
+                         unsafe: Unsafe) -> dict[int, tuple[float, float]]:
+    """The unsafe setting nearest to the original in every plane with unsafe settings; distances are in widths of the domains.
 
-    A branch and bound search: a square with an unsafe corner is divided into smaller squares if a point in it is nearer than the
-    nearest unsafe setting so far; each round divides the `SQUARES` nearest squares of each plane.
+    A branch and bound search: a square with an unsafe corner is divided into smaller squares if it comes nearer to the original than
+    the nearest unsafe setting so far; each round divides the `MAX_SQUARES` nearest squares of each plane.
     """
-    members = evaluator.characteristics
+    characteristics = evaluator.characteristics
     columns = np.array(chosen, dtype=int).reshape(-1, 2)
-    original, width = members.original[columns], (members.upper - members.lower)[columns]
-    lower, size = members.lower[columns], width / (SIDE - 1)
+    original, width = characteristics.original[columns], (characteristics.upper - characteristics.lower)[columns]
+    lower, size = characteristics.lower[columns], width / (GRID_VALUES - 1)
     best_distance, best_values = np.full(len(chosen), np.inf), np.zeros((len(chosen), 2))
 
     def improve(plane: npt.NDArray[np.intp], values: FloatArray) -> None:
@@ -108,27 +108,27 @@ def _nearest_unsafe(evaluator: Evaluator, chosen: Sequence[tuple[int, int]], is_
 
     plane, i, j = np.nonzero(is_unsafe)
     improve(plane, lower[plane] + np.stack([i, j], axis=1) * size[plane])
-    plane_of, i, j = np.nonzero(_with_unsafe_corner(is_unsafe))  # the plane of every square, shape (K,)
-    corner = lower[plane_of] + np.stack([i, j], axis=1) * size[plane_of]  # its lower corner, shape (K, 2)
-    steps = np.stack(np.meshgrid(np.arange(PARTS + 1), np.arange(PARTS + 1), indexing="ij"), axis=-1).reshape(-1, 2)
+    square_planes, i, j = np.nonzero(_with_unsafe_corner(is_unsafe))  # shape (K,), for K squares
+    corner = lower[square_planes] + np.stack([i, j], axis=1) * size[square_planes]  # lower corner of every square, shape (K, 2)
+    steps = np.stack(np.meshgrid(np.arange(PARTS_PER_SIDE + 1), np.arange(PARTS_PER_SIDE + 1), indexing="ij"), axis=-1).reshape(-1, 2)
     for _ in range(ROUNDS):
-        offset = corner - original[plane_of]
-        gap = np.maximum(np.maximum(offset, -offset - size[plane_of]), 0.0)
-        bound = np.sqrt(np.sum((gap / width[plane_of]) ** 2, axis=1))
-        rows = np.flatnonzero(bound < best_distance[plane_of])
-        groups = [rows[plane_of[rows] == k] for k in np.unique(plane_of[rows])]
-        squares = np.array([row for group in groups for row in group[np.argsort(bound[group], kind="stable")[:SQUARES]]], dtype=np.intp)
+        offset = corner - original[square_planes]
+        gap = np.maximum(np.maximum(offset, -offset - size[square_planes]), 0.0)
+        bound = np.sqrt(np.sum((gap / width[square_planes]) ** 2, axis=1))
+        rows = np.flatnonzero(bound < best_distance[square_planes])
+        groups = [rows[square_planes[rows] == k] for k in np.unique(square_planes[rows])]
+        squares = np.array([row for group in groups for row in group[np.argsort(bound[group], kind="stable")[:MAX_SQUARES]]], dtype=np.intp)
         if not len(squares):
             break
-        plane_of, corner, size = plane_of[squares], corner[squares], size / PARTS
-        plane = np.repeat(plane_of, len(steps))
+        square_planes, corner, size = square_planes[squares], corner[squares], size / PARTS_PER_SIDE
+        plane = np.repeat(square_planes, len(steps))
         values = np.minimum(np.repeat(corner, len(steps), axis=0) + np.tile(steps, (len(squares), 1)) * size[plane], (lower + width)[plane])
-        settings = np.tile(members.original, (len(values), 1))
+        settings = np.tile(characteristics.original, (len(values), 1))
         np.put_along_axis(settings, columns[plane], values, axis=1)
-        hits = unsafe.of(evaluator.evaluate(settings, "nearest unsafe settings"))
-        improve(plane[hits], values[hits])
-        square, i, j = np.nonzero(_with_unsafe_corner(hits.reshape(len(squares), PARTS + 1, PARTS + 1)))
-        plane_of, corner = plane_of[square], corner[square] + np.stack([i, j], axis=1) * size[plane_of[square]]
+        new_unsafe = unsafe.of(evaluator.evaluate(settings, "nearest unsafe settings"))
+        improve(plane[new_unsafe], values[new_unsafe])
+        square, i, j = np.nonzero(_with_unsafe_corner(new_unsafe.reshape(len(squares), PARTS_PER_SIDE + 1, PARTS_PER_SIDE + 1)))
+        square_planes, corner = square_planes[square], corner[square] + np.stack([i, j], axis=1) * size[square_planes[square]]
     return {int(k): (float(best_values[k, 0]), float(best_values[k, 1])) for k in np.flatnonzero(np.isfinite(best_distance))}
 
 
@@ -140,7 +140,7 @@ def _with_unsafe_corner(grids: BoolArray) -> BoolArray:
 MAX_UNSAFE_SHARE = 0.003
 """Share of a box that may be unsafe, with 95 % confidence, if every sampled setting is safe."""
 FIRST_SEARCH, SECOND_SEARCH = 256, 1024
-"""Numbers of Sobol points, and also of corners, in the first search of a box, and in the second if the first finds nothing unsafe."""
+"""Number of Sobol points, and number of corners, in the first search of a box; the same in the second, after a first that finds nothing."""
 MAX_LINES = 16
 """Maximum number of unsafe settings, the nearest first, from which the search goes back towards the original."""
 STEP_BACK = 0.999
@@ -150,11 +150,11 @@ MIN_FACTOR = 1e-6
 
 
 class SafeBox(NamedTuple):
-    """Within `factor` times the domain around the original, no setting of a random sample is unsafe.
+    """A box around the original, `factor` times the domain; no setting of a random sample in it is unsafe.
 
     With `confidence`, at most `unsafe_at_most` of all settings in the box are unsafe or cannot be simulated: `failed` of the `samples`
-    settings could not be simulated, and count as unsafe in that bound. `attempts` boxes were tested. Only `characteristics` vary, the
-    others are the original's. If no box is safe, `factor` is 0 and the bound 1.
+    settings could not be simulated, and count as unsafe in that bound. `attempts` boxes were tested. Only `characteristics` vary; the
+    others keep their original values. If no box is safe, `factor` is 0 and the bound is 1.
     """
 
     factor: float
@@ -170,12 +170,12 @@ class SafeBox(NamedTuple):
         return {**self._asdict(), "characteristics": list(self.characteristics)}
 
 
-def no_box(evaluator: Evaluator, columns: Sequence[int], attempts: int = 0) -> SafeBox:
-    """The result if no box is safe: the original vehicle, or a setting arbitrarily near to the original, is unsafe."""
+def no_safe_box(evaluator: Evaluator, columns: Sequence[int], attempts: int = 0) -> SafeBox:
+    """The result if no box is safe because the original vehicle, or a setting arbitrarily near to the original, is unsafe."""
     return SafeBox(0.0, CONFIDENCE, 0, 0, attempts, 1.0, tuple(evaluator.characteristics.names[column] for column in columns))
 
 
-def safe_box(evaluator: Evaluator, columns: Sequence[int], unsafe: Unsafe, unsafe_settings: FloatArray) -> SafeBox:
+def find_safe_box(evaluator: Evaluator, columns: Sequence[int], unsafe: Unsafe, unsafe_settings: FloatArray) -> SafeBox:
     """The largest safe box around an original vehicle that is safe itself.
 
     Parameters
@@ -187,9 +187,9 @@ def safe_box(evaluator: Evaluator, columns: Sequence[int], unsafe: Unsafe, unsaf
 
     Notes
     -----
-    The search of a box simulates Sobol points and as many corners, where all changes add up. From unsafe points the
-    search goes back towards the original, and the box shrinks to end before the first unsafe setting on the way, until the search finds
-    nothing unsafe. As these points chose the box, they prove nothing about it.
+    The search of a box simulates Sobol points and as many corners, where all changes add up. From unsafe settings the search goes back
+    towards the original, and the box shrinks to end before the first unsafe setting on the way, until the search finds nothing unsafe.
+    These settings determined the box, so they prove nothing about it.
 
     The box is then tested with settings drawn independently and uniformly in it, by a separate random generator. If any is unsafe,
     the box shrinks and is searched and tested again. Test k, k = 1, 2, ..., may be wrong with probability alpha_k = alpha / 2^k, alpha
@@ -206,8 +206,8 @@ def safe_box(evaluator: Evaluator, columns: Sequence[int], unsafe: Unsafe, unsaf
         for number in (FIRST_SEARCH, SECOND_SEARCH):
             sobol = sobol_points(number, len(columns), evaluator.study.search.seed + search)
             points = np.concatenate([sobol, np.round(sobol)])  # and corners
-            hits, _ = _unsafe_of(evaluator, factor, _settings_in_box(evaluator, columns, factor, points), unsafe)
-            if len(hits):
+            unsafe_found, _ = _unsafe_in_box(evaluator, factor, _settings_in_box(evaluator, columns, factor, points), unsafe)
+            if len(unsafe_found):
                 break
         else:
             attempt += 1
@@ -215,25 +215,25 @@ def safe_box(evaluator: Evaluator, columns: Sequence[int], unsafe: Unsafe, unsaf
             samples = math.ceil(math.log(error) / math.log1p(-MAX_UNSAFE_SHARE))
             settings = _random_settings(evaluator, columns, factor, samples, np.random.default_rng((evaluator.study.search.seed, attempt)))
             samples = len(settings)
-            hits, failed = _unsafe_of(evaluator, factor, settings, unsafe)
-            if not len(hits):
+            unsafe_found, failed = _unsafe_in_box(evaluator, factor, settings, unsafe)
+            if not len(unsafe_found):
                 share = float(scipy.stats.beta.ppf(1 - error, failed + 1, samples - failed)) if failed < samples else 1.0
                 return SafeBox(factor, CONFIDENCE, samples, failed, attempt, share,
                                tuple(evaluator.characteristics.names[column] for column in columns))
-        nearest_hits = hits[np.argsort(_box_factors(evaluator, hits), kind="stable")[:MAX_LINES]]
-        lines = [Line(evaluator.characteristics.original, end, 0.0) for end in nearest_hits]
-        shares = first_unsafe_shares(evaluator, lines, unsafe, "nearest unsafe settings")
-        edge = np.stack([line.at(np.array([share]))[0] for line, share in zip(lines, shares, strict=True)])
-        factor = min(factor, float(np.min(_box_factors(evaluator, edge)))) * STEP_BACK
-    return no_box(evaluator, columns, attempt)
+        nearest = unsafe_found[np.argsort(_box_factors(evaluator, unsafe_found), kind="stable")[:MAX_LINES]]
+        lines = [Line(evaluator.characteristics.original, end, 0.0) for end in nearest]
+        shares = find_first_unsafe_shares(evaluator, lines, unsafe, "nearest unsafe settings")
+        edge_settings = np.stack([line.settings_at(np.array([share]))[0] for line, share in zip(lines, shares, strict=True)])
+        factor = min(factor, float(np.min(_box_factors(evaluator, edge_settings)))) * STEP_BACK
+    return no_safe_box(evaluator, columns, attempt)
 
 
 def _settings_in_box(evaluator: Evaluator, columns: Sequence[int], factor: float, points: FloatArray) -> FloatArray:
     """Settings in a box around the original, from points of the unit cube; shape (K, n)."""
-    members, indices = evaluator.characteristics, list(columns)
-    lower = members.original - factor * (members.original - members.lower)
-    upper = members.original + factor * (members.upper - members.original)
-    settings = np.tile(members.original, (len(points), 1))
+    characteristics, indices = evaluator.characteristics, list(columns)
+    lower = characteristics.original - factor * (characteristics.original - characteristics.lower)
+    upper = characteristics.original + factor * (characteristics.upper - characteristics.original)
+    settings = np.tile(characteristics.original, (len(points), 1))
     settings[:, indices] = lower[indices] + points * (upper - lower)[indices]
     return settings
 
@@ -244,15 +244,15 @@ def _random_settings(evaluator: Evaluator, columns: Sequence[int], factor: float
         lambda count: _settings_in_box(evaluator, columns, factor, rng.random((count, len(columns)))), number)
 
 
-def _unsafe_of(evaluator: Evaluator, factor: float, settings: FloatArray, unsafe: Unsafe) -> tuple[FloatArray, int]:
+def _unsafe_in_box(evaluator: Evaluator, factor: float, settings: FloatArray, unsafe: Unsafe) -> tuple[FloatArray, int]:
     """The unsafe settings, shape (K, n), and the number of feasible settings that could not be simulated."""
     evaluations = evaluator.evaluate(settings, f"all characteristics within {factor:.0%} of the domain")
     return settings[unsafe.of(evaluations)], int(np.count_nonzero(~evaluations.valid & ~evaluations.infeasible))
 
 
 def _box_factors(evaluator: Evaluator, settings: FloatArray) -> FloatArray:
-    """Factor of the box on whose surface each of K settings lies, shape (K,)."""
-    members = evaluator.characteristics
-    change = settings - members.original
-    limit = np.where(change < 0, members.original - members.lower, members.upper - members.original)
-    return np.asarray(np.max(np.divide(np.abs(change), limit, out=np.zeros_like(change), where=limit > 0), axis=1, initial=0.0))
+    """Factors of the boxes on whose surfaces K settings lie, shape (K,)."""
+    characteristics = evaluator.characteristics
+    change = settings - characteristics.original
+    room = np.where(change < 0, characteristics.original - characteristics.lower, characteristics.upper - characteristics.original)
+    return np.asarray(np.max(np.divide(np.abs(change), room, out=np.zeros_like(change), where=room > 0), axis=1, initial=0.0))
