@@ -1,4 +1,4 @@
-"""Findings of a check, and the time limit for an author's code."""
+"""Findings of a check, and the time limit of user code."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ ADVICE: Mapping[str, str] = {
     "picklable": "give functions a name at the top of the module; open files, sockets and locks in `start`, not in `__init__`",
 }
 """Advice by check."""
-REFUSED = ("contract", "units", "determinism", "state", "batch", "inputs", "finite")
+BLOCKING_CHECKS = ("contract", "units", "determinism", "state", "batch", "inputs", "finite")
 """Checks whose failure makes results wrong: the study does not begin. A failure of any other check is a warning."""
 
 
@@ -67,7 +67,7 @@ class Report:
                 "seconds": round(self.seconds, 3)}
 
 
-class TakesTooLong(BaseException):
+class UserCodeTimeout(BaseException):
     """User code exceeds its time limit. The error is raised inside that code, so it is no `Exception`, which the code may catch."""
 
 
@@ -83,7 +83,7 @@ TICKS = 10
 
 @contextmanager
 def time_limit(seconds: float) -> Iterator[None]:
-    """Raise `TakesTooLong` in a block that would take longer than `seconds` on an idle machine.
+    """Raise `UserCodeTimeout` in a block that would take longer than `seconds` on an idle machine.
 
     The import of modules does not count. The limit has no effect outside the main thread and on Windows.
     """
@@ -98,7 +98,7 @@ def time_limit(seconds: float) -> Iterator[None]:
             frame = frame.f_back
         ticks_left -= frame is None
         if not ticks_left:
-            raise TakesTooLong
+            raise UserCodeTimeout
 
     previous_handler = signal.signal(signal.SIGALRM, tick)
     signal.setitimer(signal.ITIMER_REAL, *[seconds * load_factor() / TICKS] * 2)

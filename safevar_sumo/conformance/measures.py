@@ -13,14 +13,14 @@ from safevar_sumo.ads import Ads
 from safevar_sumo.conformance.models import AdsProbe, StudyProbe, VehicleProbe
 from safevar_sumo.conformance.probe import NoReaction, Outputs, Probe, Rows, corners, cost_of, guard_of, loaded_again, timed
 from safevar_sumo.conformance.subject import Subject
-from safevar_sumo.metrics import METRICS, foreign_metric
-from safevar_sumo.plugins import Lookup, forget_foreign, instance_of
+from safevar_sumo.metrics import METRICS, guard_metric
+from safevar_sumo.plugins import Lookup, instance_of, unload_user_modules
 from safevar_sumo.records import Command, Evaluations, FloatArray, Nominal, Observation, SimulationRuns
 from safevar_sumo.search import ALGORITHMS, GuardedAlgorithm, Problem
 from safevar_sumo.study import Study
 from safevar_sumo.sumo.batch import drive_all
 from safevar_sumo.sumo.system import assemble
-from safevar_sumo.vehicles import CharacteristicSet, foreign_change
+from safevar_sumo.vehicles import CharacteristicSet, guard_change
 
 
 class MetricProbe(Probe):
@@ -34,8 +34,8 @@ class MetricProbe(Probe):
         self._runs = _runs_of(subject.study)
 
     def load(self) -> Any:
-        forget_foreign()
-        return foreign_metric(loaded_again(self.subject), guard_of(self.subject))
+        unload_user_modules()
+        return guard_metric(loaded_again(self.subject), guard_of(self.subject))
 
     def run(self, model: Any, rows: Rows) -> Outputs:
         runs = self._runs.of(slice(0, self.number))
@@ -95,8 +95,8 @@ class ObjectiveProbe(Probe):
         self.number = len(self._settings)
 
     def load(self) -> Any:
-        forget_foreign()
-        return foreign_change(loaded_again(self.subject), guard_of(self.subject))
+        unload_user_modules()
+        return guard_change(loaded_again(self.subject), guard_of(self.subject))
 
     def run(self, model: Any, rows: Rows) -> Outputs:
         return {"values": model.function(self._settings[rows], self._members)}
@@ -125,7 +125,7 @@ class AlgorithmProbe(Probe):
                                 population=min(study.search.population, self.POPULATION), scoring=self._scoring)
 
     def load(self) -> Any:
-        forget_foreign()
+        unload_user_modules()
         return self._instance()
 
     def _instance(self) -> Any:
@@ -150,7 +150,7 @@ class AlgorithmProbe(Probe):
             answer = self._scored(settings)
 
     def repeat(self, model: Any, rows: Rows) -> Outputs:
-        forget_foreign()
+        unload_user_modules()
         self.run(self._instance(), rows, seed=2)
         return self.run(self._instance(), rows)
 

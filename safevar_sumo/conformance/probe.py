@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from safevar_sumo.conformance.finding import load_factor
 from safevar_sumo.conformance.subject import Subject
-from safevar_sumo.plugins import Guard, Lookup, forget_foreign
+from safevar_sumo.plugins import Guard, Lookup, unload_user_modules
 from safevar_sumo.records import FloatArray
 from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.sumo.traci_module import importable
@@ -44,8 +44,8 @@ class Probe(ABC):
         self.subject = subject
 
     def system(self) -> System:
-        """The system of the subject's study, with all foreign modules reloaded."""
-        forget_foreign()
+        """The system of the subject's study, with all user code reloaded."""
+        unload_user_modules()
         system = assemble(self.subject.study, self.subject.study.source)
         return replace(system, matrix=system.matrix[::max(len(system.matrix) // POINTS, 1)], rater=None)
 

@@ -1,4 +1,4 @@
-"""An author's source code: the last line that returned, the line that raised, and lines that may cause a defect."""
+"""The source of user code: the last line that returned, the line that raised, and lines that may cause a defect."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from safevar_sumo.plugins import Member
 
 
 class Source:
-    """An author's source file, and the last line in it that returned.
+    """A source file of user code, and the last line in it that returned.
 
     Parameters
     ----------
@@ -31,7 +31,7 @@ class Source:
         self._is_fmu, self.file = bool(member.file), member.file or self._file()
         self._folder = str(Path(self.file).parent)
         self._last: tuple[str, int] | None = None
-        self._of_author: dict[CodeType, bool] = {}
+        self._user_code_flags: dict[CodeType, bool] = {}
 
     def _file(self) -> str:
         try:
@@ -41,7 +41,7 @@ class Source:
 
     @contextmanager
     def watched(self) -> Iterator[None]:
-        """A context that notes the last line of the author's code that returned."""
+        """A context that notes the last line of user code that returned."""
         previous = sys.getprofile()
         sys.setprofile(self._note)
         try:
@@ -53,23 +53,23 @@ class Source:
         if event != "return":
             return
         code = frame.f_code
-        if self._is_own_code(code):
+        if self._is_user_code(code):
             self._last = code.co_filename, frame.f_lineno
 
-    def _is_own_code(self, code: CodeType) -> bool:
-        if code not in self._of_author:
-            self._of_author[code] = code.co_filename.startswith(self._folder) and "site-packages" not in code.co_filename
-        return self._of_author[code]
+    def _is_user_code(self, code: CodeType) -> bool:
+        if code not in self._user_code_flags:
+            self._user_code_flags[code] = code.co_filename.startswith(self._folder) and "site-packages" not in code.co_filename
+        return self._user_code_flags[code]
 
     def of_error(self, error: BaseException) -> tuple[str, int]:
-        """The innermost line of the author's code that raised an exception; else the last line that returned."""
+        """The innermost line of user code that raised an exception; else the last line that returned."""
         if self._is_fmu:
             return self.definition()
         exception: BaseException | None = error
         while exception is not None:
             frame, location = exception.__traceback__, None
             while frame is not None:
-                if self._is_own_code(frame.tb_frame.f_code):
+                if self._is_user_code(frame.tb_frame.f_code):
                     location = frame.tb_frame.f_code.co_filename, frame.tb_lineno
                 frame = frame.tb_next
             if location is not None and not isinstance(exception, InputError):

@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 
 from safevar_sumo.ads import ScalarAds
-from safevar_sumo.conformance.finding import ADVICE, REFUSED, Finding, Report, TakesTooLong, time_limit
+from safevar_sumo.conformance.finding import ADVICE, BLOCKING_CHECKS, Finding, Report, UserCodeTimeout, time_limit
 from safevar_sumo.conformance.measures import PROBES
 from safevar_sumo.conformance.models import StudyProbe
 from safevar_sumo.conformance.probe import Outputs, Probe, Rows, loaded_again, timed
 from safevar_sumo.conformance.source import Source
 from safevar_sumo.conformance.subject import Subject, subject_of, subjects_of, violation
-from safevar_sumo.errors import ForeignError, InputError
+from safevar_sumo.errors import InputError, UserCodeError
 from safevar_sumo.plugins import guard_process_state
 from safevar_sumo.study import Study, load_study, study_names
 
@@ -59,9 +59,9 @@ def check(name: str, study: str | None = None) -> Report:
     return report
 
 
-def checks_of(study: Study, *, foreign: bool = False) -> Iterator[Report]:
-    """Check all subjects that a study names, or only code from outside (`foreign`). Raises as `checked`; simulates the study once."""
-    subjects = [subject for subject in subjects_of(study) if not (foreign and subject.is_ours)]
+def checks_of(study: Study, *, only_user_code: bool = False) -> Iterator[Report]:
+    """Check all subjects that a study names, or only user code (`only_user_code`). Raises as `checked`; simulates the study once."""
+    subjects = [subject for subject in subjects_of(study) if not (only_user_code and subject.is_ours)]
     order = ("traci", "scenario", "ads", "vehicle")
     models = sorted((subject for subject in subjects if subject.kind in order),
                     key=lambda subject: (subject.is_ours, order.index(subject.kind)))
@@ -70,21 +70,21 @@ def checks_of(study: Study, *, foreign: bool = False) -> Iterator[Report]:
 
 
 def refuse_defects(study: Study) -> list[str]:
-    """Check the code from outside that a study names; returns the warnings.
+    """Check the user code that a study names; returns the warnings.
 
     Raises
     ------
-    ForeignError
+    UserCodeError
         With file, line and advice of the first finding that makes results wrong.
     """
     remarks = []
-    for report in checks_of(study, foreign=True):
+    for report in checks_of(study, only_user_code=True):
         for finding in report.findings:
             location = f"{finding.file}:{finding.line}"
             problem = f"{report.key} {finding.got}{'' if location in finding.got else f' ({location})'}"
-            if finding.check in REFUSED:
+            if finding.check in BLOCKING_CHECKS:
                 command = f"python -m safevar_sumo check {shlex.quote(study.origin.called or study.name)}"
-                raise ForeignError(study.source, f"{problem}; again by: {command}", f"{finding.expected}; {finding.advice}")
+                raise UserCodeError(study.source, f"{problem}; again by: {command}", f"{finding.expected}; {finding.advice}")
             remarks.append(f"{problem}; expected: {finding.expected}")
     return remarks
 
@@ -147,9 +147,9 @@ class _Suite:
                                  for reaction in probe.reactions(model, outputs)]
                     findings += self._cost_findings(probe, model)
             yield from findings
-        except ForeignError as error:
+        except UserCodeError as error:
             yield self._of_error(error)
-        except TakesTooLong as error:
+        except UserCodeTimeout as error:
             location = self._source.of_error(error)
             yield self._finding("speed", f"does not come back within {RUN_LIMIT:g} s", "microseconds per vehicle and step", location)
         except InputError as error:
@@ -219,7 +219,7 @@ class _Suite:
             location = self._source.definition("__init__") if isinstance(subject, type) else self._source.definition()
             yield self._finding("picklable", problem, "an object that pickle can send to a worker process", location)
 
-    def _of_error(self, error: ForeignError) -> Finding:
+    def _of_error(self, error: UserCodeError) -> Finding:
         """The finding for an error that a guard raised."""
         text = error.problem.removeprefix(f"{self._subject.key} ")
         if "returned" in text:  # the finding has the line already

@@ -1,4 +1,4 @@
-"""Files that results depend on: the files that code from outside the package reads, and digests by names equal on every machine.
+"""Files that results depend on: the files that user code reads, and digests by names equal on every machine.
 
 The interpreter raises an audit event for every file that Python code opens and for every module that is loaded. Compiled code
 raises no event: files that a study's parameters name always count.
@@ -32,7 +32,7 @@ KNOWN_FOLDERS = tuple(f"{folder}{os.sep}" for folder in sorted({
     *(os.path.realpath(os.path.join(prefix, name)) for prefix in (sys.prefix, sys.base_prefix, "/", "/usr", "/usr/local")
       for name in ("bin", "etc", "include", "lib", "lib64", "sbin", "share")),
     "/dev", "/proc", "/sys", "/System", "/Library", os.environ.get("SYSTEMROOT", "/dev")}))
-"""Folders of this package, the interpreter, installed libraries and the operating system: the code in them is not foreign."""
+"""Folders of this package, the interpreter, installed libraries and the operating system: the code in them is no user code."""
 CACHE_FOLDERS = ("__pycache__", ".cache", ".config")
 """Names of folders in which programs keep caches and settings."""
 WRITE_FLAGS = os.O_WRONLY | os.O_CREAT | os.O_TRUNC
@@ -40,7 +40,7 @@ WRITE_FLAGS = os.O_WRONLY | os.O_CREAT | os.O_TRUNC
 
 
 class Reading:
-    """Absolute `paths` of the files that code from outside opened for reading, and names of the `modules` that this code loaded."""
+    """Absolute `paths` of the files that user code opened for reading, and names of the `modules` that this code loaded."""
 
     def __init__(self) -> None:
         self.paths: set[str] = set()
@@ -48,7 +48,7 @@ class Reading:
 
     def files(self, packages: Sequence[str] = ()) -> set[str]:
         """Every input file: sources in place of Python's caches; files of an installed package only if `packages` names the package."""
-        installed = {file for name in list(sys.modules) if name.partition(".")[0] in packages and not is_foreign(file := _file_of(name))}
+        installed = {file for name in list(sys.modules) if name.partition(".")[0] in packages and not is_user_file(file := _file_of(name))}
         files = {*self.paths, *map(_file_of, self.modules), *installed} - {""}
         return {path for path in map(_source_of, files) if _is_input(path, packages)}
 
@@ -60,7 +60,7 @@ def _file_of(module: str) -> str:
 class _Watch:
     """State of the process's only audit hook, which cannot be removed.
 
-    `call_depth` is the number of calls of code from outside under way; `written_files` are files that such code wrote, hence no inputs;
+    `call_depth` is the number of calls of user code under way; `written_files` are files that such code wrote, hence no inputs;
     `imported_modules` are the names of all modules that such code has loaded.
     """
 
@@ -102,7 +102,7 @@ watch = _Watch()
 
 @contextmanager
 def noted_reading() -> Iterator[Reading]:
-    """Record the files and modules that code from outside opens and loads while a guard calls it."""
+    """Record the files and modules that user code opens and loads while a guard calls it."""
     watch.hook()
     reading = Reading()
     watch.readings.append(reading)
@@ -112,7 +112,7 @@ def noted_reading() -> Iterator[Reading]:
         watch.readings[:] = [other for other in watch.readings if other is not reading]
 
 
-def is_foreign(path: str) -> bool:
+def is_user_file(path: str) -> bool:
     """Whether a file lies outside the interpreter, installed libraries, this package and the operating system."""
     return not path.startswith(KNOWN_FOLDERS) and not any(name in Path(path).parts for name in LIBRARY_FOLDERS)
 
@@ -129,7 +129,8 @@ def _is_input(path: str, packages: Sequence[str]) -> bool:
     parts = Path(path).parts
     if path in watch.written_files or any(name in parts for name in CACHE_FOLDERS) or not os.path.isfile(path):
         return False
-    return is_foreign(path) or any(parts[parts.index(name) + 1].partition(".")[0] in packages for name in LIBRARY_FOLDERS if name in parts)
+    library_members = [parts[parts.index(folder) + 1] for folder in LIBRARY_FOLDERS if folder in parts]
+    return is_user_file(path) or any(member.partition(".")[0] in packages for member in library_members)
 
 
 def digest_of(path: Path | str) -> str:

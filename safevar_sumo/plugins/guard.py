@@ -1,4 +1,4 @@
-"""The contracts of users' classes, the guard that calls users' code, and checks of the results."""
+"""The contracts of users' classes, the guard that calls user code, and checks of the results."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from typing import Any, NamedTuple, Self
 
 import numpy as np
 
-from safevar_sumo.errors import ForeignError, InputError, in_one_line
+from safevar_sumo.errors import InputError, UserCodeError, in_one_line
 from safevar_sumo.plugins.files import watch
 from safevar_sumo.records import BoolArray, FloatArray
 
@@ -121,7 +121,7 @@ def read_only_copy(value: Any) -> Any:
 
 @contextmanager
 def guard_process_state(source: str, names: Sequence[str]) -> Iterator[None]:
-    """Restore the working directory, environment variables and numpy's error state after a block; nothing without plug-ins in `names`."""
+    """Restore the working directory, environment variables and numpy's error state after a block; nothing if `names` is empty."""
     if not names:
         yield
         return
@@ -137,16 +137,16 @@ def guard_process_state(source: str, names: Sequence[str]) -> Iterator[None]:
 
 
 class Guard(NamedTuple):
-    """Calls a plug-in and checks the results.
+    """Calls user code and checks the results.
 
     Attributes
     ----------
     source
         The study, as errors name it.
     name
-        The plug-in as the study names it, such as `ads.model = 'my_ads:Careful'`.
+        The user code as the study names it, such as `ads.model = 'my_ads:Careful'`.
     folder
-        Folder of the plug-in's sources; an error names the innermost line in this folder.
+        Folder of the user code; an error names the innermost line in this folder.
     target
         The class, function or record; the error for a wrong result names the line where the method begins.
     """
@@ -161,34 +161,34 @@ class Guard(NamedTuple):
 
         Raises
         ------
-        ForeignError
+        UserCodeError
             If the function raises anything, `SystemExit` included.
         """
         watch.call_depth += 1
         try:
             return function(*arguments)
-        except ForeignError:
+        except UserCodeError:
             raise
         except (Exception, SystemExit) as error:
             raise self.failed(method, error) from error
         finally:
             watch.call_depth -= 1
 
-    def failed(self, method: str, error: BaseException) -> ForeignError:
-        """The error for an exception that the plug-in raised."""
+    def failed(self, method: str, error: BaseException) -> UserCodeError:
+        """The error for an exception that user code raised."""
         location = self._location(error)
         problem = f"{self.name} raised in {method}: {in_one_line(error)}{f' ({location})' if location else ''}"
-        return ForeignError(self.source, problem, error.legal if isinstance(error, InputError) else "")
+        return UserCodeError(self.source, problem, error.legal if isinstance(error, InputError) else "")
 
-    def wrong(self, method: str, part: str, value: object, expected: str) -> ForeignError:
+    def wrong(self, method: str, part: str, value: object, expected: str) -> UserCodeError:
         """The error for a result whose part `part` has a wrong value."""
         return self._returned(f"{part} = {_short(value)}", method, expected)
 
-    def _returned(self, result: str, method: str, expected: str) -> ForeignError:
+    def _returned(self, result: str, method: str, expected: str) -> UserCodeError:
         function = inspect.unwrap(getattr(self.target, method, getattr(self.target, "function", self.target)))
         code = getattr(function, "__code__", None)  # FMUs and compiled code have none
         location = f" ({code.co_filename}:{code.co_firstlineno})" if code is not None else ""
-        return ForeignError(self.source, f"{self.name} returned {result} from {method}{location}", expected)
+        return UserCodeError(self.source, f"{self.name} returned {result} from {method}{location}", expected)
 
     def parts(self, method: str, value: Any, expected: str, number: int = 2) -> tuple[Any, ...]:
         """The parts of a result that must be a tuple or list of `number` parts."""
@@ -246,7 +246,7 @@ class Guard(NamedTuple):
         return np.broadcast_to(array, shape)
 
     def _location(self, error: BaseException) -> str:
-        """File and line of the innermost frame in the plug-in's folder, else of the innermost frame outside this package."""
+        """File and line of the innermost frame in the user code's folder, else of the innermost frame outside this package."""
         frames = [(frame.filename, frame.lineno) for frame in traceback.extract_tb(error.__traceback__)]
         if isinstance(error, SyntaxError) and error.filename:
             frames.append((error.filename, error.lineno))

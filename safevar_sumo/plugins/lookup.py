@@ -20,13 +20,13 @@ from typing import Any, NamedTuple
 
 import msgspec
 
-from safevar_sumo.errors import ForeignError, InputError, did_you_mean, one_of
-from safevar_sumo.plugins.files import file_beside, is_foreign, watch
+from safevar_sumo.errors import InputError, UserCodeError, did_you_mean, one_of
+from safevar_sumo.plugins.files import file_beside, is_user_file, watch
 from safevar_sumo.plugins.guard import Contract, Guard
 from safevar_sumo.study import converted
 
 _KNOWN_MODULES = {__name__.partition(".")[0], *sys.stdlib_module_names}
-"""Names of top modules that are not foreign: of this package and of Python."""
+"""Names of top modules that are no user code: this package and Python's standard library."""
 
 
 class Member(NamedTuple):
@@ -73,7 +73,7 @@ class Lookup(NamedTuple):
         ------
         InputError
             If there is no such member or module.
-        ForeignError
+        UserCodeError
             If the module fails while it is imported.
         """
         if name in members:
@@ -91,7 +91,7 @@ class Lookup(NamedTuple):
         return Member(target, Guard(self.source, f"{key} = {name!r}", folder, target), module_name, folder)
 
     def class_of(self, members: Mapping[str, Any], name: str, key: str, *contracts: Contract, otherwise: str = "") -> Member:
-        """A class by name; a class from outside must meet the first contract that applies to it.
+        """A class by name; a user's class must meet the first contract that applies to it.
 
         `otherwise` names further expected values, which are no classes.
         """
@@ -103,7 +103,7 @@ class Lookup(NamedTuple):
         return member
 
     def with_paths(self, member: Member, parameters: Mapping[str, Any], key: str) -> dict[str, Any]:
-        """Parameters for a member from outside, in which names of files beside the study's file are absolute paths.
+        """Parameters for a member that is user code, in which names of files beside the study's file are absolute paths.
 
         Raises
         ------
@@ -134,7 +134,7 @@ class Lookup(NamedTuple):
         if top == "__main__":
             raise InputError(self.source, f"{guard.name}: other processes cannot import from __main__", "a module in a file of its own")
         place = _module_folder(top, places)
-        _forget_all_but(places)
+        _unload_stale_modules(places)
         make_reachable(places)
         if place:
             self._refuse_installed_name(top, place, guard)
@@ -142,10 +142,10 @@ class Lookup(NamedTuple):
         dont_write_bytecode, sys.dont_write_bytecode = sys.dont_write_bytecode, True
         try:
             module = guard._replace(folder=place).call("import", importlib.import_module, name)
-        except ForeignError as error:
+        except UserCodeError as error:
             problem = error.problem.replace("raised in import", "cannot be imported", 1)
             expected = f"a module in {' or '.join(dict.fromkeys(places))}, or an installed one"
-            raise ForeignError(self.source, problem, expected) from error
+            raise UserCodeError(self.source, problem, expected) from error
         finally:
             sys.dont_write_bytecode = dont_write_bytecode
             remember(set(sys.modules) - before, places)
@@ -201,31 +201,31 @@ def inherit_reachable(folders: Iterable[str]) -> None:
     _added_folders[:] = folders
 
 
-def forget_foreign() -> None:
-    """Unload all modules from outside the package: the next lookup loads them again."""
-    _forget(list(_loaded_modules))
+def unload_user_modules() -> None:
+    """Unload all user modules: the next lookup loads them again."""
+    _unload(list(_loaded_modules))
     for name in sorted(watch.imported_modules):
         module = sys.modules.get(name)
         place = getattr(module, "__file__", None) or next(iter(getattr(module, "__path__", [])), "")  # a namespace package has no file
-        if place and is_foreign(str(place)) and name.partition(".")[0] not in _KNOWN_MODULES:
+        if place and is_user_file(str(place)) and name.partition(".")[0] not in _KNOWN_MODULES:
             del sys.modules[name]
     watch.imported_modules.clear()
 
 
-def _forget_all_but(places: Iterable[str]) -> None:
+def _unload_stale_modules(places: Iterable[str]) -> None:
     """Unload modules from folders of other studies, and all modules of a folder in which a file has changed."""
     stale_folders = {module.folder for module in _loaded_modules.values()
                      if module.folder not in places or _digest(module.file) != module.digest}
-    _forget({name for name, module in _loaded_modules.items() if module.folder in stale_folders})
+    _unload({name for name, module in _loaded_modules.items() if module.folder in stale_folders})
 
 
-def _forget(names: Iterable[str]) -> None:
+def _unload(names: Iterable[str]) -> None:
     for name in names:
         if _loaded_modules.pop(name, None) is not None:
             sys.modules.pop(name, None)
 
 
-def foreign_modules(top: str) -> list[str]:
+def user_module_names(top: str) -> list[str]:
     """Names of the modules loaded from users' folders and, if `top` is an installed package, of the modules of `top`."""
     if top in _loaded_modules:
         return list(_loaded_modules)
@@ -287,7 +287,7 @@ def check_parameters(function: Callable[..., Any], arguments: tuple[Any, ...], p
         pass
 
 
-class OwnModules:
+class ModuleCopies:
     """A copy of the user's modules for one of many vehicles, so that each vehicle has its own variables of these modules.
 
     Parameters
@@ -326,5 +326,5 @@ class OwnModules:
             sys.modules.update(shared)
 
     def _remove(self) -> dict[str, ModuleType]:
-        names = foreign_modules(self._member.module.partition(".")[0])
+        names = user_module_names(self._member.module.partition(".")[0])
         return {name: sys.modules.pop(name) for name in names if name in sys.modules}

@@ -1,4 +1,4 @@
-"""The contract of a scenario (its actors and the geometry of the encounter), and checks of scenarios from outside the package."""
+"""The contract of a scenario (its actors and the geometry of the encounter), and checks of users' scenarios."""
 
 from __future__ import annotations
 
@@ -203,7 +203,7 @@ MAX_TEST_SPEED = 100.0
 
 
 class GuardedScenario:
-    """A scenario from outside the package: it gets read-only copies, and this class checks its results."""
+    """A user's scenario: it gets read-only copies, and this class checks its results."""
 
     def __init__(self, scenario: Any, guard: Guard) -> None:
         self._scenario, self._guard = scenario, guard

@@ -1,4 +1,4 @@
-"""The contract of a search algorithm, independent of SUMO, processes and files, and checks of algorithms from outside the package."""
+"""The contract of a search algorithm, independent of SUMO, processes and files, and checks of users' algorithms."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from safevar_sumo.errors import ForeignError
+from safevar_sumo.errors import UserCodeError
 from safevar_sumo.metrics import SAFEVAR, Scoring
 from safevar_sumo.plugins import Contract, Guard, read_only_copy
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray
@@ -65,7 +65,7 @@ ALGORITHM_CONTRACT = Contract.of(Algorithm, "an algorithm")
 
 
 class GuardedAlgorithm:
-    """An algorithm from outside the package: it gets read-only copies, and this class checks its settings and its result."""
+    """A user's algorithm: it gets read-only copies, and this class checks its settings and its result."""
 
     def __init__(self, algorithm: Algorithm, guard: Guard) -> None:
         self._algorithm, self._guard = algorithm, guard
@@ -111,7 +111,7 @@ class GuardedAlgorithm:
         if not isinstance(result, Evaluations):
             raise self._guard.wrong("search", "its result", result, expected)
         if not answers:
-            raise ForeignError(self._guard.source, f"{self._guard.name} ended in search without yielding any setting",
+            raise UserCodeError(self._guard.source, f"{self._guard.name} ended in search without yielding any setting",
                                f"a generator that yields from 1 to {problem.evaluations} settings before it returns")
         rows = self._guard.numbers("search", "its result's settings", result.settings, (len(result), len(problem.characteristics)))
         if any(row.tobytes() not in answers for row in rows):

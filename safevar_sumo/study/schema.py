@@ -191,7 +191,7 @@ class Origin(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The files of a study; results do not depend on them.
 
     `called` is the study's path as given on the command line, empty if the study was given by its name; `places` are the folders of its
-    file and of the files that it extends, where plug-ins are looked up first; `remarks` are for the user.
+    file and of the files that it extends, where user code is looked up first; `remarks` are for the user.
     """
 
     called: str = ""
@@ -325,9 +325,9 @@ def study_path(study: str) -> Path:
     raise unknown("study", f"there is no study or file {study!r}", study, study_names(), ", or the path of a study file (TOML)")
 
 
-def foreign_names(study: Study) -> list[str]:
+def user_code_names(study: Study) -> list[str]:
     """The keys of a study that name user code, such as `ads.model = 'my_ads:Careful'`."""
-    return [f"{key} = {name!r}" for key, name in (*_foreign(study), *fmus_of(study))]
+    return [f"{key} = {name!r}" for key, name in (*_keys_of_user_code(study), *fmus_of(study))]
 
 
 def fmus_of(study: Study) -> list[tuple[str, str]]:
@@ -335,12 +335,12 @@ def fmus_of(study: Study) -> list[tuple[str, str]]:
     return [(f"{key}.model", table.model) for key, table in (("vehicle", study.vehicle), ("ads", study.ads)) if table.kind == "fmu"]
 
 
-def foreign_packages(study: Study) -> list[str]:
+def user_code_packages(study: Study) -> list[str]:
     """The top-level packages of a study's user code."""
-    return sorted({name.partition(":")[0].partition(".")[0] for _, name in _foreign(study)})
+    return sorted({name.partition(":")[0].partition(".")[0] for _, name in _keys_of_user_code(study)})
 
 
-def _foreign(study: Study) -> list[tuple[str, str]]:
+def _keys_of_user_code(study: Study) -> list[tuple[str, str]]:
     """Keys and names of a study's user code."""
     tests = [] if study.matrix is None else [test.model for test in study.matrix.tests]
     names_by_key = {"vehicle.model": [study.vehicle.model], "ads.model": [study.ads.model],

@@ -18,13 +18,13 @@ import numpy as np
 from safevar_sumo.ads import ADS, ADS_CONTRACT, REACTIONS, SCALAR_ADS_CONTRACT, Ads, FmuAds, GuardedAds, PerVehicle, ScalarAds
 from safevar_sumo.errors import InputError, one_of, unknown
 from safevar_sumo.fmu import LONGEST, description_of
-from safevar_sumo.metrics import FURTHER, METRICS, RATING_POINTS, Metric, Objective, Scoring, foreign_metric
+from safevar_sumo.metrics import FURTHER, METRICS, RATING_POINTS, Metric, Objective, Scoring, guard_metric
 from safevar_sumo.metrics import OBJECTIVES as BY_OBJECTIVE
-from safevar_sumo.plugins import Guard, Lookup, Member, OwnModules, check_parameters, guard_process_state, instance_of
+from safevar_sumo.plugins import Guard, Lookup, Member, ModuleCopies, check_parameters, guard_process_state, instance_of
 from safevar_sumo.protocol.rater import Rater, is_rated, rated, rater_of
 from safevar_sumo.records import FloatArray, Nominal
 from safevar_sumo.scenarios import SCENARIO_CONTRACT, SCENARIOS, WEATHERS, GuardedScenario, Point, Scenario, weather_of
-from safevar_sumo.study import MatrixTest, MetricsTable, ModelTable, Study, VehicleTable, Weather, foreign_names
+from safevar_sumo.study import MatrixTest, MetricsTable, ModelTable, Study, VehicleTable, Weather, user_code_names
 from safevar_sumo.sumo.network import check_network, network_remarks
 from safevar_sumo.sumo.sources import is_network, is_shipped
 from safevar_sumo.sumo.traci_controller import TraciController
@@ -40,7 +40,7 @@ from safevar_sumo.vehicles import (
     GuardedVehicle,
     Vehicle,
     calibration_drive,
-    foreign_change,
+    guard_change,
     region_of,
 )
 
@@ -83,7 +83,7 @@ def measuring_of(study: Study, lookup: Lookup) -> Measuring:
             return member.target  # type: ignore[no-any-return]
         members.append(member)
         is_change = isinstance(member.target, Change) and key == OBJECTIVES_KEY
-        record = foreign_change(member.target, member.guard) if is_change else foreign_metric(member.target, member.guard)
+        record = guard_change(member.target, member.guard) if is_change else guard_metric(member.target, member.guard)
         if record.name in (*COLUMNS, *metrics, *FURTHER, *changes, *study.vehicle.characteristics):
             raise InputError(lookup.source, f"{key} = {name!r}: the name {record.name!r} is taken", "a unique name")
         if isinstance(record, Change):
@@ -203,7 +203,7 @@ def assemble(study: Study, source: str = "") -> System:
         Naming the study, the key, the value and the legal values.
     """
     source = source or study.source
-    with guard_process_state(source, foreign_names(study)):
+    with guard_process_state(source, user_code_names(study)):
         return _assemble(study, source)
 
 
@@ -259,7 +259,7 @@ def _traci_controller(choice: ModelTable, lookup: Lookup) -> tuple[Ads, Member]:
 
         controller_of(controller)
     places, attribute = [*lookup.places, os.getcwd()], choice.model.partition(":")[2]
-    modules = partial(OwnModules, member, attribute, places, set())
+    modules = partial(ModuleCopies, member, attribute, places, set())
     return TraciController(modules, controller_of, member.guard or Guard(lookup.source, name)), member
 
 

@@ -16,7 +16,7 @@ from safevar_sumo.vehicles.base import (
 )
 from safevar_sumo.vehicles.calibration_drive import calibration_drive
 from safevar_sumo.vehicles.carla import Carla
-from safevar_sumo.vehicles.characteristics import CHANGES, Change, Characteristic, CharacteristicSet, foreign_change
+from safevar_sumo.vehicles.characteristics import CHANGES, Change, Characteristic, CharacteristicSet, guard_change
 from safevar_sumo.vehicles.fmu import FmuVehicle
 from safevar_sumo.vehicles.lgsvl import Lgsvl
 from safevar_sumo.vehicles.region import FeasibleRegion, region_of
@@ -34,4 +34,4 @@ VEHICLES: Mapping[str, type[Any]] = {
 __all__ = [
     "CHANGES", "LEVEL", "VEHICLES", "VEHICLE_CONTRACT", "Carla", "Change", "Characteristic", "CharacteristicSet", "FeasibleRegion",
     "FmuVehicle", "GuardedVehicle", "Sensors", "Slope", "SumoType", "Vehicle", "VehicleState", "at_start", "calibration_drive",
-    "foreign_change", "region_of", "slope_of"]
+    "guard_change", "region_of", "slope_of"]

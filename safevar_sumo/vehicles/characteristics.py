@@ -212,7 +212,7 @@ CHANGES = {change.name: change for change in (
 )}
 
 
-def foreign_change(change: Any, guard: Guard) -> Change:
+def guard_change(change: Any, guard: Guard) -> Change:
     """Guard a user's measure of change: its function gets read-only copies, and its result is checked.
 
     Raises

@@ -13,7 +13,7 @@ from safevar_sumo.errors import warn
 from safevar_sumo.plugins import Files, digest_of, digests, located, named_files
 from safevar_sumo.protocol.rater import driven_in_sumo
 from safevar_sumo.records import Evaluations, FloatArray
-from safevar_sumo.study import Study, fmus_of, foreign_names
+from safevar_sumo.study import Study, fmus_of, user_code_names
 from safevar_sumo.sumo import Engine, assemble, reason_for_sumo, settings_per_batch
 from safevar_sumo.vehicles import CharacteristicSet
 from safevar_sumo.workers.evaluation import Pool, packed
@@ -45,7 +45,7 @@ def batches_of(study: Study) -> tuple[int, bool]:
 def evaluate_all(study: Study, settings: FloatArray, pool: Pool, done: Callable[[int], None] = lambda number: None) -> Evaluations:
     """Evaluate M filtered settings of n characteristics, shape (M, n); equal settings are simulated once.
 
-    Code from outside is checked first (`check_code`). A sample of the settings in a recorded scene is also simulated in SUMO.
+    User code is checked first (`check_code`). A sample of the settings in a recorded scene is also simulated in SUMO.
     `done` is called with the number of settings of every finished batch.
     """
     retrying_pool, work = RetryingPool(pool, study), packed(study, inputs := inputs_of(study, pool))
@@ -86,9 +86,9 @@ def inputs_of(study: Study, pool: Pool) -> Inputs:
 
 
 def digests_of_sources(study: Study, pool: Pool) -> Files:
-    """Digests, by name, of files that parameters name, and of files that models from outside read in a run of the original vehicle.
+    """Digests, by name, of files that parameters name, and of files that users' models read in a run of the original vehicle.
 
-    The run takes place in a worker that reloads all code from outside.
+    The run takes place in a worker that reloads all user code.
 
     Raises
     ------
@@ -96,7 +96,7 @@ def digests_of_sources(study: Study, pool: Pool) -> Files:
         If the original vehicle cannot be simulated.
     """
     files = digests(named_files(_parameters(study), study.origin.places), study.origin.places)
-    if foreign_names(study):
+    if user_code_names(study):
         work = packed(study, {}, afresh=True)
         key = work, os.getcwd()
         files_read = _files_read.get(key, {"": "never read"})

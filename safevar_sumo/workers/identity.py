@@ -35,7 +35,7 @@ def identity_of(study: Study, system: System, sources: Mapping[str, str] = Mappi
     Parameters
     ----------
     sources
-        Digests of the files that code from outside reads: see `safevar_sumo.workers.batches.digests_of_sources`.
+        Digests of the files that user code reads: see `safevar_sumo.workers.batches.digests_of_sources`.
     """
     resolved = evaluation_keys(study)
     for table, model in (("vehicle", system.vehicle), ("ads", system.ads), ("scenario", system.scenario)):
