@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from safevar_sumo.errors import InputError, unknown
-from safevar_sumo.plugins import Files, Lookup, Member, digests, guard_process_state, instance_of, noted_reading, unload_user_modules
+from safevar_sumo.plugins import Files, Lookup, Member, digests, guard_process_state, instance_of, note_inputs, unload_user_modules
 from safevar_sumo.search import ALGORITHM_CONTRACT, ALGORITHMS, Algorithm, GuardedAlgorithm, MapElites, MoCell, Problem, Search
 from safevar_sumo.study import SearchTable, Study
 
@@ -62,7 +62,7 @@ def read_by_algorithms(study: Study) -> Files:
     if not packages:
         return {}
     unload_user_modules()
-    with noted_reading() as reading:
+    with note_inputs() as reading:
         for label in study.search.labels:
             algorithm_of(label, study)
     return digests(reading.files(packages), study.origin.places)
@@ -74,7 +74,7 @@ def search_of(key: RunKey, study: Study, problem: Problem, note: Callable[[Files
     search: Search | None = None
     answer: Any = None  # None starts a generator
     while True:
-        with noted_reading() as reading:
+        with note_inputs() as reading:
             try:
                 search = search or algorithm_of(key.algorithm, study).search(problem, rng)
                 step: Any = search.send(answer)

@@ -258,7 +258,7 @@ def _traci_controller(choice: ModelTable, lookup: Lookup) -> tuple[Ads, Member]:
             return instance_of(member._replace(target=target), parameters, name, "ads.parameters", lookup.source)
 
         controller_of(controller)
-    places, attribute = [*lookup.places, os.getcwd()], choice.model.partition(":")[2]
+    places, attribute = [*lookup.folders, os.getcwd()], choice.model.partition(":")[2]
     modules = partial(ModuleCopies, member, attribute, places, set())
     return TraciController(modules, controller_of, member.guard or Guard(lookup.source, name)), member
 
@@ -326,7 +326,7 @@ def _vehicle(choice: VehicleTable, lookup: Lookup, limit: float) -> tuple[Vehicl
         table = {**msgspec.structs.asdict(choice), "parameters": lookup.with_paths(Member(FmuVehicle, guard), choice.parameters,
                                                                                    "vehicle.parameters")}
         units = {name: row.unit for name, row in choice.characteristics.items()}
-        description = description_of(choice.model, lookup.places, lookup.source, "vehicle.model")
+        description = description_of(choice.model, lookup.folders, lookup.source, "vehicle.model")
         return FmuVehicle(description, units, table, guard, limit), Member(FmuVehicle, guard, file=description.path)
     member = lookup.class_of(VEHICLES, choice.model, "vehicle.model", VEHICLE_CONTRACT)
     parameters = lookup.with_paths(member, choice.parameters, "vehicle.parameters")
@@ -338,7 +338,7 @@ def _scenario(choice: ModelTable, lookup: Lookup) -> tuple[Scenario, Member]:
     member = lookup.class_of(SCENARIOS, choice.model, "scenario.model", SCENARIO_CONTRACT)
     parameters = lookup.with_paths(member, choice.parameters, "scenario.parameters")
     scenario = instance_of(member, parameters, f"scenario.model = {choice.model!r}", "scenario.parameters", lookup.source)
-    return _locate_network(scenario if member.guard is None else GuardedScenario(scenario, member.guard), lookup.places), member
+    return _locate_network(scenario if member.guard is None else GuardedScenario(scenario, member.guard), lookup.folders), member
 
 
 def _ads(choice: ModelTable, lookup: Lookup, limit: float) -> tuple[Ads, Member]:
@@ -347,7 +347,7 @@ def _ads(choice: ModelTable, lookup: Lookup, limit: float) -> tuple[Ads, Member]
     if choice.kind == "fmu":
         guard = Guard(lookup.source, f"ads.model = {choice.model!r}")
         parameters = lookup.with_paths(Member(FmuAds, guard), choice.parameters, "ads.parameters")
-        description = description_of(choice.model, lookup.places, lookup.source, "ads.model")
+        description = description_of(choice.model, lookup.folders, lookup.source, "ads.model")
         ads = FmuAds(description, choice.inputs, choice.outputs, parameters, choice.step, guard, limit)
         return ads, Member(FmuAds, guard, file=description.path)
     member = lookup.class_of(ADS, choice.model, "ads.model", SCALAR_ADS_CONTRACT, ADS_CONTRACT,

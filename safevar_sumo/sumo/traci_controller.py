@@ -90,4 +90,4 @@ class _Driver:
         with self._modules.inside(), driven_vehicle(self.view, self._subscriptions):
             self._guard.call(method, function, traci_module(), VUT)
         if self.view.last_error is not None:  # the controller caught the error and continued
-            raise self._guard.failed(method, self.view.last_error)
+            raise self._guard.failure(method, self.view.last_error)

@@ -156,7 +156,7 @@ class GuardedVehicle:
         self.model, self._guard = vehicle, guard
         units = guard.field("__init__", vehicle, "UNITS")
         if not isinstance(units, Mapping) or not all(isinstance(text, str) for item in units.items() for text in item):
-            raise guard.wrong("__init__", "UNITS", units, "a mapping from names of characteristics to their units")
+            raise guard.wrong_value("__init__", "UNITS", units, "a mapping from names of characteristics to their units")
         self.UNITS = dict(units)
         self.takes_slope = accepts(vehicle.prepare, 4)
         self.can_start_moving = hasattr(vehicle, "at_speed")
@@ -225,7 +225,7 @@ class GuardedVehicle:
 
     def sense(self, prepared: _Prepared, state: _State, seen: Observation) -> tuple[Observation, _State]:
         result = self._guard.call("sense", self.model.sense, prepared.constants, state.model_state, read_only_copy(seen))
-        sensed, next_state = self._guard.parts("sense", result, "(Observation, state)")
+        sensed, next_state = self._guard.elements("sense", result, "(Observation, state)")
         values: dict[str, Any] = {}
         for name, value in seen._asdict().items():
             shape = (prepared.n,) if hasattr(value, "shape") else ()
@@ -237,7 +237,7 @@ class GuardedVehicle:
         result = self._guard.call("advance", self.model.advance, prepared.constants, state.model_state, read_only_copy(command))
         state, max_speed = self._state("advance", prepared.n, result), prepared.types.max_speed
         for i in np.flatnonzero(state.speed > max_speed * (1 + ROUNDING))[:1]:  # SUMO itself accepts any speed
-            raise self._guard.wrong("advance", "speed", float(state.speed[i]), f"up to max_speed = {max_speed[i]:g} of its sumo_type")
+            raise self._guard.wrong_value("advance", "speed", float(state.speed[i]), f"up to max_speed = {max_speed[i]:g} of its sumo_type")
         return state
 
     def _state(self, method: str, n: int, model_state: Any) -> _State:

@@ -187,7 +187,7 @@ class FmuVehicle:
         released = Command(np.zeros_like(speed), np.zeros_like(speed))
         state = self._state(dict(zip(self._outputs, outputs, strict=True)), released, None, history)
         for i in np.flatnonzero(np.abs(state.speed - speed) > 1e-6)[:1]:
-            raise self._guard.wrong("initialisation", "speed", float(state.speed[i]), f"{speed[i]:g} m/s, the initial speed")
+            raise self._guard.wrong_value("initialisation", "speed", float(state.speed[i]), f"{speed[i]:g} m/s, the initial speed")
         return state._replace(speed=np.asarray(speed, dtype=float))
 
     def sensors(self, prepared: _Prepared) -> Sensors:
@@ -210,7 +210,8 @@ class FmuVehicle:
         outputs["speed"] = dict(zip(self._outputs, step_outputs, strict=True))["speed"]
         next_state, max_speed = self._state(outputs, command, state.seen, history), prepared.types.max_speed
         for i in np.flatnonzero(next_state.speed > np.maximum(max_speed, state.speed) * (1 + ROUNDING))[:1]:
-            raise self._guard.wrong("doStep", "speed", float(next_state.speed[i]), f"up to vehicle.sumo_type.max_speed = {max_speed[i]:g}")
+            raise self._guard.wrong_value("doStep", "speed", float(next_state.speed[i]),
+                                          f"up to vehicle.sumo_type.max_speed = {max_speed[i]:g}")
         return next_state
 
     @property

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from safevar_sumo.errors import warn
-from safevar_sumo.plugins import Files, digest_of, digests, located, named_files
+from safevar_sumo.plugins import Files, digest_of, digests, file_by_name, files_named_in
 from safevar_sumo.protocol.rater import driven_in_sumo
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.study import Study, fmus_of, user_code_names
@@ -95,12 +95,12 @@ def digests_of_sources(study: Study, pool: Pool) -> Files:
     SafevarError
         If the original vehicle cannot be simulated.
     """
-    files = digests(named_files(_parameters(study), study.origin.places), study.origin.places)
+    files = digests(files_named_in(_parameters(study), study.origin.places), study.origin.places)
     if user_code_names(study):
         work = packed(study, {}, afresh=True)
         key = work, os.getcwd()
         files_read = _files_read.get(key, {"": "never read"})
-        if any(digest_of(located(name, study.origin.places)) != digest for name, digest in files_read.items()):
+        if any(digest_of(file_by_name(name, study.origin.places)) != digest for name, digest in files_read.items()):
             original = CharacteristicSet.of(study.vehicle.characteristics).original[np.newaxis]
             _files_read[key] = dict(awaited(RetryingPool(pool, study).submit(work, original, must_succeed=True)).files)
         files |= _files_read[key]

@@ -12,7 +12,7 @@ import msgspec
 
 from safevar_sumo.errors import InputError, SafevarError
 from safevar_sumo.metrics import METRICS
-from safevar_sumo.plugins import Files, changed_files, digests, noted_reading, unload_user_modules
+from safevar_sumo.plugins import Files, changed_files, digests, note_inputs, unload_user_modules
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.study import Study, user_code_packages
 from safevar_sumo.sumo.engine import Engine
@@ -108,7 +108,7 @@ def evaluate_batch(work: bytes, settings: FloatArray) -> Evaluations:
         assembler = _task_and_system.__wrapped__
     else:
         assembler = _task_and_system
-    with noted_reading() as reading:
+    with note_inputs() as reading:
         cells = mode.cells
         task, system = assembler(work if cells is None else _work_for_all_cells(work))
         _refuse_changed_networks(task.inputs, system)
