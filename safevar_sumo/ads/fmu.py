@@ -71,7 +71,7 @@ class FmuAds:
         mapped_names = [port.variable.name for port in input_ports.values()]
         self._instances = Instances(description, [*input_ports.values()], [*output_ports.values()],
                                     list(constants_of(description, parameters, mapped_names, source, "ads.parameters")), limit)
-        self.most_vehicles = self._instances.most_vehicles
+        self.max_vehicles = self._instances.max_vehicles
         if "warns" in output_ports:
             self.warns = self._warns
 

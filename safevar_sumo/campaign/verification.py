@@ -12,7 +12,7 @@ from safevar_sumo.campaign.keys import RunKey, run_generator
 from safevar_sumo.campaign.run import Observer, Run
 from safevar_sumo.errors import UserCodeError
 from safevar_sumo.plugins import unload_user_modules
-from safevar_sumo.protocol.rater import driven_in_sumo
+from safevar_sumo.protocol.rater import study_for_sumo_check
 from safevar_sumo.records import Evaluations
 from safevar_sumo.results import ResultsDirectory
 from safevar_sumo.search import Search
@@ -36,7 +36,7 @@ class Verification:
         self._study, self._pool, self._begin_search, self._observer = study, pool, begin_search, observer
         self._isolated_work = packed(study, results.inputs, engine=engine, afresh=True) if user_code_names(study) else b""
         self._is_recorded = engine is Engine.RECORDED
-        self._sumo_study = driven_in_sumo(study, assemble(study).weather)
+        self._sumo_study = study_for_sumo_check(study, assemble(study).weather)
         inputs = results.inputs if self._sumo_study is study else {**results.inputs, "network": networks_of(assemble(self._sumo_study))}
         self._in_sumo = Batcher(pool, packed(self._sumo_study, inputs, engine=Engine.LIBSUMO), LARGEST_WORLD)
         self._isolated_checks: dict[Future[Evaluations], tuple[Run, Evaluations]] = {}

@@ -95,8 +95,8 @@ def _with_fmu(raw: _RawStudy, tables: dict[str, Any]) -> dict[str, Any]:
     if is_complete and not file_of(model, raw.origin.places):
         return tables  # so results can be read without their FMU
     description = description_of(model, raw.origin.places, str(raw.source), "vehicle.model")
-    rows = {**description.rows(parameters),
-            **{name: {**description.row(name, str(row.get("unit", ""))), **row} for name, row in stated_rows.items()}}
+    rows = {**description.table_rows(parameters),
+            **{name: {**description.table_row(name, str(row.get("unit", ""))), **row} for name, row in stated_rows.items()}}
     return {**tables, "vehicle": {**vehicle, "characteristics": rows}}
 
 

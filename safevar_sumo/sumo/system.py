@@ -17,11 +17,11 @@ import numpy as np
 
 from safevar_sumo.ads import ADS, ADS_CONTRACT, REACTIONS, SCALAR_ADS_CONTRACT, Ads, FmuAds, GuardedAds, PerVehicle, ScalarAds
 from safevar_sumo.errors import InputError, one_of, unknown
-from safevar_sumo.fmu import LONGEST, description_of
+from safevar_sumo.fmu import STEP_LIMIT, description_of
 from safevar_sumo.metrics import FURTHER, METRICS, RATING_POINTS, Metric, Objective, Scoring, guard_metric
 from safevar_sumo.metrics import OBJECTIVES as BY_OBJECTIVE
 from safevar_sumo.plugins import Guard, Lookup, Member, ModuleCopies, check_parameters, guard_process_state, instance_of
-from safevar_sumo.protocol.rater import Rater, is_rated, rated, rater_of
+from safevar_sumo.protocol.rater import Rater, expand_protocol, is_rated, rater_of
 from safevar_sumo.records import FloatArray, Nominal
 from safevar_sumo.scenarios import SCENARIO_CONTRACT, SCENARIOS, WEATHERS, GuardedScenario, Point, Scenario, weather_of
 from safevar_sumo.study import MatrixTest, MetricsTable, ModelTable, Study, VehicleTable, Weather, user_code_names
@@ -215,7 +215,7 @@ def _assemble(study: Study, source: str) -> System:
         if name not in measuring.metrics:
             raise unknown(source, f"published.{name} is no metric", name, measuring.metrics)
     rater = rater_of(study, source)
-    matrix = _matrix(study if rater is None else rated(study, models.weather), source)
+    matrix = _matrix(study if rater is None else expand_protocol(study, models.weather), source)
     for network in dict.fromkeys(scenario.network for scenario in (models.scenario, *(point.scenario for point in matrix))):
         check_network(network)
     region = region_of(study, source)
@@ -235,7 +235,7 @@ def _assemble(study: Study, source: str) -> System:
 
 def models_of(study: Study, source: str) -> Models:
     """The study's models with their parameters; raises the errors of `assemble`."""
-    lookup, limit = Lookup(source, study.origin.places), min(study.search.time_limit / 2, LONGEST)  # less than the time limit of a batch
+    lookup, limit = Lookup(source, study.origin.places), min(study.search.time_limit / 2, STEP_LIMIT)  # less than the time limit of a batch
     vehicle, ads, scenario = _vehicle(study.vehicle, lookup, limit), _ads(study.ads, lookup, limit), _scenario(study.scenario, lookup)
     return Models(vehicle[0], ads[0], scenario[0], weather_of(study.weather, source), (vehicle[1], ads[1], scenario[1]))
 

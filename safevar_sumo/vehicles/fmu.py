@@ -111,7 +111,7 @@ class FmuVehicle:
         mapped_names = [port.variable.name for port in ports]
         constants = list(constants_of(description, table["parameters"], mapped_names, source, "vehicle.parameters"))
         self._instances = Instances(description, ports, [*outputs.values(), *types.values()], constants, limit)
-        self.most_vehicles = self._instances.most_vehicles
+        self.max_vehicles = self._instances.max_vehicles
         self.takes_slope, self.can_start_moving = "grade" in inputs, "initial_speed" in inputs
         self._takes_friction = "road_friction" in inputs
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from safevar_sumo.errors import warn
 from safevar_sumo.plugins import Files, digest_of, digests, file_by_name, files_named_in
-from safevar_sumo.protocol.rater import driven_in_sumo
+from safevar_sumo.protocol.rater import study_for_sumo_check
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.study import Study, fmus_of, user_code_names
 from safevar_sumo.sumo import Engine, assemble, reason_for_sumo, settings_per_batch
@@ -62,7 +62,7 @@ def evaluate_all(study: Study, settings: FloatArray, pool: Pool, done: Callable[
     sample = np.linspace(0, len(distinct_settings) - 1, sample_size).astype(int)
     in_sumo = in_scenes = None
     if is_recorded and len(sample):
-        sumo_study = driven_in_sumo(study, assemble(study).weather)
+        sumo_study = study_for_sumo_check(study, assemble(study).weather)
         sumo_inputs = inputs if sumo_study is study else inputs_of(sumo_study, pool)
         in_sumo = retrying_pool.submit(packed(sumo_study, sumo_inputs, engine=Engine.LIBSUMO), distinct_settings[sample])
         if sumo_study is not study:

@@ -19,9 +19,9 @@ from safevar_sumo.analysis.rating.render import rating_in_words
 from safevar_sumo.analysis.rating.workbook import Preprocessed, Template
 from safevar_sumo.cli.program import commands
 from safevar_sumo.errors import InputError
-from safevar_sumo.protocol import COLOURS, EURO_NCAP_2026, part_of, points_of, protocol_of
+from safevar_sumo.protocol import COLOURS, EURO_NCAP_2026, cells_of_part, points_of, protocol_of
 from safevar_sumo.protocol.points import colours_of
-from safevar_sumo.protocol.rater import by_night
+from safevar_sumo.protocol.rater import darken
 from safevar_sumo.records import CellResults
 from safevar_sumo.scenarios import WEATHERS
 from safevar_sumo.study import load_study
@@ -127,11 +127,11 @@ def test_faster_impacts_never_gain_points_in_a_matrix(seed: int, share: float, m
 
 def test_a_weather_by_night_keeps_its_road_and_multiplies_both_visibilities() -> None:
     """Hard rain leaves 68 % of the visibility; low beams leave 75 % of these 68 %."""
-    dark = by_night(WEATHERS["hard_rain"])
+    dark = darken(WEATHERS["hard_rain"])
     assert (dark.road_friction, dark.wet, dark.light) == (0.59, True, "night")
     assert dark.visibility == pytest.approx(0.68 * 0.75)
-    assert by_night(dark) == dark
-    assert by_night(WEATHERS["clear"]) == WEATHERS["night"]
+    assert darken(dark) == dark
+    assert darken(WEATHERS["clear"]) == WEATHERS["night"]
 
 
 @pytest.mark.slow
@@ -139,9 +139,9 @@ def test_a_cell_has_equal_results_alone_and_in_any_batch() -> None:
     study = load_study("euro_ncap_rating")
     system = assemble(study)
     settings_ = np.array([system.characteristics.original, system.characteristics.lower])
-    found, numbers_ = in_cells(system, settings_, (7, 620)), part_of(PROTOCOL, 7, 620)
+    found, numbers_ = in_cells(system, settings_, (7, 620)), cells_of_part(PROTOCOL, 7, 620)
     assert found.cells is not None
-    assert sorted(number for k in range(620) for number in part_of(PROTOCOL, k, 620)) == list(range(N))
+    assert sorted(number for k in range(620) for number in cells_of_part(PROTOCOL, k, 620)) == list(range(N))
     points = [system.matrix[number] for number in numbers_]
     assert [point.name.rpartition(", ")[0] for point in points] == [CELLS[number].name for number in numbers_]
     for column, point in enumerate(points):

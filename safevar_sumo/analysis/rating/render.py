@@ -148,7 +148,7 @@ def print_matrices(console: Console, result: Rating) -> None:
 
 
 def _cell(result: Rating, block: Block, row: int, column: int) -> Text:
-    number = result.protocol.matrix_of[block.name, row, column]
+    number = result.protocol.matrix_cell_numbers[block.name, row, column]
     differs = len({vehicle.colour(number) for vehicle in result.variants}) > 1
     text = Text()
     for k, vehicle in enumerate(result.variants if differs else result.variants[:1]):
@@ -228,4 +228,4 @@ def _cells_of(block: Block, result: Rating) -> Iterator[tuple[int, int, int]]:
     for row, speeds in enumerate(block.rows):
         for column, letter in enumerate(speeds.ranges):
             if letter != "-":
-                yield row, column, result.protocol.matrix_of[block.name, row, column]
+                yield row, column, result.protocol.matrix_cell_numbers[block.name, row, column]
