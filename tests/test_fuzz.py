@@ -25,11 +25,11 @@ from safevar_sumo.metrics import METRICS
 from safevar_sumo.plugins import Guard
 from safevar_sumo.records import Evaluations, FloatArray, Nominal, Observation, PedalTables
 from safevar_sumo.study import Study, load_study, tables_of
-from safevar_sumo.study.file import without_nulls
+from safevar_sumo.study.file import drop_nulls
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet
 
-TABLES = without_nulls(tables_of(load_study("smoke")))
+TABLES = drop_nulls(tables_of(load_study("smoke")))
 SCALARS = st.one_of(st.integers(), st.floats(), st.text(max_size=20), st.booleans(), st.dates(), st.datetimes(), st.times())
 ANYTHING = st.recursive(
     SCALARS, lambda inner: st.one_of(st.lists(inner, max_size=3), st.dictionaries(st.text(max_size=8), inner, max_size=3)), max_leaves=6)

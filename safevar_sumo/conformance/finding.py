@@ -47,7 +47,7 @@ class Finding:
 
 @dataclass(kw_only=True)
 class Report:
-    """The findings on a subject. `key` is its key and name in a study, `remarks` state assumptions, `speed` describes its speed."""
+    """The findings on a subject. `key` is its key and name in a study, `remarks` state assumptions, `speed` is a sentence on speed."""
 
     subject: str
     kind: str
@@ -72,13 +72,13 @@ class UserCodeTimeout(BaseException):
 
 
 def load_factor() -> float:
-    """Number of runnable processes per core, at least 1: the factor by which the load of the machine slows everything down."""
+    """The factor by which other processes slow this one down: the number of runnable processes per core, at least 1."""
     load = os.getloadavg()[0] if hasattr(os, "getloadavg") else 1.0
     return max(1.0, load / (os.cpu_count() or 1))
 
 
 TICKS = 10
-"""A time limit is divided into this many parts; parts that end during an import do not count."""
+"""Number of intervals of a time limit; intervals that end during an import do not count."""
 
 
 @contextmanager

@@ -108,7 +108,7 @@ class ObjectiveProbe(Probe):
 
 
 class AlgorithmProbe(Probe):
-    """Searches a smooth function with an algorithm; the requested settings take the place of vehicles."""
+    """Lets an algorithm minimise a smooth function in place of simulations."""
 
     methods = ("search",)
     vehicle_count = 1

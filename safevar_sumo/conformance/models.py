@@ -230,7 +230,7 @@ class StudyProbe(Probe):
             yield from self._undeclared_reactive_actors(model, outputs)
 
     def _undeclared_reactive_actors(self, model: System, outputs: Outputs) -> Iterator[MissingReaction]:
-        """A finding if actors react although the scenario denies it: SUMO itself then gives other results."""
+        """A missing declaration: actors react, as SUMO gives other results than the recorded scene, but the scenario denies it."""
         in_sumo = evaluate(model, self.settings, Engine.LIBSUMO)
         for name, values in {"outcome": in_sumo.outcome, **in_sumo.metrics}.items():
             if not (np.array_equal(outputs[name], values) if values.dtype.kind == "U" else

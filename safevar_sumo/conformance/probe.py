@@ -24,7 +24,7 @@ Indices = npt.NDArray[np.intp]
 Outputs = Mapping[str, np.ndarray]
 """Results by name; the last axis runs over the vehicles."""
 MATRIX_POINTS = 2
-"""Approximate number of points of a matrix at which a study is tried."""
+"""Approximate number of points of a study's matrix that are simulated."""
 
 
 class MissingReaction(NamedTuple):

@@ -30,6 +30,7 @@ KINDS: Mapping[str, Mapping[str, Any]] = {
 METHODS: Mapping[str, tuple[str, ...]] = {
     "ads": ("start", "drive"), "vehicle": ("prepare", "sumo_type", "at_rest", "sense", "advance"),
     "scenario": ("begin", "observe", "encounter"), "algorithm": ("search",), "traci": ("step",)}
+"""Methods by which `kind_of` recognises a class, by kind."""
 KEYS = {"metric": "metrics.also", "objective": "search.objectives", "algorithm": "search.algorithms", "traci": "ads.model"}
 """Key of a study that names subjects of a kind; `KIND.model` for all other kinds."""
 DEFAULT_STUDIES = {"traci": "native"}
@@ -39,11 +40,11 @@ MAX_FILES = 50
 DOMAINS_BY_UNIT = {
     "kg": (1500.0, 1000.0, 2500.0), "m/s^2": (5.0, 3.0, 8.0), "m/s": (30.0, 20.0, 40.0), "s": (0.1, 0.05, 0.3), "m": (1.0, 0.5, 2.0),
     "Nm": (400.0, 200.0, 600.0), "N": (4000.0, 2000.0, 6000.0)}
-"""Original, lower and upper end for a characteristic that no study names, by unit; 1, 0.8 and 1.2 for all other units."""
+"""Original, lower and upper value by unit, for a characteristic that no study names; 1, 0.8 and 1.2 for all other units."""
 
 
 class Subject(NamedTuple):
-    """A class, function or record to check. `name` stands on the command line or in `study`; `remarks` state assumptions."""
+    """A class, function or record to check. `name` is its name on the command line or in `study`; `remarks` state assumptions."""
 
     name: str
     kind: str

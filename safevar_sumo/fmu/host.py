@@ -1,4 +1,4 @@
-"""The program that runs an FMU in a separate process, where a crash or a hang does no harm; it answers over its standard streams.
+"""The program that runs an FMU in a separate process, where a crash or a hang does no harm; it communicates over its standard streams.
 
 The parent process starts the program by its path; it imports nothing of this package. A request is a pickled tuple of a name and
 arguments; an answer is a pickled tuple of a status and a value.

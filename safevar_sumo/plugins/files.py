@@ -1,7 +1,7 @@
-"""Files that results depend on: the files that user code reads, and digests by names equal on every machine.
+"""Files that results depend on: finds the files that user code reads, and names them alike on every machine.
 
-The interpreter raises an audit event for every file that Python code opens and for every module that is loaded. Compiled code
-raises no event: files that a study's parameters name always count.
+The interpreter raises an audit event for every file that Python code opens and for every module that it loads. Compiled code
+raises no event, so all files that a study's parameters name count as read.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ KNOWN_FOLDERS = tuple(f"{folder}{os.sep}" for folder in sorted({
     *(os.path.realpath(os.path.join(prefix, name)) for prefix in (sys.prefix, sys.base_prefix, "/", "/usr", "/usr/local")
       for name in ("bin", "etc", "include", "lib", "lib64", "sbin", "share")),
     "/dev", "/proc", "/sys", "/System", "/Library", os.environ.get("SYSTEMROOT", "/dev")}))
-"""Folders of this package, the interpreter, installed libraries and the operating system: the code in them is no user code."""
+"""Folders without user code: of this package, the interpreter, installed libraries and the operating system."""
 CACHE_FOLDERS = ("__pycache__", ".cache", ".config")
 """Names of folders in which programs keep caches and settings."""
 WRITE_FLAGS = os.O_WRONLY | os.O_CREAT | os.O_TRUNC

@@ -121,7 +121,7 @@ def read_only_copy(value: Any) -> Any:
 
 @contextmanager
 def guard_process_state(source: str, names: Sequence[str]) -> Iterator[None]:
-    """Restore the working directory, environment variables and numpy's error state after a block; nothing if `names` is empty."""
+    """Restore the working directory, environment variables and numpy's error state after a block, unless `names` is empty."""
     if not names:
         yield
         return

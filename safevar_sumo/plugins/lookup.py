@@ -23,7 +23,7 @@ import msgspec
 from safevar_sumo.errors import InputError, UserCodeError, did_you_mean, one_of
 from safevar_sumo.plugins.files import audit_hook, file_beside, is_user_file
 from safevar_sumo.plugins.guard import Contract, Guard
-from safevar_sumo.study import converted
+from safevar_sumo.study import convert_table
 
 _KNOWN_MODULES = {__name__.partition(".")[0], *sys.stdlib_module_names}
 """Names of top modules that are no user code: this package and Python's standard library."""
@@ -268,7 +268,7 @@ def instance_of(member: Member, parameters: Mapping[str, Any], name: str, key: s
     if issubclass(cls, msgspec.Struct):
         audit_hook.call_depth += member.guard is not None
         try:
-            return converted(source, parameters, cls, key)
+            return convert_table(source, parameters, cls, key)
         finally:
             audit_hook.call_depth -= member.guard is not None
     check_parameters(cls, (), parameters, name, key, source)
@@ -287,7 +287,7 @@ def check_parameters(function: Callable[..., Any], arguments: tuple[Any, ...], p
 
 
 class ModuleCopies:
-    """A copy of the user's modules for one of many vehicles, so that each vehicle has its own variables of these modules.
+    """Copies of the user's modules for one of many vehicles, so that the vehicles share no variables of these modules.
 
     Parameters
     ----------
@@ -309,7 +309,7 @@ class ModuleCopies:
 
     @contextmanager
     def inside(self) -> Iterator[None]:
-        """A context in which imports find these copies; a module imported for the first time is added to them."""
+        """A context in which imports find these copies; it adds modules that are imported for the first time."""
         shared = self._remove()
         sys.modules.update(self._modules)
         module_count, dont_write_bytecode, sys.dont_write_bytecode = len(sys.modules), sys.dont_write_bytecode, True

@@ -1,4 +1,4 @@
-"""The tables of a study: vehicle, ADS, scenario, weather, metrics and search; and the places of its files."""
+"""The tables of a study: vehicle, ADS, scenario, weather, metrics and search; and the folders of its files."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from safevar_sumo.study.variation import Correlation, Distribution
 
 PositiveNumber = Annotated[float, Meta(gt=0, le=1e6)]
 PositiveInt = Annotated[int, Meta(ge=1, le=10_000_000)]
-OwnStep = Annotated[float, Meta(ge=1e-6, le=10)]
+FmuStep = Annotated[float, Meta(ge=1e-6, le=10)]
 Weight = Annotated[float, Meta(ge=0, le=1e6)]
 Seed = Annotated[int, Meta(ge=0, le=2**63 - 1)]
 Parameters = dict[str, Any]
-NAME = r"^[A-Za-z0-9][A-Za-z0-9_.-]*\Z"
+NAME_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9_.-]*\Z"
 SAFETY_DEGREE: Final = "safety_degree"
 """Column and key of the metric."""
 OBJECTIVES = (SAFETY_DEGREE, "f_diff", "f_num_diff")
@@ -63,7 +63,7 @@ class ModelTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     kind: Literal["", "traci", "fmu"] = ""
     inputs: dict[str, str] = {}
     outputs: dict[str, str] = {}
-    step: OwnStep | None = None
+    step: FmuStep | None = None
 
 
 class VehicleTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -82,7 +82,7 @@ class VehicleTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     outputs: dict[str, str] = {}
     sensors: dict[str, str | float] = {}
     sumo_type: dict[str, str | float] = {}
-    step: OwnStep | None = None
+    step: FmuStep | None = None
 
 
 class Weather(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -106,7 +106,7 @@ class MetricsTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
 
     `ttc_threshold` is TTC* [s]; `sampling_interval` [s] is the time between two samples that
     TET, TIT and aveDece are computed from (a whole multiple of the simulation's step; by default the step).
-    `also` names further metrics: metrics of the package, such as `max_jerk`, or your own metrics as `package.module:Name`.
+    `also` names further metrics: metrics of the package, such as `max_jerk`, or users' metrics as `package.module:Name`.
     """
 
     ttc_threshold: PositiveNumber
@@ -252,7 +252,7 @@ class Study(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
     # A new key that changes no result of a campaign also belongs in KEYS_WITHOUT_EFFECT_ON_RESULTS of results/manifest.py. Any other new
     # key becomes part of the identity of results: let `evaluation_keys` there omit its default, so that older results keep their identity.
-    name: Annotated[str, Meta(pattern=NAME)]
+    name: Annotated[str, Meta(pattern=NAME_PATTERN)]
     title: str
     scenario: ModelTable
     weather: str | Weather
