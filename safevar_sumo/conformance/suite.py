@@ -67,7 +67,7 @@ def check_study(study: Study, *, only_user_code: bool = False) -> Iterator[Repor
     models = sorted((subject for subject in subjects if subject.kind in order),
                     key=lambda subject: (not subject.is_user_code, order.index(subject.kind)))
     for subject in subjects:
-        yield check_subject(subject, simulated=subject in models[:1])
+        yield check_subject(subject, with_study=subject in models[:1])
 
 
 def refuse_defects(study: Study) -> list[str]:
@@ -90,8 +90,8 @@ def refuse_defects(study: Study) -> list[str]:
     return remarks
 
 
-def check_subject(subject: Subject, *, simulated: bool = True) -> Report:
-    """Check one subject; with `simulated`, simulate its study too.
+def check_subject(subject: Subject, *, with_study: bool = True) -> Report:
+    """Check one subject; `with_study` also simulates its study.
 
     Raises
     ------
@@ -99,7 +99,7 @@ def check_subject(subject: Subject, *, simulated: bool = True) -> Report:
         If the subject does not take its parameters, or its study cannot be assembled.
     """
     report = Report(subject=subject.name, kind=subject.kind, key=subject.key, remarks=list(subject.remarks))
-    start, suite = time.perf_counter(), _Suite(subject, simulated)
+    start, suite = time.perf_counter(), _Suite(subject, with_study)
     with guard_process_state("check", [subject.name]):
         report.findings += suite.findings()
     report.speed, report.seconds = suite.speed, time.perf_counter() - start
@@ -114,10 +114,10 @@ ADVICE_ON_FMUS = {
 
 
 class _Suite:
-    def __init__(self, subject: Subject, simulated: bool) -> None:
+    def __init__(self, subject: Subject, with_study: bool) -> None:
         self._subject, self._source = subject, Source(subject.member)
-        self._probes = [probe for probe in PROBES[subject.kind] if simulated or probe is not StudyProbe]
-        self.speed, self._seconds = "", 0.0
+        self._probes = [probe for probe in PROBES[subject.kind] if with_study or probe is not StudyProbe]
+        self.speed, self._run_time = "", 0.0
 
     def findings(self) -> Iterator[Finding]:
         """The findings on the subject; no probe runs after a probe with findings."""
@@ -172,7 +172,7 @@ class _Suite:
             yield self._difference_finding("determinism", probe, f"{difference} when the run is repeated", "the same, to the bit")
             return
         repetition: dict[str, Outputs] = {}
-        self._seconds = measure_time(lambda: repetition.update(outputs=probe.repeat(model, vehicles)))
+        self._run_time = measure_time(lambda: repetition.update(outputs=probe.repeat(model, vehicles)))
         difference = _difference(outputs, repetition["outputs"], vehicles)
         if difference:
             yield self._difference_finding("state", probe, f"{difference} in a second run", "the same as in the first run, to the bit")
@@ -195,7 +195,7 @@ class _Suite:
         return self._finding(check, got, expected, location)
 
     def _cost_findings(self, probe: Probe, model: Any) -> Iterator[Finding]:
-        seconds, sentence = probe.cost(model, self._seconds)
+        seconds, sentence = probe.cost(model, self._run_time)
         self.speed = self.speed or sentence
         limit = COST_LIMIT * (10 if self._subject.kind == "traci" else 1)  # this includes the time of SUMO
         if seconds > limit:

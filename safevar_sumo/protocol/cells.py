@@ -81,7 +81,7 @@ class Layer(Struct, frozen=True, forbid_unknown_fields=True):
     conditions: tuple[Condition, ...]
 
     @property
-    def simulated(self) -> tuple[Condition, ...]:
+    def simulated_conditions(self) -> tuple[Condition, ...]:
         """The layer's variations if they can be simulated; the calculator lists none for CBLA by night, which is rated like other tests."""
         if self.layer == NIGHT:
             return self.conditions or (Condition(IN_DARKNESS, NOT_RED),)
@@ -203,7 +203,7 @@ class Protocol(Struct, frozen=True, eq=False, forbid_unknown_fields=True, dict=T
         return [layer for layer in self.layers if layer.test == test]
 
     @property
-    def not_simulated(self) -> dict[str, float]:
+    def points_not_simulated(self) -> dict[str, float]:
         """Points of tests that cannot be simulated here, by test."""
         return {test: sum(points) for test, points in self.scenarios.items() if test not in self.tests}
 
@@ -219,7 +219,7 @@ class Protocol(Struct, frozen=True, eq=False, forbid_unknown_fields=True, dict=T
     def _layer_cells(self) -> Iterator[Cell]:
         standard_cells = [cell for cell in self._matrix_cells() if cell.range == STANDARD]
         for layer in self.layers:
-            for condition in layer.simulated:
+            for condition in layer.simulated_conditions:
                 speed_increase = _leading_number(condition.condition) if layer.layer == SPEED else 0.0
                 for cell in standard_cells:
                     if cell.block.test == layer.test:

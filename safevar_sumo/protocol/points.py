@@ -101,7 +101,7 @@ def _columns_of(protocol: Protocol) -> _Columns:
               for block in protocol.blocks for name in (STANDARD, EXTENDED)}
     variations = [(layer, condition.criterion, cells_where(lambda cell, varied_by=layer, c=condition: cell.block.test == varied_by.test
                                                           and cell.range == varied_by.layer and cell.condition == c.condition))
-              for layer in protocol.layers for condition in layer.simulated]
+              for layer in protocol.layers for condition in layer.simulated_conditions]
     nominal_cells = np.array([protocol.matrix_cell_numbers[cell.block.name, cell.row, cell.column] for cell in cells])
     required_cells = cells_where(lambda cell: cell.block.test == REQUIRED_TEST and cell.range == STANDARD and cell.vut <= REQUIRED_SPEED)
     return _Columns(bands, nominal_cells, ranges, variations, required_cells)

@@ -67,7 +67,7 @@ def rater_of(study: Study, source: str) -> Rater | None:
         key = f"rating.claims.{test}"
         if test not in protocol.tests:
             raise unknown(source, f"{key}: there is no such test, or it is not simulated", test, protocol.tests)
-        is_simulated = {layer.layer: bool(layer.simulated) for layer in protocol.layers_of(test)}
+        is_simulated = {layer.layer: bool(layer.simulated_conditions) for layer in protocol.layers_of(test)}
         for layer in layers:
             if layer not in is_simulated:
                 raise unknown(source, f"{key}: {layer!r} does not count for {test}", layer, is_simulated)

@@ -68,10 +68,10 @@ def test_a_warning_is_green_from_1_7_s_and_measured_values_have_two_decimals() -
 
 
 def test_a_vehicle_that_avoids_every_impact_earns_all_simulated_points_and_one_that_never_brakes_none() -> None:
-    whole = points_of(PROTOCOL, results(vehicles=2), {test: [one.layer for one in PROTOCOL.layers_of(test) if not one.simulated]
+    whole = points_of(PROTOCOL, results(vehicles=2), {test: [one.layer for one in PROTOCOL.layers_of(test) if not one.simulated_conditions]
                                                       for test in PROTOCOL.tests})
     assert whole.total.tolist() == [40.0, 40.0]
-    assert sum(PROTOCOL.not_simulated.values()) + whole.total[0] == 100
+    assert sum(PROTOCOL.points_not_simulated.values()) + whole.total[0] == 100
     assert points_of(PROTOCOL, results(60.0, np.nan)).total.tolist() == [0.0]
 
 
@@ -91,14 +91,14 @@ def test_robustness_counts_from_half_of_the_standard_range_and_claims_count_as_h
         assert points[0] == pytest.approx(1 - red / 12)
         assert (points[2] > 0) == earned
     layers = PROTOCOL.layers_of("CBNA")
-    held, claim = sum(bool(one.simulated) for one in layers), next(one.layer for one in layers if not one.simulated)
+    held, claim = sum(bool(one.simulated_conditions) for one in layers), next(one.layer for one in layers if not one.simulated_conditions)
     shares = [points_of(PROTOCOL, results(), claims).tests["CBNA"][0, 2] / 0.125 for claims in ({}, {"CBNA": [claim]})]
     assert shares == pytest.approx([held / len(layers), (held + 1) / len(layers)])
 
 
 def test_a_layer_of_a_test_whose_cells_are_all_red_does_not_hold() -> None:
     """No cell has variations that could hold; a single cell that is not red is enough."""
-    layers = [("CBNA", one.layer) for one in PROTOCOL.layers_of("CBNA") if one.simulated]
+    layers = [("CBNA", one.layer) for one in PROTOCOL.layers_of("CBNA") if one.simulated_conditions]
     for red, holds in ((12, False), (11, True)):
         impact = np.full(N, np.nan)
         impact[numbers("CBNA", "standard")[:red]] = 50.0

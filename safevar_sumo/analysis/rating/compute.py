@@ -72,7 +72,7 @@ class RatedVehicle:
 
     def _layers(self, block: Block) -> dict[str, bool | None]:
         claimed = self.claims.get(block.test, ())
-        return {layer.layer: bool(self.scored.layers[block.test, layer.layer][0]) if layer.simulated
+        return {layer.layer: bool(self.scored.layers[block.test, layer.layer][0]) if layer.simulated_conditions
                 else (True if layer.layer in claimed else None) for layer in self.protocol.layers_of(block.test)}
 
     def colour(self, number: int) -> str | None:
@@ -144,7 +144,7 @@ class Rating:
         claims, open_points = self.original.claims, 0.0
         for test, blocks in self.protocol.tests.items():
             layers = self.protocol.layers_of(test)
-            open_layers = [layer for layer in layers if not layer.simulated and layer.layer not in claims.get(test, ())]
+            open_layers = [layer for layer in layers if not layer.simulated_conditions and layer.layer not in claims.get(test, ())]
             open_points += sum(block.points[2] for block in blocks) * len(open_layers) / len(layers)
         return round(open_points, DECIMALS)
 
@@ -169,7 +169,7 @@ class Rating:
     def to_dict(self) -> dict[str, Any]:
         """The JSON of `rating`."""
         return {"study": self.study.name, "variants": [variant.to_dict() for variant in self.variants],
-                "not_simulated": [{"test": test, "points": points} for test, points in self.protocol.not_simulated.items()]}
+                "not_simulated": [{"test": test, "points": points} for test, points in self.protocol.points_not_simulated.items()]}
 
     def __repr__(self) -> str:
         vehicles = "; ".join(f"{vehicle.name} {vehicle.points:.2f}" for vehicle in self.variants)

@@ -78,7 +78,7 @@ def turned_in_words(result: Rating) -> list[tuple[str, str]]:
 
 def not_simulated(result: Rating) -> str:
     """Sentences on the tests and robustness layers without points."""
-    tests = result.protocol.not_simulated
+    tests = result.protocol.points_not_simulated
     named = ", ".join(f"{test} {points:g}" for test, points in tests.items())
     text = f"Not simulated, neither passed nor failed: {named}; {sum(tests.values()):g} points."
     if result.left_open:
