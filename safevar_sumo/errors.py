@@ -42,7 +42,7 @@ class InputError(SafevarError):
         return f"{message}\nexpected: {self.legal}" if self.legal else message
 
 
-class ForeignError(InputError):
+class UserCodeError(InputError):
     """User code that a study names failed or returned an illegal value."""
 
 

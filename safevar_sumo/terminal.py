@@ -71,7 +71,7 @@ def print_constraints(console: Console, study: Study) -> None:
     """Print the constraints that all settings satisfy, if the study has any."""
     characteristics = study.vehicle.characteristics
     if study.constraints:
-        conditions = "; ".join(f"{constraint.quantity} {constraint.legal(characteristics)}" for constraint in study.constraints)
+        conditions = "; ".join(f"{constraint.quantity} {constraint.bounds_in_words(characteristics)}" for constraint in study.constraints)
         print_text(console, f"Only settings that satisfy the study's constraints: {conditions}.")
 
 

@@ -1,4 +1,4 @@
-"""Checks of your own code as pytest classes, to use in your test files.
+"""Checks of user code as pytest classes, to use in your test files.
 
 ```python
 from safevar_sumo.testing import AdsChecks

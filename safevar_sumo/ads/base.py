@@ -73,7 +73,7 @@ class GuardedAds:
 
     def _warns(self, memory: Any) -> BoolArray:
         ads: Any = self._ads
-        return self._guard.truths("warns", "warnings", self._guard.call("warns", ads.warns, memory), (self._vehicles,))
+        return self._guard.booleans("warns", "warnings", self._guard.call("warns", ads.warns, memory), (self._vehicles,))
 
     def start(self, n: int, nominal: Nominal, step: float) -> Any:
         self._vehicles = n
@@ -81,8 +81,8 @@ class GuardedAds:
 
     def drive(self, seen: Observation, memory: Any) -> tuple[Command, Any]:
         result = self._guard.call("drive", self._ads.drive, read_only_copy(seen), memory)
-        command, memory = self._guard.parts("drive", result, "(Command(throttle, brake), memory)")
-        throttle, brake = self._guard.parts("drive", command, "(Command(throttle, brake), memory)")
+        command, memory = self._guard.elements("drive", result, "(Command(throttle, brake), memory)")
+        throttle, brake = self._guard.elements("drive", command, "(Command(throttle, brake), memory)")
         return Command(self._pedal("throttle", throttle, seen), self._pedal("brake", brake, seen)), memory
 
     def _pedal(self, name: str, value: Any, seen: Observation) -> FloatArray:
@@ -114,7 +114,7 @@ class PerVehicle:
             throttle, brake = command
             if type(throttle) is type(brake) is float and 0 <= throttle <= 1 and 0 <= brake <= 1:
                 return throttle, brake  # the fast path: this runs for every vehicle in every step
-        throttle, brake = self._guard.parts("drive", command, "(throttle, brake), each in [0, 1]")
+        throttle, brake = self._guard.elements("drive", command, "(throttle, brake), each in [0, 1]")
         return (float(self._guard.numbers("drive", "throttle", throttle, (), 0.0, 1.0)),
                 float(self._guard.numbers("drive", "brake", brake, (), 0.0, 1.0)))
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from safevar_sumo.errors import InputError, SimulationError
 from safevar_sumo.metrics import METRICS, RATING_POINTS, Unsafe
-from safevar_sumo.protocol import part_of
+from safevar_sumo.protocol import cells_of_part
 from safevar_sumo.protocol.rater import is_rated, rater_of
 from safevar_sumo.records import CellResults, Evaluations, FloatArray, Outcome
 from safevar_sumo.study import Study
@@ -129,7 +129,7 @@ class Evaluator:
                 results_by_part[futures[future]] = evaluations.cells
                 done += evaluations.cells.impact.shape[1]
                 self.progress(stage, done, cell_count)
-        order = np.argsort(np.concatenate([part_of(rater.protocol, part, parts) for part in range(parts)]))
+        order = np.argsort(np.concatenate([cells_of_part(rater.protocol, part, parts) for part in range(parts)]))
         self.simulated += len(settings)
         columns = zip(*(results_by_part[part] for part in range(parts)), strict=True)
         return CellResults._make(np.concatenate(column, axis=1)[:, order] for column in columns)

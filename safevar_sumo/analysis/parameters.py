@@ -9,7 +9,7 @@ import msgspec
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.scenarios import weather_of
-from safevar_sumo.study import Study, invalid
+from safevar_sumo.study import Study, error_with_key
 
 FITTED_TABLES = ("vehicle.parameters.", "ads.parameters.", "weather.")
 """Prefixes of the parameters that may be fitted."""
@@ -30,7 +30,7 @@ def with_values(study: Study, values: Mapping[str, float]) -> Study:
     try:
         return msgspec.convert(tables, Study)
     except msgspec.ValidationError as error:
-        raise invalid(study.source, tables, error) from None
+        raise error_with_key(study.source, tables, error) from None
 
 
 def value_of(study: Study, name: str) -> float:

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from safevar_sumo.errors import InputError, unknown
-from safevar_sumo.plugins import Files, Lookup, Member, digests, forget_foreign, guard_process_state, instance_of, noted_reading
+from safevar_sumo.plugins import Files, Lookup, Member, digests, guard_process_state, instance_of, note_inputs, unload_user_modules
 from safevar_sumo.search import ALGORITHM_CONTRACT, ALGORITHMS, Algorithm, GuardedAlgorithm, MapElites, MoCell, Problem, Search
 from safevar_sumo.study import SearchTable, Study
 
@@ -57,24 +57,24 @@ def algorithm_of(label: str, study: Study) -> Algorithm:
 
 
 def read_by_algorithms(study: Study) -> Files:
-    """Digests of files that algorithms from outside read while this process loads and instantiates them."""
+    """Digests of files that users' algorithms read while this process loads and instantiates them."""
     packages = _packages(study)
     if not packages:
         return {}
-    forget_foreign()
-    with noted_reading() as reading:
+    unload_user_modules()
+    with note_inputs() as reading:
         for label in study.search.labels:
             algorithm_of(label, study)
     return digests(reading.files(packages), study.origin.places)
 
 
 def search_of(key: RunKey, study: Study, problem: Problem, note: Callable[[Files], None]) -> Search:
-    """The search of a run; after each step, calls `note` with the files that an algorithm from outside has read."""
+    """The search of a run; after each step, calls `note` with the files that a user's algorithm has read."""
     packages, rng, ended = _packages(study), run_generator(study, key), False
     search: Search | None = None
     answer: Any = None  # None starts a generator
     while True:
-        with noted_reading() as reading:
+        with note_inputs() as reading:
             try:
                 search = search or algorithm_of(key.algorithm, study).search(problem, rng)
                 step: Any = search.send(answer)
@@ -88,7 +88,7 @@ def search_of(key: RunKey, study: Study, problem: Problem, note: Callable[[Files
 
 
 def _packages(study: Study) -> list[str]:
-    """Top-level packages of the algorithms from outside."""
+    """Top-level packages of a study's user algorithms."""
     return [name.partition(":")[0].partition(".")[0] for name in study.search.algorithms if ":" in name]
 
 

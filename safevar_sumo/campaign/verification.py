@@ -10,13 +10,13 @@ import numpy as np
 from safevar_sumo.campaign.batcher import Batcher
 from safevar_sumo.campaign.keys import RunKey, run_generator
 from safevar_sumo.campaign.run import Observer, Run
-from safevar_sumo.errors import ForeignError
-from safevar_sumo.plugins import forget_foreign
-from safevar_sumo.protocol.rater import driven_in_sumo
+from safevar_sumo.errors import UserCodeError
+from safevar_sumo.plugins import unload_user_modules
+from safevar_sumo.protocol.rater import study_for_sumo_check
 from safevar_sumo.records import Evaluations
 from safevar_sumo.results import ResultsDirectory
 from safevar_sumo.search import Search
-from safevar_sumo.study import Study, foreign_names
+from safevar_sumo.study import Study, user_code_names
 from safevar_sumo.sumo import Engine, assemble, evaluate
 from safevar_sumo.sumo.matrix import MAX_COPIES
 from safevar_sumo.workers.evaluation import packed
@@ -29,14 +29,14 @@ LEGAL = ("requests that depend only on the run's problem, evaluations and `rng`:
 
 
 class Verification:
-    """Simulates settings of ended runs again: first one by one, with code from outside reloaded; then in SUMO."""
+    """Simulates settings of ended runs again: first one by one, with user code reloaded; then in SUMO."""
 
     def __init__(self, study: Study, results: ResultsDirectory, pool: RetryingPool, begin_search: Callable[[RunKey], Search],
                  engine: Engine, observer: Observer) -> None:
         self._study, self._pool, self._begin_search, self._observer = study, pool, begin_search, observer
-        self._isolated_work = packed(study, results.inputs, engine=engine, afresh=True) if foreign_names(study) else b""
+        self._isolated_work = packed(study, results.inputs, engine=engine, afresh=True) if user_code_names(study) else b""
         self._is_recorded = engine is Engine.RECORDED
-        self._sumo_study = driven_in_sumo(study, assemble(study).weather)
+        self._sumo_study = study_for_sumo_check(study, assemble(study).weather)
         inputs = results.inputs if self._sumo_study is study else {**results.inputs, "network": networks_of(assemble(self._sumo_study))}
         self._in_sumo = Batcher(pool, packed(self._sumo_study, inputs, engine=Engine.LIBSUMO), MAX_COPIES)
         self._isolated_checks: dict[Future[Evaluations], tuple[Run, Evaluations]] = {}
@@ -58,8 +58,8 @@ class Verification:
 
         Raises
         ------
-        ForeignError
-            If the last run of an algorithm from outside requests other settings when the reloaded algorithm repeats it.
+        UserCodeError
+            If the last run of a user's algorithm requests other settings when the reloaded algorithm repeats it.
         """
         self._refuse_unrepeatable(run)
         rng = run_generator(self._study, run.key._replace(algorithm=f"recheck {run.key.algorithm}"))
@@ -97,20 +97,20 @@ class Verification:
         return run not in self._unverified
 
     def _refuse_unrepeatable(self, run: Run) -> None:
-        name = self._outside_name(run.key)
+        name = self._user_algorithm(run.key)
         if name and run.key.run == self._study.search.runs - 1:
-            forget_foreign()
+            unload_user_modules()
             if not run.is_repeated_by(self._begin_search(run.key)):
                 raise self._repetition_error(name, run.key)
 
-    def _outside_name(self, key: RunKey) -> str:
-        """The name of the algorithm of a run if it comes from outside, else ""."""
+    def _user_algorithm(self, key: RunKey) -> str:
+        """The name of a run's algorithm if it is user code, else ""."""
         name = self._study.search.labels.get(key.algorithm, "")
         return name if ":" in name else ""
 
-    def _repetition_error(self, name: str, key: RunKey) -> ForeignError:
+    def _repetition_error(self, name: str, key: RunKey) -> UserCodeError:
         problem = f"search.algorithms: {name!r} requests other settings when run {key.run} is repeated alone"
-        return ForeignError(f"study {self._study.name!r}", problem, LEGAL)
+        return UserCodeError(f"study {self._study.name!r}", problem, LEGAL)
 
     def take(self, batch: Future[Evaluations]) -> list[Run]:
         """Compare a computed batch with the runs; returns the runs whose verification it completes.

@@ -1,4 +1,4 @@
-"""The command `check`, which tests users' own code."""
+"""The command `check`, which tests user code."""
 
 from __future__ import annotations
 

@@ -1,7 +1,8 @@
-"""Checks whether an author's own driving system, vehicle, scenario, metric, objective, algorithm or TraCI controller works here."""
+"""Checks of user code: a driving system, vehicle, scenario, metric, objective, algorithm or TraCI controller."""
 
-from safevar_sumo.conformance.finding import REFUSED, Finding, Report
-from safevar_sumo.conformance.subject import KINDS, Subject, subject_of, subjects_of
-from safevar_sumo.conformance.suite import check, checked, refuse_defects
+from safevar_sumo.conformance.finding import BLOCKING_CHECKS, Finding, Report
+from safevar_sumo.conformance.subject import KINDS, Subject, find_subject, subjects_of
+from safevar_sumo.conformance.suite import check, check_subject, refuse_defects
 
-__all__ = ["KINDS", "REFUSED", "Finding", "Report", "Subject", "check", "checked", "refuse_defects", "subject_of", "subjects_of"]
+__all__ = [
+    "BLOCKING_CHECKS", "KINDS", "Finding", "Report", "Subject", "check", "check_subject", "find_subject", "refuse_defects", "subjects_of"]

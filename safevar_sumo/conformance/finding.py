@@ -1,4 +1,4 @@
-"""Findings of a check, and the time limit for an author's code."""
+"""Findings of a check, and the time limit of user code."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ ADVICE: Mapping[str, str] = {
     "picklable": "give functions a name at the top of the module; open files, sockets and locks in `start`, not in `__init__`",
 }
 """Advice by check."""
-REFUSED = ("contract", "units", "determinism", "state", "batch", "inputs", "finite")
+BLOCKING_CHECKS = ("contract", "units", "determinism", "state", "batch", "inputs", "finite")
 """Checks whose failure makes results wrong: the study does not begin. A failure of any other check is a warning."""
 
 
@@ -47,7 +47,7 @@ class Finding:
 
 @dataclass(kw_only=True)
 class Report:
-    """The findings on a subject. `key` is its key and name in a study, `remarks` state assumptions, `speed` describes its speed."""
+    """The findings on a subject. `key` is its key and name in a study, `remarks` state assumptions, `speed` is a sentence on speed."""
 
     subject: str
     kind: str
@@ -67,23 +67,23 @@ class Report:
                 "seconds": round(self.seconds, 3)}
 
 
-class TakesTooLong(BaseException):
+class UserCodeTimeout(BaseException):
     """User code exceeds its time limit. The error is raised inside that code, so it is no `Exception`, which the code may catch."""
 
 
 def load_factor() -> float:
-    """Number of runnable processes per core, at least 1: the factor by which the load of the machine slows everything down."""
+    """The factor by which other processes slow this one down: the number of runnable processes per core, at least 1."""
     load = os.getloadavg()[0] if hasattr(os, "getloadavg") else 1.0
     return max(1.0, load / (os.cpu_count() or 1))
 
 
 TICKS = 10
-"""A time limit is divided into this many parts; parts that end during an import do not count."""
+"""Number of intervals of a time limit; intervals that end during an import do not count."""
 
 
 @contextmanager
 def time_limit(seconds: float) -> Iterator[None]:
-    """Raise `TakesTooLong` in a block that would take longer than `seconds` on an idle machine.
+    """Raise `UserCodeTimeout` in a block that would take longer than `seconds` on an idle machine.
 
     The import of modules does not count. The limit has no effect outside the main thread and on Windows.
     """
@@ -98,7 +98,7 @@ def time_limit(seconds: float) -> Iterator[None]:
             frame = frame.f_back
         ticks_left -= frame is None
         if not ticks_left:
-            raise TakesTooLong
+            raise UserCodeTimeout
 
     previous_handler = signal.signal(signal.SIGALRM, tick)
     signal.setitimer(signal.ITIMER_REAL, *[seconds * load_factor() / TICKS] * 2)

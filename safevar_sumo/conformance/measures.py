@@ -11,10 +11,10 @@ import numpy as np
 
 from safevar_sumo.ads import Ads
 from safevar_sumo.conformance.models import AdsProbe, StudyProbe, VehicleProbe
-from safevar_sumo.conformance.probe import NoReaction, Outputs, Probe, Rows, corners, cost_of, guard_of, loaded_again, timed
+from safevar_sumo.conformance.probe import Indices, MissingReaction, Outputs, Probe, corners_of, cost_of, guard_of, measure_time, target_of
 from safevar_sumo.conformance.subject import Subject
-from safevar_sumo.metrics import METRICS, foreign_metric
-from safevar_sumo.plugins import Lookup, forget_foreign, instance_of
+from safevar_sumo.metrics import METRICS, guard_metric
+from safevar_sumo.plugins import Lookup, instance_of, unload_user_modules
 from safevar_sumo.records import Command, Evaluations, FloatArray, Nominal, Observation, SimulationRuns
 from safevar_sumo.search import ALGORITHMS, GuardedAlgorithm, Problem
 from safevar_sumo.study import Study
@@ -27,49 +27,49 @@ class MetricProbe(Probe):
     """Applies a metric to runs with and without collisions."""
 
     methods = ("function",)
-    number = 24
+    vehicle_count = 24
 
     def __init__(self, subject: Subject) -> None:
         super().__init__(subject)
-        self._runs = _runs_of(subject.study)
+        self._runs = _simulate_runs(subject.study)
 
     def load(self) -> Any:
-        forget_foreign()
-        return foreign_metric(loaded_again(self.subject), guard_of(self.subject))
+        unload_user_modules()
+        return guard_metric(target_of(self.subject), guard_of(self.subject))
 
-    def run(self, model: Any, rows: Rows) -> Outputs:
-        runs = self._runs.of(slice(0, self.number))
-        if not np.array_equal(rows, np.arange(self.number)):
-            first, last, sign = int(rows[0]), int(rows[-1]), 1 if len(rows) == 1 or rows[1] > rows[0] else -1
-            runs = self._runs.of(slice(first, last + sign if last + sign >= 0 else None, sign))
+    def run(self, model: Any, vehicles: Indices) -> Outputs:
+        runs = self._runs.of(slice(0, self.vehicle_count))
+        if not np.array_equal(vehicles, np.arange(self.vehicle_count)):
+            first, last, step = int(vehicles[0]), int(vehicles[-1]), 1 if len(vehicles) == 1 or vehicles[1] > vehicles[0] else -1
+            runs = self._runs.of(slice(first, last + step if last + step >= 0 else None, step))
         with np.errstate(all="ignore"):
             return {"values": model(runs, self.subject.study.metrics)}
 
-    def reactions(self, model: Any, outputs: Outputs) -> Iterator[NoReaction]:
+    def missing_reactions(self, model: Any, outputs: Outputs) -> Iterator[MissingReaction]:
         values = outputs["values"]
         if np.isnan(values).all():
-            yield NoReaction((), "a number for some drive", f"NaN for all of {self.number} drives")
+            yield MissingReaction((), "a number for some drive", f"NaN for all of {self.vehicle_count} drives")
         elif not np.isnan(values).any() and np.ptp(values) == 0 and values[0] != 0:
-            yield NoReaction((), "other values for other drives", f"{values[0]:g} for all of {self.number} drives")
+            yield MissingReaction((), "other values for other drives", f"{values[0]:g} for all of {self.vehicle_count} drives")
 
     def cost(self, model: Any, seconds: float) -> tuple[float, str]:
-        reference = timed(lambda: METRICS["tet"](self._runs, self.subject.study.metrics))
-        return cost_of(seconds, reference, "tet", self.number, len(self._runs.trace.time))
+        reference = measure_time(lambda: METRICS["tet"](self._runs, self.subject.study.metrics))
+        return cost_of(seconds, reference, "tet", self.vehicle_count, len(self._runs.trace.time))
 
 
-def _runs_of(study: Study) -> SimulationRuns:
-    """Runs of 24 vehicles in a study; every fourth vehicle gives full throttle all the time."""
+def _simulate_runs(study: Study) -> SimulationRuns:
+    """Simulate 24 vehicles in a study; every fourth vehicle gives full throttle all the time."""
     plain_study = msgspec.structs.replace(study, metrics=msgspec.structs.replace(study.metrics, also=[]),
                                           search=msgspec.structs.replace(study.search, objectives=["safety_degree", "f_diff"]))
     system = assemble(plain_study)
-    members = system.characteristics
-    settings = members.lower + np.random.default_rng(0).random((MetricProbe.number, len(members))) * (members.upper - members.lower)
-    settings[0] = members.original
+    lower, upper = system.characteristics.lower, system.characteristics.upper
+    settings = lower + np.random.default_rng(0).random((MetricProbe.vehicle_count, len(lower))) * (upper - lower)
+    settings[0] = system.characteristics.original
     return drive_all(replace(system, ads=_RecklessAds(system.ads), matrix=()), settings)
 
 
 class _RecklessAds:
-    """An ADS with full throttle in every fourth vehicle."""
+    """An ADS, but with full throttle in every fourth vehicle."""
 
     def __init__(self, ads: Ads) -> None:
         self._ads = ads
@@ -90,28 +90,28 @@ class ObjectiveProbe(Probe):
 
     def __init__(self, subject: Subject) -> None:
         super().__init__(subject)
-        self._members = CharacteristicSet.of(subject.study.vehicle.characteristics)
-        self._settings = self._members.filter(corners(self._members))
-        self.number = len(self._settings)
+        self._characteristics = CharacteristicSet.of(subject.study.vehicle.characteristics)
+        self._settings = self._characteristics.filter(corners_of(self._characteristics))
+        self.vehicle_count = len(self._settings)
 
     def load(self) -> Any:
-        forget_foreign()
-        return guard_change(loaded_again(self.subject), guard_of(self.subject))
+        unload_user_modules()
+        return guard_change(target_of(self.subject), guard_of(self.subject))
 
-    def run(self, model: Any, rows: Rows) -> Outputs:
-        return {"values": model.function(self._settings[rows], self._members)}
+    def run(self, model: Any, vehicles: Indices) -> Outputs:
+        return {"values": model.function(self._settings[vehicles], self._characteristics)}
 
-    def reactions(self, model: Any, outputs: Outputs) -> Iterator[NoReaction]:
+    def missing_reactions(self, model: Any, outputs: Outputs) -> Iterator[MissingReaction]:
         values = outputs["values"]
         if np.ptp(values) == 0:
-            yield NoReaction((), "other values at the corners of the domains than at the original", f"{values[0]:g} everywhere")
+            yield MissingReaction((), "other values at the corners of the domains than at the original", f"{values[0]:g} everywhere")
 
 
 class AlgorithmProbe(Probe):
-    """Searches a smooth function with an algorithm; the requested settings take the place of vehicles."""
+    """Lets an algorithm minimise a smooth function in place of simulations."""
 
     methods = ("search",)
-    number = 1
+    vehicle_count = 1
     EVALUATIONS = 57
     POPULATION = 20
 
@@ -120,12 +120,12 @@ class AlgorithmProbe(Probe):
         study = subject.study
         self._characteristics = CharacteristicSet.of(study.vehicle.characteristics)
         self._scoring = assemble(study).measuring.scoring
-        self._problem = Problem(characteristics=self._characteristics, original=self._scored(self._characteristics.original[np.newaxis]),
+        self._problem = Problem(characteristics=self._characteristics, original=self._evaluate(self._characteristics.original[np.newaxis]),
                                 evaluations=min(study.search.evaluations, self.EVALUATIONS),
                                 population=min(study.search.population, self.POPULATION), scoring=self._scoring)
 
     def load(self) -> Any:
-        forget_foreign()
+        unload_user_modules()
         return self._instance()
 
     def _instance(self) -> Any:
@@ -136,45 +136,46 @@ class AlgorithmProbe(Probe):
         parameters = lookup.with_paths(member, subject.parameters, f"search.{subject.name}")
         return GuardedAlgorithm(instance_of(member, parameters, subject.key, f"search.{subject.name}", "check"), guard_of(subject))
 
-    def run(self, model: Any, rows: Rows, seed: int = 1) -> Outputs:
+    def run(self, model: Any, vehicles: Indices, seed: int = 1) -> Outputs:
         """All settings that a run requests, and the solutions of the run."""
         search = model.search(self._problem, np.random.default_rng(seed))
-        requested, answer = list[FloatArray](), None
+        requested, evaluations = list[FloatArray](), None
         while True:
             try:
-                settings = next(search) if answer is None else search.send(answer)
+                settings = next(search) if evaluations is None else search.send(evaluations)
             except StopIteration as end:
                 return {"settings requested": np.concatenate(requested)[..., np.newaxis],
                         "settings returned": end.value.settings[..., np.newaxis]}
             requested.append(settings)
-            answer = self._scored(settings)
+            evaluations = self._evaluate(settings)
 
-    def repeat(self, model: Any, rows: Rows) -> Outputs:
-        forget_foreign()
-        self.run(self._instance(), rows, seed=2)
-        return self.run(self._instance(), rows)
+    def repeat(self, model: Any, vehicles: Indices) -> Outputs:
+        unload_user_modules()
+        self.run(self._instance(), vehicles, seed=2)
+        return self.run(self._instance(), vehicles)
 
-    def _scored(self, settings: FloatArray) -> Evaluations:
-        """Evaluations whose safety degree falls towards the upper ends of the domains; below 0 it is a collision."""
-        members = self._characteristics
-        share = (settings - members.lower) / (members.upper - members.lower)
-        degree = 1.0 - np.add.accumulate(share, axis=1)[:, -1] / len(members) * 1.5
-        metrics = {metric.name: degree if metric.name == "safety_degree" else np.abs(degree) for metric in self._scoring.metrics}
-        extra = {objective.name: np.abs(degree) for objective in self._scoring.objectives
+    def _evaluate(self, settings: FloatArray) -> Evaluations:
+        """Evaluate a smooth function: the safety degree falls towards the upper ends of the domains; below 0 it is a collision."""
+        characteristics = self._characteristics
+        share = (settings - characteristics.lower) / (characteristics.upper - characteristics.lower)
+        safety_degree = 1.0 - np.add.accumulate(share, axis=1)[:, -1] / len(characteristics) * 1.5
+        metrics = {metric.name: safety_degree if metric.name == "safety_degree" else np.abs(safety_degree)
+                   for metric in self._scoring.metrics}
+        extra = {objective.name: np.abs(safety_degree) for objective in self._scoring.objectives
                  if objective.name not in metrics and not objective.name.startswith("f_")}
-        collided = degree < 0
+        collided = safety_degree < 0
         return Evaluations(
             settings=settings, outcome=np.where(collided, "collision", "stopped").astype("U16"), metrics={**metrics, **extra},
-            collision_speed=np.where(collided, -degree, np.nan), f_diff=members.largest_change(settings),
-            f_num_diff=members.number_changed(settings))
+            collision_speed=np.where(collided, -safety_degree, np.nan), f_diff=characteristics.largest_change(settings),
+            f_num_diff=characteristics.number_changed(settings))
 
-    def reactions(self, model: Any, outputs: Outputs) -> Iterator[NoReaction]:
+    def missing_reactions(self, model: Any, outputs: Outputs) -> Iterator[MissingReaction]:
         other_outputs = self.run(model, np.arange(1), seed=2)
         if np.array_equal(outputs["settings requested"], other_outputs["settings requested"]):
-            yield NoReaction(("search",), "other settings with other random numbers `rng`", "the same settings in every run")
+            yield MissingReaction(("search",), "other settings with other random numbers `rng`", "the same settings in every run")
         if not outputs["settings returned"].size:
-            yield NoReaction(("search",), "a result: settings that the run was sent evaluations of",
-                           f"nothing, after {len(outputs['settings requested'])} evaluations")
+            yield MissingReaction(("search",), "a result: settings that the run was sent evaluations of",
+                                  f"nothing, after {len(outputs['settings requested'])} evaluations")
 
 
 PROBES: Mapping[str, tuple[type[Probe], ...]] = {

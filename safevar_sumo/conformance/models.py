@@ -10,7 +10,7 @@ import numpy as np
 
 from safevar_sumo.ads import Ads, GuardedAds
 from safevar_sumo.ads.aeb import Aeb
-from safevar_sumo.conformance.probe import NoReaction, Outputs, Probe, Rows, corners, cost_of, guard_of, timed
+from safevar_sumo.conformance.probe import Indices, MissingReaction, Outputs, Probe, corners_of, cost_of, guard_of, measure_time
 from safevar_sumo.conformance.subject import Subject
 from safevar_sumo.records import Command, FloatArray, Nominal, Observation
 from safevar_sumo.sumo import Engine, reason_for_sumo
@@ -46,7 +46,7 @@ COLLISION_COURSE, FREE_ROAD = slice(0, 6), 8
 """Indices of encounters on a collision course, and of a free road with the speed of the second encounter."""
 
 
-def _traffic() -> _Traffic:
+def _build_traffic() -> _Traffic:
     """Vehicles that hold their speed for half of the time and then brake with 4 m/s^2."""
     speed0, gap0, lateral0, lateral_speed, obstacle, start = (column[np.newaxis] for column in ENCOUNTERS.T)
     times = np.arange(STEPS)[:, np.newaxis] * STEP
@@ -64,40 +64,41 @@ class AdsProbe(Probe):
     """Drives with an ADS in many encounters."""
 
     methods = ("drive", "start")
-    number = len(ENCOUNTERS)
+    vehicle_count = len(ENCOUNTERS)
 
     def __init__(self, subject: Subject) -> None:
         super().__init__(subject)
         self._nominal: Nominal
-        self._traffic = _traffic()
+        self._traffic = _build_traffic()
 
     def load(self) -> Ads:
         system = self.system()
         self._nominal = system.nominal
         self._nominal.tables()
-        return GuardedAds(system.ads, guard_of(self.subject)) if self.subject.is_ours else system.ads
+        return system.ads if self.subject.is_user_code else GuardedAds(system.ads, guard_of(self.subject))
 
-    def run(self, model: Ads, rows: Rows) -> Outputs:
-        n, zeros = len(rows), np.zeros(len(rows))
+    def run(self, model: Ads, vehicles: Indices) -> Outputs:
+        n, zeros = len(vehicles), np.zeros(len(vehicles))
         memory, command = model.start(n, self._nominal, STEP), Command(zeros, zeros)
         pedals = np.zeros((2, STEPS, n))
         for step in range(STEPS):
-            speed, gap, closing, lateral, lateral_speed, obstacle = (column[step, rows] for column in self._traffic)
+            speed, gap, closing, lateral, lateral_speed, obstacle = (column[step, vehicles] for column in self._traffic)
             seen = Observation(step * STEP, speed, gap, closing, lateral, lateral_speed, 0.9, obstacle, command.throttle, command.brake)
             command, memory = model.drive(seen, memory)
             pedals[:, step] = command.throttle, command.brake
         return {"throttle": pedals[0], "brake": pedals[1]}
 
-    def reactions(self, model: Ads, outputs: Outputs) -> Iterator[NoReaction]:
+    def missing_reactions(self, model: Ads, outputs: Outputs) -> Iterator[MissingReaction]:
         brake, throttle = outputs["brake"], outputs["throttle"]
         if not brake[:, COLLISION_COURSE].any():
-            yield NoReaction(("drive",), "a brake pedal above 0 at some time before an obstacle that stands in its way",
-                           f"never brakes, at 5 to 25 m/s with {STEPS * STEP:g} s to look on")
+            yield MissingReaction(("drive",), "a brake pedal above 0 at some time before an obstacle that stands in its way",
+                                  f"never brakes, at 5 to 25 m/s with {STEPS * STEP:g} s to look on")
         elif np.ptp(brake[:, 1]) == 0 and all(np.array_equal(pedal[:, 1], pedal[:, FREE_ROAD]) for pedal in (throttle, brake)):
-            yield NoReaction(("drive",), "other pedals before an obstacle than on a free road", "the same with an obstacle and without")
+            yield MissingReaction(("drive",), "other pedals before an obstacle than on a free road",
+                                  "the same with an obstacle and without")
 
     def cost(self, model: Ads, seconds: float) -> tuple[float, str]:
-        return cost_of(seconds, timed(lambda: self.run(Aeb(), np.arange(self.number))), "aeb", self.number, STEPS)
+        return cost_of(seconds, measure_time(lambda: self.run(Aeb(), np.arange(self.vehicle_count))), "aeb", self.vehicle_count, STEPS)
 
 
 class VehicleProbe(Probe):
@@ -110,35 +111,35 @@ class VehicleProbe(Probe):
 
     def __init__(self, subject: Subject) -> None:
         super().__init__(subject)
-        self._members = CharacteristicSet.of(subject.study.vehicle.characteristics)
-        self.settings = corners(self._members)
-        self.number = len(self.settings)
+        self._characteristics = CharacteristicSet.of(subject.study.vehicle.characteristics)
+        self.settings = corners_of(self._characteristics)
+        self.vehicle_count = len(self.settings)
 
     def load(self) -> Any:
         vehicle = self.system().vehicle
-        return GuardedVehicle(vehicle, guard_of(self.subject)) if self.subject.is_ours else vehicle
+        return vehicle if self.subject.is_user_code else GuardedVehicle(vehicle, guard_of(self.subject))
 
-    def run(self, model: Any, rows: Rows) -> Outputs:
-        n, outputs = len(rows), dict[str, list[np.ndarray]]()
-        values = dict(zip(self._members.names, np.ascontiguousarray(self.settings[rows].T), strict=True))
+    def run(self, model: Any, vehicles: Indices) -> Outputs:
+        n, outputs = len(vehicles), dict[str, list[np.ndarray]]()
+        values = dict(zip(self._characteristics.names, np.ascontiguousarray(self.settings[vehicles].T), strict=True))
         slope = slope_of(np.full(n, 5.0)) if model.takes_slope else LEVEL
         for surface in ((1.0, self.STEP), (0.5, self.STEP, slope, np.ones(n, dtype=bool))):  # dry and level; wet and, if possible, steep
             prepared = model.prepare(values, *surface)
             for name, column in zip(model.sumo_type(prepared)._fields, model.sumo_type(prepared), strict=True):
                 outputs.setdefault(f"{name} of sumo_type", []).append(column)
-            state, sample = model.at_rest(prepared), 0
+            state, first_step = model.at_rest(prepared), 0
             if model.can_start_moving:
                 self._drive(model, prepared, model.at_speed(prepared, np.full(n, 5.0)), 5, 0.0, 0.5, outputs)
             for throttle, brake, steps in self.PHASES:
-                state = self._drive(model, prepared, state, steps, throttle, brake, outputs, sample)
-                sample += steps
+                state = self._drive(model, prepared, state, steps, throttle, brake, outputs, first_step)
+                first_step += steps
         return {name: np.stack(columns) for name, columns in outputs.items()}
 
     def _drive(self, model: Any, prepared: Any, state: Any, steps: int, throttle: float, brake: float,
-               outputs: dict[str, list[np.ndarray]], sample: int = 0) -> Any:
+               outputs: dict[str, list[np.ndarray]], first_step: int = 0) -> Any:
         n = len(state.speed)
         zeros = np.zeros(n)
-        for step in range(sample, sample + steps):
+        for step in range(first_step, first_step + steps):
             gap = 100.0 - step + zeros
             seen = Observation(step * self.STEP, state.speed, gap, state.speed, zeros + 2 - 0.02 * step, zeros - 0.2, 0.9, zeros,
                                state.throttle, state.brake)
@@ -150,23 +151,26 @@ class VehicleProbe(Probe):
                 outputs.setdefault(f"{name} sensed", []).append(getattr(sensed, name))
         return state
 
-    def reactions(self, model: Any, outputs: Outputs) -> Iterator[NoReaction]:
+    def missing_reactions(self, model: Any, outputs: Outputs) -> Iterator[MissingReaction]:
         start = 5 if model.can_start_moving else 0
-        speed, braking_end = outputs["speed"][start:, 0], start + sum(steps for *_, steps in self.PHASES[:5])
-        top_speed = outputs["speed"][start + self.PHASES[0][2] - 1, 0]
+        speed, braking_start = outputs["speed"][start:, 0], sum(steps for *_, steps in self.PHASES[:5])
+        throttle_steps, braking_steps = self.PHASES[0][-1], self.PHASES[5][-1]
+        top_speed = speed[throttle_steps - 1]
         if not top_speed > 0:
-            yield NoReaction(("advance",), "a speed above 0 after 4 s of full throttle", f"the original vehicle goes {top_speed:g} m/s")
-        elif not speed[braking_end - start + self.PHASES[5][2] - 1] < speed[braking_end - start - 1]:
-            yield NoReaction(("advance",), "a lower speed after 3 s of full brake", "the original vehicle does not slow down")
-        for column, name in enumerate(self._members.names):
-            lower, upper = 5 + 2 * column, 6 + 2 * column
-            if all(np.array_equal(values[..., lower], values[..., upper]) for values in outputs.values()):
-                yield NoReaction(("prepare", "advance"), f"another drive, type or observation at the two ends of {name}",
-                               f"{name} = {self.settings[lower, column]:g} and {self.settings[upper, column]:g} are the same to the bit")
+            yield MissingReaction(("advance",), "a speed above 0 after 4 s of full throttle",
+                                  f"the original vehicle goes {top_speed:g} m/s")
+        elif not speed[braking_start + braking_steps - 1] < speed[braking_start - 1]:
+            yield MissingReaction(("advance",), "a lower speed after 3 s of full brake", "the original vehicle does not slow down")
+        for column, name in enumerate(self._characteristics.names):
+            at_lower, at_upper = 5 + 2 * column, 6 + 2 * column  # vehicles with this characteristic at an end of its domain
+            if all(np.array_equal(values[..., at_lower], values[..., at_upper]) for values in outputs.values()):
+                yield MissingReaction(("prepare", "advance"), f"another drive, type or observation at the two ends of {name}",
+                                      f"{name} = {self.settings[at_lower, column]:g} and {self.settings[at_upper, column]:g} "
+                                      "are the same to the bit")
 
     def cost(self, model: Any, seconds: float) -> tuple[float, str]:
         steps = 2 * sum(phase[-1] for phase in self.PHASES) + 10 * model.can_start_moving
-        return cost_of(seconds, timed(lambda: _drive_example(self.number, steps)), "sumo", self.number, steps)
+        return cost_of(seconds, measure_time(lambda: _drive_example(self.vehicle_count, steps)), "sumo", self.vehicle_count, steps)
 
 
 def _drive_example(n: int, steps: int) -> None:
@@ -187,21 +191,21 @@ class StudyProbe(Probe):
     """Simulates the subject's study with the original vehicle and with corners of the domains."""
 
     methods = ("observe", "encounter", "begin", "step", "drive", "advance")
-    number = 5
+    vehicle_count = 5
 
     def __init__(self, subject: Subject) -> None:
         super().__init__(subject)
-        members = CharacteristicSet.of(subject.study.vehicle.characteristics)
-        self.settings = members.filter(corners(members)[:5])
+        characteristics = CharacteristicSet.of(subject.study.vehicle.characteristics)
+        self.settings = characteristics.filter(corners_of(characteristics)[:5])
 
     def load(self) -> System:
         return self.system()
 
-    def run(self, model: System, rows: Rows) -> Outputs:
-        evaluations = evaluate(model, self.settings[rows])
+    def run(self, model: System, vehicles: Indices) -> Outputs:
+        evaluations = evaluate(model, self.settings[vehicles])
         return {"outcome": evaluations.outcome, "collision_speed": evaluations.collision_speed, **evaluations.metrics}
 
-    def reactions(self, model: System, outputs: Outputs) -> Iterator[NoReaction]:
+    def missing_reactions(self, model: System, outputs: Outputs) -> Iterator[MissingReaction]:
         if self.subject.kind not in ("scenario", "traci"):
             return
         runs = drive_all(replace(model, matrix=()), self.settings[:1])
@@ -209,31 +213,34 @@ class StudyProbe(Probe):
         is_detected = np.isfinite(gap)
         if self.subject.kind == "traci":
             if outputs["outcome"][0] == "never-moved":
-                yield NoReaction(("step",), "a command to move: setSpeed, slowDown or setAcceleration", "the vehicle never moves")
+                yield MissingReaction(("step",), "a command to move: setSpeed, slowDown or setAcceleration", "the vehicle never moves")
             elif outputs["outcome"][0] == "collision" and not runs.trace.brake.any():
-                yield NoReaction(("step",), "a brake pedal above 0 at some time before somebody in its way", "never brakes, and collides")
+                yield MissingReaction(("step",), "a brake pedal above 0 at some time before somebody in its way",
+                                      "never brakes, and collides")
             return
         if not is_detected.any():
-            yield NoReaction(("observe",), "a finite gap to somebody at some time", "a gap that is infinite all the time")
+            yield MissingReaction(("observe",), "a finite gap to somebody at some time", "a gap that is infinite all the time")
         elif speed.max() > 1 and np.ptp(gap[is_detected]) == 0:
-            yield NoReaction(("observe",), "a gap that shrinks as the vehicle drives", f"a gap of {gap[is_detected][0]:g} m all the time")
+            yield MissingReaction(("observe",), "a gap that shrinks as the vehicle drives",
+                                  f"a gap of {gap[is_detected][0]:g} m all the time")
         elif not (runs.encounter.in_conflict & runs.trace.active).any():
-            yield NoReaction(("encounter",), "in_conflict true at some time, so that metrics are defined", "in_conflict is always false")
-        if not reason_for_sumo(model) and not self.subject.is_ours:
-            yield from self._reacting_actors(model, outputs)
+            yield MissingReaction(("encounter",), "in_conflict true at some time, so that metrics are defined",
+                                  "in_conflict is always false")
+        if not reason_for_sumo(model) and self.subject.is_user_code:
+            yield from self._undeclared_reactive_actors(model, outputs)
 
-    def _reacting_actors(self, model: System, outputs: Outputs) -> Iterator[NoReaction]:
-        """A finding if actors react although the scenario denies it: SUMO itself then gives other results."""
+    def _undeclared_reactive_actors(self, model: System, outputs: Outputs) -> Iterator[MissingReaction]:
+        """A missing declaration: actors react, as SUMO gives other results than the recorded scene, but the scenario denies it."""
         in_sumo = evaluate(model, self.settings, Engine.LIBSUMO)
         for name, values in {"outcome": in_sumo.outcome, **in_sumo.metrics}.items():
             if not (np.array_equal(outputs[name], values) if values.dtype.kind == "U" else
                     np.allclose(outputs[name], values, rtol=0, atol=1e-9, equal_nan=True)):
-                yield NoReaction(("observe",), "reactive_actors = True where somebody reacts to the vehicle under test",
-                               f"{name} is {outputs[name][0]} in the recorded scene and {values[0]} in SUMO")
+                yield MissingReaction(("observe",), "reactive_actors = True where somebody reacts to the vehicle under test",
+                                      f"{name} is {outputs[name][0]} in the recorded scene and {values[0]} in SUMO")
                 return
 
     def cost(self, model: System, seconds: float) -> tuple[float, str]:
         if self.subject.kind != "traci":
             return 0.0, ""
-        per_step = seconds / self.number / len(drive_all(model, self.settings).trace.time)
-        return per_step, f"{per_step * 1e6:.2g} microseconds per vehicle and step, SUMO's own included"
+        cost = seconds / self.vehicle_count / len(drive_all(model, self.settings).trace.time)
+        return cost, f"{cost * 1e6:.2g} microseconds per vehicle and step, SUMO's own included"

@@ -1,4 +1,4 @@
-"""An author's source code: the last line that returned, the line that raised, and lines that may cause a defect."""
+"""The source of user code: the last line that returned, the line that raised, and lines that may cause a defect."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from safevar_sumo.plugins import Member
 
 
 class Source:
-    """An author's source file, and the last line in it that returned.
+    """A source file of user code, and the last line in it that returned.
 
     Parameters
     ----------
@@ -30,8 +30,8 @@ class Source:
         self._object = getattr(member.target, "function", member.target)
         self._is_fmu, self.file = bool(member.file), member.file or self._file()
         self._folder = str(Path(self.file).parent)
-        self._last: tuple[str, int] | None = None
-        self._of_author: dict[CodeType, bool] = {}
+        self._last_line: tuple[str, int] | None = None
+        self._user_code_flags: dict[CodeType, bool] = {}
 
     def _file(self) -> str:
         try:
@@ -40,48 +40,48 @@ class Source:
             return str(getattr(sys.modules.get(getattr(self._object, "__module__", "")), "__file__", "") or "")
 
     @contextmanager
-    def watched(self) -> Iterator[None]:
-        """A context that notes the last line of the author's code that returned."""
+    def watch_returns(self) -> Iterator[None]:
+        """In a block, note the last line of user code that returned."""
         previous = sys.getprofile()
-        sys.setprofile(self._note)
+        sys.setprofile(self._note_return)
         try:
             yield
         finally:
             sys.setprofile(previous)
 
-    def _note(self, frame: FrameType, event: str, _: Any) -> None:
+    def _note_return(self, frame: FrameType, event: str, _: Any) -> None:
         if event != "return":
             return
         code = frame.f_code
-        if self._is_own_code(code):
-            self._last = code.co_filename, frame.f_lineno
+        if self._is_user_code(code):
+            self._last_line = code.co_filename, frame.f_lineno
 
-    def _is_own_code(self, code: CodeType) -> bool:
-        if code not in self._of_author:
-            self._of_author[code] = code.co_filename.startswith(self._folder) and "site-packages" not in code.co_filename
-        return self._of_author[code]
+    def _is_user_code(self, code: CodeType) -> bool:
+        if code not in self._user_code_flags:
+            self._user_code_flags[code] = code.co_filename.startswith(self._folder) and "site-packages" not in code.co_filename
+        return self._user_code_flags[code]
 
-    def of_error(self, error: BaseException) -> tuple[str, int]:
-        """The innermost line of the author's code that raised an exception; else the last line that returned."""
+    def line_of_error(self, error: BaseException) -> tuple[str, int]:
+        """The innermost line of user code that raised an exception; else the last line that returned."""
         if self._is_fmu:
-            return self.definition()
+            return self.line_of_definition()
         exception: BaseException | None = error
         while exception is not None:
             frame, location = exception.__traceback__, None
             while frame is not None:
-                if self._is_own_code(frame.tb_frame.f_code):
+                if self._is_user_code(frame.tb_frame.f_code):
                     location = frame.tb_frame.f_code.co_filename, frame.tb_lineno
                 frame = frame.tb_next
             if location is not None and not isinstance(exception, InputError):
                 return location
             exception = exception.__cause__ or exception.__context__
-        return self._last or self.definition()
+        return self._last_line or self.line_of_definition()
 
     @property
-    def last(self) -> tuple[str, int]:
-        return self._last or self.definition()
+    def last_line(self) -> tuple[str, int]:
+        return self._last_line or self.line_of_definition()
 
-    def definition(self, *methods: str) -> tuple[str, int]:
+    def line_of_definition(self, *methods: str) -> tuple[str, int]:
         """The line that defines the first existing method of `methods`, or else the subject; line 1 of an FMU."""
         if self._is_fmu:
             return self.file, 1
@@ -97,23 +97,23 @@ class Source:
 
     def line_of_text(self, pattern: str) -> tuple[str, int] | None:
         """The first line of the file that matches a pattern."""
-        text = _text(self.file).splitlines()
+        text = _read_text(self.file).splitlines()
         return next(((self.file, number) for number, line in enumerate(text, 1) if re.search(pattern, line)), None)
 
-    def suspect(self, check: str) -> tuple[str, int] | None:
+    def line_of_suspect(self, check: str) -> tuple[str, int] | None:
         """The first line of the file that may cause a failure of `check`; None without such a line."""
         if self._is_fmu:
             return None
         try:
-            tree = _part_of(ast.parse(_text(self.file)), str(getattr(self._object, "__name__", "")))
+            tree = _used_part(ast.parse(_read_text(self.file)), str(getattr(self._object, "__name__", "")))
         except (SyntaxError, ValueError):
             return None
-        lines = sorted({*SUSPECTS[check](tree)})
+        lines = sorted({*SUSPECT_LINES[check](tree)})
         return (self.file, lines[0]) if lines else None
 
 
 @lru_cache(maxsize=64)
-def _text(file: str) -> str:
+def _read_text(file: str) -> str:
     try:
         return Path(file).read_text(encoding="utf-8", errors="replace")
     except OSError:
@@ -127,7 +127,7 @@ REDUCTIONS = ("mean", "sum", "max", "min", "std", "var", "median", "average", "a
 MUTATING_METHODS = ("append", "add", "update", "setdefault", "extend", "insert", "pop", "remove", "clear", "popleft", "appendleft")
 
 
-def _part_of(tree: ast.Module, name: str) -> ast.Module:
+def _used_part(tree: ast.Module, name: str) -> ast.Module:
     """The classes and functions of a module that the class or function `name` uses, and all other statements of the module."""
     definitions = {node.name: node for node in tree.body if isinstance(node, ast.ClassDef | ast.FunctionDef)}
     used_names, names_left = set[str](), [name]
@@ -142,24 +142,24 @@ def _part_of(tree: ast.Module, name: str) -> ast.Module:
         node, ast.ClassDef | ast.FunctionDef)], [])
 
 
-def _functions(tree: ast.AST) -> Iterator[ast.FunctionDef]:
+def _functions_in(tree: ast.AST) -> Iterator[ast.FunctionDef]:
     yield from (node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef))
 
 
-def _calls(function: ast.FunctionDef) -> Iterator[tuple[str, int]]:
+def _calls_in(function: ast.FunctionDef) -> Iterator[tuple[str, int]]:
     """The name and the line of every call."""
     yield from ((ast.unparse(node.func), node.lineno) for node in ast.walk(function) if isinstance(node, ast.Call))
 
 
 def _random_lines(tree: ast.AST) -> Iterator[int]:
     """Lines that draw random numbers or read clocks; draws from the `rng` of an algorithm do not count."""
-    yield from (line for function in _functions(tree) for name, line in _calls(function)
+    yield from (line for function in _functions_in(tree) for name, line in _calls_in(function)
                 if RANDOM_CALLS.search(name) and not name.startswith(("rng.", "problem.", "self.rng.")))
 
 
 def _batch_lines(tree: ast.AST) -> Iterator[int]:
     """Lines that reduce over vehicles, or depend on the number of vehicles."""
-    yield from (line for function in _functions(tree) if function.name != "__init__" for name, line in _calls(function)
+    yield from (line for function in _functions_in(tree) if function.name != "__init__" for name, line in _calls_in(function)
                 if name.rpartition(".")[2] in REDUCTIONS)
 
 
@@ -171,7 +171,7 @@ def _state_lines(tree: ast.AST) -> Iterator[int]:
                     if isinstance(node, ast.Assign | ast.AnnAssign)
                     for target in (node.targets if isinstance(node, ast.Assign) else [node.target]) if isinstance(target, ast.Name)}
     scalar_classes = {id(class_def) for class_def in classes if any("ScalarAds" in ast.unparse(base) for base in class_def.bases)}
-    for function in _functions(tree):
+    for function in _functions_in(tree):
         outer_names = {name for node in ast.walk(function) if isinstance(node, ast.Global | ast.Nonlocal) for name in node.names}
         for default in [*function.args.defaults, *filter(None, function.args.kw_defaults)]:
             if isinstance(default, ast.List | ast.Dict | ast.Set):
@@ -197,4 +197,5 @@ def _state_lines(tree: ast.AST) -> Iterator[int]:
                 yield node.lineno
 
 
-SUSPECTS = {"determinism": _random_lines, "batch": _batch_lines, "state": _state_lines}
+SUSPECT_LINES = {"determinism": _random_lines, "batch": _batch_lines, "state": _state_lines}
+"""Functions that list the suspicious lines of a syntax tree, by check."""

@@ -19,7 +19,7 @@ from safevar_sumo.metrics import FURTHER, METRICS, OBJECTIVES, Metric
 from safevar_sumo.plugins import Contract, Guard, Lookup, Member
 from safevar_sumo.scenarios import SCENARIO_CONTRACT, SCENARIOS
 from safevar_sumo.search import ALGORITHM_CONTRACT, ALGORITHMS
-from safevar_sumo.study import CharacteristicTable, MatrixTest, ModelTable, Study, fmus_of, load_study, study_names
+from safevar_sumo.study import CharacteristicTable, ModelTable, Study, fmus_of, load_study, study_names
 from safevar_sumo.sumo.traci_module import substitute_traci
 from safevar_sumo.vehicles import CHANGES, VEHICLE_CONTRACT, VEHICLES, Change, FmuVehicle
 
@@ -30,6 +30,7 @@ KINDS: Mapping[str, Mapping[str, Any]] = {
 METHODS: Mapping[str, tuple[str, ...]] = {
     "ads": ("start", "drive"), "vehicle": ("prepare", "sumo_type", "at_rest", "sense", "advance"),
     "scenario": ("begin", "observe", "encounter"), "algorithm": ("search",), "traci": ("step",)}
+"""Methods by which `kind_of` recognises a class, by kind."""
 KEYS = {"metric": "metrics.also", "objective": "search.objectives", "algorithm": "search.algorithms", "traci": "ads.model"}
 """Key of a study that names subjects of a kind; `KIND.model` for all other kinds."""
 DEFAULT_STUDIES = {"traci": "native"}
@@ -39,11 +40,11 @@ MAX_FILES = 50
 DOMAINS_BY_UNIT = {
     "kg": (1500.0, 1000.0, 2500.0), "m/s^2": (5.0, 3.0, 8.0), "m/s": (30.0, 20.0, 40.0), "s": (0.1, 0.05, 0.3), "m": (1.0, 0.5, 2.0),
     "Nm": (400.0, 200.0, 600.0), "N": (4000.0, 2000.0, 6000.0)}
-"""Original, lower and upper end for a characteristic that no study names, by unit; 1, 0.8 and 1.2 for all other units."""
+"""Original, lower and upper value by unit, for a characteristic that no study names; 1, 0.8 and 1.2 for all other units."""
 
 
 class Subject(NamedTuple):
-    """A class, function or record to check. `name` stands on the command line or in `study`; `remarks` state assumptions."""
+    """A class, function or record to check. `name` is its name on the command line or in `study`; `remarks` state assumptions."""
 
     name: str
     kind: str
@@ -58,11 +59,11 @@ class Subject(NamedTuple):
         return f"{KEYS.get(self.kind, f'{self.kind}.model')} = {self.name!r}"
 
     @property
-    def is_ours(self) -> bool:
-        return self.member.guard is None
+    def is_user_code(self) -> bool:
+        return self.member.guard is not None
 
 
-def subject_of(name: str, study: str | None = None) -> Subject:
+def find_subject(name: str, study: str | None = None) -> Subject:
     """Find a subject by its name.
 
     Parameters
@@ -82,34 +83,34 @@ def subject_of(name: str, study: str | None = None) -> Subject:
     kinds = [kind for kind, members in KINDS.items() if name in members]
     if kinds:
         shipped_studies = (shipped for shipped in map(load_study, study_names()) if _is_named(shipped, kinds[0], name))
-        study_to_try = given_study or next(shipped_studies, load_study("smoke"))
-        return _in_study(Subject(name, kinds[0], Member(KINDS[kinds[0]][name]), study_to_try))
+        trial_study = given_study or next(shipped_studies, load_study("smoke"))
+        return _put_in_study(Subject(name, kinds[0], Member(KINDS[kinds[0]][name]), trial_study))
     if name.endswith(".fmu"):
-        return _fmu_of(name, given_study)
+        return _find_fmu(name, given_study)
     if ":" not in name:
         names = [*study_names(), *OBJECTIVES, *(member for members in KINDS.values() for member in members)]
         raise unknown("check", f"there is nothing called {name!r}", name, names, ", package.module:Name, or the path of a study file")
-    places = () if given_study is None else given_study.origin.places
+    folders = () if given_study is None else given_study.origin.places
     with substitute_traci():
-        member = Lookup("check", places).find({}, name, "SUBJECT")
-    studies_nearby = [] if given_study else list(_studies_beside(name, member.folder))
-    trial_study = given_study or (studies_nearby[0] if studies_nearby else None)
-    kind = next((kind for kind in KINDS if trial_study is not None and _is_named(trial_study, kind, name)), "") or kind_of(member.target)
+        member = Lookup("check", folders).find({}, name, "SUBJECT")
+    nearby_study = None if given_study else next(_studies_beside(name, member.folder), None)
+    naming_study = given_study or nearby_study
+    kind = next((kind for kind in KINDS if naming_study and _is_named(naming_study, kind, name)), "") or kind_of(member.target)
     if not kind:
         legal = "a class with the methods of an ADS, a vehicle, a scenario, an algorithm or a TraCI controller; a Metric; a Change"
         raise InputError("check", f"{name!r} is {_type_name(member.target)}, which is nothing that a study can name", legal)
-    remarks = (f"tried in {studies_nearby[0].origin.called}, which names it",) if studies_nearby else ()
-    return _in_study(Subject(name, kind, member, trial_study or load_study(DEFAULT_STUDIES.get(kind, "smoke")), {}, remarks))
+    remarks = (f"tried in {nearby_study.origin.called}, which names it",) if nearby_study else ()
+    return _put_in_study(Subject(name, kind, member, naming_study or load_study(DEFAULT_STUDIES.get(kind, "smoke")), {}, remarks))
 
 
-def _fmu_of(name: str, given_study: Study | None) -> Subject:
+def _find_fmu(name: str, given_study: Study | None) -> Subject:
     """An FMU in a study that maps its variables."""
     refuse_other_than_file(Path(name))
     for study in [given_study] if given_study else _studies_beside(Path(name).name, str(Path(name).absolute().parent)):
         for key, model in fmus_of(study):
             if file_of(model, study.origin.places) == str(Path(name).absolute()):
                 remarks = () if given_study else (f"tried in {study.origin.called}, which names it",)
-                return _fmu_subject(study, key.partition(".")[0], model)._replace(remarks=remarks)
+                return _subject_of_fmu(study, key.partition(".")[0], model)._replace(remarks=remarks)
     problem = f"no study says what the variables of {name!r} stand for" if Path(name).exists() else f"there is no file {name!r}"
     raise InputError("check", problem, '--study STUDY, whose [ads] or [vehicle] has kind = "fmu" and that model')
 
@@ -117,14 +118,15 @@ def _fmu_of(name: str, given_study: Study | None) -> Subject:
 def subjects_of(study: Study) -> Iterator[Subject]:
     """Each subject that a study names, once."""
     lookup = Lookup(study.source, study.origin.places)
+    tests = study.matrix.tests if study.matrix else []
     names_by_kind = {"vehicle": [study.vehicle.model], "traci" if study.ads.kind == "traci" else "ads": [study.ads.model],
-                     "scenario": [study.scenario.model, *(test.model for test in _tests(study) if test.model)],
+                     "scenario": [study.scenario.model, *(test.model for test in tests if test.model)],
                      "metric": study.metrics.also, "objective": study.search.objectives, "algorithm": study.search.algorithms}
     names_done = set[str]()
     for kind, names in names_by_kind.items():
         for name in dict.fromkeys(names):
             if (f"{kind}.model", name) in fmus_of(study):
-                yield _fmu_subject(study, kind, name)
+                yield _subject_of_fmu(study, kind, name)
                 continue
             is_metric_name = kind == "objective" and ":" not in name and name not in CHANGES  # not a change
             if name in names_done or is_metric_name:
@@ -133,12 +135,13 @@ def subjects_of(study: Study) -> Iterator[Subject]:
             with substitute_traci():
                 member = lookup.find(CHANGES if kind == "objective" else KINDS[kind], name, KEYS.get(kind, f"{kind}.model"))
             subject_kind = "metric" if isinstance(member.target, Metric) else kind
-            yield Subject(name, subject_kind, member, study, _parameters(study, subject_kind, name))
+            yield Subject(name, subject_kind, member, study, _stated_parameters(study, subject_kind, name))
 
 
-def _fmu_subject(study: Study, kind: str, name: str) -> Subject:
+def _subject_of_fmu(study: Study, kind: str, name: str) -> Subject:
     guard, file = Guard(study.source, f"{kind}.model = {name!r}"), file_of(name, study.origin.places)
-    return Subject(name, kind, Member(FmuAds if kind == "ads" else FmuVehicle, guard, file=file), study, _parameters(study, kind, name))
+    member = Member(FmuAds if kind == "ads" else FmuVehicle, guard, file=file)
+    return Subject(name, kind, member, study, _stated_parameters(study, kind, name))
 
 
 def kind_of(target: Any) -> str:
@@ -160,8 +163,8 @@ def kind_of(target: Any) -> str:
     return "traci"
 
 
-def violation(subject: Subject) -> tuple[str, str]:
-    """How a subject breaks its contract, by inspection alone, and what the contract expects; "" for a subject that meets it."""
+def contract_violation(subject: Subject) -> tuple[str, str]:
+    """How a subject breaks its contract, by inspection alone, or ""; and what the contract expects."""
     target, kind = subject.member.target, subject.kind
     if kind in ("metric", "objective"):
         record = Metric if kind == "metric" else Change
@@ -173,7 +176,7 @@ def violation(subject: Subject) -> tuple[str, str]:
         expected = "a function step(traci, vehicle_id), or a class with that method"
         if not callable(function):
             return "has no step", expected
-        return _refused_arguments(function, 2 + inspect.isclass(target), len(subject.parameters)), expected
+        return _step_violation(function, 2 + inspect.isclass(target), len(subject.parameters)), expected
     contracts: Mapping[str, tuple[Contract, ...]] = {
         "ads": (SCALAR_ADS_CONTRACT, ADS_CONTRACT), "vehicle": (VEHICLE_CONTRACT,), "scenario": (SCENARIO_CONTRACT,),
         "algorithm": (ALGORITHM_CONTRACT,)}
@@ -181,8 +184,8 @@ def violation(subject: Subject) -> tuple[str, str]:
     return contract.violation(target), str(contract)
 
 
-def _refused_arguments(function: Callable[..., Any], passed: int, named: int) -> str:
-    """Why a step cannot take `passed` arguments by position and `named` arguments by name; "" if it can."""
+def _step_violation(function: Callable[..., Any], passed: int, named: int) -> str:
+    """Why the function cannot be called with `passed` arguments by position and `named` arguments by name; "" if it can."""
     try:
         parameters = list(inspect.signature(function).parameters.values())
     except (TypeError, ValueError):
@@ -196,12 +199,12 @@ def _refused_arguments(function: Callable[..., Any], passed: int, named: int) ->
     return f"has a step that takes ({names}), not (traci, vehicle_id)"
 
 
-def _in_study(subject: Subject) -> Subject:
+def _put_in_study(subject: Subject) -> Subject:
     """The subject in a study that names it, with parameters from the study, or else with guessed parameters."""
     study, kind, name = subject.study, subject.kind, subject.name
     if _is_named(study, kind, name):
-        return subject._replace(parameters=_parameters(study, kind, name))
-    parameters, guess = _guess(subject.member.target) if kind in METHODS else ({}, "")
+        return subject._replace(parameters=_stated_parameters(study, kind, name))
+    parameters, guess = _guess_parameters(subject.member.target) if kind in METHODS else ({}, "")
     remarks = [*subject.remarks, *([guess] if guess else [])]
     tables: dict[str, Any] = {}
     if kind in ("ads", "traci"):
@@ -210,7 +213,7 @@ def _in_study(subject: Subject) -> Subject:
         tables["scenario"], tables["matrix"] = ModelTable(model=name, parameters=parameters), None
     elif kind == "vehicle":
         units = getattr(subject.member.target, "UNITS", None)
-        rows, note = _characteristics(units if isinstance(units, Mapping) else {}, study)
+        rows, note = _guess_characteristics(units if isinstance(units, Mapping) else {}, study)
         remarks += [note] if note else []
         tables["vehicle"] = msgspec.structs.replace(study.vehicle, model=name, parameters=parameters, characteristics=rows)
         tables |= {"variation": {}, "correlations": [], "calibration": {}}
@@ -223,7 +226,7 @@ def _in_study(subject: Subject) -> Subject:
     return subject._replace(study=msgspec.structs.replace(study, **tables), parameters=parameters, remarks=tuple(remarks))
 
 
-def _guess(target: Any) -> tuple[dict[str, Any], str]:
+def _guess_parameters(target: Any) -> tuple[dict[str, Any], str]:
     """Guessed values for parameters without defaults, and a remark on these values."""
     try:
         signature = inspect.signature(target, eval_str=False)
@@ -243,7 +246,7 @@ def _guess(target: Any) -> tuple[dict[str, Any], str]:
     return guesses, f"no study gives its parameters: tried with {values}; --study STUDY names a study that does"
 
 
-def _characteristics(units: Mapping[str, str], study: Study) -> tuple[dict[str, CharacteristicTable], str]:
+def _guess_characteristics(units: Mapping[str, str], study: Study) -> tuple[dict[str, CharacteristicTable], str]:
     """A domain for every characteristic, and a remark: from a study with the same name and unit, or else by unit."""
     rows: dict[str, CharacteristicTable] = {}
     guesses = []
@@ -259,10 +262,6 @@ def _characteristics(units: Mapping[str, str], study: Study) -> tuple[dict[str, 
     return rows, note
 
 
-def _tests(study: Study) -> list[MatrixTest]:
-    return [] if study.matrix is None else study.matrix.tests
-
-
 def _is_named(study: Study, kind: str, name: str) -> bool:
     """Whether a study names the subject `name` of a kind."""
     return name in {
@@ -271,7 +270,7 @@ def _is_named(study: Study, kind: str, name: str) -> bool:
         "objective": [] if name in study.metrics.also else study.search.objectives, "algorithm": study.search.algorithms}[kind]
 
 
-def _parameters(study: Study, kind: str, name: str) -> Mapping[str, Any]:
+def _stated_parameters(study: Study, kind: str, name: str) -> Mapping[str, Any]:
     if kind == "algorithm":
         return study.search.parameters.get(name.rpartition(":")[2], {})
     tables = {"ads": study.ads.parameters, "traci": study.ads.parameters, "vehicle": study.vehicle.parameters,

@@ -14,16 +14,16 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from safevar_sumo.errors import InputError, did_you_mean, in_one_line
-from safevar_sumo.fmu.units import BASES, COMMON_UNITS, Unit
+from safevar_sumo.fmu.units import BASE_UNITS, COMMON_UNITS, Unit
 
 REAL_TYPES = ("Real", "Float64", "Float32")
 """Types of variables that have units."""
 NUMBER_TYPES = (*REAL_TYPES, "Integer", "Boolean", "Int8", "UInt8", "Int16", "UInt16", "Int32", "UInt32", "Int64", "UInt64", "Enumeration")
 """Types of variables that hold numbers."""
 SUPPORTED_FMU = "an FMU of FMI 2.0 or 3.0 for co-simulation"
-LONGEST_MEANING = 200
+MAX_MEANING = 200
 """Longest description of a variable that becomes a characteristic's meaning [characters]."""
-MOST_LISTED = 12
+MAX_LISTED = 12
 """Largest number of variables that an error lists."""
 
 
@@ -75,29 +75,29 @@ class Description:
             If the variable does not exist, or has another causality or type.
         """
         candidates = [variable.name for variable in self.variables.values() if variable.causality in causalities and variable.type in types]
-        listing = ", ".join(candidates[:MOST_LISTED]) + ", ..." * (len(candidates) > MOST_LISTED)
-        expected = f"{_article(' or '.join(causalities))} of the FMU: {listing or 'it has none'}"
+        listing = ", ".join(candidates[:MAX_LISTED]) + ", ..." * (len(candidates) > MAX_LISTED)
+        expected = f"{_with_article(' or '.join(causalities))} of the FMU: {listing or 'it has none'}"
         if name not in self.variables:
             problem = f"{Path(self.path).name} has no such variable{did_you_mean(name, candidates)}"
             raise InputError(source, f"{key} = {name!r}: {problem}", expected)
         variable = self.variables[name]
         if variable.causality not in causalities:
-            raise InputError(source, f"{key} = {name!r}: that variable is {_article(variable.causality)}", expected)
+            raise InputError(source, f"{key} = {name!r}: that variable is {_with_article(variable.causality)}", expected)
         if variable.type not in types:
             raise InputError(source, f"{key} = {name!r}: that variable is of type {variable.type}", f"a type among {', '.join(types)}")
         return variable
 
-    def rows(self, fixed: Collection[str]) -> dict[str, dict[str, Any]]:
+    def table_rows(self, fixed: Collection[str]) -> dict[str, dict[str, Any]]:
         """Rows of the characteristics' table for all tunable parameters whose names are not in `fixed`."""
-        return {name: self.row(name) for name, variable in self.variables.items() if variable.is_tunable and name not in fixed}
+        return {name: self.table_row(name) for name, variable in self.variables.items() if variable.is_tunable and name not in fixed}
 
-    def row(self, name: str, unit: str = "") -> dict[str, Any]:
+    def table_row(self, name: str, unit: str = "") -> dict[str, Any]:
         """The table row that a parameter declares, converted to `unit` if a unit is given; empty if the variable is no parameter."""
         variable = self.variables.get(name)
         if variable is None or variable.causality != "parameter":
             return {}
         row = {"unit": variable.unit_name or "-", "original": variable.start, "lower": variable.lower, "upper": variable.upper,
-               "meaning": variable.meaning if len(variable.meaning) <= LONGEST_MEANING else ""}
+               "meaning": variable.meaning if len(variable.meaning) <= MAX_MEANING else ""}
         declared_unit, row_unit = variable.unit, self.units.get(unit) or COMMON_UNITS.get(unit)
         if unit and unit != row["unit"] and variable.unit_name:
             if declared_unit is None or row_unit is None or not declared_unit.fits(row_unit):
@@ -147,13 +147,13 @@ def description_of(model: str, folders: Sequence[str], source: str, key: str) ->
         raise InputError(source, f"{key} = {model!r}: {problem}", SUPPORTED_FMU)
     status = os.stat(path)
     try:
-        return _read(path, status.st_mtime_ns, status.st_size, status.st_ino)
+        return _read_description(path, status.st_mtime_ns, status.st_size, status.st_ino)
     except InputError as error:
         raise InputError(source, f"{key} = {model!r} {error.problem}", error.legal) from None
 
 
 @lru_cache(maxsize=32)
-def _read(path: str, *_: int) -> Description:
+def _read_description(path: str, *_: int) -> Description:
     try:
         from fmpy import platform, platform_tuple, sharedLibraryExtension
         from fmpy.model_description import read_model_description
@@ -181,22 +181,22 @@ def _read(path: str, *_: int) -> Description:
                             if name.startswith("binaries/") and name.count("/") > 1 and name[-1] != "/"})
         others = f"only for {', '.join(platforms)}" if platforms else "nor for any other"
         raise InputError("fmu", f"has no binary for this machine ({folder}), {others}", f"binaries/{folder}")
-    units = {unit.name: Unit(tuple(int(getattr(unit.baseUnit, base)) for base in BASES), float(unit.baseUnit.factor),
+    units = {unit.name: Unit(tuple(int(getattr(unit.baseUnit, base)) for base in BASE_UNITS), float(unit.baseUnit.factor),
                              float(unit.baseUnit.offset)) for unit in model.unitDefinitions if unit.baseUnit is not None}
     return Description(
-        path, sha256(Path(path).read_bytes()).hexdigest(), model.fmiVersion, simulation.modelIdentifier, model.guid or "", _step(model),
-        simulation.canBeInstantiatedOnlyOncePerProcess, units,
-        {variable.name: _variable(variable, units) for variable in model.modelVariables if not variable.dimensions})
+        path, sha256(Path(path).read_bytes()).hexdigest(), model.fmiVersion, simulation.modelIdentifier, model.guid or "",
+        _required_step(model), simulation.canBeInstantiatedOnlyOncePerProcess, units,
+        {variable.name: _variable_of(variable, units) for variable in model.modelVariables if not variable.dimensions})
 
 
-def _step(model: Any) -> float | None:
+def _required_step(model: Any) -> float | None:
     """The step that an FMU requires [s]: its internal step, or its default step if its step cannot change; None if any step will do."""
     simulation, default_step = model.coSimulation, getattr(model.defaultExperiment, "stepSize", None)
     step = simulation.fixedInternalStepSize or (None if simulation.canHandleVariableCommunicationStepSize else default_step)
     return float(step) if step and float(step) > 0 else None
 
 
-def _variable(variable: Any, units: Mapping[str, Unit]) -> Variable:
+def _variable_of(variable: Any, units: Mapping[str, Unit]) -> Variable:
     def attribute(name: str) -> Any:
         value = getattr(variable, name, None)
         return getattr(variable.declaredType, name, None) if value is None else value
@@ -207,11 +207,11 @@ def _variable(variable: Any, units: Mapping[str, Unit]) -> Variable:
         unit = unit._replace(offset=0.0)
     variability = variable.variability or ("continuous" if variable.type in REAL_TYPES else "discrete")
     return Variable(variable.name, variable.valueReference, variable.type, variable.causality or "local", variability, unit_name, unit,
-                    _number(start) if variable.type in REAL_TYPES else start, _number(attribute("min")), _number(attribute("max")),
+                    _to_float(start) if variable.type in REAL_TYPES else start, _to_float(attribute("min")), _to_float(attribute("max")),
                     " ".join((variable.description or "").split()))
 
 
-def _number(text: Any) -> float | None:
+def _to_float(text: Any) -> float | None:
     try:
         number = float(text)
     except (TypeError, ValueError):
@@ -219,5 +219,5 @@ def _number(text: Any) -> float | None:
     return number if isfinite(number) else None
 
 
-def _article(word: str) -> str:
+def _with_article(word: str) -> str:
     return f"{'an' if word[0] in 'aeiou' else 'a'} {word}"

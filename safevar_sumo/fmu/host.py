@@ -1,4 +1,4 @@
-"""The program that runs an FMU in a separate process, where a crash or a hang does no harm; it answers over its standard streams.
+"""The program that runs an FMU in a separate process, where a crash or a hang does no harm; it communicates over its standard streams.
 
 The parent process starts the program by its path; it imports nothing of this package. A request is a pickled tuple of a name and
 arguments; an answer is a pickled tuple of a status and a value.
@@ -48,6 +48,13 @@ class HostSetup(NamedTuple):
     limit: float
 
 
+class Activity(NamedTuple):
+    """What an instance does since `start` [s]; `description` continues a sentence."""
+
+    start: float
+    description: str
+
+
 class InstanceFailure(Exception):
     """An FMU could not carry out a request."""
 
@@ -66,8 +73,8 @@ class HostedInstances:
         self._callbacks = None if self._is_3 else self._callbacks_of_fmi_2()
         self._instances: dict[int, Any] = {}
         self._inputs, self._parameters, self._outputs = map(self._groups_of, (setup.inputs, setup.parameters, setup.outputs))
-        self.activity: tuple[float, int, str] | None = None
-        """The activity in progress: start time [s], position of the instance in the request, and description."""
+        self.activity: Activity | None = None
+        """The activity in progress."""
 
     def start(self, numbers: list[int], parameters: list[list[Any]], inputs: list[list[float]]) -> np.ndarray:
         """Initialise N instances, new or reset; returns their m outputs, shape (N, m)."""
@@ -78,8 +85,8 @@ class HostedInstances:
         def advance(position: int, instance: Any) -> list[list[float]]:
             self._set(instance, self._inputs, inputs[position])
             outputs = []
-            for count, (time_, step) in enumerate(times, 1):
-                self._step(instance, time_, step)
+            for count, (start, step) in enumerate(times, 1):
+                self._step(instance, start, step)
                 if count > len(times) - kept_steps:
                     outputs.append(self._read_outputs(instance))
             return outputs
@@ -89,14 +96,14 @@ class HostedInstances:
     def _on_each_instance(self, numbers: list[int], description: str, work: Callable[[int, Any], Any]) -> np.ndarray:
         results = []
         for position, number in enumerate(numbers):
-            self.activity = (time.monotonic(), position, description)
+            self.activity = Activity(time.monotonic(), description)
             try:
                 instance = self._instances.get(number)
                 if instance is None:
                     instance = self._instances[number] = self._new_instance()
                 results.append(work(position, instance))
             except Exception as error:  # any error of FMPy about an FMU
-                self._drop(number)
+                self._forget(number)
                 raise InstanceFailure(f"{self._reason(error)} while it {description}") from error
             finally:
                 self.activity = None
@@ -106,7 +113,7 @@ class HostedInstances:
         instance = copy.copy(self._library)  # shares the library and its functions
         instance.component, instance.used = None, False
         if self._is_3:
-            instance.instantiate(loggingOn=True, logMessage=lambda _, status, category, message: self._note(status, message))
+            instance.instantiate(loggingOn=True, logMessage=lambda _, status, category, message: self._note_message(status, message))
         else:
             instance.instantiate(callbacks=self._callbacks, loggingOn=True)
         return instance
@@ -126,8 +133,8 @@ class HostedInstances:
         instance.exitInitializationMode()
         return self._read_outputs(instance)
 
-    def _step(self, instance: Any, time_: float, step: float) -> None:
-        result = instance.doStep(time_, step)
+    def _step(self, instance: Any, start: float, step: float) -> None:
+        result = instance.doStep(start, step)
         if not self._is_3:
             return
         _, termination, early_return, end_time = result
@@ -137,32 +144,32 @@ class HostedInstances:
             raise InstanceFailure(f"it returned early, at {end_time:g} s")
 
     def _set(self, instance: Any, groups: list[tuple[str, list[int], list[int]]], values: list[Any]) -> None:
-        for kind, references, columns in groups:
-            group_values = [values[column] for column in columns]
-            if kind == "Boolean":
+        for type_name, references, positions in groups:
+            group_values = [values[position] for position in positions]
+            if type_name == "Boolean":
                 group_values = [bool(value) for value in group_values]
-            elif kind not in ("Real", "Float64", "Float32", "String"):
+            elif type_name not in ("Real", "Float64", "Float32", "String"):
                 group_values = [round(value) for value in group_values]
-            getattr(instance, f"set{kind}")(references, group_values)
+            getattr(instance, f"set{type_name}")(references, group_values)
 
     def _read_outputs(self, instance: Any) -> list[float]:
         outputs = [0.0] * len(self._setup.outputs)
-        for kind, references, columns in self._outputs:
-            for column, value in zip(columns, getattr(instance, f"get{kind}")(references), strict=True):
-                outputs[column] = float(value)
+        for type_name, references, positions in self._outputs:
+            for position, value in zip(positions, getattr(instance, f"get{type_name}")(references), strict=True):
+                outputs[position] = float(value)
         return outputs
 
     def _groups_of(self, ports: tuple[tuple[str, int], ...]) -> list[tuple[str, list[int], list[int]]]:
-        """Value references and columns, grouped by the FMI function that sets or gets them."""
+        """Value references and positions, grouped by the FMI function that sets or gets them."""
         groups: dict[str, tuple[list[int], list[int]]] = {}
-        for column, (kind, reference) in enumerate(ports):
-            name = ("Int64" if kind == "Enumeration" else kind) if self._is_3 else FUNCTION_NAMES[kind]
-            references, columns = groups.setdefault(name, ([], []))
+        for position, (type_name, reference) in enumerate(ports):
+            name = ("Int64" if type_name == "Enumeration" else type_name) if self._is_3 else FUNCTION_NAMES[type_name]
+            references, positions = groups.setdefault(name, ([], []))
             references.append(reference)
-            columns.append(column)
+            positions.append(position)
         return [(name, *group) for name, group in groups.items()]
 
-    def _drop(self, number: int) -> None:
+    def _forget(self, number: int) -> None:
         """Forget an instance that failed: any further call, even freeing it, is undefined."""
         self._instances.pop(number, None)
 
@@ -171,12 +178,12 @@ class HostedInstances:
         from fmpy.logging import addLoggerProxy
 
         callbacks = fmi2CallbackFunctions()
-        callbacks.logger = fmi2CallbackLoggerTYPE(lambda _, name, status, category, message: self._note(status, message))
+        callbacks.logger = fmi2CallbackLoggerTYPE(lambda _, name, status, category, message: self._note_message(status, message))
         callbacks.allocateMemory, callbacks.freeMemory = defaultCallbacks.allocateMemory, defaultCallbacks.freeMemory
         addLoggerProxy(byref(callbacks))
         return callbacks
 
-    def _note(self, status: int, message: bytes | None) -> None:
+    def _note_message(self, status: int, message: bytes | None) -> None:
         if status > 1 and message:  # worse than a warning
             self._messages[:] = [*self._messages[-1:], " ".join(message.decode(errors="replace").split())]
 
@@ -198,18 +205,18 @@ def unpack(setup: HostSetup) -> str:
     return folder
 
 
-def watch(instances: HostedInstances, limit: float, folder: str, parent: int, answers: BinaryIO) -> None:
+def end_when_hung(instances: HostedInstances, limit: float, folder: str, parent: int, answers: BinaryIO) -> None:
     """End the process when an instance takes too long, or when the parent process has ended."""
     while os.getppid() == parent:
         time.sleep(CHECK_INTERVAL)
         activity = instances.activity
-        if activity is not None and time.monotonic() - activity[0] > limit:
-            send(answers, ("hangs", f"takes longer than {limit:g} s while it {activity[2]}"))
+        if activity is not None and time.monotonic() - activity.start > limit:
+            send(answers, ("hangs", f"takes longer than {limit:g} s while it {activity.description}"))
             break
-    end(folder)
+    exit_at_once(folder)
 
 
-def end(folder: str) -> NoReturn:
+def exit_at_once(folder: str) -> NoReturn:
     """End at once: to unload the library could run code of the FMU."""
     shutil.rmtree(folder, ignore_errors=True)
     os._exit(1)
@@ -224,23 +231,23 @@ def main() -> None:
     """Answer requests until there are no more."""
     requests = os.fdopen(os.dup(0), "rb")
     answers = os.fdopen(os.dup(1), "wb")
-    null = os.open(os.devnull, os.O_RDWR)
+    null_device = os.open(os.devnull, os.O_RDWR)
     for descriptor in range(3):  # output that an FMU prints must not be read as an answer
-        os.dup2(null, descriptor)
+        os.dup2(null_device, descriptor)
     sys.stdin, sys.stdout, sys.stderr = (os.fdopen(number, mode) for number, mode in enumerate("rww"))
     parent, folder, instances = os.getppid(), "", None
     while True:
         try:
             name, *arguments = pickle.load(requests)
         except EOFError:
-            end(folder)
+            exit_at_once(folder)
         try:
             if instances is None:
                 setup = HostSetup(*arguments)
                 folder = unpack(setup)
                 send(answers, ("done", folder))
                 instances = HostedInstances(setup, folder)
-                threading.Thread(target=watch, args=(instances, setup.limit, folder, parent, answers), daemon=True).start()
+                threading.Thread(target=end_when_hung, args=(instances, setup.limit, folder, parent, answers), daemon=True).start()
                 send(answers, ("done", None))
             else:
                 send(answers, ("done", getattr(instances, name)(*arguments)))

@@ -21,9 +21,9 @@ from safevar_sumo.fmu.description import Description, Variable
 from safevar_sumo.fmu.host import HostSetup
 from safevar_sumo.fmu.ports import FloatArray, Port
 
-LONGEST = 10.0
+STEP_LIMIT = 10.0
 """Longest time that an instance may take for one simulation step; beyond it the instance counts as hung [s]."""
-MOST_INSTANCES, MOST_PROCESSES = 200, 4
+MAX_INSTANCES, MAX_PROCESSES = 200, 4
 """Largest number of vehicles of a simulation: with all instances in one process, and with one process for each."""
 POINT_TOLERANCE = 1e-9
 """Tolerance for times of communication points, as a share of a step [-]."""
@@ -34,11 +34,11 @@ class Fault(SafevarError):
 
 
 class History(NamedTuple):
-    """All inputs so far, as a chain: `inputs` of step `number` after the steps of `previous`; the initialisation is the first link."""
+    """All inputs so far, as a chain: `inputs` of step `step_number` after the steps of `previous`; the initialisation is the first link."""
 
     previous: History | None
     inputs: FloatArray
-    number: int
+    step_number: int
 
 
 class _Host:
@@ -70,7 +70,7 @@ class _Host:
             status, answer = pickle.load(self._process.stdout)  # type: ignore[arg-type]
         except (EOFError, OSError, pickle.UnpicklingError):
             self._process.wait()
-            raise Fault(f"crashed {_cause(self._process.returncode)} while it {self.activity}") from None
+            raise Fault(f"crashed {_describe_end(self._process.returncode)} while it {self.activity}") from None
         if status == "hangs":
             self.end()
             raise Fault(answer)
@@ -92,11 +92,11 @@ def _end_process(process: subprocess.Popen[bytes], folders: list[str]) -> None:
     process.wait()
 
 
-def _cause(code: int) -> str:
+def _describe_end(exit_code: int) -> str:
     try:
-        return f"(signal {signal.Signals(-code).name})" if code < 0 else f"(exit code {code})"
+        return f"(signal {signal.Signals(-exit_code).name})" if exit_code < 0 else f"(exit code {exit_code})"
     except ValueError:
-        return f"(signal {-code})"
+        return f"(signal {-exit_code})"
 
 
 class Instances:
@@ -128,8 +128,8 @@ class Instances:
         """Number of times that all instances were lost."""
 
     @property
-    def most_vehicles(self) -> int:
-        return MOST_PROCESSES if self.description.single_instance else MOST_INSTANCES
+    def max_vehicles(self) -> int:
+        return MAX_PROCESSES if self.description.single_instance else MAX_INSTANCES
 
     def lease(self, n: int) -> list[int]:
         """Numbers of n instances."""
@@ -148,7 +148,7 @@ class Instances:
         parameters = [[*(float(fmu_values[k][i]) for k in self._parameter_indices), *self._constants] for i in range(len(numbers))]
         inputs = [[float(fmu_values[k][i]) for k in self._input_indices] for i in range(len(numbers))]
         answers = self._request("start", numbers, "is initialised",
-                                lambda members: ([parameters[i] for i in members], [inputs[i] for i in members]))
+                                lambda positions: ([parameters[i] for i in positions], [inputs[i] for i in positions]))
         return np.asarray(self._outputs_of(answers[:, np.newaxis])[-1])
 
     def step(self, numbers: Sequence[int], times: Sequence[tuple[float, float]], values: FloatArray) -> FloatArray:
@@ -160,7 +160,7 @@ class Instances:
         inputs = list(map(list, zip(*fmu_values, strict=True))) or [[] for _ in numbers]
         kept_steps = min(len(times), 2)
         return self._outputs_of(self._request("step", numbers, f"is at {times[0][0]:g} s",
-                                             lambda members: (times, [inputs[i] for i in members], kept_steps)))
+                                             lambda positions: (times, [inputs[i] for i in positions], kept_steps)))
 
     def _outputs_of(self, answers: FloatArray) -> FloatArray:
         """Answers, shape (N, steps, m), as outputs in the outer units of the ports, shape (steps, m, N)."""
@@ -169,14 +169,13 @@ class Instances:
 
     def _request(self, name: str, numbers: Sequence[int], activity: str, arguments: Any) -> FloatArray:
         """Answers of N instances, shape (N, ...). All instances run in one process, or each runs in its own process."""
-        positions = range(len(numbers))
-        groups = {numbers[i]: [i] for i in positions} if self.description.single_instance else {0: [*positions]}
+        groups = {key: [i] for i, key in enumerate(numbers)} if self.description.single_instance else {0: [*range(len(numbers))]}
         hosts = {}
         try:
-            for key, members in groups.items():
+            for key, positions in groups.items():
                 hosts[key] = host = self._host(key)
                 host.activity = activity
-                host.send((name, [numbers[i] for i in members], *arguments(members)))
+                host.send((name, [numbers[i] for i in positions], *arguments(positions)))
             return np.concatenate([host.receive() for host in hosts.values()])
         except Fault:
             self.close()  # answers of other processes may be pending
@@ -184,8 +183,8 @@ class Instances:
 
     def _host(self, key: int) -> _Host:
         if key not in self._hosts:
-            d = self.description
-            self._hosts[key] = _Host(HostSetup(d.path, d.digest, d.version, d.identifier, d.token, *self._slots, self._limit))
+            fmu = self.description
+            self._hosts[key] = _Host(HostSetup(fmu.path, fmu.digest, fmu.version, fmu.identifier, fmu.token, *self._slots, self._limit))
         return self._hosts[key]
 
     def close(self) -> None:
@@ -229,36 +228,37 @@ class Fleet:
         First come the outputs at the last communication point, then the outputs interpolated to the end of the step.
         """
         if self._history is not history or self._generation != self._instances.generation:
-            self._go_back(history)
-        number = history.number + 1
+            self._replay(history)
+        step_number = history.step_number + 1
         self._history = None
-        self._drive(number, inputs)
-        self._history = History(history, inputs, number)
-        return np.stack([self._last_outputs[1], self._end_outputs(number)]), self._history
+        self._drive(step_number, inputs)
+        self._history = History(history, inputs, step_number)
+        return np.stack([self._last_outputs[1], self._end_outputs(step_number)]), self._history
 
-    def _go_back(self, history: History) -> None:
+    def _replay(self, history: History) -> None:
         chain = [history]
         while chain[-1].previous is not None:
             chain.append(chain[-1].previous)
         self.start(chain.pop().inputs)
         for link in reversed(chain):
-            self._drive(link.number, link.inputs)
+            self._drive(link.step_number, link.inputs)
 
-    def _drive(self, number: int, inputs: FloatArray) -> None:
+    def _drive(self, step_number: int, inputs: FloatArray) -> None:
         """Advance to the last communication point in a step, if the step contains any."""
-        length = self._communication_step or self._step
-        times = [(point * length, length) for point in range(self._first_point(number), self._first_point(number + 1))]
+        interval = self._communication_step or self._step
+        times = [(point * interval, interval) for point in range(self._first_point_in(step_number), self._first_point_in(step_number + 1))]
         if times:
             outputs = self._instances.step(self._numbers, times, inputs)
             self._last_outputs = outputs if len(outputs) == 2 else np.stack([self._last_outputs[1], outputs[0]])
 
-    def _first_point(self, number: int) -> int:
+    def _first_point_in(self, step_number: int) -> int:
         """Number of the first communication point at or after the start of a step."""
-        return math.ceil(number * self._step / (self._communication_step or self._step) - POINT_TOLERANCE)
+        return math.ceil(step_number * self._step / (self._communication_step or self._step) - POINT_TOLERANCE)
 
-    def _end_outputs(self, number: int) -> FloatArray:
-        length = self._communication_step or self._step
-        overshoot = self._first_point(number + 1) - (number + 1) * self._step / length  # of the last point over the step's end [-]
+    def _end_outputs(self, step_number: int) -> FloatArray:
+        interval = self._communication_step or self._step
+        # by which the last communication point lies beyond the step's end [-]
+        overshoot = self._first_point_in(step_number + 1) - (step_number + 1) * self._step / interval
         if abs(overshoot) <= POINT_TOLERANCE:
             return np.asarray(self._last_outputs[1])
         return np.asarray(self._last_outputs[1] - (self._last_outputs[1] - self._last_outputs[0]) * overshoot)

@@ -30,6 +30,7 @@ class Port(NamedTuple):
 
     @property
     def slot(self) -> tuple[str, int]:
+        """Type and value reference of the variable."""
         return self.variable.type, self.variable.reference
 
     def to_fmu(self, values: FloatArray) -> FloatArray:

@@ -6,12 +6,12 @@ import math
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-BASES = ("kg", "m", "s", "A", "K", "mol", "cd", "rad")
+BASE_UNITS = ("kg", "m", "s", "A", "K", "mol", "cd", "rad")
 """FMI's base units (FMI 2.0.4, section 2.2.2)."""
 
 
 class Unit(NamedTuple):
-    """A unit: value in SI = `factor` * value + `offset`; `exponents` belong to the units `BASES`."""
+    """A unit: value in SI = `factor` * value + `offset`; `exponents` belong to the units `BASE_UNITS`."""
 
     exponents: tuple[int, ...]
     factor: float = 1.0
@@ -29,7 +29,7 @@ class Unit(NamedTuple):
 
 
 def _unit(factor: float = 1.0, offset: float = 0.0, **exponents: int) -> Unit:
-    return Unit(tuple(exponents.get(base, 0) for base in BASES), factor, offset)
+    return Unit(tuple(exponents.get(base, 0) for base in BASE_UNITS), factor, offset)
 
 
 SI: Mapping[str, Unit] = {

@@ -1,6 +1,6 @@
 """Metrics by name: the safety metrics of method section 4, and metrics of comfort."""
 
-from safevar_sumo.metrics.base import F_DIFF, F_NUM_DIFF, F_SAFE, Metric, MetricFacts, Objective, Scoring, foreign_metric
+from safevar_sumo.metrics.base import F_DIFF, F_NUM_DIFF, F_SAFE, Metric, MetricFacts, Objective, Scoring, guard_metric
 from safevar_sumo.metrics.comfort import BRAKE_HARSHNESS, MAX_JERK, RMS_ACCELERATION
 from safevar_sumo.metrics.deceleration import AVE_DECE
 from safevar_sumo.metrics.rating_points import RATING_POINTS
@@ -27,4 +27,4 @@ SAFEVAR = Scoring(metrics=tuple(metric.facts for metric in METRICS.values()), ob
 
 __all__ = [
     "FURTHER", "F_DIFF", "F_NUM_DIFF", "F_SAFE", "METRICS", "OBJECTIVES", "RATING_POINTS", "SAFEVAR", "Criterion", "Metric", "MetricFacts",
-    "Objective", "Scoring", "Unsafe", "foreign_metric", "time_to_collision"]
+    "Objective", "Scoring", "Unsafe", "guard_metric", "time_to_collision"]

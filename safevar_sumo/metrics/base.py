@@ -99,8 +99,8 @@ def without_collision(runs: SimulationRuns, values: FloatArray) -> FloatArray:
     return np.where(np.isnan(runs.collision_speed), values, np.nan)
 
 
-def foreign_metric(metric: Any, guard: Guard) -> Metric:
-    """A metric from outside the package with its record checked; each call gives it read-only copies and checks its values.
+def guard_metric(metric: Any, guard: Guard) -> Metric:
+    """Guard a user's metric: its function gets read-only copies, and its values are checked.
 
     Raises
     ------

@@ -1,20 +1,20 @@
-"""Code from outside the package: looked up by name, held to a contract, called through one guard."""
+"""User code: looked up by name, checked against a contract, called through a guard."""
 
-from safevar_sumo.plugins.files import DIGITS, Files, changed_files, digest_of, digests, located, named_files, noted_reading
+from safevar_sumo.plugins.files import DIGEST_LENGTH, Files, changed_files, digest_of, digests, file_by_name, files_named_in, note_inputs
 from safevar_sumo.plugins.guard import Contract, Guard, accepts, guard_process_state, read_only_copy
 from safevar_sumo.plugins.lookup import (
     Lookup,
     Member,
-    OwnModules,
+    ModuleCopies,
+    add_import_folders,
+    added_import_folders,
     check_parameters,
-    forget_foreign,
-    inherit_reachable,
+    inherit_import_folders,
     instance_of,
-    make_reachable,
-    reachable,
+    unload_user_modules,
 )
 
 __all__ = [
-    "DIGITS", "Contract", "Files", "Guard", "Lookup", "Member", "OwnModules", "accepts", "changed_files", "check_parameters", "digest_of",
-    "digests", "forget_foreign", "guard_process_state", "inherit_reachable", "instance_of", "located", "make_reachable", "named_files",
-    "noted_reading", "reachable", "read_only_copy"]
+    "DIGEST_LENGTH", "Contract", "Files", "Guard", "Lookup", "Member", "ModuleCopies", "accepts", "add_import_folders",
+    "added_import_folders", "changed_files", "check_parameters", "digest_of", "digests", "file_by_name", "files_named_in",
+    "guard_process_state", "inherit_import_folders", "instance_of", "note_inputs", "read_only_copy", "unload_user_modules"]

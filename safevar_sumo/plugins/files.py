@@ -1,7 +1,7 @@
-"""Files that results depend on: the files that code from outside the package reads, and digests by names equal on every machine.
+"""Files that results depend on: finds the files that user code reads, and names them alike on every machine.
 
-The interpreter raises an audit event for every file that Python code opens and for every module that is loaded. Compiled code
-raises no event: files that a study's parameters name always count.
+The interpreter raises an audit event for every file that Python code opens and for every module that it loads. Compiled code
+raises no event, so all files that a study's parameters name count as read.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from urllib.parse import unquote, urlsplit
 
 from safevar_sumo.shipped import NETWORKS, PACKAGE, STUDIES
 
-DIGITS = 16
+DIGEST_LENGTH = 16
 """Length of a file's digest."""
 Files = dict[str, str]
 """Digests of files by the names that `digests` gives them."""
@@ -32,15 +32,15 @@ KNOWN_FOLDERS = tuple(f"{folder}{os.sep}" for folder in sorted({
     *(os.path.realpath(os.path.join(prefix, name)) for prefix in (sys.prefix, sys.base_prefix, "/", "/usr", "/usr/local")
       for name in ("bin", "etc", "include", "lib", "lib64", "sbin", "share")),
     "/dev", "/proc", "/sys", "/System", "/Library", os.environ.get("SYSTEMROOT", "/dev")}))
-"""Folders of this package, the interpreter, installed libraries and the operating system: the code in them is not foreign."""
+"""Folders without user code: of this package, the interpreter, installed libraries and the operating system."""
 CACHE_FOLDERS = ("__pycache__", ".cache", ".config")
 """Names of folders in which programs keep caches and settings."""
 WRITE_FLAGS = os.O_WRONLY | os.O_CREAT | os.O_TRUNC
 """Flags of a file that is opened for writing only; a file opened for reading and writing counts as read."""
 
 
-class Reading:
-    """Absolute `paths` of the files that code from outside opened for reading, and names of the `modules` that this code loaded."""
+class InputFiles:
+    """The files that user code reads: absolute `paths` of opened files, and names of loaded `modules`."""
 
     def __init__(self) -> None:
         self.paths: set[str] = set()
@@ -48,7 +48,7 @@ class Reading:
 
     def files(self, packages: Sequence[str] = ()) -> set[str]:
         """Every input file: sources in place of Python's caches; files of an installed package only if `packages` names the package."""
-        installed = {file for name in list(sys.modules) if name.partition(".")[0] in packages and not is_foreign(file := _file_of(name))}
+        installed = {file for name in list(sys.modules) if name.partition(".")[0] in packages and not is_user_file(file := _file_of(name))}
         files = {*self.paths, *map(_file_of, self.modules), *installed} - {""}
         return {path for path in map(_source_of, files) if _is_input(path, packages)}
 
@@ -57,23 +57,23 @@ def _file_of(module: str) -> str:
     return str(getattr(sys.modules.get(module), "__file__", None) or "")
 
 
-class _Watch:
-    """State of the process's only audit hook, which cannot be removed.
+class _AuditHook:
+    """The process's only audit hook, which cannot be removed.
 
-    `call_depth` is the number of calls of code from outside under way; `written_files` are files that such code wrote, hence no inputs;
+    `call_depth` is the number of calls of user code under way; `written_files` are files that such code wrote, hence no inputs;
     `imported_modules` are the names of all modules that such code has loaded.
     """
 
     def __init__(self) -> None:
-        self.call_depth, self._hooked = 0, False
-        self.readings: list[Reading] = []
+        self.call_depth, self._is_installed = 0, False
+        self.readings: list[InputFiles] = []
         self.written_files: set[str] = set()
         self.imported_modules: set[str] = set()
 
-    def hook(self) -> None:
-        if not self._hooked:
+    def install(self) -> None:
+        if not self._is_installed:
             sys.addaudithook(self._note)
-            self._hooked = True
+            self._is_installed = True
 
     def _note(self, event: str, arguments: tuple[Any, ...]) -> None:
         if not self.call_depth or event not in ("open", "import", "ctypes.dlopen", "sqlite3.connect"):
@@ -97,22 +97,22 @@ class _Watch:
             reading.paths.add(path)
 
 
-watch = _Watch()
+audit_hook = _AuditHook()
 
 
 @contextmanager
-def noted_reading() -> Iterator[Reading]:
-    """Record the files and modules that code from outside opens and loads while a guard calls it."""
-    watch.hook()
-    reading = Reading()
-    watch.readings.append(reading)
+def note_inputs() -> Iterator[InputFiles]:
+    """Record the files and modules that user code opens and loads while a guard calls it."""
+    audit_hook.install()
+    reading = InputFiles()
+    audit_hook.readings.append(reading)
     try:
         yield reading
     finally:
-        watch.readings[:] = [other for other in watch.readings if other is not reading]
+        audit_hook.readings[:] = [other for other in audit_hook.readings if other is not reading]
 
 
-def is_foreign(path: str) -> bool:
+def is_user_file(path: str) -> bool:
     """Whether a file lies outside the interpreter, installed libraries, this package and the operating system."""
     return not path.startswith(KNOWN_FOLDERS) and not any(name in Path(path).parts for name in LIBRARY_FOLDERS)
 
@@ -127,9 +127,10 @@ def _source_of(path: str) -> str:
 
 def _is_input(path: str, packages: Sequence[str]) -> bool:
     parts = Path(path).parts
-    if path in watch.written_files or any(name in parts for name in CACHE_FOLDERS) or not os.path.isfile(path):
+    if path in audit_hook.written_files or any(name in parts for name in CACHE_FOLDERS) or not os.path.isfile(path):
         return False
-    return is_foreign(path) or any(parts[parts.index(name) + 1].partition(".")[0] in packages for name in LIBRARY_FOLDERS if name in parts)
+    library_members = [parts[parts.index(folder) + 1] for folder in LIBRARY_FOLDERS if folder in parts]
+    return is_user_file(path) or any(member.partition(".")[0] in packages for member in library_members)
 
 
 def digest_of(path: Path | str) -> str:
@@ -151,7 +152,7 @@ def _digest(path: str, *_: int) -> str:
     if path.endswith(".py"):
         with suppress(SyntaxError, ValueError, RecursionError):  # the digest of invalid Python covers the file's content
             content = "".join(_syntax_text(ast.parse(content))).encode()
-    return sha256(content.replace(b"\r\n", b"\n")).hexdigest()[:DIGITS]
+    return sha256(content.replace(b"\r\n", b"\n")).hexdigest()[:DIGEST_LENGTH]
 
 
 def _syntax_text(node: Any) -> Iterator[str]:
@@ -181,33 +182,33 @@ def _is_docstring(body: Sequence[ast.stmt]) -> bool:
     return bool(body) and isinstance(body[0], ast.Expr) and isinstance(body[0].value, ast.Constant) and isinstance(body[0].value.value, str)
 
 
-def digests(paths: Iterable[str], places: Sequence[str]) -> Files:
+def digests(paths: Iterable[str], folders: Sequence[str]) -> Files:
     """Digests of files by name.
 
     Parameters
     ----------
-    places
+    folders
         The folders of the study's file and of the files that it extends.
     """
     named: dict[str, str] = {}
     for path in sorted(paths):
-        parts = 0
-        while named.setdefault(_name_of(path, places, parts), path) != path:
-            parts += 1
+        extra_parts = 0
+        while named.setdefault(_name_of(path, folders, extra_parts), path) != path:
+            extra_parts += 1
     return {name: digest_of(path) for name, path in sorted(named.items())}
 
 
-def _name_of(path: str, places: Sequence[str], extra_parts: int = 0) -> str:
-    """A file's path relative to the first of `places` that contains the file; if none does, the path's last 2 + `extra_parts` parts."""
-    for root in (*places, *_roots()):
-        if not extra_parts and Path(path).is_relative_to(root):
-            return Path(path).relative_to(root).as_posix()
+def _name_of(path: str, folders: Sequence[str], extra_parts: int = 0) -> str:
+    """A file's path relative to the first of `folders` that contains the file; if none does, the path's last 2 + `extra_parts` parts."""
+    for folder in (*folders, *_import_folders()):
+        if not extra_parts and Path(path).is_relative_to(folder):
+            return Path(path).relative_to(folder).as_posix()
     return Path(*Path(path).parts[-2 - extra_parts:]).as_posix()
 
 
-def located(name: str, places: Sequence[str]) -> str:
-    """The file with the name that `digests` gives it; "" if there is no such file."""
-    return next((str(path) for root in (*places, *_roots()) if (path := Path(root, name)).is_file()), "")
+def file_by_name(name: str, folders: Sequence[str]) -> str:
+    """The path of the file to which `digests` gives a name; "" if there is no such file."""
+    return next((str(path) for folder in (*folders, *_import_folders()) if (path := Path(folder, name)).is_file()), "")
 
 
 def changed_files(before: Mapping[str, str], now: Mapping[str, str]) -> list[str]:
@@ -215,27 +216,27 @@ def changed_files(before: Mapping[str, str], now: Mapping[str, str]) -> list[str
     return [name for name in sorted({*before, *now}) if before.get(name) != now.get(name)]
 
 
-def named_files(value: Any, places: Sequence[str]) -> Iterator[str]:
-    """Files beside a study's file whose names occur as texts anywhere in a value."""
+def files_named_in(value: Any, folders: Sequence[str]) -> Iterator[str]:
+    """Files in `folders` whose names occur as texts anywhere in a value."""
     if isinstance(value, dict):
         value = list(value.values())
     if isinstance(value, list | tuple):
         for item in value:
-            yield from named_files(item, places)
+            yield from files_named_in(item, folders)
     elif isinstance(value, str):
-        path = file_beside(value, places or (os.getcwd(),))
+        path = file_beside(value, folders or (os.getcwd(),))
         if path:
             yield path
 
 
-def file_beside(text: str, places: Sequence[str]) -> str:
+def file_beside(text: str, folders: Sequence[str]) -> str:
     """The file that a text names, relative to the folder of the study's file or of a file that it extends; "" if there is none."""
     try:
-        return next((os.path.abspath(path) for place in places if (path := Path(place, text)).is_file()), "")
+        return next((os.path.abspath(path) for folder in folders if (path := Path(folder, text)).is_file()), "")
     except (OSError, ValueError):  # the text is no path
         return ""
 
 
-def _roots() -> list[str]:
+def _import_folders() -> list[str]:
     """Folders in which Python looks for modules."""
-    return [os.getcwd(), *(place for place in sys.path if place)]
+    return [os.getcwd(), *(folder for folder in sys.path if folder)]

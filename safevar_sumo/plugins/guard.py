@@ -1,4 +1,4 @@
-"""The contracts of users' classes, the guard that calls users' code, and checks of the results."""
+"""The contracts of users' classes, the guard that calls user code, and checks of the results."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from typing import Any, NamedTuple, Self
 
 import numpy as np
 
-from safevar_sumo.errors import ForeignError, InputError, in_one_line
-from safevar_sumo.plugins.files import watch
+from safevar_sumo.errors import InputError, UserCodeError, in_one_line
+from safevar_sumo.plugins.files import audit_hook
 from safevar_sumo.records import BoolArray, FloatArray
 
 _PACKAGE_FOLDER = str(Path(__file__).resolve().parents[1])
@@ -26,7 +26,7 @@ INFINITY = float("inf")
 
 
 class Contract(NamedTuple):
-    """The members that a class must have, taken from the protocol or base class that documents them.
+    """The methods and attributes that a class must have, taken from the protocol or base class that documents them.
 
     Attributes
     ----------
@@ -49,8 +49,8 @@ class Contract(NamedTuple):
     @classmethod
     def of(cls, protocol: type, title: str, optional: Iterable[str] = ()) -> Self:
         """The public methods and annotated attributes of a protocol or base class; methods named in `optional` may be missing."""
-        methods = {name: _required_parameters(member) for name, member in vars(protocol).items()
-                   if not name.startswith("_") and inspect.isfunction(member)}
+        methods = {name: _required_parameters(attribute) for name, attribute in vars(protocol).items()
+                   if not name.startswith("_") and inspect.isfunction(attribute)}
         return cls(title, {name: parameters for name, parameters in methods.items() if name not in optional},
                    {name: parameters for name, parameters in methods.items() if name in optional},
                    tuple(inspect.get_annotations(protocol)), None if getattr(protocol, "_is_protocol", False) else protocol)
@@ -62,19 +62,19 @@ class Contract(NamedTuple):
     def violation(self, candidate: Any) -> str:
         """The reason why `candidate` does not meet the contract, found by inspection only; "" if `candidate` meets it."""
         if not inspect.isclass(candidate):
-            kind = "module" if inspect.ismodule(candidate) else "function" if callable(candidate) else f"value of type {_type(candidate)}"
-            return f"is a {kind}, not a class"
+            value = f"value of type {_type_name(candidate)}"
+            return f"is a {'module' if inspect.ismodule(candidate) else 'function' if callable(candidate) else value}, not a class"
         for name, parameters in {**self.methods, **self.optional}.items():
-            member = getattr(candidate, name, None)
+            attribute = getattr(candidate, name, None)
             signature = ", ".join(parameters)
-            if member is None and name in self.optional:
+            if attribute is None and name in self.optional:
                 continue
-            if member is None or name in getattr(candidate, "__abstractmethods__", ()):
+            if attribute is None or name in getattr(candidate, "__abstractmethods__", ()):
                 return f"has no method {name}({signature})"
-            if not callable(member):
-                return f"has {name} = {member!r} instead of a method {name}({signature})"
+            if not callable(attribute):
+                return f"has {name} = {attribute!r} instead of a method {name}({signature})"
             self_count = 1 if inspect.isfunction(inspect.getattr_static(candidate, name)) else 0
-            if not accepts(member, self_count + len(parameters)):
+            if not accepts(attribute, self_count + len(parameters)):
                 return f"has a method {name} that does not take ({signature})"
         return ""
 
@@ -92,10 +92,10 @@ def _required_parameters(method: Any) -> tuple[str, ...]:
     return tuple(parameter.name for parameter in parameters if parameter.default is parameter.empty)[1:]
 
 
-def accepts(function: Any, number: int) -> bool:
-    """Whether a function can be called with `number` positional arguments; True if the function has no signature."""
+def accepts(function: Any, count: int) -> bool:
+    """Whether a function can be called with `count` positional arguments; True if the function has no signature."""
     try:
-        inspect.signature(function).bind(*[None] * number)
+        inspect.signature(function).bind(*[None] * count)
     except TypeError:
         return False
     except ValueError:  # compiled code, without a signature
@@ -121,7 +121,7 @@ def read_only_copy(value: Any) -> Any:
 
 @contextmanager
 def guard_process_state(source: str, names: Sequence[str]) -> Iterator[None]:
-    """Restore the working directory, environment variables and numpy's error state after a block; nothing without plug-ins in `names`."""
+    """Restore the working directory, environment variables and numpy's error state after a block, unless `names` is empty."""
     if not names:
         yield
         return
@@ -137,16 +137,16 @@ def guard_process_state(source: str, names: Sequence[str]) -> Iterator[None]:
 
 
 class Guard(NamedTuple):
-    """Calls a plug-in and checks the results.
+    """Calls user code and checks the results.
 
     Attributes
     ----------
     source
         The study, as errors name it.
     name
-        The plug-in as the study names it, such as `ads.model = 'my_ads:Careful'`.
+        The user code as the study names it, such as `ads.model = 'my_ads:Careful'`.
     folder
-        Folder of the plug-in's sources; an error names the innermost line in this folder.
+        Folder of the user code; an error names the innermost line in this folder.
     target
         The class, function or record; the error for a wrong result names the line where the method begins.
     """
@@ -161,39 +161,39 @@ class Guard(NamedTuple):
 
         Raises
         ------
-        ForeignError
+        UserCodeError
             If the function raises anything, `SystemExit` included.
         """
-        watch.call_depth += 1
+        audit_hook.call_depth += 1
         try:
             return function(*arguments)
-        except ForeignError:
+        except UserCodeError:
             raise
         except (Exception, SystemExit) as error:
-            raise self.failed(method, error) from error
+            raise self.failure(method, error) from error
         finally:
-            watch.call_depth -= 1
+            audit_hook.call_depth -= 1
 
-    def failed(self, method: str, error: BaseException) -> ForeignError:
-        """The error for an exception that the plug-in raised."""
+    def failure(self, method: str, error: BaseException) -> UserCodeError:
+        """The error for an exception that user code raised."""
         location = self._location(error)
         problem = f"{self.name} raised in {method}: {in_one_line(error)}{f' ({location})' if location else ''}"
-        return ForeignError(self.source, problem, error.legal if isinstance(error, InputError) else "")
+        return UserCodeError(self.source, problem, error.legal if isinstance(error, InputError) else "")
 
-    def wrong(self, method: str, part: str, value: object, expected: str) -> ForeignError:
-        """The error for a result whose part `part` has a wrong value."""
-        return self._returned(f"{part} = {_short(value)}", method, expected)
+    def wrong_value(self, method: str, quantity: str, value: object, expected: str) -> UserCodeError:
+        """The error for a result with a wrong value of `quantity`."""
+        return self._wrong_result(f"{quantity} = {_short_text(value)}", method, expected)
 
-    def _returned(self, result: str, method: str, expected: str) -> ForeignError:
+    def _wrong_result(self, result: str, method: str, expected: str) -> UserCodeError:
         function = inspect.unwrap(getattr(self.target, method, getattr(self.target, "function", self.target)))
         code = getattr(function, "__code__", None)  # FMUs and compiled code have none
         location = f" ({code.co_filename}:{code.co_firstlineno})" if code is not None else ""
-        return ForeignError(self.source, f"{self.name} returned {result} from {method}{location}", expected)
+        return UserCodeError(self.source, f"{self.name} returned {result} from {method}{location}", expected)
 
-    def parts(self, method: str, value: Any, expected: str, number: int = 2) -> tuple[Any, ...]:
-        """The parts of a result that must be a tuple or list of `number` parts."""
-        if not isinstance(value, tuple | list) or len(value) != number:
-            raise self._returned(_short(value), method, expected)
+    def elements(self, method: str, value: Any, expected: str, count: int = 2) -> tuple[Any, ...]:
+        """The elements of a result that must be a tuple or list of `count` elements."""
+        if not isinstance(value, tuple | list) or len(value) != count:
+            raise self._wrong_result(_short_text(value), method, expected)
         return tuple(value)
 
     def field(self, method: str, value: Any, name: str) -> Any:
@@ -201,16 +201,16 @@ class Guard(NamedTuple):
         try:
             return getattr(value, name)
         except AttributeError:
-            raise self._returned(_short(value), method, f"an object with the attribute {name}") from None
+            raise self._wrong_result(_short_text(value), method, f"an object with the attribute {name}") from None
 
-    def numbers(self, method: str, part: str, value: Any, shape: tuple[int, ...], lowest: float = -INFINITY, highest: float = INFINITY,
+    def numbers(self, method: str, quantity: str, value: Any, shape: tuple[int, ...], lowest: float = -INFINITY, highest: float = INFINITY,
                 *, above: bool = False, infinite: bool = False, undefined: bool = False) -> FloatArray:
         """A result as a new array of float64.
 
         Parameters
         ----------
         shape
-            Expected shape; a plain number is accepted as the value of all elements.
+            Expected shape; a single number is accepted as the value of all elements.
         lowest, highest
             Bounds; `above` excludes `lowest` itself.
         infinite, undefined
@@ -219,50 +219,50 @@ class Guard(NamedTuple):
         bounds = "" if (lowest, highest) == (-INFINITY, INFINITY) else f" {'above' if above else 'from'} {lowest:g}" \
             if highest == INFINITY else f" in {'(' if above else '['}{lowest:g}, {highest:g}]"
         expected = f"numbers{bounds}, {'' if infinite else 'finite, '}shape {shape}"
-        numbers = self._array(method, part, value, shape, "biuf", expected).astype(float)
-        valid = (numbers > lowest) if above else (numbers >= lowest)
-        valid &= numbers <= highest
+        numbers = self._array(method, quantity, value, shape, "biuf", expected).astype(float)
+        is_valid = (numbers > lowest) if above else (numbers >= lowest)
+        is_valid &= numbers <= highest
         if not infinite:
-            valid &= np.isfinite(numbers)
+            is_valid &= np.isfinite(numbers)
         if undefined:
-            valid |= np.isnan(numbers)
-        if not valid.all():
-            raise self.wrong(method, part, float(numbers[~valid][0]), expected)
+            is_valid |= np.isnan(numbers)
+        if not is_valid.all():
+            raise self.wrong_value(method, quantity, float(numbers[~is_valid][0]), expected)
         return numbers
 
-    def truths(self, method: str, part: str, value: Any, shape: tuple[int, ...]) -> BoolArray:
+    def booleans(self, method: str, quantity: str, value: Any, shape: tuple[int, ...]) -> BoolArray:
         """A result as a new array of bool."""
-        return self._array(method, part, value, shape, "b", f"truth values, shape {shape}").astype(bool)
+        return self._array(method, quantity, value, shape, "b", f"truth values, shape {shape}").astype(bool)
 
-    def _array(self, method: str, part: str, value: Any, shape: tuple[int, ...], kinds: str, expected: str) -> np.ndarray:
+    def _array(self, method: str, quantity: str, value: Any, shape: tuple[int, ...], kinds: str, expected: str) -> np.ndarray:
         try:
             array = np.asarray(value)
         except ValueError:
-            raise self.wrong(method, part, value, expected) from None
+            raise self.wrong_value(method, quantity, value, expected) from None
         if array.dtype.kind not in kinds:
-            raise self.wrong(method, part, value, expected)
+            raise self.wrong_value(method, quantity, value, expected)
         if array.shape not in (shape, ()):
-            raise self._returned(f"{part} of shape {array.shape}", method, expected)
+            raise self._wrong_result(f"{quantity} of shape {array.shape}", method, expected)
         return np.broadcast_to(array, shape)
 
     def _location(self, error: BaseException) -> str:
-        """File and line of the innermost frame in the plug-in's folder, else of the innermost frame outside this package."""
+        """File and line of the innermost frame in the user code's folder, else of the innermost frame outside this package."""
         frames = [(frame.filename, frame.lineno) for frame in traceback.extract_tb(error.__traceback__)]
         if isinstance(error, SyntaxError) and error.filename:
             frames.append((error.filename, error.lineno))
-        outside_frames = [frame for frame in frames if not frame[0].startswith((_PACKAGE_FOLDER, _IMPORTLIB_FOLDER, "<frozen"))]
-        own_frames = [frame for frame in outside_frames if self.folder and frame[0].startswith(self.folder)
-                      and (LIBRARY_FOLDER in self.folder or LIBRARY_FOLDER not in frame[0])]
-        return "{}:{}".format(*(own_frames or outside_frames)[-1]) if outside_frames else ""
+        frames_beyond_package = [frame for frame in frames if not frame[0].startswith((_PACKAGE_FOLDER, _IMPORTLIB_FOLDER, "<frozen"))]
+        user_frames = [frame for frame in frames_beyond_package if self.folder and frame[0].startswith(self.folder)
+                       and (LIBRARY_FOLDER in self.folder or LIBRARY_FOLDER not in frame[0])]
+        return "{}:{}".format(*(user_frames or frames_beyond_package)[-1]) if frames_beyond_package else ""
 
 
-def _type(value: object) -> str:
+def _type_name(value: object) -> str:
     return type(value).__name__
 
 
-def _short(value: object) -> str:
+def _short_text(value: object) -> str:
     """A returned value in a few words on one line."""
     if isinstance(value, np.ndarray) and value.size > 4:
         return f"an array of {value.dtype}, shape {value.shape}"
     text = " ".join(repr(value).split())
-    return text if len(text) <= 80 else f"a {_type(value)}"
+    return text if len(text) <= 80 else f"a {_type_name(value)}"

@@ -1,20 +1,19 @@
 """Euro NCAP's crash avoidance protocol as data: matrices, colours, and the computation of points."""
 
-from safevar_sumo.protocol.cells import EURO_NCAP_2026, NOT_RED, PROTOCOLS, Block, Cell, CellScenario, Layer, Protocol, part_of, protocol_of
+from safevar_sumo.protocol.cells import (
+    EURO_NCAP_2026,
+    NOT_RED,
+    PROTOCOLS,
+    Block,
+    Cell,
+    CellScenario,
+    Layer,
+    Protocol,
+    cells_of_part,
+    protocol_of,
+)
 from safevar_sumo.protocol.points import COLOURS, RED, Points, points_of
 
 __all__ = [
-           "COLOURS",
-           "EURO_NCAP_2026",
-           "NOT_RED",
-           "PROTOCOLS",
-           "RED",
-           "Block",
-           "Cell",
-           "CellScenario",
-           "Layer",
-           "Points",
-           "Protocol",
-           "part_of", "points_of",
-           "protocol_of",
-]
+    "COLOURS", "EURO_NCAP_2026", "NOT_RED", "PROTOCOLS", "RED", "Block", "Cell", "CellScenario", "Layer", "Points", "Protocol",
+    "cells_of_part", "points_of", "protocol_of"]

@@ -81,7 +81,7 @@ class Layer(Struct, frozen=True, forbid_unknown_fields=True):
     conditions: tuple[Condition, ...]
 
     @property
-    def simulated(self) -> tuple[Condition, ...]:
+    def simulated_conditions(self) -> tuple[Condition, ...]:
         """The layer's variations if they can be simulated; the calculator lists none for CBLA by night, which is rated like other tests."""
         if self.layer == NIGHT:
             return self.conditions or (Condition(IN_DARKNESS, NOT_RED),)
@@ -145,7 +145,7 @@ class Cell(NamedTuple):
         return f"{self.block.name}, {self.vut:g} km/h{choice}, {column}{variation}"
 
     @property
-    def scene(self) -> CellScenario:
+    def scenario(self) -> CellScenario:
         test = self.block.test
         model = next((model for prefix, model in MODELS.items() if test.startswith(prefix)), "crossing")
         parameters: dict[str, Any] = {"test": test, "speed": self.vut, "target_speed": self.target}
@@ -187,8 +187,8 @@ class Protocol(Struct, frozen=True, eq=False, forbid_unknown_fields=True, dict=T
         return (*self._matrix_cells(), *self._layer_cells())
 
     @cached_property
-    def matrix_of(self) -> dict[tuple[str, int, int], int]:
-        """Numbers of the cells of the matrices, by block name, row and column."""
+    def matrix_cell_numbers(self) -> dict[tuple[str, int, int], int]:
+        """Indices in `cells` of the cells of the matrices, by block name, row and column."""
         return {(cell.block.name, cell.row, cell.column): number for number, cell in enumerate(self.cells) if not cell.is_varied}
 
     @property
@@ -203,23 +203,23 @@ class Protocol(Struct, frozen=True, eq=False, forbid_unknown_fields=True, dict=T
         return [layer for layer in self.layers if layer.test == test]
 
     @property
-    def not_simulated(self) -> dict[str, float]:
+    def points_not_simulated(self) -> dict[str, float]:
         """Points of tests that cannot be simulated here, by test."""
         return {test: sum(points) for test, points in self.scenarios.items() if test not in self.tests}
 
     def _matrix_cells(self) -> Iterator[Cell]:
         for block in self.blocks:
-            for row, values in enumerate(block.rows):
-                for column, letter in enumerate(values.ranges):
+            for row, cell_row in enumerate(block.rows):
+                for column, letter in enumerate(cell_row.ranges):
                     if letter != "-":
                         yield Cell(block, row, column, STANDARD if letter == "S" else EXTENDED, "", "",
                                    WARNING if block.is_warning(row) else block.criterion,
-                                   block.target_speeds[column] if values.target is None else values.target)
+                                   block.target_speeds[column] if cell_row.target is None else cell_row.target)
 
     def _layer_cells(self) -> Iterator[Cell]:
         standard_cells = [cell for cell in self._matrix_cells() if cell.range == STANDARD]
         for layer in self.layers:
-            for condition in layer.simulated:
+            for condition in layer.simulated_conditions:
                 speed_increase = _leading_number(condition.condition) if layer.layer == SPEED else 0.0
                 for cell in standard_cells:
                     if cell.block.test == layer.test:
@@ -227,14 +227,14 @@ class Protocol(Struct, frozen=True, eq=False, forbid_unknown_fields=True, dict=T
                                             target=cell.target + speed_increase)
 
 
-def part_of(protocol: Protocol, part: int, parts: int) -> list[int]:
-    """Numbers of the cells in part `part`, from 0, of `parts`; cells with the same network are in the same part as far as possible."""
-    def network(number: int) -> tuple[Any, ...]:
+def cells_of_part(protocol: Protocol, part: int, parts: int) -> list[int]:
+    """Numbers of the cells in part `part` of `parts`, counted from 0; cells with the same network share a part as far as possible."""
+    def network_of(number: int) -> tuple[Any, ...]:
         cell = protocol.cells[number]
-        variation = (cell.scene.parameters.get("heading", 0.0), "start_share" in cell.scene.parameters)
-        return cell.scene.model, cell.block.test in ("CPNA", "CPFA", "CPNCO"), variation, cell.block.test
+        variation = (cell.scenario.parameters.get("heading", 0.0), "start_share" in cell.scenario.parameters)
+        return cell.scenario.model, cell.block.test in ("CPNA", "CPFA", "CPNCO"), variation, cell.block.test
 
-    numbers = sorted(range(len(protocol.cells)), key=network)
+    numbers = sorted(range(len(protocol.cells)), key=network_of)
     return numbers[len(numbers) * part // parts:len(numbers) * (part + 1) // parts]
 
 

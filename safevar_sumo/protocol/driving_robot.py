@@ -42,26 +42,26 @@ class DrivingRobot:
         n = len(state.speed)
         speeds = [getattr(point.scenario, "test_speed", None) for point in points]
         self._target = np.repeat([np.nan if speed is None else speed for speed in speeds], n // len(points))
-        self.tested: BoolArray = ~np.isnan(self._target)
+        self.has_test_speed: BoolArray = ~np.isnan(self._target)
         """Which vehicles are in a scenario with a `test_speed`."""
-        self._drives = self.tested.copy()
-        self._has_tests = bool(self.tested.any())
+        self._drives = self.has_test_speed.copy()
+        self._is_needed = bool(self.has_test_speed.any())
         self._prepared, self._hold_gear = prepared, getattr(vehicle, "hold_gear", None)
         self._pedal, self._least_brake = state.throttle - state.brake, state.brake + ACTION_THRESHOLD
         self._step, self._integral = step, np.zeros(n)
-        self._has_braked, self._highest_pedal = ~self.tested, np.full(n, -np.inf)
-        self.error = np.where(self.tested, 0.0, np.nan)
+        self._has_braked, self._highest_pedal = ~self.has_test_speed, np.full(n, -np.inf)
+        self.error = np.where(self.has_test_speed, 0.0, np.nan)
         """Deviation from the test speed [m/s] that was largest relative to the tolerance while the robot drove; NaN without a test."""
 
     def drive(self, command: Command, state: Any, is_open: BoolArray) -> tuple[Command, Any]:
         """The command of the robot while it drives, otherwise of the system; and the state, with the gear held while the robot drives.
 
-        `is_open` marks the runs that are not over: only their speeds are compared with the tolerance.
+        `is_open` marks the runs that are not over; the speeds of other runs are not compared with the tolerance.
         """
-        if not self._has_tests:
+        if not self._is_needed:
             return command, state
         error = np.where(self._drives, state.speed - self._target, 0.0)
-        self.error = np.where(is_open & (_share(error) > _share(self.error)), error, self.error)
+        self.error = np.where(is_open & (_tolerance_share(error) > _tolerance_share(self.error)), error, self.error)
         self._has_braked |= command.brake > self._least_brake
         system_pedal = command.throttle - command.brake
         self._highest_pedal = np.maximum(self._highest_pedal, system_pedal)
@@ -76,9 +76,9 @@ class DrivingRobot:
     @property
     def invalid(self) -> BoolArray:
         """Which vehicles left the tolerance before the system acted; shape (N,)."""
-        return self.tested & (_share(self.error) > 1)
+        return self.has_test_speed & (_tolerance_share(self.error) > 1)
 
 
-def _share(error: FloatArray) -> FloatArray:
+def _tolerance_share(error: FloatArray) -> FloatArray:
     """A speed error divided by the tolerance in the error's direction [-]; 0 without a test."""
     return np.nan_to_num(np.where(error > 0, error / MAX_ERROR, error / MIN_ERROR))

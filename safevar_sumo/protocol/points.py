@@ -20,16 +20,16 @@ UNKNOWN = -1
 """Colour of a cell whose test is invalid; it earns nothing."""
 WEIGHTS = np.array([1.0, 0.75, 0.5, 0.25, 0.0, 0.0])
 """Weight of a cell of the standard range, by colour (protocol 5.2); the last weight is for an unknown colour."""
-STEPS = ((1.0, 1.0), (0.75, 0.75), (0.5, 0.5))
-"""Minimum shares of extended-range cells that are not red, and the share of the range's points that each earns; below, no points."""
+EXTENDED_STEPS = ((1.0, 1.0), (0.75, 0.75), (0.5, 0.5))
+"""Minimum share of extended-range cells that are not red, and the share of the range's points that it earns; below, no points."""
 ROBUSTNESS_SHARE = 0.5
 """Share of the standard range's points from which on robustness earns points."""
 DECIMALS = 2
 """Decimals to which the calculator rounds measured values, half up."""
 SHARE_DECIMALS = 6
 """Decimals to which the calculator rounds shares before a comparison."""
-REQUIRED = ("CCRs", 20.0)
-"""Test and speed [km/h]: its standard-range cells up to this speed must be green, otherwise all frontal collisions score nothing.
+REQUIRED_TEST, REQUIRED_SPEED = "CCRs", 20.0
+"""The standard-range cells of this test up to this speed [km/h] must be green, otherwise all frontal collisions score nothing.
 
 The calculator also intends to require CPNA at 10 km/h and 75 %, but version 5.4.9 does not find those cells.
 """
@@ -66,7 +66,7 @@ class Points:
         return np.where(self.fails, 0.0, np.round(total, SHARE_DECIMALS))
 
 
-def half_up(values: FloatArray, decimals: int) -> FloatArray:
+def round_half_up(values: FloatArray, decimals: int) -> FloatArray:
     """Round values to decimals; a half rounds up."""
     scale = 10.0**decimals
     return np.asarray(np.floor(np.round(values * scale, 4) + 0.5) / scale)
@@ -83,36 +83,36 @@ class _Columns(NamedTuple):
 
 
 @lru_cache
-def _columns(protocol: Protocol) -> _Columns:
+def _columns_of(protocol: Protocol) -> _Columns:
     cells = protocol.cells
-    kinds: dict[tuple[str, str], list[int]] = {}
+    numbers_by_measure: dict[tuple[str, str], list[int]] = {}
     for number, cell in enumerate(cells):
         slowest = str(int(min(cell.vut, max(float(speed) for speed in protocol.mitigation))))
-        kinds.setdefault((cell.judged, slowest if cell.judged == "mitigation" else ""), []).append(number)
+        numbers_by_measure.setdefault((cell.judged, slowest if cell.judged == "mitigation" else ""), []).append(number)
     bands = []
-    for (judged, speed), numbers in kinds.items():
+    for (judged, speed), numbers in numbers_by_measure.items():
         starts = protocol.mitigation[speed] if speed else protocol.criteria[judged]
         bands.append((np.array(numbers), [(COLOURS.index(name), start) for name, start in starts.items()], judged == WARNING))
 
     def cells_where(condition: object) -> npt.NDArray[np.intp]:
         return np.array([number for number, cell in enumerate(cells) if condition(cell)], dtype=np.intp)  # type: ignore[operator]
 
-    ranges = {(block.name, kind): cells_where(lambda cell, b=block, k=kind: cell.block is b and cell.range == k)
-              for block in protocol.blocks for kind in (STANDARD, EXTENDED)}
+    ranges = {(block.name, name): cells_where(lambda cell, b=block, n=name: cell.block is b and cell.range == n)
+              for block in protocol.blocks for name in (STANDARD, EXTENDED)}
     variations = [(layer, condition.criterion, cells_where(lambda cell, varied_by=layer, c=condition: cell.block.test == varied_by.test
                                                           and cell.range == varied_by.layer and cell.condition == c.condition))
-              for layer in protocol.layers for condition in layer.simulated]
-    nominal_cells = np.array([protocol.matrix_of[cell.block.name, cell.row, cell.column] for cell in cells])
-    required_cells = cells_where(lambda cell: cell.block.test == REQUIRED[0] and cell.range == STANDARD and cell.vut <= REQUIRED[1])
+              for layer in protocol.layers for condition in layer.simulated_conditions]
+    nominal_cells = np.array([protocol.matrix_cell_numbers[cell.block.name, cell.row, cell.column] for cell in cells])
+    required_cells = cells_where(lambda cell: cell.block.test == REQUIRED_TEST and cell.range == STANDARD and cell.vut <= REQUIRED_SPEED)
     return _Columns(bands, nominal_cells, ranges, variations, required_cells)
 
 
 def colours_of(protocol: Protocol, results: CellResults) -> npt.NDArray[np.int8]:
     """The colour of every cell, shape (M, cells); at a bound between two colours, an impact has the worse and a warning the better one."""
     colours = np.full(results.impact.shape, UNKNOWN, dtype=np.int8)
-    impact = half_up(np.maximum(np.nan_to_num(results.impact, nan=0.0), 0.0), DECIMALS)
-    warning = half_up(np.nan_to_num(results.warning, nan=-1.0), DECIMALS)
-    for numbers, starts, is_warning in _columns(protocol).bands:
+    impact = round_half_up(np.maximum(np.nan_to_num(results.impact, nan=0.0), 0.0), DECIMALS)
+    warning = round_half_up(np.nan_to_num(results.warning, nan=-1.0), DECIMALS)
+    for numbers, starts, is_warning in _columns_of(protocol).bands:
         values = (warning if is_warning else impact)[:, numbers]
         band_colours = np.full(values.shape, starts[0][0], dtype=np.int8)
         for colour, start in starts[1:]:
@@ -123,8 +123,8 @@ def colours_of(protocol: Protocol, results: CellResults) -> npt.NDArray[np.int8]
 
 def points_of(protocol: Protocol, results: CellResults, claims: Mapping[str, Sequence[str]] | None = None) -> Points:
     """Points of M vehicles; `claims` are, by test, layers that are not simulated and count as if they held."""
-    colours, columns = colours_of(protocol, results), _columns(protocol)
-    layers = _layer_results(protocol, colours)
+    colours, columns = colours_of(protocol, results), _columns_of(protocol)
+    layers = _which_layers_hold(protocol, colours)
     fails = (colours[:, columns.required_cells] != GREEN).any(axis=1)
     tests = {}
     for test, blocks in protocol.tests.items():
@@ -146,14 +146,15 @@ def _range_points(block: Block, colours: npt.NDArray[np.int8], columns: _Columns
     share = np.count_nonzero((extended != RED) & (extended != UNKNOWN), axis=1) / extended.shape[1]
     share_points = _rounded_share(share * block.points[1])
     earned_points = np.zeros(len(colours))
-    for minimum, part in reversed(STEPS):
-        earned_points = np.where(share_points >= _rounded_share(np.array(minimum * block.points[1])), part * block.points[1], earned_points)
+    for minimum, earned_share in reversed(EXTENDED_STEPS):
+        earned_points = np.where(share_points >= _rounded_share(np.array(minimum * block.points[1])), earned_share * block.points[1],
+                                 earned_points)
     return total / weights.shape[1] * block.points[0], earned_points
 
 
-def _layer_results(protocol: Protocol, colours: npt.NDArray[np.int8]) -> dict[tuple[str, str], BoolArray]:
+def _which_layers_hold(protocol: Protocol, colours: npt.NDArray[np.int8]) -> dict[tuple[str, str], BoolArray]:
     """Whether simulated layers hold: all standard-range cells that are not red, at least one, pass in every variation; shape (M,) each."""
-    columns = _columns(protocol)
+    columns = _columns_of(protocol)
     holds: dict[tuple[str, str], BoolArray] = {}
     for layer, criterion, numbers in columns.variations:
         varied, nominal = colours[:, numbers], colours[:, columns.nominal_cells[numbers]]
@@ -175,4 +176,4 @@ def _layer_share(protocol: Protocol, test: str, layers: Mapping[tuple[str, str],
 
 
 def _rounded_share(values: FloatArray | float) -> FloatArray:
-    return half_up(np.asarray(values), SHARE_DECIMALS)
+    return round_half_up(np.asarray(values), SHARE_DECIMALS)

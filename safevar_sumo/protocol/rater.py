@@ -17,8 +17,6 @@ from safevar_sumo.study import OBJECTIVES, MatrixTable, MatrixTest, RatingTable,
 
 SHARED_PARAMETERS = ("vut_length", "vut_width", "grade")
 """Parameters of a study's scenario that apply to every cell."""
-
-
 SUMO_CELLS = 8
 """Number of a protocol's cells that a check simulates in SUMO: all cells would take hours."""
 
@@ -34,23 +32,23 @@ class Rater:
         return points_of(self.protocol, results, self.claims)
 
 
-def cell_columns(runs: SimulationRuns) -> tuple[FloatArray, FloatArray, Any]:
+def rated_quantities(runs: SimulationRuns) -> tuple[FloatArray, FloatArray, Any]:
     """Rated quantities of N simulations of a cell: impact [km/h], warning [s], validity; shape (N,) each; see `CellResults`."""
     warning = np.broadcast_to(runs.warning_ttc, runs.relative_speed.shape)
     return runs.relative_speed * KMH_PER_MS, warning, (runs.outcome != Outcome.INVALID_TEST) & (runs.outcome != Outcome.SIMULATOR_ERROR)
 
 
-def joined_cells(columns: Sequence[tuple[FloatArray, FloatArray, Any]]) -> CellResults:
-    """The results of all cells for M vehicles, from the `cell_columns` of each cell."""
-    return CellResults(*(np.stack(list(values), axis=1) for values in zip(*columns, strict=True)))
+def join_cells(quantities: Sequence[tuple[FloatArray, FloatArray, Any]]) -> CellResults:
+    """Join the `rated_quantities` of each cell to the results of all cells for M vehicles."""
+    return CellResults(*(np.stack(list(values), axis=1) for values in zip(*quantities, strict=True)))
 
 
 def is_rated(study: Study) -> bool:
     return study.matrix is not None and bool(study.matrix.protocol)
 
 
-def rated_study(study: Study, protocol: str) -> Study:
-    """The study with the matrix of a protocol."""
+def with_protocol(study: Study, protocol: str) -> Study:
+    """The study with the matrix of a protocol; a rated study as it is."""
     return study if is_rated(study) else replace(study, matrix=MatrixTable(protocol=protocol))  # type: ignore[arg-type]
 
 
@@ -69,7 +67,7 @@ def rater_of(study: Study, source: str) -> Rater | None:
         key = f"rating.claims.{test}"
         if test not in protocol.tests:
             raise unknown(source, f"{key}: there is no such test, or it is not simulated", test, protocol.tests)
-        is_simulated = {layer.layer: bool(layer.simulated) for layer in protocol.layers_of(test)}
+        is_simulated = {layer.layer: bool(layer.simulated_conditions) for layer in protocol.layers_of(test)}
         for layer in layers:
             if layer not in is_simulated:
                 raise unknown(source, f"{key}: {layer!r} does not count for {test}", layer, is_simulated)
@@ -79,25 +77,25 @@ def rater_of(study: Study, source: str) -> Rater | None:
     return Rater(protocol=protocol, claims=study.rating.claims)
 
 
-def driven_in_sumo(study: Study, weather: Weather) -> Study:
+def study_for_sumo_check(study: Study, weather: Weather) -> Study:
     """The study for a check in SUMO; a rated study is reduced to a few of its cells, spread over the matrices."""
     if not is_rated(study):
         return study
     cell_count = len(protocol_of(study.matrix.protocol).cells)  # type: ignore[union-attr]
-    return in_some_cells(study, weather, np.linspace(0, cell_count - 1, SUMO_CELLS).astype(int).tolist())
+    return reduce_to_cells(study, weather, np.linspace(0, cell_count - 1, SUMO_CELLS).astype(int).tolist())
 
 
-def in_some_cells(study: Study, weather: Weather, numbers: Sequence[int]) -> Study:
-    """A rated study reduced to some of its cells; it has no rating points."""
-    whole_matrix = rated(study, weather)
+def reduce_to_cells(study: Study, weather: Weather, numbers: Sequence[int]) -> Study:
+    """Reduce a rated study to some of its cells; the result has no rating points."""
+    whole_matrix = expand_protocol(study, weather)
     assert whole_matrix.matrix is not None
     tests = [whole_matrix.matrix.tests[number] for number in numbers]
     search = replace(study.search, objectives=[*OBJECTIVES])
     return replace(whole_matrix, matrix=MatrixTable(tests=tests), rating=RatingTable(), search=search)
 
 
-def by_night(weather: Weather) -> Weather:
-    """The weather by night: an equal road, with visibility and recognition delay changed by darkness."""
+def darken(weather: Weather) -> Weather:
+    """The weather by night: the same road; darkness changes visibility and recognition delay."""
     night = weather_of("night", "weather")
     if weather.light == "night":
         return weather
@@ -106,14 +104,14 @@ def by_night(weather: Weather) -> Weather:
                    recognition_delay=weather.recognition_delay + night.recognition_delay)
 
 
-def rated(study: Study, weather: Weather) -> Study:
-    """The study with a test for each cell of its protocol; tests by day have the study's weather."""
+def expand_protocol(study: Study, weather: Weather) -> Study:
+    """Give the study a test for each cell of its protocol; tests by day have the study's weather."""
     assert study.matrix is not None
     shared_parameters = {name: value for name, value in study.scenario.parameters.items() if name in SHARED_PARAMETERS}
-    night, tests = by_night(weather), []
+    weather_by_night, tests = darken(weather), []
     for cell in protocol_of(study.matrix.protocol).cells:
-        scene = cell.scene
-        tests.append(MatrixTest(name=cell.name, model=scene.model, parameters={**shared_parameters, **scene.parameters},
-                                weathers=[night if scene.night else weather]))
-    scenario = replace(study.scenario, parameters={})  # each test has its own parameters
-    return replace(study, matrix=MatrixTable(tests=tests), scenario=scenario)
+        scenario = cell.scenario
+        tests.append(MatrixTest(name=cell.name, model=scenario.model, parameters={**shared_parameters, **scenario.parameters},
+                                weathers=[weather_by_night if scenario.night else weather]))
+    no_parameters = replace(study.scenario, parameters={})  # each test has its own parameters
+    return replace(study, matrix=MatrixTable(tests=tests), scenario=no_parameters)

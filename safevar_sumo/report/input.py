@@ -30,7 +30,7 @@ from safevar_sumo.replay.scene import flat_scene_of
 from safevar_sumo.results import ANSWERS, MANIFEST, RESULTS, SOLUTIONS, chosen_handle, handles, read_manifest, write_whole
 from safevar_sumo.scenarios import Point
 from safevar_sumo.shipped import PACKAGE
-from safevar_sumo.study import SAFETY_DEGREE, foreign_names, refuse_other_than_file
+from safevar_sumo.study import SAFETY_DEGREE, refuse_other_than_file, user_code_names
 from safevar_sumo.sumo.matrix import evaluate, evaluations_at_worst_points, simulate_all_points, study_at
 from safevar_sumo.sumo.system import System, assemble
 
@@ -249,7 +249,7 @@ def stored_answer(data: ReportInput, name: str, compute: Callable[[], Any]) -> A
 
     The result is not stored if the directory cannot be written, or if the code that computes the result has no identity.
     """
-    if data.changed or ("imported" in data.manifest and foreign_names(data.case.study)):
+    if data.changed or ("imported" in data.manifest and user_code_names(data.case.study)):
         return json.loads(json.dumps(compute(), allow_nan=False))
     suffix = f"-{data.anchor(data.point)}" if data.point else ""
     file, identity = data.directory / ANSWERS / f"{name}{suffix}.json", _digest(data, name)

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from safevar_sumo.errors import InputError, SafevarError
-from safevar_sumo.plugins import DIGITS, Files
+from safevar_sumo.plugins import DIGEST_LENGTH, Files
 from safevar_sumo.study import Study, refuse_other_than_file
 
 MANIFEST, SOLUTIONS, RUNS, ANSWERS = "manifest.json", "solutions.csv", "runs", "answers"
@@ -36,8 +36,8 @@ FILES = (
     ResultsFile(f"{RUNS}/*-*.journal", "every evaluation of the run ALGORITHM-NN, from which an interrupted study continues",
                 "`study` after each batch"),
     ResultsFile(f"{RUNS}/{ORIGINAL}.journal", "the original vehicle's evaluation", "`study` before its first run"),
-    ResultsFile(f"{RUNS}/{FOLDERS_FILE}", "folders of your own code and files, relative to the directory", "`study` before its first run"),
-    ResultsFile(f"{RUNS}/{READ_FILES}", "a file that your own code read in the middle of a study, with its digest",
+    ResultsFile(f"{RUNS}/{FOLDERS_FILE}", "folders of user code and files, relative to the directory", "`study` before its first run"),
+    ResultsFile(f"{RUNS}/{READ_FILES}", "a file that user code read in the middle of a study, with its digest",
                 "`study` after each batch"),
     ResultsFile(f"{ANSWERS}/*.json", "results that `report` computed; reused for the same results, options and program; safe to delete",
                 "`report`"))
@@ -121,7 +121,7 @@ def write_places(directory: Path, study: Study) -> None:
 
 
 def places_of(directory: Path) -> tuple[str, ...]:
-    """Folders of the plug-ins and files of a directory's study: the recorded folders that exist, then the directory's two parents."""
+    """Folders of the user code and files of a directory's study: the recorded folders that exist, then the directory's two parents."""
     folders = [os.path.abspath(directory.resolve() / folder) for folder in _read(directory / RUNS / FOLDERS_FILE, [])]
     return tuple(dict.fromkeys([*filter(os.path.isdir, folders), *map(str, directory.resolve().parents[:2])]))
 
@@ -129,7 +129,8 @@ def places_of(directory: Path) -> tuple[str, ...]:
 def note_later_file(directory: Path, name: str, digest: str) -> None:
     """Record a file that was read after the study began, in a separate JSON file, because several processes may record files."""
     make_durable(directory / RUNS)
-    write_whole(directory / RUNS / READ_FILES.replace("*", sha256(name.encode()).hexdigest()[:DIGITS]), json.dumps({name: digest}) + "\n")
+    digest_of_name = sha256(name.encode()).hexdigest()[:DIGEST_LENGTH]
+    write_whole(directory / RUNS / READ_FILES.replace("*", digest_of_name), json.dumps({name: digest}) + "\n")
 
 
 def later_files(directory: Path) -> Files:

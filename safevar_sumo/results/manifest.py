@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from safevar_sumo.errors import InputError
-from safevar_sumo.plugins import Files, digest_of, located
+from safevar_sumo.plugins import Files, digest_of, file_by_name
 from safevar_sumo.results.files import MANIFEST, write_whole
 from safevar_sumo.study import DESCRIPTION_KEYS, RatingTable, Study, refuse_other_than_file, tables_of
 
@@ -205,7 +205,7 @@ def comparable_inputs(stored: Mapping[str, Any], present_files: Mapping[str, str
     stored_digests, present_digests = dict(stored.get("sources", {})), dict(present_files)
     for name, digest in late_files.items():
         if name not in stored_digests:
-            digest_now = present_digests.pop(name, None) or digest_of(located(name, places))
+            digest_now = present_digests.pop(name, None) or digest_of(file_by_name(name, places))
             if digest_now != digest:
                 stored_digests[name], present_digests[name] = digest, digest_now
     return {**stored, "sources": stored_digests}, {name: digest for name, digest in present_digests.items() if digest}

@@ -209,7 +209,7 @@ class GuardedScenario:
         self._scenario, self._guard = scenario, guard
         network = guard.field("__init__", scenario, "network")
         if not isinstance(network, str):
-            raise guard.wrong("__init__", "network", network, "the name or path of a folder with a network")
+            raise guard.wrong_value("__init__", "network", network, "the name or path of a folder with a network")
         self.network = network
         duration = guard.numbers("__init__", "duration", guard.field("__init__", scenario, "duration"), (), 0.0, MAX_DURATION, above=True)
         self.duration = float(duration)
@@ -227,7 +227,7 @@ class GuardedScenario:
     def _changes(self, method: str, file: str, roads: Roads) -> XmlChanges:
         changes = self._guard.call(method, getattr(self._scenario, method, lambda roads: {}), roads)
         if not isinstance(changes, Mapping):
-            raise self._guard.wrong(method, "changes", changes, f"a mapping from XPaths of {file} to attributes")
+            raise self._guard.wrong_value(method, "changes", changes, f"a mapping from XPaths of {file} to attributes")
         return {str(path): change if change is None else {str(name): str(value) for name, value in change.items()}
                 for path, change in changes.items()}
 
@@ -245,12 +245,12 @@ class GuardedScenario:
     def observe(self, world: World, step: float, memory: Any) -> tuple[Scene, Any]:
         n = len(world.vehicle_positions("vut"))
         result = self._guard.call("observe", self._scenario.observe, _ReadOnlyWorld(world), step, memory)
-        scene, memory = self._guard.parts("observe", result, "(Scene, memory)")
+        scene, memory = self._guard.elements("observe", result, "(Scene, memory)")
         values: dict[str, Any] = {}
         for name in Scene._fields:
             value = self._guard.field("observe", scene, name)
             if name in ("over", "visible"):
-                values[name] = self._guard.truths("observe", name, value, (n,))
+                values[name] = self._guard.booleans("observe", name, value, (n,))
             else:
                 values[name] = self._guard.numbers("observe", name, value, (n,), infinite=name == "gap")
         return Scene(**values), memory
@@ -259,13 +259,13 @@ class GuardedScenario:
         encounter = self._guard.call("encounter", self._scenario.encounter, read_only_copy(trace))
         shape = trace.speed.shape
         values = {name: self._guard.field("encounter", encounter, name) for name in Encounter._fields}
-        in_conflict = self._guard.truths("encounter", "in_conflict", values.pop("in_conflict"), shape)
+        in_conflict = self._guard.booleans("encounter", "in_conflict", values.pop("in_conflict"), shape)
         is_counted = in_conflict & trace.active
         numbers = {name: self._guard.numbers("encounter", name, value, shape, infinite=True, undefined=True)
                    for name, value in values.items()}
         for name, array in numbers.items():
             if np.isnan(array[is_counted]).any():
-                raise self._guard.wrong("encounter", name, float("nan"), "numbers wherever in_conflict is true")
+                raise self._guard.wrong_value("encounter", name, float("nan"), "numbers wherever in_conflict is true")
         return Encounter(**numbers, in_conflict=in_conflict)
 
 

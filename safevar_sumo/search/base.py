@@ -1,4 +1,4 @@
-"""The contract of a search algorithm, independent of SUMO, processes and files, and checks of algorithms from outside the package."""
+"""The contract of a search algorithm, independent of SUMO, processes and files, and checks of users' algorithms."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from safevar_sumo.errors import ForeignError
+from safevar_sumo.errors import UserCodeError
 from safevar_sumo.metrics import SAFEVAR, Scoring
 from safevar_sumo.plugins import Contract, Guard, read_only_copy
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray
@@ -65,7 +65,7 @@ ALGORITHM_CONTRACT = Contract.of(Algorithm, "an algorithm")
 
 
 class GuardedAlgorithm:
-    """An algorithm from outside the package: it gets read-only copies, and this class checks its settings and its result."""
+    """A user's algorithm: it gets read-only copies, and this class checks its settings and its result."""
 
     def __init__(self, algorithm: Algorithm, guard: Guard) -> None:
         self._algorithm, self._guard = algorithm, guard
@@ -73,7 +73,8 @@ class GuardedAlgorithm:
     def search(self, problem: Problem, rng: np.random.Generator) -> Search:
         search = self._guard.call("search", self._algorithm.search, read_only_copy(problem), rng)
         if not (hasattr(search, "send") and hasattr(search, "__next__")):
-            raise self._guard.wrong("search", "the search", search, "a generator: a method that yields settings and returns its result")
+            raise self._guard.wrong_value("search", "the search", search,
+                                          "a generator: a method that yields settings and returns its result")
         answers: dict[bytes, Evaluations] = {}
         answer: Evaluations | None = None
         budget = problem.evaluations
@@ -92,15 +93,15 @@ class GuardedAlgorithm:
         members = problem.characteristics
         expected = f"an array of shape (k, {len(members)}) with k from 1 to the {budget} evaluations that are left"
         if not isinstance(output, np.ndarray) or output.ndim != 2 or output.shape[1] != len(members) or not 1 <= len(output) <= budget:
-            raise self._guard.wrong("search", "settings", output, expected)
+            raise self._guard.wrong_value("search", "settings", output, expected)
         settings = self._guard.numbers("search", "settings", output, output.shape)
         for column, member in enumerate(members):
             self._guard.numbers("search", member.name, settings[:, column], (len(settings),), member.lower, member.upper)
         unfiltered_cells = np.argwhere(members.filter(settings) != settings)
         if len(unfiltered_cells):
             row, column = unfiltered_cells[0]
-            raise self._guard.wrong("search", members.names[column], float(settings[row, column]),
-                                    "filtered settings: problem.characteristics.filter(settings)")
+            raise self._guard.wrong_value("search", members.names[column], float(settings[row, column]),
+                                          "filtered settings: problem.characteristics.filter(settings)")
         if problem.region and not problem.region.feasible(settings).all():
             problem.region.check(settings, self._guard.source, otherwise=f", for every setting that {self._guard.name} yields: "
                                  "problem.characteristics.filter(problem.repaired(settings))")
@@ -109,13 +110,13 @@ class GuardedAlgorithm:
     def _result(self, result: Any, answers: dict[bytes, Evaluations], problem: Problem) -> Evaluations:
         expected = "an Evaluations of settings that it was sent, such as evaluations.take(rows)"
         if not isinstance(result, Evaluations):
-            raise self._guard.wrong("search", "its result", result, expected)
+            raise self._guard.wrong_value("search", "its result", result, expected)
         if not answers:
-            raise ForeignError(self._guard.source, f"{self._guard.name} ended in search without yielding any setting",
+            raise UserCodeError(self._guard.source, f"{self._guard.name} ended in search without yielding any setting",
                                f"a generator that yields from 1 to {problem.evaluations} settings before it returns")
         rows = self._guard.numbers("search", "its result's settings", result.settings, (len(result), len(problem.characteristics)))
         if any(row.tobytes() not in answers for row in rows):
-            raise self._guard.wrong("search", "its result", "settings that it never yielded", expected)
+            raise self._guard.wrong_value("search", "its result", "settings that it never yielded", expected)
         empty = next(iter(answers.values())).take([])
         evaluations = Evaluations.concatenate([empty, *(answers[row.tobytes()] for row in rows)])
         return evaluations.take(problem.scoring.valid(evaluations))

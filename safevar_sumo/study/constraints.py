@@ -47,17 +47,18 @@ class Constraint(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         units = {table[name].unit for name in self.sum if name in table}
         return self.unit if self.unit is not None else next(iter(units), "-")
 
-    def legal(self, table: Mapping[str, CharacteristicTable]) -> str:
+    def bounds_in_words(self, table: Mapping[str, CharacteristicTable]) -> str:
         """The bounds in words."""
         unit = "" if self.unit_of(table) == "-" else f" {self.unit_of(table)}"
         bounds = {"at least": self.at_least, "at most": self.at_most}
         return " and ".join(f"{word} {value:g}{unit}" for word, value in bounds.items() if value is not None)
 
 
-def constraint_mistakes(source: object, table: Mapping[str, CharacteristicTable], conditions: Sequence[Constraint]) -> Iterator[InputError]:
+def constraint_mistakes(source: object, table: Mapping[str, CharacteristicTable],
+                        constraints: Sequence[Constraint]) -> Iterator[InputError]:
     """Errors for constraints that name unknown characteristics, add quantities of different units, or have no bounds."""
-    for number, constraint in enumerate(conditions):
-        key = f"constraints[{number}]"
+    for index, constraint in enumerate(constraints):
+        key = f"constraints[{index}]"
         if bool(constraint.sum) == bool(constraint.function):
             yield InputError(source, f"{key}: {'both sum and function' if constraint.sum else 'neither sum nor function'}", "one of them")
         for name, weight in constraint.sum.items():
@@ -77,8 +78,8 @@ def _unit_mistakes(source: object, key: str, constraint: Constraint, table: Mapp
     units = dict.fromkeys(table[name].unit for name in constraint.sum if name in table)
     known_units = list(dict.fromkeys(["-", *(row.unit for row in table.values())]))
     if constraint.unit is None and len(units) > 1:
-        members = ", ".join(f"{name} [{table[name].unit}]" for name in constraint.sum if name in table)
-        yield InputError(source, f"{key}.sum adds {members}", "characteristics of the same unit, or weights that convert units, and "
+        terms = ", ".join(f"{name} [{table[name].unit}]" for name in constraint.sum if name in table)
+        yield InputError(source, f"{key}.sum adds {terms}", "characteristics of the same unit, or weights that convert units, and "
                          f"unit = {one_of(known_units)}")
     elif constraint.unit is not None and len(units) == 1 and constraint.unit not in (*units, "-"):
         yield InputError(source, f"{key}.unit = {constraint.unit!r}",

@@ -13,8 +13,8 @@ import tomli_w
 
 from safevar_sumo.errors import InputError, refuse_other_than_file
 from safevar_sumo.shipped import STUDIES
-from safevar_sumo.study.schema import NAME, Origin, SearchTable, Study, StudyLike, is_file, study_path, tables_of
-from safevar_sumo.study.validation import contradictions, converted, refuse, unusable_values
+from safevar_sumo.study.schema import NAME_PATTERN, Origin, SearchTable, Study, StudyLike, is_file, study_path, tables_of
+from safevar_sumo.study.validation import contradictions, convert_table, raise_mistakes, unusable_values
 
 WHOLE_TABLES = ("calibration", "published", "repeatability", "spread", "model_error")
 """Tables that a study inherits as a whole or not at all."""
@@ -52,25 +52,25 @@ def load_study(study: StudyLike, **changes: Any) -> Study:
 
 def _raw_study(study: StudyLike) -> _RawStudy:
     if isinstance(study, Study):
-        return _RawStudy(study.source, without_nulls(tables_of(study)), study.origin)
+        return _RawStudy(study.source, drop_nulls(tables_of(study)), study.origin)
     if isinstance(study, Mapping):
         return _with_base(_RawStudy("study", dict(study)), Path("."), ())
-    return _read(study_path(str(study)), visited_paths=())
+    return _read_file(study_path(str(study)), visited_paths=())
 
 
 def _checked_study(raw: _RawStudy) -> Study:
-    refuse(unusable_values(raw.source, raw.tables))
-    tables = _with_fmu(raw, of_today(raw.tables))
+    raise_mistakes(unusable_values(raw.source, raw.tables))
+    tables = _with_fmu(raw, upgrade_tables(raw.tables))
     remarks = raw.origin.remarks
     if tables.get("ads") != raw.tables.get("ads"):
         remarks = (*remarks, f"{raw.source}: weather.hesitation is read as ads.parameters.hesitation")
-    study = converted(raw.source, _with_algorithms(tables), Study)
-    refuse(contradictions(raw.source, study))
+    study = convert_table(raw.source, _with_algorithms(tables), Study)
+    raise_mistakes(contradictions(raw.source, study))
     return msgspec.structs.replace(study, origin=msgspec.structs.replace(raw.origin, remarks=remarks))
 
 
-def of_today(tables: dict[str, Any]) -> dict[str, Any]:
-    """Tables of any earlier version in the present form: `weather.hesitation` becomes a parameter of the driving system."""
+def upgrade_tables(tables: dict[str, Any]) -> dict[str, Any]:
+    """Bring tables of any earlier version into the present form: `weather.hesitation` becomes a parameter of the driving system."""
     weather, ads = tables.get("weather"), tables.get("ads")
     if not (isinstance(weather, dict) and "hesitation" in weather and isinstance(ads, dict)):
         return tables
@@ -95,8 +95,8 @@ def _with_fmu(raw: _RawStudy, tables: dict[str, Any]) -> dict[str, Any]:
     if is_complete and not file_of(model, raw.origin.places):
         return tables  # so results can be read without their FMU
     description = description_of(model, raw.origin.places, str(raw.source), "vehicle.model")
-    rows = {**description.rows(parameters),
-            **{name: {**description.row(name, str(row.get("unit", ""))), **row} for name, row in stated_rows.items()}}
+    rows = {**description.table_rows(parameters),
+            **{name: {**description.table_row(name, str(row.get("unit", ""))), **row} for name, row in stated_rows.items()}}
     return {**tables, "vehicle": {**vehicle, "characteristics": rows}}
 
 
@@ -111,8 +111,8 @@ def _with_algorithms(tables: dict[str, Any]) -> dict[str, Any]:
     return {**tables, "search": {**other_keys, "parameters": parameters}} if algorithm_tables else tables
 
 
-def _read(path: Path, visited_paths: tuple[Path, ...]) -> _RawStudy:
-    """Read a TOML file and the study that it `extends`; the file's own keys override table by table."""
+def _read_file(path: Path, visited_paths: tuple[Path, ...]) -> _RawStudy:
+    """Read a TOML file and the study that it `extends`; keys of the file override that study, table by table."""
     if path in visited_paths:
         raise InputError(path, f"extends = {path.stem!r} leads back to this file", "a study that does not extend this one")
     try:
@@ -127,38 +127,39 @@ def _read(path: Path, visited_paths: tuple[Path, ...]) -> _RawStudy:
         raise InputError(path, f"cannot be read: {error}") from None
     except OSError as error:
         raise InputError(path, f"cannot be read: {error.strerror}") from None
-    places = () if path.parent == STUDIES else (str(path.resolve().parent),)
-    return _with_base(_RawStudy(path, tables, Origin(called=str(path) if places else "", places=places)), path, visited_paths)
+    folders = () if path.parent == STUDIES else (str(path.resolve().parent),)
+    return _with_base(_RawStudy(path, tables, Origin(called=str(path) if folders else "", places=folders)), path, visited_paths)
 
 
 def _with_base(raw: _RawStudy, path: Path, visited_paths: tuple[Path, ...]) -> _RawStudy:
     """The tables of the study that `raw` extends, overridden by the tables of `raw`, with the folders of both studies."""
-    refuse(unusable_values(raw.source, raw.tables))
+    raise_mistakes(unusable_values(raw.source, raw.tables))
     tables = dict(raw.tables)
     base = tables.pop("extends", None)
     if base is None:
         return raw
     if not isinstance(base, str):
         raise InputError(raw.source, f"extends = {base!r}", "the name or path of a study")
-    if "name" not in tables and re.fullmatch(NAME, path.stem):
+    if "name" not in tables and re.fullmatch(NAME_PATTERN, path.stem):
         tables["name"] = path.stem
     sibling = path.parent / base
     try:
         base_path = sibling if is_file(sibling) else study_path(base)
     except InputError as error:
         raise InputError(raw.source, f"extends = {base!r}: {error.problem}", error.legal) from None
-    base_study = _read(base_path, (*visited_paths, path))
-    result = _with_overrides(base_study, tables, raw.source)
-    places = tuple(dict.fromkeys((*raw.origin.places, *base_study.origin.places)))
-    remarks = () if path.parent == STUDIES else result.origin.remarks  # shipped studies leave keys out on purpose
-    return result._replace(origin=msgspec.structs.replace(result.origin, called=raw.origin.called, places=places, remarks=remarks))
+    base_study = _read_file(base_path, (*visited_paths, path))
+    merged_study = _with_overrides(base_study, tables, raw.source)
+    folders = tuple(dict.fromkeys((*raw.origin.places, *base_study.origin.places)))
+    remarks = () if path.parent == STUDIES else merged_study.origin.remarks  # shipped studies leave keys out on purpose
+    origin = msgspec.structs.replace(merged_study.origin, called=raw.origin.called, places=folders, remarks=remarks)
+    return merged_study._replace(origin=origin)
 
 
 def _with_overrides(base: _RawStudy, overrides: Mapping[str, Any], source: object) -> _RawStudy:
     """Override a study's tables; a study of another system does not inherit `SYSTEM_KEYS`."""
-    tables = _merged(base.tables, overrides)
+    tables = _merge(base.tables, overrides)
     changed_keys = [key for key in ("weather", "vehicle", "ads", "scenario", "matrix")
-                    if _kind(tables.get(key)) != _kind(base.tables.get(key))]
+                    if _model_and_network(tables.get(key)) != _model_and_network(base.tables.get(key))]
     remarks = base.origin.remarks
     if changed_keys:
         omitted_keys = [key for key in SYSTEM_KEYS[:2] if key in base.tables and key not in overrides]
@@ -172,7 +173,7 @@ def _with_overrides(base: _RawStudy, overrides: Mapping[str, Any], source: objec
     return _RawStudy(source, tables, msgspec.structs.replace(base.origin, remarks=remarks))
 
 
-def _kind(table: object) -> object:
+def _model_and_network(table: object) -> object:
     """The model and network that a table names; a weather or matrix as it is."""
     if not isinstance(table, dict):
         return table
@@ -180,11 +181,11 @@ def _kind(table: object) -> object:
     return table.get("model", table), parameters.get("network") if isinstance(parameters, dict) else None
 
 
-def _merged(base: Mapping[str, Any], overrides: Mapping[str, Any]) -> dict[str, Any]:
+def _merge(base: Mapping[str, Any], overrides: Mapping[str, Any]) -> dict[str, Any]:
     """Override `base` by `overrides`; another `model` or `distribution`, and the tables `WHOLE_TABLES`, replace a whole table."""
     result = dict(base)
     for key, value in overrides.items():
-        result[key] = _merged(base[key], value) if _refines(key, base.get(key), value) else value
+        result[key] = _merge(base[key], value) if _refines(key, base.get(key), value) else value
     return result
 
 
@@ -195,9 +196,9 @@ def _refines(key: str, base_value: object, override: object) -> bool:
     return all(override.get(kind, base_value.get(kind)) == base_value.get(kind) for kind in ("model", "distribution"))
 
 
-def without_nulls(raw: Any) -> Any:
+def drop_nulls(raw: Any) -> Any:
     """Tables without null values, which TOML does not have."""
-    return {key: without_nulls(value) for key, value in raw.items() if value is not None} if isinstance(raw, dict) else raw
+    return {key: drop_nulls(value) for key, value in raw.items() if value is not None} if isinstance(raw, dict) else raw
 
 
 def write_study(path: Path, study: Study, comment: str) -> None:
@@ -208,9 +209,9 @@ def write_study(path: Path, study: Study, comment: str) -> None:
     InputError
         If the file cannot be written.
     """
-    if re.fullmatch(NAME, path.stem):
+    if re.fullmatch(NAME_PATTERN, path.stem):
         study = msgspec.structs.replace(study, name=path.stem)
-    tables = {name: value for name, value in without_nulls(tables_of(study)).items() if value != {}}
+    tables = {name: value for name, value in drop_nulls(tables_of(study)).items() if value != {}}
     lines = ("".join(character if character.isprintable() else "?" for character in line) for line in comment.splitlines())
     text = "".join(f"# {line}".rstrip() + "\n" for line in lines) + "\n" + tomli_w.dumps(tables)
     try:

@@ -1,4 +1,4 @@
-"""The tables of a study: vehicle, ADS, scenario, weather, metrics and search; and the places of its files."""
+"""The tables of a study: vehicle, ADS, scenario, weather, metrics and search; and the folders of its files."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from safevar_sumo.study.variation import Correlation, Distribution
 
 PositiveNumber = Annotated[float, Meta(gt=0, le=1e6)]
 PositiveInt = Annotated[int, Meta(ge=1, le=10_000_000)]
-OwnStep = Annotated[float, Meta(ge=1e-6, le=10)]
+FmuStep = Annotated[float, Meta(ge=1e-6, le=10)]
 Weight = Annotated[float, Meta(ge=0, le=1e6)]
 Seed = Annotated[int, Meta(ge=0, le=2**63 - 1)]
 Parameters = dict[str, Any]
-NAME = r"^[A-Za-z0-9][A-Za-z0-9_.-]*\Z"
+NAME_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9_.-]*\Z"
 SAFETY_DEGREE: Final = "safety_degree"
 """Column and key of the metric."""
 OBJECTIVES = (SAFETY_DEGREE, "f_diff", "f_num_diff")
@@ -63,7 +63,7 @@ class ModelTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     kind: Literal["", "traci", "fmu"] = ""
     inputs: dict[str, str] = {}
     outputs: dict[str, str] = {}
-    step: OwnStep | None = None
+    step: FmuStep | None = None
 
 
 class VehicleTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -82,7 +82,7 @@ class VehicleTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     outputs: dict[str, str] = {}
     sensors: dict[str, str | float] = {}
     sumo_type: dict[str, str | float] = {}
-    step: OwnStep | None = None
+    step: FmuStep | None = None
 
 
 class Weather(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -106,7 +106,7 @@ class MetricsTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
 
     `ttc_threshold` is TTC* [s]; `sampling_interval` [s] is the time between two samples that
     TET, TIT and aveDece are computed from (a whole multiple of the simulation's step; by default the step).
-    `also` names further metrics: metrics of the package, such as `max_jerk`, or your own metrics as `package.module:Name`.
+    `also` names further metrics: metrics of the package, such as `max_jerk`, or users' metrics as `package.module:Name`.
     """
 
     ttc_threshold: PositiveNumber
@@ -191,7 +191,7 @@ class Origin(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The files of a study; results do not depend on them.
 
     `called` is the study's path as given on the command line, empty if the study was given by its name; `places` are the folders of its
-    file and of the files that it extends, where plug-ins are looked up first; `remarks` are for the user.
+    file and of the files that it extends, where user code is looked up first; `remarks` are for the user.
     """
 
     called: str = ""
@@ -252,7 +252,7 @@ class Study(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
     # A new key that changes no result of a campaign also belongs in KEYS_WITHOUT_EFFECT_ON_RESULTS of results/manifest.py. Any other new
     # key becomes part of the identity of results: let `evaluation_keys` there omit its default, so that older results keep their identity.
-    name: Annotated[str, Meta(pattern=NAME)]
+    name: Annotated[str, Meta(pattern=NAME_PATTERN)]
     title: str
     scenario: ModelTable
     weather: str | Weather
@@ -325,9 +325,9 @@ def study_path(study: str) -> Path:
     raise unknown("study", f"there is no study or file {study!r}", study, study_names(), ", or the path of a study file (TOML)")
 
 
-def foreign_names(study: Study) -> list[str]:
+def user_code_names(study: Study) -> list[str]:
     """The keys of a study that name user code, such as `ads.model = 'my_ads:Careful'`."""
-    return [f"{key} = {name!r}" for key, name in (*_foreign(study), *fmus_of(study))]
+    return [f"{key} = {name!r}" for key, name in (*_keys_of_user_code(study), *fmus_of(study))]
 
 
 def fmus_of(study: Study) -> list[tuple[str, str]]:
@@ -335,12 +335,12 @@ def fmus_of(study: Study) -> list[tuple[str, str]]:
     return [(f"{key}.model", table.model) for key, table in (("vehicle", study.vehicle), ("ads", study.ads)) if table.kind == "fmu"]
 
 
-def foreign_packages(study: Study) -> list[str]:
+def user_code_packages(study: Study) -> list[str]:
     """The top-level packages of a study's user code."""
-    return sorted({name.partition(":")[0].partition(".")[0] for _, name in _foreign(study)})
+    return sorted({name.partition(":")[0].partition(".")[0] for _, name in _keys_of_user_code(study)})
 
 
-def _foreign(study: Study) -> list[tuple[str, str]]:
+def _keys_of_user_code(study: Study) -> list[tuple[str, str]]:
     """Keys and names of a study's user code."""
     tests = [] if study.matrix is None else [test.model for test in study.matrix.tests]
     names_by_key = {"vehicle.model": [study.vehicle.model], "ads.model": [study.ads.model],

@@ -24,23 +24,23 @@ MAX_MISTAKES = 8
 """Largest number of mistakes of a file that an error lists."""
 
 
-def converted(source: object, raw: object, table: type[T], prefix: str = "") -> T:
-    """A table converted to a record.
+def convert_table(source: object, raw: object, table: type[T], prefix: str = "") -> T:
+    """Convert a table to a record.
 
     Raises
     ------
     InputError
         If a key is wrong; the error names every wrong key.
     """
-    refuse(mistakes(source, raw, table, prefix))
+    raise_mistakes(mistakes(source, raw, table, prefix))
     try:
         return msgspec.convert(raw, table)
     except msgspec.ValidationError as error:
-        raise invalid(source, raw, error, prefix) from None
+        raise error_with_key(source, raw, error, prefix) from None
 
 
-def refuse(errors: Iterable[InputError]) -> None:
-    """Raise mistakes as one error, if there are any."""
+def raise_mistakes(errors: Iterable[InputError]) -> None:
+    """Raise all mistakes as one error; do nothing without mistakes."""
     all_errors = list(errors)
     if len(all_errors) == 1:
         raise all_errors[0]
@@ -57,7 +57,7 @@ def mistakes(source: object, raw: Any, kind: Any, key_path: str = "") -> Iterato
         fields = _fields(kind)
         for key in raw:
             if key not in fields and key != kind.__struct_config__.tag_field:
-                yield _no_key(source, _path_within(key_path, key), key, fields)
+                yield _unknown_key(source, _path_within(key_path, key), key, fields)
         for name, field in fields.items():
             if name in raw:
                 yield from mistakes(source, raw[name], field.type, _path_within(key_path, name))
@@ -71,16 +71,16 @@ def mistakes(source: object, raw: Any, kind: Any, key_path: str = "") -> Iterato
                 yield InputError(source, f"{inner_path} lacks {', '.join(missing_keys)}{hint}")
             else:
                 yield from mistakes(source, value, get_args(kind)[1], inner_path)
-    elif get_origin(kind) in (Union, UnionType) and isinstance(raw, Mapping) and (tables := _tables(kind)):
+    elif get_origin(kind) in (Union, UnionType) and isinstance(raw, Mapping) and (tables := _record_types(kind)):
         field = tables[0].__struct_config__.tag_field
         by_tag = {table.__struct_config__.tag: table for table in tables}
         if len(tables) == 1 or raw.get(field) in by_tag:
             yield from mistakes(source, raw, by_tag.get(raw.get(field), tables[0]), key_path)
         else:
-            yield _no_choice(source, _path_within(key_path, field), raw.get(field), by_tag)
+            yield _unknown_choice(source, _path_within(key_path, field), raw.get(field), by_tag)
     elif get_origin(kind) is Literal:
         if raw not in get_args(kind):
-            yield _no_choice(source, key_path, raw, get_args(kind))
+            yield _unknown_choice(source, key_path, raw, get_args(kind))
     elif isinstance(raw, list) and get_origin(list_type := get_args(kind)[0] if get_origin(kind) is Annotated else kind) is list and (
             member_errors := [error for i, value in enumerate(raw)
                               for error in mistakes(source, value, get_args(list_type)[0], f"{key_path}[{i}]")]):
@@ -89,7 +89,7 @@ def mistakes(source: object, raw: Any, kind: Any, key_path: str = "") -> Iterato
         try:
             msgspec.convert(raw, kind)
         except msgspec.ValidationError as error:
-            yield invalid(source, raw, error, key_path)
+            yield error_with_key(source, raw, error, key_path)
 
 
 def _missing_keys(raw: object, kind: Any) -> list[str]:
@@ -98,9 +98,9 @@ def _missing_keys(raw: object, kind: Any) -> list[str]:
     return [name for name, field in _fields(kind).items() if field.required and name not in raw] if is_table else []  # type: ignore[operator]
 
 
-def _no_key(source: object, key_path: str, key: str, fields: Iterable[str]) -> InputError:
+def _unknown_key(source: object, key_path: str, key: str, fields: Iterable[str]) -> InputError:
     """The error for an unknown key: it suggests tables of a study that have this key, else the nearest known key."""
-    tables = {name: _tables(field.type) for name, field in _fields(Study).items()}
+    tables = {name: _record_types(field.type) for name, field in _fields(Study).items()}
     known_paths = [f"{name}.{key}" for name, kinds in tables.items() if any(key in _fields(kind) for kind in kinds)]
     if known_paths:
         return InputError(source, f"{key_path}: there is no such key; did you mean {' or '.join(known_paths)}?", one_of(fields))
@@ -113,12 +113,12 @@ def _fields(kind: type[Struct]) -> dict[str, msgspec.structs.FieldInfo]:
     return {field.name: field for field in msgspec.structs.fields(kind) if field.type is not Origin}
 
 
-def _tables(kind: Any) -> list[Any]:
+def _record_types(kind: Any) -> list[Any]:
     """The records among the alternatives of a type."""
     return [option for option in get_args(kind) or (kind,) if isinstance(option, type) and issubclass(option, Struct)]
 
 
-def _no_choice(source: object, key_path: str, value: object, names: Iterable[str]) -> InputError:
+def _unknown_choice(source: object, key_path: str, value: object, names: Iterable[str]) -> InputError:
     """The error for a value that is none of `names`; "" among the names means that the key may be omitted."""
     problem = f"{key_path} is missing" if value is None else f"{key_path} = {_short_text(value)}"
     return unknown(source, problem, value, filter(None, names), ", or no such key" * ("" in names))
@@ -129,8 +129,8 @@ def _path_within(key_path: str, key: str) -> str:
     return f"{key_path}.{shown}" if key_path else shown
 
 
-def invalid(source: object, raw: object, error: msgspec.ValidationError, prefix: str = "") -> InputError:
-    """Turn msgspec's error on `raw` into one that names the key and its value."""
+def error_with_key(source: object, raw: object, error: msgspec.ValidationError, prefix: str = "") -> InputError:
+    """Turn msgspec's error on `raw` into an error that names the key and its value."""
     problem, _, location = str(error).partition(" - at `$")
     keys = [key for key in location.rstrip("`").replace("[...]", "").split(".") if key]
     value, exists = raw, True

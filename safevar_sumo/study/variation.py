@@ -103,13 +103,13 @@ def _distribution_mistakes(source: object, key: str, row: CharacteristicTable, d
 def _correlation_mistakes(source: object, names: Sequence[str], correlations: Sequence[Correlation]) -> Iterator[InputError]:
     values: dict[frozenset[str], float] = {}
     for correlation in correlations:
-        members, pair = correlation.between, frozenset(correlation.between)
-        unknown_names = [name for name in members if name not in names]
+        between, pair = correlation.between, frozenset(correlation.between)
+        unknown_names = [name for name in between if name not in names]
         if unknown_names:
             yield unknown(source, f"correlations.between: there is no characteristic {unknown_names[0]!r}", unknown_names[0], names)
         elif len(pair) == 1:
-            yield InputError(source, f"correlations.between = {list(members)}", "two different characteristics")
+            yield InputError(source, f"correlations.between = {list(between)}", "two different characteristics")
         elif pair in values:
-            yield InputError(source, f"correlations: {members[0]} and {members[1]} are given twice, "
+            yield InputError(source, f"correlations: {between[0]} and {between[1]} are given twice, "
                              f"with {values[pair]:g} and {correlation.value:g}", "each pair once")
         values.setdefault(pair, correlation.value)

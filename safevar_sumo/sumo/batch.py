@@ -115,7 +115,7 @@ def _simulate(system: System, settings: FloatArray, world: Any, watch: Watcher |
     batch = PointBatch(system.points, world, n)
     log = _Log(n, int(batch.last_step.max()) + 1, frame)
     outcomes, robot = _Outcomes(n), DrivingRobot(system.points, vehicle, prepared, state, step)
-    contacts, warnings = Contacts(n, robot.tested), _FirstWarnings(system.ads, n)
+    contacts, warnings = Contacts(n, robot.has_test_speed), _FirstWarnings(system.ads, n)
     for sample in range(log.length):
         if watch is not None:
             watch(world)

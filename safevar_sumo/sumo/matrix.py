@@ -13,8 +13,8 @@ from msgspec.structs import replace as replace_in
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import RATING_POINTS
-from safevar_sumo.protocol import part_of
-from safevar_sumo.protocol.rater import cell_columns, in_some_cells, joined_cells
+from safevar_sumo.protocol import cells_of_part
+from safevar_sumo.protocol.rater import join_cells, rated_quantities, reduce_to_cells
 from safevar_sumo.records import CellResults, Contact, Encounter, Evaluations, FloatArray, Outcome, SimulationRuns, Trace, finite_or_none
 from safevar_sumo.scenarios import Point
 from safevar_sumo.scenarios.euro_ncap import KMH
@@ -116,8 +116,8 @@ def rate_settings(system: System, settings: FloatArray, engine: Engine = Engine.
     for group in _simulate_groups(system, settings, engine):
         for result in group:
             name = result.point.name
-            scored[name], columns[name] = PointEvaluations(result.point, result.evaluations), cell_columns(result.runs)
-    cells = joined_cells([columns[point.name] for point in system.points])
+            scored[name], columns[name] = PointEvaluations(result.point, result.evaluations), rated_quantities(result.runs)
+    cells = join_cells([columns[point.name] for point in system.points])
     evaluations = evaluations_at_worst_points([scored[point.name] for point in system.points])
     if system.rater is None:  # the system has only some of the protocol's cells
         return evaluations, cells
@@ -127,7 +127,7 @@ def rate_settings(system: System, settings: FloatArray, engine: Engine = Engine.
 def in_cells(system: System, settings: FloatArray, part: tuple[int, int], engine: Engine = Engine.RECORDED) -> Evaluations:
     """Evaluations, including `cells`, of settings, shape (N, n), in the k-th of m parts of a protocol's cells; `part` is (k, m)."""
     assert system.rater is not None
-    points = tuple(system.matrix[number] for number in part_of(system.rater.protocol, *part))
+    points = tuple(system.matrix[number] for number in cells_of_part(system.rater.protocol, *part))
     evaluations, cells = rate_settings(replace(system, matrix=points, rater=None), settings, engine)
     return replace(evaluations, cells=cells)
 
@@ -139,7 +139,7 @@ def settings_per_batch(system: System, engine: Engine) -> int:
 
 def largest_batch(system: System) -> int:
     """Largest number of vehicles in one batch; it is smaller if each vehicle has its own instance of an FMU."""
-    return min(MAX_VEHICLES, *(getattr(model, "most_vehicles", MAX_VEHICLES) for model in (system.vehicle, system.ads)))
+    return min(MAX_VEHICLES, *(getattr(model, "max_vehicles", MAX_VEHICLES) for model in (system.vehicle, system.ads)))
 
 
 def _is_recorded(system: System, engine: Engine) -> bool:
@@ -239,7 +239,7 @@ def study_at(study: Study, name: str, source: object) -> Study:
     parameters = dict(_find_point(system, name, source).parameters)
     assert study.matrix is not None
     if system.rater is not None:
-        return in_some_cells(study, system.weather, [[point.name for point in system.matrix].index(name)])
+        return reduce_to_cells(study, system.weather, [[point.name for point in system.matrix].index(name)])
     title, weather = parameters.pop("test"), parameters.pop("weather")
     test = next(test for test in study.matrix.tests if test.name == title and test.over.keys() == parameters.keys()
                 and all(value in test.over[key] for key, value in parameters.items()))

@@ -17,14 +17,14 @@ import numpy as np
 
 from safevar_sumo.ads import ADS, ADS_CONTRACT, REACTIONS, SCALAR_ADS_CONTRACT, Ads, FmuAds, GuardedAds, PerVehicle, ScalarAds
 from safevar_sumo.errors import InputError, one_of, unknown
-from safevar_sumo.fmu import LONGEST, description_of
-from safevar_sumo.metrics import FURTHER, METRICS, RATING_POINTS, Metric, Objective, Scoring, foreign_metric
+from safevar_sumo.fmu import STEP_LIMIT, description_of
+from safevar_sumo.metrics import FURTHER, METRICS, RATING_POINTS, Metric, Objective, Scoring, guard_metric
 from safevar_sumo.metrics import OBJECTIVES as BY_OBJECTIVE
-from safevar_sumo.plugins import Guard, Lookup, Member, OwnModules, check_parameters, guard_process_state, instance_of
-from safevar_sumo.protocol.rater import Rater, is_rated, rated, rater_of
+from safevar_sumo.plugins import Guard, Lookup, Member, ModuleCopies, check_parameters, guard_process_state, instance_of
+from safevar_sumo.protocol.rater import Rater, expand_protocol, is_rated, rater_of
 from safevar_sumo.records import FloatArray, Nominal
 from safevar_sumo.scenarios import SCENARIO_CONTRACT, SCENARIOS, WEATHERS, GuardedScenario, Point, Scenario, weather_of
-from safevar_sumo.study import MatrixTest, MetricsTable, ModelTable, Study, VehicleTable, Weather, foreign_names
+from safevar_sumo.study import MatrixTest, MetricsTable, ModelTable, Study, VehicleTable, Weather, user_code_names
 from safevar_sumo.sumo.network import check_network, network_remarks
 from safevar_sumo.sumo.sources import is_network, is_shipped
 from safevar_sumo.sumo.traci_controller import TraciController
@@ -83,7 +83,7 @@ def measuring_of(study: Study, lookup: Lookup) -> Measuring:
             return member.target  # type: ignore[no-any-return]
         members.append(member)
         is_change = isinstance(member.target, Change) and key == OBJECTIVES_KEY
-        record = guard_change(member.target, member.guard) if is_change else foreign_metric(member.target, member.guard)
+        record = guard_change(member.target, member.guard) if is_change else guard_metric(member.target, member.guard)
         if record.name in (*RESULT_COLUMNS, *metrics, *FURTHER, *changes, *study.vehicle.characteristics):
             raise InputError(lookup.source, f"{key} = {name!r}: the name {record.name!r} is taken", "a unique name")
         if isinstance(record, Change):
@@ -203,7 +203,7 @@ def assemble(study: Study, source: str = "") -> System:
         Naming the study, the key, the value and the legal values.
     """
     source = source or study.source
-    with guard_process_state(source, foreign_names(study)):
+    with guard_process_state(source, user_code_names(study)):
         return _assemble(study, source)
 
 
@@ -216,7 +216,7 @@ def _assemble(study: Study, source: str) -> System:
         if name not in measuring.metrics:
             raise unknown(source, f"published.{name} is no metric", name, measuring.metrics)
     rater = rater_of(study, source)
-    matrix = _matrix_points(study if rater is None else rated(study, models.weather), source)
+    matrix = _matrix_points(study if rater is None else expand_protocol(study, models.weather), source)
     for network in dict.fromkeys(scenario.network for scenario in (models.scenario, *(point.scenario for point in matrix))):
         check_network(network)
     region = region_of(study, source)
@@ -236,7 +236,7 @@ def _assemble(study: Study, source: str) -> System:
 def models_of(study: Study, source: str) -> Models:
     """The study's models with their parameters; raises the errors of `assemble`."""
     lookup = Lookup(source, study.origin.places)
-    time_limit = min(study.search.time_limit / 2, LONGEST)  # less than the time limit of a batch
+    time_limit = min(study.search.time_limit / 2, STEP_LIMIT)  # less than the time limit of a batch
     vehicle, vehicle_member = _create_vehicle(study.vehicle, lookup, time_limit)
     ads, ads_member = _create_ads(study.ads, lookup, time_limit)
     scenario, scenario_member = _create_scenario(study.scenario, lookup)
@@ -261,8 +261,8 @@ def _create_traci_controller(table: ModelTable, lookup: Lookup) -> tuple[Ads, Me
             return instance_of(member._replace(target=target), parameters, name, "ads.parameters", lookup.source)
 
         controller_of(controller)
-    folders, attribute = [*lookup.places, os.getcwd()], table.model.partition(":")[2]
-    modules = partial(OwnModules, member, attribute, folders, set())
+    folders, attribute = [*lookup.folders, os.getcwd()], table.model.partition(":")[2]
+    modules = partial(ModuleCopies, member, attribute, folders, set())
     return TraciController(modules, controller_of, member.guard or Guard(lookup.source, name)), member
 
 
@@ -330,7 +330,7 @@ def _create_vehicle(table: VehicleTable, lookup: Lookup, time_limit: float) -> t
         fmu_table = {**msgspec.structs.asdict(table),
                      "parameters": lookup.with_paths(Member(FmuVehicle, guard), table.parameters, "vehicle.parameters")}
         units = {name: row.unit for name, row in table.characteristics.items()}
-        description = description_of(table.model, lookup.places, lookup.source, "vehicle.model")
+        description = description_of(table.model, lookup.folders, lookup.source, "vehicle.model")
         return FmuVehicle(description, units, fmu_table, guard, time_limit), Member(FmuVehicle, guard, file=description.path)
     member = lookup.class_of(VEHICLES, table.model, "vehicle.model", VEHICLE_CONTRACT)
     parameters = lookup.with_paths(member, table.parameters, "vehicle.parameters")
@@ -342,7 +342,7 @@ def _create_scenario(table: ModelTable, lookup: Lookup) -> tuple[Scenario, Membe
     member = lookup.class_of(SCENARIOS, table.model, "scenario.model", SCENARIO_CONTRACT)
     parameters = lookup.with_paths(member, table.parameters, "scenario.parameters")
     scenario = instance_of(member, parameters, f"scenario.model = {table.model!r}", "scenario.parameters", lookup.source)
-    return _locate_network(scenario if member.guard is None else GuardedScenario(scenario, member.guard), lookup.places), member
+    return _locate_network(scenario if member.guard is None else GuardedScenario(scenario, member.guard), lookup.folders), member
 
 
 def _create_ads(table: ModelTable, lookup: Lookup, time_limit: float) -> tuple[Ads, Member]:
@@ -351,7 +351,7 @@ def _create_ads(table: ModelTable, lookup: Lookup, time_limit: float) -> tuple[A
     if table.kind == "fmu":
         guard = Guard(lookup.source, f"ads.model = {table.model!r}")
         parameters = lookup.with_paths(Member(FmuAds, guard), table.parameters, "ads.parameters")
-        description = description_of(table.model, lookup.places, lookup.source, "ads.model")
+        description = description_of(table.model, lookup.folders, lookup.source, "ads.model")
         ads = FmuAds(description, table.inputs, table.outputs, parameters, table.step, guard, time_limit)
         return ads, Member(FmuAds, guard, file=description.path)
     member = lookup.class_of(ADS, table.model, "ads.model", SCALAR_ADS_CONTRACT, ADS_CONTRACT,

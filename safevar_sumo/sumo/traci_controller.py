@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from safevar_sumo.ads.driver import Trim, pedals, trim
-from safevar_sumo.plugins import Guard, OwnModules
+from safevar_sumo.plugins import Guard, ModuleCopies
 from safevar_sumo.records import Command, Nominal, Observation
 from safevar_sumo.scenarios import VUT
 from safevar_sumo.sumo.sensing import SensedTraffic
@@ -34,7 +34,7 @@ class TraciController:
         Creates a controller from the object that the study names in these modules.
     """
 
-    def __init__(self, modules: Callable[[], OwnModules], controller_of: Callable[[Any], Any], guard: Guard) -> None:
+    def __init__(self, modules: Callable[[], ModuleCopies], controller_of: Callable[[Any], Any], guard: Guard) -> None:
         self._modules, self._controller_of, self._guard = modules, controller_of, guard
 
     def start(self, n: int, nominal: Nominal, step: float) -> _Memory:
@@ -71,7 +71,7 @@ class _Memory(NamedTuple):
 class _Driver:
     """The controller of one vehicle, with separate instances of the user's modules."""
 
-    def __init__(self, view: TraciView, modules: OwnModules, controller_of: Callable[[Any], Any], guard: Guard) -> None:
+    def __init__(self, view: TraciView, modules: ModuleCopies, controller_of: Callable[[Any], Any], guard: Guard) -> None:
         self.view, self._modules, self._guard = view, modules, guard
         self._subscriptions = Subscriptions(view)
         with modules.inside():
@@ -90,4 +90,4 @@ class _Driver:
         with self._modules.inside(), bind_traci(self.view, self._subscriptions):
             self._guard.call(method, function, traci_module(), VUT)
         if self.view.last_error is not None:  # the controller caught the error and continued
-            raise self._guard.failed(method, self.view.last_error)
+            raise self._guard.failure(method, self.view.last_error)

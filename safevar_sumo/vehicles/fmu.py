@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from safevar_sumo.errors import ForeignError, InputError, unknown
+from safevar_sumo.errors import InputError, UserCodeError, unknown
 from safevar_sumo.fmu import COMMON_UNITS, REAL_TYPES, SI, Description, Fault, Fleet, History, Instances, Port, Unit, constants_of, ports_of
 from safevar_sumo.plugins import Guard
 from safevar_sumo.records import BoolArray, Command, FloatArray, Observation
@@ -111,7 +111,7 @@ class FmuVehicle:
         mapped_names = [port.variable.name for port in ports]
         constants = list(constants_of(description, table["parameters"], mapped_names, source, "vehicle.parameters"))
         self._instances = Instances(description, ports, [*outputs.values(), *types.values()], constants, limit)
-        self.most_vehicles = self._instances.most_vehicles
+        self.max_vehicles = self._instances.max_vehicles
         self.takes_slope, self.can_start_moving = "grade" in inputs, "initial_speed" in inputs
         self._takes_friction = "road_friction" in inputs
 
@@ -144,7 +144,7 @@ class FmuVehicle:
                 wet: bool | BoolArray = False) -> _Prepared:
         n = len(next(iter(characteristics.values())))
         if slope is not LEVEL and not self.takes_slope:
-            raise ForeignError(self._guard.source, f"{self._guard.name} has no vehicle.inputs.grade, and the road has a grade",
+            raise UserCodeError(self._guard.source, f"{self._guard.name} has no vehicle.inputs.grade, and the road has a grade",
                                "a variable for the grade, or scenarios with grade 0")
         zeros = np.zeros(n)
         inputs = {"throttle": zeros, "brake": zeros, "road_friction": zeros + road_friction, "wet": zeros + wet,
@@ -181,13 +181,13 @@ class FmuVehicle:
         """The initial state at a speed [m/s], shape (N,)."""
         if np.any(speed > 0) and not self.can_start_moving:
             problem = f"{self._guard.name} has no vehicle.inputs.initial_speed, and the traffic puts it onto the road in motion"
-            raise ForeignError(self._guard.source, problem, "a variable for the initial speed, or traffic that departs with speed 0")
+            raise UserCodeError(self._guard.source, problem, "a variable for the initial speed, or traffic that departs with speed 0")
         inputs = self._input_array({**prepared.inputs, "initial_speed": speed}, prepared.characteristics)
         outputs, history = self._start_fleet(prepared.fleet, inputs)
         released = Command(np.zeros_like(speed), np.zeros_like(speed))
         state = self._state(dict(zip(self._outputs, outputs, strict=True)), released, None, history)
         for i in np.flatnonzero(np.abs(state.speed - speed) > 1e-6)[:1]:
-            raise self._guard.wrong("initialisation", "speed", float(state.speed[i]), f"{speed[i]:g} m/s, the initial speed")
+            raise self._guard.wrong_value("initialisation", "speed", float(state.speed[i]), f"{speed[i]:g} m/s, the initial speed")
         return state._replace(speed=np.asarray(speed, dtype=float))
 
     def sensors(self, prepared: _Prepared) -> Sensors:
@@ -210,7 +210,8 @@ class FmuVehicle:
         outputs["speed"] = dict(zip(self._outputs, step_outputs, strict=True))["speed"]
         next_state, max_speed = self._state(outputs, command, state.seen, history), prepared.types.max_speed
         for i in np.flatnonzero(next_state.speed > np.maximum(max_speed, state.speed) * (1 + SPEED_ROUNDING))[:1]:
-            raise self._guard.wrong("doStep", "speed", float(next_state.speed[i]), f"up to vehicle.sumo_type.max_speed = {max_speed[i]:g}")
+            raise self._guard.wrong_value("doStep", "speed", float(next_state.speed[i]),
+                                          f"up to vehicle.sumo_type.max_speed = {max_speed[i]:g}")
         return next_state
 
     @property
@@ -225,8 +226,8 @@ class FmuVehicle:
         except Fault as fault:
             raise self._user_code_error(fault) from None
 
-    def _user_code_error(self, fault: Fault) -> ForeignError:
-        return ForeignError(self._guard.source, f"{self._guard.name} {fault}")
+    def _user_code_error(self, fault: Fault) -> UserCodeError:
+        return UserCodeError(self._guard.source, f"{self._guard.name} {fault}")
 
     def _input_array(self, inputs: Mapping[str, FloatArray], characteristics: Characteristics) -> FloatArray:
         return np.stack([*(inputs[name] for name in self._quantities), *(characteristics[name] for name in self._characteristics)])

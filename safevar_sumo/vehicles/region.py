@@ -170,7 +170,7 @@ def _bounds_of(constraint: Constraint, study: Study, characteristics: Characteri
             members: list[Member]) -> _Bounds:
     minimum = -np.inf if constraint.at_least is None else constraint.at_least
     maximum = np.inf if constraint.at_most is None else constraint.at_most
-    condition, unit = constraint.legal(study.vehicle.characteristics), constraint.unit_of(study.vehicle.characteristics)
+    condition, unit = constraint.bounds_in_words(study.vehicle.characteristics), constraint.unit_of(study.vehicle.characteristics)
     suffix = "" if unit == "-" else f" {unit}"
     if constraint.sum:
         weights = [(characteristics.names.index(name), weight) for name, weight in constraint.sum.items()]

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 
 from safevar_sumo.errors import warn
-from safevar_sumo.plugins import Files, digest_of, digests, located, named_files
-from safevar_sumo.protocol.rater import driven_in_sumo
+from safevar_sumo.plugins import Files, digest_of, digests, file_by_name, files_named_in
+from safevar_sumo.protocol.rater import study_for_sumo_check
 from safevar_sumo.records import Evaluations, FloatArray
-from safevar_sumo.study import Study, fmus_of, foreign_names
+from safevar_sumo.study import Study, fmus_of, user_code_names
 from safevar_sumo.sumo import Engine, assemble, reason_for_sumo, settings_per_batch
 from safevar_sumo.vehicles import CharacteristicSet
 from safevar_sumo.workers.evaluation import Pool, packed
@@ -45,7 +45,7 @@ def batches_of(study: Study) -> tuple[int, bool]:
 def evaluate_all(study: Study, settings: FloatArray, pool: Pool, done: Callable[[int], None] = lambda number: None) -> Evaluations:
     """Evaluate M filtered settings of n characteristics, shape (M, n); equal settings are simulated once.
 
-    Code from outside is checked first (`check_code`). A sample of the settings in a recorded scene is also simulated in SUMO.
+    User code is checked first (`check_code`). A sample of the settings in a recorded scene is also simulated in SUMO.
     `done` is called with the number of settings of every finished batch.
     """
     retrying_pool, work = RetryingPool(pool, study), packed(study, inputs := inputs_of(study, pool))
@@ -62,7 +62,7 @@ def evaluate_all(study: Study, settings: FloatArray, pool: Pool, done: Callable[
     sample = np.linspace(0, len(distinct_settings) - 1, sample_size).astype(int)
     in_sumo = in_scenes = None
     if is_recorded and len(sample):
-        sumo_study = driven_in_sumo(study, assemble(study).weather)
+        sumo_study = study_for_sumo_check(study, assemble(study).weather)
         sumo_inputs = inputs if sumo_study is study else inputs_of(sumo_study, pool)
         in_sumo = retrying_pool.submit(packed(sumo_study, sumo_inputs, engine=Engine.LIBSUMO), distinct_settings[sample])
         if sumo_study is not study:
@@ -86,21 +86,21 @@ def inputs_of(study: Study, pool: Pool) -> Inputs:
 
 
 def digests_of_sources(study: Study, pool: Pool) -> Files:
-    """Digests, by name, of files that parameters name, and of files that models from outside read in a run of the original vehicle.
+    """Digests, by name, of files that parameters name, and of files that users' models read in a run of the original vehicle.
 
-    The run takes place in a worker that reloads all code from outside.
+    The run takes place in a worker that reloads all user code.
 
     Raises
     ------
     SafevarError
         If the original vehicle cannot be simulated.
     """
-    files = digests(named_files(_parameters(study), study.origin.places), study.origin.places)
-    if foreign_names(study):
+    files = digests(files_named_in(_parameters(study), study.origin.places), study.origin.places)
+    if user_code_names(study):
         work = packed(study, {}, afresh=True)
         key = work, os.getcwd()
         files_read = _files_read.get(key, {"": "never read"})
-        if any(digest_of(located(name, study.origin.places)) != digest for name, digest in files_read.items()):
+        if any(digest_of(file_by_name(name, study.origin.places)) != digest for name, digest in files_read.items()):
             original = CharacteristicSet.of(study.vehicle.characteristics).original[np.newaxis]
             _files_read[key] = dict(awaited(RetryingPool(pool, study).submit(work, original, must_succeed=True)).files)
         files |= _files_read[key]

@@ -12,9 +12,9 @@ import msgspec
 
 from safevar_sumo.errors import InputError, SafevarError
 from safevar_sumo.metrics import METRICS
-from safevar_sumo.plugins import Files, changed_files, digests, forget_foreign, noted_reading
+from safevar_sumo.plugins import Files, changed_files, digests, note_inputs, unload_user_modules
 from safevar_sumo.records import Evaluations, FloatArray
-from safevar_sumo.study import Study, foreign_packages
+from safevar_sumo.study import Study, user_code_packages
 from safevar_sumo.sumo.engine import Engine
 from safevar_sumo.sumo.matrix import evaluate, in_cells
 from safevar_sumo.sumo.system import System, assemble
@@ -46,7 +46,7 @@ class Pool(Protocol):
 class _Work(msgspec.Struct, frozen=True):
     """A study for a worker, with digests of the files that its results depend on, and the way to evaluate its settings.
 
-    With `check` the worker checks the code from outside instead; see `packed` for the other fields.
+    With `check` the worker checks the user code instead; see `packed` for the other fields.
     """
 
     study: Study
@@ -73,13 +73,13 @@ def packed(study: Study, inputs: Mapping[str, Any] | None = None, *, engine: Eng
     ----------
     inputs
         Layers of the study's identity by name; by default the present networks. A worker refuses to compute with other files, and
-        reports files that code from outside reads and `sources` lacks.
+        reports files that user code reads and `sources` lacks.
     engine
         What moves the vehicles.
     afresh
         Whether models are reloaded, which removes all state of earlier batches from their modules and classes.
     check
-        Whether the worker checks the code from outside instead; the `reasons` of the result are remarks on this code.
+        Whether the worker checks the user code instead; the `reasons` of the result are remarks on this code.
     cells
         (k, n): for a rated study, results in part k of n parts of the cells, instead of points for all cells.
     """
@@ -104,17 +104,18 @@ def evaluate_batch(work: bytes, settings: FloatArray) -> Evaluations:
         remarks = refuse_defects(msgspec.msgpack.decode(work, type=_Work).study)
         return replace(Evaluations.none(settings.shape[1], METRICS), reasons={remark.encode(): remark for remark in remarks})
     if mode.afresh:
-        forget_foreign()
+        unload_user_modules()
         assembler = _task_and_system.__wrapped__
     else:
         assembler = _task_and_system
-    with noted_reading() as reading:
+    with note_inputs() as reading:
         cells = mode.cells
         task, system = assembler(work if cells is None else _work_for_all_cells(work))
         _refuse_changed_networks(task.inputs, system)
         evaluations = evaluate(system, settings, task.engine) if cells is None else in_cells(system, settings, cells, task.engine)
     _refuse_changed_networks(task.inputs, system)
-    return replace(evaluations, files=_unknown_files(task, digests(reading.files(foreign_packages(task.study)), task.study.origin.places)))
+    files_read = digests(reading.files(user_code_packages(task.study)), task.study.origin.places)
+    return replace(evaluations, files=_unknown_files(task, files_read))
 
 
 def _work_for_all_cells(work: bytes) -> bytes:

@@ -12,7 +12,7 @@ from typing import Any
 
 import msgspec
 
-from safevar_sumo.plugins import DIGITS, named_files
+from safevar_sumo.plugins import DIGEST_LENGTH, files_named_in
 from safevar_sumo.results import RESULTS, evaluation_keys
 from safevar_sumo.study import Study
 from safevar_sumo.sumo.network import network_files
@@ -35,13 +35,13 @@ def identity_of(study: Study, system: System, sources: Mapping[str, str] = Mappi
     Parameters
     ----------
     sources
-        Digests of the files that code from outside reads: see `safevar_sumo.workers.batches.digests_of_sources`.
+        Digests of the files that user code reads: see `safevar_sumo.workers.batches.digests_of_sources`.
     """
     resolved = evaluation_keys(study)
     for table, model in (("vehicle", system.vehicle), ("ads", system.ads), ("scenario", system.scenario)):
         if isinstance(model, msgspec.Struct):
             names = {key: value for key, value in resolved[table]["parameters"].items()
-                     if isinstance(value, str) or any(named_files(value, study.origin.places))}
+                     if isinstance(value, str) or any(files_named_in(value, study.origin.places))}
             resolved[table] = {**resolved[table], "parameters": {**msgspec.to_builtins(model), **names}}
     resolved["weather"] = msgspec.to_builtins(system.weather)
     if system.matrix and system.rater is None:
@@ -65,4 +65,4 @@ def _platform() -> dict[str, str]:
 def powers_digest() -> str:
     """Digest of powers: only these depend on the mathematical library; IEEE 754 determines all other operations."""
     bases = [(number + 0.5) / POWERS * 2 for number in range(POWERS)]
-    return sha256(repr([[base ** exponent for base in bases] for exponent in EXPONENTS]).encode()).hexdigest()[:DIGITS]
+    return sha256(repr([[base ** exponent for base in bases] for exponent in EXPONENTS]).encode()).hexdigest()[:DIGEST_LENGTH]

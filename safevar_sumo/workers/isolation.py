@@ -1,4 +1,4 @@
-"""Checks that code from outside does not mix settings up, and that recorded scenes give the same results as SUMO."""
+"""Checks that user code does not mix settings up, and that recorded scenes give the same results as SUMO."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from importlib.metadata import version
 import numpy as np
 import platformdirs
 
-from safevar_sumo.errors import ForeignError, InputError
+from safevar_sumo.errors import InputError, UserCodeError
 from safevar_sumo.records import BoolArray, Evaluations
 from safevar_sumo.results import RESULTS
-from safevar_sumo.study import Study, foreign_names, tables_of
+from safevar_sumo.study import Study, tables_of, user_code_names
 from safevar_sumo.vehicles import CharacteristicSet
 from safevar_sumo.workers.evaluation import packed
 from safevar_sumo.workers.identity import Inputs
@@ -30,16 +30,16 @@ _passed_checks: set[str] = set()
 
 
 def check_code(study: Study, inputs: Inputs, pool: RetryingPool) -> list[str]:
-    """Check the code from outside of a study in a worker, unless it has passed before with the same files.
+    """Check the user code of a study in a worker, unless it has passed before with the same files.
 
     Returns warnings.
 
     Raises
     ------
-    ForeignError
+    UserCodeError
         With file, line and advice of the first finding that makes results wrong.
     """
-    if not (foreign_names(study) or any(":" in name for name in study.search.algorithms)):
+    if not (user_code_names(study) or any(":" in name for name in study.search.algorithms)):
         return []
     identity = json.dumps([tables_of(study), inputs, RESULTS, version("safevar_sumo")], sort_keys=True, default=str)
     name = hashlib.sha256(identity.encode()).hexdigest()
@@ -60,16 +60,16 @@ def refuse_difference(study: Study, ways: dict[str, Evaluations], again: str = "
 
     Raises
     ------
-    ForeignError
+    UserCodeError
         With the models, the first result that differs, and the contract.
     """
     (first_way, evaluation), (other_way, other_evaluation) = next(iter(ways.items())), list(ways.items())[-1]
     difference = _difference(evaluation, other_evaluation)
     if difference:
         name, value, other_value = difference
-        problem = (f"with {' and '.join(foreign_names(study))} a result depends on what else is simulated: "
+        problem = (f"with {' and '.join(user_code_names(study))} a result depends on what else is simulated: "
                    f"{name} is {value} {first_way} and {other_value} {other_way}")
-        raise ForeignError(f"study {study.name!r}", f"{problem}{again and f'; again by: {again}'}", LEGAL)
+        raise UserCodeError(f"study {study.name!r}", f"{problem}{again and f'; again by: {again}'}", LEGAL)
 
 
 def refuse_unlike_sumo(study: Study, recorded: Evaluations, in_sumo: Evaluations) -> None:

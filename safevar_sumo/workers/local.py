@@ -16,7 +16,7 @@ from types import ModuleType
 from typing import Any
 
 from safevar_sumo.errors import EnvironmentFault, SafevarError, in_one_line
-from safevar_sumo.plugins import inherit_reachable, reachable
+from safevar_sumo.plugins import added_import_folders, inherit_import_folders
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.workers.evaluation import PoolLostError, WorkerLostError, evaluate_batch
 from safevar_sumo.workers.interrupts import interrupts_noted, leave_interrupts_to_the_caller
@@ -120,7 +120,7 @@ class _Worker:
         context = multiprocessing.get_context("spawn")
         try:
             self._pipe, worker_end = context.Pipe()
-            self._process = context.Process(target=_serve, args=(worker_end, reachable()), daemon=True)
+            self._process = context.Process(target=_serve, args=(worker_end, added_import_folders()), daemon=True)
             with _without_main():
                 self._process.start()
         except OSError as error:
@@ -174,7 +174,7 @@ def _without_main() -> Iterator[None]:
 
 def _serve(pipe: connection.Connection[Any, Any], folders: list[str]) -> None:
     """The main function of a worker process, which answers batches until the other end of the pipe is closed."""
-    inherit_reachable(folders)
+    inherit_import_folders(folders)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_the_caller, daemon=True).start()
     try:

@@ -1,7 +1,7 @@
 """A pool that retries a failed batch: first the whole batch, then smaller and smaller parts, down to the setting that fails.
 
 A setting that fails again by itself, while the original vehicle can be simulated, gets the outcome `simulator-error`. Faults of the
-environment (disk, network files, memory) and of code from outside end the study; the same command resumes it later.
+environment (disk, network files, memory) and of user code end the study; the same command resumes it later.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ from functools import partial
 
 import numpy as np
 
-from safevar_sumo.errors import EnvironmentFault, ForeignError, SafevarError, SimulationError
+from safevar_sumo.errors import EnvironmentFault, SafevarError, SimulationError, UserCodeError
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import Evaluations, FloatArray, Outcome
 from safevar_sumo.shipped import RUN
-from safevar_sumo.study import Study, foreign_names
+from safevar_sumo.study import Study, user_code_names
 from safevar_sumo.vehicles import CharacteristicSet
 from safevar_sumo.workers.evaluation import Pool, PoolLostError, WorkerLostError
 
@@ -43,12 +43,12 @@ class RetryingPool:
     study
         The study of the settings.
     note
-        Called with files that code from outside reads and the study did not know; may raise an error.
+        Called with files that user code reads and the study did not know; may raise an error.
     """
 
     def __init__(self, pool: Pool, study: Study, note: Callable[[Mapping[str, str]], None] = lambda files: None) -> None:
         self._pool, self._study, self._note, self._failures = pool, study, note, 0
-        self._characteristics, self._foreign = CharacteristicSet.of(study.vehicle.characteristics), foreign_names(study)
+        self._characteristics, self._user_code_names = CharacteristicSet.of(study.vehicle.characteristics), user_code_names(study)
 
     @property
     def workers(self) -> int:
@@ -67,7 +67,7 @@ class RetryingPool:
             if evaluations is not None:
                 self._failures = 0
                 result.set_result(evaluations)
-            elif isinstance(error, ForeignError):
+            elif isinstance(error, UserCodeError):
                 self._locate(study, settings, error, result)
             elif not isinstance(error, SimulationError | WorkerLostError | EnvironmentFault):
                 result.set_exception(error)
@@ -77,8 +77,8 @@ class RetryingPool:
                 result.set_exception(error)
             elif len(settings) > 1:
                 self._split(study, settings, result)
-            elif self._foreign and isinstance(error, WorkerLostError):
-                result.set_exception(self._with_command(self._worker_lost_in_foreign_code(error), settings))
+            elif self._user_code_names and isinstance(error, WorkerLostError):
+                result.set_exception(self._with_command(self._worker_lost_in_user_code(error), settings))
             elif must_succeed:
                 result.set_exception(error)
             else:
@@ -157,37 +157,37 @@ class RetryingPool:
             metrics=dict.fromkeys(METRICS, undefined), f_diff=self._characteristics.largest_change(setting),
             f_num_diff=self._characteristics.number_changed(setting), reasons={setting[0].tobytes(): " ".join(str(error).split())})
 
-    def _locate(self, study: bytes, settings: FloatArray, error: ForeignError, result: Future[Evaluations]) -> None:
-        """Find, by bisection, the setting on which code from outside fails; add the command that reproduces the error."""
+    def _locate(self, study: bytes, settings: FloatArray, error: UserCodeError, result: Future[Evaluations]) -> None:
+        """Find, by bisection, the setting on which user code fails; add the command that reproduces the error."""
         if len(settings) == 1:
             result.set_exception(self._with_command(error, settings))
             return
         halves = settings[:len(settings) // 2], settings[len(settings) // 2:]
 
         def second_done(_: Evaluations | None, part_error: BaseException | None) -> None:
-            if isinstance(part_error, ForeignError):
+            if isinstance(part_error, UserCodeError):
                 self._locate(study, halves[1], part_error, result)
             else:
                 result.set_exception(error)
 
         def first_done(_: Evaluations | None, part_error: BaseException | None) -> None:
-            if isinstance(part_error, ForeignError):
+            if isinstance(part_error, UserCodeError):
                 self._locate(study, halves[0], part_error, result)
             else:
                 self._compute(study, halves[1], second_done)
 
         self._compute(study, halves[0], first_done)
 
-    def _worker_lost_in_foreign_code(self, error: WorkerLostError) -> ForeignError:
-        """The error for workers that repeatedly end or hang in code from outside."""
-        problem = f"{error}, again and again, with {' and '.join(self._foreign)} in it; a dead process cannot report file and line"
-        return ForeignError(f"study {self._study.name!r}", problem)
+    def _worker_lost_in_user_code(self, error: WorkerLostError) -> UserCodeError:
+        """The error for workers that repeatedly end or hang in user code."""
+        problem = f"{error}, again and again, with {' and '.join(self._user_code_names)} in it; a dead process cannot report file and line"
+        return UserCodeError(f"study {self._study.name!r}", problem)
 
-    def _with_command(self, error: ForeignError, setting: FloatArray) -> ForeignError:
+    def _with_command(self, error: UserCodeError, setting: FloatArray) -> UserCodeError:
         """The error, with a command that reproduces it if the error has no command yet."""
         if COMMAND_PREFIX in error.problem:
             return error
-        return ForeignError(error.source, f"{error.problem}{COMMAND_PREFIX}{reproduction_command(self._study, setting[0])}", error.legal)
+        return UserCodeError(error.source, f"{error.problem}{COMMAND_PREFIX}{reproduction_command(self._study, setting[0])}", error.legal)
 
 
 def reproduction_command(study: Study, setting: FloatArray) -> str:

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import pytest
 
 from safevar_sumo import testing
-from safevar_sumo.conformance import KINDS, check, checked, finding, subject_of, subjects_of, suite
+from safevar_sumo.conformance import KINDS, check, check_subject, find_subject, finding, subjects_of, suite
 from safevar_sumo.study import load_study, study_names
 from safevar_sumo.workers.isolation import check_code
 from safevar_sumo.workers.retrying import RetryingPool
@@ -208,7 +208,7 @@ SHIPPED = [(kind, name) for kind, members in KINDS.items() for name in members]
 @pytest.mark.parametrize(("kind", "name"), [
     pytest.param(kind, name, marks=[] if name in ("krauss", "nsga2", "f_diff", "tet") else [pytest.mark.slow]) for kind, name in SHIPPED])
 def test_what_is_shipped_passes(kind: str, name: str) -> None:
-    report = checked(subject_of(name))
+    report = check_subject(find_subject(name))
     assert report.kind == kind
     assert report.passed, "\n".join(map(str, report.findings))
 

@@ -19,9 +19,9 @@ from safevar_sumo.analysis.rating.render import rating_in_words
 from safevar_sumo.analysis.rating.workbook import Preprocessed, Template
 from safevar_sumo.cli.program import commands
 from safevar_sumo.errors import InputError
-from safevar_sumo.protocol import COLOURS, EURO_NCAP_2026, part_of, points_of, protocol_of
+from safevar_sumo.protocol import COLOURS, EURO_NCAP_2026, cells_of_part, points_of, protocol_of
 from safevar_sumo.protocol.points import colours_of
-from safevar_sumo.protocol.rater import by_night
+from safevar_sumo.protocol.rater import darken
 from safevar_sumo.records import CellResults
 from safevar_sumo.scenarios import WEATHERS
 from safevar_sumo.study import load_study
@@ -68,10 +68,10 @@ def test_a_warning_is_green_from_1_7_s_and_measured_values_have_two_decimals() -
 
 
 def test_a_vehicle_that_avoids_every_impact_earns_all_simulated_points_and_one_that_never_brakes_none() -> None:
-    whole = points_of(PROTOCOL, results(vehicles=2), {test: [one.layer for one in PROTOCOL.layers_of(test) if not one.simulated]
+    whole = points_of(PROTOCOL, results(vehicles=2), {test: [one.layer for one in PROTOCOL.layers_of(test) if not one.simulated_conditions]
                                                       for test in PROTOCOL.tests})
     assert whole.total.tolist() == [40.0, 40.0]
-    assert sum(PROTOCOL.not_simulated.values()) + whole.total[0] == 100
+    assert sum(PROTOCOL.points_not_simulated.values()) + whole.total[0] == 100
     assert points_of(PROTOCOL, results(60.0, np.nan)).total.tolist() == [0.0]
 
 
@@ -91,14 +91,14 @@ def test_robustness_counts_from_half_of_the_standard_range_and_claims_count_as_h
         assert points[0] == pytest.approx(1 - red / 12)
         assert (points[2] > 0) == earned
     layers = PROTOCOL.layers_of("CBNA")
-    held, claim = sum(bool(one.simulated) for one in layers), next(one.layer for one in layers if not one.simulated)
+    held, claim = sum(bool(one.simulated_conditions) for one in layers), next(one.layer for one in layers if not one.simulated_conditions)
     shares = [points_of(PROTOCOL, results(), claims).tests["CBNA"][0, 2] / 0.125 for claims in ({}, {"CBNA": [claim]})]
     assert shares == pytest.approx([held / len(layers), (held + 1) / len(layers)])
 
 
 def test_a_layer_of_a_test_whose_cells_are_all_red_does_not_hold() -> None:
     """No cell has variations that could hold; a single cell that is not red is enough."""
-    layers = [("CBNA", one.layer) for one in PROTOCOL.layers_of("CBNA") if one.simulated]
+    layers = [("CBNA", one.layer) for one in PROTOCOL.layers_of("CBNA") if one.simulated_conditions]
     for red, holds in ((12, False), (11, True)):
         impact = np.full(N, np.nan)
         impact[numbers("CBNA", "standard")[:red]] = 50.0
@@ -127,11 +127,11 @@ def test_faster_impacts_never_gain_points_in_a_matrix(seed: int, share: float, m
 
 def test_a_weather_by_night_keeps_its_road_and_multiplies_both_visibilities() -> None:
     """Hard rain leaves 68 % of the visibility; low beams leave 75 % of these 68 %."""
-    dark = by_night(WEATHERS["hard_rain"])
+    dark = darken(WEATHERS["hard_rain"])
     assert (dark.road_friction, dark.wet, dark.light) == (0.59, True, "night")
     assert dark.visibility == pytest.approx(0.68 * 0.75)
-    assert by_night(dark) == dark
-    assert by_night(WEATHERS["clear"]) == WEATHERS["night"]
+    assert darken(dark) == dark
+    assert darken(WEATHERS["clear"]) == WEATHERS["night"]
 
 
 @pytest.mark.slow
@@ -139,9 +139,9 @@ def test_a_cell_has_equal_results_alone_and_in_any_batch() -> None:
     study = load_study("euro_ncap_rating")
     system = assemble(study)
     settings_ = np.array([system.characteristics.original, system.characteristics.lower])
-    found, numbers_ = in_cells(system, settings_, (7, 620)), part_of(PROTOCOL, 7, 620)
+    found, numbers_ = in_cells(system, settings_, (7, 620)), cells_of_part(PROTOCOL, 7, 620)
     assert found.cells is not None
-    assert sorted(number for k in range(620) for number in part_of(PROTOCOL, k, 620)) == list(range(N))
+    assert sorted(number for k in range(620) for number in cells_of_part(PROTOCOL, k, 620)) == list(range(N))
     points = [system.matrix[number] for number in numbers_]
     assert [point.name.rpartition(", ")[0] for point in points] == [CELLS[number].name for number in numbers_]
     for column, point in enumerate(points):

@@ -353,7 +353,7 @@ def test_of_an_original_that_collides_no_change_is_called_the_cause(
     assert "Cause 1" not in page
 
 
-def test_what_comes_from_outside_is_called_by_its_name_once(slippery: Path) -> None:
+def test_user_code_is_called_by_its_name_once(slippery: Path) -> None:
     (data,) = read_inputs([slippery])
     scenario = SimpleNamespace()
     study = msgspec.structs.replace(data.case.study, ads=msgspec.structs.replace(data.case.study.ads, model="my_controller:Pilot"))

@@ -15,7 +15,7 @@ from safevar_sumo.analysis.rating import RatingOptions
 from safevar_sumo.analysis.research_questions.case import Case
 from safevar_sumo.errors import InputError
 from safevar_sumo.protocol import COLOURS, EURO_NCAP_2026, NOT_RED, RED, Block, Cell, Points, Protocol, points_of
-from safevar_sumo.protocol.rater import by_night, rated_study, rater_of
+from safevar_sumo.protocol.rater import darken, rater_of, with_protocol
 from safevar_sumo.records import CellResults, FloatArray, finite_or_none
 from safevar_sumo.results import SolutionId, position_of
 from safevar_sumo.scenarios import weather_of
@@ -72,7 +72,7 @@ class RatedVehicle:
 
     def _layers(self, block: Block) -> dict[str, bool | None]:
         claimed = self.claims.get(block.test, ())
-        return {layer.layer: bool(self.scored.layers[block.test, layer.layer][0]) if layer.simulated
+        return {layer.layer: bool(self.scored.layers[block.test, layer.layer][0]) if layer.simulated_conditions
                 else (True if layer.layer in claimed else None) for layer in self.protocol.layers_of(block.test)}
 
     def colour(self, number: int) -> str | None:
@@ -88,7 +88,7 @@ class RatedVehicle:
     def nominal(self, number: int) -> int:
         """Number of the matrix cell of which a layer's cell is a variation."""
         cell = self.protocol.cells[number]
-        return self.protocol.matrix_of[cell.block.name, cell.row, cell.column]
+        return self.protocol.matrix_cell_numbers[cell.block.name, cell.row, cell.column]
 
     def cell(self, number: int) -> dict[str, Any]:
         """A cell as `rating --json` prints it."""
@@ -144,7 +144,7 @@ class Rating:
         claims, open_points = self.original.claims, 0.0
         for test, blocks in self.protocol.tests.items():
             layers = self.protocol.layers_of(test)
-            open_layers = [layer for layer in layers if not layer.simulated and layer.layer not in claims.get(test, ())]
+            open_layers = [layer for layer in layers if not layer.simulated_conditions and layer.layer not in claims.get(test, ())]
             open_points += sum(block.points[2] for block in blocks) * len(open_layers) / len(layers)
         return round(open_points, DECIMALS)
 
@@ -169,7 +169,7 @@ class Rating:
     def to_dict(self) -> dict[str, Any]:
         """The JSON of `rating`."""
         return {"study": self.study.name, "variants": [variant.to_dict() for variant in self.variants],
-                "not_simulated": [{"test": test, "points": points} for test, points in self.protocol.not_simulated.items()]}
+                "not_simulated": [{"test": test, "points": points} for test, points in self.protocol.points_not_simulated.items()]}
 
     def __repr__(self) -> str:
         vehicles = "; ".join(f"{vehicle.name} {vehicle.points:.2f}" for vehicle in self.variants)
@@ -210,7 +210,7 @@ def rate(study: Study, settings: Mapping[str, FloatArray], *, pool: Pool | None 
     SimulationError
         If a vehicle cannot be simulated.
     """
-    with open_evaluator(rated_study(study, EURO_NCAP_2026), pool, jobs, progress) as evaluator:
+    with open_evaluator(with_protocol(study, EURO_NCAP_2026), pool, jobs, progress) as evaluator:
         return rate_on(evaluator, settings)
 
 
@@ -232,7 +232,7 @@ def remarks(rating: Rating) -> list[str]:
     weather = weather_of(rating.study.weather, f"study {rating.study.name!r}")
     lines = []
     if weather.wet or weather.road_friction != 1:
-        lines.append(f"Euro NCAP tests on a dry road; this rating has the weather {weather.name!r}, by night {by_night(weather).name!r}.")
+        lines.append(f"Euro NCAP tests on a dry road; this rating has the weather {weather.name!r}, by night {darken(weather).name!r}.")
     for vehicle in rating.variants:
         if vehicle.fails:
             lines.append(f"{vehicle.name}: it earns nothing, because CCRs at 10 and 20 km/h is not green in the whole standard range.")

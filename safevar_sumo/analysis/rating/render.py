@@ -78,7 +78,7 @@ def turned_in_words(result: Rating) -> list[tuple[str, str]]:
 
 def not_simulated(result: Rating) -> str:
     """Sentences on the tests and robustness layers without points."""
-    tests = result.protocol.not_simulated
+    tests = result.protocol.points_not_simulated
     named = ", ".join(f"{test} {points:g}" for test, points in tests.items())
     text = f"Not simulated, neither passed nor failed: {named}; {sum(tests.values()):g} points."
     if result.left_open:
@@ -148,7 +148,7 @@ def print_matrices(console: Console, result: Rating) -> None:
 
 
 def _cell(result: Rating, block: Block, row: int, column: int) -> Text:
-    number = result.protocol.matrix_of[block.name, row, column]
+    number = result.protocol.matrix_cell_numbers[block.name, row, column]
     differs = len({vehicle.colour(number) for vehicle in result.variants}) > 1
     text = Text()
     for k, vehicle in enumerate(result.variants if differs else result.variants[:1]):
@@ -228,4 +228,4 @@ def _cells_of(block: Block, result: Rating) -> Iterator[tuple[int, int, int]]:
     for row, speeds in enumerate(block.rows):
         for column, letter in enumerate(speeds.ranges):
             if letter != "-":
-                yield row, column, result.protocol.matrix_of[block.name, row, column]
+                yield row, column, result.protocol.matrix_cell_numbers[block.name, row, column]

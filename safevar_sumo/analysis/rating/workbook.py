@@ -19,7 +19,7 @@ from openpyxl.utils.exceptions import InvalidFileException
 from safevar_sumo.analysis.rating.compute import RatedVehicle
 from safevar_sumo.errors import InputError
 from safevar_sumo.protocol import EURO_NCAP_2026, Block, protocol_of
-from safevar_sumo.protocol.points import DECIMALS, half_up
+from safevar_sumo.protocol.points import DECIMALS, round_half_up
 
 PARAMETERS, VERSION = "Input parameters", "Version"
 NOT_ASSESSED, PREDICTED = "N/A", "Self claimed"
@@ -157,7 +157,7 @@ class Preprocessed(_Book):
             if scenario not in {block.name for block in self.protocol.blocks}:
                 continue  # the test is not simulated
             indices = point.strip("()").split(",")
-            number = self.protocol.matrix_of.get((scenario, int(indices[0]), int(indices[1]))) if all(
+            number = self.protocol.matrix_cell_numbers.get((scenario, int(indices[0]), int(indices[1]))) if all(
                 part.strip().isdigit() for part in indices) and len(indices) == 2 else None
             if number is None:
                 raise InputError(self.source, f"sheet {name!r}, row {row}: {scenario} has no test point {point!r}", self._expected_file)
@@ -186,4 +186,4 @@ def _measurement(rated: RatedVehicle, number: int) -> float:
     """Relative impact speed [km/h], 0 without an impact; in a row with FCW, the time to collision at the warning [s]."""
     is_warning = rated.protocol.cells[number].judged == "warning"
     value = float((rated.cells.warning if is_warning else rated.cells.impact)[0, number])
-    return 0.0 if math.isnan(value) else float(half_up(max(value, 0.0), DECIMALS))  # type: ignore[arg-type]
+    return 0.0 if math.isnan(value) else float(round_half_up(max(value, 0.0), DECIMALS))  # type: ignore[arg-type]

@@ -17,7 +17,7 @@ from safevar_sumo.metrics import SAFEVAR, MetricFacts, Scoring, Unsafe
 from safevar_sumo.records import FloatArray, Outcome
 from safevar_sumo.results import MANIFEST, Failure, failure_lines, load_runs, places_of
 from safevar_sumo.scenarios import weather_of
-from safevar_sumo.study import Origin, Study, Weather, invalid, of_today
+from safevar_sumo.study import Origin, Study, Weather, error_with_key, upgrade_tables
 from safevar_sumo.vehicles import CharacteristicSet
 
 NSGA2 = "nsga2"
@@ -175,16 +175,17 @@ def load_case(directory: Path) -> Case:
     """Read one results directory."""
     manifest, evaluations, solutions, finished, failures = load_runs(directory)
     try:
-        study = msgspec.structs.replace(msgspec.convert(of_today(manifest["study"]), Study), origin=Origin(places=places_of(directory)))
+        study = msgspec.convert(upgrade_tables(manifest["study"]), Study)
+        study = msgspec.structs.replace(study, origin=Origin(places=places_of(directory)))
     except msgspec.ValidationError as error:
-        raise invalid(directory / MANIFEST, manifest["study"], error, "study") from None
+        raise error_with_key(directory / MANIFEST, manifest["study"], error, "study") from None
     original = manifest.get("original")
     if not isinstance(original, dict):
         raise InputError(directory / MANIFEST, "does not describe the original vehicle", "a manifest of the command study")
     try:
         scoring = msgspec.convert(manifest["scoring"], Scoring) if "scoring" in manifest else SAFEVAR
     except msgspec.ValidationError as error:
-        raise invalid(directory / MANIFEST, manifest["scoring"], error, "scoring") from None
+        raise error_with_key(directory / MANIFEST, manifest["scoring"], error, "scoring") from None
     return case_of(study, original, solutions, evaluations, finished, "imported" not in manifest, failures, scoring)
 
 
