@@ -17,7 +17,7 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import SAFEVAR, Scoring
 from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.records import Evaluations
-from safevar_sumo.results import ORIGINAL, Failure, JournalBusy, ResultsDirectory
+from safevar_sumo.results import ORIGINAL, Failure, JournalBusyError, ResultsDirectory
 from safevar_sumo.search import Problem, Search
 from safevar_sumo.study import Study
 from safevar_sumo.sumo import Engine
@@ -115,7 +115,7 @@ def run_campaign(study: Study, keys: Iterable[RunKey], results: ResultsDirectory
                 key = keys_left.popleft()
                 try:
                     journal = results.journal(str(key))
-                except JournalBusy:
+                except JournalBusyError:
                     campaign.busy.append(key)
                     continue
                 runs.add(run := Run(key, begin_search(key), journal, observer, study.search.evaluations, retry=retry_failed))
@@ -152,11 +152,11 @@ def _original(study: Study, work: bytes, characteristics: CharacteristicSet, res
 
     try:
         journal = results.journal(ORIGINAL)
-    except JournalBusy:  # another process, such as a job of an array, writes this journal
+    except JournalBusyError:  # another process, such as a job of an array, writes this journal
         return simulate()
     try:
-        if journal.cut:
-            observer.warned(f"{journal.path}: the last {journal.cut} bytes were torn; what they held is simulated again")
+        if journal.cut_bytes:
+            observer.warned(f"{journal.path}: the last {journal.cut_bytes} bytes were torn; what they held is simulated again")
         if journal.content.evaluations is not None:
             return journal.content.evaluations
         evaluations = simulate()

@@ -10,7 +10,7 @@ import numpy as np
 from safevar_sumo.campaign.keys import RunKey
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import Evaluations, FloatArray, Outcome
-from safevar_sumo.results import SPARE, Failure, Journal
+from safevar_sumo.results import SPARE_POSITION, Failure, Journal
 from safevar_sumo.search import Search
 from safevar_sumo.workers.batches import VERIFIED_SETTINGS
 
@@ -35,7 +35,7 @@ class Observer(Protocol):
 
 
 class _KnownSetting(NamedTuple):
-    """The `position` of a setting in the run (`SPARE` until the search requests it), and its `row` in `evaluations`."""
+    """The `position` of a setting in the run (`SPARE_POSITION` until the search requests it), and its `row` in `evaluations`."""
 
     position: int
     evaluations: Evaluations
@@ -74,8 +74,8 @@ class Run:
         """Number of simulated settings of the present request."""
         self.result: Evaluations
         self.finished = False
-        if journal.cut:
-            observer.warned(f"{journal.path}: the last {journal.cut} bytes were torn; what they held is simulated again")
+        if journal.cut_bytes:
+            observer.warned(f"{journal.path}: the last {journal.cut_bytes} bytes were torn; what they held is simulated again")
         if retry and journal.content.evaluations is not None and journal.content.evaluations.failed.any():
             journal.retry()
         if journal.content.evaluations is not None:
@@ -115,9 +115,9 @@ class Run:
         """Answer the search as long as all requested evaluations are known; returns whether the search has ended."""
         stored_result = self._journal.content.result(self._budget)
         if stored_result is not None:
-            self.result = self._journal.content.by_position(stored_result.positions)
+            self.result = self._journal.content.take_positions(stored_result.positions)
             self._requested, self.finished = stored_result.asked, True
-            evaluations = self._journal.content.within(self._budget)
+            evaluations = self._journal.content.requested_within(self._budget)
             if evaluations is not None:
                 self._observer.evaluated(self.key, evaluations, 0)
             return True
@@ -194,7 +194,7 @@ class Run:
 
     def _store_spares(self) -> None:
         """Journal the positions of settings whose evaluations were known before the search requested them."""
-        spares = [position - self._requested for key, position in self._positions.items() if self._known[key].position == SPARE]
+        spares = [position - self._requested for key, position in self._positions.items() if self._known[key].position == SPARE_POSITION]
         if spares:
             self._store(self._evaluations_of(self._settings[spares]))
 
@@ -207,7 +207,7 @@ class Run:
         self._remember(positions, evaluations)
 
     def _remember(self, positions: list[int], evaluations: Evaluations) -> None:
-        self._positions_done.update(position for position in positions if position != SPARE)
+        self._positions_done.update(position for position in positions if position != SPARE_POSITION)
         for row, position in enumerate(positions):
             self._known[evaluations.settings[row].tobytes()] = _KnownSetting(position, evaluations, row)
 

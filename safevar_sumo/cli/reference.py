@@ -37,8 +37,7 @@ from safevar_sumo.reference import (
     write_totals,
 )
 from safevar_sumo.reference.conclusions import pair_cases
-from safevar_sumo.reference.effects import LEAST as LEAST_EFFECT
-from safevar_sumo.reference.effects import SHARE as EFFECT_SHARE
+from safevar_sumo.reference.effects import ABSOLUTE_TOLERANCE, RELATIVE_TOLERANCE
 from safevar_sumo.reference.fit_result import rename_fitted
 from safevar_sumo.reference.profiles import plot_profiles
 from safevar_sumo.reference.replication import Nearness, compare_with_nearest_rows, render_replication
@@ -335,7 +334,7 @@ def print_agreement(console: Console, study: Study, result: Agreement) -> None:
 
 def print_effects(console: Console, effects: Sequence[Effect]) -> None:
     """Print the effects in the reference and here, and whether they agree."""
-    title = f"Linear effects on the safety degree over a domain, m (agree: within {EFFECT_SHARE:.0%} or {LEAST_EFFECT:g} m)"
+    title = f"Linear effects on the safety degree over a domain, m (agree: within {RELATIVE_TOLERANCE:.0%} or {ABSOLUTE_TOLERANCE:g} m)"
     table = WholeTable("characteristic", right=("reference", "here", "agree"), title=title)
     for effect in effects:
         agrees = "-" if effect.agrees is None else "yes" if effect.agrees else "no"

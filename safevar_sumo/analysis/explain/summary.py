@@ -18,7 +18,7 @@ from safevar_sumo.analysis.rating.summary import rated_lead
 from safevar_sumo.analysis.words import ENDS, joined, list_of_changes, number_of, question_command
 from safevar_sumo.metrics import RATING_POINTS, Unsafe
 from safevar_sumo.records import KMH_PER_MS, Evaluations, FloatArray, Outcome, finite_or_none
-from safevar_sumo.results import CHOICES, chosen_handle, handles, position_of, record
+from safevar_sumo.results import CHOICES, choose_handle, handles_of, record, row_of_handle
 from safevar_sumo.scenarios import Point
 from safevar_sumo.scenarios.base import pre_crash_of
 from safevar_sumo.study import Study
@@ -59,8 +59,8 @@ def lead(study: Study, solutions: pd.DataFrame, original: Evaluations, pool: Poo
     if not unsafe.any():
         return [f"Nothing unsafe found in {number_of(len(solutions), 'solution')}: no collision, no SD below half of the original's.",
                 f"How far each characteristic may go: {question_command('tolerance', place)}"]
-    handle_of = {reason: chosen_handle(solutions, criterion, choice, study.name) for choice, reason in REASONS.items()}
-    rows = solutions.iloc[[position_of(solutions, handle) for handle in handle_of.values()]]
+    handle_of = {reason: choose_handle(solutions, criterion, choice, study.name) for choice, reason in REASONS.items()}
+    rows = solutions.iloc[[row_of_handle(solutions, handle) for handle in handle_of.values()]]
     settings = rows[list(evaluator.characteristics.names)].to_numpy(dtype=float)
     causes_of, (failing_points, worst) = minimal_causes(evaluator, settings, criterion), _failing_points(study, settings, criterion)
     number_distinct = len(solutions.drop_duplicates(list(evaluator.characteristics.names)))
@@ -80,7 +80,7 @@ def lead(study: Study, solutions: pd.DataFrame, original: Evaluations, pool: Poo
 def _paragraph(evaluator: Evaluator, solutions: pd.DataFrame, is_unsafe: pd.Series[bool], original: Evaluations, unsafe: Unsafe,
                point: str) -> str:
     """One paragraph on the unsafe solutions; with `point`, on the solutions that are unsafe at this point of a matrix."""
-    names, all_handles = evaluator.characteristics.names, handles(solutions)
+    names, all_handles = evaluator.characteristics.names, handles_of(solutions)
     candidates = np.flatnonzero(is_unsafe.to_numpy() & ~solutions.duplicated(list(names)).to_numpy())
     if point:
         evaluator = evaluator.for_study(study_at(evaluator.study, point, point))

@@ -15,7 +15,7 @@ import pandas as pd
 from safevar_sumo.errors import InputError, in_one_line
 from safevar_sumo.metrics import SAFEVAR, MetricFacts, Scoring, Unsafe
 from safevar_sumo.records import FloatArray, Outcome
-from safevar_sumo.results import MANIFEST, Failure, failure_lines, load_runs, places_of
+from safevar_sumo.results import MANIFEST, Failure, failure_lines, folders_of, load_runs
 from safevar_sumo.scenarios import weather_of
 from safevar_sumo.study import Origin, Study, Weather, invalid, of_today
 from safevar_sumo.vehicles import CharacteristicSet
@@ -175,7 +175,7 @@ def load_case(directory: Path) -> Case:
     """Read one results directory."""
     manifest, evaluations, solutions, finished, failures = load_runs(directory)
     try:
-        study = msgspec.structs.replace(msgspec.convert(of_today(manifest["study"]), Study), origin=Origin(places=places_of(directory)))
+        study = msgspec.structs.replace(msgspec.convert(of_today(manifest["study"]), Study), origin=Origin(places=folders_of(directory)))
     except msgspec.ValidationError as error:
         raise invalid(directory / MANIFEST, manifest["study"], error, "study") from None
     original = manifest.get("original")
