@@ -19,8 +19,8 @@ from safevar_sumo.sumo import Engine, settings_per_batch
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet
 from safevar_sumo.workers.batches import inputs_of
-from safevar_sumo.workers.evaluation import Pool, packed
-from safevar_sumo.workers.interrupts import awaited
+from safevar_sumo.workers.evaluation import Pool, pack_study
+from safevar_sumo.workers.interrupts import wait_for_result
 from safevar_sumo.workers.retrying import RetryingPool
 
 
@@ -76,12 +76,12 @@ class StudyFit:
 
     def submit(self, study: Study) -> list[Future[Evaluations]]:
         """Begin to simulate the study, which may have other parameter values; returns a future for each batch of settings."""
-        work, size = packed(study, self._inputs), self._batch_size
+        work, size = pack_study(study, self._inputs), self._batch_size
         return [self._pool.submit(work, self._settings[start:start + size]) for start in range(0, len(self._settings), size)]
 
     def loss(self, futures: Sequence[Future[Evaluations]]) -> float:
         """The loss, from the futures of all batches."""
-        distinct_evaluations = Evaluations.concatenate([awaited(future) for future in futures])
+        distinct_evaluations = Evaluations.concatenate([wait_for_result(future) for future in futures])
         if not distinct_evaluations.valid.all():
             return MAX_LOSS
         evaluations = distinct_evaluations.take(self._row_of.ravel())

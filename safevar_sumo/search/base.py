@@ -1,4 +1,4 @@
-"""The contract of a search algorithm, independent of SUMO, processes and files, and checks of algorithms from outside the package."""
+"""The contract of a search algorithm, independent of SUMO, processes and files, and checks of user code."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ ALGORITHM_CONTRACT = Contract.of(Algorithm, "an algorithm")
 
 
 class GuardedAlgorithm:
-    """An algorithm from outside the package: it gets read-only copies, and this class checks its settings and its result."""
+    """An algorithm in user code: it gets read-only copies, and this class checks its settings and its result."""
 
     def __init__(self, algorithm: Algorithm, guard: Guard) -> None:
         self._algorithm, self._guard = algorithm, guard

@@ -18,7 +18,7 @@ from safevar_sumo.study import Study, foreign_packages
 from safevar_sumo.sumo.engine import Engine
 from safevar_sumo.sumo.matrix import evaluate, in_cells
 from safevar_sumo.sumo.system import System, assemble
-from safevar_sumo.workers.identity import Inputs, networks_of
+from safevar_sumo.workers.identity import Inputs, network_digests
 
 SHARED_LAYERS = ("network", "sources")
 """Layers of a study's identity that must be the same on every worker."""
@@ -46,7 +46,7 @@ class Pool(Protocol):
 class _Work(msgspec.Struct, frozen=True):
     """A study for a worker, with digests of the files that its results depend on, and the way to evaluate its settings.
 
-    With `check` the worker checks the code from outside instead; see `packed` for the other fields.
+    See `pack_study` for the fields.
     """
 
     study: Study
@@ -65,26 +65,26 @@ class _Mode(msgspec.Struct, frozen=True):
     cells: tuple[int, int] | None = None
 
 
-def packed(study: Study, inputs: Mapping[str, Any] | None = None, *, engine: Engine = Engine.RECORDED, afresh: bool = False,
+def pack_study(study: Study, inputs: Mapping[str, Any] | None = None, *, engine: Engine = Engine.RECORDED, afresh: bool = False,
            check: bool = False, cells: tuple[int, int] | None = None) -> bytes:
-    """A study, packed for a worker as bytes.
+    """Pack a study for a worker as bytes.
 
     Parameters
     ----------
     inputs
         Layers of the study's identity by name; by default the present networks. A worker refuses to compute with other files, and
-        reports files that code from outside reads and `sources` lacks.
+        reports files that user code reads and `sources` lacks.
     engine
         What moves the vehicles.
     afresh
         Whether models are reloaded, which removes all state of earlier batches from their modules and classes.
     check
-        Whether the worker checks the code from outside instead; the `reasons` of the result are remarks on this code.
+        Whether the worker only checks the user code; the `reasons` of the result are then remarks on this code.
     cells
         (k, n): for a rated study, results in part k of n parts of the cells, instead of points for all cells.
     """
     if inputs is None:
-        inputs = {"network": networks_of(assemble(study))}
+        inputs = {"network": network_digests(assemble(study))}
     return msgspec.msgpack.encode(_Work(study, {layer: dict(inputs[layer]) for layer in SHARED_LAYERS if layer in inputs}, engine, afresh,
                                         check, cells))
 
@@ -124,14 +124,14 @@ def _work_for_all_cells(work: bytes) -> bytes:
 
 @lru_cache(maxsize=4)
 def _task_and_system(work: bytes) -> tuple[_Work, System]:
-    """The unpacked work and the system of its study. Both are cached, even if source files change."""
+    """The unpacked work and the system of its study; both are cached and stay the same even if source files change."""
     task = msgspec.msgpack.decode(work, type=_Work)
     return task, assemble(task.study)
 
 
 def _refuse_changed_networks(expected: Inputs, system: System) -> None:
     if "network" in expected:
-        _refuse_changed_files(changed_files(expected["network"], networks_of(system)))
+        _refuse_changed_files(changed_files(expected["network"], network_digests(system)))
 
 
 def _unknown_files(task: _Work, files: Files) -> Files:
