@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from safevar_sumo.analysis.options import Options
 from safevar_sumo.errors import InputError, did_you_mean, one_of, warn
-from safevar_sumo.results import MANIFEST, comparable_inputs, differences_now, later_files, manifest_of, read_manifest
+from safevar_sumo.results import MANIFEST, differences_now, later_files, make_inputs_comparable, manifest_of, read_manifest
 from safevar_sumo.study import Study, StudyLike, load_study, study_names
 from safevar_sumo.terminal import shown
 
@@ -150,7 +150,7 @@ def changes_since(directory: Path, case: Case, *, as_it_is_now: bool = False) ->
     system = assemble(study, str(directory))
     with local_pool(1, study.search.time_limit) as pool:
         sources = {**source_digests(study, pool), **files_read_by_algorithms(study)}
-    manifest, sources = comparable_inputs(manifest, sources, later_files(directory), study.origin.places)
+    manifest, sources = make_inputs_comparable(manifest, sources, later_files(directory), study.origin.places)
     changes = differences_now(manifest, manifest_of(study, identity_of(study, system, sources)))
     if changes and not as_it_is_now:
         rest = f" (and {len(changes) - MAX_CHANGES} more)" if len(changes) > MAX_CHANGES else ""

@@ -50,9 +50,9 @@ def algorithm_of(label: str, study: Study) -> Algorithm:
         parameters = Lookup(source, study.origin.places).with_paths(member, search.parameters.get(label, {}), key)
         algorithm = instance_of(member, parameters, f"search.algorithms: {name!r}", key, source)
     if isinstance(algorithm, MoCell):
-        algorithm.sides(search.population, source)
+        algorithm.grid_sides(search.population, source)
     if isinstance(algorithm, MapElites):
-        algorithm.cells(len(study.vehicle.characteristics), source)
+        algorithm.count_cells(len(study.vehicle.characteristics), source)
     return algorithm if member.guard is None else GuardedAlgorithm(algorithm, member.guard)
 
 

@@ -60,7 +60,7 @@ def calibrate_together(subjects: Sequence[FitSubject], pool: Pool, done: Callabl
     done
         Called after every trial with the lowest loss so far, and the studies with this loss.
     from_scratch
-        Start only at random places, and ignore the values that the studies give to the free parameters.
+        Whether to start only at random places, without the values that the studies give to the free parameters.
 
     Raises
     ------

@@ -14,7 +14,7 @@ from safevar_sumo.results.files import (
 from safevar_sumo.results.imported import UNKNOWN, write_imported
 from safevar_sumo.results.journal import SPARE_POSITION, Journal, JournalBusyError
 from safevar_sumo.results.load import Failure, RunStatus, Status, StoredResults, failure_lines, load_runs, status
-from safevar_sumo.results.manifest import RESULTS, comparable_inputs, differences_now, evaluation_keys, manifest_of, read_manifest
+from safevar_sumo.results.manifest import RESULTS, differences_now, evaluation_keys, make_inputs_comparable, manifest_of, read_manifest
 from safevar_sumo.results.solution_id import CHOICES, SolutionId, choose_handle, handles_of, row_of_handle
 from safevar_sumo.results.store import ResultsDirectory, evaluations_frame, record, solutions_frame
 
@@ -37,7 +37,6 @@ __all__ = [
     "Status",
     "StoredResults",
     "choose_handle",
-    "comparable_inputs",
     "differences_now",
     "evaluation_keys",
     "evaluations_frame",
@@ -47,6 +46,7 @@ __all__ = [
     "later_files",
     "load_runs",
     "make_directory",
+    "make_inputs_comparable",
     "manifest_of",
     "read_manifest",
     "record",

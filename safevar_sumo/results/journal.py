@@ -148,12 +148,12 @@ def content_of(frames: list[JournalFrame]) -> JournalContent:
         elif isinstance(frame, Result):
             results[frame.budget] = frame
         elif isinstance(frame, Retry) and batches:
-            positions, remaining_evaluations = _without_failures(positions, Evaluations.concatenate(batches))
+            positions, remaining_evaluations = _drop_failures(positions, Evaluations.concatenate(batches))
             batches, results = [remaining_evaluations], {}
     return JournalContent(positions, Evaluations.concatenate(batches) if positions else None, results)
 
 
-def _without_failures(positions: list[int], evaluations: Evaluations) -> tuple[list[int], Evaluations]:
+def _drop_failures(positions: list[int], evaluations: Evaluations) -> tuple[list[int], Evaluations]:
     """Positions and evaluations that a run keeps when its failed settings are simulated again."""
     has_succeeded = ~evaluations.failed
     pairs = list(zip(positions, has_succeeded, strict=True))

@@ -195,11 +195,11 @@ def _changed_values(first: Any, second: Any, key: str = "") -> Iterator[tuple[st
         yield key, first, second
 
 
-def comparable_inputs(stored: Mapping[str, Any], present_files: Mapping[str, str], late_files: Mapping[str, str], folders: Sequence[str]
-                  ) -> tuple[dict[str, Any], Files]:
-    """A stored manifest and the files that its study reads now, prepared for their comparison.
+def make_inputs_comparable(stored: Mapping[str, Any], present_files: Mapping[str, str], late_files: Mapping[str, str],
+                           folders: Sequence[str]) -> tuple[dict[str, Any], Files]:
+    """Prepare a stored manifest, and the files that its study reads now, for their comparison.
 
-    Both omit a file that was first read after the study began, unless the file has changed since. If such a file is missing now,
+    Both then omit a file that was first read after the study began, unless the file has changed since. If such a file is missing now,
     only the manifest holds it.
     """
     stored_digests, present_digests = dict(stored.get("sources", {})), dict(present_files)

@@ -29,9 +29,9 @@ from safevar_sumo.results.files import (
 from safevar_sumo.results.journal import Journal, JournalBusyError, owner_of
 from safevar_sumo.results.manifest import (
     DIGESTS_KEY,
-    comparable_inputs,
     digest_of_table,
     first_difference,
+    make_inputs_comparable,
     manifest_of,
     owner_digest,
     read_manifest,
@@ -135,7 +135,7 @@ class ResultsDirectory:
         stored_manifest, late_files = read_manifest(self.path), later_files(self.path)
         if "imported" not in stored_manifest and late_files:
             folders = self._study.origin.places
-            stored_manifest, self.manifest["sources"] = comparable_inputs(stored_manifest, self._digests, late_files, folders)
+            stored_manifest, self.manifest["sources"] = make_inputs_comparable(stored_manifest, self._digests, late_files, folders)
         problem, remedy = ("they are imported", "") if "imported" in stored_manifest else first_difference(stored_manifest, self.manifest)
         self._digests = {**self.manifest.get("sources", {}), **late_files}
         if problem:

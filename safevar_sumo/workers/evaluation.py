@@ -114,7 +114,8 @@ def evaluate_batch(work: bytes, settings: FloatArray) -> Evaluations:
         _refuse_changed_networks(task.inputs, system)
         evaluations = evaluate(system, settings, task.engine) if cells is None else in_cells(system, settings, cells, task.engine)
     _refuse_changed_networks(task.inputs, system)
-    return replace(evaluations, files=_unknown_files(task, digests(reading.files(foreign_packages(task.study)), task.study.origin.places)))
+    files_read = digests(reading.files(foreign_packages(task.study)), task.study.origin.places)
+    return replace(evaluations, files=_find_unknown_files(task, files_read))
 
 
 def _work_for_all_cells(work: bytes) -> bytes:
@@ -134,7 +135,7 @@ def _refuse_changed_networks(expected: Inputs, system: System) -> None:
         _refuse_changed_files(changed_files(expected["network"], network_digests(system)))
 
 
-def _unknown_files(task: _Work, files: Files) -> Files:
+def _find_unknown_files(task: _Work, files: Files) -> Files:
     """The files that were not known when the study began; refuses known files that have changed."""
     sources = task.inputs.get("sources", {})
     _refuse_changed_files([name for name, digest in files.items() if sources.get(name, digest) != digest])

@@ -63,6 +63,6 @@ def _platform() -> dict[str, str]:
 
 
 def powers_digest() -> str:
-    """Digest of powers: only these depend on the mathematical library; IEEE 754 determines all other operations."""
+    """Digest of sample powers: of all operations, only powers depend on the mathematical library and not on IEEE 754 alone."""
     bases = [(i + 0.5) / BASES * 2 for i in range(BASES)]
     return sha256(repr([[base ** exponent for base in bases] for exponent in EXPONENTS]).encode()).hexdigest()[:DIGITS]

@@ -32,14 +32,14 @@ def defer_interrupts() -> Iterator[None]:
         yield
     finally:
         signal.signal(signal.SIGINT, signal.default_int_handler if previous_handler is None else previous_handler)
-    _raise_if_pressed()
+    _raise_pending_interrupt()
 
 
 def wait_for_first(futures: Iterable[Future[Evaluations]]) -> set[Future[Evaluations]]:
     """Wait until a future is done, and return all futures that are done; an empty set if there are no futures."""
     while True:
         done, waiting_futures = wait(futures, timeout=SECONDS_BETWEEN_CHECKS, return_when=FIRST_COMPLETED)
-        _raise_if_pressed()
+        _raise_pending_interrupt()
         if done or not waiting_futures:
             return done
 
@@ -50,7 +50,7 @@ def wait_for_result(future: Future[Evaluations]) -> Evaluations:
     return future.result()
 
 
-def _raise_if_pressed() -> None:
+def _raise_pending_interrupt() -> None:
     if _interrupt.is_set():
         _interrupt.clear()
         raise KeyboardInterrupt

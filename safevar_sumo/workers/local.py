@@ -121,7 +121,7 @@ class _Worker:
         try:
             self._pipe, worker_end = context.Pipe()
             self._process = context.Process(target=_serve, args=(worker_end, reachable()), daemon=True)
-            with _without_main():
+            with _hide_main():
                 self._process.start()
         except OSError as error:
             raise PoolLostError(f"no worker process can be started: {error.strerror}") from None
@@ -161,7 +161,7 @@ class _Worker:
 
 
 @contextmanager
-def _without_main() -> Iterator[None]:
+def _hide_main() -> Iterator[None]:
     """Hide the main module, which a spawned process would run again; scripts then need no `if __name__ == "__main__"`."""
     with _start_lock:
         main = sys.modules["__main__"]
