@@ -37,7 +37,7 @@ from safevar_sumo.sumo.staging import stage_network
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet
 from safevar_sumo.workers.cluster import cluster_pool
-from safevar_sumo.workers.evaluation import Pool, evaluate_batch, packed
+from safevar_sumo.workers.evaluation import Pool, evaluate_batch, pack_study
 from safevar_sumo.workers.identity import identity_of
 from safevar_sumo.workers.local import local_pool
 
@@ -101,7 +101,7 @@ def drawn(study: Study, n: int, seed: int = 1) -> FloatArray:
 def campaign(study: Study, opened: AbstractContextManager[Pool]) -> Cost:
     """Carry out a study in a pool that is at work already."""
     with tempfile.TemporaryDirectory() as folder, opened as pool:
-        for future in [pool.submit(packed(study), drawn(study, MAX_VEHICLES)) for _ in range(4 * pool.workers)]:
+        for future in [pool.submit(pack_study(study), drawn(study, MAX_VEHICLES)) for _ in range(4 * pool.workers)]:
             future.result()
         recording = Recording(pool)
         before = processors()

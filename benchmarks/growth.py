@@ -16,7 +16,7 @@ from measuring import Record, print_records
 
 from safevar_sumo.study import Study, load_study
 from safevar_sumo.sumo.matrix import MAX_VEHICLES
-from safevar_sumo.workers.evaluation import packed
+from safevar_sumo.workers.evaluation import pack_study
 from safevar_sumo.workers.local import local_pool
 
 FIRST = 5000
@@ -25,7 +25,7 @@ FIRST = 5000
 
 def records_of(study: Study, evaluations: int) -> Iterator[Record]:
     """Measure the first and the last `FIRST` evaluations of one worker, and its memory after both."""
-    work, spans = packed(study), []
+    work, spans = pack_study(study), []
     with local_pool(1, study.search.time_limit) as pool:
         pool.submit(work, drawn(study, MAX_VEHICLES)).result()
         worker = next(child for child in psutil.Process().children() if "spawn_main" in " ".join(child.cmdline()))

@@ -18,8 +18,8 @@ from safevar_sumo.study import Study
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet, region_of
 from safevar_sumo.workers.batches import evaluate_all, inputs_of
-from safevar_sumo.workers.evaluation import Pool, packed
-from safevar_sumo.workers.interrupts import first_of
+from safevar_sumo.workers.evaluation import Pool, pack_study
+from safevar_sumo.workers.interrupts import wait_for_first
 from safevar_sumo.workers.local import available_cores, local_pool
 from safevar_sumo.workers.retrying import RetryingPool
 
@@ -119,10 +119,10 @@ class Evaluator:
         parts = min(PARTS_PER_WORKER * self._pool.workers, cell_count)
         inputs, pool = inputs_of(self.study, self._pool), RetryingPool(self._pool, self.study)
         self.progress(stage, 0, cell_count)
-        futures = {pool.submit(packed(self.study, inputs, cells=(part, parts)), settings): part for part in range(parts)}
+        futures = {pool.submit(pack_study(self.study, inputs, cells=(part, parts)), settings): part for part in range(parts)}
         results_by_part, done = dict[int, CellResults](), 0
         while len(results_by_part) < parts:
-            for future in first_of([future for future, part in futures.items() if part not in results_by_part]):
+            for future in wait_for_first([future for future, part in futures.items() if part not in results_by_part]):
                 evaluations = future.result()
                 if evaluations.cells is None:
                     raise SimulationError(f"study {self.study.name!r}: a vehicle cannot be simulated: {evaluations.reason(0)}")

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from safevar_sumo.analysis.options import Options
 from safevar_sumo.errors import InputError, did_you_mean, one_of, warn
-from safevar_sumo.results import MANIFEST, comparable_inputs, differences_now, later_files, manifest_of, read_manifest
+from safevar_sumo.results import MANIFEST, differences_now, later_files, make_inputs_comparable, manifest_of, read_manifest
 from safevar_sumo.study import Study, StudyLike, load_study, study_names
 from safevar_sumo.terminal import shown
 
@@ -138,9 +138,9 @@ def changes_since(directory: Path, case: Case, *, as_it_is_now: bool = False) ->
     InputError
         If an input has changed and `as_it_is_now` is false; the message names the changes.
     """
-    from safevar_sumo.campaign import read_by_algorithms
+    from safevar_sumo.campaign import files_read_by_algorithms
     from safevar_sumo.sumo.system import assemble
-    from safevar_sumo.workers.batches import digests_of_sources
+    from safevar_sumo.workers.batches import source_digests
     from safevar_sumo.workers.identity import identity_of
     from safevar_sumo.workers.local import local_pool
 
@@ -149,8 +149,8 @@ def changes_since(directory: Path, case: Case, *, as_it_is_now: bool = False) ->
         return []
     system = assemble(study, str(directory))
     with local_pool(1, study.search.time_limit) as pool:
-        sources = {**digests_of_sources(study, pool), **read_by_algorithms(study)}
-    manifest, sources = comparable_inputs(manifest, sources, later_files(directory), study.origin.places)
+        sources = {**source_digests(study, pool), **files_read_by_algorithms(study)}
+    manifest, sources = make_inputs_comparable(manifest, sources, later_files(directory), study.origin.places)
     changes = differences_now(manifest, manifest_of(study, identity_of(study, system, sources)))
     if changes and not as_it_is_now:
         rest = f" (and {len(changes) - MAX_CHANGES_NAMED} more)" if len(changes) > MAX_CHANGES_NAMED else ""

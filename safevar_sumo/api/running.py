@@ -11,7 +11,7 @@ from rich.console import Console
 
 from safevar_sumo.analysis.subject import Results, load
 from safevar_sumo.api.simulation import load_and_assemble
-from safevar_sumo.campaign import Campaign, Observer, RunKey, algorithm_of, all_runs, read_by_algorithms, run_campaign
+from safevar_sumo.campaign import Campaign, Observer, RunKey, algorithm_of, all_runs, files_read_by_algorithms, run_campaign
 from safevar_sumo.errors import InputError, SafevarError, one_of, warn
 from safevar_sumo.progress import CampaignProgress
 from safevar_sumo.records import Evaluations
@@ -19,7 +19,7 @@ from safevar_sumo.results import ResultsDirectory
 from safevar_sumo.study import Study, StudyLike
 from safevar_sumo.sumo import Engine, reason_for_sumo, settings_per_batch
 from safevar_sumo.sumo.system import System
-from safevar_sumo.workers.batches import digests_of_sources
+from safevar_sumo.workers.batches import source_digests
 from safevar_sumo.workers.cluster import cluster_pool
 from safevar_sumo.workers.evaluation import Pool
 from safevar_sumo.workers.identity import identity_of
@@ -100,7 +100,7 @@ def carry_out_runs(study: Study, system: System, keys: list[RunKey], directory: 
     SafevarError
         If another process works on one of the runs, or `run_campaign` raises it.
     """
-    sources = {**digests_of_sources(study, pool), **read_by_algorithms(study)}
+    sources = {**source_digests(study, pool), **files_read_by_algorithms(study)}
     results = ResultsDirectory(directory, study, identity_of(study, system, sources), system.measuring.scoring)
     engine_used, reason = engine_for(system, engine)
     results.manifest["engine"] = {"name": ENGINES[engine_used], "reason": reason}

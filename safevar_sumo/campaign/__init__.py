@@ -7,19 +7,19 @@ settings of all runs for the pool: a lost worker costs a batch, and no result de
 
 from safevar_sumo.campaign.campaign import Campaign, run_campaign
 from safevar_sumo.campaign.forecast import Forecast, forecast
-from safevar_sumo.campaign.keys import RunKey, algorithm_member, algorithm_of, all_runs, read_by_algorithms, run_generator
+from safevar_sumo.campaign.keys import RunKey, algorithm_class, algorithm_of, all_runs, files_read_by_algorithms, random_generator_of
 from safevar_sumo.campaign.run import Observer
 
 __all__ = [
-           "Campaign",
-           "Forecast",
-           "Observer",
-           "RunKey",
-           "algorithm_member",
-           "algorithm_of",
-           "all_runs",
-           "forecast",
-           "read_by_algorithms",
-           "run_campaign",
-           "run_generator",
+    "Campaign",
+    "Forecast",
+    "Observer",
+    "RunKey",
+    "algorithm_class",
+    "algorithm_of",
+    "all_runs",
+    "files_read_by_algorithms",
+    "forecast",
+    "random_generator_of",
+    "run_campaign",
 ]

@@ -10,34 +10,34 @@ from typing import NamedTuple
 import numpy as np
 
 from safevar_sumo.campaign.batcher import Batcher
-from safevar_sumo.campaign.keys import RunKey, search_of
+from safevar_sumo.campaign.keys import RunKey, make_search
 from safevar_sumo.campaign.run import Observer, Run
 from safevar_sumo.campaign.verification import Verification
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import SAFEVAR, Scoring
 from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.records import Evaluations
-from safevar_sumo.results import ORIGINAL, Failure, JournalBusy, ResultsDirectory
+from safevar_sumo.results import ORIGINAL, Failure, JournalBusyError, ResultsDirectory
 from safevar_sumo.search import Problem, Search
 from safevar_sumo.study import Study
 from safevar_sumo.sumo import Engine
 from safevar_sumo.sumo.matrix import MAX_COPIES
 from safevar_sumo.vehicles import CharacteristicSet, region_of
-from safevar_sumo.workers.evaluation import Pool, packed
-from safevar_sumo.workers.interrupts import awaited, first_of
+from safevar_sumo.workers.evaluation import Pool, pack_study
+from safevar_sumo.workers.interrupts import wait_for_first, wait_for_result
 from safevar_sumo.workers.isolation import check_code
 from safevar_sumo.workers.retrying import RetryingPool
 
 JOURNALS_AT_ONCE = 8
-"""Number of journals written at the same time: a run waits until the disk has its evaluations."""
+"""Maximum number of journals written at the same time: a run waits until its evaluations are on the disk."""
 
 
 class Campaign(NamedTuple):
     """Results of the runs of a study: the evaluation of the original vehicle, and the solutions of each finished run.
 
-    `failures` are settings that could not be simulated. `busy` are runs that another process carries out. `collisions` is the number
-    of distinct settings of each finished run that collided, `invalid_tests` the number of those that left the speed tolerance of a
-    test. `scoring` holds the metrics and objectives.
+    `failures` are settings that could not be simulated. `busy` are runs that another process carries out. `collisions` and
+    `invalid_tests` are numbers of distinct settings of each finished run: those that collided, and those that left the speed tolerance
+    of a test. `scoring` holds the metrics and objectives.
     """
 
     original: Evaluations
@@ -74,8 +74,8 @@ def run_campaign(study: Study, keys: Iterable[RunKey], results: ResultsDirectory
         If a journal cannot be written, or the study is at fault.
     """
     characteristics = CharacteristicSet.of(study.vehicle.characteristics)
-    retrying_pool, work = RetryingPool(pool, study, results.note), packed(study, results.inputs, engine=engine)
-    original = _original(study, work, characteristics, results, retrying_pool, observer)
+    retrying_pool, work = RetryingPool(pool, study, results.note), pack_study(study, results.inputs, engine=engine)
+    original = _evaluate_original(study, work, characteristics, results, retrying_pool, observer)
     if not original.valid[0]:
         raise InputError(study.source, "the original vehicle leaves the tolerance of a test's speed before the ADS acts "
                          "(invalid-test): nothing can be compared with it", "tests whose speed the vehicle can hold")
@@ -88,7 +88,7 @@ def run_campaign(study: Study, keys: Iterable[RunKey], results: ResultsDirectory
     keys_left, runs = deque(keys), set[Run]()
 
     def begin_search(key: RunKey) -> Search:
-        return search_of(key, study, problem, results.note)
+        return make_search(key, study, problem, results.note)
 
     batcher = Batcher(retrying_pool, work, batch or MAX_COPIES)
     verification = Verification(study, results, retrying_pool, begin_search, engine, observer)
@@ -96,7 +96,7 @@ def run_campaign(study: Study, keys: Iterable[RunKey], results: ResultsDirectory
     def advance(run: Run) -> None:
         """Advance a run as far as its known evaluations allow, then queue the missing settings, verify the run or finish it."""
         if not run.advance():
-            batcher.add(run, run.missing)
+            batcher.add(run, run.missing_settings)
         elif run.finished or not verification.begin(run):
             finish(run)
 
@@ -111,24 +111,24 @@ def run_campaign(study: Study, keys: Iterable[RunKey], results: ResultsDirectory
     journalling = ThreadPoolExecutor(JOURNALS_AT_ONCE, thread_name_prefix="journal")
     try:
         while keys_left or runs:
-            while keys_left and len(runs) < batcher.runs_wanted(study.search.population):
+            while keys_left and len(runs) < batcher.wanted_run_count(study.search.population):
                 key = keys_left.popleft()
                 try:
                     journal = results.journal(str(key))
-                except JournalBusy:
+                except JournalBusyError:
                     campaign.busy.append(key)
                     continue
                 runs.add(run := Run(key, begin_search(key), journal, observer, study.search.evaluations, retry=retry_failed))
                 advance(run)
             batcher.send()
             verification.send()
-            for future in first_of([*batcher.under_way, *verification.under_way]):
+            for future in wait_for_first([*batcher.under_way, *verification.under_way]):
                 if future in verification.under_way:
-                    for run in verification.take(future):
+                    for run in verification.collect(future):
                         finish(run)
                     continue
-                shares = list(batcher.take(future))
-                for (run, _), is_complete in zip(shares, journalling.map(_take, shares), strict=True):
+                runs_of_batch, evaluations_of_runs = zip(*batcher.collect(future), strict=True)
+                for run, is_complete in zip(runs_of_batch, journalling.map(Run.take, runs_of_batch, evaluations_of_runs), strict=True):
                     if is_complete:
                         advance(run)
     finally:
@@ -139,24 +139,19 @@ def run_campaign(study: Study, keys: Iterable[RunKey], results: ResultsDirectory
                              failures=sorted(campaign.failures))
 
 
-def _take(share: tuple[Run, Evaluations]) -> bool:
-    run, evaluations = share
-    return run.take(evaluations)
-
-
-def _original(study: Study, work: bytes, characteristics: CharacteristicSet, results: ResultsDirectory, pool: RetryingPool,
-              observer: Observer) -> Evaluations:
-    """The evaluation of the original vehicle, from its journal or simulated; raises if it fails, or if models mix settings up."""
+def _evaluate_original(study: Study, work: bytes, characteristics: CharacteristicSet, results: ResultsDirectory, pool: RetryingPool,
+                       observer: Observer) -> Evaluations:
+    """Evaluate the original vehicle, or read its journal; raises an error if the simulation fails, or if user code mixes settings up."""
     def simulate() -> Evaluations:
-        return awaited(pool.submit(work, characteristics.original[np.newaxis], must_succeed=True))
+        return wait_for_result(pool.submit(work, characteristics.original[np.newaxis], must_succeed=True))
 
     try:
         journal = results.journal(ORIGINAL)
-    except JournalBusy:  # another process, such as a job of an array, writes this journal
+    except JournalBusyError:  # another process, such as a job of an array, writes this journal
         return simulate()
     try:
-        if journal.cut:
-            observer.warned(f"{journal.path}: the last {journal.cut} bytes were torn; what they held is simulated again")
+        if journal.cut_bytes:
+            observer.warned(f"{journal.path}: the last {journal.cut_bytes} bytes were torn; what they held is simulated again")
         if journal.content.evaluations is not None:
             return journal.content.evaluations
         evaluations = simulate()

@@ -12,8 +12,8 @@ from safevar_sumo.study import Study
 from safevar_sumo.sumo import Engine
 from safevar_sumo.sumo.matrix import MAX_COPIES
 from safevar_sumo.vehicles import CharacteristicSet
-from safevar_sumo.workers.evaluation import Pool, packed
-from safevar_sumo.workers.interrupts import awaited
+from safevar_sumo.workers.evaluation import Pool, pack_study
+from safevar_sumo.workers.interrupts import wait_for_result
 from safevar_sumo.workers.retrying import RetryingPool
 
 PROBE_BATCHES = 4
@@ -32,22 +32,22 @@ class Forecast(NamedTuple):
 
 
 def forecast(study: Study, runs: int, pool: Pool, batch: int = MAX_COPIES, engine: Engine = Engine.LIBSUMO) -> Forecast:
-    """Upper limits for a number of runs, from a short measurement of the pool that will carry out the runs."""
+    """Estimate upper limits for a number of runs, from a short measurement of the pool that will carry out the runs."""
     characteristics, size = CharacteristicSet.of(study.vehicle.characteristics), min(batch, max(runs, 1) * study.search.population)
-    retrying_pool, work, rng = RetryingPool(pool, study), packed(study, engine=engine), np.random.default_rng(study.search.seed)
+    retrying_pool, work, rng = RetryingPool(pool, study), pack_study(study, engine=engine), np.random.default_rng(study.search.seed)
 
-    def probe(number: int) -> float:
+    def measure_time(batches_per_worker: int) -> float:
         """Time for a number of batches on every worker [s]."""
         start = time.perf_counter()
         batches = [characteristics.filter(rng.uniform(characteristics.lower, characteristics.upper, (size, len(characteristics))))
-                   for _ in range(number * pool.workers)]
+                   for _ in range(batches_per_worker * pool.workers)]
         for future in [retrying_pool.submit(work, settings) for settings in batches]:
-            awaited(future)
+            wait_for_result(future)
         return time.perf_counter() - start
 
-    awaited(retrying_pool.submit(work, characteristics.original[np.newaxis], must_succeed=True))
-    probe(1)  # starts the workers and builds the network
-    rate = PROBE_BATCHES * pool.workers * size / probe(PROBE_BATCHES)
+    wait_for_result(retrying_pool.submit(work, characteristics.original[np.newaxis], must_succeed=True))
+    measure_time(1)  # starts the workers and builds the network
+    rate = PROBE_BATCHES * pool.workers * size / measure_time(PROBE_BATCHES)
     evaluations = runs * study.search.evaluations
     row_size = 8 * (len(characteristics) + len(METRICS) + NUMBERS_BESIDE_METRICS)
     return Forecast(evaluations, rate, evaluations / rate, evaluations * row_size)

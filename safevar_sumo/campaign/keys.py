@@ -1,4 +1,4 @@
-"""The runs of a study: their keys, algorithms and random numbers."""
+"""The runs of a study: their keys, searches and random numbers."""
 
 from __future__ import annotations
 
@@ -41,24 +41,24 @@ def algorithm_of(label: str, study: Study) -> Algorithm:
     name, key = search.labels.get(label, label), f"search.{label}"
     if len(search.labels) < len(search.algorithms):
         raise InputError(source, f"search.algorithms = {search.algorithms}: two have the same name", "algorithms with different names")
-    for stray in search.parameters:
-        if stray not in ALGORITHMS and stray not in search.labels:
+    for table in search.parameters:
+        if table not in ALGORITHMS and table not in search.labels:
             legal = [*SearchTable.__struct_fields__, *ALGORITHMS, *search.labels]
-            raise unknown(source, f"search.{stray}: there is no such key and no such algorithm", stray, legal)
-    member = algorithm_member(name, study)
+            raise unknown(source, f"search.{table}: there is no such key and no such algorithm", table, legal)
+    member = algorithm_class(name, study)
     with guard_process_state(source, [name] if member.guard else []):
         parameters = Lookup(source, study.origin.places).with_paths(member, search.parameters.get(label, {}), key)
         algorithm = instance_of(member, parameters, f"search.algorithms: {name!r}", key, source)
     if isinstance(algorithm, MoCell):
-        algorithm.sides(search.population, source)
+        algorithm.grid_sides(search.population, source)
     if isinstance(algorithm, MapElites):
-        algorithm.cells(len(study.vehicle.characteristics), source)
+        algorithm.count_cells(len(study.vehicle.characteristics), source)
     return algorithm if member.guard is None else GuardedAlgorithm(algorithm, member.guard)
 
 
-def read_by_algorithms(study: Study) -> Files:
-    """Digests of files that users' algorithms read while this process loads and instantiates them."""
-    packages = _packages(study)
+def files_read_by_algorithms(study: Study) -> Files:
+    """Digests of files that the user's algorithms read while this process loads and instantiates them."""
+    packages = _user_packages(study)
     if not packages:
         return {}
     unload_user_modules()
@@ -68,9 +68,9 @@ def read_by_algorithms(study: Study) -> Files:
     return digests(reading.files(packages), study.origin.places)
 
 
-def search_of(key: RunKey, study: Study, problem: Problem, note: Callable[[Files], None]) -> Search:
-    """The search of a run; after each step, calls `note` with the files that a user's algorithm has read."""
-    packages, rng, ended = _packages(study), run_generator(study, key), False
+def make_search(key: RunKey, study: Study, problem: Problem, note: Callable[[Files], None]) -> Search:
+    """Make the search of a run; after each step, calls `note` with the files that a user's algorithm has read."""
+    packages, rng, ended = _user_packages(study), random_generator_of(study, key), False
     search: Search | None = None
     answer: Any = None  # None starts a generator
     while True:
@@ -87,18 +87,18 @@ def search_of(key: RunKey, study: Study, problem: Problem, note: Callable[[Files
         answer = yield step
 
 
-def _packages(study: Study) -> list[str]:
+def _user_packages(study: Study) -> list[str]:
     """Top-level packages of a study's user algorithms."""
     return [name.partition(":")[0].partition(".")[0] for name in study.search.algorithms if ":" in name]
 
 
-def algorithm_member(name: str, study: Study) -> Member:
+def algorithm_class(name: str, study: Study) -> Member:
     """The class of an algorithm, by its name in a study."""
     lookup = Lookup(study.source, study.origin.places)
     return lookup.class_of(ALGORITHMS, name, "search.algorithms", ALGORITHM_CONTRACT)
 
 
-def run_generator(study: Study, key: RunKey) -> np.random.Generator:
+def random_generator_of(study: Study, key: RunKey) -> np.random.Generator:
     """The random numbers of a run, independent of other runs."""
     sequence = np.random.SeedSequence(study.search.seed, spawn_key=(zlib.crc32(key.algorithm.encode()), key.run))
     return np.random.Generator(np.random.PCG64(sequence))

@@ -10,7 +10,7 @@ import numpy as np
 from safevar_sumo.campaign.keys import RunKey
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import Evaluations, FloatArray, Outcome
-from safevar_sumo.results import SPARE, Failure, Journal
+from safevar_sumo.results import SPARE_POSITION, Failure, Journal
 from safevar_sumo.search import Search
 from safevar_sumo.workers.batches import VERIFIED_SETTINGS
 
@@ -18,7 +18,7 @@ RANDOM_SAMPLES = 10
 """Number of random evaluations of a run that are simulated again. 30 runs then reveal an error in 1 % of the evaluations with a
 probability of 1 - 0.99^300 = 95 %."""
 
-FAILURE = Outcome.SIMULATOR_ERROR.value
+FAILED = Outcome.SIMULATOR_ERROR.value
 
 
 class Observer(Protocol):
@@ -35,7 +35,7 @@ class Observer(Protocol):
 
 
 class _KnownSetting(NamedTuple):
-    """The `position` of a setting in the run (`SPARE` until the search requests it), and its `row` in `evaluations`."""
+    """The `position` of a setting in the run (`SPARE_POSITION` until the search requests it), and its `row` in `evaluations`."""
 
     position: int
     evaluations: Evaluations
@@ -63,8 +63,8 @@ class Run:
     def __init__(self, key: RunKey, search: Search, journal: Journal, observer: Observer, budget: int, *, retry: bool = False) -> None:
         self.key, self._search, self._journal, self._observer, self._budget = key, search, journal, observer, budget
         self._known: dict[bytes, _KnownSetting] = {}
-        self._positions_done: set[int] = set()
-        """Positions in the run with an evaluation."""
+        self._known_positions: set[int] = set()
+        """Positions in the run whose settings are evaluated."""
         self._requested = 0
         """Number of settings in all earlier requests."""
         self._settings: FloatArray = np.empty((0, 0))
@@ -74,15 +74,15 @@ class Run:
         """Number of simulated settings of the present request."""
         self.result: Evaluations
         self.finished = False
-        if journal.cut:
-            observer.warned(f"{journal.path}: the last {journal.cut} bytes were torn; what they held is simulated again")
+        if journal.cut_bytes:
+            observer.warned(f"{journal.path}: the last {journal.cut_bytes} bytes were torn; what they held is simulated again")
         if retry and journal.content.evaluations is not None and journal.content.evaluations.failed.any():
             journal.retry()
         if journal.content.evaluations is not None:
             self._remember(journal.content.positions, journal.content.evaluations)
 
     @property
-    def missing(self) -> FloatArray:
+    def missing_settings(self) -> FloatArray:
         """The distinct requested settings without a known evaluation, shape (k, n)."""
         return self._settings[[position - self._requested for key, position in self._positions.items() if key not in self._known]]
 
@@ -90,23 +90,23 @@ class Run:
     def failures(self) -> list[Failure]:
         """Settings of this run that could not be simulated."""
         return [Failure(self.key.algorithm, self.key.run, position, evaluations.reason(row))
-                for position, evaluations, row in self._requests() if evaluations.outcome[row] == FAILURE]
+                for position, evaluations, row in self._requested_entries() if evaluations.outcome[row] == FAILED]
 
-    def _requests(self) -> list[_KnownSetting]:
-        """The distinct settings that this run requested, by position."""
+    def _requested_entries(self) -> list[_KnownSetting]:
+        """The known settings that this run requested, in the order of their positions."""
         return sorted((entry for entry in self._known.values() if 0 <= entry.position < self._budget), key=lambda entry: entry.position)
 
     @property
     def collisions(self) -> int:
         """Number of distinct requested settings that collided."""
-        return self._number_of(Outcome.COLLISION)
+        return self._count(Outcome.COLLISION)
 
     @property
     def invalid_tests(self) -> int:
         """Number of distinct requested settings that left the speed tolerance of a test."""
-        return self._number_of(Outcome.INVALID_TEST)
+        return self._count(Outcome.INVALID_TEST)
 
-    def _number_of(self, outcome: Outcome) -> int:
+    def _count(self, outcome: Outcome) -> int:
         value = outcome.value  # numpy compares enum members slowly
         return sum(evaluations.outcome[row] == value for position, evaluations, row in self._known.values()
                    if 0 <= position < self._budget)
@@ -115,9 +115,9 @@ class Run:
         """Answer the search as long as all requested evaluations are known; returns whether the search has ended."""
         stored_result = self._journal.content.result(self._budget)
         if stored_result is not None:
-            self.result = self._journal.content.by_position(stored_result.positions)
+            self.result = self._journal.content.take_positions(stored_result.positions)
             self._requested, self.finished = stored_result.asked, True
-            evaluations = self._journal.content.within(self._budget)
+            evaluations = self._journal.content.requested_within(self._budget)
             if evaluations is not None:
                 self._observer.evaluated(self.key, evaluations, 0)
             return True
@@ -135,9 +135,9 @@ class Run:
                 return True
         return False
 
-    def samples(self, rng: np.random.Generator) -> list[Evaluations]:
-        """The worst evaluation (users will look at it), the last (most state may have leaked into it), and random evaluations."""
-        entries = [entry for entry in self._requests() if entry.evaluations.valid[entry.row]]
+    def sample_evaluations(self, rng: np.random.Generator) -> list[Evaluations]:
+        """Sample the worst evaluation, at which users look; the last one, into which most state may have leaked; and random ones."""
+        entries = [entry for entry in self._requested_entries() if entry.evaluations.valid[entry.row]]
         if not entries:
             return []
         worst_entry = min(entries, key=lambda entry: np.nan_to_num(entry.evaluations.f_safe[entry.row], nan=np.inf))
@@ -145,10 +145,10 @@ class Run:
         sample = {entry.position: entry for entry in (worst_entry, entries[-1], *random_entries)}
         return [evaluations.take([row]) for _, evaluations, row in sample.values()]
 
-    def solutions_and_others(self, rng: np.random.Generator) -> Evaluations:
-        """The evaluations to verify in SUMO: all solutions, and `VERIFIED_SETTINGS` random other settings."""
+    def sample_for_sumo(self, rng: np.random.Generator) -> Evaluations:
+        """Sample the evaluations to verify in SUMO: all solutions, and `VERIFIED_SETTINGS` random other settings."""
         solutions = {setting.tobytes() for setting in self.result.settings}
-        settings = [entry.evaluations.settings[entry.row] for entry in self._requests() if entry.evaluations.outcome[entry.row] != FAILURE]
+        settings = [evaluations.settings[row] for _, evaluations, row in self._requested_entries() if evaluations.outcome[row] != FAILED]
         sample = [setting for setting in settings if setting.tobytes() in solutions]
         other_settings = [setting for setting in settings if setting.tobytes() not in solutions]
         sample += [other_settings[i] for i in rng.permutation(len(other_settings))[:VERIFIED_SETTINGS].tolist()]
@@ -194,20 +194,20 @@ class Run:
 
     def _store_spares(self) -> None:
         """Journal the positions of settings whose evaluations were known before the search requested them."""
-        spares = [position - self._requested for key, position in self._positions.items() if self._known[key].position == SPARE]
+        spares = [position - self._requested for key, position in self._positions.items() if self._known[key].position == SPARE_POSITION]
         if spares:
             self._store(self._evaluations_of(self._settings[spares]))
 
     def _store(self, evaluations: Evaluations) -> None:
         """Journal and remember evaluations of the present request."""
         positions = [self._positions[setting.tobytes()] for setting in evaluations.settings]
-        if not self._positions_done.isdisjoint(positions):
+        if not self._known_positions.isdisjoint(positions):
             raise InputError(self._journal.path, "holds other settings than this search requests", "another --out")
         self._journal.append(positions, evaluations)
         self._remember(positions, evaluations)
 
     def _remember(self, positions: list[int], evaluations: Evaluations) -> None:
-        self._positions_done.update(position for position in positions if position != SPARE)
+        self._known_positions.update(position for position in positions if position != SPARE_POSITION)
         for row, position in enumerate(positions):
             self._known[evaluations.settings[row].tobytes()] = _KnownSetting(position, evaluations, row)
 

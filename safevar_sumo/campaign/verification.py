@@ -8,7 +8,7 @@ from concurrent.futures import Future
 import numpy as np
 
 from safevar_sumo.campaign.batcher import Batcher
-from safevar_sumo.campaign.keys import RunKey, run_generator
+from safevar_sumo.campaign.keys import RunKey, random_generator_of
 from safevar_sumo.campaign.run import Observer, Run
 from safevar_sumo.errors import UserCodeError
 from safevar_sumo.plugins import unload_user_modules
@@ -19,13 +19,14 @@ from safevar_sumo.search import Search
 from safevar_sumo.study import Study, user_code_names
 from safevar_sumo.sumo import Engine, assemble, evaluate
 from safevar_sumo.sumo.matrix import MAX_COPIES
-from safevar_sumo.workers.evaluation import packed
-from safevar_sumo.workers.identity import networks_of
+from safevar_sumo.workers.evaluation import pack_study
+from safevar_sumo.workers.identity import network_digests
 from safevar_sumo.workers.isolation import refuse_difference, refuse_unlike_sumo
 from safevar_sumo.workers.retrying import RetryingPool, reproduction_command
 
-LEGAL = ("requests that depend only on the run's problem, evaluations and `rng`: nothing kept in a class or a module between runs, no "
-         "clock, no random numbers of its own")
+EXPECTED_REQUESTS = (
+    "requests that depend only on the run's problem, evaluations and `rng`: nothing kept in a class or a module between runs, no "
+    "clock, no random numbers of its own")
 
 
 class Verification:
@@ -34,11 +35,11 @@ class Verification:
     def __init__(self, study: Study, results: ResultsDirectory, pool: RetryingPool, begin_search: Callable[[RunKey], Search],
                  engine: Engine, observer: Observer) -> None:
         self._study, self._pool, self._begin_search, self._observer = study, pool, begin_search, observer
-        self._isolated_work = packed(study, results.inputs, engine=engine, afresh=True) if user_code_names(study) else b""
-        self._is_recorded = engine is Engine.RECORDED
+        self._isolated_work = pack_study(study, results.inputs, engine=engine, afresh=True) if user_code_names(study) else b""
+        self._uses_recorded_scenes = engine is Engine.RECORDED
         self._sumo_study = study_for_sumo_check(study, assemble(study).weather)
-        inputs = results.inputs if self._sumo_study is study else {**results.inputs, "network": networks_of(assemble(self._sumo_study))}
-        self._in_sumo = Batcher(pool, packed(self._sumo_study, inputs, engine=Engine.LIBSUMO), MAX_COPIES)
+        inputs = results.inputs if self._sumo_study is study else {**results.inputs, "network": network_digests(assemble(self._sumo_study))}
+        self._sumo_batcher = Batcher(pool, pack_study(self._sumo_study, inputs, engine=Engine.LIBSUMO), MAX_COPIES)
         self._isolated_checks: dict[Future[Evaluations], tuple[Run, Evaluations]] = {}
         """By batch of one setting: the run, and the setting's evaluation in that run."""
         self._unverified: dict[Run, tuple[Evaluations, int]] = {}
@@ -47,11 +48,11 @@ class Verification:
     @property
     def under_way(self) -> list[Future[Evaluations]]:
         """Batches that are being computed."""
-        return [*self._isolated_checks, *self._in_sumo.under_way]
+        return [*self._isolated_checks, *self._sumo_batcher.under_way]
 
     def send(self) -> None:
         """Send batches for SUMO; see `Batcher.send`."""
-        self._in_sumo.send()
+        self._sumo_batcher.send()
 
     def begin(self, run: Run) -> bool:
         """Begin to verify a run; returns whether there are settings to verify.
@@ -59,41 +60,41 @@ class Verification:
         Raises
         ------
         UserCodeError
-            If the last run of a user's algorithm requests other settings when the reloaded algorithm repeats it.
+            If a reloaded user algorithm requests other settings when it repeats its last run.
         """
         self._refuse_unrepeatable(run)
-        rng = run_generator(self._study, run.key._replace(algorithm=f"recheck {run.key.algorithm}"))
-        for expected in run.samples(rng) if self._isolated_work else ():
+        rng = random_generator_of(self._study, run.key._replace(algorithm=f"recheck {run.key.algorithm}"))
+        for expected in run.sample_evaluations(rng) if self._isolated_work else ():
             self._isolated_checks[self._pool.submit(self._isolated_work, expected.settings)] = run, expected
         return self._awaits_isolated_checks(run) or self._begin_in_sumo(run)
 
     def _begin_in_sumo(self, run: Run) -> bool:
         """Begin to verify a run in SUMO; returns whether there are settings to verify."""
-        rng = run_generator(self._study, run.key._replace(algorithm=f"verify {run.key.algorithm}"))
-        expected = run.solutions_and_others(rng) if self._is_recorded else None
+        rng = random_generator_of(self._study, run.key._replace(algorithm=f"verify {run.key.algorithm}"))
+        expected = run.sample_for_sumo(rng) if self._uses_recorded_scenes else None
         if not expected:
             return False
         if self._sumo_study is not self._study:  # SUMO repeats only a few cells of a rating, so these cells need values to compare with
             expected = evaluate(assemble(self._sumo_study), expected.settings)
         self._unverified[run] = expected, len(expected)
-        self._in_sumo.add(run, expected.settings)
+        self._sumo_batcher.add(run, expected.settings)
         return True
 
     def _awaits_isolated_checks(self, run: Run) -> bool:
         """Whether single settings of a run are still under way."""
         return any(run is checked_run for checked_run, _ in self._isolated_checks.values())
 
-    def _verify(self, run: Run, in_sumo: Evaluations) -> bool:
+    def _verify(self, run: Run, sumo_evaluations: Evaluations) -> bool:
         """Compare evaluations from SUMO with those of a run; returns whether the run is verified completely."""
-        expected, number_left = self._unverified.pop(run)
+        expected, settings_left = self._unverified.pop(run)
         rows = {row.tobytes(): i for i, row in enumerate(expected.settings)}
-        refuse_unlike_sumo(self._study, expected.take([rows[row.tobytes()] for row in in_sumo.settings]), in_sumo)
-        failed = np.flatnonzero(in_sumo.failed).tolist()
-        if failed:
-            self._observer.warned(f"run {run.key}: {len(failed)} of {len(expected)} settings could not be verified in SUMO: "
-                                  f"{in_sumo.reason(failed[0])}")
-        if number_left > len(in_sumo):
-            self._unverified[run] = expected, number_left - len(in_sumo)
+        refuse_unlike_sumo(self._study, expected.take([rows[row.tobytes()] for row in sumo_evaluations.settings]), sumo_evaluations)
+        failed_rows = np.flatnonzero(sumo_evaluations.failed).tolist()
+        if failed_rows:
+            self._observer.warned(f"run {run.key}: {len(failed_rows)} of {len(expected)} settings could not be verified in SUMO: "
+                                  f"{sumo_evaluations.reason(failed_rows[0])}")
+        if settings_left > len(sumo_evaluations):
+            self._unverified[run] = expected, settings_left - len(sumo_evaluations)
         return run not in self._unverified
 
     def _refuse_unrepeatable(self, run: Run) -> None:
@@ -110,9 +111,9 @@ class Verification:
 
     def _repetition_error(self, name: str, key: RunKey) -> UserCodeError:
         problem = f"search.algorithms: {name!r} requests other settings when run {key.run} is repeated alone"
-        return UserCodeError(f"study {self._study.name!r}", problem, LEGAL)
+        return UserCodeError(f"study {self._study.name!r}", problem, EXPECTED_REQUESTS)
 
-    def take(self, batch: Future[Evaluations]) -> list[Run]:
+    def collect(self, batch: Future[Evaluations]) -> list[Run]:
         """Compare a computed batch with the runs; returns the runs whose verification it completes.
 
         Raises
@@ -120,9 +121,9 @@ class Verification:
         InputError
             If a setting has another result by itself, or in SUMO.
         """
-        if batch in self._in_sumo.under_way:
-            return [run for run, in_sumo in self._in_sumo.take(batch) if self._verify(run, in_sumo)]
+        if batch in self._sumo_batcher.under_way:
+            return [run for run, sumo_evaluations in self._sumo_batcher.collect(batch) if self._verify(run, sumo_evaluations)]
         run, expected = self._isolated_checks.pop(batch)
         command = reproduction_command(self._study, expected.settings[0])
-        refuse_difference(self._study, {f"in run {run.key}": expected, "alone": batch.result()}, command)
+        refuse_difference(self._study, str(run.key), expected, batch.result(), command)
         return [] if self._awaits_isolated_checks(run) or self._begin_in_sumo(run) else [run]

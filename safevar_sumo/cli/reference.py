@@ -25,23 +25,22 @@ from safevar_sumo.reference import (
     Effect,
     FitSubject,
     ReferenceData,
-    agreement,
     calibrate,
     calibrate_together,
-    covered_by_spread,
     effects_of,
     evaluations_of,
-    keep_totals,
+    measure_agreement,
+    measure_coverage,
     original_metrics,
     plot_agreement,
     read_reference,
+    write_totals,
 )
 from safevar_sumo.reference.conclusions import pair_cases
-from safevar_sumo.reference.effects import LEAST as LEAST_EFFECT
-from safevar_sumo.reference.effects import SHARE as EFFECT_SHARE
-from safevar_sumo.reference.fit_result import fitted_as
+from safevar_sumo.reference.effects import ABSOLUTE_TOLERANCE, RELATIVE_TOLERANCE
+from safevar_sumo.reference.fit_result import rename_fitted
 from safevar_sumo.reference.profiles import plot_profiles
-from safevar_sumo.reference.replication import Nearness, nearness, replication
+from safevar_sumo.reference.replication import Nearness, compare_with_nearest_rows, render_replication
 from safevar_sumo.results import MANIFEST, write_imported, write_whole
 from safevar_sumo.study import SAFETY_DEGREE, Study, check_writable, load_study, study_names, write_study
 from safevar_sumo.sumo.system import assemble
@@ -79,14 +78,14 @@ def validate(study: str, reference: Path, jobs: int | None, plot: Path | None, a
     data, rows = _simulated_rows(reference, data, evaluations.take(np.arange(1, len(settings))))
     if not evaluations.valid[0]:
         raise SimulationError(f"study {study!r} cannot be simulated with the original vehicle")
-    result = agreement(data, rows, loaded_study, evaluations.take([0]))
+    result = measure_agreement(data, rows, loaded_study, evaluations.take([0]))
     if plot is not None:
         plot_agreement(plot, f"{loaded_study.title}\nagainst {reference.name}", system.characteristics, data, rows,
                        loaded_study.repeatability.get(SAFETY_DEGREE))
     if totals is not None:
-        keep_totals(totals, loaded_study, reference.name, result)
+        write_totals(totals, loaded_study, reference.name, result)
     effects = effects_of(data, rows, system.characteristics) if with_effects else []
-    coverage = covered_by_spread(data, loaded_study) if with_spread else None
+    coverage = measure_coverage(data, loaded_study) if with_spread else None
     if as_json:
         by_name = {effect.name: {"reference": effect.reference, "here": effect.here, "agrees": effect.agrees} for effect in effects}
         extras = {**({"effects": by_name} if with_effects else {}), **({"spread": coverage.to_dict()} if coverage is not None else {})}
@@ -159,14 +158,14 @@ def calibrate_command(study: str, words: tuple[str, ...], trials: int | None, se
         if trials_done:
             comment = f"Best of {trials_done} of {max_trials} trials, then interrupted (seed {studies[0].fit.seed}). Loss {least_loss:.4f}."
             for item, best_study, target in zip(studies, best_studies, targets, strict=True):
-                write_study(target, fitted_as(item, best_study), comment)
+                write_study(target, rename_fitted(item, best_study), comment)
             click.echo(f"interrupted: the best of {trials_done} trials is in {', '.join(map(str, targets))}", err=True)
         raise
     if plot is not None and calibrations[0].profiles is not None:
         plot_profiles(plot, calibrations[0].profiles, studies)
     for item, calibration, references, target in zip(studies, calibrations, data, targets, strict=True):
         print_calibration(Console(), item, calibration)
-        write_study(target, fitted_as(item, calibration.study), calibration.comment(item, references, from_scratch=from_scratch))
+        write_study(target, rename_fitted(item, calibration.study), calibration.comment(item, references, from_scratch=from_scratch))
         Console().print(f"Study file: {target}", soft_wrap=True)
 
 
@@ -275,7 +274,7 @@ def replicate(directories: tuple[str, ...], published: tuple[str, ...], out: Pat
         if Path(directory).resolve() in [Path(other).resolve() for other in directories]:
             raise InputError("--published", f"{directory} is given as results too", "results that the command import has written")
     pairs = pair_cases(load_cases(directories), load_cases(published))
-    page = replication(pairs, _nearness(pairs.here, references))
+    page = render_replication(pairs, _nearness(pairs.here, references))
     if out is None:
         click.echo(page, nl=False)
     else:
@@ -296,7 +295,7 @@ def _nearness(cases: Sequence[Case], references: Sequence[str]) -> list[Nearness
             raise InputError("--reference", f"{reference} {relation} {names}", "STUDY=FILE.csv")
         for case, data in rows_by_case.items():
             rows.setdefault(case, []).append(data)
-    return [result for case in cases if case.name in rows for result in nearness(case, rows[case.name])]
+    return [result for case in cases if case.name in rows for result in compare_with_nearest_rows(case, rows[case.name])]
 
 
 def _rows_by_case(path: Path, cases: Sequence[Case]) -> dict[str, ReferenceData]:
@@ -335,7 +334,7 @@ def print_agreement(console: Console, study: Study, result: Agreement) -> None:
 
 def print_effects(console: Console, effects: Sequence[Effect]) -> None:
     """Print the effects in the reference and here, and whether they agree."""
-    title = f"Linear effects on the safety degree over a domain, m (agree: within {EFFECT_SHARE:.0%} or {LEAST_EFFECT:g} m)"
+    title = f"Linear effects on the safety degree over a domain, m (agree: within {RELATIVE_TOLERANCE:.0%} or {ABSOLUTE_TOLERANCE:g} m)"
     table = WholeTable("characteristic", right=("reference", "here", "agree"), title=title)
     for effect in effects:
         agrees = "-" if effect.agrees is None else "yes" if effect.agrees else "no"

@@ -13,7 +13,7 @@ from safevar_sumo.analysis.options import Option, Options
 from safevar_sumo.cli.arguments import NumberRange
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import FloatArray
-from safevar_sumo.results import UNKNOWN, SolutionId, chosen_handle, position_of
+from safevar_sumo.results import UNKNOWN, SolutionId, choose_handle, row_of_handle
 from safevar_sumo.study import Study
 
 if TYPE_CHECKING:
@@ -59,8 +59,8 @@ def target_of(source: str, solution: str | None, choice: str | None) -> CommandT
     case = results_or_study(source, results_only=True)
     assert not isinstance(case, Study)
     requested_handle = None if solution is None else SolutionId.parse(solution)
-    handle = requested_handle or chosen_handle(case.solutions, case.unsafe, str(choice), source)
-    row = case.solutions.iloc[position_of(case.solutions, handle)]
+    handle = requested_handle or choose_handle(case.solutions, case.unsafe, str(choice), source)
+    row = case.solutions.iloc[row_of_handle(case.solutions, handle)]
     setting = row[list(case.characteristics.names)].to_numpy(dtype=float)
     return CommandTarget(case.study, source, handle, setting, {str(name): value for name, value in row.items()})
 

@@ -2,10 +2,10 @@
 
 from safevar_sumo.analysis.parameters import with_values
 from safevar_sumo.reference.calibration import FitSubject, calibrate, calibrate_together
-from safevar_sumo.reference.effects import Coverage, Effect, covered_by_spread, effects_of
+from safevar_sumo.reference.effects import Coverage, Effect, effects_of, measure_coverage
 from safevar_sumo.reference.fit_result import Calibration
 from safevar_sumo.reference.rows import ReferenceData, evaluations_of, original_metrics, package_filter, read_reference
-from safevar_sumo.reference.validation import Agreement, Totals, agreement, keep_totals, plot_agreement, quoted
+from safevar_sumo.reference.validation import Agreement, Totals, measure_agreement, plot_agreement, shipped_totals_of, write_totals
 
 __all__ = [
     "Agreement",
@@ -15,17 +15,17 @@ __all__ = [
     "FitSubject",
     "ReferenceData",
     "Totals",
-    "agreement",
     "calibrate",
     "calibrate_together",
-    "covered_by_spread",
     "effects_of",
     "evaluations_of",
-    "keep_totals",
+    "measure_agreement",
+    "measure_coverage",
     "original_metrics",
     "package_filter",
     "plot_agreement",
-    "quoted",
     "read_reference",
+    "shipped_totals_of",
     "with_values",
+    "write_totals",
 ]

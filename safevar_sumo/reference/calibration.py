@@ -14,13 +14,13 @@ from safevar_sumo.analysis.parameters import value_of, with_values
 from safevar_sumo.errors import InputError, SimulationError
 from safevar_sumo.reference.effects import error_beyond_spread
 from safevar_sumo.reference.fit_result import Calibration
-from safevar_sumo.reference.fit_space import FitSpace, FittedStudy
+from safevar_sumo.reference.fit_space import FitSpace, StudyFit
 from safevar_sumo.reference.loss import MAX_LOSS
 from safevar_sumo.reference.parameters import FittedParameter, free_parameters
 from safevar_sumo.reference.profiles import Profiles
 from safevar_sumo.reference.rows import COLUMNS, ReferenceData
-from safevar_sumo.reference.search import StudyGroup, TrialSearch
-from safevar_sumo.reference.validation import Agreement, agreement
+from safevar_sumo.reference.search import SearchRace, StudyGroup
+from safevar_sumo.reference.validation import Agreement, measure_agreement
 from safevar_sumo.study import SAFETY_DEGREE, Study
 from safevar_sumo.vehicles import CharacteristicSet
 from safevar_sumo.workers.batches import evaluate_all
@@ -60,7 +60,7 @@ def calibrate_together(subjects: Sequence[FitSubject], pool: Pool, done: Callabl
     done
         Called after every trial with the lowest loss so far, and the studies with this loss.
     from_scratch
-        Start only at random places, and ignore the values that the studies give to the free parameters.
+        Whether to start only at random places, without the values that the studies give to the free parameters.
 
     Raises
     ------
@@ -73,7 +73,7 @@ def calibrate_together(subjects: Sequence[FitSubject], pool: Pool, done: Callabl
     if not any(study.calibration for study in studies):
         raise InputError(studies[0].source, "has no table [calibration]", "the free parameters with bounds, unit and meaning")
     for subject in subjects:
-        _check(subject)
+        _check_subject(subject)
     fit, parameters = studies[0].fit, free_parameters(studies)
     if from_scratch and not fit.starts:
         raise InputError(studies[0].source, "fit.starts = 0", "at least 1 for a fit from scratch")
@@ -82,30 +82,30 @@ def calibrate_together(subjects: Sequence[FitSubject], pool: Pool, done: Callabl
         is_test = {name: np.arange(len(data.settings)) % study.fit.hold_out == study.fit.hold_out - 1 for name, data in references.items()}
         fit_data.append({name: data.take(~is_test[name]) for name, data in references.items()})
         test_data.append({name: data.take(is_test[name]) for name, data in references.items()})
-    start, trials, rng = studies, fit.trials, np.random.default_rng(fit.seed)
+    start_studies, trials, rng = studies, fit.trials, np.random.default_rng(fit.seed)
     if has_stages := from_scratch and (len(studies) > 1 or fit.thinning > 1):
-        start, trials = _fit_in_stages(subjects, parameters, fit_data, pool, rng, done)
-    space = FitSpace(parameters, [FittedStudy(study, data, pool) for study, data in zip(start, fit_data, strict=True)])
-    search = TrialSearch(space, fit.population, trials, done, fit.alike)
-    if not from_scratch and search.try_studies([studies])[0] >= MAX_LOSS:
+        start_studies, trials = _fit_in_stages(subjects, parameters, fit_data, pool, rng, done)
+    space = FitSpace(parameters, [StudyFit(study, data, pool) for study, data in zip(start_studies, fit_data, strict=True)])
+    race = SearchRace(space, fit.population, trials, done, fit.alike)
+    if not from_scratch and race.try_studies([studies])[0] >= MAX_LOSS:
         names = " and ".join(f"study {study.name!r}" for study in studies)
         raise SimulationError(f"{names} cannot be simulated with {'its' if len(studies) == 1 else 'their'} own values")
-    searches = [] if has_stages else search.from_random_places(_first_indices(parameters), fit.starts, fit.screened, fit.width, rng)
+    searches = [] if has_stages else race.begin_at_random_places(_first_indices(parameters), fit.starts, fit.screened, fit.width, rng)
     if has_stages or not from_scratch:
         population = _refining_population(fit.population, len(parameters))
-        searches.append(search.begin(space.shares(start), START_DEVIATION, fit.seed + 1, population))
-    search.race(searches)
-    assert search.best is not None, "there is at least one trial"
-    lowest_losses, results = [run.lowest for run in searches if run.lowest < np.inf], []
-    profiles = Profiles.of(parameters, space, search, space.shares(search.best))
-    for k, best in enumerate(search.best):
+        searches.append(race.begin(space.place_of(start_studies), START_DEVIATION, fit.seed + 1, population))
+    race.run(searches)
+    assert race.best is not None, "there is at least one trial"
+    lowest_losses, results = [search.lowest for search in searches if search.lowest < np.inf], []
+    profiles = Profiles.of(parameters, space, race, space.place_of(race.best))
+    for k, best_study in enumerate(race.best):
         study_parameters = [parameter for parameter in parameters if k in parameter.studies]
-        best = msgspec.structs.replace(best, spread=profiles.spread(k))
+        best = msgspec.structs.replace(best_study, spread=profiles.spread(k))
         error = {SAFETY_DEGREE: round(error_beyond_spread(best, fit_data[k]), ERROR_DECIMALS)} if fit_data[k] else {}
         best = msgspec.structs.replace(best, model_error=error)
         results.append(Calibration(
-            {parameter.key: value_of(best, parameter.key) for parameter in study_parameters}, best, search.loss, lowest_losses,
-            _agreements(best, fit_data[k], pool), _agreements(best, test_data[k], pool),
+            {parameter.key: value_of(best, parameter.key) for parameter in study_parameters}, best, race.loss, lowest_losses,
+            _measure_agreements(best, fit_data[k], pool), _measure_agreements(best, test_data[k], pool),
             {parameter.key: parameter.bounds for parameter in study_parameters}, fit,
             tuple(study.name for study in studies if study is not studies[k]),
             frozenset(parameter.key for parameter in study_parameters if len(parameter.studies) > 1),
@@ -119,7 +119,7 @@ def _refining_population(population: int, parameters: int) -> int:
 
 
 def _first_indices(parameters: Sequence[FittedParameter]) -> list[int]:
-    """For each parameter, the index of the first parameter with the same key, as both describe one model and start at one value."""
+    """For each parameter, the index of the first parameter with the same key: parameters with one key start at the same place."""
     keys = [parameter.key for parameter in parameters]
     return [keys.index(key) for key in keys]
 
@@ -137,11 +137,11 @@ def _fit_in_stages(subjects: Sequence[FitSubject], parameters: Sequence[FittedPa
         trials = fit.trials * percentage // 100
         if stage_parameters and trials:
             thinned_data = [{name: _thin(data, fit.thinning) for name, data in fit_data[k].items()} for k in indices]
-            space = FitSpace(stage_parameters, [FittedStudy(studies[k], data, pool) for k, data in zip(indices, thinned_data, strict=True)])
-            search = TrialSearch(space, fit.population, trials, partial(_report_on_stage, done, studies, indices))
-            search.race(search.from_random_places(_first_indices(stage_parameters), fit.starts, fit.screened, fit.width, rng))
-            assert search.best is not None, "there is at least one trial"
-            studies, trials_left = _with_replacements(studies, indices, search.best), trials_left - trials
+            space = FitSpace(stage_parameters, [StudyFit(studies[k], data, pool) for k, data in zip(indices, thinned_data, strict=True)])
+            race = SearchRace(space, fit.population, trials, partial(_report_on_stage, done, studies, indices))
+            race.run(race.begin_at_random_places(_first_indices(stage_parameters), fit.starts, fit.screened, fit.width, rng))
+            assert race.best is not None, "there is at least one trial"
+            studies, trials_left = _with_replacements(studies, indices, race.best), trials_left - trials
             values = [(parameter, value_of(studies[0], parameter.key)) for parameter in parameters if 0 in parameter.studies]
             studies = tuple(with_values(study, {parameter.key: value for parameter, value in values if k in parameter.studies})
                             for k, study in enumerate(studies))
@@ -165,7 +165,7 @@ def _thin(data: ReferenceData, thinning: int) -> ReferenceData:
     return data.take(rows)
 
 
-def _check(subject: FitSubject) -> None:
+def _check_subject(subject: FitSubject) -> None:
     source = subject.study.source
     if not subject.references and not subject.study.published:
         raise InputError(source, "has no table [published] and there is no reference file", "something to fit to")
@@ -174,11 +174,11 @@ def _check(subject: FitSubject) -> None:
             raise InputError(source, f"fit.weights.{name} is no metric of the reference", f"some of {', '.join(COLUMNS)}")
 
 
-def _agreements(study: Study, references: Mapping[str, ReferenceData], pool: Pool) -> dict[str, Agreement]:
+def _measure_agreements(study: Study, references: Mapping[str, ReferenceData], pool: Pool) -> dict[str, Agreement]:
     characteristics = CharacteristicSet.of(study.vehicle.characteristics)
     agreements = {}
     for name, data in references.items():
         evaluations = evaluate_all(study, np.concatenate([characteristics.original[np.newaxis], data.settings]), pool)
         simulated_rows = evaluations.take(np.arange(1, len(evaluations)))
-        agreements[name] = agreement(data, simulated_rows, study, evaluations.take([0]))
+        agreements[name] = measure_agreement(data, simulated_rows, study, evaluations.take([0]))
     return agreements

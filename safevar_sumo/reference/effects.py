@@ -1,4 +1,4 @@
-"""Effects of characteristics on the safety degree, in a reference and here; and the rows within the uncertainty of the model."""
+"""Effects of characteristics on the safety degree, in a reference and here; and the share of rows within the model's uncertainty."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from safevar_sumo.reference.rows import ReferenceData
 from safevar_sumo.study import SAFETY_DEGREE, Study
 from safevar_sumo.vehicles import CharacteristicSet
 
-SHARE, LEAST = 0.2, 0.1
-"""Two effects agree if they differ by at most `SHARE` of the published effect, or by at most `LEAST` metres."""
-ROWS_EACH = 10
+RELATIVE_TOLERANCE, ABSOLUTE_TOLERANCE = 0.2, 0.1
+"""Two effects agree if they differ by at most `RELATIVE_TOLERANCE` of the published effect, or by at most `ABSOLUTE_TOLERANCE` metres."""
+ROWS_PER_COEFFICIENT = 10
 """Minimum number of rows for each coefficient of a regression."""
 
 
@@ -32,49 +32,49 @@ class Effect(NamedTuple):
         """Whether the effect here agrees with the published effect; None if one of them is undefined."""
         if self.reference is None or self.here is None:
             return None
-        return abs(self.here - self.reference) <= max(LEAST, SHARE * abs(self.reference))
+        return abs(self.here - self.reference) <= max(ABSOLUTE_TOLERANCE, RELATIVE_TOLERANCE * abs(self.reference))
 
 
 class Regression(NamedTuple):
-    """Linear regression on all n characteristics, for fixed settings and any values of them.
+    """Linear regression of any values on all n characteristics of fixed settings.
 
     `shares` are the changes of the settings as shares of the domains, shape (rows, n). `varies` is true for the k characteristics that
-    the settings vary, shape (n,). `slopes_of` maps values to k slopes, shape (k, rows); None for too few rows.
+    the settings vary, shape (n,). `slope_matrix`, shape (k, rows), times the values gives the k slopes; None for too few rows.
     """
 
     shares: FloatArray
     varies: BoolArray
-    slopes_of: FloatArray | None
+    slope_matrix: FloatArray | None
 
     @classmethod
     def over(cls, settings: FloatArray, characteristics: CharacteristicSet) -> Regression:
         """The regression for settings, shape (rows, n)."""
-        return cls._on((settings - characteristics.original) / (characteristics.upper - characteristics.lower))
+        return cls._of_shares((settings - characteristics.original) / (characteristics.upper - characteristics.lower))
 
     @classmethod
-    def _on(cls, shares: FloatArray) -> Regression:
+    def _of_shares(cls, shares: FloatArray) -> Regression:
         varies = np.asarray(np.ptp(shares, axis=0) > 0) if len(shares) else np.zeros(shares.shape[1], dtype=bool)
         design = np.column_stack([np.ones(len(shares)), shares[:, varies]])
-        has_enough_rows = len(shares) >= ROWS_EACH * design.shape[1]
+        has_enough_rows = len(shares) >= ROWS_PER_COEFFICIENT * design.shape[1]
         return cls(shares, varies, np.linalg.pinv(design)[1:] if has_enough_rows else None)
 
     def effects(self, values: FloatArray) -> FloatArray:
         """Change of `values`, shape (rows,), over each whole domain, shape (n,), in their unit; NaN if undefined."""
         defined = np.isfinite(values)
         if not defined.all():
-            return Regression._on(self.shares[defined]).effects(values[defined])
+            return Regression._of_shares(self.shares[defined]).effects(values[defined])
         effects = np.full(len(self.varies), np.nan)
-        if self.slopes_of is not None:
-            effects[self.varies] = self.slopes_of @ values
+        if self.slope_matrix is not None:
+            effects[self.varies] = self.slope_matrix @ values
         return effects
 
 
 def effects_of(data: ReferenceData, evaluations: Evaluations, characteristics: CharacteristicSet) -> list[Effect]:
-    """The effects of all characteristics, in the order of the study."""
+    """The effects of all characteristics on the safety degree, in the order of the study."""
     regression = Regression.over(data.settings, characteristics)
-    effect_columns = (regression.effects(values) for values in (data.metrics[SAFETY_DEGREE], evaluations.f_safe))
+    effects_of_sides = (regression.effects(values) for values in (data.metrics[SAFETY_DEGREE], evaluations.f_safe))
     return [Effect(name, *(finite_or_none(value) for value in pair))
-            for name, *pair in zip(characteristics.names, *effect_columns, strict=True)]
+            for name, *pair in zip(characteristics.names, *effects_of_sides, strict=True)]
 
 
 class Coverage(NamedTuple):
@@ -102,8 +102,8 @@ class Coverage(NamedTuple):
                 f"{self.needed:.2f} m more on each side would cover {BAND_SHARE:.0%} of the latter.")
 
 
-def covered_by_spread(data: ReferenceData, study: Study) -> Coverage:
-    """The share of published rows within the band of the model's uncertainty.
+def measure_coverage(data: ReferenceData, study: Study) -> Coverage:
+    """Measure how many published rows lie within the band of the model's uncertainty.
 
     Raises
     ------
@@ -113,14 +113,14 @@ def covered_by_spread(data: ReferenceData, study: Study) -> Coverage:
     evaluations = evaluate_sets(study, data.settings)
     lower, upper = band_of(study, evaluations)
     published = data.metrics[SAFETY_DEGREE]
-    distances = _outside(published, lower, upper)
+    distances = _distance_from_band(published, lower, upper)
     held_back = np.arange(len(published)) % study.fit.hold_out == study.fit.hold_out - 1
     rows = held_back if held_back.any() else np.ones(len(published), dtype=bool)
     return Coverage(len(evaluations), len(published), float(np.mean(distances == 0)), float(np.mean(distances[rows] == 0)),
                     float(np.median(upper - lower)), float(np.quantile(distances[rows], BAND_SHARE)))
 
 
-def _outside(values: FloatArray, lower: FloatArray, upper: FloatArray) -> FloatArray:
+def _distance_from_band(values: FloatArray, lower: FloatArray, upper: FloatArray) -> FloatArray:
     """Distance of values from a band; 0 inside the band."""
     return np.asarray(np.maximum(np.maximum(lower - values, values - upper), 0.0))
 
@@ -138,7 +138,7 @@ def error_beyond_spread(study: Study, references: Mapping[str, ReferenceData]) -
         is_usable = (distances > 0) & np.isfinite(published)
         if is_usable.any():
             lower, upper = band_of(study_without_error, evaluate_sets(study_without_error, data.settings[is_usable]))
-            scores.append(_outside(published[is_usable], lower, upper) / distances[is_usable])
+            scores.append(_distance_from_band(published[is_usable], lower, upper) / distances[is_usable])
             weights.append(np.full(len(scores[-1]), 1 / len(scores[-1])))
     if not scores:
         return 0.0

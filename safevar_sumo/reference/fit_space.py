@@ -19,15 +19,15 @@ from safevar_sumo.sumo import Engine, settings_per_batch
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet
 from safevar_sumo.workers.batches import inputs_of
-from safevar_sumo.workers.evaluation import Pool, packed
-from safevar_sumo.workers.interrupts import awaited
+from safevar_sumo.workers.evaluation import Pool, pack_study
+from safevar_sumo.workers.interrupts import wait_for_result
 from safevar_sumo.workers.retrying import RetryingPool
 
 
 class FitSpace:
-    """Maps places in the unit cube of the bounds to studies with the parameter values of the place, and to their losses."""
+    """The unit cube of the parameters' bounds: a place in it determines the parameters' values, hence the studies and their loss."""
 
-    def __init__(self, parameters: Sequence[FittedParameter], fits: Sequence[FittedStudy]) -> None:
+    def __init__(self, parameters: Sequence[FittedParameter], fits: Sequence[StudyFit]) -> None:
         self._parameters, self._fits = parameters, fits
         self._lower, self._upper = np.array([(parameter.bounds.lower, parameter.bounds.upper) for parameter in parameters]).T
         self._log = np.array([parameter.bounds.log for parameter in parameters])
@@ -36,31 +36,33 @@ class FitSpace:
     def _scaled(self, values: FloatArray) -> FloatArray:
         return np.log(values, out=values.copy(), where=self._log)
 
-    def values(self, shares: FloatArray) -> FloatArray:
-        """Values at places in the unit cube of the bounds, shape (..., parameters)."""
-        scaled = self._start + np.asarray(shares) * self._width
+    def values(self, places: FloatArray) -> FloatArray:
+        """The parameters' values at places, both of shape (..., parameters)."""
+        scaled = self._start + np.asarray(places) * self._width
         return np.asarray(np.clip(np.exp(scaled, out=scaled.copy(), where=self._log), self._lower, self._upper))
 
-    def at(self, shares: FloatArray) -> StudyGroup:
-        """The studies at a place in the unit cube of the bounds."""
-        values = self.values(shares).tolist()
+    def studies_at(self, place: FloatArray) -> StudyGroup:
+        """The studies with the parameters' values at a place."""
+        values = self.values(place).tolist()
         return tuple(
             with_values(fit.study, {parameter.key: value for parameter, value in zip(self._parameters, values, strict=True)
                                     if k in parameter.studies})
             for k, fit in enumerate(self._fits))
 
-    def shares(self, studies: StudyGroup) -> FloatArray:
-        """The place of studies in the unit cube of the bounds."""
+    def place_of(self, studies: StudyGroup) -> FloatArray:
+        """The place at which the parameters have the values of the studies."""
         values = np.array([value_of(studies[parameter.studies[0]], parameter.key) for parameter in self._parameters])
         return np.asarray(np.clip((self._scaled(values) - self._start) / self._width, 0, 1))
 
-    def losses(self, studies: Sequence[StudyGroup]) -> list[float]:
-        futures = [[fit.submit(study) for fit, study in zip(self._fits, group, strict=True)] for group in studies]
-        return [float(np.mean([fit.loss(parts) for fit, parts in zip(self._fits, batches, strict=True)])) for batches in futures]
+    def losses(self, groups: Sequence[StudyGroup]) -> list[float]:
+        """The mean loss of the studies of each group."""
+        futures_of_groups = [[fit.submit(study) for fit, study in zip(self._fits, group, strict=True)] for group in groups]
+        return [float(np.mean([fit.loss(futures) for fit, futures in zip(self._fits, futures_of_studies, strict=True)]))
+                for futures_of_studies in futures_of_groups]
 
 
-class FittedStudy:
-    """A study to fit, the data to fit it to, and the pool that simulates it."""
+class StudyFit:
+    """A study with the data that it is fitted to, and the pool that simulates it."""
 
     def __init__(self, study: Study, references: Mapping[str, ReferenceData], pool: Pool) -> None:
         self.study = study
@@ -70,20 +72,22 @@ class FittedStudy:
         settings = [self._characteristics.original[np.newaxis], *(data.settings for data in references.values())]
         self._settings, self._row_of = np.unique(np.concatenate(settings), axis=0, return_inverse=True)
         batches = max(1, round(len(self._settings) / settings_per_batch(assemble(study), Engine.RECORDED)))  # larger batches cost less
-        self._size = math.ceil(len(self._settings) / batches)
+        self._batch_size = math.ceil(len(self._settings) / batches)
 
     def submit(self, study: Study) -> list[Future[Evaluations]]:
-        work, size = packed(study, self._inputs), self._size
+        """Begin to simulate the study, which may have other parameter values; returns a future for each batch of settings."""
+        work, size = pack_study(study, self._inputs), self._batch_size
         return [self._pool.submit(work, self._settings[start:start + size]) for start in range(0, len(self._settings), size)]
 
-    def loss(self, parts: Sequence[Future[Evaluations]]) -> float:
-        distinct_evaluations = Evaluations.concatenate([awaited(part) for part in parts])
+    def loss(self, futures: Sequence[Future[Evaluations]]) -> float:
+        """The loss, from the futures of all batches."""
+        distinct_evaluations = Evaluations.concatenate([wait_for_result(future) for future in futures])
         if not distinct_evaluations.valid.all():
             return MAX_LOSS
         evaluations = distinct_evaluations.take(self._row_of.ravel())
         loss = original_loss(evaluations.take([0]), self.study.published, self.study.fit)
-        row = 1
-        for rows, reference_loss in self._references:
-            loss += reference_loss.of(evaluations.take(np.arange(row, row + rows))) / len(self._references)
-            row += rows
+        first_row = 1
+        for row_count, reference_loss in self._references:
+            loss += reference_loss.of(evaluations.take(np.arange(first_row, first_row + row_count))) / len(self._references)
+            first_row += row_count
         return loss

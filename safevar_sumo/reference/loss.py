@@ -10,7 +10,7 @@ from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import Evaluations
 from safevar_sumo.reference.effects import Regression
 from safevar_sumo.reference.rows import ReferenceData
-from safevar_sumo.reference.validation import agreement
+from safevar_sumo.reference.validation import measure_agreement
 from safevar_sumo.study import SAFETY_DEGREE, FitTable, Study
 from safevar_sumo.vehicles import CharacteristicSet
 
@@ -57,7 +57,7 @@ class ReferenceLoss:
     def of(self, evaluations: Evaluations) -> float:
         """The loss, from evaluations of the settings of the reference."""
         fit, loss = self._study.fit, 0.0
-        result = agreement(self._data, evaluations, self._study, original=evaluations)  # no result of the original is read below
+        result = measure_agreement(self._data, evaluations, self._study, original=evaluations)  # no result of the original is read below
         for name, unit in self._units.items():
             rho, error = result.spearman[name], result.mean_absolute_error[name]
             loss += fit.weights[name] * (fit.rank * (1 - (rho or 0.0)) + (np.inf if error is None else error) / unit)

@@ -44,7 +44,7 @@ def free_parameters(studies: Sequence[Study]) -> list[FittedParameter]:
                 legal = f"a value in its bounds, [{bounds.lower:g}, {bounds.upper:g}]"
                 raise InputError(study.source, f"{key} = {value}", legal)
             check_bounds(study, key, bounds)
-            sharers = (k for k, sharer in enumerate(studies) if k > index and not bounds.own and _is_shared_by(sharer, key, value))
+            sharers = (k for k, other in enumerate(studies) if k > index and not bounds.own and _is_shared_by(other, key, value))
             parameters.append(FittedParameter(key, (index, *sharers), bounds))
     return parameters
 
@@ -61,14 +61,14 @@ def _is_shared_by(study: Study, key: str, value: float) -> bool:
 
 
 def check_bounds(study: Study, name: str, bounds: FreeParameter) -> None:
-    """Refuse bounds whose ends the models do not accept: the search may try both ends."""
+    """Refuse bounds if the models do not accept a value at one of their ends: the search may try both ends."""
     if bounds.log and bounds.lower <= 0:
         raise InputError(study.source, f"calibration.{name!r} has log = true and lower = {bounds.lower:g}",
                          "a lower bound above 0")
-    for side in ("lower", "upper"):
-        bound = getattr(bounds, side)
+    for end in ("lower", "upper"):
+        bound = getattr(bounds, end)
         try:
             models_of(with_values(study, {name: bound}), name)
         except InputError as error:
             legal = error.legal or error.problem
-            raise InputError(study.source, f"calibration.{name!r}.{side} = {bound:g}", legal) from None
+            raise InputError(study.source, f"calibration.{name!r}.{end} = {bound:g}", legal) from None

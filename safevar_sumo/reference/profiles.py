@@ -11,19 +11,19 @@ import numpy as np
 from safevar_sumo.analysis.figures import save
 from safevar_sumo.records import FloatArray
 from safevar_sumo.reference.parameters import FittedParameter
-from safevar_sumo.reference.search import TrialSearch
+from safevar_sumo.reference.search import SearchRace
 from safevar_sumo.study import Study
 
-SETS = 20
+MAX_SETS = 20
 """Maximum number of parameter sets in a table [spread], including the best set."""
-DIGITS = 6
+SIGNIFICANT_DIGITS = 6
 """Significant digits of values in a table [spread]."""
 
 
 class ParameterSpace(Protocol):
     """Maps places in the unit cube of the parameters' bounds to values."""
 
-    def values(self, shares: FloatArray) -> FloatArray: ...
+    def values(self, places: FloatArray) -> FloatArray: ...
 
 
 class Profiles(NamedTuple):
@@ -36,7 +36,7 @@ class Profiles(NamedTuple):
     losses, values
         Losses of the K trials, shape (K,), and their parameter values, shape (K, parameters). The best trial comes first.
     sets
-        Indices of up to `SETS` trials that fit as well as the best and lie as far apart as possible. The best trial comes first.
+        Indices of up to `MAX_SETS` trials that fit as well as the best and lie as far apart as possible. The best trial comes first.
     limit
         The loss up to which a trial fits as well as the best.
     """
@@ -48,17 +48,17 @@ class Profiles(NamedTuple):
     limit: float
 
     @classmethod
-    def of(cls, parameters: Sequence[FittedParameter], bounds: ParameterSpace, search: TrialSearch, best: FloatArray) -> Profiles:
-        """The profiles of a finished search with its best trial at the place `best`."""
-        limit = search.loss * (1 + search.alike)
-        trials = sorted((trial for trial in search.kept if search.loss < trial[0]), key=lambda trial: trial[0])
-        losses = np.array([search.loss, *(loss for loss, _ in trials)])
-        shares = np.array([best, *(share for _, share in trials)])
-        return cls(parameters, losses, bounds.values(shares), _distant_rows(shares[losses <= limit]), limit)
+    def of(cls, parameters: Sequence[FittedParameter], space: ParameterSpace, race: SearchRace, best_place: FloatArray) -> Profiles:
+        """The profiles of a finished race, whose best trial was at `best_place`."""
+        limit = race.loss * (1 + race.alike)
+        trials = sorted((trial for trial in race.kept if race.loss < trial.loss), key=lambda trial: trial.loss)
+        losses = np.array([race.loss, *(trial.loss for trial in trials)])
+        places = np.array([best_place, *(trial.place for trial in trials)])
+        return cls(parameters, losses, space.values(places), _distant_trials(places[losses <= limit]), limit)
 
     def spread(self, study: int) -> dict[str, list[float]]:
         """Values of each parameter of the study with this index, one for each of the `sets`: the table [spread]."""
-        return {parameter.key: [float(f"{value:.{DIGITS}g}") for value in self.values[self.sets, k]]
+        return {parameter.key: [float(f"{value:.{SIGNIFICANT_DIGITS}g}") for value in self.values[self.sets, k]]
                 for k, parameter in enumerate(self.parameters) if study in parameter.studies}
 
     def interval(self, k: int) -> tuple[float, float]:
@@ -67,14 +67,14 @@ class Profiles(NamedTuple):
         return float(values.min()), float(values.max())
 
 
-def _distant_rows(shares: FloatArray) -> list[int]:
+def _distant_trials(places: FloatArray) -> list[int]:
     """Indices of trials that lie as far apart as possible, from the first trial on (farthest-point sampling)."""
-    rows = [0]
-    distances = np.linalg.norm(shares - shares[0], axis=1)
-    while len(rows) < min(SETS, len(shares)) and distances.max() > 0:
-        rows.append(int(np.argmax(distances)))
-        distances = np.minimum(distances, np.linalg.norm(shares - shares[rows[-1]], axis=1))
-    return rows
+    indices = [0]
+    distances = np.linalg.norm(places - places[0], axis=1)
+    while len(indices) < min(MAX_SETS, len(places)) and distances.max() > 0:
+        indices.append(int(np.argmax(distances)))
+        distances = np.minimum(distances, np.linalg.norm(places - places[indices[-1]], axis=1))
+    return indices
 
 
 def plot_profiles(path: Path, profiles: Profiles, studies: Sequence[Study]) -> None:

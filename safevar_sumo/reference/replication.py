@@ -13,18 +13,19 @@ import scipy
 from safevar_sumo.analysis.research_questions.case import NSGA2, Case, collided
 from safevar_sumo.records import FloatArray
 from safevar_sumo.reference.conclusions import (
+    COMPARED_SIDES,
     DIFFERS,
-    DIRECTION,
     HERE,
     HOLDS,
-    OPEN,
+    IN_DIRECTION,
     PUBLISHED,
     RULES,
+    UNDECIDED,
     ComparedTable,
     Conclusion,
     Pairs,
-    compared_tables,
-    conclusions,
+    compare_tables,
+    draw_conclusions,
 )
 from safevar_sumo.reference.rows import ReferenceData
 from safevar_sumo.study import SAFETY_DEGREE
@@ -52,30 +53,30 @@ class Nearness(NamedTuple):
     also_collide: float | None
 
 
-def nearness(case: Case, references: Sequence[ReferenceData]) -> list[Nearness]:
+def compare_with_nearest_rows(case: Case, references: Sequence[ReferenceData]) -> list[Nearness]:
     """Compare the solutions of each algorithm with the nearest rows of the references, which must be data of the same vehicle."""
     domains = case.characteristics
     width = domains.upper - domains.lower
     scaled_rows = np.concatenate([data.settings for data in references]) / width
     safety = np.concatenate([data.metrics[SAFETY_DEGREE] for data in references])
-    tree, number = scipy.spatial.cKDTree(scaled_rows), min(NEIGHBOURS, len(scaled_rows))
-    published_distances = tree.query(scaled_rows, number + 1)[0][:, 1:] if len(scaled_rows) > number else np.full((1, 1), np.nan)
+    tree, count = scipy.spatial.cKDTree(scaled_rows), min(NEIGHBOURS, len(scaled_rows))
+    published_distances = tree.query(scaled_rows, count + 1)[0][:, 1:] if len(scaled_rows) > count else np.full((1, 1), np.nan)
     results = []
     for algorithm in case.algorithms:
         solutions = case.solutions_of(algorithm)
         if solutions.empty:
             continue
         scaled_solutions: FloatArray = solutions[list(domains.names)].to_numpy(dtype=float) / width
-        distance, nearest = (np.reshape(part, (len(scaled_solutions), number)) for part in tree.query(scaled_solutions, number))
+        distances, nearest_rows = (np.reshape(array, (len(scaled_solutions), count)) for array in tree.query(scaled_solutions, count))
         is_collision = collided(solutions).to_numpy()
         results.append(Nearness(
-            case.name, algorithm, len(solutions), float(np.median(distance)), float(np.median(published_distances)),
-            float(np.nanmean(solutions[SAFETY_DEGREE])), float(safety[nearest].mean()), int(is_collision.sum()),
-            float((safety[nearest[is_collision]] <= 0).mean()) if is_collision.any() else None))
+            case.name, algorithm, len(solutions), float(np.median(distances)), float(np.median(published_distances)),
+            float(np.nanmean(solutions[SAFETY_DEGREE])), float(safety[nearest_rows].mean()), int(is_collision.sum()),
+            float((safety[nearest_rows[is_collision]] <= 0).mean()) if is_collision.any() else None))
     return results
 
 
-COUNTED = {HOLDS: "hold", DIRECTION: "hold in direction", DIFFERS: "differ", OPEN: "cannot be decided"}
+VERDICT_PLURALS = {HOLDS: "hold", IN_DIRECTION: "hold in direction", DIFFERS: "differ", UNDECIDED: "cannot be decided"}
 TITLES = {
     "rq1": "RQ1: solutions against the original vehicle", "rq2": "RQ2: NSGA-II against the others",
     "rq3.1": "RQ3.1: how many characteristics are changed [% of the critical solutions]",
@@ -84,23 +85,22 @@ TITLES = {
     "weather": "One weather against another"}
 
 
-
-def replication(pairs: Pairs, comparisons: Sequence[Nearness]) -> str:
+def render_replication(pairs: Pairs, comparisons: Sequence[Nearness]) -> str:
     """The page, as Markdown."""
-    tables = compared_tables(pairs)
-    verdicts = conclusions(tables)
-    parts = [_head(pairs, verdicts), _conclusions(verdicts)]
+    tables = compare_tables(pairs)
+    conclusions = draw_conclusions(tables)
+    sections = [_render_head(pairs, conclusions), _render_conclusions(conclusions)]
     if comparisons:
-        parts.append(_nearest_rows(comparisons))
-    return "\n".join([*parts, "## Cell beside cell\n", *(_side_by_side(table) for table in tables)])
+        sections.append(_render_nearest_rows(comparisons))
+    return "\n".join([*sections, "## Cell beside cell\n", *(_render_table(table) for table in tables)])
 
 
-def _head(pairs: Pairs, verdicts: Sequence[Conclusion]) -> str:
-    counts = Counter(conclusion.verdict for conclusion in verdicts)
-    summary = ", ".join(f"{counts[verdict]} {words}" for verdict, words in COUNTED.items())
-    lines = ["# Does the published study replicate?", "", f"Of {len(verdicts)} conclusions: {summary}.", ""]
+def _render_head(pairs: Pairs, conclusions: Sequence[Conclusion]) -> str:
+    counts = Counter(conclusion.verdict for conclusion in conclusions)
+    summary = ", ".join(f"{counts[verdict]} {words}" for verdict, words in VERDICT_PLURALS.items())
+    lines = ["# Does the published study replicate?", "", f"Of {len(conclusions)} conclusions: {summary}.", ""]
     for case, published_case in zip(pairs.here, pairs.published, strict=True):
-        sizes = f"{_solutions(case.solutions)} here, {_solutions(published_case.solutions)} published"
+        sizes = f"{_count_solutions(case.solutions)} here, {_count_solutions(published_case.solutions)} published"
         lines.append(f"- {case.study.title} ({case.study.name}): {sizes}.")
     lines += [f"- {name}: results here, none published given." for name in pairs.only_here]
     lines += [f"- {name}: published results given, none here." for name in pairs.only_published]
@@ -113,45 +113,46 @@ def _head(pairs: Pairs, verdicts: Sequence[Conclusion]) -> str:
     return "\n".join([*lines, ""])
 
 
-def _solutions(frame: pd.DataFrame) -> str:
+def _count_solutions(frame: pd.DataFrame) -> str:
     return " + ".join(f"{number} of {name}" for name, number in frame["algorithm"].value_counts(sort=False).items()) or "no solution"
 
 
-def _conclusions(verdicts: Sequence[Conclusion]) -> str:
-    rows = [(question, setting, words, f"*{verdict}*", why) for question, setting, words, verdict, why in verdicts]
+def _render_conclusions(conclusions: Sequence[Conclusion]) -> str:
+    rows = [(*conclusion[:3], f"*{conclusion.verdict}*", conclusion.evidence) for conclusion in conclusions]
     return "\n".join(["## Conclusions", "", "Conclusions of the published results, and whether they hold here. The rules:", "",
                       *(f"- {rule}" for rule in RULES), "",
-                      _markdown(("question", "setting", "published conclusion", "here", "why"), rows), ""])
+                      _markdown_table(("question", "setting", "published conclusion", "here", "why"), rows), ""])
 
 
-def _nearest_rows(comparisons: Sequence[Nearness]) -> str:
+def _render_nearest_rows(comparisons: Sequence[Nearness]) -> str:
     rows = [(*values, None if also_collide is None else 100 * also_collide) for *values, also_collide in comparisons]
-    heads = ("setting", "algorithm", "solutions", "distance to published rows", "distance among published rows", "mean SD here",
+    headings = ("setting", "algorithm", "solutions", "distance to published rows", "distance among published rows", "mean SD here",
              "mean SD published", "collisions here", "published rows next to them that collide [%]")
     return "\n".join([
         "## Does the search exploit the model?", "",
         f"Each solution beside its {NEIGHBOURS} nearest published rows; distances are medians, in widths of the domains. If the search "
-        "found holes in the model, the published rows next to its solutions would be as safe as others.", "", _markdown(heads, rows), ""])
+        "found holes in the model, the published rows next to its solutions would be as safe as others.", "",
+        _markdown_table(headings, rows), ""])
 
 
-def _side_by_side(table: ComparedTable) -> str:
+def _render_table(table: ComparedTable) -> str:
     lines = [f"### {TITLES[table.name]}", ""]
     if not table.frame.empty:
         keys = [column for column in table.frame if column not in _column_names(table.quantities)]
-        heads = [*map(str, keys), *(f"{name} {HERE} / {PUBLISHED}" for name in table.quantities)]
+        headings = [*map(str, keys), *(f"{name} {HERE} / {PUBLISHED}" for name in table.quantities)]
         rows = [(*(row[key] for key in keys),
-                 *(" / ".join(_cell(row[f"{name} {side}"]) for side in (HERE, PUBLISHED)) for name in table.quantities))
+                 *(" / ".join(_cell(row[f"{name} {side}"]) for side in COMPARED_SIDES) for name in table.quantities))
                 for row in table.frame.to_dict("records")]
-        lines += [_markdown(heads, rows), ""]
+        lines += [_markdown_table(headings, rows), ""]
     return "\n".join([*lines, *(f"{note}  " for note in table.notes), ""])
 
 
 def _column_names(quantities: Iterable[str]) -> set[str]:
-    return {f"{name} {side}" for name in quantities for side in (HERE, PUBLISHED)}
+    return {f"{name} {side}" for name in quantities for side in COMPARED_SIDES}
 
 
-def _markdown(heads: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
-    lines = [heads, [":---"] * len(heads), *rows]
+def _markdown_table(headings: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
+    lines = [headings, [":---"] * len(headings), *rows]
     return "\n".join(f"| {' | '.join(_cell(cell) for cell in line)} |" for line in lines)
 
 

@@ -72,15 +72,15 @@ def read_reference(path: Path, characteristics: CharacteristicSet) -> ReferenceD
     InputError
         With file, row and column, if the file cannot be read, lacks a column or rows, or has a cell without a number in range.
     """
-    content = _content(path)
-    table = _table(path, content)
-    columns = _characteristic_columns(path, table, characteristics)
+    content = _read_content(path)
+    table = _parse_table(path, content)
+    columns = _columns_of_characteristics(path, table, characteristics)
     required = [*columns, *(column for name, column in COLUMNS.items() if name != OPTIONAL_METRIC or column in table)]
     missing_columns = [column for column in required if column not in table]
     if missing_columns:
         raise InputError(path, f"lacks the columns {', '.join(missing_columns)}", "the format of the published package")
     ranges = {column: RANGES[name] for name, column in COLUMNS.items()}
-    numbers = {column: _numbers(path, table, column, *ranges.get(column, ())) for column in required}
+    numbers = {column: _parse_numbers(path, table, column, *ranges.get(column, ())) for column in required}
     settings = np.stack([numbers[column] for column in columns], axis=1)
     is_in_domain = np.all((settings >= characteristics.lower) & (settings <= characteristics.upper), axis=1)
     if not is_in_domain.any():
@@ -101,7 +101,7 @@ def package_filter(characteristics: CharacteristicSet, settings: FloatArray) -> 
     return np.where(share >= characteristics.threshold / width - 1e-12, settings, characteristics.original)
 
 
-def _content(path: Path) -> bytes:
+def _read_content(path: Path) -> bytes:
     """The bytes of a file, which is read once: a pipe cannot be read again."""
     try:
         refuse_other_than_file(path, streams=True)
@@ -111,7 +111,7 @@ def _content(path: Path) -> bytes:
         raise InputError(path, f"cannot be read: {error.strerror or error}", "a CSV file") from None
 
 
-def _table(path: Path, content: bytes) -> pd.DataFrame:
+def _parse_table(path: Path, content: bytes) -> pd.DataFrame:
     """The rows of a file as text, without empty lines. The index is the line number minus two."""
     try:
         text = content.decode("utf-8-sig")
@@ -143,7 +143,7 @@ def _plain_name(name: str) -> str:
     return ALIASES.get(key, key)
 
 
-def _characteristic_columns(path: Path, table: pd.DataFrame, characteristics: CharacteristicSet) -> list[str]:
+def _columns_of_characteristics(path: Path, table: pd.DataFrame, characteristics: CharacteristicSet) -> list[str]:
     """The columns of the characteristics, in the order of the study."""
     by_plain_name: dict[str, str] = {}
     for column in map(str, table.columns):
@@ -157,7 +157,7 @@ def _characteristic_columns(path: Path, table: pd.DataFrame, characteristics: Ch
     return [by_plain_name[_plain_name(name)] for name in characteristics.names]
 
 
-def _numbers(path: Path, table: pd.DataFrame, column: str, lowest: float = -np.inf, highest: float = np.inf) -> FloatArray:
+def _parse_numbers(path: Path, table: pd.DataFrame, column: str, lowest: float = -np.inf, highest: float = np.inf) -> FloatArray:
     values = pd.to_numeric(table[column], errors="coerce").to_numpy(dtype=float)
     invalid_rows = np.flatnonzero(~(np.isfinite(values) & (values >= lowest) & (values <= highest)))
     if invalid_rows.size:
@@ -189,15 +189,15 @@ def original_metrics(text: str | None, published: Mapping[str, float]) -> dict[s
         If `text` has another form, or there is no safety degree.
     """
     original: dict[str, float | None] = {name: published.get(name) for name in METRICS}
-    for part in text.split(",") if text is not None else ():
-        name, _, number = (word.strip() for word in part.partition("="))
+    for assignment in text.split(",") if text is not None else ():
+        name, _, number = (word.strip() for word in assignment.partition("="))
         try:
             value = float(number)
         except ValueError:
             value = np.nan
         lowest, highest = RANGES.get(METRIC_NAMES.get(name, ""), (np.inf, -np.inf))
         if not lowest <= value <= highest:
-            raise InputError("original", f"{part!r} in {text!r}", f"{ORIGINAL_FORM}, each in the metric's range")
+            raise InputError("original", f"{assignment!r} in {text!r}", f"{ORIGINAL_FORM}, each in the metric's range")
         original[METRIC_NAMES[name]] = value
     if original[SAFETY_DEGREE] is None:
         raise InputError("original", "the study has no published values of the original vehicle", ORIGINAL_FORM)

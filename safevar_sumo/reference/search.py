@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
@@ -17,19 +17,26 @@ StudyGroup = tuple[Study, ...]
 class Space(Protocol):
     """Maps places in the unit cube of the parameters' bounds to studies, and studies to their losses."""
 
-    def at(self, shares: FloatArray) -> StudyGroup: ...
+    def studies_at(self, place: FloatArray) -> StudyGroup: ...
 
-    def losses(self, studies: Sequence[StudyGroup]) -> list[float]: ...
+    def losses(self, groups: Sequence[StudyGroup]) -> list[float]: ...
 
 
-KEPT_LOSS = 1.25
+MAX_KEPT_RATIO = 1.25
 """A trial is kept, for profiles and the spread, if its loss is at most this multiple of the lowest loss."""
-SCREENING = 4
+SCREENING_DIVISOR = 4
 """Screening takes at most the trials divided by this number."""
 
 
-class TrialSearch:
-    """Keeps the studies of the best trial, and counts the trials left.
+class Trial(NamedTuple):
+    """A tried place in the unit cube of the parameters' bounds, and the loss of its studies."""
+
+    loss: float
+    place: FloatArray
+
+
+class SearchRace:
+    """Searches that compete for a number of trials; keeps the studies of the best trial, and counts the trials left.
 
     Parameters
     ----------
@@ -45,71 +52,72 @@ class TrialSearch:
         self.alike = alike
         self.best: StudyGroup | None = None
         self.loss, self.trials_left = np.inf, trials
-        self.kept: list[tuple[float, FloatArray]] = []
-        """Losses and places of trials with a loss of at most `KEPT_LOSS` times the lowest loss at the time of the trial."""
+        self.kept: list[Trial] = []
+        """Trials of searches with a loss of at most `MAX_KEPT_RATIO` times the lowest loss at the time of the trial."""
         self.space, self.population, self._done = space, population, done
 
-    def try_studies(self, studies: Sequence[StudyGroup]) -> list[float]:
+    def try_studies(self, groups: Sequence[StudyGroup]) -> list[float]:
         """The losses of groups of studies; each group is one trial."""
-        losses = self.space.losses(studies)
+        losses = self.space.losses(groups)
         self.trials_left -= len(losses)
-        for group, loss in zip(studies, losses, strict=True):
+        for group, loss in zip(groups, losses, strict=True):
             if self.best is None or loss < self.loss:
                 self.best, self.loss = group, loss
             self._done(self.loss, self.best)
         return losses
 
-    def begin(self, place: FloatArray, spread: float, seed: int, population: int | None = None) -> OneSearch:
-        """A search from a place in the unit cube, with `spread` as initial standard deviation; by default with the common population."""
-        return OneSearch(self, place, spread, seed, population or self.population)
+    def begin(self, place: FloatArray, deviation: float, seed: int, population: int | None = None) -> CmaSearch:
+        """Begin a search at a place, with `deviation` as initial standard deviation; the race's population is the default."""
+        return CmaSearch(self, place, deviation, seed, population or self.population)
 
-    def from_random_places(self, leaders: Sequence[int], starts: int, screened: int, spread: float,
-                           rng: np.random.Generator) -> list[OneSearch]:
-        """`starts` searches from random places, or from the best of `screened` random places, whose number `SCREENING` limits.
+    def begin_at_random_places(self, first_indices: Sequence[int], starts: int, screened: int, deviation: float,
+                               rng: np.random.Generator) -> list[CmaSearch]:
+        """Begin `starts` searches at random places, or at the best of `screened` random places, whose number `SCREENING_DIVISOR` limits.
 
-        Parameter i starts at the same share of its bounds as parameter `same[i]`.
+        Parameter i starts at the same share of its bounds as parameter `first_indices[i]`.
         """
-        screened = min(screened, self.trials_left // SCREENING) if starts else 0
+        size = len(first_indices)
+        screened = min(screened, self.trials_left // SCREENING_DIVISOR) if starts else 0
         if screened < max(starts, 1):
-            return [self.begin(rng.random(len(leaders))[leaders], spread, int(rng.integers(1, 2**31))) for _ in range(starts)]
-        places = rng.random((screened, len(leaders)))[:, leaders]
+            return [self.begin(rng.random(size)[first_indices], deviation, int(rng.integers(1, 2**31))) for _ in range(starts)]
+        places = rng.random((screened, size))[:, first_indices]
         losses = [loss for k in range(0, screened, self.population)
-                 for loss in self.try_studies([self.space.at(place) for place in places[k:k + self.population]])]
-        return [self.begin(places[k], spread, int(rng.integers(1, 2**31))) for k in np.argsort(losses, kind="stable")[:starts]]
+                 for loss in self.try_studies([self.space.studies_at(place) for place in places[k:k + self.population]])]
+        return [self.begin(places[k], deviation, int(rng.integers(1, 2**31))) for k in np.argsort(losses, kind="stable")[:starts]]
 
-    def race(self, searches: Sequence[OneSearch]) -> None:
+    def run(self, searches: Sequence[CmaSearch]) -> None:
         """Spend all trials left by successive halving (Jamieson and Talwalkar 2016).
 
         All rounds have the same number of trials. Half of the searches reach the next round; the last search gets the remaining trials.
         """
         competitors = list(searches)
         rounds = 1 + (len(competitors) - 1).bit_length()
-        share = self.trials_left // rounds
+        trials_per_round = self.trials_left // rounds
         for _ in range(rounds):
-            trials = share // len(competitors)
+            trials = trials_per_round // len(competitors)
             for search in competitors:
                 search.advance(trials - trials % search.population if trials > search.population else trials)
             competitors = sorted(competitors, key=lambda search: search.lowest)[:(len(competitors) + 1) // 2]
         competitors[0].advance(self.trials_left)
 
 
-class OneSearch:
+class CmaSearch:
     """One search by CMA-ES (Hansen 2016); `lowest` is its lowest loss so far."""
 
-    def __init__(self, search: TrialSearch, place: FloatArray, spread: float, seed: int, population: int) -> None:
+    def __init__(self, race: SearchRace, place: FloatArray, deviation: float, seed: int, population: int) -> None:
         import cma  # slow to import
 
-        self._search, self.lowest, self.population = search, np.inf, population
-        self._strategy: Any = cma.CMAEvolutionStrategy(place, spread, {
+        self._race, self.lowest, self.population = race, np.inf, population
+        self._strategy: Any = cma.CMAEvolutionStrategy(place, deviation, {
             "bounds": [0, 1], "seed": seed, "verbose": -9, "popsize": population, "maxstd": np.inf})
 
     def advance(self, trials: int) -> None:
         """Run generations for a number of trials; CMA-ES does not learn from an incomplete last generation."""
-        search = self._search
+        race = self._race
         for trials_left in range(trials, 0, -self.population):
-            shares = self._strategy.ask()
-            losses = search.try_studies([search.space.at(share) for share in shares[:trials_left]])
-            search.kept += [(loss, share) for loss, share in zip(losses, shares, strict=False) if loss <= KEPT_LOSS * search.loss]
+            places = self._strategy.ask()
+            losses = race.try_studies([race.space.studies_at(place) for place in places[:trials_left]])
+            race.kept += [Trial(loss, place) for loss, place in zip(losses, places, strict=False) if loss <= MAX_KEPT_RATIO * race.loss]
             self.lowest = min(self.lowest, min(losses))
-            if len(losses) == len(shares):
-                self._strategy.tell(shares, losses)
+            if len(losses) == len(places):
+                self._strategy.tell(places, losses)

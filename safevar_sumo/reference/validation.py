@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 BINS = 8
-"""Number of bins of values in the figure; each bin holds about as many rows."""
+"""Number of bins of values in the figure; all bins hold about equally many rows."""
 SCATTER_WIDTH = 2.0
 """An outcome is undecided if its safety degree is at most this number of standard deviations of repeats away from 0, the collision."""
 
@@ -77,8 +77,8 @@ class Agreement:
         return asdict(self)
 
 
-def agreement(reference: ReferenceData, evaluations: Evaluations, study: Study, original: Evaluations) -> Agreement:
-    """Compare row by row. The study gives the published values of the original vehicle, and the scatter of repeats, if it has them."""
+def measure_agreement(reference: ReferenceData, evaluations: Evaluations, study: Study, original: Evaluations) -> Agreement:
+    """Compare evaluations of the reference's settings with the reference, row by row, and the original vehicle with the study's values."""
     rows_of = {name: _is_defined(reference, evaluations, name) for name in reference.metrics}
     differences = {name: evaluations.metrics[name][rows] - reference.metrics[name][rows] for name, rows in rows_of.items()}
     errors = {name: _mean(np.abs(values)) for name, values in differences.items()}
@@ -99,7 +99,7 @@ def agreement(reference: ReferenceData, evaluations: Evaluations, study: Study, 
         collision_speed={"reference": _mean(-reference.metrics[SAFETY_DEGREE][collide]),
                          "here": _mean(evaluations.collision_speed[collide])},
         in_repeats={name: _error_in_repeats(error, study.repeatability.get(name)) for name, error in errors.items()},
-        undecided=_undecided_numbers(reference, evaluations, study.repeatability.get(SAFETY_DEGREE)),
+        undecided=_count_undecided(reference, evaluations, study.repeatability.get(SAFETY_DEGREE)),
         by_predicted=_error_by_bin(evaluations.f_safe, evaluations.f_safe - reference.metrics[SAFETY_DEGREE]))
 
 
@@ -109,7 +109,7 @@ def may_be_scatter(reference: ReferenceData, evaluations: Evaluations, repeatabi
     return np.asarray((reference.collided != evaluations.collided) & (distance <= SCATTER_WIDTH * repeatability))
 
 
-def _undecided_numbers(reference: ReferenceData, evaluations: Evaluations, repeatability: float | None) -> dict[str, int | None]:
+def _count_undecided(reference: ReferenceData, evaluations: Evaluations, repeatability: float | None) -> dict[str, int | None]:
     number = None if repeatability is None else int(np.count_nonzero(may_be_scatter(reference, evaluations, repeatability)))
     return {"differ": int(np.count_nonzero(reference.collided != evaluations.collided)), "within_repeats": number}
 
@@ -122,17 +122,17 @@ def _error_by_bin(predicted: FloatArray, error: FloatArray) -> list[dict[str, fl
     is_defined = ~np.isnan(predicted) & ~np.isnan(error)
     return [{"lowest": float(predicted[rows].min()), "highest": float(predicted[rows].max()), "rows": len(rows),
              "bias": float(error[rows].mean())}
-            for rows in _bins(np.where(is_defined, predicted, np.nan))]
+            for rows in _split_into_bins(np.where(is_defined, predicted, np.nan))]
 
 
-def _bins(values: FloatArray) -> list[npt.NDArray[np.intp]]:
+def _split_into_bins(values: FloatArray) -> list[npt.NDArray[np.intp]]:
     """Indices of defined values, in bins of about equal size; equal values share a bin."""
     defined = values[~np.isnan(values)]
     if not defined.size:
         return []
     edges = np.unique(np.quantile(defined, np.linspace(0, 1, BINS + 1)))
-    bin_of = np.where(np.isnan(values), -1, np.clip(np.searchsorted(edges, values, side="right") - 1, 0, max(len(edges) - 2, 0)))
-    bins = [np.flatnonzero(bin_of == i) for i in range(max(len(edges) - 1, 1))]
+    bin_numbers = np.where(np.isnan(values), -1, np.clip(np.searchsorted(edges, values, side="right") - 1, 0, max(len(edges) - 2, 0)))
+    bins = [np.flatnonzero(bin_numbers == i) for i in range(max(len(edges) - 1, 1))]
     return [rows for rows in bins if rows.size]
 
 
@@ -144,7 +144,7 @@ def rank_correlation(values: FloatArray, other_values: FloatArray) -> float | No
 
 
 def _is_defined(reference: ReferenceData, evaluations: Evaluations, metric: str) -> BoolArray:
-    """Whether a metric is defined on both sides, by row."""
+    """Whether a metric is defined in the reference and here, by row."""
     return np.asarray(~np.isnan(reference.metrics[metric]) & ~np.isnan(evaluations.metrics[metric]))
 
 
@@ -168,9 +168,9 @@ def plot_agreement(path: Path, title: str, characteristics: CharacteristicSet, r
     figure, axes = new_figure(title, rows, columns, (12, 2.4 * rows + 0.8), gridspec_kw={"height_ratios": [1.5] + [1] * (rows - 1)})
     undecided = np.zeros(len(evaluations), dtype=bool) if repeatability is None else may_be_scatter(reference, evaluations, repeatability)
     for axis, error_axis, metric in zip(axes[0], axes[1], reference.metrics, strict=False):
-        _scatter(axis, metric, reference, evaluations, undecided)
-        _error_by(error_axis, evaluations.metrics[metric], evaluations.metrics[metric] - reference.metrics[metric])
-        error_axis.set_xlabel(f"here: {_label(metric)}")
+        _draw_scatter(axis, metric, reference, evaluations, undecided)
+        _draw_error(error_axis, evaluations.metrics[metric], evaluations.metrics[metric] - reference.metrics[metric])
+        error_axis.set_xlabel(f"here: {_axis_label(metric)}")
         error_axis.set_ylabel("mean error")
     error = evaluations.metrics[SAFETY_DEGREE] - reference.metrics[SAFETY_DEGREE]
     lowest, highest = [], []
@@ -178,11 +178,11 @@ def plot_agreement(path: Path, title: str, characteristics: CharacteristicSet, r
         if i >= len(characteristics):
             axis.set_axis_off()
             continue
-        lowest_here, highest_here = _error_by(axis, evaluations.settings[:, i], error)
+        lowest_here, highest_here = _draw_error(axis, evaluations.settings[:, i], error)
         lowest.append(lowest_here)
         highest.append(highest_here)
-        member = characteristics.members[i]
-        axis.set_xlabel(member.name + ("" if member.unit == "-" else f" [{as_formula(member.unit)}]"))
+        characteristic = characteristics.members[i]
+        axis.set_xlabel(characteristic.name + ("" if characteristic.unit == "-" else f" [{as_formula(characteristic.unit)}]"))
     margin = 0.1 * (max(highest) - min(lowest)) + 1e-6
     for i, axis in enumerate(axes[2:].flat):
         axis.set_ylim(min(lowest) - margin, max(highest) + margin)
@@ -191,11 +191,11 @@ def plot_agreement(path: Path, title: str, characteristics: CharacteristicSet, r
     save(figure, path, "plot")
 
 
-def _label(metric: str) -> str:
+def _axis_label(metric: str) -> str:
     return f"{METRICS[metric].title} [{as_formula(METRICS[metric].unit)}]"
 
 
-def _scatter(axis: Axes, metric: str, reference: ReferenceData, evaluations: Evaluations, undecided: BoolArray) -> None:
+def _draw_scatter(axis: Axes, metric: str, reference: ReferenceData, evaluations: Evaluations, undecided: BoolArray) -> None:
     rows = _is_defined(reference, evaluations, metric)
     is_collision = (reference.collided | evaluations.collided)[rows]
     x, y = reference.metrics[metric][rows], evaluations.metrics[metric][rows]
@@ -212,14 +212,14 @@ def _scatter(axis: Axes, metric: str, reference: ReferenceData, evaluations: Eva
         axis.plot(ends, ends, color="black", linewidth=0.8, linestyle="--")
     rho = rank_correlation(x, y)
     axis.set_title(f"rho = {'-' if rho is None else f'{rho:.3f}'}, {x.size} rows", fontsize=FONT)
-    label = _label(metric)
+    label = _axis_label(metric)
     axis.set_xlabel(f"reference: {label}")
     axis.set_ylabel(f"here: {label}")
 
 
-def _error_by(axis: Axes, values: FloatArray, error: FloatArray) -> tuple[float, float]:
+def _draw_error(axis: Axes, values: FloatArray, error: FloatArray) -> tuple[float, float]:
     """Draw the mean error and the quartiles of the error over bins of `values`; return the lowest and highest value drawn."""
-    bins = _bins(np.where(np.isnan(error), np.nan, values))
+    bins = _split_into_bins(np.where(np.isnan(error), np.nan, values))
     if not bins:
         return 0.0, 0.0
     centres = np.array([values[rows].mean() for rows in bins])
@@ -231,10 +231,10 @@ def _error_by(axis: Axes, values: FloatArray, error: FloatArray) -> tuple[float,
     return float(min(quartiles.min(), means.min())), float(max(quartiles.max(), means.max()))
 
 
-TOTALS = Path(__file__).with_name("published.toml")
-HEADER = "Agreement of studies with published data: totals, no row of it. `validate STUDY FILE --totals THIS_FILE` writes an entry."
+SHIPPED_TOTALS = Path(__file__).with_name("published.toml")
+TOTALS_COMMENT = "Agreement of studies with published data: totals, no row of it. `validate STUDY FILE --totals THIS_FILE` writes an entry."
 SIMULATION_KEYS = ("scenario", "vehicle", "ads", "weather", "metrics", "step_length", "matrix")
-"""Keys of a study on which the metrics of a simulated setting depend."""
+"""Study keys that affect the metrics of a setting."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -273,13 +273,14 @@ class Totals:
         return self.both / self.here if self.here else None
 
 
-def quoted(study: Study) -> list[Totals]:
+def shipped_totals_of(study: Study) -> list[Totals]:
     """Shipped totals that hold for a study: those of shipped studies with the same `SIMULATION_KEYS`."""
-    names = {name for name in _read(TOTALS) if name in study_names() and _simulation(load_study(name)) == _simulation(study)}
-    return [_totals(name, file, entry) for name, files in _read(TOTALS).items() if name in names for file, entry in files.items()]
+    tables, shipped_names = _simulation_tables(study), study_names()
+    return [_parse_totals(name, file, entry) for name, files in _read_totals(SHIPPED_TOTALS).items()
+            if name in shipped_names and _simulation_tables(load_study(name)) == tables for file, entry in files.items()]
 
 
-def keep_totals(path: Path, study: Study, file: str, result: Agreement) -> None:
+def write_totals(path: Path, study: Study, file: str, result: Agreement) -> None:
     """Write, or replace, the entry of one study and one file.
 
     Raises
@@ -287,11 +288,11 @@ def keep_totals(path: Path, study: Study, file: str, result: Agreement) -> None:
     InputError
         If the file holds anything but totals, or cannot be written.
     """
-    totals = _read(path) if path.exists() else {}
+    totals = _read_totals(path) if path.exists() else {}
     entry = {"rows": result.rows, "spearman": _rounded(result.spearman), "mean_absolute_error": _rounded(result.mean_absolute_error),
              "collisions": result.collisions}
     totals = {**totals, study.name: {**totals.get(study.name, {}), file: entry}}
-    write_whole(path, f"# {HEADER}\n\n{tomli_w.dumps(totals)}")
+    write_whole(path, f"# {TOTALS_COMMENT}\n\n{tomli_w.dumps(totals)}")
 
 
 def _rounded(values: Mapping[str, float | None]) -> dict[str, float]:
@@ -299,23 +300,23 @@ def _rounded(values: Mapping[str, float | None]) -> dict[str, float]:
     return {name: round(value, 4) for name, value in values.items() if value is not None}
 
 
-def _read(path: Path) -> dict[str, dict[str, Any]]:
+def _read_totals(path: Path) -> dict[str, dict[str, Any]]:
     refuse_other_than_file(path)
     try:
         totals: dict[str, dict[str, Any]] = tomllib.loads(path.read_text(encoding="utf-8"))
         for name, files in totals.items():
             for file, entry in files.items():
-                _totals(name, file, entry)
+                _parse_totals(name, file, entry)
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         raise InputError(path, "holds no totals", "a new file, or one that `validate --totals` has written") from None
     return totals
 
 
-def _totals(study: str, file: str, entry: Mapping[str, Any]) -> Totals:
+def _parse_totals(study: str, file: str, entry: Mapping[str, Any]) -> Totals:
     return Totals(study=study, file=file, rows=entry["rows"], spearman=entry["spearman"], mean_absolute_error=entry["mean_absolute_error"],
                   **{name: entry["collisions"][name] for name in ("reference", "here", "both")})
 
 
-def _simulation(study: Study) -> dict[str, Any]:
+def _simulation_tables(study: Study) -> dict[str, Any]:
     keys = evaluation_keys(study)
     return {name: keys.get(name) for name in SIMULATION_KEYS}

@@ -27,7 +27,7 @@ from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.replay.comparison import Comparison, changes_in_words, compare_setting
 from safevar_sumo.replay.page import player_data
 from safevar_sumo.replay.scene import flat_scene_of
-from safevar_sumo.results import ANSWERS, MANIFEST, RESULTS, SOLUTIONS, chosen_handle, handles, read_manifest, write_whole
+from safevar_sumo.results import ANSWERS, MANIFEST, RESULTS, SOLUTIONS, choose_handle, handles_of, read_manifest, write_whole
 from safevar_sumo.scenarios import Point
 from safevar_sumo.shipped import PACKAGE
 from safevar_sumo.study import SAFETY_DEGREE, refuse_other_than_file, user_code_names
@@ -123,7 +123,7 @@ class ReportInput:
     @cached_property
     def solutions(self) -> dict[str, dict[str, Any]]:
         """Rows of the solutions by handle; each row also holds its handle."""
-        pairs = zip(handles(self.case.solutions), self.case.solutions.to_dict("records"), strict=True)
+        pairs = zip(handles_of(self.case.solutions), self.case.solutions.to_dict("records"), strict=True)
         return {str(handle): {**{str(name): value for name, value in row.items()}, "handle": str(handle)} for handle, row in pairs}
 
     @cached_property
@@ -133,7 +133,7 @@ class ReportInput:
 
     def chosen(self, choice: str) -> str:
         """The handle of the solution that a choice selects: fewest, smallest or most_severe."""
-        return str(chosen_handle(self.case.solutions, self.case.unsafe, choice, self.directory))
+        return str(choose_handle(self.case.solutions, self.case.unsafe, choice, self.directory))
 
     def setting_of(self, handle: str) -> FloatArray:
         """A solution's setting, shape (n,)."""

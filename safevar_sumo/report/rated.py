@@ -22,7 +22,7 @@ from safevar_sumo.analysis.rating.render import (
 )
 from safevar_sumo.analysis.words import question_command
 from safevar_sumo.report.input import ReportInput
-from safevar_sumo.results import chosen_handle, position_of
+from safevar_sumo.results import choose_handle, row_of_handle
 from safevar_sumo.vehicles import CharacteristicSet
 
 CHOICE = "fewest"
@@ -33,8 +33,8 @@ def rated_study_page(data: ReportInput, jobs: int | None, progress: Progress) ->
     """The data of one study for the page; simulates the vehicles in all cells."""
     case, variants, handle = data.case, dict[str, np.ndarray](), None
     if case.unsafe.rows(case.solutions).any():
-        handle = chosen_handle(case.solutions, case.unsafe, CHOICE, data.directory)
-        row = case.solutions.iloc[position_of(case.solutions, handle)]
+        handle = choose_handle(case.solutions, case.unsafe, CHOICE, data.directory)
+        row = case.solutions.iloc[row_of_handle(case.solutions, handle)]
         names = CharacteristicSet.of(case.study.vehicle.characteristics).names
         variants[str(handle)] = row[list(names)].to_numpy(dtype=float)
     rating = rate(case.study, variants, jobs=jobs, progress=progress)

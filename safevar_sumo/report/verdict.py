@@ -19,7 +19,7 @@ from safevar_sumo.analysis.research_questions.case import ALGORITHM_TITLES, coll
 from safevar_sumo.analysis.words import number_of
 from safevar_sumo.metrics import METRICS, Unsafe
 from safevar_sumo.records import KMH_PER_MS, FloatArray, Outcome
-from safevar_sumo.reference import Totals, quoted
+from safevar_sumo.reference import Totals, shipped_totals_of
 from safevar_sumo.replay.comparison import number, raised
 from safevar_sumo.report.findings import FIRST_CHOICES, Explanations
 from safevar_sumo.report.input import ChangeRow, FailingPoints, ReportInput, stored_answer
@@ -286,7 +286,7 @@ def _joint_tolerance(tolerance: Mapping[str, Any] | None) -> KeyFigure:
 
 def agreement_with_published(data: ReportInput) -> AgreementRows:
     """How well the study agrees with published data."""
-    totals = quoted(data.case.study)
+    totals = shipped_totals_of(data.case.study)
     if not totals:
         return AgreementRows("This study was not compared with published data: how far another simulator or a real vehicle does the same "
                          "is unknown.", [])

@@ -12,13 +12,13 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from safevar_sumo.errors import InputError, SafevarError
-from safevar_sumo.plugins import DIGEST_LENGTH, Files
+from safevar_sumo.plugins import DIGITS, Files
 from safevar_sumo.study import Study, refuse_other_than_file
 
 MANIFEST, SOLUTIONS, RUNS, ANSWERS = "manifest.json", "solutions.csv", "runs", "answers"
 ORIGINAL = "original"
 """Name of the original vehicle's journal; the study that writes it first owns the directory."""
-FOLDERS_FILE, READ_FILES = "places.json", "read-*.json"
+FOLDERS_FILE, LATE_FILE_PATTERN = "places.json", "read-*.json"
 
 
 class ResultsFile(NamedTuple):
@@ -36,8 +36,8 @@ FILES = (
     ResultsFile(f"{RUNS}/*-*.journal", "every evaluation of the run ALGORITHM-NN, from which an interrupted study continues",
                 "`study` after each batch"),
     ResultsFile(f"{RUNS}/{ORIGINAL}.journal", "the original vehicle's evaluation", "`study` before its first run"),
-    ResultsFile(f"{RUNS}/{FOLDERS_FILE}", "folders of user code and files, relative to the directory", "`study` before its first run"),
-    ResultsFile(f"{RUNS}/{READ_FILES}", "a file that user code read in the middle of a study, with its digest",
+    ResultsFile(f"{RUNS}/{FOLDERS_FILE}", "folders of your own code and files, relative to the directory", "`study` before its first run"),
+    ResultsFile(f"{RUNS}/{LATE_FILE_PATTERN}", "a file that your own code read in the middle of a study, with its digest",
                 "`study` after each batch"),
     ResultsFile(f"{ANSWERS}/*.json", "results that `report` computed; reused for the same results, options and program; safe to delete",
                 "`report`"))
@@ -112,30 +112,30 @@ def sync_directory(path: Path) -> None:
         os.close(descriptor)
 
 
-def write_places(directory: Path, study: Study) -> None:
-    """Write the folders of a study's files, relative to the directory; the manifest does not depend on them."""
+def write_folders(directory: Path, study: Study) -> None:
+    """Record the folders of a study's files, relative to the directory; the manifest does not depend on them."""
     if study.origin.places:
         make_durable(directory / RUNS)
         folders = [_relative_path(folder, directory.resolve()) for folder in study.origin.places]
         write_whole(directory / RUNS / FOLDERS_FILE, json.dumps(folders) + "\n")
 
 
-def places_of(directory: Path) -> tuple[str, ...]:
+def folders_of(directory: Path) -> tuple[str, ...]:
     """Folders of the user code and files of a directory's study: the recorded folders that exist, then the directory's two parents."""
-    folders = [os.path.abspath(directory.resolve() / folder) for folder in _read(directory / RUNS / FOLDERS_FILE, [])]
+    folders = [os.path.abspath(directory.resolve() / folder) for folder in _read_json(directory / RUNS / FOLDERS_FILE, [])]
     return tuple(dict.fromkeys([*filter(os.path.isdir, folders), *map(str, directory.resolve().parents[:2])]))
 
 
-def note_later_file(directory: Path, name: str, digest: str) -> None:
+def record_late_file(directory: Path, name: str, digest: str) -> None:
     """Record a file that was read after the study began, in a separate JSON file, because several processes may record files."""
     make_durable(directory / RUNS)
-    digest_of_name = sha256(name.encode()).hexdigest()[:DIGEST_LENGTH]
-    write_whole(directory / RUNS / READ_FILES.replace("*", digest_of_name), json.dumps({name: digest}) + "\n")
+    file_name = LATE_FILE_PATTERN.replace("*", sha256(name.encode()).hexdigest()[:DIGITS])
+    write_whole(directory / RUNS / file_name, json.dumps({name: digest}) + "\n")
 
 
 def later_files(directory: Path) -> Files:
     """Digests, by file name, of the files that were read after the study began."""
-    return {name: digest for path in sorted((directory / RUNS).glob(READ_FILES)) for name, digest in _read(path, {}).items()}
+    return {name: digest for path in sorted((directory / RUNS).glob(LATE_FILE_PATTERN)) for name, digest in _read_json(path, {}).items()}
 
 
 def _relative_path(folder: str, directory: Path) -> str:
@@ -145,7 +145,7 @@ def _relative_path(folder: str, directory: Path) -> str:
         return folder
 
 
-def _read(path: Path, default: Any) -> Any:
+def _read_json(path: Path, default: Any) -> Any:
     """The content of a JSON file beside the journals; the default if the file is missing or damaged."""
     try:
         return json.loads(path.read_text(encoding="utf-8"))

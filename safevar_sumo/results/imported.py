@@ -1,4 +1,4 @@
-"""Imported results: a results directory of solutions from another program, without runs and evaluations."""
+"""Imported results: a results directory with solutions of another program, but without runs and evaluations."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import Evaluations
 from safevar_sumo.results.files import MANIFEST, RUNS, SOLUTIONS, make_directory, write_whole
-from safevar_sumo.results.manifest import DIGESTS, FORMAT, digest_of_table, read_manifest, refuse_edited_table, write_manifest
+from safevar_sumo.results.manifest import DIGESTS_KEY, FORMAT, digest_of_table, read_manifest, refuse_edited_table, write_manifest
 from safevar_sumo.results.store import solutions_frame
 from safevar_sumo.study import Study, refuse_other_than_file, tables_of
 
@@ -60,7 +60,7 @@ def write_imported(path: Path, study: Study, solutions: Mapping[str, Evaluations
         "format": FORMAT, "study": tables, "imported": {"files": {**earlier_manifest.get("imported", {}).get("files", {}), **files}},
         "versions": {"safevar_sumo": version("safevar_sumo")},
         "original": dict(earlier_manifest.get("original", {}) if original is None else original),
-        DIGESTS: {SOLUTIONS: digest_of_table(text)}}
+        DIGESTS_KEY: {SOLUTIONS: digest_of_table(text)}}
     write_whole(path / SOLUTIONS, text)
     write_manifest(path, manifest)
 

@@ -1,8 +1,8 @@
 """The journal of one run: every evaluated batch, appended and synced before the search continues.
 
 A journal is a file of frames: magic, length and CRC-32 of a payload, then the payload in MessagePack. The first frame names the
-journal's study and run, the last frame of a finished run its result. A torn tail, left by a kill or a full disk, is cut off;
-damage before intact frames is an error.
+study and the run; the last frame of a finished run holds its result. A torn tail, left by a killed process or a full disk, is cut
+off; damage before intact frames is an error.
 """
 
 from __future__ import annotations
@@ -28,15 +28,15 @@ from safevar_sumo.study import refuse_other_than_file
 FORMAT = 2
 READABLE_FORMATS = (1, FORMAT)
 MAGIC = b"SVJ\n"
-HEAD = struct.Struct("<4sII")
+FRAME_HEAD = struct.Struct("<4sII")
 OUTCOMES = {
     Outcome.STOPPED: 0, Outcome.PASSED: 1, Outcome.COLLISION: 2, Outcome.TIMEOUT: 3, Outcome.NEVER_MOVED: 4, Outcome.SIMULATOR_ERROR: 5,
     Outcome.INVALID_TEST: 6, Outcome.INFEASIBLE: 7}
 """Codes of outcomes in journals; a code never changes its meaning."""
-_OUTCOME_OF = {code: outcome.value for outcome, code in OUTCOMES.items()}
-OTHER_COLUMNS = ("collision_speed", "f_diff", "f_num_diff")
-SPARE = -1
-"""Position of an evaluation that the search has not requested (again)."""
+_OUTCOME_BY_CODE = {code: outcome.value for outcome, code in OUTCOMES.items()}
+NON_METRIC_COLUMNS = ("collision_speed", "f_diff", "f_num_diff")
+SPARE_POSITION = -1
+"""Position of an evaluation that the search has not requested yet, or not again after `Retry`."""
 
 
 class Owner(msgspec.Struct, frozen=True, tag="owner"):
@@ -66,14 +66,14 @@ class Result(msgspec.Struct, frozen=True, tag="result", omit_defaults=True):
 
 
 class Retry(msgspec.Struct, frozen=True, tag="retry"):
-    """Discards all earlier failed evaluations; evaluations after the first failure become `SPARE`."""
+    """Discards all earlier failed evaluations; evaluations after the first failure become `SPARE_POSITION`."""
 
 
 JournalFrame = Owner | Batch | Result | Retry
 
 
-class Content(NamedTuple):
-    """The contents of a journal: evaluations (or None), their positions, results by budget, and the size of a torn tail [bytes]."""
+class JournalContent(NamedTuple):
+    """The contents of a journal: evaluations, or None; their positions, results by budget, and the size of a torn tail [bytes]."""
 
     positions: list[int]
     evaluations: Evaluations | None
@@ -84,31 +84,28 @@ class Content(NamedTuple):
         """The result of the run with a budget of evaluations; None if it is unfinished."""
         return self.results.get(budget, self.results.get(0))
 
-    def by_position(self, positions: list[int]) -> Evaluations:
+    def take_positions(self, positions: list[int]) -> Evaluations:
         """The evaluations at `positions`, in this order."""
         assert self.evaluations is not None
         row_of = {position: row for row, position in enumerate(self.positions)}
         return self.evaluations.take([row_of[position] for position in positions])
 
-    def within(self, budget: int) -> Evaluations | None:
+    def requested_within(self, budget: int) -> Evaluations | None:
         """The evaluations that a run with this budget requested; None if there is none."""
         if self.evaluations is None:
             return None
         return self.evaluations.take(np.array([0 <= position < budget for position in self.positions], dtype=bool))
 
 
-EMPTY_CONTENT = Content([], None, {})
-
-
-def bytes_of(frame: JournalFrame) -> bytes:
-    """A frame's bytes."""
+def encode_frame(frame: JournalFrame) -> bytes:
+    """Magic, length, CRC-32 and payload of a frame."""
     payload = msgspec.msgpack.encode(frame)
-    return HEAD.pack(MAGIC, len(payload), zlib.crc32(payload)) + payload
+    return FRAME_HEAD.pack(MAGIC, len(payload), zlib.crc32(payload)) + payload
 
 
-def batch_of(positions: list[int], evaluations: Evaluations) -> Batch:
-    """The frame of a batch."""
-    numbers = {**{name: getattr(evaluations, name) for name in OTHER_COLUMNS}, **evaluations.metrics}
+def make_batch(positions: list[int], evaluations: Evaluations) -> Batch:
+    """Make the frame that holds a batch of evaluations."""
+    numbers = {**{name: getattr(evaluations, name) for name in NON_METRIC_COLUMNS}, **evaluations.metrics}
     reasons = {row: evaluations.reasons[setting.tobytes()] for row, setting in enumerate(evaluations.settings)
                if setting.tobytes() in evaluations.reasons}
     return Batch(
@@ -117,7 +114,7 @@ def batch_of(positions: list[int], evaluations: Evaluations) -> Batch:
         numbers={name: values.astype("<f8").tobytes() for name, values in numbers.items()}, reasons=reasons)
 
 
-def read_frames(data: bytes, path: Path) -> tuple[list[JournalFrame], int]:
+def decode_frames(data: bytes, path: Path) -> tuple[list[JournalFrame], int]:
     """All intact frames, and the offset at which the last frame ends.
 
     Raises
@@ -128,9 +125,9 @@ def read_frames(data: bytes, path: Path) -> tuple[list[JournalFrame], int]:
     frames: list[JournalFrame] = []
     offset = 0
     while offset < len(data):
-        frame, end = _frame_at(data, offset, path)
+        frame, end = _decode_frame_at(data, offset, path)
         if frame is None:
-            if any(_frame_at(data, match.start(), path)[0] is not None for match in re.compile(MAGIC).finditer(data, offset + 1)):
+            if any(_decode_frame_at(data, match.start(), path)[0] is not None for match in re.compile(MAGIC).finditer(data, offset + 1)):
                 raise InputError(path, f"is damaged at byte {offset}, and intact frames follow",
                                  "restore the file, or remove it to simulate the run again")
             break
@@ -139,7 +136,7 @@ def read_frames(data: bytes, path: Path) -> tuple[list[JournalFrame], int]:
     return frames, offset
 
 
-def content_of(frames: list[JournalFrame]) -> Content:
+def content_of(frames: list[JournalFrame]) -> JournalContent:
     """The contents of a journal from its frames in order."""
     positions: list[int] = []
     batches: list[Evaluations] = []
@@ -151,48 +148,48 @@ def content_of(frames: list[JournalFrame]) -> Content:
         elif isinstance(frame, Result):
             results[frame.budget] = frame
         elif isinstance(frame, Retry) and batches:
-            positions, remaining_evaluations = _without_failures(positions, Evaluations.concatenate(batches))
+            positions, remaining_evaluations = _drop_failures(positions, Evaluations.concatenate(batches))
             batches, results = [remaining_evaluations], {}
-    return Content(positions, Evaluations.concatenate(batches) if positions else None, results)
+    return JournalContent(positions, Evaluations.concatenate(batches) if positions else None, results)
 
 
-def _without_failures(positions: list[int], evaluations: Evaluations) -> tuple[list[int], Evaluations]:
+def _drop_failures(positions: list[int], evaluations: Evaluations) -> tuple[list[int], Evaluations]:
     """Positions and evaluations that a run keeps when its failed settings are simulated again."""
-    successes = ~evaluations.failed
-    rows = list(zip(positions, successes, strict=True))
-    first_failure = min((position for position, success in rows if not success), default=max(positions) + 1)
-    new_positions = [position if position < first_failure else SPARE for position, success in rows if success]
-    return new_positions, evaluations.take(successes)
+    has_succeeded = ~evaluations.failed
+    pairs = list(zip(positions, has_succeeded, strict=True))
+    first_failure = min((position for position, success in pairs if not success), default=max(positions) + 1)
+    new_positions = [position if position < first_failure else SPARE_POSITION for position, success in pairs if success]
+    return new_positions, evaluations.take(has_succeeded)
 
 
-def _frame_at(data: bytes, offset: int, path: Path) -> tuple[JournalFrame | None, int]:
-    if offset + HEAD.size > len(data):
+def _decode_frame_at(data: bytes, offset: int, path: Path) -> tuple[JournalFrame | None, int]:
+    if offset + FRAME_HEAD.size > len(data):
         return None, offset
-    magic, length, checksum = HEAD.unpack_from(data, offset)
-    payload = data[offset + HEAD.size:offset + HEAD.size + length]
+    magic, length, checksum = FRAME_HEAD.unpack_from(data, offset)
+    payload = data[offset + FRAME_HEAD.size:offset + FRAME_HEAD.size + length]
     if magic != MAGIC or len(payload) != length or zlib.crc32(payload) != checksum:
         return None, offset
     try:
-        return msgspec.msgpack.decode(payload, type=JournalFrame), offset + HEAD.size + length
+        return msgspec.msgpack.decode(payload, type=JournalFrame), offset + FRAME_HEAD.size + length
     except msgspec.DecodeError as error:
         raise InputError(path, f"holds at byte {offset} a frame of another version: {error}", "the version that wrote it") from None
 
 
 def _evaluations_of(batch: Batch) -> Evaluations:
-    numbers = {name: _floats(values) for name, values in batch.numbers.items()}
-    speed, f_diff, f_num_diff = (numbers.pop(name) for name in OTHER_COLUMNS)
-    outcome = np.array([_OUTCOME_OF[code] for code in batch.outcome], dtype="U16")
-    settings = _floats(batch.settings).reshape(len(outcome), -1)
+    numbers = {name: _decode_floats(values) for name, values in batch.numbers.items()}
+    speed, f_diff, f_num_diff = (numbers.pop(name) for name in NON_METRIC_COLUMNS)
+    outcome = np.array([_OUTCOME_BY_CODE[code] for code in batch.outcome], dtype="U16")
+    settings = _decode_floats(batch.settings).reshape(len(outcome), -1)
     reasons = {settings[row].tobytes(): reason for row, reason in batch.reasons.items()}
     return Evaluations(settings=settings, outcome=outcome, metrics=numbers, reasons=reasons, collision_speed=speed, f_diff=f_diff,
                        f_num_diff=f_num_diff)
 
 
-def _floats(values: bytes) -> FloatArray:
+def _decode_floats(values: bytes) -> FloatArray:
     return np.frombuffer(values, dtype="<f8").astype(float)
 
 
-class JournalBusy(SafevarError):
+class JournalBusyError(SafevarError):
     """Another live process works on this run."""
 
 
@@ -215,14 +212,14 @@ class Journal:
 
     Raises
     ------
-    JournalBusy
+    JournalBusyError
         If another live process works on the run.
     InputError
         If the journal belongs to another study or is damaged before its tail; the error names file and offset.
     """
 
     def __init__(self, path: Path, study: str, run: str) -> None:
-        self.path, self.cut = path, 0
+        self.path, self.cut_bytes = path, 0
         self._file = _open_and_lock(path)
         try:
             self.content = self._read(Owner(format=FORMAT, study=study, run=run))
@@ -235,7 +232,7 @@ class Journal:
 
     def append(self, positions: list[int], evaluations: Evaluations) -> None:
         """Add a batch and sync it to the disk."""
-        self._write(batch_of(positions, evaluations))
+        self._write(make_batch(positions, evaluations))
 
     def finish(self, positions: list[int], asked: int, budget: int) -> None:
         """Add the result of the run with a budget of evaluations."""
@@ -245,26 +242,26 @@ class Journal:
         """Drop failed evaluations, and results based on them."""
         self._write(Retry())
         self._file.seek(0)
-        self.content = content_of(read_frames(self._file.read(), self.path)[0])
+        self.content = content_of(decode_frames(self._file.read(), self.path)[0])
 
     def close(self) -> None:
         """Release the lock."""
         self._file.close()
 
-    def _read(self, owner: Owner) -> Content:
+    def _read(self, owner: Owner) -> JournalContent:
         data = self._file.read()
         size = len(data)
-        frames, end = read_frames(data, self.path)
+        frames, end = decode_frames(data, self.path)
         if not frames and data.strip(b"\0") and not data.startswith(MAGIC[:len(data)]):
             raise InputError(self.path, "is no journal", "another --out")
         if frames and frames[0] != owner:
             if any(isinstance(frame, Batch) for frame in frames):
                 raise _owner_error(self.path, frames[0], owner, "another --out")
             frames, end, size = [], 0, 0
-            self._cut_at(0)
+            self._truncate(0)
         if end < size:
-            self.cut = size - end
-            self._cut_at(end)
+            self.cut_bytes = size - end
+            self._truncate(end)
         if not frames:
             self._write(owner)
             sync_directory(self.path.parent)
@@ -273,7 +270,7 @@ class Journal:
     def _write(self, frame: JournalFrame) -> None:
         start = self._file.tell()
         try:
-            remainder = memoryview(bytes_of(frame))
+            remainder = memoryview(encode_frame(frame))
             while remainder:
                 remainder = remainder[self._file.write(remainder):]
             os.fsync(self._file.fileno())
@@ -286,16 +283,16 @@ class Journal:
     def _undo(self, start: int) -> None:
         """Cut off a half-written frame; if that fails too, the next reader cuts it off."""
         try:
-            self._cut_at(start)
+            self._truncate(start)
         except OSError:
             return
 
-    def _cut_at(self, end: int) -> None:
+    def _truncate(self, end: int) -> None:
         self._file.truncate(end)
         self._file.seek(end)
 
 
-def read_journal(path: Path, study: str, run: str) -> Content:
+def read_journal(path: Path, study: str, run: str) -> JournalContent:
     """The contents of a journal that another process may be writing.
 
     Raises
@@ -303,7 +300,7 @@ def read_journal(path: Path, study: str, run: str) -> Content:
     InputError
         If the journal cannot be read, is damaged, or belongs to another study or run.
     """
-    frames, tail_size = _frames_of(path)
+    frames, tail_size = _read_frames(path)
     if frames and not (isinstance(frames[0], Owner) and frames[0].format in READABLE_FORMATS):
         raise InputError(path, "is of a format that this version does not read", "the version that wrote it")
     owner = Owner(format=FORMAT, study=study, run=run)
@@ -322,16 +319,16 @@ def _owner_error(path: Path, frame: JournalFrame, owner: Owner, expected: str) -
 
 def owner_of(path: Path) -> str | None:
     """The digest of a journal's study; None until the process that opened the journal has written its owner."""
-    frames, _ = _frames_of(path)
+    frames, _ = _read_frames(path)
     return frames[0].study if frames and isinstance(frames[0], Owner) else None
 
 
-def _frames_of(path: Path) -> tuple[list[JournalFrame], int]:
+def _read_frames(path: Path) -> tuple[list[JournalFrame], int]:
     """The frames of a journal, and the number of bytes of a torn tail after them."""
     try:
         refuse_other_than_file(path)
         data = path.read_bytes()
-        frames, end = read_frames(data, path)
+        frames, end = decode_frames(data, path)
         return frames, len(data) - end
     except OSError as error:
         raise InputError(path, f"cannot be read: {error.strerror}") from None
@@ -348,7 +345,7 @@ def _open_and_lock(path: Path) -> IO[bytes]:
         portalocker.lock(file, portalocker.LOCK_EX | portalocker.LOCK_NB)
     except portalocker.AlreadyLocked:
         file.close()
-        raise JournalBusy(f"{path}: another process works on this run") from None
+        raise JournalBusyError(f"{path}: another process works on this run") from None
     except portalocker.LockException as error:
         file.close()
         raise SafevarError(f"{path}: cannot be locked: {error.strerror or error}; results need a disk whose files can be locked") from None

@@ -1,4 +1,4 @@
-"""Results read back as tidy frames or as the progress of a study, without SUMO."""
+"""Reads results as tidy frames, or as the progress of a study, without SUMO."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 from safevar_sumo.errors import InputError, warn
 from safevar_sumo.results.files import MANIFEST, SOLUTIONS, journal_file
 from safevar_sumo.results.imported import read_imported
-from safevar_sumo.results.journal import Content, read_journal
+from safevar_sumo.results.journal import JournalContent, read_journal
 from safevar_sumo.results.manifest import is_edited, owner_digest, read_manifest, refuse_edited_table
 from safevar_sumo.results.store import evaluations_frame, solutions_frame
 from safevar_sumo.study import label_of
@@ -123,7 +123,7 @@ class _Search(NamedTuple):
     characteristics: tuple[str, ...]
 
 
-def _search_of(folder: Path, manifest: Mapping[str, Any]) -> _Search:
+def _read_search(folder: Path, manifest: Mapping[str, Any]) -> _Search:
     try:
         search = manifest["study"]["search"]
         runs = [(name, run) for name in dict.fromkeys(map(label_of, search["algorithms"])) for run in range(search["runs"])]
@@ -132,8 +132,9 @@ def _search_of(folder: Path, manifest: Mapping[str, Any]) -> _Search:
         raise InputError(folder / MANIFEST, "has no characteristics or no search", "what the command study has written") from None
 
 
-def _journals(folder: Path, manifest: Mapping[str, Any], runs: Sequence[tuple[str, int]]) -> Iterator[tuple[str, int, Content | None]]:
-    """Algorithm, run and journal of every run; None for a run without a journal."""
+def _read_journals(folder: Path, manifest: Mapping[str, Any],
+                   runs: Sequence[tuple[str, int]]) -> Iterator[tuple[str, int, JournalContent | None]]:
+    """Algorithm, number and journal's content of every run; None for a run without a journal."""
     owner = owner_digest(manifest)
     for algorithm, run in runs:
         path = journal_file(folder, f"{algorithm}-{run:02d}")
@@ -150,31 +151,31 @@ def load_runs(directory: str | Path) -> StoredResults:
     """
     folder = Path(directory)
     manifest = read_manifest(folder)
-    search = _search_of(folder, manifest)
+    search = _read_search(folder, manifest)
     remedy = "the same import again" if "imported" in manifest else "the same study again, which writes it from the journals"
     refuse_edited_table(folder / SOLUTIONS, manifest, f"the file as it was, or {remedy}")
     if "imported" in manifest:
         no_evaluations = evaluations_frame(search.characteristics, []).assign(evaluation=0)
         return StoredResults(manifest, no_evaluations, read_imported(folder, search.characteristics))
     evaluations_of_runs, solutions_of_runs, positions, failures = [], [], [], []
-    for algorithm, run, content in _journals(folder, manifest, search.runs):
+    for algorithm, run, content in _read_journals(folder, manifest, search.runs):
         if content is not None and content.tail_size and content.result(search.budget) is None:
             warn(f"{journal_file(folder, f'{algorithm}-{run:02d}')}: the last {content.tail_size} bytes are torn, so the run is left out; "
                  "running the same study again simulates the lost evaluations")
         if content is None or content.evaluations is None:
             continue
-        order = sorted((position, row) for row, position in enumerate(content.positions) if 0 <= position < search.budget)
-        evaluations = content.evaluations.take([row for _, row in order])
+        requests = sorted((position, row) for row, position in enumerate(content.positions) if 0 <= position < search.budget)
+        evaluations = content.evaluations.take([row for _, row in requests])
         evaluations_of_runs.append(((algorithm, run), evaluations))
-        positions += [position for position, _ in order]
-        failures += [Failure(algorithm, run, order[row][0], evaluations.reason(row)) for row in np.flatnonzero(evaluations.failed).tolist()]
+        positions += [position for position, _ in requests]
+        failures += [Failure(algorithm, run, requests[i][0], evaluations.reason(i)) for i in np.flatnonzero(evaluations.failed).tolist()]
         result = content.result(search.budget)
         if result is not None:
-            solutions_of_runs.append(((algorithm, run), content.by_position(result.positions)))
+            solutions_of_runs.append(((algorithm, run), content.take_positions(result.positions)))
     frame = evaluations_frame(search.characteristics, evaluations_of_runs)
     frame.insert(2, "evaluation", positions)
     solutions = solutions_frame(search.characteristics, solutions_of_runs)
-    return StoredResults(manifest, frame, solutions, tuple(key for key, _ in solutions_of_runs), tuple(failures))
+    return StoredResults(manifest, frame, solutions, tuple(run_key for run_key, _ in solutions_of_runs), tuple(failures))
 
 
 def status(directory: str | Path) -> Status:
@@ -189,17 +190,17 @@ def status(directory: str | Path) -> Status:
     manifest = read_manifest(folder)
     if "imported" in manifest:
         raise InputError(folder, "holds imported solutions, which have no runs", "results of the command study")
-    search = _search_of(folder, manifest)
-    runs = [_progress(*journal, search.budget) for journal in _journals(folder, manifest, search.runs)]
+    search = _read_search(folder, manifest)
+    runs = [_summarise_run(*journal, search.budget) for journal in _read_journals(folder, manifest, search.runs)]
     table = folder / SOLUTIONS
     remarks = [f"{table} was edited: it no longer holds the computed solutions"] if is_edited(table, manifest) else []
     return Status(str(manifest["study"].get("name")), str(manifest["study"].get("title")), search.budget, tuple(run for run, _ in runs),
                   np.concatenate([points for _, points in runs]), tuple(remarks))
 
 
-def _progress(algorithm: str, run: int, content: Content | None, budget: int) -> tuple[RunStatus, np.ndarray]:
+def _summarise_run(algorithm: str, run: int, content: JournalContent | None, budget: int) -> tuple[RunStatus, np.ndarray]:
     """Progress of a run, and objectives of its valid evaluations."""
-    evaluations = content.within(budget) if content is not None else None
+    evaluations = content.requested_within(budget) if content is not None else None
     if content is None or evaluations is None:
         return RunStatus(algorithm, run, "waiting" if content is None else "begun", 0, 0, 0, None), np.zeros((0, 3))
     valid_evaluations = evaluations.take(evaluations.valid)

@@ -1,4 +1,4 @@
-"""The manifest of a results directory: the inputs of the results and digests of its files; and how two manifests differ."""
+"""The manifest of a results directory: inputs of the results, digests of the directory's files; and differences of two manifests."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ LAYERS_OF_FORMAT_2 = ("resolved", "network", "sources", "code", "versions", "pla
 """Layers in format 2, which had digests of the package's own files in place of `RESULTS`."""
 SIMULATORS = ("libsumo", "eclipse-sumo")
 """Packages on whose versions a single simulation depends."""
-DIGESTS = "digests"
+DIGESTS_KEY = "digests"
 """Key of the digests of the table of solutions and of the manifest, the latter without this key."""
 
 
@@ -70,17 +70,17 @@ def evaluation_keys(study: Study) -> dict[str, Any]:
 def owner_digest(manifest: Mapping[str, Any]) -> str:
     """The digest that identifies a manifest's study in its journals."""
     if "format" in manifest:
-        return _digest({layer: manifest.get(layer) for layer in (LAYERS if manifest["format"] == FORMAT else LAYERS_OF_FORMAT_2)})
+        return _digest_of_json({layer: manifest.get(layer) for layer in (LAYERS if manifest["format"] == FORMAT else LAYERS_OF_FORMAT_2)})
     search = {key: value for key, value in manifest["study"]["search"].items() if key not in ("runs", "algorithms")}
-    return _digest([{**manifest["study"], "search": search}, manifest["versions"], manifest.get("network")])
+    return _digest_of_json([{**manifest["study"], "search": search}, manifest["versions"], manifest.get("network")])
 
 
-def difference(stored_manifest: Mapping[str, Any], new_manifest: Mapping[str, Any]) -> tuple[str, str]:
+def first_difference(stored_manifest: Mapping[str, Any], new_manifest: Mapping[str, Any]) -> tuple[str, str]:
     """The first difference of two manifests that may change results, and its remedy; two empty texts if there is no difference."""
     if stored_manifest.get("format") != FORMAT:
         return f"version {stored_manifest['versions'].get('safevar_sumo')} wrote them", "that version"
     for layer, remedy in LAYERS.items():
-        for text in _differences(layer, stored_manifest.get(layer, {}), new_manifest.get(layer, {})):
+        for text in _describe_differences(layer, stored_manifest.get(layer, {}), new_manifest.get(layer, {})):
             return text, remedy
     return "", ""
 
@@ -94,22 +94,22 @@ def differences_now(stored: Mapping[str, Any], new: Mapping[str, Any]) -> list[s
         return [f"version {stored['versions'].get('safevar_sumo')} wrote them"]
     texts = [f"{key} was {before!r} and is {now!r} now" for key, before, now in _changed_values(stored["resolved"], new["resolved"])
              if before is not None]  # a new key is ignored: had it changed results, `RESULTS` would have been raised
-    texts += [text for layer in (*LAYERS_OF_FILES, "results") for text in _differences(layer, stored.get(layer, {}), new[layer])]
+    texts += [text for layer in (*LAYERS_OF_FILES, "results") for text in _describe_differences(layer, stored.get(layer, {}), new[layer])]
     before, now = ({name: manifest["versions"].get(name) for name in SIMULATORS} for manifest in (stored, new))
-    return [*texts, *_differences("versions", before, now)]
+    return [*texts, *_describe_differences("versions", before, now)]
 
 
-def extent_of(manifest: Mapping[str, Any]) -> Any:
-    """Algorithms, runs and evaluations of each run: the part of a study that decides which journals make the solutions."""
+def search_extent_of(manifest: Mapping[str, Any]) -> Any:
+    """The study keys that decide which runs, of which length, the table of solutions covers."""
     search = manifest["study"]["search"]
     return [search["algorithms"], search["runs"], search["evaluations"]]
 
 
 def write_manifest(directory: Path, manifest: Mapping[str, Any]) -> None:
     """Write a manifest with a digest of itself, so that edits are detected."""
-    digests = {name: digest for name, digest in manifest.get(DIGESTS, {}).items() if name != MANIFEST}
-    signed_manifest = {**manifest, DIGESTS: digests}
-    signed_manifest[DIGESTS] = {**digests, MANIFEST: _digest(signed_manifest)}
+    digests = {name: digest for name, digest in manifest.get(DIGESTS_KEY, {}).items() if name != MANIFEST}
+    signed_manifest = {**manifest, DIGESTS_KEY: digests}
+    signed_manifest[DIGESTS_KEY] = {**digests, MANIFEST: _digest_of_json(signed_manifest)}
     write_whole(directory / MANIFEST, json.dumps(signed_manifest, indent=2, allow_nan=False) + "\n")
 
 
@@ -127,7 +127,7 @@ def read_manifest(directory: Path) -> dict[str, Any]:
         refuse_other_than_file(file)
         manifest = json.loads(file.read_text(encoding="utf-8", errors="replace"))
         is_readable = isinstance(manifest["study"], dict) and isinstance(manifest["versions"], dict) \
-            and manifest.get("format", FORMAT) in READABLE_FORMATS and isinstance(manifest.get(DIGESTS, {}), dict)
+            and manifest.get("format", FORMAT) in READABLE_FORMATS and isinstance(manifest.get(DIGESTS_KEY, {}), dict)
     except FileNotFoundError:
         likely_path = Path("results") / directory.name
         hint = f"; did you mean {likely_path}?" if likely_path != directory and (likely_path / MANIFEST).is_file() else ""
@@ -141,9 +141,9 @@ def read_manifest(directory: Path) -> dict[str, Any]:
         is_readable = False
     if not is_readable:
         raise InputError(file, "is not a manifest of this version of the program", expected)
-    digests = dict(manifest.get(DIGESTS, {}))
+    digests = dict(manifest.get(DIGESTS_KEY, {}))
     digest = digests.pop(MANIFEST, None)  # versions up to 0.2.0 wrote no digest
-    if digest is not None and digest != _digest({**manifest, DIGESTS: digests}):
+    if digest is not None and digest != _digest_of_json({**manifest, DIGESTS_KEY: digests}):
         raise InputError(file, "was edited; restore it, or remove it and run the same command again, which writes it anew")
     return dict(manifest)
 
@@ -161,7 +161,7 @@ def is_edited(file: Path, manifest: Mapping[str, Any]) -> bool:
     InputError
         If the file cannot be read.
     """
-    digest = manifest.get(DIGESTS, {}).get(file.name)
+    digest = manifest.get(DIGESTS_KEY, {}).get(file.name)
     try:
         return digest is not None and digest_of_table(file.read_bytes().decode("utf-8", "replace")) != digest
     except FileNotFoundError:
@@ -176,7 +176,7 @@ def refuse_edited_table(file: Path, manifest: Mapping[str, Any], remedy: str) ->
         raise InputError(file, "was edited: it no longer holds the computed solutions", remedy)
 
 
-def _differences(layer: str, stored: Any, new: Any) -> Iterator[str]:
+def _describe_differences(layer: str, stored: Any, new: Any) -> Iterator[str]:
     """All differences between a layer of two manifests, in words."""
     for key, old_value, new_value in _changed_values(stored, new):
         if layer in LAYERS_OF_FILES:
@@ -195,21 +195,21 @@ def _changed_values(first: Any, second: Any, key: str = "") -> Iterator[tuple[st
         yield key, first, second
 
 
-def comparable_inputs(stored: Mapping[str, Any], present_files: Mapping[str, str], late_files: Mapping[str, str], places: Sequence[str]
-                  ) -> tuple[dict[str, Any], Files]:
-    """A stored manifest and the files that its study reads now, prepared for their comparison.
+def make_inputs_comparable(stored: Mapping[str, Any], present_files: Mapping[str, str], late_files: Mapping[str, str],
+                           folders: Sequence[str]) -> tuple[dict[str, Any], Files]:
+    """Prepare a stored manifest, and the files that its study reads now, for their comparison.
 
-    Both omit a file that was first read after the study began, unless the file has changed since. If such a file is missing now,
+    Both then omit a file that was first read after the study began, unless the file has changed since. If such a file is missing now,
     only the manifest holds it.
     """
     stored_digests, present_digests = dict(stored.get("sources", {})), dict(present_files)
     for name, digest in late_files.items():
         if name not in stored_digests:
-            digest_now = present_digests.pop(name, None) or digest_of(file_by_name(name, places))
+            digest_now = present_digests.pop(name, None) or digest_of(file_by_name(name, folders))
             if digest_now != digest:
                 stored_digests[name], present_digests[name] = digest, digest_now
     return {**stored, "sources": stored_digests}, {name: digest for name, digest in present_digests.items() if digest}
 
 
-def _digest(value: Any) -> str:
+def _digest_of_json(value: Any) -> str:
     return sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()

@@ -1,4 +1,4 @@
-"""Identifiers of solutions, `ALGORITHM:RUN:N`, and the choice of a solution by its severity or size."""
+"""Handles, `ALGORITHM:RUN:N`, which identify solutions; and the choice of a solution by its severity or size."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ HANDLE_FORMAT = "ALGORITHM:RUN:N, the N-th row of that run in solutions.csv, fro
 
 
 class SolutionId(NamedTuple):
-    """One solution: the `row`-th of a run's solutions in the order of solutions.csv, from 0.
+    """The handle of a solution: the `row`-th of its run's solutions in the order of solutions.csv, from 0.
 
     Imported solutions belong to no run; their run number is 0.
     """
@@ -42,8 +42,8 @@ class SolutionId(NamedTuple):
         return cls(algorithm, int(run), int(row))
 
 
-def handles(solutions: pd.DataFrame) -> list[SolutionId]:
-    """The handle of every row of a frame of solutions, as `safevar_sumo.results.load_runs` gives it."""
+def handles_of(solutions: pd.DataFrame) -> list[SolutionId]:
+    """The handle of every row of `solutions`, a frame of solutions from `safevar_sumo.results.load_runs`."""
     import pandas as pd
 
     runs = solutions["run"] if "run" in solutions else pd.Series(0, index=solutions.index)
@@ -51,15 +51,15 @@ def handles(solutions: pd.DataFrame) -> list[SolutionId]:
     return [SolutionId(str(algorithm), int(run), int(row)) for algorithm, run, row in zip(solutions["algorithm"], runs, rows, strict=True)]
 
 
-def position_of(solutions: pd.DataFrame, handle: SolutionId, source: object = "solution") -> int:
-    """The row of a handle's solution in the frame.
+def row_of_handle(solutions: pd.DataFrame, handle: SolutionId, source: object = "solution") -> int:
+    """The row number, in the frame, of the solution with this handle.
 
     Raises
     ------
     InputError
         If there is no such solution.
     """
-    all_handles = handles(solutions)
+    all_handles = handles_of(solutions)
     if handle in all_handles:
         return all_handles.index(handle)
     last_rows = {(other.algorithm, other.run): other.row for other in all_handles}
@@ -80,7 +80,7 @@ CHOICES = {
 """Objectives that decide a choice, in order; smaller values first."""
 
 
-def chosen_handle(solutions: pd.DataFrame, unsafe: Unsafe, choice: str, source: object) -> SolutionId:
+def choose_handle(solutions: pd.DataFrame, unsafe: Unsafe, choice: str, source: object) -> SolutionId:
     """The handle of the most severe solution, or of the unsafe solution that is first in the order of another choice.
 
     Parameters
@@ -95,7 +95,7 @@ def chosen_handle(solutions: pd.DataFrame, unsafe: Unsafe, choice: str, source: 
     InputError
         If there is no such solution.
     """
-    table = solutions.assign(handle=list(map(str, handles(solutions))))
+    table = solutions.assign(handle=list(map(str, handles_of(solutions))))
     candidates = table if choice == "most_severe" else table[unsafe.rows(table)]
     if candidates.empty:
         if table.empty:

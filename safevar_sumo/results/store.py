@@ -21,21 +21,21 @@ from safevar_sumo.results.files import (
     journal_file,
     later_files,
     make_directory,
-    note_later_file,
+    record_late_file,
     sync_directory,
-    write_places,
+    write_folders,
     write_whole,
 )
-from safevar_sumo.results.journal import Journal, JournalBusy, owner_of
+from safevar_sumo.results.journal import Journal, JournalBusyError, owner_of
 from safevar_sumo.results.manifest import (
-    DIGESTS,
-    comparable_inputs,
-    difference,
+    DIGESTS_KEY,
     digest_of_table,
-    extent_of,
+    first_difference,
+    make_inputs_comparable,
     manifest_of,
     owner_digest,
     read_manifest,
+    search_extent_of,
     write_manifest,
 )
 from safevar_sumo.study import Study
@@ -82,7 +82,7 @@ class ResultsDirectory:
         return {"network": self.manifest.get("network", {}), "sources": self._digests}
 
     def note(self, files: Mapping[str, str]) -> None:
-        """Record files that user code has read since the study began; call this before results based on these files are journalled.
+        """Record files that user code has read since the study began; must be called before evaluations that use the files are journalled.
 
         Raises
         ------
@@ -95,7 +95,7 @@ class ResultsDirectory:
                 raise InputError(name, "is not the file that this study began with: it was changed meanwhile",
                                  "the file as it was, and the same command; or another --out")
             if name not in self._digests:
-                note_later_file(self.path, name, digest)
+                record_late_file(self.path, name, digest)
                 self._digests[name] = digest
 
     def journal(self, run: str) -> Journal:
@@ -103,7 +103,7 @@ class ResultsDirectory:
         path = journal_file(self.path, run)
         try:
             return Journal(path, owner_digest(self.manifest), run)
-        except JournalBusy:
+        except JournalBusyError:
             self._refuse_another_owner(path)
             raise
 
@@ -111,11 +111,11 @@ class ResultsDirectory:
         """Write the manifest with the original vehicle's evaluation; remove solutions of other runs."""
         manifest = {**self.manifest, "original": record(original, 0)}
         earlier_manifest = read_manifest(self.path) if (self.path / MANIFEST).exists() else manifest
-        is_outdated = extent_of(earlier_manifest) != extent_of(manifest)
-        if not is_outdated and DIGESTS in earlier_manifest:
-            manifest[DIGESTS] = earlier_manifest[DIGESTS]
+        is_outdated = search_extent_of(earlier_manifest) != search_extent_of(manifest)
+        if not is_outdated and DIGESTS_KEY in earlier_manifest:
+            manifest[DIGESTS_KEY] = earlier_manifest[DIGESTS_KEY]
         write_manifest(self.path, manifest)
-        write_places(self.path, self._study)
+        write_folders(self.path, self._study)
         if is_outdated:
             self._remove(self.path / SOLUTIONS)
 
@@ -124,7 +124,7 @@ class ResultsDirectory:
         frame = solutions_frame(tuple(self._study.vehicle.characteristics), solutions.items())
         text = frame.to_csv(index=False, lineterminator="\n")
         write_whole(self.path / SOLUTIONS, text)
-        write_manifest(self.path, {**read_manifest(self.path), DIGESTS: {SOLUTIONS: digest_of_table(text)}})
+        write_manifest(self.path, {**read_manifest(self.path), DIGESTS_KEY: {SOLUTIONS: digest_of_table(text)}})
 
     def _refuse_another_study(self) -> None:
         if not (self.path / MANIFEST).exists():
@@ -135,8 +135,8 @@ class ResultsDirectory:
         stored_manifest, late_files = read_manifest(self.path), later_files(self.path)
         if "imported" not in stored_manifest and late_files:
             folders = self._study.origin.places
-            stored_manifest, self.manifest["sources"] = comparable_inputs(stored_manifest, self._digests, late_files, folders)
-        problem, remedy = ("they are imported", "") if "imported" in stored_manifest else difference(stored_manifest, self.manifest)
+            stored_manifest, self.manifest["sources"] = make_inputs_comparable(stored_manifest, self._digests, late_files, folders)
+        problem, remedy = ("they are imported", "") if "imported" in stored_manifest else first_difference(stored_manifest, self.manifest)
         self._digests = {**self.manifest.get("sources", {}), **late_files}
         if problem:
             expected = f"another --out, or {remedy}" if remedy else "another --out"

@@ -75,56 +75,57 @@ class GuardedAlgorithm:
         if not (hasattr(search, "send") and hasattr(search, "__next__")):
             raise self._guard.wrong_value("search", "the search", search,
                                           "a generator: a method that yields settings and returns its result")
-        answers: dict[bytes, Evaluations] = {}
-        answer: Evaluations | None = None
+        evaluations_by_setting: dict[bytes, Evaluations] = {}
+        last_answer: Evaluations | None = None
         budget = problem.evaluations
         while True:
-            output, finished = self._guard.call("search", _next_output, search, answer)
-            if finished:
-                return self._result(output, answers, problem)
-            settings = self._settings(output, problem, budget)
+            output, has_finished = self._guard.call("search", _advance, search, last_answer)
+            if has_finished:
+                return self._check_result(output, evaluations_by_setting, problem)
+            settings = self._check_settings(output, problem, budget)
             budget -= len(settings)
-            evaluated = yield settings
-            for i, row in enumerate(settings):
-                answers[row.tobytes()] = evaluated.take([i])
-            answer = read_only_copy(evaluated)
+            evaluations = yield settings
+            for i, setting in enumerate(settings):
+                evaluations_by_setting[setting.tobytes()] = evaluations.take([i])
+            last_answer = read_only_copy(evaluations)
 
-    def _settings(self, output: Any, problem: Problem, budget: int) -> FloatArray:
-        members = problem.characteristics
-        expected = f"an array of shape (k, {len(members)}) with k from 1 to the {budget} evaluations that are left"
-        if not isinstance(output, np.ndarray) or output.ndim != 2 or output.shape[1] != len(members) or not 1 <= len(output) <= budget:
+    def _check_settings(self, output: Any, problem: Problem, budget: int) -> FloatArray:
+        characteristics = problem.characteristics
+        expected = f"an array of shape (k, {len(characteristics)}) with k from 1 to the {budget} evaluations that are left"
+        is_matrix = isinstance(output, np.ndarray) and output.ndim == 2
+        if not is_matrix or output.shape[1] != len(characteristics) or not 1 <= len(output) <= budget:
             raise self._guard.wrong_value("search", "settings", output, expected)
         settings = self._guard.numbers("search", "settings", output, output.shape)
-        for column, member in enumerate(members):
-            self._guard.numbers("search", member.name, settings[:, column], (len(settings),), member.lower, member.upper)
-        unfiltered_cells = np.argwhere(members.filter(settings) != settings)
+        for characteristic, values in zip(characteristics, settings.T, strict=True):
+            self._guard.numbers("search", characteristic.name, values, (len(settings),), characteristic.lower, characteristic.upper)
+        unfiltered_cells = np.argwhere(characteristics.filter(settings) != settings)
         if len(unfiltered_cells):
             row, column = unfiltered_cells[0]
-            raise self._guard.wrong_value("search", members.names[column], float(settings[row, column]),
+            raise self._guard.wrong_value("search", characteristics.names[column], float(settings[row, column]),
                                           "filtered settings: problem.characteristics.filter(settings)")
         if problem.region and not problem.region.feasible(settings).all():
             problem.region.check(settings, self._guard.source, otherwise=f", for every setting that {self._guard.name} yields: "
                                  "problem.characteristics.filter(problem.repaired(settings))")
         return settings
 
-    def _result(self, result: Any, answers: dict[bytes, Evaluations], problem: Problem) -> Evaluations:
+    def _check_result(self, result: Any, evaluations_by_setting: dict[bytes, Evaluations], problem: Problem) -> Evaluations:
         expected = "an Evaluations of settings that it was sent, such as evaluations.take(rows)"
         if not isinstance(result, Evaluations):
             raise self._guard.wrong_value("search", "its result", result, expected)
-        if not answers:
+        if not evaluations_by_setting:
             raise UserCodeError(self._guard.source, f"{self._guard.name} ended in search without yielding any setting",
                                f"a generator that yields from 1 to {problem.evaluations} settings before it returns")
-        rows = self._guard.numbers("search", "its result's settings", result.settings, (len(result), len(problem.characteristics)))
-        if any(row.tobytes() not in answers for row in rows):
+        settings = self._guard.numbers("search", "its result's settings", result.settings, (len(result), len(problem.characteristics)))
+        if any(setting.tobytes() not in evaluations_by_setting for setting in settings):
             raise self._guard.wrong_value("search", "its result", "settings that it never yielded", expected)
-        empty = next(iter(answers.values())).take([])
-        evaluations = Evaluations.concatenate([empty, *(answers[row.tobytes()] for row in rows)])
+        empty = next(iter(evaluations_by_setting.values())).take([])
+        evaluations = Evaluations.concatenate([empty, *(evaluations_by_setting[setting.tobytes()] for setting in settings)])
         return evaluations.take(problem.scoring.valid(evaluations))
 
 
-def _next_output(search: Any, answer: Evaluations | None) -> tuple[Any, bool]:
-    """What a generator yields next, or its result; and whether the generator has finished."""
+def _advance(search: Any, last_answer: Evaluations | None) -> tuple[Any, bool]:
+    """Advance a generator; returns what it yields or, at its end, its result; and whether it has finished."""
     try:
-        return (next(search) if answer is None else search.send(answer)), False
+        return (next(search) if last_answer is None else search.send(last_answer)), False
     except StopIteration as end:
         return end.value, True

@@ -17,23 +17,23 @@ from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.search.base import Problem
 
 Probability = Annotated[float, Meta(ge=0, le=1)]
-Index = Annotated[float, Meta(ge=0, le=1000)]
+DistributionIndex = Annotated[float, Meta(ge=0, le=1000)]
 Size = Annotated[int, Meta(ge=1, le=100_000)]
 TournamentSize = Annotated[int, Meta(ge=2, le=1000)]
 MAX_REDRAWS = 10
 """Maximum number of draws to replace a child equal to an existing individual; then the child is accepted."""
 MAX_MISSES = 50
-"""Maximum number of consecutive groups without a feasible child; the next such group is repaired."""
+"""Maximum number of consecutive draws without a feasible child; the children of the next such draw are repaired."""
 
 
 @cache
 def fitness_of(objectives: int) -> type[Any]:
     """The class of a fitness with this number of objectives, all minimised."""
-    def set_values(self: base.Fitness, values: tuple[float, ...] = ()) -> None:
-        if values:  # DEAP's own constructor also checks the type of the weights, which takes longer than everything else
+    def initialise(self: base.Fitness, values: tuple[float, ...] = ()) -> None:
+        if values:  # DEAP's constructor also checks the type of the weights, which takes longer than everything else
             self.values = values
 
-    return type("Fitness", (base.Fitness,), {"weights": (-1.0,) * objectives, "__init__": set_values})
+    return type("Fitness", (base.Fitness,), {"weights": (-1.0,) * objectives, "__init__": initialise})
 
 
 class Individual(list[float]):
@@ -55,9 +55,9 @@ class Operators(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """
 
     crossover_probability: Probability = 0.9
-    crossover_index: Index = 20.0
+    crossover_index: DistributionIndex = 20.0
     mutation_probability: Probability | None = None
-    mutation_index: Index = 20.0
+    mutation_index: DistributionIndex = 20.0
     tournament_size: TournamentSize = 2
 
 
@@ -66,7 +66,7 @@ class Variation:
 
     def __init__(self, operators: Operators, problem: Problem, rng: np.random.Generator) -> None:
         characteristics, self._problem = problem.characteristics, problem
-        self._operators, self._state = operators, random.Random(int(rng.integers(2**63))).getstate()
+        self._operators, self._random_state = operators, random.Random(int(rng.integers(2**63))).getstate()
         self._candidates: list[Individual] = []
         self._misses = 0
         probability = operators.mutation_probability
@@ -77,24 +77,24 @@ class Variation:
     def randomness(self) -> Iterator[None]:
         """Set the global `random`, from which DEAP draws, to this run's state; restore the caller's state afterwards."""
         state_of_caller = random.getstate()
-        random.setstate(self._state)
+        random.setstate(self._random_state)
         try:
             yield
         finally:
-            self._state = random.getstate()
+            self._random_state = random.getstate()
             random.setstate(state_of_caller)
 
-    def offspring(self, population: list[Individual], number: int) -> list[Individual]:
-        """`number` new individuals: two tournaments, crossover, mutation, pair by pair."""
+    def draw_offspring(self, population: list[Individual], number: int) -> list[Individual]:
+        """Draw `number` new individuals, in pairs: two tournaments, crossover, mutation."""
         children: list[Individual] = []
         with self.randomness():
             while population and len(children) < number:
-                pair = self._crossover(self.winner(population), self.winner(population))
+                pair = self._crossover(self.select_parent(population), self.select_parent(population))
                 children += self._feasible_children([self._mutate(child) for child in pair])
         return children[:number]
 
-    def distinct_offspring(self, population: list[Individual], number: int) -> list[Individual]:
-        """As `offspring`, but all individuals enter equally many tournaments, and a copy of an existing individual is drawn again."""
+    def draw_distinct_offspring(self, population: list[Individual], number: int) -> list[Individual]:
+        """As `draw_offspring`, but all individuals enter equally many tournaments, and copies of existing individuals are drawn again."""
         existing, children, draws = set(map(tuple, population)), list[Individual](), 0
         self._candidates = []
         with self.randomness():
@@ -106,12 +106,13 @@ class Variation:
                         children.append(child)
         return children[:number]
 
-    def child(self, first: list[Individual], second: list[Individual]) -> Individual:
-        """A new individual that is in neither group; its parents win a tournament in each group. Call this method within `randomness`."""
+    def draw_child(self, first: list[Individual], second: list[Individual]) -> Individual:
+        """Draw an individual that is in neither group, from a parent of each group. Call this method within `randomness`."""
         feasible: list[Individual] = []
         for _ in range(MAX_REDRAWS):
             while not feasible:
-                feasible = self._feasible_children([self._mutate(self._crossover(self.winner(first), self.winner(second))[0])])
+                parents = self.select_parent(first), self.select_parent(second)
+                feasible = self._feasible_children([self._mutate(self._crossover(*parents)[0])])
             child = feasible.pop()
             if child not in first and child not in second:
                 break
@@ -121,7 +122,7 @@ class Variation:
         """The children that satisfy the study's constraints.
 
         Under constrained domination (Deb 2000) a feasible individual dominates every infeasible one. The first population is feasible,
-        so an infeasible child would not survive: it is not simulated; other children are drawn in its place. After `MAX_MISSES` groups in a
+        so an infeasible child would not survive: it is not simulated; other children are drawn in its place. After `MAX_MISSES` draws in a
         row without a feasible child, the next children are moved towards the original until they are feasible.
         """
         if not self._problem.region:
@@ -139,12 +140,12 @@ class Variation:
         for _ in range(2):
             if len(self._candidates) < size:
                 self._candidates = random.sample(population, len(population))
-            winners.append(tournament(self._candidates[:size], size))
+            winners.append(run_tournament(self._candidates[:size], size))
             del self._candidates[:size]
         return winners[0], winners[1]
 
-    def winner(self, population: list[Individual]) -> Individual:
-        return tournament(population, self._operators.tournament_size)
+    def select_parent(self, population: list[Individual]) -> Individual:
+        return run_tournament(population, self._operators.tournament_size)
 
     def _crossover(self, first: Individual, second: Individual) -> tuple[Individual, Individual]:
         children = Individual(first), Individual(second)
@@ -176,8 +177,8 @@ def objectives_of(individuals: Sequence[Individual]) -> FloatArray:
     return np.array([individual.fitness.values for individual in individuals])
 
 
-def fronts(individuals: Sequence[Individual]) -> list[list[Individual]]:
-    """Individuals grouped by non-domination rank; each group keeps the given order."""
+def sort_into_fronts(individuals: Sequence[Individual]) -> list[list[Individual]]:
+    """Group individuals by non-domination rank; each front keeps the given order."""
     if not individuals:
         return []
     ranks = moocore.pareto_rank([individual.fitness.wvalues for individual in individuals], maximise=True).tolist()
@@ -189,7 +190,7 @@ def fronts(individuals: Sequence[Individual]) -> list[list[Individual]]:
 
 def set_standings(individuals: Sequence[Individual]) -> list[list[Individual]]:
     """The fronts of individuals; sets the `standing` of each to its rank, from 0, and its negative crowding distance."""
-    ranked = fronts(individuals)
+    ranked = sort_into_fronts(individuals)
     for rank, front in enumerate(ranked):
         set_front_standings(front, rank)
     return ranked
@@ -202,7 +203,7 @@ def set_front_standings(front: Sequence[Individual], rank: int) -> None:
         individual.standing = rank, -individual.fitness.crowding_dist
 
 
-def tournament(population: list[Individual], size: int = 2) -> Individual:
+def run_tournament(population: list[Individual], size: int = 2) -> Individual:
     """The best, by standing, of `size` individuals drawn without replacement; chance decides ties."""
     if len(population) == 1:
         return population[0]
@@ -213,7 +214,7 @@ def tournament(population: list[Individual], size: int = 2) -> Individual:
     return best
 
 
-def joined_evaluations(individuals: Sequence[Individual], problem: Problem) -> Evaluations:
-    """The evaluations of individuals."""
+def join_evaluations(individuals: Sequence[Individual], problem: Problem) -> Evaluations:
+    """Join the evaluations of individuals in one batch."""
     rows = [evaluations.take([row]) for evaluations, row in (individual.evaluation for individual in individuals)]
     return Evaluations.concatenate(rows) if rows else problem.original.take([])

@@ -49,17 +49,17 @@ class MapElites(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     speeds: Annotated[int, Meta(ge=1, le=100)] = 20
     tournament_size: TournamentSize = 6
 
-    def cells(self, characteristics: int, source: str = "search.map_elites") -> int:
-        """Number of cells.
+    def count_cells(self, characteristic_count: int, source: str = "search.map_elites") -> int:
+        """The number of cells of an atlas.
 
         Raises
         ------
         InputError
             If there are too many cells, or pyribs is not installed.
         """
-        number = 2**characteristics if self.behaviour == "changes" else characteristics * (self.speeds + 1)
+        number = 2**characteristic_count if self.behaviour == "changes" else characteristic_count * (self.speeds + 1)
         if number > MAX_CELLS:
-            raise InputError(source, f"search.map_elites.behaviour = 'changes' has 2^{characteristics} cells", "'speed'")
+            raise InputError(source, f"search.map_elites.behaviour = 'changes' has 2^{characteristic_count} cells", "'speed'")
         try:
             import ribs  # noqa: F401
         except ImportError:
@@ -68,7 +68,7 @@ class MapElites(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         return number
 
     def search(self, problem: Problem, rng: np.random.Generator) -> Search:
-        cell_count = self.cells(len(problem.characteristics))
+        cell_count = self.count_cells(len(problem.characteristics))
         from ribs.archives import GridArchive  # takes a second to load
 
         archive = GridArchive(solution_dim=1, dims=[cell_count], ranges=[(-0.5, cell_count - 0.5)])
@@ -84,8 +84,8 @@ class MapElites(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
             settings[used:used + number] = evaluated.settings
             valid = np.flatnonzero(problem.scoring.valid(evaluated))
             if len(valid):
-                quality[used + valid] = _quality(evaluated, problem)[valid]
-                cells = self._cell(evaluated, problem)[valid, np.newaxis]
+                quality[used + valid] = _qualities(evaluated, problem)[valid]
+                cells = self._cell_numbers(evaluated, problem)[valid, np.newaxis]
                 archive.add((used + valid)[:, np.newaxis].astype(float), quality[used + valid], cells)
             used += number
         evaluations = Evaluations.concatenate(batches)
@@ -101,23 +101,23 @@ class MapElites(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
     def _children(self, parents: FloatArray | None, number: int, problem: Problem, rng: np.random.Generator) -> FloatArray:
         """Unfiltered settings, feasible after the filter; without parents, each setting has random changes."""
-        members = problem.characteristics
-        size, width = len(members), members.upper - members.lower
+        characteristics = problem.characteristics
+        size, width = len(characteristics), characteristics.upper - characteristics.lower
         if parents is None:
-            changes = rng.random((number, size)) < rng.integers(1, size + 1, (number, 1)) / size
-            return problem.repaired(np.where(changes, problem.uniform(number, rng), members.original))
-        changed = members.changed(parents)
+            is_changed = rng.random((number, size)) < rng.integers(1, size + 1, (number, 1)) / size
+            return problem.repaired(np.where(is_changed, problem.uniform(number, rng), characteristics.original))
+        changed = characteristics.changed(parents)
         mutated_values = parents + rng.normal(0, self.reach, parents.shape) * width
-        children = np.where(changed, np.clip(mutated_values, members.lower, members.upper), parents)
-        new_values = rng.uniform(members.lower, members.upper, parents.shape)
-        for probability, values in ((self.added, new_values), (self.removed, np.broadcast_to(members.original, parents.shape))):
+        children = np.where(changed, np.clip(mutated_values, characteristics.lower, characteristics.upper), parents)
+        new_values = rng.uniform(characteristics.lower, characteristics.upper, parents.shape)
+        for probability, values in ((self.added, new_values), (self.removed, np.broadcast_to(characteristics.original, parents.shape))):
             columns = rng.integers(0, size, number) if values is new_values else np.argmax(
                 np.where(changed, rng.random(parents.shape), -1.0), axis=1)
             rows = np.flatnonzero(rng.random(number) < probability)
             children[rows, columns[rows]] = values[rows, columns[rows]]
         return problem.repaired(children)
 
-    def _cell(self, evaluated: Evaluations, problem: Problem) -> IntArray:
+    def _cell_numbers(self, evaluated: Evaluations, problem: Problem) -> IntArray:
         changed = problem.characteristics.changed(evaluated.settings)
         if self.behaviour == "changes":
             return np.asarray(changed @ (1 << np.arange(changed.shape[1])))
@@ -127,6 +127,6 @@ class MapElites(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         return np.asarray(number * (self.speeds + 1) + interval.astype(int))
 
 
-def _quality(evaluated: Evaluations, problem: Problem) -> FloatArray:
+def _qualities(evaluated: Evaluations, problem: Problem) -> FloatArray:
     """Quality of M settings, more is better: collisions by their largest change; other settings, all worse, by the first objective."""
     return np.where(evaluated.collided, QUALITY_OFFSET - evaluated.f_diff, -problem.scoring.values(evaluated)[:, 0])

@@ -17,12 +17,12 @@ from safevar_sumo.search.evolution import (
     Size,
     Variation,
     initial_population,
-    joined_evaluations,
+    join_evaluations,
     request_evaluations,
     set_standings,
 )
 
-Side = Annotated[int, Meta(ge=1, le=100_000)]
+GridSide = Annotated[int, Meta(ge=1, le=100_000)]
 CROSS = ((-1, 0), (1, 0), (0, 1), (0, -1))
 NEIGHBOURHOODS = {"von_neumann": CROSS, "moore": (*CROSS, (-1, 1), (-1, -1), (1, 1), (1, -1))}
 """Offsets, in rows and columns, from a cell to its 4 or 8 neighbours."""
@@ -52,10 +52,10 @@ class MoCell(Operators, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """
 
     archive: Size | None = None
-    grid: tuple[Side, Side] | None = None
+    grid: tuple[GridSide, GridSide] | None = None
     neighbourhood: Literal["moore", "von_neumann"] = "moore"
 
-    def sides(self, population: int, source: str = "search.mocell") -> tuple[int, int]:
+    def grid_sides(self, population: int, source: str = "search.mocell") -> tuple[int, int]:
         """Rows and columns of the grid.
 
         Raises
@@ -76,29 +76,29 @@ class MoCell(Operators, frozen=True, kw_only=True, forbid_unknown_fields=True):
         variation, size = Variation(self, problem, rng), self.archive or problem.population
         cells = initial_population(problem, rng)
         used = yield from request_evaluations(cells, problem)
-        archive = updated_archive([], cells, size)
+        archive = update_archive([], cells, size)
         while used < problem.evaluations and archive:
             valid = [cell for cell in cells if not cell.has_failed]
             set_standings(valid)
             neighbourhoods = [[cells[i] for i in indices if not cells[i].has_failed] for indices in neighbours]
             with variation.randomness():
-                offspring = [variation.child(mates or archive, archive) for mates in neighbourhoods[:problem.evaluations - used]]
+                offspring = [variation.draw_child(mates or archive, archive) for mates in neighbourhoods[:problem.evaluations - used]]
             used += yield from request_evaluations(offspring, problem)
             generation = zip(cells, offspring, neighbourhoods, strict=False)  # the last generation may be incomplete
-            cells[:len(offspring)] = [survivor(cell, child, mates) for cell, child, mates in generation]
-            archive = updated_archive(archive, offspring, size)
-        return joined_evaluations(archive, problem)
+            cells[:len(offspring)] = [choose_survivor(cell, child, mates) for cell, child, mates in generation]
+            archive = update_archive(archive, offspring, size)
+        return join_evaluations(archive, problem)
 
     def _neighbours(self, population: int) -> list[list[int]]:
         """Indices of each cell and its neighbours, without repetition."""
-        rows, columns = self.sides(population)
+        rows, columns = self.grid_sides(population)
         offsets = ((0, 0), *NEIGHBOURHOODS[self.neighbourhood])
         return [list(dict.fromkeys((row + down) % rows * columns + (column + right) % columns for down, right in offsets))
                 for row in range(rows) for column in range(columns)]
 
 
-def survivor(cell: Individual, child: Individual, mates: list[Individual]) -> Individual:
-    """The survivor of a cell and its evaluated child; `mates` are the cell and its neighbours, whose `standing` may change."""
+def choose_survivor(cell: Individual, child: Individual, mates: list[Individual]) -> Individual:
+    """Choose between a cell and its evaluated child; `mates` are the cell and its neighbours, whose `standing` may change."""
     if child.has_failed or (not cell.has_failed and cell.fitness.dominates(child.fitness)):
         return cell
     if cell.has_failed or child.fitness.dominates(cell.fitness):
@@ -107,17 +107,17 @@ def survivor(cell: Individual, child: Individual, mates: list[Individual]) -> In
     return cell if all(mate.standing <= child.standing for mate in mates) else child
 
 
-def updated_archive(archive: list[Individual], offspring: list[Individual], size: int) -> list[Individual]:
-    """At most `size` non-dominated individuals of archive and offspring, without duplicates, the least crowded; sets their `standing`.
+def update_archive(archive: list[Individual], offspring: list[Individual], size: int) -> list[Individual]:
+    """Select the at most `size` least crowded non-dominated individuals of archive and offspring, without duplicates; sets `standing`.
 
     Offspring are copied into the archive, because archive and grid each set the `standing` of their own copy.
     """
-    distinct = {member.fitness.values: member for member in archive}
+    distinct = {individual.fitness.values: individual for individual in archive}
     for child in offspring:
         if not child.has_failed and child.fitness.values not in distinct:
             distinct[child.fitness.values] = copy(child)
-    members = next(iter(set_standings(list(distinct.values()))), [])
-    while len(members) > size:
-        del members[max(range(len(members)), key=lambda i: members[i].standing)]
-        set_standings(members)
-    return members
+    new_archive = next(iter(set_standings(list(distinct.values()))), [])
+    while len(new_archive) > size:
+        del new_archive[max(range(len(new_archive)), key=lambda i: new_archive[i].standing)]
+        set_standings(new_archive)
+    return new_archive

@@ -9,11 +9,11 @@ from safevar_sumo.search.evolution import (
     Individual,
     Operators,
     Variation,
-    fronts,
     initial_population,
-    joined_evaluations,
+    join_evaluations,
     request_evaluations,
     set_front_standings,
+    sort_into_fronts,
 )
 
 
@@ -30,16 +30,17 @@ class Nsga2(Operators, frozen=True, kw_only=True, forbid_unknown_fields=True):
         offspring, population, used = initial_population(problem, rng), list[Individual](), 0
         while offspring:
             used += yield from request_evaluations(offspring, problem)
-            population = survivors(population + [individual for individual in offspring if not individual.has_failed], problem.population)
-            offspring = variation.offspring(population, min(problem.population, problem.evaluations - used))
-        return joined_evaluations([best for best in population if best.standing[0] == 0], problem)
+            valid_offspring = [individual for individual in offspring if not individual.has_failed]
+            population = select_survivors(population + valid_offspring, problem.population)
+            offspring = variation.draw_offspring(population, min(problem.population, problem.evaluations - used))
+        return join_evaluations([best for best in population if best.standing[0] == 0], problem)
 
 
-def survivors(individuals: list[Individual], number: int) -> list[Individual]:
-    """The best `number` by rank, then by crowding distance; DEAP's `selNSGA2`, sorted by compiled code."""
+def select_survivors(individuals: list[Individual], number: int) -> list[Individual]:
+    """Select the best `number` by rank, then by crowding distance, as DEAP's `selNSGA2`, sorted by compiled code."""
     sorted_individuals = sorted(individuals, key=lambda individual: individual.fitness.wvalues, reverse=True)
     best: list[Individual] = []
-    for rank, front in enumerate(fronts(sorted_individuals)):
+    for rank, front in enumerate(sort_into_fronts(sorted_individuals)):
         set_front_standings(front, rank)
         best += sorted(front, key=lambda individual: individual.standing)
         if len(best) >= number:

@@ -19,12 +19,12 @@ class RandomSearch(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
         archive: Evaluations | None = None
         for start in range(0, len(settings), problem.population):
             evaluated = yield settings[start:start + problem.population]
-            archive = _non_dominated(evaluated if archive is None else Evaluations.concatenate([archive, evaluated]), problem.scoring)
+            archive = _keep_non_dominated(evaluated if archive is None else Evaluations.concatenate([archive, evaluated]), problem.scoring)
         assert archive is not None
         return archive
 
 
-def _non_dominated(evaluations: Evaluations, scoring: Scoring) -> Evaluations:
+def _keep_non_dominated(evaluations: Evaluations, scoring: Scoring) -> Evaluations:
     """The valid non-dominated evaluations, including all with equal objectives."""
     valid = evaluations.take(scoring.valid(evaluations))
     return valid.take(moocore.is_nondominated(scoring.values(valid), keep_weakly=True)) if len(valid) else valid

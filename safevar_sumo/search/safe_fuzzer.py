@@ -15,7 +15,7 @@ RESULT_SIZE = 50
 SAFETY_WEIGHT = 6.0
 MAX_REDRAWS = 100
 """Maximum number of draws to replace an infeasible setting."""
-Number = Annotated[int, Meta(ge=1, le=1_000_000)]
+PositiveCount = Annotated[int, Meta(ge=1, le=1_000_000)]
 
 
 class SafeFuzzer(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -35,11 +35,11 @@ class SafeFuzzer(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         Weight of the first objective in the score; the other objectives have weight 1.
     """
 
-    generation: Number = 50
-    kept: Number = RESULT_SIZE
+    generation: PositiveCount = 50
+    kept: PositiveCount = RESULT_SIZE
     warm_up: Annotated[int, Meta(ge=0)] = 500
-    generations_between_updates: Number = 5
-    generations_without_improvement: Number = 5
+    generations_between_updates: PositiveCount = 5
+    generations_without_improvement: PositiveCount = 5
     safety_weight: Annotated[float, Meta(ge=0, le=1e6)] = SAFETY_WEIGHT
 
     def search(self, problem: Problem, rng: np.random.Generator) -> Search:
@@ -75,25 +75,25 @@ class _Ranges:
 
     def draw(self, number: int, rng: np.random.Generator) -> FloatArray:
         """Filtered settings; each changes k characteristics, with k drawn uniformly from 1 to `max_changes`."""
-        settings = np.stack([self._feasible_setting(rng) for _ in range(number)])
+        settings = np.stack([self._draw_feasible_setting(rng) for _ in range(number)])
         return self._characteristics.filter(settings)
 
-    def _feasible_setting(self, rng: np.random.Generator) -> FloatArray:
+    def _draw_feasible_setting(self, rng: np.random.Generator) -> FloatArray:
         """A feasible setting; after `MAX_REDRAWS` infeasible draws, the last one moved towards the original until it is feasible."""
-        setting = self._setting(rng)
+        setting = self._draw_setting(rng)
         for _ in range(MAX_REDRAWS):
             if self._problem.feasible(setting[np.newaxis])[0]:
                 return setting
-            setting = self._setting(rng)
+            setting = self._draw_setting(rng)
         return np.asarray(self._problem.repaired(setting[np.newaxis])[0])
 
-    def _setting(self, rng: np.random.Generator) -> FloatArray:
+    def _draw_setting(self, rng: np.random.Generator) -> FloatArray:
         setting = self._characteristics.original.copy()
         for i in rng.choice(len(setting), size=rng.integers(1, self.max_changes, endpoint=True), replace=False):
-            setting[i] = self._value(i, rng)
+            setting[i] = self._draw_value(i, rng)
         return setting
 
-    def _value(self, i: int, rng: np.random.Generator) -> float:
+    def _draw_value(self, i: int, rng: np.random.Generator) -> float:
         """A value drawn uniformly from the range without the filter's band; the original value if the band covers the whole range."""
         original, threshold = self._characteristics.original[i], self._characteristics.threshold[i]
         width_below = max(original - threshold - self.lower[i], 0.0)
@@ -105,16 +105,16 @@ class _Ranges:
 
     def narrow(self, window: Evaluations) -> None:
         """Narrow each range to the mean increase and mean decrease in the settings of `window` that are less safe than the original."""
-        unsafe = window.take(self._scoring.valid(window) & (self._scoring.values(window)[:, 0] < self._original))
-        if not len(unsafe):
+        less_safe = window.take(self._scoring.valid(window) & (self._scoring.values(window)[:, 0] < self._original))
+        if not len(less_safe):
             return
         for i, original in enumerate(self._characteristics.original):
-            values = unsafe.settings[:, i]
+            values = less_safe.settings[:, i]
             if np.any(values > original):
                 self.upper[i] = np.mean(values[values > original])
             if np.any(values < original):
                 self.lower[i] = np.mean(values[values < original])
-        self.max_changes = max(1, int(np.floor(np.mean(unsafe.f_num_diff) + 0.5)))
+        self.max_changes = max(1, int(np.floor(np.mean(less_safe.f_num_diff) + 0.5)))
 
 
 def _improves(generation: Evaluations, earlier: Evaluations, scoring: Scoring = SAFEVAR, safety_weight: float = SAFETY_WEIGHT,

@@ -12,7 +12,7 @@ from safevar_sumo.search.evolution import (
     Size,
     Variation,
     initial_population,
-    joined_evaluations,
+    join_evaluations,
     objectives_of,
     request_evaluations,
 )
@@ -48,18 +48,18 @@ class Spea2(Operators, frozen=True, kw_only=True, forbid_unknown_fields=True):
         while offspring:
             used += yield from request_evaluations(offspring, problem)
             valid_offspring = [individual for individual in offspring if not individual.has_failed]
-            archive = environmental_selection(archive + valid_offspring, size, normalised=self.normalised)
-            offspring = variation.distinct_offspring(archive, min(problem.population, problem.evaluations - used))
-        return joined_evaluations([best for best in archive if best.standing[0] < 1], problem)
+            archive = select_archive(archive + valid_offspring, size, normalised=self.normalised)
+            offspring = variation.draw_distinct_offspring(archive, min(problem.population, problem.evaluations - used))
+        return join_evaluations([best for best in archive if best.standing[0] < 1], problem)
 
 
-def environmental_selection(individuals: list[Individual], number: int, *, normalised: bool = False) -> list[Individual]:
-    """Environmental selection; sets `standing` to the fitness, which is below 1 for non-dominated individuals."""
+def select_archive(individuals: list[Individual], number: int, *, normalised: bool = False) -> list[Individual]:
+    """The publication's environmental selection; sets `standing` to the fitness, which is below 1 for non-dominated individuals."""
     if not individuals:
         return []
     objectives = objectives_of(individuals)
-    dominates = domination(objectives)
-    distances = _distances(_unit_range(objectives) if normalised else objectives)
+    dominates = domination_matrix(objectives)
+    distances = _distances(_scale_to_unit_range(objectives) if normalised else objectives)
     fitness = _raw_fitness(dominates) + _density(distances)
     for individual, value in zip(individuals, fitness.tolist(), strict=True):
         individual.standing = (value,)
@@ -70,7 +70,7 @@ def environmental_selection(individuals: list[Individual], number: int, *, norma
     return [individuals[i] for i in selection]
 
 
-def domination(objectives: FloatArray) -> BoolArray:
+def domination_matrix(objectives: FloatArray) -> BoolArray:
     """Whether row i dominates row j; shape (M, M)."""
     first, second = objectives[:, np.newaxis], objectives[np.newaxis]
     return np.asarray((first <= second).all(axis=2) & (first < second).any(axis=2))
@@ -83,22 +83,22 @@ def _raw_fitness(dominates: BoolArray) -> FloatArray:
 
 
 def _density(distances: FloatArray) -> FloatArray:
-    """1 / (distance to the k-th nearest individual + 2); k is the square root of the number of individuals, counted from 0 as in pymoo."""
+    """1 / (distance to the k-th nearest individual + 2); k is the root of the number of individuals, and counts from 0 as in pymoo."""
     k = min(int(np.sqrt(len(distances))), len(distances) - 1)
     return np.asarray(1 / (np.sort(distances, axis=1)[:, k] + 2))
 
 
-def _distances(points: FloatArray) -> FloatArray:
-    """Euclidean distances, infinite from a point to itself; summed objective by objective, so that they do not depend on the shape."""
-    squares = np.zeros((len(points), len(points)))
-    for column in points.T:
+def _distances(objectives: FloatArray) -> FloatArray:
+    """Euclidean distances, infinite from a row to itself; summed objective by objective, so that they do not depend on the shape."""
+    squares = np.zeros((len(objectives), len(objectives)))
+    for column in objectives.T:
         squares += (column[:, np.newaxis] - column) ** 2
     distances = np.sqrt(squares)
     np.fill_diagonal(distances, np.inf)
     return distances
 
 
-def _unit_range(objectives: FloatArray) -> FloatArray:
+def _scale_to_unit_range(objectives: FloatArray) -> FloatArray:
     """Objectives scaled to [0, 1]."""
     least = objectives.min(axis=0)
     width = objectives.max(axis=0) - least

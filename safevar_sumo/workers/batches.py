@@ -16,28 +16,28 @@ from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.study import Study, fmus_of, user_code_names
 from safevar_sumo.sumo import Engine, assemble, reason_for_sumo, settings_per_batch
 from safevar_sumo.vehicles import CharacteristicSet
-from safevar_sumo.workers.evaluation import Pool, packed
-from safevar_sumo.workers.identity import Inputs, networks_of
-from safevar_sumo.workers.interrupts import awaited, first_of
+from safevar_sumo.workers.evaluation import Pool, pack_study
+from safevar_sumo.workers.identity import Inputs, network_digests
+from safevar_sumo.workers.interrupts import wait_for_first, wait_for_result
 from safevar_sumo.workers.isolation import check_code, refuse_unlike_sumo
 from safevar_sumo.workers.retrying import RetryingPool
 
-SHARES = 4
+BATCHES_PER_CALL_AND_WORKER = 4
 """Number of batches per worker: with several small batches, no worker waits long for another."""
 MIN_BATCH = 100
 """Minimum number of settings of a batch: a smaller batch takes as long."""
 VERIFIED_SETTINGS = 50
 """Number of settings of a study, over all calls, and number of evaluations of each run, that are verified in SUMO."""
 _batch_sizes: dict[bytes, tuple[int, bool]] = {}
-"""Results of `batches_of` by packed study."""
+"""Results of `choose_batch_size`, by packed study."""
 _verified_counts: dict[bytes, int] = {}
 """Number of settings with verified results, by packed study."""
 _files_read: dict[tuple[bytes, str], Files] = {}
 """Files that models have read in this process, by packed study and working directory."""
 
 
-def batches_of(study: Study) -> tuple[int, bool]:
-    """The most economical number of settings in a batch, and whether a recorded scene can replace SUMO."""
+def choose_batch_size(study: Study) -> tuple[int, bool]:
+    """Choose the most economical number of settings in a batch; also returns whether a recorded scene can replace SUMO."""
     system = assemble(study, study.source)
     return settings_per_batch(system, Engine.RECORDED), not reason_for_sumo(system)
 
@@ -48,14 +48,14 @@ def evaluate_all(study: Study, settings: FloatArray, pool: Pool, done: Callable[
     User code is checked first (`check_code`). A sample of the settings in a recorded scene is also simulated in SUMO.
     `done` is called with the number of settings of every finished batch.
     """
-    retrying_pool, work = RetryingPool(pool, study), packed(study, inputs := inputs_of(study, pool))
+    retrying_pool, work = RetryingPool(pool, study), pack_study(study, inputs := inputs_of(study, pool))
     for remark in check_code(study, inputs, retrying_pool):
         warn(remark)
     distinct_settings, row_of = np.unique(settings, axis=0, return_inverse=True)
     if work not in _batch_sizes:
-        _batch_sizes[work] = batches_of(study)
+        _batch_sizes[work] = choose_batch_size(study)
     best_size, is_recorded = _batch_sizes[work]
-    size = min(best_size, max(math.ceil(len(distinct_settings) / (SHARES * pool.workers)), MIN_BATCH))
+    size = min(best_size, max(math.ceil(len(distinct_settings) / (BATCHES_PER_CALL_AND_WORKER * pool.workers)), MIN_BATCH))
     starts = range(0, len(distinct_settings), size)
     futures = {retrying_pool.submit(work, distinct_settings[start:start + size]): start for start in starts}
     sample_size = min(VERIFIED_SETTINGS - _verified_counts.get(work, 0), len(distinct_settings))
@@ -64,50 +64,50 @@ def evaluate_all(study: Study, settings: FloatArray, pool: Pool, done: Callable[
     if is_recorded and len(sample):
         sumo_study = study_for_sumo_check(study, assemble(study).weather)
         sumo_inputs = inputs if sumo_study is study else inputs_of(sumo_study, pool)
-        in_sumo = retrying_pool.submit(packed(sumo_study, sumo_inputs, engine=Engine.LIBSUMO), distinct_settings[sample])
+        in_sumo = retrying_pool.submit(pack_study(sumo_study, sumo_inputs, engine=Engine.LIBSUMO), distinct_settings[sample])
         if sumo_study is not study:
-            in_scenes = retrying_pool.submit(packed(sumo_study, sumo_inputs), distinct_settings[sample])
-    parts: dict[int, Evaluations] = {}
-    while len(parts) < len(futures):
-        for future in first_of([future for future, start in futures.items() if start not in parts]):
-            parts[futures[future]] = future.result()
-            done(len(parts[futures[future]]))
-    evaluations = Evaluations.concatenate([parts[start] for start in starts])
+            in_scenes = retrying_pool.submit(pack_study(sumo_study, sumo_inputs), distinct_settings[sample])
+    evaluations_by_start: dict[int, Evaluations] = {}
+    while len(evaluations_by_start) < len(futures):
+        for future in wait_for_first([future for future, start in futures.items() if start not in evaluations_by_start]):
+            batch = evaluations_by_start[futures[future]] = future.result()
+            done(len(batch))
+    evaluations = Evaluations.concatenate([evaluations_by_start[start] for start in starts])
     if in_sumo is not None:
-        expected = evaluations.take(sample) if in_scenes is None else awaited(in_scenes)
-        refuse_unlike_sumo(study, expected.take(~expected.failed), awaited(in_sumo).take(~expected.failed))
+        expected = evaluations.take(sample) if in_scenes is None else wait_for_result(in_scenes)
+        refuse_unlike_sumo(study, expected.take(~expected.failed), wait_for_result(in_sumo).take(~expected.failed))
         _verified_counts[work] = _verified_counts.get(work, 0) + len(sample)
     return evaluations.take(row_of.ravel())
 
 
 def inputs_of(study: Study, pool: Pool) -> Inputs:
-    """Digests of the files that must be the same on every worker, by layer and name; raises as `digests_of_sources`."""
-    return {"network": networks_of(assemble(study)), "sources": digests_of_sources(study, pool)}
+    """Digests of the files that must be the same on every worker, by layer and name; raises as `source_digests`."""
+    return {"network": network_digests(assemble(study)), "sources": source_digests(study, pool)}
 
 
-def digests_of_sources(study: Study, pool: Pool) -> Files:
-    """Digests, by name, of files that parameters name, and of files that users' models read in a run of the original vehicle.
+def source_digests(study: Study, pool: Pool) -> Files:
+    """Digests, by name, of files that parameters name, and of files that user code reads while a worker simulates the original vehicle.
 
-    The run takes place in a worker that reloads all user code.
+    The worker reloads all user code before.
 
     Raises
     ------
     SafevarError
         If the original vehicle cannot be simulated.
     """
-    files = digests(files_named_in(_parameters(study), study.origin.places), study.origin.places)
+    files = digests(files_named_in(_all_parameters(study), study.origin.places), study.origin.places)
     if user_code_names(study):
-        work = packed(study, {}, afresh=True)
+        work = pack_study(study, {}, afresh=True)
         key = work, os.getcwd()
         files_read = _files_read.get(key, {"": "never read"})
         if any(digest_of(file_by_name(name, study.origin.places)) != digest for name, digest in files_read.items()):
             original = CharacteristicSet.of(study.vehicle.characteristics).original[np.newaxis]
-            _files_read[key] = dict(awaited(RetryingPool(pool, study).submit(work, original, must_succeed=True)).files)
+            _files_read[key] = dict(wait_for_result(RetryingPool(pool, study).submit(work, original, must_succeed=True)).files)
         files |= _files_read[key]
     return dict(sorted(files.items()))
 
 
-def _parameters(study: Study) -> list[Any]:
+def _all_parameters(study: Study) -> list[Any]:
     """All parameters of the models and algorithms of a study, and the paths of its FMUs."""
     tests = [] if study.matrix is None else study.matrix.tests
     return [study.vehicle.parameters, study.ads.parameters, study.scenario.parameters, study.search.parameters,

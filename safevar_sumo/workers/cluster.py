@@ -21,7 +21,7 @@ from safevar_sumo.errors import InputError, in_one_line
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.results import RESULTS
 from safevar_sumo.workers.evaluation import PoolLostError, WorkerLostError, evaluate_batch
-from safevar_sumo.workers.interrupts import interrupts_noted
+from safevar_sumo.workers.interrupts import defer_interrupts
 
 ADDRESS = re.compile(r"[a-z]+://[^\s/]+:\d+/?")
 CERTIFICATES = "for tls:// certificates in Dask's configuration: distributed.comm.tls.ca-file and .client.cert, .client.key"
@@ -64,7 +64,7 @@ def cluster_pool(address: str, time_limit: float) -> Iterator[ClusterPool]:
         raise InputError("cluster", f"nobody answers at {address!r}: {error}", legal) from None
     except (TypeError, RuntimeError) as error:
         raise InputError("cluster", f"{address!r}: {in_one_line(error)}", CERTIFICATES) from None
-    with interrupts_noted():
+    with defer_interrupts():
         try:
             yield ClusterPool(client, time_limit)
         finally:
@@ -77,18 +77,18 @@ class ClusterPool:
     def __init__(self, client: Any, time_limit: float) -> None:
         self._executor = client.get_executor(pure=False)
         self._client, self._time_limit = client, time_limit
-        self._workers, self._counted = 1, -np.inf
+        self._workers, self._time_of_count = 1, -np.inf
 
     @property
     def workers(self) -> int:
         """Number of worker processes, counted every few seconds; each process computes one batch at a time."""
         now = time.monotonic()
-        if now - self._counted > SECONDS_BETWEEN_COUNTS:
+        if now - self._time_of_count > SECONDS_BETWEEN_COUNTS:
             try:
                 self._workers = max(1, len(self._client.nthreads()))
             except (OSError, TimeoutError) as error:
                 raise PoolLostError(f"the cluster does not answer any more: {error}") from None
-            self._counted = now
+            self._time_of_count = now
         return self._workers
 
     def submit(self, study: bytes, settings: FloatArray) -> Future[Evaluations]:
@@ -97,7 +97,7 @@ class ClusterPool:
             dask_future = self._executor.submit(_evaluate_in_time, self._time_limit, _versions(), study, settings)
         except RuntimeError as error:
             raise PoolLostError(f"the cluster does not answer any more: {error}") from None
-        dask_future.add_done_callback(lambda source: _hand_on(source, future))
+        dask_future.add_done_callback(lambda source: _forward_result(source, future))
         return future
 
 
@@ -118,7 +118,7 @@ def _versions() -> dict[str, str]:
     return {**{name: version(name) for name in VERSIONED_PACKAGES}, "results": str(RESULTS)}
 
 
-def _hand_on(dask_future: Future[Evaluations], future: Future[Evaluations]) -> None:
+def _forward_result(dask_future: Future[Evaluations], future: Future[Evaluations]) -> None:
     from distributed import KilledWorker
 
     if dask_future.cancelled():

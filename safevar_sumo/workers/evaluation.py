@@ -18,7 +18,7 @@ from safevar_sumo.study import Study, user_code_packages
 from safevar_sumo.sumo.engine import Engine
 from safevar_sumo.sumo.matrix import evaluate, in_cells
 from safevar_sumo.sumo.system import System, assemble
-from safevar_sumo.workers.identity import Inputs, networks_of
+from safevar_sumo.workers.identity import Inputs, network_digests
 
 SHARED_LAYERS = ("network", "sources")
 """Layers of a study's identity that must be the same on every worker."""
@@ -46,7 +46,7 @@ class Pool(Protocol):
 class _Work(msgspec.Struct, frozen=True):
     """A study for a worker, with digests of the files that its results depend on, and the way to evaluate its settings.
 
-    With `check` the worker checks the user code instead; see `packed` for the other fields.
+    See `pack_study` for the fields.
     """
 
     study: Study
@@ -65,9 +65,9 @@ class _Mode(msgspec.Struct, frozen=True):
     cells: tuple[int, int] | None = None
 
 
-def packed(study: Study, inputs: Mapping[str, Any] | None = None, *, engine: Engine = Engine.RECORDED, afresh: bool = False,
+def pack_study(study: Study, inputs: Mapping[str, Any] | None = None, *, engine: Engine = Engine.RECORDED, afresh: bool = False,
            check: bool = False, cells: tuple[int, int] | None = None) -> bytes:
-    """A study, packed for a worker as bytes.
+    """Pack a study for a worker as bytes.
 
     Parameters
     ----------
@@ -79,12 +79,12 @@ def packed(study: Study, inputs: Mapping[str, Any] | None = None, *, engine: Eng
     afresh
         Whether models are reloaded, which removes all state of earlier batches from their modules and classes.
     check
-        Whether the worker checks the user code instead; the `reasons` of the result are remarks on this code.
+        Whether the worker only checks the user code; the `reasons` of the result are then remarks on this code.
     cells
         (k, n): for a rated study, results in part k of n parts of the cells, instead of points for all cells.
     """
     if inputs is None:
-        inputs = {"network": networks_of(assemble(study))}
+        inputs = {"network": network_digests(assemble(study))}
     return msgspec.msgpack.encode(_Work(study, {layer: dict(inputs[layer]) for layer in SHARED_LAYERS if layer in inputs}, engine, afresh,
                                         check, cells))
 
@@ -115,7 +115,7 @@ def evaluate_batch(work: bytes, settings: FloatArray) -> Evaluations:
         evaluations = evaluate(system, settings, task.engine) if cells is None else in_cells(system, settings, cells, task.engine)
     _refuse_changed_networks(task.inputs, system)
     files_read = digests(reading.files(user_code_packages(task.study)), task.study.origin.places)
-    return replace(evaluations, files=_unknown_files(task, files_read))
+    return replace(evaluations, files=_find_unknown_files(task, files_read))
 
 
 def _work_for_all_cells(work: bytes) -> bytes:
@@ -125,17 +125,17 @@ def _work_for_all_cells(work: bytes) -> bytes:
 
 @lru_cache(maxsize=4)
 def _task_and_system(work: bytes) -> tuple[_Work, System]:
-    """The unpacked work and the system of its study. Both are cached, even if source files change."""
+    """The unpacked work and the system of its study; both are cached and stay the same even if source files change."""
     task = msgspec.msgpack.decode(work, type=_Work)
     return task, assemble(task.study)
 
 
 def _refuse_changed_networks(expected: Inputs, system: System) -> None:
     if "network" in expected:
-        _refuse_changed_files(changed_files(expected["network"], networks_of(system)))
+        _refuse_changed_files(changed_files(expected["network"], network_digests(system)))
 
 
-def _unknown_files(task: _Work, files: Files) -> Files:
+def _find_unknown_files(task: _Work, files: Files) -> Files:
     """The files that were not known when the study began; refuses known files that have changed."""
     sources = task.inputs.get("sources", {})
     _refuse_changed_files([name for name, digest in files.items() if sources.get(name, digest) != digest])

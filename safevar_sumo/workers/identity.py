@@ -22,7 +22,7 @@ Inputs = dict[str, dict[str, str]]
 """Digests of files, by layer and name."""
 EXPONENTS = (1 / 21, 1 / 20, -21.0, 21.0)
 """Exponents of the powers that NSGA-II's operators compute (distribution index 20)."""
-POWERS = 2000
+BASES = 2000
 """Number of bases for each exponent."""
 
 
@@ -35,7 +35,7 @@ def identity_of(study: Study, system: System, sources: Mapping[str, str] = Mappi
     Parameters
     ----------
     sources
-        Digests of the files that user code reads: see `safevar_sumo.workers.batches.digests_of_sources`.
+        Digests of the files that user code reads: see `safevar_sumo.workers.batches.source_digests`.
     """
     resolved = evaluation_keys(study)
     for table, model in (("vehicle", system.vehicle), ("ads", system.ads), ("scenario", system.scenario)):
@@ -46,10 +46,10 @@ def identity_of(study: Study, system: System, sources: Mapping[str, str] = Mappi
     resolved["weather"] = msgspec.to_builtins(system.weather)
     if system.matrix and system.rater is None:
         resolved["weathers"] = [msgspec.to_builtins(point.weather) for point in system.matrix]
-    return {"resolved": resolved, "network": networks_of(system), "sources": dict(sources), "results": RESULTS, "platform": _platform()}
+    return {"resolved": resolved, "network": network_digests(system), "sources": dict(sources), "results": RESULTS, "platform": _platform()}
 
 
-def networks_of(system: System) -> dict[str, str]:
+def network_digests(system: System) -> dict[str, str]:
     """Digests of the files of all networks in the simulations."""
     folders = list(dict.fromkeys(point.scenario.network for point in system.points))
     if len(folders) == 1:
@@ -63,6 +63,6 @@ def _platform() -> dict[str, str]:
 
 
 def powers_digest() -> str:
-    """Digest of powers: only these depend on the mathematical library; IEEE 754 determines all other operations."""
-    bases = [(number + 0.5) / POWERS * 2 for number in range(POWERS)]
+    """Digest of sample powers: of all operations, only powers depend on the mathematical library and not on IEEE 754 alone."""
+    bases = [(i + 0.5) / BASES * 2 for i in range(BASES)]
     return sha256(repr([[base ** exponent for base in bases] for exponent in EXPONENTS]).encode()).hexdigest()[:DIGEST_LENGTH]

@@ -15,14 +15,14 @@ from contextlib import contextmanager
 
 from safevar_sumo.records import Evaluations
 
-SECONDS_BETWEEN_LOOKS = 0.2
+SECONDS_BETWEEN_CHECKS = 0.2
 """Longest time for which Ctrl-C goes unnoticed [s]."""
 _interrupt = threading.Event()
 
 
 @contextmanager
-def interrupts_noted() -> Iterator[None]:
-    """A context in which only `first_of` and `awaited` raise Ctrl-C; its end raises a pending Ctrl-C."""
+def defer_interrupts() -> Iterator[None]:
+    """Raise Ctrl-C only in `wait_for_first` and `wait_for_result`, and at the end of this context."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -32,31 +32,31 @@ def interrupts_noted() -> Iterator[None]:
         yield
     finally:
         signal.signal(signal.SIGINT, signal.default_int_handler if previous_handler is None else previous_handler)
-    _raise_if_pressed()
+    _raise_pending_interrupt()
 
 
-def first_of(futures: Iterable[Future[Evaluations]]) -> set[Future[Evaluations]]:
+def wait_for_first(futures: Iterable[Future[Evaluations]]) -> set[Future[Evaluations]]:
     """Wait until a future is done, and return all futures that are done; an empty set if there are no futures."""
     while True:
-        done, waiting_futures = wait(futures, timeout=SECONDS_BETWEEN_LOOKS, return_when=FIRST_COMPLETED)
-        _raise_if_pressed()
+        done, waiting_futures = wait(futures, timeout=SECONDS_BETWEEN_CHECKS, return_when=FIRST_COMPLETED)
+        _raise_pending_interrupt()
         if done or not waiting_futures:
             return done
 
 
-def awaited(future: Future[Evaluations]) -> Evaluations:
+def wait_for_result(future: Future[Evaluations]) -> Evaluations:
     """The result of a future, or its error, once the future is done."""
-    first_of([future])
+    wait_for_first([future])
     return future.result()
 
 
-def _raise_if_pressed() -> None:
+def _raise_pending_interrupt() -> None:
     if _interrupt.is_set():
         _interrupt.clear()
         raise KeyboardInterrupt
 
 
-def leave_interrupts_to_the_caller() -> None:
+def block_interrupts() -> None:
     """Block Ctrl-C in this thread and, because the mask is inherited, in the processes that the thread starts."""
     if sys.platform == "win32":  # without signal masks; `_serve` ignores interrupts
         return

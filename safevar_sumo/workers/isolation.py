@@ -15,13 +15,14 @@ from safevar_sumo.records import BoolArray, Evaluations
 from safevar_sumo.results import RESULTS
 from safevar_sumo.study import Study, tables_of, user_code_names
 from safevar_sumo.vehicles import CharacteristicSet
-from safevar_sumo.workers.evaluation import packed
+from safevar_sumo.workers.evaluation import pack_study
 from safevar_sumo.workers.identity import Inputs
-from safevar_sumo.workers.interrupts import awaited
+from safevar_sumo.workers.interrupts import wait_for_result
 from safevar_sumo.workers.retrying import RetryingPool
 
-LEGAL = ("results of a vehicle that depend on this vehicle alone: nothing kept in a class, a module or the model itself from one call or "
-         "setting to another, no mean or sum over the batch, nothing random")
+EXPECTED_RESULTS = (
+    "results of a vehicle that depend on this vehicle alone: nothing kept in a class, a module or the model itself from one call or "
+    "setting to another, no mean or sum over the batch, nothing random")
 
 ROUNDING = 1e-9
 """Largest accepted difference between a metric in a recorded scene and in SUMO."""
@@ -47,7 +48,7 @@ def check_code(study: Study, inputs: Inputs, pool: RetryingPool) -> list[str]:
     if name in _passed_checks or marker.exists():
         return []
     original = CharacteristicSet.of(study.vehicle.characteristics).original[np.newaxis]
-    remarks = list(awaited(pool.submit(packed(study, inputs, check=True), original, must_succeed=True)).reasons.values())
+    remarks = list(wait_for_result(pool.submit(pack_study(study, inputs, check=True), original, must_succeed=True)).reasons.values())
     _passed_checks.add(name)
     with suppress(OSError):  # without the marker, the next process checks again
         marker.parent.mkdir(parents=True, exist_ok=True)
@@ -55,21 +56,20 @@ def check_code(study: Study, inputs: Inputs, pool: RetryingPool) -> list[str]:
     return remarks
 
 
-def refuse_difference(study: Study, ways: dict[str, Evaluations], again: str = "") -> None:
-    """Refuse differing evaluations of one setting, given by the way of simulation; the command `again` repeats one of them.
+def refuse_difference(study: Study, run: str, in_run: Evaluations, alone: Evaluations, repetition_command: str) -> None:
+    """Refuse a setting whose evaluation in a run differs from its evaluation alone, which `repetition_command` repeats.
 
     Raises
     ------
     UserCodeError
         With the models, the first result that differs, and the contract.
     """
-    (first_way, evaluation), (other_way, other_evaluation) = next(iter(ways.items())), list(ways.items())[-1]
-    difference = _difference(evaluation, other_evaluation)
+    difference = _find_difference(in_run, alone)
     if difference:
-        name, value, other_value = difference
+        name, value, value_alone = difference
         problem = (f"with {' and '.join(user_code_names(study))} a result depends on what else is simulated: "
-                   f"{name} is {value} {first_way} and {other_value} {other_way}")
-        raise UserCodeError(f"study {study.name!r}", f"{problem}{again and f'; again by: {again}'}", LEGAL)
+                   f"{name} is {value} in run {run} and {value_alone} alone; again by: {repetition_command}")
+        raise UserCodeError(f"study {study.name!r}", problem, EXPECTED_RESULTS)
 
 
 def refuse_unlike_sumo(study: Study, recorded: Evaluations, in_sumo: Evaluations) -> None:
@@ -80,9 +80,9 @@ def refuse_unlike_sumo(study: Study, recorded: Evaluations, in_sumo: Evaluations
     InputError
         With the first such setting and both values.
     """
-    for row in np.flatnonzero(~_is_alike(recorded, in_sumo, ROUNDING) & ~in_sumo.failed).tolist():
+    for row in np.flatnonzero(~_are_alike(recorded, in_sumo, ROUNDING) & ~in_sumo.failed).tolist():
         setting = recorded.settings[row]
-        difference = _difference(recorded.take([row]), in_sumo.take([row]), ROUNDING)
+        difference = _find_difference(recorded.take([row]), in_sumo.take([row]), ROUNDING)
         if difference:
             name, value, sumo_value = difference
             values = ", ".join(f"{key} = {value:.17g}" for key, value in zip(study.vehicle.characteristics, setting, strict=True))
@@ -90,7 +90,7 @@ def refuse_unlike_sumo(study: Study, recorded: Evaluations, in_sumo: Evaluations
                              "scenario: reactive_actors = True, if anybody reacts to the vehicle under test; or --engine sumo")
 
 
-def _is_alike(batch: Evaluations, other_batch: Evaluations, tolerance: float) -> BoolArray:
+def _are_alike(batch: Evaluations, other_batch: Evaluations, tolerance: float) -> BoolArray:
     """Whether each of N settings has the same outcome, and numbers that differ by at most `tolerance`; shape (N,)."""
     is_alike = batch.outcome == other_batch.outcome
     quantities = ((batch.collision_speed, other_batch.collision_speed),
@@ -100,14 +100,15 @@ def _is_alike(batch: Evaluations, other_batch: Evaluations, tolerance: float) ->
     return np.asarray(is_alike)
 
 
-def _difference(evaluations: Evaluations, other_evaluations: Evaluations, tolerance: float = 0.0) -> tuple[str, object, object] | None:
+def _find_difference(evaluations: Evaluations, other_evaluations: Evaluations,
+                     tolerance: float = 0.0) -> tuple[str, object, object] | None:
     """Name and both values of the first quantity that differs by more than `tolerance`; None if a simulation failed."""
     if evaluations.failed[0] or other_evaluations.failed[0]:
         return None
     if evaluations.outcome[0] != other_evaluations.outcome[0]:
         return "outcome", str(evaluations.outcome[0]), str(other_evaluations.outcome[0])
     for name in ("collision_speed", *evaluations.metrics):
-        values, other_values = (side.metrics.get(name, side.collision_speed) for side in (evaluations, other_evaluations))
+        values, other_values = (batch.metrics.get(name, batch.collision_speed) for batch in (evaluations, other_evaluations))
         if not np.allclose(values, other_values, rtol=0, atol=tolerance, equal_nan=True):
             return name, float(values[0]), float(other_values[0])
     return None

@@ -19,9 +19,9 @@ from safevar_sumo.errors import EnvironmentFault, SafevarError, in_one_line
 from safevar_sumo.plugins import added_import_folders, inherit_import_folders
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.workers.evaluation import PoolLostError, WorkerLostError, evaluate_batch
-from safevar_sumo.workers.interrupts import interrupts_noted, leave_interrupts_to_the_caller
+from safevar_sumo.workers.interrupts import block_interrupts, defer_interrupts
 
-START_LIMIT = 120.0
+MAX_START_TIME = 120.0
 """Longest time until a worker process is ready for its first batch [s]."""
 START_ATTEMPTS = 5
 """Number of workers in a row that may die before they are ready, which is never the fault of a batch."""
@@ -44,7 +44,7 @@ def local_pool(jobs: int, time_limit: float) -> Iterator[LocalPool]:
     time_limit
         Time limit of a batch [s]; a worker that exceeds it is stopped.
     """
-    with interrupts_noted():
+    with defer_interrupts():
         pool = LocalPool(jobs, time_limit)
         try:
             yield pool
@@ -60,7 +60,7 @@ class LocalPool:
 
     def __init__(self, jobs: int, time_limit: float) -> None:
         self.workers, self._time_limit = jobs, time_limit
-        self._threads = ThreadPoolExecutor(jobs, thread_name_prefix="worker", initializer=leave_interrupts_to_the_caller)
+        self._threads = ThreadPoolExecutor(jobs, thread_name_prefix="worker", initializer=block_interrupts)
         self._thread_data = threading.local()
         self._live_workers: set[_Worker] = set()
         self._closed = False
@@ -121,7 +121,7 @@ class _Worker:
         try:
             self._pipe, worker_end = context.Pipe()
             self._process = context.Process(target=_serve, args=(worker_end, added_import_folders()), daemon=True)
-            with _without_main():
+            with _hide_main():
                 self._process.start()
         except OSError as error:
             raise PoolLostError(f"no worker process can be started: {error.strerror}") from None
@@ -133,7 +133,7 @@ class _Worker:
 
     def wait_until_ready(self) -> None:
         """Wait for the first message of the process; raises WorkerLostError without a message."""
-        self._receive(START_LIMIT, "start")
+        self._receive(MAX_START_TIME, "start")
 
     def compute(self, study: bytes, settings: FloatArray, time_limit: float) -> Evaluations:
         """Compute a batch; raises the error of the batch, or WorkerLostError."""
@@ -161,7 +161,7 @@ class _Worker:
 
 
 @contextmanager
-def _without_main() -> Iterator[None]:
+def _hide_main() -> Iterator[None]:
     """Hide the main module, which a spawned process would run again; scripts then need no `if __name__ == "__main__"`."""
     with _start_lock:
         main = sys.modules["__main__"]
@@ -176,16 +176,16 @@ def _serve(pipe: connection.Connection[Any, Any], folders: list[str]) -> None:
     """The main function of a worker process, which answers batches until the other end of the pipe is closed."""
     inherit_import_folders(folders)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=_end_with_the_caller, daemon=True).start()
+    threading.Thread(target=_end_with_caller, daemon=True).start()
     try:
         pipe.send(None)
         while True:
-            pipe.send(_answer(*pipe.recv()))
+            pipe.send(_evaluate_or_return_error(*pipe.recv()))
     except (EOFError, OSError):
         return
 
 
-def _answer(study: bytes, settings: FloatArray) -> Evaluations | Exception:
+def _evaluate_or_return_error(study: bytes, settings: FloatArray) -> Evaluations | Exception:
     try:
         return evaluate_batch(study, settings)
     except SafevarError as error:
@@ -196,7 +196,7 @@ def _answer(study: bytes, settings: FloatArray) -> Evaluations | Exception:
         return RuntimeError(f"in a worker process\n{traceback.format_exc()}")  # not every exception survives the pipe
 
 
-def _end_with_the_caller() -> None:
+def _end_with_caller() -> None:
     """End this process with its caller. Otherwise a worker that hangs in a simulation would outlive a killed caller."""
     caller = multiprocessing.parent_process()
     assert caller is not None

@@ -1,7 +1,7 @@
 """A pool that retries a failed batch: first the whole batch, then smaller and smaller parts, down to the setting that fails.
 
 A setting that fails again by itself, while the original vehicle can be simulated, gets the outcome `simulator-error`. Faults of the
-environment (disk, network files, memory) and of user code end the study; the same command resumes it later.
+environment (disk, network files, memory) and of user code end the study, which the same command resumes later.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ BatchCallback = Callable[[Evaluations | None, BaseException | None], None]
 """Callback for a finished batch, with its evaluations or its error."""
 ATTEMPTS = 2
 """Number of attempts for a whole batch, and for a single setting in a part: another process may have killed the worker."""
-PARTS = 8
+PARTS_PER_SPLIT = 8
 """Number of parts of a failing batch: with 8, one fatal setting among 200 costs five time limits."""
 COMMAND_PREFIX = "; again by: "
-FAILURES_IN_A_ROW = 20
-"""Number of failing settings in a row that count as a fault of the study."""
+MAX_FAILURES_IN_A_ROW = 20
+"""Number of failing settings in a row from which on the study is at fault."""
 
 
 class RetryingPool:
@@ -43,98 +43,98 @@ class RetryingPool:
     study
         The study of the settings.
     note
-        Called with files that user code reads and the study did not know; may raise an error.
+        Called with files that user code has read and that were unknown when the study began; may raise an error.
     """
 
-    def __init__(self, pool: Pool, study: Study, note: Callable[[Mapping[str, str]], None] = lambda files: None) -> None:
-        self._pool, self._study, self._note, self._failures = pool, study, note, 0
-        self._characteristics, self._user_code_names = CharacteristicSet.of(study.vehicle.characteristics), user_code_names(study)
+    def __init__(self, pool: Pool, study: Study, note_files: Callable[[Mapping[str, str]], None] = lambda files: None) -> None:
+        self._pool, self._study, self._note_files, self._failures_in_a_row = pool, study, note_files, 0
+        self._characteristics, self._user_code = CharacteristicSet.of(study.vehicle.characteristics), user_code_names(study)
 
     @property
     def workers(self) -> int:
         """Number of batches that are computed at the same time."""
         return self._pool.workers
 
-    def submit(self, study: bytes, settings: FloatArray, *, must_succeed: bool = False) -> Future[Evaluations]:
+    def submit(self, work: bytes, settings: FloatArray, *, must_succeed: bool = False) -> Future[Evaluations]:
         """Evaluate k filtered settings of n characteristics, shape (k, n); with `must_succeed` a failure is an error, not an outcome."""
         result: Future[Evaluations] = Future()
         is_single = len(settings) == 1 and not must_succeed
-        self._attempt(study, settings, 2 * ATTEMPTS if is_single else ATTEMPTS, result, must_succeed)
+        self._attempt(work, settings, 2 * ATTEMPTS if is_single else ATTEMPTS, result, must_succeed)
         return result
 
-    def _attempt(self, study: bytes, settings: FloatArray, attempts: int, result: Future[Evaluations], must_succeed: bool) -> None:
-        def done(evaluations: Evaluations | None, error: BaseException | None) -> None:
+    def _attempt(self, work: bytes, settings: FloatArray, attempts: int, result: Future[Evaluations], must_succeed: bool) -> None:
+        def accept_or_retry(evaluations: Evaluations | None, error: BaseException | None) -> None:
             if evaluations is not None:
-                self._failures = 0
+                self._failures_in_a_row = 0
                 result.set_result(evaluations)
             elif isinstance(error, UserCodeError):
-                self._locate(study, settings, error, result)
+                self._locate_failure(work, settings, error, result)
             elif not isinstance(error, SimulationError | WorkerLostError | EnvironmentFault):
                 result.set_exception(error)
             elif attempts > 1:
-                self._attempt(study, settings, attempts - 1, result, must_succeed)
+                self._attempt(work, settings, attempts - 1, result, must_succeed)
             elif isinstance(error, EnvironmentFault):
                 result.set_exception(error)
             elif len(settings) > 1:
-                self._split(study, settings, result)
-            elif self._user_code_names and isinstance(error, WorkerLostError):
-                result.set_exception(self._with_command(self._worker_lost_in_user_code(error), settings))
+                self._evaluate_parts(work, settings, result)
+            elif self._user_code and isinstance(error, WorkerLostError):
+                result.set_exception(self._with_command(self._error_of_lost_workers(error), settings))
             elif must_succeed:
                 result.set_exception(error)
             else:
-                self._give_up(study, settings, error, result)
+                self._confirm_failure(work, settings, error, result)
 
-        self._compute(study, settings, done)
+        self._compute(work, settings, accept_or_retry)
 
-    def _compute(self, study: bytes, settings: FloatArray, callback: BatchCallback) -> None:
+    def _compute(self, work: bytes, settings: FloatArray, callback: BatchCallback) -> None:
         """Compute a batch once; call `callback` with the evaluations or the error."""
-        def done(attempt: Future[Evaluations]) -> None:
+        def note_and_call(attempt: Future[Evaluations]) -> None:
             error = PoolLostError("the batch was cancelled") if attempt.cancelled() else attempt.exception()
             if error is None and attempt.result().files:
                 try:
-                    self._note(attempt.result().files)
+                    self._note_files(attempt.result().files)
                 except SafevarError as refusal:
                     error = refusal
             callback(attempt.result() if error is None else None, error)
 
         try:
-            attempt = self._pool.submit(study, settings)
+            attempt = self._pool.submit(work, settings)
         except PoolLostError as error:
             callback(None, error)
         else:
-            attempt.add_done_callback(done)
+            attempt.add_done_callback(note_and_call)
 
-    def _split(self, study: bytes, settings: FloatArray, result: Future[Evaluations]) -> None:
+    def _evaluate_parts(self, work: bytes, settings: FloatArray, result: Future[Evaluations]) -> None:
         """Split a failing batch into parts; a part that fails is split again."""
-        parts = np.array_split(settings, min(PARTS, len(settings)))
+        parts = np.array_split(settings, min(PARTS_PER_SPLIT, len(settings)))
         results: dict[int, Evaluations] = {}
         lock = threading.Lock()
 
-        def done(number: int, part: Future[Evaluations]) -> None:
+        def collect_part(index: int, part: Future[Evaluations]) -> None:
             with lock:
                 if result.done():
                     return
                 if part.exception() is not None:
                     result.set_exception(part.exception())
                     return
-                results[number] = part.result()
+                results[index] = part.result()
                 if len(results) == len(parts):
-                    result.set_result(Evaluations.concatenate([results[number] for number in range(len(parts))]))
+                    result.set_result(Evaluations.concatenate([results[index] for index in range(len(parts))]))
 
-        for number, rows in enumerate(parts):
+        for index, rows in enumerate(parts):
             if not result.done():
                 part: Future[Evaluations] = Future()
-                part.add_done_callback(partial(done, number))
-                self._attempt(study, rows, ATTEMPTS if len(rows) == 1 else 1, part, must_succeed=False)
+                part.add_done_callback(partial(collect_part, index))
+                self._attempt(work, rows, ATTEMPTS if len(rows) == 1 else 1, part, must_succeed=False)
 
-    def _give_up(self, study: bytes, setting: FloatArray, error: SafevarError, result: Future[Evaluations]) -> None:
-        """Give a setting the outcome `simulator-error` if it fails once more after a simulation of the original vehicle."""
+    def _confirm_failure(self, work: bytes, setting: FloatArray, error: SafevarError, result: Future[Evaluations]) -> None:
+        """Simulate the original vehicle, then the setting again; a setting that fails once more has the outcome `simulator-error`."""
         def repetition_done(evaluations: Evaluations | None, last_error: BaseException | None) -> None:
             if evaluations is not None:
                 result.set_result(evaluations)
             elif isinstance(last_error, SimulationError | WorkerLostError):
-                self._failures += 1
-                if self._failures >= FAILURES_IN_A_ROW:
+                self._failures_in_a_row += 1
+                if self._failures_in_a_row >= MAX_FAILURES_IN_A_ROW:
                     result.set_exception(last_error)
                 else:
                     result.set_result(self._failed_evaluation(setting, last_error))
@@ -143,12 +143,12 @@ class RetryingPool:
 
         def original_done(evaluations: Evaluations | None, fault: BaseException | None) -> None:
             if evaluations is not None:
-                self._compute(study, setting, repetition_done)
+                self._compute(work, setting, repetition_done)
             else:
                 result.set_exception(EnvironmentFault(f"{error}; the original vehicle cannot be simulated either: {fault}")
                                    if isinstance(fault, SimulationError | WorkerLostError) else fault)
 
-        self._compute(study, self._characteristics.original[np.newaxis], original_done)
+        self._compute(work, self._characteristics.original[np.newaxis], original_done)
 
     def _failed_evaluation(self, setting: FloatArray, error: SafevarError) -> Evaluations:
         undefined = np.full(1, np.nan)
@@ -157,7 +157,7 @@ class RetryingPool:
             metrics=dict.fromkeys(METRICS, undefined), f_diff=self._characteristics.largest_change(setting),
             f_num_diff=self._characteristics.number_changed(setting), reasons={setting[0].tobytes(): " ".join(str(error).split())})
 
-    def _locate(self, study: bytes, settings: FloatArray, error: UserCodeError, result: Future[Evaluations]) -> None:
+    def _locate_failure(self, work: bytes, settings: FloatArray, error: UserCodeError, result: Future[Evaluations]) -> None:
         """Find, by bisection, the setting on which user code fails; add the command that reproduces the error."""
         if len(settings) == 1:
             result.set_exception(self._with_command(error, settings))
@@ -166,21 +166,21 @@ class RetryingPool:
 
         def second_done(_: Evaluations | None, part_error: BaseException | None) -> None:
             if isinstance(part_error, UserCodeError):
-                self._locate(study, halves[1], part_error, result)
+                self._locate_failure(work, halves[1], part_error, result)
             else:
                 result.set_exception(error)
 
         def first_done(_: Evaluations | None, part_error: BaseException | None) -> None:
             if isinstance(part_error, UserCodeError):
-                self._locate(study, halves[0], part_error, result)
+                self._locate_failure(work, halves[0], part_error, result)
             else:
-                self._compute(study, halves[1], second_done)
+                self._compute(work, halves[1], second_done)
 
-        self._compute(study, halves[0], first_done)
+        self._compute(work, halves[0], first_done)
 
-    def _worker_lost_in_user_code(self, error: WorkerLostError) -> UserCodeError:
+    def _error_of_lost_workers(self, error: WorkerLostError) -> UserCodeError:
         """The error for workers that repeatedly end or hang in user code."""
-        problem = f"{error}, again and again, with {' and '.join(self._user_code_names)} in it; a dead process cannot report file and line"
+        problem = f"{error}, again and again, with {' and '.join(self._user_code)} in it; a dead process cannot report file and line"
         return UserCodeError(f"study {self._study.name!r}", problem)
 
     def _with_command(self, error: UserCodeError, setting: FloatArray) -> UserCodeError:
@@ -192,7 +192,7 @@ class RetryingPool:
 
 def reproduction_command(study: Study, setting: FloatArray) -> str:
     """The command that simulates a setting of n characteristics, shape (n,)."""
-    changes = [f"--set {member.name}={value!r}"
-               for member, value in zip(CharacteristicSet.of(study.vehicle.characteristics), setting.tolist(), strict=True)
-               if value != member.original]
+    changes = [f"--set {characteristic.name}={value!r}"
+               for characteristic, value in zip(CharacteristicSet.of(study.vehicle.characteristics), setting.tolist(), strict=True)
+               if value != characteristic.original]
     return " ".join([f"{RUN} simulate", shlex.quote(study.origin.called or study.name), *changes])

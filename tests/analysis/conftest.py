@@ -12,12 +12,12 @@ from safevar_sumo.workers import batches as many
 
 @pytest.fixture(autouse=True)
 def _made_up_studies_travel_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
-    pack = many.packed
+    pack = many.pack_study
 
-    def packed(study: Study, *inputs: Any, **options: Any) -> bytes:
+    def pack_study(study: Study, *inputs: Any, **options: Any) -> bytes:
         return study.name.encode() if study.name == "made-up" else pack(study, *inputs, **options)
 
-    read, batches = many.inputs_of, many.batches_of
-    monkeypatch.setattr(many, "batches_of", lambda study: (100, False) if study.name == "made-up" else batches(study))
-    monkeypatch.setattr(many, "packed", packed)
+    read, batches = many.inputs_of, many.choose_batch_size
+    monkeypatch.setattr(many, "choose_batch_size", lambda study: (100, False) if study.name == "made-up" else batches(study))
+    monkeypatch.setattr(many, "pack_study", pack_study)
     monkeypatch.setattr(many, "inputs_of", lambda study, pool: {} if study.name == "made-up" else read(study, pool))

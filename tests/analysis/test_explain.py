@@ -44,7 +44,7 @@ from safevar_sumo.cli.program import commands
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import BoolArray, FloatArray
-from safevar_sumo.results import handles
+from safevar_sumo.results import handles_of
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo import assemble, evaluate
 from safevar_sumo.vehicles import CharacteristicSet
@@ -88,7 +88,7 @@ def test_every_boundary_is_unsafe_and_just_below_it_is_safe(case: Case, explaine
 def test_the_records_are_those_of_the_solutions(case: Case, explained: Explained) -> None:
     assert repr(explained).startswith(f"<Explained {case.study.name}, unsafe collision: {explained.failures} of ")
     *records, last = json.loads(json.dumps(explained.to_dict(), allow_nan=False))
-    output = [str(handle) for handle in handles(case.solutions)]
+    output = [str(handle) for handle in handles_of(case.solutions)]
     for one in records:
         assert list(one) == ["algorithm", "run", "index", "setting", "outcome", "safety_degree", "changed", "minimal_causes", "robustness",
                              "because", "reasons"]
@@ -136,7 +136,7 @@ def test_the_failure_to_lead_with_is_the_smallest_that_is_not_borderline(case: C
 @pytest.mark.slow
 def test_a_named_solution_is_explained_whatever_it_is(case: Case) -> None:
     safe = case.solutions["f_safe"].idxmax()
-    handle = str(handles(case.solutions)[safe])
+    handle = str(handles_of(case.solutions)[safe])
     (one,) = explain_failures(case, ExplainOptions(solutions=(handle,), unsafe="collision"), pool=InlinePool()).explanations
     assert (str(one.handle), one.causes, one.reasons) == (handle, (), ("asked for",))
     with pytest.raises(InputError, match="nsga2:7:0"):

@@ -11,7 +11,7 @@ import pytest
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import Evaluations
-from safevar_sumo.reference import ReferenceData, agreement, package_filter, plot_agreement, read_reference
+from safevar_sumo.reference import ReferenceData, measure_agreement, package_filter, plot_agreement, read_reference
 from safevar_sumo.reference.validation import rank_correlation
 from safevar_sumo.study import Study, load_study
 from safevar_sumo.vehicles import Characteristic, CharacteristicSet
@@ -41,7 +41,7 @@ def here(safety: list[float], tet: list[float]) -> Evaluations:
 
 
 def test_every_number_is_what_it_says() -> None:
-    result = agreement(reference([1.0, 2.0, 3.0, -1.0], [1.0, 1.2, 1.4, 0]), here([1.5, 2.0, 2.0, 1.0], [1.1, 1.2, 1.2, 9.0]),
+    result = measure_agreement(reference([1.0, 2.0, 3.0, -1.0], [1.0, 1.2, 1.4, 0]), here([1.5, 2.0, 2.0, 1.0], [1.1, 1.2, 1.2, 9.0]),
                      study({"safety_degree": 2.7}, 0.4), here([2.5], [1.0]))
     assert result.rows == 4
     assert result.mean_absolute_error["safety_degree"] == pytest.approx((0.5 + 0 + 1 + 2) / 4)
@@ -60,8 +60,9 @@ def test_every_number_is_what_it_says() -> None:
 
 def test_collisions_are_counted_and_those_that_repeats_may_turn_are_told() -> None:
     """Four collide there and four here, three on both sides; of the two others one is 0.05 m from a collision."""
-    result = agreement(reference([-1.0, -2.0, -3.0, -1.0, 0.5, 2.0], [1.0] * 6), here([-2.0, -2.0, -2.0, 0.05, -1.5, 2.0], [1.0] * 6),
-                     study({}, 0.03), here([2.5], [1.0]))
+    result = measure_agreement(reference([-1.0, -2.0, -3.0, -1.0, 0.5, 2.0], [1.0] * 6),
+                               here([-2.0, -2.0, -2.0, 0.05, -1.5, 2.0], [1.0] * 6),
+                               study({}, 0.03), here([2.5], [1.0]))
     assert (result.precision, result.recall) == (0.75, 0.75)
     assert result.collision_speed == {"reference": 2.0, "here": 2.0}
     assert result.undecided == {"differ": 2, "within_repeats": 1}

@@ -13,12 +13,12 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.records import Evaluations, FloatArray, Outcome
 from safevar_sumo.reference import FitSubject, ReferenceData, calibrate, calibrate_together, with_values
 from safevar_sumo.reference.calibration import _refining_population, _thin
-from safevar_sumo.reference.effects import Effect, Regression, covered_by_spread, error_beyond_spread
+from safevar_sumo.reference.effects import Effect, Regression, error_beyond_spread, measure_coverage
 from safevar_sumo.reference.fit_space import FitSpace
 from safevar_sumo.reference.loss import ReferenceLoss, original_loss
 from safevar_sumo.reference.parameters import FittedParameter, free_parameters, value_of
 from safevar_sumo.reference.profiles import Profiles
-from safevar_sumo.reference.search import TrialSearch
+from safevar_sumo.reference.search import SearchRace
 from safevar_sumo.study import FitTable, FreeParameter, Study, load_study
 from safevar_sumo.sumo.matrix import evaluate
 from safevar_sumo.sumo.system import assemble
@@ -202,7 +202,7 @@ class Bowl:
     def __init__(self) -> None:
         self.tried = 0
 
-    def at(self, shares: FloatArray) -> Any:
+    def studies_at(self, shares: FloatArray) -> Any:
         return shares
 
     def losses(self, studies: Sequence[Any]) -> list[float]:
@@ -226,7 +226,7 @@ def silent(loss: float, best: Any) -> None:
 
 def test_the_worse_half_gives_up_after_every_round() -> None:
     runners = [Runner(lowest) for lowest in (5.0, 1.0, 4.0, 2.0, 3.0)]
-    TrialSearch(Bowl(), 1, 300, silent).race(runners)  # type: ignore[arg-type]
+    SearchRace(Bowl(), 1, 300, silent).run(runners)  # type: ignore[arg-type]
     # Rounds of 5, 3, 2 and 1 searches with 75 trials each; the winner gets what remains, which these runners never take.
     assert [runner.rounds for runner in runners] == [[15], [15, 25, 37, 75, 300], [15], [15, 25, 37], [15, 25]]
 
@@ -238,8 +238,8 @@ def test_a_search_around_known_values_has_smaller_generations() -> None:
             return super().losses(studies)
 
     generations = list[int]()
-    search = TrialSearch(Counted(), 12, 100, silent)
-    search.race([search.begin(np.full(3, 0.5), 0.1, 1, _refining_population(12, 3))])
+    search = SearchRace(Counted(), 12, 100, silent)
+    search.run([search.begin(np.full(3, 0.5), 0.1, 1, _refining_population(12, 3))])
     # 4 + 3 ln 3 = 7.3, the usual population, is more than a third of 12.
     assert generations == [7] * 14 + [2]
     assert (_refining_population(80, 26), _refining_population(6, 2)) == (26, 6)
@@ -256,8 +256,8 @@ def test_searches_begin_at_the_best_of_many_places_with_what_is_the_same_at_one_
             return super().losses(studies)
 
     bowl = Noted()
-    search = TrialSearch(bowl, 7, 200, silent)
-    search.from_random_places([0, 1, 0], 2, 80, 1e-9, np.random.default_rng(4))[1].advance(1)
+    search = SearchRace(bowl, 7, 200, silent)
+    search.begin_at_random_places([0, 1, 0], 2, 80, 1e-9, np.random.default_rng(4))[1].advance(1)
     screened = bowl.places[:-1]
     assert len(screened) == 50, "a quarter of the trials at most"
     assert all(place[2] == place[0] for place in screened)
@@ -277,23 +277,23 @@ def test_the_models_error_covers_nine_tenths_of_rows_each_file_counted_alike(dat
     assert error_beyond_spread(study, {"near": data, "far": far}) == pytest.approx(21, abs=1e-6)
     # A file of 8 rows without a miss counts as much as one of 24: again the 21st (20.6 of 24); row by row it would be the 22nd.
     assert error_beyond_spread(study, {"near": data.take(np.arange(24) < 8), "far": far}) == pytest.approx(21, abs=1e-6)
-    assert covered_by_spread(far, msgspec.structs.replace(study, model_error={"safety_degree": 21.000001})).all_rows == 21 / 24
+    assert measure_coverage(far, msgspec.structs.replace(study, model_error={"safety_degree": 21.000001})).all_rows == 21 / 24
 
 
 @pytest.mark.parametrize(("starts", "trials"), [(1, 7), (3, 100), (6, 500), (40, 30)])
 def test_no_trial_is_lost_and_none_too_many(starts: int, trials: int) -> None:
     bowl, losses = Bowl(), list[float]()
-    search = TrialSearch(bowl, 6, trials, lambda loss, best: losses.append(loss))
+    search = SearchRace(bowl, 6, trials, lambda loss, best: losses.append(loss))
     searches = [search.begin(np.full(2, 0.9), 0.3, seed) for seed in range(1, starts + 1)]
-    search.race(searches)
+    search.run(searches)
     assert bowl.tried == trials == len(losses)
     assert search.trials_left == 0
     assert losses == sorted(losses, reverse=True)
 
 
 def test_a_race_finds_the_bottom_from_whatever_half() -> None:
-    search = TrialSearch(Bowl(), 8, 1200, silent)
-    search.race([search.begin(np.array([place, 0.9]), 0.1, 3) for place in (0.9, 0.8, 0.1, 0.7)])
+    search = SearchRace(Bowl(), 8, 1200, silent)
+    search.run([search.begin(np.array([place, 0.9]), 0.1, 3) for place in (0.9, 0.8, 0.1, 0.7)])
     assert search.best == pytest.approx([0.2, 0.2], abs=0.01)
 
 
@@ -309,8 +309,8 @@ class Basin(Bowl):
 
 def test_what_fits_as_well_is_an_interval_and_sets_that_are_far_apart() -> None:
     basin = Basin()
-    search = TrialSearch(basin, 8, 800, silent, alike=0.04)
-    search.race([search.begin(np.array([place, 0.6]), 0.3, 3) for place in (0.3, 0.5)])
+    search = SearchRace(basin, 8, 800, silent, alike=0.04)
+    search.run([search.begin(np.array([place, 0.6]), 0.3, 3) for place in (0.3, 0.5)])
     assert search.best is not None
     bounds = FreeParameter(lower=0, upper=1, unit="-", meaning="place")
     profiles = Profiles.of([FittedParameter("a", (0,), bounds), FittedParameter("b", (1,), bounds)], basin, search, np.asarray(search.best))

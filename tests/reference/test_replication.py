@@ -16,8 +16,17 @@ from click.testing import CliRunner, Result
 from safevar_sumo.analysis.research_questions.case import load_cases
 from safevar_sumo.cli.program import commands
 from safevar_sumo.errors import InputError
-from safevar_sumo.reference import Agreement, keep_totals, quoted, validation
-from safevar_sumo.reference.conclusions import DIFFERS, DIRECTION, HOLDS, OPEN, compared_tables, conclusions, grade, pair_cases
+from safevar_sumo.reference import Agreement, shipped_totals_of, validation, write_totals
+from safevar_sumo.reference.conclusions import (
+    DIFFERS,
+    HOLDS,
+    IN_DIRECTION,
+    UNDECIDED,
+    compare_tables,
+    draw_conclusions,
+    judge_test,
+    pair_cases,
+)
 from safevar_sumo.reference.validation import rank_correlation
 from safevar_sumo.report.verdict import AgreementRows, agreement_with_published
 from safevar_sumo.study import load_study
@@ -61,22 +70,22 @@ def sides(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def verdicts_of(sides: Path, here: str, there: str) -> dict[tuple[str, str], str]:
-    tables = compared_tables(pair_cases(load_cases([sides / here]), load_cases([sides / there])))
-    return {(one.question, one.words.split(":")[0]): one.verdict for one in conclusions(tables)}
+    tables = compare_tables(pair_cases(load_cases([sides / here]), load_cases([sides / there])))
+    return {(one.question, one.statement.split(":")[0]): one.verdict for one in draw_conclusions(tables)}
 
 
 @pytest.mark.parametrize(("here", "published", "verdict"), [
-    ((0.00, 1e-9), (0.42, 1e-9), DIRECTION),  # large here, small there: only the sign agrees
+    ((0.00, 1e-9), (0.42, 1e-9), IN_DIRECTION),  # large here, small there: only the sign agrees
     ((0.05, 1e-9), (0.20, 1e-9), HOLDS),
     ((0.80, 1e-9), (0.20, 1e-9), DIFFERS),
     ((0.53, 0.3), (0.48, 0.4), HOLDS),  # negligible on both sides, wherever they lie
-    ((0.53, 0.3), (0.60, 0.4), DIRECTION),
+    ((0.53, 0.3), (0.60, 0.4), IN_DIRECTION),
     ((0.40, 0.3), (0.60, 0.4), HOLDS),  # no difference on either side
-    ((0.60, 1e-9), (0.60, 0.4), DIRECTION),
+    ((0.60, 1e-9), (0.60, 0.4), IN_DIRECTION),
     ((0.40, 1e-9), (0.60, 0.4), DIFFERS)])
 def test_a_test_holds_in_direction_magnitude_and_significance(
         here: tuple[float, float], published: tuple[float, float], verdict: str) -> None:
-    assert grade(*here, *published) == verdict
+    assert judge_test(*here, *published) == verdict
 
 
 def test_what_differs_is_marked_by_the_rules(sides: Path) -> None:
@@ -87,8 +96,8 @@ def test_what_differs_is_marked_by_the_rules(sides: Path) -> None:
     assert verdicts["collisions", "RS"] == HOLDS, "none on either side"
     assert verdicts["RQ3.1", "most critical solutions change 1 characteristics"] == HOLDS
     assert verdicts["RQ3.2", "changed most often"] == DIFFERS
-    assert verdicts["RQ3.3", "avgSD_cS"] == OPEN, "nothing collides there"
-    assert verdicts["RQ3.3", "avgSD_mD"] in (HOLDS, DIRECTION)
+    assert verdicts["RQ3.3", "avgSD_cS"] == UNDECIDED, "nothing collides there"
+    assert verdicts["RQ3.3", "avgSD_mD"] in (HOLDS, IN_DIRECTION)
 
 
 def test_the_page_has_both_sides_and_says_what_is_missing(sides: Path) -> None:
@@ -133,8 +142,8 @@ def page_of(study: Any) -> AgreementRows:
 def totals(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The only entry is made up: 10 of 40 published collisions collide here, which are half of the 20 here."""
     path = tmp_path / "totals.toml"
-    keep_totals(path, load_study("rain"), "made_up.csv", MADE_UP)
-    monkeypatch.setattr(validation, "TOTALS", path)
+    write_totals(path, load_study("rain"), "made_up.csv", MADE_UP)
+    monkeypatch.setattr(validation, "SHIPPED_TOTALS", path)
     return path
 
 
@@ -153,23 +162,23 @@ def test_nobody_elses_agreement_is_claimed() -> None:
     rain = load_study("rain")
     other = msgspec.structs.replace(rain, ads=msgspec.structs.replace(rain.ads, parameters={**rain.ads.parameters, "margin": 9.0}))
     for study in (load_study("sun"), other):
-        assert quoted(study) == []
+        assert shipped_totals_of(study) == []
         assert "was not compared with published data" in page_of(study).sentence
 
 
 def test_an_entry_is_replaced_and_others_stay(totals: Path) -> None:
-    keep_totals(totals, load_study("sun"), "made_up.csv", MADE_UP)
-    keep_totals(totals, load_study("rain"), "made_up.csv", Agreement(**{**MADE_UP.to_dict(), "rows": 7}))
-    assert [one.rows for one in (*quoted(load_study("rain")), *quoted(load_study("sun")))] == [7, 80]
+    write_totals(totals, load_study("sun"), "made_up.csv", MADE_UP)
+    write_totals(totals, load_study("rain"), "made_up.csv", Agreement(**{**MADE_UP.to_dict(), "rows": 7}))
+    assert [one.rows for one in (*shipped_totals_of(load_study("rain")), *shipped_totals_of(load_study("sun")))] == [7, 80]
     totals.write_text("[rain]\nrows = 3\n")
     with pytest.raises(InputError, match="holds no totals"):
-        quoted(load_study("rain"))
+        shipped_totals_of(load_study("rain"))
 
 
 def test_what_ships_is_what_the_trust_page_says() -> None:
     lines = (Path(__file__).parents[2] / "docs/trust.md").read_text()
     shown = re.findall(r"^\| \w+, [\w\- ]+ \| (\d+) \| (\d+) \| (\d+) \| [\d.]+ \| [\d.]+ \|", lines, re.MULTILINE)
-    ships = [one for name in ("sun", "rain") for one in quoted(load_study(name))]
+    ships = [one for name in ("sun", "rain") for one in shipped_totals_of(load_study(name))]
     assert len(shown) == 4
     assert set(shown) <= {(str(one.reference), str(one.here), str(one.both)) for one in ships}
 

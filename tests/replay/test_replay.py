@@ -25,7 +25,7 @@ from safevar_sumo.replay.comparison import Comparison, compare_setting, differen
 from safevar_sumo.replay.figure import draw_comparison
 from safevar_sumo.replay.film import film
 from safevar_sumo.replay.gui import show_in_gui
-from safevar_sumo.results import handles
+from safevar_sumo.results import handles_of
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.batch import score
 from safevar_sumo.sumo.matrix import simulate, study_at
@@ -44,7 +44,7 @@ def simulated(*arguments: str) -> Result:
 @pytest.mark.slow
 def test_the_command_replays_every_solution_of_solutions_csv(slippery: Path) -> None:
     frame = pd.read_csv(slippery / "solutions.csv")
-    for handle, (_, row) in list(zip(handles(frame), frame.iterrows(), strict=True))[::4]:
+    for handle, (_, row) in list(zip(handles_of(frame), frame.iterrows(), strict=True))[::4]:
         done = simulated(str(slippery), "--solution", str(handle), "--json")
         output = json.loads(done.stdout)
         assert done.stderr == ""

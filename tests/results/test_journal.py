@@ -17,8 +17,8 @@ from hypothesis import strategies as st
 
 from safevar_sumo.errors import InputError, SafevarError
 from safevar_sumo.records import Evaluations
-from safevar_sumo.results import Journal, JournalBusy
-from safevar_sumo.results.journal import SPARE, Content, Result, batch_of, owner_of, read_journal
+from safevar_sumo.results import Journal, JournalBusyError
+from safevar_sumo.results.journal import SPARE_POSITION, JournalContent, Result, make_batch, owner_of, read_journal
 
 BATCHES = 4
 ROWS = 3
@@ -62,7 +62,7 @@ def same(one: Evaluations, other: Evaluations) -> bool:
     return bool(all(np.array_equal(a, b, equal_nan=True) for a, b in numbers) and np.array_equal(one.outcome, other.outcome))
 
 
-def holds_the_first(batches: int, content: Content) -> bool:
+def holds_the_first(batches: int, content: JournalContent) -> bool:
     """Whether the journal holds exactly the first batches."""
     positions, evaluations, *_ = content
     if not batches:
@@ -77,13 +77,13 @@ def test_a_journal_returns_its_evaluations(tmp_path: Path) -> None:
     journal = Journal(path, "study", "nsga2-00")
     assert holds_the_first(BATCHES, journal.content)
     assert journal.content.result(BUDGET) == Result(positions=RESULT, asked=99, budget=BUDGET)
-    assert journal.cut == 0
+    assert journal.cut_bytes == 0
     journal.close()
     content = read_journal(path, "study", "nsga2-00")
     assert holds_the_first(BATCHES, content)
     assert content.result(BUDGET) == Result(positions=RESULT, asked=99, budget=BUDGET)
     assert content.result(BUDGET + 1) is None
-    first = content.within(ROWS)
+    first = content.requested_within(ROWS)
     assert first is not None
     assert same(first, batch(0)), "positions count from 0: the first three"
 
@@ -100,7 +100,7 @@ def test_a_truncated_journal_loads_its_whole_frames_and_continues(tmp_path: Path
     journal = Journal(path, "study", "nsga2-00")
     assert holds_the_first(max(0, whole - 1), journal.content)
     assert not journal.content.results
-    assert journal.cut == left - max([0, *(end for end in ends if end <= left)])
+    assert journal.cut_bytes == left - max([0, *(end for end in ends if end <= left)])
     for number in range(max(0, whole - 1), BATCHES):
         journal.append(places(number), batch(number))
     journal.close()
@@ -148,7 +148,7 @@ def test_a_run_has_one_owner_and_the_lock_ends_with_the_process(tmp_path: Path) 
     other = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
     assert other.stdout is not None
     assert other.stdout.readline() == "locked\n"
-    with pytest.raises(JournalBusy):
+    with pytest.raises(JournalBusyError):
         Journal(path, "study", "nsga2-00")
     other.kill()
     other.communicate()
@@ -201,7 +201,7 @@ def test_a_reason_is_stored_with_its_setting_and_adds_nothing_to_other_batches(t
     content = read_journal(tmp_path / "with", "study", "nsga2-00")
     assert content.evaluations is not None
     assert content.evaluations.reason(2) == "SUMO failed: it said so"
-    assert batch_of(places(0), failed).reasons == {}
+    assert make_batch(places(0), failed).reasons == {}
     assert sizes[1] > sizes[0]
 
 
@@ -211,7 +211,7 @@ def test_evaluations_after_a_failure_are_spare_after_a_retry(tmp_path: Path) -> 
     journal = Journal(path, "study", "nsga2-00")
     journal.retry()
     for content in (journal.content, read_journal(path, "study", "nsga2-00")):
-        assert content.positions == [0, 1, SPARE, SPARE], "the third and the sixth have failed"
+        assert content.positions == [0, 1, SPARE_POSITION, SPARE_POSITION], "the third and the sixth have failed"
         assert content.evaluations is not None
         assert content.evaluations.f_diff.tolist() == [0.0, 1 / 3, 10 / 3, 11 / 3]
         assert content.result(BUDGET) is None
@@ -222,7 +222,7 @@ def test_a_journal_without_evaluations_passes_to_the_next_owner(tmp_path: Path) 
     Journal(tmp_path / "a.journal", "study", "nsga2-00").close()
     taken_over = Journal(tmp_path / "a.journal", "other", "nsga2-00")
     taken_over.close()
-    assert taken_over.cut == 0, "nothing was torn"
+    assert taken_over.cut_bytes == 0, "nothing was torn"
     assert owner_of(tmp_path / "a.journal") == "other"
     with pytest.raises(InputError, match="belongs to another study"):
         read_journal(tmp_path / "a.journal", "study", "nsga2-00")

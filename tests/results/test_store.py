@@ -20,14 +20,14 @@ from safevar_sumo.errors import InputError, SafevarError
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import Evaluations
 from safevar_sumo.results import (
-    JournalBusy,
+    JournalBusyError,
     ResultsDirectory,
     SolutionId,
-    chosen_handle,
-    handles,
+    choose_handle,
+    handles_of,
     load_runs,
-    position_of,
     record,
+    row_of_handle,
     solutions_frame,
     status,
 )
@@ -147,7 +147,7 @@ def test_a_directory_belongs_to_its_first_study(tmp_path: Path, study: Study) ->
     journal = first.journal("original")
     with pytest.raises(InputError, match="is in use by another study that is running now"):
         second.journal("original")
-    with pytest.raises(JournalBusy):
+    with pytest.raises(JournalBusyError):
         same.journal("original")
     journal.append([0], wide(study))
     journal.close()
@@ -190,9 +190,9 @@ FRAME = pd.DataFrame({
 
 
 def test_rows_count_within_their_run() -> None:
-    assert list(map(str, handles(FRAME))) == ["nsga2:0:0", "nsga2:0:1", "nsga2:3:0", "rs:0:0"]
-    for place, handle in enumerate(handles(FRAME)):
-        assert position_of(FRAME, SolutionId.parse(str(handle))) == place
+    assert list(map(str, handles_of(FRAME))) == ["nsga2:0:0", "nsga2:0:1", "nsga2:3:0", "rs:0:0"]
+    for place, handle in enumerate(handles_of(FRAME)):
+        assert row_of_handle(FRAME, SolutionId.parse(str(handle))) == place
 
 
 @pytest.mark.parametrize("text", [
@@ -205,24 +205,24 @@ def test_a_text_that_is_no_handle_is_refused(text: str) -> None:
 @pytest.mark.parametrize(("handle", "legal"), [("nsga2:0:2", "0 to 1"), ("nsga2:1:0", "nsga2:0, nsga2:3, rs:0"), ("sf:0:0", "nsga2:0")])
 def test_the_error_for_a_missing_solution_names_the_present_ones(handle: str, legal: str) -> None:
     with pytest.raises(InputError) as refused:
-        position_of(FRAME, SolutionId.parse(handle))
+        row_of_handle(FRAME, SolutionId.parse(handle))
     assert handle in str(refused.value)
     assert legal in str(refused.value)
 
 
 def test_chosen_by_what_they_are_among_the_unsafe() -> None:
-    assert str(chosen_handle(FRAME, Unsafe(), "most_severe", "x")) == "nsga2:0:0"
-    assert str(chosen_handle(FRAME, Unsafe(), "fewest", "x")) == "nsga2:0:1"
-    assert str(chosen_handle(FRAME, Unsafe(), "smallest", "x")) == "nsga2:3:0"
+    assert str(choose_handle(FRAME, Unsafe(), "most_severe", "x")) == "nsga2:0:0"
+    assert str(choose_handle(FRAME, Unsafe(), "fewest", "x")) == "nsga2:0:1"
+    assert str(choose_handle(FRAME, Unsafe(), "smallest", "x")) == "nsga2:3:0"
 
 
 def test_without_a_collision_half_the_distance_is_unsafe() -> None:
     safe = FRAME[FRAME["outcome"] == "stopped"]
     wide, narrow = (Unsafe.default({"safety_degree": degree}, safe["outcome"]) for degree in (4.1, 4.0))
-    assert str(chosen_handle(safe, wide, "smallest", "x")) == "rs:0:0"
+    assert str(choose_handle(safe, wide, "smallest", "x")) == "rs:0:0"
     with pytest.raises(InputError, match="no unsafe solution"):
-        chosen_handle(safe, narrow, "smallest", "x")
-    assert str(chosen_handle(safe, narrow, "most_severe", "x")) == "rs:0:0"
+        choose_handle(safe, narrow, "smallest", "x")
+    assert str(choose_handle(safe, narrow, "most_severe", "x")) == "rs:0:0"
 
 
 def test_a_point_is_lost_to_six_decimals() -> None:

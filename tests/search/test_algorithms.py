@@ -24,9 +24,9 @@ from safevar_sumo.api.running import load_for_search
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import Evaluations, Outcome
 from safevar_sumo.search import ALGORITHMS, MapElites, MoCell, Problem
-from safevar_sumo.search.evolution import Individual, fitness_of, tournament
-from safevar_sumo.search.mocell import survivor
-from safevar_sumo.search.nsga2 import survivors
+from safevar_sumo.search.evolution import Individual, fitness_of, run_tournament
+from safevar_sumo.search.mocell import choose_survivor
+from safevar_sumo.search.nsga2 import select_survivors
 from safevar_sumo.search.safe_fuzzer import _improves, _Ranges, _scores
 from safevar_sumo.study import load_study
 from safevar_sumo.vehicles import Characteristic, CharacteristicSet
@@ -231,7 +231,7 @@ def test_survivors_are_those_of_deap(objectives: list[tuple[float, float, float]
     for front in fronts:
         tools.emo.assignCrowdingDist(front)
         expected += sorted(front, key=lambda one: one.fitness.crowding_dist, reverse=True)
-    places = [next(i for i, one in enumerate(ours) if one is survivor) for survivor in survivors(ours, number)]
+    places = [next(i for i, one in enumerate(ours) if one is survivor) for survivor in select_survivors(ours, number)]
     assert places == [next(i for i, one in enumerate(deaps) if one is survivor) for survivor in expected[:number]]
 
 
@@ -239,9 +239,9 @@ def test_a_tournament_is_won_by_rank_then_by_crowding_distance() -> None:
     better, worse = individuals((0, 0, 0), (1, 1, 1))
     for one, rank, room in ((better, 0, 0.1), (worse, 1, 9.0)):
         one.standing = rank, -room
-    assert all(tournament([better, worse]) is better for _ in range(20))
+    assert all(run_tournament([better, worse]) is better for _ in range(20))
     worse.standing = 0, -9.0
-    assert all(tournament([better, worse]) is worse for _ in range(20))
+    assert all(run_tournament([better, worse]) is worse for _ in range(20))
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -300,7 +300,7 @@ def test_a_generation_improves_if_its_best_beats_the_worst_of_the_fifty_best() -
 
 @pytest.mark.parametrize(("population", "sides"), [(50, (5, 10)), (36, (6, 6)), (7, (1, 7)), (2, (1, 2))])
 def test_a_grid_is_as_near_to_a_square_as_the_population_allows(population: int, sides: tuple[int, int]) -> None:
-    assert MoCell().sides(population) == sides
+    assert MoCell().grid_sides(population) == sides
 
 
 def test_a_grid_closes_on_itself() -> None:
@@ -313,9 +313,9 @@ def test_a_grid_closes_on_itself() -> None:
 
 def test_a_child_that_neither_dominates_nor_is_dominated_enters_only_if_a_neighbour_is_worse() -> None:
     cell, child, far, worst = individuals((0, 2, 0), (0, 2, 0), (2, 0, 0), (3, 3, 0))
-    assert survivor(cell, child, [cell]) is cell
-    assert survivor(cell, child, [cell, far]) is cell
-    assert survivor(cell, child, [cell, worst]) is child
+    assert choose_survivor(cell, child, [cell]) is cell
+    assert choose_survivor(cell, child, [cell, far]) is cell
+    assert choose_survivor(cell, child, [cell, worst]) is child
 
 
 @pytest.mark.parametrize(("search", "problem"), [
@@ -362,15 +362,15 @@ def test_cells_of_an_atlas_over_the_speed_are_a_metre_a_second_wide_and_the_last
     speeds = [np.nan, 0.0, 0.9, 1.0, 18.9, 19.0, 25.0]
     one, two = (dataclasses.replace(window([setting] * 7, [1.0] * 7), collision_speed=np.array(speeds)) for setting in ([60, 50], [60, 60]))
     atlas = MapElites(behaviour="speed")
-    assert atlas._cell(one, problem()).tolist() == [0, 1, 1, 2, 19, 20, 20]
-    assert atlas._cell(two, problem()).tolist() == [21, 22, 22, 23, 40, 41, 41]
-    assert atlas.cells(2) == 42
+    assert atlas._cell_numbers(one, problem()).tolist() == [0, 1, 1, 2, 19, 20, 20]
+    assert atlas._cell_numbers(two, problem()).tolist() == [21, 22, 22, 23, 40, 41, 41]
+    assert atlas.count_cells(2) == 42
 
 
 def test_an_impossible_atlas_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(InputError, match="2\\^17 cells"):
-        MapElites().cells(17)
-    assert MapElites(behaviour="speed").cells(17) == 17 * 21
+        MapElites().count_cells(17)
+    assert MapElites(behaviour="speed").count_cells(17) == 17 * 21
     monkeypatch.setitem(sys.modules, "ribs", None)
     with pytest.raises(InputError, match="needs pyribs"):
         load_for_search(load_study("smoke", search={"algorithms": ["map_elites"]}))

@@ -28,7 +28,7 @@ from safevar_sumo.metrics import SAFEVAR
 from safevar_sumo.records import Evaluations
 from safevar_sumo.search import ALGORITHMS, Problem
 from safevar_sumo.search.evolution import Individual, fitness_of
-from safevar_sumo.search.spea2 import environmental_selection
+from safevar_sumo.search.spea2 import select_archive
 from safevar_sumo.vehicles import Characteristic, CharacteristicSet
 from tests.search.problems import evaluated
 
@@ -178,7 +178,7 @@ def random_front(seed: int) -> np.ndarray:
 def test_spea2_ranks_what_nothing_dominates_by_its_distance_to_the_third_nearest_of_four() -> None:
     """1 / (distance + 2), below one half whatever the distance: those at the ends have more room."""
     ours = individuals(np.array([[0.0, 3.0], [1.0, 2.0], [2.0, 1.0], [3.0, 0.0]]))
-    environmental_selection(ours, 4)
+    select_archive(ours, 4)
     ends, middle = 1 / (3 * np.sqrt(2) + 2), 1 / (2 * np.sqrt(2) + 2)
     assert [one.standing[0] for one in ours] == pytest.approx([ends, middle, middle, ends])
 
@@ -191,7 +191,7 @@ def test_survivors_of_spea2_are_those_of_pymoo_on_random_fronts(hundred: int) ->
         objectives = random_front(seed)
         number = int(np.random.default_rng(seed + 10_000).integers(1, len(objectives) + 1))
         ours = individuals(objectives)
-        mine = sorted(one.fitness.values for one in environmental_selection(ours, number))
+        mine = sorted(one.fitness.values for one in select_archive(ours, number))
         population = Population.new(F=objectives)
         others = SPEA2Survival().do(PymooProblem(n_obj=objectives.shape[1]), population, n_survive=number)
         assert [one.standing[0] for one in ours] == population.get("SPEA_F").tolist(), seed

@@ -16,9 +16,9 @@ from safevar_sumo.shipped import NETWORKS
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet
-from safevar_sumo.workers.batches import digests_of_sources
-from safevar_sumo.workers.evaluation import evaluate_batch, packed
-from safevar_sumo.workers.identity import identity_of, networks_of, powers_digest
+from safevar_sumo.workers.batches import source_digests
+from safevar_sumo.workers.evaluation import evaluate_batch, pack_study
+from safevar_sumo.workers.identity import identity_of, network_digests, powers_digest
 from tests.in_process import InlinePool
 
 
@@ -40,10 +40,10 @@ def test_names_and_defaults_are_resolved_to_numbers() -> None:
 def test_every_file_of_a_network_that_results_hang_on_counts(file: str, tmp_path: Path) -> None:
     shutil.copytree(NETWORKS / "lead_vehicle_stopped", tmp_path / "mine")
     study = load_study("native", scenario={"parameters": {"network": str(tmp_path / "mine")}})
-    before = networks_of(assemble(study))
+    before = network_digests(assemble(study))
     text = (tmp_path / "mine" / file).read_text()
     (tmp_path / "mine" / file).write_text(text + "<!-- -->")
-    after = networks_of(assemble(study))
+    after = network_digests(assemble(study))
     assert changed_files(before, after) == [file]
 
 
@@ -51,7 +51,7 @@ def test_a_network_that_changes_between_two_batches_is_noticed(tmp_path: Path) -
     shutil.copytree(NETWORKS / "lead_vehicle_stopped", tmp_path / "mine")
     study = load_study("native")
     study = msgspec.structs.replace(study, scenario=msgspec.structs.replace(study.scenario, parameters={"network": str(tmp_path / "mine")}))
-    work, original = packed(study), CharacteristicSet.of(study.vehicle.characteristics).original[None]
+    work, original = pack_study(study), CharacteristicSet.of(study.vehicle.characteristics).original[None]
     evaluate_batch(work, original)
     traffic = tmp_path / "mine" / "traffic.rou.xml"
     traffic.write_text(traffic.read_text() + "<!-- -->")
@@ -117,7 +117,7 @@ def place(in_tmp: Path) -> Path:
 
 
 def read(place: Path) -> dict[str, str]:
-    return digests_of_sources(load_study(place / "mine.toml"), InlinePool())
+    return source_digests(load_study(place / "mine.toml"), InlinePool())
 
 
 def test_what_is_read_while_models_are_loaded_made_and_first_run_counts_wherever_the_command_is_started(

@@ -19,13 +19,13 @@ from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import Evaluations, Outcome
 from safevar_sumo.study import ModelTable, Origin, load_study
 from safevar_sumo.vehicles import CharacteristicSet
-from safevar_sumo.workers.evaluation import PoolLostError, WorkerLostError, packed
-from safevar_sumo.workers.interrupts import awaited, first_of, interrupts_noted
+from safevar_sumo.workers.evaluation import PoolLostError, WorkerLostError, pack_study
+from safevar_sumo.workers.interrupts import defer_interrupts, wait_for_first, wait_for_result
 from safevar_sumo.workers.local import LocalPool, local_pool
 from safevar_sumo.workers.retrying import ATTEMPTS, RetryingPool
 
 pytestmark = pytest.mark.usefixtures("worker_processes")
-SMOKE = packed(load_study("smoke"))
+SMOKE = pack_study(load_study("smoke"))
 ORIGINAL = CharacteristicSet.of(load_study("smoke").vehicle.characteristics).original[np.newaxis]
 
 
@@ -95,22 +95,22 @@ def press() -> None:
 
 def test_ctrl_c_is_raised_where_a_result_is_waited_for_and_nowhere_else() -> None:
     before = signal.getsignal(signal.SIGINT)
-    with pytest.raises(KeyboardInterrupt), interrupts_noted():  # noqa: PT012
+    with pytest.raises(KeyboardInterrupt), defer_interrupts():  # noqa: PT012
         press()
         press()
         with pytest.raises(KeyboardInterrupt):
-            awaited(Future())
+            wait_for_result(Future())
         press()  # while the pool is closed, say
     assert signal.getsignal(signal.SIGINT) is before
-    with interrupts_noted():
-        assert first_of([]) == set(), "what was pressed before is forgotten"
+    with defer_interrupts():
+        assert wait_for_first([]) == set(), "what was pressed before is forgotten"
 
 
 def test_ctrl_c_during_a_wait_is_noticed_soon() -> None:
     threading.Timer(0.1, os.kill, (os.getpid(), signal.SIGINT)).start()
     start = time.monotonic()
-    with pytest.raises(KeyboardInterrupt), interrupts_noted():
-        first_of([Future()])
+    with pytest.raises(KeyboardInterrupt), defer_interrupts():
+        wait_for_first([Future()])
     assert time.monotonic() - start < 5
 
 

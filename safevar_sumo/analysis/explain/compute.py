@@ -32,7 +32,7 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray, finite_or_none
-from safevar_sumo.results import CHOICES, UNKNOWN, SolutionId, handles, position_of
+from safevar_sumo.results import CHOICES, UNKNOWN, SolutionId, handles_of, row_of_handle
 from safevar_sumo.study import Study
 from safevar_sumo.sumo.matrix import PointResult, simulate_all_points, worst_points
 from safevar_sumo.sumo.system import System, assemble
@@ -93,8 +93,8 @@ def find_failures(source: Study | Case, evaluator: Evaluator, original: Evaluati
         rows = None
     else:
         solutions = source.solutions
-        all_handles, all_settings = handles(solutions), solutions[list(evaluator.characteristics.names)].to_numpy(dtype=float)
-        named_rows = list(dict.fromkeys(position_of(solutions, handle, "solutions") for handle in named_solutions))
+        all_handles, all_settings = handles_of(solutions), solutions[list(evaluator.characteristics.names)].to_numpy(dtype=float)
+        named_rows = list(dict.fromkeys(row_of_handle(solutions, handle, "solutions") for handle in named_solutions))
         chosen_rows = [*named_rows, *(row for row in _distinct_rows(all_settings) if row not in set(named_rows))]
         settings, solution_handles = all_settings[chosen_rows], [all_handles[row] for row in chosen_rows]
         recorded_outcomes = solutions["outcome"].to_numpy(dtype=str)[chosen_rows]

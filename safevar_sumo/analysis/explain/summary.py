@@ -18,7 +18,7 @@ from safevar_sumo.analysis.rating.summary import summarise_rated_study
 from safevar_sumo.analysis.words import OUTCOME_VERBS, join_phrases, list_of_changes, number_of, question_command
 from safevar_sumo.metrics import RATING_POINTS, Unsafe
 from safevar_sumo.records import KMH_PER_MS, Evaluations, FloatArray, Outcome, finite_or_none
-from safevar_sumo.results import CHOICES, chosen_handle, handles, position_of, record
+from safevar_sumo.results import CHOICES, choose_handle, handles_of, record, row_of_handle
 from safevar_sumo.scenarios import Point
 from safevar_sumo.scenarios.base import pre_crash_of
 from safevar_sumo.study import Study
@@ -59,8 +59,8 @@ def summarise_failures(study: Study, solutions: pd.DataFrame, original: Evaluati
     if not unsafe.any():
         return [f"Nothing unsafe found in {number_of(len(solutions), 'solution')}: no collision, no SD below half of the original's.",
                 f"How far each characteristic may go: {question_command('tolerance', directory)}"]
-    handle_of = {reason: chosen_handle(solutions, criterion, choice, study.name) for choice, reason in REASONS.items()}
-    rows = solutions.iloc[[position_of(solutions, handle) for handle in handle_of.values()]]
+    handle_of = {reason: choose_handle(solutions, criterion, choice, study.name) for choice, reason in REASONS.items()}
+    rows = solutions.iloc[[row_of_handle(solutions, handle) for handle in handle_of.values()]]
     settings = rows[list(evaluator.characteristics.names)].to_numpy(dtype=float)
     all_causes = find_minimal_causes(evaluator, settings, criterion)
     failing_points, worst = _find_failing_points(study, settings, criterion)
@@ -81,7 +81,7 @@ def summarise_failures(study: Study, solutions: pd.DataFrame, original: Evaluati
 def _write_paragraph(evaluator: Evaluator, solutions: pd.DataFrame, is_unsafe: pd.Series[bool], original: Evaluations, unsafe: Unsafe,
                point: str) -> str:
     """One paragraph on the unsafe solutions; with `point`, on the solutions that are unsafe at this point of a matrix."""
-    names, all_handles = evaluator.characteristics.names, handles(solutions)
+    names, all_handles = evaluator.characteristics.names, handles_of(solutions)
     candidates = np.flatnonzero(is_unsafe.to_numpy() & ~solutions.duplicated(list(names)).to_numpy())
     if point:
         evaluator = evaluator.for_study(study_at(evaluator.study, point, point))

@@ -17,7 +17,7 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.protocol import COLOURS, EURO_NCAP_2026, NOT_RED, RED, Block, Cell, Points, Protocol, points_of
 from safevar_sumo.protocol.rater import darken, rater_of, with_protocol
 from safevar_sumo.records import CellResults, FloatArray, finite_or_none
-from safevar_sumo.results import SolutionId, position_of
+from safevar_sumo.results import SolutionId, row_of_handle
 from safevar_sumo.scenarios import weather_of
 from safevar_sumo.study import Study
 from safevar_sumo.vehicles import CharacteristicSet
@@ -190,7 +190,7 @@ def rate_variant(subject: Study | Case, options: RatingOptions, *, pool: Pool | 
     if options.solution is not None:
         if isinstance(subject, Study):
             raise InputError("solution", f"{study.name!r} is a study and has no solutions", "a results directory")
-        row = subject.solutions.iloc[position_of(subject.solutions, SolutionId.parse(options.solution))]
+        row = subject.solutions.iloc[row_of_handle(subject.solutions, SolutionId.parse(options.solution))]
         values, name = {characteristic: float(row[characteristic]) for characteristic in characteristics.names}, options.solution
     if options.changes:
         characteristics.setting(options.changes, "changes", switch="")  # refuses unknown names

@@ -9,7 +9,7 @@ import pandas as pd
 from safevar_sumo.analysis.words import list_of_changes, number_of, question_command
 from safevar_sumo.metrics import RATING_POINTS, Unsafe
 from safevar_sumo.records import Evaluations
-from safevar_sumo.results import chosen_handle, position_of, record
+from safevar_sumo.results import choose_handle, record, row_of_handle
 from safevar_sumo.study import Study
 from safevar_sumo.vehicles import CharacteristicSet
 
@@ -33,8 +33,8 @@ def summarise_rated_study(study: Study, solutions: pd.DataFrame, original: Evalu
              "at least one of them."]
     handle = None
     for choice, title in TITLES.items():
-        handle = chosen_handle(solutions, unsafe, choice, study.name)
-        row = solutions.iloc[position_of(solutions, handle)]
+        handle = choose_handle(solutions, unsafe, choice, study.name)
+        row = solutions.iloc[row_of_handle(solutions, handle)]
         setting = {characteristic: float(row[characteristic]) for characteristic in characteristics.names}
         lines.append(f"{title}: {handle} loses {points - row[name]:.2f} points with {list_of_changes(characteristics, setting)}.")
     return [*lines, f"Which cells change colour: {question_command('rating', place)} --solution {quote(str(handle))} --matrix; which "

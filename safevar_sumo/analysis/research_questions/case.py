@@ -15,7 +15,7 @@ import pandas as pd
 from safevar_sumo.errors import InputError, in_one_line
 from safevar_sumo.metrics import SAFEVAR, MetricFacts, Scoring, Unsafe
 from safevar_sumo.records import FloatArray, Outcome
-from safevar_sumo.results import MANIFEST, Failure, failure_lines, load_runs, places_of
+from safevar_sumo.results import MANIFEST, Failure, failure_lines, folders_of, load_runs
 from safevar_sumo.scenarios import weather_of
 from safevar_sumo.study import Origin, Study, Weather, error_with_key, upgrade_tables
 from safevar_sumo.vehicles import CharacteristicSet
@@ -176,7 +176,7 @@ def load_case(directory: Path) -> Case:
     manifest, evaluations, solutions, finished, failures = load_runs(directory)
     try:
         study = msgspec.convert(upgrade_tables(manifest["study"]), Study)
-        study = msgspec.structs.replace(study, origin=Origin(places=places_of(directory)))
+        study = msgspec.structs.replace(study, origin=Origin(places=folders_of(directory)))
     except msgspec.ValidationError as error:
         raise error_with_key(directory / MANIFEST, manifest["study"], error, "study") from None
     original = manifest.get("original")
