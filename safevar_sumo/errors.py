@@ -42,7 +42,7 @@ class InputError(SafevarError):
         return f"{message}\nexpected: {self.legal}" if self.legal else message
 
 
-class ForeignError(InputError):
+class UserCodeError(InputError):
     """User code that a study names failed or returned an illegal value."""
 
 
@@ -63,11 +63,11 @@ def warn(message: str) -> None:
 
 
 MAX_MESSAGE_LENGTH = 500
-"""Largest number of characters of somebody else's message in an error."""
+"""Length at which an error cuts a message that it quotes [characters]."""
 
 
-def in_one_line(error: BaseException) -> str:
-    """The class of an error and its message, up to `MAX_MESSAGE_LENGTH` characters, even if `str(error)` fails."""
+def describe_error(error: BaseException) -> str:
+    """Describe an error by its class and its message, cut at `MAX_MESSAGE_LENGTH`, even if `str(error)` fails."""
     try:
         message = " ".join(str(error).split())
     except Exception:
@@ -76,7 +76,7 @@ def in_one_line(error: BaseException) -> str:
     return f"{type(error).__name__}: {excerpt}" if excerpt else type(error).__name__
 
 
-def unknown(source: object, problem: str, name: object, names: Iterable[str], otherwise: str = "") -> InputError:
+def unknown_name(source: object, problem: str, name: object, names: Iterable[str], otherwise: str = "") -> InputError:
     """The error for an unknown name: it suggests the nearest known name and lists all of them.
 
     Parameters
@@ -106,7 +106,7 @@ def one_of(names: Iterable[str]) -> str:
     return "one of " + ", ".join(sorted(names))
 
 
-STREAMS = ("/dev/stdin", "/dev/stdout", "/dev/stderr", "/dev/null")
+STREAM_PATHS = ("/dev/stdin", "/dev/stdout", "/dev/stderr", "/dev/null")
 DESCRIPTOR_FOLDERS = ("/dev/fd", "/proc/self/fd")
 
 
@@ -127,7 +127,7 @@ def refuse_other_than_file(path: Path, source: object = None, *, streams: bool =
     InputError
         If the path is a directory, a pipe or a device.
     """
-    is_stream = streams and (str(path) in STREAMS or str(path.parent) in DESCRIPTOR_FOLDERS)
+    is_stream = streams and (str(path) in STREAM_PATHS or str(path.parent) in DESCRIPTOR_FOLDERS)
     if path.exists() and not path.is_file() and not is_stream:
         problem = "is no regular file but a directory" if path.is_dir() else "is no regular file"
         raise InputError(path if source is None else source, problem if source is None else f"{path} {problem}", "a file")

@@ -14,7 +14,7 @@ from rich.progress import BarColumn, Progress, TextColumn
 from safevar_sumo.campaign import RunKey
 from safevar_sumo.records import Evaluations
 from safevar_sumo.study import Study
-from safevar_sumo.terminal import SECONDS_BETWEEN_LINES, print_text, stages
+from safevar_sumo.terminal import SECONDS_BETWEEN_LINES, print_text, show_stages
 
 SETTLING_TIME = 5.0
 """Seconds of work before throughput is shown: batches that end together make earlier values meaningless."""
@@ -134,7 +134,7 @@ class _Tally:
 def counting_bar(console: Console, label: str, total: int) -> Iterator[Callable[[int], None]]:
     """Show a bar that counts up to `total`; yields the function that adds to the count."""
     done = 0
-    with stages(console) as show:
+    with show_stages(console) as show:
         show(label, done, total)
 
         def add(number: int) -> None:

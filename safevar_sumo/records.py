@@ -24,7 +24,7 @@ GRAVITY = 9.81
 """Acceleration of gravity [m/s^2]."""
 TIME_ROUNDING = 1e-9
 """Difference below which two sums of time steps are the same time [s]."""
-TOUCH = 2e-3
+TOUCH_OVERLAP = 2e-3
 """Overlap below which bodies may only touch, as SUMO ignores an overlap of a millimetre [m]."""
 TIME_DECIMALS = 9
 """Decimals to which sums of time steps are rounded: 0.15 s, not 0.15000000000000002 s."""
@@ -45,9 +45,9 @@ class Outcome(StrEnum):
 
 ZERO: FloatArray = np.zeros(())
 """Scalar zero, broadcast to all N vehicles."""
-EVERYWHERE: BoolArray = np.ones((), dtype=bool)
+ALL_TRUE: BoolArray = np.ones((), dtype=bool)
 """Scalar True, broadcast to all N vehicles."""
-for _constant in (ZERO, EVERYWHERE):
+for _constant in (ZERO, ALL_TRUE):
     _constant.flags.writeable = False
 
 
@@ -244,7 +244,7 @@ class SimulationRuns:
         obstacle_speed = np.broadcast_to(trace.obstacle_speed, trace.speed.shape)
         (first_speed, end_speed), (gap, gap_after) = (([values[np.maximum(last_sample - 1, 0), columns], values[last_sample, columns]])
                                         for values in (trace.speed - obstacle_speed, trace.gap))
-        gap_closes = (gap > -TOUCH) & np.isfinite(gap) & (gap_after <= 0) & (first_speed > 0)
+        gap_closes = (gap > -TOUCH_OVERLAP) & np.isfinite(gap) & (gap_after <= 0) & (first_speed > 0)
         distance = np.where(gap_closes, np.maximum(gap, 0.0), 0.0)
         squared_speed = first_speed * first_speed + 2 * (end_speed - first_speed) / trace.step * distance
         min_speed, max_speed = np.minimum(first_speed, end_speed), np.maximum(first_speed, end_speed)

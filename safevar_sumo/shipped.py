@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 PACKAGE = Path(__file__).resolve().parent
-RUN = "python -m safevar_sumo"
+PROGRAM_COMMAND = "python -m safevar_sumo"
 """Start of every command line of this package."""
 
 

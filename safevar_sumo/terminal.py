@@ -24,7 +24,7 @@ class WholeTable(Table):
     """
 
     def __init__(self, *text_heads: str, right: Iterable[str] = (), title: str = "", **options: Any) -> None:
-        super().__init__(title=plain(title) if title else None, title_justify="left", **options)
+        super().__init__(title=printable_text(title) if title else None, title_justify="left", **options)
         for head in text_heads:
             self.add_column(Text(head))
         for head in right:
@@ -32,7 +32,7 @@ class WholeTable(Table):
 
     def add_row(self, *cells: RenderableType | None, **options: Any) -> None:
         """Add a row of texts, or of cells with their own style."""
-        super().add_row(*(plain(cell) if isinstance(cell, str) else cell for cell in cells), **options)
+        super().add_row(*(printable_text(cell) if isinstance(cell, str) else cell for cell in cells), **options)
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         for column in self.columns:
@@ -47,7 +47,7 @@ class WholeTable(Table):
         yield from super().__rich_console__(console, options)
 
 
-def plain(text: object, style: str = "") -> Text:
+def printable_text(text: object, style: str = "") -> Text:
     """Printable text for rich: white space becomes a space, any other unprintable character a question mark."""
     return Text("".join(letter if letter.isprintable() else " " if letter.isspace() else "?" for letter in str(text)), style)
 
@@ -62,7 +62,7 @@ def print_meanings(console: Console, members: Iterable[Characteristic]) -> None:
     table = Table.grid(padding=(0, 2))
     for member in members:
         if member.words:
-            table.add_row(plain(member.name), plain(member.words))
+            table.add_row(printable_text(member.name), printable_text(member.words))
     if table.row_count:
         console.print(table)
 
@@ -89,7 +89,7 @@ StageProgress = Callable[[str, int, int], None]
 
 
 @contextmanager
-def stages(console: Console) -> Iterator[StageProgress]:
+def show_stages(console: Console) -> Iterator[StageProgress]:
     """Show a bar on a terminal, or else a line every half minute; yields the function that reports progress."""
     columns = (TextColumn("{task.description}", markup=False), BarColumn(bar_width=20), MofNCompleteColumn(), TimeRemainingColumn())
     last_line = time.monotonic()
@@ -109,10 +109,10 @@ def stages(console: Console) -> Iterator[StageProgress]:
 
 
 @contextmanager
-def shown(progress: bool | StageProgress) -> Iterator[StageProgress]:
+def open_progress(progress: bool | StageProgress) -> Iterator[StageProgress]:
     """Yield the function that reports progress: a bar for True, nothing for False, else `progress` itself."""
     if progress is True:
-        with stages(Console(stderr=True)) as bar:
+        with show_stages(Console(stderr=True)) as bar:
             yield bar
     else:
         yield progress or (lambda stage, done, total: None)

@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 import safevar_sumo.cli.study
 from safevar_sumo.ads import GuardedAds, PerVehicle
 from safevar_sumo.cli.program import commands
-from safevar_sumo.errors import ForeignError, InputError, SafevarError
+from safevar_sumo.errors import InputError, SafevarError, UserCodeError
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.plugins import Guard
 from safevar_sumo.records import Evaluations, FloatArray, Nominal, Observation, PedalTables
@@ -94,7 +94,7 @@ def test_whatever_an_ads_commands_is_two_pedals_for_each_vehicle_or_an_error(wha
     for ads in (GuardedAds(Returning((what, None)), guard), PerVehicle(lambda: Returning(what), guard)):  # type: ignore[arg-type, return-value]
         try:
             command, _ = ads.drive(SEEN, ads.start(2, KNOWN, 0.05))
-        except ForeignError:
+        except UserCodeError:
             continue
         for pedal in command:
             assert pedal.shape == (2,)

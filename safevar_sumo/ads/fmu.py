@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from safevar_sumo.ads.driver import Trim, pedals, trim
-from safevar_sumo.errors import ForeignError, InputError
+from safevar_sumo.errors import InputError, UserCodeError
 from safevar_sumo.fmu import Description, Fault, Fleet, History, Instances, constants_of, ports_of
 from safevar_sumo.plugins import Guard
 from safevar_sumo.records import BoolArray, Command, FloatArray, Nominal, Observation
@@ -86,7 +86,7 @@ class FmuAds:
             history = memory.history or memory.fleet.start(inputs)[1]
             values, history = memory.fleet.advance(history, inputs)
         except Fault as fault:
-            raise ForeignError(self._guard.source, f"{self._guard.name} {fault}") from None
+            raise UserCodeError(self._guard.source, f"{self._guard.name} {fault}") from None
         outputs = dict(zip(self._outputs, values[0], strict=True))
         warns = None if "warns" not in outputs else outputs["warns"] > 0.5
         memory = memory._replace(history=history, warns=warns)

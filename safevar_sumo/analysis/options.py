@@ -17,7 +17,7 @@ from textwrap import fill, indent
 from typing import Any, ClassVar, NamedTuple, TypeVar
 
 from safevar_sumo.errors import InputError
-from safevar_sumo.shipped import RUN
+from safevar_sumo.shipped import PROGRAM_COMMAND
 
 
 class Option(NamedTuple):
@@ -103,7 +103,7 @@ class Options:
 
     def command_line(self, place: str, point: str = "") -> str:
         """The command that asks this question about a study or results directory, with a flag for each option off its default."""
-        parts = [RUN, self.question, quote(place)]
+        parts = [PROGRAM_COMMAND, self.question, quote(place)]
         for item in fields(self):
             value, flag, definition = getattr(self, item.name), self.flags()[item.name], item.metadata["option"]
             if value == item.default:

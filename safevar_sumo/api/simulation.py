@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from safevar_sumo.ads import Ads
 from safevar_sumo.analysis.words import ENDS
-from safevar_sumo.errors import InputError, unknown
+from safevar_sumo.errors import InputError, unknown_name
 from safevar_sumo.metrics import Scoring, time_to_collision
 from safevar_sumo.records import STANDSTILL, TIME_DECIMALS, Command, Evaluations, FloatArray, Nominal, Observation, Outcome, SimulationRuns
 from safevar_sumo.results import evaluations_frame, record
@@ -23,7 +23,7 @@ from safevar_sumo.sumo.engine import Engine
 from safevar_sumo.sumo.matrix import at_worst
 from safevar_sumo.sumo.matrix import simulate as drive
 from safevar_sumo.sumo.system import System, assemble
-from safevar_sumo.terminal import shown
+from safevar_sumo.terminal import open_progress
 from safevar_sumo.vehicles import CharacteristicSet
 
 if TYPE_CHECKING:
@@ -278,7 +278,7 @@ def evaluate(study: StudyLike, settings: pd.DataFrame | Sequence[Mapping[str, fl
     if not beyond:
         system.check_feasible(requested, "settings", filtered=filtered)
     simulated_settings = characteristics.filter(requested) if filtered else requested
-    with shown(progress) as report:
+    with open_progress(progress) as report:
         evaluations = evaluate_settings(loaded_study, simulated_settings, pool, jobs, report)
     frame = evaluations_frame(characteristics.names, [(("", 0), evaluations)]).drop(columns=["algorithm", "run"])
     frame.insert(len(frame.columns) - 1, "collision_speed", evaluations.collision_speed)
@@ -304,7 +304,7 @@ def _table(settings: Any, characteristics: CharacteristicSet) -> tuple[FloatArra
     if isinstance(settings, pd.DataFrame):
         for name in settings.columns:
             if name not in names:
-                raise unknown("settings", f"column {name!r} is no characteristic", name, names)
+                raise unknown_name("settings", f"column {name!r} is no characteristic", name, names)
         if settings.columns.has_duplicates:
             raise InputError("settings", "a column appears twice", "each characteristic once")
         table = pd.DataFrame(dict(zip(names, characteristics.original, strict=True)), index=settings.index)

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from safevar_sumo.errors import InputError, unknown
+from safevar_sumo.errors import InputError, unknown_name
 from safevar_sumo.plugins import Files, Lookup, Member, digests, forget_foreign, guard_process_state, instance_of, noted_reading
 from safevar_sumo.search import ALGORITHM_CONTRACT, ALGORITHMS, Algorithm, GuardedAlgorithm, MapElites, MoCell, Problem, Search
 from safevar_sumo.study import SearchTable, Study
@@ -44,7 +44,7 @@ def algorithm_of(label: str, study: Study) -> Algorithm:
     for stray in search.parameters:
         if stray not in ALGORITHMS and stray not in search.labels:
             legal = [*SearchTable.__struct_fields__, *ALGORITHMS, *search.labels]
-            raise unknown(source, f"search.{stray}: there is no such key and no such algorithm", stray, legal)
+            raise unknown_name(source, f"search.{stray}: there is no such key and no such algorithm", stray, legal)
     member = algorithm_member(name, study)
     with guard_process_state(source, [name] if member.guard else []):
         parameters = Lookup(source, study.origin.places).with_paths(member, search.parameters.get(label, {}), key)

@@ -10,7 +10,7 @@ import numpy as np
 from safevar_sumo.campaign.batcher import Batcher
 from safevar_sumo.campaign.keys import RunKey, run_generator
 from safevar_sumo.campaign.run import Observer, Run
-from safevar_sumo.errors import ForeignError
+from safevar_sumo.errors import UserCodeError
 from safevar_sumo.plugins import forget_foreign
 from safevar_sumo.protocol.rater import driven_in_sumo
 from safevar_sumo.records import Evaluations
@@ -58,7 +58,7 @@ class Verification:
 
         Raises
         ------
-        ForeignError
+        UserCodeError
             If the last run of an algorithm from outside requests other settings when the reloaded algorithm repeats it.
         """
         self._refuse_unrepeatable(run)
@@ -108,9 +108,9 @@ class Verification:
         name = self._study.search.labels.get(key.algorithm, "")
         return name if ":" in name else ""
 
-    def _repetition_error(self, name: str, key: RunKey) -> ForeignError:
+    def _repetition_error(self, name: str, key: RunKey) -> UserCodeError:
         problem = f"search.algorithms: {name!r} requests other settings when run {key.run} is repeated alone"
-        return ForeignError(f"study {self._study.name!r}", problem, LEGAL)
+        return UserCodeError(f"study {self._study.name!r}", problem, LEGAL)
 
     def take(self, batch: Future[Evaluations]) -> list[Run]:
         """Compare a computed batch with the runs; returns the runs whose verification it completes.

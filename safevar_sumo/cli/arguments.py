@@ -12,7 +12,7 @@ import click
 import numpy as np
 from click.shell_completion import CompletionItem
 
-from safevar_sumo.errors import InputError, SafevarError, unknown
+from safevar_sumo.errors import InputError, SafevarError, unknown_name
 from safevar_sumo.records import FloatArray
 from safevar_sumo.study import check_writable, load_study, study_names
 from safevar_sumo.vehicles import CharacteristicSet
@@ -90,7 +90,7 @@ def read_changes(changes: tuple[str, ...], characteristics: CharacteristicSet, b
         if name in values_by_name:
             raise InputError("--set", f"{name} is set twice", "each characteristic once")
         if name not in characteristics.names:
-            raise unknown("--set", f"there is no characteristic {name!r}", name, characteristics.names)
+            raise unknown_name("--set", f"there is no characteristic {name!r}", name, characteristics.names)
         characteristic = characteristics.members[characteristics.names.index(name)]
         values_by_name[name] = _parse_values(change, text, characteristic.original, forms)
         if single and len(values_by_name[name]) > 1:

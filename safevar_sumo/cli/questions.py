@@ -30,7 +30,7 @@ from safevar_sumo.cli.target import (
 )
 from safevar_sumo.errors import InputError
 from safevar_sumo.results import make_directory, write_whole
-from safevar_sumo.terminal import stages
+from safevar_sumo.terminal import show_stages
 
 
 def question(options: type[Options], metavar: str, *more: Callable[[CommandFunction], CommandFunction]
@@ -49,7 +49,7 @@ def question(options: type[Options], metavar: str, *more: Callable[[CommandFunct
 
 def _compute(compute: Callable[..., Any], subject: Any, options: Options, jobs: int | None) -> Any:
     """Compute a result; a bar on the terminal shows the progress."""
-    with stages(Console(stderr=True)) as progress:
+    with show_stages(Console(stderr=True)) as progress:
         return compute(subject, options, jobs=jobs, progress=progress)
 
 

@@ -15,7 +15,7 @@ from safevar_sumo.cli.program import commands
 from safevar_sumo.cli.target import as_it_is_now_option, flags_of, jobs_option, json_option, results_or_study
 from safevar_sumo.errors import InputError
 from safevar_sumo.study import Study
-from safevar_sumo.terminal import stages
+from safevar_sumo.terminal import show_stages
 from safevar_sumo.vehicles import CharacteristicSet
 
 SPREADSHEETS = (".xlsx",)
@@ -51,7 +51,7 @@ def rating(source: str, changes: tuple[str, ...], solution: str | None, matrix: 
         check_output(plot, "--plot", PICTURES)
         _refuse_existing(plot, "--plot", force)
     spreadsheet = _open_spreadsheet(xlsx, template, preprocessed, force)
-    with stages(Console(stderr=True)) as progress:
+    with show_stages(Console(stderr=True)) as progress:
         result = rate_variant(subject, options, jobs=jobs, progress=progress)
     for remark in remarks(result):
         click.echo(f"note: {remark}", err=True)

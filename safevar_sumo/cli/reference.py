@@ -45,7 +45,7 @@ from safevar_sumo.reference.replication import Nearness, nearness, replication
 from safevar_sumo.results import MANIFEST, write_imported, write_whole
 from safevar_sumo.study import SAFETY_DEGREE, Study, check_writable, load_study, study_names, write_study
 from safevar_sumo.sumo.system import assemble
-from safevar_sumo.terminal import WholeTable, stages
+from safevar_sumo.terminal import WholeTable, show_stages
 from safevar_sumo.vehicles import CharacteristicSet
 from safevar_sumo.workers.batches import evaluate_all
 from safevar_sumo.workers.local import available_cores, local_pool
@@ -142,7 +142,7 @@ def calibrate_command(study: str, words: tuple[str, ...], trials: int | None, se
     max_trials = studies[0].fit.trials
     try:
         with (local_pool(jobs or available_cores(), max(item.search.time_limit for item in studies)) as pool,
-              stages(Console(stderr=True)) as show_progress):
+              show_stages(Console(stderr=True)) as show_progress):
             show_progress("trials", 0, max_trials)
 
             def after_trial(loss: float, best: Study | tuple[Study, ...]) -> None:

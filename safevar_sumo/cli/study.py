@@ -26,7 +26,7 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.progress import CampaignProgress
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.results import RunStatus, Status, failure_lines, record, solutions_frame
-from safevar_sumo.shipped import RUN
+from safevar_sumo.shipped import PROGRAM_COMMAND
 from safevar_sumo.study import Study, load_study
 from safevar_sumo.sumo import Engine, settings_per_batch, vehicle_remarks
 from safevar_sumo.terminal import WholeTable, print_text
@@ -189,7 +189,7 @@ def print_summary(console: Console, study: Study, campaign: Campaign, directory:
                    scoring=campaign.scoring)
     for line in summary_lines(case):
         print_text(console, line)
-    print_text(console, f"All tables: {RUN} tables {shlex.quote(str(directory))}")
+    print_text(console, f"All tables: {PROGRAM_COMMAND} tables {shlex.quote(str(directory))}")
 
 
 def _mean(values: FloatArray) -> str:

@@ -18,7 +18,7 @@ from safevar_sumo.conformance.models import StudyProbe
 from safevar_sumo.conformance.probe import Outputs, Probe, Rows, loaded_again, timed
 from safevar_sumo.conformance.source import Source
 from safevar_sumo.conformance.subject import Subject, subject_of, subjects_of, violation
-from safevar_sumo.errors import ForeignError, InputError
+from safevar_sumo.errors import InputError, UserCodeError
 from safevar_sumo.plugins import guard_process_state
 from safevar_sumo.study import Study, load_study, study_names
 
@@ -74,7 +74,7 @@ def refuse_defects(study: Study) -> list[str]:
 
     Raises
     ------
-    ForeignError
+    UserCodeError
         With file, line and advice of the first finding that makes results wrong.
     """
     remarks = []
@@ -84,7 +84,7 @@ def refuse_defects(study: Study) -> list[str]:
             problem = f"{report.key} {finding.got}{'' if location in finding.got else f' ({location})'}"
             if finding.check in REFUSED:
                 command = f"python -m safevar_sumo check {shlex.quote(study.origin.called or study.name)}"
-                raise ForeignError(study.source, f"{problem}; again by: {command}", f"{finding.expected}; {finding.advice}")
+                raise UserCodeError(study.source, f"{problem}; again by: {command}", f"{finding.expected}; {finding.advice}")
             remarks.append(f"{problem}; expected: {finding.expected}")
     return remarks
 
@@ -147,7 +147,7 @@ class _Suite:
                                  for reaction in probe.reactions(model, outputs)]
                     findings += self._cost_findings(probe, model)
             yield from findings
-        except ForeignError as error:
+        except UserCodeError as error:
             yield self._of_error(error)
         except TakesTooLong as error:
             location = self._source.of_error(error)
@@ -219,7 +219,7 @@ class _Suite:
             location = self._source.definition("__init__") if isinstance(subject, type) else self._source.definition()
             yield self._finding("picklable", problem, "an object that pickle can send to a worker process", location)
 
-    def _of_error(self, error: ForeignError) -> Finding:
+    def _of_error(self, error: UserCodeError) -> Finding:
         """The finding for an error that a guard raised."""
         text = error.problem.removeprefix(f"{self._subject.key} ")
         if "returned" in text:  # the finding has the line already

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple, Self
 
 import numpy as np
 
-from safevar_sumo.errors import ForeignError, InputError, in_one_line
+from safevar_sumo.errors import InputError, UserCodeError, describe_error
 from safevar_sumo.plugins.files import watch
 from safevar_sumo.records import BoolArray, FloatArray
 
@@ -161,34 +161,34 @@ class Guard(NamedTuple):
 
         Raises
         ------
-        ForeignError
+        UserCodeError
             If the function raises anything, `SystemExit` included.
         """
         watch.call_depth += 1
         try:
             return function(*arguments)
-        except ForeignError:
+        except UserCodeError:
             raise
         except (Exception, SystemExit) as error:
             raise self.failed(method, error) from error
         finally:
             watch.call_depth -= 1
 
-    def failed(self, method: str, error: BaseException) -> ForeignError:
+    def failed(self, method: str, error: BaseException) -> UserCodeError:
         """The error for an exception that the plug-in raised."""
         location = self._location(error)
-        problem = f"{self.name} raised in {method}: {in_one_line(error)}{f' ({location})' if location else ''}"
-        return ForeignError(self.source, problem, error.legal if isinstance(error, InputError) else "")
+        problem = f"{self.name} raised in {method}: {describe_error(error)}{f' ({location})' if location else ''}"
+        return UserCodeError(self.source, problem, error.legal if isinstance(error, InputError) else "")
 
-    def wrong(self, method: str, part: str, value: object, expected: str) -> ForeignError:
+    def wrong(self, method: str, part: str, value: object, expected: str) -> UserCodeError:
         """The error for a result whose part `part` has a wrong value."""
         return self._returned(f"{part} = {_short(value)}", method, expected)
 
-    def _returned(self, result: str, method: str, expected: str) -> ForeignError:
+    def _returned(self, result: str, method: str, expected: str) -> UserCodeError:
         function = inspect.unwrap(getattr(self.target, method, getattr(self.target, "function", self.target)))
         code = getattr(function, "__code__", None)  # FMUs and compiled code have none
         location = f" ({code.co_filename}:{code.co_firstlineno})" if code is not None else ""
-        return ForeignError(self.source, f"{self.name} returned {result} from {method}{location}", expected)
+        return UserCodeError(self.source, f"{self.name} returned {result} from {method}{location}", expected)
 
     def parts(self, method: str, value: Any, expected: str, number: int = 2) -> tuple[Any, ...]:
         """The parts of a result that must be a tuple or list of `number` parts."""

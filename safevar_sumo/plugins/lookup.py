@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 
 import msgspec
 
-from safevar_sumo.errors import ForeignError, InputError, did_you_mean, one_of
+from safevar_sumo.errors import InputError, UserCodeError, did_you_mean, one_of
 from safevar_sumo.plugins.files import file_beside, is_foreign, watch
 from safevar_sumo.plugins.guard import Contract, Guard
 from safevar_sumo.study import converted
@@ -73,7 +73,7 @@ class Lookup(NamedTuple):
         ------
         InputError
             If there is no such member or module.
-        ForeignError
+        UserCodeError
             If the module fails while it is imported.
         """
         if name in members:
@@ -142,10 +142,10 @@ class Lookup(NamedTuple):
         dont_write_bytecode, sys.dont_write_bytecode = sys.dont_write_bytecode, True
         try:
             module = guard._replace(folder=place).call("import", importlib.import_module, name)
-        except ForeignError as error:
+        except UserCodeError as error:
             problem = error.problem.replace("raised in import", "cannot be imported", 1)
             expected = f"a module in {' or '.join(dict.fromkeys(places))}, or an installed one"
-            raise ForeignError(self.source, problem, expected) from error
+            raise UserCodeError(self.source, problem, expected) from error
         finally:
             sys.dont_write_bytecode = dont_write_bytecode
             remember(set(sys.modules) - before, places)

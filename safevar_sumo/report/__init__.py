@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from safevar_sumo.analysis.subject import Results
 from safevar_sumo.report.page import SECTIONS, make_report
 from safevar_sumo.results import write_whole
-from safevar_sumo.terminal import shown
+from safevar_sumo.terminal import open_progress
 
 if TYPE_CHECKING:
     from safevar_sumo.analysis.evaluator import Progress
@@ -54,7 +54,7 @@ def report(*results: Results | str | Path, out: str | Path | None = None, only: 
         If a directory holds no results, there is no such section or point, or the file cannot be written.
     """
     directories = [source.directory if isinstance(source, Results) else source for source in results]
-    with shown(progress) as show_progress:
+    with open_progress(progress) as show_progress:
         page = make_report(directories, only, jobs, show_progress, point=point, as_it_is_now=as_it_is_now)
     if out is not None:
         write_whole(Path(out), page)

@@ -31,7 +31,7 @@ from safevar_sumo.report.limits import LIMITS
 from safevar_sumo.report.rated import rated_study_page
 from safevar_sumo.report.svg import Dot, scatter
 from safevar_sumo.report.verdict import tested_system, trust, verdict
-from safevar_sumo.shipped import RUN
+from safevar_sumo.shipped import PROGRAM_COMMAND
 from safevar_sumo.study import Study, load_study, study_names
 
 if TYPE_CHECKING:
@@ -117,11 +117,11 @@ def reproduce(inputs: Sequence[ReportInput], parts: Sequence[str]) -> list[dict[
         if data.point:
             continue
         commands.append({"what": "A replay, with figure and animation",
-                         "command": f"{RUN} simulate {directory} --most-severe --plot it.png --animate it.html{flag}"})
+                         "command": f"{PROGRAM_COMMAND} simulate {directory} --most-severe --plot it.png --animate it.html{flag}"})
     if any(data.point for data in inputs):
         return commands
-    commands.append({"what": "The tables of RQ1 to RQ3", "command": f"{RUN} tables {directories}"})
-    commands.append({"what": "The figures", "command": f"{RUN} figures {directories} --out figures"})
+    commands.append({"what": "The tables of RQ1 to RQ3", "command": f"{PROGRAM_COMMAND} tables {directories}"})
+    commands.append({"what": "The figures", "command": f"{PROGRAM_COMMAND} figures {directories} --out figures"})
     return commands
 
 
@@ -133,7 +133,7 @@ def _rerun_command(study: Study, out: str, directory: Path) -> str:
         shipped = load_study(study.name)
         if msgspec.structs.replace(shipped, search=msgspec.structs.replace(shipped.search, **options), origin=study.origin) == study:
             flags = {**options, "algorithms": shlex.quote(",".join(search.algorithms)), "out": shlex.quote(out)}
-            return " ".join([f"{RUN} study {study.name}", *(f"--{name} {value}" for name, value in flags.items())])
+            return " ".join([f"{PROGRAM_COMMAND} study {study.name}", *(f"--{name} {value}" for name, value in flags.items())])
     script = f"import safevar_sumo as sv; sv.run(sv.load({json.dumps(str(directory))}).study, out={json.dumps(out)}, progress=True)"
     return f"python -c {shlex.quote(script)}"
 

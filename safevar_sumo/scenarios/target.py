@@ -12,7 +12,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from msgspec import Struct
 
-from safevar_sumo.records import EVERYWHERE, BoolArray, FloatArray
+from safevar_sumo.records import ALL_TRUE, BoolArray, FloatArray
 from safevar_sumo.scenarios.base import VUT, Scene, World
 from safevar_sumo.scenarios.frame import Frame
 
@@ -137,7 +137,7 @@ def scene_of(course: Course, target: Target, front: FloatArray, speed: FloatArra
     if course.follows is not False:
         approached = approached | (speed - target.speed > APPROACH_SPEED)
         over = over | course.follows & approached & (speed <= target.speed)
-    visible = EVERYWHERE if course.hidden is False else _visible(course, target, gap)
+    visible = ALL_TRUE if course.hidden is False else _visible(course, target, gap)
     return Scene(gap, zeros + target.lateral, zeros + target.lateral_speed, over, zeros + target.speed, visible), approached
 
 

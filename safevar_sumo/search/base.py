@@ -8,7 +8,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from safevar_sumo.errors import ForeignError
+from safevar_sumo.errors import UserCodeError
 from safevar_sumo.metrics import SAFEVAR, Scoring
 from safevar_sumo.plugins import Contract, Guard, read_only_copy
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray
@@ -111,8 +111,8 @@ class GuardedAlgorithm:
         if not isinstance(result, Evaluations):
             raise self._guard.wrong("search", "its result", result, expected)
         if not answers:
-            raise ForeignError(self._guard.source, f"{self._guard.name} ended in search without yielding any setting",
-                               f"a generator that yields from 1 to {problem.evaluations} settings before it returns")
+            raise UserCodeError(self._guard.source, f"{self._guard.name} ended in search without yielding any setting",
+                                f"a generator that yields from 1 to {problem.evaluations} settings before it returns")
         rows = self._guard.numbers("search", "its result's settings", result.settings, (len(result), len(problem.characteristics)))
         if any(row.tobytes() not in answers for row in rows):
             raise self._guard.wrong("search", "its result", "settings that it never yielded", expected)

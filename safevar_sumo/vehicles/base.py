@@ -7,7 +7,7 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from safevar_sumo.errors import ForeignError
+from safevar_sumo.errors import UserCodeError
 from safevar_sumo.plugins import Contract, Guard, accepts, read_only_copy
 from safevar_sumo.records import GRAVITY, BoolArray, Command, FloatArray, Observation
 from safevar_sumo.vehicles.sensors import Sensors
@@ -166,7 +166,7 @@ class GuardedVehicle:
         n, method = len(next(iter(characteristics.values()))), self.model.prepare
         if slope is not LEVEL and not self.takes_slope:
             problem = f"{self._guard.name} has no slope in prepare(characteristics, road_friction, step, slope), and the road has a grade"
-            raise ForeignError(self._guard.source, problem, "a vehicle with the argument slope, or scenarios with grade 0")
+            raise UserCodeError(self._guard.source, problem, "a vehicle with the argument slope, or scenarios with grade 0")
         arguments: tuple[Any, ...] = (read_only_copy(characteristics), road_friction, step)
         if np.any(wet) and accepts(method, 5):
             arguments = (*arguments, read_only_copy(slope), read_only_copy(wet))
@@ -189,7 +189,7 @@ class GuardedVehicle:
     def at_speed(self, prepared: _Prepared, speed: FloatArray) -> _State:
         if not self.can_start_moving:
             problem = f"{self._guard.name} has no method at_speed(prepared, speed), and the traffic puts it onto the road in motion"
-            raise ForeignError(self._guard.source, problem, "a vehicle with that method, or traffic that departs with speed 0")
+            raise UserCodeError(self._guard.source, problem, "a vehicle with that method, or traffic that departs with speed 0")
         state = self._guard.call("at_speed", self.model.at_speed, prepared.constants, read_only_copy(speed))
         return self._state("at_speed", prepared.n, state)
 
@@ -220,8 +220,9 @@ class GuardedVehicle:
             for name, value in seen._asdict().items():
                 if not np.array_equal(getattr(sensed, name), value):
                     problem = f"{self._guard.name} changes {name} in sense, but a controller that reads through TraCI bypasses sense"
-                    raise ForeignError(self._guard.source, problem, "a method sensors(prepared) that returns safevar_sumo.vehicles.Sensors("
-                                       "latency, reach, scale); or an ADS that gets the sensed values, without ads.kind = \"traci\"")
+                    raise UserCodeError(self._guard.source, problem, "a method sensors(prepared) that returns "
+                                        "safevar_sumo.vehicles.Sensors(latency, reach, scale); or an ADS that gets the sensed values, "
+                                        "without ads.kind = \"traci\"")
 
     def sense(self, prepared: _Prepared, state: _State, seen: Observation) -> tuple[Observation, _State]:
         result = self._guard.call("sense", self.model.sense, prepared.constants, state.model_state, read_only_copy(seen))

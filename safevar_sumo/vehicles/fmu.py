@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from safevar_sumo.errors import ForeignError, InputError, unknown
+from safevar_sumo.errors import InputError, UserCodeError, unknown_name
 from safevar_sumo.fmu import COMMON_UNITS, REAL_TYPES, SI, Description, Fault, Fleet, History, Instances, Port, Unit, constants_of, ports_of
 from safevar_sumo.plugins import Guard
 from safevar_sumo.records import BoolArray, Command, FloatArray, Observation
@@ -82,10 +82,10 @@ class FmuVehicle:
         for key, entries, quantities in (("sensors", self._sensors, SENSOR_UNITS), ("sumo_type", self._type, TYPE_UNITS)):
             for name, entry in entries.items():
                 if name not in quantities:
-                    raise unknown(source, f"vehicle.{key}.{name}: there is no such quantity", name, quantities)
+                    raise unknown_name(source, f"vehicle.{key}.{name}: there is no such quantity", name, quantities)
                 if key == "sensors" and isinstance(entry, str) and entry not in units:
-                    raise unknown(source, f"vehicle.{key}.{name} = {entry!r}: there is no such characteristic", entry, units,
-                                  ", or a number")
+                    raise unknown_name(source, f"vehicle.{key}.{name} = {entry!r}: there is no such characteristic", entry, units,
+                                       ", or a number")
                 self._refuse_too_small(table["characteristics"], f"vehicle.{key}.{name}", entry, may_be_0=name == "latency")
         inputs = ports_of(description, table["inputs"], {**PEDALS, **ROAD}, ("input",), source, "vehicle.inputs", constants=ROAD)
         outputs = ports_of(description, table["outputs"], OUTPUTS, ("output",), source, "vehicle.outputs")
@@ -144,8 +144,8 @@ class FmuVehicle:
                 wet: bool | BoolArray = False) -> _Prepared:
         n = len(next(iter(characteristics.values())))
         if slope is not LEVEL and not self.takes_slope:
-            raise ForeignError(self._guard.source, f"{self._guard.name} has no vehicle.inputs.grade, and the road has a grade",
-                               "a variable for the grade, or scenarios with grade 0")
+            raise UserCodeError(self._guard.source, f"{self._guard.name} has no vehicle.inputs.grade, and the road has a grade",
+                                "a variable for the grade, or scenarios with grade 0")
         zeros = np.zeros(n)
         inputs = {"throttle": zeros, "brake": zeros, "road_friction": zeros + road_friction, "wet": zeros + wet,
                   "grade": zeros + slope.back / slope.down, "step": zeros + step, "initial_speed": zeros}
@@ -181,7 +181,7 @@ class FmuVehicle:
         """The initial state at a speed [m/s], shape (N,)."""
         if np.any(speed > 0) and not self.can_start_moving:
             problem = f"{self._guard.name} has no vehicle.inputs.initial_speed, and the traffic puts it onto the road in motion"
-            raise ForeignError(self._guard.source, problem, "a variable for the initial speed, or traffic that departs with speed 0")
+            raise UserCodeError(self._guard.source, problem, "a variable for the initial speed, or traffic that departs with speed 0")
         inputs = self._input_array({**prepared.inputs, "initial_speed": speed}, prepared.characteristics)
         outputs, history = self._start(prepared.fleet, inputs)
         released = Command(np.zeros_like(speed), np.zeros_like(speed))
@@ -225,8 +225,8 @@ class FmuVehicle:
         except Fault as fault:
             raise self._foreign_error(fault) from None
 
-    def _foreign_error(self, fault: Fault) -> ForeignError:
-        return ForeignError(self._guard.source, f"{self._guard.name} {fault}")
+    def _foreign_error(self, fault: Fault) -> UserCodeError:
+        return UserCodeError(self._guard.source, f"{self._guard.name} {fault}")
 
     def _input_array(self, inputs: Mapping[str, FloatArray], characteristics: Characteristics) -> FloatArray:
         return np.stack([*(inputs[name] for name in self._quantities), *(characteristics[name] for name in self._characteristics)])

@@ -10,7 +10,7 @@ from importlib.metadata import version
 import numpy as np
 import platformdirs
 
-from safevar_sumo.errors import ForeignError, InputError
+from safevar_sumo.errors import InputError, UserCodeError
 from safevar_sumo.records import BoolArray, Evaluations
 from safevar_sumo.results import RESULTS
 from safevar_sumo.study import Study, foreign_names, tables_of
@@ -36,7 +36,7 @@ def check_code(study: Study, inputs: Inputs, pool: RetryingPool) -> list[str]:
 
     Raises
     ------
-    ForeignError
+    UserCodeError
         With file, line and advice of the first finding that makes results wrong.
     """
     if not (foreign_names(study) or any(":" in name for name in study.search.algorithms)):
@@ -60,7 +60,7 @@ def refuse_difference(study: Study, ways: dict[str, Evaluations], again: str = "
 
     Raises
     ------
-    ForeignError
+    UserCodeError
         With the models, the first result that differs, and the contract.
     """
     (first_way, evaluation), (other_way, other_evaluation) = next(iter(ways.items())), list(ways.items())[-1]
@@ -69,7 +69,7 @@ def refuse_difference(study: Study, ways: dict[str, Evaluations], again: str = "
         name, value, other_value = difference
         problem = (f"with {' and '.join(foreign_names(study))} a result depends on what else is simulated: "
                    f"{name} is {value} {first_way} and {other_value} {other_way}")
-        raise ForeignError(f"study {study.name!r}", f"{problem}{again and f'; again by: {again}'}", LEGAL)
+        raise UserCodeError(f"study {study.name!r}", f"{problem}{again and f'; again by: {again}'}", LEGAL)
 
 
 def refuse_unlike_sumo(study: Study, recorded: Evaluations, in_sumo: Evaluations) -> None:

@@ -14,10 +14,10 @@ from functools import partial
 
 import numpy as np
 
-from safevar_sumo.errors import EnvironmentFault, ForeignError, SafevarError, SimulationError
+from safevar_sumo.errors import EnvironmentFault, SafevarError, SimulationError, UserCodeError
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import Evaluations, FloatArray, Outcome
-from safevar_sumo.shipped import RUN
+from safevar_sumo.shipped import PROGRAM_COMMAND
 from safevar_sumo.study import Study, foreign_names
 from safevar_sumo.vehicles import CharacteristicSet
 from safevar_sumo.workers.evaluation import Pool, PoolLostError, WorkerLostError
@@ -67,7 +67,7 @@ class RetryingPool:
             if evaluations is not None:
                 self._failures = 0
                 result.set_result(evaluations)
-            elif isinstance(error, ForeignError):
+            elif isinstance(error, UserCodeError):
                 self._locate(study, settings, error, result)
             elif not isinstance(error, SimulationError | WorkerLostError | EnvironmentFault):
                 result.set_exception(error)
@@ -157,7 +157,7 @@ class RetryingPool:
             metrics=dict.fromkeys(METRICS, undefined), f_diff=self._characteristics.largest_change(setting),
             f_num_diff=self._characteristics.number_changed(setting), reasons={setting[0].tobytes(): " ".join(str(error).split())})
 
-    def _locate(self, study: bytes, settings: FloatArray, error: ForeignError, result: Future[Evaluations]) -> None:
+    def _locate(self, study: bytes, settings: FloatArray, error: UserCodeError, result: Future[Evaluations]) -> None:
         """Find, by bisection, the setting on which code from outside fails; add the command that reproduces the error."""
         if len(settings) == 1:
             result.set_exception(self._with_command(error, settings))
@@ -165,29 +165,29 @@ class RetryingPool:
         halves = settings[:len(settings) // 2], settings[len(settings) // 2:]
 
         def second_done(_: Evaluations | None, part_error: BaseException | None) -> None:
-            if isinstance(part_error, ForeignError):
+            if isinstance(part_error, UserCodeError):
                 self._locate(study, halves[1], part_error, result)
             else:
                 result.set_exception(error)
 
         def first_done(_: Evaluations | None, part_error: BaseException | None) -> None:
-            if isinstance(part_error, ForeignError):
+            if isinstance(part_error, UserCodeError):
                 self._locate(study, halves[0], part_error, result)
             else:
                 self._compute(study, halves[1], second_done)
 
         self._compute(study, halves[0], first_done)
 
-    def _worker_lost_in_foreign_code(self, error: WorkerLostError) -> ForeignError:
+    def _worker_lost_in_foreign_code(self, error: WorkerLostError) -> UserCodeError:
         """The error for workers that repeatedly end or hang in code from outside."""
         problem = f"{error}, again and again, with {' and '.join(self._foreign)} in it; a dead process cannot report file and line"
-        return ForeignError(f"study {self._study.name!r}", problem)
+        return UserCodeError(f"study {self._study.name!r}", problem)
 
-    def _with_command(self, error: ForeignError, setting: FloatArray) -> ForeignError:
+    def _with_command(self, error: UserCodeError, setting: FloatArray) -> UserCodeError:
         """The error, with a command that reproduces it if the error has no command yet."""
         if COMMAND_PREFIX in error.problem:
             return error
-        return ForeignError(error.source, f"{error.problem}{COMMAND_PREFIX}{reproduction_command(self._study, setting[0])}", error.legal)
+        return UserCodeError(error.source, f"{error.problem}{COMMAND_PREFIX}{reproduction_command(self._study, setting[0])}", error.legal)
 
 
 def reproduction_command(study: Study, setting: FloatArray) -> str:
@@ -195,4 +195,4 @@ def reproduction_command(study: Study, setting: FloatArray) -> str:
     changes = [f"--set {member.name}={value!r}"
                for member, value in zip(CharacteristicSet.of(study.vehicle.characteristics), setting.tolist(), strict=True)
                if value != member.original]
-    return " ".join([f"{RUN} simulate", shlex.quote(study.origin.called or study.name), *changes])
+    return " ".join([f"{PROGRAM_COMMAND} simulate", shlex.quote(study.origin.called or study.name), *changes])

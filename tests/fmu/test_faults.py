@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from safevar_sumo.conformance import check
-from safevar_sumo.errors import ForeignError, InputError
+from safevar_sumo.errors import InputError, UserCodeError
 from safevar_sumo.records import Nominal, Observation
 from safevar_sumo.sumo.system import System
 from tests.fmu.exported import changed
@@ -104,7 +104,7 @@ def driven(system: System, gaps: list[float], step: float = 0.1) -> np.ndarray:
 ])
 def test_what_it_does_wrong_is_told_and_when(small: Make, then: str, message: str) -> None:
     system = small(then, time_limit=2)
-    with pytest.raises(ForeignError) as error:
+    with pytest.raises(UserCodeError) as error:
         driven(system, [100.0, 50.0, 20.0, 10.0])
     assert error.value.problem.startswith("ads.model = 'Small.fmu'")
     assert message in error.value.problem

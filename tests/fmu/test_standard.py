@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from safevar_sumo.errors import ForeignError, InputError
+from safevar_sumo.errors import InputError, UserCodeError
 from safevar_sumo.records import Command
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.matrix import evaluate
@@ -67,7 +67,7 @@ def test_one_instance_in_a_process_is_enough(small: Make) -> None:
     table = TABLE.replace("brake", "acceleration").replace("25.0", "1e6")
     expected = degrees(small("self.pedal = 2.0 - 0.1 * self.steps", table))
     once = "if now > 0 and Small.last is not self: raise RuntimeError('a second instance')\n            Small.last = self; "
-    with pytest.raises(ForeignError, match="a second instance"):
+    with pytest.raises(UserCodeError, match="a second instance"):
         degrees(small(once + "self.pedal = 2.0 - 0.1 * self.steps", table))
     edit = edited('canBeInstantiatedOnlyOncePerProcess="false"', 'canBeInstantiatedOnlyOncePerProcess="true"')
     np.testing.assert_array_equal(degrees(small(once + "self.pedal = 2.0 - 0.1 * self.steps", table, edit)), expected)

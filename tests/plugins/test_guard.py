@@ -1,4 +1,4 @@
-"""Every exception and every wrong result of a user's model is a ForeignError; a model cannot alter measurements."""
+"""Every exception and every wrong result of a user's model is a UserCodeError; a model cannot alter measurements."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from safevar_sumo.errors import ForeignError, InputError
+from safevar_sumo.errors import InputError, UserCodeError
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.matrix import evaluate
 from safevar_sumo.sumo.system import assemble
@@ -22,7 +22,7 @@ ROWS = "\n".join(f'{name} = {{ unit = "{row.unit}", original = {row.original}, l
 
 
 def failing(system: object) -> str:
-    with pytest.raises(ForeignError) as caught:
+    with pytest.raises(UserCodeError) as caught:
         evaluate(system, np.repeat(system.characteristics.original[None], 3, axis=0))  # type: ignore[arg-type, attr-defined]
     assert len(str(caught.value).splitlines()) <= 2
     return str(caught.value)
@@ -93,7 +93,7 @@ def test_a_vehicle_that_is_wrong(method: str, body: str, expected: str, mine: Mi
         system = mine(vehicle(method, body), VEHICLE.format(ROWS))
         evaluate(system, np.repeat(system.characteristics.original[None], 3, axis=0))
 
-    with pytest.raises(ForeignError) as caught:
+    with pytest.raises(UserCodeError) as caught:
         tried()
     assert expected in str(caught.value)
     assert "vehicle.model = 'mine:Mine'" in str(caught.value)
@@ -139,7 +139,7 @@ def test_a_scenario_that_is_wrong(method: str, body: str, expected: str, mine: M
 @pytest.mark.parametrize("values", ["network, duration = 7, 2.0", "network, duration = 'pedestrian_crossing', 'long'",
                                     "network, duration = 'pedestrian_crossing', -1", "network = 'pedestrian_crossing'"])
 def test_a_scenario_without_a_network_or_a_duration_is_refused(values: str, mine: Mine) -> None:
-    with pytest.raises(ForeignError, match=r"network|duration"):
+    with pytest.raises(UserCodeError, match=r"network|duration"):
         mine(scenario("", "").replace("network, duration = 'pedestrian_crossing', 2.0", values), SCENARIO)
 
 

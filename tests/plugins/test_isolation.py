@@ -12,7 +12,7 @@ import pytest
 from safevar_sumo.api.running import NullObserver, carry_out_runs
 from safevar_sumo.campaign import all_runs
 from safevar_sumo.conformance import refuse_defects
-from safevar_sumo.errors import ForeignError, InputError
+from safevar_sumo.errors import InputError, UserCodeError
 from safevar_sumo.results import load_runs
 from safevar_sumo.shipped import NETWORKS
 from safevar_sumo.study import load_study
@@ -39,7 +39,7 @@ def checked(mine: Mine, module: str, folder: Path) -> None:
     (MEAN, "in two halves (|alone|in another order)"), (CLASS, "in a second run"), (SELF, "in a second run"),
     (RANDOM, "when the run is repeated"), (PLACE, "in another order")], ids=["mean", "class", "self", "random", "place"])
 def test_an_ads_that_mixes_settings_up_is_refused(module: str, message: str, mine: Mine, folder: Path) -> None:
-    with pytest.raises(ForeignError, match=rf"'mine:Mine' (throttle|brake) of vehicle \d+ is .* {message}") as caught:
+    with pytest.raises(UserCodeError, match=rf"'mine:Mine' (throttle|brake) of vehicle \d+ is .* {message}") as caught:
         checked(mine, module, folder)
     assert "mine.py:" in str(caught.value)
 
@@ -84,7 +84,7 @@ def test_a_class_that_remembers_what_only_a_rare_setting_does(mine: Mine, folder
     system = mine(LATCH)
     study = load_study(str(folder / "mine.toml"), search={"algorithms": ["nsga2"], "evaluations": 60, "runs": 1})
     for _ in range(2):  # the same command again does not get by either
-        with pytest.raises(ForeignError, match=r"in run nsga2-00 and [\d.]+ alone; again by: python -m safevar_sumo simulate") as caught:
+        with pytest.raises(UserCodeError, match=r"in run nsga2-00 and [\d.]+ alone; again by: python -m safevar_sumo simulate") as caught:
             carry_out_runs(study, system, all_runs(study), tmp_path / "out", InlinePool(), NullObserver(), 7)
         assert "ads.model = 'mine:Mine' a result depends on what else is simulated" in str(caught.value)
     assert not (tmp_path / "out/solutions.csv").exists()
@@ -114,7 +114,7 @@ def test_an_algorithm_whose_runs_learn_from_each_other(own: str, shared: bool, m
         return carry_out_runs(study, system, all_runs(study), tmp_path / "out", InlinePool(), NullObserver(), None)
 
     if shared:
-        with pytest.raises(ForeignError, match=r"'mine:Mine' settings requested .* in a second run .*mine.py:9"):
+        with pytest.raises(UserCodeError, match=r"'mine:Mine' settings requested .* in a second run .*mine.py:9"):
             searched()
     else:
         searched()
@@ -145,7 +145,7 @@ def test_a_class_that_makes_every_twelfth_vehicle_safer(mine: Mine, folder: Path
     """Neither the most severe nor the last evaluation of a run reveals the class; the checks at the start or another evaluation do."""
     system = mine(SAFER)
     study = load_study(str(folder / "mine.toml"), search={"algorithms": ["rs"], "evaluations": 100, "runs": 2})
-    with pytest.raises(ForeignError, match=r"ads.model = 'mine:Mine' (a result depends on what else is simulated|.* in another order)"):
+    with pytest.raises(UserCodeError, match=r"ads.model = 'mine:Mine' (a result depends on what else is simulated|.* in another order)"):
         carry_out_runs(study, system, all_runs(study), tmp_path / "out", InlinePool(), NullObserver(), None)
 
 
@@ -167,7 +167,7 @@ class Mine:
 def test_an_algorithm_that_draws_from_the_clock(mine: Mine, folder: Path, tmp_path: Path) -> None:
     system = mine(CLOCK, '[search]\nalgorithms = ["mine:Mine"]\nevaluations = 20\nruns = 1\n')
     study = load_study(str(folder / "mine.toml"))
-    with pytest.raises(ForeignError, match=r"'mine:Mine' settings requested .* when the run is repeated .*mine.py:10"):
+    with pytest.raises(UserCodeError, match=r"'mine:Mine' settings requested .* when the run is repeated .*mine.py:10"):
         carry_out_runs(study, system, all_runs(study), tmp_path / "out", InlinePool(), NullObserver(), None)
 
 
@@ -194,7 +194,7 @@ def test_an_algorithm_that_changes_its_problem_or_asks_for_nothing(module: str, 
                                                                   tmp_path: Path) -> None:
     system = mine(module, '[search]\nalgorithms = ["mine:Mine"]\nevaluations = 10\nruns = 1\n')
     study = load_study(str(folder / "mine.toml"))
-    with pytest.raises(ForeignError, match=problem):
+    with pytest.raises(UserCodeError, match=problem):
         carry_out_runs(study, system, all_runs(study), tmp_path / "out", InlinePool(), NullObserver(), None)
 
 

@@ -14,7 +14,7 @@ import numpy as np
 import psutil
 import pytest
 
-from safevar_sumo.errors import EnvironmentFault, ForeignError, InputError, SimulationError
+from safevar_sumo.errors import EnvironmentFault, InputError, SimulationError, UserCodeError
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import Evaluations, Outcome
 from safevar_sumo.study import ModelTable, Origin, load_study
@@ -204,10 +204,10 @@ def test_a_fault_of_the_surroundings_is_an_error_and_no_outcome() -> None:
 
 def test_what_a_users_code_does_on_one_setting_is_an_error_that_names_it() -> None:
     def fault(rows: np.ndarray, before: int) -> Exception | None:
-        return ForeignError("study", "ads.model = 'my_ads:Mine' raised in drive: ZeroDivisionError") if 4313 in rows[:, 0] else None
+        return UserCodeError("study", "ads.model = 'my_ads:Mine' raised in drive: ZeroDivisionError") if 4313 in rows[:, 0] else None
 
     pool = ToldPool(fault)
-    with pytest.raises(ForeignError) as caught:
+    with pytest.raises(UserCodeError) as caught:
         RetryingPool(pool, FOREIGN).submit(b"", settings(50)).result(timeout=5)
     assert "ZeroDivisionError; again by: python -m safevar_sumo simulate 'my study.toml' --set " in str(caught.value)
     assert f"--set {SUN.names[0]}=4313.0" in str(caught.value)
