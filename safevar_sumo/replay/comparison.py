@@ -101,23 +101,23 @@ class Comparison:
 
 def changes_in_words(characteristics: CharacteristicSet, setting: FloatArray) -> list[str]:
     """The changes from the original: `tireFric 3.5 → 1.1 (-69 %)`."""
-    return [f"{member.name} {number(member.original)} → {number(value)}{spaced(member.unit)} "
+    return [f"{member.name} {format_number(member.original)} → {quantity_text(value, member.unit)} "
             f"({(value - member.original) / abs(member.original) * 100:+.0f}\N{NO-BREAK SPACE}%)"
             for member, value in zip(characteristics, setting.tolist(), strict=True) if value != member.original]
 
 
-def number(value: float) -> str:
-    """A number with four significant digits; a number from 10,000 on with all digits before the point."""
+def format_number(value: float) -> str:
+    """A number with four significant digits; from 10,000 on, with all digits before the point."""
     return f"{value:.0f}" if 1e4 <= abs(value) < 1e15 else f"{value:.4g}"
 
 
-def spaced(unit: str) -> str:
-    """A unit to follow a number, with raised powers; empty for a pure number."""
-    return "" if unit == "-" else " " + raised(unit)
+def quantity_text(value: float, unit: str) -> str:
+    """A number with its unit, whose powers are raised; a pure number has no unit."""
+    return format_number(value) + ("" if unit == "-" else " " + superscript_powers(unit))
 
 
-def raised(text: str) -> str:
-    """A text with raised powers in its units: m/s² for m/s^2."""
+def superscript_powers(text: str) -> str:
+    """Raise the powers of a text's units: m/s² for m/s^2."""
     return text.replace("^2", "²").replace("^3", "³")
 
 
