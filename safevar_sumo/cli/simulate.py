@@ -143,10 +143,10 @@ def _print_results(target: CommandTarget, system: System, simulation: Simulation
 
 def _warn_of_differences(target: CommandTarget, simulation: Simulation) -> None:
     """Warn where a replay differs from the recorded solution."""
-    from safevar_sumo.replay.comparison import differences
+    from safevar_sumo.replay.comparison import list_differences
 
     assert target.row is not None
-    for difference in differences(simulation.evaluation, target.row):
+    for difference in list_differences(simulation.evaluation, target.row):
         click.echo(f"warning: {target.handle} of {target.source}: {difference}; other versions or code than in the study?", err=True)
 
 
@@ -184,11 +184,11 @@ class Replays(NamedTuple):
             refuse_overwriting(self.plot, "--plot", study)
             check_output(self.plot, "--plot", PICTURES)
         if self.animate is not None:
-            from safevar_sumo.replay.animation import ANIMATIONS, check_animation
+            from safevar_sumo.replay.animation import ANIMATION_WRITERS, require_ffmpeg
 
             refuse_overwriting(self.animate, "--animate", study)
-            check_output(self.animate, "--animate", tuple(ANIMATIONS))
-            check_animation(self.animate)
+            check_output(self.animate, "--animate", tuple(ANIMATION_WRITERS))
+            require_ffmpeg(self.animate)
 
     def show(self, study: Study, system: System, setting: FloatArray) -> None:
         """Simulate a filtered setting, shape (n,), beside the original vehicle, and show both."""

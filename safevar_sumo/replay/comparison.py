@@ -14,7 +14,7 @@ from safevar_sumo.analysis.words import ENDS
 from safevar_sumo.api.simulation import changed_setting, load_and_assemble
 from safevar_sumo.metrics import METRICS, RATING_POINTS, MetricFacts
 from safevar_sumo.records import Evaluations, FloatArray, Outcome, SimulationRuns
-from safevar_sumo.replay.film import Film, film
+from safevar_sumo.replay.film import Film, record_film
 from safevar_sumo.results import UNKNOWN
 from safevar_sumo.study import Study, StudyLike
 from safevar_sumo.sumo.batch import score
@@ -39,13 +39,13 @@ class Moments(NamedTuple):
     end: int
 
 
-def moments(runs: SimulationRuns, row: int) -> Moments:
-    """The moments of one of N runs."""
+def find_moments(runs: SimulationRuns, row: int) -> Moments:
+    """Find the moments of one of N runs."""
     return Moments(brake_onset(runs, row), runs.nearest(row), int(np.flatnonzero(runs.trace.active[:, row])[-1]))
 
 
-def divergence(runs: SimulationRuns, first: int = 0, second: int = 1) -> int | None:
-    """The first sample at which the speeds of two of N runs have diverged, None if they never do."""
+def find_divergence(runs: SimulationRuns, first: int = 0, second: int = 1) -> int | None:
+    """Find the first sample at which the speeds of two of N runs have diverged; None if they never do."""
     trace = runs.trace
     is_active = trace.active[:, first] & trace.active[:, second]
     samples = np.flatnonzero(is_active & (np.abs(trace.speed[:, first] - trace.speed[:, second]) > MIN_DIVERGENCE))
@@ -91,7 +91,7 @@ class Comparison:
         runs = self.film.runs
         if not math.isnan(runs.collision_speed[row]):
             return f"collides at {runs.collision_speed[row]:.1f} m/s"
-        nearest = moments(runs, row).nearest
+        nearest = find_moments(runs, row).nearest
         ending = ENDS[Outcome(str(runs.outcome[row]))]
         if nearest is not None and runs.outcome[row] == Outcome.STOPPED:
             ending = f"{ending} with {runs.trace.gap[nearest, row]:.2f} m to spare"
@@ -158,10 +158,10 @@ def compare_setting(study: Study, system: System, setting: FloatArray) -> Compar
     original = system.characteristics.original
     settings = np.stack([original]) if np.array_equal(original, setting) else np.stack([original, setting])
     worst_system = at_worst(system, settings)
-    names = [f" ({point.name})" for point in system.matrix
-             if (point.scenario, point.weather) == (worst_system.scenario, worst_system.weather)]
-    recording = film(worst_system, settings)
-    return Comparison(title=study.title + "".join(names[:1]), characteristics=system.characteristics,
+    point_names = [f" ({point.name})" for point in system.matrix
+                   if (point.scenario, point.weather) == (worst_system.scenario, worst_system.weather)]
+    recording = record_film(worst_system, settings)
+    return Comparison(title=study.title + "".join(point_names[:1]), characteristics=system.characteristics,
                       ttc_threshold=system.metrics.ttc_threshold, network=staged(worst_system.scenario).folder,
                       evaluations=score(worst_system, settings, recording.runs),
                       film=replace(recording, runs=_with_pedals_before_impacts(recording.runs)),
@@ -169,7 +169,7 @@ def compare_setting(study: Study, system: System, setting: FloatArray) -> Compar
 
 
 def _further_objectives(measuring: Measuring) -> tuple[MetricFacts, ...]:
-    """Objectives of one run besides the paper's; without the points of a rating, which belong to all cells together."""
+    """Objectives of one run besides the paper's; the points of a rating are none, as they belong to all cells together."""
     objectives = {objective.name for objective in measuring.scoring.objectives}
     return tuple(metric for metric in measuring.scoring.metrics if metric.name in objectives - {*METRICS, RATING_POINTS.name})
 
@@ -179,16 +179,16 @@ def _with_pedals_before_impacts(runs: SimulationRuns) -> SimulationRuns:
     trace = runs.trace
     throttle, brake = trace.throttle.copy(), trace.brake.copy()
     for row in np.flatnonzero(~np.isnan(runs.collision_speed)).tolist():
-        end = moments(runs, row).end
+        end = find_moments(runs, row).end
         for pedal in (throttle, brake):
             pedal[end, row] = pedal[max(end - 1, 0), row]
     return replace(runs, trace=replace(trace, throttle=throttle, brake=brake))
 
 
-def differences(replayed: Evaluations, recorded: Mapping[str, Any]) -> list[str]:
-    """The differences of a replay of one setting from its row of solutions.csv, with both values."""
-    problems = [f"{name} is {recorded[name]:.6g} there and {replayed.metrics[name][0]:.6g} here" for name in replayed.metrics
-            if name in recorded and not np.array_equal(float(recorded[name]), float(replayed.metrics[name][0]), equal_nan=True)]
+def list_differences(replayed: Evaluations, recorded: Mapping[str, Any]) -> list[str]:
+    """List where the replay of a solution differs from its row of solutions.csv, with both values."""
+    differing_metrics = [f"{name} is {recorded[name]:.6g} there and {replayed.metrics[name][0]:.6g} here" for name in replayed.metrics
+                         if name in recorded and not np.array_equal(float(recorded[name]), float(replayed.metrics[name][0]), equal_nan=True)]
     if recorded["outcome"] not in (replayed.outcome[0], UNKNOWN):
-        problems.insert(0, f"the outcome is {recorded['outcome']} there and {replayed.outcome[0]} here")
-    return problems
+        return [f"the outcome is {recorded['outcome']} there and {replayed.outcome[0]} here", *differing_metrics]
+    return differing_metrics

@@ -16,7 +16,7 @@ from safevar_sumo.analysis.explain.result import CauseEntry, FailureEntry, Summa
 from safevar_sumo.analysis.opinion.compute import JudgedCause, opinions_of, second_system
 from safevar_sumo.analysis.research_questions.indicators import nondominated
 from safevar_sumo.errors import InputError
-from safevar_sumo.replay.comparison import differences, quantity_text, superscript_powers
+from safevar_sumo.replay.comparison import list_differences, quantity_text, superscript_powers
 from safevar_sumo.report.input import ChangeRow, FailingPointsTable, ReportInput, load_or_compute
 from safevar_sumo.report.svg import Bar, draw_bars
 
@@ -191,7 +191,7 @@ def replay_solutions(data: ReportInput, explanations: Explanations | None) -> li
                                  is_open=index == 0 and not (explanations and explanations.failures))
         entries.append(entry if data.system is None else entry._replace(
             player_data=data.player_data_of(setting), failing_points=data.failing_points(setting),
-            differences=differences(data.simulate_again([setting])[0].evaluation, row)))
+            differences=list_differences(data.simulate_again([setting])[0].evaluation, row)))
     return sorted(entries, key=lambda entry: (entry.f_safe, entry.handle))
 
 

@@ -26,7 +26,7 @@ from safevar_sumo.errors import InputError, SafevarError, warn
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.replay.comparison import Comparison, changes_in_words, compare_setting
 from safevar_sumo.replay.page import player_data
-from safevar_sumo.replay.scene import flat_scene_of
+from safevar_sumo.replay.scene import lay_out_scene
 from safevar_sumo.results import ANSWERS, MANIFEST, RESULTS, SOLUTIONS, chosen_handle, handles, read_manifest, write_whole
 from safevar_sumo.scenarios import Point
 from safevar_sumo.shipped import PACKAGE
@@ -194,7 +194,7 @@ class ReportInput:
 
     def player_data_of(self, setting: FloatArray) -> dict[str, Any]:
         """A setting's animation, in the form that the template `player` takes."""
-        return player_data(flat_scene_of(self.compare_with_original(setting)))
+        return player_data(lay_out_scene(self.compare_with_original(setting)))
 
     def anchor(self, *parts: object) -> str:
         """The HTML anchor of an element of the page, in this study's section."""

@@ -24,7 +24,7 @@ from safevar_sumo.analysis.research_questions.layout import Bold, Table, lay_out
 from safevar_sumo.errors import InputError, did_you_mean, warn
 from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.replay.comparison import superscript_powers
-from safevar_sumo.replay.page import environment, player_parts
+from safevar_sumo.replay.page import player_files, template_environment
 from safevar_sumo.report.causes import (
     draw_necessity,
     evenly_spaced_indices,
@@ -185,7 +185,7 @@ def make_report(directories: Iterable[str | Path], only: Sequence[str] = (), job
     if any(are_rated):
         if not all(are_rated):
             raise InputError("directories", "some hold results of rated studies, others do not", "a report for each kind")
-        return environment(TEMPLATE_FOLDER).get_template("rated.html.j2").render(
+        return template_environment(TEMPLATE_FOLDER).get_template("rated.html.j2").render(
             title=f"Euro NCAP rating: {', '.join(data.case.name for data in inputs)}", css=_web_file("report.css"),
             studies=[rated_study_data(data, jobs, progress) for data in inputs]) + "\n"
     cases = [data.case for data in inputs] if "questions" in sections else []
@@ -194,12 +194,12 @@ def make_report(directories: Iterable[str | Path], only: Sequence[str] = (), job
         studies = [_study_data(data, sections, jobs, progress) for data in inputs]
         progress("tables and figures", 0, 1)
         answers, pictures = questions.result()
-    page = environment(TEMPLATE_FOLDER).get_template("report.html.j2").render(
+    page = template_environment(TEMPLATE_FOLDER).get_template("report.html.j2").render(
         title=f"Safety report: {', '.join(data.case.name for data in inputs)}", sections={name: SECTIONS[name] for name in sections},
         studies=studies, tables=answers, figures=pictures,
         commands=commands_to_reproduce(inputs, [command for name, command in COMMAND_OF_SECTION.items() if name in sections])
         if "reproduce" in sections else [],
-        simulated_sections=list(COMMAND_OF_SECTION), player=player_parts(), css=_web_file("report.css"), js=_web_file("report.js"))
+        simulated_sections=list(COMMAND_OF_SECTION), player=player_files(), css=_web_file("report.css"), js=_web_file("report.js"))
     progress("tables and figures", 1, 1)
     return page + "\n"
 

@@ -224,7 +224,7 @@ def test_a_kept_answer_belongs_to_its_options_and_to_the_code_that_computed_it(
     ask("other results")
     monkeypatch.setattr(report_input, "SAMPLES", 33)
     ask("another sample size")
-    monkeypatch.setattr(report_input, "_package", lambda: "edited since")
+    monkeypatch.setattr(report_input, "_package_identity", lambda: "edited since")
     ask("other code")
     assert computed == ["first", "other results", "another sample size", "other code"]
 

@@ -27,7 +27,8 @@ from tests.in_process import searched
 
 
 def first_command(study: Study) -> list[str]:
-    one: Any = SimpleNamespace(directory=Path("its results"), point="", changed=(), case=SimpleNamespace(study=study, has_runs=True))
+    one: Any = SimpleNamespace(directory=Path("its results"), point="", later_changes=(),
+                               case=SimpleNamespace(study=study, has_runs=True))
     return shlex.split(commands_to_reproduce([one], [])[0]["command"])
 
 
