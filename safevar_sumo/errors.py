@@ -13,7 +13,7 @@ INTERRUPTED = 130
 
 
 class SafevarError(Exception):
-    """A failure that is not a bug of this package; the command ends with `exit_code`."""
+    """A failure that is no bug of this package; a command that raises it ends with `exit_code`."""
 
     exit_code = 1
 
@@ -77,7 +77,7 @@ def describe_error(error: BaseException) -> str:
 
 
 def unknown_name(source: object, problem: str, name: object, names: Iterable[str], otherwise: str = "") -> InputError:
-    """The error for an unknown name: it suggests the nearest known name and lists all of them.
+    """Make the error for an unknown name: it suggests the nearest known name, and lists all known names.
 
     Parameters
     ----------
@@ -90,19 +90,19 @@ def unknown_name(source: object, problem: str, name: object, names: Iterable[str
     otherwise
         What is accepted besides the names.
     """
-    options = list(names)
-    return InputError(source, f"{problem}{did_you_mean(name, options)}", f"{one_of(options)}{otherwise}")
+    known_names = list(names)
+    return InputError(source, f"{problem}{did_you_mean(name, known_names)}", f"{one_of(known_names)}{otherwise}")
 
 
 def did_you_mean(name: object, names: Iterable[str]) -> str:
     """The text `; did you mean 'rain'?` with the name nearest in spelling, ignoring case; empty if no name is similar."""
-    by_lower = {option.lower(): option for option in names}
-    matches = get_close_matches(str(name).lower(), by_lower, n=1)
-    return f"; did you mean {by_lower[matches[0]]!r}?" if matches else ""
+    names_in_lower_case = {known_name.lower(): known_name for known_name in names}
+    matches = get_close_matches(str(name).lower(), names_in_lower_case, n=1)
+    return f"; did you mean {names_in_lower_case[matches[0]]!r}?" if matches else ""
 
 
 def one_of(names: Iterable[str]) -> str:
-    """List the legal names of a choice for an error message."""
+    """The text `one of`, with all legal names, for an error message."""
     return "one of " + ", ".join(sorted(names))
 
 

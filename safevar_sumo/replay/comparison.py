@@ -187,8 +187,9 @@ def _with_pedals_before_impacts(runs: SimulationRuns) -> SimulationRuns:
 
 def list_differences(replayed: Evaluations, recorded: Mapping[str, Any]) -> list[str]:
     """List where the replay of a solution differs from its row of solutions.csv, with both values."""
-    differing_metrics = [f"{name} is {recorded[name]:.6g} there and {replayed.metrics[name][0]:.6g} here" for name in replayed.metrics
-                         if name in recorded and not np.array_equal(float(recorded[name]), float(replayed.metrics[name][0]), equal_nan=True)]
+    differing_metrics = [
+        f"{name} is {recorded[name]:.6g} there and {values[0]:.6g} here" for name, values in replayed.metrics.items()
+        if name in recorded and not np.array_equal(float(recorded[name]), float(values[0]), equal_nan=True)]
     if recorded["outcome"] not in (replayed.outcome[0], UNKNOWN):
         return [f"the outcome is {recorded['outcome']} there and {replayed.outcome[0]} here", *differing_metrics]
     return differing_metrics

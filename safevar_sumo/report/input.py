@@ -56,19 +56,9 @@ AVOIDED_TEXT, FAILURE_TEXT = "–", "fails"  # noqa: RUF001
 
 
 def tabulate_failing_points(matrix: Sequence[Point], failing: Collection[str]) -> FailingPointsTable:
-    """Make a table of the failing points: a row for each test and weather, a column for each speed, cells of impact locations.
+    """Make a table of the points whose names are in `failing`: rows for tests and weathers, columns for speeds.
 
-    Parameters
-    ----------
-    matrix
-        All points of the matrix.
-    failing
-        Names of the failing points.
-
-    Returns
-    -------
-    FailingPointsTable
-        Cells without a test are empty.
+    A cell lists the impact locations that fail; a cell without a test is empty.
     """
     coordinates_of_points = [(point.name in failing, dict(point.place)) for point in matrix]
     speeds = sorted({coordinates[SPEED_DIMENSION] for _, coordinates in coordinates_of_points if SPEED_DIMENSION in coordinates})

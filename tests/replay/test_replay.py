@@ -1,4 +1,4 @@
-"""Replays: solutions of a results directory are simulated again with the same results, and seen from above."""
+"""ReplayOutputs: solutions of a results directory are simulated again with the same results, and seen from above."""
 
 from __future__ import annotations
 

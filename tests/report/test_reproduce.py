@@ -38,7 +38,7 @@ def test_of_a_shipped_study_the_command_asks_for_the_same() -> None:
     assert (python, package, asked[0]) == ("python", "safevar_sumo", "study")
     given = command.study.make_context("study", asked[1:]).params
     options = {name: given[name] for name in ("algorithms", "seed", "runs", "evaluations")}
-    assert command._with_options(load_study(given["study"]), **options) == study
+    assert command._apply_options(load_study(given["study"]), **options) == study
 
 
 @pytest.mark.parametrize("changes", [{"name": "pilot"}, {"step_length": 0.02}])
