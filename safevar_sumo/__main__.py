@@ -16,9 +16,9 @@ def main() -> None:
 
         cli.main()
     except KeyboardInterrupt:
-        from safevar_sumo.errors import INTERRUPTED
+        from safevar_sumo.errors import INTERRUPT_EXIT_CODE
 
-        _exit_with_error("interrupted", INTERRUPTED)
+        _exit_with_error("interrupted", INTERRUPT_EXIT_CODE)
     except ModuleNotFoundError as error:
         if (error.name or "").startswith("safevar_sumo."):
             raise

@@ -131,7 +131,7 @@ class _Tally:
 
 
 @contextmanager
-def counting_bar(console: Console, label: str, total: int) -> Iterator[Callable[[int], None]]:
+def show_counting_bar(console: Console, label: str, total: int) -> Iterator[Callable[[int], None]]:
     """Show a bar that counts up to `total`; yields the function that adds to the count."""
     done = 0
     with show_stages(console) as report_progress:

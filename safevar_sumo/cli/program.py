@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, NoReturn, TextIO
 
 import click
 
-from safevar_sumo.errors import INTERRUPTED, InputError, SafevarError, did_you_mean
+from safevar_sumo.errors import INTERRUPT_EXIT_CODE, InputError, SafevarError, did_you_mean
 
 if TYPE_CHECKING:
     from safevar_sumo.study import Study
@@ -127,7 +127,7 @@ def main() -> None:
         code = commands.main(standalone_mode=False, prog_name="safevar-sumo")
         sys.stdout.flush()
     except click.exceptions.Abort:
-        _exit_with_error("interrupted", INTERRUPTED)
+        _exit_with_error("interrupted", INTERRUPT_EXIT_CODE)
     except click.exceptions.NoArgsIsHelpError as error:
         error.show()
         _exit_program(error.exit_code)
@@ -136,7 +136,7 @@ def main() -> None:
     except SafevarError as error:
         _exit_with_error(str(error), error.exit_code)
     except KeyboardInterrupt:
-        _exit_with_error("interrupted", INTERRUPTED)
+        _exit_with_error("interrupted", INTERRUPT_EXIT_CODE)
     except BrokenPipeError:
         _discard_output()
         _exit_program(1)
@@ -164,7 +164,7 @@ def _exit_on_interrupt() -> Iterator[None]:
     """End the program on Ctrl-C while modules load: compiled modules would swallow the exception."""
     def exit_at_once(*_: object) -> None:
         os.write(2, b"safevar-sumo: interrupted\n")
-        os._exit(INTERRUPTED)
+        os._exit(INTERRUPT_EXIT_CODE)
 
     in_main_thread = threading.current_thread() is threading.main_thread()
     previous_handler = signal.signal(signal.SIGINT, exit_at_once) if in_main_thread else None

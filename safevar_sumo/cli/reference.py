@@ -17,7 +17,7 @@ from safevar_sumo.cli.program import StrictCommand, commands, print_remarks
 from safevar_sumo.cli.target import jobs_option
 from safevar_sumo.errors import InputError, SimulationError
 from safevar_sumo.metrics import METRICS
-from safevar_sumo.progress import counting_bar
+from safevar_sumo.progress import show_counting_bar
 from safevar_sumo.records import Evaluations
 from safevar_sumo.reference import (
     Agreement,
@@ -74,7 +74,7 @@ def validate(study: str, reference: Path, jobs: int | None, plot: Path | None, a
     data = _read_rows(reference, system.characteristics)
     settings = np.concatenate([system.characteristics.original[np.newaxis], data.settings])
     with (local_pool(jobs or available_cores(), loaded_study.search.time_limit) as pool,
-          counting_bar(Console(stderr=True), "settings", len(np.unique(settings, axis=0))) as count_settings):
+          show_counting_bar(Console(stderr=True), "settings", len(np.unique(settings, axis=0))) as count_settings):
         evaluations = evaluate_all(loaded_study, settings, pool, count_settings)
     data, rows = _simulated_rows(reference, data, evaluations.take(np.arange(1, len(settings))))
     if not evaluations.valid[0]:

@@ -36,7 +36,7 @@ def report(*results: Results | str | Path, out: str | Path | None = None, only: 
     progress
         True for a bar on the terminal, or a function called with the stage, the amount done, and the total amount.
     as_it_is_now
-        If results were computed with other files or versions, simulate with the present ones; the page then says so.
+        If results were computed with other files or versions, simulate with the present ones; the page says so.
 
     Returns
     -------

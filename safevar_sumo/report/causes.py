@@ -25,7 +25,7 @@ MAX_CAUSES = 6
 MAX_REPLAYS = 10
 """Maximum number of solutions with a replay in a report, unless there are more explained failures."""
 FIRST_CHOICES = ("fewest", "smallest", "most_severe")
-"""Choices of the first solutions on the page."""
+"""Choices that select the first solutions on the page, as the flags of `simulate` do."""
 OBJECTIVES = ["f_safe", "f_diff", "f_num_diff"]
 
 
@@ -102,7 +102,7 @@ def explain_main_failures(data: ReportInput, jobs: int | None, progress: Progres
 
 
 def draw_necessity(summary: SummaryEntry, data: ReportInput) -> Markup | None:
-    """A chart of how often failures change each characteristic, and how often they need this change."""
+    """Draw how often failures change each characteristic, and how often they need this change."""
     changed, necessary = summary.changed, summary.necessary
     names = sorted((name for name in necessary if changed.get(name)), key=lambda name: (-necessary[name], -changed[name], name))
     if not names:
@@ -121,7 +121,7 @@ def _interval_text(low: float, high: float) -> str:
 
 
 def make_cause_sections(failures: Sequence[FailureEntry], data: ReportInput) -> list[CauseSection]:
-    """Minimal causes with replays, one for each set of characteristics, ordered by number and size of their changes."""
+    """Make a section for the smallest minimal cause of each set of characteristics, in order of the number and size of changes."""
     smallest: dict[tuple[str, ...], tuple[CauseEntry, FailureEntry]] = {}
     for failure in failures:
         for cause in failure.minimal_causes:
@@ -161,7 +161,7 @@ def _size_of_changes(data: ReportInput, cause: CauseEntry) -> tuple[int, float]:
 
 def _make_cause_section(data: ReportInput, rank: int, cause: CauseEntry, failure: FailureEntry, opinion: SecondOpinion | None
                         ) -> CauseSection:
-    """A cause on the page; `rank` counts causes from 1."""
+    """Make the section of one cause; `rank` counts causes from 1."""
     setting = data.setting_with(cause.changes)
     change_rows, characteristics = [], {characteristic.name: characteristic for characteristic in data.case.characteristics}
     for name, value in cause.changes.items():

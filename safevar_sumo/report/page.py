@@ -205,7 +205,7 @@ def make_report(directories: Iterable[str | Path], only: Sequence[str] = (), job
 
 
 def _study_data(data: ReportInput, sections: Sequence[str], jobs: int | None, show_progress: Progress) -> Mapping[str, Any]:
-    """The data of one study for the given sections."""
+    """Make the data of one study that the templates of these sections need."""
     def progress(stage: str, done: int, total: int) -> None:
         show_progress(f"{data.case.name}: {stage}", done, total)
 
