@@ -7,25 +7,25 @@ import sys
 
 
 def main() -> None:
-    """Run the program, whose import stands here and not above because every worker process loads this module too."""
+    """Run the program; it is imported here and not above, because every worker process loads this module too."""
     if sys.version_info < (3, 11):  # noqa: UP036
-        _fail(f"needs Python 3.11 or newer; this is {'.'.join(map(str, sys.version_info[:3]))}", 1)
+        _exit_with_error(f"needs Python 3.11 or newer; this is {'.'.join(map(str, sys.version_info[:3]))}", 1)
     _put_installed_modules_first()
     try:
         from safevar_sumo import cli
 
         cli.main()
     except KeyboardInterrupt:
-        from safevar_sumo.errors import INTERRUPTED
+        from safevar_sumo.errors import INTERRUPT_EXIT_CODE
 
-        _fail("interrupted", INTERRUPTED)
+        _exit_with_error("interrupted", INTERRUPT_EXIT_CODE)
     except ModuleNotFoundError as error:
         if (error.name or "").startswith("safevar_sumo."):
             raise
-        _fail(f"{error.name} is not installed; in the checkout: pip install . (or make study, which makes a .venv)", 1)
+        _exit_with_error(f"{error.name} is not installed; in the checkout: pip install . (or make study, which makes a .venv)", 1)
 
 
-def _fail(message: str, code: int) -> None:
+def _exit_with_error(message: str, code: int) -> None:
     print(f"safevar-sumo: {message}", file=sys.stderr)
     sys.exit(code)
 

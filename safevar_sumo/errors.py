@@ -8,12 +8,12 @@ from collections.abc import Iterable
 from difflib import get_close_matches
 from pathlib import Path
 
-INTERRUPTED = 130
+INTERRUPT_EXIT_CODE = 130
 """Exit code after Ctrl-C, as in shells: 128 plus the signal's number."""
 
 
 class SafevarError(Exception):
-    """A failure that is not a bug of this package; the command ends with `exit_code`."""
+    """A failure that is no bug of this package; a command that raises it ends with `exit_code`."""
 
     exit_code = 1
 
@@ -63,11 +63,11 @@ def warn(message: str) -> None:
 
 
 MAX_MESSAGE_LENGTH = 500
-"""Largest number of characters of somebody else's message in an error."""
+"""Length at which an error cuts a message that it quotes [characters]."""
 
 
-def in_one_line(error: BaseException) -> str:
-    """The class of an error and its message, up to `MAX_MESSAGE_LENGTH` characters, even if `str(error)` fails."""
+def describe_error(error: BaseException) -> str:
+    """Describe an error by its class and its message, cut at `MAX_MESSAGE_LENGTH`, even if `str(error)` fails."""
     try:
         message = " ".join(str(error).split())
     except Exception:
@@ -76,8 +76,8 @@ def in_one_line(error: BaseException) -> str:
     return f"{type(error).__name__}: {excerpt}" if excerpt else type(error).__name__
 
 
-def unknown(source: object, problem: str, name: object, names: Iterable[str], otherwise: str = "") -> InputError:
-    """The error for an unknown name: it suggests the nearest known name and lists all of them.
+def unknown_name(source: object, problem: str, name: object, names: Iterable[str], otherwise: str = "") -> InputError:
+    """Make the error for an unknown name: it suggests the nearest known name, and lists all known names.
 
     Parameters
     ----------
@@ -90,23 +90,23 @@ def unknown(source: object, problem: str, name: object, names: Iterable[str], ot
     otherwise
         What is accepted besides the names.
     """
-    options = list(names)
-    return InputError(source, f"{problem}{did_you_mean(name, options)}", f"{one_of(options)}{otherwise}")
+    known_names = list(names)
+    return InputError(source, f"{problem}{did_you_mean(name, known_names)}", f"{one_of(known_names)}{otherwise}")
 
 
 def did_you_mean(name: object, names: Iterable[str]) -> str:
     """The text `; did you mean 'rain'?` with the name nearest in spelling, ignoring case; empty if no name is similar."""
-    by_lower = {option.lower(): option for option in names}
-    matches = get_close_matches(str(name).lower(), by_lower, n=1)
-    return f"; did you mean {by_lower[matches[0]]!r}?" if matches else ""
+    names_in_lower_case = {known_name.lower(): known_name for known_name in names}
+    matches = get_close_matches(str(name).lower(), names_in_lower_case, n=1)
+    return f"; did you mean {names_in_lower_case[matches[0]]!r}?" if matches else ""
 
 
 def one_of(names: Iterable[str]) -> str:
-    """List the legal names of a choice for an error message."""
+    """The text `one of`, with all legal names, for an error message."""
     return "one of " + ", ".join(sorted(names))
 
 
-STREAMS = ("/dev/stdin", "/dev/stdout", "/dev/stderr", "/dev/null")
+STREAM_PATHS = ("/dev/stdin", "/dev/stdout", "/dev/stderr", "/dev/null")
 DESCRIPTOR_FOLDERS = ("/dev/fd", "/proc/self/fd")
 
 
@@ -127,7 +127,7 @@ def refuse_other_than_file(path: Path, source: object = None, *, streams: bool =
     InputError
         If the path is a directory, a pipe or a device.
     """
-    is_stream = streams and (str(path) in STREAMS or str(path.parent) in DESCRIPTOR_FOLDERS)
+    is_stream = streams and (str(path) in STREAM_PATHS or str(path.parent) in DESCRIPTOR_FOLDERS)
     if path.exists() and not path.is_file() and not is_stream:
         problem = "is no regular file but a directory" if path.is_dir() else "is no regular file"
         raise InputError(path if source is None else source, problem if source is None else f"{path} {problem}", "a file")

@@ -14,10 +14,10 @@ from rich.progress import BarColumn, Progress, TextColumn
 from safevar_sumo.campaign import RunKey
 from safevar_sumo.records import Evaluations
 from safevar_sumo.study import Study
-from safevar_sumo.terminal import SECONDS_BETWEEN_LINES, print_text, stages
+from safevar_sumo.terminal import SECONDS_BETWEEN_LINES, print_text, show_stages
 
 SETTLING_TIME = 5.0
-"""Seconds of work before throughput is shown: batches that end together make earlier values meaningless."""
+"""Work before throughput is shown [s]: batches that end together make earlier values meaningless."""
 BAR_WIDTH = 10
 """Width of the bar [characters]."""
 MIN_TEXT_WIDTH = 26
@@ -105,13 +105,13 @@ class _Tally:
         self.total -= self._evaluations - asked
 
     def text(self, width: int | None = None) -> str:
-        """The progress in at most `width` characters; the most important parts come first."""
+        """The progress as text of at most `width` characters; what matters most comes first."""
         collisions = [] if np.isinf(self._lowest_degree) else [f"{self._collisions} collisions"]
         best = [] if np.isinf(self._lowest_degree) else [f"best SD {self._lowest_degree:.2f}"]
         rate = [f"{self._timed_simulations / self._seconds:.0f}/s"] if self._timed_simulations and self._seconds >= SETTLING_TIME else []
         text = ""
-        for part in (*rate, self._time_left(), *collisions, f"runs {self._finished_runs}/{self._runs}", *best):
-            extended_text = f"{text}, {part}" if text else part
+        for item in (*rate, self._time_left(), *collisions, f"runs {self._finished_runs}/{self._runs}", *best):
+            extended_text = f"{text}, {item}" if text else item
             if width is not None and len(extended_text) > width:
                 break
             text = extended_text
@@ -131,15 +131,15 @@ class _Tally:
 
 
 @contextmanager
-def counting_bar(console: Console, label: str, total: int) -> Iterator[Callable[[int], None]]:
+def show_counting_bar(console: Console, label: str, total: int) -> Iterator[Callable[[int], None]]:
     """Show a bar that counts up to `total`; yields the function that adds to the count."""
     done = 0
-    with stages(console) as show:
-        show(label, done, total)
+    with show_stages(console) as report_progress:
+        report_progress(label, done, total)
 
-        def add(number: int) -> None:
+        def add(count: int) -> None:
             nonlocal done
-            done += number
-            show(label, done, total)
+            done += count
+            report_progress(label, done, total)
 
         yield add

@@ -23,9 +23,9 @@ KMH_PER_MS = 3.6
 GRAVITY = 9.81
 """Acceleration of gravity [m/s^2]."""
 TIME_ROUNDING = 1e-9
-"""Difference below which two sums of time steps are the same time [s]."""
-TOUCH = 2e-3
-"""Overlap below which bodies may only touch, as SUMO ignores an overlap of a millimetre [m]."""
+"""Difference below which two sums of time steps count as the same time [s]."""
+TOUCH_OVERLAP = 2e-3
+"""Overlap up to which bodies count as touching, not colliding: SUMO ignores an overlap of a millimetre [m]."""
 TIME_DECIMALS = 9
 """Decimals to which sums of time steps are rounded: 0.15 s, not 0.15000000000000002 s."""
 
@@ -45,14 +45,14 @@ class Outcome(StrEnum):
 
 ZERO: FloatArray = np.zeros(())
 """Scalar zero, broadcast to all N vehicles."""
-EVERYWHERE: BoolArray = np.ones((), dtype=bool)
+ALL_TRUE: BoolArray = np.ones((), dtype=bool)
 """Scalar True, broadcast to all N vehicles."""
-for _constant in (ZERO, EVERYWHERE):
+for _constant in (ZERO, ALL_TRUE):
     _constant.flags.writeable = False
 
 
 def finite_or_none(value: float) -> float | None:
-    """A value for JSON, which has no NaN: an undefined value becomes None."""
+    """Make a number fit for JSON, which has no NaN: an undefined number becomes None."""
     return None if np.isnan(value) else float(value)
 
 
@@ -179,7 +179,7 @@ class Trace:
 
 
 class Contact(NamedTuple):
-    """The position of the first contact on each of N vehicles, shape (N,).
+    """The position of the first contact on the outline of each of N vehicles, shape (N,).
 
     `side` is one of `SIDES`, empty without a contact. `place` is the position of the obstacle's middle [% of the vehicle's width from the
     side on which `lateral` is negative, or of its length from the front], within 0 to 100, NaN without a contact.
@@ -215,17 +215,17 @@ class SimulationRuns:
 
     def of(self, vehicles: slice) -> SimulationRuns:
         """The runs of some of the vehicles."""
-        def selection(values: np.ndarray) -> np.ndarray:
+        def select(values: np.ndarray) -> np.ndarray:
             return values[vehicles] if values.ndim else values
 
         return SimulationRuns(
             trace=self.trace.of(vehicles), encounter=Encounter._make(values[:, vehicles] for values in self.encounter),
             outcome=self.outcome[vehicles], collision_speed=self.collision_speed[vehicles],
-            contact=Contact._make(map(selection, self.contact)), test_speed_error=selection(self.test_speed_error),
-            warning_ttc=selection(self.warning_ttc))
+            contact=Contact._make(map(select, self.contact)), test_speed_error=select(self.test_speed_error),
+            warning_ttc=select(self.warning_ttc))
 
     def nearest(self, column: int) -> int | None:
-        """The sample of the impact or, without a collision, of the smallest separation in conflict; None if there is no such sample."""
+        """The sample of the impact or, without a collision, of the smallest separation in conflict; None if never in conflict."""
         active = self.trace.active[:, column]
         if np.isfinite(self.collision_speed[column]):
             return int(np.flatnonzero(active)[-1])
@@ -239,17 +239,17 @@ class SimulationRuns:
         A gap d that closes within a time step, from the relative speed v at the relative acceleration a, closes at sqrt(v^2 + 2 a d);
         `collision_speed` holds only the speed at the end of the step, which counts where no gap closes.
         """
-        trace, columns = self.trace, np.arange(len(self.collision_speed))
+        trace, vehicles = self.trace, np.arange(len(self.collision_speed))
         last_sample = len(trace.time) - 1 - np.argmax(trace.active[::-1], axis=0)
         obstacle_speed = np.broadcast_to(trace.obstacle_speed, trace.speed.shape)
-        (first_speed, end_speed), (gap, gap_after) = (([values[np.maximum(last_sample - 1, 0), columns], values[last_sample, columns]])
-                                        for values in (trace.speed - obstacle_speed, trace.gap))
-        gap_closes = (gap > -TOUCH) & np.isfinite(gap) & (gap_after <= 0) & (first_speed > 0)
+        (first_speed, end_speed), (gap, gap_after) = (([values[np.maximum(last_sample - 1, 0), vehicles], values[last_sample, vehicles]])
+                                                         for values in (trace.speed - obstacle_speed, trace.gap))
+        gap_closes = (gap > -TOUCH_OVERLAP) & np.isfinite(gap) & (gap_after <= 0) & (first_speed > 0)
         distance = np.where(gap_closes, np.maximum(gap, 0.0), 0.0)
         squared_speed = first_speed * first_speed + 2 * (end_speed - first_speed) / trace.step * distance
         min_speed, max_speed = np.minimum(first_speed, end_speed), np.maximum(first_speed, end_speed)
         at_contact = np.minimum(np.maximum(np.sqrt(np.maximum(squared_speed, 0.0)), min_speed), max_speed)
-        at_end_of_step = self.collision_speed - obstacle_speed[last_sample, columns]
+        at_end_of_step = self.collision_speed - obstacle_speed[last_sample, vehicles]
         return np.asarray(np.where(gap_closes & ~np.isnan(self.collision_speed), at_contact, at_end_of_step))
 
 
@@ -314,7 +314,7 @@ class Evaluations:
 
     @property
     def valid(self) -> BoolArray:
-        """Where the simulation can be scored: the setting is feasible, the test valid, and the simulator reported no error."""
+        """Where the setting can be scored: it is feasible, the test was valid, and the simulator reported no error."""
         return np.asarray(~self.failed & (self.outcome != Outcome.INVALID_TEST) & ~self.infeasible)
 
     @property
@@ -346,14 +346,14 @@ class Evaluations:
                    metrics=dict.fromkeys(metrics, empty_array), f_diff=empty_array, f_num_diff=empty_array)
 
     @classmethod
-    def concatenate(cls, parts: Sequence[Evaluations]) -> Evaluations:
-        """Join evaluations in order; a metric that a part lacks is undefined in its rows."""
+    def concatenate(cls, batches: Sequence[Evaluations]) -> Evaluations:
+        """Join batches of evaluations in order; a metric that a batch lacks is undefined in its rows."""
         def join(name: str) -> np.ndarray:
-            return np.concatenate([getattr(part, name) for part in parts])
+            return np.concatenate([getattr(batch, name) for batch in batches])
 
         return cls(
             settings=join("settings"), outcome=join("outcome"), collision_speed=join("collision_speed"),
-            metrics={name: np.concatenate([part.metrics.get(name, np.full(len(part), np.nan)) for part in parts])
-                     for name in dict.fromkeys(name for part in parts for name in part.metrics)},
+            metrics={name: np.concatenate([batch.metrics.get(name, np.full(len(batch), np.nan)) for batch in batches])
+                     for name in dict.fromkeys(name for batch in batches for name in batch.metrics)},
             f_diff=join("f_diff"), f_num_diff=join("f_num_diff"),
-            reasons={setting: reason for part in parts for setting, reason in part.reasons.items()})
+            reasons={setting: reason for batch in batches for setting, reason in batch.reasons.items()})

@@ -18,13 +18,13 @@ from safevar_sumo.vehicles import Characteristic
 
 
 class WholeTable(Table):
-    """A table of plain text whose first column, the names, is not broken within words; other cells wrap.
+    """A table of plain text that cuts nothing off: the names in its first column break only between words, other cells anywhere.
 
-    Columns with `text_heads` hold text, columns with the heads `right` numbers. Text is shown unchanged, without markup.
+    Columns under `text_heads` hold text, those under `right` numbers. Text is shown as it is, without markup.
     """
 
     def __init__(self, *text_heads: str, right: Iterable[str] = (), title: str = "", **options: Any) -> None:
-        super().__init__(title=plain(title) if title else None, title_justify="left", **options)
+        super().__init__(title=printable_text(title) if title else None, title_justify="left", **options)
         for head in text_heads:
             self.add_column(Text(head))
         for head in right:
@@ -32,7 +32,7 @@ class WholeTable(Table):
 
     def add_row(self, *cells: RenderableType | None, **options: Any) -> None:
         """Add a row of texts, or of cells with their own style."""
-        super().add_row(*(plain(cell) if isinstance(cell, str) else cell for cell in cells), **options)
+        super().add_row(*(printable_text(cell) if isinstance(cell, str) else cell for cell in cells), **options)
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         for column in self.columns:
@@ -47,8 +47,8 @@ class WholeTable(Table):
         yield from super().__rich_console__(console, options)
 
 
-def plain(text: object, style: str = "") -> Text:
-    """Printable text for rich: white space becomes a space, any other unprintable character a question mark."""
+def printable_text(text: object, style: str = "") -> Text:
+    """Make text printable by rich: white space becomes a space, any other unprintable character a question mark."""
     return Text("".join(letter if letter.isprintable() else " " if letter.isspace() else "?" for letter in str(text)), style)
 
 
@@ -57,12 +57,12 @@ def print_text(console: Console, text: str) -> None:
     console.print(text, soft_wrap=True, markup=False, highlight=False)
 
 
-def print_meanings(console: Console, members: Iterable[Characteristic]) -> None:
+def print_meanings(console: Console, characteristics: Iterable[Characteristic]) -> None:
     """Print the descriptions of characteristics, one line each; a characteristic without description is left out."""
     table = Table.grid(padding=(0, 2))
-    for member in members:
-        if member.words:
-            table.add_row(plain(member.name), plain(member.words))
+    for characteristic in characteristics:
+        if characteristic.words:
+            table.add_row(printable_text(characteristic.name), printable_text(characteristic.words))
     if table.row_count:
         console.print(table)
 
@@ -84,35 +84,36 @@ def print_names(console: Console, title: str, rows: Iterable[tuple[str, ...]], h
 
 
 SECONDS_BETWEEN_LINES = 30.0
+"""Interval of the lines that show progress without a terminal [s]."""
 StageProgress = Callable[[str, int, int], None]
 """Called with the stage, the amount done, and the total amount."""
 
 
 @contextmanager
-def stages(console: Console) -> Iterator[StageProgress]:
-    """Show a bar on a terminal, or else a line every half minute; yields the function that reports progress."""
+def show_stages(console: Console) -> Iterator[StageProgress]:
+    """Show a bar on a terminal, or else a line every half minute; yields the function that moves it."""
     columns = (TextColumn("{task.description}", markup=False), BarColumn(bar_width=20), MofNCompleteColumn(), TimeRemainingColumn())
     last_line = time.monotonic()
     with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
         task = bar.add_task("starting", total=None)
 
-        def report(stage: str, number: int, total: int) -> None:
+        def report_progress(stage: str, done: int, total: int) -> None:
             nonlocal last_line
-            if number == 0:
+            if done == 0:
                 bar.reset(task, description=stage, total=total)
-            bar.update(task, description=stage, completed=number)
+            bar.update(task, description=stage, completed=done)
             if not console.is_terminal and time.monotonic() - last_line >= SECONDS_BETWEEN_LINES:
                 last_line = time.monotonic()
-                print_text(console, f"{stage}: {number} of {total}")
+                print_text(console, f"{stage}: {done} of {total}")
 
-        yield report
+        yield report_progress
 
 
 @contextmanager
-def shown(progress: bool | StageProgress) -> Iterator[StageProgress]:
-    """Yield the function that reports progress: a bar for True, nothing for False, else `progress` itself."""
+def open_progress(progress: bool | StageProgress) -> Iterator[StageProgress]:
+    """Yield the function to call with progress: for True it moves a bar, for False it does nothing, else it is `progress` itself."""
     if progress is True:
-        with stages(Console(stderr=True)) as bar:
-            yield bar
+        with show_stages(Console(stderr=True)) as report_progress:
+            yield report_progress
     else:
         yield progress or (lambda stage, done, total: None)

@@ -40,7 +40,7 @@ class Checks:
 
     @classmethod
     def report(cls) -> Report:
-        """The report of `check`, which runs once for each subject and study."""
+        """Check the subject, once for each study; returns the report."""
         subject = cls.subject if isinstance(cls.subject, str) else f"{cls.subject.__module__}:{cls.subject.__qualname__}"
         key = subject, cls.study
         if key not in _REPORTS:
@@ -85,4 +85,4 @@ class TraciControllerChecks(Checks, kind="traci"):
 
 
 class StudyChecks(Checks, kind="study"):
-    """All checks of all parts that a study names; `subject` is the study's name or path."""
+    """All checks of everything that a study names; `subject` is the study's name or path."""

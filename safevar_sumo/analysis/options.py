@@ -17,7 +17,7 @@ from textwrap import fill, indent
 from typing import Any, ClassVar, NamedTuple, TypeVar
 
 from safevar_sumo.errors import InputError
-from safevar_sumo.shipped import RUN
+from safevar_sumo.shipped import PROGRAM_COMMAND
 
 
 class Option(NamedTuple):
@@ -103,7 +103,7 @@ class Options:
 
     def command_line(self, subject: str, point: str = "") -> str:
         """The command that asks this question about a study or results directory; it has a flag for each option not at its default."""
-        parts = [RUN, self.question, quote(subject)]
+        parts = [PROGRAM_COMMAND, self.question, quote(subject)]
         for option_field in fields(self):
             value, flag, definition = getattr(self, option_field.name), self.flags()[option_field.name], option_field.metadata["option"]
             if value == option_field.default:

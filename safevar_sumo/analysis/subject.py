@@ -13,7 +13,7 @@ from safevar_sumo.analysis.options import Options
 from safevar_sumo.errors import InputError, did_you_mean, one_of, warn
 from safevar_sumo.results import MANIFEST, differences_now, later_files, make_inputs_comparable, manifest_of, read_manifest
 from safevar_sumo.study import Study, StudyLike, load_study, study_names
-from safevar_sumo.terminal import shown
+from safevar_sumo.terminal import open_progress
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -170,5 +170,5 @@ def answer_question(compute: Callable[..., Answer], subject: Study | Case, optio
     values = {name: arguments[name] for name in options.definitions()}
     if values.get("unsafe") is not None:
         values["unsafe"] = str(Unsafe.parse(values["unsafe"]))
-    with shown(arguments["progress"]) as show:
+    with open_progress(arguments["progress"]) as show:
         return compute(subject, options(**values), pool=arguments["pool"], jobs=arguments["jobs"], progress=show)

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping
 from shlex import quote
 
 from safevar_sumo.records import Outcome
-from safevar_sumo.shipped import RUN
+from safevar_sumo.shipped import PROGRAM_COMMAND
 from safevar_sumo.vehicles import Characteristic, CharacteristicSet
 
 OUTCOME_VERBS = {
@@ -41,7 +41,7 @@ def simulate_command(study: str, values: Mapping[str, float], point: str = "") -
 
 def question_command(question: str, subject: str, point: str = "") -> str:
     """The command that asks a question about results or a study; `point` may name a point of the study's matrix."""
-    return " ".join([RUN, question, quote(subject), *(["--point", quote(point)] if point else [])])
+    return " ".join([PROGRAM_COMMAND, question, quote(subject), *(["--point", quote(point)] if point else [])])
 
 
 def join_phrases(phrases: Iterable[str]) -> str:

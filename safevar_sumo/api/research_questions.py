@@ -1,4 +1,4 @@
-"""Answers to the research questions as tables, and figures."""
+"""The research questions answered as tables and figures."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 class Tables(dict[str, "pd.DataFrame"]):
-    """Answers by name, each a tidy frame over all results; notebooks show the answers in the paper's layout."""
+    """Answers by name, each a tidy frame over all results; a notebook shows them in the paper's layout."""
 
     def __init__(self, answers: list[Answer]) -> None:
         super().__init__({answer.name: answer.frame for answer in answers})
@@ -61,7 +61,7 @@ def tables(*results: Results | str | Path, question: str | None = None) -> Table
     """
     from safevar_sumo.analysis.research_questions.answer import answer
 
-    return Tables(answer(_cases(results), question))
+    return Tables(answer(_load_cases(results), question))
 
 
 def figures(*results: Results | str | Path) -> Figures:
@@ -84,13 +84,13 @@ def figures(*results: Results | str | Path) -> Figures:
     """
     from safevar_sumo.analysis.research_questions.gallery import draw
 
-    figures_by_name, lacking = draw(_cases(results))
-    result = Figures(figures_by_name)
-    result.lacking = tuple(lacking)
-    return result
+    figures_by_name, lacking = draw(_load_cases(results))
+    drawn_figures = Figures(figures_by_name)
+    drawn_figures.lacking = tuple(lacking)
+    return drawn_figures
 
 
-def _cases(results: tuple[Results | str | Path, ...]) -> list[Case]:
+def _load_cases(results: tuple[Results | str | Path, ...]) -> list[Case]:
     from safevar_sumo.analysis.research_questions.case import load_cases
 
-    return load_cases([item.directory if isinstance(item, Results) else item for item in results])
+    return load_cases([source.directory if isinstance(source, Results) else source for source in results])

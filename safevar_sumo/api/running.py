@@ -25,7 +25,7 @@ from safevar_sumo.workers.evaluation import Pool
 from safevar_sumo.workers.identity import identity_of
 from safevar_sumo.workers.local import available_cores, local_pool
 
-ENGINES = {Engine.RECORDED: "recorded", Engine.LIBSUMO: "sumo"}
+ENGINE_NAMES = {Engine.RECORDED: "recorded", Engine.LIBSUMO: "sumo"}
 """Names of the engines in commands and manifests."""
 if TYPE_CHECKING:
     from safevar_sumo.analysis.evaluator import Progress
@@ -72,13 +72,13 @@ def run(study: StudyLike, out: str | Path | None = None, *, jobs: int | None = N
     keys = all_runs(loaded_study) if only is None else [RunKey(*key) for key in only]
     directory = Path(out) if out is not None else Path("results") / loaded_study.name
     pool_context = nullcontext(pool) if pool is not None else open_pool(loaded_study, jobs, cluster)
-    with pool_context as workers, _observer(progress, loaded_study, keys) as observer:
+    with pool_context as workers, _choose_observer(progress, loaded_study, keys) as observer:
         carry_out_runs(loaded_study, system, keys, directory, workers, observer, batch, engine, retry_failed=retry_failed)
     return load(directory)
 
 
 def load_for_search(study: StudyLike, source: str = "") -> tuple[Study, System]:
-    """Load a study that can be searched, and assemble its system; errors name it `source`.
+    """Load a study, assemble its system and check its algorithms; errors name the study `source`.
 
     Raises
     ------
@@ -92,8 +92,8 @@ def load_for_search(study: StudyLike, source: str = "") -> tuple[Study, System]:
 
 
 def carry_out_runs(study: Study, system: System, keys: list[RunKey], directory: Path, pool: Pool, observer: Observer,
-                batch: int | None, engine: str = Engine.RECORDED, *, retry_failed: bool = False) -> Campaign:
-    """Carry out runs of a study in a directory; write its solutions once all runs are finished. See `run_campaign`.
+                   batch: int | None, engine: str = Engine.RECORDED, *, retry_failed: bool = False) -> Campaign:
+    """Carry out runs of a study in a directory with `run_campaign`; write the solutions once all of the study's runs are finished.
 
     Raises
     ------
@@ -102,8 +102,8 @@ def carry_out_runs(study: Study, system: System, keys: list[RunKey], directory: 
     """
     sources = {**source_digests(study, pool), **files_read_by_algorithms(study)}
     results = ResultsDirectory(directory, study, identity_of(study, system, sources), system.measuring.scoring)
-    engine_used, reason = engine_for(system, engine)
-    results.manifest["engine"] = {"name": ENGINES[engine_used], "reason": reason}
+    engine_used, reason = choose_engine(system, engine)
+    results.manifest["engine"] = {"name": ENGINE_NAMES[engine_used], "reason": reason}
     campaign = run_campaign(study, keys, results, pool, observer, batch or settings_per_batch(system, engine_used), engine=engine_used,
                             retry_failed=retry_failed)
     if campaign.busy:
@@ -113,11 +113,11 @@ def carry_out_runs(study: Study, system: System, keys: list[RunKey], directory: 
     return campaign
 
 
-def engine_for(system: System, name: str) -> tuple[Engine, str]:
-    """The engine that moves a system's vehicles, and the reason for its choice; raises InputError for an unknown engine."""
-    if name not in ENGINES.values():
-        raise InputError("--engine", repr(name), one_of(ENGINES.values()))
-    if name == ENGINES[Engine.LIBSUMO]:
+def choose_engine(system: System, name: str) -> tuple[Engine, str]:
+    """Choose the engine that moves a system's vehicles, and say why; raises InputError for an unknown engine."""
+    if name not in ENGINE_NAMES.values():
+        raise InputError("--engine", repr(name), one_of(ENGINE_NAMES.values()))
+    if name == ENGINE_NAMES[Engine.LIBSUMO]:
         return Engine.LIBSUMO, "asked for"
     reason = reason_for_sumo(system)
     return (Engine.LIBSUMO, reason) if reason else (Engine.RECORDED, "nobody reacts to the vehicle under test")
@@ -129,8 +129,8 @@ def open_pool(study: Study, jobs: int | None = None, cluster: str | None = None)
     return cluster_pool(cluster, limit) if cluster is not None else local_pool(jobs or available_cores(), limit)
 
 
-def _observer(progress: bool | Progress | Observer, study: Study, keys: list[RunKey]) -> AbstractContextManager[Observer]:
-    """The observer for a value of `progress`."""
+def _choose_observer(progress: bool | Progress | Observer, study: Study, keys: list[RunKey]) -> AbstractContextManager[Observer]:
+    """Choose the observer for a value of `progress`."""
     if progress is True:
         return CampaignProgress(Console(stderr=True), study, keys, quiet=False)
     if progress is False:

@@ -1,4 +1,4 @@
-"""Simulate one setting beside the original vehicle, with a trace step by step, or many settings at once."""
+"""Simulate one setting beside the original vehicle, with a trace of every step, or many settings at once."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ import numpy.typing as npt
 
 from safevar_sumo.ads import Ads
 from safevar_sumo.analysis.words import OUTCOME_VERBS
-from safevar_sumo.errors import InputError, unknown
+from safevar_sumo.errors import InputError, unknown_name
 from safevar_sumo.metrics import Scoring, time_to_collision
 from safevar_sumo.records import STANDSTILL, TIME_DECIMALS, Command, Evaluations, FloatArray, Nominal, Observation, Outcome, SimulationRuns
 from safevar_sumo.results import evaluations_frame, record
 from safevar_sumo.study import SAFETY_DEGREE, Study, StudyLike, load_study
 from safevar_sumo.sumo.batch import score
 from safevar_sumo.sumo.engine import Engine
-from safevar_sumo.sumo.matrix import simulate as drive
+from safevar_sumo.sumo.matrix import simulate as simulate_settings
 from safevar_sumo.sumo.matrix import system_at_worst_point
 from safevar_sumo.sumo.system import System, assemble
-from safevar_sumo.terminal import shown
+from safevar_sumo.terminal import open_progress
 from safevar_sumo.vehicles import CharacteristicSet
 
 if TYPE_CHECKING:
@@ -92,7 +92,7 @@ class Simulation:
     evaluation
         Outcome, metrics and objectives as arrays of one row.
     runs
-        The trajectory and outcome, of one vehicle.
+        The trajectory and outcome of the only vehicle.
     scoring
         The metrics, and the objectives that a search of the study minimises.
     original
@@ -130,8 +130,8 @@ class Simulation:
     @property
     def objectives(self) -> dict[str, float]:
         """f_safe [m, or -m/s on a collision], f_diff [fraction], f_num_diff [characteristics]; all are minimised."""
-        values = self.to_dict()
-        return {name: float(value) if value is not None else np.nan for name, value in values.items() if name.startswith("f_")}
+        fields = self.to_dict()
+        return {name: float(value) if value is not None else np.nan for name, value in fields.items() if name.startswith("f_")}
 
     @property
     def units(self) -> dict[str, str]:
@@ -191,7 +191,7 @@ def simulate(study: StudyLike, changes: Mapping[str, float] | None = None, *, fi
 
 
 def changed_setting(system: System, changes: Mapping[str, float] | None, filtered: bool, beyond: bool) -> FloatArray:
-    """The setting with these changes, shape (n,), before the filter; raises InputError if it is illegal or, once filtered, infeasible."""
+    """The unfiltered setting with these changes, shape (n,); raises InputError if it is illegal or, once filtered, infeasible."""
     setting = system.characteristics.setting(changes or {}, "changes", beyond=beyond)
     if not beyond:
         system.check_feasible(setting[np.newaxis], "changes", filtered=filtered)
@@ -199,7 +199,7 @@ def changed_setting(system: System, changes: Mapping[str, float] | None, filtere
 
 
 def simulate_with_original(study: Study, system: System, requested: FloatArray, *, filtered: bool = True, gui: bool = False) -> Simulation:
-    """Simulate a requested setting, shape (n,), and the original vehicle."""
+    """Simulate a setting, shape (n,), that is yet to be filtered, and the original vehicle."""
     characteristics = system.characteristics
     setting = characteristics.filter(requested) if filtered else requested
     original = _simulate_one(study, system, characteristics.original, characteristics.original)
@@ -217,7 +217,7 @@ def load_and_assemble(study: StudyLike, source: str = "") -> tuple[Study, System
 def _simulate_one(study: Study, system: System, requested: FloatArray, setting: FloatArray, engine: Engine = Engine.LIBSUMO) -> Simulation:
     recording = RecordingAds(system.ads)
     settings = setting[np.newaxis]
-    runs = drive(replace(system_at_worst_point(system, settings), ads=recording), settings, engine)  # in SUMO itself
+    runs = simulate_settings(replace(system_at_worst_point(system, settings), ads=recording), settings, engine)  # in SUMO itself
     return Simulation(
         study=study, setting=dict(zip(system.characteristics.names, setting.tolist(), strict=True)),
         put_back=_put_back(system, requested, setting), evaluation=score(system, settings, runs), runs=runs,
@@ -273,13 +273,13 @@ def evaluate(study: StudyLike, settings: pd.DataFrame | Sequence[Mapping[str, fl
     """
     loaded_study, system = load_and_assemble(study)
     characteristics = system.characteristics
-    requested, index = _table(settings, characteristics)
-    _check(requested, characteristics, beyond)
+    requested, index = _read_settings(settings, characteristics)
+    _refuse_illegal_values(requested, characteristics, beyond)
     if not beyond:
         system.check_feasible(requested, "settings", filtered=filtered)
     simulated_settings = characteristics.filter(requested) if filtered else requested
-    with shown(progress) as report:
-        evaluations = evaluate_settings(loaded_study, simulated_settings, pool, jobs, report)
+    with open_progress(progress) as report_progress:
+        evaluations = evaluate_settings(loaded_study, simulated_settings, pool, jobs, report_progress)
     frame = evaluations_frame(characteristics.names, [(("", 0), evaluations)]).drop(columns=["algorithm", "run"])
     frame.insert(len(frame.columns) - 1, "collision_speed", evaluations.collision_speed)
     return frame.set_axis(index)
@@ -294,8 +294,8 @@ def evaluate_settings(study: Study, settings: FloatArray, pool: Pool | None = No
         return evaluator.evaluate(settings, "settings", ignore_constraints=True)
 
 
-def _table(settings: Any, characteristics: CharacteristicSet) -> tuple[FloatArray, Any]:
-    """Settings as an array of shape (M, n), and the index of their rows."""
+def _read_settings(settings: Any, characteristics: CharacteristicSet) -> tuple[FloatArray, Any]:
+    """Convert a user's settings into an array of shape (M, n), and the index of its rows."""
     import pandas as pd
 
     names = list(characteristics.names)
@@ -304,31 +304,31 @@ def _table(settings: Any, characteristics: CharacteristicSet) -> tuple[FloatArra
     if isinstance(settings, pd.DataFrame):
         for name in settings.columns:
             if name not in names:
-                raise unknown("settings", f"column {name!r} is no characteristic", name, names)
+                raise unknown_name("settings", f"column {name!r} is no characteristic", name, names)
         if settings.columns.has_duplicates:
             raise InputError("settings", "a column appears twice", "each characteristic once")
         table = pd.DataFrame(dict(zip(names, characteristics.original, strict=True)), index=settings.index)
         for name in settings.columns:
             values = settings[name].astype(object)
             table[name] = values.where(values.notna(), table[name])
-        return _numbers(table), settings.index
+        return _float_array(table), settings.index
     if isinstance(settings, Mapping):
         raise InputError("settings", f"is a {type(settings).__name__}", SETTINGS_FORMAT)
-    array = _numbers(settings)
+    array = _float_array(settings)
     if array.ndim != 2 or array.shape[1] != len(names):
         raise InputError("settings", f"an array of shape {array.shape}", f"shape (M, {len(names)}): {', '.join(names)}")
     return array, pd.RangeIndex(len(array))
 
 
-def _numbers(settings: Any) -> FloatArray:
+def _float_array(settings: Any) -> FloatArray:
     try:
         return np.array(settings, dtype=float)
     except (TypeError, ValueError) as error:
         raise InputError("settings", str(error), SETTINGS_FORMAT) from None
 
 
-def _check(requested: FloatArray, characteristics: CharacteristicSet, beyond: bool) -> None:
-    is_legal = np.column_stack([member.is_legal(values, beyond=beyond)
-                                for member, values in zip(characteristics, requested.T, strict=True)])
+def _refuse_illegal_values(requested: FloatArray, characteristics: CharacteristicSet, beyond: bool) -> None:
+    is_legal = np.column_stack([characteristic.is_legal(values, beyond=beyond)
+                                for characteristic, values in zip(characteristics, requested.T, strict=True)])
     for row, column in np.argwhere(~is_legal)[:1]:
         characteristics.members[column].check(float(requested[row, column]), f"settings, row {row}", beyond=beyond)

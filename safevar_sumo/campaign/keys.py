@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from safevar_sumo.errors import InputError, unknown
+from safevar_sumo.errors import InputError, unknown_name
 from safevar_sumo.plugins import Files, Lookup, Member, digests, guard_process_state, instance_of, note_inputs, unload_user_modules
 from safevar_sumo.search import ALGORITHM_CONTRACT, ALGORITHMS, Algorithm, GuardedAlgorithm, MapElites, MoCell, Problem, Search
 from safevar_sumo.study import SearchTable, Study
@@ -44,7 +44,7 @@ def algorithm_of(label: str, study: Study) -> Algorithm:
     for table in search.parameters:
         if table not in ALGORITHMS and table not in search.labels:
             legal = [*SearchTable.__struct_fields__, *ALGORITHMS, *search.labels]
-            raise unknown(source, f"search.{table}: there is no such key and no such algorithm", table, legal)
+            raise unknown_name(source, f"search.{table}: there is no such key and no such algorithm", table, legal)
     member = algorithm_class(name, study)
     with guard_process_state(source, [name] if member.guard else []):
         parameters = Lookup(source, study.origin.places).with_paths(member, search.parameters.get(label, {}), key)

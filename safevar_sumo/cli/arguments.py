@@ -1,4 +1,4 @@
-"""Check what users type: output files, changes of characteristics, numbers in a range; complete it in the shell."""
+"""Check what users type (output files, changes of characteristics, numbers in a range), and complete it in the shell."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ import click
 import numpy as np
 from click.shell_completion import CompletionItem
 
-from safevar_sumo.errors import InputError, SafevarError, unknown
+from safevar_sumo.errors import InputError, SafevarError, unknown_name
 from safevar_sumo.records import FloatArray
 from safevar_sumo.study import check_writable, load_study, study_names
 from safevar_sumo.vehicles import CharacteristicSet
 
-PICTURES = (".png", ".pdf", ".svg")
+PICTURE_ENDINGS = (".png", ".pdf", ".svg")
 
 
 def check_output(path: Path, flag: str, endings: tuple[str, ...]) -> None:
@@ -45,7 +45,7 @@ def refuse_overwriting(path: Path, flag: str, *inputs: str | Path) -> None:
         return
     for source in map(Path, inputs):
         files = [source, *source.glob("*.*"), *source.glob("runs/*")] if source.is_dir() else [source]
-        if any(file.exists() and path.samefile(file) for file in files if file.suffix not in PICTURES):
+        if any(file.exists() and path.samefile(file) for file in files if file.suffix not in PICTURE_ENDINGS):
             raise InputError(flag, f"{path} is an input of the command", "another file")
 
 
@@ -60,10 +60,10 @@ class NumberRange(click.FloatRange):
         return number
 
 
-NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
+NUMBER_PATTERN = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
 SIGNED_NUMBER = re.compile(r"[+-](?:\d+\.?\d*|\.\d+)")
 PERCENTAGE = re.compile(rf"({SIGNED_NUMBER.pattern})%")
-SWEEP = re.compile(rf"({NUMBER})\.\.({NUMBER})(?::(\d{{1,6}}))?")
+SWEEP = re.compile(rf"({NUMBER_PATTERN})\.\.({NUMBER_PATTERN})(?::(\d{{1,6}}))?")
 DEFAULT_SWEEP_LENGTH = 11
 """Number of values of a sweep without `:NUMBER`."""
 MAX_SETTINGS = 10_000
@@ -74,7 +74,7 @@ CHANGE_FORMS = "NAME=VALUE in the characteristic's unit, NAME=+10% of the origin
 
 def read_changes(changes: tuple[str, ...], characteristics: CharacteristicSet, beyond: bool, *, single: bool = False
                  ) -> dict[str, list[float]]:
-    """Parse --set; returns the values of each named characteristic. `single` refuses sweeps, and its errors do not suggest --beyond.
+    """Parse --set into the values of each named characteristic; `single` refuses sweeps, without suggesting --beyond.
 
     Raises
     ------
@@ -84,13 +84,13 @@ def read_changes(changes: tuple[str, ...], characteristics: CharacteristicSet, b
     values_by_name: dict[str, list[float]] = {}
     forms = SINGLE_VALUE_FORMS if single else CHANGE_FORMS
     for change in changes:
-        name, equals, text = (part.strip() for part in change.partition("="))
+        name, equals, text = (text.strip() for text in change.partition("="))
         if not equals:
             raise InputError("--set", repr(change), forms)
         if name in values_by_name:
             raise InputError("--set", f"{name} is set twice", "each characteristic once")
         if name not in characteristics.names:
-            raise unknown("--set", f"there is no characteristic {name!r}", name, characteristics.names)
+            raise unknown_name("--set", f"there is no characteristic {name!r}", name, characteristics.names)
         characteristic = characteristics.members[characteristics.names.index(name)]
         values_by_name[name] = _parse_values(change, text, characteristic.original, forms)
         if single and len(values_by_name[name]) > 1:
@@ -103,8 +103,8 @@ def read_changes(changes: tuple[str, ...], characteristics: CharacteristicSet, b
     return values_by_name
 
 
-def settings_of(changes: dict[str, list[float]], base: FloatArray, characteristics: CharacteristicSet) -> FloatArray:
-    """Settings, shape (M, n): `base`, shape (n,), with each of the M combinations of the values in turn."""
+def combine_values(changes: dict[str, list[float]], base: FloatArray, characteristics: CharacteristicSet) -> FloatArray:
+    """Make M settings, shape (M, n): `base`, shape (n,), with each of the M combinations of values in turn."""
     columns = [characteristics.names.index(name) for name in changes]
     settings = []
     for values in product(*changes.values()):
@@ -118,11 +118,11 @@ def _parse_values(change: str, text: str, original: float, forms: str) -> list[f
     if percentage := PERCENTAGE.fullmatch(text):
         return [original + abs(original) * float(percentage[1]) / 100]
     if sweep := SWEEP.fullmatch(text):
-        number = int(sweep[3] or DEFAULT_SWEEP_LENGTH)
-        if number < 2:
-            raise InputError("--set", f"{change!r}: {number} values from {sweep[1]} to {sweep[2]}", "NUMBER of at least 2")
-        return np.linspace(float(sweep[1]), float(sweep[2]), number).tolist()  # type: ignore[no-any-return]
-    if re.fullmatch(NUMBER, text):
+        count = int(sweep[3] or DEFAULT_SWEEP_LENGTH)
+        if count < 2:
+            raise InputError("--set", f"{change!r}: {count} values from {sweep[1]} to {sweep[2]}", "NUMBER of at least 2")
+        return np.linspace(float(sweep[1]), float(sweep[2]), count).tolist()  # type: ignore[no-any-return]
+    if re.fullmatch(NUMBER_PATTERN, text):
         return [float(text)]
     raise InputError("--set", repr(change), forms)
 
@@ -142,5 +142,5 @@ def complete_changes(ctx: click.Context, param: click.Parameter, incomplete: str
         characteristics = load_study(study).vehicle.characteristics
     except SafevarError:
         return []
-    return [CompletionItem(f"{name}=", help=f"{table.lower:g} to {table.upper:g}" + (f" {table.unit}" if table.unit != "-" else ""))
-            for name, table in characteristics.items() if name.startswith(incomplete)]
+    return [CompletionItem(f"{name}=", help=f"{item.lower:g} to {item.upper:g}" + (f" {item.unit}" if item.unit != "-" else ""))
+            for name, item in characteristics.items() if name.startswith(incomplete)]

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, NoReturn, TextIO
 
 import click
 
-from safevar_sumo.errors import INTERRUPTED, InputError, SafevarError, did_you_mean
+from safevar_sumo.errors import INTERRUPT_EXIT_CODE, InputError, SafevarError, did_you_mean
 
 if TYPE_CHECKING:
     from safevar_sumo.study import Study
@@ -41,7 +41,7 @@ COMMANDS = {
     "replicate": ("reference", "Compare whole studies with published ones: tables, and which conclusions hold."),
     "calibrate": ("reference", "Fit a study's free parameters to reference data."),
 }
-"""Module in this folder and sentence in the help of each command, in the order of the help."""
+"""Each command's module in this folder and its sentence in the help, in the order of the help."""
 
 
 class StrictCommand(click.Command):
@@ -72,7 +72,7 @@ class StrictCommand(click.Command):
 
 
 class LazyCommands(click.Group):
-    """Loads a command's module only when the command is called, since modules take long to load."""
+    """The group of all commands; it loads a command's module, which takes long, only when the command is called."""
 
     command_class = StrictCommand
 
@@ -82,7 +82,8 @@ class LazyCommands(click.Group):
     def get_command(self, ctx: click.Context, name: str) -> click.Command | None:
         if name in COMMANDS:
             with _exit_on_interrupt():
-                importlib.import_module(f"safevar_sumo.cli.{COMMANDS[name][0]}")
+                module, _ = COMMANDS[name]
+                importlib.import_module(f"safevar_sumo.cli.{module}")
         return super().get_command(ctx, name)
 
     def resolve_command(self, ctx: click.Context, args: list[str]) -> tuple[str | None, click.Command | None, list[str]]:
@@ -126,27 +127,27 @@ def main() -> None:
         code = commands.main(standalone_mode=False, prog_name="safevar-sumo")
         sys.stdout.flush()
     except click.exceptions.Abort:
-        _fail("interrupted", INTERRUPTED)
+        _exit_with_error("interrupted", INTERRUPT_EXIT_CODE)
     except click.exceptions.NoArgsIsHelpError as error:
         error.show()
         _exit_program(error.exit_code)
     except click.ClickException as error:
-        _fail(_in_two_lines(error), error.exit_code)
+        _exit_with_error(_error_in_two_lines(error), error.exit_code)
     except SafevarError as error:
-        _fail(str(error), error.exit_code)
+        _exit_with_error(str(error), error.exit_code)
     except KeyboardInterrupt:
-        _fail("interrupted", INTERRUPTED)
+        _exit_with_error("interrupted", INTERRUPT_EXIT_CODE)
     except BrokenPipeError:
         _discard_output()
         _exit_program(1)
     except OSError as error:
         _discard_output()
-        _fail(f"{error.strerror or error}{f': {error.filename}' if error.filename else ''}", 1)
+        _exit_with_error(f"{error.strerror or error}{f': {error.filename}' if error.filename else ''}", 1)
     _exit_program(code if isinstance(code, int) else 0)
 
 
-def _in_two_lines(error: click.ClickException) -> str:
-    """An error of click in the form of this program's errors."""
+def _error_in_two_lines(error: click.ClickException) -> str:
+    """Put an error of click into the form of this program's errors."""
     context = error.ctx if isinstance(error, click.UsageError) else None
     command = context.command_path if context is not None else "safevar-sumo"
     return f"{' '.join(error.format_message().split())}\nexpected: see {command} --help"
@@ -163,7 +164,7 @@ def _exit_on_interrupt() -> Iterator[None]:
     """End the program on Ctrl-C while modules load: compiled modules would swallow the exception."""
     def exit_at_once(*_: object) -> None:
         os.write(2, b"safevar-sumo: interrupted\n")
-        os._exit(INTERRUPTED)
+        os._exit(INTERRUPT_EXIT_CODE)
 
     in_main_thread = threading.current_thread() is threading.main_thread()
     previous_handler = signal.signal(signal.SIGINT, exit_at_once) if in_main_thread else None
@@ -188,16 +189,16 @@ def _discard_output() -> None:
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
-def _fail(message: str, code: int) -> None:
+def _exit_with_error(message: str, code: int) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # another Ctrl-C must change neither exit code nor message
     click.echo(f"safevar-sumo: {message}", err=True)
     _exit_program(code)
 
 
 def _exit_program(code: int) -> NoReturn:
-    """End the program even while threads of user code run. Python waits for the tasks of executors, then their threads end."""
+    """End the program even while threads of user code run; only Python's own executors may finish their tasks."""
     thread_names = [thread.name for thread in threading.enumerate()
-               if thread is not threading.current_thread() and not thread.daemon and thread not in _threads_queues]
+                    if thread is not threading.current_thread() and not thread.daemon and thread not in _threads_queues]
     if thread_names:
         click.echo(f"note: threads still running, ended now: {', '.join(thread_names)}", err=True)
         sys.stdout.flush()

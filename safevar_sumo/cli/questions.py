@@ -16,12 +16,12 @@ from safevar_sumo.analysis.options import Options
 from safevar_sumo.analysis.risk import RiskOptions
 from safevar_sumo.analysis.rules import RulesOptions
 from safevar_sumo.analysis.tolerance import ToleranceOptions
-from safevar_sumo.cli.arguments import PICTURES, check_output
+from safevar_sumo.cli.arguments import PICTURE_ENDINGS, check_output
 from safevar_sumo.cli.program import commands
 from safevar_sumo.cli.target import (
     CommandFunction,
+    add_flags,
     as_it_is_now_option,
-    flags_of,
     jobs_option,
     json_option,
     point_option,
@@ -30,16 +30,16 @@ from safevar_sumo.cli.target import (
 )
 from safevar_sumo.errors import InputError
 from safevar_sumo.results import make_directory, write_whole
-from safevar_sumo.terminal import stages
+from safevar_sumo.terminal import show_stages
 
 
-def question(options: type[Options], metavar: str, *more: Callable[[CommandFunction], CommandFunction]
-             ) -> Callable[[CommandFunction], click.Command]:
-    """Decorator of a question's command: adds flags for its options, flags that all questions share, and `more` decorators."""
+def question_with(options: type[Options], metavar: str, *further_decorators: Callable[[CommandFunction], CommandFunction]
+                  ) -> Callable[[CommandFunction], click.Command]:
+    """Decorator of a question's command: adds flags for its options, and flags that all questions share."""
     def add(command: CommandFunction) -> click.Command:
         decorators: list[Callable[[CommandFunction], CommandFunction]] = [
-            click.argument("source", metavar=metavar), flags_of(options), point_option, as_it_is_now_option, jobs_option, json_option,
-            *more]
+            click.argument("source", metavar=metavar), add_flags(options), point_option, as_it_is_now_option, jobs_option, json_option,
+            *further_decorators]
         for decorator in reversed(decorators):
             command = decorator(command)
         return commands.command(name=options.question)(command)
@@ -47,13 +47,13 @@ def question(options: type[Options], metavar: str, *more: Callable[[CommandFunct
     return add
 
 
-def _compute(compute: Callable[..., Any], subject: Any, options: Options, jobs: int | None) -> Any:
+def _compute_with_bar(compute: Callable[..., Any], subject: Any, options: Options, jobs: int | None) -> Any:
     """Compute a result; a bar on the terminal shows the progress."""
-    with stages(Console(stderr=True)) as progress:
+    with show_stages(Console(stderr=True)) as progress:
         return compute(subject, options, jobs=jobs, progress=progress)
 
 
-def _json(result: Any) -> str:
+def _to_json(result: Any) -> str:
     return json.dumps(result.to_dict(), indent=2, allow_nan=False)
 
 
@@ -61,8 +61,10 @@ def _plot_option(help_text: str) -> Callable[[CommandFunction], CommandFunction]
     return click.option("--plot", type=click.Path(path_type=Path), metavar="FILE", help=help_text)
 
 
-@question(ExplainOptions, "DIR|STUDY", click.option("--full", is_flag=True, help="Print every explanation in full, not only the answer."),
-          click.option("--out", type=click.Path(path_type=Path), metavar="DIR", help="Write causes.json, causes.csv and a figure there."))
+@question_with(ExplainOptions, "DIR|STUDY",
+               click.option("--full", is_flag=True, help="Print every explanation in full, not only the answer."),
+               click.option("--out", type=click.Path(path_type=Path), metavar="DIR",
+                            help="Write causes.json, causes.csv and a figure there."))
 def explain(source: str, full: bool, point: str | None, jobs: int | None, as_json: bool, out: Path | None, **values: Any) -> None:
     """Explain failures of results in DIR, or across the domain of STUDY: which changes cause them, how small a change is enough, why."""
     from safevar_sumo.analysis.explain.compute import explain_failures
@@ -72,36 +74,36 @@ def explain(source: str, full: bool, point: str | None, jobs: int | None, as_jso
     subject = results_or_study(source, point)
     if out is not None:
         make_directory(out)
-    result = _compute(explain_failures, subject, ExplainOptions(**values), jobs)
+    result = _compute_with_bar(explain_failures, subject, ExplainOptions(**values), jobs)
     if as_json:
-        click.echo(_json(result))
+        click.echo(_to_json(result))
     else:
         print_explained(Console(), source, result, point or "", full=full)
     if out is not None:
-        write_whole(out / "causes.json", _json(result) + "\n")
+        write_whole(out / "causes.json", _to_json(result) + "\n")
         write_whole(out / "causes.csv", result.to_frame().to_csv(index=False, lineterminator="\n"))
         save(necessity_figure(result), out / "necessity.png")
         click.echo(f"Causes: {out}", err=as_json)
 
 
-@question(OpinionOptions, "DIR", click.argument("handles", nargs=-1, metavar=""))
+@question_with(OpinionOptions, "DIR", click.argument("handles", nargs=-1, metavar=""))
 def opinion(source: str, handles: tuple[str, ...], point: str | None, jobs: int | None, as_json: bool, **values: Any) -> None:
     """Have another vehicle model confirm or contradict the minimal causes of failures of results in DIR."""
     from safevar_sumo.analysis.opinion.compute import ask_for_opinions
     from safevar_sumo.analysis.opinion.render import print_opinions
 
     options = OpinionOptions(**{**values, "solutions": (*values["solutions"], *handles)})
-    result = _compute(ask_for_opinions, results_or_study(source, point, results_only=True), options, jobs)
+    result = _compute_with_bar(ask_for_opinions, results_or_study(source, point, results_only=True), options, jobs)
     if not as_json:
         print_opinions(Console(), result)
         return
     for handle in result.without_cause:
         click.echo(f"note: {handle} is not unsafe: it has no cause", err=True)
-    click.echo(_json(result))
+    click.echo(_to_json(result))
 
 
-@question(ToleranceOptions, "STUDY|DIR",
-          _plot_option("Draw the profiles to this file: png, pdf or svg; with --pairs, the worst pairs to a second file beside it."))
+@question_with(ToleranceOptions, "STUDY|DIR",
+               _plot_option("Draw the profiles to this file: png, pdf or svg; with --pairs, the worst pairs to a second file beside it."))
 def tolerance(source: str, point: str | None, jobs: int | None, as_json: bool, plot: Path | None, **values: Any) -> None:
     """Find how far each characteristic of STUDY may go: alone, in pairs, and all together."""
     from safevar_sumo.analysis.figures import save
@@ -112,10 +114,10 @@ def tolerance(source: str, point: str | None, jobs: int | None, as_json: bool, p
     pairs_plot = None if plot is None else plot.with_stem(f"{plot.stem}-pairs")
     for path in (plot, pairs_plot if options.pairs else None):
         if path is not None:
-            check_output(path, "--plot", PICTURES)
-    result = _compute(find_tolerances, study, options, jobs)
+            check_output(path, "--plot", PICTURE_ENDINGS)
+    result = _compute_with_bar(find_tolerances, study, options, jobs)
     if as_json:
-        click.echo(_json(result))
+        click.echo(_to_json(result))
     else:
         print_tolerance(Console(), result)
     if plot is not None and pairs_plot is not None:
@@ -124,7 +126,7 @@ def tolerance(source: str, point: str | None, jobs: int | None, as_json: bool, p
             save(pairs_figure(result), pairs_plot, "--plot")
 
 
-@question(RiskOptions, "STUDY|DIR", _plot_option("Draw the sensitivity indices to this file: png, pdf or svg."))
+@question_with(RiskOptions, "STUDY|DIR", _plot_option("Draw the sensitivity indices to this file: png, pdf or svg."))
 def risk(source: str, point: str | None, jobs: int | None, as_json: bool, plot: Path | None, **values: Any) -> None:
     """Estimate how likely an unsafe outcome is if vehicles vary as [variation] of STUDY says, and which characteristics decide it."""
     from safevar_sumo.analysis.figures import save
@@ -133,33 +135,33 @@ def risk(source: str, point: str | None, jobs: int | None, as_json: bool, plot: 
 
     options, study = RiskOptions(**values), study_at_point(source, point)
     if plot is not None:
-        check_output(plot, "--plot", PICTURES)
+        check_output(plot, "--plot", PICTURE_ENDINGS)
         if study.correlations:
             raise InputError("--plot", "sensitivity indices of correlated characteristics are not defined", "a study without correlations")
         if options.requires_rare_method:
             raise InputError("--plot", "a method for rare failures computes no sensitivity indices to draw", "--method auto")
-    result = _compute(estimate_risk, study, options, jobs)
+    result = _compute_with_bar(estimate_risk, study, options, jobs)
     if study.correlations:
         click.echo("note: no sensitivity indices: they are not defined for correlated characteristics", err=True)
     if result.errors:
         click.echo(f"warning: {result.errors} vehicles could not be simulated and are left out", err=True)
     if as_json:
-        click.echo(_json(result))
+        click.echo(_to_json(result))
     else:
         print_risk(Console(), result)
     if plot is not None:
         save(sensitivity_figure(result), plot, "--plot")
 
 
-@question(RulesOptions, "STUDY|DIR")
+@question_with(RulesOptions, "STUDY|DIR")
 def rules(source: str, point: str | None, jobs: int | None, as_json: bool, **values: Any) -> None:
     """Find rules, in physical units, that describe the unsafe settings of STUDY, from evenly spread settings instead of a search."""
     from safevar_sumo.analysis.rules.compute import find_rules, print_rules
 
-    result = _compute(find_rules, study_at_point(source, point), RulesOptions(**values), jobs)
+    result = _compute_with_bar(find_rules, study_at_point(source, point), RulesOptions(**values), jobs)
     if not as_json:
         print_rules(Console(), result)
         return
     if result.remark:
         click.echo(f"note: {result.remark}", err=True)
-    click.echo(_json(result))
+    click.echo(_to_json(result))

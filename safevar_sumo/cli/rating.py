@@ -10,21 +10,21 @@ import click
 from rich.console import Console
 
 from safevar_sumo.analysis.rating import RatingOptions
-from safevar_sumo.cli.arguments import PICTURES, check_output, read_changes
+from safevar_sumo.cli.arguments import PICTURE_ENDINGS, check_output, read_changes
 from safevar_sumo.cli.program import commands
-from safevar_sumo.cli.target import as_it_is_now_option, flags_of, jobs_option, json_option, results_or_study
+from safevar_sumo.cli.target import add_flags, as_it_is_now_option, jobs_option, json_option, results_or_study
 from safevar_sumo.errors import InputError
 from safevar_sumo.study import Study
-from safevar_sumo.terminal import stages
+from safevar_sumo.terminal import show_stages
 from safevar_sumo.vehicles import CharacteristicSet
 
-SPREADSHEETS = (".xlsx",)
+SPREADSHEET_ENDINGS = (".xlsx",)
 FILE = click.Path(path_type=Path)
 
 
 @commands.command(name="rating")
 @click.argument("source", metavar="STUDY|DIR")
-@flags_of(RatingOptions)
+@add_flags(RatingOptions)
 @click.option("--matrix", is_flag=True, help="Print every matrix: speed by impact location, with the colours of the cells.")
 @click.option("--plot", type=FILE, metavar="FILE", help="Draw the matrices to this file: png, pdf or svg.")
 @click.option("--xlsx", type=FILE, metavar="FILE", help="Write the official spreadsheet with the predictions of the variant, if any, else "
@@ -44,14 +44,15 @@ def rating(source: str, changes: tuple[str, ...], solution: str | None, matrix: 
     from safevar_sumo.analysis.rating.render import matrices_figure, print_matrices, print_rating
 
     subject = results_or_study(source)
-    options = RatingOptions(changes=_changes(subject if isinstance(subject, Study) else subject.study, changes), solution=solution)
+    study = subject if isinstance(subject, Study) else subject.study
+    options = RatingOptions(changes=_read_single_changes(study, changes), solution=solution)
     if force and xlsx is None and preprocessed is None and plot is None:
         raise InputError("--force", "there is no file to overwrite", "together with --xlsx, --preprocessed or --plot")
     if plot is not None:
-        check_output(plot, "--plot", PICTURES)
+        check_output(plot, "--plot", PICTURE_ENDINGS)
         _refuse_existing(plot, "--plot", force)
     spreadsheet = _open_spreadsheet(xlsx, template, preprocessed, force)
-    with stages(Console(stderr=True)) as progress:
+    with show_stages(Console(stderr=True)) as progress:
         result = rate_variant(subject, options, jobs=jobs, progress=progress)
     for remark in remarks(result):
         click.echo(f"note: {remark}", err=True)
@@ -69,8 +70,8 @@ def rating(source: str, changes: tuple[str, ...], solution: str | None, matrix: 
         click.echo(f"Spreadsheet of {vehicle.name}: {spreadsheet.output}", err=True)
 
 
-def _changes(study: Study, changes: tuple[str, ...]) -> dict[str, float]:
-    """Parse --set; returns the value of each changed characteristic."""
+def _read_single_changes(study: Study, changes: tuple[str, ...]) -> dict[str, float]:
+    """Parse --set into the value of each changed characteristic."""
     values = read_changes(changes, CharacteristicSet.of(study.vehicle.characteristics), False, single=True)
     return {name: value for name, (value,) in values.items()}
 
@@ -96,7 +97,7 @@ def _open_spreadsheet(xlsx: Path | None, template: Path | None, preprocessed: Pa
     output = xlsx if xlsx is not None else sheets
     flag = "--xlsx" if xlsx is not None else "--preprocessed"
     _refuse_existing(output, flag, force)
-    check_output(output, flag, SPREADSHEETS)
+    check_output(output, flag, SPREADSHEET_ENDINGS)
     try:
         from safevar_sumo.analysis.rating.workbook import Preprocessed, Template
     except ModuleNotFoundError:

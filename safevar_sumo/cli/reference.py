@@ -12,12 +12,12 @@ import numpy as np
 from rich.console import Console
 
 from safevar_sumo.analysis.research_questions.case import Case, load_cases
-from safevar_sumo.cli.arguments import PICTURES, check_output, complete_study, refuse_overwriting
+from safevar_sumo.cli.arguments import PICTURE_ENDINGS, check_output, complete_study, refuse_overwriting
 from safevar_sumo.cli.program import StrictCommand, commands, print_remarks
 from safevar_sumo.cli.target import jobs_option
 from safevar_sumo.errors import InputError, SimulationError
 from safevar_sumo.metrics import METRICS
-from safevar_sumo.progress import counting_bar
+from safevar_sumo.progress import show_counting_bar
 from safevar_sumo.records import Evaluations
 from safevar_sumo.reference import (
     Agreement,
@@ -44,7 +44,7 @@ from safevar_sumo.reference.replication import Nearness, compare_with_nearest_ro
 from safevar_sumo.results import MANIFEST, write_imported, write_whole
 from safevar_sumo.study import SAFETY_DEGREE, Study, check_writable, load_study, study_names, write_study
 from safevar_sumo.sumo.system import assemble
-from safevar_sumo.terminal import WholeTable, stages
+from safevar_sumo.terminal import WholeTable, show_stages
 from safevar_sumo.vehicles import CharacteristicSet
 from safevar_sumo.workers.batches import evaluate_all
 from safevar_sumo.workers.local import available_cores, local_pool
@@ -67,13 +67,13 @@ def validate(study: str, reference: Path, jobs: int | None, plot: Path | None, a
     print_remarks(loaded_study)
     system = assemble(loaded_study, study)
     if plot is not None:
-        check_output(plot, "--plot", PICTURES)
+        check_output(plot, "--plot", PICTURE_ENDINGS)
     if totals is not None:
         check_output(totals, "--totals", (".toml",))
     data = _read_rows(reference, system.characteristics)
     settings = np.concatenate([system.characteristics.original[np.newaxis], data.settings])
     with (local_pool(jobs or available_cores(), loaded_study.search.time_limit) as pool,
-          counting_bar(Console(stderr=True), "settings", len(np.unique(settings, axis=0))) as count_settings):
+          show_counting_bar(Console(stderr=True), "settings", len(np.unique(settings, axis=0))) as count_settings):
         evaluations = evaluate_all(loaded_study, settings, pool, count_settings)
     data, rows = _simulated_rows(reference, data, evaluations.take(np.arange(1, len(settings))))
     if not evaluations.valid[0]:
@@ -123,10 +123,10 @@ def calibrate_command(study: str, words: tuple[str, ...], trials: int | None, se
     systems = [assemble(item, name) for item, name in zip(studies, names, strict=True)]
     if len({item.name for item in studies}) < len(studies):
         raise InputError("STUDY", f"two studies are called {studies[0].name!r}", "studies of different names")
-    targets = _targets(studies, out)
+    targets = _choose_targets(studies, out)
     if plot is not None:
-        check_output(plot, "--plot", PICTURES)
-    owners = [_owner(file, studies) for file in files]
+        check_output(plot, "--plot", PICTURE_ENDINGS)
+    owners = [_find_owner(file, studies) for file in files]
     for source in (*map(Path, names), *(path for _, path in owners)):
         for target in targets:
             if target.exists() and source.exists() and target.samefile(source):
@@ -135,13 +135,13 @@ def calibrate_command(study: str, words: tuple[str, ...], trials: int | None, se
         check_writable(target)
     if len({path.name for _, path in owners}) < len(owners):
         raise InputError("REFERENCE.csv", "two files have the same name", "files of different names")
-    data = [{path.name: _read_rows(path, system.characteristics) for owner, path in owners if owner == k}
-            for k, system in enumerate(systems)]
+    data = [{path.name: _read_rows(path, system.characteristics) for owner, path in owners if owner == index}
+            for index, system in enumerate(systems)]
     trials_done, least_loss, best_studies = 0, np.inf, tuple(studies)
     max_trials = studies[0].fit.trials
     try:
         with (local_pool(jobs or available_cores(), max(item.search.time_limit for item in studies)) as pool,
-              stages(Console(stderr=True)) as show_progress):
+              show_stages(Console(stderr=True)) as show_progress):
             show_progress("trials", 0, max_trials)
 
             def after_trial(loss: float, best: Study | tuple[Study, ...]) -> None:
@@ -174,8 +174,8 @@ def _is_study(word: str) -> bool:
     return word in study_names() or word.endswith(".toml")
 
 
-def _targets(studies: Sequence[Study], out: Path | None) -> list[Path]:
-    """The study files to write, one for each study."""
+def _choose_targets(studies: Sequence[Study], out: Path | None) -> list[Path]:
+    """Choose the study files to write, one for each study."""
     if len(studies) == 1:
         return [out or Path(f"{studies[0].name}-calibrated.toml")]
     if out is not None and not out.is_dir():
@@ -183,8 +183,8 @@ def _targets(studies: Sequence[Study], out: Path | None) -> list[Path]:
     return [(out or Path()) / f"{study.name}-calibrated.toml" for study in studies]
 
 
-def _owner(word: str, studies: Sequence[Study]) -> tuple[int, Path]:
-    """Index of the study that a reference file belongs to, and the file's path."""
+def _find_owner(word: str, studies: Sequence[Study]) -> tuple[int, Path]:
+    """Find the index of the study that a reference file belongs to, and the file's path."""
     names = [study.name for study in studies]
     name, _, file = word.partition("=")
     if file and name in names and not Path(word).exists():
@@ -274,7 +274,7 @@ def replicate(directories: tuple[str, ...], published: tuple[str, ...], out: Pat
         if Path(directory).resolve() in [Path(other).resolve() for other in directories]:
             raise InputError("--published", f"{directory} is given as results too", "results that the command import has written")
     pairs = pair_cases(load_cases(directories), load_cases(published))
-    page = render_replication(pairs, _nearness(pairs.here, references))
+    page = render_replication(pairs, _compare_nearby(pairs.here, references))
     if out is None:
         click.echo(page, nl=False)
     else:
@@ -282,7 +282,7 @@ def replicate(directories: tuple[str, ...], published: tuple[str, ...], out: Pat
         click.echo(f"Replication: {out}")
 
 
-def _nearness(cases: Sequence[Case], references: Sequence[str]) -> list[Nearness]:
+def _compare_nearby(cases: Sequence[Case], references: Sequence[str]) -> list[Nearness]:
     """Compare the solutions of each case with the nearest rows of its published files."""
     rows: dict[str, list[ReferenceData]] = {}
     for reference in references:
@@ -322,9 +322,9 @@ def print_agreement(console: Console, study: Study, result: Agreement) -> None:
     console.print(table)
     collisions = result.collisions
     console.print(f"Collisions: {collisions['reference']} in the reference, {collisions['here']} here, {collisions['both']} in both: "
-                  f"precision {_decimals(result.precision)}, recall {_decimals(result.recall)}; their mean speed is "
-                  f"{_decimals(result.collision_speed['reference'])} m/s in the reference, "
-                  f"{_decimals(result.collision_speed['here'])} m/s here.")
+                  f"precision {_two_decimals(result.precision)}, recall {_two_decimals(result.recall)}; their mean speed is "
+                  f"{_two_decimals(result.collision_speed['reference'])} m/s in the reference, "
+                  f"{_two_decimals(result.collision_speed['here'])} m/s here.")
     if result.undecided["within_repeats"] is not None:
         console.print(f"Of {result.undecided['differ']} settings that collide only in the reference or only here, "
                       f"{result.undecided['within_repeats']} may collide or not within the scatter of repeats.")
@@ -342,7 +342,7 @@ def print_effects(console: Console, effects: Sequence[Effect]) -> None:
     console.print(table)
 
 
-def _decimals(value: float | None) -> str:
+def _two_decimals(value: float | None) -> str:
     return "-" if value is None else f"{value:.2f}"
 
 

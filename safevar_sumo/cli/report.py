@@ -11,7 +11,7 @@ from rich.console import Console
 
 from safevar_sumo.analysis.research_questions.answer import QUESTIONS, answer
 from safevar_sumo.analysis.research_questions.case import load_cases
-from safevar_sumo.analysis.research_questions.gallery import FORMATS as PICTURES
+from safevar_sumo.analysis.research_questions.gallery import FORMATS as PICTURE_FORMATS
 from safevar_sumo.analysis.research_questions.gallery import draw_all
 from safevar_sumo.analysis.research_questions.tables import ENDINGS, FORMATS, FORMATS_WITH_LAYOUT, LAYOUTS_BY_NAME
 from safevar_sumo.cli.arguments import check_output
@@ -27,26 +27,27 @@ FORMATS_WITHOUT_NOTES = ("csv", "json")
 @commands.command()
 @click.argument("directories", nargs=-1, required=True, metavar="DIR...")
 @click.option("--rq", "question", type=click.Choice(QUESTIONS), help="Answer only this question.")
-@click.option("--format", "kind", type=click.Choice(list(FORMATS)), default="text", show_default=True, help="Format of the tables.")
+@click.option("--format", "format_name", type=click.Choice(list(FORMATS)), default="text", show_default=True, help="Format of the tables.")
 @click.option("--layout", type=click.Choice(list(LAYOUTS_BY_NAME)), default="full", show_default=True,
               help="Everything, or only RQ1, RQ2 and the combinations, laid out as in the paper.")
 @click.option("--out", type=click.Path(path_type=Path), metavar="DIR", help="Write each table to a file in this directory.")
-def tables(directories: tuple[str, ...], question: str | None, kind: str, layout: str, out: Path | None) -> None:
+def tables(directories: tuple[str, ...], question: str | None, format_name: str, layout: str, out: Path | None) -> None:
     """Answer the research questions as tables, from the results directories DIR..., one for each case."""
-    if layout != "full" and kind not in FORMATS_WITH_LAYOUT:
-        raise InputError("--layout", f"{layout!r}, but --format {kind} has no layout", f"--format {', '.join(FORMATS_WITH_LAYOUT)}")
-    write = partial(FORMATS_WITH_LAYOUT[kind], layouts=LAYOUTS_BY_NAME[layout]) if kind in FORMATS_WITH_LAYOUT else FORMATS[kind]
+    if layout != "full" and format_name not in FORMATS_WITH_LAYOUT:
+        raise InputError("--layout", f"{layout!r}, but --format {format_name} has no layout", f"--format {', '.join(FORMATS_WITH_LAYOUT)}")
+    write = (partial(FORMATS_WITH_LAYOUT[format_name], layouts=LAYOUTS_BY_NAME[layout]) if format_name in FORMATS_WITH_LAYOUT
+             else FORMATS[format_name])
     answers = answer(load_cases(directories), question)
-    if kind in FORMATS_WITHOUT_NOTES:
+    if format_name in FORMATS_WITHOUT_NOTES:
         _print_notes(list(dict.fromkeys(note for table in answers for note in table.notes)))
     if out is not None:
         make_directory(out)
         for table in answers:
             if not table.frame.empty:
-                write_whole(out / f"{table.name}.{ENDINGS[kind]}", write([table]))
+                write_whole(out / f"{table.name}.{ENDINGS[format_name]}", write([table]))
         click.echo(f"Tables: {out}")
         return
-    if question is not None and kind in FORMATS_WITHOUT_NOTES:
+    if question is not None and format_name in FORMATS_WITHOUT_NOTES:
         answers = [table for table in answers if table.name == question]
     click.echo(write(answers), nl=False)
 
@@ -54,12 +55,13 @@ def tables(directories: tuple[str, ...], question: str | None, kind: str, layout
 @commands.command()
 @click.argument("directories", nargs=-1, required=True, metavar="DIR...")
 @click.option("--out", type=click.Path(path_type=Path), required=True, metavar="DIR", help="Directory for the pictures.")
-@click.option("--format", "kind", type=click.Choice(PICTURES), default="png", show_default=True, help="Format of the pictures.")
-def figures(directories: tuple[str, ...], out: Path, kind: str) -> None:
+@click.option("--format", "format_name", type=click.Choice(PICTURE_FORMATS), default="png", show_default=True,
+              help="Format of the pictures.")
+def figures(directories: tuple[str, ...], out: Path, format_name: str) -> None:
     """Draw the figures of the results directories DIR..., one file for each figure and case."""
     cases = load_cases(directories)
     make_directory(out)
-    paths, notes = draw_all(cases, out, kind)
+    paths, notes = draw_all(cases, out, format_name)
     _print_notes([*(remark for case in cases for remark in case.remarks), *notes])
     for path in paths:
         click.echo(str(path))
@@ -81,11 +83,11 @@ def _print_notes(notes: list[str]) -> None:
 def report(directories: tuple[str, ...], out: Path, only: str | None, point: str | None, jobs: int | None) -> None:
     """Write one self-contained page about the results directories DIR...: verdict, causes, replays, tables, figures."""
     from safevar_sumo.report import make_report
-    from safevar_sumo.terminal import stages
+    from safevar_sumo.terminal import show_stages
 
     check_output(out, "--out", (".html", ".htm"))
     sections = [name.strip() for name in only.split(",")] if only is not None else []
-    with stages(Console(stderr=True)) as progress, warnings.catch_warnings(record=True) as caught:
+    with show_stages(Console(stderr=True)) as progress, warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", UserWarning)
         page = make_report(directories, sections, jobs, progress, point=point, as_it_is_now=as_it_is_now())
     for warning in caught:

@@ -16,17 +16,17 @@ from safevar_sumo.analysis.model_spread import ModelSpread, compute_model_spread
 from safevar_sumo.analysis.words import question_command
 from safevar_sumo.api.simulation import Simulation, evaluate_settings, simulate_with_original
 from safevar_sumo.cli.arguments import (
-    PICTURES,
+    PICTURE_ENDINGS,
     NumberRange,
     check_output,
+    combine_values,
     complete_changes,
     complete_study,
     read_changes,
     refuse_overwriting,
-    settings_of,
 )
 from safevar_sumo.cli.program import commands
-from safevar_sumo.cli.target import CommandTarget, as_it_is_now_option, replay_options, target_of
+from safevar_sumo.cli.target import CommandTarget, as_it_is_now_option, load_target, replay_options
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import KMH_PER_MS, Evaluations, FloatArray, Outcome
@@ -61,18 +61,18 @@ FILE = click.Path(path_type=Path)
 def simulate_command(study: str, solution: str | None, choice: str | None, changes: tuple[str, ...], no_filter: bool, beyond: bool,
                      trace: Path | None, point: str | None, spread: bool, as_json: bool, **replay_outputs: Any) -> None:
     """Simulate STUDY once, or a solution of the results directory DIR with the study as recorded there."""
-    target, replays = target_of(study, solution, choice), Replays(**replay_outputs)
+    target, outputs = load_target(study, solution, choice), ReplayOutputs(**replay_outputs)
     system = assemble(target.study, target.source)
     if point is not None:
         system = system_at_point(system, point, "--point")
     values_by_name = read_changes(changes, system.characteristics, beyond)
     base = system.characteristics.original if target.setting is None else target.setting
-    requested_settings = settings_of(values_by_name, base, system.characteristics)
+    requested_settings = combine_values(values_by_name, base, system.characteristics)
     if not beyond and changes:
         system.check_feasible(requested_settings, "--set", filtered=not no_filter, switch="--beyond")
-    _check_outputs(study, trace, replays)
+    _check_outputs(study, trace, outputs)
     if any(len(values) > 1 for values in values_by_name.values()):
-        if trace is not None or replays.are_requested or spread:
+        if trace is not None or outputs.are_requested or spread:
             expected = "one value for each with --trace, --plot, --animate, --gui or --spread"
             raise InputError("--set", f"{' '.join(changes)} is a sweep", expected)
         _simulate_sweep(target, system, requested_settings, tuple(values_by_name), not no_filter, as_json)
@@ -83,25 +83,25 @@ def simulate_command(study: str, solution: str | None, choice: str | None, chang
         _warn_of_differences(target, simulation)
     if trace is not None:
         _write_trace(trace, simulation)
-    if replays.are_requested:
-        replays.show(target.study, system, simulation.evaluation.settings[0])
+    if outputs.are_requested:
+        outputs.show(target.study, system, simulation.evaluation.settings[0])
     settings = np.stack([simulation.evaluation.settings[0], system.characteristics.original])
     spreads = compute_model_spreads(target.study, settings, point or "") if parameter_sets else []
     _print_results(target, system, simulation, spreads, as_json)
 
 
-def _check_outputs(study: str, trace: Path | None, replays: Replays) -> None:
+def _check_outputs(study: str, trace: Path | None, outputs: ReplayOutputs) -> None:
     if trace is not None:
         refuse_overwriting(trace, "--trace", study)
         check_writable(trace, "--trace")
-    replays.check(study)
-    if trace is not None and trace.resolve() in replays.files:
+    outputs.check(study)
+    if trace is not None and trace.resolve() in outputs.files:
         raise InputError("--trace", f"{trace} is what --plot or --animate writes", "another file")
 
 
-def _simulate_sweep(target: CommandTarget, system: System, requests: FloatArray, names: tuple[str, ...], filtered: bool,
+def _simulate_sweep(target: CommandTarget, system: System, requested_settings: FloatArray, names: tuple[str, ...], filtered: bool,
                     as_json: bool) -> None:
-    settings = system.characteristics.filter(requests) if filtered else requests
+    settings = system.characteristics.filter(requested_settings) if filtered else requested_settings
     evaluations = evaluate_settings(target.study, np.concatenate([system.characteristics.original[np.newaxis], settings]))
     original, variants = evaluations.take([0]), evaluations.take(np.arange(1, len(evaluations)))
     if as_json:
@@ -110,9 +110,9 @@ def _simulate_sweep(target: CommandTarget, system: System, requests: FloatArray,
         click.echo(json.dumps(records, indent=2, allow_nan=False))
     else:
         print_sweep(Console(), target.study, names, original, variants)
-    reset_count = int(np.count_nonzero((settings != requests).any(axis=1)))
+    reset_count = int(np.count_nonzero((settings != requested_settings).any(axis=1)))
     if reset_count:
-        click.echo(f"note: in {reset_count} of {len(requests)} settings the filter reset small changes; --no-filter keeps them",
+        click.echo(f"note: in {reset_count} of {len(requested_settings)} settings the filter reset small changes; --no-filter keeps them",
                    err=True)
 
 
@@ -143,10 +143,10 @@ def _print_results(target: CommandTarget, system: System, simulation: Simulation
 
 def _warn_of_differences(target: CommandTarget, simulation: Simulation) -> None:
     """Warn where a replay differs from the recorded solution."""
-    from safevar_sumo.replay.comparison import differences
+    from safevar_sumo.replay.comparison import list_differences
 
     assert target.row is not None
-    for difference in differences(simulation.evaluation, target.row):
+    for difference in list_differences(simulation.evaluation, target.row):
         click.echo(f"warning: {target.handle} of {target.source}: {difference}; other versions or code than in the study?", err=True)
 
 
@@ -159,7 +159,7 @@ def _write_trace(path: Path, simulation: Simulation) -> None:
         raise InputError("--trace", f"cannot write {path}: {error.strerror or error}", "a file in a directory that exists") from None
 
 
-class Replays(NamedTuple):
+class ReplayOutputs(NamedTuple):
     """The figure, animation and window of a replay: files to write, or None, and options of the window."""
 
     plot: Path | None
@@ -182,13 +182,13 @@ class Replays(NamedTuple):
             raise InputError("--slower", f"{self.slower:g} without --gui", "together with --gui")
         if self.plot is not None:
             refuse_overwriting(self.plot, "--plot", study)
-            check_output(self.plot, "--plot", PICTURES)
+            check_output(self.plot, "--plot", PICTURE_ENDINGS)
         if self.animate is not None:
-            from safevar_sumo.replay.animation import ANIMATIONS, check_animation
+            from safevar_sumo.replay.animation import ANIMATION_WRITERS, require_ffmpeg
 
             refuse_overwriting(self.animate, "--animate", study)
-            check_output(self.animate, "--animate", tuple(ANIMATIONS))
-            check_animation(self.animate)
+            check_output(self.animate, "--animate", tuple(ANIMATION_WRITERS))
+            require_ffmpeg(self.animate)
 
     def show(self, study: Study, system: System, setting: FloatArray) -> None:
         """Simulate a filtered setting, shape (n,), beside the original vehicle, and show both."""
@@ -211,7 +211,7 @@ def print_simulation(console: Console, simulation: Simulation) -> None:
     """Print a setting beside the original vehicle: its values, outcome, metrics and objectives, and a verdict."""
     _print_setting(console, simulation)
     characteristics = CharacteristicSet.of(simulation.study.vehicle.characteristics)
-    print_meanings(console, [member for member in characteristics if simulation.setting[member.name] != member.original])
+    print_meanings(console, [item for item in characteristics if simulation.setting[item.name] != item.original])
     records = (simulation.original.to_dict(), simulation.to_dict())
     table = WholeTable("result", "unit", right=("original", "simulated"))
     table.add_row("outcome", "", *(record["outcome"] for record in records))
@@ -220,20 +220,20 @@ def print_simulation(console: Console, simulation: Simulation) -> None:
     console.print(table)
     print_text(console, f"The original vehicle {simulation.original.verdict}.")
     if simulation is not simulation.original and simulation.setting != simulation.original.setting:
-        print_text(console, f"The changed vehicle {simulation.verdict}: {_compared_with_original(simulation)}.")
+        print_text(console, f"The changed vehicle {simulation.verdict}: {_safety_comparison(simulation)}.")
 
 
 def _print_setting(console: Console, simulation: Simulation) -> None:
     table = WholeTable("characteristic", "unit", right=("original", "simulated"), title=simulation.study.title)
-    for member in CharacteristicSet.of(simulation.study.vehicle.characteristics):
-        value = simulation.setting[member.name]
-        changed = value != member.original
-        value_text = f"{value:g}" + ("" if member.lower <= value <= member.upper else " (beyond)")
-        table.add_row(member.name, member.unit, f"{member.original:g}", value_text, style="bold" if changed else None)
+    for characteristic in CharacteristicSet.of(simulation.study.vehicle.characteristics):
+        value = simulation.setting[characteristic.name]
+        style = "bold" if value != characteristic.original else None
+        value_text = f"{value:g}" + ("" if characteristic.lower <= value <= characteristic.upper else " (beyond)")
+        table.add_row(characteristic.name, characteristic.unit, f"{characteristic.original:g}", value_text, style=style)
     console.print(table)
 
 
-def _compared_with_original(simulation: Simulation) -> str:
+def _safety_comparison(simulation: Simulation) -> str:
     degree, original = simulation.metrics[SAFETY_DEGREE], simulation.original.metrics[SAFETY_DEGREE]
     if np.isnan(degree) or np.isnan(original):
         return "whether that is less safe cannot be decided"
@@ -276,7 +276,7 @@ def print_matrix(console: Console, results: Sequence[PointResult], row: int = 0)
         coordinates = dict(result.point.parameters)
         tables.setdefault((coordinates.pop("test"), coordinates.pop("weather")), []).append((coordinates, result_record))
     for (test, weather), cells in tables.items():
-        _print_table(console, f"{test}, {weather}", cells)
+        _print_test_table(console, f"{test}, {weather}", cells)
     if records:
         collision_points = [result["point"] for result in records if result["impact_speed"] is not None]
         rest = f" and {len(collision_points) - MAX_POINTS_NAMED} more" if len(collision_points) > MAX_POINTS_NAMED else ""
@@ -288,14 +288,14 @@ def print_matrix(console: Console, results: Sequence[PointResult], row: int = 0)
         print_text(console, summary)
 
 
-def _print_table(console: Console, title: str, results: Sequence[tuple[dict[str, Any], dict[str, Any]]]) -> None:
-    columns = list(dict.fromkeys(coordinates.get(COLUMN_DIMENSION) for coordinates, _ in results))
+def _print_test_table(console: Console, title: str, cells: Sequence[tuple[dict[str, Any], dict[str, Any]]]) -> None:
+    columns = list(dict.fromkeys(coordinates.get(COLUMN_DIMENSION) for coordinates, _ in cells))
     table = WholeTable("speed", right=("" if column is None else f"{column:g} %" for column in columns), title=title)
-    cells: dict[str, dict[Any, Text]] = {}
-    for coordinates, result in results:
-        cells.setdefault(_row_name(coordinates), {})[coordinates.get(COLUMN_DIMENSION)] = _cell(result)
-    for name, by_column in cells.items():
-        table.add_row(name, *(by_column.get(column, Text("")) for column in columns))
+    texts_by_row: dict[str, dict[Any, Text]] = {}
+    for coordinates, result in cells:
+        texts_by_row.setdefault(_row_name(coordinates), {})[coordinates.get(COLUMN_DIMENSION)] = _cell_text(result)
+    for name, texts in texts_by_row.items():
+        table.add_row(name, *(texts.get(column, Text("")) for column in columns))
     console.print(table)
 
 
@@ -304,7 +304,7 @@ def _row_name(coordinates: dict[str, Any]) -> str:
     return ", ".join([*speed, *(f"{name} {value}" for name, value in coordinates.items() if name not in (ROW_DIMENSION, COLUMN_DIMENSION))])
 
 
-def _cell(result: dict[str, Any]) -> Text:
+def _cell_text(result: dict[str, Any]) -> Text:
     if result["outcome"] == Outcome.INVALID_TEST:
         return Text(f"{result['outcome']} ({result['test_speed_error']:+.1f} km/h)", "magenta")
     if result["impact_speed"] is None:

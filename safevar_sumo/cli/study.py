@@ -17,7 +17,7 @@ from rich.live import Live
 from rich.text import Text
 
 from safevar_sumo.analysis.research_questions.indicators import nondominated
-from safevar_sumo.api.running import ENGINES, carry_out_runs, engine_for, load_for_search, open_pool
+from safevar_sumo.api.running import ENGINE_NAMES, carry_out_runs, choose_engine, load_for_search, open_pool
 from safevar_sumo.campaign import Campaign, Forecast, RunKey, all_runs, forecast
 from safevar_sumo.cli.arguments import NumberRange, complete_study
 from safevar_sumo.cli.program import commands, print_remarks
@@ -26,7 +26,7 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.progress import CampaignProgress
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.results import RunStatus, Status, failure_lines, record, solutions_frame
-from safevar_sumo.shipped import RUN
+from safevar_sumo.shipped import PROGRAM_COMMAND
 from safevar_sumo.study import Study, load_study
 from safevar_sumo.sumo import Engine, settings_per_batch, vehicle_remarks
 from safevar_sumo.terminal import WholeTable, print_text
@@ -42,7 +42,7 @@ from safevar_sumo.workers.evaluation import Pool
 @click.option("--seed", type=click.IntRange(min=0, max=2**63 - 1), help="Seed of the whole study.")
 @click.option("--batch", type=click.IntRange(1, 10_000),
               help="Maximum settings per batch, gathered from several runs; does not change results.  [default: the fastest]")
-@click.option("--engine", type=click.Choice(list(ENGINES.values())), default=ENGINES[Engine.RECORDED], show_default=True,
+@click.option("--engine", type=click.Choice(list(ENGINE_NAMES.values())), default=ENGINE_NAMES[Engine.RECORDED], show_default=True,
               help="What moves the vehicles. recorded: numpy, in a scene that SUMO has played once, if no actor reacts to the vehicles; "
                    "results are verified in SUMO. sumo: always SUMO.")
 @click.option("--out", type=click.Path(path_type=Path), help="Directory of the results.  [default: results/STUDY]")
@@ -56,16 +56,16 @@ from safevar_sumo.workers.evaluation import Pool
 def study(study: str, batch: int | None, engine: str, out: Path | None, jobs: int | None, cluster: str | None, only: str | None,
           shard: str | None, retry_failed: bool, quiet: bool, dry_run: bool, **options: Any) -> None:
     """Search STUDY; run the same command again to continue where it stopped."""
-    loaded_study, system = load_for_search(_with_options(load_study(study), **options), study)
+    loaded_study, system = load_for_search(_apply_options(load_study(study), **options), study)
     print_remarks(loaded_study, [*system.remarks, *vehicle_remarks(system)])
     keys = _select_runs(all_runs(loaded_study), only, shard)
     directory = out or Path("results") / loaded_study.name
     with open_pool(loaded_study, jobs, cluster) as pool:
         if dry_run:
-            used_engine, reason = engine_for(system, engine)
+            used_engine, reason = choose_engine(system, engine)
             size = batch or settings_per_batch(system, used_engine)
             cost = forecast(loaded_study, len(keys), pool, size, used_engine)
-            print_forecast(Console(), loaded_study, len(keys), cost, f"{ENGINES[used_engine]}: {reason}")
+            print_forecast(Console(), loaded_study, len(keys), cost, f"{ENGINE_NAMES[used_engine]}: {reason}")
             return
         try:
             with CampaignProgress(Console(stderr=True), loaded_study, keys, quiet) as progress:
@@ -79,7 +79,7 @@ def study(study: str, batch: int | None, engine: str, out: Path | None, jobs: in
         print_text(Console(), f"Results: {directory}")
 
 
-def _with_options(study: Study, algorithms: str | None, **numbers: int | None) -> Study:
+def _apply_options(study: Study, algorithms: str | None, **numbers: int | None) -> Study:
     """The study with its search table changed by the command's options."""
     changes: dict[str, Any] = {name: value for name, value in numbers.items() if value is not None}
     if algorithms is not None:
@@ -96,10 +96,10 @@ def _select_runs(keys: list[RunKey], only: str | None, shard: str | None) -> lis
         if not keys:
             raise InputError("--only", repr(only), "ALGORITHM:RUN, an algorithm of the study and a run from 0 to less than --runs")
     if shard is not None:
-        k, _, n = shard.partition("/")
-        if not (k.isdecimal() and n.isdecimal() and len(n) < 10 and len(k) < 10 and 1 <= int(k) <= int(n)):
+        rank, _, count = shard.partition("/")
+        if not (all(text.isdecimal() and len(text) < 10 for text in (rank, count)) and 1 <= int(rank) <= int(count)):
             raise InputError("--shard", repr(shard), "K/N, with K in 1..N")
-        keys = keys[int(k) - 1::int(n)]
+        keys = keys[int(rank) - 1::int(count)]
     return keys
 
 
@@ -162,18 +162,19 @@ def print_summary(console: Console, study: Study, campaign: Campaign, directory:
     if len(solutions):
         for line in summarise_failures(study, solutions, campaign.original, pool, str(directory)):
             print_text(console, line)
-    by_vehicle = {"original vehicle": campaign.original}
+    evaluations_by_vehicle = {"original vehicle": campaign.original}
     for algorithm in study.search.labels:
         solutions_of_runs = [solutions_of_run for key, solutions_of_run in campaign.solutions.items() if key.algorithm == algorithm]
         if solutions_of_runs:
-            by_vehicle[algorithm] = Evaluations.concatenate(solutions_of_runs)
-    table = WholeTable("", right=by_vehicle, title=study.title)
-    table.add_row("solutions", "-", *(str(len(rows)) for rows in list(by_vehicle.values())[1:]))
-    table.add_row("solutions that collide", *(str(int(np.count_nonzero(rows.collided))) for rows in by_vehicle.values()))
-    collisions = [sum(number for key, number in campaign.collisions.items() if key.algorithm == name) for name in list(by_vehicle)[1:]]
+            evaluations_by_vehicle[algorithm] = Evaluations.concatenate(solutions_of_runs)
+    table = WholeTable("", right=evaluations_by_vehicle, title=study.title)
+    table.add_row("solutions", "-", *(str(len(rows)) for rows in list(evaluations_by_vehicle.values())[1:]))
+    table.add_row("solutions that collide", *(str(int(np.count_nonzero(rows.collided))) for rows in evaluations_by_vehicle.values()))
+    collisions = [sum(count for key, count in campaign.collisions.items() if key.algorithm == name)
+                  for name in list(evaluations_by_vehicle)[1:]]
     table.add_row("collisions simulated", *map(str, [int(campaign.original.collided[0]), *collisions]))
     for metric in campaign.scoring.metrics:
-        table.add_row(f"mean {metric.heading}", *(_mean(rows.metrics[metric.name]) for rows in by_vehicle.values()))
+        table.add_row(f"mean {metric.heading}", *(_mean_text(rows.metrics[metric.name]) for rows in evaluations_by_vehicle.values()))
     console.print(table)
     console.print(SAFETY_NOTE)
     if campaign.failures:
@@ -189,10 +190,10 @@ def print_summary(console: Console, study: Study, campaign: Campaign, directory:
                    scoring=campaign.scoring)
     for line in summary_lines(case):
         print_text(console, line)
-    print_text(console, f"All tables: {RUN} tables {shlex.quote(str(directory))}")
+    print_text(console, f"All tables: {PROGRAM_COMMAND} tables {shlex.quote(str(directory))}")
 
 
-def _mean(values: FloatArray) -> str:
+def _mean_text(values: FloatArray) -> str:
     defined_values = values[~np.isnan(values)]
     return f"{np.mean(defined_values):.2f}" if defined_values.size else "-"
 
@@ -205,8 +206,8 @@ def _print_most_critical(console: Console, study: Study, campaign: Campaign) -> 
     characteristics = CharacteristicSet.of(study.vehicle.characteristics)
     most_critical = solutions.take([int(np.lexsort((solutions.f_diff, solutions.f_num_diff, solutions.f_safe))[0])])
     changes = [
-        f"{member.name} {member.original:g} -> {value:.6g} {'' if member.unit == '-' else member.unit}".rstrip()
-        for member, value in zip(characteristics, most_critical.settings[0].tolist(), strict=True) if value != member.original]
+        f"{item.name} {item.original:g} -> {value:.6g} {'' if item.unit == '-' else item.unit}".rstrip()
+        for item, value in zip(characteristics, most_critical.settings[0].tolist(), strict=True) if value != item.original]
     console.print(f"Most critical setting: SD {most_critical.f_safe[0]:.2f} ({most_critical.outcome[0]}), "
                   f"the original's {campaign.original.f_safe[0]:.2f} ({campaign.original.outcome[0]}). Its changes:")
     for change in changes or ["no change"]:
@@ -224,11 +225,11 @@ def status_view(progress: Status, rate: float | None) -> RenderableType:
     table = WholeTable("algorithm", right=("runs", "under\nway", "simulated", "collisions", "simulator\nerrors", "best\nSD"),
                        title=progress.title)
     for algorithm in dict.fromkeys(run.algorithm for run in progress.runs):
-        table.add_row(algorithm, *_counts([run for run in progress.runs if run.algorithm == algorithm]))
-    return Group(table, Text(_list_runs(progress)), Text(_remaining_time(progress, rate)), _front(progress))
+        table.add_row(algorithm, *_count_texts([run for run in progress.runs if run.algorithm == algorithm]))
+    return Group(table, Text(_list_runs(progress)), Text(_remaining_time(progress, rate)), _front_table(progress))
 
 
-def _counts(runs: list[RunStatus]) -> list[str]:
+def _count_texts(runs: list[RunStatus]) -> list[str]:
     degrees = [run.best for run in runs if run.best is not None]
     return [f"{sum(run.state == 'finished' for run in runs)}/{len(runs)}", str(sum(run.state == "begun" for run in runs)),
             str(sum(run.simulated for run in runs)), str(sum(run.collisions for run in runs)),
@@ -249,7 +250,7 @@ def _remaining_time(progress: Status, rate: float | None) -> str:
     return f"{progress.share:.0%} done, {timedelta(seconds=round((1 - progress.share) / rate))} left at this pace."
 
 
-def _front(progress: Status) -> RenderableType:
+def _front_table(progress: Status) -> RenderableType:
     """A table of the most severe non-dominated settings."""
     if not len(progress.points):
         return Text("Nothing simulated yet.")

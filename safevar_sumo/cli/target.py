@@ -24,7 +24,7 @@ CommandFunction = Callable[..., Any]
 
 
 class CommandTarget(NamedTuple):
-    """A study, its name in errors, and the solution of its results to replay, if any: handle, setting, row of the results."""
+    """A study and its name in errors; if a solution is to be replayed, its handle, setting and row of the results."""
 
     study: Study
     source: str
@@ -44,7 +44,7 @@ def replay_options(command: CommandFunction) -> CommandFunction:
     return command
 
 
-def target_of(source: str, solution: str | None, choice: str | None) -> CommandTarget:
+def load_target(source: str, solution: str | None, choice: str | None) -> CommandTarget:
     """Load the subject of a command: a study by name or path, or a results directory.
 
     Raises
@@ -86,29 +86,29 @@ def as_it_is_now() -> bool:
     return bool(click.get_current_context().meta.get(AS_IT_IS_NOW_KEY))
 
 
-def flags_of(question: type[Options]) -> Callable[[CommandFunction], CommandFunction]:
-    """Add the flags of a question's options; `question(**keywords)` makes the options from the command's keywords."""
+def add_flags(question: type[Options]) -> Callable[[CommandFunction], CommandFunction]:
+    """Decorator that adds the flags of a question's options; the command makes them by `question(**keywords)`."""
     def add(command: CommandFunction) -> CommandFunction:
         for field in reversed(fields(question)):
-            command = _flag(question.flags()[field.name], field.name, field.default, question.definitions()[field.name])(command)
+            command = _add_flag(question.flags()[field.name], field.name, field.default, question.definitions()[field.name])(command)
         return command
 
     return add
 
 
-def _flag(flag: str, name: str, default: Any, option: Option) -> Callable[[CommandFunction], CommandFunction]:
+def _add_flag(flag: str, name: str, default: Any, option: Option) -> Callable[[CommandFunction], CommandFunction]:
     if option.kind is bool:
         return click.option(flag, name, is_flag=True, default=default, help=option.help)
     if option.form != "one":
         return click.option(flag, name, multiple=option.form == "repeated", metavar=option.metavar, help=option.help,
                             callback=lambda _context, _option, value: _split_names(value) if option.form == "commas" else value)
     (low_is_open, high_is_open), show_default = option.is_open, default is not None
-    kind: click.ParamType[Any] = click.STRING
+    click_type: click.ParamType[Any] = click.STRING
     if option.kind is int:
-        kind = click.IntRange(option.low, option.high)  # type: ignore[arg-type]
+        click_type = click.IntRange(option.low, option.high)  # type: ignore[arg-type]
     elif option.kind is float:
-        kind = NumberRange(option.low, option.high, min_open=low_is_open, max_open=high_is_open)
-    return click.option(flag, name, type=kind, default=default, show_default=show_default, metavar=option.metavar, help=option.help)
+        click_type = NumberRange(option.low, option.high, min_open=low_is_open, max_open=high_is_open)
+    return click.option(flag, name, type=click_type, default=default, show_default=show_default, metavar=option.metavar, help=option.help)
 
 
 def _split_names(text: str | None) -> tuple[str, ...] | None:
@@ -134,11 +134,11 @@ def results_or_study(source: str, point: str | None = None, *, results_only: boo
     if point is None:
         return subject
     if isinstance(subject, Study):
-        return _restrict(subject, point)
-    return replace(subject, study=_restrict(subject.study, point), solutions=subject.solutions.assign(outcome=UNKNOWN))
+        return _restrict_to_point(subject, point)
+    return replace(subject, study=_restrict_to_point(subject.study, point), solutions=subject.solutions.assign(outcome=UNKNOWN))
 
 
-def _restrict(study: Study, point: str) -> Study:
+def _restrict_to_point(study: Study, point: str) -> Study:
     from safevar_sumo.sumo.matrix import study_at
 
     return study_at(study, point, "--point")

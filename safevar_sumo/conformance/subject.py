@@ -13,7 +13,7 @@ from typing import Any, NamedTuple, get_args
 import msgspec
 
 from safevar_sumo.ads import ADS, ADS_CONTRACT, SCALAR_ADS_CONTRACT, FmuAds, ScalarAds
-from safevar_sumo.errors import InputError, SafevarError, refuse_other_than_file, unknown
+from safevar_sumo.errors import InputError, SafevarError, refuse_other_than_file, unknown_name
 from safevar_sumo.fmu import file_of
 from safevar_sumo.metrics import FURTHER, METRICS, OBJECTIVES, Metric
 from safevar_sumo.plugins import Contract, Guard, Lookup, Member
@@ -89,7 +89,7 @@ def find_subject(name: str, study: str | None = None) -> Subject:
         return _find_fmu(name, given_study)
     if ":" not in name:
         names = [*study_names(), *OBJECTIVES, *(member for members in KINDS.values() for member in members)]
-        raise unknown("check", f"there is nothing called {name!r}", name, names, ", package.module:Name, or the path of a study file")
+        raise unknown_name("check", f"there is nothing called {name!r}", name, names, ", package.module:Name, or the path of a study file")
     folders = () if given_study is None else given_study.origin.places
     with substitute_traci():
         member = Lookup("check", folders).find({}, name, "SUBJECT")

@@ -13,7 +13,7 @@ from math import isfinite
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from safevar_sumo.errors import InputError, did_you_mean, in_one_line
+from safevar_sumo.errors import InputError, describe_error, did_you_mean
 from safevar_sumo.fmu.units import BASE_UNITS, COMMON_UNITS, Unit
 
 REAL_TYPES = ("Real", "Float64", "Float32")
@@ -164,13 +164,13 @@ def _read_description(path: str, *_: int) -> Description:
             files = set(archive.namelist())
             version = ElementTree.fromstring(archive.read("modelDescription.xml")).get("fmiVersion", "")
     except Exception as error:  # any error in a user's file
-        raise InputError("fmu", f"cannot be read as an FMU: {in_one_line(error)}", SUPPORTED_FMU) from None
+        raise InputError("fmu", f"cannot be read as an FMU: {describe_error(error)}", SUPPORTED_FMU) from None
     if not version.startswith(("2.", "3.")):
         raise InputError("fmu", f"is of FMI {version}", SUPPORTED_FMU)
     try:
         model = read_model_description(path, validate=False)
     except Exception as error:  # any error of FMPy about a user's file
-        raise InputError("fmu", f"cannot be read as an FMU: {in_one_line(error)}", SUPPORTED_FMU) from None
+        raise InputError("fmu", f"cannot be read as an FMU: {describe_error(error)}", SUPPORTED_FMU) from None
     simulation = model.coSimulation
     if simulation is None:
         kind = "model exchange" if model.modelExchange is not None else "scheduled execution"

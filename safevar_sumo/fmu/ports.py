@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from safevar_sumo.errors import InputError, unknown
+from safevar_sumo.errors import InputError, unknown_name
 from safevar_sumo.fmu.description import NUMBER_TYPES, REAL_TYPES, Description, Variable
 from safevar_sumo.fmu.units import SI, Unit
 
@@ -67,7 +67,7 @@ def ports_of(description: Description, variable_names: Mapping[str, str], units:
     ports: dict[str, Port] = {}
     for quantity, name in variable_names.items():
         if quantity not in units:
-            raise unknown(source, f"{key}.{quantity}: there is no such quantity", quantity, units)
+            raise unknown_name(source, f"{key}.{quantity}: there is no such quantity", quantity, units)
         legal_causalities = (*causalities, "parameter") if quantity in constants else causalities
         variable = description.variable(name, legal_causalities, source, f"{key}.{quantity}")
         first_quantity = next((mapped_quantity for mapped_quantity, port in ports.items() if port.variable.name == name), None)

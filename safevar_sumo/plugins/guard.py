@@ -15,7 +15,7 @@ from typing import Any, NamedTuple, Self
 
 import numpy as np
 
-from safevar_sumo.errors import InputError, UserCodeError, in_one_line
+from safevar_sumo.errors import InputError, UserCodeError, describe_error
 from safevar_sumo.plugins.files import audit_hook
 from safevar_sumo.records import BoolArray, FloatArray
 
@@ -177,7 +177,7 @@ class Guard(NamedTuple):
     def failure(self, method: str, error: BaseException) -> UserCodeError:
         """The error for an exception that user code raised."""
         location = self._location(error)
-        problem = f"{self.name} raised in {method}: {in_one_line(error)}{f' ({location})' if location else ''}"
+        problem = f"{self.name} raised in {method}: {describe_error(error)}{f' ({location})' if location else ''}"
         return UserCodeError(self.source, problem, error.legal if isinstance(error, InputError) else "")
 
     def wrong_value(self, method: str, quantity: str, value: object, expected: str) -> UserCodeError:

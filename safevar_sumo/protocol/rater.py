@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from msgspec.structs import replace
 
-from safevar_sumo.errors import InputError, unknown
+from safevar_sumo.errors import InputError, unknown_name
 from safevar_sumo.protocol import Points, Protocol, points_of, protocol_of
 from safevar_sumo.records import KMH_PER_MS, CellResults, FloatArray, Outcome, SimulationRuns
 from safevar_sumo.scenarios import weather_of
@@ -66,11 +66,11 @@ def rater_of(study: Study, source: str) -> Rater | None:
     for test, layers in study.rating.claims.items():
         key = f"rating.claims.{test}"
         if test not in protocol.tests:
-            raise unknown(source, f"{key}: there is no such test, or it is not simulated", test, protocol.tests)
+            raise unknown_name(source, f"{key}: there is no such test, or it is not simulated", test, protocol.tests)
         is_simulated = {layer.layer: bool(layer.simulated_conditions) for layer in protocol.layers_of(test)}
         for layer in layers:
             if layer not in is_simulated:
-                raise unknown(source, f"{key}: {layer!r} does not count for {test}", layer, is_simulated)
+                raise unknown_name(source, f"{key}: {layer!r} does not count for {test}", layer, is_simulated)
             if is_simulated[layer]:
                 raise InputError(source, f"{key}: {layer!r} is simulated for {test} and cannot be claimed",
                                  "one of " + ", ".join(name for name in is_simulated if not is_simulated[name]))

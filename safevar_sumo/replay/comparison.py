@@ -14,7 +14,7 @@ from safevar_sumo.analysis.words import OUTCOME_VERBS
 from safevar_sumo.api.simulation import changed_setting, load_and_assemble
 from safevar_sumo.metrics import METRICS, RATING_POINTS, MetricFacts
 from safevar_sumo.records import Evaluations, FloatArray, Outcome, SimulationRuns
-from safevar_sumo.replay.film import Film, film
+from safevar_sumo.replay.film import Film, record_film
 from safevar_sumo.results import UNKNOWN
 from safevar_sumo.study import Study, StudyLike
 from safevar_sumo.sumo.batch import score
@@ -39,13 +39,13 @@ class Moments(NamedTuple):
     end: int
 
 
-def moments(runs: SimulationRuns, row: int) -> Moments:
-    """The moments of one of N runs."""
+def find_moments(runs: SimulationRuns, row: int) -> Moments:
+    """Find the moments of one of N runs."""
     return Moments(brake_onset(runs, row), runs.nearest(row), int(np.flatnonzero(runs.trace.active[:, row])[-1]))
 
 
-def divergence(runs: SimulationRuns, first: int = 0, second: int = 1) -> int | None:
-    """The first sample at which the speeds of two of N runs have diverged, None if they never do."""
+def find_divergence(runs: SimulationRuns, first: int = 0, second: int = 1) -> int | None:
+    """Find the first sample at which the speeds of two of N runs have diverged; None if they never do."""
     trace = runs.trace
     is_active = trace.active[:, first] & trace.active[:, second]
     samples = np.flatnonzero(is_active & (np.abs(trace.speed[:, first] - trace.speed[:, second]) > MIN_DIVERGENCE))
@@ -91,7 +91,7 @@ class Comparison:
         runs = self.film.runs
         if not math.isnan(runs.collision_speed[row]):
             return f"collides at {runs.collision_speed[row]:.1f} m/s"
-        nearest = moments(runs, row).nearest
+        nearest = find_moments(runs, row).nearest
         ending = OUTCOME_VERBS[Outcome(str(runs.outcome[row]))]
         if nearest is not None and runs.outcome[row] == Outcome.STOPPED:
             ending = f"{ending} with {runs.trace.gap[nearest, row]:.2f} m to spare"
@@ -101,23 +101,23 @@ class Comparison:
 
 def changes_in_words(characteristics: CharacteristicSet, setting: FloatArray) -> list[str]:
     """The changes from the original: `tireFric 3.5 → 1.1 (-69 %)`."""
-    return [f"{member.name} {number(member.original)} → {number(value)}{spaced(member.unit)} "
+    return [f"{member.name} {format_number(member.original)} → {quantity_text(value, member.unit)} "
             f"({(value - member.original) / abs(member.original) * 100:+.0f}\N{NO-BREAK SPACE}%)"
             for member, value in zip(characteristics, setting.tolist(), strict=True) if value != member.original]
 
 
-def number(value: float) -> str:
-    """A number with four significant digits; a number from 10,000 on with all digits before the point."""
+def format_number(value: float) -> str:
+    """A number with four significant digits; from 10,000 on, with all digits before the point."""
     return f"{value:.0f}" if 1e4 <= abs(value) < 1e15 else f"{value:.4g}"
 
 
-def spaced(unit: str) -> str:
-    """A unit to follow a number, with raised powers; empty for a pure number."""
-    return "" if unit == "-" else " " + raised(unit)
+def quantity_text(value: float, unit: str) -> str:
+    """A number with its unit, whose powers are raised; a pure number has no unit."""
+    return format_number(value) + ("" if unit == "-" else " " + superscript_powers(unit))
 
 
-def raised(text: str) -> str:
-    """A text with raised powers in its units: m/s² for m/s^2."""
+def superscript_powers(text: str) -> str:
+    """Raise the powers of a text's units: m/s² for m/s^2."""
     return text.replace("^2", "²").replace("^3", "³")
 
 
@@ -158,10 +158,10 @@ def compare_setting(study: Study, system: System, setting: FloatArray) -> Compar
     original = system.characteristics.original
     settings = np.stack([original]) if np.array_equal(original, setting) else np.stack([original, setting])
     worst_system = system_at_worst_point(system, settings)
-    names = [f" ({point.name})" for point in system.matrix
-             if (point.scenario, point.weather) == (worst_system.scenario, worst_system.weather)]
-    recording = film(worst_system, settings)
-    return Comparison(title=study.title + "".join(names[:1]), characteristics=system.characteristics,
+    point_names = [f" ({point.name})" for point in system.matrix
+                   if (point.scenario, point.weather) == (worst_system.scenario, worst_system.weather)]
+    recording = record_film(worst_system, settings)
+    return Comparison(title=study.title + "".join(point_names[:1]), characteristics=system.characteristics,
                       ttc_threshold=system.metrics.ttc_threshold, network=stage_network(worst_system.scenario).folder,
                       evaluations=score(worst_system, settings, recording.runs),
                       film=replace(recording, runs=_with_pedals_before_impacts(recording.runs)),
@@ -169,7 +169,7 @@ def compare_setting(study: Study, system: System, setting: FloatArray) -> Compar
 
 
 def _further_objectives(measuring: Measuring) -> tuple[MetricFacts, ...]:
-    """Objectives of one run besides the paper's; without the points of a rating, which belong to all cells together."""
+    """Objectives of one run besides the paper's; the points of a rating are none, as they belong to all cells together."""
     objectives = {objective.name for objective in measuring.scoring.objectives}
     return tuple(metric for metric in measuring.scoring.metrics if metric.name in objectives - {*METRICS, RATING_POINTS.name})
 
@@ -179,16 +179,17 @@ def _with_pedals_before_impacts(runs: SimulationRuns) -> SimulationRuns:
     trace = runs.trace
     throttle, brake = trace.throttle.copy(), trace.brake.copy()
     for row in np.flatnonzero(~np.isnan(runs.collision_speed)).tolist():
-        end = moments(runs, row).end
+        end = find_moments(runs, row).end
         for pedal in (throttle, brake):
             pedal[end, row] = pedal[max(end - 1, 0), row]
     return replace(runs, trace=replace(trace, throttle=throttle, brake=brake))
 
 
-def differences(replayed: Evaluations, recorded: Mapping[str, Any]) -> list[str]:
-    """The differences of a replay of one setting from its row of solutions.csv, with both values."""
-    problems = [f"{name} is {recorded[name]:.6g} there and {replayed.metrics[name][0]:.6g} here" for name in replayed.metrics
-            if name in recorded and not np.array_equal(float(recorded[name]), float(replayed.metrics[name][0]), equal_nan=True)]
+def list_differences(replayed: Evaluations, recorded: Mapping[str, Any]) -> list[str]:
+    """List where the replay of a solution differs from its row of solutions.csv, with both values."""
+    differing_metrics = [
+        f"{name} is {recorded[name]:.6g} there and {values[0]:.6g} here" for name, values in replayed.metrics.items()
+        if name in recorded and not np.array_equal(float(recorded[name]), float(values[0]), equal_nan=True)]
     if recorded["outcome"] not in (replayed.outcome[0], UNKNOWN):
-        problems.insert(0, f"the outcome is {recorded['outcome']} there and {replayed.outcome[0]} here")
-    return problems
+        return [f"the outcome is {recorded['outcome']} there and {replayed.outcome[0]} here", *differing_metrics]
+    return differing_metrics

@@ -10,7 +10,7 @@ import numpy as np
 
 from safevar_sumo.metrics import time_to_collision
 from safevar_sumo.records import STANDSTILL, FloatArray, SimulationRuns
-from safevar_sumo.replay.comparison import CHANGED, ORIGINAL, Comparison, divergence, moments
+from safevar_sumo.replay.comparison import CHANGED, ORIGINAL, Comparison, find_divergence, find_moments
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -19,29 +19,29 @@ if TYPE_CHECKING:
 COLOURS = {ORIGINAL: "#0072b2", CHANGED: "#d55e00"}
 """Okabe and Ito's blue and vermillion."""
 DASHES: Mapping[int, Literal["-", "--"]] = {ORIGINAL: "-", CHANGED: "--"}
-BRAKING, NEAREST, IMPACT = "v", "o", "X"
+BRAKING_MARK, NEAREST_MARK, IMPACT_MARK = "v", "o", "X"
 MAX_TTC = 6.0
 """Largest time to collision that is drawn [s]."""
-FONT = 9
+FONT_SIZE = 9
 LINE_LENGTH = 118
 """Length of a line of the heading [characters]."""
 
 
 def draw_comparison(comparison: Comparison) -> Figure:
-    """Draw a comparison; the figure belongs to no window."""
+    """Draw a comparison as a figure outside any window."""
     import matplotlib.style
     from matplotlib.figure import Figure
     from matplotlib.layout_engine import ConstrainedLayoutEngine
 
-    with matplotlib.style.context(["seaborn-v0_8-whitegrid", {"font.size": FONT, "axes.labelsize": FONT}]):
+    with matplotlib.style.context(["seaborn-v0_8-whitegrid", {"font.size": FONT_SIZE, "axes.labelsize": FONT_SIZE}]):
         figure = Figure(figsize=(9.6, 6.2), layout=ConstrainedLayoutEngine(h_pad=0.06, w_pad=0.08))
         axes = figure.subplots(2, 2, sharex=True).ravel()
     ttc = time_to_collision(comparison.film.runs)
     for row in comparison.rows:
-        _speed(axes[0], comparison, row)
-        _gap(axes[1], comparison, row)
-        _pedals(axes[2], comparison, row)
-        _line(axes[3], comparison, row, np.where(ttc[:, row] <= MAX_TTC, ttc[:, row], np.nan))
+        _draw_speed(axes[0], comparison, row)
+        _draw_gap(axes[1], comparison, row)
+        _draw_pedals(axes[2], comparison, row)
+        _draw_line(axes[3], comparison, row, np.where(ttc[:, row] <= MAX_TTC, ttc[:, row], np.nan))
     axes[0].set_ylabel("speed [m/s]")
     axes[1].set_ylabel("gap to the obstacle [m]")
     axes[2].set_ylabel("brake     |     throttle")
@@ -58,29 +58,30 @@ def draw_comparison(comparison: Comparison) -> Figure:
         axis.set_xlabel("time [s]")
     if len(comparison.rows) > 1:
         _mark_divergence(axes, comparison)
-    _heading(figure, comparison)
-    _legend(figure, comparison)
+    _draw_heading(figure, comparison)
+    _draw_legend(figure, comparison)
     return figure
 
 
 def _end_time(comparison: Comparison) -> float:
-    """Time at which the last vehicle is nearest or comes to rest [s]."""
+    """The later of the times at which the vehicles are nearest and at rest [s]."""
     runs = comparison.film.runs
-    ends = [sample for row in comparison.rows for sample in (moments(runs, row).nearest, _last_motion(runs, row)) if sample is not None]
-    return float(runs.trace.time[min(max(ends) + 1, len(runs.trace.time) - 1)])
+    samples = [sample for row in comparison.rows for sample in (find_moments(runs, row).nearest, _last_moving_sample(runs, row))]
+    last_sample = max(sample for sample in samples if sample is not None)
+    return float(runs.trace.time[min(last_sample + 1, len(runs.trace.time) - 1)])
 
 
-def _last_motion(runs: SimulationRuns, row: int) -> int:
+def _last_moving_sample(runs: SimulationRuns, row: int) -> int:
     """The last sample of a run in which the vehicle moves; 0 if it never moves."""
     return int(np.flatnonzero(runs.trace.active[:, row] & (runs.trace.speed[:, row] > STANDSTILL)).max(initial=0))
 
 
-def _legend(figure: Figure, comparison: Comparison) -> None:
+def _draw_legend(figure: Figure, comparison: Comparison) -> None:
     """Draw the legend: vehicles and marks."""
     from matplotlib.lines import Line2D
 
     has_impact = bool(np.isfinite(comparison.film.runs.collision_speed).any())
-    marks = {"begins to brake": BRAKING, "nearest": NEAREST, **({"impact": IMPACT} if has_impact else {})}
+    marks = {"begins to brake": BRAKING_MARK, "nearest": NEAREST_MARK, **({"impact": IMPACT_MARK} if has_impact else {})}
     entries = [Line2D([], [], color=COLOURS[row], linestyle=DASHES[row], label=f"{comparison.name(row)} vehicle: {comparison.verdict(row)}")
                for row in comparison.rows]
     entries += [Line2D([], [], color="0.35", marker=mark, linestyle="", markersize=7, label=label) for label, mark in marks.items()]
@@ -90,62 +91,62 @@ def _legend(figure: Figure, comparison: Comparison) -> None:
     figure.legend(entries, [str(entry.get_label()) for entry in entries], loc="outside lower center", ncols=3, frameon=False)
 
 
-def _line(axis: Axes, comparison: Comparison, row: int, values: FloatArray) -> None:
+def _draw_line(axis: Axes, comparison: Comparison, row: int, values: FloatArray) -> None:
     """Draw a quantity of one run until its end."""
-    end = moments(comparison.film.runs, row).end + 1
+    end = find_moments(comparison.film.runs, row).end + 1
     time = comparison.film.runs.trace.time[:end]
     axis.plot(time, values[:end], color=COLOURS[row], linestyle=DASHES[row], linewidth=1.6, zorder=3 + row)
 
 
-def _mark(axis: Axes, row: int, point: tuple[float, float], mark: str, text: str = "", *, is_speed: bool = False) -> None:
-    """Draw a mark on a line; the original's mark is larger, so that it shows below the changed vehicle's mark, and has its text above."""
-    axis.plot(*point, marker=mark, color=COLOURS[row], markersize=12 - 4 * row + 2 * (mark == IMPACT), linestyle="", zorder=6 + row,
+def _draw_mark(axis: Axes, row: int, point: tuple[float, float], mark: str, text: str = "", *, is_speed: bool = False) -> None:
+    """Draw a mark on a line. The original's mark is larger, to show behind the changed vehicle's mark; its text is above it."""
+    axis.plot(*point, marker=mark, color=COLOURS[row], markersize=12 - 4 * row + 2 * (mark == IMPACT_MARK), linestyle="", zorder=6 + row,
               markeredgecolor="white")
-    offset, side = ((3, 7), "left") if is_speed else ((0, 9 if row == ORIGINAL else -17), "center")
-    axis.annotate(text, point, xytext=offset, textcoords="offset points", color=COLOURS[row], fontweight="bold", ha=side)
+    offset, alignment = ((3, 7), "left") if is_speed else ((0, 9 if row == ORIGINAL else -17), "center")
+    axis.annotate(text, point, xytext=offset, textcoords="offset points", color=COLOURS[row], fontweight="bold", ha=alignment)
 
 
-def _speed(axis: Axes, comparison: Comparison, row: int) -> None:
-    trace, key_moments = comparison.film.runs.trace, moments(comparison.film.runs, row)
-    _line(axis, comparison, row, trace.speed[:, row])
+def _draw_speed(axis: Axes, comparison: Comparison, row: int) -> None:
+    trace, key_moments = comparison.film.runs.trace, find_moments(comparison.film.runs, row)
+    _draw_line(axis, comparison, row, trace.speed[:, row])
     if key_moments.brake is not None:
-        _mark(axis, row, (trace.time[key_moments.brake], trace.speed[key_moments.brake, row]), BRAKING)
+        _draw_mark(axis, row, (trace.time[key_moments.brake], trace.speed[key_moments.brake, row]), BRAKING_MARK)
     impact_speed = float(comparison.film.runs.collision_speed[row])
     if not np.isnan(impact_speed):
-        _mark(axis, row, (trace.time[key_moments.end], impact_speed), IMPACT, f"{impact_speed:.1f} m/s", is_speed=True)
+        _draw_mark(axis, row, (trace.time[key_moments.end], impact_speed), IMPACT_MARK, f"{impact_speed:.1f} m/s", is_speed=True)
 
 
-def _gap(axis: Axes, comparison: Comparison, row: int) -> None:
+def _draw_gap(axis: Axes, comparison: Comparison, row: int) -> None:
     runs = comparison.film.runs
-    gap, key_moments = np.where(np.isfinite(runs.trace.gap[:, row]), runs.trace.gap[:, row], np.nan), moments(runs, row)
-    _line(axis, comparison, row, gap)
+    gap, key_moments = np.where(np.isfinite(runs.trace.gap[:, row]), runs.trace.gap[:, row], np.nan), find_moments(runs, row)
+    _draw_line(axis, comparison, row, gap)
     if key_moments.nearest is not None and not np.isnan(gap[key_moments.nearest]):
-        has_impact = not np.isnan(runs.collision_speed[row])
-        text = "impact" if has_impact else f"{gap[key_moments.nearest]:.2f} m"
-        _mark(axis, row, (runs.trace.time[key_moments.nearest], gap[key_moments.nearest]), IMPACT if has_impact else NEAREST, text)
+        gap_text = f"{gap[key_moments.nearest]:.2f} m"
+        mark, text = (NEAREST_MARK, gap_text) if np.isnan(runs.collision_speed[row]) else (IMPACT_MARK, "impact")
+        _draw_mark(axis, row, (runs.trace.time[key_moments.nearest], gap[key_moments.nearest]), mark, text)
 
 
-def _pedals(axis: Axes, comparison: Comparison, row: int) -> None:
+def _draw_pedals(axis: Axes, comparison: Comparison, row: int) -> None:
     trace = comparison.film.runs.trace
-    _line(axis, comparison, row, trace.throttle[:, row] - trace.brake[:, row])
+    _draw_line(axis, comparison, row, trace.throttle[:, row] - trace.brake[:, row])
 
 
 def _mark_divergence(axes: np.ndarray, comparison: Comparison) -> None:
-    sample = divergence(comparison.film.runs)
+    sample = find_divergence(comparison.film.runs)
     if sample is not None:
         for axis in axes:
             axis.axvline(comparison.film.runs.trace.time[sample], color="0.35", linewidth=0.9, linestyle="-.", zorder=1)
 
 
-def _heading(figure: Figure, comparison: Comparison) -> None:
+def _draw_heading(figure: Figure, comparison: Comparison) -> None:
     """Draw the study's title and, below it, the changes; lines break only between changes."""
     lines = textwrap.wrap(comparison.title, LINE_LENGTH)
     line = "changed:" if comparison.changes else "the original vehicle"
-    for i, change in enumerate(comparison.changes):
-        part = f" {change}{',' if i < len(comparison.changes) - 1 else ''}"
-        if len(line) + len(part) > LINE_LENGTH:
+    for index, change in enumerate(comparison.changes):
+        text = f" {change}{',' if index < len(comparison.changes) - 1 else ''}"
+        if len(line) + len(text) > LINE_LENGTH:
             lines.append(line)
-            line = part.strip()
+            line = text.strip()
         else:
-            line += part
-    figure.suptitle("\n".join([*lines, line]).replace("$", r"\$"), fontsize=FONT + 1)
+            line += text
+    figure.suptitle("\n".join([*lines, line]).replace("$", r"\$"), fontsize=FONT_SIZE + 1)

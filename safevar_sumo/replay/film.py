@@ -61,7 +61,7 @@ class Film:
         return np.asarray(len(active) - 1 - np.argmax(active[::-1], axis=0))
 
 
-def film(system: System, settings: FloatArray) -> Film:
+def record_film(system: System, settings: FloatArray) -> Film:
     """Simulate N settings of n characteristics, shape (N, n), and record the positions of all actors.
 
     In a matrix all settings are simulated at the worst point of the last setting.
@@ -73,30 +73,30 @@ def film(system: System, settings: FloatArray) -> Film:
     """
     camera, system = _Camera(len(settings)), system_at_worst_point(system, settings)
     runs = simulate(system, settings, watch=camera.record)
-    return Film(runs=runs, tracks=camera.tracks(), road=road_of(stage_network(system.scenario).folder))
+    return Film(runs=runs, tracks=camera.tracks(), road=read_road(stage_network(system.scenario).folder))
 
 
 class _Camera:
-    """Records the position of every actor in N copies at every sample."""
+    """Records the position of every actor in all copies at every sample."""
 
-    def __init__(self, n: int) -> None:
-        self._n = n
+    def __init__(self, copy_count: int) -> None:
+        self._copy_count = copy_count
         self._frames: list[dict[str, tuple[float, float, float]]] = []
-        self._measures: dict[str, tuple[bool, float, float]] = {}
+        self._sizes: dict[str, tuple[bool, float, float]] = {}
 
     def record(self, world: SumoWorld) -> None:
         frame = world.actor_poses()
-        for name in frame.keys() - self._measures.keys():
-            self._measures[name] = world.actor_size(name)
+        for name in frame.keys() - self._sizes.keys():
+            self._sizes[name] = world.actor_size(name)
         self._frames.append(frame)
 
     def tracks(self) -> dict[str, ActorTrack]:
         """The recorded tracks, in alphabetical order."""
         by_name: dict[str, ActorTrack] = {}
-        for actor in sorted(self._measures):
+        for actor in sorted(self._sizes):
             copy, name = copy_and_name(actor)
             if name not in by_name:
-                by_name[name] = ActorTrack(*self._measures[actor], *(np.full((len(self._frames), self._n), np.nan) for _ in range(3)))
+                by_name[name] = ActorTrack(*self._sizes[actor], *(np.full((len(self._frames), self._copy_count), np.nan) for _ in range(3)))
             for sample, frame in enumerate(self._frames):
                 if actor in frame:
                     for array, value in zip(by_name[name][3:], frame[actor], strict=True):
@@ -104,8 +104,8 @@ class _Camera:
         return by_name
 
 
-def road_of(network: str) -> tuple[LaneLine, ...]:
-    """The lanes of one copy of a network, as netconvert built it."""
+def read_road(network: str) -> tuple[LaneLine, ...]:
+    """Read the lanes of one copy of a network, as netconvert built it."""
     root = ElementTree.parse(built_network(network)).getroot()
     return tuple(_lane(edge.get("function", ""), lane) for edge in root.iter("edge") for lane in edge.iter("lane"))
 

@@ -8,19 +8,19 @@ from pathlib import Path
 
 import numpy as np
 
-from safevar_sumo.replay.animation import OTHER_ACTOR, PERSON, VEHICLES, quad, stripes
+from safevar_sumo.replay.animation import ACTOR_COLOUR, PERSON_COLOUR, VEHICLE_COLOURS, crossing_stripes, strip_corners
 from safevar_sumo.replay.comparison import CHANGED, ORIGINAL, Comparison
 from safevar_sumo.replay.film import LaneLine
-from safevar_sumo.replay.scene import FlatScene, flat_scene_of
+from safevar_sumo.replay.scene import FlatScene, lay_out_scene
 from safevar_sumo.replay.window import ActorPose, Colour, Window, open_window
 from safevar_sumo.scenarios import VUT
 
 COLOUR_NAMES = {ORIGINAL: "blue", CHANGED: "orange"}
 PAUSE = 2.0
 """Pause at the nearest moment and at the end [s]."""
-SPACE = 5.0
+ROAD_SPACING = 5.0
 """Space between the two roads [m]."""
-ROAD, PATH, WHITE = (154, 161, 169, 255), (207, 211, 207, 255), (255, 255, 255, 255)
+ROAD_COLOUR, PATH_COLOUR, WHITE = (154, 161, 169, 255), (207, 211, 207, 255), (255, 255, 255, 255)
 LEGEND_HEIGHT = 1.8
 """Height of the legend above the lower edge of the view [m]."""
 
@@ -45,18 +45,18 @@ def show_in_gui(comparison: Comparison, network: str | None = None, *, slower: f
     InputError, SimulationError
         If `replay.window.open_window` raises it.
     """
-    scene = flat_scene_of(comparison)
+    scene = lay_out_scene(comparison)
     layout = _Layout(scene)
     with open_window(network or comparison.network, scene.step) as window:
         for row in comparison.rows:
-            _add_row(window, scene, row, layout)
+            _add_road_and_actors(window, scene, row, layout)
         pauses = {moments.nearest for moments in scene.moments if moments.nearest is not None} | {scene.length - 1}
         start = time.monotonic()
         for sample in range(scene.length):
-            _show(window, scene, sample, layout)
+            _show_sample(window, scene, sample, layout)
             if sample in pauses:
                 if pictures is not None:
-                    window.picture(pictures / f"{sample:04d}.png")
+                    window.save_picture(pictures / f"{sample:04d}.png")
                 time.sleep(rest)
                 start += rest
             time.sleep(max(0.0, start + (sample + 1) * scene.step * slower - time.monotonic()))
@@ -66,29 +66,30 @@ class _Layout:
     """Positions of the roads in the window: the changed vehicle's road lies below the original's road by the height of the view."""
 
     def __init__(self, scene: FlatScene) -> None:
-        self._road_distance = scene.view.height + SPACE
+        self._road_distance = scene.view.height + ROAD_SPACING
         track = scene.comparison.film.tracks[VUT]
         heading = np.deg2rad(90 - track.angle[0, 0])
-        self._side = np.array([np.sin(heading), -np.cos(heading)])
+        self._rightward = np.array([np.sin(heading), -np.cos(heading)])
 
     def offset(self, row: int) -> np.ndarray:
         """Offset of a row's road, shape (2,) [m]."""
-        return self._side * self._road_distance * (row == CHANGED)
+        return self._rightward * self._road_distance * (row == CHANGED)
 
 
-def _add_row(window: Window, scene: FlatScene, row: int, layout: _Layout) -> None:
-    """Add the road of a row, if SUMO does not draw it, and its actors."""
+def _add_road_and_actors(window: Window, scene: FlatScene, row: int, layout: _Layout) -> None:
+    """Add the actors of a row, and the changed vehicle's road: SUMO draws only the original's road."""
     film = scene.comparison.film
     if row == CHANGED:
         for i, lane in enumerate(film.road):
-            for j, points in enumerate(_areas(lane)):
-                window.paint(f"road.{i}.{j}", _points(points + layout.offset(row)), _colour_of(lane), 2 if lane.kind == "crossing" else 0)
+            for j, points in enumerate(_lane_outlines(lane)):
+                outline = _point_pairs(points + layout.offset(row))
+                window.paint(f"road.{i}.{j}", outline, _colour_of(lane), layer=2 if lane.kind == "crossing" else 0)
     for name, track in film.tracks.items():
-        colour = _rgba(VEHICLES[row] if name == VUT else PERSON if track.is_person else OTHER_ACTOR)
-        window.add(_id(row, name), track.is_person, track.length, track.width, colour)
+        colour = _rgba(VEHICLE_COLOURS[row] if name == VUT else PERSON_COLOUR if track.is_person else ACTOR_COLOUR)
+        window.add(_actor_id(row, name), track.is_person, track.length, track.width, colour)
 
 
-def _show(window: Window, scene: FlatScene, sample: int, layout: _Layout) -> None:
+def _show_sample(window: Window, scene: FlatScene, sample: int, layout: _Layout) -> None:
     """Show one sample: the camera, the actors' poses, the legend."""
     comparison, poses = scene.comparison, []
     film = comparison.film
@@ -100,20 +101,20 @@ def _show(window: Window, scene: FlatScene, sample: int, layout: _Layout) -> Non
             if not np.isnan(x):
                 brakes = name == VUT and bool(film.runs.trace.brake[run_sample, row] > 0)
                 angle = float(track.angle[run_sample, row])
-                poses.append(ActorPose(_id(row, name), x + float(offset[0]), y + float(offset[1]), angle, brakes))
-        frame = _frame(scene, sample) + offset
-        corners.append(frame)
-        words = f"{comparison.name(row)} ({COLOUR_NAMES[row]}): {film.runs.trace.speed[run_sample, row]:.1f} m/s"
+                poses.append(ActorPose(_actor_id(row, name), x + float(offset[0]), y + float(offset[1]), angle, brakes))
+        view_corners = _view_corners(scene, sample) + offset
+        corners.append(view_corners)
+        legend = f"{comparison.name(row)} ({COLOUR_NAMES[row]}): {film.runs.trace.speed[run_sample, row]:.1f} m/s"
         is_finished = sample >= (scene.moments[row].end if scene.moments[row].nearest is None else int(scene.moments[row].nearest or 0))
-        middle = frame.mean(axis=0)
-        window.write(f"legend.{row}", float(middle[0]), float(frame[:, 1].min()) + LEGEND_HEIGHT,
-                     f"{words}, {comparison.verdict(row)}" if is_finished else f"{words}, {sample * scene.step:.2f} s")
+        middle = view_corners.mean(axis=0)
+        window.write(f"legend.{row}", float(middle[0]), float(view_corners[:, 1].min()) + LEGEND_HEIGHT,
+                     f"{legend}, {comparison.verdict(row)}" if is_finished else f"{legend}, {sample * scene.step:.2f} s")
     all_corners = np.concatenate(corners)
-    window.look(*(float(value) for value in (*all_corners.min(axis=0), *all_corners.max(axis=0))))
+    window.set_view(*(float(value) for value in (*all_corners.min(axis=0), *all_corners.max(axis=0))))
     window.show(poses)
 
 
-def _frame(scene: FlatScene, sample: int) -> np.ndarray:
+def _view_corners(scene: FlatScene, sample: int) -> np.ndarray:
     """The corners of a scene's view, in the film's plane; shape (4, 2)."""
     view, track = scene.view, scene.comparison.film.tracks[VUT]
     heading = np.deg2rad(90 - track.angle[0, 0])
@@ -123,19 +124,19 @@ def _frame(scene: FlatScene, sample: int) -> np.ndarray:
                      for y in (view.bottom, view.bottom + view.height)])
 
 
-def _areas(lane: LaneLine) -> Sequence[np.ndarray]:
+def _lane_outlines(lane: LaneLine) -> Sequence[np.ndarray]:
     if lane.kind == "area":
         return [lane.line]
     if lane.kind == "crossing":
-        return list(stripes(lane))
-    return [quad(start, end, lane.width - 0.1) for start, end in zip(lane.line[:-1], lane.line[1:], strict=True)]
+        return list(crossing_stripes(lane))
+    return [strip_corners(start, end, lane.width - 0.1) for start, end in zip(lane.line[:-1], lane.line[1:], strict=True)]
 
 
 def _colour_of(lane: LaneLine) -> Colour:
-    return {"road": ROAD, "crossing": WHITE}.get(lane.kind, PATH)
+    return {"road": ROAD_COLOUR, "crossing": WHITE}.get(lane.kind, PATH_COLOUR)
 
 
-def _points(points: np.ndarray) -> list[tuple[float, float]]:
+def _point_pairs(points: np.ndarray) -> list[tuple[float, float]]:
     return [(float(x), float(y)) for x, y in points]
 
 
@@ -144,7 +145,7 @@ def _rgba(colour: str) -> Colour:
     return red, green, blue, 255
 
 
-def _id(row: int, name: str) -> str:
+def _actor_id(row: int, name: str) -> str:
     return f"{'original' if row == ORIGINAL else 'changed'}.{name}"
 
 

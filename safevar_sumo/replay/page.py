@@ -15,65 +15,65 @@ from safevar_sumo.replay.scene import MARK_DISTANCE, SEAM_WIDTH, FlatBody, FlatS
 if TYPE_CHECKING:
     from jinja2 import Environment
 
-WEB = Path(__file__).parent / "web"
-TEXT_HEIGHTS = 65
+PLAYER_FOLDER = Path(__file__).parent / "web"
+WIDTH_IN_TEXT_HEIGHTS = 65
 """Width of a scene [heights of its text]."""
 DECIMALS = 2
 """Decimals of a position [m]; a heading has one decimal [degrees]."""
 
 
 @cache
-def player_parts() -> dict[str, str]:
+def player_files() -> dict[str, str]:
     """The style sheet and the script of the player, to include in a page."""
     from markupsafe import Markup
 
-    return {name: Markup((WEB / f"player.{name}").read_text(encoding="utf-8")) for name in ("css", "js")}
+    return {name: Markup((PLAYER_FOLDER / f"player.{name}").read_text(encoding="utf-8")) for name in ("css", "js")}
 
 
-def environment(*folders: Path) -> Environment:
-    """The environment of these folders' templates and the player's, which escape all values."""
+def template_environment(*folders: Path) -> Environment:
+    """The jinja2 environment for templates in these folders and for the player; it escapes all values."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
-    return Environment(loader=FileSystemLoader([*folders, WEB]), autoescape=True, undefined=StrictUndefined, trim_blocks=True,
+    return Environment(loader=FileSystemLoader([*folders, PLAYER_FOLDER]), autoescape=True, undefined=StrictUndefined, trim_blocks=True,
                        lstrip_blocks=True)
 
 
 def animation_page(scene: FlatScene) -> str:
     """A self-contained page that shows one scene."""
-    template = environment().get_template("animation.html.j2")
+    template = template_environment().get_template("animation.html.j2")
     comparison = scene.comparison
-    return template.render(title=comparison.title, changes=comparison.changes, data=player_data(scene), **player_parts())
+    return template.render(title=comparison.title, changes=comparison.changes, data=player_data(scene), **player_files())
 
 
 def player_data(scene: FlatScene) -> dict[str, Any]:
     """The data of the template `player`: the still picture, and under `played` the data of the script. y points down."""
     view, key_sample = scene.view, scene.key_sample
-    runs = [_drive(scene, row) for row in scene.comparison.rows]
+    drives = [_drive_data(scene, row) for row in scene.comparison.rows]
     bodies = sorted(scene.bodies, key=lambda body: (body.is_vut, body.row))
-    left_ends = _numbers(view.left_ends)
+    left_ends = _rounded_or_constant(view.left_ends)
     box = {"left": left_ends, "top": round(-view.bottom - view.height, DECIMALS), "width": round(view.width, DECIMALS),
            "height": round(view.height, DECIMALS)}
-    common_data = {"step": scene.step, "length": scene.length, "key": key_sample, "view": box, "drives": runs}
+    common_data = {"step": scene.step, "length": scene.length, "key": key_sample, "view": box, "drives": drives}
     return {
         **common_data,
-        "description": _description(scene), "moments": _moments(scene), "bottom": round(-view.bottom, DECIMALS),
-        "letters": round(view.width / TEXT_HEIGHTS, DECIMALS),
-        "road": [_lane(lane) for kind in ("area", "path", "road", "crossing") for lane in scene.road if lane.kind == kind],
+        "description": _describe_scene(scene), "moments": _list_jumps(scene), "bottom": round(-view.bottom, DECIMALS),
+        "letters": round(view.width / WIDTH_IN_TEXT_HEIGHTS, DECIMALS),
+        "road": [_lane_data(lane) for kind in ("area", "path", "road", "crossing") for lane in scene.road if lane.kind == kind],
         "ticks": list(range(int(np.floor(view.left_ends.min() / MARK_DISTANCE)) * MARK_DISTANCE,
                             int(view.left_ends.max() + view.width) + MARK_DISTANCE, MARK_DISTANCE)),
-        "bodies": [_still_body(body, scene) for body in bodies],
-        "played": {**common_data, "bodies": [_moving_body(body) for body in bodies]}}
+        "bodies": [_still_body_data(body, scene) for body in bodies],
+        "played": {**common_data, "bodies": [_moving_body_data(body) for body in bodies]}}
 
 
-def _description(scene: FlatScene) -> str:
-    """The picture in words."""
+def _describe_scene(scene: FlatScene) -> str:
+    """Describe the still picture in words."""
     comparison = scene.comparison
     vehicles = " and ".join(f"the {comparison.name(row)} vehicle, which {comparison.verdict(row)}" for row in comparison.rows)
     return f"Seen from above after {scene.key_sample * scene.step:.2f} s: {vehicles}"
 
 
-def _moments(scene: FlatScene) -> list[dict[str, Any]]:
-    """Moments that the player's buttons jump to."""
+def _list_jumps(scene: FlatScene) -> list[dict[str, Any]]:
+    """The moments that the player's buttons jump to, in order of time."""
     jumps = []
     for row, moments in enumerate(scene.moments):
         name = scene.comparison.name(row)
@@ -85,7 +85,7 @@ def _moments(scene: FlatScene) -> list[dict[str, Any]]:
     return sorted(jumps, key=lambda moment: moment["sample"])
 
 
-def _drive(scene: FlatScene, row: int) -> dict[str, Any]:
+def _drive_data(scene: FlatScene, row: int) -> dict[str, Any]:
     trace, moments = scene.comparison.film.runs.trace, scene.moments[row]
     samples = slice(0, moments.end + 1)
     return {"name": scene.comparison.name(row), "verdict": scene.comparison.verdict(row), "end": moments.end,
@@ -93,17 +93,18 @@ def _drive(scene: FlatScene, row: int) -> dict[str, Any]:
             "gap": _rounded_list(trace.gap[samples, row]), "brakes": (trace.brake[samples, row] > 0).astype(int).tolist()}
 
 
-def _lane(lane: Any) -> dict[str, Any]:
+def _lane_data(lane: Any) -> dict[str, Any]:
     return {"kind": lane.kind, "width": round(lane.width, 3), "inside": round(lane.width - SEAM_WIDTH, 3),
             "points": " ".join(f"{x:.2f},{-y:.2f}" for x, y in lane.line.tolist())}
 
 
-def _moving_body(body: FlatBody) -> dict[str, Any]:
+def _moving_body_data(body: FlatBody) -> dict[str, Any]:
     degrees = -np.rad2deg(np.unwrap(body.heading)) if np.isfinite(body.heading).all() else -np.rad2deg(body.heading)
-    return {"drive": body.row if body.is_vut else None, "x": _numbers(body.x), "y": _numbers(-body.y), "heading": _numbers(degrees, 1)}
+    return {"drive": body.row if body.is_vut else None, "x": _rounded_or_constant(body.x), "y": _rounded_or_constant(-body.y),
+            "heading": _rounded_or_constant(degrees, 1)}
 
 
-def _still_body(body: FlatBody, scene: FlatScene) -> dict[str, Any]:
+def _still_body_data(body: FlatBody, scene: FlatScene) -> dict[str, Any]:
     """One body at the key sample."""
     key_sample = scene.key_sample
     x, y, heading = (_rounded_list(values[key_sample:key_sample + 1])[0] for values in (body.x, -body.y, -np.rad2deg(body.heading)))
@@ -120,7 +121,7 @@ def _rounded_list(values: FloatArray, decimals: int = DECIMALS) -> list[float | 
     return [round(value, decimals) + 0.0 if np.isfinite(value) else None for value in values.tolist()]
 
 
-def _numbers(values: FloatArray, decimals: int = DECIMALS) -> list[float | None] | float | None:
+def _rounded_or_constant(values: FloatArray, decimals: int = DECIMALS) -> list[float | None] | float | None:
     """Rounded numbers, or a single number if all are equal."""
     numbers = _rounded_list(values, decimals)
     return numbers[0] if len(set(numbers)) == 1 else numbers

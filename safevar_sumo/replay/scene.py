@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from safevar_sumo.records import FloatArray
-from safevar_sumo.replay.comparison import CHANGED, Comparison, Moments, moments
+from safevar_sumo.replay.comparison import CHANGED, Comparison, Moments, find_moments
 from safevar_sumo.replay.film import ActorTrack, Film, LaneLine
 from safevar_sumo.scenarios import VUT
 
@@ -47,9 +47,9 @@ class FlatBody(NamedTuple):
     def corners(self, sample: int) -> FloatArray:
         """The outline of a vehicle, shape (4, 2): front left, front right, rear right, rear left."""
         direction = np.array([np.cos(self.heading[sample]), np.sin(self.heading[sample])])
-        side, front = np.array([-direction[1], direction[0]]) * self.width / 2, np.array([self.x[sample], self.y[sample]])
+        half_width, front = np.array([-direction[1], direction[0]]) * self.width / 2, np.array([self.x[sample], self.y[sample]])
         rear = front - direction * self.length
-        return np.array([front + side, front - side, rear - side, rear + side])
+        return np.array([front + half_width, front - half_width, rear - half_width, rear + half_width])
 
 
 class View(NamedTuple):
@@ -85,27 +85,28 @@ class FlatScene:
         return list(range(math.ceil(left / MARK_DISTANCE) * MARK_DISTANCE, math.floor(left + self.view.width) + 1, MARK_DISTANCE))
 
 
-def flat_scene_of(comparison: Comparison) -> FlatScene:
-    """Lay a comparison out as a scene."""
+def lay_out_scene(comparison: Comparison) -> FlatScene:
+    """Lay out a comparison for drawing."""
     film = comparison.film
     vut = film.tracks[VUT]
     turn = np.deg2rad(90 - vut.angle[0, 0])
-    to_scene = np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
+    rotation = np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
     start = np.array([vut.x[0, 0], vut.y[0, 0]])
-    all_moments = tuple(moments(film.runs, row) for row in comparison.rows)
+    all_moments = tuple(find_moments(film.runs, row) for row in comparison.rows)
     length = max(run_moments.end for run_moments in all_moments) + 1
-    bodies = tuple(_body(name, track, row, all_moments[row].end, length, to_scene, start, turn)
+    bodies = tuple(_lay_out_body(name, track, row, all_moments[row].end, length, rotation, start, turn)
                    for name, track in film.tracks.items() for row in comparison.rows
                    if name == VUT or (_is_near(film, name, row) and not _is_duplicate(comparison, name, row)))
-    road = tuple(lane._replace(line=(lane.line - start) @ to_scene.T) for lane in film.road)
+    road = tuple(lane._replace(line=(lane.line - start) @ rotation.T) for lane in film.road)
     return FlatScene(comparison=comparison, step=film.runs.trace.step, length=length, road=road, bodies=bodies, moments=all_moments,
-                 view=_view(bodies, length))
+                 view=_choose_view(bodies, length))
 
 
-def _body(name: str, track: ActorTrack, row: int, end: int, length: int, to_scene: FloatArray, start: FloatArray, turn: float) -> FlatBody:
+def _lay_out_body(name: str, track: ActorTrack, row: int, end: int, length: int, rotation: FloatArray, start: FloatArray, turn: float
+                 ) -> FlatBody:
     """An actor until its simulation ends; afterwards the actor stays in place."""
     samples = np.minimum(np.arange(length), end)
-    x, y = to_scene @ (np.stack([track.x[samples, row], track.y[samples, row]]) - start[:, np.newaxis])
+    x, y = rotation @ (np.stack([track.x[samples, row], track.y[samples, row]]) - start[:, np.newaxis])
     return FlatBody(name, row, name == VUT, track.is_person, track.length, track.width, x, y,
                 np.deg2rad(90 - track.angle[samples, row]) - turn)
 
@@ -126,12 +127,12 @@ def _is_duplicate(comparison: Comparison, name: str, row: int) -> bool:
     return _is_near(comparison.film, name, CHANGED) and bool(np.all((offset < MAX_OFFSET) | np.isnan(offset)))
 
 
-def _view(bodies: tuple[FlatBody, ...], length: int) -> View:
+def _choose_view(bodies: tuple[FlatBody, ...], length: int) -> View:
     """The whole road or, in a long scene, the view of a camera that follows the vehicles."""
     left_end = min(float(np.nanmin(body.x)) - body.length for body in bodies) - MARGIN / 2
     right_end = max(float(np.nanmax(body.x)) + (0 if body.is_vut else body.length) for body in bodies) + MARGIN
-    sides = [side for body in bodies for side in (np.nanmin(body.y) - body.width / 2, np.nanmax(body.y) + body.width / 2)]
-    bottom, top = float(min(sides)) - MARGIN / 2, float(max(sides)) + MARGIN / 2
+    edges = [edge for body in bodies for edge in (np.nanmin(body.y) - body.width / 2, np.nanmax(body.y) + body.width / 2)]
+    bottom, top = float(min(edges)) - MARGIN / 2, float(max(edges)) + MARGIN / 2
     padding = max(0.0, MIN_HEIGHT - (top - bottom)) / 2
     if right_end - left_end <= MAX_LENGTH:
         return View(np.full(length, left_end), bottom - padding, right_end - left_end, top - bottom + 2 * padding)

@@ -16,9 +16,9 @@ BRAKE_LIGHT = 8
 """Signal of a vehicle (TraCI, "change vehicle state": bit 3)."""
 ANY_POSITION = 2
 """Value of keepRoute that allows positions beside every road (TraCI, "move to XY")."""
-VIEW = "View #0"
+VIEW_NAME = "View #0"
 TEXT_SIZE = 85
-SETTINGS = """<viewsettings>
+VIEW_SETTINGS = """<viewsettings>
     <scheme name="safevar">
         <opengl antialiase="1" dither="0"/>
         <background backgroundColor="238,240,236" showGrid="0"/>
@@ -36,7 +36,7 @@ SETTINGS = """<viewsettings>
 </viewsettings>
 """
 Colour = tuple[int, int, int, int]
-Points = Sequence[tuple[float, float]]
+Outline = Sequence[tuple[float, float]]
 
 
 class ActorPose(NamedTuple):
@@ -69,21 +69,21 @@ class Window:
         self._api.vehicle.setSpeedMode(name, 0)
         self._api.vehicle.setLaneChangeMode(name, 0)
 
-    def paint(self, name: str, points: Points, colour: Colour, layer: int) -> None:
+    def paint(self, name: str, outline: Outline, colour: Colour, layer: int) -> None:
         """Paint an area."""
-        self._api.polygon.add(name, list(points), colour, fill=True, layer=layer)
+        self._api.polygon.add(name, list(outline), colour, fill=True, layer=layer)
 
     def write(self, name: str, x: float, y: float, words: str) -> None:
-        """Write words at a position; a second call changes words and position."""
+        """Write words at a position; a second call with the same name changes both."""
         if name in self._api.poi.getIDList():
             self._api.poi.setPosition(name, x, y)
         else:
             self._api.poi.add(name, x, y, (0, 0, 0, 0), layer=200)
         self._api.poi.setParameter(name, "words", words)
 
-    def look(self, left: float, bottom: float, right: float, top: float) -> None:
+    def set_view(self, left: float, bottom: float, right: float, top: float) -> None:
         """Show this part of the plane [m]."""
-        self._api.gui.setBoundary(VIEW, left, bottom, right, top)
+        self._api.gui.setBoundary(VIEW_NAME, left, bottom, right, top)
 
     def show(self, poses: Sequence[ActorPose]) -> None:
         """Move all actors to their poses."""
@@ -92,9 +92,9 @@ class Window:
             self._api.vehicle.setSignals(pose.name, BRAKE_LIGHT if pose.brakes else 0)
         self._api.simulationStep()
 
-    def picture(self, path: Path) -> None:
+    def save_picture(self, path: Path) -> None:
         """Write a picture of the window, in the next time step."""
-        self._api.gui.screenshot(VIEW, str(path))
+        self._api.gui.screenshot(VIEW_NAME, str(path))
         self._api.simulationStep()
 
 
@@ -110,11 +110,11 @@ def open_window(network: str, step: float, width: int = 1200, height: int = 700)
         If SUMO cannot load the network, or its window was closed before the end.
     """
     with tempfile.TemporaryDirectory() as folder:
-        settings = Path(folder) / "view.xml"
-        settings.write_text(SETTINGS.format(text_size=TEXT_SIZE), encoding="utf-8")
+        settings_file = Path(folder) / "view.xml"
+        settings_file.write_text(VIEW_SETTINGS.format(text_size=TEXT_SIZE), encoding="utf-8")
         api = engine_api(Engine.GUI)
         command = ["-n", str(copied_network(network, 1).network), "--step-length", repr(step), "--collision.action", "none",
-                   "--gui-settings-file", str(settings), "--start", "true", "--quit-on-end", "true", "--no-step-log", "true",
+                   "--gui-settings-file", str(settings_file), "--start", "true", "--quit-on-end", "true", "--no-step-log", "true",
                    "--no-warnings", "true", "--window-size", f"{width},{height}", "--time-to-teleport", "-1",
                    "--xml-validation", "never", "--xml-validation.net", "never"]
         try:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from safevar_sumo.analysis.subject import Results
 from safevar_sumo.report.page import SECTIONS, make_report
 from safevar_sumo.results import write_whole
-from safevar_sumo.terminal import shown
+from safevar_sumo.terminal import open_progress
 
 if TYPE_CHECKING:
     from safevar_sumo.analysis.evaluator import Progress
@@ -36,7 +36,7 @@ def report(*results: Results | str | Path, out: str | Path | None = None, only: 
     progress
         True for a bar on the terminal, or a function called with the stage, the amount done, and the total amount.
     as_it_is_now
-        If results were computed with other files or versions, simulate with the present ones; the page then says so.
+        If results were computed with other files or versions, simulate with the present ones; the page says so.
 
     Returns
     -------
@@ -54,7 +54,7 @@ def report(*results: Results | str | Path, out: str | Path | None = None, only: 
         If a directory holds no results, there is no such section or point, or the file cannot be written.
     """
     directories = [source.directory if isinstance(source, Results) else source for source in results]
-    with shown(progress) as show_progress:
+    with open_progress(progress) as show_progress:
         page = make_report(directories, only, jobs, show_progress, point=point, as_it_is_now=as_it_is_now)
     if out is not None:
         write_whole(Path(out), page)

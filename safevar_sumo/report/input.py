@@ -1,4 +1,4 @@
-"""The input of a report: results, replays and stored answers of a study; and the table of the points at which a setting fails."""
+"""The input of a report: results, replays and stored answers of a study; the table of the points at which a setting fails."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from safevar_sumo.errors import InputError, SafevarError, warn
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.replay.comparison import Comparison, changes_in_words, compare_setting
 from safevar_sumo.replay.page import player_data
-from safevar_sumo.replay.scene import flat_scene_of
+from safevar_sumo.replay.scene import lay_out_scene
 from safevar_sumo.results import ANSWERS, MANIFEST, RESULTS, SOLUTIONS, choose_handle, handles_of, read_manifest, write_whole
 from safevar_sumo.scenarios import Point
 from safevar_sumo.shipped import PACKAGE
@@ -35,8 +35,8 @@ from safevar_sumo.sumo.matrix import evaluate, evaluations_at_worst_points, simu
 from safevar_sumo.sumo.system import System, assemble
 
 
-class FailingPoints(NamedTuple):
-    """A table of the failing points: a sentence, the heads of the columns, and rows with a name and a cell for each head."""
+class FailingPointsTable(NamedTuple):
+    """The failing points of a matrix: a sentence, the heads of the columns, and rows with a name and a text for each column."""
 
     summary: str
     heads: list[str]
@@ -44,81 +44,71 @@ class FailingPoints(NamedTuple):
 
 
 class ChangeRow(NamedTuple):
-    """A change from the original: both values in a text, and the short and the long description of the characteristic, or empty texts."""
+    """A change: both values in a text, and the characteristic's short name and description, empty if it has none."""
 
     text: str
-    short: str
-    words: str
+    short_name: str
+    description: str
 
 
-SPEED, LOCATION = "speed", "impact_location"
-AVOIDED, FAILS = "–", "fails"  # noqa: RUF001
+SPEED_DIMENSION, LOCATION_DIMENSION = "speed", "impact_location"
+AVOIDED_TEXT, FAILURE_TEXT = "–", "fails"  # noqa: RUF001
 
 
-def failing_table(matrix: Sequence[Point], failing: Collection[str]) -> FailingPoints:
-    """Make a table of the failing points: a row for each test and weather, a column for each speed, impact locations in the cells.
+def tabulate_failing_points(matrix: Sequence[Point], failing: Collection[str]) -> FailingPointsTable:
+    """Make a table of the points whose names are in `failing`: rows for tests and weathers, columns for speeds.
 
-    Parameters
-    ----------
-    matrix
-        All points of the matrix.
-    failing
-        Names of the failing points.
-
-    Returns
-    -------
-    FailingPoints
-        Cells without a test are empty.
+    A cell lists the impact locations that fail; a cell without a test is empty.
     """
-    points = [(point.name in failing, dict(point.parameters)) for point in matrix]
-    speeds = sorted({coordinates[SPEED] for _, coordinates in points if SPEED in coordinates})
+    coordinates_of_points = [(point.name in failing, dict(point.parameters)) for point in matrix]
+    speeds = sorted({coordinates[SPEED_DIMENSION] for _, coordinates in coordinates_of_points if SPEED_DIMENSION in coordinates})
     rows: dict[str, dict[Any, list[str]]] = {}
-    for fails, coordinates in points:
-        speed, location = coordinates.pop(SPEED, None), coordinates.pop(LOCATION, None)
+    for fails, coordinates in coordinates_of_points:
+        speed, location = coordinates.pop(SPEED_DIMENSION, None), coordinates.pop(LOCATION_DIMENSION, None)
         test, weather = str(coordinates.pop("test", "")), str(coordinates.pop("weather", ""))
         name = ", ".join([test, weather, *(f"{key} {value}" for key, value in coordinates.items())])
-        cell = rows.setdefault(name, {}).setdefault(speed, [])
+        texts = rows.setdefault(name, {}).setdefault(speed, [])
         if fails:
-            cell.append(FAILS if location is None else f"{location:g} %")
-    columns = [*speeds, *([None] if any(None in cells for cells in rows.values()) else [])]
-    has_location = any(LOCATION in dict(point.parameters) for point in matrix if point.name in failing)
-    return FailingPoints(
+            texts.append(FAILURE_TEXT if location is None else f"{location:g} %")
+    speeds_or_none = [*speeds, *([None] if any(None in cells for cells in rows.values()) else [])]
+    has_location = any(LOCATION_DIMENSION in dict(point.parameters) for point in matrix if point.name in failing)
+    return FailingPointsTable(
         summary=f"Fails at {len(failing)} of {len(matrix)} points.{' Percentages are impact locations.' if has_location else ''}",
-        heads=["" if speed is None else f"{speed:g} km/h" for speed in columns],
-        rows=[(name, [", ".join(cells[speed]) or AVOIDED if speed in cells else "" for speed in columns])
+        heads=["" if speed is None else f"{speed:g} km/h" for speed in speeds_or_none],
+        rows=[(name, [", ".join(cells[speed]) or AVOIDED_TEXT if speed in cells else "" for speed in speeds_or_none])
               for name, cells in rows.items() if any(cells.values())])
 
 
 SAMPLES = 4000
-"""Number of samples in the sections on risk and rules."""
+"""Number of vehicles sampled for the section on risk, and for the one on rules."""
 
 
 class Resimulation(NamedTuple):
     """A new simulation of a recorded setting: its evaluation, and the points of the matrix at which the setting is unsafe."""
 
     evaluation: Evaluations
-    points: tuple[str, ...]
+    unsafe_points: tuple[str, ...]
 
 
 @dataclass(frozen=True, kw_only=True)
 class ReportInput:
     """One study of a report.
 
-    `directory` holds the results, `number` counts studies from 1. `system` is None if the study cannot be simulated here; `problem`
-    says why. `point` names the only point of the matrix that the page is about; it is empty for the whole study. `changed` lists the
-    files and versions that have changed since the results were computed.
+    `study_number` counts from 1, `directory` holds the results. `system` is None if the study cannot be simulated here; `problem`
+    says why. `point` names the only point of the matrix that the page is about; it is empty for the whole study. `later_changes`
+    names the files and versions that have changed since the results were computed.
     """
 
-    number: int
+    study_number: int
     directory: Path
     case: Case
     manifest: Mapping[str, Any]
     system: System | None
     problem: str = ""
     point: str = ""
-    changed: Sequence[str] = ()
-    _compared: dict[bytes, Comparison] = field(default_factory=dict)
-    _simulated_again: dict[bytes, Resimulation] = field(default_factory=dict)
+    later_changes: Sequence[str] = ()
+    _comparisons: dict[bytes, Comparison] = field(default_factory=dict)
+    _resimulations: dict[bytes, Resimulation] = field(default_factory=dict)
 
     @cached_property
     def solutions(self) -> dict[str, dict[str, Any]]:
@@ -131,7 +121,7 @@ class ReportInput:
         """Whether each solution is unsafe."""
         return [] if self.case.solutions.empty else list(self.case.unsafe.rows(self.case.solutions).tolist())
 
-    def chosen(self, choice: str) -> str:
+    def select_handle(self, choice: str) -> str:
         """The handle of the solution that a choice selects: fewest, smallest or most_severe."""
         return str(choose_handle(self.case.solutions, self.case.unsafe, choice, self.directory))
 
@@ -147,34 +137,34 @@ class ReportInput:
             setting[self.case.characteristics.names.index(name)] = value
         return setting
 
-    def changes(self, setting: FloatArray) -> list[ChangeRow]:
+    def list_changes(self, setting: FloatArray) -> list[ChangeRow]:
         """A setting's changes from the original."""
-        members = [member for member, value in zip(self.case.characteristics, setting.tolist(), strict=True) if value != member.original]
+        changed = [item for item, value in zip(self.case.characteristics, setting.tolist(), strict=True) if value != item.original]
         texts = changes_in_words(self.case.characteristics, setting)
-        return [ChangeRow(text, member.short_name, member.words) for member, text in zip(members, texts, strict=True)]
+        return [ChangeRow(text, item.short_name, item.words) for item, text in zip(changed, texts, strict=True)]
 
-    def compared(self, setting: FloatArray) -> Comparison:
-        """Compare a setting with the original vehicle; simulates each setting once."""
+    def compare_with_original(self, setting: FloatArray) -> Comparison:
+        """Simulate a setting, once, beside the original vehicle."""
         assert self.system is not None
         key = setting.tobytes()
-        if key not in self._compared:
-            self._compared[key] = compare_setting(self.case.study, self.system, setting)
-        return self._compared[key]
+        if key not in self._comparisons:
+            self._comparisons[key] = compare_setting(self.case.study, self.system, setting)
+        return self._comparisons[key]
 
     def simulate_again(self, settings: Sequence[FloatArray]) -> list[Resimulation]:
-        """Simulate recorded settings again, each once and all in one batch; the page warns where results differ."""
+        """Simulate recorded settings again, in one batch and each only once; the page warns of results that differ."""
         assert self.system is not None
-        batch = {setting.tobytes(): setting for setting in settings if setting.tobytes() not in self._simulated_again}
+        batch = {setting.tobytes(): setting for setting in settings if setting.tobytes() not in self._resimulations}
         if batch:
             at_points = simulate_all_points(self.system, np.stack(list(batch.values())))
-            evaluations, points = evaluations_at_worst_points(at_points), unsafe_points_of(self.system, at_points, self.case.unsafe)
+            evaluations, unsafe_points = evaluations_at_worst_points(at_points), unsafe_points_of(self.system, at_points, self.case.unsafe)
             for row, key in enumerate(batch):
-                self._simulated_again[key] = Resimulation(evaluations.take([row]), points[row])
-        return [self._simulated_again[setting.tobytes()] for setting in settings]
+                self._resimulations[key] = Resimulation(evaluations.take([row]), unsafe_points[row])
+        return [self._resimulations[setting.tobytes()] for setting in settings]
 
     @cached_property
     def options(self) -> dict[str, Any]:
-        """Options of every question for the page: smaller samples than the commands' defaults, and one criterion for all questions."""
+        """Each question's options on the page: one criterion for all questions, and smaller samples than the commands take."""
         unsafe = None if self.case.solutions.empty else str(self.case.unsafe)
         all_options: tuple[Options, ...] = (
             ExplainOptions(unsafe=unsafe, limit=12_000), OpinionOptions(unsafe=unsafe), ToleranceOptions(unsafe=unsafe),
@@ -186,24 +176,24 @@ class ReportInput:
         """Whether the original vehicle itself collides; if so, no change is a cause."""
         return self.case.original[SAFETY_DEGREE] < 0
 
-    def failing_points(self, setting: FloatArray) -> FailingPoints | None:
+    def failing_points(self, setting: FloatArray) -> FailingPointsTable | None:
         """The points of the matrix at which a setting fails; None without a matrix, or if the page is about one point."""
         if self.system is None or not self.system.matrix or self.point:
             return None
-        return failing_table(self.system.matrix, self.simulate_again([setting])[0].points)
+        return tabulate_failing_points(self.system.matrix, self.simulate_again([setting])[0].unsafe_points)
 
-    def replay(self, setting: FloatArray) -> dict[str, Any]:
+    def player_data_of(self, setting: FloatArray) -> dict[str, Any]:
         """A setting's animation, in the form that the template `player` takes."""
-        return player_data(flat_scene_of(self.compared(setting)))
+        return player_data(lay_out_scene(self.compare_with_original(setting)))
 
     def anchor(self, *parts: object) -> str:
-        """The HTML anchor of a part of this study's section."""
-        words = "-".join(str(part) for part in ("study", self.number, *parts))
-        return "".join(letter if letter.isascii() and letter.isalnum() else "-" for letter in words)
+        """The HTML anchor of an element of the page, in this study's section."""
+        text = "-".join(str(part) for part in ("study", self.study_number, *parts))
+        return "".join(letter if letter.isascii() and letter.isalnum() else "-" for letter in text)
 
 
 def read_inputs(directories: Iterable[str | Path], point: str | None = None, *, as_it_is_now: bool = False) -> list[ReportInput]:
-    """Read results directories; with `point`, their solutions are simulated again at this point of the matrix.
+    """Read results directories; with `point`, simulate their solutions again at this point of the matrix.
 
     Raises
     ------
@@ -213,20 +203,20 @@ def read_inputs(directories: Iterable[str | Path], point: str | None = None, *, 
     """
     paths = [Path(directory) for directory in directories]
     inputs = []
-    for number, (path, case) in enumerate(zip(paths, load_cases(paths), strict=True), 1):
-        system, problem, changed = None, "", list[str]()
+    for study_number, (path, case) in enumerate(zip(paths, load_cases(paths), strict=True), 1):
+        system, problem, later_changes = None, "", list[str]()
         try:
             system = assemble(case.study, str(path))
         except InputError as error:
             problem = f"This study cannot be simulated here: {error.source}: {error.problem}."
             warn(f"{path}: {problem}")
         else:
-            changed = changes_since(path, case, as_it_is_now=as_it_is_now)
+            later_changes = changes_since(path, case, as_it_is_now=as_it_is_now)
         if point is not None:
             case = _at_point(case, point)
             system = assemble(case.study, str(path))
-        inputs.append(ReportInput(number=number, directory=path, case=case, manifest=read_manifest(path), system=system, problem=problem,
-                              point=point or "", changed=changed))
+        inputs.append(ReportInput(study_number=study_number, directory=path, case=case, manifest=read_manifest(path), system=system,
+                                  problem=problem, point=point or "", later_changes=later_changes))
     return inputs
 
 
@@ -244,22 +234,22 @@ def _at_point(case: Case, point: str) -> Case:
                    solutions=solutions.assign(**{name: values[1:] for name, values in columns.items()}))
 
 
-def stored_answer(data: ReportInput, name: str, compute: Callable[[], Any]) -> Any:
-    """The result of `compute` as plain values; read from the results directory if it was computed before.
+def load_or_compute(data: ReportInput, name: str, compute: Callable[[], Any]) -> Any:
+    """The result of `compute` as plain values: stored in the results directory, and read from there the next time.
 
-    The result is not stored if the directory cannot be written, or if the code that computes the result has no identity.
+    Nothing is stored if the directory cannot be written, or if the code that computes the result has no identity.
     """
-    if data.changed or ("imported" in data.manifest and user_code_names(data.case.study)):
+    if data.later_changes or ("imported" in data.manifest and user_code_names(data.case.study)):
         return json.loads(json.dumps(compute(), allow_nan=False))
     suffix = f"-{data.anchor(data.point)}" if data.point else ""
-    file, identity = data.directory / ANSWERS / f"{name}{suffix}.json", _digest(data, name)
+    file, identity = data.directory / ANSWERS / f"{name}{suffix}.json", _answer_digest(data, name)
     try:
         refuse_other_than_file(file)
         content = json.loads(file.read_text(encoding="utf-8"))
         if content["identity"] == identity:
             return content["value"]
     except (OSError, ValueError, KeyError, TypeError):
-        pass  # never computed, or computed by another version of the package: compute it now
+        pass  # not stored, or stored by another version of the package: compute it now
     text = json.dumps({"identity": identity, "value": compute()}, indent=1, allow_nan=False) + "\n"
     try:
         file.parent.mkdir(exist_ok=True)
@@ -269,21 +259,21 @@ def stored_answer(data: ReportInput, name: str, compute: Callable[[], Any]) -> A
     return json.loads(text)["value"]
 
 
-def _digest(data: ReportInput, name: str) -> str:
+def _answer_digest(data: ReportInput, name: str) -> str:
     """Digest of everything that an answer depends on: the results, the options, the package's code."""
-    digest = sha256(_package().encode())
+    digest = sha256(_package_identity().encode())
     for file_name in (MANIFEST, SOLUTIONS):
         file = data.directory / file_name
         content = file.read_bytes() if file.is_file() else b""
         digest.update(len(content).to_bytes(8, "big") + content)
-    parts = [data.case.finished, data.point, data.options.get(name, data.case.study.spread)]
-    digest.update(repr(parts).encode())
+    inputs = [data.case.finished, data.point, data.options.get(name, data.case.study.spread)]
+    digest.update(repr(inputs).encode())
     return digest.hexdigest()
 
 
 @cache
-def _package() -> str:
-    """Identity of the whole package's code, since answers depend on more code than results do."""
+def _package_identity() -> str:
+    """Identity of the code of the whole package: answers depend on more of it than results do."""
     files = sorted(PACKAGE.rglob("*.py"))
     return repr([version("safevar_sumo"), RESULTS, [(file.relative_to(PACKAGE).as_posix(), sha256(file.read_bytes()).hexdigest())
                                                     for file in files]])

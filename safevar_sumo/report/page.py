@@ -23,29 +23,37 @@ from safevar_sumo.analysis.research_questions.gallery import draw
 from safevar_sumo.analysis.research_questions.layout import Bold, Table, lay_out
 from safevar_sumo.errors import InputError, did_you_mean, warn
 from safevar_sumo.protocol.rater import is_rated
-from safevar_sumo.replay.comparison import raised
-from safevar_sumo.replay.page import environment, player_parts
-from safevar_sumo.report.findings import causes, evenly_spaced, explanations_of, front_of, necessity_chart, no_opinion, replays
+from safevar_sumo.replay.comparison import superscript_powers
+from safevar_sumo.replay.page import player_files, template_environment
+from safevar_sumo.report.causes import (
+    draw_necessity,
+    evenly_spaced_indices,
+    explain_main_failures,
+    make_cause_sections,
+    nondominated_rows,
+    reason_without_opinion,
+    replay_solutions,
+)
+from safevar_sumo.report.domain import DOMAIN_SECTIONS
 from safevar_sumo.report.input import ReportInput, read_inputs
-from safevar_sumo.report.limits import LIMITS
-from safevar_sumo.report.rated import rated_study_page
-from safevar_sumo.report.svg import Dot, scatter
-from safevar_sumo.report.verdict import tested_system, trust, verdict
-from safevar_sumo.shipped import RUN
+from safevar_sumo.report.rated import rated_study_data
+from safevar_sumo.report.svg import Dot, draw_scatter
+from safevar_sumo.report.verdict import describe_limits, describe_tested_system, reach_verdict
+from safevar_sumo.shipped import PROGRAM_COMMAND
 from safevar_sumo.study import Study, load_study, study_names
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-DIGITS = re.compile(r"(\d\.\d\d)\d+")
-"""Numbers of a picture with more decimals than a screen can show."""
+LONG_DECIMALS = re.compile(r"(\d\.\d\d)\d+")
+"""Numbers with more decimals than a screen can show."""
 MAX_DOTS = 150
 """Maximum number of points in a scatter chart."""
 SVG_STYLE = {"svg.fonttype": "none", "svg.hashsalt": "safevar_sumo", "font.family": ["sans-serif"]}
 
 
-def tables(cases: Sequence[Case]) -> list[dict[str, Any]]:
-    """All tables for the template; if no question can be answered, a table with the reason."""
+def list_tables(cases: Sequence[Case]) -> list[dict[str, Any]]:
+    """Every table of the research questions; if none can be answered, one table with the reason."""
     try:
         answers = answer(cases)
     except Unanswerable as error:
@@ -54,14 +62,14 @@ def tables(cases: Sequence[Case]) -> list[dict[str, Any]]:
 
 
 def _table_data(table: Table) -> dict[str, Any]:
-    rows = [[{"text": raised(str(cell)), "bold": isinstance(cell, Bold)} for cell in row] for row in table.rows]
-    spans = [("", table.labels), *((raised(name), width) for name, width in table.spans)] if table.spans else []
-    heads, notes = ([raised(text) for text in texts] for texts in (table.heads, table.notes))
-    return {"title": raised(table.title), "heads": heads, "spans": spans, "rows": rows, "labels": table.labels, "notes": notes}
+    rows = [[{"text": superscript_powers(str(cell)), "bold": isinstance(cell, Bold)} for cell in row] for row in table.rows]
+    spans = [("", table.labels), *((superscript_powers(name), width) for name, width in table.spans)] if table.spans else []
+    heads, notes = ([superscript_powers(text) for text in texts] for texts in (table.heads, table.notes))
+    return {"title": superscript_powers(table.title), "heads": heads, "spans": spans, "rows": rows, "labels": table.labels, "notes": notes}
 
 
-def figures(cases: Sequence[Case]) -> list[dict[str, str]]:
-    """All figures as pictures to embed in the page."""
+def embed_figures(cases: Sequence[Case]) -> list[dict[str, str]]:
+    """Draw every figure of the research questions as a picture to embed in the page."""
     try:
         figures_by_name, _ = draw(cases)
     except Unanswerable:
@@ -80,17 +88,17 @@ def _data_url(figure: Figure) -> str:
     buffer = BytesIO()
     with matplotlib.rc_context(SVG_STYLE):  # type: ignore[arg-type]
         figure.savefig(buffer, format="svg", metadata={"Date": None})
-    picture = DIGITS.sub(r"\1", buffer.getvalue().decode())
+    picture = LONG_DECIMALS.sub(r"\1", buffer.getvalue().decode())
     return "data:image/svg+xml," + quote(picture, safe=" =:/;,()'!?@&+$*")
 
 
-def front(data: ReportInput, handles: Sequence[str]) -> Markup:
-    """A chart of non-dominated solutions by largest change and safety degree; those of `handles` link to their replays."""
+def draw_front(data: ReportInput, handles: Sequence[str]) -> Markup:
+    """Draw non-dominated solutions by largest change and safety degree; those of `handles` link to their replays."""
     rows = [row for row in data.solutions.values() if not np.isnan([row["f_safe"], row["f_diff"]]).any()]
-    best = front_of(rows)
-    selection = [best[index] for index in evenly_spaced(len(best), MAX_DOTS)] + [row for row in rows if row["handle"] in handles]
+    best = nondominated_rows(rows)
+    selection = [best[index] for index in evenly_spaced_indices(len(best), MAX_DOTS)] + [row for row in rows if row["handle"] in handles]
     dots = {row["handle"]: _dot(data, row, row["handle"] in handles) for row in selection}
-    return scatter(f"{data.case.name}: safety degree over the largest change of the solutions that no other solution beats",
+    return draw_scatter(f"{data.case.name}: safety degree over the largest change of the solutions that no other solution beats",
                    list(dots.values()), "largest change [% of the original]", "safety degree [m, or -m/s]", 0.0, "collision below")
 
 
@@ -101,44 +109,44 @@ def _dot(data: ReportInput, row: dict[Any, Any], has_replay: bool) -> Dot:
     return Dot(100 * row["f_diff"], row["f_safe"], words, css_class, data.anchor("replay", row["handle"]) if has_replay else "")
 
 
-def reproduce(inputs: Sequence[ReportInput], parts: Sequence[str]) -> list[dict[str, str]]:
-    """Commands that reproduce the numbers of the page; `parts` are the questions whose answers the page shows."""
+def commands_to_reproduce(inputs: Sequence[ReportInput], questions: Sequence[str]) -> list[dict[str, str]]:
+    """List the commands that reproduce the numbers of the page; `questions` are those that the page answers."""
     directories = " ".join(shlex.quote(str(data.directory)) for data in inputs)
     commands = []
     for data in inputs:
         directory, study = shlex.quote(str(data.directory)), data.case.study
-        flag = " --as-it-is-now" if data.changed else ""
+        flag = " --as-it-is-now" if data.later_changes else ""
         if data.case.has_runs:
             commands.append({"what": f"The study {study.name}, as its manifest.json records it, into another directory",
                              "command": _rerun_command(study, f"{data.directory}-again", data.directory)})
-        questions = [*parts, *(["opinion"] if "explain" in parts and data.system is not None and not no_opinion(data) else [])]
-        commands += [{"what": f"The part {part}", "command": data.options[part].command_line(str(data.directory), data.point) + flag}
-                     for part in questions]
+        has_opinion = "explain" in questions and data.system is not None and not reason_without_opinion(data)
+        commands += [{"what": f"The part {name}", "command": data.options[name].command_line(str(data.directory), data.point) + flag}
+                     for name in (*questions, *(["opinion"] if has_opinion else []))]
         if data.point:
             continue
         commands.append({"what": "A replay, with figure and animation",
-                         "command": f"{RUN} simulate {directory} --most-severe --plot it.png --animate it.html{flag}"})
+                         "command": f"{PROGRAM_COMMAND} simulate {directory} --most-severe --plot it.png --animate it.html{flag}"})
     if any(data.point for data in inputs):
         return commands
-    commands.append({"what": "The tables of RQ1 to RQ3", "command": f"{RUN} tables {directories}"})
-    commands.append({"what": "The figures", "command": f"{RUN} figures {directories} --out figures"})
+    commands.append({"what": "The tables of RQ1 to RQ3", "command": f"{PROGRAM_COMMAND} tables {directories}"})
+    commands.append({"what": "The figures", "command": f"{PROGRAM_COMMAND} figures {directories} --out figures"})
     return commands
 
 
 def _rerun_command(study: Study, out: str, directory: Path) -> str:
-    """The command that runs a study again: `study` with options for a shipped study, else a call of `run` with the recorded study."""
+    """The command that runs a study again: `study` with options for a shipped study, else Python's `run` with the recorded study."""
     search = study.search
     if study.name in study_names():
         options = {name: getattr(search, name) for name in ("seed", "runs", "evaluations", "algorithms")}
         shipped = load_study(study.name)
         if msgspec.structs.replace(shipped, search=msgspec.structs.replace(shipped.search, **options), origin=study.origin) == study:
             flags = {**options, "algorithms": shlex.quote(",".join(search.algorithms)), "out": shlex.quote(out)}
-            return " ".join([f"{RUN} study {study.name}", *(f"--{name} {value}" for name, value in flags.items())])
+            return " ".join([f"{PROGRAM_COMMAND} study {study.name}", *(f"--{name} {value}" for name, value in flags.items())])
     script = f"import safevar_sumo as sv; sv.run(sv.load({json.dumps(str(directory))}).study, out={json.dumps(out)}, progress=True)"
     return f"python -c {shlex.quote(script)}"
 
 
-WEB = Path(__file__).parent / "web"
+TEMPLATE_FOLDER = Path(__file__).parent / "web"
 SECTIONS = {
     "verdict": "Verdict",
     "tested": "What was tested",
@@ -153,8 +161,8 @@ SECTIONS = {
 """Headings of the sections in order, by the names that `--only` accepts."""
 
 
-PARTS = {"causes": "explain", **{name: name for name in LIMITS}}
-"""Commands that compute the sections that need simulations, by section."""
+COMMAND_OF_SECTION = {"causes": "explain", **{name: name for name in DOMAIN_SECTIONS}}
+"""The command that computes each section that needs simulations."""
 
 
 def make_report(directories: Iterable[str | Path], only: Sequence[str] = (), jobs: int | None = None, progress: Progress = show_no_progress,
@@ -171,57 +179,59 @@ def make_report(directories: Iterable[str | Path], only: Sequence[str] = (), job
         sections = [name for name in sections if name != "questions"]
     inputs = read_inputs(directories, point, as_it_is_now=as_it_is_now)
     for data in inputs:
-        for change in data.changed:
+        for change in data.later_changes:
             warn(f"{data.directory}: {change}")
     are_rated = [is_rated(data.case.study) and point is None for data in inputs]
     if any(are_rated):
         if not all(are_rated):
             raise InputError("directories", "some hold results of rated studies, others do not", "a report for each kind")
-        return environment(WEB).get_template("rated.html.j2").render(
+        return template_environment(TEMPLATE_FOLDER).get_template("rated.html.j2").render(
             title=f"Euro NCAP rating: {', '.join(data.case.name for data in inputs)}", css=_web_file("report.css"),
-            studies=[rated_study_page(data, jobs, progress) for data in inputs]) + "\n"
+            studies=[rated_study_data(data, jobs, progress) for data in inputs]) + "\n"
     cases = [data.case for data in inputs] if "questions" in sections else []
     with ThreadPoolExecutor(1) as drawing_thread:  # meanwhile this process only waits for workers, and nothing else in it draws
-        questions = drawing_thread.submit(lambda: (tables(cases), figures(cases)) if cases else ([], []))
-        studies = [_study(data, sections, jobs, progress) for data in inputs]
+        questions = drawing_thread.submit(lambda: (list_tables(cases), embed_figures(cases)) if cases else ([], []))
+        studies = [_study_data(data, sections, jobs, progress) for data in inputs]
         progress("tables and figures", 0, 1)
         answers, pictures = questions.result()
-    page = environment(WEB).get_template("report.html.j2").render(
+    page = template_environment(TEMPLATE_FOLDER).get_template("report.html.j2").render(
         title=f"Safety report: {', '.join(data.case.name for data in inputs)}", sections={name: SECTIONS[name] for name in sections},
         studies=studies, tables=answers, figures=pictures,
-        commands=reproduce(inputs, [PARTS[name] for name in PARTS if name in sections]) if "reproduce" in sections else [],
-        takes_simulations=list(PARTS), player=player_parts(), css=_web_file("report.css"), js=_web_file("report.js"))
+        commands=commands_to_reproduce(inputs, [command for name, command in COMMAND_OF_SECTION.items() if name in sections])
+        if "reproduce" in sections else [],
+        simulated_sections=list(COMMAND_OF_SECTION), player=player_files(), css=_web_file("report.css"), js=_web_file("report.js"))
     progress("tables and figures", 1, 1)
     return page + "\n"
 
 
-def _study(data: ReportInput, sections: Sequence[str], jobs: int | None, show: Progress) -> Mapping[str, Any]:
-    """The data of one study for the given sections."""
+def _study_data(data: ReportInput, sections: Sequence[str], jobs: int | None, show_progress: Progress) -> Mapping[str, Any]:
+    """Make the data of one study that the templates of these sections need."""
     def progress(stage: str, done: int, total: int) -> None:
-        show(f"{data.case.name}: {stage}", done, total)
+        show_progress(f"{data.case.name}: {stage}", done, total)
 
-    explanations = explanations_of(data, jobs, progress) if "causes" in sections and data.system is not None else None
-    limits = {name: make(data, jobs, progress) for name, make in LIMITS.items()
-              if name in sections and data.system is not None}
+    explanations = explain_main_failures(data, jobs, progress) if "causes" in sections and data.system is not None else None
+    domain_sections = {name: make(data, jobs, progress) for name, make in DOMAIN_SECTIONS.items()
+                       if name in sections and data.system is not None}
     progress("replays", 0, 1)
-    solutions = replays(data, explanations) if "causes" in sections else []
-    functions: dict[str, Callable[[], Any]] = {
-        "tested": lambda: tested_system(data),
-        "verdict": lambda: verdict(data, explanations, limits.get("tolerance")),
-        "causes": lambda: causes(explanations.failures if explanations else [], data),
-        "no_opinion": lambda: "" if data.system is None else no_opinion(data),
-        "necessity": lambda: necessity_chart(explanations.summary, data) if explanations else None,
-        "trust": lambda: trust(data, explanations)}
-    handles = [solution.handle for solution in solutions if solution.differences]
-    if handles:
-        warn(f"{data.directory}: simulated again with different results: {', '.join(handles)}; other versions or code than in the study?")
+    solutions = replay_solutions(data, explanations) if "causes" in sections else []
+    makers: dict[str, Callable[[], Any]] = {
+        "tested": lambda: describe_tested_system(data),
+        "verdict": lambda: reach_verdict(data, explanations, domain_sections.get("tolerance")),
+        "causes": lambda: make_cause_sections(explanations.failures if explanations else [], data),
+        "opinion_problem": lambda: "" if data.system is None else reason_without_opinion(data),
+        "necessity": lambda: draw_necessity(explanations.summary, data) if explanations else None,
+        "trust": lambda: describe_limits(data, explanations)}
+    different_handles = [solution.handle for solution in solutions if solution.differences]
+    if different_handles:
+        warn(f"{data.directory}: simulated again with different results: {', '.join(different_handles)}; "
+             "other versions or code than in the study?")
     return {"name": data.case.name, "title": data.case.study.title, "anchor": data.anchor(), "replays": solutions,
-            "different": handles,
-            "problem": data.problem, "changed": data.changed, "original_fails": data.original_fails,
-            "front": front(data, [solution.handle for solution in solutions]) if solutions else None,
-            **limits, **{name: make() for name, make in functions.items()
-                         if name in sections or (name in ("necessity", "no_opinion") and "causes" in sections)}}
+            "different": different_handles,
+            "problem": data.problem, "later_changes": data.later_changes, "original_fails": data.original_fails,
+            "front": draw_front(data, [solution.handle for solution in solutions]) if solutions else None,
+            **domain_sections, **{name: make() for name, make in makers.items()
+                         if name in sections or (name in ("necessity", "opinion_problem") and "causes" in sections)}}
 
 
 def _web_file(name: str) -> Markup:
-    return Markup((WEB / name).read_text(encoding="utf-8"))
+    return Markup((TEMPLATE_FOLDER / name).read_text(encoding="utf-8"))

@@ -25,27 +25,28 @@ from safevar_sumo.report.input import ReportInput
 from safevar_sumo.results import choose_handle, row_of_handle
 from safevar_sumo.vehicles import CharacteristicSet
 
-CHOICE = "fewest"
+VARIANT_CHOICE = "fewest"
 """Choice of the solution beside the original: the fewest changes that lose a point."""
 
 
-def rated_study_page(data: ReportInput, jobs: int | None, progress: Progress) -> dict[str, Any]:
-    """The data of one study for the page; simulates the vehicles in all cells."""
+def rated_study_data(data: ReportInput, jobs: int | None, progress: Progress) -> dict[str, Any]:
+    """The page's data about one study; simulates the vehicles in all cells."""
     case, variants, handle = data.case, dict[str, np.ndarray](), None
     if case.unsafe.rows(case.solutions).any():
-        handle = choose_handle(case.solutions, case.unsafe, CHOICE, data.directory)
+        handle = choose_handle(case.solutions, case.unsafe, VARIANT_CHOICE, data.directory)
         row = case.solutions.iloc[row_of_handle(case.solutions, handle)]
         names = CharacteristicSet.of(case.study.vehicle.characteristics).names
         variants[str(handle)] = row[list(names)].to_numpy(dtype=float)
     rating = rate(case.study, variants, jobs=jobs, progress=progress)
     rating_command = RatingOptions(solution=None if handle is None else str(handle)).command_line(str(data.directory))
-    return {"title": case.study.title, "sentence": rating_in_words(rating), "notes": remarks(rating), "points": _points(rating),
+    return {"title": case.study.title, "sentence": rating_in_words(rating), "notes": remarks(rating), "points": _point_rows(rating),
             "lost": [(test_in_words(test), f"{lost:.2f}") for test, lost in lost_by_test(rating)], "turned": turned_in_words(rating),
-            "picture": picture(rating), "names": [variant.name for variant in rating.variants], "not_simulated": not_simulated(rating),
+            "picture": draw_matrices(rating), "names": [variant.name for variant in rating.variants],
+            "not_simulated": not_simulated(rating),
             "commands": [rating_command, *(question_command(question, str(data.directory)) for question in ("tolerance", "explain"))]}
 
 
-def _points(rating: Rating) -> Sequence[tuple[str, Sequence[str], str]]:
+def _point_rows(rating: Rating) -> Sequence[tuple[str, Sequence[str], str]]:
     """Rows of texts: a test, the points of each vehicle, and the points available."""
     rows = [(tests[0].block.name, [f"{test.total:.2f}" for test in tests], f"{sum(tests[0].block.points):g}")
             for tests in zip(*(variant.tests for variant in rating.variants), strict=True)]
@@ -53,8 +54,8 @@ def _points(rating: Rating) -> Sequence[tuple[str, Sequence[str], str]]:
     return [*rows, ("all", [f"{variant.points:.2f}" for variant in rating.variants], f"{available:g}")]
 
 
-def picture(rating: Rating) -> Markup:
-    """The matrices as SVG to embed in the page; equal ratings give equal bytes."""
+def draw_matrices(rating: Rating) -> Markup:
+    """Draw the matrices as SVG to embed in the page; equal ratings give equal bytes."""
     import matplotlib
 
     file = io.StringIO()

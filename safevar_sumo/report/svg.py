@@ -8,10 +8,10 @@ from typing import Any, NamedTuple
 from markupsafe import Markup, escape
 
 WIDTH = 720
-ROW = 26
-"""Height of a row of bars."""
-LABEL = 170
-"""Width of the column of names at the left."""
+ROW_HEIGHT = 26
+"""Height of a row of bars [pixels]."""
+NAME_WIDTH = 170
+"""Width of the column of names at the left [pixels]."""
 RIGHT_MARGIN = 24
 
 
@@ -34,27 +34,27 @@ class Bar(NamedTuple):
     title: str
 
 
-def bar_chart(description: str, names: Sequence[str], bars_of_rows: Sequence[Sequence[Bar]], marks: Sequence[float | None],
-         ends: Sequence[tuple[str, str]]) -> Markup:
-    """A chart of rows with bars and a mark; `description` is the chart in words, `ends` are the texts at both ends of each row."""
-    parts, track_width = [], WIDTH - LABEL - RIGHT_MARGIN
-    for i, (name, bars, mark, (left, right)) in enumerate(zip(names, bars_of_rows, marks, ends, strict=True)):
-        y = i * ROW * 1.6
-        parts.append(_text(LABEL - 8, y + 17, name, "name"))
-        parts.append(f'<rect class="track" x="{LABEL}" y="{y + 4:.1f}" width="{track_width}" height="{ROW - 8}" rx="3"/>')
+def draw_bars(description: str, names: Sequence[str], bars_of_rows: Sequence[Sequence[Bar]], marks: Sequence[float | None],
+              ends: Sequence[tuple[str, str]]) -> Markup:
+    """Draw rows of bars, each row with a mark; `description` is the chart in words, `ends` are the texts at both ends of each row."""
+    elements, track_width = [], WIDTH - NAME_WIDTH - RIGHT_MARGIN
+    for row, (name, bars, mark, (left, right)) in enumerate(zip(names, bars_of_rows, marks, ends, strict=True)):
+        y = row * ROW_HEIGHT * 1.6
+        elements.append(_text(NAME_WIDTH - 8, y + 17, name, "name"))
+        elements.append(f'<rect class="track" x="{NAME_WIDTH}" y="{y + 4:.1f}" width="{track_width}" height="{ROW_HEIGHT - 8}" rx="3"/>')
         for bar in bars:
-            x, width = LABEL + track_width * bar.start, max(track_width * (bar.end - bar.start), 1.5)
-            parts.append(f'<rect class="{bar.css_class}" x="{x:.1f}" y="{y + 4:.1f}" width="{width:.1f}" height="{ROW - 8}">'
+            x, width = NAME_WIDTH + track_width * bar.start, max(track_width * (bar.end - bar.start), 1.5)
+            elements.append(f'<rect class="{bar.css_class}" x="{x:.1f}" y="{y + 4:.1f}" width="{width:.1f}" height="{ROW_HEIGHT - 8}">'
                          f"<title>{escape(bar.title)}</title></rect>")
         if mark is not None:
-            parts.append(f'<path class="mark" d="M{LABEL + track_width * mark:.1f} {y:.1f}v{ROW}"/>')
-        parts.append(_text(LABEL, y + ROW + 8, left, "end start"))
-        parts.append(_text(WIDTH - RIGHT_MARGIN, y + ROW + 8, right, "end"))
-    return _svg(description, ROW * 1.6 * len(names) + 4, parts)
+            elements.append(f'<path class="mark" d="M{NAME_WIDTH + track_width * mark:.1f} {y:.1f}v{ROW_HEIGHT}"/>')
+        elements.append(_text(NAME_WIDTH, y + ROW_HEIGHT + 8, left, "end start"))
+        elements.append(_text(WIDTH - RIGHT_MARGIN, y + ROW_HEIGHT + 8, right, "end"))
+    return _svg(description, ROW_HEIGHT * 1.6 * len(names) + 4, elements)
 
 
-def scatter(description: str, dots: Sequence[Dot], x_title: str, y_title: str, line: float | None, line_title: str) -> Markup:
-    """A scatter chart; `line` is the y of a horizontal line, if any."""
+def draw_scatter(description: str, dots: Sequence[Dot], x_title: str, y_title: str, line: float | None, line_title: str) -> Markup:
+    """Draw a scatter chart; `line` is the y of a horizontal line, if any."""
     height, left, bottom = 330, 62, 44
     xs, ys = [dot.x for dot in dots], [dot.y for dot in dots] + ([] if line is None else [line])
     x_scale, y_scale = _ticks(min([0.0, *xs]), max(xs)), _ticks(min(ys), max([0.0, *ys]))
@@ -65,27 +65,27 @@ def scatter(description: str, dots: Sequence[Dot], x_title: str, y_title: str, l
     def pixel_y(y: float) -> float:
         return height - bottom - (height - bottom - 14) * (y - y_scale[0]) / (y_scale[-1] - y_scale[0])
 
-    parts = [f'<path class="grid" d="M{left} {pixel_y(y):.1f}H{WIDTH - RIGHT_MARGIN}"/>'
+    elements = [f'<path class="grid" d="M{left} {pixel_y(y):.1f}H{WIDTH - RIGHT_MARGIN}"/>'
              + _text(left - 7, pixel_y(y) + 4, f"{y:g}", "end") for y in y_scale]
-    parts += [f'<path class="grid" d="M{pixel_x(x):.1f} 14V{height - bottom}"/>'
+    elements += [f'<path class="grid" d="M{pixel_x(x):.1f} 14V{height - bottom}"/>'
               + _text(pixel_x(x), height - bottom + 17, f"{x:g}", "middle")
               for x in x_scale]
-    parts += [_text((WIDTH + left) / 2, height - 8, x_title, "middle title"),
+    elements += [_text((WIDTH + left) / 2, height - 8, x_title, "middle title"),
               f'<g transform="translate(14 {(height - bottom) / 2}) rotate(-90)">{_text(0, 0, y_title, "middle title")}</g>']
     if line is not None:
-        parts += [f'<path class="level" d="M{left} {pixel_y(line):.1f}H{WIDTH - RIGHT_MARGIN}"/>',
+        elements += [f'<path class="level" d="M{left} {pixel_y(line):.1f}H{WIDTH - RIGHT_MARGIN}"/>',
                   _text(WIDTH - RIGHT_MARGIN, pixel_y(line) - 5, line_title, "end")]
     for dot in dots:
         centre = f'cx="{pixel_x(dot.x):.1f}" cy="{pixel_y(dot.y):.1f}"'
         circle = f'<circle class="{dot.css_class}" {centre} r="4.5"><title>{escape(dot.title)}</title></circle>'
-        parts.append(f'<a href="#{escape(dot.link)}" aria-label="{escape(dot.title)}">{circle}</a>' if dot.link else circle)
-    return _svg(description, height, parts, role="group" if any(dot.link for dot in dots) else "img")
+        elements.append(f'<a href="#{escape(dot.link)}" aria-label="{escape(dot.title)}">{circle}</a>' if dot.link else circle)
+    return _svg(description, height, elements, role="group" if any(dot.link for dot in dots) else "img")
 
 
-def _svg(description: str, height: float, parts: Sequence[str], role: str = "img") -> Markup:
-    """A chart of SVG elements; their texts must be escaped."""
+def _svg(description: str, height: float, elements: Sequence[str], role: str = "img") -> Markup:
+    """Put SVG elements into a chart; their texts must be escaped already."""
     return Markup(f'<svg class="chart" role="{role}" viewBox="0 0 {WIDTH} {height:.0f}" aria-label="{escape(description)}">\n'
-                  + "\n".join(parts) + "\n</svg>")
+                  + "\n".join(elements) + "\n</svg>")
 
 
 def _text(x: float, y: float, words: Any, css_class: str) -> str:
@@ -93,7 +93,7 @@ def _text(x: float, y: float, words: Any, css_class: str) -> str:
 
 
 def _ticks(low: float, high: float) -> list[float]:
-    """Round numbers that span the range from low to high."""
+    """Round numbers for an axis, from at most `low` to at least `high`."""
     from matplotlib.ticker import MaxNLocator
 
     ticks = MaxNLocator(6, steps=[1, 2, 2.5, 5, 10]).tick_values(low, high if high > low else low + 1)

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from safevar_sumo.errors import InputError, SafevarError
-from safevar_sumo.plugins import DIGITS, Files
+from safevar_sumo.plugins import DIGEST_LENGTH, Files
 from safevar_sumo.study import Study, refuse_other_than_file
 
 MANIFEST, SOLUTIONS, RUNS, ANSWERS = "manifest.json", "solutions.csv", "runs", "answers"
@@ -129,7 +129,7 @@ def folders_of(directory: Path) -> tuple[str, ...]:
 def record_late_file(directory: Path, name: str, digest: str) -> None:
     """Record a file that was read after the study began, in a separate JSON file, because several processes may record files."""
     make_durable(directory / RUNS)
-    file_name = LATE_FILE_PATTERN.replace("*", sha256(name.encode()).hexdigest()[:DIGITS])
+    file_name = LATE_FILE_PATTERN.replace("*", sha256(name.encode()).hexdigest()[:DIGEST_LENGTH])
     write_whole(directory / RUNS / file_name, json.dumps({name: digest}) + "\n")
 
 

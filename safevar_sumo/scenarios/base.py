@@ -13,9 +13,9 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
-from safevar_sumo.errors import unknown
+from safevar_sumo.errors import unknown_name
 from safevar_sumo.plugins import Contract, Guard, read_only_copy
-from safevar_sumo.records import EVERYWHERE, ZERO, BoolArray, Encounter, FloatArray, Trace
+from safevar_sumo.records import ALL_TRUE, ZERO, BoolArray, Encounter, FloatArray, Trace
 from safevar_sumo.study import Weather
 
 VUT = "vut"
@@ -112,7 +112,7 @@ class Scene(NamedTuple):
     lateral_speed: FloatArray
     over: BoolArray
     obstacle_speed: FloatArray = ZERO
-    visible: BoolArray = EVERYWHERE
+    visible: BoolArray = ALL_TRUE
 
 
 class Scenario(Protocol):
@@ -166,7 +166,7 @@ def weather_of(choice: str | Weather, source: object) -> Weather:
         return choice
     if choice not in WEATHERS:
         fields = ", ".join(Weather.__struct_fields__)
-        raise unknown(source, f"weather = {choice!r}", choice, WEATHERS, f", or a table with {fields}")
+        raise unknown_name(source, f"weather = {choice!r}", choice, WEATHERS, f", or a table with {fields}")
     return WEATHERS[choice]
 
 

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from msgspec import Struct
 
-from safevar_sumo.records import EVERYWHERE, BoolArray, FloatArray
+from safevar_sumo.records import ALL_TRUE, BoolArray, FloatArray
 from safevar_sumo.scenarios.base import VUT, Scene, World
 from safevar_sumo.scenarios.frame import Frame
 
@@ -138,7 +138,7 @@ def scene_of(constants: EncounterConstants, target: Target, front: FloatArray, s
     if constants.follows is not False:
         approached = approached | (speed - target.speed > APPROACH_SPEED)
         over = over | constants.follows & approached & (speed <= target.speed)
-    visible = EVERYWHERE if constants.hidden is False else _visible(constants, target, gap)
+    visible = ALL_TRUE if constants.hidden is False else _visible(constants, target, gap)
     return Scene(gap, zeros + target.lateral, zeros + target.lateral_speed, over, zeros + target.speed, visible), approached
 
 

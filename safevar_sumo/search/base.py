@@ -114,7 +114,7 @@ class GuardedAlgorithm:
             raise self._guard.wrong_value("search", "its result", result, expected)
         if not evaluations_by_setting:
             raise UserCodeError(self._guard.source, f"{self._guard.name} ended in search without yielding any setting",
-                               f"a generator that yields from 1 to {problem.evaluations} settings before it returns")
+                                f"a generator that yields from 1 to {problem.evaluations} settings before it returns")
         settings = self._guard.numbers("search", "its result's settings", result.settings, (len(result), len(problem.characteristics)))
         if any(setting.tobytes() not in evaluations_by_setting for setting in settings):
             raise self._guard.wrong_value("search", "its result", "settings that it never yielded", expected)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from msgspec import Meta, Struct
 
-from safevar_sumo.errors import InputError, one_of, unknown
+from safevar_sumo.errors import InputError, one_of, unknown_name
 
 if TYPE_CHECKING:
     from safevar_sumo.study.schema import CharacteristicTable
@@ -63,7 +63,7 @@ def constraint_mistakes(source: object, table: Mapping[str, CharacteristicTable]
             yield InputError(source, f"{key}: {'both sum and function' if constraint.sum else 'neither sum nor function'}", "one of them")
         for name, weight in constraint.sum.items():
             if name not in table:
-                yield unknown(source, f"{key}.sum.{name}: there is no such characteristic", name, table)
+                yield unknown_name(source, f"{key}.sum.{name}: there is no such characteristic", name, table)
             if weight == 0:
                 yield InputError(source, f"{key}.sum.{name} = 0", "a number other than 0")
         if constraint.at_least is None and constraint.at_most is None:
@@ -85,4 +85,4 @@ def _unit_mistakes(source: object, key: str, constraint: Constraint, table: Mapp
         yield InputError(source, f"{key}.unit = {constraint.unit!r}",
                          f"{next(iter(units))!r}, the unit of {' and '.join(constraint.sum)}, or '-'")
     elif constraint.unit is not None and constraint.unit not in known_units:
-        yield unknown(source, f"{key}.unit = {constraint.unit!r} is no unit of this study", constraint.unit, known_units)
+        yield unknown_name(source, f"{key}.unit = {constraint.unit!r} is no unit of this study", constraint.unit, known_units)

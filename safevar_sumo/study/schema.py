@@ -10,7 +10,7 @@ from typing import Annotated, Any, Final, Literal
 import msgspec
 from msgspec import Meta, Struct
 
-from safevar_sumo.errors import InputError, refuse_other_than_file, unknown
+from safevar_sumo.errors import InputError, refuse_other_than_file, unknown_name
 from safevar_sumo.shipped import STUDIES
 from safevar_sumo.study.constraints import Constraint
 from safevar_sumo.study.variation import Correlation, Distribution
@@ -322,7 +322,7 @@ def study_path(study: str) -> Path:
         pass
     except OSError as error:
         raise InputError(path, f"cannot be read: {error.strerror}", "the path of a study file (TOML)") from None
-    raise unknown("study", f"there is no study or file {study!r}", study, study_names(), ", or the path of a study file (TOML)")
+    raise unknown_name("study", f"there is no study or file {study!r}", study, study_names(), ", or the path of a study file (TOML)")
 
 
 def user_code_names(study: Study) -> list[str]:

@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 import msgspec
 from msgspec import Struct
 
-from safevar_sumo.errors import InputError, did_you_mean, one_of, unknown
+from safevar_sumo.errors import InputError, did_you_mean, one_of, unknown_name
 from safevar_sumo.study.constraints import constraint_mistakes
 from safevar_sumo.study.schema import CharacteristicTable, Origin, Study
 from safevar_sumo.study.variation import variation_mistakes
@@ -104,7 +104,7 @@ def _unknown_key(source: object, key_path: str, key: str, fields: Iterable[str])
     known_paths = [f"{name}.{key}" for name, kinds in tables.items() if any(key in _fields(kind) for kind in kinds)]
     if known_paths:
         return InputError(source, f"{key_path}: there is no such key; did you mean {' or '.join(known_paths)}?", one_of(fields))
-    return unknown(source, f"{key_path}: there is no such key", key, fields)
+    return unknown_name(source, f"{key_path}: there is no such key", key, fields)
 
 
 @cache
@@ -121,7 +121,7 @@ def _record_types(kind: Any) -> list[Any]:
 def _unknown_choice(source: object, key_path: str, value: object, names: Iterable[str]) -> InputError:
     """The error for a value that is none of `names`; "" among the names means that the key may be omitted."""
     problem = f"{key_path} is missing" if value is None else f"{key_path} = {_short_text(value)}"
-    return unknown(source, problem, value, filter(None, names), ", or no such key" * ("" in names))
+    return unknown_name(source, problem, value, filter(None, names), ", or no such key" * ("" in names))
 
 
 def _path_within(key_path: str, key: str) -> str:

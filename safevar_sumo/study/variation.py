@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import msgspec
 from msgspec import Meta, Struct
 
-from safevar_sumo.errors import InputError, unknown
+from safevar_sumo.errors import InputError, unknown_name
 
 if TYPE_CHECKING:
     from safevar_sumo.study.schema import CharacteristicTable
@@ -74,7 +74,7 @@ def variation_mistakes(source: object, rows: Mapping[str, CharacteristicTable], 
         if name in rows:
             yield from _distribution_mistakes(source, f"variation.{name}", rows[name], distribution)
         else:
-            yield unknown(source, f"variation.{name}: there is no such characteristic", name, rows)
+            yield unknown_name(source, f"variation.{name}: there is no such characteristic", name, rows)
     yield from _correlation_mistakes(source, list(rows), correlations)
 
 
@@ -106,7 +106,7 @@ def _correlation_mistakes(source: object, names: Sequence[str], correlations: Se
         between, pair = correlation.between, frozenset(correlation.between)
         unknown_names = [name for name in between if name not in names]
         if unknown_names:
-            yield unknown(source, f"correlations.between: there is no characteristic {unknown_names[0]!r}", unknown_names[0], names)
+            yield unknown_name(source, f"correlations.between: there is no characteristic {unknown_names[0]!r}", unknown_names[0], names)
         elif len(pair) == 1:
             yield InputError(source, f"correlations.between = {list(between)}", "two different characteristics")
         elif pair in values:

@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from safevar_sumo.ads.driver import DelayLine
-from safevar_sumo.records import EVERYWHERE, BoolArray, Encounter, FloatArray, Observation, Trace
+from safevar_sumo.records import ALL_TRUE, BoolArray, Encounter, FloatArray, Observation, Trace
 from safevar_sumo.scenarios import Point
 from safevar_sumo.scenarios.base import Scene
 from safevar_sumo.study import Weather
@@ -30,7 +30,7 @@ class Perception:
         """The observation at this step; must be called in every step. An occluded obstacle appears at rest, infinitely far away."""
         values = np.empty((len(OCCLUDED_VALUES) + 1, len(speed)))
         values[0], values[1], values[2], values[3], values[4] = scene.gap, scene.lateral, scene.lateral_speed, scene.obstacle_speed, speed
-        if scene.visible is not EVERYWHERE:
+        if scene.visible is not ALL_TRUE:
             values[:-1] = np.where(scene.visible, values[:-1], OCCLUDED_VALUES)
         (gap, lateral, lateral_speed, obstacle_speed, old_speed), self._delay_line = self._delay_line.delayed(values)
         return Observation(time, speed, gap, old_speed - obstacle_speed, lateral, lateral_speed, self._visibility, obstacle_speed)

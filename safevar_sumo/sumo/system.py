@@ -16,7 +16,7 @@ import msgspec
 import numpy as np
 
 from safevar_sumo.ads import ADS, ADS_CONTRACT, REACTIONS, SCALAR_ADS_CONTRACT, Ads, FmuAds, GuardedAds, PerVehicle, ScalarAds
-from safevar_sumo.errors import InputError, one_of, unknown
+from safevar_sumo.errors import InputError, one_of, unknown_name
 from safevar_sumo.fmu import STEP_LIMIT, description_of
 from safevar_sumo.metrics import FURTHER, METRICS, RATING_POINTS, Metric, Objective, Scoring, guard_metric
 from safevar_sumo.metrics import OBJECTIVES as BY_OBJECTIVE
@@ -214,7 +214,7 @@ def _assemble(study: Study, source: str) -> System:
     measuring = measuring_of(study, Lookup(source, study.origin.places))
     for name in study.published:
         if name not in measuring.metrics:
-            raise unknown(source, f"published.{name} is no metric", name, measuring.metrics)
+            raise unknown_name(source, f"published.{name} is no metric", name, measuring.metrics)
     rater = rater_of(study, source)
     matrix = _matrix_points(study if rater is None else expand_protocol(study, models.weather), source)
     for network in dict.fromkeys(scenario.network for scenario in (models.scenario, *(point.scenario for point in matrix))):
@@ -314,7 +314,7 @@ def _check_units(study: Study, vehicle: Vehicle, is_shipped_vehicle: bool, sourc
             raise InputError(source, f"vehicle.characteristics.{name}: the name is a column of results",
                              f"none of {', '.join(RESULT_COLUMNS)}")
         if name not in units:
-            raise unknown(source, f"vehicle.characteristics.{name}: {study.vehicle.model} has no such characteristic", name, units)
+            raise unknown_name(source, f"vehicle.characteristics.{name}: {study.vehicle.model} has no such characteristic", name, units)
         if table[name].unit != units[name]:
             raise InputError(source, f"vehicle.characteristics.{name}.unit = {table[name].unit!r}", repr(units[name]))
         if is_shipped_vehicle and table[name].lower <= 0:

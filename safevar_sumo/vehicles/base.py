@@ -219,8 +219,9 @@ class GuardedVehicle:
             for name, value in seen._asdict().items():
                 if not np.array_equal(getattr(sensed, name), value):
                     problem = f"{self._guard.name} changes {name} in sense, but a controller that reads through TraCI bypasses sense"
-                    raise UserCodeError(self._guard.source, problem, "a method sensors(prepared) that returns safevar_sumo.vehicles."
-                                        'Sensors(latency, reach, scale); or an ADS that gets the sensed values, without ads.kind = "traci"')
+                    raise UserCodeError(self._guard.source, problem, "a method sensors(prepared) that returns "
+                                        "safevar_sumo.vehicles.Sensors(latency, reach, scale); or an ADS that gets the sensed values, "
+                                        'without ads.kind = "traci"')
 
     def sense(self, prepared: _Prepared, state: _State, seen: Observation) -> tuple[Observation, _State]:
         result = self._guard.call("sense", self.model.sense, prepared.constants, state.model_state, read_only_copy(seen))

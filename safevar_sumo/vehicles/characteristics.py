@@ -14,7 +14,7 @@ import msgspec
 import numpy as np
 from msgspec import Struct
 
-from safevar_sumo.errors import InputError, unknown
+from safevar_sumo.errors import InputError, unknown_name
 from safevar_sumo.plugins import Guard, read_only_copy
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.study import CharacteristicTable
@@ -179,7 +179,7 @@ class CharacteristicSet:
         setting = self.original.copy()
         for name, value in values.items():
             if name not in self.names:
-                raise unknown(source, f"there is no characteristic {name!r}", name, self.names)
+                raise unknown_name(source, f"there is no characteristic {name!r}", name, self.names)
             column = self.names.index(name)
             self.members[column].check(value, source, beyond=beyond, switch=switch)
             setting[column] = value

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from safevar_sumo.errors import InputError, UserCodeError, unknown
+from safevar_sumo.errors import InputError, UserCodeError, unknown_name
 from safevar_sumo.fmu import COMMON_UNITS, REAL_TYPES, SI, Description, Fault, Fleet, History, Instances, Port, Unit, constants_of, ports_of
 from safevar_sumo.plugins import Guard
 from safevar_sumo.records import BoolArray, Command, FloatArray, Observation
@@ -82,10 +82,10 @@ class FmuVehicle:
         for key, entries, quantities in (("sensors", self._sensors, SENSOR_UNITS), ("sumo_type", self._type, TYPE_UNITS)):
             for name, entry in entries.items():
                 if name not in quantities:
-                    raise unknown(source, f"vehicle.{key}.{name}: there is no such quantity", name, quantities)
+                    raise unknown_name(source, f"vehicle.{key}.{name}: there is no such quantity", name, quantities)
                 if key == "sensors" and isinstance(entry, str) and entry not in units:
-                    raise unknown(source, f"vehicle.{key}.{name} = {entry!r}: there is no such characteristic", entry, units,
-                                  ", or a number")
+                    raise unknown_name(source, f"vehicle.{key}.{name} = {entry!r}: there is no such characteristic", entry, units,
+                                       ", or a number")
                 self._refuse_too_small(table["characteristics"], f"vehicle.{key}.{name}", entry, may_be_0=name == "latency")
         inputs = ports_of(description, table["inputs"], {**PEDALS, **CONSTANTS}, ("input",), source, "vehicle.inputs", constants=CONSTANTS)
         outputs = ports_of(description, table["outputs"], OUTPUTS, ("output",), source, "vehicle.outputs")
@@ -145,7 +145,7 @@ class FmuVehicle:
         n = len(next(iter(characteristics.values())))
         if slope is not LEVEL and not self.takes_slope:
             raise UserCodeError(self._guard.source, f"{self._guard.name} has no vehicle.inputs.grade, and the road has a grade",
-                               "a variable for the grade, or scenarios with grade 0")
+                                "a variable for the grade, or scenarios with grade 0")
         zeros = np.zeros(n)
         inputs = {"throttle": zeros, "brake": zeros, "road_friction": zeros + road_friction, "wet": zeros + wet,
                   "grade": zeros + slope.back / slope.down, "step": zeros + step, "initial_speed": zeros}

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from safevar_sumo.errors import InputError, in_one_line
+from safevar_sumo.errors import InputError, describe_error
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.results import RESULTS
 from safevar_sumo.workers.evaluation import PoolLostError, WorkerLostError, evaluate_batch
@@ -63,7 +63,7 @@ def cluster_pool(address: str, time_limit: float) -> Iterator[ClusterPool]:
     except (OSError, TimeoutError, ValueError) as error:
         raise InputError("cluster", f"nobody answers at {address!r}: {error}", legal) from None
     except (TypeError, RuntimeError) as error:
-        raise InputError("cluster", f"{address!r}: {in_one_line(error)}", CERTIFICATES) from None
+        raise InputError("cluster", f"{address!r}: {describe_error(error)}", CERTIFICATES) from None
     with defer_interrupts():
         try:
             yield ClusterPool(client, time_limit)

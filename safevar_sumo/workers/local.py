@@ -15,7 +15,7 @@ from multiprocessing import connection
 from types import ModuleType
 from typing import Any
 
-from safevar_sumo.errors import EnvironmentFault, SafevarError, in_one_line
+from safevar_sumo.errors import EnvironmentFault, SafevarError, describe_error
 from safevar_sumo.plugins import added_import_folders, inherit_import_folders
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.workers.evaluation import PoolLostError, WorkerLostError, evaluate_batch
@@ -191,7 +191,7 @@ def _evaluate_or_return_error(study: bytes, settings: FloatArray) -> Evaluations
     except SafevarError as error:
         return error
     except (OSError, MemoryError) as error:
-        return EnvironmentFault(f"a batch cannot be computed: {in_one_line(error)}")
+        return EnvironmentFault(f"a batch cannot be computed: {describe_error(error)}")
     except Exception:
         return RuntimeError(f"in a worker process\n{traceback.format_exc()}")  # not every exception survives the pipe
 

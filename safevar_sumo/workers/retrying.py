@@ -17,7 +17,7 @@ import numpy as np
 from safevar_sumo.errors import EnvironmentFault, SafevarError, SimulationError, UserCodeError
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import Evaluations, FloatArray, Outcome
-from safevar_sumo.shipped import RUN
+from safevar_sumo.shipped import PROGRAM_COMMAND
 from safevar_sumo.study import Study, user_code_names
 from safevar_sumo.vehicles import CharacteristicSet
 from safevar_sumo.workers.evaluation import Pool, PoolLostError, WorkerLostError
@@ -195,4 +195,4 @@ def reproduction_command(study: Study, setting: FloatArray) -> str:
     changes = [f"--set {characteristic.name}={value!r}"
                for characteristic, value in zip(CharacteristicSet.of(study.vehicle.characteristics), setting.tolist(), strict=True)
                if value != characteristic.original]
-    return " ".join([f"{RUN} simulate", shlex.quote(study.origin.called or study.name), *changes])
+    return " ".join([f"{PROGRAM_COMMAND} simulate", shlex.quote(study.origin.called or study.name), *changes])

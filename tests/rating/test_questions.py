@@ -27,7 +27,7 @@ from safevar_sumo.analysis.tolerance.render import print_tolerance, profiles_fig
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.protocol import EURO_NCAP_2026, protocol_of, rater
 from safevar_sumo.report.input import _at_point as at_point
-from safevar_sumo.report.rated import picture
+from safevar_sumo.report.rated import draw_matrices
 from safevar_sumo.results import record, solutions_frame
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.system import assemble
@@ -116,8 +116,8 @@ def test_a_rating_prints_draws_and_stands_in_a_page() -> None:
     assert "loses" in text
     assert "G>" in text
     assert matrices_figure(result).get_axes()
-    assert picture(result) == picture(result)
-    assert str(picture(result)).startswith("<svg")
+    assert draw_matrices(result) == draw_matrices(result)
+    assert str(draw_matrices(result)).startswith("<svg")
     assert result.to_frame().groupby("vehicle")["total"].sum().loc["variant"] == pytest.approx(result.variant.points)  # type: ignore[union-attr]
 
 

@@ -28,7 +28,7 @@ from safevar_sumo.reference.conclusions import (
     pair_cases,
 )
 from safevar_sumo.reference.validation import rank_correlation
-from safevar_sumo.report.verdict import AgreementRows, agreement_with_published
+from safevar_sumo.report.verdict import PublishedAgreement, describe_agreement
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo import simulate
 from safevar_sumo.sumo.batch import score
@@ -133,9 +133,9 @@ MADE_UP = Agreement(
     undecided={}, by_predicted=[])
 
 
-def page_of(study: Any) -> AgreementRows:
+def page_of(study: Any) -> PublishedAgreement:
     material: Any = SimpleNamespace(case=SimpleNamespace(study=study))
-    return agreement_with_published(material)
+    return describe_agreement(material)
 
 
 @pytest.fixture

@@ -14,10 +14,10 @@ from PIL import Image
 
 from safevar_sumo.analysis.research_questions.case import load_cases
 from safevar_sumo.errors import InputError
-from safevar_sumo.replay.animation import PANEL, VEHICLES, WIDTH, animate, check_animation, frames_of
+from safevar_sumo.replay.animation import PANEL_HEIGHT, VEHICLE_COLOURS, WIDTH, animate, draw_frames, require_ffmpeg
 from safevar_sumo.replay.comparison import Comparison, compare_setting
 from safevar_sumo.replay.page import animation_page
-from safevar_sumo.replay.scene import flat_scene_of
+from safevar_sumo.replay.scene import lay_out_scene
 from safevar_sumo.sumo.system import assemble
 
 
@@ -29,22 +29,22 @@ def crash(slippery: Path) -> Comparison:
 
 def where(picture: Image.Image, colour: str) -> tuple[np.ndarray, np.ndarray]:
     """Rows and columns of the pixels of a colour, below the words."""
-    pixels = np.asarray(picture.convert("RGB")).astype(int)[PANEL:]
+    pixels = np.asarray(picture.convert("RGB")).astype(int)[PANEL_HEIGHT:]
     wanted = [int(colour[i:i + 2], 16) for i in (1, 3, 5)]
     return np.nonzero(np.abs(pixels - wanted).max(axis=2) < 26)
 
 
 def test_both_vehicles_are_drawn_at_their_positions_to_scale(crash: Comparison) -> None:
-    scene = flat_scene_of(crash)
-    picture = next(frames_of(scene, scene.length))  # the start: the changed vehicle stands on the original's place
+    scene = lay_out_scene(crash)
+    picture = next(draw_frames(scene, scene.length))  # the start: the changed vehicle stands on the original's place
     scale = WIDTH / scene.view.width
-    rows, columns = where(picture, VEHICLES[0])
+    rows, columns = where(picture, VEHICLE_COLOURS[0])
     vut = next(body for body in scene.bodies if body.is_vut)
     assert columns.max() - columns.min() == pytest.approx(vut.length * scale, abs=4)
     assert rows.max() - rows.min() == pytest.approx(vut.width * scale, abs=4)
-    end = list(frames_of(scene, scene.length))[-1]
+    end = list(draw_frames(scene, scene.length))[-1]
     for row, body in enumerate(one for one in scene.bodies if one.is_vut):
-        _, columns = where(end, VEHICLES[row])
+        _, columns = where(end, VEHICLE_COLOURS[row])
         assert columns.max() == pytest.approx((body.x[-1] - scene.view.left_ends[-1]) * scale, abs=4)
 
 
@@ -58,7 +58,7 @@ def test_a_road_in_any_direction_looks_the_same(angle: float, crash: Comparison)
         return track._replace(x=x.reshape(track.x.shape), y=y.reshape(track.y.shape), angle=track.angle + angle)
 
     film = dataclasses.replace(crash.film, tracks={name: turned(track) for name, track in crash.film.tracks.items()})
-    straight, rotated = flat_scene_of(crash), flat_scene_of(dataclasses.replace(crash, film=film))
+    straight, rotated = lay_out_scene(crash), lay_out_scene(dataclasses.replace(crash, film=film))
     for one, other in zip(straight.bodies, rotated.bodies, strict=True):
         assert np.allclose(one.x, other.x)
         assert np.allclose(one.y, other.y)
@@ -78,14 +78,14 @@ def test_the_same_bytes_twice(kind: str, crash: Comparison, tmp_path: Path) -> N
             for frame in range(image.n_frames):
                 image.seek(frame)
                 durations.append(image.info["duration"])
-        seconds = flat_scene_of(crash).length * crash.film.runs.trace.step
+        seconds = lay_out_scene(crash).length * crash.film.runs.trace.step
         assert sum(durations[:-1]) / 1000 == pytest.approx(seconds, abs=0.3), "it lasts as long as the drive"
     if kind == "mp4":
         assert (tmp_path / "a.mp4").read_bytes()[4:8] == b"ftyp"
 
 
 def test_the_page_holds_every_place_to_the_centimetre(crash: Comparison) -> None:
-    page, scene = animation_page(flat_scene_of(crash)), flat_scene_of(crash)
+    page, scene = animation_page(lay_out_scene(crash)), lay_out_scene(crash)
     data = json.loads(re.search(r'<script type="application/json">(.*?)</script>', page, re.DOTALL)[1])  # type: ignore[index]
     assert data["step"] == scene.step
     vuts = [body for body in data["bodies"] if body["drive"] is not None]
@@ -95,7 +95,7 @@ def test_the_page_holds_every_place_to_the_centimetre(crash: Comparison) -> None
 
 
 def test_text_of_a_study_stays_text(crash: Comparison) -> None:
-    page = animation_page(flat_scene_of(dataclasses.replace(crash, title="<script>alert(1)</script></title>")))
+    page = animation_page(lay_out_scene(dataclasses.replace(crash, title="<script>alert(1)</script></title>")))
     assert "<script>alert" not in page
     assert "&lt;script&gt;alert(1)&lt;/script&gt;" in page
     assert "http" not in page.replace("http-equiv", ""), "nothing is fetched from elsewhere"
@@ -105,4 +105,4 @@ def test_without_ffmpeg_a_film_is_refused_before_anything_runs(tmp_path: Path, m
     monkeypatch.setenv("PATH", "/nowhere")
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     with pytest.raises(InputError, match="ffmpeg"):
-        check_animation(tmp_path / "it.mp4")
+        require_ffmpeg(tmp_path / "it.mp4")

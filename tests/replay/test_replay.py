@@ -1,4 +1,4 @@
-"""Replays: solutions of a results directory are simulated again with the same results, and seen from above."""
+"""ReplayOutputs: solutions of a results directory are simulated again with the same results, and seen from above."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from safevar_sumo.analysis.research_questions.case import Case, load_cases
 from safevar_sumo.cli.program import commands
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import METRICS
-from safevar_sumo.replay.comparison import Comparison, compare_setting, differences, divergence, moments
+from safevar_sumo.replay.comparison import Comparison, compare_setting, find_divergence, find_moments, list_differences
 from safevar_sumo.replay.figure import draw_comparison
-from safevar_sumo.replay.film import film
+from safevar_sumo.replay.film import record_film
 from safevar_sumo.replay.gui import show_in_gui
 from safevar_sumo.results import handles_of
 from safevar_sumo.study import load_study
@@ -62,7 +62,7 @@ def test_the_most_severe_the_smallest_and_the_fewest(flag: str, column: str, sli
 
 def test_a_replay_that_differs_from_its_row_is_reported(slippery: Path, case: Case) -> None:
     comparison = compare_setting(case.study, assemble(case.study), case.characteristics.original)
-    result = differences(comparison.evaluations, {"safety_degree": 1.0, "tet": np.nan, "outcome": "collision"})
+    result = list_differences(comparison.evaluations, {"safety_degree": 1.0, "tet": np.nan, "outcome": "collision"})
     assert [one.split(" is ")[0] for one in result] == ["the outcome", "safety_degree", "tet"]
 
 
@@ -82,7 +82,7 @@ def test_what_cannot_be_replayed_is_refused(arguments: list[str], legal: str, sl
 def test_a_film_shows_what_is_simulated(study: str) -> None:
     system = assemble(load_study(study))
     settings = np.stack([system.characteristics.original, system.characteristics.lower])
-    result, plain = film(system, settings), simulate(system, settings)
+    result, plain = record_film(system, settings), simulate(system, settings)
     for name, values in score(system, settings, plain).metrics.items():
         assert np.array_equal(values, score(system, settings, result.runs).metrics[name], equal_nan=True)
     vut = result.tracks["vut"]
@@ -95,7 +95,7 @@ def test_a_film_shows_what_is_simulated(study: str) -> None:
 
 
 def test_a_film_of_the_crossing_has_its_pedestrian_and_its_crossing(sun: System) -> None:
-    result = film(sun, sun.characteristics.original[np.newaxis])
+    result = record_film(sun, sun.characteristics.original[np.newaxis])
     pedestrian = result.tracks["pedestrian"]
     assert pedestrian.is_person
     assert np.allclose(pedestrian.y[:, 0] - result.tracks["vut"].y[:, 0], result.runs.trace.lateral[:, 0])
@@ -107,7 +107,7 @@ def test_a_film_of_the_crossing_has_its_pedestrian_and_its_crossing(sun: System)
 def test_moments_of_a_drive(case: Case) -> None:
     comparison = compare_setting(case.study, assemble(case.study), case.solutions[list(case.characteristics.names)].to_numpy()[0])
     runs = comparison.film.runs
-    trace, original, hit = runs.trace, moments(runs, 0), moments(runs, 1)
+    trace, original, hit = runs.trace, find_moments(runs, 0), find_moments(runs, 1)
     assert original.brake is not None
     assert trace.brake[original.brake, 0] > 0
     assert not trace.brake[trace.time < trace.time[original.brake], 0].any()
@@ -115,7 +115,7 @@ def test_moments_of_a_drive(case: Case) -> None:
     assert hit.nearest == hit.end
     assert comparison.verdict(0) == f"stops with {comparison.evaluations.f_safe[0]:.2f} m to spare"
     assert comparison.verdict(1) == f"collides at {-comparison.evaluations.f_safe[1]:.1f} m/s"
-    apart = divergence(runs)
+    apart = find_divergence(runs)
     assert apart is not None
     assert abs(trace.speed[apart, 0] - trace.speed[apart, 1]) > 0.1
     assert np.all(np.abs(trace.speed[:apart, 0] - trace.speed[:apart, 1]) <= 0.1)
@@ -210,7 +210,7 @@ def test_both_vehicles_are_in_the_window_at_the_nearest_moment(slippery: Path, t
     system = assemble(case.study)
     comparison = compare_setting(case.study, system, case.solutions[list(case.characteristics.names)].to_numpy()[0])
     show_in_gui(comparison, system.scenario.network, slower=0.01, rest=0.0, pictures=tmp_path)
-    first, second = (moments(comparison.film.runs, row) for row in comparison.rows)
+    first, second = (find_moments(comparison.film.runs, row) for row in comparison.rows)
     assert {path.stem for path in tmp_path.iterdir()} == {f"{sample:04d}" for sample in (first.nearest, second.nearest, first.end)}
     with Image.open(tmp_path / f"{second.nearest:04d}.png") as image:
         picture = np.asarray(image.convert("RGB"))

@@ -24,15 +24,15 @@ from safevar_sumo.analysis.research_questions.case import load_cases
 from safevar_sumo.cli.program import commands
 from safevar_sumo.errors import InputError
 from safevar_sumo.replay.comparison import changes_in_words
-from safevar_sumo.report import SECTIONS, findings, make_report
+from safevar_sumo.report import SECTIONS, causes, make_report
 from safevar_sumo.report import input as report_input
 from safevar_sumo.report import verdict as what
-from safevar_sumo.report.findings import Explanations
-from safevar_sumo.report.input import AVOIDED, failing_table, stored_answer
-from safevar_sumo.report.limits import LIMITS, _percent
-from safevar_sumo.report.page import PARTS, read_inputs
-from safevar_sumo.report.svg import Dot, scatter
-from safevar_sumo.report.verdict import verdict
+from safevar_sumo.report.causes import Explanations
+from safevar_sumo.report.domain import DOMAIN_SECTIONS, _estimate_text
+from safevar_sumo.report.input import AVOIDED_TEXT, load_or_compute, tabulate_failing_points
+from safevar_sumo.report.page import COMMAND_OF_SECTION, read_inputs
+from safevar_sumo.report.svg import Dot, draw_scatter
+from safevar_sumo.report.verdict import reach_verdict
 from safevar_sumo.results import SolutionId
 from safevar_sumo.results.manifest import write_manifest
 from safevar_sumo.scenarios import Point
@@ -90,7 +90,7 @@ def page(slippery: Path, explained: Explained) -> str:
     friction = list(study.vehicle.characteristics).index("tireFric")
     shutil.rmtree(slippery / "answers", ignore_errors=True)  # of tests that simulated before
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(findings, "explain", lambda *_, **__: explained)
+        patch.setattr(causes, "explain_failures", lambda *_, **__: explained)
         patch.setattr(report_input, "SAMPLES", 400)
         patch.setattr(local, "LocalPool", lambda *_: Plant(study, lambda rows: rows[:, friction] < 1.5))
         return make_report([slippery], jobs=1)
@@ -101,7 +101,7 @@ def never_again(few_samples: None, monkeypatch: pytest.MonkeyPatch) -> None:
     def ask(*_: object, **__: object) -> None:
         raise AssertionError("asked twice")
 
-    monkeypatch.setattr(findings, "explain", ask)
+    monkeypatch.setattr(causes, "explain_failures", ask)
     monkeypatch.setattr(InlinePool, "submit", ask)
 
 
@@ -169,18 +169,19 @@ def test_the_verdict_leads_with_the_robust_failure_and_calls_the_others_borderli
     fewest, robust = (msgspec.structs.replace(
         entry, reasons=[reason], robustness=share, **dict(zip(("algorithm", "run", "index"), SolutionId.parse(row["handle"]), strict=True)))
         for reason, share, row in zip(("fewest changes", "smallest robust"), (0.79, 0.81), failing, strict=False))
-    result = verdict(data, Explanations([fewest, robust], summary), {"joint": {"factor": 0.42, "samples": 1024}})
-    assert [(one.title, one.borderline) for one in result.findings] == [("Smallest robust failure", False), ("Fewest changes", True)]
-    first = result.findings[0]
+    result = reach_verdict(data, Explanations([fewest, robust], summary), {"joint": {"factor": 0.42, "samples": 1024}})
+    assert [(one.title, one.borderline) for one in result.failures] == [("Smallest robust failure", False), ("Fewest changes", True)]
+    first = result.failures[0]
     assert [one.text for one in first.changes] == changes_in_words(data.case.characteristics, data.setting_of(first.handle))
     number, needed = len(first.changes), len(robust.minimal_causes[0].changes)
     assert 0 < needed < number, "or the next line tells nothing"
     assert result.headline.startswith(f"{number} changes lead to a collision that is robust ({needed} of them suffice")
     all_changes = msgspec.structs.replace(robust.minimal_causes[0], changes={one.text: 1.0 for one in first.changes})
-    every = verdict(data, Explanations([fewest, msgspec.structs.replace(robust, minimal_causes=[all_changes])], summary), None).headline
+    whole_cause = msgspec.structs.replace(robust, minimal_causes=[all_changes])
+    every = reach_verdict(data, Explanations([fewest, whole_cause], summary), None).headline
     assert every.startswith(f"{number} changes suffice for a collision that is robust: the vehicle collides")
-    assert [one.value for one in result.figures[2:]] == ["14% of the collisions", "42.0% of the way"]
-    assert result.figures[0].value.startswith(f"{number} changes")
+    assert [one.value for one in result.key_figures[2:]] == ["14% of the collisions", "42.0% of the way"]
+    assert result.key_figures[0].value.startswith(f"{number} changes")
 
 
 @pytest.mark.slow
@@ -214,7 +215,7 @@ def test_a_kept_answer_belongs_to_its_options_and_to_the_code_that_computed_it(
     computed: list[str] = []
 
     def ask(why: str) -> None:
-        stored_answer(read_inputs([place])[0], "risk", lambda: computed.append(why))
+        load_or_compute(read_inputs([place])[0], "risk", lambda: computed.append(why))
 
     for why in ("first", "again"):
         ask(why)
@@ -223,7 +224,7 @@ def test_a_kept_answer_belongs_to_its_options_and_to_the_code_that_computed_it(
     ask("other results")
     monkeypatch.setattr(report_input, "SAMPLES", 33)
     ask("another sample size")
-    monkeypatch.setattr(report_input, "_package", lambda: "edited since")
+    monkeypatch.setattr(report_input, "_package_identity", lambda: "edited since")
     ask("other code")
     assert computed == ["first", "other results", "another sample size", "other code"]
 
@@ -287,7 +288,7 @@ def test_the_command_writes_the_page_and_refuses_what_it_cannot(slippery: Path, 
 
 
 def test_a_chart_puts_its_points_where_they_belong_and_escapes_their_words() -> None:
-    chart = str(scatter("chart", [Dot(0, 0, "a", "hit"), Dot(100, 2, "<b>", "miss", "x")], "x", "y", 0.0, "line"))
+    chart = str(draw_scatter("chart", [Dot(0, 0, "a", "hit"), Dot(100, 2, "<b>", "miss", "x")], "x", "y", 0.0, "line"))
     dots = [tuple(map(float, result)) for result in re.findall(r'cx="([\d.]+)" cy="([\d.]+)"', chart)]
     level = float(re.search(r'class="level" d="M62 ([\d.]+)H', chart)[1])  # type: ignore[index]
     assert dots[0] == (62.0, level)
@@ -311,16 +312,16 @@ def test_tests_and_weathers_stand_down_and_speeds_across() -> None:
                 for speed in (10, 20, 30) for at in (25, 50)),
               point("along 30", test="along", speed=30, weather="clear"), point("along 40", test="along", speed=40, weather="clear"),
               point("safe 10", test="safe", speed=10, weather="clear")]
-    result = failing_table(matrix, ("near 20 50", "near 30 25", "near 30 50", "along 40"))
+    result = tabulate_failing_points(matrix, ("near 20 50", "near 30 25", "near 30 50", "along 40"))
     assert result.summary == "Fails at 4 of 9 points. Percentages are impact locations."
     assert result.heads == ["10 km/h", "20 km/h", "30 km/h", "40 km/h"]
-    assert dict(result.rows) == {"near, night": [AVOIDED, "50 %", "25 %, 50 %", ""], "along, clear": ["", "", AVOIDED, "fails"]}
+    assert dict(result.rows) == {"near, night": [AVOIDED_TEXT, "50 %", "25 %, 50 %", ""], "along, clear": ["", "", AVOIDED_TEXT, "fails"]}
 
 
 def test_a_matrix_of_something_else_than_speeds_has_a_table_too() -> None:
-    result = failing_table([point("a", test="a", weather="fog", slope=0.1), point("b", test="b", weather="fog")], ["a"])
+    result = tabulate_failing_points([point("a", test="a", weather="fog", slope=0.1), point("b", test="b", weather="fog")], ["a"])
     assert (result.heads, result.rows) == ([""], [("a, fog, slope 0.1", ["fails"])])
-    assert failing_table([point("b", test="b", weather="fog")], []).rows == []
+    assert tabulate_failing_points([point("b", test="b", weather="fog")], []).rows == []
 
 
 def test_a_study_that_cannot_be_simulated_has_its_page(slippery: Path, tmp_path: Path) -> None:
@@ -330,9 +331,9 @@ def test_a_study_that_cannot_be_simulated_has_its_page(slippery: Path, tmp_path:
     manifest["study"]["scenario"]["parameters"] = {"network": "/nowhere/gone"}
     write_manifest(tmp_path / "copy", manifest)
     with pytest.warns(UserWarning, match="copy: This study cannot be simulated here: .*gone"):
-        page = make_report([tmp_path / "copy"], only=["tested", "verdict", *PARTS, "trust", "reproduce"], jobs=1)
+        page = make_report([tmp_path / "copy"], only=["tested", "verdict", *COMMAND_OF_SECTION, "trust", "reproduce"], jobs=1)
     result = re.findall(r"slippery: This study cannot be simulated here: .*gone", page)
-    assert len(result) == 1 + len(LIMITS), "each section that would take simulations says so"
+    assert len(result) == 1 + len(DOMAIN_SECTIONS), "each section that would take simulations says so"
     assert '<details class="replay"' in page
 
 
@@ -345,7 +346,7 @@ def test_of_an_original_that_collides_no_change_is_called_the_cause(
     write_manifest(tmp_path / "copy", manifest)
     empty = {"changes": {}, "boundary": {}, "fraction": 0.0, "end": "safe", "outcome": "collision", "safety_degree": -3.9}
     failure, *_, summary = explained.to_dict()
-    monkeypatch.setattr(findings, "explain", lambda *_, **__: SimpleNamespace(
+    monkeypatch.setattr(causes, "explain_failures", lambda *_, **__: SimpleNamespace(
         to_dict=lambda: [failure | {"minimal_causes": [empty]}, summary]))
     page = make_report([tmp_path / "copy"], only=["verdict", "causes"], jobs=1)
     assert "No change is needed: the original vehicle itself collides." in page
@@ -360,7 +361,7 @@ def test_user_code_is_called_by_its_name_once(slippery: Path) -> None:
     points = [Point(scenario, data.case.weather)]  # type: ignore[arg-type]
     others: Any = SimpleNamespace(case=dataclasses.replace(data.case, study=study), manifest=data.manifest, problem="", point="",
                                   system=SimpleNamespace(points=points, matrix=(), vehicle=None))
-    result = what.tested_system(others)
+    result = what.describe_tested_system(others)
     assert "Driving system: my_controller:Pilot. Scenario: pedestrian_crossing (" in result.subject
     assert "NSGA-II (1 run)" in result.search
     assert not result.tags
@@ -368,4 +369,4 @@ def test_user_code_is_called_by_its_name_once(slippery: Path) -> None:
 
 def test_an_estimate_stands_beside_its_error_and_just_below_nothing_it_is_nothing() -> None:
     estimates = [(-0.002, (-0.01, 0.006)), (0.126, (0.106, 0.146)), (1.04, (0.94, 1.14)), (0.3, (None, None)), (None, (None, None))]
-    assert [_percent(share, interval) for share, interval in estimates] == ["0 % ± 1", "13 % ± 2", "104 % ± 10", "30 %", "-"]
+    assert [_estimate_text(share, interval) for share, interval in estimates] == ["0 % ± 1", "13 % ± 2", "104 % ± 10", "30 %", "-"]

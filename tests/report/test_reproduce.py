@@ -21,14 +21,15 @@ from safevar_sumo.cli.program import commands
 from safevar_sumo.errors import InputError
 from safevar_sumo.report import input as report_input
 from safevar_sumo.report import make_report
-from safevar_sumo.report.page import read_inputs, reproduce
+from safevar_sumo.report.page import commands_to_reproduce, read_inputs
 from safevar_sumo.study import Study, load_study
 from tests.in_process import searched
 
 
 def first_command(study: Study) -> list[str]:
-    one: Any = SimpleNamespace(directory=Path("its results"), point="", changed=(), case=SimpleNamespace(study=study, has_runs=True))
-    return shlex.split(reproduce([one], [])[0]["command"])
+    one: Any = SimpleNamespace(directory=Path("its results"), point="", later_changes=(),
+                               case=SimpleNamespace(study=study, has_runs=True))
+    return shlex.split(commands_to_reproduce([one], [])[0]["command"])
 
 
 def test_of_a_shipped_study_the_command_asks_for_the_same() -> None:
@@ -37,7 +38,7 @@ def test_of_a_shipped_study_the_command_asks_for_the_same() -> None:
     assert (python, package, asked[0]) == ("python", "safevar_sumo", "study")
     given = command.study.make_context("study", asked[1:]).params
     options = {name: given[name] for name in ("algorithms", "seed", "runs", "evaluations")}
-    assert command._with_options(load_study(given["study"]), **options) == study
+    assert command._apply_options(load_study(given["study"]), **options) == study
 
 
 @pytest.mark.parametrize("changes", [{"name": "pilot"}, {"step_length": 0.02}])

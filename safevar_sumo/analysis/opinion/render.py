@@ -6,7 +6,7 @@ from rich.console import Console
 
 from safevar_sumo.analysis.opinion.result import Opinions, OpinionVerdict
 from safevar_sumo.analysis.words import join_phrases, list_of_changes, number_of
-from safevar_sumo.terminal import plain, print_text
+from safevar_sumo.terminal import print_text, printable_text
 from safevar_sumo.vehicles import CharacteristicSet
 
 MODEL = "Driven again with CommonRoad's multi-body vehicle, Pacejka's tyres and anti-lock brakes"
@@ -22,8 +22,8 @@ def print_opinions(console: Console, result: Opinions) -> None:
     for handle in result.without_cause:
         print_text(console, f"note: {handle} is not unsafe: it has no cause")
     for opinion in result.opinions:
-        line = plain(f"{opinion.solution}: " if opinion.solution else "").append(str(opinion.opinion), STYLES[opinion.opinion])
-        console.print(line.append(plain(f": {list_of_changes(members, opinion.changes)}")), soft_wrap=True, highlight=False)
+        line = printable_text(f"{opinion.solution}: " if opinion.solution else "").append(str(opinion.opinion), STYLES[opinion.opinion])
+        console.print(line.append(printable_text(f": {list_of_changes(members, opinion.changes)}")), soft_wrap=True, highlight=False)
         print_text(console, f"  with our model {opinion.here}; {opinion.because}")
 
 

@@ -22,7 +22,7 @@ from safevar_sumo.analysis.research_questions.changes import (
 )
 from safevar_sumo.analysis.research_questions.comparisons import rq1, rq2
 from safevar_sumo.analysis.research_questions.over_runs import difference_line, rq1_runs, rq2_runs
-from safevar_sumo.errors import unknown
+from safevar_sumo.errors import unknown_name
 from safevar_sumo.metrics import SAFEVAR, MetricFacts
 
 Frames = dict[str, pd.DataFrame]
@@ -64,7 +64,7 @@ def answer(cases: Sequence[Case], question: str | None = None) -> list[Answer]:
         If there is no such question, or no case has an answer.
     """
     if question is not None and question not in QUESTIONS:
-        raise unknown("question", f"there is no question {question!r}", question, QUESTIONS)
+        raise unknown_name("question", f"there is no question {question!r}", question, QUESTIONS)
     answers, all_errors, names = [], [], [case.name for case in cases]
     metrics = tuple({metric.name: metric for case in cases for metric in case.scoring.metrics}.values())
     questions = (*FRAMES_OF_ONE_CASE, WEATHER)

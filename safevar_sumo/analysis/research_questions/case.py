@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 import pandas as pd
 
-from safevar_sumo.errors import InputError, in_one_line
+from safevar_sumo.errors import InputError, describe_error
 from safevar_sumo.metrics import SAFEVAR, MetricFacts, Scoring, Unsafe
 from safevar_sumo.records import FloatArray, Outcome
 from safevar_sumo.results import MANIFEST, Failure, failure_lines, folders_of, load_runs
@@ -168,7 +168,7 @@ def _load_or_refuse(path: Path) -> Case:
     try:
         return load_case(path)
     except (TypeError, ValueError, KeyError, ArithmeticError) as error:
-        raise InputError(path, f"is damaged: {in_one_line(error)}", "an unchanged directory of the command study") from error
+        raise InputError(path, f"is damaged: {describe_error(error)}", "an unchanged directory of the command study") from error
 
 
 def load_case(directory: Path) -> Case:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 from safevar_sumo.analysis.options import Options, document_options, option, unsafe_option
 from safevar_sumo.analysis.subject import Results, answer_question, study_of
-from safevar_sumo.errors import InputError, unknown
+from safevar_sumo.errors import InputError, unknown_name
 from safevar_sumo.study import StudyLike
 
 if TYPE_CHECKING:
@@ -44,7 +44,7 @@ class RiskOptions(Options):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.method not in METHODS:
-            raise unknown("method", repr(self.method), self.method, METHODS)
+            raise unknown_name("method", repr(self.method), self.method, METHODS)
         if self.rare and self.method == "monte_carlo":
             raise InputError("rare", "cannot be combined with method = 'monte_carlo'", "either rare or method")
 

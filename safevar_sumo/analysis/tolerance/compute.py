@@ -15,7 +15,7 @@ import pandas as pd
 from safevar_sumo.analysis.evaluator import Evaluator, Progress, open_evaluator, show_no_progress
 from safevar_sumo.analysis.tolerance import ToleranceOptions
 from safevar_sumo.analysis.tolerance.joint import Pair, SafeBox, find_safe_box, no_safe_box, scan_pairs
-from safevar_sumo.errors import InputError, unknown
+from safevar_sumo.errors import InputError, unknown_name
 from safevar_sumo.metrics import RATING_POINTS, Unsafe
 from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.records import Evaluations, FloatArray, Outcome, finite_or_none
@@ -238,7 +238,7 @@ def _columns_of(study: Study, characteristics: Sequence[str] | None) -> list[int
     names, chosen = list(study.vehicle.characteristics), characteristics or ()
     for name in chosen:
         if name not in names:
-            raise unknown("characteristics", f"there is no characteristic {name!r}", name, names)
+            raise unknown_name("characteristics", f"there is no characteristic {name!r}", name, names)
     if len(set(chosen)) < len(chosen):
         raise InputError("characteristics", f"{','.join(chosen)}: a characteristic is named twice", "each characteristic once")
     return [column for column, name in enumerate(names) if characteristics is None or name in characteristics]
