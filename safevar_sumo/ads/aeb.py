@@ -8,7 +8,7 @@ import numpy as np
 from msgspec import Meta, Struct
 
 from safevar_sumo.ads.base import NotNegative, Positive
-from safevar_sumo.ads.driver import Trim, in_the_way, pedals, time_to_reach, trim
+from safevar_sumo.ads.driver import Trim, in_the_way, pedals_for, time_to_reach, trim_at
 from safevar_sumo.records import BoolArray, Command, FloatArray, Nominal, Observation
 
 LEAST_DECELERATION = 0.5
@@ -82,11 +82,11 @@ class Aeb(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
     def drive(self, seen: Observation, memory: _Memory) -> tuple[Command, _Memory]:
         nominal = memory.nominal
-        cruise_speed, cruise_trim = memory.cruise or (self._speed_to_hold(seen), trim(nominal, seen))
+        cruise_speed, cruise_trim = memory.cruise or (self._speed_to_hold(seen), trim_at(nominal, seen))
         threat = in_the_way(seen, self.corridor, self.reach) & (seen.closing_speed > 0)
         stage = self._stage(seen, memory, threat)
         intervened = memory.intervened | (stage > 0)
-        cruising = pedals(nominal, seen.speed, self.cruise_gain * (cruise_speed - seen.speed), cruise_trim)
+        cruising = pedals_for(nominal, seen.speed, self.cruise_gain * (cruise_speed - seen.speed), cruise_trim)
         command = Command(
             np.where(intervened, 0.0, cruising.throttle),
             np.where(stage == 2, 1.0, np.where(stage == 1, self.partial_share, np.where(intervened, 0.0, cruising.brake))))

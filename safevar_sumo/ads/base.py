@@ -19,7 +19,7 @@ NotNegative = Annotated[float, Meta(ge=0, le=1e3)]
 """A driver's parameter that may be 0, in SI units."""
 
 
-REACTIONS = ("recognition_delay", "hesitation")
+REACTION_PARAMETERS = ("recognition_delay", "hesitation")
 """Names of the parameters of an ADS that delay its reaction [s]; a study may raise them in bad weather."""
 
 
@@ -89,7 +89,7 @@ class GuardedAds:
         return self._guard.numbers("drive", name, value, seen.speed.shape, 0.0, 1.0)
 
 
-class PerVehicle:
+class PerVehicleAds:
     """Drives N vehicles with N instances of a `ScalarAds`."""
 
     def __init__(self, make: Callable[[], ScalarAds], guard: Guard) -> None:

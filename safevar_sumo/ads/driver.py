@@ -54,7 +54,7 @@ class Trim(NamedTuple):
     brake: FloatArray
 
 
-def trim(nominal: Nominal, seen: Observation) -> Trim:
+def trim_at(nominal: Nominal, seen: Observation) -> Trim:
     """The trim of a driver who already holds the speed of a rolling vehicle."""
     rolls = seen.speed > 0
     throttle = np.where(rolls, seen.throttle - _throttle(nominal, seen.speed, np.zeros_like(seen.speed)), 0.0)
@@ -62,7 +62,7 @@ def trim(nominal: Nominal, seen: Observation) -> Trim:
     return Trim(throttle, np.where(rolls & (seen.brake > 0), seen.brake + coasting / nominal.braking, 0.0))
 
 
-def pedals(nominal: Nominal, speed: FloatArray, acceleration: FloatArray, pedal_trim: Trim) -> Command:
+def pedals_for(nominal: Nominal, speed: FloatArray, acceleration: FloatArray, pedal_trim: Trim) -> Command:
     """Pedals for an acceleration [m/s^2] at a speed [m/s], from the tables of the original vehicle and a trim."""
     (coasting,) = interpolated_tables(nominal.speeds, speed, nominal.coasting)
     excess = acceleration + coasting - nominal.braking * pedal_trim.brake
@@ -161,7 +161,7 @@ def react(seen: Observation, reaction: Reaction, danger: BoolArray, deceleration
     cruise = reaction.cruise
     if cruise is None:
         speed = seen.speed if cruise_speed is None else np.full_like(seen.speed, cruise_speed)
-        cruise = speed, trim(reaction.nominal, seen)
+        cruise = speed, trim_at(reaction.nominal, seen)
     nears = np.isfinite(seen.gap) & (seen.gap > 0) & (seen.closing_speed > 0)
     lasts = nears | blocks_the_way(seen, corridor)
     aware = reaction.danger_time >= 0
@@ -171,7 +171,7 @@ def react(seen: Observation, reaction: Reaction, danger: BoolArray, deceleration
     cruising = np.minimum(CRUISE_GAIN * (cruise[0] - seen.speed), following)
     coasts = (danger_time >= 0) & (coasting_deceleration > 0)
     acceleration = np.where(brakes, -braking, np.where(coasts, -coasting_deceleration, cruising))
-    command = pedals(reaction.nominal, seen.speed, acceleration, cruise[1])
+    command = pedals_for(reaction.nominal, seen.speed, acceleration, cruise[1])
     sample = round(seen.time / reaction.step)
     if sample < len(start):
         starts = danger_time < 0
@@ -204,10 +204,10 @@ class CarFollowing(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
         return FollowingMemory(nominal, step, None)
 
     def drive(self, seen: Observation, memory: FollowingMemory) -> tuple[Command, FollowingMemory]:
-        initial_trim = trim(memory.nominal, seen) if memory.initial_trim is None else memory.initial_trim
+        initial_trim = trim_at(memory.nominal, seen) if memory.initial_trim is None else memory.initial_trim
         gap = np.where(in_the_way(seen, self.corridor), seen.gap, LARGEST_GAP)
         acceleration = self.acceleration_at(gap, seen.speed, seen.obstacle_speed)
-        return pedals(memory.nominal, seen.speed, acceleration, initial_trim), memory._replace(initial_trim=initial_trim)
+        return pedals_for(memory.nominal, seen.speed, acceleration, initial_trim), memory._replace(initial_trim=initial_trim)
 
     def acceleration_at(self, gap: FloatArray, speed: FloatArray, leader_speed: FloatArray) -> FloatArray:
         """Commanded acceleration [m/s^2] at a gap from bumper to bumper [m] and speeds [m/s], shape (N,)."""

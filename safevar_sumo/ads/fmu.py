@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from safevar_sumo.ads.driver import Trim, pedals, trim
+from safevar_sumo.ads.driver import Trim, pedals_for, trim_at
 from safevar_sumo.errors import ForeignError, InputError
 from safevar_sumo.fmu import Description, Fault, Fleet, History, Instances, constants_of, ports_of
 from safevar_sumo.plugins import Guard
@@ -92,8 +92,8 @@ class FmuAds:
         memory = memory._replace(history=history, warns=warns)
         if "acceleration" in outputs:
             acceleration = self._guard.numbers("doStep", "acceleration", outputs["acceleration"], seen.speed.shape)
-            initial_trim = memory.trim or trim(memory.nominal, seen)
-            return pedals(memory.nominal, seen.speed, acceleration, initial_trim), memory._replace(trim=initial_trim)
+            initial_trim = memory.trim or trim_at(memory.nominal, seen)
+            return pedals_for(memory.nominal, seen.speed, acceleration, initial_trim), memory._replace(trim=initial_trim)
         zeros = np.zeros_like(seen.speed)
         return Command(*(self._guard.numbers("doStep", name, outputs.get(name, zeros), seen.speed.shape, 0.0, 1.0)
                          for name in Command._fields)), memory

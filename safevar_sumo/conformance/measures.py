@@ -13,7 +13,7 @@ from safevar_sumo.ads import Ads
 from safevar_sumo.conformance.models import AdsProbe, StudyProbe, VehicleProbe
 from safevar_sumo.conformance.probe import NoReaction, Outputs, Probe, Rows, corners, cost_of, guard_of, loaded_again, timed
 from safevar_sumo.conformance.subject import Subject
-from safevar_sumo.metrics import METRICS, foreign_metric
+from safevar_sumo.metrics import METRICS, guard_metric
 from safevar_sumo.plugins import Lookup, forget_foreign, instance_of
 from safevar_sumo.records import Command, Evaluations, FloatArray, Nominal, Observation, SimulationRuns
 from safevar_sumo.search import ALGORITHMS, GuardedAlgorithm, Problem
@@ -35,7 +35,7 @@ class MetricProbe(Probe):
 
     def load(self) -> Any:
         forget_foreign()
-        return foreign_metric(loaded_again(self.subject), guard_of(self.subject))
+        return guard_metric(loaded_again(self.subject), guard_of(self.subject))
 
     def run(self, model: Any, rows: Rows) -> Outputs:
         runs = self._runs.of(slice(0, self.number))

@@ -99,7 +99,7 @@ def without_collision(runs: SimulationRuns, values: FloatArray) -> FloatArray:
     return np.where(np.isnan(runs.collision_speed), values, np.nan)
 
 
-def foreign_metric(metric: Any, guard: Guard) -> Metric:
+def guard_metric(metric: Any, guard: Guard) -> Metric:
     """A metric from outside the package with its record checked; each call gives it read-only copies and checks its values.
 
     Raises

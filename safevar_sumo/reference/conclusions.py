@@ -8,9 +8,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 
-from safevar_sumo.analysis.research_questions.answer import Answer, answer
-from safevar_sumo.analysis.research_questions.case import ALGORITHM_TITLES, Case, Unanswerable
-from safevar_sumo.analysis.research_questions.changes import by_number, changes, critical
+from safevar_sumo.analysis.research_questions.answer import Answer, answer_questions
+from safevar_sumo.analysis.research_questions.case import ALGORITHM_TITLES, Case, UnanswerableError
+from safevar_sumo.analysis.research_questions.changes import change_matrix, critical_solutions, masks_by_change_count
 from safevar_sumo.analysis.research_questions.comparisons import ALPHA, magnitude
 from safevar_sumo.errors import InputError
 from safevar_sumo.reference.validation import rank_correlation
@@ -76,7 +76,7 @@ def _by_study(cases: Sequence[Case], flag: str) -> dict[str, Case]:
 
 def compared_tables(pairs: Pairs) -> list[ComparedTable]:
     """Every table of the research questions, with its columns here and published."""
-    sides = [{result.name: result for result in answer(cases)} for cases in (pairs.here, pairs.published)]
+    sides = [{result.name: result for result in answer_questions(cases)} for cases in (pairs.here, pairs.published)]
     tables = []
     for name, keys in KEYS.items():
         answers = [side.get(name, Answer(name, pd.DataFrame(), ())) for side in sides]  # a missing table has no notes
@@ -99,11 +99,11 @@ def _number_shares(cases: Sequence[Case]) -> pd.DataFrame:
     rows: list[dict[str, Any]] = []
     for case in cases:
         try:
-            change_table = changes(case, critical(case))
-        except Unanswerable:
+            change_table = change_matrix(case, critical_solutions(case))
+        except UnanswerableError:
             continue
         rows += [{"setting": case.name, "j": j, "percent": 100 * float(np.mean(is_member)) if len(is_member) else None}
-                 for j, is_member in by_number(case, change_table).items() if j != "any"]
+                 for j, is_member in masks_by_change_count(case, change_table).items() if j != "any"]
     return pd.DataFrame(rows)
 
 

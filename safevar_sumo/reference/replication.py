@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 import scipy
 
-from safevar_sumo.analysis.research_questions.case import NSGA2, Case, collided
+from safevar_sumo.analysis.research_questions.case import NSGA2, Case, are_collisions
 from safevar_sumo.records import FloatArray
 from safevar_sumo.reference.conclusions import (
     DIFFERS,
@@ -67,7 +67,7 @@ def nearness(case: Case, references: Sequence[ReferenceData]) -> list[Nearness]:
             continue
         scaled_solutions: FloatArray = solutions[list(domains.names)].to_numpy(dtype=float) / width
         distance, nearest = (np.reshape(part, (len(scaled_solutions), number)) for part in tree.query(scaled_solutions, number))
-        is_collision = collided(solutions).to_numpy()
+        is_collision = are_collisions(solutions).to_numpy()
         results.append(Nearness(
             case.name, algorithm, len(solutions), float(np.median(distance)), float(np.median(published_distances)),
             float(np.nanmean(solutions[SAFETY_DEGREE])), float(safety[nearest].mean()), int(is_collision.sum()),

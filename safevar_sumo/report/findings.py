@@ -13,8 +13,8 @@ from safevar_sumo.analysis.evaluator import Progress
 from safevar_sumo.analysis.explain.compute import explain_failures as explain
 from safevar_sumo.analysis.explain.necessity import in_words
 from safevar_sumo.analysis.explain.result import CauseEntry, FailureEntry, SummaryEntry
-from safevar_sumo.analysis.opinion.compute import JudgedCause, opinions_of, second_system
-from safevar_sumo.analysis.research_questions.indicators import nondominated
+from safevar_sumo.analysis.opinion.compute import CauseToJudge, assemble_both_systems, judge_causes
+from safevar_sumo.analysis.research_questions.indicators import nondominated_points
 from safevar_sumo.errors import InputError
 from safevar_sumo.replay.comparison import differences, number, raised, spaced
 from safevar_sumo.report.input import ChangeRow, FailingPoints, ReportInput, stored_answer
@@ -139,7 +139,7 @@ def causes(failures: Sequence[FailureEntry], data: ReportInput) -> list[CauseSec
 def no_opinion(data: ReportInput) -> str:
     """Why there is no second opinion on causes, in a sentence; empty if there is one."""
     try:
-        second_system(data.case.study)
+        assemble_both_systems(data.case.study)
     except InputError as error:
         return f"No second opinion on these causes: {error.problem}; expected: {error.legal}."
     return ""
@@ -147,8 +147,8 @@ def no_opinion(data: ReportInput) -> str:
 
 def _opinions(data: ReportInput, selection: Sequence[tuple[CauseEntry, FailureEntry]]) -> list[SecondOpinion]:
     """Ask the second vehicle model for its opinion on each cause, once for these results."""
-    causes = [JudgedCause(failure.handle or None, cause.changes, cause.fraction) for cause, failure in selection]
-    opinions = stored_answer(data, "opinion", lambda: opinions_of(data.case.study, causes, data.case.unsafe).to_dict())
+    causes = [CauseToJudge(failure.handle or None, cause.changes, cause.fraction) for cause, failure in selection]
+    opinions = stored_answer(data, "opinion", lambda: judge_causes(data.case.study, causes, data.case.unsafe).to_dict())
     return msgspec.convert(opinions, list[SecondOpinion])
 
 
@@ -204,7 +204,7 @@ def front_of(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     if not rows:
         return []
     points = np.array([[row[name] for name in OBJECTIVES] for row in rows], dtype=float)
-    best = {tuple(point) for point in nondominated(points).tolist()}
+    best = {tuple(point) for point in nondominated_points(points).tolist()}
     by_point = {tuple(point): row for point, row in zip(points.tolist(), rows, strict=True) if tuple(point) in best}
     return list(by_point.values())
 

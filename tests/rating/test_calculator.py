@@ -10,7 +10,7 @@ import openpyxl
 import pytest
 
 from safevar_sumo.analysis.rating.compute import RatedVehicle, rate
-from safevar_sumo.analysis.rating.workbook import Preprocessed, Template
+from safevar_sumo.analysis.rating.workbook import PreprocessedFile, Template
 from safevar_sumo.errors import InputError
 from safevar_sumo.protocol import EURO_NCAP_2026, points_of, protocol_of
 from safevar_sumo.records import CellResults
@@ -39,7 +39,7 @@ def agrees(rated: RatedVehicle, calculator: Calculator, template: Path, place: P
     place.mkdir(exist_ok=True)
     Template(template, place / "predicted.xlsx").fill(rated)
     drawn = calculator.preprocessed(place / "predicted.xlsx", place / "drawn")
-    Preprocessed(drawn, place / "measured.xlsx").fill(rated)
+    PreprocessedFile(drawn, place / "measured.xlsx").fill(rated)
     theirs = calculator.scored(place / "measured.xlsx", place / "scored")
     ours: dict[str, np.ndarray] = {}
     for test in rated.tests:
@@ -104,4 +104,4 @@ def test_other_cells_and_sheets_are_refused_by_name(template: Path, tmp_path: Pa
     with pytest.raises(InputError, match=r"has no sheet 'FC - Car & PTW pred\.'"):
         Template(tmp_path / "other.xlsx", tmp_path / "out.xlsx")
     with pytest.raises(InputError, match=r"has no sheet 'FC - Car & PTW verif.'"):
-        Preprocessed(template, tmp_path / "out.xlsx")
+        PreprocessedFile(template, tmp_path / "out.xlsx")

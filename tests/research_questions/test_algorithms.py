@@ -11,8 +11,8 @@ import scipy
 
 from safevar_sumo.analysis.research_questions.algorithm_figures import attainment_surfaces, cliques, critical_differences
 from safevar_sumo.analysis.research_questions.algorithms import attainment, critical_difference, pairs, ranks
-from safevar_sumo.analysis.research_questions.answer import answer
-from safevar_sumo.analysis.research_questions.case import Case, Unanswerable
+from safevar_sumo.analysis.research_questions.answer import answer_questions
+from safevar_sumo.analysis.research_questions.case import Case, UnanswerableError
 from safevar_sumo.analysis.research_questions.comparisons import compare_samples, reverse_effect
 from safevar_sumo.analysis.research_questions.over_runs import holm
 from safevar_sumo.analysis.research_questions.tables import FORMATS_WITH_LAYOUT
@@ -87,11 +87,11 @@ def test_attainment_is_what_so_many_runs_reach() -> None:
 def test_what_cannot_be_asked_says_why() -> None:
     two = made_up(row("nsga2"), row("rs"))
     for question in (ranks, critical_differences):
-        with pytest.raises(Unanswerable, match="of 2 algorithms"):
+        with pytest.raises(UnanswerableError, match="of 2 algorithms"):
             question(two)
-    with pytest.raises(Unanswerable, match="of 1 algorithm"):
+    with pytest.raises(UnanswerableError, match="of 1 algorithm"):
         pairs(made_up(row("nsga2")))
-    with pytest.raises(Unanswerable, match="imported"):
+    with pytest.raises(UnanswerableError, match="imported"):
         pairs(made_up(row("nsga2"), row("rs"), has_runs=False))
 
 
@@ -99,7 +99,7 @@ def test_what_cannot_be_asked_says_why() -> None:
 def test_tables_and_figures_of_three_algorithms_can_be_made() -> None:
     case = three_algorithms()
     for name in ("rq2-pairs", "rq2-ranks"):
-        for rendered in (make(answer([case], name)) for make in FORMATS_WITH_LAYOUT.values()):
+        for rendered in (make(answer_questions([case], name)) for make in FORMATS_WITH_LAYOUT.values()):
             assert "SPEA2" in rendered
             assert "MOCell" in rendered
     assert len(critical_differences(case).axes) == 3

@@ -19,7 +19,7 @@ from safevar_sumo.analysis.research_questions.indicators import (
     igd,
     igd_plus,
     indicators,
-    nondominated,
+    nondominated_points,
     objectives,
     reference_front,
 )
@@ -50,8 +50,8 @@ def test_hypervolume_of_boxes() -> None:
     assert hypervolume(np.full((1, 3), 1.2)) == 0
 
 
-@pytest.mark.parametrize("indicator", [lambda front: igd(front, FRONT), lambda front: igd_plus(front, FRONT), hypervolume, nondominated,
-                                       lambda front: igd(FRONT, front)])
+@pytest.mark.parametrize("indicator", [lambda front: igd(front, FRONT), lambda front: igd_plus(front, FRONT), hypervolume,
+                                       nondominated_points, lambda front: igd(FRONT, front)])
 @pytest.mark.parametrize("front", [np.zeros((0, 3)), np.array([[math.nan, 0, 0]]), np.array([[math.inf, 0, 0]])])
 def test_no_indicator_of_an_empty_or_undefined_front(indicator: Any, front: np.ndarray) -> None:
     with pytest.raises(InputError, match=r"empty|undefined"):
@@ -61,7 +61,7 @@ def test_no_indicator_of_an_empty_or_undefined_front(indicator: Any, front: np.n
 def test_nondominated_points_are_those_that_none_dominates() -> None:
     points = np.random.default_rng(7).integers(0, 5, size=(60, 3)).astype(float)
     kept = {tuple(one) for one in points if not any((other <= one).all() and (other < one).any() for other in points)}
-    result = nondominated(points)
+    result = nondominated_points(points)
     assert {tuple(one) for one in result} == kept
     assert len(result) == len(kept)
 

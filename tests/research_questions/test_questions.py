@@ -11,12 +11,12 @@ import pandas as pd
 import pytest
 import scipy
 
-from safevar_sumo.analysis.research_questions.answer import answer
-from safevar_sumo.analysis.research_questions.case import Unanswerable
+from safevar_sumo.analysis.research_questions.answer import answer_questions
+from safevar_sumo.analysis.research_questions.case import UnanswerableError
 from safevar_sumo.analysis.research_questions.changes import (
     collisions,
     combinations,
-    critical,
+    critical_solutions,
     rq31,
     rq32,
     rq33,
@@ -61,7 +61,7 @@ def test_a_tet_that_stands_at_a_collision_is_not_counted() -> None:
 
 
 def test_rq1_says_which_values_are_undefined() -> None:
-    result = answer([made_up(row(tet=None), row(sd=-1), row(), original={**ORIGINAL, "tit": None})], "rq1")[0]
+    result = answer_questions([made_up(row(tet=None), row(sd=-1), row(), original={**ORIGINAL, "tit": None})], "rq1")[0]
     assert only(result.frame, metric="tet")["n1"] == 1
     assert only(result.frame, metric="tit")["p_value"] is None
     assert any("tet is undefined in 1 of 2 solutions" in note for note in result.notes)
@@ -86,7 +86,7 @@ def test_rq2_compares_runs_by_front_and_pooled_solutions_by_metric() -> None:
 
 
 def test_rq2_of_imported_solutions_leaves_the_fronts_open() -> None:
-    result = answer([made_up(row(sd=1), row("rs", sd=2), has_runs=False)], "rq2")[0]
+    result = answer_questions([made_up(row(sd=1), row("rs", sd=2), has_runs=False)], "rq2")[0]
     assert only(result.frame, metric="igd")["p_value"] is None
     assert only(result.frame, metric="igd")["n1"] == 0
     assert only(result.frame, metric="safety_degree")["effect_size"] == 1
@@ -97,14 +97,14 @@ def test_rq2_of_imported_solutions_leaves_the_fronts_open() -> None:
                                                    ([], "no finished run")])
 def test_rq2_without_an_algorithm_is_refused(rows: list[dict[str, Any]], expected: str) -> None:
     with pytest.raises(InputError, match=expected):
-        answer([made_up(*rows)], "rq2")
+        answer_questions([made_up(*rows)], "rq2")
 
 
 def test_critical_solutions_are_strictly_below_the_original() -> None:
     case = made_up(row(sd=2.0), row(sd=1.999), row(sd=-1), row("rs", sd=1), row(sd=math.nan))
-    assert critical(case)["safety_degree"].tolist() == [1.999, -1]
-    with pytest.raises(Unanswerable, match="safety degree"):
-        critical(made_up(row(), original={}))
+    assert critical_solutions(case)["safety_degree"].tolist() == [1.999, -1]
+    with pytest.raises(UnanswerableError, match="safety degree"):
+        critical_solutions(made_up(row(), original={}))
 
 
 def test_rq31_counts_runs_without_any() -> None:
@@ -181,25 +181,25 @@ def test_weather_compares_settings_that_differ_in_it_alone() -> None:
     assert (result["increase"], result["increase_other"], result["decrease"]) == (100, 200, None)
     assert (result["rank"], result["rank_other"]) == (1, 1)
     with pytest.raises(InputError, match="differ in the weather alone"):
-        answer([clear, other], "weather")
+        answer_questions([clear, other], "weather")
 
 
 def test_every_question_at_once_tells_what_is_lacking() -> None:
-    result = {one.name: one for one in answer([made_up(row(values=HEAVY))])}
+    result = {one.name: one for one in answer_questions([made_up(row(values=HEAVY))])}
     assert not result["rq1"].frame.empty
     assert result["rq2"].frame.empty
     assert "only nsga2" in result["rq2"].notes[0]
     assert result["weather"].frame.empty
     with pytest.raises(InputError, match="no finished run"):
-        answer([made_up()])
+        answer_questions([made_up()])
     with pytest.raises(InputError, match="rq9"):
-        answer([made_up(row())], "rq9")
+        answer_questions([made_up(row())], "rq9")
 
 
 def test_several_settings_stand_in_one_frame_and_the_refused_in_the_notes() -> None:
     good = made_up(row(), row("rs"))
     alone = made_up(row(), study=made_up_study(name="alone"))
-    result = answer([good, alone], "rq2")[0]
+    result = answer_questions([good, alone], "rq2")[0]
     assert set(result.frame["setting"]) == {"made-up"}
     assert any(note.startswith("alone: ") for note in result.notes)
 

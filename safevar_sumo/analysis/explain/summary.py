@@ -14,7 +14,7 @@ from safevar_sumo.analysis.explain.compute import compare_at_points, points_in_w
 from safevar_sumo.analysis.explain.necessity import Robustness, robustness, smallest_robust_failure
 from safevar_sumo.analysis.explain.result import REASONS, ROBUST
 from safevar_sumo.analysis.preventability import Preventability, PreventableBy, preventability
-from safevar_sumo.analysis.rating.summary import rated_lead
+from safevar_sumo.analysis.rating.summary import summarise_rated_solutions
 from safevar_sumo.analysis.words import ENDS, joined, list_of_changes, number_of, question_command
 from safevar_sumo.metrics import RATING_POINTS, Unsafe
 from safevar_sumo.records import KMH_PER_MS, Evaluations, FloatArray, Outcome, finite_or_none
@@ -50,7 +50,7 @@ def lead(study: Study, solutions: pd.DataFrame, original: Evaluations, pool: Poo
         The directory of the results.
     """
     if RATING_POINTS.name in original.metrics:
-        return rated_lead(study, solutions, original, place)
+        return summarise_rated_solutions(study, solutions, original, place)
     if original.collided[0]:
         return ["The original vehicle itself collides: no change is needed."]
     evaluator, degree = Evaluator(study, pool), float(original.f_safe[0])

@@ -35,7 +35,7 @@ LADDER = np.arange(1, 10) / 10
 """Shares of a cause's changes that the second model simulates, to locate where they become unsafe."""
 
 
-class JudgedCause(NamedTuple):
+class CauseToJudge(NamedTuple):
     """A minimal cause for the second model to judge: its values, and its boundary as a share of its changes."""
 
     solution: str | None
@@ -50,7 +50,7 @@ class Neighbour(NamedTuple):
     share: float
 
 
-def second_system(study: Study) -> tuple[System, System, VehicleMapping]:
+def assemble_both_systems(study: Study) -> tuple[System, System, VehicleMapping]:
     """A study's system, the same system with the second vehicle model, and the vehicle's mapping to that model.
 
     Both have the same driving system, including its knowledge of our original vehicle.
@@ -73,28 +73,28 @@ def ask_for_opinions(source: Study | Case, options: OpinionOptions, *, pool: Poo
     Raises
     ------
     InputError
-        As `second_system` and `chosen_failures`, and if `source` is a study, which has no failures yet.
+        As `assemble_both_systems` and `chosen_failures`, and if `source` is a study, which has no failures yet.
     """
     if isinstance(source, Study):
         raise InputError(source.origin.called or source.name, "is a study and has no solutions",
                          "a directory that the command study has written")
-    second_system(source.study)
+    assemble_both_systems(source.study)
     explain_options = ExplainOptions(solutions=options.solutions, unsafe=options.unsafe, limit=SIMULATION_LIMIT)
     with open_evaluator(source.study, pool, jobs, progress) as evaluator:
         selection = chosen_failures(source, explain_options, evaluator)
         minimal_causes = [(str(selection.failures.handles[row]), cause) for row in selection.reasons for cause in selection.causes[row]]
         limits = boundaries(evaluator, [cause for _, cause in minimal_causes], selection.failures.unsafe)
     names = evaluator.characteristics.names
-    causes = [JudgedCause(handle, {names[column]: float(cause.setting[column]) for column in cause.columns}, limit.fraction)
+    causes = [CauseToJudge(handle, {names[column]: float(cause.setting[column]) for column in cause.columns}, limit.fraction)
               for (handle, cause), limit in zip(minimal_causes, limits, strict=True)]
-    opinions = opinions_of(source.study, causes, selection.failures.unsafe, progress)
+    opinions = judge_causes(source.study, causes, selection.failures.unsafe, progress)
     return replace(opinions, without_cause=tuple(str(selection.failures.handles[row])
                                                  for row in selection.reasons if not selection.causes[row]))
 
 
-def opinions_of(study: Study, causes: Sequence[JudgedCause], unsafe: Unsafe, progress: Progress = silent) -> Opinions:
-    """The second model's opinions on minimal causes; raises as `second_system`."""
-    system, second, mapping = second_system(study)
+def judge_causes(study: Study, causes: Sequence[CauseToJudge], unsafe: Unsafe, progress: Progress = silent) -> Opinions:
+    """The second model's opinions on minimal causes; raises as `assemble_both_systems`."""
+    system, second, mapping = assemble_both_systems(study)
     members = system.characteristics
     settings = np.stack([members.original, *(members.setting(cause.changes, "cause", beyond=True) for cause in causes)])
     stage, number = "second vehicle model", len(settings)
@@ -136,7 +136,7 @@ class _Original(NamedTuple):
     fails_second: bool
 
 
-def _opinion(cause: JudgedCause, mapping: VehicleMapping, original: _Original, our_end: RunEnd, second_end: RunEnd, fails: bool | None,
+def _opinion(cause: CauseToJudge, mapping: VehicleMapping, original: _Original, our_end: RunEnd, second_end: RunEnd, fails: bool | None,
              neighbour: str) -> Opinion:
     """The opinion on a cause; `fails` states whether the cause is unsafe with the second model, None if it could not be simulated."""
     def judge(verdict: OpinionVerdict, reason: str, second_end: RunEnd = second_end) -> Opinion:
@@ -157,7 +157,7 @@ def _opinion(cause: JudgedCause, mapping: VehicleMapping, original: _Original, o
     return judge(OpinionVerdict.CONTRADICTED, f"safe with the second model: {second_end}; the original vehicle: {original.second_end}")
 
 
-def _neighbours(system: System, causes: Sequence[JudgedCause], settings: FloatArray, unsafe: Unsafe) -> list[Neighbour]:
+def _neighbours(system: System, causes: Sequence[CauseToJudge], settings: FloatArray, unsafe: Unsafe) -> list[Neighbour]:
     """For each cause, the first setting below its boundary that is safe with our model; the original setting if there is none."""
     if not causes:
         return []

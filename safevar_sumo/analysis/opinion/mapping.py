@@ -144,7 +144,7 @@ class MappingTable(NamedTuple):
 
 NO_ENGINE = "the model takes a torque at the wheels: it has no engine, clutch or gearbox"
 DEAD_TIME = "dead time from command to brake torque"
-TABLES: Mapping[str, MappingTable] = {
+MAPPING_TABLES: Mapping[str, MappingTable] = {
     "worn": MappingTable("wear", (
         MapRow("treadDepth", "mm", "p_dx1", "-", "p_dx1 = mu, our friction coefficient of tyre, road and tread"),
         MapRow("brakeTorque", "-", "T_B", "N m", "T_B = brakeTorque brake_force R_w (1 + 4 I_y_w / (m_0 R_w^2)), m_0 the original's m"),
@@ -214,12 +214,12 @@ def mapping_of(study: Study, vehicle: Any) -> VehicleMapping:
     units = {name: row.unit for name, row in study.vehicle.characteristics.items()}
     for name, cls in [*((name, cls) for name, cls in VEHICLES.items() if isinstance(model, cls)),
                       *((name, cls) for name, cls in VEHICLES.items() if cls.UNITS.items() <= units.items())]:
-        table = TABLES[name]
+        table = MAPPING_TABLES[name]
         defaults = load_study(table.study).vehicle.parameters
         parameters = {field.name: getattr(
             model, field.name, study.vehicle.parameters.get(field.name, defaults.get(field.name, field.default)))
             for field in msgspec.structs.fields(cls)}
         return VehicleMapping(name, cls(**parameters), table, tuple(key for key, unit in units.items() if cls.UNITS.get(key) != unit))
-    alternatives = f"one of {', '.join(TABLES)}, a class derived from one, or one with the same characteristics in the same units"
+    alternatives = f"one of {', '.join(MAPPING_TABLES)}, a class derived from one, or one with the same characteristics in the same units"
     problem = f"vehicle.model = {study.vehicle.model!r} with {', '.join(units)} is no vehicle that the second model can represent"
     raise InputError(study.source, problem, alternatives)

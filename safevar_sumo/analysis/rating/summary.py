@@ -17,7 +17,7 @@ TITLES = {"fewest": "Fewest changes that cost a point", "smallest": "Smallest la
           "most_points": "Most points lost"}
 
 
-def rated_lead(study: Study, solutions: pd.DataFrame, original: Evaluations, place: str) -> list[str]:
+def summarise_rated_solutions(study: Study, solutions: pd.DataFrame, original: Evaluations, place: str) -> list[str]:
     """Lines that summarise the solutions of a rated study; the last line has commands for the next steps.
 
     Parameters are those of `safevar_sumo.analysis.explain.summary.lead`, which calls this function for rated studies.

@@ -128,7 +128,7 @@ class Template(_Book):
         self._save()
 
 
-class Preprocessed(_Book):
+class PreprocessedFile(_Book):
     """The file that the calculator has preprocessed, with randomly drawn cells whose measurements are to be filled in."""
 
     command = "preprocess"

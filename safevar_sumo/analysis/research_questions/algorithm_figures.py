@@ -8,7 +8,7 @@ import numpy as np
 
 from safevar_sumo.analysis.figures import FONT, literal, new_figure
 from safevar_sumo.analysis.research_questions.algorithms import SURFACE_PERCENTAGES, attainment, ranks
-from safevar_sumo.analysis.research_questions.case import ALGORITHM_TITLES, Case, Unanswerable
+from safevar_sumo.analysis.research_questions.case import ALGORITHM_TITLES, Case, UnanswerableError
 from safevar_sumo.analysis.research_questions.comparisons import ALPHA
 from safevar_sumo.analysis.research_questions.figures import COLOURS, legend_below, objective_title
 from safevar_sumo.analysis.research_questions.indicators import INDICATOR_TITLES
@@ -27,13 +27,13 @@ def critical_differences(case: Case) -> Figure:
 
     Raises
     ------
-    Unanswerable
+    UnanswerableError
         If there are fewer than three algorithms, or no run in which all of them have solutions.
     """
     frame = ranks(case)
     frame = frame[frame["metric"].isin(list(INDICATOR_TITLES)) & frame["mean_rank"].notna()]
     if frame.empty:
-        raise Unanswerable(case.name, "has no run in which every algorithm has solutions", "results of three algorithms or more")
+        raise UnanswerableError(case.name, "has no run in which every algorithm has solutions", "results of three algorithms or more")
     metrics, algorithms = list(dict.fromkeys(frame["metric"])), frame["algorithm"].nunique()
     runs, difference = int(frame["runs"].iloc[0]), float(frame["critical_difference"].iloc[0])
     title = f"{case.name}: mean ranks over {runs} runs, critical difference {difference:.2f}"
@@ -83,7 +83,7 @@ def attainment_surfaces(case: Case) -> Figure:
 
     Raises
     ------
-    Unanswerable
+    UnanswerableError
         If there are no runs with solutions.
     """
     surfaces, goals = attainment(case), case.scoring.objectives[:2]

@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 import scipy
 
-from safevar_sumo.analysis.research_questions.case import Case, Unanswerable
+from safevar_sumo.analysis.research_questions.case import Case, UnanswerableError
 from safevar_sumo.analysis.research_questions.comparisons import ALPHA, compare_samples, reverse_effect
 from safevar_sumo.analysis.research_questions.indicators import MORE_IS_BETTER, indicators, objectives
 from safevar_sumo.analysis.research_questions.over_runs import holm, series_of_means
@@ -31,7 +31,7 @@ def pairs(case: Case) -> pd.DataFrame:
 
     Raises
     ------
-    Unanswerable
+    UnanswerableError
         If there are no runs, or runs of only one algorithm.
     """
     samples, rows = _samples(case, 2), list[dict[str, Any]]()
@@ -54,7 +54,7 @@ def ranks(case: Case) -> pd.DataFrame:
 
     Raises
     ------
-    Unanswerable
+    UnanswerableError
         If there are no runs, or fewer than three algorithms.
     """
     p_values, rows = dict[str, float | None](), list[dict[str, Any]]()
@@ -87,7 +87,7 @@ def attainment(case: Case) -> dict[str, dict[float, FloatArray]]:
 
     Raises
     ------
-    Unanswerable
+    UnanswerableError
         If there are no runs with solutions.
     """
     surfaces: dict[str, dict[float, FloatArray]] = {}
@@ -104,7 +104,7 @@ def attainment(case: Case) -> dict[str, dict[float, FloatArray]]:
             surfaces[algorithm] = {level: (group := points[points[:, 2] == level, :2])[np.argsort(group[:, 0], kind="stable")] * signs
                                    for level in levels.tolist()}
     if not surfaces:
-        raise Unanswerable(case.name, "has no solution", "results with at least one finished run")
+        raise UnanswerableError(case.name, "has no solution", "results with at least one finished run")
     return surfaces
 
 
@@ -113,8 +113,9 @@ def _samples(case: Case, minimum: int) -> Mapping[str, tuple[bool, dict[str, pd.
     if not case.has_runs:
         case.runs_of(next(iter(case.algorithms), ""))  # raises with the reason
     if len(case.algorithms) < minimum:
-        raise Unanswerable(case.name, f"has finished runs of {len(case.algorithms)} algorithms ({', '.join(case.algorithms) or 'none'})",
-                           f"results of {minimum} algorithms or more")
+        names = ", ".join(case.algorithms) or "none"
+        raise UnanswerableError(case.name, f"has finished runs of {len(case.algorithms)} algorithms ({names})",
+                                f"results of {minimum} algorithms or more")
     samples: dict[str, tuple[bool, dict[str, pd.Series[float]]]] = {}
     if len(case.solutions):
         quality = indicators(case).set_index(["algorithm", "run"])

@@ -8,11 +8,11 @@ from typing import NamedTuple
 import pandas as pd
 
 from safevar_sumo.analysis.research_questions.algorithms import pairs, ranks
-from safevar_sumo.analysis.research_questions.case import NSGA2, Case, Unanswerable, counted_solutions
+from safevar_sumo.analysis.research_questions.case import NSGA2, Case, UnanswerableError, counted_solutions
 from safevar_sumo.analysis.research_questions.changes import (
     collisions,
     combinations,
-    critical,
+    critical_solutions,
     rq31,
     rq32,
     rq33,
@@ -23,7 +23,7 @@ from safevar_sumo.analysis.research_questions.changes import (
 from safevar_sumo.analysis.research_questions.comparisons import rq1, rq2
 from safevar_sumo.analysis.research_questions.over_runs import difference_line, rq1_runs, rq2_runs
 from safevar_sumo.errors import unknown
-from safevar_sumo.metrics import SAFEVAR, MetricFacts
+from safevar_sumo.metrics import PUBLISHED_SCORING, MetricFacts
 
 Frames = dict[str, pd.DataFrame]
 SAFETY = "rq3.3-safety"
@@ -52,10 +52,10 @@ class Answer(NamedTuple):
     name: str
     frame: pd.DataFrame
     notes: tuple[str, ...]
-    metrics: tuple[MetricFacts, ...] = SAFEVAR.metrics
+    metrics: tuple[MetricFacts, ...] = PUBLISHED_SCORING.metrics
 
 
-def answer(cases: Sequence[Case], question: str | None = None) -> list[Answer]:
+def answer_questions(cases: Sequence[Case], question: str | None = None) -> list[Answer]:
     """Answer one question, or all of them.
 
     Raises
@@ -84,7 +84,7 @@ def answer(cases: Sequence[Case], question: str | None = None) -> list[Answer]:
     return [reply for reply in answers if reply.name == SAFETY] if question == SAFETY else answers
 
 
-def _ask(name: str, cases: Sequence[Case]) -> tuple[dict[str, list[pd.DataFrame]], list[Unanswerable]]:
+def _ask(name: str, cases: Sequence[Case]) -> tuple[dict[str, list[pd.DataFrame]], list[UnanswerableError]]:
     """The frames of a question by table, and an error for each case without a frame."""
     tables: dict[str, list[pd.DataFrame]] = {}
     errors = []
@@ -96,7 +96,7 @@ def _ask(name: str, cases: Sequence[Case]) -> tuple[dict[str, list[pd.DataFrame]
                 frames = FRAMES_OF_ONE_CASE[name](*group)
             for table, frame in frames.items():
                 tables.setdefault(table, []).append(frame)
-        except Unanswerable as error:
+        except UnanswerableError as error:
             errors.append(error)
     return tables, errors
 
@@ -123,7 +123,7 @@ def _notes(question: str, case: Case) -> list[str]:
         if empty_runs:
             notes.append(f"{case.name}: {empty_runs} finished runs found no solution; they have no igd, igd_plus and hypervolume.")
     if question.startswith("rq3") or question in ("combinations", WEATHER):
-        notes.append(f"{case.name}: {len(critical(case))} critical solutions of {len(case.solutions_of(NSGA2))} of {NSGA2}.")
+        notes.append(f"{case.name}: {len(critical_solutions(case))} critical solutions of {len(case.solutions_of(NSGA2))} of {NSGA2}.")
     if question == "combinations" and combinations(case).empty:
         notes.append(f"{case.name}: no critical solution has exactly four characteristics changed.")
     return notes

@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 
 from safevar_sumo.errors import InputError, in_one_line
-from safevar_sumo.metrics import SAFEVAR, MetricFacts, Scoring, Unsafe
+from safevar_sumo.metrics import PUBLISHED_SCORING, MetricFacts, Scoring, Unsafe
 from safevar_sumo.records import FloatArray, Outcome
 from safevar_sumo.results import MANIFEST, Failure, failure_lines, load_runs, places_of
 from safevar_sumo.scenarios import weather_of
@@ -26,7 +26,7 @@ ALGORITHM_TITLES = {
     "nsga2": "NSGA-II", "spea2": "SPEA2", "mocell": "MOCell", "map_elites": "MAP-Elites", "rs": "RS", "safe_fuzzer": "SafeFuzzer"}
 
 
-class Unanswerable(InputError):
+class UnanswerableError(InputError):
     """The results lack the data for a question."""
 
 
@@ -62,7 +62,7 @@ class Case:
     finished: tuple[tuple[str, int], ...]
     has_runs: bool
     failures: tuple[Failure, ...] = ()
-    scoring: Scoring = SAFEVAR
+    scoring: Scoring = PUBLISHED_SCORING
 
     @property
     def characteristics(self) -> CharacteristicSet:
@@ -84,21 +84,21 @@ class Case:
         return tuple(name for name in dict.fromkeys([*self.study.search.labels, *sorted(names)]) if name in names)
 
     def require_solutions(self) -> None:
-        """Raise `Unanswerable` if no run is finished."""
+        """Raise `UnanswerableError` if no run is finished."""
         if not self.algorithms:
-            raise Unanswerable(self.name, "has no finished run", "results with at least one finished run")
+            raise UnanswerableError(self.name, "has no finished run", "results with at least one finished run")
 
     def solutions_of(self, algorithm: str) -> pd.DataFrame:
         """Pooled solutions of all finished runs of an algorithm.
 
         Raises
         ------
-        Unanswerable
+        UnanswerableError
             If the algorithm has no finished run.
         """
         if algorithm not in self.algorithms:
             names = ", ".join(self.algorithms) or "no algorithm"
-            raise Unanswerable(self.name, f"has no finished run of {algorithm}", f"results of {algorithm} (it has results of {names})")
+            raise UnanswerableError(self.name, f"has no finished run of {algorithm}", f"results of {algorithm} (it has results of {names})")
         return self.solutions[self.solutions["algorithm"] == algorithm]
 
     def runs_of(self, algorithm: str) -> list[int]:
@@ -106,11 +106,11 @@ class Case:
 
         Raises
         ------
-        Unanswerable
+        UnanswerableError
             If the solutions are imported and belong to no run.
         """
         if not self.has_runs:
-            raise Unanswerable(self.name, "is imported: the runs of its solutions are unknown", "results of the command study")
+            raise UnanswerableError(self.name, "is imported: the runs of its solutions are unknown", "results of the command study")
         return sorted(run for name, run in self.finished if name == algorithm)
 
     @property
@@ -133,7 +133,7 @@ class Case:
 
 def counted_solutions(solutions: pd.DataFrame, metric: MetricFacts) -> pd.DataFrame:
     """The solutions that count for a metric: for TET and TIT only those without collision (method section 4)."""
-    return solutions if metric.over_collisions else solutions[~collided(solutions)]
+    return solutions if metric.over_collisions else solutions[~are_collisions(solutions)]
 
 
 def values(solutions: pd.DataFrame, metric: MetricFacts) -> FloatArray:
@@ -142,7 +142,7 @@ def values(solutions: pd.DataFrame, metric: MetricFacts) -> FloatArray:
     return np.asarray(column[~np.isnan(column)])
 
 
-def collided(solutions: pd.DataFrame) -> pd.Series[bool]:
+def are_collisions(solutions: pd.DataFrame) -> pd.Series[bool]:
     """Whether solutions are collisions."""
     return solutions["outcome"] == str(Outcome.COLLISION)
 
@@ -182,15 +182,15 @@ def load_case(directory: Path) -> Case:
     if not isinstance(original, dict):
         raise InputError(directory / MANIFEST, "does not describe the original vehicle", "a manifest of the command study")
     try:
-        scoring = msgspec.convert(manifest["scoring"], Scoring) if "scoring" in manifest else SAFEVAR
+        scoring = msgspec.convert(manifest["scoring"], Scoring) if "scoring" in manifest else PUBLISHED_SCORING
     except msgspec.ValidationError as error:
         raise invalid(directory / MANIFEST, manifest["scoring"], error, "scoring") from None
-    return case_of(study, original, solutions, evaluations, finished, "imported" not in manifest, failures, scoring)
+    return build_case(study, original, solutions, evaluations, finished, "imported" not in manifest, failures, scoring)
 
 
-def case_of(study: Study, original: Mapping[str, Any], solutions: pd.DataFrame, evaluations: pd.DataFrame,
+def build_case(study: Study, original: Mapping[str, Any], solutions: pd.DataFrame, evaluations: pd.DataFrame,
             finished: Sequence[tuple[str, int]], has_runs: bool = True, failures: Sequence[Failure] = (),
-            scoring: Scoring = SAFEVAR) -> Case:
+            scoring: Scoring = PUBLISHED_SCORING) -> Case:
     """Put a case together; in `original` an undefined metric is None or missing."""
     names = [metric.name for metric in scoring.metrics]
     columns = [*names, *(objective.name for objective in scoring.objectives)]

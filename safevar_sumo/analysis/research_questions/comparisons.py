@@ -10,7 +10,7 @@ import pandas as pd
 import scipy
 from numpy.typing import ArrayLike
 
-from safevar_sumo.analysis.research_questions.case import NSGA2, Case, Unanswerable, values
+from safevar_sumo.analysis.research_questions.case import NSGA2, Case, UnanswerableError, values
 from safevar_sumo.analysis.research_questions.indicators import MORE_IS_BETTER, indicators
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import MetricFacts
@@ -78,7 +78,7 @@ def rq1(case: Case) -> pd.DataFrame:
 
     Raises
     ------
-    Unanswerable
+    UnanswerableError
         If no run is finished.
     """
     case.require_solutions()
@@ -122,12 +122,12 @@ def rq2(case: Case) -> pd.DataFrame:
 
     Raises
     ------
-    Unanswerable
+    UnanswerableError
         If NSGA-II or every other algorithm is missing.
     """
-    case.solutions_of(NSGA2)  # raises Unanswerable if there are none
+    case.solutions_of(NSGA2)  # raises UnanswerableError if there are none
     if all(name == NSGA2 for name in case.algorithms):
-        raise Unanswerable(case.name, f"only {NSGA2} has finished runs", "results of another algorithm to compare with, such as rs")
+        raise UnanswerableError(case.name, f"only {NSGA2} has finished runs", "results of another algorithm to compare with, such as rs")
     rows = rq2_rows(case, lambda algorithm, metric: values(case.solutions_of(algorithm), metric))
     return pd.DataFrame(rows, columns=RQ2_COLUMNS, dtype=object)
 

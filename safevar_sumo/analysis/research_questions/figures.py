@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from safevar_sumo.analysis.figures import FONT, as_formula, literal, new_figure, panels
-from safevar_sumo.analysis.research_questions.case import ALGORITHM_TITLES, Case, Unanswerable
-from safevar_sumo.analysis.research_questions.changes import ANY, critical, effects, rq31, rq32
-from safevar_sumo.analysis.research_questions.indicators import REFERENCE_COORDINATE, convergence, nondominated, objectives
+from safevar_sumo.analysis.research_questions.case import ALGORITHM_TITLES, Case, UnanswerableError
+from safevar_sumo.analysis.research_questions.changes import ANY, critical_solutions, effects, rq31, rq32
+from safevar_sumo.analysis.research_questions.indicators import REFERENCE_COORDINATE, convergence, nondominated_points, objectives
 from safevar_sumo.metrics import F_DIFF, F_NUM_DIFF, F_SAFE, Objective
 from safevar_sumo.study import SAFETY_DEGREE
 
@@ -38,7 +38,7 @@ def number_of_changes(cases: Sequence[Case]) -> Figure:
 
     Raises
     ------
-    Unanswerable
+    UnanswerableError
         As `rq31`, for the first case that has no answer.
     """
     import seaborn as sns
@@ -116,7 +116,7 @@ def pareto_fronts(case: Case) -> Figure:
 
     Raises
     ------
-    Unanswerable
+    UnanswerableError
         If there is no solution.
     """
     goals = case.scoring.objectives
@@ -125,9 +125,9 @@ def pareto_fronts(case: Case) -> Figure:
     for algorithm in case.algorithms:
         points = objectives(case, case.solutions_of(algorithm))
         if len(points):
-            fronts[algorithm] = nondominated(points) * signs
+            fronts[algorithm] = nondominated_points(points) * signs
     if not fronts:
-        raise Unanswerable(case.name, "has no solution", "results with at least one finished run")
+        raise UnanswerableError(case.name, "has no solution", "results with at least one finished run")
     pairs = list(combinations(range(len(goals)), 2))
     rows = next(rows for rows in (5, 2, 1) if len(pairs) % (3 * rows) == 0 or rows == 1)
     columns = len(pairs) // rows
@@ -190,10 +190,10 @@ def legend_below(figure: Figure, axis: Axes) -> None:
 
 
 def _critical_count(case: Case) -> int:
-    """Number of critical solutions; raises Unanswerable if there are none."""
-    number = len(critical(case))
+    """Number of critical solutions; raises UnanswerableError if there are none."""
+    number = len(critical_solutions(case))
     if not number:
-        raise Unanswerable(case.name, "has no critical solution", "results with solutions that are more unsafe than the original")
+        raise UnanswerableError(case.name, "has no critical solution", "results with solutions that are more unsafe than the original")
     return number
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from safevar_sumo.analysis.figures import save
 from safevar_sumo.analysis.research_questions.algorithm_figures import attainment_surfaces, critical_differences
-from safevar_sumo.analysis.research_questions.case import Case, Unanswerable
+from safevar_sumo.analysis.research_questions.case import Case, UnanswerableError
 from safevar_sumo.analysis.research_questions.changes import rq31
 from safevar_sumo.analysis.research_questions.figures import (
     changed_characteristics,
@@ -35,12 +35,12 @@ FIGURES_OF_ONE_CASE: Mapping[str, Callable[[Case], Figure]] = {
 }
 
 
-def draw(cases: Sequence[Case]) -> tuple[dict[str, Figure], list[str]]:
+def draw_figures(cases: Sequence[Case]) -> tuple[dict[str, Figure], list[str]]:
     """Every figure of the cases by name, and the reasons for missing figures; with several cases, names start with the case's name.
 
     Raises
     ------
-    Unanswerable
+    UnanswerableError
         If no figure can be drawn.
     """
     figures, all_errors = {}, []
@@ -56,26 +56,26 @@ def draw(cases: Sequence[Case]) -> tuple[dict[str, Figure], list[str]]:
                 continue
             try:
                 figures[name if is_single else f"{case.name}-{name}"] = draw_figure(case)
-            except Unanswerable as error:
+            except UnanswerableError as error:
                 all_errors.append(error)
     if not figures:
         raise all_errors[0]
     return figures, list(dict.fromkeys(f"{error.source}: {error.problem}" for error in all_errors))
 
 
-def _answerable_cases(cases: Sequence[Case]) -> tuple[list[Case], list[Unanswerable]]:
+def _answerable_cases(cases: Sequence[Case]) -> tuple[list[Case], list[UnanswerableError]]:
     """The cases that have an answer to RQ3.1, and the errors of the others."""
     answerable_cases, errors = [], []
     for case in cases:
         try:
             rq31(case)
             answerable_cases.append(case)
-        except Unanswerable as error:
+        except UnanswerableError as error:
             errors.append(error)
     return answerable_cases, errors
 
 
-def draw_all(cases: Sequence[Case], directory: Path, kind: str) -> tuple[list[Path], list[str]]:
+def save_figures(cases: Sequence[Case], directory: Path, kind: str) -> tuple[list[Path], list[str]]:
     """Draw every figure into a file; returns the files, and the reasons for missing figures.
 
     Raises
@@ -83,7 +83,7 @@ def draw_all(cases: Sequence[Case], directory: Path, kind: str) -> tuple[list[Pa
     InputError
         If the directory cannot be written, or no figure can be drawn.
     """
-    figures, reasons = draw(cases)
+    figures, reasons = draw_figures(cases)
     files = []
     for name, figure in figures.items():
         path = directory / f"{_file_name(f'{cases[0].name}-{name}' if len(cases) == 1 else name)}.{kind}"

@@ -9,7 +9,7 @@ import moocore
 import numpy as np
 import pandas as pd
 
-from safevar_sumo.analysis.research_questions.case import Case, Unanswerable
+from safevar_sumo.analysis.research_questions.case import Case, UnanswerableError
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import MetricFacts
 from safevar_sumo.records import FloatArray
@@ -25,7 +25,7 @@ def titles_of(metrics: Iterable[MetricFacts]) -> dict[str, str]:
     return {**INDICATOR_TITLES, **{metric.name: metric.title for metric in metrics}}
 
 
-def nondominated(points: FloatArray) -> FloatArray:
+def nondominated_points(points: FloatArray) -> FloatArray:
     """The M distinct non-dominated points for minimisation of m objectives, shape (M, m)."""
     return np.asarray(moocore.filter_dominated(_check_points(points, "the set of points")))
 
@@ -78,13 +78,13 @@ def reference_front(case: Case) -> FloatArray:
 
     Raises
     ------
-    Unanswerable
+    UnanswerableError
         If there is no solution.
     """
     points = objectives(case, case.solutions)
     if not len(points):
-        raise Unanswerable(case.name, "has no solution", "results with at least one finished run")
-    return nondominated(points)
+        raise UnanswerableError(case.name, "has no solution", "results with at least one finished run")
+    return nondominated_points(points)
 
 
 def indicators(case: Case) -> pd.DataFrame:
@@ -92,7 +92,7 @@ def indicators(case: Case) -> pd.DataFrame:
 
     Raises
     ------
-    Unanswerable
+    UnanswerableError
         If there are no runs or no solutions.
     """
     rows = []
@@ -117,7 +117,7 @@ def convergence(case: Case, points: int = 50) -> pd.DataFrame:
 
     Raises
     ------
-    Unanswerable
+    UnanswerableError
         If there are no runs or no solutions.
     """
     keys = [(algorithm, run) for algorithm in case.algorithms for run in case.runs_of(algorithm)]
@@ -128,7 +128,7 @@ def convergence(case: Case, points: int = 50) -> pd.DataFrame:
     parts = [pd.DataFrame({"algorithm": key[0], "run": key[1], "evaluations": grid, "hypervolume": _growth(case, by_run[key], scale, grid)})
              for key in keys if key in by_run]
     if not parts:
-        raise Unanswerable(case.name, "has no evaluations", "results with the journals of their runs")
+        raise UnanswerableError(case.name, "has no evaluations", "results with the journals of their runs")
     return pd.concat(parts, ignore_index=True)
 
 
@@ -141,7 +141,7 @@ def _growth(case: Case, evaluations: pd.DataFrame, scale: Scale, grid: np.ndarra
     front, volumes = np.zeros((0, scaled_points.shape[1])), []
     for start, end in zip([0, *ends[:-1]], ends, strict=True):
         front = np.concatenate([front, scaled_points[start:end]])
-        front = nondominated(front) if len(front) else front
+        front = nondominated_points(front) if len(front) else front
         volumes.append(hypervolume(front) if len(front) else 0.0)
     return volumes
 

@@ -48,7 +48,7 @@ Row = Mapping[Any, Any]
 """A row of a frame by column."""
 
 
-class Bold(str):
+class BoldText(str):
     """A cell in bold."""
 
 
@@ -307,7 +307,7 @@ def _paper_combinations(answer: Answer) -> list[Table]:
 
 
 def _bold(cell: str, is_bold: bool) -> str:
-    return Bold(cell) if is_bold else cell
+    return BoldText(cell) if is_bold else cell
 
 
 def _number(value: Any, spec: str) -> str:

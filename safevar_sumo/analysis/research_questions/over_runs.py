@@ -14,7 +14,7 @@ import numpy as np
 import pandas as pd
 import scipy
 
-from safevar_sumo.analysis.research_questions.case import ALGORITHM_TITLES, NSGA2, Case, Unanswerable, counted_solutions
+from safevar_sumo.analysis.research_questions.case import ALGORITHM_TITLES, NSGA2, Case, UnanswerableError, counted_solutions
 from safevar_sumo.analysis.research_questions.comparisons import ALPHA, TwoSampleTest, magnitude, rq1, rq1_rows, rq2, rq2_rows
 from safevar_sumo.analysis.research_questions.indicators import titles_of
 from safevar_sumo.metrics import MetricFacts
@@ -37,7 +37,7 @@ def rq1_runs(case: Case) -> pd.DataFrame:
 
     Raises
     ------
-    Unanswerable
+    UnanswerableError
         If the solutions belong to no run, or no run is finished.
     """
     return _corrected_frames(case)[0]
@@ -50,13 +50,13 @@ def rq2_runs(case: Case) -> pd.DataFrame:
 
     Raises
     ------
-    Unanswerable
+    UnanswerableError
         If the solutions belong to no run, or NSGA-II or every other algorithm is missing.
     """
     frame = _corrected_frames(case)[1]
     if frame is None:
         rq2(case)  # raises with the reason
-        raise Unanswerable(case.name, "has no runs to compare", "results of nsga2 and another algorithm")
+        raise UnanswerableError(case.name, "has no runs to compare", "results of nsga2 and another algorithm")
     return frame
 
 
@@ -100,7 +100,7 @@ def difference_line(case: Case) -> str:
 
     Raises
     ------
-    Unanswerable
+    UnanswerableError
         As `rq1_runs`.
     """
     titles = titles_of(case.scoring.metrics)
@@ -131,7 +131,7 @@ def summary_lines(case: Case) -> list[str]:
     for question, frame_of, group_column, meaning in SUMMARY_ROWS:
         try:
             frame = frame_of(case)
-        except Unanswerable as error:
+        except UnanswerableError as error:
             lines.append(f"{question} over runs: {error.problem}.")
             continue
         lines.append(f"{question} over runs: {meaning}; * p < {ALPHA:g} after Holm's correction")
@@ -175,7 +175,7 @@ def run_means(case: Case, algorithm: str, metric: MetricFacts) -> FloatArray:
 
     Raises
     ------
-    Unanswerable
+    UnanswerableError
         If the solutions belong to no run.
     """
     return np.asarray(series_of_means(case, algorithm, metric), dtype=float)

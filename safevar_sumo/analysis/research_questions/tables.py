@@ -11,7 +11,7 @@ from typing import Any
 import pandas as pd
 
 from safevar_sumo.analysis.research_questions.answer import Answer
-from safevar_sumo.analysis.research_questions.layout import LAYOUTS, PAPER, Bold, Layouts, Table, lay_out
+from safevar_sumo.analysis.research_questions.layout import LAYOUTS, PAPER, BoldText, Layouts, Table, lay_out
 
 MINUS = "\N{MINUS SIGN}"
 _LATEX = {
@@ -28,24 +28,24 @@ _LAST_LETTER = "\N{LATIN SMALL LETTER Z WITH CARON}"
 LATEX_NEEDS = r"% In the preamble: \usepackage[T1]{fontenc} \usepackage{textcomp} \usepackage{booktabs} \usepackage{graphicx}"
 
 
-def text(answers: Sequence[Answer], layouts: Layouts = LAYOUTS) -> str:
+def as_text(answers: Sequence[Answer], layouts: Layouts = LAYOUTS) -> str:
     """Text for a terminal: aligned columns, bold cells with an asterisk."""
     return "\n".join(_text(table) for answer in answers for table in lay_out(answer, layouts))
 
 
-def markdown(answers: Sequence[Answer], layouts: Layouts = LAYOUTS) -> str:
+def as_markdown(answers: Sequence[Answer], layouts: Layouts = LAYOUTS) -> str:
     """Markdown tables; a heading that spans several columns is repeated in each column's heading."""
     return "\n".join(_markdown(table) for answer in answers for table in lay_out(answer, layouts))
 
 
-def latex(answers: Sequence[Answer], layouts: Layouts = LAYOUTS) -> str:
+def as_latex(answers: Sequence[Answer], layouts: Layouts = LAYOUTS) -> str:
     r"""Booktabs tables for `\input`, each with a label: `tab:rq1`, and `tab:rq1-2` for an answer's second table."""
     tables = [_latex(table, f"{answer.name}-{i}" if i > 1 else answer.name)
               for answer in answers for i, table in enumerate(lay_out(answer, layouts), 1)]
     return "\n".join([LATEX_NEEDS, *tables])
 
 
-def csv(answers: Sequence[Answer]) -> str:
+def as_csv(answers: Sequence[Answer]) -> str:
     """The tidy frame as CSV; several frames are separated by empty lines, and each follows a line with its name."""
     parts = []
     for answer in answers:
@@ -71,14 +71,14 @@ def records(frame: pd.DataFrame) -> list[dict[str, Any]]:
 
 
 LAYOUTS_BY_NAME: Mapping[str, Layouts] = {"full": LAYOUTS, "paper": PAPER}
-FORMATS_WITH_LAYOUT: Mapping[str, Callable[..., str]] = {"text": text, "markdown": markdown, "latex": latex}
+FORMATS_WITH_LAYOUT: Mapping[str, Callable[..., str]] = {"text": as_text, "markdown": as_markdown, "latex": as_latex}
 """Formats for human readers, whose functions take a layout; the other formats hold the frames."""
-FORMATS: Mapping[str, Callable[..., str]] = {**FORMATS_WITH_LAYOUT, "csv": csv, "json": as_json}
+FORMATS: Mapping[str, Callable[..., str]] = {**FORMATS_WITH_LAYOUT, "csv": as_csv, "json": as_json}
 ENDINGS = {"text": "txt", "markdown": "md", "latex": "tex", "csv": "csv", "json": "json"}
 
 
 def _text(table: Table) -> str:
-    rows = [tuple(f"{cell}*" if isinstance(cell, Bold) else f"{cell} " if i >= table.labels else cell for i, cell in enumerate(row))
+    rows = [tuple(f"{cell}*" if isinstance(cell, BoldText) else f"{cell} " if i >= table.labels else cell for i, cell in enumerate(row))
             for row in table.rows]
     heads = tuple(f"{head} " if i >= table.labels else head for i, head in enumerate(table.heads))
     widths = [max(len(cell) for cell in column) for column in zip(heads, *rows, strict=True)]
@@ -110,7 +110,7 @@ def _markdown(table: Table) -> str:
     lines = [f"**{_markdown_text(table.title)}**", ""]
     if heads:
         rule = [":---" if i < table.labels else "---:" for i in range(len(heads))]
-        cells = [[f"**{_markdown_text(cell)}**" if isinstance(cell, Bold) else _markdown_text(cell) for cell in row]
+        cells = [[f"**{_markdown_text(cell)}**" if isinstance(cell, BoldText) else _markdown_text(cell) for cell in row]
                  for row in table.rows]
         lines += [f"| {' | '.join(row)} |" for row in ([_markdown_text(head) for head in heads], rule, *cells)] + [""]
     return "\n".join([*lines, *(f"{_markdown_text(note)}  " for note in table.notes), ""])
@@ -138,7 +138,7 @@ def _tabular(table: Table) -> list[str]:
                  for (_, number), start in zip(table.spans, _span_starts(table), strict=True)]
         lines += [" & ".join([""] * table.labels + spans).strip() + r" \\", "".join(rules)]
     lines += [" & ".join(escaped_for_latex(head) for head in table.heads) + r" \\", r"\midrule"]
-    cells = [[rf"\textbf{{{escaped_for_latex(cell)}}}" if isinstance(cell, Bold) else escaped_for_latex(cell) for cell in row]
+    cells = [[rf"\textbf{{{escaped_for_latex(cell)}}}" if isinstance(cell, BoldText) else escaped_for_latex(cell) for cell in row]
              for row in table.rows]
     lines += [" & ".join(row) + r" \\" for row in cells]
     return [*lines, r"\bottomrule", r"\end{tabular}%"]
