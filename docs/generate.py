@@ -124,7 +124,7 @@ def second_model() -> str:
     """Which characteristic is which parameter of the second vehicle model."""
     parts = []
     for name, table in REPRESENTED.items():
-        outside = [f"`{key}`: {why}" for key, why in table.outside.items()]
+        outside = [f"`{key}`: {why}" for key, why in table.omission_reasons.items()]
         rows = [(f"`{row.characteristic}`", row.unit, row.parameter, row.parameter_unit, f"`{row.equation}`") for row in table.rows]
         listed = f"\nOutside: {'; '.join(outside)}.\n" if outside else ""
         parts.append(f"### {name}\n\n{_table(('characteristic', 'unit', 'parameter', 'unit', 'equation'), rows)}{listed}")
