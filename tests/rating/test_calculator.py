@@ -40,7 +40,7 @@ def agrees(rated: RatedVehicle, calculator: Calculator, template: Path, place: P
     Template(template, place / "predicted.xlsx").fill(rated)
     drawn = calculator.preprocessed(place / "predicted.xlsx", place / "drawn")
     PreprocessedFile(drawn, place / "measured.xlsx").fill(rated)
-    theirs = calculator.scored(place / "measured.xlsx", place / "scored")
+    theirs = calculator.scores(place / "measured.xlsx", place / "scored")
     ours: dict[str, np.ndarray] = {}
     for test in rated.tests:
         ours[test.block.test] = ours.get(test.block.test, np.zeros(3)) + np.array(test.points)
@@ -70,7 +70,7 @@ def test_vehicles_with_any_colours_score_alike(seed: int, calculator: Calculator
     warning = np.where(rng.random((1, N)) < 0.7, 1.9, rng.choice([np.nan, 1.2, 1.696], (1, N)))
     nominal = [PROTOCOL.matrix_of[cell.block.name, cell.row, cell.column] for cell in PROTOCOL.cells] if seed % 2 else list(range(N))
     cells, claims = CellResults(impact[:, nominal], warning[:, nominal], np.ones((1, N), dtype=bool)), CLAIMS if seed % 3 else {}
-    rated = RatedVehicle(name="any", setting={}, protocol=PROTOCOL, cells=cells, scored=points_of(PROTOCOL, cells, claims), claims=claims)
+    rated = RatedVehicle(name="any", setting={}, protocol=PROTOCOL, cells=cells, scores=points_of(PROTOCOL, cells, claims), claims=claims)
     assert rated.fails == (seed == 0)
     agrees(rated, calculator, template, tmp_path)
 

@@ -47,7 +47,7 @@ def numbers(test: str, kind: str = "", light: str | None = None) -> list[int]:
 
 def rated(cells: CellResults, name: str = "original", claims: dict[str, list[str]] | None = None) -> RatedVehicle:
     scored = points_of(PROTOCOL, cells, claims)
-    return RatedVehicle(name=name, setting={}, protocol=PROTOCOL, cells=cells, scored=scored, claims=claims or {})
+    return RatedVehicle(name=name, setting={}, protocol=PROTOCOL, cells=cells, scores=scored, claims=claims or {})
 
 
 @pytest.mark.parametrize("vut", BANDS)

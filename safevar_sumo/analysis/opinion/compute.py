@@ -151,8 +151,8 @@ def _judge(cause: CauseToJudge, mapping: VehicleMapping, original: _Original, ou
     if fails is None:
         return conclude(OpinionVerdict.OUTSIDE, f"it could not be simulated with the second model: {second_end}")
     if fails:
-        return conclude(OpinionVerdict.CONFIRMED,
-                        f"also unsafe with the second model: {second_end}; the original vehicle is safe: {original.second_end}. {comparison}")
+        return conclude(OpinionVerdict.CONFIRMED, f"also unsafe with the second model: {second_end}; the original vehicle is safe: "
+                                                  f"{original.second_end}. {comparison}")
     return conclude(OpinionVerdict.CONTRADICTED, f"safe with the second model: {second_end}; the original vehicle: {original.second_end}")
 
 
