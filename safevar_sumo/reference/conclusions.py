@@ -11,7 +11,7 @@ import pandas as pd
 from safevar_sumo.analysis.research_questions.answer import Answer, answer_questions
 from safevar_sumo.analysis.research_questions.case import ALGORITHM_TITLES, Case, UnanswerableError
 from safevar_sumo.analysis.research_questions.changes import change_matrix, critical_solutions, masks_by_change_count
-from safevar_sumo.analysis.research_questions.comparisons import ALPHA, magnitude
+from safevar_sumo.analysis.research_questions.comparisons import ALPHA, magnitude_of
 from safevar_sumo.errors import InputError
 from safevar_sumo.reference.validation import rank_correlation
 
@@ -172,7 +172,7 @@ def grade(effect: float, p: float, published_effect: float, published_p: float) 
     """How far a published test holds here, by direction, magnitude and significance; see `RULES`."""
     same_side = (effect - 0.5) * (published_effect - 0.5) > 0
     as_significant = (p < ALPHA) == (published_p < ALPHA)
-    bands = {magnitude(effect), magnitude(published_effect)}
+    bands = {magnitude_of(effect), magnitude_of(published_effect)}
     if as_significant and len(bands) == 1 and (same_side or p >= ALPHA or bands == {"negligible"}):
         return HOLDS
     return DIRECTION if same_side else DIFFERS

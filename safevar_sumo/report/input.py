@@ -276,7 +276,7 @@ def _digest(data: ReportInput, name: str) -> str:
         file = data.directory / file_name
         content = file.read_bytes() if file.is_file() else b""
         digest.update(len(content).to_bytes(8, "big") + content)
-    parts = [data.case.finished, data.point, data.options.get(name, data.case.study.spread)]
+    parts = [data.case.finished_runs, data.point, data.options.get(name, data.case.study.spread)]
     digest.update(repr(parts).encode())
     return digest.hexdigest()
 

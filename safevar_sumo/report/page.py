@@ -55,9 +55,9 @@ def tables(cases: Sequence[Case]) -> list[dict[str, Any]]:
 
 def _table_data(table: Table) -> dict[str, Any]:
     rows = [[{"text": raised(str(cell)), "bold": isinstance(cell, BoldText)} for cell in row] for row in table.rows]
-    spans = [("", table.labels), *((raised(name), width) for name, width in table.spans)] if table.spans else []
-    heads, notes = ([raised(text) for text in texts] for texts in (table.heads, table.notes))
-    return {"title": raised(table.title), "heads": heads, "spans": spans, "rows": rows, "labels": table.labels, "notes": notes}
+    spans = [("", table.label_count), *((raised(name), width) for name, width in table.spans)] if table.spans else []
+    heads, notes = ([raised(text) for text in texts] for texts in (table.headings, table.notes))
+    return {"title": raised(table.title), "heads": heads, "spans": spans, "rows": rows, "labels": table.label_count, "notes": notes}
 
 
 def figures(cases: Sequence[Case]) -> list[dict[str, str]]:

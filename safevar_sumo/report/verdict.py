@@ -78,7 +78,7 @@ def _search(data: ReportInput) -> str:
     versions = ", ".join(f"{name} {value}" for name, value in data.manifest["versions"].items())
     if not case.has_runs:
         return f"The {len(case.solutions)} solutions are imported ({versions})."
-    runs = Counter(algorithm for algorithm, _ in case.finished)
+    runs = Counter(algorithm for algorithm, _ in case.finished_runs)
     names = [f"{ALGORITHM_TITLES.get(name, name)} ({number_of(count, 'run')})" for name, count in runs.items()]
     return (f"Searched by {', '.join(names) or 'no finished run'} of at most {search.evaluations} simulations each, "
             f"{len(case.evaluations)} different vehicles in all, from seed {search.seed}, with {versions}.")

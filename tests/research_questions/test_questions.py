@@ -14,18 +14,18 @@ import scipy
 from safevar_sumo.analysis.research_questions.answer import answer_questions
 from safevar_sumo.analysis.research_questions.case import UnanswerableError
 from safevar_sumo.analysis.research_questions.changes import (
-    collisions,
-    combinations,
+    compare_weathers,
+    count_collisions,
     critical_solutions,
+    find_weather_pairs,
+    frequent_combinations,
     rq31,
     rq32,
     rq33,
     rq33_safety,
-    weather,
-    weather_pairs,
 )
 from safevar_sumo.analysis.research_questions.comparisons import ALPHA, rq1, rq2
-from safevar_sumo.analysis.research_questions.over_runs import difference_line, holm, rq1_runs, rq2_runs, summary_lines
+from safevar_sumo.analysis.research_questions.over_runs import correct_by_holm, difference_line, rq1_runs, rq2_runs, summary_lines
 from safevar_sumo.errors import InputError
 from safevar_sumo.study import CharacteristicTable
 from tests.research_questions.made_up import CHARACTERISTICS, ORIGINAL, made_up, made_up_study, row
@@ -147,7 +147,7 @@ def test_the_footer_of_rq33() -> None:
 
 
 def test_collisions_and_their_share() -> None:
-    frame = collisions(made_up(row(sd=-1), row(sd=0), row(sd=1), row("rs")))
+    frame = count_collisions(made_up(row(sd=-1), row(sd=0), row(sd=1), row("rs")))
     assert only(frame, algorithm="nsga2") == {"setting": "made-up", "algorithm": "nsga2", "solutions": 3, "collisions": 2,
                                               "share": pytest.approx(2 / 3)}
     assert only(frame, algorithm="rs")["share"] == 0
@@ -164,7 +164,7 @@ def test_combinations_of_exactly_four() -> None:
 
     case = made_up(study=study, finished=[("nsga2", 0)])
     solutions = pd.DataFrame([changed(names) for names in ("abcd", "bcde", "abcd", "cdef", "abcf", "abcde", "abc")])
-    result = combinations(dataclasses.replace(case, solutions=solutions))
+    result = frequent_combinations(dataclasses.replace(case, solutions=solutions))
     assert result["characteristics"].tolist() == [list("abcd"), list("abcf"), list("bcde")]
     assert result["percent"].tolist() == [40, 20, 20]
     assert result["rank"].tolist() == [1, 2, 2]
@@ -175,8 +175,8 @@ def test_weather_compares_settings_that_differ_in_it_alone() -> None:
     wet = made_up(row(values=BOTH), study=made_up_study(name="wet", weather="hard_rain"))
     other = made_up(row(values=BOTH), study=made_up_study(name="other", weather="hard_rain", metrics=made_up_study().metrics.__class__(
         ttc_threshold=9)))
-    assert [(one.name, two.name) for one, two in weather_pairs([wet, other, clear])] == [("made-up", "wet")]
-    result = only(weather(clear, wet), characteristic="mass")
+    assert [(one.name, two.name) for one, two in find_weather_pairs([wet, other, clear])] == [("made-up", "wet")]
+    result = only(compare_weathers(clear, wet), characteristic="mass")
     assert (result["percent"], result["percent_other"], result["difference"]) == (50, 100, 50)
     assert (result["increase"], result["increase_other"], result["decrease"]) == (100, 200, None)
     assert (result["rank"], result["rank_other"]) == (1, 1)
@@ -213,7 +213,7 @@ def test_the_brief_lines_say_what_the_data_allows() -> None:
 
 
 def test_holms_correction_of_a_worked_example() -> None:
-    corrected = holm([0.01, None, 0.04, 0.03, 0.005])
+    corrected = correct_by_holm([0.01, None, 0.04, 0.03, 0.005])
     assert [p and round(p, 12) for p in corrected] == [0.03, None, 0.06, 0.06, 0.02]
 
 
@@ -249,6 +249,6 @@ def test_no_share_of_an_original_that_is_zero() -> None:
 @pytest.mark.parametrize(("clear", "wet"), [("clear", "wet"), ("wet", "fog"), ("clear", "night")])
 def test_the_clearer_weather_comes_first(clear: str, wet: str) -> None:
     friction_first = [made_up(row(values=HEAVIER), study=made_up_study(name=name, weather=name)) for name in (wet, clear)]
-    pair, = weather_pairs(friction_first)
+    pair, = find_weather_pairs(friction_first)
     expected = sorted((clear, wet), key=lambda name: {"clear": (1, 1), "fog": (0.9, 0.6), "wet": (0.71, 1), "night": (1, 0.75)}[name])
     assert [one.name for one in pair] == expected[::-1]

@@ -21,9 +21,14 @@ from matplotlib.transforms import Bbox, BboxBase
 
 from safevar_sumo.analysis.research_questions.answer import answer_questions
 from safevar_sumo.analysis.research_questions.case import Case, UnanswerableError
-from safevar_sumo.analysis.research_questions.figures import changed_characteristics, number_of_changes, pareto_fronts, sizes_of_changes
+from safevar_sumo.analysis.research_questions.figures import (
+    draw_change_counts,
+    draw_change_sizes,
+    draw_changed_characteristics,
+    draw_pareto_fronts,
+)
 from safevar_sumo.analysis.research_questions.gallery import FIGURES_OF_ALL_CASES, FIGURES_OF_ONE_CASE, draw_figures, save_figures
-from safevar_sumo.analysis.research_questions.layout import PAPER
+from safevar_sumo.analysis.research_questions.layout import PAPER_LAYOUTS
 from safevar_sumo.analysis.research_questions.tables import FORMATS, as_json, as_latex, as_markdown, as_text, escaped_for_latex
 from safevar_sumo.errors import InputError
 from safevar_sumo.study import CharacteristicTable, load_study
@@ -76,7 +81,8 @@ DOCUMENT = r"""\documentclass{article}
 @pytest.mark.skipif(shutil.which("pdflatex") is None, reason="there is no TeX here, as there is in CI")
 @pytest.mark.slow
 def test_latex_compiles(cases: list[Case], tmp_path: Path) -> None:
-    document = DOCUMENT % (as_latex(answer_questions(cases)) + as_latex(answer_questions(cases), PAPER).replace("tab:", "tab:paper-"))
+    answers = answer_questions(cases)
+    document = DOCUMENT % (as_latex(answers) + as_latex(answers, PAPER_LAYOUTS).replace("tab:", "tab:paper-"))
     (tmp_path / "tables.tex").write_text(document, encoding="utf-8")
     done = subprocess.run(["pdflatex", "-halt-on-error", "-interaction=nonstopmode", "tables.tex"], cwd=tmp_path, capture_output=True,
                           text=True, errors="replace", check=False)
@@ -141,7 +147,7 @@ def test_what_cannot_be_told_is_never_a_nan(kind: str) -> None:
 
 def test_the_papers_layout_has_cases_by_metrics_and_cells_of_p_and_a12() -> None:
     cases = [made_up(*(row(sd=1 - i / 100) for i in range(30))), rich_setting(name="wet", weather="hard_rain")]
-    output = as_text(answer_questions(cases, "rq1"), PAPER)
+    output = as_text(answer_questions(cases, "rq1"), PAPER_LAYOUTS)
     head = next(line for line in output.splitlines() if line.startswith("case"))
     assert head.split() == ["case", "algorithm", "SD", "TET", "TIT", "aveDece"]
     assert "<0.001 / 0.000*" in output
@@ -192,7 +198,7 @@ def test_axes_are_labelled_and_no_text_lies_on_another(name: str, study: str, ca
 @pytest.mark.slow
 def test_cases_stand_side_by_side_in_one_figure(case: Case) -> None:
     cases = [dataclasses.replace(case, name=f"case {i}") for i in range(2)]
-    figure = number_of_changes(cases)
+    figure = draw_change_counts(cases)
     assert [axis.get_title() for axis in figure.axes if axis.axison] == [one.name for one in cases]
     _check_layout(figure, "rq3.1-number-of-changes")
     result, lacking = draw_figures(cases)
@@ -202,7 +208,7 @@ def test_cases_stand_side_by_side_in_one_figure(case: Case) -> None:
 
 
 def test_the_original_vehicle_and_the_line_of_collisions_are_in_the_fronts(case: Case) -> None:
-    for axis, marked in zip(pareto_fronts(case).axes, (True, True, False), strict=True):
+    for axis, marked in zip(draw_pareto_fronts(case).axes, (True, True, False), strict=True):
         output = {str(line.get_label()): line for line in axis.lines}
         assert float(output["original vehicle"].get_xdata()[0]) == (case.original["safety_degree"] if marked else 0.0)  # type: ignore[index,arg-type]
         assert ("collision: 0 or less" in output) == marked
@@ -253,7 +259,7 @@ def test_what_cannot_be_drawn_says_why(tmp_path: Path) -> None:
     assert sorted(path.name for path in written) == [
         "made-up-pareto-fronts.svg", "made-up-rq3.2-changed-characteristics.svg", "made-up-rq3.3-sizes-of-changes.svg"]
     assert any("imported" in reason for reason in lacking)
-    for one in (sizes_of_changes, changed_characteristics):
+    for one in (draw_change_sizes, draw_changed_characteristics):
         with pytest.raises(UnanswerableError, match="no critical solution"):
             one(made_up(row(sd=9)))
     with pytest.raises(InputError, match="no finished run"):

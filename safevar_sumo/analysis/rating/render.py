@@ -92,9 +92,8 @@ def test_in_words(test: RatedTest) -> str:
 
 def _changes_in_words(rating: Rating, variant: RatedVehicle) -> str:
     characteristics = CharacteristicSet.of(rating.study.vehicle.characteristics)
-    values = ((characteristic, variant.setting[characteristic.name]) for characteristic in characteristics)
-    changes = [f"{characteristic.short_name} {float(characteristic.text(value)):g}{characteristic.suffix}" for characteristic, value in values
-               if value != characteristic.original]
+    changes = [f"{characteristic.short_name} {float(characteristic.text(variant.setting[characteristic.name])):g}{characteristic.suffix}"
+               for characteristic in characteristics if variant.setting[characteristic.name] != characteristic.original]
     return joined(changes) if changes else "no change at all"
 
 
@@ -126,7 +125,7 @@ def _build_layers_table(rating: Rating) -> WholeTable:
         for vehicle, test in zip(rating.variants, vehicle_tests, strict=True):
             if test.block.light != "night" and (vehicle is rating.original or test.layers != vehicle_tests[0].layers):
                 held_layers, failed_layers = ([layer for layer, holds in test.layers.items() if holds is expected and layer not in claimed]
-                                    for expected in (True, False))
+                                              for expected in (True, False))
                 table.add_row(test.block.test, vehicle.name, ", ".join(held_layers), ", ".join(failed_layers), ", ".join(claimed))
     return table
 

@@ -59,7 +59,7 @@ class Case:
     original: Mapping[str, float]
     solutions: pd.DataFrame
     evaluations: pd.DataFrame
-    finished: tuple[tuple[str, int], ...]
+    finished_runs: tuple[tuple[str, int], ...]
     has_runs: bool
     failures: tuple[Failure, ...] = ()
     scoring: Scoring = PUBLISHED_SCORING
@@ -80,7 +80,7 @@ class Case:
     @property
     def algorithms(self) -> tuple[str, ...]:
         """Algorithms that have solutions or a finished run, in the study's order."""
-        names = {*self.solutions["algorithm"], *(algorithm for algorithm, _ in self.finished)}
+        names = {*self.solutions["algorithm"], *(algorithm for algorithm, _ in self.finished_runs)}
         return tuple(name for name in dict.fromkeys([*self.study.search.labels, *sorted(names)]) if name in names)
 
     def require_solutions(self) -> None:
@@ -111,7 +111,7 @@ class Case:
         """
         if not self.has_runs:
             raise UnanswerableError(self.name, "is imported: the runs of its solutions are unknown", "results of the command study")
-        return sorted(run for name, run in self.finished if name == algorithm)
+        return sorted(run for name, run in self.finished_runs if name == algorithm)
 
     @property
     def remarks(self) -> list[str]:
@@ -120,7 +120,7 @@ class Case:
         if not self.has_runs:
             lines.append(f"{self.name}: imported solutions, without runs; the original vehicle's metrics are published or supplied.")
         else:
-            done = Counter(algorithm for algorithm, _ in self.finished)
+            done = Counter(algorithm for algorithm, _ in self.finished_runs)
             planned = self.study.search.runs
             shortfalls = [f"{name} {done[name]} of {planned} runs" for name in self.study.search.labels if done[name] < planned]
             if shortfalls:
@@ -136,7 +136,7 @@ def counted_solutions(solutions: pd.DataFrame, metric: MetricFacts) -> pd.DataFr
     return solutions if metric.over_collisions else solutions[~are_collisions(solutions)]
 
 
-def values(solutions: pd.DataFrame, metric: MetricFacts) -> FloatArray:
+def defined_values(solutions: pd.DataFrame, metric: MetricFacts) -> FloatArray:
     """A metric's defined values over the solutions that count for it."""
     column = counted_solutions(solutions, metric)[metric.name].to_numpy(dtype=float)
     return np.asarray(column[~np.isnan(column)])
@@ -156,7 +156,7 @@ def load_cases(directories: Iterable[str | Path]) -> list[Case]:
         If a directory holds no results, is damaged or is given twice.
     """
     paths = [Path(directory) for directory in directories]
-    duplicates = [path for path, number in Counter(path.resolve() for path in paths).items() if number > 1]
+    duplicates = [path for path, count in Counter(path.resolve() for path in paths).items() if count > 1]
     if duplicates:
         raise InputError("directories", f"{duplicates[0]} is given twice", "each results directory once")
     cases = [_load_or_refuse(path) for path in paths]
@@ -197,4 +197,4 @@ def build_case(study: Study, original: Mapping[str, Any], solutions: pd.DataFram
     metrics = {name: np.nan if original.get(name) is None else float(original[name]) for name in names}
     solutions, evaluations = (frame.assign(**{name: np.nan for name in columns if name not in frame}) for frame in (solutions, evaluations))
     return Case(name=study.name, study=study, original=metrics, solutions=solutions, evaluations=evaluations,
-                finished=tuple(finished), has_runs=has_runs, failures=tuple(failures), scoring=scoring)
+                finished_runs=tuple(finished), has_runs=has_runs, failures=tuple(failures), scoring=scoring)

@@ -46,15 +46,15 @@ def change_matrix(case: Case, solutions: pd.DataFrame) -> FloatArray:
 
 def masks_by_change_count(case: Case, deltas: FloatArray) -> dict[str, BoolArray]:
     """Whether solutions have j characteristics changed, for j = "1".."n" and "any"."""
-    number = np.count_nonzero(deltas, axis=1)
-    return {**{str(j): number == j for j in range(1, len(case.characteristics) + 1)}, ANY: np.ones(len(deltas), dtype=bool)}
+    change_counts = np.count_nonzero(deltas, axis=1)
+    return {**{str(j): change_counts == j for j in range(1, len(case.characteristics) + 1)}, ANY: np.ones(len(deltas), dtype=bool)}
 
 
 def rq31(case: Case) -> pd.DataFrame:
     """Number of critical solutions of each run with exactly j characteristics changed; columns setting, run, j, count."""
     solutions, runs = critical_solutions(case), case.runs_of(NSGA2)
-    number, run_of = np.count_nonzero(change_matrix(case, solutions), axis=1), solutions["run"].to_numpy()
-    rows = [(case.name, run, str(j), int(np.count_nonzero((run_of == run) & (number == j))))
+    change_counts, run_of_solution = np.count_nonzero(change_matrix(case, solutions), axis=1), solutions["run"].to_numpy()
+    rows = [(case.name, run, str(j), int(np.count_nonzero((run_of_solution == run) & (change_counts == j))))
             for run in runs for j in range(1, len(case.characteristics) + 1)]
     return pd.DataFrame(rows, columns=["setting", "run", "j", "count"])
 
@@ -68,11 +68,11 @@ def rq32(case: Case) -> pd.DataFrame:
     deltas = change_matrix(case, critical_solutions(case))
     change_counts = np.count_nonzero(deltas, axis=0)
     rows = []
-    for i, member in enumerate(case.characteristics):
+    for column, characteristic in enumerate(case.characteristics):
         for j, mask in masks_by_change_count(case, deltas).items():
-            percent = 100 * float(np.mean(deltas[mask, i] != 0)) if mask.any() else None
-            rank = 1 + int(np.count_nonzero(change_counts > change_counts[i])) if j == ANY and len(deltas) else None
-            rows.append((case.name, member.name, j, percent, rank))
+            percent = 100 * float(np.mean(deltas[mask, column] != 0)) if mask.any() else None
+            rank = 1 + int(np.count_nonzero(change_counts > change_counts[column])) if j == ANY and len(deltas) else None
+            rows.append((case.name, characteristic.name, j, percent, rank))
     return pd.DataFrame(rows, columns=["setting", "characteristic", "j", "percent", "rank"], dtype=object)
 
 
@@ -84,14 +84,14 @@ def rq33(case: Case) -> pd.DataFrame:
     """
     deltas = change_matrix(case, critical_solutions(case))
     rows = []
-    for i, member in enumerate(case.characteristics):
+    for column, characteristic in enumerate(case.characteristics):
         for direction, sign in (("increase", 1), ("decrease", -1)):
             for j, mask in masks_by_change_count(case, deltas).items():
-                delta = deltas[mask, i]
+                delta = deltas[mask, column]
                 delta = delta[np.sign(delta) == sign]
                 mean = float(np.mean(delta)) if delta.size else None
-                pc = None if mean is None else abs(mean / member.original)
-                rows.append((case.name, member.name, direction, j, pc, mean, delta.size))
+                pc = None if mean is None else abs(mean / characteristic.original)
+                rows.append((case.name, characteristic.name, direction, j, pc, mean, delta.size))
     return pd.DataFrame(rows, columns=["setting", "characteristic", "direction", "j", "pc", "delta", "n"], dtype=object)
 
 
@@ -113,16 +113,16 @@ def rq33_safety(case: Case) -> pd.DataFrame:
         "TIT": (np.where(has_collided, np.nan, tit - original["tit"]), original["tit"]),
         "aveDece": (original["ave_dece"] - dece, original["ave_dece"])}
     rows = []
-    for quantity, (difference, reference) in quantities.items():
+    for quantity, (differences, reference) in quantities.items():
         for j, mask in masks_by_change_count(case, change_matrix(case, solutions)).items():
-            sample = difference[mask & ~np.isnan(difference)]
+            sample = differences[mask & ~np.isnan(differences)]
             mean = float(np.mean(sample)) if sample.size else None
             percent = None if mean is None or np.isnan(reference) or reference == 0 else 100 * mean / abs(reference)
             rows.append((case.name, quantity, j, mean, percent, sample.size))
     return pd.DataFrame(rows, columns=["setting", "quantity", "j", "value", "percent", "n"], dtype=object)
 
 
-def collisions(case: Case) -> pd.DataFrame:
+def count_collisions(case: Case) -> pd.DataFrame:
     """Number of collisions among each algorithm's solutions; columns setting, algorithm, solutions, collisions, share [fraction].
 
     Raises
@@ -134,12 +134,12 @@ def collisions(case: Case) -> pd.DataFrame:
     rows = []
     for algorithm in case.algorithms:
         solutions = case.solutions_of(algorithm)
-        crashes = int(are_collisions(solutions).sum())
-        rows.append((case.name, algorithm, len(solutions), crashes, crashes / len(solutions) if len(solutions) else None))
+        collision_count = int(are_collisions(solutions).sum())
+        rows.append((case.name, algorithm, len(solutions), collision_count, collision_count / len(solutions) if len(solutions) else None))
     return pd.DataFrame(rows, columns=["setting", "algorithm", "solutions", "collisions", "share"], dtype=object)
 
 
-def combinations(case: Case) -> pd.DataFrame:
+def frequent_combinations(case: Case) -> pd.DataFrame:
     """The most frequent combinations among the critical solutions with exactly four characteristics changed.
 
     Columns setting, rank (ties share the better one), characteristics (a list), percent of those solutions; no row
@@ -148,15 +148,15 @@ def combinations(case: Case) -> pd.DataFrame:
     """
     is_changed = change_matrix(case, critical_solutions(case)) != 0
     masks = is_changed[np.count_nonzero(is_changed, axis=1) == COMBINATION_SIZE]
-    counts = Counter(tuple(np.flatnonzero(row).tolist()) for row in masks)
+    counts = Counter(tuple(np.flatnonzero(mask).tolist()) for mask in masks)
     ranking = sorted(counts.items(), key=lambda item: (-item[1], item[0]))[:COMBINATIONS_SHOWN]
     names = case.characteristics.names
-    rows = [(case.name, 1 + sum(other > number for other in counts.values()), [names[i] for i in members], 100 * number / len(masks))
-            for members, number in ranking]
+    rows = [(case.name, 1 + sum(other > count for other in counts.values()), [names[i] for i in columns], 100 * count / len(masks))
+            for columns, count in ranking]
     return pd.DataFrame(rows, columns=["setting", "rank", "characteristics", "percent"])
 
 
-def weather_pairs(cases: Sequence[Case]) -> list[tuple[Case, Case]]:
+def find_weather_pairs(cases: Sequence[Case]) -> list[tuple[Case, Case]]:
     """Pairs of cases that differ only in the weather and the ADS's reaction to it, clearer weather first (by friction, visibility, delays).
 
     Raises
@@ -172,7 +172,7 @@ def weather_pairs(cases: Sequence[Case]) -> list[tuple[Case, Case]]:
     return pairs
 
 
-def weather(clear: Case, wet: Case) -> pd.DataFrame:
+def compare_weathers(clear: Case, wet: Case) -> pd.DataFrame:
     """One weather against another, characteristic by characteristic, over the critical solutions.
 
     Columns setting, other, characteristic, percent and percent_other (share of the critical solutions that change
@@ -197,12 +197,12 @@ def weather(clear: Case, wet: Case) -> pd.DataFrame:
     return table.reset_index()[columns]
 
 
-def effects(case: Case) -> pd.DataFrame:
+def list_changes(case: Case) -> pd.DataFrame:
     """Every change in every critical solution; columns setting, characteristic, change (signed, in the characteristic's unit)."""
     deltas = change_matrix(case, critical_solutions(case))
-    parts = [pd.DataFrame({"setting": case.name, "characteristic": name, "change": column[column != 0]})
+    frames = [pd.DataFrame({"setting": case.name, "characteristic": name, "change": column[column != 0]})
              for name, column in zip(case.characteristics.names, deltas.T, strict=True)]
-    return pd.concat(parts, ignore_index=True)
+    return pd.concat(frames, ignore_index=True)
 
 
 def _clearness(case: Case) -> tuple[float, float, float]:

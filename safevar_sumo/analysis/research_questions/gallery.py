@@ -7,15 +7,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from safevar_sumo.analysis.figures import save
-from safevar_sumo.analysis.research_questions.algorithm_figures import attainment_surfaces, critical_differences
+from safevar_sumo.analysis.research_questions.algorithm_figures import draw_attainment_surfaces, draw_critical_differences
 from safevar_sumo.analysis.research_questions.case import Case, UnanswerableError
 from safevar_sumo.analysis.research_questions.changes import rq31
 from safevar_sumo.analysis.research_questions.figures import (
-    changed_characteristics,
-    hypervolume_growth,
-    number_of_changes,
-    pareto_fronts,
-    sizes_of_changes,
+    draw_change_counts,
+    draw_change_sizes,
+    draw_changed_characteristics,
+    draw_convergence,
+    draw_pareto_fronts,
 )
 
 if TYPE_CHECKING:
@@ -24,14 +24,14 @@ if TYPE_CHECKING:
 FORMATS = ("png", "pdf", "svg")
 LEAST_ALGORITHMS = 3
 """Minimum number of algorithms for a figure of ranks; for two, the test of the pair suffices."""
-FIGURES_OF_ALL_CASES: Mapping[str, Callable[[Sequence[Case]], Figure]] = {"rq3.1-number-of-changes": number_of_changes}
+FIGURES_OF_ALL_CASES: Mapping[str, Callable[[Sequence[Case]], Figure]] = {"rq3.1-number-of-changes": draw_change_counts}
 FIGURES_OF_ONE_CASE: Mapping[str, Callable[[Case], Figure]] = {
-    "rq3.2-changed-characteristics": changed_characteristics,
-    "rq3.3-sizes-of-changes": sizes_of_changes,
-    "pareto-fronts": pareto_fronts,
-    "convergence": hypervolume_growth,
-    "critical-differences": critical_differences,
-    "attainment": attainment_surfaces,
+    "rq3.2-changed-characteristics": draw_changed_characteristics,
+    "rq3.3-sizes-of-changes": draw_change_sizes,
+    "pareto-fronts": draw_pareto_fronts,
+    "convergence": draw_convergence,
+    "critical-differences": draw_critical_differences,
+    "attainment": draw_attainment_surfaces,
 }
 
 
@@ -52,7 +52,7 @@ def draw_figures(cases: Sequence[Case]) -> tuple[dict[str, Figure], list[str]]:
             figures[name] = draw_cases(answerable_cases)
     for case in cases:
         for name, draw_figure in FIGURES_OF_ONE_CASE.items():
-            if draw_figure is critical_differences and len(case.algorithms) < LEAST_ALGORITHMS:
+            if draw_figure is draw_critical_differences and len(case.algorithms) < LEAST_ALGORITHMS:
                 continue
             try:
                 figures[name if is_single else f"{case.name}-{name}"] = draw_figure(case)
