@@ -12,7 +12,7 @@ from scipy import signal
 import safevar_sumo as sv
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import OPTIONAL_METRICS
-from safevar_sumo.metrics.comfort import weighted
+from safevar_sumo.metrics.comfort import weight_acceleration
 from safevar_sumo.records import Encounter, SimulationRuns, Trace
 from safevar_sumo.study import MetricsTable, load_study
 from safevar_sumo.sumo.system import assemble
@@ -57,7 +57,7 @@ def test_weighting_agrees_with_iso_2631_1(frequency: float) -> None:
     time = np.arange(0, 40, step)
     low = np.abs(1j * f) ** 2 / np.abs((1j * f) ** 2 + np.sqrt(2) * 0.4 * 1j * f + 0.4**2)
     shape = np.abs((1 + 1j * f / 2) / (1 + 1j * f / (0.63 * 2) - (f / 2) ** 2))
-    settled = weighted(np.sin(2 * np.pi * f * time)[:, np.newaxis], step)[len(time) // 2:]
+    settled = weight_acceleration(np.sin(2 * np.pi * f * time)[:, np.newaxis], step)[len(time) // 2:]
     assert np.sqrt(2 * np.mean(settled**2)) == pytest.approx(low * shape, rel=2e-3)
 
 
