@@ -186,7 +186,7 @@ def print_summary(console: Console, study: Study, campaign: Campaign, directory:
                             "they are neither failures nor successes, and no result contains them.")
     _print_most_critical(console, study, campaign)
     case = build_case(study, record(campaign.original, 0), solutions, solutions_frame(names, []), tuple(campaign.solutions),
-                   scoring=campaign.scoring)
+                      scoring=campaign.scoring)
     for line in summary_lines(case):
         print_text(console, line)
     print_text(console, f"All tables: {RUN} tables {shlex.quote(str(directory))}")

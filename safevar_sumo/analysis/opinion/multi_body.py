@@ -89,7 +89,7 @@ class Plant(NamedTuple):
 
 
 def build_plant(mass: FloatArray, unladen_mass: float, slope: Slope, *, brake_front: float, drive_front: float,
-             centre: FloatArray | None = None, wheelbase: float | None = None, height: float | None = None, **constants: Any) -> Plant:
+                centre: FloatArray | None = None, wheelbase: float | None = None, height: float | None = None, **constants: Any) -> Plant:
     """Vehicles with masses [kg] that differ from the package's vehicle.
 
     Unsprung masses, springs, dampers, tyres and inertia grow with `unladen_mass` [kg], so that all frequencies stay the package's;

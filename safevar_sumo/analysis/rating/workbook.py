@@ -169,7 +169,7 @@ class PreprocessedFile(_Spreadsheet):
     def fill(self, vehicle: RatedVehicle) -> None:
         """Fill in each drawn cell's simulated value, and whether the robustness layer that is drawn with the cell holds."""
         layer_cells = {(cell.block.name, cell.row, cell.column, cell.range, cell.condition): cell_number
-                  for cell_number, cell in enumerate(self.protocol.cells) if cell.is_varied}
+                       for cell_number, cell in enumerate(self.protocol.cells) if cell.is_varied}
         for sheet, columns, row, cell_number in self._drawn_cells:
             cell = self.protocol.cells[cell_number]
             sheet.cell(row, columns["Value"]).value = _measurement(vehicle, cell_number)

@@ -189,8 +189,8 @@ def load_case(directory: Path) -> Case:
 
 
 def build_case(study: Study, original: Mapping[str, Any], solutions: pd.DataFrame, evaluations: pd.DataFrame,
-            finished: Sequence[tuple[str, int]], has_runs: bool = True, failures: Sequence[Failure] = (),
-            scoring: Scoring = PUBLISHED_SCORING) -> Case:
+               finished: Sequence[tuple[str, int]], has_runs: bool = True, failures: Sequence[Failure] = (),
+               scoring: Scoring = PUBLISHED_SCORING) -> Case:
     """Put a case together; in `original` an undefined metric is None or missing."""
     names = [metric.name for metric in scoring.metrics]
     columns = [*names, *(objective.name for objective in scoring.objectives)]

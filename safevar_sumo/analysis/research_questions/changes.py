@@ -45,7 +45,7 @@ def change_matrix(case: Case, solutions: pd.DataFrame) -> FloatArray:
 
 
 def masks_by_change_count(case: Case, deltas: FloatArray) -> dict[str, BoolArray]:
-    """Whether solutions have j characteristics changed, for j = "1".."n" and "any"."""
+    """For j = "1".."n" and "any": whether each solution has j characteristics changed, shape (M,)."""
     change_counts = np.count_nonzero(deltas, axis=1)
     return {**{str(j): change_counts == j for j in range(1, len(case.characteristics) + 1)}, ANY: np.ones(len(deltas), dtype=bool)}
 
@@ -201,7 +201,7 @@ def list_changes(case: Case) -> pd.DataFrame:
     """Every change in every critical solution; columns setting, characteristic, change (signed, in the characteristic's unit)."""
     deltas = change_matrix(case, critical_solutions(case))
     frames = [pd.DataFrame({"setting": case.name, "characteristic": name, "change": column[column != 0]})
-             for name, column in zip(case.characteristics.names, deltas.T, strict=True)]
+              for name, column in zip(case.characteristics.names, deltas.T, strict=True)]
     return pd.concat(frames, ignore_index=True)
 
 

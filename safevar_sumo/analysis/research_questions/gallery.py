@@ -94,5 +94,5 @@ def save_figures(cases: Sequence[Case], directory: Path, kind: str) -> tuple[lis
 
 
 def _file_name(name: str) -> str:
-    """A case's name without characters that file systems may refuse."""
+    """The name of a figure or case without characters that file systems may refuse."""
     return "".join(character if character.isalnum() or character in "._-" else "-" for character in name).strip("-")

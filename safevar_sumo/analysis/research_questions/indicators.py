@@ -63,7 +63,7 @@ class Scale(NamedTuple):
 
 
 def objective_values(case: Case, frame: pd.DataFrame) -> FloatArray:
-    """The objectives, each to be minimised, of the M rows that have all of them; shape (M, objectives)."""
+    """The objectives' values, smaller being better, of the M rows in which all of them are defined; shape (M, objectives)."""
     points = _values(case, frame)
     return np.asarray(points[np.isfinite(points).all(axis=1)])
 

@@ -127,8 +127,8 @@ def _lay_out_tests(answer: Answer, group_column: str, sizes: tuple[str, ...], no
     method_notes = [f"p{f' with {marks[method]}' if method in marks else ''}: {method}."
                     for method in (EXACT_SIGNED_TEST, ASYMPTOTIC_SIGNED_TEST, ASYMPTOTIC_TEST, EXACT_TEST) if method in methods]
     return pivot_table(TITLES[answer.name], frame, (group_column, "metric"), lambda row: _format_test_cells(row, sizes, marks),
-                   ("p", *(("p Holm",) if has_holm else ()), "A12", "magnitude", *sizes), names=_titles(answer),
-                   notes=(*method_notes, *notes, HOLM_NOTE if has_holm else BOLD_NOTE))
+                       ("p", *(("p Holm",) if has_holm else ()), "A12", "magnitude", *sizes), names=_titles(answer),
+                       notes=(*method_notes, *notes, HOLM_NOTE if has_holm else BOLD_NOTE))
 
 
 def _format_test_cells(row: Row, sizes: Sequence[str] = (), marks: Mapping[str, str] = MappingProxyType({})) -> tuple[str, ...]:
@@ -209,19 +209,19 @@ def _lay_out_ranks(answer: Answer) -> list[Table]:
 def _lay_out_rq31(answer: Answer) -> list[Table]:
     counts = answer.frame.groupby(["setting", "j"], sort=False)["count"].agg(list).reset_index()
     return [pivot_table(TITLES["rq3.1"], counts, ("j",),
-                    lambda row: [f"{value:g}" for value in np.quantile(row["count"], [0, 0.25, 0.5, 0.75, 1])],
-                    ("min", "Q1", "median", "Q3", "max"),
-                    notes=("Critical solutions of a run with exactly j characteristics changed, over the runs.",))]
+                        lambda row: [f"{value:g}" for value in np.quantile(row["count"], [0, 0.25, 0.5, 0.75, 1])],
+                        ("min", "Q1", "median", "Q3", "max"),
+                        notes=("Critical solutions of a run with exactly j characteristics changed, over the runs.",))]
 
 
 def _lay_out_rq32(answer: Answer) -> list[Table]:
     tables = []
     for setting, group in answer.frame.groupby("setting", sort=False):
         table = pivot_table(f"{TITLES['rq3.2']}: {setting}", group, ("characteristic",), _format_column("percent", ".1f"), over="j",
-                        notes=("Columns: number of characteristics changed; ranked by 'any'.",))
+                            notes=("Columns: number of characteristics changed; ranked by 'any'.",))
         ranks = group.loc[group["j"] == ANY, "rank"]
         tables.append(table._replace(headings=(*table.headings, "rank"), rows=[(*row, _format_number(rank, "d")) for row, rank in
-                                                                         zip(table.rows, ranks, strict=True)]))
+                                                                               zip(table.rows, ranks, strict=True)]))
     if len(tables) == 1:
         return tables
     return [*tables, pivot_table("RQ3.2: % of all critical solutions, cases side by side", answer.frame[answer.frame["j"] == ANY],
@@ -234,8 +234,8 @@ def _lay_out_rq33(setting: str, group: pd.DataFrame) -> list[Table]:
     paper_rows = group[group["j"].isin(PAPER_CHANGE_COUNTS)]
     return [
         pivot_table(f"{TITLES['rq3.3']}, 2 to 6 changed: {setting}", paper_rows.assign(j="j = " + paper_rows["j"]), labels,
-                lambda row: [_format_number(row[name], spec) for name, spec in specs.items()], ("PC", "delta"), over="j",
-                notes=("PC: mean of |v - v''| / v; delta: mean signed change in the characteristic's unit.",)),
+                    lambda row: [_format_number(row[name], spec) for name, spec in specs.items()], ("PC", "delta"), over="j",
+                    notes=("PC: mean of |v - v''| / v; delta: mean signed change in the characteristic's unit.",)),
         *(pivot_table(f"RQ3.3: {title}, any number changed: {setting}", group, labels, _format_column(name, specs[name]), over="j")
           for title, name in (("PC", "pc"), ("delta", "delta")))]
 
@@ -260,8 +260,8 @@ def _lay_out_safety(setting: str, group: pd.DataFrame) -> list[Table]:
 
 def _lay_out_collisions(answer: Answer) -> list[Table]:
     return [pivot_table(TITLES["collisions"], answer.frame, ("algorithm",),
-                    lambda row: (str(row["solutions"]), str(row["collisions"]), _format_number(row["share"], ".1%")),
-                    ("solutions", "collisions", "share"), names=ALGORITHM_TITLES)]
+                        lambda row: (str(row["solutions"]), str(row["collisions"]), _format_number(row["share"], ".1%")),
+                        ("solutions", "collisions", "share"), names=ALGORITHM_TITLES)]
 
 
 def _lay_out_combinations(answer: Answer) -> list[Table]:
@@ -294,7 +294,7 @@ def _lay_out_paper_tests(answer: Answer, group_column: str, note: str) -> list[T
         return (_bold_if(cell, row["p_value"] < ALPHA and row["magnitude"] in NOTABLE_MAGNITUDES),)
 
     table = pivot_table(TITLES[answer.name], answer.frame, ("setting", group_column), cells, over="metric", names=ALGORITHM_TITLES,
-                    notes=(CELL_NOTE, note))
+                        notes=(CELL_NOTE, note))
     return [table._replace(headings=("case", group_column, *(names.get(metric, metric) for metric in table.headings[2:])))]
 
 

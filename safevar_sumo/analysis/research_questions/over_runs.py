@@ -150,7 +150,7 @@ def summary_lines(case: Case) -> list[str]:
 
 
 SUMMARY_QUESTIONS = (("RQ1", rq1_runs, "algorithm", "A12 below 0.5: the runs are more unsafe than the original vehicle"),
-                ("RQ2", rq2_runs, "baseline", "A12 above 0.5: NSGA-II is better"))
+                     ("RQ2", rq2_runs, "baseline", "A12 above 0.5: NSGA-II is better"))
 
 
 def _rounded(value: float) -> str:
@@ -182,7 +182,7 @@ def run_means(case: Case, algorithm: str, metric: MetricFacts) -> FloatArray:
 
 
 def run_mean_series(case: Case, algorithm: str, metric: MetricFacts) -> pd.Series[float]:
-    """The means of `run_means`, indexed by the number of the run."""
+    """The means of `run_means`, indexed by the run's number."""
     run_numbers, solutions = case.runs_of(algorithm), counted_solutions(case.solutions_of(algorithm), metric)
     runs, column = solutions["run"].to_numpy(), solutions[metric.name].to_numpy(dtype=float)
     defined = ~np.isnan(column)
