@@ -11,8 +11,8 @@ import msgspec
 from msgspec.inspect import type_info
 
 from safevar_sumo.ads import ADS
-from safevar_sumo.analysis.opinion.mapping import TABLES as REPRESENTED
-from safevar_sumo.metrics import FURTHER, METRICS, SAFEVAR
+from safevar_sumo.analysis.opinion.mapping import MAPPING_TABLES as REPRESENTED
+from safevar_sumo.metrics import METRICS, OPTIONAL_METRICS, PUBLISHED_SCORING
 from safevar_sumo.results import FILES
 from safevar_sumo.search import ALGORITHMS
 from safevar_sumo.study import Study
@@ -110,8 +110,8 @@ def _bounds(annotation: Any) -> str:
 
 def metric_columns() -> str:
     """Columns of metrics and objectives in solutions.csv."""
-    objectives = [(f"`{one.name}`", one.unit, f"objective: {one.title}") for one in SAFEVAR.objectives]
-    metrics = [(f"`{name}`", metric.unit, metric.description) for name, metric in {**METRICS, **FURTHER}.items()]
+    objectives = [(f"`{one.name}`", one.unit, f"objective: {one.title}") for one in PUBLISHED_SCORING.objectives]
+    metrics = [(f"`{name}`", metric.unit, metric.description) for name, metric in {**METRICS, **OPTIONAL_METRICS}.items()]
     return _table(("column", "unit", "content"), [*objectives, *metrics])
 
 
@@ -124,7 +124,7 @@ def second_model() -> str:
     """Which characteristic is which parameter of the second vehicle model."""
     parts = []
     for name, table in REPRESENTED.items():
-        outside = [f"`{key}`: {why}" for key, why in table.outside.items()]
+        outside = [f"`{key}`: {why}" for key, why in table.omission_reasons.items()]
         rows = [(f"`{row.characteristic}`", row.unit, row.parameter, row.parameter_unit, f"`{row.equation}`") for row in table.rows]
         listed = f"\nOutside: {'; '.join(outside)}.\n" if outside else ""
         parts.append(f"### {name}\n\n{_table(('characteristic', 'unit', 'parameter', 'unit', 'equation'), rows)}{listed}")

@@ -18,7 +18,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import safevar_sumo.cli.study
-from safevar_sumo.ads import GuardedAds, PerVehicle
+from safevar_sumo.ads import GuardedAds, PerVehicleAds
 from safevar_sumo.cli.program import commands
 from safevar_sumo.errors import InputError, SafevarError, UserCodeError
 from safevar_sumo.metrics import METRICS
@@ -91,7 +91,7 @@ class Returning:
 @given(what=COMMANDS)
 def test_whatever_an_ads_commands_is_two_pedals_for_each_vehicle_or_an_error(what: object) -> None:
     guard = Guard("mine.toml", "ads.model = 'mine:Mine'")
-    for ads in (GuardedAds(Returning((what, None)), guard), PerVehicle(lambda: Returning(what), guard)):  # type: ignore[arg-type, return-value]
+    for ads in (GuardedAds(Returning((what, None)), guard), PerVehicleAds(lambda: Returning(what), guard)):  # type: ignore[arg-type, return-value]
         try:
             command, _ = ads.drive(SEEN, ads.start(2, KNOWN, 0.05))
         except UserCodeError:

@@ -7,7 +7,7 @@ from typing import Annotated
 import numpy as np
 from msgspec import Meta
 
-from safevar_sumo.ads.base import Positive
+from safevar_sumo.ads.base import PositiveParameter
 from safevar_sumo.ads.driver import CarFollowing
 from safevar_sumo.records import FloatArray
 
@@ -33,18 +33,19 @@ class Acc(CarFollowing, frozen=True, kw_only=True):
         Half the width of the corridor that it watches [m].
     """
 
-    cruise_speed: Positive = 13.89
-    headway: Positive = 1.0
+    cruise_speed: PositiveParameter = 13.89
+    headway: PositiveParameter = 1.0
     standing_gap: Annotated[float, Meta(ge=0, le=100)] = 2.5
-    corridor: Positive = 1.4
+    corridor: PositiveParameter = 1.4
 
     def acceleration_at(self, gap: FloatArray, speed: FloatArray, leader_speed: FloatArray) -> FloatArray:
         """Commanded acceleration [m/s^2] at a gap from bumper to bumper [m] and speeds [m/s], shape (N,)."""
         excess_speed, relative_speed = speed - self.cruise_speed, leader_speed - speed
-        error = gap - self.standing_gap - _standing_distance(speed) - self.headway * speed
-        keeps = (np.abs(error) < GAP_TOLERANCE) & (np.abs(excess_speed) < SPEED_TOLERANCE)
-        gap_law = np.where(error < 0, _law(AVOIDING_GAINS, relative_speed, error), _law(CLOSING_GAINS, relative_speed, error))
-        acceleration = np.where(keeps, _law(KEEPING_GAINS, relative_speed, error), gap_law)
+        gap_error = gap - self.standing_gap - _standing_distance(speed) - self.headway * speed
+        keeps_gap = (np.abs(gap_error) < GAP_TOLERANCE) & (np.abs(excess_speed) < SPEED_TOLERANCE)
+        gap_law = np.where(gap_error < 0, _acceleration_law(AVOIDING_GAINS, relative_speed, gap_error),
+                           _acceleration_law(CLOSING_GAINS, relative_speed, gap_error))
+        acceleration = np.where(keeps_gap, _acceleration_law(KEEPING_GAINS, relative_speed, gap_error), gap_law)
         return np.where(gap - self.standing_gap > FOLLOWING_GAP, SPEED_GAIN * excess_speed, acceleration)
 
 
@@ -53,5 +54,5 @@ def _standing_distance(speed: FloatArray) -> FloatArray:
     return np.minimum(np.maximum(75 / np.maximum(speed, 1.0) - 5, 0.0), 2.0)
 
 
-def _law(gains: tuple[float, float], speed_error: FloatArray, gap_error: FloatArray) -> FloatArray:
+def _acceleration_law(gains: tuple[float, float], speed_error: FloatArray, gap_error: FloatArray) -> FloatArray:
     return gains[0] * speed_error + gains[1] * gap_error

@@ -7,8 +7,8 @@ from typing import Annotated, NamedTuple
 import numpy as np
 from msgspec import Meta, Struct
 
-from safevar_sumo.ads.base import NotNegative, Positive
-from safevar_sumo.ads.driver import Trim, in_the_way, pedals, time_to_reach, trim
+from safevar_sumo.ads.base import NonNegativeParameter, PositiveParameter
+from safevar_sumo.ads.driver import Trim, is_in_the_way, pedals_for, time_to_reach, trim_at
 from safevar_sumo.records import BoolArray, Command, FloatArray, Nominal, Observation
 
 LEAST_DECELERATION = 0.5
@@ -65,16 +65,16 @@ class Aeb(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     points of Euro NCAP's pedestrian and car-to-car tests. docs/scenarios.md lists the exceptions.
     """
 
-    cruise_speed: Positive | None = None
-    cruise_gain: Positive = 1.0
-    response_time: NotNegative = 0.15
+    cruise_speed: PositiveParameter | None = None
+    cruise_gain: PositiveParameter = 1.0
+    response_time: NonNegativeParameter = 0.15
     braking_share: Annotated[float, Meta(gt=0, le=1)] = 0.95
-    margin: NotNegative = 0.5
+    margin: NonNegativeParameter = 0.5
     partial_share: Annotated[float, Meta(ge=0, le=1)] = 0.4
-    partial_time: NotNegative = 0.15
-    corridor: Positive = 1.4
-    reach: Positive = 100.0
-    warning_time: NotNegative = 2.0
+    partial_time: NonNegativeParameter = 0.15
+    corridor: PositiveParameter = 1.4
+    reach: PositiveParameter = 100.0
+    warning_time: NonNegativeParameter = 2.0
 
     def start(self, n: int, nominal: Nominal, step: float) -> _Memory:
         zeros = np.zeros(n)
@@ -82,16 +82,16 @@ class Aeb(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
     def drive(self, seen: Observation, memory: _Memory) -> tuple[Command, _Memory]:
         nominal = memory.nominal
-        cruise_speed, cruise_trim = memory.cruise or (self._speed_to_hold(seen), trim(nominal, seen))
-        threat = in_the_way(seen, self.corridor, self.reach) & (seen.closing_speed > 0)
-        stage = self._stage(seen, memory, threat)
-        intervened = memory.intervened | (stage > 0)
-        cruising = pedals(nominal, seen.speed, self.cruise_gain * (cruise_speed - seen.speed), cruise_trim)
+        cruise_speed, cruise_trim = memory.cruise or (self._speed_to_hold(seen), trim_at(nominal, seen))
+        is_threatened = is_in_the_way(seen, self.corridor, self.reach) & (seen.closing_speed > 0)
+        stage = self._stage(seen, memory, is_threatened)
+        has_intervened = memory.intervened | (stage > 0)
+        cruising = pedals_for(nominal, seen.speed, self.cruise_gain * (cruise_speed - seen.speed), cruise_trim)
         command = Command(
-            np.where(intervened, 0.0, cruising.throttle),
-            np.where(stage == 2, 1.0, np.where(stage == 1, self.partial_share, np.where(intervened, 0.0, cruising.brake))))
-        warns = (threat & (time_to_reach(seen) < self.warning_time)) | (stage > 0)
-        return command, _Memory(nominal, memory.step, (cruise_speed, cruise_trim), stage, intervened, _obstacle_speed(seen), warns)
+            np.where(has_intervened, 0.0, cruising.throttle),
+            np.where(stage == 2, 1.0, np.where(stage == 1, self.partial_share, np.where(has_intervened, 0.0, cruising.brake))))
+        warns = (is_threatened & (time_to_reach(seen) < self.warning_time)) | (stage > 0)
+        return command, _Memory(nominal, memory.step, (cruise_speed, cruise_trim), stage, has_intervened, _obstacle_speed(seen), warns)
 
     def warns(self, memory: _Memory) -> BoolArray:
         """Whether each driver is warned now."""
@@ -100,7 +100,7 @@ class Aeb(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     def _speed_to_hold(self, seen: Observation) -> FloatArray:
         return seen.speed if self.cruise_speed is None else np.full_like(seen.speed, self.cruise_speed)
 
-    def _stage(self, seen: Observation, memory: _Memory, threat: BoolArray) -> FloatArray:
+    def _stage(self, seen: Observation, memory: _Memory, is_threatened: BoolArray) -> FloatArray:
         """The braking stage; it does not fall before the obstacle has left the way of the vehicle."""
         speed, obstacle_speed = seen.speed, _obstacle_speed(seen)
         deceleration = self.braking_share * memory.nominal.decel
@@ -112,11 +112,11 @@ class Aeb(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
                                       np.where(obstacle_deceleration > LEAST_DECELERATION, stop_difference, 0.0))
         full_gap = speed * self.response_time + braking_distance + self.margin
         partial_gap = full_gap + speed * self.partial_time
-        stage = np.where(threat & (seen.gap < full_gap), 2.0, np.where(threat & (seen.gap < partial_gap), 1.0, 0.0))
-        stays = np.isfinite(seen.gap) & (seen.gap > 0) & (closing_speed > 0) & (
+        stage = np.where(is_threatened & (seen.gap < full_gap), 2.0, np.where(is_threatened & (seen.gap < partial_gap), 1.0, 0.0))
+        stays_in_way = np.isfinite(seen.gap) & (seen.gap > 0) & (closing_speed > 0) & (
             (np.abs(seen.lateral) <= self.corridor) | (np.sign(seen.lateral) * seen.lateral_speed < 0))
-        stands = speed <= 0
-        return np.where(stays | stands, np.maximum(stage, memory.stage), stage)
+        is_standing = speed <= 0
+        return np.where(stays_in_way | is_standing, np.maximum(stage, memory.stage), stage)
 
 
 def _obstacle_speed(seen: Observation) -> FloatArray:

@@ -7,10 +7,10 @@ from typing import Annotated, NamedTuple
 import numpy as np
 from msgspec import Meta, Struct
 
-from safevar_sumo.ads.driver import interpolated_tables
+from safevar_sumo.ads.driver import interpolate_tables
 from safevar_sumo.records import BoolArray, Command, FloatArray, Nominal, Observation
 
-Positive = Annotated[float, Meta(gt=0, le=1e5)]
+WidePositive = Annotated[float, Meta(gt=0, le=1e5)]
 HOLDING_DECELERATION = 2.0  # m/s^2, commanded to hold at standstill
 TAPER_TIME = 0.3  # s, over which the deceleration fades into the creep
 CREEP_MARGIN = 0.1  # m/s, above the creep speed, where the creep begins
@@ -55,17 +55,17 @@ class Apollo(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """
 
     first_command: Annotated[float, Meta(ge=0)]
-    cruise_speed: Positive
-    cruise_gain: Positive
-    cruise_acceleration: Positive
-    jerk: Positive
+    cruise_speed: WidePositive
+    cruise_gain: WidePositive
+    cruise_acceleration: WidePositive
+    jerk: WidePositive
     stop_gap: Annotated[float, Meta(ge=0)]
-    comfortable_deceleration: Positive
-    largest_deceleration: Positive
+    comfortable_deceleration: WidePositive
+    largest_deceleration: WidePositive
     creep_speed: Annotated[float, Meta(ge=0)]
     creep_time: Annotated[float, Meta(ge=0)]
     pedal_lag: Annotated[float, Meta(ge=0)]
-    perception_range: Positive = 100.0
+    perception_range: WidePositive = 100.0
 
     def start(self, n: int, nominal: Nominal, step: float) -> _Memory:
         zeros = np.zeros(n)
@@ -76,38 +76,38 @@ class Apollo(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         command = self._pedals(seen, plan)
         if seen.time >= self.first_command - FIRST_COMMAND_ROUNDING:
             return command, plan
-        waits = seen.speed == 0
-        columns = (np.where(waits, old, new) for old, new in zip(memory[2:], plan[2:], strict=True))
-        return Command(*(np.where(waits, 0.0, pedal) for pedal in command)), _Memory(memory.nominal, memory.step, *columns)
+        is_waiting = seen.speed == 0
+        fields = (np.where(is_waiting, old, new) for old, new in zip(memory[2:], plan[2:], strict=True))
+        return Command(*(np.where(is_waiting, 0.0, pedal) for pedal in command)), _Memory(memory.nominal, memory.step, *fields)
 
     def _plan(self, seen: Observation, memory: _Memory) -> _Memory:
         """Plan an acceleration: cruise, or brake with v^2 / (2 d) to stop within the distance d; then creep and hold."""
-        v = seen.speed
-        detected = seen.gap <= self.perception_range * seen.visibility
-        distance = np.where(detected, np.minimum(seen.gap, self.perception_range) - self.stop_gap, np.inf)
-        needed_deceleration = v * v / (2 * np.maximum(distance, LEAST_DISTANCE))
+        speed = seen.speed
+        is_detected = seen.gap <= self.perception_range * seen.visibility
+        distance = np.where(is_detected, np.minimum(seen.gap, self.perception_range) - self.stop_gap, np.inf)
+        needed_deceleration = speed * speed / (2 * np.maximum(distance, LEAST_DISTANCE))
         # The onset allows for the distance lost by the lag of the pedals and while the deceleration rises at the jerk limit.
-        lost_distance = v * (self.pedal_lag + 0.5 * self.comfortable_deceleration / self.jerk)
-        planned_deceleration = v * v / (2 * np.maximum(distance - lost_distance, LEAST_DISTANCE))
-        begins = (planned_deceleration > self.comfortable_deceleration) & ~memory.stops
-        stops = memory.stops | begins
-        last_acceleration, most_change = memory.commanded_acceleration, np.array(self.jerk * memory.step)
-        if np.count_nonzero(begins):
+        lost_distance = speed * (self.pedal_lag + 0.5 * self.comfortable_deceleration / self.jerk)
+        planned_deceleration = speed * speed / (2 * np.maximum(distance - lost_distance, LEAST_DISTANCE))
+        begins_braking = (planned_deceleration > self.comfortable_deceleration) & ~memory.stops
+        stops = memory.stops | begins_braking
+        last_acceleration, largest_change = memory.commanded_acceleration, np.array(self.jerk * memory.step)
+        if np.count_nonzero(begins_braking):
             # Planning is continuous in time: braking began within the last step, when the needed deceleration passed the limit.
             rise = np.maximum(planned_deceleration - memory.planned_deceleration, 1e-9)
-            share = np.where(begins, np.minimum((planned_deceleration - self.comfortable_deceleration) / rise, 1.0), 1.0)
-            last_acceleration = np.where(begins, np.minimum(last_acceleration, 0.0), last_acceleration)
-            most_change = most_change * share
+            share = np.where(begins_braking, np.minimum((planned_deceleration - self.comfortable_deceleration) / rise, 1.0), 1.0)
+            last_acceleration = np.where(begins_braking, np.minimum(last_acceleration, 0.0), last_acceleration)
+            largest_change = largest_change * share
 
         braking = np.minimum(needed_deceleration, self.largest_deceleration)
-        braking = np.minimum(braking, np.maximum(v - self.creep_speed, 0.0) / TAPER_TIME)
-        cruising = np.minimum(self.cruise_gain * (self.cruise_speed - v), self.cruise_acceleration)
+        braking = np.minimum(braking, np.maximum(speed - self.creep_speed, 0.0) / TAPER_TIME)
+        cruising = np.minimum(self.cruise_gain * (self.cruise_speed - speed), self.cruise_acceleration)
         change = np.where(stops, -braking, cruising) - last_acceleration
-        acceleration = last_acceleration + np.minimum(np.maximum(change, -most_change), most_change)
+        acceleration = last_acceleration + np.minimum(np.maximum(change, -largest_change), largest_change)
 
-        creeps = stops & (v < self.creep_speed + CREEP_MARGIN)
-        creeping_time = memory.creeping_time + memory.step * creeps
-        acceleration[creeps] = 0.0
+        is_creeping = stops & (speed < self.creep_speed + CREEP_MARGIN)
+        creeping_time = memory.creeping_time + memory.step * is_creeping
+        acceleration[is_creeping] = 0.0
         acceleration[creeping_time > self.creep_time] = -HOLDING_DECELERATION
         return memory._replace(stops=stops, planned_deceleration=planned_deceleration, commanded_acceleration=acceleration,
                                creeping_time=creeping_time)
@@ -115,7 +115,7 @@ class Apollo(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     def _pedals(self, seen: Observation, memory: _Memory) -> Command:
         """Pedals for the commanded acceleration, from the calibration table of the original vehicle."""
         nominal = memory.nominal
-        coasting, full_throttle = interpolated_tables(nominal.speeds, seen.speed, nominal.coasting, nominal.full_throttle)
+        coasting, full_throttle = interpolate_tables(nominal.speeds, seen.speed, nominal.coasting, nominal.full_throttle)
         excess = memory.commanded_acceleration + coasting
         throttle = np.minimum(np.maximum(excess / (full_throttle + coasting), 0.0), 1.0)
         brake = np.minimum(np.maximum(-excess / nominal.braking, 0.0), 1.0)

@@ -1,4 +1,4 @@
-"""The contract of an automated driving system (ADS), the base of an ADS for a single vehicle, and checks of a user's own ADS."""
+"""The contract of an automated driving system (ADS), the base of an ADS for a single vehicle, and checks of an ADS that is user code."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from msgspec import Meta
 from safevar_sumo.plugins import Contract, Guard, read_only_copy
 from safevar_sumo.records import BoolArray, Command, FloatArray, Nominal, Observation
 
-Positive = Annotated[float, Meta(gt=0, le=1e3)]
+PositiveParameter = Annotated[float, Meta(gt=0, le=1e3)]
 """A driver's parameter above 0, in SI units."""
-NotNegative = Annotated[float, Meta(ge=0, le=1e3)]
+NonNegativeParameter = Annotated[float, Meta(ge=0, le=1e3)]
 """A driver's parameter that may be 0, in SI units."""
 
 
-REACTIONS = ("recognition_delay", "hesitation")
+REACTION_PARAMETERS = ("recognition_delay", "hesitation")
 """Names of the parameters of an ADS that delay its reaction [s]; a study may raise them in bad weather."""
 
 
@@ -64,7 +64,7 @@ SCALAR_ADS_CONTRACT = Contract.of(ScalarAds, "a ScalarAds")
 
 
 class GuardedAds:
-    """Guards a user's own ADS: passes read-only copies to it, and checks its commands."""
+    """Guards an ADS that is user code: passes read-only copies to it, and checks its commands."""
 
     def __init__(self, ads: Ads, guard: Guard) -> None:
         self._ads, self._guard = ads, guard
@@ -73,43 +73,43 @@ class GuardedAds:
 
     def _warns(self, memory: Any) -> BoolArray:
         ads: Any = self._ads
-        return self._guard.booleans("warns", "warnings", self._guard.call("warns", ads.warns, memory), (self._vehicles,))
+        return self._guard.booleans("warns", "warnings", self._guard.call("warns", ads.warns, memory), (self._vehicle_count,))
 
     def start(self, n: int, nominal: Nominal, step: float) -> Any:
-        self._vehicles = n
+        self._vehicle_count = n
         return self._guard.call("start", self._ads.start, n, read_only_copy(nominal), step)
 
     def drive(self, seen: Observation, memory: Any) -> tuple[Command, Any]:
         result = self._guard.call("drive", self._ads.drive, read_only_copy(seen), memory)
         command, memory = self._guard.elements("drive", result, "(Command(throttle, brake), memory)")
         throttle, brake = self._guard.elements("drive", command, "(Command(throttle, brake), memory)")
-        return Command(self._pedal("throttle", throttle, seen), self._pedal("brake", brake, seen)), memory
+        return Command(self._checked_pedal("throttle", throttle, seen), self._checked_pedal("brake", brake, seen)), memory
 
-    def _pedal(self, name: str, value: Any, seen: Observation) -> FloatArray:
+    def _checked_pedal(self, name: str, value: Any, seen: Observation) -> FloatArray:
         return self._guard.numbers("drive", name, value, seen.speed.shape, 0.0, 1.0)
 
 
-class PerVehicle:
+class PerVehicleAds:
     """Drives N vehicles with N instances of a `ScalarAds`."""
 
-    def __init__(self, make: Callable[[], ScalarAds], guard: Guard) -> None:
-        self._make, self._guard = make, guard
+    def __init__(self, create: Callable[[], ScalarAds], guard: Guard) -> None:
+        self._create, self._guard = create, guard
 
     def start(self, n: int, nominal: Nominal, step: float) -> list[ScalarAds]:
-        drivers = [self._guard.call("__init__", self._make) for _ in range(n)]
+        drivers = [self._guard.call("__init__", self._create) for _ in range(n)]
         for driver in drivers:
             self._guard.call("start", driver.start, read_only_copy(nominal), step)
         return drivers
 
     def drive(self, seen: Observation, memory: list[ScalarAds]) -> tuple[Command, list[ScalarAds]]:
-        pedals = [self._pedals(self._guard.call("drive", driver.drive, observation))
+        pedals = [self._checked_pedals(self._guard.call("drive", driver.drive, observation))
                   for driver, observation in zip(memory, _scalar_observations(seen), strict=True)]
         return Command(*np.array(pedals, dtype=float).reshape(len(memory), 2).T.copy()), memory
 
     def warns(self, memory: list[ScalarAds]) -> BoolArray:
         return np.array([bool(driver.warns) for driver in memory], dtype=bool)
 
-    def _pedals(self, command: Any) -> tuple[float, float]:
+    def _checked_pedals(self, command: Any) -> tuple[float, float]:
         if type(command) is tuple and len(command) == 2:
             throttle, brake = command
             if type(throttle) is type(brake) is float and 0 <= throttle <= 1 and 0 <= brake <= 1:

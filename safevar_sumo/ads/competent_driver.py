@@ -8,8 +8,8 @@ import numpy as np
 from msgspec import Struct
 
 from safevar_sumo.ads.acc import KEEPING_GAINS
-from safevar_sumo.ads.base import NotNegative, Positive
-from safevar_sumo.ads.driver import HARDEST_BRAKING, Reaction, Start, in_the_way, initial_reaction, react, time_to_reach
+from safevar_sumo.ads.base import NonNegativeParameter, PositiveParameter
+from safevar_sumo.ads.driver import HARDEST_BRAKING, Reaction, StartThrottle, initial_reaction, is_in_the_way, react, time_to_reach
 from safevar_sumo.records import TIME_ROUNDING, BoolArray, Command, FloatArray, Nominal, Observation
 
 
@@ -49,22 +49,22 @@ class CompetentDriver(Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
         Throttle in the run's first steps, one value per step, until it sees a danger [-].
     """
 
-    cruise_speed: Positive | None = None
-    critical_ttc: Positive = 2.0
-    reaction_time: NotNegative = 0.75
-    stray: NotNegative = 0.375
-    perception_time: NotNegative = 0.4
-    lets_go: NotNegative = 0.4
-    headway: Positive = 2.0
-    corridor: Positive = 1.4
-    start_throttle: Start = ()
+    cruise_speed: PositiveParameter | None = None
+    critical_ttc: PositiveParameter = 2.0
+    reaction_time: NonNegativeParameter = 0.75
+    stray: NonNegativeParameter = 0.375
+    perception_time: NonNegativeParameter = 0.4
+    lets_go: NonNegativeParameter = 0.4
+    headway: PositiveParameter = 2.0
+    corridor: PositiveParameter = 1.4
+    start_throttle: StartThrottle = ()
 
     def start(self, n: int, nominal: Nominal, step: float) -> _Memory:
         return _Memory(initial_reaction(n, nominal, step), np.full(n, np.inf), np.zeros(n, dtype=bool), np.full(n, -1.0))
 
     def drive(self, seen: Observation, memory: _Memory) -> tuple[Command, _Memory]:
-        perceived, memory = self._perceive(seen, memory)
-        has_leader = perceived & in_the_way(seen, self.corridor)
+        is_perceived, memory = self._perceive(seen, memory)
+        has_leader = is_perceived & is_in_the_way(seen, self.corridor)
         command, reaction = react(
             seen, memory.reaction, has_leader & (time_to_reach(seen) < self.critical_ttc), np.full_like(seen.speed, HARDEST_BRAKING),
             reaction_time=self.reaction_time, corridor=self.corridor, coasting_deceleration=self.lets_go, cruise_speed=self.cruise_speed,
@@ -74,17 +74,17 @@ class CompetentDriver(Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     def _following(self, seen: Observation, has_leader: BoolArray) -> FloatArray:
         """Acceleration that keeps the headway to a moving leader [m/s^2]; infinite without a leader."""
         gap = np.where(has_leader, seen.gap, 0.0)
-        law = KEEPING_GAINS[0] * (seen.obstacle_speed - seen.speed) + KEEPING_GAINS[1] * (gap - self.headway * seen.speed)
-        return np.where(has_leader & (seen.obstacle_speed > 0), np.maximum(law, -self.lets_go), np.inf)
+        gap_control = KEEPING_GAINS[0] * (seen.obstacle_speed - seen.speed) + KEEPING_GAINS[1] * (gap - self.headway * seen.speed)
+        return np.where(has_leader & (seen.obstacle_speed > 0), np.maximum(gap_control, -self.lets_go), np.inf)
 
     def _perceive(self, seen: Observation, memory: _Memory) -> tuple[BoolArray, _Memory]:
-        sighted = np.isfinite(seen.gap) & np.isfinite(seen.lateral)
-        lateral = np.where(sighted, seen.lateral, 0.0)
-        appears = sighted & ~np.isfinite(memory.first_lateral)
+        is_sighted = np.isfinite(seen.gap) & np.isfinite(seen.lateral)
+        lateral = np.where(is_sighted, seen.lateral, 0.0)
+        appears = is_sighted & ~np.isfinite(memory.first_lateral)
         first_lateral = np.where(appears, lateral, memory.first_lateral)
         first_in_way = memory.first_in_way | (appears & (np.abs(lateral) <= self.corridor))
         deviation = np.abs(lateral - np.where(np.isfinite(first_lateral), first_lateral, 0.0))
-        strays = sighted & (deviation >= self.stray)
-        stray_time = np.where(memory.stray_time >= 0, memory.stray_time + memory.reaction.step, np.where(strays, 0.0, -1.0))
-        perceived = first_in_way | (stray_time >= self.perception_time - TIME_ROUNDING)
-        return perceived, memory._replace(first_lateral=first_lateral, first_in_way=first_in_way, stray_time=stray_time)
+        is_astray = is_sighted & (deviation >= self.stray)
+        stray_time = np.where(memory.stray_time >= 0, memory.stray_time + memory.reaction.step, np.where(is_astray, 0.0, -1.0))
+        is_perceived = first_in_way | (stray_time >= self.perception_time - TIME_ROUNDING)
+        return is_perceived, memory._replace(first_lateral=first_lateral, first_in_way=first_in_way, stray_time=stray_time)

@@ -1,4 +1,4 @@
-"""Parts that drivers share: pedals for an acceleration, perception of an obstacle in the way, reaction to a danger, car following."""
+"""Functions that drivers share: pedals for an acceleration, perception of an obstacle in the way, reaction to a danger, car following."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from msgspec import Meta, Struct
 from safevar_sumo.records import GRAVITY, TIME_ROUNDING, BoolArray, Command, FloatArray, Nominal, Observation
 
 
-def interpolated_tables(speeds: FloatArray, speed: FloatArray, *tables: FloatArray) -> list[FloatArray]:
+def interpolate_tables(table_speeds: FloatArray, speed: FloatArray, *tables: FloatArray) -> list[FloatArray]:
     """Tables over equally spaced speeds, interpolated linearly at `speed`."""
-    position = np.minimum(speed / speeds[1], len(speeds) - 1.001)
+    position = np.minimum(speed / table_speeds[1], len(table_speeds) - 1.001)
     row = position.astype(np.intp)
     share, next_row = position - row, row + 1
     values = ((table[row], table[next_row]) for table in tables)
@@ -54,25 +54,25 @@ class Trim(NamedTuple):
     brake: FloatArray
 
 
-def trim(nominal: Nominal, seen: Observation) -> Trim:
+def trim_at(nominal: Nominal, seen: Observation) -> Trim:
     """The trim of a driver who already holds the speed of a rolling vehicle."""
-    rolls = seen.speed > 0
-    throttle = np.where(rolls, seen.throttle - _throttle(nominal, seen.speed, np.zeros_like(seen.speed)), 0.0)
-    (coasting,) = interpolated_tables(nominal.speeds, seen.speed, nominal.coasting)
-    return Trim(throttle, np.where(rolls & (seen.brake > 0), seen.brake + coasting / nominal.braking, 0.0))
+    is_rolling = seen.speed > 0
+    throttle = np.where(is_rolling, seen.throttle - _throttle_for(nominal, seen.speed, np.zeros_like(seen.speed)), 0.0)
+    (coasting,) = interpolate_tables(nominal.speeds, seen.speed, nominal.coasting)
+    return Trim(throttle, np.where(is_rolling & (seen.brake > 0), seen.brake + coasting / nominal.braking, 0.0))
 
 
-def pedals(nominal: Nominal, speed: FloatArray, acceleration: FloatArray, pedal_trim: Trim) -> Command:
+def pedals_for(nominal: Nominal, speed: FloatArray, acceleration: FloatArray, pedal_trim: Trim) -> Command:
     """Pedals for an acceleration [m/s^2] at a speed [m/s], from the tables of the original vehicle and a trim."""
-    (coasting,) = interpolated_tables(nominal.speeds, speed, nominal.coasting)
+    (coasting,) = interpolate_tables(nominal.speeds, speed, nominal.coasting)
     excess = acceleration + coasting - nominal.braking * pedal_trim.brake
     brake = np.minimum(np.maximum(-excess / nominal.braking, 0.0), 1.0)
-    throttle = np.minimum(np.maximum(_throttle(nominal, speed, acceleration) + pedal_trim.throttle, 0.0), 1.0)
+    throttle = np.minimum(np.maximum(_throttle_for(nominal, speed, acceleration) + pedal_trim.throttle, 0.0), 1.0)
     return Command(np.where(excess < 0, 0.0, throttle), brake)
 
 
-def _throttle(nominal: Nominal, speed: FloatArray, acceleration: FloatArray) -> FloatArray:
-    coasting, full_throttle = interpolated_tables(nominal.speeds, speed, nominal.coasting, nominal.full_throttle)
+def _throttle_for(nominal: Nominal, speed: FloatArray, acceleration: FloatArray) -> FloatArray:
+    coasting, full_throttle = interpolate_tables(nominal.speeds, speed, nominal.coasting, nominal.full_throttle)
     return (acceleration + coasting) / (full_throttle + coasting)
 
 
@@ -88,21 +88,21 @@ def time_to_reach(seen: Observation) -> FloatArray:
     return np.where(seen.closing_speed > 0, gap / np.maximum(seen.closing_speed, LEAST_CLOSING_SPEED), LARGEST_GAP)
 
 
-def in_the_way(seen: Observation, corridor: float, reach: float = np.inf) -> BoolArray:
+def is_in_the_way(seen: Observation, corridor: float, reach: float = np.inf) -> BoolArray:
     """Whether a detected obstacle ahead is within `corridor` of the lane's middle [m], or will be when the vehicle reaches it.
 
     `reach` is the sensors' range in clear weather [m].
     """
-    detected = np.isfinite(seen.gap) & (seen.gap <= reach * seen.visibility) & (seen.gap > 0)
-    lateral = np.where(detected, seen.lateral, LARGEST_GAP)
+    is_detected = np.isfinite(seen.gap) & (seen.gap <= reach * seen.visibility) & (seen.gap > 0)
+    lateral = np.where(is_detected, seen.lateral, LARGEST_GAP)
     lateral_at_arrival = lateral + seen.lateral_speed * time_to_reach(seen)
-    return np.asarray(detected & ((np.abs(lateral) <= corridor) | (np.abs(lateral_at_arrival) <= corridor)))
+    return np.asarray(is_detected & ((np.abs(lateral) <= corridor) | (np.abs(lateral_at_arrival) <= corridor)))
 
 
 def blocks_the_way(seen: Observation, corridor: float) -> BoolArray:
     """Whether a detected obstacle ahead that does not move away is within `corridor` of the lane's middle [m] or on its way there."""
-    ahead = np.isfinite(seen.gap) & (seen.gap > 0) & (seen.closing_speed >= 0)
-    return np.asarray(ahead & ((np.abs(seen.lateral) <= corridor) | (np.sign(seen.lateral) * seen.lateral_speed < 0)))
+    is_ahead = np.isfinite(seen.gap) & (seen.gap > 0) & (seen.closing_speed >= 0)
+    return np.asarray(is_ahead & ((np.abs(seen.lateral) <= corridor) | (np.sign(seen.lateral) * seen.lateral_speed < 0)))
 
 
 HARDEST_BRAKING = 0.774 * GRAVITY
@@ -111,7 +111,7 @@ JERK = 12.65
 """Jerk limit while that deceleration builds up [m/s^3] (UN R157, annex 4, appendix 3)."""
 CRUISE_GAIN = 1.0
 """Acceleration per speed error [1/s]."""
-Start = tuple[Annotated[float, Meta(ge=0, le=1)], ...]
+StartThrottle = tuple[Annotated[float, Meta(ge=0, le=1)], ...]
 """Throttle in the run's first steps, one value per step [-]: the replayed start of another driver."""
 
 
@@ -135,9 +135,9 @@ def initial_reaction(n: int, nominal: Nominal, step: float) -> Reaction:
 
 
 def react(seen: Observation, reaction: Reaction, danger: BoolArray, deceleration: FloatArray, *, reaction_time: float, corridor: float,
-          jerk: float = JERK, coasting_deceleration: float = 0.0, cruise_speed: float | None = None, start: Start = (),
+          jerk: float = JERK, coasting_deceleration: float = 0.0, cruise_speed: float | None = None, start: StartThrottle = (),
           following: FloatArray | float = np.inf) -> tuple[Command, Reaction]:
-    """Pedals of drivers who may face a danger; the danger is over when no obstacle ahead approaches or blocks the way.
+    """Drive on, or react to a danger; the danger is over when no obstacle ahead approaches or blocks the way.
 
     Parameters
     ----------
@@ -161,21 +161,22 @@ def react(seen: Observation, reaction: Reaction, danger: BoolArray, deceleration
     cruise = reaction.cruise
     if cruise is None:
         speed = seen.speed if cruise_speed is None else np.full_like(seen.speed, cruise_speed)
-        cruise = speed, trim(reaction.nominal, seen)
-    nears = np.isfinite(seen.gap) & (seen.gap > 0) & (seen.closing_speed > 0)
-    lasts = nears | blocks_the_way(seen, corridor)
-    aware = reaction.danger_time >= 0
-    danger_time = np.where(aware, np.where(lasts, reaction.danger_time + reaction.step, -1.0), np.where(danger, 0.0, -1.0))
-    brakes = danger_time >= reaction_time - TIME_ROUNDING
-    braking = np.where(brakes, np.minimum(reaction.braking + jerk * reaction.step, deceleration), 0.0)
-    cruising = np.minimum(CRUISE_GAIN * (cruise[0] - seen.speed), following)
-    coasts = (danger_time >= 0) & (coasting_deceleration > 0)
-    acceleration = np.where(brakes, -braking, np.where(coasts, -coasting_deceleration, cruising))
-    command = pedals(reaction.nominal, seen.speed, acceleration, cruise[1])
-    sample = round(seen.time / reaction.step)
-    if sample < len(start):
-        starts = danger_time < 0
-        command = Command(np.where(starts, start[sample], command.throttle), np.where(starts, 0.0, command.brake))
+        cruise = speed, trim_at(reaction.nominal, seen)
+    is_approaching = np.isfinite(seen.gap) & (seen.gap > 0) & (seen.closing_speed > 0)
+    danger_lasts = is_approaching | blocks_the_way(seen, corridor)
+    is_aware = reaction.danger_time >= 0
+    danger_time = np.where(is_aware, np.where(danger_lasts, reaction.danger_time + reaction.step, -1.0), np.where(danger, 0.0, -1.0))
+    is_braking = danger_time >= reaction_time - TIME_ROUNDING
+    braking = np.where(is_braking, np.minimum(reaction.braking + jerk * reaction.step, deceleration), 0.0)
+    speed_to_hold, initial_trim = cruise
+    cruising = np.minimum(CRUISE_GAIN * (speed_to_hold - seen.speed), following)
+    is_coasting = (danger_time >= 0) & (coasting_deceleration > 0)
+    acceleration = np.where(is_braking, -braking, np.where(is_coasting, -coasting_deceleration, cruising))
+    command = pedals_for(reaction.nominal, seen.speed, acceleration, initial_trim)
+    step_index = round(seen.time / reaction.step)
+    if step_index < len(start):
+        is_starting = danger_time < 0
+        command = Command(np.where(is_starting, start[step_index], command.throttle), np.where(is_starting, 0.0, command.brake))
     return command, reaction._replace(cruise=cruise, danger_time=danger_time, braking=braking)
 
 
@@ -204,10 +205,10 @@ class CarFollowing(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
         return FollowingMemory(nominal, step, None)
 
     def drive(self, seen: Observation, memory: FollowingMemory) -> tuple[Command, FollowingMemory]:
-        initial_trim = trim(memory.nominal, seen) if memory.initial_trim is None else memory.initial_trim
-        gap = np.where(in_the_way(seen, self.corridor), seen.gap, LARGEST_GAP)
+        initial_trim = trim_at(memory.nominal, seen) if memory.initial_trim is None else memory.initial_trim
+        gap = np.where(is_in_the_way(seen, self.corridor), seen.gap, LARGEST_GAP)
         acceleration = self.acceleration_at(gap, seen.speed, seen.obstacle_speed)
-        return pedals(memory.nominal, seen.speed, acceleration, initial_trim), memory._replace(initial_trim=initial_trim)
+        return pedals_for(memory.nominal, seen.speed, acceleration, initial_trim), memory._replace(initial_trim=initial_trim)
 
     def acceleration_at(self, gap: FloatArray, speed: FloatArray, leader_speed: FloatArray) -> FloatArray:
         """Commanded acceleration [m/s^2] at a gap from bumper to bumper [m] and speeds [m/s], shape (N,)."""

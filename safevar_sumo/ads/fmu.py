@@ -7,17 +7,17 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from safevar_sumo.ads.driver import Trim, pedals, trim
+from safevar_sumo.ads.driver import Trim, pedals_for, trim_at
 from safevar_sumo.errors import InputError, UserCodeError
 from safevar_sumo.fmu import Description, Fault, Fleet, History, Instances, constants_of, ports_of
 from safevar_sumo.plugins import Guard
 from safevar_sumo.records import BoolArray, Command, FloatArray, Nominal, Observation
 
-OBSERVATIONS: Mapping[str, str] = {
+OBSERVATION_UNITS: Mapping[str, str] = {
     "time": "s", "speed": "m/s", "gap": "m", "closing_speed": "m/s", "lateral": "m", "lateral_speed": "m/s", "visibility": "-",
     "obstacle_speed": "m/s", "throttle": "-", "brake": "-", "detected": "-"}
 """Quantities that an ADS observes, and their units; `detected` is 1 while an obstacle is detected."""
-CONSTANTS: Mapping[str, str] = {
+CONSTANT_UNITS: Mapping[str, str] = {
     "nominal_mass": "kg", "nominal_accel": "m/s^2", "nominal_decel": "m/s^2", "nominal_max_speed": "m/s", "nominal_actuator_lag": "s",
     "step": "s"}
 """Facts about the original vehicle, and the time between two calls: inputs, or parameters that are set at the start."""
@@ -61,12 +61,13 @@ class FmuAds:
                  step: float | None, guard: Guard, limit: float) -> None:
         source = guard.source
         self._guard, self._communication_step = guard, step or description.step
-        input_ports = ports_of(description, inputs, {**OBSERVATIONS, **CONSTANTS}, ("input",), source, "ads.inputs", constants=CONSTANTS)
+        input_ports = ports_of(description, inputs, {**OBSERVATION_UNITS, **CONSTANT_UNITS}, ("input",), source, "ads.inputs",
+                               constants=CONSTANT_UNITS)
         output_ports = ports_of(description, outputs, OUTPUT_UNITS, ("output",), source, "ads.outputs")
         if ("acceleration" in output_ports) == bool({"throttle", "brake"} & output_ports.keys()):
             raise InputError(source, f"ads.outputs = {sorted(outputs)}", "throttle, brake or both; alternatively acceleration")
-        if not input_ports.keys() & OBSERVATIONS.keys():
-            raise InputError(source, "ads.inputs: no observed quantity", f"some of {', '.join(OBSERVATIONS)}")
+        if not input_ports.keys() & OBSERVATION_UNITS.keys():
+            raise InputError(source, "ads.inputs: no observed quantity", f"some of {', '.join(OBSERVATION_UNITS)}")
         self._inputs, self._outputs = tuple(input_ports), tuple(output_ports)
         mapped_names = [port.variable.name for port in input_ports.values()]
         self._instances = Instances(description, [*input_ports.values()], [*output_ports.values()],
@@ -77,7 +78,7 @@ class FmuAds:
 
     def start(self, n: int, nominal: Nominal, step: float) -> _Memory:
         constants = {"step": step, **{name: getattr(nominal, name.removeprefix(NOMINAL_PREFIX))
-                                      for name in CONSTANTS if name.startswith(NOMINAL_PREFIX)}}
+                                      for name in CONSTANT_UNITS if name.startswith(NOMINAL_PREFIX)}}
         return _Memory(Fleet(self._instances, n, step, self._communication_step), constants, nominal)
 
     def drive(self, seen: Observation, memory: _Memory) -> tuple[Command, _Memory]:
@@ -92,8 +93,8 @@ class FmuAds:
         memory = memory._replace(history=history, warns=warns)
         if "acceleration" in outputs:
             acceleration = self._guard.numbers("doStep", "acceleration", outputs["acceleration"], seen.speed.shape)
-            initial_trim = memory.trim or trim(memory.nominal, seen)
-            return pedals(memory.nominal, seen.speed, acceleration, initial_trim), memory._replace(trim=initial_trim)
+            initial_trim = memory.trim or trim_at(memory.nominal, seen)
+            return pedals_for(memory.nominal, seen.speed, acceleration, initial_trim), memory._replace(trim=initial_trim)
         zeros = np.zeros_like(seen.speed)
         return Command(*(self._guard.numbers("doStep", name, outputs.get(name, zeros), seen.speed.shape, 0.0, 1.0)
                          for name in Command._fields)), memory

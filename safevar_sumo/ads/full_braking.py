@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from msgspec import Struct
 
-from safevar_sumo.ads.base import Positive
-from safevar_sumo.ads.driver import Reaction, Start, in_the_way, initial_reaction, react
+from safevar_sumo.ads.base import PositiveParameter
+from safevar_sumo.ads.driver import Reaction, StartThrottle, initial_reaction, is_in_the_way, react
 from safevar_sumo.records import Command, Nominal, Observation
 
 UNLIMITED_BRAKING = 1e6
@@ -26,14 +26,15 @@ class FullBraking(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
         Throttle in the run's first steps, one value per step, until it brakes [-].
     """
 
-    cruise_speed: Positive | None = None
-    corridor: Positive = 1.4
-    start_throttle: Start = ()
+    cruise_speed: PositiveParameter | None = None
+    corridor: PositiveParameter = 1.4
+    start_throttle: StartThrottle = ()
 
     def start(self, n: int, nominal: Nominal, step: float) -> Reaction:
         return initial_reaction(n, nominal, step)
 
     def drive(self, seen: Observation, memory: Reaction) -> tuple[Command, Reaction]:
         deceleration = np.full_like(seen.speed, UNLIMITED_BRAKING)
-        return react(seen, memory, in_the_way(seen, self.corridor), deceleration, reaction_time=0.0, jerk=UNLIMITED_BRAKING / memory.step,
-                     corridor=self.corridor, cruise_speed=self.cruise_speed, start=self.start_throttle)
+        return react(seen, memory, is_in_the_way(seen, self.corridor), deceleration, reaction_time=0.0,
+                     jerk=UNLIMITED_BRAKING / memory.step, corridor=self.corridor, cruise_speed=self.cruise_speed,
+                     start=self.start_throttle)

@@ -8,7 +8,7 @@ from typing import Annotated
 import numpy as np
 from msgspec import Meta
 
-from safevar_sumo.ads.base import Positive
+from safevar_sumo.ads.base import PositiveParameter
 from safevar_sumo.ads.driver import CarFollowing
 from safevar_sumo.records import FloatArray
 
@@ -30,12 +30,12 @@ class Idm(CarFollowing, frozen=True, kw_only=True):
         Half the width of the corridor that it watches [m].
     """
 
-    cruise_speed: Positive = 13.89
-    headway: Positive = 1.0
+    cruise_speed: PositiveParameter = 13.89
+    headway: PositiveParameter = 1.0
     standing_gap: Annotated[float, Meta(ge=0, le=100)] = 2.5
-    acceleration: Positive = 2.6
-    deceleration: Positive = 4.5
-    corridor: Positive = 1.4
+    acceleration: PositiveParameter = 2.6
+    deceleration: PositiveParameter = 4.5
+    corridor: PositiveParameter = 1.4
 
     def acceleration_at(self, gap: FloatArray, speed: FloatArray, leader_speed: FloatArray) -> FloatArray:
         """dv/dt [m/s^2] at a gap from bumper to bumper [m] and speeds [m/s], shape (N,)."""

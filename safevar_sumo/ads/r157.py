@@ -7,8 +7,8 @@ from typing import Annotated
 import numpy as np
 from msgspec import Meta, Struct
 
-from safevar_sumo.ads.base import Positive
-from safevar_sumo.ads.driver import Reaction, in_the_way, initial_reaction, react, time_to_reach
+from safevar_sumo.ads.base import PositiveParameter
+from safevar_sumo.ads.driver import Reaction, initial_reaction, is_in_the_way, react, time_to_reach
 from safevar_sumo.records import Command, Nominal, Observation
 
 
@@ -27,17 +27,17 @@ class R157(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         Half the width of the corridor that it watches [m].
     """
 
-    cruise_speed: Positive | None = None
-    deceleration: Positive = 6.0
+    cruise_speed: PositiveParameter | None = None
+    deceleration: PositiveParameter = 6.0
     reaction_time: Annotated[float, Meta(ge=0, le=60)] = 0.35
     margin: Annotated[float, Meta(ge=0, le=60)] = 0.1
-    corridor: Positive = 1.4
+    corridor: PositiveParameter = 1.4
 
     def start(self, n: int, nominal: Nominal, step: float) -> Reaction:
         return initial_reaction(n, nominal, step)
 
     def drive(self, seen: Observation, memory: Reaction) -> tuple[Command, Reaction]:
         critical_ttc = seen.closing_speed / (2 * self.deceleration) + self.reaction_time + self.margin
-        danger = in_the_way(seen, self.corridor) & (time_to_reach(seen) < critical_ttc)
+        danger = is_in_the_way(seen, self.corridor) & (time_to_reach(seen) < critical_ttc)
         return react(seen, memory, danger, np.full_like(seen.speed, self.deceleration), reaction_time=self.reaction_time,
                      jerk=self.deceleration / memory.step, corridor=self.corridor, cruise_speed=self.cruise_speed)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from msgspec import Struct
 
-from safevar_sumo.ads.base import NotNegative, Positive
-from safevar_sumo.ads.driver import HARDEST_BRAKING, Reaction, in_the_way, initial_reaction, react
+from safevar_sumo.ads.base import NonNegativeParameter, PositiveParameter
+from safevar_sumo.ads.driver import HARDEST_BRAKING, Reaction, initial_reaction, is_in_the_way, react
 from safevar_sumo.records import Command, FloatArray, Nominal, Observation
 
 
@@ -27,18 +27,18 @@ class Rss(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         Half the width of the corridor that it watches [m].
     """
 
-    cruise_speed: Positive | None = None
-    reaction_time: NotNegative = 0.75
-    acceleration: NotNegative = 0.0
-    deceleration: Positive = HARDEST_BRAKING
-    leader_deceleration: Positive = HARDEST_BRAKING
-    corridor: Positive = 1.4
+    cruise_speed: PositiveParameter | None = None
+    reaction_time: NonNegativeParameter = 0.75
+    acceleration: NonNegativeParameter = 0.0
+    deceleration: PositiveParameter = HARDEST_BRAKING
+    leader_deceleration: PositiveParameter = HARDEST_BRAKING
+    corridor: PositiveParameter = 1.4
 
     def start(self, n: int, nominal: Nominal, step: float) -> Reaction:
         return initial_reaction(n, nominal, step)
 
     def drive(self, seen: Observation, memory: Reaction) -> tuple[Command, Reaction]:
-        danger = in_the_way(seen, self.corridor) & (seen.gap < self.safe_distance(seen.speed, seen.obstacle_speed))
+        danger = is_in_the_way(seen, self.corridor) & (seen.gap < self.safe_distance(seen.speed, seen.obstacle_speed))
         return react(seen, memory, danger, np.full_like(seen.speed, self.deceleration), reaction_time=self.reaction_time,
                      corridor=self.corridor, cruise_speed=self.cruise_speed)
 

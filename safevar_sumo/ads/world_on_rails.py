@@ -10,7 +10,7 @@ from msgspec import Meta, Struct
 from safevar_sumo.ads.driver import DelayLine
 from safevar_sumo.records import KMH_PER_MS, BoolArray, Command, FloatArray, Nominal, Observation
 
-NotNegative = Annotated[float, Meta(ge=0, le=60)]
+UpTo60 = Annotated[float, Meta(ge=0, le=60)]
 Throttle = Annotated[float, Meta(ge=0, le=1)]
 Delay = Annotated[float, Meta(ge=0, le=5)]
 SPEED_LIMIT = 20 / KMH_PER_MS
@@ -58,14 +58,14 @@ class WorldOnRails(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
         Time between releasing the accelerator and braking, while the policy is not yet sure [s]. It releases the brake at once.
     """
 
-    first_command: NotNegative
-    latency: NotNegative
-    corridor: NotNegative
+    first_command: UpTo60
+    latency: UpTo60
+    corridor: UpTo60
     brake_gap: float
     brake_gap_per_speed: float
     brake_place: float
-    brake_gap_before: NotNegative
-    brake_gap_past: NotNegative
+    brake_gap_before: UpTo60
+    brake_gap_past: UpTo60
     throttle: Annotated[tuple[Throttle, Throttle, Throttle], Meta()]
     recognition_delay: Delay = 0.0
     hesitation: Delay = 0.0
@@ -77,22 +77,22 @@ class WorldOnRails(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
 
     def drive(self, seen: Observation, memory: _Memory) -> tuple[Command, _Memory]:
         (gap, lateral), recognition_line = memory.recognition_line.delayed(np.array([seen.gap, seen.lateral]))
-        brakes = self._brakes(seen, gap, lateral, memory.brakes)
-        waits = (seen.speed == 0) & (seen.time < self.first_command)
-        throttle = np.where(brakes | waits | (seen.speed > SPEED_LIMIT), 0.0, self._throttle(seen.speed))
-        command, *pending_commands = (*memory.pending_commands, Command(throttle, brakes.astype(float)))
+        is_braking = self._brakes(seen, gap, lateral, memory.brakes)
+        is_waiting = (seen.speed == 0) & (seen.time < self.first_command)
+        throttle = np.where(is_braking | is_waiting | (seen.speed > SPEED_LIMIT), 0.0, self._throttle(seen.speed))
+        command, *pending_commands = (*memory.pending_commands, Command(throttle, is_braking.astype(float)))
         delayed_brake, brake_delay_line = memory.brake_delay_line.delayed(command.brake)
-        memory = _Memory(brakes, tuple(pending_commands), recognition_line, brake_delay_line)
+        memory = _Memory(is_braking, tuple(pending_commands), recognition_line, brake_delay_line)
         return Command(command.throttle, np.minimum(command.brake, delayed_brake)), memory
 
-    def _brakes(self, seen: Observation, gap: FloatArray, lateral: FloatArray, braked: BoolArray) -> BoolArray:
+    def _brakes(self, seen: Observation, gap: FloatArray, lateral: FloatArray, was_braking: BoolArray) -> BoolArray:
         """Whether to brake: the recognised obstacle is near and in the corridor. (The policy's brake probability exceeds one half.)"""
         offset = lateral - self.brake_place
         reduction = self.brake_gap_past * np.maximum(offset, 0.0) + self.brake_gap_before * np.maximum(-offset, 0.0)
         braking_gap = seen.visibility * (self.brake_gap + self.brake_gap_per_speed * seen.speed - reduction)
-        watched = np.abs(lateral) <= self.corridor
-        starts_braking = watched & (gap <= braking_gap) & (gap > PASSED_GAP)
-        keeps_braking = watched & braked & (gap > 2 * PASSED_GAP)
+        is_watched = np.abs(lateral) <= self.corridor
+        starts_braking = is_watched & (gap <= braking_gap) & (gap > PASSED_GAP)
+        keeps_braking = is_watched & was_braking & (gap > 2 * PASSED_GAP)
         brakes: BoolArray = starts_braking | keeps_braking
         return brakes
 

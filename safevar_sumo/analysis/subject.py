@@ -66,7 +66,7 @@ class Results:
     @property
     def finished(self) -> tuple[tuple[str, int], ...]:
         """Algorithm and number of every finished run."""
-        return self.case.finished
+        return self.case.finished_runs
 
     def __repr__(self) -> str:
         return f"<Results of {self.case.name} in {self.directory}: {len(self.finished)} runs, {len(self.solutions)} solutions>"

@@ -28,9 +28,9 @@ class Tables(dict[str, "pd.DataFrame"]):
         return {answer.name: answer.notes for answer in self.answers}
 
     def _repr_markdown_(self) -> str:
-        from safevar_sumo.analysis.research_questions.tables import markdown
+        from safevar_sumo.analysis.research_questions.tables import as_markdown
 
-        return markdown(self.answers)
+        return as_markdown(self.answers)
 
 
 class Figures(dict[str, "Figure"]):
@@ -59,9 +59,9 @@ def tables(*results: Results | str | Path, question: str | None = None) -> Table
     InputError
         If there is no such question, or no results can answer it.
     """
-    from safevar_sumo.analysis.research_questions.answer import answer
+    from safevar_sumo.analysis.research_questions.answer import answer_questions
 
-    return Tables(answer(_load_cases(results), question))
+    return Tables(answer_questions(_load_cases(results), question))
 
 
 def figures(*results: Results | str | Path) -> Figures:
@@ -82,9 +82,9 @@ def figures(*results: Results | str | Path) -> Figures:
     InputError
         If no figure can be drawn.
     """
-    from safevar_sumo.analysis.research_questions.gallery import draw
+    from safevar_sumo.analysis.research_questions.gallery import draw_figures
 
-    figures_by_name, lacking = draw(_load_cases(results))
+    figures_by_name, lacking = draw_figures(_load_cases(results))
     drawn_figures = Figures(figures_by_name)
     drawn_figures.lacking = tuple(lacking)
     return drawn_figures

@@ -14,7 +14,7 @@ from safevar_sumo.campaign.keys import RunKey, make_search
 from safevar_sumo.campaign.run import Observer, Run
 from safevar_sumo.campaign.verification import Verification
 from safevar_sumo.errors import InputError
-from safevar_sumo.metrics import SAFEVAR, Scoring
+from safevar_sumo.metrics import PUBLISHED_SCORING, Scoring
 from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.records import Evaluations
 from safevar_sumo.results import ORIGINAL, Failure, JournalBusyError, ResultsDirectory
@@ -46,7 +46,7 @@ class Campaign(NamedTuple):
     busy: list[RunKey]
     collisions: dict[RunKey, int]
     invalid_tests: dict[RunKey, int]
-    scoring: Scoring = SAFEVAR
+    scoring: Scoring = PUBLISHED_SCORING
 
 
 def run_campaign(study: Study, keys: Iterable[RunKey], results: ResultsDirectory, pool: Pool, observer: Observer,

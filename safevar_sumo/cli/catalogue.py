@@ -12,7 +12,7 @@ from rich.console import Console
 
 from safevar_sumo.ads import ADS
 from safevar_sumo.cli.program import commands
-from safevar_sumo.metrics import FURTHER, METRICS, OBJECTIVES, RATING_POINTS
+from safevar_sumo.metrics import METRIC_OF_OBJECTIVE, METRICS, OPTIONAL_METRICS, RATING_POINTS
 from safevar_sumo.scenarios import SCENARIOS, WEATHERS
 from safevar_sumo.search import ALGORITHMS
 from safevar_sumo.study import Study, load_study, study_names
@@ -46,9 +46,10 @@ def _catalogue(studies: list[Study]) -> dict[str, Any]:
         "scenarios": [_name_and_description(name, cls) for name, cls in SCENARIOS.items()],
         "weathers": [msgspec.to_builtins(weather) for weather in WEATHERS.values()],
         "algorithms": [_name_and_description(name, cls) for name, cls in ALGORITHMS.items()],
-        "metrics": [{"name": name, "description": metric.description} for name, metric in {**METRICS, **FURTHER}.items()],
+        "metrics": [{"name": name, "description": metric.description} for name, metric in {**METRICS, **OPTIONAL_METRICS}.items()],
         "objectives": [
-            *({"name": name, "description": f"The search drives {metric.name} to unsafe values."} for name, metric in OBJECTIVES.items()),
+            *({"name": name, "description": f"The search drives {metric.name} to unsafe values."}
+              for name, metric in METRIC_OF_OBJECTIVE.items()),
             *({"name": change.name, "description": f"{change.title.capitalize()} [{change.unit}]."} for change in CHANGES.values()),
             {"name": RATING_POINTS.name, "description": f"Only in studies that a protocol rates: {RATING_POINTS.description}"}],
     }

@@ -99,7 +99,7 @@ def _open_spreadsheet(xlsx: Path | None, template: Path | None, preprocessed: Pa
     _refuse_existing(output, flag, force)
     check_output(output, flag, SPREADSHEET_ENDINGS)
     try:
-        from safevar_sumo.analysis.rating.workbook import Preprocessed, Template
+        from safevar_sumo.analysis.rating.workbook import PreprocessedFile, Template
     except ModuleNotFoundError:
         raise InputError(flag, "openpyxl is not installed", "pip install 'safevar_sumo[rating]'") from None
-    return (Preprocessed if template is None else Template)(sheets, output)
+    return (PreprocessedFile if template is None else Template)(sheets, output)

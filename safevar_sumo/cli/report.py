@@ -9,10 +9,10 @@ from pathlib import Path
 import click
 from rich.console import Console
 
-from safevar_sumo.analysis.research_questions.answer import QUESTIONS, answer
+from safevar_sumo.analysis.research_questions.answer import QUESTIONS, answer_questions
 from safevar_sumo.analysis.research_questions.case import load_cases
 from safevar_sumo.analysis.research_questions.gallery import FORMATS as PICTURE_FORMATS
-from safevar_sumo.analysis.research_questions.gallery import draw_all
+from safevar_sumo.analysis.research_questions.gallery import save_figures
 from safevar_sumo.analysis.research_questions.tables import ENDINGS, FORMATS, FORMATS_WITH_LAYOUT, LAYOUTS_BY_NAME
 from safevar_sumo.cli.arguments import check_output
 from safevar_sumo.cli.program import commands
@@ -37,7 +37,7 @@ def tables(directories: tuple[str, ...], question: str | None, format_name: str,
         raise InputError("--layout", f"{layout!r}, but --format {format_name} has no layout", f"--format {', '.join(FORMATS_WITH_LAYOUT)}")
     write = (partial(FORMATS_WITH_LAYOUT[format_name], layouts=LAYOUTS_BY_NAME[layout]) if format_name in FORMATS_WITH_LAYOUT
              else FORMATS[format_name])
-    answers = answer(load_cases(directories), question)
+    answers = answer_questions(load_cases(directories), question)
     if format_name in FORMATS_WITHOUT_NOTES:
         _print_notes(list(dict.fromkeys(note for table in answers for note in table.notes)))
     if out is not None:
@@ -61,7 +61,7 @@ def figures(directories: tuple[str, ...], out: Path, format_name: str) -> None:
     """Draw the figures of the results directories DIR..., one file for each figure and case."""
     cases = load_cases(directories)
     make_directory(out)
-    paths, notes = draw_all(cases, out, format_name)
+    paths, notes = save_figures(cases, out, format_name)
     _print_notes([*(remark for case in cases for remark in case.remarks), *notes])
     for path in paths:
         click.echo(str(path))

@@ -16,7 +16,7 @@ from rich.console import Console, Group, RenderableType
 from rich.live import Live
 from rich.text import Text
 
-from safevar_sumo.analysis.research_questions.indicators import nondominated
+from safevar_sumo.analysis.research_questions.indicators import nondominated_points
 from safevar_sumo.api.running import ENGINE_NAMES, carry_out_runs, choose_engine, load_for_search, open_pool
 from safevar_sumo.campaign import Campaign, Forecast, RunKey, all_runs, forecast
 from safevar_sumo.cli.arguments import NumberRange, complete_study
@@ -154,7 +154,7 @@ def print_forecast(console: Console, study: Study, runs: int, cost: Forecast, en
 def print_summary(console: Console, study: Study, campaign: Campaign, directory: Path, pool: Pool) -> None:
     """Print the answer, a table of the original and of each algorithm's solutions, the most critical setting, and RQ1 and RQ2 in brief."""
     from safevar_sumo.analysis.explain.summary import summarise_failures
-    from safevar_sumo.analysis.research_questions.case import case_of
+    from safevar_sumo.analysis.research_questions.case import build_case
     from safevar_sumo.analysis.research_questions.over_runs import summary_lines  # loads more slowly than all other modules
 
     names = tuple(study.vehicle.characteristics)
@@ -186,8 +186,8 @@ def print_summary(console: Console, study: Study, campaign: Campaign, directory:
         print_text(console, f"{invalid} settings leave the tolerance of a test's speed before the ADS acts (invalid-test): "
                             "they are neither failures nor successes, and no result contains them.")
     _print_most_critical(console, study, campaign)
-    case = case_of(study, record(campaign.original, 0), solutions, solutions_frame(names, []), tuple(campaign.solutions),
-                   scoring=campaign.scoring)
+    case = build_case(study, record(campaign.original, 0), solutions, solutions_frame(names, []), tuple(campaign.solutions),
+                      scoring=campaign.scoring)
     for line in summary_lines(case):
         print_text(console, line)
     print_text(console, f"All tables: {PROGRAM_COMMAND} tables {shlex.quote(str(directory))}")
@@ -254,7 +254,7 @@ def _front_table(progress: Status) -> RenderableType:
     """A table of the most severe non-dominated settings."""
     if not len(progress.points):
         return Text("Nothing simulated yet.")
-    front = nondominated(progress.points)
+    front = nondominated_points(progress.points)
     front = front[front[:, 0].argsort(kind="stable")]
     table = WholeTable(right=("safety degree [m, -m/s]", "f_diff [fraction]", "changed"),
                        title=f"Front so far: {len(front)} points, the most severe ones")

@@ -15,7 +15,7 @@ import msgspec
 from safevar_sumo.ads import ADS, ADS_CONTRACT, SCALAR_ADS_CONTRACT, FmuAds, ScalarAds
 from safevar_sumo.errors import InputError, SafevarError, refuse_other_than_file, unknown_name
 from safevar_sumo.fmu import file_of
-from safevar_sumo.metrics import FURTHER, METRICS, OBJECTIVES, Metric
+from safevar_sumo.metrics import METRIC_OF_OBJECTIVE, METRICS, OPTIONAL_METRICS, Metric
 from safevar_sumo.plugins import Contract, Guard, Lookup, Member
 from safevar_sumo.scenarios import SCENARIO_CONTRACT, SCENARIOS
 from safevar_sumo.search import ALGORITHM_CONTRACT, ALGORITHMS
@@ -24,7 +24,7 @@ from safevar_sumo.sumo.traci_module import substitute_traci
 from safevar_sumo.vehicles import CHANGES, VEHICLE_CONTRACT, VEHICLES, Change, FmuVehicle
 
 KINDS: Mapping[str, Mapping[str, Any]] = {
-    "ads": ADS, "vehicle": VEHICLES, "scenario": SCENARIOS, "metric": {**METRICS, **FURTHER}, "objective": CHANGES,
+    "ads": ADS, "vehicle": VEHICLES, "scenario": SCENARIOS, "metric": {**METRICS, **OPTIONAL_METRICS}, "objective": CHANGES,
     "algorithm": ALGORITHMS, "traci": {}}
 """Kinds of subjects, each with its shipped subjects by name."""
 METHODS: Mapping[str, tuple[str, ...]] = {
@@ -79,7 +79,7 @@ def find_subject(name: str, study: str | None = None) -> Subject:
         If nothing has this name, or the subject cannot be checked.
     """
     given_study = None if study is None else load_study(study)
-    name = OBJECTIVES[name].name if name in OBJECTIVES else name
+    name = METRIC_OF_OBJECTIVE[name].name if name in METRIC_OF_OBJECTIVE else name
     kinds = [kind for kind, members in KINDS.items() if name in members]
     if kinds:
         shipped_studies = (shipped for shipped in map(load_study, study_names()) if _is_named(shipped, kinds[0], name))
@@ -88,7 +88,7 @@ def find_subject(name: str, study: str | None = None) -> Subject:
     if name.endswith(".fmu"):
         return _find_fmu(name, given_study)
     if ":" not in name:
-        names = [*study_names(), *OBJECTIVES, *(member for members in KINDS.values() for member in members)]
+        names = [*study_names(), *METRIC_OF_OBJECTIVE, *(member for members in KINDS.values() for member in members)]
         raise unknown_name("check", f"there is nothing called {name!r}", name, names, ", package.module:Name, or the path of a study file")
     folders = () if given_study is None else given_study.origin.places
     with substitute_traci():

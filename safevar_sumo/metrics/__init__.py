@@ -14,17 +14,17 @@ METRICS = {metric.name: metric for metric in (
     TIT,
     AVE_DECE,
 )}
-FURTHER = {metric.name: metric for metric in (
+OPTIONAL_METRICS = {metric.name: metric for metric in (
     MAX_JERK,
     RMS_ACCELERATION,
     BRAKE_HARSHNESS,
 )}
-"""Metrics that a study has only if it names them."""
-OBJECTIVES = {F_SAFE.name: SAFETY_DEGREE_METRIC, "f_comfort": MAX_JERK}
-"""By name of an objective: the metric that it uses."""
-SAFEVAR = Scoring(metrics=tuple(metric.facts for metric in METRICS.values()), objectives=(F_SAFE, F_DIFF, F_NUM_DIFF))
+"""Metrics that only the studies have that name them."""
+METRIC_OF_OBJECTIVE = {F_SAFE.name: SAFETY_DEGREE_METRIC, "f_comfort": MAX_JERK}
+"""The metric that an objective uses, by the objective's name."""
+PUBLISHED_SCORING = Scoring(metrics=tuple(metric.facts for metric in METRICS.values()), objectives=(F_SAFE, F_DIFF, F_NUM_DIFF))
 """Metrics and objectives of the published study (method sections 3 and 4)."""
 
 __all__ = [
-    "FURTHER", "F_DIFF", "F_NUM_DIFF", "F_SAFE", "METRICS", "OBJECTIVES", "RATING_POINTS", "SAFEVAR", "Criterion", "Metric", "MetricFacts",
-    "Objective", "Scoring", "Unsafe", "guard_metric", "time_to_collision"]
+    "F_DIFF", "F_NUM_DIFF", "F_SAFE", "METRICS", "METRIC_OF_OBJECTIVE", "OPTIONAL_METRICS", "PUBLISHED_SCORING", "RATING_POINTS",
+    "Criterion", "Metric", "MetricFacts", "Objective", "Scoring", "Unsafe", "guard_metric", "time_to_collision"]

@@ -34,13 +34,13 @@ def sampling_stride(step: float, interval: float | None) -> int:
     return steps
 
 
-def total(samples: FloatArray) -> FloatArray:
-    """Sum over the first axis in order; the order of numpy's own sum depends on the shape, so that results would depend on N."""
+def sum_in_order(samples: FloatArray) -> FloatArray:
+    """Sum over the first axis, in order; in numpy's own sum the order depends on the shape, and results would depend on N."""
     return np.asarray(np.add.accumulate(samples, axis=0)[-1]) if len(samples) else np.zeros(samples.shape[1:])
 
 
-Name = Annotated[str, Meta(pattern=r"^[A-Za-z][A-Za-z0-9_]{0,63}\Z")]
-Text = Annotated[str, Meta(pattern=r"^[^\x00-\x1f\x7f]{1,200}\Z")]
+MetricName = Annotated[str, Meta(pattern=r"^[A-Za-z][A-Za-z0-9_]{0,63}\Z")]
+TitleText = Annotated[str, Meta(pattern=r"^[^\x00-\x1f\x7f]{1,200}\Z")]
 MetricFunction = Callable[[SimulationRuns, MetricsTable], FloatArray]
 
 
@@ -63,9 +63,9 @@ class MetricFacts(Struct, frozen=True, kw_only=True):
         Heading of the metric's column in tables, by default title and unit.
     """
 
-    name: Name
-    title: Text
-    unit: Text
+    name: MetricName
+    title: TitleText
+    unit: TitleText
     more_is_unsafe: bool
     over_collisions: bool = True
     description: str = ""
@@ -80,7 +80,7 @@ class MetricFacts(Struct, frozen=True, kw_only=True):
 class Metric(MetricFacts, frozen=True, kw_only=True):
     """A metric: `function` takes N simulation runs and thresholds and returns an array of shape (N,), NaN where it is undefined.
 
-    Element i depends, to the bit, on run i only.
+    Element i depends only on run i, bit for bit.
     """
 
     function: MetricFunction
@@ -94,7 +94,7 @@ class Metric(MetricFacts, frozen=True, kw_only=True):
         return MetricFacts(**{name: getattr(self, name) for name in MetricFacts.__struct_fields__})
 
 
-def without_collision(runs: SimulationRuns, values: FloatArray) -> FloatArray:
+def mask_collisions(runs: SimulationRuns, values: FloatArray) -> FloatArray:
     """A metric's values, shape (N,), undefined on a collision."""
     return np.where(np.isnan(runs.collision_speed), values, np.nan)
 
@@ -125,7 +125,7 @@ def guard_metric(metric: Any, guard: Guard) -> Metric:
 
 
 class Objective(Struct, frozen=True, kw_only=True):
-    """A column of results that a search minimises, or maximises if `maximised` is true."""
+    """A column of results that a search minimises, or maximises if `maximised`."""
 
     name: str
     title: str

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from safevar_sumo.metrics.base import Metric, total, without_collision
+from safevar_sumo.metrics.base import Metric, mask_collisions, sum_in_order
 from safevar_sumo.records import BoolArray, FloatArray, SimulationRuns
 from safevar_sumo.study import MetricsTable
 
@@ -48,7 +48,7 @@ class _BiquadFilter(NamedTuple):
         return result
 
 
-def weighted(acceleration: FloatArray, step: float) -> FloatArray:
+def weight_acceleration(acceleration: FloatArray, step: float) -> FloatArray:
     """Acceleration along the vehicle, weighted with W_d of ISO 2631-1 [m/s^2], shape (T, N).
 
     The low pass at 100 Hz is omitted, since the samples of a simulation contain no frequencies above half the sampling rate.
@@ -62,25 +62,25 @@ def weighted(acceleration: FloatArray, step: float) -> FloatArray:
 
 def max_jerk(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
     """Largest magnitude of the jerk over a second [m/s^3]; shape (N,), NaN on a collision."""
-    accelerations, counts = _accelerations(runs)
-    steps = _steps(JERK_TIME, runs.trace.step, len(accelerations) - 1)
+    accelerations, is_counted = _accelerations(runs)
+    steps = _step_count(JERK_TIME, runs.trace.step, len(accelerations) - 1)
     jerk = np.abs(accelerations[steps:] - accelerations[:-steps]) / (steps * runs.trace.step)
-    return without_collision(runs, np.max(np.where(counts[steps:], jerk, 0.0), axis=0, initial=0.0))
+    return mask_collisions(runs, np.max(np.where(is_counted[steps:], jerk, 0.0), axis=0, initial=0.0))
 
 
 def rms_acceleration(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
     """Root mean square of the weighted acceleration over the run [m/s^2]; shape (N,), NaN on a collision."""
-    accelerations, counts = _accelerations(runs)
-    squares = np.where(counts, weighted(np.where(counts, accelerations, 0.0), runs.trace.step), 0.0) ** 2
-    return without_collision(runs, np.sqrt(total(squares) / np.maximum(np.count_nonzero(counts, axis=0), 1)))
+    accelerations, is_counted = _accelerations(runs)
+    squares = np.where(is_counted, weight_acceleration(np.where(is_counted, accelerations, 0.0), runs.trace.step), 0.0) ** 2
+    return mask_collisions(runs, np.sqrt(sum_in_order(squares) / np.maximum(np.count_nonzero(is_counted, axis=0), 1)))
 
 
 def brake_harshness(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
     """Largest deceleration over half a second [m/s^2]; shape (N,), NaN on a collision."""
     speed, active = runs.trace.speed, runs.trace.active
-    steps = _steps(BRAKING_TIME, runs.trace.step, len(speed) - 1)
+    steps = _step_count(BRAKING_TIME, runs.trace.step, len(speed) - 1)
     decelerations = (speed[:-steps] - speed[steps:]) / (steps * runs.trace.step)
-    return without_collision(runs, np.max(np.where(active[steps:], decelerations, 0.0), axis=0, initial=0.0))
+    return mask_collisions(runs, np.max(np.where(active[steps:], decelerations, 0.0), axis=0, initial=0.0))
 
 
 def _accelerations(runs: SimulationRuns) -> tuple[FloatArray, BoolArray]:
@@ -88,9 +88,9 @@ def _accelerations(runs: SimulationRuns) -> tuple[FloatArray, BoolArray]:
     return np.diff(runs.trace.speed, axis=0) / runs.trace.step, runs.trace.active[1:]
 
 
-def _steps(time: float, step: float, step_count: int) -> int:
+def _step_count(time: float, step: float, limit: int) -> int:
     """Number of steps in a time [s], from 1 to `step_count`."""
-    return max(1, min(round(time / step), step_count))
+    return max(1, min(round(time / step), limit))
 
 
 MAX_JERK = Metric(

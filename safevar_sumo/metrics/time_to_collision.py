@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from safevar_sumo.metrics.base import Metric, sampling_stride, total, without_collision
+from safevar_sumo.metrics.base import Metric, mask_collisions, sampling_stride, sum_in_order
 from safevar_sumo.records import STANDSTILL, TIME_DECIMALS, FloatArray, SimulationRuns
 from safevar_sumo.study import MetricsTable
 
@@ -24,14 +24,14 @@ def time_to_collision(runs: SimulationRuns) -> FloatArray:
 def time_exposed(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
     """TET* = sum of dt over the samples with 0 <= TTC(t) <= TTC* [s]; shape (N,), NaN on a collision."""
     critical_ttc, interval = _critical_ttc(runs, thresholds)
-    return without_collision(runs, np.round(np.count_nonzero(np.isfinite(critical_ttc), axis=0) * interval, TIME_DECIMALS))
+    return mask_collisions(runs, np.round(np.count_nonzero(np.isfinite(critical_ttc), axis=0) * interval, TIME_DECIMALS))
 
 
 def time_integrated(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
     """TIT* = sum of (TTC* - TTC(t)) dt over the samples of TET* [s^2]; shape (N,), NaN on a collision."""
     critical_ttc, interval = _critical_ttc(runs, thresholds)
     deficit = np.where(np.isfinite(critical_ttc), thresholds.ttc_threshold - critical_ttc, 0.0)
-    return without_collision(runs, total(deficit) * interval)
+    return mask_collisions(runs, sum_in_order(deficit) * interval)
 
 
 def _critical_ttc(runs: SimulationRuns, thresholds: MetricsTable) -> tuple[FloatArray, float]:

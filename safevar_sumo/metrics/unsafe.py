@@ -18,7 +18,7 @@ from safevar_sumo.study import SAFETY_DEGREE
 if TYPE_CHECKING:
     import pandas as pd
 
-EXPECTED = "collision, points=X with X points of a rating, or below=X with a safety degree X [m, or minus a collision's speed in m/s]"
+CRITERIA = "collision, points=X with X points of a rating, or below=X with a safety degree X [m, or minus a collision's speed in m/s]"
 COLLISION = str(Outcome.COLLISION)
 DEGREE_SHARE, LIMIT_DIGITS = 0.5, 6
 """The default limit if nothing collides: this share of the original's safety degree, to this many significant digits."""
@@ -77,14 +77,14 @@ class Unsafe:
             return criterion
         if criterion == COLLISION:
             return cls()
-        kind, _, text = criterion.partition("=") if isinstance(criterion, str) else ("below", "", criterion)
+        quantity, _, text = criterion.partition("=") if isinstance(criterion, str) else ("below", "", criterion)
         try:
-            limit = float(text) if kind in ("below", "points") else math.nan
+            limit = float(text) if quantity in ("below", "points") else math.nan
         except (TypeError, ValueError):
             limit = math.nan
         if not math.isfinite(limit):
-            raise InputError("unsafe", repr(criterion), EXPECTED)
-        return cls(points=limit) if kind == "points" else cls(limit)
+            raise InputError("unsafe", repr(criterion), CRITERIA)
+        return cls(points=limit) if quantity == "points" else cls(limit)
 
     @classmethod
     def default(cls, original: Mapping[str, Any], outcomes: Any) -> Unsafe:
@@ -101,12 +101,12 @@ class Unsafe:
         outcomes
             Outcomes of the other vehicles, as an array or a column of `Outcome`.
         """
-        points, degree = original.get(RATING_POINTS.name), original.get(SAFETY_DEGREE) or 0.0
+        points, safety_degree = original.get(RATING_POINTS.name), original.get(SAFETY_DEGREE) or 0.0
         if points is not None:
             return cls(points=round(points - POINT_LOSS, POINT_DECIMALS))
-        if (outcomes == COLLISION).any() or not degree > 0:
+        if (outcomes == COLLISION).any() or not safety_degree > 0:
             return cls()
-        return cls(float(f"{DEGREE_SHARE * degree:.{LIMIT_DIGITS}g}"))
+        return cls(float(f"{DEGREE_SHARE * safety_degree:.{LIMIT_DIGITS}g}"))
 
     @classmethod
     def default_among(cls, evaluations: Evaluations, original: Evaluations) -> Unsafe:
@@ -120,9 +120,9 @@ class Unsafe:
         outcomes = np.concatenate([original.outcome, evaluations.outcome])
         unsafe = cls.default({name: float(values[0]) for name, values in original.metrics.items()}, outcomes)
         if unsafe.points is not None and unsafe.points < 0:
-            raise InputError("unsafe", f"the original vehicle earns {unsafe.points + POINT_LOSS:g} points and has none to lose", EXPECTED)
+            raise InputError("unsafe", f"the original vehicle earns {unsafe.points + POINT_LOSS:g} points and has none to lose", CRITERIA)
         if unsafe == cls() and not (outcomes == COLLISION).any():
-            raise InputError("unsafe", "nothing collides, and the original vehicle has no safety degree to halve", EXPECTED)
+            raise InputError("unsafe", "nothing collides, and the original vehicle has no safety degree to halve", CRITERIA)
         return unsafe
 
 

@@ -9,10 +9,10 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 
-from safevar_sumo.analysis.research_questions.answer import Answer, answer
-from safevar_sumo.analysis.research_questions.case import ALGORITHM_TITLES, Case, Unanswerable
-from safevar_sumo.analysis.research_questions.changes import by_number, changes, critical
-from safevar_sumo.analysis.research_questions.comparisons import ALPHA, magnitude
+from safevar_sumo.analysis.research_questions.answer import Answer, answer_questions
+from safevar_sumo.analysis.research_questions.case import ALGORITHM_TITLES, Case, UnanswerableError
+from safevar_sumo.analysis.research_questions.changes import change_matrix, critical_solutions, masks_by_change_count
+from safevar_sumo.analysis.research_questions.comparisons import ALPHA, magnitude_of
 from safevar_sumo.errors import InputError
 from safevar_sumo.reference.validation import rank_correlation
 
@@ -77,7 +77,7 @@ def _index_by_study(cases: Sequence[Case], argument: str) -> dict[str, Case]:
 def compare_tables(pairs: Pairs) -> list[ComparedTable]:
     """Every table of the research questions, with columns of both sides."""
     cases_of_sides = pairs.here, pairs.published
-    answers_by_table = [{result.name: result for result in answer(cases)} for cases in cases_of_sides]
+    answers_by_table = [{result.name: result for result in answer_questions(cases)} for cases in cases_of_sides]
     tables = []
     for name, keys in KEY_COLUMNS.items():
         answers = [by_table.get(name, Answer(name, pd.DataFrame(), ())) for by_table in answers_by_table]  # a missing table has no notes
@@ -100,11 +100,11 @@ def _tabulate_change_numbers(cases: Sequence[Case]) -> pd.DataFrame:
     rows: list[dict[str, Any]] = []
     for case in cases:
         try:
-            change_table = changes(case, critical(case))
-        except Unanswerable:
+            change_table = change_matrix(case, critical_solutions(case))
+        except UnanswerableError:
             continue
         rows += [{"setting": case.name, "j": j, "percent": 100 * float(np.mean(has_j_changes)) if len(has_j_changes) else None}
-                 for j, has_j_changes in by_number(case, change_table).items() if j != "any"]
+                 for j, has_j_changes in masks_by_change_count(case, change_table).items() if j != "any"]
     return pd.DataFrame(rows)
 
 
@@ -187,7 +187,7 @@ def judge_test(effect: float, p: float, published_effect: float, published_p: fl
     """Whether a published test holds here, by direction, magnitude and significance."""
     is_same_direction = (effect - 0.5) * (published_effect - 0.5) > 0
     is_same_significance = (p < ALPHA) == (published_p < ALPHA)
-    magnitudes = {magnitude(effect), magnitude(published_effect)}
+    magnitudes = {magnitude_of(effect), magnitude_of(published_effect)}
     if is_same_significance and len(magnitudes) == 1 and (is_same_direction or p >= ALPHA or magnitudes == {"negligible"}):
         return HOLDS
     return IN_DIRECTION if is_same_direction else DIFFERS

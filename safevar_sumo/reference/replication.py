@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 import scipy
 
-from safevar_sumo.analysis.research_questions.case import NSGA2, Case, collided
+from safevar_sumo.analysis.research_questions.case import NSGA2, Case, are_collisions
 from safevar_sumo.records import FloatArray
 from safevar_sumo.reference.conclusions import (
     COMPARED_SIDES,
@@ -68,7 +68,7 @@ def compare_with_nearest_rows(case: Case, references: Sequence[ReferenceData]) -
             continue
         scaled_solutions: FloatArray = solutions[list(domains.names)].to_numpy(dtype=float) / width
         distances, nearest_rows = (np.reshape(array, (len(scaled_solutions), count)) for array in tree.query(scaled_solutions, count))
-        is_collision = collided(solutions).to_numpy()
+        is_collision = are_collisions(solutions).to_numpy()
         results.append(Nearness(
             case.name, algorithm, len(solutions), float(np.median(distances)), float(np.median(published_distances)),
             float(np.nanmean(solutions[SAFETY_DEGREE])), float(safety[nearest_rows].mean()), int(is_collision.sum()),

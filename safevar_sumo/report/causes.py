@@ -13,8 +13,8 @@ from safevar_sumo.analysis.evaluator import Progress
 from safevar_sumo.analysis.explain.compute import explain_failures
 from safevar_sumo.analysis.explain.necessity import robustness_in_words
 from safevar_sumo.analysis.explain.result import CauseEntry, FailureEntry, SummaryEntry
-from safevar_sumo.analysis.opinion.compute import JudgedCause, opinions_of, second_system
-from safevar_sumo.analysis.research_questions.indicators import nondominated
+from safevar_sumo.analysis.opinion.compute import CauseToJudge, assemble_both_systems, judge_causes
+from safevar_sumo.analysis.research_questions.indicators import nondominated_points
 from safevar_sumo.errors import InputError
 from safevar_sumo.replay.comparison import list_differences, quantity_text, superscript_powers
 from safevar_sumo.report.input import ChangeRow, FailingPointsTable, ReportInput, load_or_compute
@@ -140,7 +140,7 @@ def make_cause_sections(failures: Sequence[FailureEntry], data: ReportInput) -> 
 def reason_without_opinion(data: ReportInput) -> str:
     """Why there is no second opinion on causes, in a sentence; empty if there is one."""
     try:
-        second_system(data.case.study)
+        assemble_both_systems(data.case.study)
     except InputError as error:
         return f"No second opinion on these causes: {error.problem}; expected: {error.legal}."
     return ""
@@ -148,8 +148,8 @@ def reason_without_opinion(data: ReportInput) -> str:
 
 def _ask_opinions(data: ReportInput, selection: Sequence[tuple[CauseEntry, FailureEntry]]) -> list[SecondOpinion]:
     """Ask the second vehicle model for its opinion on each cause, once for these results."""
-    judged_causes = [JudgedCause(failure.handle or None, cause.changes, cause.fraction) for cause, failure in selection]
-    opinions = load_or_compute(data, "opinion", lambda: opinions_of(data.case.study, judged_causes, data.case.unsafe).to_dict())
+    judged_causes = [CauseToJudge(failure.handle or None, cause.changes, cause.fraction) for cause, failure in selection]
+    opinions = load_or_compute(data, "opinion", lambda: judge_causes(data.case.study, judged_causes, data.case.unsafe).to_dict())
     return msgspec.convert(opinions, list[SecondOpinion])
 
 
@@ -211,7 +211,7 @@ def nondominated_rows(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     if not rows:
         return []
     objectives = np.array([[row[name] for name in OBJECTIVES] for row in rows], dtype=float)
-    best = set(map(tuple, nondominated(objectives).tolist()))
+    best = set(map(tuple, nondominated_points(objectives).tolist()))
     rows_by_objectives = {key: row for key, row in zip(map(tuple, objectives.tolist()), rows, strict=True) if key in best}
     return list(rows_by_objectives.values())
 

@@ -266,7 +266,7 @@ def _answer_digest(data: ReportInput, name: str) -> str:
         file = data.directory / file_name
         content = file.read_bytes() if file.is_file() else b""
         digest.update(len(content).to_bytes(8, "big") + content)
-    inputs = [data.case.finished, data.point, data.options.get(name, data.case.study.spread)]
+    inputs = [data.case.finished_runs, data.point, data.options.get(name, data.case.study.spread)]
     digest.update(repr(inputs).encode())
     return digest.hexdigest()
 

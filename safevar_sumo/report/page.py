@@ -17,10 +17,10 @@ import numpy as np
 from markupsafe import Markup
 
 from safevar_sumo.analysis.evaluator import Progress, show_no_progress
-from safevar_sumo.analysis.research_questions.answer import answer
-from safevar_sumo.analysis.research_questions.case import Case, Unanswerable
-from safevar_sumo.analysis.research_questions.gallery import draw
-from safevar_sumo.analysis.research_questions.layout import Bold, Table, lay_out
+from safevar_sumo.analysis.research_questions.answer import answer_questions
+from safevar_sumo.analysis.research_questions.case import Case, UnanswerableError
+from safevar_sumo.analysis.research_questions.gallery import draw_figures
+from safevar_sumo.analysis.research_questions.layout import BoldText, Table, lay_out
 from safevar_sumo.errors import InputError, did_you_mean, warn
 from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.replay.comparison import superscript_powers
@@ -55,24 +55,24 @@ SVG_STYLE = {"svg.fonttype": "none", "svg.hashsalt": "safevar_sumo", "font.famil
 def list_tables(cases: Sequence[Case]) -> list[dict[str, Any]]:
     """Every table of the research questions; if none can be answered, one table with the reason."""
     try:
-        answers = answer(cases)
-    except Unanswerable as error:
+        answers = answer_questions(cases)
+    except UnanswerableError as error:
         return [{"title": "RQ1 to RQ3", "heads": (), "spans": (), "rows": [], "labels": 0, "notes": [f"{error.source}: {error.problem}."]}]
     return [_table_data(table) for question_table in answers for table in lay_out(question_table)]
 
 
 def _table_data(table: Table) -> dict[str, Any]:
-    rows = [[{"text": superscript_powers(str(cell)), "bold": isinstance(cell, Bold)} for cell in row] for row in table.rows]
-    spans = [("", table.labels), *((superscript_powers(name), width) for name, width in table.spans)] if table.spans else []
-    heads, notes = ([superscript_powers(text) for text in texts] for texts in (table.heads, table.notes))
-    return {"title": superscript_powers(table.title), "heads": heads, "spans": spans, "rows": rows, "labels": table.labels, "notes": notes}
+    rows = [[{"text": superscript_powers(str(cell)), "bold": isinstance(cell, BoldText)} for cell in row] for row in table.rows]
+    spans = [("", table.label_count), *((superscript_powers(name), width) for name, width in table.spans)] if table.spans else []
+    heads, notes = ([superscript_powers(text) for text in texts] for texts in (table.headings, table.notes))
+    return {"title": superscript_powers(table.title), "heads": heads, "spans": spans, "rows": rows, "labels": table.label_count, "notes": notes}
 
 
 def embed_figures(cases: Sequence[Case]) -> list[dict[str, str]]:
     """Draw every figure of the research questions as a picture to embed in the page."""
     try:
-        figures_by_name, _ = draw(cases)
-    except Unanswerable:
+        figures_by_name, _ = draw_figures(cases)
+    except UnanswerableError:
         return []
     return [{"name": name, "alt": _alt_text(figure), "source": _data_url(figure)} for name, figure in figures_by_name.items()]
 

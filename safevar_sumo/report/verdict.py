@@ -15,7 +15,7 @@ from safevar_sumo.analysis.explain.necessity import BORDERLINE, is_borderline, r
 from safevar_sumo.analysis.explain.result import REASONS, ROBUST, CauseEntry, FailureEntry
 from safevar_sumo.analysis.model_spread import ModelSpread, compute_model_spreads
 from safevar_sumo.analysis.preventability import PreventedShares
-from safevar_sumo.analysis.research_questions.case import ALGORITHM_TITLES, collided
+from safevar_sumo.analysis.research_questions.case import ALGORITHM_TITLES, are_collisions
 from safevar_sumo.analysis.words import number_of
 from safevar_sumo.metrics import METRICS, Unsafe
 from safevar_sumo.records import KMH_PER_MS, FloatArray, Outcome
@@ -79,7 +79,7 @@ def _describe_search(data: ReportInput) -> str:
     versions = ", ".join(f"{name} {value}" for name, value in data.manifest["versions"].items())
     if not case.has_runs:
         return f"The {len(case.solutions)} solutions are imported ({versions})."
-    runs = Counter(algorithm for algorithm, _ in case.finished)
+    runs = Counter(algorithm for algorithm, _ in case.finished_runs)
     names = [f"{ALGORITHM_TITLES.get(name, name)} ({number_of(count, 'run')})" for name, count in runs.items()]
     return (f"Searched by {', '.join(names) or 'no finished run'} of at most {search.evaluations} simulations each, "
             f"{len(case.evaluations)} different vehicles in all, from seed {search.seed}, with {versions}.")
@@ -222,7 +222,7 @@ def _headline(data: ReportInput, failures: Sequence[SelectedFailure], explanatio
     first = failures[0]
     if first.needed == 0:
         return "No change is needed: the original vehicle itself is unsafe."
-    outcome = "a collision" if collided(data.case.solutions).any() else "an unsafe outcome"
+    outcome = "a collision" if are_collisions(data.case.solutions).any() else "an unsafe outcome"
     phrase = f"{outcome} that is robust" if ROBUST in first.reasons else outcome
     borderline = "Every failure analysed is borderline. The one with the fewest changes: " if explanations and phrase == outcome else ""
     versions = "simulated with the present files and versions, " if data.later_changes else ""
@@ -266,7 +266,7 @@ def _severity_figure(most_severe: SelectedFailure | None, data: ReportInput) -> 
 def _preventability_figure(preventable: PreventedShares | None, data: ReportInput) -> KeyFigure:
     title = "A competent driver avoids"
     if preventable is None or preventable.competent_driver is None or preventable.interval_competent_driver is None:
-        any_collision = collided(data.case.solutions).any()
+        any_collision = are_collisions(data.case.solutions).any()
         return KeyFigure(title, NO_VALUE, "not computed" if any_collision else "there is no collision to avoid")
     low, high = preventable.interval_competent_driver
     sample = "all" if low == high else f"95 % interval {low:.0%} to {high:.0%};"

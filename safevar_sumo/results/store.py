@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 
 from safevar_sumo.errors import InputError, SafevarError
-from safevar_sumo.metrics import METRICS, SAFEVAR, Scoring
+from safevar_sumo.metrics import METRICS, PUBLISHED_SCORING, Scoring
 from safevar_sumo.records import Evaluations, finite_or_none
 from safevar_sumo.results.files import (
     MANIFEST,
@@ -67,10 +67,11 @@ class ResultsDirectory:
         If the directory cannot be written, holds other files, or belongs to another study or version.
     """
 
-    def __init__(self, path: Path, study: Study, identity: Mapping[str, Any] = MappingProxyType({}), scoring: Scoring = SAFEVAR) -> None:
+    def __init__(self, path: Path, study: Study, identity: Mapping[str, Any] = MappingProxyType({}),
+                 scoring: Scoring = PUBLISHED_SCORING) -> None:
         self.path, self._study, self.scoring = path, study, scoring
         self.manifest = manifest_of(study, identity)
-        if scoring != SAFEVAR:
+        if scoring != PUBLISHED_SCORING:
             self.manifest["scoring"] = msgspec.to_builtins(scoring)
         make_directory(path)
         self._digests: dict[str, str] = dict(self.manifest.get("sources", {}))

@@ -9,7 +9,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from safevar_sumo.errors import UserCodeError
-from safevar_sumo.metrics import SAFEVAR, Scoring
+from safevar_sumo.metrics import PUBLISHED_SCORING, Scoring
 from safevar_sumo.plugins import Contract, Guard, read_only_copy
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray
 from safevar_sumo.vehicles import CharacteristicSet, FeasibleRegion
@@ -30,7 +30,7 @@ class Problem:
     original: Evaluations
     evaluations: int
     population: int = 50
-    scoring: Scoring = SAFEVAR
+    scoring: Scoring = PUBLISHED_SCORING
     region: FeasibleRegion | None = None
 
     def uniform(self, number: int, rng: np.random.Generator) -> FloatArray:

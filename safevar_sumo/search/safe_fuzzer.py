@@ -7,7 +7,7 @@ from typing import Annotated
 import numpy as np
 from msgspec import Meta, Struct
 
-from safevar_sumo.metrics import F_DIFF, F_NUM_DIFF, SAFEVAR, Scoring
+from safevar_sumo.metrics import F_DIFF, F_NUM_DIFF, PUBLISHED_SCORING, Scoring
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.search.base import Problem, Search
 
@@ -117,7 +117,7 @@ class _Ranges:
         self.max_changes = max(1, int(np.floor(np.mean(less_safe.f_num_diff) + 0.5)))
 
 
-def _improves(generation: Evaluations, earlier: Evaluations, scoring: Scoring = SAFEVAR, safety_weight: float = SAFETY_WEIGHT,
+def _improves(generation: Evaluations, earlier: Evaluations, scoring: Scoring = PUBLISHED_SCORING, safety_weight: float = SAFETY_WEIGHT,
               kept: int = RESULT_SIZE) -> bool:
     """Whether the best score of a generation is lower than the worst of the `kept` best earlier scores."""
     scores = _scores(Evaluations.concatenate([earlier, generation]), scoring, safety_weight)
@@ -127,7 +127,7 @@ def _improves(generation: Evaluations, earlier: Evaluations, scoring: Scoring = 
     return bool(new_scores.size and (not best.size or new_scores.min() < best[-1]))
 
 
-def _scores(evaluations: Evaluations, scoring: Scoring = SAFEVAR, safety_weight: float = SAFETY_WEIGHT) -> FloatArray:
+def _scores(evaluations: Evaluations, scoring: Scoring = PUBLISHED_SCORING, safety_weight: float = SAFETY_WEIGHT) -> FloatArray:
     """(6 SD_norm + f_diff + num_norm) / 8, lower is better; SD is normalised by min-max over `evaluations`; NaN where invalid.
 
     With other objectives, the first objective takes the place of SD; further objectives are normalised by min-max, too.

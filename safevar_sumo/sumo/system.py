@@ -15,11 +15,10 @@ from typing import Any, NamedTuple
 import msgspec
 import numpy as np
 
-from safevar_sumo.ads import ADS, ADS_CONTRACT, REACTIONS, SCALAR_ADS_CONTRACT, Ads, FmuAds, GuardedAds, PerVehicle, ScalarAds
+from safevar_sumo.ads import ADS, ADS_CONTRACT, REACTION_PARAMETERS, SCALAR_ADS_CONTRACT, Ads, FmuAds, GuardedAds, PerVehicleAds, ScalarAds
 from safevar_sumo.errors import InputError, one_of, unknown_name
 from safevar_sumo.fmu import STEP_LIMIT, description_of
-from safevar_sumo.metrics import FURTHER, METRICS, RATING_POINTS, Metric, Objective, Scoring, guard_metric
-from safevar_sumo.metrics import OBJECTIVES as BY_OBJECTIVE
+from safevar_sumo.metrics import METRIC_OF_OBJECTIVE, METRICS, OPTIONAL_METRICS, RATING_POINTS, Metric, Objective, Scoring, guard_metric
 from safevar_sumo.plugins import Guard, Lookup, Member, ModuleCopies, check_parameters, guard_process_state, instance_of
 from safevar_sumo.protocol.rater import Rater, expand_protocol, is_rated, rater_of
 from safevar_sumo.records import FloatArray, Nominal
@@ -75,16 +74,16 @@ def measuring_of(study: Study, lookup: Lookup) -> Measuring:
     def look_up(name: str, key: str) -> Metric | Change:
         if name in by_name:
             return by_name[name]
-        shipped = {**default_metrics, **FURTHER, **({**CHANGES, **BY_OBJECTIVE} if key == OBJECTIVES_KEY else {})}
+        shipped = {**default_metrics, **OPTIONAL_METRICS, **({**CHANGES, **METRIC_OF_OBJECTIVE} if key == OBJECTIVES_KEY else {})}
         member = lookup.find(shipped, name, key)
         if member.guard is None:
-            if name in FURTHER:
+            if name in OPTIONAL_METRICS:
                 metrics[name] = member.target
             return member.target  # type: ignore[no-any-return]
         members.append(member)
         is_change = isinstance(member.target, Change) and key == OBJECTIVES_KEY
         record = guard_change(member.target, member.guard) if is_change else guard_metric(member.target, member.guard)
-        if record.name in (*RESULT_COLUMNS, *metrics, *FURTHER, *changes, *study.vehicle.characteristics):
+        if record.name in (*RESULT_COLUMNS, *metrics, *OPTIONAL_METRICS, *changes, *study.vehicle.characteristics):
             raise InputError(lookup.source, f"{key} = {name!r}: the name {record.name!r} is taken", "a unique name")
         if isinstance(record, Change):
             changes[record.name] = record
@@ -95,7 +94,7 @@ def measuring_of(study: Study, lookup: Lookup) -> Measuring:
 
     for name in study.metrics.also:
         look_up(name, "metrics.also")
-    names = [BY_OBJECTIVE[name].name if name in BY_OBJECTIVE else name for name in study.search.objectives]
+    names = [METRIC_OF_OBJECTIVE[name].name if name in METRIC_OF_OBJECTIVE else name for name in study.search.objectives]
     objectives = [_objective_of(look_up(name, OBJECTIVES_KEY)) for name in names]
     _check_duplicates(objectives, lookup.source)
     scoring = Scoring(metrics=tuple(metric.facts for metric in metrics.values()), objectives=tuple(objectives))
@@ -111,7 +110,8 @@ def _objective_of(record: Metric | Change) -> Objective:
 def _check_duplicates(objectives: Iterable[Objective], source: str) -> None:
     names = [objective.name for objective in objectives]
     if len(set(names)) < len(names):
-        raise InputError(source, f"search.objectives: one of {', '.join(names)} is named twice", one_of([*METRICS, *FURTHER, *CHANGES]))
+        choices = one_of([*METRICS, *OPTIONAL_METRICS, *CHANGES])
+        raise InputError(source, f"search.objectives: one of {', '.join(names)} is named twice", choices)
 
 
 CONTROLLER_FORMS = "a function step(traci, vehicle_id), or a class with that method"
@@ -175,7 +175,7 @@ class System:
         if uses_traci and not self._has_limited_range():
             remarks += [f"weather {name!r}: visibility = {value:g} has no effect: the vehicle has no sensor range, so a controller written "
                       "for TraCI sees everything" for name, value in visibilities.items()]
-        if not any(getattr(self.ads, name, 0.0) for name in REACTIONS):
+        if not any(getattr(self.ads, name, 0.0) for name in REACTION_PARAMETERS):
             remarks += [f"weather {name!r} has no effect: its road and its visibility are those of clear weather, and no key of "
                       "[ads.parameters] delays the ADS in it"
                       for name in dict.fromkeys(point.weather.name for point in self.points if _equals_clear(point.weather))]
@@ -361,5 +361,5 @@ def _create_ads(table: ModelTable, lookup: Lookup, time_limit: float) -> tuple[A
     make = partial(instance_of, member, parameters, name, "ads.parameters", lookup.source)
     driver = make()  # also for a ScalarAds, so that wrong parameters raise errors here
     if issubclass(member.target, ScalarAds):
-        return PerVehicle(make, member.guard or Guard(lookup.source, name)), member
+        return PerVehicleAds(make, member.guard or Guard(lookup.source, name)), member
     return (driver if member.guard is None else GuardedAds(driver, member.guard)), member

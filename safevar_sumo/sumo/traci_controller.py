@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from safevar_sumo.ads.driver import Trim, pedals, trim
+from safevar_sumo.ads.driver import Trim, pedals_for, trim_at
 from safevar_sumo.plugins import Guard, ModuleCopies
 from safevar_sumo.records import Command, Nominal, Observation
 from safevar_sumo.scenarios import VUT
@@ -48,7 +48,7 @@ class TraciController:
         return _Memory(nominal, traffic, drivers, None)
 
     def drive(self, seen: Observation, memory: _Memory) -> tuple[Command, _Memory]:
-        initial_trim = trim(memory.nominal, seen) if memory.initial_trim is None else memory.initial_trim
+        initial_trim = trim_at(memory.nominal, seen) if memory.initial_trim is None else memory.initial_trim
         accelerations = np.zeros(len(memory.drivers))
         if memory.initial_trim is not None:  # `start` recorded the first step
             memory.traffic.record_step()
@@ -56,7 +56,7 @@ class TraciController:
             for i, driver in enumerate(memory.drivers):
                 if driver.view.on_the_road:
                     accelerations[i] = driver.step(seen.time, float(seen.speed[i]))
-        return pedals(memory.nominal, seen.speed, accelerations, initial_trim), memory._replace(initial_trim=initial_trim)
+        return pedals_for(memory.nominal, seen.speed, accelerations, initial_trim), memory._replace(initial_trim=initial_trim)
 
 
 class _Memory(NamedTuple):

@@ -9,7 +9,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from safevar_sumo.ads import ADS, Ads, PerVehicle, ScalarAds
+from safevar_sumo.ads import ADS, Ads, PerVehicleAds, ScalarAds
 from safevar_sumo.ads.world_on_rails import WorldOnRails
 from safevar_sumo.plugins import Guard
 from safevar_sumo.records import Nominal, Observation
@@ -99,7 +99,7 @@ class Timid(ScalarAds):
 
 
 def test_a_scalar_ads_drives_every_vehicle_with_an_instance_of_its_own() -> None:
-    ads = PerVehicle(Timid, GUARD)
+    ads = PerVehicleAds(Timid, GUARD)
     memory = ads.start(3, KNOWN, STEP)
     gap = np.array([5.0, 50.0, 50.0])
     for expected in ([0.0, 0.1, 0.1], [0.0, 0.2, 0.2]):

@@ -154,14 +154,14 @@ def test_fuzzy_metrics_are_those_worked_out_by_hand() -> None:
     """v = 20, u = 10: d_safe = 15 + 50 - 50/7 + 2 = 59.857, d_unsafe = 15 + 33.333 - 7.143 = 41.190, at gap - 2."""
     model, one = FuzzySafety(), np.ones(1)
     for gap, pfs in ((62.0, 0.0), (43.1, 1.0), (52.523809, 0.5)):
-        assert model.proactive(gap * one, 20 * one, 10 * one)[0] == pytest.approx(pfs, abs=1e-3)
+        assert model.proactive_metric(gap * one, 20 * one, 10 * one)[0] == pytest.approx(pfs, abs=1e-3)
     # a = 0: v' = 20; closing = 7.5, d_safe = 7.5 + 12.5 = 20, d_unsafe = 7.5 + 8.333 = 15.833
     for gap, cfs in ((20.1, 0.0), (15.8, 1.0), (17.91667, 0.5)):
-        assert model.critical(gap * one, 20 * one, 10 * one, 0 * one)[0] == pytest.approx(cfs, abs=1e-4)
+        assert model.critical_metric(gap * one, 20 * one, 10 * one, 0 * one)[0] == pytest.approx(cfs, abs=1e-4)
     # a = -8, at most -4: v' = 12 - 3 = 9 < u = 10: a crash is ahead where the gap is below (12 - 10)^2 / (2 * 4) = 0.5
-    assert model.critical(0.4 * one, 12 * one, 10 * one, -8 * one)[0] == 1
-    assert model.critical(0.6 * one, 12 * one, 10 * one, -8 * one)[0] == 0
-    assert model.critical(1.0 * one, 10 * one, 10 * one, 0 * one)[0] == 0
+    assert model.critical_metric(0.4 * one, 12 * one, 10 * one, -8 * one)[0] == 1
+    assert model.critical_metric(0.6 * one, 12 * one, 10 * one, -8 * one)[0] == 0
+    assert model.critical_metric(1.0 * one, 10 * one, 10 * one, 0 * one)[0] == 0
 
 
 def driven(driver: Any, seconds: float, speed: float, gap: float, leader: float = 0.0,

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from safevar_sumo.ads import GuardedAds, PerVehicle, ScalarAds
+from safevar_sumo.ads import GuardedAds, PerVehicleAds, ScalarAds
 from safevar_sumo.ads.aeb import Aeb
 from safevar_sumo.plugins import Guard
 from safevar_sumo.records import Command, SimulationRuns
@@ -67,6 +67,6 @@ class NearForMany(Hold):
 
 def test_an_ads_of_ones_own_warns() -> None:
     guard, original = Guard("it.toml", "ads"), CARLA.characteristics.original
-    for ads in (PerVehicle(Near, guard), GuardedAds(NearForMany(), guard)):
+    for ads in (PerVehicleAds(Near, guard), GuardedAds(NearForMany(), guard)):
         run = driven(CarToCar(test="CCRs", speed=36), ads, np.stack([original, original]))
         assert run.warning_ttc == pytest.approx([2.0, 2.0], abs=STEP + 1e-6)

@@ -14,9 +14,9 @@ from vehiclemodels.parameters_vehicle2 import parameters_vehicle2
 from vehiclemodels.vehicle_dynamics_mb import vehicle_dynamics_mb
 
 from safevar_sumo.analysis.opinion import OpinionOptions
-from safevar_sumo.analysis.opinion.compute import JudgedCause, opinions_of, second_system
-from safevar_sumo.analysis.opinion.mapping import TABLES
-from safevar_sumo.analysis.opinion.multi_body import MultiBody, Plant, advance, at_speed, plant_of, rates, tyre_forces
+from safevar_sumo.analysis.opinion.compute import CauseToJudge, assemble_both_systems, judge_causes
+from safevar_sumo.analysis.opinion.mapping import MAPPING_TABLES
+from safevar_sumo.analysis.opinion.multi_body import MultiBodyState, Plant, advance, at_speed, body_derivatives, build_plant, tyre_forces
 from safevar_sumo.analysis.opinion.result import OpinionVerdict
 from safevar_sumo.cli.program import commands
 from safevar_sumo.errors import InputError
@@ -34,8 +34,8 @@ ONE = np.ones(1)
 def bmw() -> Plant:
     """The package's vehicle 2 with its own masses."""
     p = parameters_vehicle2()
-    plant = plant_of(p.m * ONE, p.m, LEVEL, radius=p.R_w, wheel_inertia=p.I_y_w, friction=p.tire.p_dx1,
-                     brake_torque=9 * p.m * p.R_w, brake_front=p.T_sb, drive_front=p.T_se)
+    plant = build_plant(p.m * ONE, p.m, LEVEL, radius=p.R_w, wheel_inertia=p.I_y_w, friction=p.tire.p_dx1,
+                        brake_torque=9 * p.m * p.R_w, brake_front=p.T_sb, drive_front=p.T_se)
     return plant._replace(sprung_mass=p.m_s * ONE, unsprung_mass=p.m_uf * ONE, height=p.h_s * ONE)
 
 
@@ -52,17 +52,17 @@ def test_the_right_hand_side_is_the_packages(seed: int) -> None:
     acceleration = rng.uniform(-9, 3)
     theirs = vehicle_dynamics_mb(list(x), [0.0, acceleration], p)
     torque, share = p.m * p.R_w * acceleration * ONE, p.T_sb if acceleration < 0 else p.T_se
-    body = MultiBody(*(value * ONE for value in (x[3], x[8], x[9], x[11], x[12])), *(np.array([pair]).T for pair in (
+    body = MultiBodyState(*(value * ONE for value in (x[3], x[8], x[9], x[11], x[12])), *(np.array([pair]).T for pair in (
         (x[16], x[21]), (x[17], x[22]), (front, rear), (1.0, 1.0))))
-    ours = rates(bmw(), body, np.stack([share * torque, (1 - share) * torque]), tyre_forces(bmw(), body))
-    flat = [ours.speed, ours.pitch_rate, ours.heave_rate, *ours.height_rates, *ours.wheels]
+    ours = body_derivatives(bmw(), body, np.stack([share * torque, (1 - share) * torque]), tyre_forces(bmw(), body))
+    flat = [ours.speed, ours.pitch_rate, ours.heave_rate, *ours.axle_rates, *ours.wheel_speeds]
     assert np.concatenate(flat) == pytest.approx([theirs[column] for column in (3, 9, 12, 17, 22, 23, 25)], rel=1e-9)
 
 
 def stopping_distance(study: str, speed: float, road: float, **changes: float) -> float:
     """Full braking of the second model's vehicle, from when the brake acts [m]."""
     setting = {name: row.original * ONE for name, row in load_study(study).vehicle.characteristics.items()}
-    second = second_system(load_study(study))[1].vehicle
+    second = assemble_both_systems(load_study(study))[1].vehicle
     plant = second.prepare({**setting, **{name: value * ONE for name, value in changes.items()}}, road, 0.05).parameters.plant
     body, way = at_speed(plant, speed * ONE), 0.0
     while body.speed[0] > 0:
@@ -92,10 +92,10 @@ def test_at_the_limit_the_anti_lock_controller_uses_the_friction(friction: float
 
 @pytest.mark.parametrize("name", VEHICLES)
 def test_every_characteristic_is_in_the_table_or_outside_and_acts_as_the_table_says(name: str) -> None:
-    study = load_study(TABLES[name].study)
-    system, second, mapping = second_system(study)
+    study = load_study(MAPPING_TABLES[name].study)
+    system, second, mapping = assemble_both_systems(study)
     assert mapping.name == name
-    assert mapping.table.names | set(mapping.table.outside) == set(VEHICLES[name].UNITS)
+    assert mapping.table.represented_names | set(mapping.table.omission_reasons) == set(VEHICLES[name].UNITS)
     original = {one.name: one.original * ONE for one in system.characteristics}
 
     def constants(**changes: float) -> list[float]:
@@ -106,7 +106,7 @@ def test_every_characteristic_is_in_the_table_or_outside_and_acts_as_the_table_s
 
     for member in system.characteristics:
         value = member.lower if member.lower != member.original else member.upper
-        assert (constants(**{member.name: value}) != constants()) == (member.name in mapping.table.names), member.name
+        assert (constants(**{member.name: value}) != constants()) == (member.name in mapping.table.represented_names), member.name
     rows = {row.characteristic: row.unit for row in mapping.table.rows}
     assert rows.items() <= VEHICLES[name].UNITS.items()
 
@@ -115,7 +115,7 @@ def test_every_characteristic_is_in_the_table_or_outside_and_acts_as_the_table_s
 @pytest.mark.parametrize("study", ["sun", "lgsvl", "native"])
 def test_the_original_vehicle_meets_the_same_encounter(study: str) -> None:
     """The second model starts as ours does, and stops within half a metre of where ours does."""
-    system, second, _ = second_system(load_study(study))
+    system, second, _ = assemble_both_systems(load_study(study))
     here, there = (simulate(one, system.characteristics.original[np.newaxis]) for one in (system, second))
     assert [str(run.outcome[0]) for run in (here, there)] == ["stopped", "stopped"]
     apart = np.abs(here.trace.speed[:40, 0] - there.trace.speed[:40, 0])
@@ -182,14 +182,14 @@ def test_a_failure_that_our_model_alone_has_is_contradicted(made: str, tmp_path:
             for name, row in load_study("wear").vehicle.characteristics.items()}
     study = load_study({"extends": "wear", "name": "glitch", "matrix": ONE_TEST,
                         "vehicle": {"model": f"glitch_{made.lower()}:{made}", "characteristics": rows}})
-    causes = [JudgedCause("nsga2:0:0", {"payload": 300.0}, 0.9), JudgedCause("nsga2:0:1", {"brakeResponse": 0.4}, 0.9)]
-    planted, true = opinions_of(study, causes, Unsafe()).opinions
+    causes = [CauseToJudge("nsga2:0:0", {"payload": 300.0}, 0.9), CauseToJudge("nsga2:0:1", {"brakeResponse": 0.4}, 0.9)]
+    planted, true = judge_causes(study, causes, Unsafe()).opinions
     assert planted.to_dict() | {"because": ""} == {
         "solution": "nsga2:0:0", "changes": {"payload": 300.0},
         "here": {"outcome": "collision", "safety_degree": planted.here.safety_degree},
         "there": {"outcome": "passed", "safety_degree": planted.there.safety_degree}, "opinion": "contradicted", "because": ""}
     assert true.opinion == OpinionVerdict.CONFIRMED
-    assert opinions_of(study, causes, Unsafe()).opinions == (planted, true)
+    assert judge_causes(study, causes, Unsafe()).opinions == (planted, true)
 
 
 def test_what_cannot_be_represented_at_all_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -199,7 +199,7 @@ def test_what_cannot_be_represented_at_all_is_refused(tmp_path: Path, monkeypatc
     study = load_study({"extends": "wear", "name": "boat", "matrix": ONE_TEST,
                         "vehicle": {"model": "glitch_boat:Boat", "characteristics": rows}})
     with pytest.raises(InputError, match=r"glitch_boat:Boat.*sails"):
-        second_system(study)
+        assemble_both_systems(study)
 
 
 @pytest.mark.slow
@@ -209,7 +209,7 @@ def test_the_command_asks_about_the_failures_or_about_those_named(slippery: Path
     every = json.loads(done.stdout)
     assert {one["opinion"] for one in every} <= {str(verdict) for verdict in OpinionVerdict}
     assert all(list(one) == ["solution", "changes", "here", "there", "opinion", "because"] for one in every)
-    outside = set(TABLES["carla"].outside)
+    outside = set(MAPPING_TABLES["carla"].omission_reasons)
     for one in every:
         assert (one["opinion"] == "outside") == bool(outside & set(one["changes"]))
         assert (one["there"]["outcome"] is None) == (one["opinion"] == "outside")

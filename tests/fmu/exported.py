@@ -9,10 +9,10 @@ from pathlib import Path
 from pythonfmu.builder import FmuBuilder
 from pythonfmu3.builder import FmuBuilder as FmuBuilder3
 
-from safevar_sumo.ads.fmu import OBSERVATIONS
+from safevar_sumo.ads.fmu import OBSERVATION_UNITS
 from safevar_sumo.records import Nominal
 
-SEEN = tuple(name for name in OBSERVATIONS if name != "detected")
+SEEN = tuple(name for name in OBSERVATION_UNITS if name != "detected")
 AEB = '''
 import numpy as np
 from pythonfmu import Fmi2Causality, Fmi2Slave, Fmi2Variability, Real

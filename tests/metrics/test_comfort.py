@@ -11,8 +11,8 @@ from scipy import signal
 
 import safevar_sumo as sv
 from safevar_sumo.errors import InputError
-from safevar_sumo.metrics import FURTHER
-from safevar_sumo.metrics.comfort import weighted
+from safevar_sumo.metrics import OPTIONAL_METRICS
+from safevar_sumo.metrics.comfort import weight_acceleration
 from safevar_sumo.records import Encounter, SimulationRuns, Trace
 from safevar_sumo.study import MetricsTable, load_study
 from safevar_sumo.sumo.system import assemble
@@ -27,7 +27,7 @@ def comfort(name: str, speed: np.ndarray, until: float = np.inf, collision_speed
                   throttle=zero, brake=zero, gear=zero, active=np.repeat((time <= until)[:, np.newaxis], v.shape[1], axis=1))
     runs = SimulationRuns(trace=trace, encounter=Encounter(zero, zero, zero, zero > 0), outcome=np.full(v.shape[1], "stopped"),
                           collision_speed=np.full(v.shape[1], collision_speed))
-    return FURTHER[name](runs, MetricsTable(ttc_threshold=2.0))
+    return OPTIONAL_METRICS[name](runs, MetricsTable(ttc_threshold=2.0))
 
 
 def sampled(speed: Callable[[np.ndarray], np.ndarray], seconds: float = 6.0) -> np.ndarray:
@@ -57,7 +57,7 @@ def test_weighting_agrees_with_iso_2631_1(frequency: float) -> None:
     time = np.arange(0, 40, step)
     low = np.abs(1j * f) ** 2 / np.abs((1j * f) ** 2 + np.sqrt(2) * 0.4 * 1j * f + 0.4**2)
     shape = np.abs((1 + 1j * f / 2) / (1 + 1j * f / (0.63 * 2) - (f / 2) ** 2))
-    settled = weighted(np.sin(2 * np.pi * f * time)[:, np.newaxis], step)[len(time) // 2:]
+    settled = weight_acceleration(np.sin(2 * np.pi * f * time)[:, np.newaxis], step)[len(time) // 2:]
     assert np.sqrt(2 * np.mean(settled**2)) == pytest.approx(low * shape, rel=2e-3)
 
 
@@ -78,7 +78,7 @@ def test_rms_is_over_the_run_and_not_over_what_follows_its_end() -> None:
     assert comfort("rms_acceleration", speed, until=99 * STEP + STEP / 2) == pytest.approx(comfort("rms_acceleration", speed[:100]))
 
 
-@pytest.mark.parametrize("name", FURTHER)
+@pytest.mark.parametrize("name", OPTIONAL_METRICS)
 def test_each_vehicle_counts_for_itself_to_the_bit_and_not_on_a_collision(name: str) -> None:
     speed = np.cumsum(np.random.default_rng(2).normal(size=(150, 7)), axis=0)
     assert np.array_equal(comfort(name, speed)[[4]], comfort(name, speed[:, 4].copy()))

@@ -50,7 +50,7 @@ class Calculator:
         self.run("preprocess", place, "-i", str(predicted), "-o", str(place))
         return place / "ca_preprocessed_template.xlsx"
 
-    def scored(self, filled: Path, place: Path) -> CalculatorScores:
+    def scores(self, filled: Path, place: Path) -> CalculatorScores:
         place.mkdir()
         output = self.run("compute-score", place, "-i", str(filled), "-o", str(place))
         assert "Warning" not in output, output

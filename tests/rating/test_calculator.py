@@ -10,7 +10,7 @@ import openpyxl
 import pytest
 
 from safevar_sumo.analysis.rating.compute import RatedVehicle, rate
-from safevar_sumo.analysis.rating.workbook import Preprocessed, Template
+from safevar_sumo.analysis.rating.workbook import PreprocessedFile, Template
 from safevar_sumo.errors import InputError
 from safevar_sumo.protocol import EURO_NCAP_2026, points_of, protocol_of
 from safevar_sumo.records import CellResults
@@ -39,8 +39,8 @@ def agrees(rated: RatedVehicle, calculator: Calculator, template: Path, place: P
     place.mkdir(exist_ok=True)
     Template(template, place / "predicted.xlsx").fill(rated)
     drawn = calculator.preprocessed(place / "predicted.xlsx", place / "drawn")
-    Preprocessed(drawn, place / "measured.xlsx").fill(rated)
-    theirs = calculator.scored(place / "measured.xlsx", place / "scored")
+    PreprocessedFile(drawn, place / "measured.xlsx").fill(rated)
+    theirs = calculator.scores(place / "measured.xlsx", place / "scored")
     ours: dict[str, np.ndarray] = {}
     for test in rated.tests:
         ours[test.block.test] = ours.get(test.block.test, np.zeros(3)) + np.array(test.points)
@@ -72,7 +72,7 @@ def test_vehicles_with_any_colours_score_alike(seed: int, calculator: Calculator
     if seed % 2:
         nominal = [PROTOCOL.matrix_cell_numbers[cell.block.name, cell.row, cell.column] for cell in PROTOCOL.cells]
     cells, claims = CellResults(impact[:, nominal], warning[:, nominal], np.ones((1, N), dtype=bool)), CLAIMS if seed % 3 else {}
-    rated = RatedVehicle(name="any", setting={}, protocol=PROTOCOL, cells=cells, scored=points_of(PROTOCOL, cells, claims), claims=claims)
+    rated = RatedVehicle(name="any", setting={}, protocol=PROTOCOL, cells=cells, scores=points_of(PROTOCOL, cells, claims), claims=claims)
     assert rated.fails == (seed == 0)
     agrees(rated, calculator, template, tmp_path)
 
@@ -106,4 +106,4 @@ def test_other_cells_and_sheets_are_refused_by_name(template: Path, tmp_path: Pa
     with pytest.raises(InputError, match=r"has no sheet 'FC - Car & PTW pred\.'"):
         Template(tmp_path / "other.xlsx", tmp_path / "out.xlsx")
     with pytest.raises(InputError, match=r"has no sheet 'FC - Car & PTW verif.'"):
-        Preprocessed(template, tmp_path / "out.xlsx")
+        PreprocessedFile(template, tmp_path / "out.xlsx")

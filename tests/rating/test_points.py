@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from safevar_sumo.analysis.rating.compute import RatedVehicle, Rating
 from safevar_sumo.analysis.rating.render import rating_in_words
-from safevar_sumo.analysis.rating.workbook import Preprocessed, Template
+from safevar_sumo.analysis.rating.workbook import PreprocessedFile, Template
 from safevar_sumo.cli.program import commands
 from safevar_sumo.errors import InputError
 from safevar_sumo.protocol import COLOURS, EURO_NCAP_2026, cells_of_part, points_of, protocol_of
@@ -47,7 +47,7 @@ def numbers(test: str, kind: str = "", light: str | None = None) -> list[int]:
 
 def rated(cells: CellResults, name: str = "original", claims: dict[str, list[str]] | None = None) -> RatedVehicle:
     scored = points_of(PROTOCOL, cells, claims)
-    return RatedVehicle(name=name, setting={}, protocol=PROTOCOL, cells=cells, scored=scored, claims=claims or {})
+    return RatedVehicle(name=name, setting={}, protocol=PROTOCOL, cells=cells, scores=scored, claims=claims or {})
 
 
 @pytest.mark.parametrize("vut", BANDS)
@@ -214,7 +214,7 @@ def test_what_a_command_cannot_write_or_read_is_refused_before_anything_is_simul
     assert not Path(new).exists()
 
 
-@pytest.mark.parametrize("kind", [Template, Preprocessed])
+@pytest.mark.parametrize("kind", [Template, PreprocessedFile])
 def test_a_spreadsheet_of_another_version_is_refused_by_its_version(kind: Any, tmp_path: Path) -> None:
     book = openpyxl.Workbook()
     book.create_sheet("Version")["B1"] = "6.0.0"

@@ -19,7 +19,7 @@ from safevar_sumo.analysis.explain.render import print_explained
 from safevar_sumo.analysis.explain.summary import summarise_failures
 from safevar_sumo.analysis.rating import RatingOptions, compute
 from safevar_sumo.analysis.rating.render import matrices_figure, print_matrices, print_rating, turned_in_words
-from safevar_sumo.analysis.research_questions.case import case_of
+from safevar_sumo.analysis.research_questions.case import build_case
 from safevar_sumo.analysis.risk.rare import Response
 from safevar_sumo.analysis.tolerance import ToleranceOptions
 from safevar_sumo.analysis.tolerance.compute import find_tolerances
@@ -129,7 +129,7 @@ def test_at_one_cell_a_collision_is_unsafe_and_points_are_no_column() -> None:
     evaluations = evaluator.evaluate(settings, "it")
     solutions = solutions_frame(evaluator.characteristics.names, [(("nsga2", 0), evaluations)])
     scoring = assemble(STUDY).measuring.scoring
-    case = case_of(STUDY, record(evaluator.evaluate_original(), 0), solutions, pd.DataFrame(), [("nsga2", 0)], scoring=scoring)
+    case = build_case(STUDY, record(evaluator.evaluate_original(), 0), solutions, pd.DataFrame(), [("nsga2", 0)], scoring=scoring)
     assert case.unsafe.points is not None
     here = at_point(case, "CCRs, 80 km/h, 100 %, wet")
     stated = RatingOptions(solution="nsga2:0:1", changes={"payload": 200.0})

@@ -8,7 +8,7 @@ from typing import Any
 import msgspec
 import pandas as pd
 
-from safevar_sumo.analysis.research_questions.case import Case, case_of
+from safevar_sumo.analysis.research_questions.case import Case, build_case
 from safevar_sumo.study import CharacteristicTable, Study, load_study
 
 ORIGINAL = {"safety_degree": 2.0, "tet": 1.0, "tit": 0.5, "ave_dece": 6.0}
@@ -49,4 +49,4 @@ def made_up(*rows: Mapping[str, Any], original: Mapping[str, Any] = ORIGINAL, st
     done = list(dict.fromkeys((one["algorithm"], one["run"]) for one in rows)) if finished is None else finished
     seen = frame(evaluations)
     seen.insert(2, "evaluation", [one["evaluation"] for one in evaluations])
-    return case_of(study or made_up_study(), original, frame(rows), seen, done if has_runs else (), has_runs)
+    return build_case(study or made_up_study(), original, frame(rows), seen, done if has_runs else (), has_runs)

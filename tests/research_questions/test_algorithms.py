@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 import scipy
 
-from safevar_sumo.analysis.research_questions.algorithm_figures import attainment_surfaces, cliques, critical_differences
-from safevar_sumo.analysis.research_questions.algorithms import attainment, critical_difference, pairs, ranks
-from safevar_sumo.analysis.research_questions.answer import answer
-from safevar_sumo.analysis.research_questions.case import Case, Unanswerable
+from safevar_sumo.analysis.research_questions.algorithm_figures import draw_attainment_surfaces, draw_critical_differences, find_cliques
+from safevar_sumo.analysis.research_questions.algorithms import compare_pairs, compute_attainment, critical_difference, rank_algorithms
+from safevar_sumo.analysis.research_questions.answer import answer_questions
+from safevar_sumo.analysis.research_questions.case import Case, UnanswerableError
 from safevar_sumo.analysis.research_questions.comparisons import compare_samples, reverse_effect
-from safevar_sumo.analysis.research_questions.over_runs import holm
+from safevar_sumo.analysis.research_questions.over_runs import correct_by_holm
 from safevar_sumo.analysis.research_questions.tables import FORMATS_WITH_LAYOUT
 from tests.research_questions.made_up import made_up, made_up_study, row
 
@@ -36,7 +36,7 @@ def three_algorithms() -> Case:
 
 def test_every_pair_is_tested_once_and_corrected_for_all() -> None:
     case = three_algorithms()
-    frame = pairs(case)
+    frame = compare_pairs(case)
     assert len(frame) == 3 * 7
     assert set(zip(frame["algorithm"], frame["other"], strict=True)) == {("nsga2", "spea2"), ("nsga2", "mocell"), ("spea2", "mocell")}
     means = {name: [group["safety_degree"].mean() for _, group in case.solutions_of(name).groupby("run")] for name in case.algorithms}
@@ -45,12 +45,12 @@ def test_every_pair_is_tested_once_and_corrected_for_all() -> None:
     assert (chosen["p_value"], chosen["effect_size"]) == (expected.p_value, expected.effect_size)
     assert (chosen["n1"], chosen["n2"]) == (RUNS, RUNS - 1)
     assert chosen["effect_size"] == 1, "every run of SPEA2 is more unsafe"
-    assert frame["p_holm"].tolist() == holm(frame["p_value"].tolist())
+    assert frame["p_holm"].tolist() == correct_by_holm(frame["p_value"].tolist())
 
 
 def test_ranks_are_friedmans_over_the_runs_that_all_have() -> None:
     case = three_algorithms()
-    frame = ranks(case)
+    frame = rank_algorithms(case)
     part = frame[frame["metric"] == "safety_degree"].set_index("algorithm")
     runs = [run for run in range(RUNS) if run != 3]
     means = case.solutions.groupby(["run", "algorithm"])["safety_degree"].mean()
@@ -61,7 +61,7 @@ def test_ranks_are_friedmans_over_the_runs_that_all_have() -> None:
     assert part.loc["spea2", "mean_rank"] == 1
     assert part["mean_rank"].sum() == pytest.approx(6)
     by_metric = frame.drop_duplicates("metric")
-    assert by_metric["p_holm"].tolist() == holm(by_metric["p_value"].tolist())
+    assert by_metric["p_holm"].tolist() == correct_by_holm(by_metric["p_value"].tolist())
 
 
 @pytest.mark.parametrize(("algorithms", "runs", "published"), [(4, 14, 1.25), (5, 30, 1.11)])
@@ -71,36 +71,36 @@ def test_critical_differences_are_published_ones(algorithms: int, runs: int, pub
 
 
 def test_a_bar_joins_the_largest_groups_that_are_not_told_apart() -> None:
-    assert cliques(np.array([1.2, 1.9, 2.1, 3.5]), 1.0) == [(0, 2)]
-    assert cliques(np.array([1.0, 1.8, 2.6]), 1.0) == [(0, 1), (1, 2)]
-    assert cliques(np.array([1.0, 3.0]), 1.0) == []
+    assert find_cliques(np.array([1.2, 1.9, 2.1, 3.5]), 1.0) == [(0, 2)]
+    assert find_cliques(np.array([1.0, 1.8, 2.6]), 1.0) == [(0, 1), (1, 2)]
+    assert find_cliques(np.array([1.0, 3.0]), 1.0) == []
 
 
 def test_attainment_is_what_so_many_runs_reach() -> None:
     """Two runs by hand: one has (1, 0.4), the other (2, 0.2): both reach (2, 0.4)."""
     case = made_up(row("nsga2", 0, (900.0, 2.0, 0.1), sd=1.0, f_diff=0.4), row("nsga2", 1, (900.0, 2.0, 0.1), sd=2.0, f_diff=0.2))
-    surface = attainment(case)["nsga2"]
+    surface = compute_attainment(case)["nsga2"]
     assert surface[50.0].tolist() == [[1.0, 0.4], [2.0, 0.2]]
     assert surface[100.0].tolist() == [[2.0, 0.4]]
 
 
 def test_what_cannot_be_asked_says_why() -> None:
     two = made_up(row("nsga2"), row("rs"))
-    for question in (ranks, critical_differences):
-        with pytest.raises(Unanswerable, match="of 2 algorithms"):
+    for question in (rank_algorithms, draw_critical_differences):
+        with pytest.raises(UnanswerableError, match="of 2 algorithms"):
             question(two)
-    with pytest.raises(Unanswerable, match="of 1 algorithm"):
-        pairs(made_up(row("nsga2")))
-    with pytest.raises(Unanswerable, match="imported"):
-        pairs(made_up(row("nsga2"), row("rs"), has_runs=False))
+    with pytest.raises(UnanswerableError, match="of 1 algorithm"):
+        compare_pairs(made_up(row("nsga2")))
+    with pytest.raises(UnanswerableError, match="imported"):
+        compare_pairs(made_up(row("nsga2"), row("rs"), has_runs=False))
 
 
 @pytest.mark.slow
 def test_tables_and_figures_of_three_algorithms_can_be_made() -> None:
     case = three_algorithms()
     for name in ("rq2-pairs", "rq2-ranks"):
-        for rendered in (make(answer([case], name)) for make in FORMATS_WITH_LAYOUT.values()):
+        for rendered in (make(answer_questions([case], name)) for make in FORMATS_WITH_LAYOUT.values()):
             assert "SPEA2" in rendered
             assert "MOCell" in rendered
-    assert len(critical_differences(case).axes) == 3
-    assert [axis.get_title() for axis in attainment_surfaces(case).axes] == ["NSGA-II", "SPEA2", "MOCell"]
+    assert len(draw_critical_differences(case).axes) == 3
+    assert [axis.get_title() for axis in draw_attainment_surfaces(case).axes] == ["NSGA-II", "SPEA2", "MOCell"]

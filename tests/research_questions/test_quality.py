@@ -11,16 +11,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from safevar_sumo.analysis.research_questions.comparisons import ASYMPTOTIC_TEST, EXACT_TEST, TwoSampleTest, compare_samples, magnitude
+from safevar_sumo.analysis.research_questions.comparisons import ASYMPTOTIC_TEST, EXACT_TEST, TwoSampleTest, compare_samples, magnitude_of
 from safevar_sumo.analysis.research_questions.indicators import (
     Scale,
-    convergence,
+    compute_convergence,
+    compute_indicators,
     hypervolume,
     igd,
     igd_plus,
-    indicators,
-    nondominated,
-    objectives,
+    nondominated_points,
+    objective_values,
     reference_front,
 )
 from safevar_sumo.errors import InputError
@@ -50,8 +50,8 @@ def test_hypervolume_of_boxes() -> None:
     assert hypervolume(np.full((1, 3), 1.2)) == 0
 
 
-@pytest.mark.parametrize("indicator", [lambda front: igd(front, FRONT), lambda front: igd_plus(front, FRONT), hypervolume, nondominated,
-                                       lambda front: igd(FRONT, front)])
+@pytest.mark.parametrize("indicator", [lambda front: igd(front, FRONT), lambda front: igd_plus(front, FRONT), hypervolume,
+                                       nondominated_points, lambda front: igd(FRONT, front)])
 @pytest.mark.parametrize("front", [np.zeros((0, 3)), np.array([[math.nan, 0, 0]]), np.array([[math.inf, 0, 0]])])
 def test_no_indicator_of_an_empty_or_undefined_front(indicator: Any, front: np.ndarray) -> None:
     with pytest.raises(InputError, match=r"empty|undefined"):
@@ -61,7 +61,7 @@ def test_no_indicator_of_an_empty_or_undefined_front(indicator: Any, front: np.n
 def test_nondominated_points_are_those_that_none_dominates() -> None:
     points = np.random.default_rng(7).integers(0, 5, size=(60, 3)).astype(float)
     kept = {tuple(one) for one in points if not any((other <= one).all() and (other < one).any() for other in points)}
-    result = nondominated(points)
+    result = nondominated_points(points)
     assert {tuple(one) for one in result} == kept
     assert len(result) == len(kept)
 
@@ -81,7 +81,7 @@ def test_the_reference_front_is_of_all_runs_of_all_algorithms() -> None:
 
 def test_indicators_are_those_of_each_runs_own_front() -> None:
     case = made_up(row(sd=1, f_diff=0.5), row("rs", sd=0.5, f_diff=0.7), row("rs", run=1, sd=1, f_diff=0.6))
-    result = indicators(case).set_index(["algorithm", "run"])
+    result = compute_indicators(case).set_index(["algorithm", "run"])
     apart = math.hypot(0.5, 0.2)
     assert result.loc[("nsga2", 0), "igd"] == pytest.approx(apart / 2)
     assert result.loc[("rs", 1), "igd"] == pytest.approx((0.1 + math.hypot(0.5, 0.1)) / 2)
@@ -94,12 +94,12 @@ def test_convergence_grows_to_the_hypervolume_of_all() -> None:
     evaluations = [{**row("nsga2", run, sd=sd, f_diff=diff), "evaluation": i}
                    for run in (0, 1) for i, (sd, diff) in enumerate(rng.uniform(0.1, 1, size=(100 if run else 40, 2)))]
     case = made_up(row(sd=0.1, f_diff=1), row(run=1, sd=1, f_diff=0.1), evaluations=evaluations)
-    grown = convergence(case)
+    grown = compute_convergence(case)
     assert set(grown["evaluations"]) >= {10, 100}
     for run, group in grown.groupby("run"):
         assert (np.diff(group["hypervolume"]) >= 0).all()
         seen = case.evaluations[case.evaluations["run"] == run]
-        normal = Scale.of(reference_front(case)).normalised(objectives(case, seen))
+        normal = Scale.of(reference_front(case)).normalised(objective_values(case, seen))
         assert group["hypervolume"].iloc[-1] == pytest.approx(moocore.hypervolume(normal, ref=[1.1] * 3))
     early = grown[grown["run"] == 0]
     assert early.loc[early["evaluations"] >= 40, "hypervolume"].nunique() == 1, "a run that ended early keeps what it had"
@@ -158,4 +158,4 @@ def test_nan_is_refused() -> None:
     (0.638, "medium"), (0.7139, "medium"), (0.714, "large"), (1, "large"), (0.362, "medium"), (0.3621, "small"), (0.286, "large"),
     (0.2861, "medium"), (0, "large"), (1 - 0.714, "large"), (1 - 0.638, "medium"), (1 - 0.556, "small")])
 def test_magnitudes_are_kitchenhams(effect: float, name: str) -> None:
-    assert magnitude(effect) == name
+    assert magnitude_of(effect) == name

@@ -11,21 +11,21 @@ import pandas as pd
 import pytest
 import scipy
 
-from safevar_sumo.analysis.research_questions.answer import answer
-from safevar_sumo.analysis.research_questions.case import Unanswerable
+from safevar_sumo.analysis.research_questions.answer import answer_questions
+from safevar_sumo.analysis.research_questions.case import UnanswerableError
 from safevar_sumo.analysis.research_questions.changes import (
-    collisions,
-    combinations,
-    critical,
+    compare_weathers,
+    count_collisions,
+    critical_solutions,
+    find_weather_pairs,
+    frequent_combinations,
     rq31,
     rq32,
     rq33,
     rq33_safety,
-    weather,
-    weather_pairs,
 )
 from safevar_sumo.analysis.research_questions.comparisons import ALPHA, rq1, rq2
-from safevar_sumo.analysis.research_questions.over_runs import difference_line, holm, rq1_runs, rq2_runs, summary_lines
+from safevar_sumo.analysis.research_questions.over_runs import correct_by_holm, difference_line, rq1_runs, rq2_runs, summary_lines
 from safevar_sumo.errors import InputError
 from safevar_sumo.study import CharacteristicTable
 from tests.research_questions.made_up import CHARACTERISTICS, ORIGINAL, made_up, made_up_study, row
@@ -61,7 +61,7 @@ def test_a_tet_that_stands_at_a_collision_is_not_counted() -> None:
 
 
 def test_rq1_says_which_values_are_undefined() -> None:
-    result = answer([made_up(row(tet=None), row(sd=-1), row(), original={**ORIGINAL, "tit": None})], "rq1")[0]
+    result = answer_questions([made_up(row(tet=None), row(sd=-1), row(), original={**ORIGINAL, "tit": None})], "rq1")[0]
     assert only(result.frame, metric="tet")["n1"] == 1
     assert only(result.frame, metric="tit")["p_value"] is None
     assert any("tet is undefined in 1 of 2 solutions" in note for note in result.notes)
@@ -86,7 +86,7 @@ def test_rq2_compares_runs_by_front_and_pooled_solutions_by_metric() -> None:
 
 
 def test_rq2_of_imported_solutions_leaves_the_fronts_open() -> None:
-    result = answer([made_up(row(sd=1), row("rs", sd=2), has_runs=False)], "rq2")[0]
+    result = answer_questions([made_up(row(sd=1), row("rs", sd=2), has_runs=False)], "rq2")[0]
     assert only(result.frame, metric="igd")["p_value"] is None
     assert only(result.frame, metric="igd")["n1"] == 0
     assert only(result.frame, metric="safety_degree")["effect_size"] == 1
@@ -97,14 +97,14 @@ def test_rq2_of_imported_solutions_leaves_the_fronts_open() -> None:
                                                    ([], "no finished run")])
 def test_rq2_without_an_algorithm_is_refused(rows: list[dict[str, Any]], expected: str) -> None:
     with pytest.raises(InputError, match=expected):
-        answer([made_up(*rows)], "rq2")
+        answer_questions([made_up(*rows)], "rq2")
 
 
 def test_critical_solutions_are_strictly_below_the_original() -> None:
     case = made_up(row(sd=2.0), row(sd=1.999), row(sd=-1), row("rs", sd=1), row(sd=math.nan))
-    assert critical(case)["safety_degree"].tolist() == [1.999, -1]
-    with pytest.raises(Unanswerable, match="safety degree"):
-        critical(made_up(row(), original={}))
+    assert critical_solutions(case)["safety_degree"].tolist() == [1.999, -1]
+    with pytest.raises(UnanswerableError, match="safety degree"):
+        critical_solutions(made_up(row(), original={}))
 
 
 def test_rq31_counts_runs_without_any() -> None:
@@ -147,7 +147,7 @@ def test_the_footer_of_rq33() -> None:
 
 
 def test_collisions_and_their_share() -> None:
-    frame = collisions(made_up(row(sd=-1), row(sd=0), row(sd=1), row("rs")))
+    frame = count_collisions(made_up(row(sd=-1), row(sd=0), row(sd=1), row("rs")))
     assert only(frame, algorithm="nsga2") == {"setting": "made-up", "algorithm": "nsga2", "solutions": 3, "collisions": 2,
                                               "share": pytest.approx(2 / 3)}
     assert only(frame, algorithm="rs")["share"] == 0
@@ -164,7 +164,7 @@ def test_combinations_of_exactly_four() -> None:
 
     case = made_up(study=study, finished=[("nsga2", 0)])
     solutions = pd.DataFrame([changed(names) for names in ("abcd", "bcde", "abcd", "cdef", "abcf", "abcde", "abc")])
-    result = combinations(dataclasses.replace(case, solutions=solutions))
+    result = frequent_combinations(dataclasses.replace(case, solutions=solutions))
     assert result["characteristics"].tolist() == [list("abcd"), list("abcf"), list("bcde")]
     assert result["percent"].tolist() == [40, 20, 20]
     assert result["rank"].tolist() == [1, 2, 2]
@@ -175,31 +175,31 @@ def test_weather_compares_settings_that_differ_in_it_alone() -> None:
     wet = made_up(row(values=BOTH), study=made_up_study(name="wet", weather="hard_rain"))
     other = made_up(row(values=BOTH), study=made_up_study(name="other", weather="hard_rain", metrics=made_up_study().metrics.__class__(
         ttc_threshold=9)))
-    assert [(one.name, two.name) for one, two in weather_pairs([wet, other, clear])] == [("made-up", "wet")]
-    result = only(weather(clear, wet), characteristic="mass")
+    assert [(one.name, two.name) for one, two in find_weather_pairs([wet, other, clear])] == [("made-up", "wet")]
+    result = only(compare_weathers(clear, wet), characteristic="mass")
     assert (result["percent"], result["percent_other"], result["difference"]) == (50, 100, 50)
     assert (result["increase"], result["increase_other"], result["decrease"]) == (100, 200, None)
     assert (result["rank"], result["rank_other"]) == (1, 1)
     with pytest.raises(InputError, match="differ in the weather alone"):
-        answer([clear, other], "weather")
+        answer_questions([clear, other], "weather")
 
 
 def test_every_question_at_once_tells_what_is_lacking() -> None:
-    result = {one.name: one for one in answer([made_up(row(values=HEAVY))])}
+    result = {one.name: one for one in answer_questions([made_up(row(values=HEAVY))])}
     assert not result["rq1"].frame.empty
     assert result["rq2"].frame.empty
     assert "only nsga2" in result["rq2"].notes[0]
     assert result["weather"].frame.empty
     with pytest.raises(InputError, match="no finished run"):
-        answer([made_up()])
+        answer_questions([made_up()])
     with pytest.raises(InputError, match="rq9"):
-        answer([made_up(row())], "rq9")
+        answer_questions([made_up(row())], "rq9")
 
 
 def test_several_settings_stand_in_one_frame_and_the_refused_in_the_notes() -> None:
     good = made_up(row(), row("rs"))
     alone = made_up(row(), study=made_up_study(name="alone"))
-    result = answer([good, alone], "rq2")[0]
+    result = answer_questions([good, alone], "rq2")[0]
     assert set(result.frame["setting"]) == {"made-up"}
     assert any(note.startswith("alone: ") for note in result.notes)
 
@@ -213,7 +213,7 @@ def test_the_brief_lines_say_what_the_data_allows() -> None:
 
 
 def test_holms_correction_of_a_worked_example() -> None:
-    corrected = holm([0.01, None, 0.04, 0.03, 0.005])
+    corrected = correct_by_holm([0.01, None, 0.04, 0.03, 0.005])
     assert [p and round(p, 12) for p in corrected] == [0.03, None, 0.06, 0.06, 0.02]
 
 
@@ -249,6 +249,6 @@ def test_no_share_of_an_original_that_is_zero() -> None:
 @pytest.mark.parametrize(("clear", "wet"), [("clear", "wet"), ("wet", "fog"), ("clear", "night")])
 def test_the_clearer_weather_comes_first(clear: str, wet: str) -> None:
     friction_first = [made_up(row(values=HEAVIER), study=made_up_study(name=name, weather=name)) for name in (wet, clear)]
-    pair, = weather_pairs(friction_first)
+    pair, = find_weather_pairs(friction_first)
     expected = sorted((clear, wet), key=lambda name: {"clear": (1, 1), "fog": (0.9, 0.6), "wet": (0.71, 1), "night": (1, 0.75)}[name])
     assert [one.name for one in pair] == expected[::-1]

@@ -19,12 +19,17 @@ from matplotlib.figure import Figure
 from matplotlib.text import Text
 from matplotlib.transforms import Bbox, BboxBase
 
-from safevar_sumo.analysis.research_questions.answer import answer
-from safevar_sumo.analysis.research_questions.case import Case, Unanswerable
-from safevar_sumo.analysis.research_questions.figures import changed_characteristics, number_of_changes, pareto_fronts, sizes_of_changes
-from safevar_sumo.analysis.research_questions.gallery import FIGURES_OF_ALL_CASES, FIGURES_OF_ONE_CASE, draw, draw_all
-from safevar_sumo.analysis.research_questions.layout import PAPER
-from safevar_sumo.analysis.research_questions.tables import FORMATS, as_json, escaped_for_latex, latex, markdown, text
+from safevar_sumo.analysis.research_questions.answer import answer_questions
+from safevar_sumo.analysis.research_questions.case import Case, UnanswerableError
+from safevar_sumo.analysis.research_questions.figures import (
+    draw_change_counts,
+    draw_change_sizes,
+    draw_changed_characteristics,
+    draw_pareto_fronts,
+)
+from safevar_sumo.analysis.research_questions.gallery import FIGURES_OF_ALL_CASES, FIGURES_OF_ONE_CASE, draw_figures, save_figures
+from safevar_sumo.analysis.research_questions.layout import PAPER_LAYOUTS
+from safevar_sumo.analysis.research_questions.tables import FORMATS, as_json, as_latex, as_markdown, as_text, escaped_for_latex
 from safevar_sumo.errors import InputError
 from safevar_sumo.study import CharacteristicTable, load_study
 from safevar_sumo.vehicles import CharacteristicSet
@@ -76,7 +81,8 @@ DOCUMENT = r"""\documentclass{article}
 @pytest.mark.skipif(shutil.which("pdflatex") is None, reason="there is no TeX here, as there is in CI")
 @pytest.mark.slow
 def test_latex_compiles(cases: list[Case], tmp_path: Path) -> None:
-    document = DOCUMENT % (latex(answer(cases)) + latex(answer(cases), PAPER).replace("tab:", "tab:paper-"))
+    answers = answer_questions(cases)
+    document = DOCUMENT % (as_latex(answers) + as_latex(answers, PAPER_LAYOUTS).replace("tab:", "tab:paper-"))
     (tmp_path / "tables.tex").write_text(document, encoding="utf-8")
     done = subprocess.run(["pdflatex", "-halt-on-error", "-interaction=nonstopmode", "tables.tex"], cwd=tmp_path, capture_output=True,
                           text=True, errors="replace", check=False)
@@ -95,7 +101,7 @@ def test_special_characters_are_escaped(plain: str, latex_form: str) -> None:
 
 
 def test_markdown_rows_are_as_wide_as_their_heads(cases: list[Case]) -> None:
-    for block in markdown(answer(cases)).split("\n\n"):
+    for block in as_markdown(answer_questions(cases)).split("\n\n"):
         lines = [line.replace(r"\|", "") for line in block.splitlines() if line.startswith("|")]
         assert len({line.count("|") for line in lines}) <= 1
 
@@ -108,7 +114,7 @@ def test_markdown_rows_are_as_wide_as_their_heads(cases: list[Case]) -> None:
     ("rq3.3-safety", {"setting", "quantity", "j", "value", "percent", "n"}),
     ("collisions", {"setting", "algorithm", "solutions", "collisions", "share"})])
 def test_json_records_have_the_promised_keys(question: str, keys: set[str]) -> None:
-    records = json.loads(as_json(answer([rich_setting()], question)[:1]))
+    records = json.loads(as_json(answer_questions([rich_setting()], question)[:1]))
     extra = {"rq1": {"method", "mean", "original"}, "rq2": {"method"}}.get(question, set())
     for one in records:
         assert set(one) == keys | extra | ({"rank"} if one.get("j") == "any" and question == "rq3.2" else set())
@@ -117,17 +123,17 @@ def test_json_records_have_the_promised_keys(question: str, keys: set[str]) -> N
 
 def test_significant_and_notable_cells_stand_out() -> None:
     cases = [made_up(*(row(sd=1 - i / 100) for i in range(30)))]
-    result = answer(cases, "rq1")
-    assert "<0.001*  0.000*" in text(result)
-    assert r"\textbf{\textless{}0.001} & \textbf{0.000}" in latex(result)
-    assert r"**\<0.001** | **0.000**" in markdown(result)
-    even = text(answer([made_up(row(sd=1), row(sd=3))], "rq1")).splitlines()
+    result = answer_questions(cases, "rq1")
+    assert "<0.001*  0.000*" in as_text(result)
+    assert r"\textbf{\textless{}0.001} & \textbf{0.000}" in as_latex(result)
+    assert r"**\<0.001** | **0.000**" in as_markdown(result)
+    even = as_text(answer_questions([made_up(row(sd=1), row(sd=3))], "rq1")).splitlines()
     assert next(line for line in even if " SD " in line).count("*") == 0
 
 
 @pytest.mark.parametrize("question", ["rq1-runs", "rq2-runs"])
 def test_a_large_effect_of_too_few_runs_does_not_stand_out(question: str) -> None:
-    document = latex(answer([rich_setting()], question))
+    document = as_latex(answer_questions([rich_setting()], question))
     assert "& large &" in document
     assert r"\textbf" not in document
     assert r"p \textless{} 0.01 after Holm)}" in document
@@ -136,16 +142,16 @@ def test_a_large_effect_of_too_few_runs_does_not_stand_out(question: str) -> Non
 @pytest.mark.parametrize("kind", list(FORMATS))
 def test_what_cannot_be_told_is_never_a_nan(kind: str) -> None:
     cases = [made_up(row(sd=-1), row("rs", tet=None, ave_dece=None), original={"safety_degree": 0.5})]
-    assert "nan" not in FORMATS[kind](answer(cases)).lower()
+    assert "nan" not in FORMATS[kind](answer_questions(cases)).lower()
 
 
 def test_the_papers_layout_has_cases_by_metrics_and_cells_of_p_and_a12() -> None:
     cases = [made_up(*(row(sd=1 - i / 100) for i in range(30))), rich_setting(name="wet", weather="hard_rain")]
-    output = text(answer(cases, "rq1"), PAPER)
+    output = as_text(answer_questions(cases, "rq1"), PAPER_LAYOUTS)
     head = next(line for line in output.splitlines() if line.startswith("case"))
     assert head.split() == ["case", "algorithm", "SD", "TET", "TIT", "aveDece"]
     assert "<0.001 / 0.000*" in output
-    for one in answer(cases, "rq1")[0].frame.to_dict("records"):
+    for one in answer_questions(cases, "rq1")[0].frame.to_dict("records"):
         if one["p_value"] is not None and one["p_value"] >= 0.001:
             assert f"{one['p_value']:.3f} / {one['effect_size']:.3f}" in output
 
@@ -192,17 +198,17 @@ def test_axes_are_labelled_and_no_text_lies_on_another(name: str, study: str, ca
 @pytest.mark.slow
 def test_cases_stand_side_by_side_in_one_figure(case: Case) -> None:
     cases = [dataclasses.replace(case, name=f"case {i}") for i in range(2)]
-    figure = number_of_changes(cases)
+    figure = draw_change_counts(cases)
     assert [axis.get_title() for axis in figure.axes if axis.axison] == [one.name for one in cases]
     _check_layout(figure, "rq3.1-number-of-changes")
-    result, lacking = draw(cases)
+    result, lacking = draw_figures(cases)
     assert [name for name in result if name.startswith("rq3.1")] == ["rq3.1-number-of-changes"]
     assert "case 1-convergence" in result
     assert not lacking
 
 
 def test_the_original_vehicle_and_the_line_of_collisions_are_in_the_fronts(case: Case) -> None:
-    for axis, marked in zip(pareto_fronts(case).axes, (True, True, False), strict=True):
+    for axis, marked in zip(draw_pareto_fronts(case).axes, (True, True, False), strict=True):
         output = {str(line.get_label()): line for line in axis.lines}
         assert float(output["original vehicle"].get_xdata()[0]) == (case.original["safety_degree"] if marked else 0.0)  # type: ignore[index,arg-type]
         assert ("collision: 0 or less" in output) == marked
@@ -249,20 +255,20 @@ def _texts(figure: Figure) -> Iterator[Text]:
 @pytest.mark.slow
 def test_what_cannot_be_drawn_says_why(tmp_path: Path) -> None:
     imported = made_up(row(values=(1100, 2, 0.1)), has_runs=False)
-    written, lacking = draw_all([imported], tmp_path, "svg")
+    written, lacking = save_figures([imported], tmp_path, "svg")
     assert sorted(path.name for path in written) == [
         "made-up-pareto-fronts.svg", "made-up-rq3.2-changed-characteristics.svg", "made-up-rq3.3-sizes-of-changes.svg"]
     assert any("imported" in reason for reason in lacking)
-    for one in (sizes_of_changes, changed_characteristics):
-        with pytest.raises(Unanswerable, match="no critical solution"):
+    for one in (draw_change_sizes, draw_changed_characteristics):
+        with pytest.raises(UnanswerableError, match="no critical solution"):
             one(made_up(row(sd=9)))
     with pytest.raises(InputError, match="no finished run"):
-        draw_all([made_up()], tmp_path, "png")
+        save_figures([made_up()], tmp_path, "png")
 
 
 @pytest.mark.slow
 def test_names_are_no_formulas(tmp_path: Path) -> None:
     strange = made_up(row(values=(1100, 2, 0.1)), study=made_up_study())
     object.__setattr__(strange, "name", "a$b$c ^_/é")
-    written, _ = draw_all([strange], tmp_path, "svg")
+    written, _ = save_figures([strange], tmp_path, "svg")
     assert all(path.parent == tmp_path for path in written)

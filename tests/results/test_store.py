@@ -336,7 +336,7 @@ def test_reading_a_torn_run_warns(slippery: Path, tmp_path: Path) -> None:
     journal.write_bytes(journal.read_bytes()[:-7])
     with pytest.warns(UserWarning, match=r"nsga2-00\.journal: the last \d+ bytes are torn, so the run is left out"):
         (case,) = load_cases([tmp_path / "it"])
-    assert ("nsga2", 0) not in case.finished
+    assert ("nsga2", 0) not in case.finished_runs
 
 
 def test_watching_ends_with_the_study_and_json_is_json(slippery: Path) -> None:

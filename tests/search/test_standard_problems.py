@@ -24,7 +24,7 @@ from pymoo.operators.crossover.sbx import SBX
 from pymoo.operators.mutation.pm import PM
 from pymoo.optimize import minimize
 
-from safevar_sumo.metrics import SAFEVAR
+from safevar_sumo.metrics import PUBLISHED_SCORING
 from safevar_sumo.records import Evaluations
 from safevar_sumo.search import ALGORITHMS, Problem
 from safevar_sumo.search.evolution import Individual, fitness_of
@@ -74,7 +74,7 @@ class StandardScoring:
     """The objectives of a standard problem in place of a vehicle's."""
 
     problem: StandardProblem
-    metrics: Any = SAFEVAR.metrics
+    metrics: Any = PUBLISHED_SCORING.metrics
     objectives: list[None] = field(init=False)
 
     def __post_init__(self) -> None:

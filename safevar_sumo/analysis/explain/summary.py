@@ -14,7 +14,7 @@ from safevar_sumo.analysis.explain.compute import compare_at_points, points_in_w
 from safevar_sumo.analysis.explain.necessity import Robustness, estimate_robustness, find_smallest_robust_failure
 from safevar_sumo.analysis.explain.result import REASONS, ROBUST
 from safevar_sumo.analysis.preventability import Preventability, PreventableBy, assess_preventability
-from safevar_sumo.analysis.rating.summary import summarise_rated_study
+from safevar_sumo.analysis.rating.summary import summarise_rated_solutions
 from safevar_sumo.analysis.words import OUTCOME_VERBS, join_phrases, list_of_changes, number_of, question_command
 from safevar_sumo.metrics import RATING_POINTS, Unsafe
 from safevar_sumo.records import KMH_PER_MS, Evaluations, FloatArray, Outcome, finite_or_none
@@ -50,7 +50,7 @@ def summarise_failures(study: Study, solutions: pd.DataFrame, original: Evaluati
         The directory of the results.
     """
     if RATING_POINTS.name in original.metrics:
-        return summarise_rated_study(study, solutions, original, directory)
+        return summarise_rated_solutions(study, solutions, original, directory)
     if original.collided[0]:
         return ["The original vehicle itself collides: no change is needed."]
     evaluator, degree = Evaluator(study, pool), float(original.f_safe[0])

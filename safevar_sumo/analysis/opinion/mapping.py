@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import msgspec
 import numpy as np
 
-from safevar_sumo.analysis.opinion.multi_body import WHEELS, Plant, commonroad, plant_of
+from safevar_sumo.analysis.opinion.multi_body import WHEEL_COUNT, Plant, build_plant, load_commonroad
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.study import Study, load_study
@@ -22,7 +22,7 @@ from safevar_sumo.vehicles.lgsvl import FRICTION, Lgsvl
 from safevar_sumo.vehicles.sumo import SumoVehicle
 from safevar_sumo.vehicles.worn import WornVehicle
 
-CM = 0.01  # m
+METRES_PER_CM = 0.01  # m
 SENSOR_PARAMETER, SAME_EQUATION = "the same sensors before the driving system", "as here"
 
 
@@ -55,65 +55,67 @@ class SecondParameters(NamedTuple):
     drive: FloatArray
 
 
-Surface = tuple[Any, Slope, bool | BoolArray]
-"""Friction factor of the road, slope of the road, whether the road is wet."""
+class Surface(NamedTuple):
+    """Friction factor and slope of the road, and whether it is wet."""
+
+    friction: Any
+    slope: Slope
+    wet: bool | BoolArray
 
 
-def _parameters_of(plant: Plant, **values: Any) -> SecondParameters:
+def _fill_parameters(plant: Plant, **values: Any) -> SecondParameters:
+    """Parameters with a plant and values; those without a value have no effect."""
     defaults: dict[str, Any] = {"brake_delay": 0.0, "brake_rise": np.inf, "brake_fall": np.inf, "brake_lag": 0.0, "drag": 0.0,
                                 "air_drag": 0.0, "wheel_damping": 0.0, "drive": 1.0}
     ones = np.ones_like(plant.mass)
     return SecondParameters(plant, **{name: np.asarray(value, dtype=float) * ones for name, value in {**defaults, **values}.items()})
 
 
-def _worn(vehicle: WornVehicle, c: Characteristics, original: Mapping[str, float], surface: Surface) -> SecondParameters:
-    p, (_, slope, _) = commonroad(), surface
-    prepared = vehicle.prepare(c, surface[0], 1.0, *surface[1:])
-    mass = vehicle.kerb_mass + original["payload"]
-    return _parameters_of(
-        plant_of(prepared.mass, vehicle.kerb_mass, slope, centre=prepared.rear_load * vehicle.wheelbase, wheelbase=vehicle.wheelbase,
-                 height=vehicle.centre_height, radius=p.R_w, wheel_inertia=p.I_y_w, friction=prepared.grip,
-                 brake_front=vehicle.front_share, drive_front=p.T_se, brake_torque=_torque(c["brakeTorque"] * vehicle.brake_force, mass)),
-        brake_delay=c["brakeResponse"])
+def _represent_worn(vehicle: WornVehicle, setting: Characteristics, original: Mapping[str, float], surface: Surface) -> SecondParameters:
+    bmw, prepared = load_commonroad(), vehicle.prepare(setting, surface.friction, 1.0, surface.slope, surface.wet)
+    brake_torque = _brake_torque_of(setting["brakeTorque"] * vehicle.brake_force, vehicle.kerb_mass + original["payload"])
+    return _fill_parameters(
+        build_plant(prepared.mass, vehicle.kerb_mass, surface.slope, centre=prepared.rear_load * vehicle.wheelbase,
+                    wheelbase=vehicle.wheelbase, height=vehicle.centre_height, radius=bmw.R_w, wheel_inertia=bmw.I_y_w,
+                    friction=prepared.grip, brake_front=vehicle.front_share, drive_front=bmw.T_se, brake_torque=brake_torque),
+        brake_delay=setting["brakeResponse"])
 
 
-def _torque(force: FloatArray, mass: float) -> FloatArray:
-    """The torque of all wheels [N m] that brakes a vehicle of this mass like a force on its body [N]; the torque also stops the wheels."""
-    p = commonroad()
-    return np.asarray(force * p.R_w * (1 + WHEELS * p.I_y_w / (mass * p.R_w**2)))
+def _brake_torque_of(force: FloatArray, mass: float) -> FloatArray:
+    """The torque of all wheels [N m] that brakes a vehicle of this mass [kg] as a force on its body [N] would; it also stops the wheels."""
+    bmw = load_commonroad()
+    return np.asarray(force * bmw.R_w * (1 + WHEEL_COUNT * bmw.I_y_w / (mass * bmw.R_w**2)))
 
 
-def _carla(vehicle: Carla, c: Characteristics, original: Mapping[str, float], surface: Surface) -> SecondParameters:
-    friction, slope, _ = surface
-    radius = CM * c["radius"]
-    return _parameters_of(
-        plant_of(c["mass"], original["mass"], slope, radius=radius, wheel_inertia=0.5 * WHEEL_MASS * radius**2,
-                 friction=c["tireFric"] * vehicle.tyre_friction * friction, brake_torque=WHEELS * c["maxBrakeTorque"], brake_front=0.5,
-                 drive_front=0.5),
+def _represent_carla(vehicle: Carla, setting: Characteristics, original: Mapping[str, float], surface: Surface) -> SecondParameters:
+    radius = METRES_PER_CM * setting["radius"]
+    return _fill_parameters(
+        build_plant(setting["mass"], original["mass"], surface.slope, radius=radius, wheel_inertia=0.5 * WHEEL_MASS * radius**2,
+                    friction=setting["tireFric"] * vehicle.tyre_friction * surface.friction,
+                    brake_torque=WHEEL_COUNT * setting["maxBrakeTorque"], brake_front=0.5, drive_front=0.5),
         brake_rise=vehicle.brake_rise, brake_fall=vehicle.brake_fall,
-        air_drag=0.5 * AIR_DENSITY * FRONTAL_AREA * (c["dragCoeff"] - original["dragCoeff"]),
-        wheel_damping=WHEELS * (c["dampRate"] - original["dampRate"]))
+        air_drag=0.5 * AIR_DENSITY * FRONTAL_AREA * (setting["dragCoeff"] - original["dragCoeff"]),
+        wheel_damping=WHEEL_COUNT * (setting["dampRate"] - original["dampRate"]))
 
 
-def _lgsvl(vehicle: Lgsvl, c: Characteristics, original: Mapping[str, float], surface: Surface) -> SecondParameters:
-    friction, slope, _ = surface
-    wheels = WHEELS * vehicle.wheel_mass_share
-    return _parameters_of(
-        plant_of(c["mass"] + wheels * c["wheelMass"], original["mass"] + wheels * original["wheelMass"], slope,
-                 radius=c["radius"], wheel_inertia=0.5 * c["wheelMass"] * c["radius"]**2, friction=FRICTION * friction,
-                 brake_torque=WHEELS * c["maxBrakeTorque"], brake_front=0.5, drive_front=0.5),
-        brake_lag=vehicle.pedal_lag, drag=c["tireDragCoeff"] - original["tireDragCoeff"],
-        wheel_damping=WHEELS * vehicle.wheel_damping_share * (c["wheelDamping"] - original["wheelDamping"]))
+def _represent_lgsvl(vehicle: Lgsvl, setting: Characteristics, original: Mapping[str, float], surface: Surface) -> SecondParameters:
+    counted_wheels = WHEEL_COUNT * vehicle.wheel_mass_share
+    return _fill_parameters(
+        build_plant(setting["mass"] + counted_wheels * setting["wheelMass"], original["mass"] + counted_wheels * original["wheelMass"],
+                    surface.slope, radius=setting["radius"], wheel_inertia=0.5 * setting["wheelMass"] * setting["radius"]**2,
+                    friction=FRICTION * surface.friction, brake_torque=WHEEL_COUNT * setting["maxBrakeTorque"], brake_front=0.5,
+                    drive_front=0.5),
+        brake_lag=vehicle.pedal_lag, drag=setting["tireDragCoeff"] - original["tireDragCoeff"],
+        wheel_damping=WHEEL_COUNT * vehicle.wheel_damping_share * (setting["wheelDamping"] - original["wheelDamping"]))
 
 
-def _sumo(vehicle: SumoVehicle, c: Characteristics, original: Mapping[str, float], surface: Surface) -> SecondParameters:
-    p, (friction, slope, _) = commonroad(), surface
-    force = vehicle.reference_mass * c["decel"] * c["brakeGain"]
-    return _parameters_of(
-        plant_of(c["mass"], original["mass"], slope, radius=p.R_w, wheel_inertia=p.I_y_w,
-                 friction=vehicle.tyre_friction * friction, brake_front=p.T_sb, drive_front=p.T_se,
-                 brake_torque=_torque(force, original["mass"])),
-        brake_delay=c["brakeDelay"], brake_lag=c["tau"], drive=c["accel"] / original["accel"])
+def _represent_sumo(vehicle: SumoVehicle, setting: Characteristics, original: Mapping[str, float], surface: Surface) -> SecondParameters:
+    bmw, brake_force = load_commonroad(), vehicle.reference_mass * setting["decel"] * setting["brakeGain"]
+    return _fill_parameters(
+        build_plant(setting["mass"], original["mass"], surface.slope, radius=bmw.R_w, wheel_inertia=bmw.I_y_w,
+                    friction=vehicle.tyre_friction * surface.friction, brake_front=bmw.T_sb, drive_front=bmw.T_se,
+                    brake_torque=_brake_torque_of(brake_force, original["mass"])),
+        brake_delay=setting["brakeDelay"], brake_lag=setting["tau"], drive=setting["accel"] / original["accel"])
 
 
 class MappingTable(NamedTuple):
@@ -122,10 +124,10 @@ class MappingTable(NamedTuple):
     Attributes
     ----------
     study
-        A shipped study with the vehicle; the study supplies parameters that your own vehicle lacks.
+        A shipped study with the vehicle; the study supplies parameters that a vehicle of user code lacks.
     rows
         The characteristics that the second model represents.
-    outside
+    omission_reasons
         Characteristics that the second model cannot represent, each with the reason.
     represent
         The equations of the rows.
@@ -133,18 +135,18 @@ class MappingTable(NamedTuple):
 
     study: str
     rows: tuple[MapRow, ...]
-    outside: Mapping[str, str]
+    omission_reasons: Mapping[str, str]
     represent: Callable[[Any, Characteristics, Mapping[str, float], Surface], SecondParameters]
 
     @property
-    def names(self) -> frozenset[str]:
+    def represented_names(self) -> frozenset[str]:
         """The characteristics that the second model represents."""
         return frozenset(row.characteristic for row in self.rows)
 
 
 NO_ENGINE = "the model takes a torque at the wheels: it has no engine, clutch or gearbox"
 DEAD_TIME = "dead time from command to brake torque"
-TABLES: Mapping[str, MappingTable] = {
+MAPPING_TABLES: Mapping[str, MappingTable] = {
     "worn": MappingTable("wear", (
         MapRow("treadDepth", "mm", "p_dx1", "-", "p_dx1 = mu, our friction coefficient of tyre, road and tread"),
         MapRow("brakeTorque", "-", "T_B", "N m", "T_B = brakeTorque brake_force R_w (1 + 4 I_y_w / (m_0 R_w^2)), m_0 the original's m"),
@@ -152,7 +154,7 @@ TABLES: Mapping[str, MappingTable] = {
         MapRow("payload", "kg", "m, m_s", "kg", "m = kerb_mass + payload; m_s = m - m_uf - m_ur"),
         MapRow("payloadCentre", "m", "a, b", "m", "a = (m x - m_ur L) / m_s, b = L - a; x common centre from the front axle, L wheelbase"),
         MapRow("sensorRange", "m", SENSOR_PARAMETER, "m", SAME_EQUATION),
-        MapRow("sensorLatency", "s", SENSOR_PARAMETER, "s", SAME_EQUATION)), {}, _worn),
+        MapRow("sensorLatency", "s", SENSOR_PARAMETER, "s", SAME_EQUATION)), {}, _represent_worn),
     "carla": MappingTable("sun", (
         MapRow("mass", "kg", "m, m_s", "kg", "m = mass; m_s = m - m_uf - m_ur"),
         MapRow("tireFric", "-", "p_dx1", "-", "p_dx1 = tireFric tyre_friction f, f the road's factor"),
@@ -161,7 +163,7 @@ TABLES: Mapping[str, MappingTable] = {
         MapRow("dampRate", "kg m^2/s", "torque on the wheels", "N m", "-4 (dampRate - original) omega"),
         MapRow("dragCoeff", "-", "torque on the wheels", "N m", "-R_w (dragCoeff - original) rho A v^2 / 2, rho 1.2 kg/m^3, A 2.2 m^2")),
         dict.fromkeys(("max_rpm", "dampRateFullT", "dampRateZeroT_CE", "dampRateZeroT_CD", "gearSwitchTime", "clutchStrength"), NO_ENGINE),
-        _carla),
+        _represent_carla),
     "lgsvl": MappingTable("lgsvl", (
         MapRow("mass", "kg", "m, m_s", "kg", "m = mass + 4 wheel_mass_share wheelMass; m_s = m - m_uf - m_ur"),
         MapRow("wheelMass", "kg", "I_y_w, m", "kg m^2, kg", "I_y_w = wheelMass R_w^2 / 2; m as above"),
@@ -170,7 +172,7 @@ TABLES: Mapping[str, MappingTable] = {
         MapRow("tireDragCoeff", "-", "torque on the wheels", "N m", "-R_w (tireDragCoeff - original) v"),
         MapRow("wheelDamping", "kg m^2/s", "torque on the wheels", "N m", "-4 wheel_damping_share (wheelDamping - original) omega")),
         {**dict.fromkeys(("maxRpm", "minRpm", "maxMotorTorque", "shiftTime", "tractionControlSlipLimit"), NO_ENGINE),
-         "maxSteeringAngle": "the model drives straight here"}, _lgsvl),
+         "maxSteeringAngle": "the model drives straight here"}, _represent_lgsvl),
     "sumo": MappingTable("native", (
         MapRow("mass", "kg", "m, m_s", "kg", "m = mass; m_s = m - m_uf - m_ur"),
         MapRow("accel", "m/s^2", "T_E", "N m", "T_E = the original's accel / original"),
@@ -180,30 +182,30 @@ TABLES: Mapping[str, MappingTable] = {
         MapRow("tau", "s", "first-order lag of the brake torque", "s", SAME_EQUATION),
         MapRow("sensorRange", "m", SENSOR_PARAMETER, "m", SAME_EQUATION),
         MapRow("reactionTime", "s", SENSOR_PARAMETER, "s", SAME_EQUATION)),
-        {"maxSpeed": "the model has no governor"}, _sumo),
+        {"maxSpeed": "the model has no governor"}, _represent_sumo),
 }
 """Tables by the names of shipped vehicles."""
 
 
 class VehicleMapping(NamedTuple):
-    """Mapping of a study's vehicle: the table of its shipped vehicle or base class, with the parameters of the study's vehicle.
+    """Mapping of a study's vehicle: name and table of the shipped vehicle that fits it, and that vehicle with the study's parameters.
 
-    `foreign` lists characteristics whose name or unit the shipped vehicle does not have.
+    `unknown_names` lists characteristics whose name or unit the shipped vehicle does not have.
     """
 
     name: str
     vehicle: Any
     table: MappingTable
-    foreign: tuple[str, ...]
+    unknown_names: tuple[str, ...]
 
-    def outside(self, changes: Mapping[str, float]) -> list[str]:
+    def reasons_to_omit(self, changes: Mapping[str, float]) -> list[str]:
         """The reason for each changed characteristic that cannot be represented; empty if all can."""
-        return [f"{name}: {self.table.outside.get(name, 'no parameter of the second model is known for it')}" for name in changes
-                if name not in self.table.names or name in self.foreign]
+        return [f"{name}: {self.table.omission_reasons.get(name, 'no parameter of the second model is known for it')}" for name in changes
+                if name not in self.table.represented_names or name in self.unknown_names]
 
 
-def mapping_of(study: Study, vehicle: Any) -> VehicleMapping:
-    """The mapping of a study's vehicle: a shipped vehicle, a class derived from one, or your own with all characteristics of a shipped one.
+def map_vehicle(study: Study, vehicle: Any) -> VehicleMapping:
+    """Map a study's vehicle: a shipped vehicle, a class derived from one, or user code with all characteristics of a shipped one.
 
     Raises
     ------
@@ -214,12 +216,12 @@ def mapping_of(study: Study, vehicle: Any) -> VehicleMapping:
     units = {name: row.unit for name, row in study.vehicle.characteristics.items()}
     for name, cls in [*((name, cls) for name, cls in VEHICLES.items() if isinstance(model, cls)),
                       *((name, cls) for name, cls in VEHICLES.items() if cls.UNITS.items() <= units.items())]:
-        table = TABLES[name]
+        table = MAPPING_TABLES[name]
         defaults = load_study(table.study).vehicle.parameters
         parameters = {field.name: getattr(
             model, field.name, study.vehicle.parameters.get(field.name, defaults.get(field.name, field.default)))
             for field in msgspec.structs.fields(cls)}
         return VehicleMapping(name, cls(**parameters), table, tuple(key for key, unit in units.items() if cls.UNITS.get(key) != unit))
-    alternatives = f"one of {', '.join(TABLES)}, a class derived from one, or one with the same characteristics in the same units"
+    alternatives = f"one of {', '.join(MAPPING_TABLES)}, a class derived from one, or one with the same characteristics in the same units"
     problem = f"vehicle.model = {study.vehicle.model!r} with {', '.join(units)} is no vehicle that the second model can represent"
     raise InputError(study.source, problem, alternatives)

@@ -16,8 +16,8 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.records import FloatArray
 from safevar_sumo.vehicles import Slope
 
-WHEELS = 4
-STEP = 1e-3
+WHEEL_COUNT = 4
+LONGEST_STEP = 1e-3
 """Longest step of the integration [s]: 0.08 rad of the fastest motion, an axle between its springs and its tyres (75 rad/s)."""
 LEAST_SPEED = 0.1
 """Smallest speed to which slip is relative [m/s]: half of `v_s` in the package's `vehicle_dynamics_std`."""
@@ -26,7 +26,7 @@ SLIP_LIMIT, LEAST_CONTROL_SPEED = 0.1, 2.0
 
 Real controllers work between 0.1 and 0.2 from about 7 km/h on (Bosch, Automotive Handbook, "Antilock braking system").
 """
-RELEASE, BUILD_UP = 25.0, 8.0
+RELEASE_RATE, BUILD_UP_RATE = 25.0, 8.0
 """Rates at which the controller releases and restores pressure [1/s], as shares of full pressure; valves release faster than they restore.
 
 Chosen values: braking uses at least 0.78 of the friction, for coefficients from 0.2 to 1 (tests). UN Regulation 13-H, annex 6, requires
@@ -34,7 +34,7 @@ Chosen values: braking uses at least 0.78 of the friction, for coefficients from
 """
 
 
-def commonroad() -> Any:
+def load_commonroad() -> Any:
     """Parameters of the package's vehicle 2, a BMW 320i, and of its tyres.
 
     Raises
@@ -57,7 +57,7 @@ def _parameters(load_parameters: Any) -> Any:
 
 @cache
 def _tyre() -> Any:
-    return commonroad().tire
+    return load_commonroad().tire
 
 
 class Plant(NamedTuple):
@@ -88,35 +88,35 @@ class Plant(NamedTuple):
     down: FloatArray
 
 
-def plant_of(mass: FloatArray, unladen_mass: float, slope: Slope, *, brake_front: float, drive_front: float,
-             centre: FloatArray | None = None, wheelbase: float | None = None, height: float | None = None, **others: Any) -> Plant:
+def build_plant(mass: FloatArray, unladen_mass: float, slope: Slope, *, brake_front: float, drive_front: float,
+                centre: FloatArray | None = None, wheelbase: float | None = None, height: float | None = None, **constants: Any) -> Plant:
     """Vehicles with masses [kg] that differ from the package's vehicle.
 
     Unsprung masses, springs, dampers, tyres and inertia grow with `unladen_mass` [kg], so that all frequencies stay the package's;
     a load rests on the springs. `centre` is the whole vehicle's centre of mass behind the front axle [m], `height` its height above the
     road [m]; the package's values replace None.
     """
-    p = commonroad()
-    ones, scale = np.ones_like(mass), unladen_mass / p.m
-    unsprung_mass = scale * p.m_uf * ones
-    sprung_mass, length = mass - 2 * unsprung_mass, p.a + p.b if wheelbase is None else wheelbase
-    front = (p.a / (p.a + p.b)) * length * ones if centre is None else (mass * centre - unsprung_mass * length) / sprung_mass
-    values = {name: np.asarray(value, dtype=float) * ones for name, value in others.items()}
+    bmw = load_commonroad()
+    ones, scale = np.ones_like(mass), unladen_mass / bmw.m
+    unsprung_mass = scale * bmw.m_uf * ones
+    sprung_mass, length = mass - 2 * unsprung_mass, bmw.a + bmw.b if wheelbase is None else wheelbase
+    front_arm = (bmw.a / (bmw.a + bmw.b)) * length * ones if centre is None else (mass * centre - unsprung_mass * length) / sprung_mass
+    values = {name: np.asarray(value, dtype=float) * ones for name, value in constants.items()}
     plant = Plant(
-        mass=mass, sprung_mass=sprung_mass, unsprung_mass=unsprung_mass, arms=np.stack([front, front - length]),
-        static_shares=np.stack([length - front, front]) / length, height=(p.h_s if height is None else height) * ones,
-        pitch_inertia=scale * p.I_y_s * ones * (length / (p.a + p.b)) ** 2, springs=scale * np.stack([p.K_sf * ones, p.K_sr * ones]),
-        dampers=scale * np.stack([p.K_sdf * ones, p.K_sdr * ones]), tyre_spring=scale * p.K_zt * ones,
+        mass=mass, sprung_mass=sprung_mass, unsprung_mass=unsprung_mass, arms=np.stack([front_arm, front_arm - length]),
+        static_shares=np.stack([length - front_arm, front_arm]) / length, height=(bmw.h_s if height is None else height) * ones,
+        pitch_inertia=scale * bmw.I_y_s * ones * (length / (bmw.a + bmw.b)) ** 2, tyre_spring=scale * bmw.K_zt * ones,
+        springs=scale * np.stack([bmw.K_sf * ones, bmw.K_sr * ones]), dampers=scale * np.stack([bmw.K_sdf * ones, bmw.K_sdr * ones]),
         brake_shares=np.stack([brake_front * ones, (1 - brake_front) * ones]),
         drive_shares=np.stack([drive_front * ones, (1 - drive_front) * ones]), back=slope.back * ones, down=slope.down * ones, **values)
     return plant._replace(height=plant.height + at_speed(plant, ones).heave)  # the body's heights count from unloaded tyres
 
 
-class MultiBody(NamedTuple):
-    """State of N vehicles, SI: speed, pitch and heave of the body with their rates, shape (N,); of the axles, front before rear, height,
-    its rate, the wheels' speed [rad/s] and the share of full pressure that the anti-lock controller allows, shape (2, N).
+class MultiBodyState(NamedTuple):
+    """State of N vehicles, SI: speed, pitch and heave of the body, and the rates of pitch and heave, shape (N,).
 
-    Heights count downwards, as in the package.
+    The other fields hold a value for each axle, front before rear, shape (2, N): its height and the height's rate, its wheels' speed
+    [rad/s], and the share of full pressure that the anti-lock controller allows. Heights count downwards, as in the package.
     """
 
     speed: FloatArray
@@ -124,22 +124,22 @@ class MultiBody(NamedTuple):
     pitch_rate: FloatArray
     heave: FloatArray
     heave_rate: FloatArray
-    heights: FloatArray
-    height_rates: FloatArray
-    wheels: FloatArray
+    axle_heights: FloatArray
+    axle_rates: FloatArray
+    wheel_speeds: FloatArray
     pressure_shares: FloatArray
 
 
-def at_speed(plant: Plant, speed: FloatArray) -> MultiBody:
+def at_speed(plant: Plant, speed: FloatArray) -> MultiBodyState:
     """The body in static balance on its springs, with rolling wheels."""
     zeros, axle_zeros = np.zeros_like(plant.mass), np.zeros_like(plant.arms)
     heights = (plant.sprung_mass * plant.static_shares + plant.unsprung_mass) * plant.down / (2 * plant.tyre_spring)
     # The springs carry the static load without deflection if, above each axle, the body is as high as the axle.
     heave, pitch = (heights * plant.static_shares).sum(axis=0), (heights[1] - heights[0]) / (plant.arms[0] - plant.arms[1])
-    return MultiBody(speed, pitch, zeros, heave, zeros, heights, axle_zeros, axle_zeros + speed / plant.radius, axle_zeros + 1)
+    return MultiBodyState(speed, pitch, zeros, heave, zeros, heights, axle_zeros, axle_zeros + speed / plant.radius, axle_zeros + 1)
 
 
-class Forces(NamedTuple):
+class TyreForces(NamedTuple):
     """One tyre of each axle, shape (2, N): the force along the road [N], its derivative `gradient` by the wheel's speed
     [N s/rad], and the slip [-], positive when braking.
     """
@@ -149,67 +149,70 @@ class Forces(NamedTuple):
     slip: FloatArray
 
 
-def tyre_forces(plant: Plant, body: MultiBody) -> Forces:
+def tyre_forces(plant: Plant, body: MultiBodyState) -> TyreForces:
     """Pacejka's formula for pure longitudinal slip, as in the package's `formula_longitudinal`, and its derivative."""
     tyre, slip_speed = _tyre(), np.maximum(body.speed, LEAST_SPEED)
-    load = np.maximum(body.heights * plant.tyre_spring, 1.0)
-    slip = (body.speed - plant.radius * body.wheels) / slip_speed
+    load = np.maximum(body.axle_heights * plant.tyre_spring, 1.0)
+    slip = (body.speed - plant.radius * body.wheel_speeds) / slip_speed
     peak, stiffness = plant.friction * load, tyre.p_kx1 / (tyre.p_cx1 * plant.friction)
     scaled_slip = stiffness * (tyre.p_hx1 - slip)
     curve = (1 - tyre.p_ex1) * scaled_slip + tyre.p_ex1 * np.arctan(scaled_slip)
     angle = tyre.p_cx1 * np.arctan(curve) + load * tyre.p_vx1
     slope = peak * np.cos(angle) * (tyre.p_cx1 / (1 + curve * curve)) * (1 - tyre.p_ex1 + tyre.p_ex1 / (1 + scaled_slip * scaled_slip))
-    return Forces(peak * np.sin(angle), slope * (stiffness * plant.radius / slip_speed), slip)
+    return TyreForces(peak * np.sin(angle), slope * (stiffness * plant.radius / slip_speed), slip)
 
 
-class Rates(NamedTuple):
-    """Time derivatives of a body's speed, rates and wheel speeds, SI; shapes as in `MultiBody`."""
+class BodyDerivatives(NamedTuple):
+    """Time derivatives of the fields of `MultiBodyState` with the same names, SI."""
 
     speed: FloatArray
     pitch_rate: FloatArray
     heave_rate: FloatArray
-    height_rates: FloatArray
-    wheels: FloatArray
+    axle_rates: FloatArray
+    wheel_speeds: FloatArray
 
 
-def rates(plant: Plant, body: MultiBody, torques: FloatArray, forces: Forces) -> Rates:
+def body_derivatives(plant: Plant, body: MultiBodyState, torques: FloatArray, forces: TyreForces) -> BodyDerivatives:
     """The right-hand side of the package's equations; `torques`, shape (2, N), turn both wheels of an axle forward [N m]."""
-    p, traction = plant, 2 * (forces.force[0] + forces.force[1])
-    deflection = body.heights - body.heave + p.arms * body.pitch
-    deflection_rate = body.height_rates - body.heave_rate + p.arms * body.pitch_rate
-    springs = p.sprung_mass * p.down * p.static_shares / 2 - deflection * p.springs - deflection_rate * p.dampers
-    moments = p.arms * springs
-    return Rates(
-        speed=traction / p.mass - p.back,
-        pitch_rate=(2 * (moments[0] + moments[1]) + traction * (p.height - body.heave)) / p.pitch_inertia,
-        heave_rate=p.down - 2 * (springs[0] + springs[1]) / p.sprung_mass,
-        height_rates=p.down - 2 * (body.heights * p.tyre_spring - springs) / p.unsprung_mass,
-        wheels=(torques / 2 - p.radius * forces.force) / p.wheel_inertia)
+    traction = 2 * (forces.force[0] + forces.force[1])
+    deflection = body.axle_heights - body.heave + plant.arms * body.pitch
+    deflection_rate = body.axle_rates - body.heave_rate + plant.arms * body.pitch_rate
+    static_loads = plant.sprung_mass * plant.down * plant.static_shares / 2
+    spring_forces = static_loads - deflection * plant.springs - deflection_rate * plant.dampers
+    moments = plant.arms * spring_forces
+    return BodyDerivatives(
+        speed=traction / plant.mass - plant.back,
+        pitch_rate=(2 * (moments[0] + moments[1]) + traction * (plant.height - body.heave)) / plant.pitch_inertia,
+        heave_rate=plant.down - 2 * (spring_forces[0] + spring_forces[1]) / plant.sprung_mass,
+        axle_rates=plant.down - 2 * (body.axle_heights * plant.tyre_spring - spring_forces) / plant.unsprung_mass,
+        wheel_speeds=(torques / 2 - plant.radius * forces.force) / plant.wheel_inertia)
 
 
-def advance(plant: Plant, body: MultiBody, pedal: FloatArray, drive_torque: FloatArray, step: float) -> MultiBody:
+def advance(plant: Plant, body: MultiBodyState, pedal: FloatArray, drive_torque: FloatArray, step: float) -> MultiBodyState:
     """One integration step under a brake pedal (0 to 1) and a torque of engine and drags on all wheels [N m].
 
     Wheel speeds, which are stiff, are integrated implicitly (linearised), all other states explicitly, rates before heights.
     """
-    p, forces = plant, tyre_forces(plant, body)
-    pressure_shares = _anti_lock(body, forces.slip, pedal, step)
-    change = rates(p, body, drive_torque * p.drive_shares - np.minimum(pedal, pressure_shares) * (p.brake_torque * p.brake_shares), forces)
+    forces = tyre_forces(plant, body)
+    pressure_shares = _limit_pressure(body, forces.slip, pedal, step)
+    brake_torques = np.minimum(pedal, pressure_shares) * (plant.brake_torque * plant.brake_shares)
+    derivatives = body_derivatives(plant, body, drive_torque * plant.drive_shares - brake_torques, forces)
     gradients = np.maximum(forces.gradient, 0.0)
-    wheels = np.maximum(body.wheels + step * change.wheels / (1 + step * gradients * p.radius / p.wheel_inertia), 0.0)
-    added_force = gradients * (wheels - body.wheels)
-    speed = np.maximum(body.speed + step * (change.speed + 2 * (added_force[0] + added_force[1]) / p.mass), 0.0)
-    is_standing = (body.speed <= 0) & (drive_torque <= 0) & (p.back >= 0)  # Pacejka's tyres push slightly even without slip
-    pitch_rate, heave_rate = body.pitch_rate + step * change.pitch_rate, body.heave_rate + step * change.heave_rate
-    height_rates = body.height_rates + step * change.height_rates
-    return MultiBody(
+    damping = 1 + step * gradients * plant.radius / plant.wheel_inertia
+    wheel_speeds = np.maximum(body.wheel_speeds + step * derivatives.wheel_speeds / damping, 0.0)
+    added_force = gradients * (wheel_speeds - body.wheel_speeds)
+    speed = np.maximum(body.speed + step * (derivatives.speed + 2 * (added_force[0] + added_force[1]) / plant.mass), 0.0)
+    is_standing = (body.speed <= 0) & (drive_torque <= 0) & (plant.back >= 0)  # Pacejka's tyres push slightly even without slip
+    pitch_rate, heave_rate = body.pitch_rate + step * derivatives.pitch_rate, body.heave_rate + step * derivatives.heave_rate
+    axle_rates = body.axle_rates + step * derivatives.axle_rates
+    return MultiBodyState(
         speed=np.where(is_standing, 0.0, speed), pitch=body.pitch + step * pitch_rate, pitch_rate=pitch_rate,
-        heave=body.heave + step * heave_rate, heave_rate=heave_rate, heights=body.heights + step * height_rates, height_rates=height_rates,
-        wheels=wheels, pressure_shares=pressure_shares)
+        heave=body.heave + step * heave_rate, heave_rate=heave_rate, axle_heights=body.axle_heights + step * axle_rates,
+        axle_rates=axle_rates, wheel_speeds=wheel_speeds, pressure_shares=pressure_shares)
 
 
-def _anti_lock(body: MultiBody, slip: FloatArray, pedal: FloatArray, step: float) -> FloatArray:
+def _limit_pressure(body: MultiBodyState, slip: FloatArray, pedal: FloatArray, step: float) -> FloatArray:
     """The share of full pressure that each axle may have: it falls while the axle's slip is too large, then rises to 1."""
     is_locking = (slip > SLIP_LIMIT) & (body.speed > LEAST_CONTROL_SPEED)
-    lower_shares = np.maximum(np.minimum(body.pressure_shares, pedal) - RELEASE * step, 0.0)
-    return np.where(is_locking, lower_shares, np.minimum(body.pressure_shares + BUILD_UP * step, 1.0))
+    lower_shares = np.maximum(np.minimum(body.pressure_shares, pedal) - RELEASE_RATE * step, 0.0)
+    return np.where(is_locking, lower_shares, np.minimum(body.pressure_shares + BUILD_UP_RATE * step, 1.0))

@@ -9,21 +9,21 @@ from safevar_sumo.analysis.words import join_phrases, list_of_changes, number_of
 from safevar_sumo.terminal import print_text, printable_text
 from safevar_sumo.vehicles import CharacteristicSet
 
-MODEL = "Driven again with CommonRoad's multi-body vehicle, Pacejka's tyres and anti-lock brakes"
+MODEL_IN_WORDS = "Driven again with CommonRoad's multi-body vehicle, Pacejka's tyres and anti-lock brakes"
 STYLES = {OpinionVerdict.CONFIRMED: "green", OpinionVerdict.CONTRADICTED: "red", OpinionVerdict.OUTSIDE: "yellow"}
 
 
 def print_opinions(console: Console, result: Opinions) -> None:
     """Print how many causes are confirmed, then every cause with the reason."""
-    members = CharacteristicSet.of(result.study.vehicle.characteristics)
+    characteristics = CharacteristicSet.of(result.study.vehicle.characteristics)
     print_text(console, result.study.title)
-    print_text(console, f"Unsafe: {result.unsafe}. {MODEL}: {opinion_in_words(result)}")
+    print_text(console, f"Unsafe: {result.unsafe}. {MODEL_IN_WORDS}: {opinion_in_words(result)}")
     print_text(console, f"The original vehicle with our model: {result.original_here}; with the second: {result.original_there}.")
     for handle in result.without_cause:
         print_text(console, f"note: {handle} is not unsafe: it has no cause")
     for opinion in result.opinions:
         line = printable_text(f"{opinion.solution}: " if opinion.solution else "").append(str(opinion.opinion), STYLES[opinion.opinion])
-        console.print(line.append(printable_text(f": {list_of_changes(members, opinion.changes)}")), soft_wrap=True, highlight=False)
+        console.print(line.append(printable_text(f": {list_of_changes(characteristics, opinion.changes)}")), soft_wrap=True, highlight=False)
         print_text(console, f"  with our model {opinion.here}; {opinion.because}")
 
 
@@ -31,5 +31,5 @@ def opinion_in_words(result: Opinions) -> str:
     """A sentence with the number of causes for each verdict."""
     if not result.opinions:
         return "there is no cause to judge."
-    parts = [f"{result.count(verdict)} {verdict}" for verdict in OpinionVerdict if result.count(verdict)]
-    return f"of {number_of(len(result.opinions), 'minimal cause')} {join_phrases(parts)}."
+    counts = [f"{result.count(verdict)} {verdict}" for verdict in OpinionVerdict if result.count(verdict)]
+    return f"of {number_of(len(result.opinions), 'minimal cause')} {join_phrases(counts)}."

@@ -105,5 +105,5 @@ class Opinions:
                                            "safety_degree_there", "opinion", "because"])
 
     def __repr__(self) -> str:
-        numbers = ", ".join(f"{self.count(verdict)} {verdict}" for verdict in OpinionVerdict)
-        return f"<Opinions on {self.study.name}, unsafe {self.unsafe}: {numbers}>"
+        counts = ", ".join(f"{self.count(verdict)} {verdict}" for verdict in OpinionVerdict)
+        return f"<Opinions on {self.study.name}, unsafe {self.unsafe}: {counts}>"

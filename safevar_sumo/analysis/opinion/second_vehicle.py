@@ -11,8 +11,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from safevar_sumo.analysis.opinion.mapping import SecondParameters, VehicleMapping
-from safevar_sumo.analysis.opinion.multi_body import STEP, WHEELS, MultiBody, advance, at_speed
+from safevar_sumo.analysis.opinion.mapping import SecondParameters, Surface, VehicleMapping
+from safevar_sumo.analysis.opinion.multi_body import LONGEST_STEP, WHEEL_COUNT, MultiBodyState, advance, at_speed
 from safevar_sumo.records import BoolArray, Command, FloatArray, Observation
 from safevar_sumo.study import Study, load_study
 from safevar_sumo.vehicles import LEVEL, CharacteristicSet, Sensors, Slope, SumoType, Vehicle
@@ -48,7 +48,7 @@ class SecondState(NamedTuple):
     gear: FloatArray
     vehicle: Any
     original: Any
-    body: MultiBody
+    body: MultiBodyState
     brake_commands: FloatArray
 
 
@@ -68,16 +68,17 @@ class SecondVehicle:
     def __init__(self, vehicle: Vehicle, mapping: VehicleMapping, study: Study) -> None:
         self._vehicle, self._mapping = vehicle, mapping
         self.UNITS = vehicle.UNITS
-        shipped_rows = load_study(mapping.table.study).vehicle.characteristics
-        rows = {**shipped_rows, **{name: row for name, row in study.vehicle.characteristics.items() if name not in mapping.foreign}}
-        self._original = {member.name: member.original
-                          for member in CharacteristicSet.of({name: rows[name] for name in mapping.vehicle.UNITS})}
+        shipped_tables = load_study(mapping.table.study).vehicle.characteristics
+        tables = {**shipped_tables, **{name: table for name, table in study.vehicle.characteristics.items()
+                                       if name not in mapping.unknown_names}}
+        self._original = {characteristic.name: characteristic.original
+                          for characteristic in CharacteristicSet.of({name: tables[name] for name in mapping.vehicle.UNITS})}
 
     def prepare(self, characteristics: Characteristics, road_friction: Any, step: float, slope: Slope = LEVEL,
                 wet: bool | BoolArray = False) -> _Prepared:
         ones = np.ones_like(next(iter(characteristics.values())))
         original = {name: value * ones for name, value in self._original.items()}
-        surface = (road_friction, slope, wet)
+        surface = Surface(road_friction, slope, wet)
         road_arguments = () if slope is LEVEL and not np.any(wet) else (slope, wet) if np.any(wet) else (slope,)
         original_vehicle, represent = self._mapping.vehicle, self._mapping.table.represent
         engine = represent(original_vehicle, original, self._original, surface).plant
@@ -87,24 +88,26 @@ class SecondVehicle:
             parameters=represent(
                 original_vehicle, {**original, **{name: characteristics[name] for name in original if name in characteristics}},
                 self._original, surface),
-            engine_mass=engine.mass + WHEELS * engine.wheel_inertia / engine.radius**2, engine_radius=engine.radius, slope=slope, step=step)
+            engine_mass=engine.mass + WHEEL_COUNT * engine.wheel_inertia / engine.radius**2, engine_radius=engine.radius,
+            slope=slope, step=step)
 
     def sumo_type(self, prepared: _Prepared) -> SumoType:
         return self._vehicle.sumo_type(prepared.vehicle)
 
     def at_rest(self, prepared: _Prepared) -> SecondState:
         zeros = np.zeros_like(prepared.engine_mass)
-        return self._state(prepared, zeros, self._vehicle.at_rest(prepared.vehicle), self._mapping.vehicle.at_rest(prepared.original))
+        return self._initial_state(prepared, zeros, self._vehicle.at_rest(prepared.vehicle),
+                                   self._mapping.vehicle.at_rest(prepared.original))
 
     def at_speed(self, prepared: _Prepared, speed: FloatArray) -> SecondState:
         """The state in which the pedals hold the original vehicle's speed."""
-        return self._state(prepared, speed, self._vehicle.at_speed(prepared.vehicle, speed),
-                           self._mapping.vehicle.at_speed(prepared.original, speed))
+        return self._initial_state(prepared, speed, self._vehicle.at_speed(prepared.vehicle, speed),
+                                   self._mapping.vehicle.at_speed(prepared.original, speed))
 
-    def _state(self, p: _Prepared, speed: FloatArray, vehicle: Any, original: Any) -> SecondState:
-        commands = start_history(float(np.max(p.parameters.brake_delay)), p.step, original.brake)
-        return SecondState(speed, original.throttle, original.brake, original.gear, vehicle, original, at_speed(p.parameters.plant, speed),
-                           commands)
+    def _initial_state(self, prepared: _Prepared, speed: FloatArray, vehicle: Any, original: Any) -> SecondState:
+        commands = start_history(float(np.max(prepared.parameters.brake_delay)), prepared.step, original.brake)
+        body = at_speed(prepared.parameters.plant, speed)
+        return SecondState(speed, original.throttle, original.brake, original.gear, vehicle, original, body, commands)
 
     def sensors(self, prepared: _Prepared) -> Sensors | None:
         sensors = getattr(self._vehicle, "sensors", None)
@@ -120,27 +123,29 @@ class SecondVehicle:
         return state if hold is None else state._replace(original=hold(prepared.original, state.original, holds))
 
     def advance(self, prepared: _Prepared, state: SecondState, command: Command) -> SecondState:
-        p, r = prepared, prepared.parameters
-        original, drive_torque = self._engine(p, state, command.throttle)
+        parameters = prepared.parameters
+        original, drive_torque = self._advance_engine(prepared, state, command.throttle)
         commands = extend_history(state.brake_commands, command.brake)
-        demand, body, brake = delay_signal(commands, r.brake_delay, p.step), state.body, state.brake
-        steps = math.ceil(p.step / STEP)
-        step = p.step / steps
-        response = step / (step + r.brake_lag)
-        for _ in range(steps):
-            brake = brake + np.minimum(np.maximum((demand - brake) * response, -r.brake_fall * step), r.brake_rise * step)
-            body = advance(r.plant, body, brake, drive_torque, step)
+        demand, body, brake = delay_signal(commands, parameters.brake_delay, prepared.step), state.body, state.brake
+        step_count = math.ceil(prepared.step / LONGEST_STEP)
+        step = prepared.step / step_count
+        response = step / (step + parameters.brake_lag)
+        for _ in range(step_count):
+            change = np.maximum((demand - brake) * response, -parameters.brake_fall * step)
+            brake = brake + np.minimum(change, parameters.brake_rise * step)
+            body = advance(parameters.plant, body, brake, drive_torque, step)
         return SecondState(body.speed, original.throttle, brake, original.gear, state.vehicle, original, body, commands)
 
-    def _engine(self, p: _Prepared, state: SecondState, throttle: FloatArray) -> tuple[Any, FloatArray]:
+    def _advance_engine(self, prepared: _Prepared, state: SecondState, throttle: FloatArray) -> tuple[Any, FloatArray]:
         """The original vehicle one step later, and the torque of its engine and drags on all wheels at their speed [N m]."""
-        r, engine = p.parameters, state.original
-        speed = state.speed * p.engine_radius / r.plant.radius
+        parameters, engine, radius = prepared.parameters, state.original, prepared.parameters.plant.radius
+        speed = state.speed * prepared.engine_radius / radius
         engine = engine._replace(speed=speed) if not hasattr(engine, "wheel_speed") else engine._replace(
             speed=speed, wheel_speed=np.where(
                 engine.speed > CREEP_SPEED, engine.wheel_speed * speed / np.maximum(engine.speed, CREEP_SPEED), engine.wheel_speed))
-        next_engine = self._mapping.vehicle.advance(p.original, engine, Command(throttle, np.zeros_like(throttle)))
-        torque = p.engine_mass * ((next_engine.speed - speed) / p.step + p.slope.back) * p.engine_radius
-        torque = np.where(torque > 0, torque * r.drive, torque)
-        resistance = r.plant.radius * (r.drag + r.air_drag * state.speed) * state.speed + r.wheel_damping * state.speed / r.plant.radius
+        next_engine = self._mapping.vehicle.advance(prepared.original, engine, Command(throttle, np.zeros_like(throttle)))
+        torque = prepared.engine_mass * ((next_engine.speed - speed) / prepared.step + prepared.slope.back) * prepared.engine_radius
+        torque = np.where(torque > 0, torque * parameters.drive, torque)
+        resistance = (radius * (parameters.drag + parameters.air_drag * state.speed) * state.speed
+                      + parameters.wheel_damping * state.speed / radius)
         return next_engine, torque - resistance

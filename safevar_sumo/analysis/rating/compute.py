@@ -23,13 +23,14 @@ from safevar_sumo.study import Study
 from safevar_sumo.vehicles import CharacteristicSet
 from safevar_sumo.workers.evaluation import Pool
 
+POINT_KINDS = ("standard", "extended", "robustness")
 DECIMALS = 9
 """Decimals of points and speeds in JSON; further decimals would hold only rounding errors."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class RatedTest:
-    """One vehicle's result in a test, by day or by night if the test has both; `points` are (standard, extended, robustness).
+    """One vehicle's result in a test, by day or by night if the test has both; `points` are in the order of `POINT_KINDS`.
 
     `layers` states whether each robustness layer holds, None if the layer is neither simulated nor claimed. Day and night share layers.
     """
@@ -51,61 +52,60 @@ class RatedVehicle:
     setting: Mapping[str, float]
     protocol: Protocol
     cells: CellResults
-    scored: Points
+    scores: Points
     claims: Mapping[str, Sequence[str]]
 
     @property
     def points(self) -> float:
-        return float(self.scored.total[0])
+        return float(self.scores.total[0])
 
     @property
     def fails(self) -> bool:
-        return bool(self.scored.fails[0])
+        return bool(self.scores.fails[0])
 
     @cached_property
     def tests(self) -> list[RatedTest]:
         tests = []
         for block in self.protocol.blocks:
-            standard, extended, robustness = (round(float(value), DECIMALS) for value in self.scored.tests[block.name][0])
-            tests.append(RatedTest(block=block, points=(standard, extended, robustness), layers=self._layers(block)))
+            standard, extended, robustness = (round(float(value), DECIMALS) for value in self.scores.tests[block.name][0])
+            tests.append(RatedTest(block=block, points=(standard, extended, robustness), layers=self._held_layers(block)))
         return tests
 
-    def _layers(self, block: Block) -> dict[str, bool | None]:
+    def _held_layers(self, block: Block) -> dict[str, bool | None]:
         claimed = self.claims.get(block.test, ())
-        return {layer.layer: bool(self.scored.layers[block.test, layer.layer][0]) if layer.simulated_conditions
+        return {layer.layer: bool(self.scores.layers[block.test, layer.layer][0]) if layer.simulated_conditions
                 else (True if layer.layer in claimed else None) for layer in self.protocol.layers_of(block.test)}
 
-    def colour(self, number: int) -> str | None:
+    def colour(self, cell_number: int) -> str | None:
         """Colour of the cell with this number; None if the vehicle could not drive the test."""
-        colour = int(self.scored.colours[0, number])
+        colour = int(self.scores.colours[0, cell_number])
         return None if colour < 0 else COLOURS[colour]
 
-    def passes(self, number: int) -> bool:
+    def passes(self, cell_number: int) -> bool:
         """Whether a cell of a robustness layer meets the layer's criterion."""
-        colour, nominal = self.scored.colours[0, [number, self.nominal(number)]].tolist()
-        return bool(colour >= 0 and (colour < RED if self.protocol.cells[number].criterion == NOT_RED else colour <= nominal))
+        colour, nominal = self.scores.colours[0, [cell_number, self.matrix_cell_number(cell_number)]].tolist()
+        return bool(colour >= 0 and (colour < RED if self.protocol.cells[cell_number].criterion == NOT_RED else colour <= nominal))
 
-    def nominal(self, number: int) -> int:
+    def matrix_cell_number(self, cell_number: int) -> int:
         """Number of the matrix cell of which a layer's cell is a variation."""
-        cell = self.protocol.cells[number]
+        cell = self.protocol.cells[cell_number]
         return self.protocol.matrix_cell_numbers[cell.block.name, cell.row, cell.column]
 
-    def cell(self, number: int) -> dict[str, Any]:
+    def cell_to_dict(self, cell_number: int) -> dict[str, Any]:
         """A cell as `rating --json` prints it."""
-        cell, impact = self.protocol.cells[number], finite_or_none(self.cells.impact[0, number])
-        warning = finite_or_none(self.cells.warning[0, number])
+        cell, impact = self.protocol.cells[cell_number], finite_or_none(self.cells.impact[0, cell_number])
+        warning = finite_or_none(self.cells.warning[0, cell_number])
         return {"range": cell.range, "vut_speed": cell.vut, "target_speed": cell.target, "impact_location": cell.location,
-                "colour": self.colour(number), "relative_impact_speed": None if impact is None else round(impact, DECIMALS),
+                "colour": self.colour(cell_number), "relative_impact_speed": None if impact is None else round(impact, DECIMALS),
                 "warning_ttc": None if warning is None else round(warning, DECIMALS)}
 
     def to_dict(self) -> dict[str, Any]:
         block_cells: dict[str, list[int]] = {}
-        for number, cell in enumerate(self.protocol.cells):
-            block_cells.setdefault(cell.block.name, []).append(number)
-        kinds = ("standard", "extended", "robustness")
-        tests = [{"test": test.block.test, "light": test.block.light, **dict(zip(kinds, test.points, strict=True)),
-                  "possible": dict(zip(kinds, test.block.points, strict=True)),
-                  "cells": [self.cell(number) for number in block_cells[test.block.name]], "layers": dict(test.layers)}
+        for cell_number, cell in enumerate(self.protocol.cells):
+            block_cells.setdefault(cell.block.name, []).append(cell_number)
+        tests = [{"test": test.block.test, "light": test.block.light, **dict(zip(POINT_KINDS, test.points, strict=True)),
+                  "possible": dict(zip(POINT_KINDS, test.block.points, strict=True)),
+                  "cells": [self.cell_to_dict(cell_number) for cell_number in block_cells[test.block.name]], "layers": dict(test.layers)}
                  for test in self.tests]
         return {"name": self.name, "setting": dict(self.setting), "points": round(self.points, DECIMALS),
                 "possible": max_points(self.protocol), "tests": tests}
@@ -150,11 +150,12 @@ class Rating:
 
     def turned(self, variant: RatedVehicle | None = None) -> list[tuple[Cell, str | None, str | None]]:
         """Cells whose colour differs from the original's, with both colours."""
-        other = variant or self.variant
-        if other is None:
+        compared = variant or self.variant
+        if compared is None:
             return []
-        numbers = np.flatnonzero(self.original.scored.colours[0] != other.scored.colours[0]).tolist()
-        return [(self.protocol.cells[number], self.original.colour(number), other.colour(number)) for number in numbers]
+        cell_numbers = np.flatnonzero(self.original.scores.colours[0] != compared.scores.colours[0]).tolist()
+        return [(self.protocol.cells[cell_number], self.original.colour(cell_number), compared.colour(cell_number))
+                for cell_number in cell_numbers]
 
     def to_frame(self) -> pd.DataFrame:
         """One row for each vehicle and test.
@@ -163,7 +164,7 @@ class Rating:
         """
         return pd.DataFrame([{
             "vehicle": vehicle.name, "test": test.block.test, "light": test.block.light,
-            **dict(zip(("standard", "extended", "robustness"), test.points, strict=True)), "total": test.total,
+            **dict(zip(POINT_KINDS, test.points, strict=True)), "total": test.total,
             "possible": sum(test.block.points)} for vehicle in self.variants for test in vehicle.tests])
 
     def to_dict(self) -> dict[str, Any]:
@@ -185,17 +186,17 @@ def rate_variant(subject: Study | Case, options: RatingOptions, *, pool: Pool | 
     InputError
         If the results have no such solution, or a value is outside its domain.
     """
-    study, values, name = subject if isinstance(subject, Study) else subject.study, dict[str, float](), "variant"
+    study, setting_values, name = subject if isinstance(subject, Study) else subject.study, dict[str, float](), "variant"
     characteristics = CharacteristicSet.of(study.vehicle.characteristics)
     if options.solution is not None:
         if isinstance(subject, Study):
             raise InputError("solution", f"{study.name!r} is a study and has no solutions", "a results directory")
         row = subject.solutions.iloc[row_of_handle(subject.solutions, SolutionId.parse(options.solution))]
-        values, name = {characteristic: float(row[characteristic]) for characteristic in characteristics.names}, options.solution
+        setting_values, name = {characteristic: float(row[characteristic]) for characteristic in characteristics.names}, options.solution
     if options.changes:
         characteristics.setting(options.changes, "changes", switch="")  # refuses unknown names
-        values, name = {**values, **options.changes}, f"{name} changed" if values else name
-    variants = {name: characteristics.setting(values, "changes")} if values else {}
+        setting_values, name = {**setting_values, **options.changes}, f"{name} changed" if setting_values else name
+    variants = {name: characteristics.setting(setting_values, "changes")} if setting_values else {}
     return rate(study, variants, pool=pool, jobs=jobs, progress=progress)
 
 
@@ -219,16 +220,17 @@ def rate_on(evaluator: Evaluator, settings: Mapping[str, FloatArray]) -> Rating:
     rater = rater_of(evaluator.study, evaluator.study.source)
     assert rater is not None
     names = CharacteristicSet.of(evaluator.study.vehicle.characteristics).names
-    rows = {"original": evaluator.characteristics.original, **settings}
-    cells = evaluator.simulate_cells(np.stack(list(rows.values())), "cells and robustness layers")
+    all_settings = {"original": evaluator.characteristics.original, **settings}
+    cells = evaluator.simulate_cells(np.stack(list(all_settings.values())), "cells and robustness layers")
     variants = [RatedVehicle(name=name, setting=dict(zip(names, setting.tolist(), strict=True)), protocol=rater.protocol,
-                             cells=cells.of([row]), scored=points_of(rater.protocol, cells.of([row]), rater.claims), claims=rater.claims)
-                for row, (name, setting) in enumerate(rows.items())]
+                             cells=cells.of([index]), scores=points_of(rater.protocol, cells.of([index]), rater.claims),
+                             claims=rater.claims)
+                for index, (name, setting) in enumerate(all_settings.items())]
     return Rating(study=evaluator.study, protocol=rater.protocol, variants=variants)
 
 
 def remarks(rating: Rating) -> list[str]:
-    """Remarks on a rating that its reader should know."""
+    """Conditions and failures that a reader of the rating should know."""
     weather = weather_of(rating.study.weather, f"study {rating.study.name!r}")
     lines = []
     if weather.wet or weather.road_friction != 1:
@@ -236,9 +238,9 @@ def remarks(rating: Rating) -> list[str]:
     for vehicle in rating.variants:
         if vehicle.fails:
             lines.append(f"{vehicle.name}: it earns nothing, because CCRs at 10 and 20 km/h is not green in the whole standard range.")
-        required_cells = [number for number, cell in enumerate(vehicle.protocol.cells) if cell.block.test == "CPNA" and cell.vut == 10
-                    and cell.location == 75 and not cell.is_varied]
-        if not vehicle.fails and any(vehicle.colour(number) != "green" for number in required_cells):
+        required_cells = [cell_number for cell_number, cell in enumerate(vehicle.protocol.cells)
+                          if cell.block.test == "CPNA" and cell.vut == 10 and cell.location == 75 and not cell.is_varied]
+        if not vehicle.fails and any(vehicle.colour(cell_number) != "green" for cell_number in required_cells):
             lines.append(f"{vehicle.name}: CPNA at 10 km/h and 75 % is not green, which Euro NCAP requires; Euro NCAP's calculator "
                          f"{vehicle.protocol.calculator} does not check this, nor do these points.")
         invalid_cells = int(np.count_nonzero(~vehicle.cells.valid))

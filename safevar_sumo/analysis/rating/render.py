@@ -20,55 +20,55 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-LETTERS = {colour: colour[0].upper() for colour in COLOURS}
-LEGEND = ", ".join(f"{letter} {colour}" for colour, letter in LETTERS.items())
+COLOUR_LETTERS = {colour: colour[0].upper() for colour in COLOURS}
+LEGEND = ", ".join(f"{letter} {colour}" for colour, letter in COLOUR_LETTERS.items())
 TERMINAL_STYLES = {"green": "black on green", "yellow": "black on bright_yellow", "orange": "black on dark_orange",
                "brown": "white on dark_red", "red": "white on red"}
 DARK_COLOURS = ("green", "brown", "red")
 """Colours of cells whose text is white."""
-LIGHTS = {"day": " by day", "night": " by night", None: ""}
+LIGHT_WORDS = {"day": " by day", "night": " by night", None: ""}
 FIGURE_COLUMNS = 4
 
 
-def print_rating(console: Console, result: Rating) -> None:
+def print_rating(console: Console, rating: Rating) -> None:
     """Print the verdict, the points of every test, the robustness layers that hold, and the tests not simulated."""
-    print_text(console, result.study.title)
-    print_text(console, rating_in_words(result))
-    console.print(_points_table(result))
-    console.print(_layers_table(result))
-    print_text(console, not_simulated(result))
+    print_text(console, rating.study.title)
+    print_text(console, rating_in_words(rating))
+    console.print(_build_points_table(rating))
+    console.print(_build_layers_table(rating))
+    print_text(console, not_simulated(rating))
 
 
-def rating_in_words(result: Rating) -> str:
+def rating_in_words(rating: Rating) -> str:
     """The rating in a sentence: the points that a variant loses and in which test, or the points of the original vehicle."""
-    maximum, variant = max_points(result.protocol), result.variant
+    maximum, variant = max_points(rating.protocol), rating.variant
     if variant is None:
-        return f"The original vehicle earns {result.original.points:.2f} of the {maximum:g} points of the tests that are simulated."
-    changes = _changes_in_words(result, variant)
-    reference = f"of the {result.original.points:.2f} points that the original earns (of {maximum:g} that are simulated)"
-    if not result.lost:
+        return f"The original vehicle earns {rating.original.points:.2f} of the {maximum:g} points of the tests that are simulated."
+    changes = _changes_in_words(rating, variant)
+    reference = f"of the {rating.original.points:.2f} points that the original earns (of {maximum:g} that are simulated)"
+    if not rating.lost:
         return f"With {changes} the vehicle keeps all {reference}."
-    if result.lost < 0:
-        return f"With {changes} the vehicle earns {-result.lost:.2f} points more, {variant.points:.2f} instead {reference}."
-    losses = lost_by_test(result)
+    if rating.lost < 0:
+        return f"With {changes} the vehicle earns {-rating.lost:.2f} points more, {variant.points:.2f} instead {reference}."
+    losses = lost_by_test(rating)
     test, largest = losses[0]
-    share = "all" if math.isclose(largest, result.lost, abs_tol=1e-6) else "most" if largest > result.lost / 2 else f"{largest:.2f}"
-    return f"With {changes} the vehicle loses {result.lost:.2f} {reference}, {share} of them in {test_in_words(test)}."
+    share = "all" if math.isclose(largest, rating.lost, abs_tol=1e-6) else "most" if largest > rating.lost / 2 else f"{largest:.2f}"
+    return f"With {changes} the vehicle loses {rating.lost:.2f} {reference}, {share} of them in {test_in_words(test)}."
 
 
-def lost_by_test(result: Rating) -> list[tuple[RatedTest, float]]:
+def lost_by_test(rating: Rating) -> list[tuple[RatedTest, float]]:
     """Tests in which the variant has fewer points than the original, the largest loss first."""
-    if result.variant is None:
+    if rating.variant is None:
         return []
-    pairs = zip(result.original.tests, result.variant.tests, strict=True)
+    pairs = zip(rating.original.tests, rating.variant.tests, strict=True)
     losses = [(before, round(before.total - after.total, 9)) for before, after in pairs]
-    return sorted((pair for pair in losses if pair[1] > 0), key=lambda pair: -pair[1])
+    return sorted(((test, loss) for test, loss in losses if loss > 0), key=lambda test_and_loss: -test_and_loss[1])
 
 
-def turned_in_words(result: Rating) -> list[tuple[str, str]]:
+def turned_in_words(rating: Rating) -> list[tuple[str, str]]:
     """Tests with matrix cells whose colour differs from the original's, each with a text on colours and speeds."""
     tests: dict[str, dict[tuple[str, str], list[str]]] = {}
-    for cell, before, after in result.turned():
+    for cell, before, after in rating.turned():
         if not cell.is_varied:
             colours = before or "unknown", after or "unknown"
             tests.setdefault(cell.block.name, {}).setdefault(colours, []).append(f"{cell.vut:g}")
@@ -76,40 +76,40 @@ def turned_in_words(result: Rating) -> list[tuple[str, str]]:
                              for (before, after), speeds in groups.items())) for test, groups in tests.items()]
 
 
-def not_simulated(result: Rating) -> str:
+def not_simulated(rating: Rating) -> str:
     """Sentences on the tests and robustness layers without points."""
-    tests = result.protocol.points_not_simulated
+    tests = rating.protocol.points_not_simulated
     named = ", ".join(f"{test} {points:g}" for test, points in tests.items())
     text = f"Not simulated, neither passed nor failed: {named}; {sum(tests.values()):g} points."
-    if result.left_open:
-        text += f" Robustness layers that are neither simulated nor claimed: {result.left_open:.2f} points of the tests above."
+    if rating.left_open:
+        text += f" Robustness layers that are neither simulated nor claimed: {rating.left_open:.2f} points of the tests above."
     return text
 
 
 def test_in_words(test: RatedTest) -> str:
-    return f"{test.block.test}{LIGHTS[test.block.light]}"
+    return f"{test.block.test}{LIGHT_WORDS[test.block.light]}"
 
 
-def _changes_in_words(result: Rating, variant: RatedVehicle) -> str:
-    members = CharacteristicSet.of(result.study.vehicle.characteristics)
-    parts = [f"{member.short_name} {float(member.text(variant.setting[member.name])):g}{member.suffix}" for member in members
-             if variant.setting[member.name] != member.original]
-    return join_phrases(parts) if parts else "no change at all"
+def _changes_in_words(rating: Rating, variant: RatedVehicle) -> str:
+    characteristics = CharacteristicSet.of(rating.study.vehicle.characteristics)
+    changes = [f"{characteristic.short_name} {float(characteristic.text(variant.setting[characteristic.name])):g}{characteristic.suffix}"
+               for characteristic in characteristics if variant.setting[characteristic.name] != characteristic.original]
+    return join_phrases(changes) if changes else "no change at all"
 
 
-def _points_table(result: Rating) -> WholeTable:
+def _build_points_table(rating: Rating) -> WholeTable:
     """Points of every test as standard + extended + robustness = total."""
-    names = [vehicle.name for vehicle in result.variants]
-    table = WholeTable("test", right=[*names, *(["lost"] if result.variant else []), "of"],
+    names = [vehicle.name for vehicle in rating.variants]
+    table = WholeTable("test", right=[*names, *(["lost"] if rating.variant else []), "of"],
                        title="Points: standard + extended + robustness = total")
-    for tests in zip(*(vehicle.tests for vehicle in result.variants), strict=True):
-        lost = round(tests[0].total - tests[-1].total, 2)
-        table.add_row(tests[0].block.name, *(_sum_in_words(test.points) for test in tests),
-                      *([f"{lost:.2f}" if lost else ""] if result.variant else []), f"{sum(tests[0].block.points):.2f}")
+    for vehicle_tests in zip(*(vehicle.tests for vehicle in rating.variants), strict=True):
+        lost = round(vehicle_tests[0].total - vehicle_tests[-1].total, 2)
+        table.add_row(vehicle_tests[0].block.name, *(_sum_in_words(test.points) for test in vehicle_tests),
+                      *([f"{lost:.2f}" if lost else ""] if rating.variant else []), f"{sum(vehicle_tests[0].block.points):.2f}")
     table.add_section()
-    totals = [[sum(test.points[kind] for test in vehicle.tests) for kind in range(3)] for vehicle in result.variants]
-    table.add_row("all", *map(_sum_in_words, totals), *([f"{result.lost:.2f}"] if result.variant else []),
-                  f"{max_points(result.protocol):g}")
+    totals = [[sum(test.points[kind] for test in vehicle.tests) for kind in range(3)] for vehicle in rating.variants]
+    table.add_row("all", *map(_sum_in_words, totals), *([f"{rating.lost:.2f}"] if rating.variant else []),
+                  f"{max_points(rating.protocol):g}")
     return table
 
 
@@ -117,115 +117,117 @@ def _sum_in_words(points: Sequence[float]) -> str:
     return f"{'+'.join(f'{value:.2f}' for value in points)} = {sum(points):.2f}"
 
 
-def _layers_table(result: Rating) -> WholeTable:
+def _build_layers_table(rating: Rating) -> WholeTable:
     """The layers that are simulated or claimed; a variant has a row only where it differs from the original."""
     table = WholeTable("test", "vehicle", "robustness layers that hold", "that do not", "that are claimed", title="Robustness layers")
-    for tests in zip(*(vehicle.tests for vehicle in result.variants), strict=True):
-        claimed = result.original.claims.get(tests[0].block.test, ())
-        for vehicle, test in zip(result.variants, tests, strict=True):
-            if test.block.light != "night" and (vehicle is result.original or test.layers != tests[0].layers):
+    for vehicle_tests in zip(*(vehicle.tests for vehicle in rating.variants), strict=True):
+        claimed = rating.original.claims.get(vehicle_tests[0].block.test, ())
+        for vehicle, test in zip(rating.variants, vehicle_tests, strict=True):
+            if test.block.light != "night" and (vehicle is rating.original or test.layers != vehicle_tests[0].layers):
                 held_layers, failed_layers = ([layer for layer, holds in test.layers.items() if holds is expected and layer not in claimed]
-                                    for expected in (True, False))
+                                              for expected in (True, False))
                 table.add_row(test.block.test, vehicle.name, ", ".join(held_layers), ", ".join(failed_layers), ", ".join(claimed))
     return table
 
 
-def print_matrices(console: Console, result: Rating) -> None:
+def print_matrices(console: Console, rating: Rating) -> None:
     """Print every matrix: for each cell a letter, a colour, and the impact speed [km/h] or the time to collision at the warning [s]."""
-    for block in result.protocol.blocks:
+    for block in rating.protocol.blocks:
         columns = [f"{location:g} %" for location in block.impact_locations] or [f"{speed:g}" for speed in block.target_speeds]
-        columns_are = "impact location" if block.impact_locations else "speed of the target"
-        heads = ["VUT", *(["target"] if block.impact_locations else [])]
-        table = WholeTable(*heads, right=columns, title=f"{block.name}: speeds [km/h], {columns_are}")
-        for k, row in enumerate(block.rows):
-            cells = [_cell(result, block, k, column) if letter != "-" else Text("") for column, letter in enumerate(row.ranges)]
-            function = " FCW" if block.is_warning(k) else ""
+        column_meaning = "impact location" if block.impact_locations else "speed of the target"
+        headings = ["VUT", *(["target"] if block.impact_locations else [])]
+        table = WholeTable(*headings, right=columns, title=f"{block.name}: speeds [km/h], {column_meaning}")
+        for row_number, row in enumerate(block.rows):
+            cells = [_format_cell(rating, block, row_number, column) if letter != "-" else Text("")
+                     for column, letter in enumerate(row.ranges)]
+            function = " FCW" if block.is_warning(row_number) else ""
             table.add_row(f"{row.vut:g}{function}", *([] if row.target is None else [f"{row.target:g}"]), *cells)
         console.print(table)
-    compared = "; original>variant where they differ" if result.variant else ""
+    compared = "; original>variant where they differ" if rating.variant else ""
     print_text(console, f"{LEGEND}; small letters: extended range. The number is the relative speed of the impact [km/h]; in rows with "
                         f"FCW it is the time to collision at the warning [s]{compared}.")
 
 
-def _cell(result: Rating, block: Block, row: int, column: int) -> Text:
-    number = result.protocol.matrix_cell_numbers[block.name, row, column]
-    differs = len({vehicle.colour(number) for vehicle in result.variants}) > 1
+def _format_cell(rating: Rating, block: Block, row: int, column: int) -> Text:
+    cell_number = rating.protocol.matrix_cell_numbers[block.name, row, column]
+    differs = len({vehicle.colour(cell_number) for vehicle in rating.variants}) > 1
     text = Text()
-    for k, vehicle in enumerate(result.variants if differs else result.variants[:1]):
-        text.append(">" if k else "")
-        is_last = k == len(result.variants) - 1 or not differs
-        text.append(_cell_text(vehicle, number, with_value=is_last), style=TERMINAL_STYLES.get(vehicle.colour(number) or "", ""))
+    for index, vehicle in enumerate(rating.variants if differs else rating.variants[:1]):
+        text.append(">" if index else "")
+        is_last = index == len(rating.variants) - 1 or not differs
+        style = TERMINAL_STYLES.get(vehicle.colour(cell_number) or "", "")
+        text.append(_format_vehicle_cell(vehicle, cell_number, with_value=is_last), style=style)
     return text
 
 
-def _cell_text(vehicle: RatedVehicle, number: int, *, with_value: bool) -> str:
-    cell, colour = vehicle.protocol.cells[number], vehicle.colour(number)
-    record = vehicle.cell(number)
-    value = record["warning_ttc"] if cell.judged == "warning" else record["relative_impact_speed"]
-    letter = "?" if colour is None else LETTERS[colour]
+def _format_vehicle_cell(vehicle: RatedVehicle, cell_number: int, *, with_value: bool) -> str:
+    cell, colour = vehicle.protocol.cells[cell_number], vehicle.colour(cell_number)
+    cell_data = vehicle.cell_to_dict(cell_number)
+    value = cell_data["warning_ttc"] if cell.judged == "warning" else cell_data["relative_impact_speed"]
+    letter = "?" if colour is None else COLOUR_LETTERS[colour]
     letter = letter.lower() if cell.range == "extended" else letter
     shows_value = with_value and value is not None and (colour != "green" or cell.judged == "warning")
     return f"{letter}{value:.1f}" if shows_value and value < 10 else f"{letter}{value:.0f}" if shows_value else letter
 
 
-def matrices_figure(result: Rating) -> Figure:
+def matrices_figure(rating: Rating) -> Figure:
     """All matrices of both vehicles side by side: colours and letters; extended cells are hatched, cells that differ are framed."""
-    blocks = result.protocol.blocks
+    blocks = rating.protocol.blocks
     rows = math.ceil(len(blocks) / FIGURE_COLUMNS)
-    figure, axes = new_figure(verdict_title(result), rows, FIGURE_COLUMNS, (15, 2.6 * rows))
+    figure, axes = new_figure(points_title(rating), rows, FIGURE_COLUMNS, (15, 2.6 * rows))
     for axis in axes.flat[len(blocks):]:
         axis.set_axis_off()
     for axis, block in zip(axes.flat, blocks, strict=False):
-        _draw_matrices(axis, result, block)
+        _draw_matrices(axis, rating, block)
     figure.supxlabel(f"impact location [% of the width], or speed of the target [km/h] in CCCscp and CMCscp; {LEGEND}; hatched: extended "
                      "range; thick frame: colour differs from the original's", fontsize=FONT)
     figure.supylabel("speed of the vehicle under test [km/h]", fontsize=FONT)
     return figure
 
 
-def verdict_title(result: Rating) -> str:
-    points = "; ".join(f"{vehicle.name}: {vehicle.points:.2f} points" for vehicle in result.variants)
-    sides = " (original left, variant right)" if result.variant else ""
-    return f"{result.study.name}: {points} of {max_points(result.protocol):g}{sides}"
+def points_title(rating: Rating) -> str:
+    points = "; ".join(f"{vehicle.name}: {vehicle.points:.2f} points" for vehicle in rating.variants)
+    arrangement = " (original left, variant right)" if rating.variant else ""
+    return f"{rating.study.name}: {points} of {max_points(rating.protocol):g}{arrangement}"
 
 
-def _draw_matrices(axis: Axes, result: Rating, block: Block) -> None:
+def _draw_matrices(axis: Axes, rating: Rating, block: Block) -> None:
     """Draw a block's matrix of each vehicle, side by side."""
     from matplotlib.patches import Rectangle
 
     columns = max(len(row.ranges) for row in block.rows)
-    heads = block.impact_locations or block.target_speeds
+    column_values = block.impact_locations or block.target_speeds
     ticks: list[tuple[float, str]] = []
-    for k, vehicle in enumerate(result.variants):
-        shift = k * (columns + 0.6)
-        ticks += [(shift + column + 0.5, f"{head:g}") for column, head in enumerate(heads)]
-        for row, column, number in _cells_of(block, result):
-            colour, is_extended = vehicle.colour(number), result.protocol.cells[number].range == "extended"
-            differs = k > 0 and colour != result.original.colour(number)
-            fill_colour = f"#{result.protocol.colours[colour]}" if colour else "#808080"
+    for k, vehicle in enumerate(rating.variants):
+        offset = k * (columns + 0.6)
+        ticks += [(offset + column + 0.5, f"{value:g}") for column, value in enumerate(column_values)]
+        for row, column, cell_number in _iterate_cells(block, rating):
+            colour, is_extended = vehicle.colour(cell_number), rating.protocol.cells[cell_number].range == "extended"
+            differs = k > 0 and colour != rating.original.colour(cell_number)
+            fill_colour = f"#{rating.protocol.colours[colour]}" if colour else "#808080"
             text_colour = "white" if colour in DARK_COLOURS or colour is None else "black"
-            axis.add_patch(Rectangle((shift + column, row), 1, 1, facecolor=fill_colour, edgecolor="white", linewidth=0.6,
+            axis.add_patch(Rectangle((offset + column, row), 1, 1, facecolor=fill_colour, edgecolor="white", linewidth=0.6,
                                      hatch="///" if is_extended else None))
             if differs:
-                axis.add_patch(Rectangle((shift + column + 0.08, row + 0.08), 0.84, 0.84, fill=False, edgecolor="black", linewidth=1.8))
-            axis.text(shift + column + 0.5, row + 0.5, LETTERS.get(colour or "", "?"), ha="center", va="center", fontsize=FONT - 2,
+                axis.add_patch(Rectangle((offset + column + 0.08, row + 0.08), 0.84, 0.84, fill=False, edgecolor="black", linewidth=1.8))
+            axis.text(offset + column + 0.5, row + 0.5, COLOUR_LETTERS.get(colour or "", "?"), ha="center", va="center", fontsize=FONT - 2,
                       color=text_colour, bbox={"facecolor": fill_colour, "edgecolor": "none", "pad": 0.8})
-    axis.set_xlim(0, len(result.variants) * (columns + 0.6) - 0.6)
+    axis.set_xlim(0, len(rating.variants) * (columns + 0.6) - 0.6)
     axis.set_ylim(len(block.rows), 0)
     axis.set_xticks([position for position, _ in ticks], [text for _, text in ticks], fontsize=FONT - 3)
-    names = [f"{row.vut:g}{' FCW' if block.is_warning(k) else ''}" for k, row in enumerate(block.rows)]
-    axis.set_yticks([k + 0.5 for k in range(len(names))], names, fontsize=FONT - 2)
+    row_names = [f"{row.vut:g}{' FCW' if block.is_warning(k) else ''}" for k, row in enumerate(block.rows)]
+    axis.set_yticks([k + 0.5 for k in range(len(row_names))], row_names, fontsize=FONT - 2)
     axis.grid(visible=False)
-    axis.set_title(escape_dollars(f"{block.name}: {_totals(result, block)} of {sum(block.points):g}"), fontsize=FONT)
+    axis.set_title(escape_dollars(f"{block.name}: {_totals_in_words(rating, block)} of {sum(block.points):g}"), fontsize=FONT)
 
 
-def _totals(result: Rating, block: Block) -> str:
-    return " / ".join(f"{test.total:.2f}" for vehicle in result.variants for test in vehicle.tests if test.block is block)
+def _totals_in_words(rating: Rating, block: Block) -> str:
+    return " / ".join(f"{test.total:.2f}" for vehicle in rating.variants for test in vehicle.tests if test.block is block)
 
 
-def _cells_of(block: Block, result: Rating) -> Iterator[tuple[int, int, int]]:
+def _iterate_cells(block: Block, rating: Rating) -> Iterator[tuple[int, int, int]]:
     """Row, column and number of each cell of a block's matrix."""
     for row, speeds in enumerate(block.rows):
         for column, letter in enumerate(speeds.ranges):
             if letter != "-":
-                yield row, column, result.protocol.matrix_cell_numbers[block.name, row, column]
+                yield row, column, rating.protocol.matrix_cell_numbers[block.name, row, column]

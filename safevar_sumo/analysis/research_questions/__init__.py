@@ -1,1 +1,1 @@
-"""What results mean: research questions, statistics, tables and pictures; without SUMO."""
+"""Answers to the research questions from results: statistics, tables and figures, without SUMO."""

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from safevar_sumo.analysis.figures import FONT, escape_dollars, new_figure
-from safevar_sumo.analysis.research_questions.algorithms import SURFACE_PERCENTAGES, attainment, ranks
-from safevar_sumo.analysis.research_questions.case import ALGORITHM_TITLES, Case, Unanswerable
+from safevar_sumo.analysis.research_questions.algorithms import SURFACE_PERCENTAGES, compute_attainment, rank_algorithms
+from safevar_sumo.analysis.research_questions.case import ALGORITHM_TITLES, Case, UnanswerableError
 from safevar_sumo.analysis.research_questions.comparisons import ALPHA
-from safevar_sumo.analysis.research_questions.figures import COLOURS, legend_below, objective_title
+from safevar_sumo.analysis.research_questions.figures import COLOURS, add_legend_below, objective_title
 from safevar_sumo.analysis.research_questions.indicators import INDICATOR_TITLES
 from safevar_sumo.records import FloatArray
 
@@ -22,53 +22,53 @@ ALGORITHM_HEIGHT = 0.34
 """Height of an algorithm's line in a diagram [inch]."""
 
 
-def critical_differences(case: Case) -> Figure:
+def draw_critical_differences(case: Case) -> Figure:
     """Mean ranks of the algorithms for each quality indicator; a bar joins ranks that Nemenyi's test does not distinguish.
 
     Raises
     ------
-    Unanswerable
+    UnanswerableError
         If there are fewer than three algorithms, or no run in which all of them have solutions.
     """
-    frame = ranks(case)
+    frame = rank_algorithms(case)
     frame = frame[frame["metric"].isin(list(INDICATOR_TITLES)) & frame["mean_rank"].notna()]
     if frame.empty:
-        raise Unanswerable(case.name, "has no run in which every algorithm has solutions", "results of three algorithms or more")
+        raise UnanswerableError(case.name, "has no run in which every algorithm has solutions", "results of three algorithms or more")
     metrics, algorithms = list(dict.fromkeys(frame["metric"])), frame["algorithm"].nunique()
     runs, difference = int(frame["runs"].iloc[0]), float(frame["critical_difference"].iloc[0])
     title = f"{case.name}: mean ranks over {runs} runs, critical difference {difference:.2f}"
     figure, axes = new_figure(title, len(metrics), 1, (6.8, 0.9 + len(metrics) * (0.75 + ALGORITHM_HEIGHT * algorithms)))
     for axis, metric in zip(axes.flat, metrics, strict=True):
         metric_ranks = frame[frame["metric"] == metric].sort_values("mean_rank", kind="stable")
-        _diagram(axis, metric_ranks["algorithm"].tolist(), metric_ranks["mean_rank"].to_numpy(dtype=float), difference)
+        _draw_mean_ranks(axis, metric_ranks["algorithm"].tolist(), metric_ranks["mean_rank"].to_numpy(dtype=float), difference)
         axis.set_ylabel(INDICATOR_TITLES[metric])
         axis.set_xlabel("mean rank, 1 is best")
     figure.supxlabel(f"a bar joins ranks that differ by less than the critical difference (Nemenyi's test at {ALPHA:g})", fontsize=FONT)
     return figure
 
 
-def _diagram(axis: Axes, algorithms: list[str], mean_ranks: FloatArray, difference: float) -> None:
-    number = len(algorithms)
-    axis.set_xlim(0.85, number + 0.25 * number)
-    axis.set_ylim(-0.6 * len(mean_ranks) - 0.4, number)
-    for position, (name, rank) in enumerate(zip(algorithms, mean_ranks, strict=True)):
-        height = number - 1 - position
+def _draw_mean_ranks(axis: Axes, algorithms: list[str], mean_ranks: FloatArray, difference: float) -> None:
+    algorithm_count = len(algorithms)
+    axis.set_xlim(0.85, algorithm_count + 0.25 * algorithm_count)
+    axis.set_ylim(-0.6 * len(mean_ranks) - 0.4, algorithm_count)
+    for index, (name, rank) in enumerate(zip(algorithms, mean_ranks, strict=True)):
+        height = algorithm_count - 1 - index
         axis.plot([rank, rank], [height, -0.2], color="black", linewidth=0.8)
         axis.plot(rank, height, marker="o", markersize=4, color="#0072b2")
         axis.annotate(f"{escape_dollars(ALGORITHM_TITLES.get(name, name))} {rank:.2f}", (rank, height), xytext=(6, 0),
                       textcoords="offset points", va="center", fontsize=FONT)
-    for bar, (first, last) in enumerate(cliques(mean_ranks, difference)):
+    for bar, (first, last) in enumerate(find_cliques(mean_ranks, difference)):
         axis.plot([mean_ranks[first] - 0.03, mean_ranks[last] + 0.03], [-0.6 - 0.5 * bar] * 2, color="#d55e00", linewidth=3,
                   solid_capstyle="round")
     axis.set_yticks([])
     axis.grid(visible=False)
     for spine in ("left", "right"):
         axis.spines[spine].set_visible(False)
-    axis.set_xticks(range(1, number + 1))
+    axis.set_xticks(range(1, algorithm_count + 1))
     axis.xaxis.set_ticks_position("bottom")
 
 
-def cliques(mean_ranks: FloatArray, difference: float) -> list[tuple[int, int]]:
+def find_cliques(mean_ranks: FloatArray, difference: float) -> list[tuple[int, int]]:
     """First and last index of each largest group of sorted mean ranks that differ by less than the critical difference."""
     groups: list[tuple[int, int]] = []
     for first in range(len(mean_ranks)):
@@ -78,41 +78,42 @@ def cliques(mean_ranks: FloatArray, difference: float) -> list[tuple[int, int]]:
     return groups
 
 
-def attainment_surfaces(case: Case) -> Figure:
+def draw_attainment_surfaces(case: Case) -> Figure:
     """The values of the first two objectives that one run, half of the runs and all runs of each algorithm attain.
 
     Raises
     ------
-    Unanswerable
+    UnanswerableError
         If there are no runs with solutions.
     """
-    surfaces, goals = attainment(case), case.scoring.objectives[:2]
+    surfaces, objectives = compute_attainment(case), case.scoring.objectives[:2]
     columns = min(len(surfaces), 3)
     rows = -(-len(surfaces) // columns)
     figure, axes = new_figure(f"{case.name}: empirical attainment", rows, columns, (max(3.0 * columns, 5.2), 0.8 + 3.1 * rows),)
-    all_points = np.concatenate([points for levels in surfaces.values() for points in levels.values()])
-    for axis, (algorithm, levels) in zip(axes.flat, surfaces.items(), strict=False):
-        worst_values = np.array([np.min(all_points[:, i]) if goal.maximised else np.max(all_points[:, i]) for i, goal in enumerate(goals)])
-        for i, (level, points) in enumerate(levels.items()):
-            label = {SURFACE_PERCENTAGES[0]: "half of the runs", SURFACE_PERCENTAGES[1]: "every run"}.get(level, "at least one run")
-            axis.plot(*_stairs(points, worst_values).T, color=COLOURS[i % len(COLOURS)], linestyle=("-", "--", "-.")[i % 3], linewidth=1.4,
-                      label=label)
+    all_points = np.concatenate([points for surfaces_by_percentage in surfaces.values() for points in surfaces_by_percentage.values()])
+    for axis, (algorithm, surfaces_by_percentage) in zip(axes.flat, surfaces.items(), strict=False):
+        worst_values = np.array([np.min(all_points[:, i]) if objective.maximised else np.max(all_points[:, i])
+                                 for i, objective in enumerate(objectives)])
+        for i, (percentage, points) in enumerate(surfaces_by_percentage.items()):
+            label = {SURFACE_PERCENTAGES[0]: "half of the runs", SURFACE_PERCENTAGES[1]: "every run"}.get(percentage, "at least one run")
+            axis.plot(*_staircase_corners(points, worst_values).T, color=COLOURS[i % len(COLOURS)], linestyle=("-", "--", "-.")[i % 3],
+                      linewidth=1.4, label=label)
         axis.set_title(escape_dollars(ALGORITHM_TITLES.get(algorithm, algorithm)), fontsize=FONT)
-        axis.set_xlabel(objective_title(goals[0]))
-        axis.set_ylabel(objective_title(goals[1]))
+        axis.set_xlabel(objective_title(objectives[0]))
+        axis.set_ylabel(objective_title(objectives[1]))
     for axis in list(axes.flat)[len(surfaces):]:
         axis.set_axis_off()
-    legend_below(figure, axes.flat[0])
+    add_legend_below(figure, axes.flat[0])
     return figure
 
 
-def _stairs(points: FloatArray, worst_values: FloatArray) -> FloatArray:
+def _staircase_corners(points: FloatArray, worst_values: FloatArray) -> FloatArray:
     """K corners of the border of the region that the points dominate, from worst value to worst value; shape (K, 2)."""
     staircase = points[np.argsort(points[:, 0], kind="stable")]
     if np.sign(worst_values[0] - np.mean(staircase[:, 0])) < 0:
         staircase = staircase[::-1]
     border = [(staircase[0, 0], worst_values[1])]
-    for position, (x, y) in enumerate(staircase):
+    for index, (x, y) in enumerate(staircase):
         border.append((x, y))
-        border.append((staircase[position + 1, 0] if position + 1 < len(staircase) else worst_values[0], y))
+        border.append((staircase[index + 1, 0] if index + 1 < len(staircase) else worst_values[0], y))
     return np.array(border)

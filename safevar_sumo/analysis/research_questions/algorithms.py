@@ -11,10 +11,10 @@ import numpy as np
 import pandas as pd
 import scipy
 
-from safevar_sumo.analysis.research_questions.case import Case, Unanswerable
+from safevar_sumo.analysis.research_questions.case import Case, UnanswerableError
 from safevar_sumo.analysis.research_questions.comparisons import ALPHA, compare_samples, reverse_effect
-from safevar_sumo.analysis.research_questions.indicators import MORE_IS_BETTER, indicators, objectives
-from safevar_sumo.analysis.research_questions.over_runs import holm, series_of_means
+from safevar_sumo.analysis.research_questions.indicators import MORE_IS_BETTER, compute_indicators, objective_values
+from safevar_sumo.analysis.research_questions.over_runs import correct_by_holm, run_mean_series
 from safevar_sumo.records import FloatArray
 
 PAIR_COLUMNS = ["setting", "algorithm", "other", "metric", "p_value", "p_holm", "effect_size", "magnitude", "n1", "n2", "method"]
@@ -23,7 +23,7 @@ SURFACE_PERCENTAGES = (50.0, 100.0)
 """Percentages of the runs whose attainment surfaces are computed, in addition to a single run's."""
 
 
-def pairs(case: Case) -> pd.DataFrame:
+def compare_pairs(case: Case) -> pd.DataFrame:
     """Every pair of algorithms, run against run: indicators and metrics' run means, Mann-Whitney U.
 
     Columns: `PAIR_COLUMNS`. `effect_size` is A12, oriented so that higher values mean that `algorithm` is better than `other`. `p_holm` is
@@ -31,21 +31,21 @@ def pairs(case: Case) -> pd.DataFrame:
 
     Raises
     ------
-    Unanswerable
+    UnanswerableError
         If there are no runs, or runs of only one algorithm.
     """
-    samples, rows = _samples(case, 2), list[dict[str, Any]]()
+    samples, rows = _collect_samples(case, 2), list[dict[str, Any]]()
     for first, second in combinations(case.algorithms, 2):
         for metric, (more_is_better, by_algorithm) in samples.items():
             test = compare_samples(*(by_algorithm[name].dropna() for name in (first, second)))
             rows.append({"setting": case.name, "algorithm": first, "other": second, "metric": metric,
                          **(test if more_is_better else reverse_effect(test))._asdict()})
-    for row, p in zip(rows, holm([row["p_value"] for row in rows]), strict=True):
+    for row, p in zip(rows, correct_by_holm([row["p_value"] for row in rows]), strict=True):
         row["p_holm"] = p
     return pd.DataFrame(rows, columns=PAIR_COLUMNS, dtype=object)
 
 
-def ranks(case: Case) -> pd.DataFrame:
+def rank_algorithms(case: Case) -> pd.DataFrame:
     """Mean ranks of the algorithms over runs, metric by metric, with Friedman's test.
 
     Runs with the same number form a block; a block in which an algorithm has no value is left out. Columns: `RANK_COLUMNS`. Rank 1 is the
@@ -54,11 +54,11 @@ def ranks(case: Case) -> pd.DataFrame:
 
     Raises
     ------
-    Unanswerable
+    UnanswerableError
         If there are no runs, or fewer than three algorithms.
     """
     p_values, rows = dict[str, float | None](), list[dict[str, Any]]()
-    for metric, (more_is_better, by_algorithm) in _samples(case, 3).items():
+    for metric, (more_is_better, by_algorithm) in _collect_samples(case, 3).items():
         blocks = pd.DataFrame(by_algorithm).dropna()
         values = blocks.to_numpy(dtype=float)
         ranks_of_runs = scipy.stats.rankdata(-values if more_is_better else values, axis=1)
@@ -69,7 +69,7 @@ def ranks(case: Case) -> pd.DataFrame:
                   "median": float(np.median(values[:, i])) if len(blocks) else None,
                   "critical_difference": critical_difference(len(blocks.columns), len(blocks)) if len(blocks) else None}
                  for i, name in enumerate(blocks.columns)]
-    corrected_p_values = dict(zip(p_values, holm(list(p_values.values())), strict=True))
+    corrected_p_values = dict(zip(p_values, correct_by_holm(list(p_values.values())), strict=True))
     return pd.DataFrame([{**row, "p_holm": corrected_p_values[row["metric"]]} for row in rows], columns=RANK_COLUMNS, dtype=object)
 
 
@@ -79,7 +79,7 @@ def critical_difference(algorithms: int, runs: int, alpha: float = ALPHA) -> flo
     return float(q * np.sqrt(algorithms * (algorithms + 1) / (6 * runs)))
 
 
-def attainment(case: Case) -> dict[str, dict[float, FloatArray]]:
+def compute_attainment(case: Case) -> dict[str, dict[float, FloatArray]]:
     """Empirical attainment surfaces of the first two objectives, by algorithm and percentage of its runs.
 
     A surface is K points, shape (K, 2), in the objectives' units, sorted by the first objective. For each of its points, that percentage
@@ -87,43 +87,44 @@ def attainment(case: Case) -> dict[str, dict[float, FloatArray]]:
 
     Raises
     ------
-    Unanswerable
+    UnanswerableError
         If there are no runs with solutions.
     """
     surfaces: dict[str, dict[float, FloatArray]] = {}
     signs = np.array([objective.sign for objective in case.scoring.objectives[:2]])
     for algorithm in case.algorithms:
         solutions = case.solutions_of(algorithm)
-        fronts = [objectives(case, solutions[solutions["run"] == run])[:, :2] for run in case.runs_of(algorithm)]
+        fronts = [objective_values(case, solutions[solutions["run"] == run])[:, :2] for run in case.runs_of(algorithm)]
         fronts = [front for front in fronts if len(front)]
         if fronts:
             run_indices = np.repeat(np.arange(len(fronts)), [len(front) for front in fronts])
             percentages = sorted({100 / len(fronts), *SURFACE_PERCENTAGES})
             points = moocore.eaf(np.concatenate(fronts), run_indices, percentiles=percentages)
-            levels = np.unique(points[:, 2])
-            surfaces[algorithm] = {level: (group := points[points[:, 2] == level, :2])[np.argsort(group[:, 0], kind="stable")] * signs
-                                   for level in levels.tolist()}
+            surfaces[algorithm] = {
+                percentage: (surface := points[points[:, 2] == percentage, :2])[np.argsort(surface[:, 0], kind="stable")] * signs
+                for percentage in np.unique(points[:, 2]).tolist()}
     if not surfaces:
-        raise Unanswerable(case.name, "has no solution", "results with at least one finished run")
+        raise UnanswerableError(case.name, "has no solution", "results with at least one finished run")
     return surfaces
 
 
-def _samples(case: Case, minimum: int) -> Mapping[str, tuple[bool, dict[str, pd.Series[float]]]]:
+def _collect_samples(case: Case, minimum: int) -> Mapping[str, tuple[bool, dict[str, pd.Series[float]]]]:
     """For each indicator and metric: whether more is better, and for each algorithm the series of values over the runs."""
     if not case.has_runs:
         case.runs_of(next(iter(case.algorithms), ""))  # raises with the reason
     if len(case.algorithms) < minimum:
-        raise Unanswerable(case.name, f"has finished runs of {len(case.algorithms)} algorithms ({', '.join(case.algorithms) or 'none'})",
-                           f"results of {minimum} algorithms or more")
+        names = ", ".join(case.algorithms) or "none"
+        raise UnanswerableError(case.name, f"has finished runs of {len(case.algorithms)} algorithms ({names})",
+                                f"results of {minimum} algorithms or more")
     samples: dict[str, tuple[bool, dict[str, pd.Series[float]]]] = {}
     if len(case.solutions):
-        quality = indicators(case).set_index(["algorithm", "run"])
+        quality = compute_indicators(case).set_index(["algorithm", "run"])
         for name, more_is_better in MORE_IS_BETTER.items():
             samples[name] = more_is_better, {
                 algorithm: quality.loc[quality.index.get_level_values(0) == algorithm, name].droplevel(0) for algorithm in case.algorithms}
     for metric in case.scoring.metrics:
         samples[metric.name] = metric.more_is_unsafe, {
-            algorithm: series_of_means(case, algorithm, metric) for algorithm in case.algorithms}
+            algorithm: run_mean_series(case, algorithm, metric) for algorithm in case.algorithms}
     return samples
 
 

@@ -7,26 +7,26 @@ from typing import NamedTuple
 
 import pandas as pd
 
-from safevar_sumo.analysis.research_questions.algorithms import pairs, ranks
-from safevar_sumo.analysis.research_questions.case import NSGA2, Case, Unanswerable, counted_solutions
+from safevar_sumo.analysis.research_questions.algorithms import compare_pairs, rank_algorithms
+from safevar_sumo.analysis.research_questions.case import NSGA2, Case, UnanswerableError, counted_solutions
 from safevar_sumo.analysis.research_questions.changes import (
-    collisions,
-    combinations,
-    critical,
+    compare_weathers,
+    count_collisions,
+    critical_solutions,
+    find_weather_pairs,
+    frequent_combinations,
     rq31,
     rq32,
     rq33,
     rq33_safety,
-    weather,
-    weather_pairs,
 )
 from safevar_sumo.analysis.research_questions.comparisons import rq1, rq2
 from safevar_sumo.analysis.research_questions.over_runs import difference_line, rq1_runs, rq2_runs
 from safevar_sumo.errors import unknown_name
-from safevar_sumo.metrics import SAFEVAR, MetricFacts
+from safevar_sumo.metrics import PUBLISHED_SCORING, MetricFacts
 
 Frames = dict[str, pd.DataFrame]
-SAFETY = "rq3.3-safety"
+SAFETY_TABLE = "rq3.3-safety"
 """Name of the table of effects on safety, the footer of the paper's table of RQ3.3. An answer to RQ3.3 has both tables."""
 
 FRAMES_OF_ONE_CASE: Mapping[str, Callable[[Case], Frames]] = {
@@ -34,16 +34,16 @@ FRAMES_OF_ONE_CASE: Mapping[str, Callable[[Case], Frames]] = {
     "rq2": lambda case: {"rq2": rq2(case)},
     "rq1-runs": lambda case: {"rq1-runs": rq1_runs(case)},
     "rq2-runs": lambda case: {"rq2-runs": rq2_runs(case)},
-    "rq2-pairs": lambda case: {"rq2-pairs": pairs(case)},
-    "rq2-ranks": lambda case: {"rq2-ranks": ranks(case)},
+    "rq2-pairs": lambda case: {"rq2-pairs": compare_pairs(case)},
+    "rq2-ranks": lambda case: {"rq2-ranks": rank_algorithms(case)},
     "rq3.1": lambda case: {"rq3.1": rq31(case)},
     "rq3.2": lambda case: {"rq3.2": rq32(case)},
-    "rq3.3": lambda case: {"rq3.3": rq33(case), SAFETY: rq33_safety(case)},
-    "collisions": lambda case: {"collisions": collisions(case)},
-    "combinations": lambda case: {"combinations": combinations(case)},
+    "rq3.3": lambda case: {"rq3.3": rq33(case), SAFETY_TABLE: rq33_safety(case)},
+    "collisions": lambda case: {"collisions": count_collisions(case)},
+    "combinations": lambda case: {"combinations": frequent_combinations(case)},
 }
 WEATHER = "weather"
-QUESTIONS = (*FRAMES_OF_ONE_CASE, SAFETY, WEATHER)
+QUESTIONS = (*FRAMES_OF_ONE_CASE, SAFETY_TABLE, WEATHER)
 
 
 class Answer(NamedTuple):
@@ -52,11 +52,11 @@ class Answer(NamedTuple):
     name: str
     frame: pd.DataFrame
     notes: tuple[str, ...]
-    metrics: tuple[MetricFacts, ...] = SAFEVAR.metrics
+    metrics: tuple[MetricFacts, ...] = PUBLISHED_SCORING.metrics
 
 
-def answer(cases: Sequence[Case], question: str | None = None) -> list[Answer]:
-    """Answer one question, or all of them.
+def answer_questions(cases: Sequence[Case], question: str | None = None) -> list[Answer]:
+    """Answer one question, or all questions.
 
     Raises
     ------
@@ -65,38 +65,38 @@ def answer(cases: Sequence[Case], question: str | None = None) -> list[Answer]:
     """
     if question is not None and question not in QUESTIONS:
         raise unknown_name("question", f"there is no question {question!r}", question, QUESTIONS)
-    answers, all_errors, names = [], [], [case.name for case in cases]
+    answers, all_errors, case_names = [], [], {case.name for case in cases}
     metrics = tuple({metric.name: metric for case in cases for metric in case.scoring.metrics}.values())
     questions = (*FRAMES_OF_ONE_CASE, WEATHER)
-    for name in questions if question is None else ("rq3.3" if question == SAFETY else question,):
-        tables, errors = _ask(name, cases)
+    for name in questions if question is None else ("rq3.3" if question == SAFETY_TABLE else question,):
+        tables, errors = _collect_frames(name, cases)
         all_errors += errors
         notes = [f"{error.source}: {error.problem}." for error in errors]
         if not tables:
             answers.append(Answer(name, pd.DataFrame(), tuple(notes)))
         for table, frames in tables.items():
             frame = pd.concat(frames, ignore_index=True)
-            answered_cases = {*frame["setting"], *frame["other"]} if name == WEATHER else set(names) - {error.source for error in errors}
-            case_notes = [note for case in cases if case.name in answered_cases for note in _notes(name, case)]
+            answered_names = {*frame["setting"], *frame["other"]} if name == WEATHER else case_names - {error.source for error in errors}
+            case_notes = [note for case in cases if case.name in answered_names for note in _notes(name, case)]
             answers.append(Answer(table, frame, tuple(dict.fromkeys([*notes, *case_notes])), metrics))
-    if all_errors and all(reply.frame.empty for reply in answers):
+    if all_errors and all(answer.frame.empty for answer in answers):
         raise all_errors[0]
-    return [reply for reply in answers if reply.name == SAFETY] if question == SAFETY else answers
+    return [answer for answer in answers if answer.name == SAFETY_TABLE] if question == SAFETY_TABLE else answers
 
 
-def _ask(name: str, cases: Sequence[Case]) -> tuple[dict[str, list[pd.DataFrame]], list[Unanswerable]]:
+def _collect_frames(name: str, cases: Sequence[Case]) -> tuple[dict[str, list[pd.DataFrame]], list[UnanswerableError]]:
     """The frames of a question by table, and an error for each case without a frame."""
     tables: dict[str, list[pd.DataFrame]] = {}
     errors = []
-    for group in [cases] if name == WEATHER else [[case] for case in cases]:
+    for cases_asked in [cases] if name == WEATHER else [[case] for case in cases]:
         try:
             if name == WEATHER:
-                frames = {WEATHER: pd.concat([weather(*pair) for pair in weather_pairs(group)])}
+                frames = {WEATHER: pd.concat([compare_weathers(*pair) for pair in find_weather_pairs(cases_asked)])}
             else:
-                frames = FRAMES_OF_ONE_CASE[name](*group)
+                frames = FRAMES_OF_ONE_CASE[name](*cases_asked)
             for table, frame in frames.items():
                 tables.setdefault(table, []).append(frame)
-        except Unanswerable as error:
+        except UnanswerableError as error:
             errors.append(error)
     return tables, errors
 
@@ -119,11 +119,11 @@ def _notes(question: str, case: Case) -> list[str]:
     if question == "rq2" and not case.has_runs:
         notes.append(f"{case.name}: igd, igd_plus and hypervolume need runs, which imported solutions do not have.")
     if question == "rq2" and case.has_runs:
-        empty_runs = len(set(case.finished) - set(zip(case.solutions["algorithm"], case.solutions["run"], strict=True)))
+        empty_runs = len(set(case.finished_runs) - set(zip(case.solutions["algorithm"], case.solutions["run"], strict=True)))
         if empty_runs:
             notes.append(f"{case.name}: {empty_runs} finished runs found no solution; they have no igd, igd_plus and hypervolume.")
     if question.startswith("rq3") or question in ("combinations", WEATHER):
-        notes.append(f"{case.name}: {len(critical(case))} critical solutions of {len(case.solutions_of(NSGA2))} of {NSGA2}.")
-    if question == "combinations" and combinations(case).empty:
+        notes.append(f"{case.name}: {len(critical_solutions(case))} critical solutions of {len(case.solutions_of(NSGA2))} of {NSGA2}.")
+    if question == "combinations" and frequent_combinations(case).empty:
         notes.append(f"{case.name}: no critical solution has exactly four characteristics changed.")
     return notes

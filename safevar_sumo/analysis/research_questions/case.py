@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 
 from safevar_sumo.errors import InputError, describe_error
-from safevar_sumo.metrics import SAFEVAR, MetricFacts, Scoring, Unsafe
+from safevar_sumo.metrics import PUBLISHED_SCORING, MetricFacts, Scoring, Unsafe
 from safevar_sumo.records import FloatArray, Outcome
 from safevar_sumo.results import MANIFEST, Failure, failure_lines, folders_of, load_runs
 from safevar_sumo.scenarios import weather_of
@@ -26,7 +26,7 @@ ALGORITHM_TITLES = {
     "nsga2": "NSGA-II", "spea2": "SPEA2", "mocell": "MOCell", "map_elites": "MAP-Elites", "rs": "RS", "safe_fuzzer": "SafeFuzzer"}
 
 
-class Unanswerable(InputError):
+class UnanswerableError(InputError):
     """The results lack the data for a question."""
 
 
@@ -59,10 +59,10 @@ class Case:
     original: Mapping[str, float]
     solutions: pd.DataFrame
     evaluations: pd.DataFrame
-    finished: tuple[tuple[str, int], ...]
+    finished_runs: tuple[tuple[str, int], ...]
     has_runs: bool
     failures: tuple[Failure, ...] = ()
-    scoring: Scoring = SAFEVAR
+    scoring: Scoring = PUBLISHED_SCORING
 
     @property
     def characteristics(self) -> CharacteristicSet:
@@ -80,25 +80,25 @@ class Case:
     @property
     def algorithms(self) -> tuple[str, ...]:
         """Algorithms that have solutions or a finished run, in the study's order."""
-        names = {*self.solutions["algorithm"], *(algorithm for algorithm, _ in self.finished)}
+        names = {*self.solutions["algorithm"], *(algorithm for algorithm, _ in self.finished_runs)}
         return tuple(name for name in dict.fromkeys([*self.study.search.labels, *sorted(names)]) if name in names)
 
     def require_solutions(self) -> None:
-        """Raise `Unanswerable` if no run is finished."""
+        """Raise `UnanswerableError` if no run is finished."""
         if not self.algorithms:
-            raise Unanswerable(self.name, "has no finished run", "results with at least one finished run")
+            raise UnanswerableError(self.name, "has no finished run", "results with at least one finished run")
 
     def solutions_of(self, algorithm: str) -> pd.DataFrame:
         """Pooled solutions of all finished runs of an algorithm.
 
         Raises
         ------
-        Unanswerable
+        UnanswerableError
             If the algorithm has no finished run.
         """
         if algorithm not in self.algorithms:
             names = ", ".join(self.algorithms) or "no algorithm"
-            raise Unanswerable(self.name, f"has no finished run of {algorithm}", f"results of {algorithm} (it has results of {names})")
+            raise UnanswerableError(self.name, f"has no finished run of {algorithm}", f"results of {algorithm} (it has results of {names})")
         return self.solutions[self.solutions["algorithm"] == algorithm]
 
     def runs_of(self, algorithm: str) -> list[int]:
@@ -106,12 +106,12 @@ class Case:
 
         Raises
         ------
-        Unanswerable
+        UnanswerableError
             If the solutions are imported and belong to no run.
         """
         if not self.has_runs:
-            raise Unanswerable(self.name, "is imported: the runs of its solutions are unknown", "results of the command study")
-        return sorted(run for name, run in self.finished if name == algorithm)
+            raise UnanswerableError(self.name, "is imported: the runs of its solutions are unknown", "results of the command study")
+        return sorted(run for name, run in self.finished_runs if name == algorithm)
 
     @property
     def remarks(self) -> list[str]:
@@ -120,7 +120,7 @@ class Case:
         if not self.has_runs:
             lines.append(f"{self.name}: imported solutions, without runs; the original vehicle's metrics are published or supplied.")
         else:
-            done = Counter(algorithm for algorithm, _ in self.finished)
+            done = Counter(algorithm for algorithm, _ in self.finished_runs)
             planned = self.study.search.runs
             shortfalls = [f"{name} {done[name]} of {planned} runs" for name in self.study.search.labels if done[name] < planned]
             if shortfalls:
@@ -133,16 +133,16 @@ class Case:
 
 def counted_solutions(solutions: pd.DataFrame, metric: MetricFacts) -> pd.DataFrame:
     """The solutions that count for a metric: for TET and TIT only those without collision (method section 4)."""
-    return solutions if metric.over_collisions else solutions[~collided(solutions)]
+    return solutions if metric.over_collisions else solutions[~are_collisions(solutions)]
 
 
-def values(solutions: pd.DataFrame, metric: MetricFacts) -> FloatArray:
+def defined_values(solutions: pd.DataFrame, metric: MetricFacts) -> FloatArray:
     """A metric's defined values over the solutions that count for it."""
     column = counted_solutions(solutions, metric)[metric.name].to_numpy(dtype=float)
     return np.asarray(column[~np.isnan(column)])
 
 
-def collided(solutions: pd.DataFrame) -> pd.Series[bool]:
+def are_collisions(solutions: pd.DataFrame) -> pd.Series[bool]:
     """Whether solutions are collisions."""
     return solutions["outcome"] == str(Outcome.COLLISION)
 
@@ -156,7 +156,7 @@ def load_cases(directories: Iterable[str | Path]) -> list[Case]:
         If a directory holds no results, is damaged or is given twice.
     """
     paths = [Path(directory) for directory in directories]
-    duplicates = [path for path, number in Counter(path.resolve() for path in paths).items() if number > 1]
+    duplicates = [path for path, count in Counter(path.resolve() for path in paths).items() if count > 1]
     if duplicates:
         raise InputError("directories", f"{duplicates[0]} is given twice", "each results directory once")
     cases = [_load_or_refuse(path) for path in paths]
@@ -183,19 +183,19 @@ def load_case(directory: Path) -> Case:
     if not isinstance(original, dict):
         raise InputError(directory / MANIFEST, "does not describe the original vehicle", "a manifest of the command study")
     try:
-        scoring = msgspec.convert(manifest["scoring"], Scoring) if "scoring" in manifest else SAFEVAR
+        scoring = msgspec.convert(manifest["scoring"], Scoring) if "scoring" in manifest else PUBLISHED_SCORING
     except msgspec.ValidationError as error:
         raise error_with_key(directory / MANIFEST, manifest["scoring"], error, "scoring") from None
-    return case_of(study, original, solutions, evaluations, finished, "imported" not in manifest, failures, scoring)
+    return build_case(study, original, solutions, evaluations, finished, "imported" not in manifest, failures, scoring)
 
 
-def case_of(study: Study, original: Mapping[str, Any], solutions: pd.DataFrame, evaluations: pd.DataFrame,
-            finished: Sequence[tuple[str, int]], has_runs: bool = True, failures: Sequence[Failure] = (),
-            scoring: Scoring = SAFEVAR) -> Case:
+def build_case(study: Study, original: Mapping[str, Any], solutions: pd.DataFrame, evaluations: pd.DataFrame,
+               finished: Sequence[tuple[str, int]], has_runs: bool = True, failures: Sequence[Failure] = (),
+               scoring: Scoring = PUBLISHED_SCORING) -> Case:
     """Put a case together; in `original` an undefined metric is None or missing."""
     names = [metric.name for metric in scoring.metrics]
     columns = [*names, *(objective.name for objective in scoring.objectives)]
     metrics = {name: np.nan if original.get(name) is None else float(original[name]) for name in names}
     solutions, evaluations = (frame.assign(**{name: np.nan for name in columns if name not in frame}) for frame in (solutions, evaluations))
     return Case(name=study.name, study=study, original=metrics, solutions=solutions, evaluations=evaluations,
-                finished=tuple(finished), has_runs=has_runs, failures=tuple(failures), scoring=scoring)
+                finished_runs=tuple(finished), has_runs=has_runs, failures=tuple(failures), scoring=scoring)

@@ -1,6 +1,6 @@
 """RQ3 and the discussion: number, kind and size of changes that make the vehicle unsafe, collisions, combinations, sun against rain.
 
-Functions of a case raise `Unanswerable` as `critical` does; functions over runs also raise it if solutions belong to no run.
+Functions of a case raise `UnanswerableError` as `critical_solutions` does; functions over runs also raise it if solutions belong to no run.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ import numpy as np
 import pandas as pd
 from msgspec.structs import replace
 
-from safevar_sumo.ads import REACTIONS
-from safevar_sumo.analysis.research_questions.case import NSGA2, Case, Unanswerable, collided
+from safevar_sumo.ads import REACTION_PARAMETERS
+from safevar_sumo.analysis.research_questions.case import NSGA2, Case, UnanswerableError, are_collisions
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.study import SAFETY_DEGREE
 
@@ -25,36 +25,36 @@ COMBINATIONS_SHOWN = 3
 """Number of the most frequent combinations that are shown."""
 
 
-def critical(case: Case) -> pd.DataFrame:
+def critical_solutions(case: Case) -> pd.DataFrame:
     """NSGA-II's solutions with a safety degree below the original's.
 
     Raises
     ------
-    Unanswerable
+    UnanswerableError
         If NSGA-II is missing or the original's safety degree is undefined.
     """
     solutions = case.solutions_of(NSGA2)
     if np.isnan(case.original[SAFETY_DEGREE]):
-        raise Unanswerable(case.name, "lacks the original vehicle's safety degree", "results that have it")
+        raise UnanswerableError(case.name, "lacks the original vehicle's safety degree", "results that have it")
     return solutions[solutions[SAFETY_DEGREE] < case.original[SAFETY_DEGREE]]
 
 
-def changes(case: Case, solutions: pd.DataFrame) -> FloatArray:
+def change_matrix(case: Case, solutions: pd.DataFrame) -> FloatArray:
     """Changes v'' - v of M solutions in n characteristics, in the characteristic's unit, shape (M, n)."""
     return np.asarray(solutions[list(case.characteristics.names)].to_numpy(dtype=float) - case.characteristics.original)
 
 
-def by_number(case: Case, deltas: FloatArray) -> dict[str, BoolArray]:
-    """Whether solutions have j characteristics changed, for j = "1".."n" and "any"."""
-    number = np.count_nonzero(deltas, axis=1)
-    return {**{str(j): number == j for j in range(1, len(case.characteristics) + 1)}, ANY: np.ones(len(deltas), dtype=bool)}
+def masks_by_change_count(case: Case, deltas: FloatArray) -> dict[str, BoolArray]:
+    """For j = "1".."n" and "any": whether each solution has j characteristics changed, shape (M,)."""
+    change_counts = np.count_nonzero(deltas, axis=1)
+    return {**{str(j): change_counts == j for j in range(1, len(case.characteristics) + 1)}, ANY: np.ones(len(deltas), dtype=bool)}
 
 
 def rq31(case: Case) -> pd.DataFrame:
     """Number of critical solutions of each run with exactly j characteristics changed; columns setting, run, j, count."""
-    solutions, runs = critical(case), case.runs_of(NSGA2)
-    number, run_of = np.count_nonzero(changes(case, solutions), axis=1), solutions["run"].to_numpy()
-    rows = [(case.name, run, str(j), int(np.count_nonzero((run_of == run) & (number == j))))
+    solutions, runs = critical_solutions(case), case.runs_of(NSGA2)
+    change_counts, run_of_solution = np.count_nonzero(change_matrix(case, solutions), axis=1), solutions["run"].to_numpy()
+    rows = [(case.name, run, str(j), int(np.count_nonzero((run_of_solution == run) & (change_counts == j))))
             for run in runs for j in range(1, len(case.characteristics) + 1)]
     return pd.DataFrame(rows, columns=["setting", "run", "j", "count"])
 
@@ -65,14 +65,14 @@ def rq32(case: Case) -> pd.DataFrame:
     Columns setting, characteristic, j ("1".."n", "any"), percent (None without such a solution), rank (only for
     j = "any"; ties share the better rank and the next one is skipped).
     """
-    deltas = changes(case, critical(case))
+    deltas = change_matrix(case, critical_solutions(case))
     change_counts = np.count_nonzero(deltas, axis=0)
     rows = []
-    for i, member in enumerate(case.characteristics):
-        for j, mask in by_number(case, deltas).items():
-            percent = 100 * float(np.mean(deltas[mask, i] != 0)) if mask.any() else None
-            rank = 1 + int(np.count_nonzero(change_counts > change_counts[i])) if j == ANY and len(deltas) else None
-            rows.append((case.name, member.name, j, percent, rank))
+    for column, characteristic in enumerate(case.characteristics):
+        for j, mask in masks_by_change_count(case, deltas).items():
+            percent = 100 * float(np.mean(deltas[mask, column] != 0)) if mask.any() else None
+            rank = 1 + int(np.count_nonzero(change_counts > change_counts[column])) if j == ANY and len(deltas) else None
+            rows.append((case.name, characteristic.name, j, percent, rank))
     return pd.DataFrame(rows, columns=["setting", "characteristic", "j", "percent", "rank"], dtype=object)
 
 
@@ -82,16 +82,16 @@ def rq33(case: Case) -> pd.DataFrame:
     Columns setting, characteristic, direction, j ("1".."n", "any"), pc (mean of |v - v''| / v, a fraction), delta (mean
     signed change in the characteristic's unit), n (number of changes); pc and delta are None where n is 0.
     """
-    deltas = changes(case, critical(case))
+    deltas = change_matrix(case, critical_solutions(case))
     rows = []
-    for i, member in enumerate(case.characteristics):
+    for column, characteristic in enumerate(case.characteristics):
         for direction, sign in (("increase", 1), ("decrease", -1)):
-            for j, mask in by_number(case, deltas).items():
-                delta = deltas[mask, i]
+            for j, mask in masks_by_change_count(case, deltas).items():
+                delta = deltas[mask, column]
                 delta = delta[np.sign(delta) == sign]
                 mean = float(np.mean(delta)) if delta.size else None
-                pc = None if mean is None else abs(mean / member.original)
-                rows.append((case.name, member.name, direction, j, pc, mean, delta.size))
+                pc = None if mean is None else abs(mean / characteristic.original)
+                rows.append((case.name, characteristic.name, direction, j, pc, mean, delta.size))
     return pd.DataFrame(rows, columns=["setting", "characteristic", "direction", "j", "pc", "delta", "n"], dtype=object)
 
 
@@ -102,8 +102,8 @@ def rq33_safety(case: Case) -> pd.DataFrame:
     avgSD_mD, mean reduction of the distance, without collisions [m]; avgSD_cS, mean speed of the collisions [m/s], without
     percent; TET [s] and TIT [s^2], mean increase, without collisions; aveDece, mean decrease, over all [m/s^2].
     """
-    solutions = critical(case)
-    has_collided = collided(solutions).to_numpy()
+    solutions = critical_solutions(case)
+    has_collided = are_collisions(solutions).to_numpy()
     sd, tet, tit, dece = (solutions[name].to_numpy(dtype=float) for name in (SAFETY_DEGREE, "tet", "tit", "ave_dece"))
     original = case.original
     quantities = {
@@ -113,66 +113,66 @@ def rq33_safety(case: Case) -> pd.DataFrame:
         "TIT": (np.where(has_collided, np.nan, tit - original["tit"]), original["tit"]),
         "aveDece": (original["ave_dece"] - dece, original["ave_dece"])}
     rows = []
-    for quantity, (difference, reference) in quantities.items():
-        for j, mask in by_number(case, changes(case, solutions)).items():
-            sample = difference[mask & ~np.isnan(difference)]
+    for quantity, (differences, reference) in quantities.items():
+        for j, mask in masks_by_change_count(case, change_matrix(case, solutions)).items():
+            sample = differences[mask & ~np.isnan(differences)]
             mean = float(np.mean(sample)) if sample.size else None
             percent = None if mean is None or np.isnan(reference) or reference == 0 else 100 * mean / abs(reference)
             rows.append((case.name, quantity, j, mean, percent, sample.size))
     return pd.DataFrame(rows, columns=["setting", "quantity", "j", "value", "percent", "n"], dtype=object)
 
 
-def collisions(case: Case) -> pd.DataFrame:
+def count_collisions(case: Case) -> pd.DataFrame:
     """Number of collisions among each algorithm's solutions; columns setting, algorithm, solutions, collisions, share [fraction].
 
     Raises
     ------
-    Unanswerable
+    UnanswerableError
         If no run is finished.
     """
     case.require_solutions()
     rows = []
     for algorithm in case.algorithms:
         solutions = case.solutions_of(algorithm)
-        crashes = int(collided(solutions).sum())
-        rows.append((case.name, algorithm, len(solutions), crashes, crashes / len(solutions) if len(solutions) else None))
+        collision_count = int(are_collisions(solutions).sum())
+        rows.append((case.name, algorithm, len(solutions), collision_count, collision_count / len(solutions) if len(solutions) else None))
     return pd.DataFrame(rows, columns=["setting", "algorithm", "solutions", "collisions", "share"], dtype=object)
 
 
-def combinations(case: Case) -> pd.DataFrame:
+def frequent_combinations(case: Case) -> pd.DataFrame:
     """The most frequent combinations among the critical solutions with exactly four characteristics changed.
 
     Columns setting, rank (ties share the better one), characteristics (a list), percent of those solutions; no row
     where there is no such solution. Of combinations that are equally frequent, those with the earlier
     characteristics in the study come first.
     """
-    is_changed = changes(case, critical(case)) != 0
+    is_changed = change_matrix(case, critical_solutions(case)) != 0
     masks = is_changed[np.count_nonzero(is_changed, axis=1) == COMBINATION_SIZE]
-    counts = Counter(tuple(np.flatnonzero(row).tolist()) for row in masks)
+    counts = Counter(tuple(np.flatnonzero(mask).tolist()) for mask in masks)
     ranking = sorted(counts.items(), key=lambda item: (-item[1], item[0]))[:COMBINATIONS_SHOWN]
     names = case.characteristics.names
-    rows = [(case.name, 1 + sum(other > number for other in counts.values()), [names[i] for i in members], 100 * number / len(masks))
-            for members, number in ranking]
+    rows = [(case.name, 1 + sum(other > count for other in counts.values()), [names[i] for i in columns], 100 * count / len(masks))
+            for columns, count in ranking]
     return pd.DataFrame(rows, columns=["setting", "rank", "characteristics", "percent"])
 
 
-def weather_pairs(cases: Sequence[Case]) -> list[tuple[Case, Case]]:
+def find_weather_pairs(cases: Sequence[Case]) -> list[tuple[Case, Case]]:
     """Pairs of cases that differ only in the weather and the ADS's reaction to it, clearer weather first (by friction, visibility, delays).
 
     Raises
     ------
-    Unanswerable
+    UnanswerableError
         If there is no such pair.
     """
     pairs = [(clear, wet) for clear, wet in permutations(cases, 2)
              if _without_weather(clear) == _without_weather(wet) and _clearness(clear) > _clearness(wet)]
     if not pairs:
-        raise Unanswerable(", ".join(clear.name for clear in cases), "two cases are needed that differ in the weather alone",
-                           "results such as those of sun and rain")
+        raise UnanswerableError(", ".join(clear.name for clear in cases), "two cases are needed that differ in the weather alone",
+                                "results such as those of sun and rain")
     return pairs
 
 
-def weather(clear: Case, wet: Case) -> pd.DataFrame:
+def compare_weathers(clear: Case, wet: Case) -> pd.DataFrame:
     """One weather against another, characteristic by characteristic, over the critical solutions.
 
     Columns setting, other, characteristic, percent and percent_other (share of the critical solutions that change
@@ -197,21 +197,21 @@ def weather(clear: Case, wet: Case) -> pd.DataFrame:
     return table.reset_index()[columns]
 
 
-def effects(case: Case) -> pd.DataFrame:
+def list_changes(case: Case) -> pd.DataFrame:
     """Every change in every critical solution; columns setting, characteristic, change (signed, in the characteristic's unit)."""
-    deltas = changes(case, critical(case))
-    parts = [pd.DataFrame({"setting": case.name, "characteristic": name, "change": column[column != 0]})
-             for name, column in zip(case.characteristics.names, deltas.T, strict=True)]
-    return pd.concat(parts, ignore_index=True)
+    deltas = change_matrix(case, critical_solutions(case))
+    frames = [pd.DataFrame({"setting": case.name, "characteristic": name, "change": column[column != 0]})
+              for name, column in zip(case.characteristics.names, deltas.T, strict=True)]
+    return pd.concat(frames, ignore_index=True)
 
 
 def _clearness(case: Case) -> tuple[float, float, float]:
     weather = case.weather
-    reaction_delays = [float(case.study.ads.parameters.get(name, 0.0)) for name in REACTIONS]
+    reaction_delays = [float(case.study.ads.parameters.get(name, 0.0)) for name in REACTION_PARAMETERS]
     return weather.road_friction, weather.visibility, -weather.recognition_delay - sum(reaction_delays)
 
 
 def _without_weather(case: Case) -> tuple[object, ...]:
     study = case.study
-    parameters = {name: value for name, value in study.ads.parameters.items() if name not in REACTIONS}
+    parameters = {name: value for name, value in study.ads.parameters.items() if name not in REACTION_PARAMETERS}
     return study.scenario, study.vehicle, replace(study.ads, parameters=parameters), study.metrics

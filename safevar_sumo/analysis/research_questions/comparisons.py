@@ -10,8 +10,8 @@ import pandas as pd
 import scipy
 from numpy.typing import ArrayLike
 
-from safevar_sumo.analysis.research_questions.case import NSGA2, Case, Unanswerable, values
-from safevar_sumo.analysis.research_questions.indicators import MORE_IS_BETTER, indicators
+from safevar_sumo.analysis.research_questions.case import NSGA2, Case, UnanswerableError, defined_values
+from safevar_sumo.analysis.research_questions.indicators import MORE_IS_BETTER, compute_indicators
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import MetricFacts
 from safevar_sumo.records import FloatArray
@@ -58,10 +58,10 @@ def compare_samples(x: ArrayLike, y: ArrayLike) -> TwoSampleTest:
     is_exact = min(first.size, second.size) <= EXACT_SAMPLE_SIZE and np.unique(pooled).size == pooled.size
     test = scipy.stats.mannwhitneyu(first, second, alternative="two-sided", method="exact" if is_exact else "asymptotic")
     a12 = float(test.statistic) / (first.size * second.size)
-    return TwoSampleTest(float(test.pvalue), a12, magnitude(a12), first.size, second.size, EXACT_TEST if is_exact else ASYMPTOTIC_TEST)
+    return TwoSampleTest(float(test.pvalue), a12, magnitude_of(a12), first.size, second.size, EXACT_TEST if is_exact else ASYMPTOTIC_TEST)
 
 
-def magnitude(effect_size: float) -> str:
+def magnitude_of(effect_size: float) -> str:
     """The magnitude of an effect size, by Kitchenham's intervals."""
     distance = round(max(effect_size, 1 - effect_size), 12)
     return next((name for limit, name in MAGNITUDES if distance >= limit), "negligible")
@@ -78,11 +78,11 @@ def rq1(case: Case) -> pd.DataFrame:
 
     Raises
     ------
-    Unanswerable
+    UnanswerableError
         If no run is finished.
     """
     case.require_solutions()
-    rows = rq1_rows(case, lambda algorithm, metric: values(case.solutions_of(algorithm), metric),
+    rows = rq1_rows(case, lambda algorithm, metric: defined_values(case.solutions_of(algorithm), metric),
                     lambda sample, original: compare_samples(sample, np.full(0 if np.isnan(original) else len(sample), original)))
     return pd.DataFrame(rows, columns=RQ1_COLUMNS, dtype=object)
 
@@ -97,9 +97,9 @@ def rq1_rows(case: Case, sample_of: SampleFunction, test: Callable[[FloatArray, 
     for algorithm in case.algorithms:
         for metric in case.scoring.metrics:
             sample, original = sample_of(algorithm, metric), case.original[metric.name]
-            result = test(sample, original)
+            comparison = test(sample, original)
             rows.append({"setting": case.name, "algorithm": algorithm, "metric": metric.name,
-                         **(reverse_effect(result) if metric.more_is_unsafe else result)._asdict(), "runs": len(sample),
+                         **(reverse_effect(comparison) if metric.more_is_unsafe else comparison)._asdict(), "runs": len(sample),
                          "mean": float(np.mean(sample)) if sample.size else None, "original": None if np.isnan(original) else original})
     return rows
 
@@ -107,7 +107,7 @@ def rq1_rows(case: Case, sample_of: SampleFunction, test: Callable[[FloatArray, 
 def reverse_effect(test: TwoSampleTest) -> TwoSampleTest:
     """The same test with the effect size of the second sample against the first, 1 - A12."""
     effect = None if test.effect_size is None else 1 - test.effect_size
-    return test if effect is None else test._replace(effect_size=effect, magnitude=magnitude(effect))
+    return test if effect is None else test._replace(effect_size=effect, magnitude=magnitude_of(effect))
 
 
 RQ2_COLUMNS = ["setting", "baseline", "metric", "p_value", "effect_size", "magnitude", "n1", "n2", "method"]
@@ -122,19 +122,19 @@ def rq2(case: Case) -> pd.DataFrame:
 
     Raises
     ------
-    Unanswerable
+    UnanswerableError
         If NSGA-II or every other algorithm is missing.
     """
-    case.solutions_of(NSGA2)  # raises Unanswerable if there are none
+    case.solutions_of(NSGA2)  # raises UnanswerableError if there are none
     if all(name == NSGA2 for name in case.algorithms):
-        raise Unanswerable(case.name, f"only {NSGA2} has finished runs", "results of another algorithm to compare with, such as rs")
-    rows = rq2_rows(case, lambda algorithm, metric: values(case.solutions_of(algorithm), metric))
+        raise UnanswerableError(case.name, f"only {NSGA2} has finished runs", "results of another algorithm to compare with, such as rs")
+    rows = rq2_rows(case, lambda algorithm, metric: defined_values(case.solutions_of(algorithm), metric))
     return pd.DataFrame(rows, columns=RQ2_COLUMNS, dtype=object)
 
 
 def rq2_rows(case: Case, sample_of: SampleFunction) -> list[dict[str, Any]]:
     """Rows for each other algorithm: its runs' indicators and its samples of the metrics against those of NSGA-II, oriented as in `rq2`."""
-    quality = indicators(case) if case.has_runs and len(case.solutions) else None
+    quality = compute_indicators(case) if case.has_runs and len(case.solutions) else None
     rows = []
     for baseline in (name for name in case.algorithms if name != NSGA2):
         pair = (NSGA2, baseline)

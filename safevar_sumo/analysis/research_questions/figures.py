@@ -9,9 +9,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from safevar_sumo.analysis.figures import FONT, as_formula, escape_dollars, new_figure, new_panels
-from safevar_sumo.analysis.research_questions.case import ALGORITHM_TITLES, Case, Unanswerable
-from safevar_sumo.analysis.research_questions.changes import ANY, critical, effects, rq31, rq32
-from safevar_sumo.analysis.research_questions.indicators import REFERENCE_COORDINATE, convergence, nondominated, objectives
+from safevar_sumo.analysis.research_questions.case import ALGORITHM_TITLES, Case, UnanswerableError
+from safevar_sumo.analysis.research_questions.changes import ANY, critical_solutions, list_changes, rq31, rq32
+from safevar_sumo.analysis.research_questions.indicators import (
+    REFERENCE_COORDINATE,
+    compute_convergence,
+    nondominated_points,
+    objective_values,
+)
 from safevar_sumo.metrics import F_DIFF, F_NUM_DIFF, F_SAFE, Objective
 from safevar_sumo.study import SAFETY_DEGREE
 
@@ -22,52 +27,52 @@ if TYPE_CHECKING:
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
 """Okabe and Ito's colours, which colour-blind readers can distinguish; each also has its own marker and line style."""
 MARKERS, DASHES = ("o", "X", "^", "s", "D", "v"), ("-", "--", "-.", ":", (0, (5, 1)), (0, (1, 1)))
-INCREASE, DECREASE = COLOURS[1], COLOURS[0]
+INCREASE_COLOUR, DECREASE_COLOUR = COLOURS[1], COLOURS[0]
 OBJECTIVE_TITLES = {"f_safe": "f_safe: safety degree [m, -m/s]", "f_diff": "f_diff: largest change [fraction of the original]",
                     "f_num_diff": "f_numDiff: characteristics changed"}
-LONG_NAME = 28
+LONGEST_NAME = 28
 """Number of letters of a name that fit above a small axis."""
-PANELS = 3
+PANELS_PER_ROW = 3
 """Number of panels in a row."""
-BINS = 24
+BIN_COUNT = 24
 """Number of bins over a characteristic's domain."""
 
 
-def number_of_changes(cases: Sequence[Case]) -> Figure:
+def draw_change_counts(cases: Sequence[Case]) -> Figure:
     """RQ3.1: number of critical solutions of a run with j characteristics changed, as box plots over the runs; a panel per case.
 
     Raises
     ------
-    Unanswerable
+    UnanswerableError
         As `rq31`, for the first case that has no answer.
     """
     import seaborn as sns
 
     counts = [rq31(case) for case in cases]
-    title = "number of changed characteristics"
-    title = f"{cases[0].name}: {title}" if len(cases) == 1 else title
-    figure, axes = new_panels(title, len(cases), PANELS, (3.9, 3.3), min_width=6.4, title_height=0.5)
+    title = f"{cases[0].name}: number of changed characteristics" if len(cases) == 1 else "number of changed characteristics"
+    figure, axes = new_panels(title, len(cases), PANELS_PER_ROW, (3.9, 3.3), min_width=6.4, title_height=0.5)
     for axis, case, group in zip(axes, cases, counts, strict=True):
         sns.boxplot(group, x="j", y="count", ax=axis, color="#56b4e9", linecolor="black", linewidth=0.8, fliersize=3)
         axis.set_xlabel("characteristics changed")
         axis.set_ylabel(f"critical solutions per run\n({group['run'].nunique()} runs)")
         axis.set_title(escape_dollars(case.name) if len(cases) > 1 else "", fontsize=FONT)
         _set_integer_ticks(axis.yaxis)
-    return _with_space(figure)
+    return _add_space(figure)
 
 
-def changed_characteristics(case: Case) -> Figure:
+def draw_changed_characteristics(case: Case) -> Figure:
     """RQ3.2 as a heat map: the share of critical solutions with j changed characteristics in which each characteristic is changed."""
     import seaborn as sns
 
-    _critical_count(case)
+    _count_critical_solutions(case)
     shares = rq32(case)
     order = shares[shares["j"] == ANY].sort_values("rank", kind="stable")["characteristic"]
-    grid = shares.pivot(index="characteristic", columns="j", values="percent").astype(float)
-    grid = grid.loc[order, list(dict.fromkeys(shares["j"]))].rename(index=escape_dollars)
-    figure, ((axis,),) = new_figure(f"{case.name}: characteristics changed in critical solutions", 1, 1, (7.6, 1.4 + 0.3 * len(grid)))
-    sns.heatmap(grid, ax=axis, cmap="cividis", vmin=0, vmax=100, annot=True, fmt=".0f", annot_kws={"fontsize": 7}, linewidths=0.5,
-                cbar_kws={"label": "critical solutions\nin which it is changed [%]"})
+    shares_by_number = shares.pivot(index="characteristic", columns="j", values="percent").astype(float)
+    shares_by_number = shares_by_number.loc[order, list(dict.fromkeys(shares["j"]))].rename(index=escape_dollars)
+    title = f"{case.name}: characteristics changed in critical solutions"
+    figure, ((axis,),) = new_figure(title, 1, 1, (7.6, 1.4 + 0.3 * len(shares_by_number)))
+    sns.heatmap(shares_by_number, ax=axis, cmap="cividis", vmin=0, vmax=100, annot=True, fmt=".0f", annot_kws={"fontsize": 7},
+                linewidths=0.5, cbar_kws={"label": "critical solutions\nin which it is changed [%]"})
     axis.grid(visible=False)
     colour_bar = axis.collections[0].colorbar.ax
     colour_bar.tick_params(labelsize=FONT)
@@ -75,77 +80,78 @@ def changed_characteristics(case: Case) -> Figure:
     axis.set_xlabel("number of characteristics changed (empty: no such solution)")
     axis.set_ylabel("characteristic, most frequent first")
     axis.tick_params(axis="both", length=0, rotation=0)
-    return _with_space(figure)
+    return _add_space(figure)
 
 
-def sizes_of_changes(case: Case) -> Figure:
+def draw_change_sizes(case: Case) -> Figure:
     """The distribution of each characteristic's signed changes in the critical solutions."""
     import seaborn as sns
 
-    total = _critical_count(case)
-    changes = effects(case)
-    members = case.characteristics.members
-    figure, axes = new_panels(f"{case.name}: changes in critical solutions", len(members), 4, (2.25, 1.85), min_width=9.0, title_height=1.0)
-    for axis, member in zip(axes, members, strict=True):
-        change = changes.loc[changes["characteristic"] == member.name, "change"]
-        low, high = (float(f"{end - member.original:.9g}") for end in (member.lower, member.upper))
-        sides = {INCREASE: change[change > 0], DECREASE: change[change < 0]}
-        for colour, side in sides.items():
-            if len(side):
-                end = high if colour == INCREASE else low
-                edges = np.sort(np.linspace(0, end, 1 + max(1, round(BINS * abs(end) / (high - low)))))
-                sns.histplot(x=side, ax=axis, bins=edges, color=colour, edgecolor="white", linewidth=0.3, alpha=1)
+    solution_count = _count_critical_solutions(case)
+    changes = list_changes(case)
+    characteristics = case.characteristics.members
+    figure, axes = new_panels(f"{case.name}: changes in critical solutions", len(characteristics), 4, (2.25, 1.85), min_width=9.0, title_height=1.0)
+    for axis, characteristic in zip(axes, characteristics, strict=True):
+        change = changes.loc[changes["characteristic"] == characteristic.name, "change"]
+        low, high = (float(f"{end - characteristic.original:.9g}") for end in (characteristic.lower, characteristic.upper))
+        changes_by_colour = {INCREASE_COLOUR: change[change > 0], DECREASE_COLOUR: change[change < 0]}
+        for colour, values in changes_by_colour.items():
+            if len(values):
+                end = high if colour == INCREASE_COLOUR else low
+                edges = np.sort(np.linspace(0, end, 1 + max(1, round(BIN_COUNT * abs(end) / (high - low)))))
+                sns.histplot(x=values, ax=axis, bins=edges, color=colour, edgecolor="white", linewidth=0.3, alpha=1)
         axis.axvline(0, color="black", linewidth=0.8)
         axis.set_xlim(low, high)
-        size = min(FONT, FONT * LONG_NAME / len(member.name))
-        axis.set_title(f"{escape_dollars(member.name)}\n+{len(sides[INCREASE])}, -{len(sides[DECREASE])}", fontsize=size)
-        axis.set_xlabel(f"change [{as_formula(member.unit)}]", fontsize=FONT)
+        font_size = min(FONT, FONT * LONGEST_NAME / len(characteristic.name))
+        counts = f"+{len(changes_by_colour[INCREASE_COLOUR])}, -{len(changes_by_colour[DECREASE_COLOUR])}"
+        axis.set_title(f"{escape_dollars(characteristic.name)}\n{counts}", fontsize=font_size)
+        axis.set_xlabel(f"change [{as_formula(characteristic.unit)}]", fontsize=FONT)
         axis.set_ylabel("")
         axis.locator_params(axis="x", nbins=3, steps=[1, 2, 5, 10])
         _set_integer_ticks(axis.yaxis, 4)
-    figure.supylabel(f"number of critical solutions (of {total})", fontsize=9)
+    figure.supylabel(f"number of critical solutions (of {solution_count})", fontsize=9)
     figure.supxlabel("orange, right of 0: increases; blue, left of 0: decreases; titles count them;\n"
                      "each axis spans the characteristic's domain", fontsize=FONT)
-    return _with_space(figure)
+    return _add_space(figure)
 
 
-def pareto_fronts(case: Case) -> Figure:
+def draw_pareto_fronts(case: Case) -> Figure:
     """The non-dominated solutions of all runs of each algorithm together, for every pair of objectives.
 
     Each panel also shows the original vehicle; solutions on the dashed line or to its left are collisions.
 
     Raises
     ------
-    Unanswerable
+    UnanswerableError
         If there is no solution.
     """
-    goals = case.scoring.objectives
-    signs = [goal.sign for goal in goals]
+    objectives = case.scoring.objectives
+    signs = [objective.sign for objective in objectives]
     fronts = {}
     for algorithm in case.algorithms:
-        points = objectives(case, case.solutions_of(algorithm))
+        points = objective_values(case, case.solutions_of(algorithm))
         if len(points):
-            fronts[algorithm] = nondominated(points) * signs
+            fronts[algorithm] = nondominated_points(points) * signs
     if not fronts:
-        raise Unanswerable(case.name, "has no solution", "results with at least one finished run")
-    pairs = list(combinations(range(len(goals)), 2))
+        raise UnanswerableError(case.name, "has no solution", "results with at least one finished run")
+    pairs = list(combinations(range(len(objectives)), 2))
     rows = next(rows for rows in (5, 2, 1) if len(pairs) % (3 * rows) == 0 or rows == 1)
     columns = len(pairs) // rows
     figure, axes = new_figure(f"{case.name}: non-dominated solutions of each algorithm, all runs together", rows, columns,
                            (max(3.2 * columns, 5), 3.7 * rows))
-    original = [_original_value(case, goal) for goal in goals]
+    original = [_original_value(case, objective) for objective in objectives]
     for axis, (first, second) in zip(axes.flat, pairs, strict=True):
         for i, (algorithm, points) in enumerate(fronts.items()):
             axis.plot(points[:, first], points[:, second], linestyle="", marker=MARKERS[i % len(MARKERS)], markersize=4, alpha=0.6,
-                      markeredgewidth=0, color=COLOURS[i % len(COLOURS)], label=f"{_title(algorithm)} ({len(points)})")
+                      markeredgewidth=0, color=COLOURS[i % len(COLOURS)], label=f"{_algorithm_title(algorithm)} ({len(points)})")
         if not np.isnan([original[first], original[second]]).any():
             axis.plot(original[first], original[second], linestyle="", marker="*", markersize=9, color="black", label="original vehicle")
-        if goals[first] == F_SAFE:
+        if objectives[first] == F_SAFE:
             axis.axvline(0, color="black", linewidth=0.8, linestyle="--", label="collision: 0 or less")
-        axis.set_xlabel(objective_title(goals[first]))
-        axis.set_ylabel(objective_title(goals[second]))
-    legend_below(figure, axes.flat[0])
-    return _with_space(figure)
+        axis.set_xlabel(objective_title(objectives[first]))
+        axis.set_ylabel(objective_title(objectives[second]))
+    add_legend_below(figure, axes.flat[0])
+    return _add_space(figure)
 
 
 def objective_title(objective: Objective) -> str:
@@ -159,9 +165,9 @@ def _original_value(case: Case, objective: Objective) -> float:
     return case.original.get(SAFETY_DEGREE if objective == F_SAFE else objective.name, np.nan)
 
 
-def hypervolume_growth(case: Case) -> Figure:
+def draw_convergence(case: Case) -> Figure:
     """Convergence: the hypervolume of all settings so far over the number of evaluations, as median and range over the runs."""
-    growth = convergence(case)
+    growth = compute_convergence(case)
     figure, ((axis,),) = new_figure(f"{case.name}: convergence", 1, 1, (6.4, 4.0))
     for i, (algorithm, group) in enumerate(growth.groupby("algorithm", sort=False)):
         statistics = group.groupby("evaluations")["hypervolume"].agg(["min", "median", "max"])
@@ -170,31 +176,31 @@ def hypervolume_growth(case: Case) -> Figure:
         for edge in ("min", "max"):
             axis.plot(statistics.index, statistics[edge], color=colour, linestyle=DASHES[i % len(DASHES)], linewidth=0.6)
         axis.plot(statistics.index, statistics["median"], color=colour, linestyle=DASHES[i % len(DASHES)], linewidth=1.8,
-                  label=f"{_title(str(algorithm))} ({group['run'].nunique()} runs)")
+                  label=f"{_algorithm_title(str(algorithm))} ({group['run'].nunique()} runs)")
     axis.set_xlabel("evaluations")
     axis.set_ylabel(f"normalised hypervolume of all settings so far\n"
                     f"(thick: median, thin: range over runs; reference point {REFERENCE_COORDINATE:g})")
-    legend_below(figure, axis)
-    return _with_space(figure)
+    add_legend_below(figure, axis)
+    return _add_space(figure)
 
 
-def _with_space(figure: Figure) -> Figure:
+def _add_space(figure: Figure) -> Figure:
     """The figure, with space between its axes."""
     figure.set_layout_engine("constrained", w_pad=0.1)
     return figure
 
 
-def legend_below(figure: Figure, axis: Axes) -> None:
+def add_legend_below(figure: Figure, axis: Axes) -> None:
     handles, labels = axis.get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=min(len(labels), 3), frameon=False, fontsize=FONT)
 
 
-def _critical_count(case: Case) -> int:
-    """Number of critical solutions; raises Unanswerable if there are none."""
-    number = len(critical(case))
-    if not number:
-        raise Unanswerable(case.name, "has no critical solution", "results with solutions that are more unsafe than the original")
-    return number
+def _count_critical_solutions(case: Case) -> int:
+    """Number of critical solutions; raises UnanswerableError if there are none."""
+    count = len(critical_solutions(case))
+    if not count:
+        raise UnanswerableError(case.name, "has no critical solution", "results with solutions that are more unsafe than the original")
+    return count
 
 
 def _set_integer_ticks(axis: object, steps: int = 6) -> None:
@@ -203,5 +209,5 @@ def _set_integer_ticks(axis: object, steps: int = 6) -> None:
     axis.set_major_locator(MaxNLocator(steps, integer=True, min_n_ticks=1))  # type: ignore[attr-defined]
 
 
-def _title(algorithm: str) -> str:
+def _algorithm_title(algorithm: str) -> str:
     return escape_dollars(ALGORITHM_TITLES.get(algorithm, algorithm))

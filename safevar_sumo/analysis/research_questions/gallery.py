@@ -7,15 +7,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from safevar_sumo.analysis.figures import save
-from safevar_sumo.analysis.research_questions.algorithm_figures import attainment_surfaces, critical_differences
-from safevar_sumo.analysis.research_questions.case import Case, Unanswerable
+from safevar_sumo.analysis.research_questions.algorithm_figures import draw_attainment_surfaces, draw_critical_differences
+from safevar_sumo.analysis.research_questions.case import Case, UnanswerableError
 from safevar_sumo.analysis.research_questions.changes import rq31
 from safevar_sumo.analysis.research_questions.figures import (
-    changed_characteristics,
-    hypervolume_growth,
-    number_of_changes,
-    pareto_fronts,
-    sizes_of_changes,
+    draw_change_counts,
+    draw_change_sizes,
+    draw_changed_characteristics,
+    draw_convergence,
+    draw_pareto_fronts,
 )
 
 if TYPE_CHECKING:
@@ -24,23 +24,23 @@ if TYPE_CHECKING:
 FORMATS = ("png", "pdf", "svg")
 LEAST_ALGORITHMS = 3
 """Minimum number of algorithms for a figure of ranks; for two, the test of the pair suffices."""
-FIGURES_OF_ALL_CASES: Mapping[str, Callable[[Sequence[Case]], Figure]] = {"rq3.1-number-of-changes": number_of_changes}
+FIGURES_OF_ALL_CASES: Mapping[str, Callable[[Sequence[Case]], Figure]] = {"rq3.1-number-of-changes": draw_change_counts}
 FIGURES_OF_ONE_CASE: Mapping[str, Callable[[Case], Figure]] = {
-    "rq3.2-changed-characteristics": changed_characteristics,
-    "rq3.3-sizes-of-changes": sizes_of_changes,
-    "pareto-fronts": pareto_fronts,
-    "convergence": hypervolume_growth,
-    "critical-differences": critical_differences,
-    "attainment": attainment_surfaces,
+    "rq3.2-changed-characteristics": draw_changed_characteristics,
+    "rq3.3-sizes-of-changes": draw_change_sizes,
+    "pareto-fronts": draw_pareto_fronts,
+    "convergence": draw_convergence,
+    "critical-differences": draw_critical_differences,
+    "attainment": draw_attainment_surfaces,
 }
 
 
-def draw(cases: Sequence[Case]) -> tuple[dict[str, Figure], list[str]]:
+def draw_figures(cases: Sequence[Case]) -> tuple[dict[str, Figure], list[str]]:
     """Every figure of the cases by name, and the reasons for missing figures; with several cases, names start with the case's name.
 
     Raises
     ------
-    Unanswerable
+    UnanswerableError
         If no figure can be drawn.
     """
     figures, all_errors = {}, []
@@ -52,30 +52,30 @@ def draw(cases: Sequence[Case]) -> tuple[dict[str, Figure], list[str]]:
             figures[name] = draw_cases(answerable_cases)
     for case in cases:
         for name, draw_figure in FIGURES_OF_ONE_CASE.items():
-            if draw_figure is critical_differences and len(case.algorithms) < LEAST_ALGORITHMS:
+            if draw_figure is draw_critical_differences and len(case.algorithms) < LEAST_ALGORITHMS:
                 continue
             try:
                 figures[name if is_single else f"{case.name}-{name}"] = draw_figure(case)
-            except Unanswerable as error:
+            except UnanswerableError as error:
                 all_errors.append(error)
     if not figures:
         raise all_errors[0]
     return figures, list(dict.fromkeys(f"{error.source}: {error.problem}" for error in all_errors))
 
 
-def _answerable_cases(cases: Sequence[Case]) -> tuple[list[Case], list[Unanswerable]]:
+def _answerable_cases(cases: Sequence[Case]) -> tuple[list[Case], list[UnanswerableError]]:
     """The cases that have an answer to RQ3.1, and the errors of the others."""
     answerable_cases, errors = [], []
     for case in cases:
         try:
             rq31(case)
             answerable_cases.append(case)
-        except Unanswerable as error:
+        except UnanswerableError as error:
             errors.append(error)
     return answerable_cases, errors
 
 
-def draw_all(cases: Sequence[Case], directory: Path, kind: str) -> tuple[list[Path], list[str]]:
+def save_figures(cases: Sequence[Case], directory: Path, kind: str) -> tuple[list[Path], list[str]]:
     """Draw every figure into a file; returns the files, and the reasons for missing figures.
 
     Raises
@@ -83,7 +83,7 @@ def draw_all(cases: Sequence[Case], directory: Path, kind: str) -> tuple[list[Pa
     InputError
         If the directory cannot be written, or no figure can be drawn.
     """
-    figures, reasons = draw(cases)
+    figures, reasons = draw_figures(cases)
     files = []
     for name, figure in figures.items():
         path = directory / f"{_file_name(f'{cases[0].name}-{name}' if len(cases) == 1 else name)}.{kind}"
@@ -94,5 +94,5 @@ def draw_all(cases: Sequence[Case], directory: Path, kind: str) -> tuple[list[Pa
 
 
 def _file_name(name: str) -> str:
-    """A case's name without characters that file systems may refuse."""
+    """The name of a figure or case without characters that file systems may refuse."""
     return "".join(character if character.isalnum() or character in "._-" else "-" for character in name).strip("-")

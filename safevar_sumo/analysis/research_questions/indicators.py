@@ -9,7 +9,7 @@ import moocore
 import numpy as np
 import pandas as pd
 
-from safevar_sumo.analysis.research_questions.case import Case, Unanswerable
+from safevar_sumo.analysis.research_questions.case import Case, UnanswerableError
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import MetricFacts
 from safevar_sumo.records import FloatArray
@@ -25,7 +25,7 @@ def titles_of(metrics: Iterable[MetricFacts]) -> dict[str, str]:
     return {**INDICATOR_TITLES, **{metric.name: metric.title for metric in metrics}}
 
 
-def nondominated(points: FloatArray) -> FloatArray:
+def nondominated_points(points: FloatArray) -> FloatArray:
     """The M distinct non-dominated points for minimisation of m objectives, shape (M, m)."""
     return np.asarray(moocore.filter_dominated(_check_points(points, "the set of points")))
 
@@ -62,8 +62,8 @@ class Scale(NamedTuple):
         return np.asarray((points - self.ideal) / self.width)
 
 
-def objectives(case: Case, frame: pd.DataFrame) -> FloatArray:
-    """The objectives, each to be minimised, of the M rows that have all of them; shape (M, objectives)."""
+def objective_values(case: Case, frame: pd.DataFrame) -> FloatArray:
+    """The objectives' values, smaller being better, of the M rows in which all of them are defined; shape (M, objectives)."""
     points = _values(case, frame)
     return np.asarray(points[np.isfinite(points).all(axis=1)])
 
@@ -78,21 +78,21 @@ def reference_front(case: Case) -> FloatArray:
 
     Raises
     ------
-    Unanswerable
+    UnanswerableError
         If there is no solution.
     """
-    points = objectives(case, case.solutions)
+    points = objective_values(case, case.solutions)
     if not len(points):
-        raise Unanswerable(case.name, "has no solution", "results with at least one finished run")
-    return nondominated(points)
+        raise UnanswerableError(case.name, "has no solution", "results with at least one finished run")
+    return nondominated_points(points)
 
 
-def indicators(case: Case) -> pd.DataFrame:
+def compute_indicators(case: Case) -> pd.DataFrame:
     """IGD, IGD+ and hypervolume of every finished run that has solutions; columns algorithm, run, igd, igd_plus and hypervolume.
 
     Raises
     ------
-    Unanswerable
+    UnanswerableError
         If there are no runs or no solutions.
     """
     rows = []
@@ -103,45 +103,46 @@ def indicators(case: Case) -> pd.DataFrame:
         scaled_reference = scale.normalised(reference)
     by_run = dict(list(case.solutions.groupby(["algorithm", "run"])))
     for algorithm, run in runs:
-        front = objectives(case, by_run[algorithm, run]) if (algorithm, run) in by_run else np.zeros((0, 0))
+        front = objective_values(case, by_run[algorithm, run]) if (algorithm, run) in by_run else np.zeros((0, 0))
         if len(front):
             scaled_front = scale.normalised(front)
             rows.append((algorithm, run, igd(front, reference), igd_plus(scaled_front, scaled_reference), hypervolume(scaled_front)))
     return pd.DataFrame(rows, columns=["algorithm", "run", *MORE_IS_BETTER])
 
 
-def convergence(case: Case, points: int = 50) -> pd.DataFrame:
+def compute_convergence(case: Case, points: int = 50) -> pd.DataFrame:
     """The hypervolume of each run's settings after a number of evaluations; columns algorithm, run, evaluations, hypervolume.
 
     A run that ended early keeps its last hypervolume; a hypervolume is 0 while all settings lie beyond the reference point.
 
     Raises
     ------
-    Unanswerable
+    UnanswerableError
         If there are no runs or no solutions.
     """
-    keys = [(algorithm, run) for algorithm in case.algorithms for run in case.runs_of(algorithm)]
+    runs = [(algorithm, run) for algorithm in case.algorithms for run in case.runs_of(algorithm)]
     scale = Scale.of(reference_front(case))
     budget = case.study.search.evaluations
-    grid = np.unique(np.linspace(min(case.study.search.population, budget), budget, points).astype(int))
+    evaluation_counts = np.unique(np.linspace(min(case.study.search.population, budget), budget, points).astype(int))
     by_run = dict(list(case.evaluations.groupby(["algorithm", "run"])))
-    parts = [pd.DataFrame({"algorithm": key[0], "run": key[1], "evaluations": grid, "hypervolume": _growth(case, by_run[key], scale, grid)})
-             for key in keys if key in by_run]
-    if not parts:
-        raise Unanswerable(case.name, "has no evaluations", "results with the journals of their runs")
-    return pd.concat(parts, ignore_index=True)
+    frames = [pd.DataFrame({"algorithm": algorithm, "run": run, "evaluations": evaluation_counts,
+                            "hypervolume": _hypervolumes_after(case, by_run[algorithm, run], scale, evaluation_counts)})
+              for algorithm, run in runs if (algorithm, run) in by_run]
+    if not frames:
+        raise UnanswerableError(case.name, "has no evaluations", "results with the journals of their runs")
+    return pd.concat(frames, ignore_index=True)
 
 
-def _growth(case: Case, evaluations: pd.DataFrame, scale: Scale, grid: np.ndarray) -> list[float]:
-    """Hypervolume of the first k evaluations, for every k of the grid."""
+def _hypervolumes_after(case: Case, evaluations: pd.DataFrame, scale: Scale, evaluation_counts: np.ndarray) -> list[float]:
+    """Hypervolume of the first k evaluations, for each count k."""
     scaled_points = scale.normalised(_values(case, evaluations))
     is_defined = np.isfinite(scaled_points).all(axis=1)
-    scaled_points, numbers = scaled_points[is_defined], evaluations["evaluation"].to_numpy()[is_defined]
-    ends = np.searchsorted(numbers, grid, side="left")
+    scaled_points, evaluation_indices = scaled_points[is_defined], evaluations["evaluation"].to_numpy()[is_defined]
+    ends = np.searchsorted(evaluation_indices, evaluation_counts, side="left")
     front, volumes = np.zeros((0, scaled_points.shape[1])), []
     for start, end in zip([0, *ends[:-1]], ends, strict=True):
         front = np.concatenate([front, scaled_points[start:end]])
-        front = nondominated(front) if len(front) else front
+        front = nondominated_points(front) if len(front) else front
         volumes.append(hypervolume(front) if len(front) else 0.0)
     return volumes
 

@@ -14,8 +14,8 @@ import numpy as np
 import pandas as pd
 import scipy
 
-from safevar_sumo.analysis.research_questions.case import ALGORITHM_TITLES, NSGA2, Case, Unanswerable, counted_solutions
-from safevar_sumo.analysis.research_questions.comparisons import ALPHA, TwoSampleTest, magnitude, rq1, rq1_rows, rq2, rq2_rows
+from safevar_sumo.analysis.research_questions.case import ALGORITHM_TITLES, NSGA2, Case, UnanswerableError, counted_solutions
+from safevar_sumo.analysis.research_questions.comparisons import ALPHA, TwoSampleTest, magnitude_of, rq1, rq1_rows, rq2, rq2_rows
 from safevar_sumo.analysis.research_questions.indicators import titles_of
 from safevar_sumo.metrics import MetricFacts
 from safevar_sumo.records import FloatArray
@@ -37,7 +37,7 @@ def rq1_runs(case: Case) -> pd.DataFrame:
 
     Raises
     ------
-    Unanswerable
+    UnanswerableError
         If the solutions belong to no run, or no run is finished.
     """
     return _corrected_frames(case)[0]
@@ -50,17 +50,17 @@ def rq2_runs(case: Case) -> pd.DataFrame:
 
     Raises
     ------
-    Unanswerable
+    UnanswerableError
         If the solutions belong to no run, or NSGA-II or every other algorithm is missing.
     """
     frame = _corrected_frames(case)[1]
     if frame is None:
         rq2(case)  # raises with the reason
-        raise Unanswerable(case.name, "has no runs to compare", "results of nsga2 and another algorithm")
+        raise UnanswerableError(case.name, "has no runs to compare", "results of nsga2 and another algorithm")
     return frame
 
 
-def holm(p_values: Sequence[float | None]) -> list[float | None]:
+def correct_by_holm(p_values: Sequence[float | None]) -> list[float | None]:
     """P-values corrected by Holm's step-down method (Holm 1979); None stays None and does not count as a test."""
     order = sorted((p, index) for index, p in enumerate(p_values) if p is not None)
     corrected_p_values, maximum = list(p_values), 0.0
@@ -70,7 +70,7 @@ def holm(p_values: Sequence[float | None]) -> list[float | None]:
     return corrected_p_values
 
 
-def signed_rank(sample: FloatArray, value: float) -> TwoSampleTest:
+def signed_rank_test(sample: FloatArray, value: float) -> TwoSampleTest:
     """Compare independent values, shape (N,), with one value: Wilcoxon's test, and the share of greater values (A12).
 
     The test drops values equal to `value` (as Wilcoxon did); the effect size counts them by half.
@@ -81,11 +81,11 @@ def signed_rank(sample: FloatArray, value: float) -> TwoSampleTest:
     sizes = np.abs(difference[difference != 0])
     effect = float(np.mean(difference > 0) + np.mean(difference == 0) / 2)
     if not sizes.size:
-        return TwoSampleTest(1.0, effect, magnitude(effect), len(sample), 1, EXACT_SIGNED_TEST)
+        return TwoSampleTest(1.0, effect, magnitude_of(effect), len(sample), 1, EXACT_SIGNED_TEST)
     is_exact = np.unique(sizes).size == len(sample) <= EXACT_RUNS
     test = scipy.stats.wilcoxon(difference, alternative="two-sided", correction=not is_exact, method="exact" if is_exact else "approx")
     method = EXACT_SIGNED_TEST if is_exact else ASYMPTOTIC_SIGNED_TEST
-    return TwoSampleTest(float(test.pvalue), effect, magnitude(effect), len(sample), 1, method)
+    return TwoSampleTest(float(test.pvalue), effect, magnitude_of(effect), len(sample), 1, method)
 
 
 def fewest_runs(question: str) -> int:
@@ -100,24 +100,24 @@ def difference_line(case: Case) -> str:
 
     Raises
     ------
-    Unanswerable
+    UnanswerableError
         As `rq1_runs`.
     """
     titles = titles_of(case.scoring.metrics)
     rq1_frame, rq2_frame = _corrected_frames(case)
     comparisons = [("RQ1", "algorithm", rq1(case), rq1_frame), *([] if rq2_frame is None else [("RQ2", "baseline", rq2(case), rq2_frame)])]
-    changes, tests = [], 0
-    for question, group_column, pooled_frame, runs in comparisons:
-        for pooled_row, runs_row in zip(pooled_frame.to_dict("records"), runs.to_dict("records"), strict=True):
+    changes, test_count = [], 0
+    for question, group_column, pooled_frame, runs_frame in comparisons:
+        for pooled_row, runs_row in zip(pooled_frame.to_dict("records"), runs_frame.to_dict("records"), strict=True):
             pooled_p, runs_p = pooled_row["p_value"], runs_row["p_holm"]
-            tests += runs_p is not None
+            test_count += runs_p is not None
             if pooled_p is None or runs_p is None or (pooled_p < ALPHA) == (runs_p < ALPHA):
                 continue
             name = ALGORITHM_TITLES.get(pooled_row[group_column], pooled_row[group_column])
             verb = "loses" if pooled_p < ALPHA else "gains"
             changes.append(f"{question} {name} {titles[pooled_row['metric']]} {verb} its star (p {_rounded(pooled_p)} to "
                            f"{_rounded(runs_row['p_value'])}, {_rounded(runs_p)} after Holm)")
-    return (f"One value for each run and Holm's correction for {tests} tests, instead of the paper's pooled solutions: "
+    return (f"One value for each run and Holm's correction for {test_count} tests, instead of the paper's pooled solutions: "
             f"{'; '.join(changes) or 'the same tests are significant'}.")
 
 
@@ -128,10 +128,10 @@ def summary_lines(case: Case) -> list[str]:
     """
     titles = titles_of(case.scoring.metrics)
     lines, any_testable = [], False
-    for question, frame_of, group_column, meaning in SUMMARY_ROWS:
+    for question, frame_of, group_column, meaning in SUMMARY_QUESTIONS:
         try:
             frame = frame_of(case)
-        except Unanswerable as error:
+        except UnanswerableError as error:
             lines.append(f"{question} over runs: {error.problem}.")
             continue
         lines.append(f"{question} over runs: {meaning}; * p < {ALPHA:g} after Holm's correction")
@@ -149,8 +149,8 @@ def summary_lines(case: Case) -> list[str]:
     return [*lines, difference_line(case)] if any_testable else lines
 
 
-SUMMARY_ROWS = (("RQ1", rq1_runs, "algorithm", "A12 below 0.5: the runs are more unsafe than the original vehicle"),
-                ("RQ2", rq2_runs, "baseline", "A12 above 0.5: NSGA-II is better"))
+SUMMARY_QUESTIONS = (("RQ1", rq1_runs, "algorithm", "A12 below 0.5: the runs are more unsafe than the original vehicle"),
+                     ("RQ2", rq2_runs, "baseline", "A12 above 0.5: NSGA-II is better"))
 
 
 def _rounded(value: float) -> str:
@@ -161,13 +161,13 @@ def _corrected_frames(case: Case) -> tuple[pd.DataFrame, pd.DataFrame | None]:
     """The frames of RQ1 and RQ2 over runs, with p-values corrected as one family; None if RQ2 has no answer."""
     case.require_solutions()
     means = partial(run_means, case)
-    tests_of_rq1 = rq1_rows(case, means, signed_rank)
+    rows_of_rq1 = rq1_rows(case, means, signed_rank_test)
     has_rq2 = NSGA2 in case.algorithms and len(case.algorithms) > 1
-    tests_of_rq2 = rq2_rows(case, means) if has_rq2 else []
-    for row, p in zip([*tests_of_rq1, *tests_of_rq2], holm([row["p_value"] for row in [*tests_of_rq1, *tests_of_rq2]]), strict=True):
+    rows_of_rq2 = rq2_rows(case, means) if has_rq2 else []
+    for row, p in zip([*rows_of_rq1, *rows_of_rq2], correct_by_holm([row["p_value"] for row in [*rows_of_rq1, *rows_of_rq2]]), strict=True):
         row["p_holm"] = p
-    return (pd.DataFrame(tests_of_rq1, columns=RQ1_COLUMNS, dtype=object),
-            pd.DataFrame(tests_of_rq2, columns=RQ2_COLUMNS, dtype=object) if has_rq2 else None)
+    return (pd.DataFrame(rows_of_rq1, columns=RQ1_COLUMNS, dtype=object),
+            pd.DataFrame(rows_of_rq2, columns=RQ2_COLUMNS, dtype=object) if has_rq2 else None)
 
 
 def run_means(case: Case, algorithm: str, metric: MetricFacts) -> FloatArray:
@@ -175,16 +175,16 @@ def run_means(case: Case, algorithm: str, metric: MetricFacts) -> FloatArray:
 
     Raises
     ------
-    Unanswerable
+    UnanswerableError
         If the solutions belong to no run.
     """
-    return np.asarray(series_of_means(case, algorithm, metric), dtype=float)
+    return np.asarray(run_mean_series(case, algorithm, metric), dtype=float)
 
 
-def series_of_means(case: Case, algorithm: str, metric: MetricFacts) -> pd.Series[float]:
-    """The means of `run_means`, indexed by the number of the run."""
-    numbers, solutions = case.runs_of(algorithm), counted_solutions(case.solutions_of(algorithm), metric)
+def run_mean_series(case: Case, algorithm: str, metric: MetricFacts) -> pd.Series[float]:
+    """The means of `run_means`, indexed by the run's number."""
+    run_numbers, solutions = case.runs_of(algorithm), counted_solutions(case.solutions_of(algorithm), metric)
     runs, column = solutions["run"].to_numpy(), solutions[metric.name].to_numpy(dtype=float)
     defined = ~np.isnan(column)
-    samples = {run: column[defined & (runs == run)] for run in numbers}
+    samples = {run: column[defined & (runs == run)] for run in run_numbers}
     return pd.Series({run: float(np.mean(sample)) for run, sample in samples.items() if sample.size}, dtype=float)
