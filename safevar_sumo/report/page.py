@@ -65,7 +65,8 @@ def _table_data(table: Table) -> dict[str, Any]:
     rows = [[{"text": superscript_powers(str(cell)), "bold": isinstance(cell, BoldText)} for cell in row] for row in table.rows]
     spans = [("", table.label_count), *((superscript_powers(name), width) for name, width in table.spans)] if table.spans else []
     heads, notes = ([superscript_powers(text) for text in texts] for texts in (table.headings, table.notes))
-    return {"title": superscript_powers(table.title), "heads": heads, "spans": spans, "rows": rows, "labels": table.label_count, "notes": notes}
+    title = superscript_powers(table.title)
+    return {"title": title, "heads": heads, "spans": spans, "rows": rows, "labels": table.label_count, "notes": notes}
 
 
 def embed_figures(cases: Sequence[Case]) -> list[dict[str, str]]:

@@ -23,7 +23,8 @@ def print_opinions(console: Console, result: Opinions) -> None:
         print_text(console, f"note: {handle} is not unsafe: it has no cause")
     for opinion in result.opinions:
         line = printable_text(f"{opinion.solution}: " if opinion.solution else "").append(str(opinion.opinion), STYLES[opinion.opinion])
-        console.print(line.append(printable_text(f": {list_of_changes(characteristics, opinion.changes)}")), soft_wrap=True, highlight=False)
+        changes = list_of_changes(characteristics, opinion.changes)
+        console.print(line.append(printable_text(f": {changes}")), soft_wrap=True, highlight=False)
         print_text(console, f"  with our model {opinion.here}; {opinion.because}")
 
 

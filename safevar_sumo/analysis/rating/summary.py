@@ -20,8 +20,8 @@ TITLES = {"fewest": "Fewest changes that cost a point", "smallest": "Smallest la
 def summarise_rated_solutions(study: Study, solutions: pd.DataFrame, original: Evaluations, directory: str) -> list[str]:
     """Summarise the solutions of a rated study in lines, the last with commands for the next steps.
 
-    `directory` is the results directory in these commands; the other parameters are those of `safevar_sumo.analysis.explain.summary.summarise_failures`,
-    which calls this function for rated studies.
+    `directory` is the results directory in these commands; the other parameters are those of
+    `safevar_sumo.analysis.explain.summary.summarise_failures`, which calls this function for rated studies.
     """
     original_points, points_column = float(original.column(RATING_POINTS.name)[0]), RATING_POINTS.name
     unsafe = Unsafe.default(record(original, 0), solutions["outcome"])

@@ -90,7 +90,8 @@ def draw_change_sizes(case: Case) -> Figure:
     solution_count = _count_critical_solutions(case)
     changes = list_changes(case)
     characteristics = case.characteristics.members
-    figure, axes = new_panels(f"{case.name}: changes in critical solutions", len(characteristics), 4, (2.25, 1.85), min_width=9.0, title_height=1.0)
+    title = f"{case.name}: changes in critical solutions"
+    figure, axes = new_panels(title, len(characteristics), 4, (2.25, 1.85), min_width=9.0, title_height=1.0)
     for axis, characteristic in zip(axes, characteristics, strict=True):
         change = changes.loc[changes["characteristic"] == characteristic.name, "change"]
         low, high = (float(f"{end - characteristic.original:.9g}") for end in (characteristic.lower, characteristic.upper))
