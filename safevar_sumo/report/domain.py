@@ -38,7 +38,8 @@ def make_risk_section(data: ReportInput, jobs: int | None, progress: Progress) -
     result = load_or_compute(data, "risk", compute)
     study = data.case.study
     fleet = {"vehicles": FLEET_VEHICLES, "probability": fleet_probability(result["probability"], FLEET_VEHICLES)}
-    return {**result, **({"fleet": fleet} if study.variation else {}), "of_domain": not study.variation, "correlated": bool(study.correlations),
+    fleets = {"fleet": fleet} if study.variation else {}
+    return {**result, **fleets, "of_domain": not study.variation, "correlated": bool(study.correlations),
             "chart": _draw_sensitivities(data, result["sensitivity"])}
 
 
