@@ -206,7 +206,7 @@ def assert_tells_a_manager(paragraph: str, explained: Explained) -> None:
 
 @pytest.mark.slow
 def test_the_summary_of_a_study_leads_with_the_answer(case: Case, explained: Explained) -> None:
-    original = Evaluator(case.study, InlinePool()).original()
+    original = Evaluator(case.study, InlinePool()).evaluate_original()
     paragraph, first, *others, more = summarise_failures(case.study, case.solutions, original, InlinePool(), "my results")
     crashes = int((case.solutions["outcome"] == "collision").sum())
     assert_tells_a_manager(paragraph, explained)

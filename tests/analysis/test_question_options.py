@@ -46,7 +46,7 @@ from safevar_sumo.report.input import ReportInput
 flag = next(one.default for one in explain.params if one.name == "top")
 signature = inspect.signature(sv.explain).parameters["top"].default
 case = types.SimpleNamespace(solutions=pd.DataFrame())
-asked = ReportInput(number=1, directory="it", case=case, manifest={}, system=None).options["explain"]
+asked = ReportInput(study_number=1, directory="it", case=case, manifest={}, system=None).options["explain"]
 print(flag, signature, asked.top, "--top" in asked.command_line("it"), "--top 8" in module.ExplainOptions(top=8).command_line("it"))
 """
 
