@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import ast
 import importlib.util
 import json
 import re
 import shlex
+import tomllib
+from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,7 +16,11 @@ import pytest
 from click.testing import CliRunner
 
 from safevar_sumo.ads import ADS
+from safevar_sumo.analysis.explain import ExplainOptions
+from safevar_sumo.analysis.risk import RiskOptions
+from safevar_sumo.analysis.rules import RulesOptions
 from safevar_sumo.cli.program import commands
+from safevar_sumo.report import input as report_input
 from safevar_sumo.study import load_study, study_names
 from safevar_sumo.vehicles import VEHICLES
 
@@ -88,6 +95,67 @@ def test_a_map_of_the_code_names_every_package_and_nothing_that_is_not_there(pag
     assert [name for name in named if not any((place / name).is_dir() for place in (ROOT, package, ROOT / "tests"))] == []
     files = re.findall(r"`?((?:[a-z_]+/)+[a-z_]+\.py)\b", text)
     assert [name for name in files if not any((place / name).is_file() for place in (ROOT, package))] == []
+
+
+def test_the_map_for_contributors_has_the_rows_that_import_linter_checks() -> None:
+    (contract,) = (contract for contract in tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["importlinter"]["contracts"]
+                   if contract["type"] == "layers")
+    rows: list[set[str]] = []
+    for line in (ROOT / "CONTRIBUTING.md").read_text().split("```")[1].split("\nsafevar_sumo/\n")[1].splitlines():
+        if re.match(r"  \S", line):
+            shares_row, names = line.startswith("  | "), re.split(r"\s{2,}", line.strip().removeprefix("| "))[0]
+            rows[len(rows) - shares_row:] = [{*(rows[-1] if shares_row else ()), *(name.rstrip("/") for name in names.split(" | "))}]
+    assert rows == [set(layer.split(" | ")) for layer in contract["layers"]]
+
+
+MENTION = re.compile(r"((?:`[\w.]+`(?:,|\s+and)\s+)*`[\w.]+`)\s+(?:in\s+|of\s+|\()`([\w/]+\.py)`")
+"""Names of code, and the file that a page says they are in."""
+
+
+@cache
+def names_defined_in(file: Path) -> set[str]:
+    """Functions, classes and constants of a module, and the members of its classes as `Class.member`."""
+    result = set()
+    for node in ast.parse(file.read_text()).body:
+        result |= names_of(node)
+        if isinstance(node, ast.ClassDef):
+            result |= {f"{node.name}.{name}" for member in node.body for name in names_of(member)}
+    return result
+
+
+def names_of(node: ast.stmt) -> set[str]:
+    if isinstance(node, ast.FunctionDef | ast.ClassDef):
+        return {node.name}
+    targets = node.targets if isinstance(node, ast.Assign) else [node.target] if isinstance(node, ast.AnnAssign) else []
+    return {target.id for target in targets if isinstance(target, ast.Name)}
+
+
+def test_every_name_of_code_that_a_page_mentions_is_in_the_file_that_it_names() -> None:
+    mentions = [(page, name, file) for page in ("CONTRIBUTING.md", *PAGES) for names, file in MENTION.findall((ROOT / page).read_text())
+                for name in re.findall(r"`([\w.]+)`", names)]
+    assert ("docs/architecture.md", "request_evaluations", "search/evolution.py") in mentions
+    for page, name, file in mentions:
+        path = next((place / file for place in (ROOT / "safevar_sumo", ROOT) if (place / file).is_file()), None)
+        assert path is not None, f"{page}: {file}"
+        assert name in names_defined_in(path), f"{page}: {name} in {file}"
+
+
+def test_every_test_file_that_is_named_exists() -> None:
+    """In a page, a study or the package; a page may also make the file that it names."""
+    code = [*sorted((ROOT / "studies").rglob("*.toml")), *sorted((ROOT / "safevar_sumo").rglob("*.py"))]
+    files = ["CONTRIBUTING.md", *PAGES, *(str(path.relative_to(ROOT)) for path in code)]
+    tests = {path.relative_to(ROOT).as_posix() for path in (ROOT / "tests").rglob("test_*.py")}
+    for file in files:
+        made = {block.title for block in blocks(file)} if file.endswith(".md") else set()
+        for name in re.findall(r"(?<![\w/.])((?:\w+/)*test_\w+\.py)\b", (ROOT / file).read_text()):
+            assert name in made or any(f"/{test}".endswith(f"/{name}") for test in tests), f"{file}: {name}"
+
+
+def test_the_numbers_of_a_reports_questions_are_those_that_the_page_about_it_gives() -> None:
+    paragraph = re.search(r"A report asks all questions.*?\n\n", (ROOT / "docs" / "gallery.md").read_text(), flags=re.DOTALL)
+    assert paragraph is not None
+    numbers = (report_input.SAMPLES, RiskOptions.samples, RulesOptions.samples, report_input.LIMIT, ExplainOptions.limit)
+    assert re.findall(r"\d+,\d+", paragraph[0]) == [f"{number:,}" for number in numbers]
 
 
 def test_every_generated_table_of_a_page_is_made_from_the_code() -> None:

@@ -21,8 +21,9 @@ from safevar_sumo.sumo import Engine, assemble, evaluate
 from safevar_sumo.sumo.matrix import MAX_COPIES
 from safevar_sumo.workers.evaluation import pack_study
 from safevar_sumo.workers.identity import network_digests
-from safevar_sumo.workers.isolation import refuse_difference, refuse_unlike_sumo
+from safevar_sumo.workers.isolation import refuse_difference
 from safevar_sumo.workers.retrying import RetryingPool, reproduction_command
+from safevar_sumo.workers.sumo_check import refuse_unlike_sumo
 
 EXPECTED_REQUESTS = (
     "requests that depend only on the run's problem, evaluations and `rng`: nothing kept in a class or a module between runs, no "

@@ -12,6 +12,7 @@ import numpy as np
 
 from safevar_sumo.analysis.parameters import value_of, with_values
 from safevar_sumo.errors import InputError, SimulationError
+from safevar_sumo.reference.agreement import Agreement, measure_agreement
 from safevar_sumo.reference.effects import error_beyond_spread
 from safevar_sumo.reference.fit_result import Calibration
 from safevar_sumo.reference.fit_space import FitSpace, StudyFit
@@ -20,7 +21,6 @@ from safevar_sumo.reference.parameters import FittedParameter, free_parameters
 from safevar_sumo.reference.profiles import Profiles
 from safevar_sumo.reference.rows import COLUMNS, ReferenceData
 from safevar_sumo.reference.search import SearchRace, StudyGroup
-from safevar_sumo.reference.validation import Agreement, measure_agreement
 from safevar_sumo.study import SAFETY_DEGREE, Study
 from safevar_sumo.vehicles import CharacteristicSet
 from safevar_sumo.workers.batches import evaluate_all

@@ -14,7 +14,7 @@ from safevar_sumo.analysis.research_questions.case import ALGORITHM_TITLES, Case
 from safevar_sumo.analysis.research_questions.changes import change_matrix, critical_solutions, masks_by_change_count
 from safevar_sumo.analysis.research_questions.comparisons import ALPHA, magnitude_of
 from safevar_sumo.errors import InputError
-from safevar_sumo.reference.validation import rank_correlation
+from safevar_sumo.reference.agreement import rank_correlation
 
 COMPARED_SIDES = HERE, PUBLISHED = "here", "published"
 KEY_COLUMNS: Mapping[str, Sequence[str]] = {

@@ -8,9 +8,9 @@ from typing import NamedTuple
 
 import msgspec
 
+from safevar_sumo.reference.agreement import Agreement
 from safevar_sumo.reference.profiles import Profiles
 from safevar_sumo.reference.rows import ReferenceData
-from safevar_sumo.reference.validation import Agreement
 from safevar_sumo.study import SAFETY_DEGREE, FitTable, FreeParameter, Study
 
 BOUND_MARGIN = 0.01

@@ -8,9 +8,9 @@ import numpy as np
 
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import Evaluations
+from safevar_sumo.reference.agreement import measure_agreement
 from safevar_sumo.reference.effects import Regression
 from safevar_sumo.reference.rows import ReferenceData
-from safevar_sumo.reference.validation import measure_agreement
 from safevar_sumo.study import SAFETY_DEGREE, FitTable, Study
 from safevar_sumo.vehicles import CharacteristicSet
 

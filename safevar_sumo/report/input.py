@@ -81,6 +81,8 @@ def tabulate_failing_points(matrix: Sequence[Point], failing: Collection[str]) -
 
 SAMPLES = 4000
 """Number of vehicles sampled for the section on risk, and for the one on rules."""
+LIMIT = 12_000
+"""Approximate number of simulations for the minimal causes of all failures."""
 
 
 class Resimulation(NamedTuple):
@@ -167,7 +169,7 @@ class ReportInput:
         """Each question's options on the page: one criterion for all questions, and smaller samples than the commands take."""
         unsafe = None if self.case.solutions.empty else str(self.case.unsafe)
         all_options: tuple[Options, ...] = (
-            ExplainOptions(unsafe=unsafe, limit=12_000), OpinionOptions(unsafe=unsafe), ToleranceOptions(unsafe=unsafe),
+            ExplainOptions(unsafe=unsafe, limit=LIMIT), OpinionOptions(unsafe=unsafe), ToleranceOptions(unsafe=unsafe),
             RiskOptions(unsafe=unsafe, samples=SAMPLES), RulesOptions(unsafe=unsafe, samples=SAMPLES))
         return {options.question: options for options in all_options}
 

@@ -19,8 +19,9 @@ from safevar_sumo.vehicles import CharacteristicSet
 from safevar_sumo.workers.evaluation import Pool, pack_study
 from safevar_sumo.workers.identity import Inputs, network_digests
 from safevar_sumo.workers.interrupts import wait_for_first, wait_for_result
-from safevar_sumo.workers.isolation import check_code, refuse_unlike_sumo
+from safevar_sumo.workers.isolation import check_code
 from safevar_sumo.workers.retrying import RetryingPool
+from safevar_sumo.workers.sumo_check import refuse_unlike_sumo
 
 BATCHES_PER_CALL_AND_WORKER = 4
 """Number of batches per worker: with several small batches, no worker waits long for another."""

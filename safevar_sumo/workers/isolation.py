@@ -1,4 +1,4 @@
-"""Checks that user code does not mix settings up, and that recorded scenes give the same results as SUMO."""
+"""Checks that user code does not mix settings up: the result of a setting depends on this setting alone."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from importlib.metadata import version
 import numpy as np
 import platformdirs
 
-from safevar_sumo.errors import InputError, UserCodeError
-from safevar_sumo.records import BoolArray, Evaluations
+from safevar_sumo.errors import UserCodeError
+from safevar_sumo.records import Evaluations
 from safevar_sumo.results import RESULTS
 from safevar_sumo.study import Study, tables_of, user_code_names
 from safevar_sumo.vehicles import CharacteristicSet
@@ -23,9 +23,6 @@ from safevar_sumo.workers.retrying import RetryingPool
 EXPECTED_RESULTS = (
     "results of a vehicle that depend on this vehicle alone: nothing kept in a class, a module or the model itself from one call or "
     "setting to another, no mean or sum over the batch, nothing random")
-
-ROUNDING = 1e-9
-"""Largest accepted difference between a metric in a recorded scene and in SUMO."""
 _passed_checks: set[str] = set()
 """Identities of studies whose code has passed in this process, in case the cache folder is not writable."""
 
@@ -64,7 +61,7 @@ def refuse_difference(study: Study, run: str, in_run: Evaluations, alone: Evalua
     UserCodeError
         With the models, the first result that differs, and the contract.
     """
-    difference = _find_difference(in_run, alone)
+    difference = find_difference(in_run, alone)
     if difference:
         name, value, value_alone = difference
         problem = (f"with {' and '.join(user_code_names(study))} a result depends on what else is simulated: "
@@ -72,35 +69,7 @@ def refuse_difference(study: Study, run: str, in_run: Evaluations, alone: Evalua
         raise UserCodeError(f"study {study.name!r}", problem, EXPECTED_RESULTS)
 
 
-def refuse_unlike_sumo(study: Study, recorded: Evaluations, in_sumo: Evaluations) -> None:
-    """Refuse settings with different results in a recorded scene and in SUMO; skip settings that SUMO could not simulate.
-
-    Raises
-    ------
-    InputError
-        With the first such setting and both values.
-    """
-    for row in np.flatnonzero(~_are_alike(recorded, in_sumo, ROUNDING) & ~in_sumo.failed).tolist():
-        setting = recorded.settings[row]
-        difference = _find_difference(recorded.take([row]), in_sumo.take([row]), ROUNDING)
-        if difference:
-            name, value, sumo_value = difference
-            values = ", ".join(f"{key} = {value:.17g}" for key, value in zip(study.vehicle.characteristics, setting, strict=True))
-            raise InputError(f"study {study.name!r}", f"{name} is {value} in the recorded scene and {sumo_value} in SUMO with {values}",
-                             "scenario: reactive_actors = True, if anybody reacts to the vehicle under test; or --engine sumo")
-
-
-def _are_alike(batch: Evaluations, other_batch: Evaluations, tolerance: float) -> BoolArray:
-    """Whether each of N settings has the same outcome, and numbers that differ by at most `tolerance`; shape (N,)."""
-    is_alike = batch.outcome == other_batch.outcome
-    quantities = ((batch.collision_speed, other_batch.collision_speed),
-                  *((batch.metrics[name], other_batch.metrics[name]) for name in batch.metrics))
-    for values, other_values in quantities:
-        is_alike &= np.isclose(values, other_values, rtol=0, atol=tolerance, equal_nan=True)
-    return np.asarray(is_alike)
-
-
-def _find_difference(evaluations: Evaluations, other_evaluations: Evaluations,
+def find_difference(evaluations: Evaluations, other_evaluations: Evaluations,
                      tolerance: float = 0.0) -> tuple[str, object, object] | None:
     """Name and both values of the first quantity that differs by more than `tolerance`; None if a simulation failed."""
     if evaluations.failed[0] or other_evaluations.failed[0]:

@@ -12,7 +12,7 @@ import pytest
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import Evaluations
 from safevar_sumo.reference import ReferenceData, measure_agreement, package_filter, plot_agreement, read_reference
-from safevar_sumo.reference.validation import rank_correlation
+from safevar_sumo.reference.agreement import rank_correlation
 from safevar_sumo.study import Study, load_study
 from safevar_sumo.vehicles import Characteristic, CharacteristicSet
 

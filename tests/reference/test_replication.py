@@ -16,7 +16,8 @@ from click.testing import CliRunner, Result
 from safevar_sumo.analysis.research_questions.case import load_cases
 from safevar_sumo.cli.program import commands
 from safevar_sumo.errors import InputError
-from safevar_sumo.reference import Agreement, shipped_totals_of, validation, write_totals
+from safevar_sumo.reference import Agreement, agreement, shipped_totals_of, write_totals
+from safevar_sumo.reference.agreement import rank_correlation
 from safevar_sumo.reference.conclusions import (
     DIFFERS,
     HOLDS,
@@ -27,7 +28,6 @@ from safevar_sumo.reference.conclusions import (
     judge_test,
     pair_cases,
 )
-from safevar_sumo.reference.validation import rank_correlation
 from safevar_sumo.report.verdict import PublishedAgreement, describe_agreement
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo import simulate
@@ -143,7 +143,7 @@ def totals(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The only entry is made up: 10 of 40 published collisions collide here, which are half of the 20 here."""
     path = tmp_path / "totals.toml"
     write_totals(path, load_study("rain"), "made_up.csv", MADE_UP)
-    monkeypatch.setattr(validation, "SHIPPED_TOTALS", path)
+    monkeypatch.setattr(agreement, "SHIPPED_TOTALS", path)
     return path
 
 

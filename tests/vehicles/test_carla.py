@@ -162,3 +162,12 @@ def test_beyond_the_limit_carla_keeps_the_friction_that_the_multi_body_model_los
     limit = friction * GRAVITY
     assert carla_deceleration(9.5, p_dx1=friction) == pytest.approx(limit, rel=0.03)
     assert least_share * limit < multi_body(9.5, p_dx1=friction) < limit
+
+
+@SLOW
+def test_a_brake_split_matters_only_at_the_limit() -> None:
+    """The vehicle of CARLA has no brake split: its four wheels share the load and brake as one."""
+    assert multi_body(5.0, T_sb=0.5) == pytest.approx(multi_body(5.0, T_sb=0.8), rel=0.02)
+    near_the_limit = [multi_body(9.0, T_sb=split) for split in (0.5, 0.66, 0.8)]
+    assert max(near_the_limit) / min(near_the_limit) > 1.1
+    assert min(near_the_limit) > 0.7 * carla_deceleration(9.0)

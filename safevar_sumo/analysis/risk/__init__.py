@@ -21,6 +21,12 @@ if TYPE_CHECKING:
 
 METHODS = ("auto", "monte_carlo", "subset_simulation", "cross_entropy")
 """Methods that estimate a probability."""
+RARE_BELOW = 1e-2
+"""Probability from which plain Monte Carlo is as efficient as a method for rare failures."""
+PILOT_VEHICLES = 1000
+"""Number of vehicles first drawn by plain Monte Carlo, whose outcomes decide the method."""
+ENOUGH_FAILURES = 100
+"""Plain Monte Carlo is kept if, at the pilot's rate, all requested vehicles would have at least this many failures."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,9 +41,9 @@ class RiskOptions(Options):
         None, "Stop as soon as the confidence interval of the probability is at most this wide.", kind=float, low=0, high=1,
         is_open=(True, False))
     unsafe: str | None = unsafe_option()
-    method: str = option("auto", "Method: monte_carlo, subset_simulation, cross_entropy, or auto, which draws 1,000 vehicles and takes "
-                                 "subset_simulation if OpenTURNS is installed, the probability is below 0.01 and --samples vehicles "
-                                 "would have fewer than 100 failures.",
+    method: str = option("auto", f"Method: monte_carlo, subset_simulation, cross_entropy, or auto, which draws {PILOT_VEHICLES:,} vehicles "
+                                 "and takes subset_simulation if OpenTURNS is installed, the probability is below "
+                                 f"{RARE_BELOW:g} and --samples vehicles would have fewer than {ENOUGH_FAILURES} failures.",
                          metavar="METHOD", kind=str)
     rare: bool = option(False, "For rare failures, 1e-3 to 1e-8: as auto, but requires OpenTURNS and computes no sensitivities.", kind=bool)
 

@@ -12,18 +12,8 @@ import pandas as pd
 import scipy
 
 from safevar_sumo.analysis.evaluator import Evaluator, Progress, clopper_pearson, open_evaluator, show_no_progress
-from safevar_sumo.analysis.risk import RiskOptions
-from safevar_sumo.analysis.risk.rare import (
-    ENOUGH_FAILURES,
-    PILOT_VEHICLES,
-    RARE_BELOW,
-    Estimate,
-    PlateauError,
-    Response,
-    estimate_rare,
-    is_plateau,
-    load_openturns,
-)
+from safevar_sumo.analysis.risk import ENOUGH_FAILURES, PILOT_VEHICLES, RARE_BELOW, RiskOptions
+from safevar_sumo.analysis.risk.rare import Estimate, PlateauError, Response, estimate_rare, is_plateau, load_openturns
 from safevar_sumo.errors import InputError, SimulationError
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import FloatArray, finite_or_none

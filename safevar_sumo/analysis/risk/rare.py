@@ -20,12 +20,6 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray
 
-RARE_BELOW = 1e-2
-"""Probability from which plain Monte Carlo is as efficient as a method for rare failures."""
-PILOT_VEHICLES = 1000
-"""Number of vehicles first drawn by plain Monte Carlo, whose outcomes decide the method."""
-ENOUGH_FAILURES = 100
-"""Plain Monte Carlo is kept if, at the pilot's rate, all requested vehicles would have at least this many failures."""
 LEVEL_SHARE = 0.1
 """p0: share of a level's vehicles (those nearest to failure) from which the next level starts."""
 LEVEL_SIZE = 1000

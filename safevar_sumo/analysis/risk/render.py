@@ -9,8 +9,8 @@ import numpy as np
 from rich.console import Console
 
 from safevar_sumo.analysis.figures import BLUE, FONT, GREY, escape_dollars, new_figure
+from safevar_sumo.analysis.risk import RARE_BELOW
 from safevar_sumo.analysis.risk.compute import FLEET_VEHICLES, Risk
-from safevar_sumo.analysis.risk.rare import RARE_BELOW
 from safevar_sumo.errors import InputError
 from safevar_sumo.study import Study
 from safevar_sumo.study.variation import Uniform
