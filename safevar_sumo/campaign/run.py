@@ -34,7 +34,7 @@ class Observer(Protocol):
         """A warning for the user."""
 
 
-class _KnownSetting(NamedTuple):
+class _EvaluatedSetting(NamedTuple):
     """The `position` of a setting in the run (`SPARE_POSITION` until the search requests it), and its `row` in `evaluations`."""
 
     position: int
@@ -62,8 +62,8 @@ class Run:
 
     def __init__(self, key: RunKey, search: Search, journal: Journal, observer: Observer, budget: int, *, retry: bool = False) -> None:
         self.key, self._search, self._journal, self._observer, self._budget = key, search, journal, observer, budget
-        self._known: dict[bytes, _KnownSetting] = {}
-        self._known_positions: set[int] = set()
+        self._entries: dict[bytes, _EvaluatedSetting] = {}
+        self._evaluated_positions: set[int] = set()
         """Positions in the run whose settings are evaluated."""
         self._requested = 0
         """Number of settings in all earlier requests."""
@@ -84,7 +84,7 @@ class Run:
     @property
     def missing_settings(self) -> FloatArray:
         """The distinct requested settings without a known evaluation, shape (k, n)."""
-        return self._settings[[position - self._requested for key, position in self._positions.items() if key not in self._known]]
+        return self._settings[[position - self._requested for key, position in self._positions.items() if key not in self._entries]]
 
     @property
     def failures(self) -> list[Failure]:
@@ -92,9 +92,9 @@ class Run:
         return [Failure(self.key.algorithm, self.key.run, position, evaluations.reason(row))
                 for position, evaluations, row in self._requested_entries() if evaluations.outcome[row] == FAILED]
 
-    def _requested_entries(self) -> list[_KnownSetting]:
+    def _requested_entries(self) -> list[_EvaluatedSetting]:
         """The known settings that this run requested, in the order of their positions."""
-        return sorted((entry for entry in self._known.values() if 0 <= entry.position < self._budget), key=lambda entry: entry.position)
+        return sorted((entry for entry in self._entries.values() if 0 <= entry.position < self._budget), key=lambda entry: entry.position)
 
     @property
     def collisions(self) -> int:
@@ -108,7 +108,7 @@ class Run:
 
     def _count(self, outcome: Outcome) -> int:
         value = outcome.value  # numpy compares enum members slowly
-        return sum(evaluations.outcome[row] == value for position, evaluations, row in self._known.values()
+        return sum(evaluations.outcome[row] == value for position, evaluations, row in self._entries.values()
                    if 0 <= position < self._budget)
 
     def advance(self) -> bool:
@@ -123,7 +123,7 @@ class Run:
             return True
         if not self._positions:
             self._note_request(next(self._search))
-        while self._positions.keys() <= self._known.keys():
+        while self._positions.keys() <= self._entries.keys():
             self._store_spares()
             evaluations = self._evaluations_of(self._settings)
             self._observer.evaluated(self.key, evaluations, self._simulated)
@@ -157,21 +157,21 @@ class Run:
     def is_repeated_by(self, search: Search) -> bool:
         """Whether a search with the evaluations of this run requests the same settings in the same order, with the same solutions."""
         settings, requested, positions = next(search), 0, dict[bytes, int]()
-        while all(setting.tobytes() in self._known for setting in settings):
+        while all(setting.tobytes() in self._entries for setting in settings):
             for i, setting in enumerate(settings):
                 positions.setdefault(setting.tobytes(), requested + i)
             requested += len(settings)
             try:
                 settings = search.send(self._evaluations_of(settings))
             except StopIteration as end:
-                expected = {key: entry.position for key, entry in self._known.items() if 0 <= entry.position < self._budget}
+                expected = {key: entry.position for key, entry in self._entries.items() if 0 <= entry.position < self._budget}
                 return positions == expected and np.array_equal(end.value.settings, self.result.settings)
         return False
 
     def finish(self) -> None:
         """Journal the result of a search that has ended."""
         if not self.finished:
-            positions = [self._known[setting.tobytes()].position for setting in self.result.settings]
+            positions = [self._entries[setting.tobytes()].position for setting in self.result.settings]
             self._journal.finish(positions, self._requested, self._budget)
         self.finished = True
         self._observer.finished(self.key, self._requested)
@@ -180,7 +180,7 @@ class Run:
         """Journal and remember new evaluations; returns whether all requested settings are known."""
         self._store(evaluations)
         self._simulated += len(evaluations)
-        return self._positions.keys() <= self._known.keys()
+        return self._positions.keys() <= self._entries.keys()
 
     def close(self) -> None:
         """Close the journal."""
@@ -194,26 +194,26 @@ class Run:
 
     def _store_spares(self) -> None:
         """Journal the positions of settings whose evaluations were known before the search requested them."""
-        spares = [position - self._requested for key, position in self._positions.items() if self._known[key].position == SPARE_POSITION]
+        spares = [position - self._requested for key, position in self._positions.items() if self._entries[key].position == SPARE_POSITION]
         if spares:
             self._store(self._evaluations_of(self._settings[spares]))
 
     def _store(self, evaluations: Evaluations) -> None:
         """Journal and remember evaluations of the present request."""
         positions = [self._positions[setting.tobytes()] for setting in evaluations.settings]
-        if not self._known_positions.isdisjoint(positions):
+        if not self._evaluated_positions.isdisjoint(positions):
             raise InputError(self._journal.path, "holds other settings than this search requests", "another --out")
         self._journal.append(positions, evaluations)
         self._remember(positions, evaluations)
 
     def _remember(self, positions: list[int], evaluations: Evaluations) -> None:
-        self._known_positions.update(position for position in positions if position != SPARE_POSITION)
+        self._evaluated_positions.update(position for position in positions if position != SPARE_POSITION)
         for row, position in enumerate(positions):
-            self._known[evaluations.settings[row].tobytes()] = _KnownSetting(position, evaluations, row)
+            self._entries[evaluations.settings[row].tobytes()] = _EvaluatedSetting(position, evaluations, row)
 
     def _evaluations_of(self, settings: FloatArray) -> Evaluations:
         """The evaluations of known settings, in their order."""
-        entries = [self._known[setting.tobytes()] for setting in settings]
+        entries = [self._entries[setting.tobytes()] for setting in settings]
         batches = list({id(evaluations): evaluations for _, evaluations, _ in entries}.values())
         starts = dict(zip(map(id, batches), accumulate(map(len, batches), initial=0), strict=False))
         return Evaluations.concatenate(batches).take([starts[id(evaluations)] + row for _, evaluations, row in entries])

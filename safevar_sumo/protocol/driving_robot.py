@@ -44,7 +44,7 @@ class DrivingRobot:
         self._target = np.repeat([np.nan if speed is None else speed for speed in speeds], n // len(points))
         self.has_test_speed: BoolArray = ~np.isnan(self._target)
         """Which vehicles are in a scenario with a `test_speed`."""
-        self._drives = self.has_test_speed.copy()
+        self._is_driving = self.has_test_speed.copy()
         self._is_needed = bool(self.has_test_speed.any())
         self._prepared, self._hold_gear = prepared, getattr(vehicle, "hold_gear", None)
         self._pedal, self._least_brake = state.throttle - state.brake, state.brake + ACTION_THRESHOLD
@@ -60,18 +60,18 @@ class DrivingRobot:
         """
         if not self._is_needed:
             return command, state
-        error = np.where(self._drives, state.speed - self._target, 0.0)
+        error = np.where(self._is_driving, state.speed - self._target, 0.0)
         self.error = np.where(is_open & (_tolerance_share(error) > _tolerance_share(self.error)), error, self.error)
         self._has_braked |= command.brake > self._least_brake
         system_pedal = command.throttle - command.brake
         self._highest_pedal = np.maximum(self._highest_pedal, system_pedal)
-        self._drives = ~self._has_braked & (system_pedal >= np.minimum(self._highest_pedal, self._pedal) - ACTION_THRESHOLD)
-        error = np.where(self._drives, error, 0.0)
+        self._is_driving = ~self._has_braked & (system_pedal >= np.minimum(self._highest_pedal, self._pedal) - ACTION_THRESHOLD)
+        error = np.where(self._is_driving, error, 0.0)
         self._integral = np.minimum(np.maximum(self._integral - error * self._step, -1 / INTEGRAL_GAIN), 1 / INTEGRAL_GAIN)
         pedal = self._pedal - PROPORTIONAL_GAIN * error + INTEGRAL_GAIN * self._integral
-        robot_command = Command(np.where(self._drives, np.minimum(np.maximum(pedal, 0.0), 1.0), command.throttle),
-                                np.where(self._drives, np.minimum(np.maximum(-pedal, 0.0), 1.0), command.brake))
-        return robot_command, state if self._hold_gear is None else self._hold_gear(self._prepared, state, self._drives)
+        robot_command = Command(np.where(self._is_driving, np.minimum(np.maximum(pedal, 0.0), 1.0), command.throttle),
+                                np.where(self._is_driving, np.minimum(np.maximum(-pedal, 0.0), 1.0), command.brake))
+        return robot_command, state if self._hold_gear is None else self._hold_gear(self._prepared, state, self._is_driving)
 
     @property
     def invalid(self) -> BoolArray:
