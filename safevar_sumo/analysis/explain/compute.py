@@ -30,6 +30,7 @@ from safevar_sumo.analysis.preventability import assess_preventability, classify
 from safevar_sumo.analysis.research_questions.case import Case
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
+from safevar_sumo.protocol.points import UNKNOWN as UNKNOWN_COLOUR
 from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray, finite_or_none
 from safevar_sumo.results import CHOICES, UNKNOWN, SolutionId, handles_of, row_of_handle
@@ -146,17 +147,20 @@ def compare_at_points(system: System, original: FloatArray, settings: FloatArray
 
 
 def compare_at_cells(evaluator: Evaluator, original: FloatArray, settings: FloatArray) -> tuple[list[PointComparison], float]:
-    """As `compare_at_points`, for a rated study: finds the cells whose colour is worse than the original's; compares in the worst cell."""
+    """As `compare_at_points`, for a rated study: finds the cells whose colour is worse than the original's; compares in the worst cell.
+
+    An unknown colour is neither better nor worse.
+    """
     system = assemble(evaluator.study)
     assert system.rater is not None
     colours = system.rater.points(evaluator.simulate_cells(np.concatenate([original, settings]), "cells that turn")).colours.astype(int)
     comparisons, step = list[PointComparison](), 0.0
     for row in range(1, len(colours)):
-        colour_change = colours[row] - colours[0]
-        point = system.matrix[int(np.argmax(colour_change))]
+        colour_loss = np.where(colours[0] == UNKNOWN_COLOUR, 0, np.maximum(colours[row] - colours[0], 0))
+        point = system.matrix[int(np.argmax(colour_loss))]
         (at_point,) = simulate_all_points(system.at(point), np.concatenate([original, settings[row - 1:row]]))
         original_run, changed_run = (summarise_run(at_point.runs, column, float(at_point.evaluations.f_safe[column])) for column in (0, 1))
-        names = tuple(system.matrix[k].name for k in np.flatnonzero(colour_change).tolist())
+        names = tuple(system.matrix[k].name for k in np.flatnonzero(colour_loss).tolist())
         comparisons.append(PointComparison(compare_braking(original_run, changed_run, point.name), names))
         step = at_point.runs.trace.step
     return comparisons, step
