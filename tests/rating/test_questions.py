@@ -80,7 +80,7 @@ def test_brakes_cost_points_one_by_one_and_the_first_loss_is_named() -> None:
 
 
 @pytest.mark.slow
-def test_explain_names_the_cells_that_turn_and_the_summary_the_points_that_are_lost() -> None:
+def test_explain_names_the_cells_of_a_worse_colour_and_the_summary_the_points_that_are_lost() -> None:
     evaluator = Evaluator(STUDY, TwoWorkers())
     members = evaluator.characteristics
     settings = np.array([members.setting({"brakeTorque": value, "payload": 200.0}, "it") for value in (0.5, 0.6)])
@@ -97,7 +97,7 @@ def test_explain_names_the_cells_that_turn_and_the_summary_the_points_that_are_l
     assert [sorted(cause.changes) for cause in failure.causes] == [["brakeTorque"]]
     console = Console(record=True, width=120, file=StringIO())
     print_explained(console, "it", result, full=True)
-    assert "turn: CCRs" in console.export_text()
+    assert " cells: CCRs" in console.export_text()
     lines = summarise_failures(STUDY, case.solutions, original, TwoWorkers(), "it")
     assert f"{points:.2f}" in lines[0]
     assert isinstance(case.solutions, pd.DataFrame)
@@ -112,8 +112,8 @@ def test_only_cells_of_a_worse_colour_explain_a_failure(monkeypatch: pytest.Monk
     monkeypatch.setattr(rater.Rater, "points", lambda self, cells: SimpleNamespace(colours=colours))
     original = evaluator.characteristics.original[np.newaxis]
     (comparison,), _ = compare_at_cells(evaluator, original, original)
-    assert comparison.points == (matrix[0].name, matrix[4].name)
-    assert comparison.because.point == matrix[4].name
+    assert comparison.failing_points == (matrix[0].name, matrix[4].name)
+    assert comparison.braking.point == matrix[4].name
 
 
 @pytest.mark.slow
