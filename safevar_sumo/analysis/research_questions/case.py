@@ -44,7 +44,7 @@ class Case:
         The original vehicle's metrics by name; NaN where undefined.
     solutions, evaluations
         Frames that `safevar_sumo.results.load_runs` returns.
-    finished
+    finished_runs
         Algorithm and number of every finished run.
     scoring
         The metrics and the minimised objectives.
