@@ -16,21 +16,23 @@ Delay = Annotated[float, Meta(ge=0, le=5)]
 SPEED_LIMIT = 20 / KMH_PER_MS
 """Speed above which the agent releases the throttle [m/s] (20 km/h in its source code)."""
 SPEED_LEVELS = (0.0, 8 / 3, 16 / 3)
-"""Speeds between which the policy is interpolated, up to the speed limit [m/s] (four levels in 0..8 m/s in its source code)."""
+"""The first three of the four speed levels in the policy's source code, 0 to 8 m/s; between them the throttle is linear in speed."""
 PASSED_GAP = -0.5
-"""Gap at which an obstacle is beside the vehicle rather than ahead [m]."""
+"""Gap at which an obstacle is beside the vehicle rather than ahead [m]; the policy does not begin to brake for it."""
+RELEASE_GAP = -1.0
+"""Once braking, the policy brakes until the obstacle is this far behind the front bumper [m]."""
 
 
 class _Memory(NamedTuple):
     """Whether the policy brakes; commands not yet carried out, newest last; delay lines.
 
-    `recognition_line` delays gap and lateral position, `brake_delay_line` the brake command.
+    `recognition_line` delays gap and lateral position, `hesitation_line` the brake command.
     """
 
-    brakes: BoolArray
+    is_braking: BoolArray
     pending_commands: tuple[Command, ...]
     recognition_line: DelayLine
-    brake_delay_line: DelayLine
+    hesitation_line: DelayLine
 
 
 class WorldOnRails(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -45,11 +47,14 @@ class WorldOnRails(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     corridor
         Half the width of the corridor in which the policy brakes for obstacles; it releases the brake when they leave the corridor [m].
     brake_gap, brake_gap_per_speed
-        The policy brakes at gaps up to `brake_gap` + `brake_gap_per_speed` * speed [m, s] for an obstacle at `brake_place`.
-    brake_place, brake_gap_before, brake_gap_past
-        The braking gap shrinks by `brake_gap_before` for each metre that the obstacle is short of `brake_place`, and by `brake_gap_past`
-        for each metre past it [m, -, -]: the policy brakes later for obstacles that enter or leave its path. The visibility
-        multiplies the remaining gap.
+        The policy brakes at gaps up to `brake_gap` + `brake_gap_per_speed` * speed [m, s] for an obstacle at the lateral position
+        `brake_place`.
+    brake_place
+        Lateral position of an obstacle for which the policy brakes earliest [m], negative on the side that it comes from.
+    brake_gap_before, brake_gap_past
+        Slopes [-]: the braking gap shrinks by `brake_gap_before` for each metre that the obstacle is short of `brake_place`, and by
+        `brake_gap_past` for each metre past it, so that the policy brakes later for obstacles that enter or leave its path. The
+        visibility multiplies the remaining gap.
     throttle
         Throttle at the policy's speed levels 0, 2.7 and 5.3 m/s.
     recognition_delay
@@ -66,7 +71,7 @@ class WorldOnRails(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     brake_place: float
     brake_gap_before: UpTo60
     brake_gap_past: UpTo60
-    throttle: Annotated[tuple[Throttle, Throttle, Throttle], Meta()]
+    throttle: tuple[Throttle, Throttle, Throttle]
     recognition_delay: Delay = 0.0
     hesitation: Delay = 0.0
 
@@ -77,24 +82,24 @@ class WorldOnRails(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
 
     def drive(self, seen: Observation, memory: _Memory) -> tuple[Command, _Memory]:
         (gap, lateral), recognition_line = memory.recognition_line.delayed(np.array([seen.gap, seen.lateral]))
-        is_braking = self._brakes(seen, gap, lateral, memory.brakes)
+        is_braking = self._decide_to_brake(seen, gap, lateral, memory.is_braking)
         is_waiting = (seen.speed == 0) & (seen.time < self.first_command)
         throttle = np.where(is_braking | is_waiting | (seen.speed > SPEED_LIMIT), 0.0, self._throttle(seen.speed))
         command, *pending_commands = (*memory.pending_commands, Command(throttle, is_braking.astype(float)))
-        delayed_brake, brake_delay_line = memory.brake_delay_line.delayed(command.brake)
-        memory = _Memory(is_braking, tuple(pending_commands), recognition_line, brake_delay_line)
+        delayed_brake, hesitation_line = memory.hesitation_line.delayed(command.brake)
+        memory = _Memory(is_braking, tuple(pending_commands), recognition_line, hesitation_line)
         return Command(command.throttle, np.minimum(command.brake, delayed_brake)), memory
 
-    def _brakes(self, seen: Observation, gap: FloatArray, lateral: FloatArray, was_braking: BoolArray) -> BoolArray:
-        """Whether to brake: the recognised obstacle is near and in the corridor. (The policy's brake probability exceeds one half.)"""
+    def _decide_to_brake(self, seen: Observation, gap: FloatArray, lateral: FloatArray, was_braking: BoolArray) -> BoolArray:
+        """Whether to brake: the recognised obstacle is near and in the corridor: the policy's brake probability exceeds one half."""
         offset = lateral - self.brake_place
         reduction = self.brake_gap_past * np.maximum(offset, 0.0) + self.brake_gap_before * np.maximum(-offset, 0.0)
         braking_gap = seen.visibility * (self.brake_gap + self.brake_gap_per_speed * seen.speed - reduction)
-        is_watched = np.abs(lateral) <= self.corridor
-        starts_braking = is_watched & (gap <= braking_gap) & (gap > PASSED_GAP)
-        keeps_braking = is_watched & was_braking & (gap > 2 * PASSED_GAP)
-        brakes: BoolArray = starts_braking | keeps_braking
-        return brakes
+        is_in_corridor = np.abs(lateral) <= self.corridor
+        starts_braking = is_in_corridor & (gap <= braking_gap) & (gap > PASSED_GAP)
+        keeps_braking = is_in_corridor & was_braking & (gap > RELEASE_GAP)
+        is_braking: BoolArray = starts_braking | keeps_braking
+        return is_braking
 
     def _throttle(self, speed: FloatArray) -> FloatArray:
         low, middle, high = self.throttle

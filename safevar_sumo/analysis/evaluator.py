@@ -91,8 +91,8 @@ class Evaluator:
             metrics=dict.fromkeys(METRICS, undefined), f_diff=self.characteristics.largest_change(settings),
             f_num_diff=self.characteristics.number_changed(settings))
 
-    def feasible_settings(self, number: int, seed: int = 0, *, filtered: bool = False) -> FloatArray:
-        """`number` settings that cover the feasible part of the domain evenly; with `filtered`, they stay feasible when filtered."""
+    def feasible_settings(self, number: int, seed: int = 0, *, feasible_after_filter: bool = False) -> FloatArray:
+        """`number` settings that cover the feasible part of the domain evenly; optionally, they also stay feasible when filtered."""
         if not self.region:
             return sobol_settings(self.characteristics, number, seed)
         rng, drawn = np.random.default_rng(seed), 0
@@ -103,7 +103,7 @@ class Evaluator:
             drawn += count
             return sobol_settings(self.characteristics, drawn, seed)[drawn - count:]
 
-        return self.region.draw_feasible(draw_next, number, rng, filtered=filtered, rejections=MAX_REJECTIONS)
+        return self.region.draw_feasible(draw_next, number, rng, filtered=feasible_after_filter, rejections=MAX_REJECTIONS)
 
     def simulate_cells(self, settings: FloatArray, stage: str) -> CellResults:
         """Simulate M settings, shape (M, n), in every cell of a rated study; the workers share the cells.

@@ -28,11 +28,14 @@ MAX_SIMULATIONS = 20_000
 """Approximate maximum number of simulations for a study's preventability; if all collisions need more, a random sample is simulated."""
 
 SETTINGS_PER_CALL = 20
-"""Number of settings simulated in one call at all points of a matrix: enough to fill the batches of simulations."""
+"""Number of settings simulated in one call at all points of a test matrix: enough to fill the batches of simulations."""
+
+REFERENCE_DRIVERS = ("competent_driver", "full_braking")
+"""Models of the drivers, the weaker one first."""
 
 
 class PreventableBy(StrEnum):
-    """The weakest reference driver that avoids a collision in the same vehicle."""
+    """The weakest reference driver that avoids a collision in the same vehicle; by NOBODY, a collision is not preventable."""
 
     COMPETENT_DRIVER = "preventable by a competent driver"
     FULL_BRAKING = "preventable by full braking at the first possible moment"
@@ -40,7 +43,10 @@ class PreventableBy(StrEnum):
 
 
 class PreventedShares(msgspec.Struct, frozen=True, kw_only=True):
-    """Shares of the simulated collisions by category, None without a collision; `looked_at` is the number of simulated collisions."""
+    """Shares of the simulated collisions by category in the JSON of `explain`, None without a collision.
+
+    `looked_at` is the number of simulated collisions; `interval_competent_driver` the 95 % interval of the share `competent_driver`.
+    """
 
     competent_driver: float | None
     full_braking: float | None
@@ -51,27 +57,27 @@ class PreventedShares(msgspec.Struct, frozen=True, kw_only=True):
 
 @dataclass(frozen=True, kw_only=True)
 class Preventability:
-    """Numbers of a study's collisions, or of a random sample of them, by category: the weakest driver that avoids each collision.
+    """Counts of a study's collisions, or of a random sample of them, by category: the weakest driver that avoids each collision.
 
     Attributes
     ----------
-    numbers
+    counts
         Number of simulated collisions in each category; the categories are disjoint.
     collisions
-        Number of distinct collisions of the study, simulated or not.
+        Number of distinct settings of the study that collide, simulated with the reference drivers or not.
     """
 
-    numbers: Mapping[PreventableBy, int]
+    counts: Mapping[PreventableBy, int]
     collisions: int
 
     @property
     def looked_at(self) -> int:
         """Number of collisions simulated with the reference drivers."""
-        return sum(self.numbers.values())
+        return sum(self.counts.values())
 
     def share(self, category: PreventableBy) -> float | None:
         """The share of a category among the simulated collisions; None if no collision was simulated."""
-        return self.numbers.get(category, 0) / self.looked_at if self.looked_at else None
+        return self.counts.get(category, 0) / self.looked_at if self.looked_at else None
 
     def interval(self, category: PreventableBy) -> tuple[float, float] | None:
         """95 % confidence interval of a category's share in all collisions of the study; None if no collision was simulated.
@@ -80,9 +86,11 @@ class Preventability:
         interval is Clopper and Pearson's. It is slightly too wide, as it has no correction for a finite population.
         """
         share = self.share(category)
-        if share is None or self.looked_at == self.collisions:
-            return None if share is None else (share, share)
-        return clopper_pearson(self.numbers.get(category, 0), self.looked_at)
+        if share is None:
+            return None
+        if self.looked_at == self.collisions:
+            return share, share
+        return clopper_pearson(self.counts.get(category, 0), self.looked_at)
 
     @property
     def shares(self) -> PreventedShares:
@@ -99,24 +107,25 @@ class Preventability:
             return ""
         sample = "" if self.looked_at == self.collisions else f"{self.looked_at}, drawn at random, of "
         parts = [f"{self.share(category):.0%} {category.replace('by full', 'only by full')}"
-                 for category in PreventableBy if self.numbers.get(category)]
+                 for category in PreventableBy if self.counts.get(category)]
         return f"Preventability in the same vehicle ({sample}{number_of(self.collisions, 'collision')}): {', '.join(parts)}."
 
 
 def assess_preventability(evaluator: Evaluator, settings: FloatArray, limit: int = MAX_SIMULATIONS) -> Preventability:
-    """Classify collisions, settings of shape (M, n), by the weakest driver that avoids each collision; equal settings count once.
+    """Classify settings that collide, shape (M, n), by the weakest driver that avoids the collision; equal settings count once.
 
     If that takes more than about `limit` simulations, only a random sample is simulated, drawn with the study's seed.
     A setting that cannot be simulated with a reference driver is not counted.
     """
     unique = np.unique(settings, axis=0)
-    sample_size = max(limit // (len(PreventableBy) - 1 + len(assemble(evaluator.study).matrix)), 1)
+    simulations_per_setting = len(REFERENCE_DRIVERS) + len(assemble(evaluator.study).matrix)
+    sample_size = max(limit // simulations_per_setting, 1)
     rows = np.random.default_rng(evaluator.study.search.seed).permutation(len(unique))[:sample_size]
-    return Preventability(numbers=Counter(filter(None, classify_collisions(evaluator, unique[rows]))), collisions=len(unique))
+    return Preventability(counts=Counter(filter(None, classify_collisions(evaluator, unique[rows]))), collisions=len(unique))
 
 
 def classify_collisions(evaluator: Evaluator, settings: FloatArray) -> list[PreventableBy | None]:
-    """The category of each collision, settings of shape (M, n); in a matrix, each setting is simulated at its worst point.
+    """The category of each of the settings that collide, shape (M, n); in a test matrix, each is simulated at its worst point.
 
     The category is None if the setting cannot be simulated.
     """
@@ -126,8 +135,9 @@ def classify_collisions(evaluator: Evaluator, settings: FloatArray) -> list[Prev
     for point_index in np.unique(worst).tolist():
         rows = np.flatnonzero(worst == point_index)
         point = system.points[point_index]
-        at_point = evaluator.for_study(study_at(evaluator.study, point.name, point.name) if system.matrix else evaluator.study)
-        for row, category in zip(rows.tolist(), _classify_at_point(at_point, system.at(point), settings[rows]), strict=True):
+        study = study_at(evaluator.study, point.name, source=point.name) if system.matrix else evaluator.study
+        point_categories = _classify_at_point(evaluator.for_study(study), system.at(point), settings[rows])
+        for row, category in zip(rows.tolist(), point_categories, strict=True):
             categories[row] = category
     return categories
 
@@ -145,14 +155,14 @@ def _find_worst_points(evaluator: Evaluator, system: System, settings: FloatArra
 def _classify_at_point(evaluator: Evaluator, system: System, settings: FloatArray) -> list[PreventableBy | None]:
     """Categories of collisions at one point. Full braking is tried only if the competent driver collides, so categories are disjoint."""
     parameters = approach_parameters(system)
-    drivers = {name: evaluator.for_study(_study_with_driver(evaluator.study, name, parameters))
-               for name in ("competent_driver", "full_braking")}
-    competent_driver = drivers["competent_driver"].evaluate(settings, "a competent driver in the same vehicle")
+    competent_evaluator, braking_evaluator = (evaluator.for_study(_study_with_driver(evaluator.study, name, parameters))
+                                              for name in REFERENCE_DRIVERS)
+    competent_driver = competent_evaluator.evaluate(settings, "a competent driver in the same vehicle")
     collisions = np.flatnonzero(competent_driver.collided)
-    full_braking = drivers["full_braking"].evaluate(settings[collisions], "full braking in the same vehicle")
+    full_braking = braking_evaluator.evaluate(settings[collisions], "full braking in the same vehicle")
     categories: list[PreventableBy | None] = [PreventableBy.COMPETENT_DRIVER if valid else None for valid in competent_driver.valid]
     for row, collided, valid in zip(collisions.tolist(), full_braking.collided, full_braking.valid, strict=True):
-        categories[row] = None if not valid else PreventableBy.NOBODY if collided else PreventableBy.FULL_BRAKING
+        categories[row] = (PreventableBy.NOBODY if collided else PreventableBy.FULL_BRAKING) if valid else None
     return categories
 
 

@@ -11,7 +11,7 @@ import pandas as pd
 
 from safevar_sumo.analysis.research_questions.answer import Answer, answer_questions
 from safevar_sumo.analysis.research_questions.case import ALGORITHM_TITLES, Case, UnanswerableError
-from safevar_sumo.analysis.research_questions.changes import change_matrix, critical_solutions, masks_by_change_count
+from safevar_sumo.analysis.research_questions.changes import changes_of, critical_solutions, masks_by_change_count
 from safevar_sumo.analysis.research_questions.comparisons import ALPHA, magnitude_of
 from safevar_sumo.errors import InputError
 from safevar_sumo.reference.agreement import rank_correlation
@@ -100,7 +100,7 @@ def _tabulate_change_numbers(cases: Sequence[Case]) -> pd.DataFrame:
     rows: list[dict[str, Any]] = []
     for case in cases:
         try:
-            change_table = change_matrix(case, critical_solutions(case))
+            change_table = changes_of(case, critical_solutions(case))
         except UnanswerableError:
             continue
         rows += [{"setting": case.name, "j": j, "percent": 100 * float(np.mean(has_j_changes)) if len(has_j_changes) else None}
@@ -194,7 +194,7 @@ def judge_test(effect: float, p: float, published_effect: float, published_p: fl
 
 
 def _read_change_numbers(frame: pd.DataFrame) -> Iterator[Conclusion]:
-    for setting, rows in frame.groupby("setting", sort=False):
+    for case, rows in frame.groupby("setting", sort=False):
         percents, published_percents = (rows[f"percent {side}"].fillna(0).to_numpy(dtype=float) for side in COMPARED_SIDES)
         if not percents.sum() or not published_percents.sum():
             continue
@@ -202,38 +202,38 @@ def _read_change_numbers(frame: pd.DataFrame) -> Iterator[Conclusion]:
         mode, published_mode = numbers[percents.argmax()], numbers[published_percents.argmax()]
         mean, published_mean = (float(numbers @ shares / shares.sum()) for shares in (percents, published_percents))
         verdict = HOLDS if mode == published_mode else IN_DIRECTION if abs(mean - published_mean) <= 1 else DIFFERS
-        yield Conclusion("RQ3.1", str(setting), f"most critical solutions change {published_mode} characteristics", verdict,
+        yield Conclusion("RQ3.1", str(case), f"most critical solutions change {published_mode} characteristics", verdict,
                          f"most frequent {mode} here, {published_mode} published; mean {mean:.1f} and {published_mean:.1f}")
 
 
 def _read_orders(frame: pd.DataFrame) -> Iterator[Conclusion]:
-    for setting, rows in frame[frame["j"] == "any"].groupby("setting", sort=False):
+    for case, rows in frame[frame["j"] == "any"].groupby("setting", sort=False):
         defined_rows = rows.dropna(subset=[f"percent {HERE}", f"percent {PUBLISHED}"])
         if defined_rows.empty:
             continue
         most_changed, published_most_changed = (
             ", ".join(defined_rows.sort_values(f"percent {side}", ascending=False, kind="stable")["characteristic"].head(3))
             for side in COMPARED_SIDES)
-        yield _compare_ranks("RQ3.2", str(setting), f"changed most often: {published_most_changed}", defined_rows, "percent",
+        yield _compare_ranks("RQ3.2", str(case), f"changed most often: {published_most_changed}", defined_rows, "percent",
                              f"; here {most_changed}")
 
 
 def _read_weathers(frame: pd.DataFrame) -> Iterator[Conclusion]:
-    for (setting, other), rows in frame.groupby(["setting", "other"], sort=False):
+    for (case, other_case), rows in frame.groupby(["setting", "other"], sort=False):
         defined_rows = rows.dropna(subset=[f"difference {HERE}", f"difference {PUBLISHED}"])
         statement = "how much more often each characteristic is changed in the worse weather"
-        yield _compare_ranks("weather", f"{setting}, {other}", statement, defined_rows, "difference", "")
+        yield _compare_ranks("weather", f"{case}, {other_case}", statement, defined_rows, "difference", "")
 
 
-def _compare_ranks(question: str, setting: str, statement: str, defined_rows: pd.DataFrame, column: str, note: str) -> Conclusion:
+def _compare_ranks(question: str, case: str, statement: str, defined_rows: pd.DataFrame, column: str, note: str) -> Conclusion:
     rho = rank_correlation(*(defined_rows[f"{column} {side}"].to_numpy(dtype=float) for side in COMPARED_SIDES))
     verdict = UNDECIDED if rho is None else HOLDS if rho >= MIN_RHO else IN_DIRECTION if rho >= MIN_RHO_IN_DIRECTION else DIFFERS
     evidence = "no rank correlation" if rho is None else f"rank correlation {rho:.2f}"
-    return Conclusion(question, setting, statement, verdict, evidence + note)
+    return Conclusion(question, case, statement, verdict, evidence + note)
 
 
 def _read_directions(frame: pd.DataFrame) -> Iterator[Conclusion]:
-    for setting, rows in frame[frame["j"] == "any"].groupby("setting", sort=False):
+    for case, rows in frame[frame["j"] == "any"].groupby("setting", sort=False):
         leans = {}
         for side in COMPARED_SIDES:
             counts = rows.pivot_table(index="characteristic", columns="direction", values=f"n {side}", aggfunc="sum", sort=False)
@@ -246,7 +246,7 @@ def _read_directions(frame: pd.DataFrame) -> Iterator[Conclusion]:
         share = float(is_same.mean())
         verdict = HOLDS if share >= MIN_SHARE else IN_DIRECTION if share >= MIN_SHARE_IN_DIRECTION else DIFFERS
         opposite = ", ".join(map(str, is_same.index[~is_same]))
-        yield Conclusion("RQ3.3", str(setting), f"{int(has_lean.sum())} characteristics are changed mostly one way", verdict,
+        yield Conclusion("RQ3.3", str(case), f"{int(has_lean.sum())} characteristics are changed mostly one way", verdict,
                          f"{int(is_same.sum())} of them the same way here" + (f", but not {opposite}" if opposite else ""))
 
 
@@ -274,14 +274,14 @@ def _judge_ratio(value: float, published_value: float) -> ReplicationVerdict:
 
 
 def _read_combinations(frame: pd.DataFrame) -> Iterator[Conclusion]:
-    for setting, rows in frame.groupby("setting", sort=False):
+    for case, rows in frame.groupby("setting", sort=False):
         here, published = (rows.sort_values("place")[f"characteristics {side}"].dropna().tolist() for side in COMPARED_SIDES)
         if not here or not published:
             continue
         shared_count = len(set(here[0].split(", ")) & set(published[0].split(", ")))
         is_similar = published[0] in here or here[0] in published or shared_count >= 3
         verdict = HOLDS if here[0] == published[0] else IN_DIRECTION if is_similar else DIFFERS
-        yield Conclusion("combinations", str(setting), f"the four most often changed together: {published[0]}", verdict,
+        yield Conclusion("combinations", str(case), f"the four most often changed together: {published[0]}", verdict,
                          f"here {here[0]}; {shared_count} of four the same")
 
 

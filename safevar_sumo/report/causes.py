@@ -109,10 +109,10 @@ def draw_necessity(summary: SummaryEntry, data: ReportInput) -> Markup | None:
         return None
     bars = [[Bar(0, changed[name], "weak", f"{name}: changed in {changed[name]:.0%} of the failures"),
              Bar(0, necessary[name], "hit", f"{name}: needed in {necessary[name]:.0%} of the failures")] for name in names]
-    ends = [("", f"needed {necessary[name]:.0%}{_interval_text(*summary.necessary_interval[name])}, changed {changed[name]:.0%}")
+    end_labels = [("", f"needed {necessary[name]:.0%}{_interval_text(*summary.necessary_interval[name])}, changed {changed[name]:.0%}")
             for name in names]
     description = f"{data.case.name}: how often a characteristic is needed for a failure, beside how often it is changed"
-    return draw_bars(description, names, bars, [None] * len(names), ends)
+    return draw_bars(description, names, bars, [None] * len(names), end_labels)
 
 
 def _interval_text(low: float, high: float) -> str:

@@ -67,7 +67,7 @@ DOMAIN_SECTIONS: Mapping[str, Callable[[ReportInput, int | None, Progress], Sect
 
 def _draw_intervals(data: ReportInput, scans: list[Section]) -> Markup:
     characteristics = {characteristic.name: characteristic for characteristic in data.case.characteristics}
-    names, bars, marks, ends = [], [], [], []
+    names, bars, marks, end_labels = [], [], [], []
     for scan in scans:
         characteristic = characteristics[scan["characteristic"]]
         safe, unsafe = scan["safe"], scan["unsafe"]
@@ -76,15 +76,16 @@ def _draw_intervals(data: ReportInput, scans: list[Section]) -> Markup:
         bars.append([*safe_bars, *(_interval_bar(characteristic, interval, "unsafe") for interval in unsafe),
                      *(_interval_bar(characteristic, interval, "weak", "could not be simulated") for interval in scan["not_simulated"])])
         marks.append(_fraction_of_domain(characteristic, characteristic.original))
-        ends.append((quantity_text(characteristic.lower, characteristic.unit), quantity_text(characteristic.upper, characteristic.unit)))
+        low_label, high_label = (quantity_text(end, characteristic.unit) for end in (characteristic.lower, characteristic.upper))
+        end_labels.append((low_label, high_label))
     description = f"{data.case.name}: where each characteristic alone is safe and where it is unsafe; a mark at the original"
-    return draw_bars(description, names, bars, marks, ends)
+    return draw_bars(description, names, bars, marks, end_labels)
 
 
 def _interval_bar(characteristic: Characteristic, interval: Sequence[float], css_class: str, state: str = "") -> Bar:
     low, high = interval
-    title = f"{characteristic.name} from {format_number(low)} to {quantity_text(high, characteristic.unit)}: {state or css_class}"
-    return Bar(_fraction_of_domain(characteristic, low), _fraction_of_domain(characteristic, high), css_class, title)
+    tooltip = f"{characteristic.name} from {format_number(low)} to {quantity_text(high, characteristic.unit)}: {state or css_class}"
+    return Bar(_fraction_of_domain(characteristic, low), _fraction_of_domain(characteristic, high), css_class, tooltip)
 
 
 def _index_bar(name: str, index: float, css_class: str, index_name: str) -> Bar:
@@ -112,7 +113,7 @@ def _draw_sensitivities(data: ReportInput, sensitivity: list[Section]) -> Markup
         return None
     bars = [[_index_bar(entry["characteristic"], entry["total"], "weak", "together with others"),
              _index_bar(entry["characteristic"], entry["first_order"] or 0.0, "safe", "alone")] for entry in entries]
-    ends = [("", ", ".join(f"{name} {_estimate_text(entry[index], entry[f'{index}_interval'])}" for index, name in INDEX_NAMES.items()))
-            for entry in entries]
+    end_labels = [("", ", ".join(f"{name} {_estimate_text(entry[index], entry[f'{index}_interval'])}"
+                                 for index, name in INDEX_NAMES.items())) for entry in entries]
     return draw_bars(f"{data.case.name}: share of the safety degree's variance that each characteristic explains",
-                     [entry["characteristic"] for entry in entries], bars, [None] * len(entries), ends)
+                     [entry["characteristic"] for entry in entries], bars, [None] * len(entries), end_labels)

@@ -10,47 +10,52 @@ from markupsafe import Markup, escape
 WIDTH = 720
 ROW_HEIGHT = 26
 """Height of a row of bars [pixels]."""
+ROW_PITCH = ROW_HEIGHT * 1.6
+"""Distance from one row of bars to the next, with the texts between them [pixels]."""
 NAME_WIDTH = 170
 """Width of the column of names at the left [pixels]."""
 RIGHT_MARGIN = 24
 
 
 class Dot(NamedTuple):
-    """A point of a scatter chart: its coordinates, title, CSS class and link."""
+    """A point of a scatter chart: its coordinates, tooltip, CSS class and link."""
 
     x: float
     y: float
-    title: str
+    tooltip: str
     css_class: str
     link: str = ""
 
 
 class Bar(NamedTuple):
-    """A bar in a row: its ends as fractions of the row, its CSS class and its title."""
+    """A bar in a row: its ends as fractions of the row, its CSS class and its tooltip."""
 
     start: float
     end: float
     css_class: str
-    title: str
+    tooltip: str
 
 
 def draw_bars(description: str, names: Sequence[str], bars_of_rows: Sequence[Sequence[Bar]], marks: Sequence[float | None],
-              ends: Sequence[tuple[str, str]]) -> Markup:
-    """Draw rows of bars, each row with a mark; `description` is the chart in words, `ends` are the texts at both ends of each row."""
+              end_labels: Sequence[tuple[str, str]]) -> Markup:
+    """Draw rows of bars; `description` is the chart in words, `end_labels` are the texts below the left and right end of each row.
+
+    `marks` has the place of each row's mark, as a fraction of the row.
+    """
     elements, track_width = [], WIDTH - NAME_WIDTH - RIGHT_MARGIN
-    for row, (name, bars, mark, (left, right)) in enumerate(zip(names, bars_of_rows, marks, ends, strict=True)):
-        y = row * ROW_HEIGHT * 1.6
+    for row, (name, bars, mark, (left, right)) in enumerate(zip(names, bars_of_rows, marks, end_labels, strict=True)):
+        y = row * ROW_PITCH
         elements.append(_text(NAME_WIDTH - 8, y + 17, name, "name"))
         elements.append(f'<rect class="track" x="{NAME_WIDTH}" y="{y + 4:.1f}" width="{track_width}" height="{ROW_HEIGHT - 8}" rx="3"/>')
         for bar in bars:
             x, width = NAME_WIDTH + track_width * bar.start, max(track_width * (bar.end - bar.start), 1.5)
             elements.append(f'<rect class="{bar.css_class}" x="{x:.1f}" y="{y + 4:.1f}" width="{width:.1f}" height="{ROW_HEIGHT - 8}">'
-                         f"<title>{escape(bar.title)}</title></rect>")
+                         f"<title>{escape(bar.tooltip)}</title></rect>")
         if mark is not None:
             elements.append(f'<path class="mark" d="M{NAME_WIDTH + track_width * mark:.1f} {y:.1f}v{ROW_HEIGHT}"/>')
-        elements.append(_text(NAME_WIDTH, y + ROW_HEIGHT + 8, left, "end start"))
-        elements.append(_text(WIDTH - RIGHT_MARGIN, y + ROW_HEIGHT + 8, right, "end"))
-    return _svg(description, ROW_HEIGHT * 1.6 * len(names) + 4, elements)
+        elements.append(_text(NAME_WIDTH, y + ROW_HEIGHT + 8, left, "anchor-start"))
+        elements.append(_text(WIDTH - RIGHT_MARGIN, y + ROW_HEIGHT + 8, right, "anchor-end"))
+    return _svg(description, ROW_PITCH * len(names) + 4, elements)
 
 
 def draw_scatter(description: str, dots: Sequence[Dot], x_title: str, y_title: str, line: float | None, line_title: str) -> Markup:
@@ -66,19 +71,19 @@ def draw_scatter(description: str, dots: Sequence[Dot], x_title: str, y_title: s
         return height - bottom - (height - bottom - 14) * (y - y_scale[0]) / (y_scale[-1] - y_scale[0])
 
     elements = [f'<path class="grid" d="M{left} {pixel_y(y):.1f}H{WIDTH - RIGHT_MARGIN}"/>'
-             + _text(left - 7, pixel_y(y) + 4, f"{y:g}", "end") for y in y_scale]
+             + _text(left - 7, pixel_y(y) + 4, f"{y:g}", "anchor-end") for y in y_scale]
     elements += [f'<path class="grid" d="M{pixel_x(x):.1f} 14V{height - bottom}"/>'
-              + _text(pixel_x(x), height - bottom + 17, f"{x:g}", "middle")
+              + _text(pixel_x(x), height - bottom + 17, f"{x:g}", "anchor-middle")
               for x in x_scale]
-    elements += [_text((WIDTH + left) / 2, height - 8, x_title, "middle title"),
-              f'<g transform="translate(14 {(height - bottom) / 2}) rotate(-90)">{_text(0, 0, y_title, "middle title")}</g>']
+    elements += [_text((WIDTH + left) / 2, height - 8, x_title, "anchor-middle title"),
+              f'<g transform="translate(14 {(height - bottom) / 2}) rotate(-90)">{_text(0, 0, y_title, "anchor-middle title")}</g>']
     if line is not None:
         elements += [f'<path class="level" d="M{left} {pixel_y(line):.1f}H{WIDTH - RIGHT_MARGIN}"/>',
-                  _text(WIDTH - RIGHT_MARGIN, pixel_y(line) - 5, line_title, "end")]
+                  _text(WIDTH - RIGHT_MARGIN, pixel_y(line) - 5, line_title, "anchor-end")]
     for dot in dots:
         centre = f'cx="{pixel_x(dot.x):.1f}" cy="{pixel_y(dot.y):.1f}"'
-        circle = f'<circle class="{dot.css_class}" {centre} r="4.5"><title>{escape(dot.title)}</title></circle>'
-        elements.append(f'<a href="#{escape(dot.link)}" aria-label="{escape(dot.title)}">{circle}</a>' if dot.link else circle)
+        circle = f'<circle class="{dot.css_class}" {centre} r="4.5"><title>{escape(dot.tooltip)}</title></circle>'
+        elements.append(f'<a href="#{escape(dot.link)}" aria-label="{escape(dot.tooltip)}">{circle}</a>' if dot.link else circle)
     return _svg(description, height, elements, role="group" if any(dot.link for dot in dots) else "img")
 
 

@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 
 from safevar_sumo.ads import ADS
-from safevar_sumo.analysis.explain.necessity import BORDERLINE, is_borderline, robustness_in_words
+from safevar_sumo.analysis.explain.necessity import MIN_ROBUST_SHARE, is_borderline, robustness_in_words
 from safevar_sumo.analysis.explain.result import REASONS, ROBUST, CauseEntry, FailureEntry
 from safevar_sumo.analysis.model_spread import ModelSpread, compute_model_spreads
 from safevar_sumo.analysis.preventability import PreventedShares
@@ -350,7 +350,7 @@ def describe_limits(data: ReportInput, explanations: Explanations | None) -> Tru
     if explanations and explanations.failures:
         borderline_count = sum(is_borderline(failure.robustness) for failure in explanations.failures)
         remarks.append(f"{borderline_count} of {len(explanations.failures)} failures analysed are borderline: "
-                       f"fewer than {BORDERLINE:.0%} of their neighbours are unsafe too.")
+                       f"fewer than {MIN_ROBUST_SHARE:.0%} of their neighbours are unsafe too.")
     if not published:
         remarks.append("There are no published values of the original vehicle to compare the study with.")
     return TrustSection(GENERAL_LIMITS, remarks, published, describe_agreement(data).rows, _simulate_spreads(data))

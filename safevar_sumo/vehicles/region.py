@@ -111,7 +111,7 @@ class FeasibleRegion:
 
     def draw_feasible(self, draw: DrawSettings, number: int, rng: np.random.Generator | None = None, *, filtered: bool = False,
                       rejections: int = REJECTIONS) -> FloatArray:
-        """The first `number` feasible settings drawn, shape (number, n).
+        """The first `number` feasible settings drawn (if `filtered`, feasible after the filter), shape (number, n).
 
         If `rejections` draws per setting do not suffice, random mixtures of the region's vertices fill the rest; without `rng`, fewer
         settings are returned.

@@ -88,6 +88,6 @@ def test_a_creeping_deceleration_is_no_late_pedal() -> None:
     runs.trace.gap[:, 1] = OBSTACLE - runs.trace.position[:, 1]
     comparison = compare_braking(*(summarise_run(runs, column, 1.0) for column in (0, 1)))
     assert comparison.parts["delay"] == 0
-    assert comparison.parts["deceleration"] == pytest.approx(comparison.lost_distance)
+    assert comparison.parts["deceleration"] == pytest.approx(comparison.lost_margin)
     assert "later" not in sentence(comparison)
     assert "brakes more weakly" in sentence(comparison)

@@ -250,7 +250,7 @@ def test_a_boundary_is_the_first_unsafe_place_and_no_island_is_skipped() -> None
     assert result.fraction == pytest.approx(1.5 / 4.5, abs=2 * RESOLUTION)
     assert result.setting[0] > 6.5 >= result.setting[0] - 2 * RESOLUTION * 4.5
     assert result.single_limits == {0: result.setting[0]}
-    assert (result.end, result.at_threshold) == (BoundaryState.SAFE, None)
+    assert (result.state_below, result.at_threshold) == (BoundaryState.SAFE, None)
 
 
 def test_nothing_is_shrunk_into_what_the_filter_takes_for_no_change() -> None:
@@ -260,7 +260,7 @@ def test_nothing_is_shrunk_into_what_the_filter_takes_for_no_change() -> None:
     threshold = evaluator.characteristics.threshold[0]
     assert result.setting[0] == pytest.approx(ORIGINAL + threshold, rel=1e-3)
     assert evaluator.characteristics.filter(result.setting)[0] == result.setting[0]
-    assert (result.end, result.at_threshold) == (BoundaryState.FILTER, 0)
+    assert (result.state_below, result.at_threshold) == (BoundaryState.FILTER, 0)
 
 
 def test_a_boundary_that_ends_where_nothing_can_be_simulated_says_so() -> None:
@@ -268,7 +268,7 @@ def test_a_boundary_that_ends_where_nothing_can_be_simulated_says_so() -> None:
     evaluator = Evaluator(study, Plant(study, lambda rows: rows[:, 0] > 7, failing=lambda rows: (rows[:, 0] > 6) & (rows[:, 0] <= 7)))
     (causes,) = find_minimal_causes(evaluator, np.array([[9.0]]), COLLISION)
     (result,) = find_boundaries(evaluator, causes, COLLISION)
-    assert (result.setting[0], result.end) == (pytest.approx(7, abs=1e-3), BoundaryState.NOT_SIMULATED)
+    assert (result.setting[0], result.state_below) == (pytest.approx(7, abs=1e-3), BoundaryState.NOT_SIMULATED)
 
 
 def test_robust_is_what_its_neighbours_are_too() -> None:
@@ -286,8 +286,8 @@ def test_the_smallest_robust_failure_is_the_first_whose_neighbours_are_unsafe_to
     """Largest changes of 40, 70 and 80 %; the first lies at the edge of the box."""
     evaluator = made_up_evaluator(2, box)
     failures = evaluator.evaluate(np.array([[9.0, 1.0], [7.01, 2.99], [8.5, 2.0]]), "failures")
-    assert find_smallest_robust_failure(evaluator, failures, 0.1, COLLISION, limit=1) == 2
-    assert find_smallest_robust_failure(evaluator, failures.take([1]), 0.1, COLLISION, limit=1) is None
+    assert find_smallest_robust_failure(evaluator, failures, 0.1, COLLISION, max_evaluations=1) == 2
+    assert find_smallest_robust_failure(evaluator, failures.take([1]), 0.1, COLLISION, max_evaluations=1) is None
 
 
 def test_necessary_and_changed_over_failures() -> None:
@@ -326,6 +326,6 @@ def test_the_paragraph_says_how_robust_the_changes_that_suffice_are_by_themselve
     system, changes = assemble(load_study("sun")), {"tireFric": 1.04, "radius": 32.05, "mass": 2500.0}
     finding = FailureDescription("rs:0:0", changes, "collision", -1.5, Robustness({0.05: 0.98}), 2, Robustness({0.05: 0.44}))
     original = evaluate(system, system.characteristics.original[None])
-    paragraph = failures_paragraph(system, original, finding, finding, Preventability(numbers={}, collisions=0))
+    paragraph = failures_paragraph(system, original, finding, finding, Preventability(counts={}, collisions=0))
     assert "a collision at 5 km/h (robust: 98 % of" in paragraph.lower()
     assert "; two of them suffice (borderline: only 44 % of the neighbours are unsafe too)." in paragraph

@@ -119,16 +119,16 @@ def failure(system: System, weak: np.ndarray) -> PointComparison:
 @pytest.mark.slow
 def test_it_fails_where_it_collides_when_simulated_there_alone(system: System, weak: np.ndarray, failure: PointComparison) -> None:
     alone = [point.name for point in system.points if evaluate(system.at(point), weak).collided[0]]
-    assert list(failure.points) == alone == ["CPLA, speed 40, clear", "CPLA, speed 40, night", "CPFA, speed 30, clear"]
+    assert list(failure.failing_points) == alone == ["CPLA, speed 40, clear", "CPLA, speed 40, night", "CPFA, speed 30, clear"]
 
 
 def test_both_vehicles_are_compared_at_the_point_where_the_failure_is_worst(system: System, weak: np.ndarray,
                                                                             failure: PointComparison) -> None:
-    assert failure.because.changed.safety_degree == evaluate(system, weak).f_safe[0]
-    at = next(point for point in system.points if point.name == failure.because.point)
+    assert failure.braking.changed.safety_degree == evaluate(system, weak).f_safe[0]
+    at = next(point for point in system.points if point.name == failure.braking.point)
     original = evaluate(system.at(at), system.characteristics.original[np.newaxis])
-    assert failure.because.original.safety_degree == original.f_safe[0]
-    assert sentence(failure.because).startswith(f"At {at.name}: the original ")
+    assert failure.braking.original.safety_degree == original.f_safe[0]
+    assert sentence(failure.braking).startswith(f"At {at.name}: the original ")
 
 
 def test_points_in_words() -> None:
@@ -143,4 +143,4 @@ def test_the_summary_of_a_matrix_asks_why_at_the_worst_point_alone(system: Syste
     solutions = solutions_frame(system.characteristics.names, [(("nsga2", 0), evaluate(system, weak))])
     original = evaluate(system, system.characteristics.original[np.newaxis])
     more = summarise_failures(study, solutions, original, InlinePool(), "out")[-1]
-    assert more.endswith(f": python -m safevar_sumo explain out --point '{failure.because.point}'")
+    assert more.endswith(f": python -m safevar_sumo explain out --point '{failure.braking.point}'")

@@ -110,7 +110,7 @@ def test_the_bound_of_the_box_holds_where_every_box_is_as_unsafe(monkeypatch: py
     Boxes that are drawn anew until a sample of one has no unsafe setting would all be wrong. The search is switched off: it would
     find that out before the tests do.
     """
-    for name, value in (("FIRST_SEARCH", 1), ("SECOND_SEARCH", 1), ("MIN_FACTOR", 1e-3), ("MAX_UNSAFE_SHARE", 0.03)):
+    for name, value in (("FIRST_SEARCH_POINTS", 1), ("SECOND_SEARCH_POINTS", 1), ("MIN_FACTOR", 1e-3), ("MAX_UNSAFE_SHARE", 0.03)):
         monkeypatch.setattr(safe_box, name, value)
     q, wrong, seeds, study = 0.031, 0, 100, made_up_study(2)
     for seed in range(seeds):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from io import StringIO
+from types import SimpleNamespace
 from typing import Any
 
 import msgspec
@@ -14,7 +15,7 @@ from rich.console import Console
 
 from safevar_sumo.analysis.evaluator import Evaluator
 from safevar_sumo.analysis.explain import ExplainOptions
-from safevar_sumo.analysis.explain.compute import explain_failures
+from safevar_sumo.analysis.explain.compute import compare_at_cells, explain_failures
 from safevar_sumo.analysis.explain.render import print_explained
 from safevar_sumo.analysis.explain.summary import summarise_failures
 from safevar_sumo.analysis.rating import RatingOptions, compute
@@ -79,7 +80,7 @@ def test_brakes_cost_points_one_by_one_and_the_first_loss_is_named() -> None:
 
 
 @pytest.mark.slow
-def test_explain_names_the_cells_that_turn_and_the_summary_the_points_that_are_lost() -> None:
+def test_explain_names_the_cells_of_a_worse_colour_and_the_summary_the_points_that_are_lost() -> None:
     evaluator = Evaluator(STUDY, TwoWorkers())
     members = evaluator.characteristics
     settings = np.array([members.setting({"brakeTorque": value, "payload": 200.0}, "it") for value in (0.5, 0.6)])
@@ -96,10 +97,23 @@ def test_explain_names_the_cells_that_turn_and_the_summary_the_points_that_are_l
     assert [sorted(cause.changes) for cause in failure.causes] == [["brakeTorque"]]
     console = Console(record=True, width=120, file=StringIO())
     print_explained(console, "it", result, full=True)
-    assert "turn: CCRs" in console.export_text()
+    assert " cells: CCRs" in console.export_text()
     lines = summarise_failures(STUDY, case.solutions, original, TwoWorkers(), "it")
     assert f"{points:.2f}" in lines[0]
     assert isinstance(case.solutions, pd.DataFrame)
+
+
+def test_only_cells_of_a_worse_colour_explain_a_failure(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Neither cells of a better colour nor cells of an unknown colour, of either vehicle, count as worse."""
+    evaluator, matrix = Evaluator(STUDY, TwoWorkers()), assemble(STUDY).matrix
+    colours = np.zeros((2, len(matrix)), dtype=np.int8)
+    colours[:, :5] = [[0, 2, -1, 1, 0], [1, 0, 4, -1, 3]]  # worse, better, unknown before, unknown after, worst
+    monkeypatch.setattr(Evaluator, "simulate_cells", lambda self, settings, stage: None)
+    monkeypatch.setattr(rater.Rater, "points", lambda self, cells: SimpleNamespace(colours=colours))
+    original = evaluator.characteristics.original[np.newaxis]
+    (comparison,), _ = compare_at_cells(evaluator, original, original)
+    assert comparison.failing_points == (matrix[0].name, matrix[4].name)
+    assert comparison.braking.point == matrix[4].name
 
 
 @pytest.mark.slow

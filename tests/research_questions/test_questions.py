@@ -25,7 +25,7 @@ from safevar_sumo.analysis.research_questions.changes import (
     rq33_safety,
 )
 from safevar_sumo.analysis.research_questions.comparisons import ALPHA, rq1, rq2
-from safevar_sumo.analysis.research_questions.over_runs import correct_by_holm, difference_line, rq1_runs, rq2_runs, summary_lines
+from safevar_sumo.analysis.research_questions.over_runs import correct_by_holm, pooling_effect_line, rq1_runs, rq2_runs, summary_lines
 from safevar_sumo.errors import InputError
 from safevar_sumo.study import CharacteristicTable
 from tests.research_questions.made_up import CHARACTERISTICS, ORIGINAL, made_up, made_up_study, row
@@ -170,7 +170,7 @@ def test_combinations_of_exactly_four() -> None:
     assert result["rank"].tolist() == [1, 2, 2]
 
 
-def test_weather_compares_settings_that_differ_in_it_alone() -> None:
+def test_weather_compares_cases_that_differ_in_it_alone() -> None:
     clear = made_up(row(values=HEAVY), row(values=GRIPLESS))
     wet = made_up(row(values=BOTH), study=made_up_study(name="wet", weather="hard_rain"))
     other = made_up(row(values=BOTH), study=made_up_study(name="other", weather="hard_rain", metrics=made_up_study().metrics.__class__(
@@ -196,7 +196,7 @@ def test_every_question_at_once_tells_what_is_lacking() -> None:
         answer_questions([made_up(row())], "rq9")
 
 
-def test_several_settings_stand_in_one_frame_and_the_refused_in_the_notes() -> None:
+def test_several_cases_stand_in_one_frame_and_the_refused_in_the_notes() -> None:
     good = made_up(row(), row("rs"))
     alone = made_up(row(), study=made_up_study(name="alone"))
     result = answer_questions([good, alone], "rq2")[0]
@@ -228,7 +228,7 @@ def test_solutions_of_one_run_are_not_taken_for_independent() -> None:
     assert (runs["n1"], runs["n2"]) == (8, 8)
     assert runs["effect_size"] == 1 - (0 + 0 + 0 + 0 + 0 + 1 + 1 + 3) / 64
     assert runs["p_value"] == scipy.stats.mannwhitneyu(ours, theirs, method="exact").pvalue > ALPHA / 10
-    assert "RQ2 RS SD loses its star" in difference_line(case)
+    assert "RQ2 RS SD is no longer significant" in pooling_effect_line(case)
     (original,) = (one for one in rq1_runs(case).to_dict("records") if (one["algorithm"], one["metric"]) == ("nsga2", "safety_degree"))
     assert original["p_value"] == 2 * 2 / 2**8, "signed ranks of which all but the smallest are negative: the second of 2^8 orders"
     assert original["effect_size"] == 1 / 8

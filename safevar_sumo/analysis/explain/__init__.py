@@ -45,7 +45,7 @@ def explain(source: StudyLike | Results, *, solutions: Sequence[str] = ExplainOp
     Parameters
     ----------
     source
-        Results or their directory: their solutions are explained. A study: failures all over its domain are explained.
+        Results or their directory: their solutions are explained. A study: failures drawn from its whole domain are explained.
     """
     from safevar_sumo.analysis.explain.compute import explain_failures
 

@@ -1,4 +1,4 @@
-"""Why a setting is less safe than the original: compares two runs, and splits the lost distance into parts.
+"""Why a setting is less safe than the original: compares two runs, and splits the lost margin into parts.
 
 The brake is commanded with a gap G ahead, at a speed v. The brake pedal follows within a time t. During t the mean speed
 is v - e, and the speed falls by d. After t the mean deceleration is a. The stopping distance is
@@ -6,9 +6,9 @@ is v - e, and the speed falls by d. After t the mean deceleration is a. The stop
     D = (v - e) t + (v - d)^2 / (2 a),
 
 and the margin is G - D. A difference of products is split exactly between the two factors,
-x2 y2 - x1 y1 = (x2 - x1) (y1 + y2) / 2 + (y2 - y1) (x1 + x2) / 2. So the margin lost between two runs is a sum of parts,
-each with the sign of one difference: gap (G smaller), speed (v larger), delay (t larger), slowing (e and d: less speed
-lost while the pedal moves) and deceleration (a smaller).
+x2 y2 - x1 y1 = (x2 - x1) (y1 + y2) / 2 + (y2 - y1) (x1 + x2) / 2. So the lost margin, the original's margin minus the
+changed vehicle's, is a sum of parts, each with the sign of one difference: gap (G smaller), speed (v larger), delay (t
+larger), slowing (e and d: less speed lost while the pedal moves) and deceleration (a smaller).
 """
 
 from __future__ import annotations
@@ -25,9 +25,11 @@ PEDAL_SHARE = 0.9
 COAST_DECELERATION = 0.1
 """Deceleration of a vehicle that rolls without a brake [m/s^2]: a rolling resistance of 1 % of its weight."""
 MAX_OMITTED_REMAINDER = 0.05
-"""A sentence leaves out the unexplained part of the lost distance if it is at most this long [m]."""
-CRUISE_SHARE, REGULATION_SHARE = 0.9, 0.05
-"""A vehicle cruises from this share of its highest speed; below this share of its largest brake command it only regulates its speed [-]."""
+"""A sentence leaves out the unexplained part of the lost margin if it is at most this long [m]."""
+CRUISE_SHARE = 0.9
+"""A vehicle cruises at this share of its highest speed or more [-]."""
+REGULATION_SHARE = 0.05
+"""With less than this share of its largest brake command, a vehicle only regulates its speed [-]."""
 
 
 class Braking(NamedTuple):
@@ -39,8 +41,10 @@ class Braking(NamedTuple):
         Time, gap and speed when the brake was commanded (`brake_onset`) [s, m, m/s].
     delay
         Time from the command until the brake pedal has followed it [s].
-    mean_speed_lost, speed_lost
-        Speed at the command minus the mean speed during the delay, and minus the speed at the end of the delay [m/s].
+    speed_deficit
+        Speed at the command minus the mean speed during the delay [m/s].
+    speed_lost
+        Speed at the command minus the speed at the end of the delay [m/s].
     deceleration
         Mean deceleration after the delay [m/s^2], averaged over the distance, as in UN R13-H.
     """
@@ -49,14 +53,14 @@ class Braking(NamedTuple):
     gap: float
     speed: float
     delay: float
-    mean_speed_lost: float
+    speed_deficit: float
     speed_lost: float
     deceleration: float
 
     @property
     def stopping_distance(self) -> float:
         """Distance from the command to standstill [m]; the mean deceleration is assumed to continue after the run."""
-        return (self.speed - self.mean_speed_lost) * self.delay + (self.speed - self.speed_lost)**2 / (2 * self.deceleration)
+        return (self.speed - self.speed_deficit) * self.delay + (self.speed - self.speed_lost)**2 / (2 * self.deceleration)
 
     @property
     def margin(self) -> float:
@@ -67,7 +71,8 @@ class Braking(NamedTuple):
 class RunSummary(NamedTuple):
     """Summary of one run; `braking` is None if the vehicle did not brake for the obstacle.
 
-    `safety_degree` is in m, or -m/s; NaN if undefined. `least_gap` is the gap when the obstacle is nearest [m], NaN on a collision.
+    `safety_degree` is a distance [m] or, on a collision, minus its speed [m/s]; NaN if undefined. `least_gap` is the gap when the obstacle
+    is nearest [m], NaN on a collision.
     """
 
     outcome: str
@@ -78,10 +83,10 @@ class RunSummary(NamedTuple):
 
 
 class BrakingComparison(NamedTuple):
-    """Runs of the original and of the changed vehicle; the `parts` [m], with the remainder, add up to the lost distance.
+    """Runs of the original and of the changed vehicle, and the parts of the margin that the changed vehicle lost [m].
 
-    `parts` is empty if one of the vehicles never braked. `point` names the point of a matrix. `saved_distances` are the distances that the
-    two vehicles save by slowing down while the pedal moves [m].
+    One of the `parts` is the remainder, which no difference explains; `parts` is empty if one of the vehicles never braked. `point` is the
+    name of a test point. `saved_distances` are those that the original and the changed vehicle save by slowing while the pedal moves [m].
     """
 
     original: RunSummary
@@ -91,8 +96,8 @@ class BrakingComparison(NamedTuple):
     saved_distances: tuple[float, float] = (0.0, 0.0)
 
     @property
-    def lost_distance(self) -> float:
-        """Lost distance, below 0 if distance is gained [m]."""
+    def lost_margin(self) -> float:
+        """Sum of the parts [m]; below 0 if the changed vehicle gained margin."""
         return sum(self.parts.values())
 
 
@@ -100,10 +105,12 @@ def brake_onset(runs: SimulationRuns, column: int) -> int | None:
     """The sample at which vehicle `column` begins to brake for the obstacle, before the obstacle is nearest; None if it does not brake.
 
     A braking manoeuvre begins where the brake command starts to rise to at least `REGULATION_SHARE` times the largest command; it ends
-    where the throttle or a smaller brake command regulates the speed again. The manoeuvre that counts is under way when the vehicle
-    last cruises (at `CRUISE_SHARE` of its highest speed or more), or is the first manoeuvre after that: earlier manoeuvres, such as
-    those of a cruise control after an overshoot, did not slow the vehicle down. If there is no such manoeuvre, a vehicle that collides has
-    not braked for the obstacle; if the vehicle does not collide, its last manoeuvre counts.
+    where the throttle or a smaller brake command regulates the speed again. The manoeuvre that counts is
+
+    1. the one under way when the vehicle last cruises (at `CRUISE_SHARE` of its highest speed or more), as earlier manoeuvres, such
+       as those of a cruise control after an overshoot, did not slow the vehicle down;
+    2. otherwise the first one after that;
+    3. otherwise none if the vehicle collides, and its last one if it does not.
     """
     trace, nearest = runs.trace, runs.nearest(column)
     active = trace.active[:None if nearest is None else nearest + 1, column]
@@ -140,18 +147,19 @@ def _measure_braking(runs: SimulationRuns, column: int, first: int, last: int) -
     speed, position = trace.speed[:last + 1, column], trace.position[:last + 1, column]
     has_followed = trace.pedal[first:last + 1, column] >= PEDAL_SHARE * trace.brake[first:last + 1, column]
     end_of_delay = first + int(np.argmax(has_followed))
-    distance, energy = float(position[last] - position[end_of_delay]), float(speed[end_of_delay]**2 - speed[last]**2) / 2
-    if not has_followed.any() or distance <= 0 or energy <= COAST_DECELERATION * distance:
+    distance = float(position[last] - position[end_of_delay])
+    specific_energy = float(speed[end_of_delay]**2 - speed[last]**2) / 2  # energy that the brake takes, per mass
+    if not has_followed.any() or distance <= 0 or specific_energy <= COAST_DECELERATION * distance:
         return None
     initial_speed, delay = float(speed[first]), (end_of_delay - first) * trace.step
     return Braking(
         time=float(trace.time[first]), gap=float(trace.gap[first, column]), speed=initial_speed, delay=delay,
-        mean_speed_lost=initial_speed - float(position[end_of_delay] - position[first]) / delay if end_of_delay > first else 0.0,
-        speed_lost=initial_speed - float(speed[end_of_delay]), deceleration=energy / distance)
+        speed_deficit=initial_speed - float(position[end_of_delay] - position[first]) / delay if end_of_delay > first else 0.0,
+        speed_lost=initial_speed - float(speed[end_of_delay]), deceleration=specific_energy / distance)
 
 
 def compare_braking(original: RunSummary, changed: RunSummary, point: str = "") -> BrakingComparison:
-    """Compare a changed vehicle's run with the original vehicle's run at the same point; `point` names the point of a matrix."""
+    """Compare a changed vehicle's run with the original vehicle's run at the same test point, whose name is `point`."""
     original_braking, changed_braking = original.braking, _braking_to_compare(changed, original)
     if original_braking is None or changed_braking is None:
         return BrakingComparison(original, changed, {}, point)
@@ -165,29 +173,35 @@ def _braking_to_compare(changed: RunSummary, original: RunSummary) -> Braking | 
     """The braking of a changed vehicle; if it collides without braking, the original vehicle's braking at the changed vehicle's speed."""
     if changed.braking is not None or original.braking is None or not np.isfinite(changed.collision_speed):
         return changed.braking
-    return original.braking._replace(time=np.nan, gap=0.0, speed=max(changed.collision_speed, original.braking.speed_lost))
+    speed = max(changed.collision_speed, original.braking.speed_lost)  # so that no speed after the delay is negative
+    return original.braking._replace(time=np.nan, gap=0.0, speed=speed)
 
 
 def _split_lost_margin(original: Braking, changed: Braking) -> tuple[dict[str, float], tuple[float, float]]:
-    """Parts of the lost margin by cause [m], and the distances that the two vehicles save while the pedal moves [m]."""
-    mean_delay, mean_inverse = (original.delay + changed.delay) / 2, (1 / original.deceleration + 1 / changed.deceleration) / 2
-    later_speeds = [braking.speed - braking.speed_lost for braking in (original, changed)]
-    mean_speed = sum(later_speeds) / 2
-    delay_speeds = [braking.speed - braking.mean_speed_lost for braking in (original, changed)]
-    savings = [braking.mean_speed_lost * mean_delay + braking.speed_lost * mean_speed * mean_inverse for braking in (original, changed)]
+    """Parts of the lost margin by cause [m], and the distances that the two vehicles save by slowing while the pedal moves [m].
+
+    With the two runs' means of t, of v - d and of 1 / a, a vehicle saves e t + d (v - d) / a.
+    """
+    mean_delay, mean_inverse_deceleration = (original.delay + changed.delay) / 2, (1 / original.deceleration + 1 / changed.deceleration) / 2
+    speeds_after_delay = [braking.speed - braking.speed_lost for braking in (original, changed)]
+    mean_speed_after_delay = sum(speeds_after_delay) / 2
+    mean_delay_speeds = [braking.speed - braking.speed_deficit for braking in (original, changed)]
+    savings = [braking.speed_deficit * mean_delay + braking.speed_lost * mean_speed_after_delay * mean_inverse_deceleration
+               for braking in (original, changed)]
     return {
         "gap": original.gap - changed.gap,
-        "speed": (changed.speed - original.speed) * (mean_delay + mean_speed * mean_inverse),
-        "delay": (changed.delay - original.delay) * sum(delay_speeds) / 2,
+        "speed": (changed.speed - original.speed) * (mean_delay + mean_speed_after_delay * mean_inverse_deceleration),
+        "delay": (changed.delay - original.delay) * sum(mean_delay_speeds) / 2,
         "slowing": savings[0] - savings[1],
-        "deceleration": (1 / changed.deceleration - 1 / original.deceleration) * (later_speeds[0]**2 + later_speeds[1]**2) / 4
+        "deceleration": ((1 / changed.deceleration - 1 / original.deceleration)
+                         * (speeds_after_delay[0]**2 + speeds_after_delay[1]**2) / 4)
     }, (savings[0], savings[1])
 
 
 MIN_PART = 0.005
 """Smallest part of a distance that a sentence mentions [m]: half a centimetre."""
 PART_PHRASES = {
-    "gap": ("it begins to brake nearer", "it begins to brake farther away"), "speed": ("it is faster", "it is slower"),
+    "gap": ("it begins to brake at a smaller gap", "it begins to brake at a larger gap"), "speed": ("it is faster", "it is slower"),
     "delay": ("its brake pedal follows later", "its brake pedal follows sooner"),
     "slowing": ("it slows less while the pedal moves", "it slows more while the pedal moves"),
     "deceleration": ("it brakes more weakly", "it brakes harder")}
@@ -199,32 +213,32 @@ def ending_in_words(run: RunSummary) -> str:
     if run.outcome == Outcome.COLLISION:
         return f"collides at {run.collision_speed:.2f} m/s"
     end = OUTCOME_VERBS.get(Outcome(run.outcome), run.outcome)
-    return end if run.safety_degree != run.safety_degree else f"{end}, safety degree {run.safety_degree:.2f} m"
+    return end if np.isnan(run.safety_degree) else f"{end}, safety degree {run.safety_degree:.2f} m"
 
 
 def sentence(comparison: BrakingComparison, *, full: bool = False) -> str:
-    """Why the changed vehicle is less safe than the original, in one sentence or two; `full` explains what the lost distance is."""
+    """Why the changed vehicle is less safe than the original, in one sentence or two; `full` explains what the lost margin is."""
     subject = f"At {comparison.point}: the" if comparison.point else "The"
     endings = f"{subject} original {ending_in_words(comparison.original)}; this one {ending_in_words(comparison.changed)}."
     original_braking, changed_braking = comparison.original.braking, comparison.changed.braking
     if original_braking is None and changed_braking is None:
         return f"{endings} Neither of them brakes."
     if not comparison.parts:
-        return f"{endings} {'The original' if original_braking is None else 'It'} does not slow down by its brake."
-    without_brake = "" if changed_braking is not None else ", without any effect of its brake"
-    parts, is_lost = comparison.parts, comparison.lost_distance >= 0
-    loss_word, gain_word = ("", "gained ") if is_lost else ("lost ", "")
-    phrases = [f"{abs(parts[name]):.2f} m {loss_word if parts[name] > 0 else gain_word}because {PART_PHRASES[name][parts[name] < 0]}"
+        return f"{endings} {'The original' if original_braking is None else 'It'} never slows down by braking."
+    no_effect = "" if changed_braking is not None else " Its brake has no effect."
+    parts, is_lost = comparison.parts, comparison.lost_margin >= 0
+    loss_prefix, gain_prefix = ("", "gained ") if is_lost else ("lost ", "")
+    phrases = [f"{abs(parts[name]):.2f} m {loss_prefix if parts[name] > 0 else gain_prefix}because {PART_PHRASES[name][parts[name] < 0]}"
                f"{_quantities_in_words(comparison, name)}"
                for name in sorted(PART_PHRASES, key=lambda name: -parts[name]) if abs(parts[name]) >= MIN_PART]
     if abs(parts["remainder"]) > MAX_OMITTED_REMAINDER:
-        phrases.append(f"{parts['remainder']:+.2f} m that this does not explain")
+        phrases.append(f"{parts['remainder']:+.2f} m unexplained")
     if not phrases:
         return f"{endings} They brake alike."
-    distance = f"{abs(comparison.lost_distance):.2f} m"
-    introduction = f"Of the {distance} {'lost' if is_lost else 'gained'}" if not full else (
-        f"Its margin, the gap at the brake command less the distance needed to stop, is {distance} {'smaller' if is_lost else 'larger'}")
-    return f"{endings} {introduction}{without_brake}: {join_phrases(phrases)}."
+    margin = f"{abs(comparison.lost_margin):.2f} m"
+    introduction = f"Of the {margin} {'lost' if is_lost else 'gained'}" if not full else (
+        f"Its margin, the gap at the brake command less the distance needed to stop, is {margin} {'smaller' if is_lost else 'larger'}")
+    return f"{endings}{no_effect} {introduction}: {join_phrases(phrases)}."
 
 
 def _quantities_in_words(comparison: BrakingComparison, part: str) -> str:
@@ -232,7 +246,7 @@ def _quantities_in_words(comparison: BrakingComparison, part: str) -> str:
     original_braking, changed_braking = comparison.original.braking, comparison.changed.braking
     if original_braking is None or changed_braking is None:
         return ""
-    quantities = {"gap": (changed_braking.gap, original_braking.gap, "m before"),
+    quantities = {"gap": (changed_braking.gap, original_braking.gap, "m"),
                   "speed": (changed_braking.speed, original_braking.speed, "m/s at the command"),
                   "delay": (changed_braking.delay, original_braking.delay, "s after the command"),
                   "slowing": (comparison.saved_distances[1], comparison.saved_distances[0], "m saved"),

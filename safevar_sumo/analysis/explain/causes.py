@@ -66,20 +66,20 @@ def find_minimal_causes(evaluator: Evaluator, settings: FloatArray, unsafe: Unsa
 
 
 def estimate_subset_count(changes: int) -> int:
-    """Estimated number of subsets of the changes that are simulated until the smallest unsafe subsets appear.
+    """Estimated number of subsets of so many changes that are simulated until the smallest unsafe subsets appear.
 
     The estimate assumes causes with half of the changes, about as in the shipped studies.
     """
     return sum(comb(changes, size) for size in range((changes + 1) // 2 + 1))
 
 
-def select_affordable_rows(settings: FloatArray, evaluator: Evaluator, limit: int) -> list[int]:
-    """Rows whose minimal causes together take at most about `limit` simulations: all rows of `settings`, or a random sample."""
+def select_affordable_rows(settings: FloatArray, evaluator: Evaluator, max_evaluations: int) -> list[int]:
+    """Rows whose minimal causes together take at most about `max_evaluations`: all rows of `settings`, or a random sample."""
     costs = [estimate_subset_count(int(changes)) for changes in evaluator.characteristics.number_changed(settings)]
-    if sum(costs) <= limit:
+    if sum(costs) <= max_evaluations:
         return list(range(len(settings)))
     order = np.random.default_rng(evaluator.study.search.seed).permutation(len(settings))
-    is_affordable = np.cumsum([costs[row] for row in order]) <= limit
+    is_affordable = np.cumsum([costs[row] for row in order]) <= max_evaluations
     return sorted(order[is_affordable].tolist())
 
 
@@ -94,7 +94,7 @@ def involved_columns(causes: Sequence[MinimalCause]) -> frozenset[int]:
 
 
 LINE_SETTINGS = 32
-"""Number of settings first simulated on a line. The search misses no unsafe stretch of the line that is as long as their spacing."""
+"""Number of settings first simulated on a line. The search finds every unsafe stretch of the line that is as long as their spacing."""
 PARTS_PER_ROUND = 8
 """Number of parts into which each of `ROUNDS` rounds divides the interval with the boundary."""
 ROUNDS = 3
@@ -113,14 +113,14 @@ class BoundaryState(StrEnum):
 class Boundary(NamedTuple):
     """The smallest unsafe share of a cause's changes, and the setting there, shape (n,).
 
-    `single_limits` has for each column the value to which its change can be reduced while the other changes stay. `end` states what
-    lies just below `fraction`; at the filter's threshold, `at_threshold` is the column whose change the filter removes.
+    `single_limits` has for each column the value to which its change can be reduced while the other changes stay. `state_below` is
+    the state just below `fraction`; at the filter's threshold, `at_threshold` is the column whose change the filter removes.
     """
 
     fraction: float
     setting: FloatArray
     single_limits: dict[int, float]
-    end: BoundaryState = BoundaryState.SAFE
+    state_below: BoundaryState = BoundaryState.SAFE
     at_threshold: int | None = None
 
 
@@ -180,7 +180,7 @@ def find_first_unsafe_shares(evaluator: Evaluator, lines: list[Line], unsafe: Un
 
 
 def find_boundary_shares(evaluator: Evaluator, lines: list[Line], unsafe: Unsafe,
-                    stage: str = "boundaries") -> tuple[FloatArray, list[BoundaryState]]:
+                         stage: str = "boundaries") -> tuple[FloatArray, list[BoundaryState]]:
     """The first unsafe share of every line, as `find_first_unsafe_shares`, and what lies just below this share.
 
     A setting that cannot be simulated is neither safe nor unsafe; just below the share, it gives the state `NOT_SIMULATED`.

@@ -48,8 +48,8 @@ def necessity_frame(characteristics: CharacteristicSet, changed: BoolArray, caus
     """
     columns = range(len(characteristics) if len(changed) else 0)
     counts = {"changed": Counter(np.nonzero(changed)[1].tolist()),
-              "necessary": Counter(column for group in causes for column in necessary_columns(group)),
-              "involved": Counter(column for group in causes for column in involved_columns(group))}
+              "necessary": Counter(column for failure_causes in causes for column in necessary_columns(failure_causes)),
+              "involved": Counter(column for failure_causes in causes for column in involved_columns(failure_causes))}
     is_sample = len(changed) < failures
     intervals = [clopper_pearson(counts["necessary"][column], len(changed)) if is_sample
                  else (counts["necessary"][column] / len(changed),) * 2 for column in columns]
@@ -67,22 +67,22 @@ def count_distinct_causes(characteristics: CharacteristicSet, causes: Sequence[S
     Returns
     -------
     pandas.DataFrame
-        Columns `cause`, a tuple of changes with their directions; `failures`, the number of failures with this cause; `share` of all
-        failures.
+        Columns `cause`, a tuple of changes with their directions; `failures`, the number of failures with this cause; and `share`, their
+        share of all failures.
     """
-    counts = Counter(key for group in causes for key in {cause_key(characteristics, cause) for cause in group})
+    counts = Counter(key for failure_causes in causes for key in {cause_key(characteristics, cause) for cause in failure_causes})
     order = sorted(counts, key=lambda key: (-counts[key], len(key), key))
     return pd.DataFrame({
         "cause": pd.Series(order, dtype=object), "failures": pd.Series([counts[key] for key in order], dtype=int),
         "share": pd.Series([counts[key] / len(causes) for key in order], dtype=float)})
 
 
-NEIGHBOURS = 64
+NEIGHBOUR_COUNT = 64
 """Number of neighbours of a setting that are simulated with each time step."""
 STEP_FACTORS = (1.0, 0.5, 2.0)
 """Factors by which the study's time step is multiplied."""
-BORDERLINE = 0.8
-"""Share of unsafe neighbours below which a failure is called borderline."""
+MIN_ROBUST_SHARE = 0.8
+"""Share of unsafe neighbours from which on a failure is called robust; below, it is borderline."""
 FAILURES_PER_BATCH = 8
 """Number of failures whose robustness is estimated at a time, the smallest failures first."""
 
@@ -109,7 +109,7 @@ class Robustness(NamedTuple):
 
 def is_borderline(share: float) -> bool:
     """Whether small perturbations remove a failure, because too few of its neighbours are unsafe."""
-    return share < BORDERLINE
+    return share < MIN_ROBUST_SHARE
 
 
 def robustness_in_words(share: float) -> str:
@@ -126,24 +126,26 @@ def estimate_robustness(evaluator: Evaluator, settings: FloatArray, step: float,
     """
     characteristics = evaluator.characteristics
     rng = np.random.default_rng(evaluator.study.search.seed)
-    offsets = rng.uniform(-1, 1, (NEIGHBOURS, len(characteristics))) * characteristics.threshold
+    offsets = rng.uniform(-1, 1, (NEIGHBOUR_COUNT, len(characteristics))) * characteristics.threshold
     neighbours = np.clip(settings[:, np.newaxis] + offsets, characteristics.lower, characteristics.upper).reshape(-1, len(characteristics))
     shares = {}
     for factor in factors:
         step_evaluator = evaluator if factor == 1 else evaluator.with_step(step * factor)
         evaluations = step_evaluator.evaluate(neighbours, f"neighbours at {step * factor:g} s a step")
-        is_unsafe, is_valid = (flags.reshape(len(settings), NEIGHBOURS) for flags in (unsafe.of(evaluations), evaluations.valid))
+        is_unsafe, is_valid = (flags.reshape(len(settings), NEIGHBOUR_COUNT) for flags in (unsafe.of(evaluations), evaluations.valid))
         shares[step * factor] = (is_unsafe & is_valid).sum(axis=1) / np.maximum(is_valid.sum(axis=1), 1)
     return [Robustness({step: float(step_shares[row]) for step, step_shares in shares.items()}) for row in range(len(settings))]
 
 
-def find_smallest_robust_failure(evaluator: Evaluator, failures: Evaluations, step: float, unsafe: Unsafe, limit: int) -> int | None:
+def find_smallest_robust_failure(evaluator: Evaluator, failures: Evaluations, step: float, unsafe: Unsafe,
+                                 max_evaluations: int) -> int | None:
     """The row of the robust failure with the fewest changes; of several, the one whose largest change is smallest.
 
-    Failures are tried in this order until one is robust, or about `limit` simulations are spent; None if no tried failure is robust.
+    Failures are tried in this order until one is robust, or about `max_evaluations` settings are evaluated; None if no tried failure is
+    robust.
     """
     order = np.lexsort([failures.f_safe, failures.f_diff, failures.f_num_diff])
-    max_failures = max(FAILURES_PER_BATCH, limit // (NEIGHBOURS * len(STEP_FACTORS)))
+    max_failures = max(FAILURES_PER_BATCH, max_evaluations // (NEIGHBOUR_COUNT * len(STEP_FACTORS)))
     for start in range(0, min(len(order), max_failures), FAILURES_PER_BATCH):
         rows = order[start:start + FAILURES_PER_BATCH]
         for row, robustness in zip(rows.tolist(), estimate_robustness(evaluator, failures.settings[rows], step, unsafe), strict=True):

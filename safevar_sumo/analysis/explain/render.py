@@ -27,19 +27,22 @@ if TYPE_CHECKING:
 MAX_CAUSES = 3
 """Maximum number of minimal causes printed for a failure."""
 MAX_DISTINCT_CAUSES = 10
-MAX_CHARACTERISTICS = 4
+"""Maximum number of distinct minimal causes in the table of all failures."""
+MAX_NECESSARY = 4
+"""Maximum number of characteristics named as necessary most often."""
 CommandFor = Callable[[Mapping[str, float]], str]
 """Returns the command that simulates the given changes."""
 
 
 def print_explained(console: Console, subject: str, result: Explained, point: str = "", *, full: bool = False) -> None:
-    """Print the answer in about ten lines; `full` explains every chosen failure. `subject` and `point` appear in the printed commands."""
+    """Print the answer in about ten lines; `full` explains every chosen failure. Printed commands name `subject` and the test `point`."""
     characteristics = CharacteristicSet.of(result.study.vehicle.characteristics)
     print_text(console, result.study.title)
     print_text(console, f"Unsafe: {result.unsafe}. {number_of(result.failures, 'failure')} among {result.looked_at} different settings.")
     print_constraints(console, result.study)
     if result.otherwise:
-        print_text(console, f"note: {number_of(result.otherwise, 'setting')} with another outcome than recorded; another version or code?")
+        print_text(console, f"note: {number_of(result.otherwise, 'setting')} with another outcome than recorded. "
+                            "Has the version or the code changed?")
     if not result.explanations:
         print_text(console, f"Nothing unsafe found. How far each characteristic may go: {question_command('tolerance', subject, point)}")
         return
@@ -79,7 +82,7 @@ def _print_answer(console: Console, command_for: CommandFor, result: Explained, 
 
 
 def _describe(failure: Explanation | None) -> FailureDescription | None:
-    """The description of a failure for the paragraph; None if the setting is not unsafe."""
+    """The description of a failure for the paragraph; None without a failure, or if its setting is not unsafe."""
     if failure is None or not failure.causes:
         return None
     changes = {name: failure.setting[name] for name in failure.changed}
@@ -90,7 +93,7 @@ def _describe(failure: Explanation | None) -> FailureDescription | None:
 
 def _most_necessary_in_words(result: Explained, characteristics: CharacteristicSet) -> str:
     full_names = {characteristic.name: _full_name(characteristic) for characteristic in characteristics}
-    rows = result.necessity[result.necessity["necessary"] > 0].head(MAX_CHARACTERISTICS).to_dict("records")
+    rows = result.necessity[result.necessity["necessary"] > 0].head(MAX_NECESSARY).to_dict("records")
     return ", ".join(f"{full_names[row['characteristic']]} {_necessary_share(row)}" for row in rows) or "none, causes differ"
 
 
@@ -133,11 +136,12 @@ def _print_explanation(console: Console, command_for: CommandFor, failure: Expla
         print_text(console, f"Needed by all of them: {', '.join(failure.necessary) or 'nothing'}.")
     print_text(console, f"Because: {sentence(failure.because, full=True)}")
     if failure.because.point:
-        number = len(assemble(result.study).matrix)
+        point_count = len(assemble(result.study).matrix)
         if is_rated(result.study):
-            print_text(console, f"{number_of(len(failure.points), 'cell')} of {number} turn: {'; '.join(failure.points)}.")
+            cells = f"{len(failure.points)} of {number_of(point_count, 'cell')}"
+            print_text(console, f"The colour is worse in {cells}{': ' if failure.points else ''}{'; '.join(failure.points)}.")
         else:
-            print_text(console, points_in_words(failure.points, number, limit=len(failure.points)))
+            print_text(console, points_in_words(failure.points, point_count, limit=len(failure.points)))
     if failure.preventable:
         print_text(console, f"In the same vehicle: {failure.preventable}.")
     console.print(_braking_table(failure.because))
@@ -165,7 +169,7 @@ def _print_cause(console: Console, command_for: CommandFor, cause: Cause, charac
 
 
 def _braking_table(comparison: BrakingComparison) -> WholeTable:
-    """Table of the original and the changed vehicle, with the part of the lost distance that each row explains."""
+    """Table of the original and the changed vehicle, with the part of the lost margin that each row explains."""
     table = WholeTable("", "unit", right=("original", "changed", "explains, m"))
     parts = comparison.parts
     brakings = comparison.original.braking, comparison.changed.braking
@@ -175,7 +179,7 @@ def _braking_table(comparison: BrakingComparison) -> WholeTable:
             ("distance there - needed", "m", "margin", "all"))
     for label, unit, field, part in rows:
         cells = [two_decimals(getattr(braking, field)) if braking else "-" for braking in brakings]
-        distance = {"all": comparison.lost_distance - parts["remainder"], **parts}[part] if part and parts else None
+        distance = {"all": comparison.lost_margin - parts["remainder"], **parts}[part] if part and parts else None
         table.add_row(label, unit, *cells, "" if distance is None else two_decimals(distance))
     if parts:
         table.add_row("not explained", "m", "", "", two_decimals(parts["remainder"]))

@@ -23,10 +23,12 @@ ROBUST = "smallest robust"
 """The reason for choosing the robust failure with the fewest changes."""
 REASONS = {"fewest": "fewest changes", "smallest": "smallest changes", "most_severe": "most severe"}
 """The other reasons for choosing a failure, by the name of the choice in `CHOICES`; the JSON contains these texts."""
+DISTINCT_CAUSE = "a cause of its own"
+"""The reason for choosing the simplest failure with a cause that no other chosen failure has."""
 
 
 class CauseEntry(msgspec.Struct, frozen=True, kw_only=True):
-    """A minimal cause in the JSON of `explain`; fields as in `Cause`."""
+    """A minimal cause in the JSON of `explain`; fields as in `Cause`, which also explains `end`."""
 
     changes: dict[str, float]
     boundary: dict[str, float]
@@ -38,7 +40,7 @@ class CauseEntry(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class FailureEntry(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """A failure in the JSON of `explain`; fields as in `Explanation`, but `because` is a sentence.
+    """A failure in the JSON of `explain`; fields as in `Explanation`, but `because` is its comparison as a sentence.
 
     `algorithm`, `run` and `index` form the handle, None if the setting is no solution; `robustness` is the unsafe share of the neighbours.
     """
@@ -89,9 +91,11 @@ class Cause:
     outcome, safety_degree
         Outcome, and safety degree [m, or -m/s], of a vehicle with these changes only.
     end, at_threshold
-        What lies just below `fraction`; at the filter's threshold, the characteristic whose change the filter would remove.
+        The end of the shrinking: the state just below `fraction`; at the filter's threshold, the characteristic whose change the filter
+        would remove.
     neighbours
-        Robustness of these changes by themselves; None in a rated study, where the simulations would take too long.
+        Robustness of these changes by themselves, estimated from the setting's neighbours; None in a rated study, where the simulations
+        would take too long.
     """
 
     changes: dict[str, float]
@@ -124,8 +128,9 @@ class Explanation:
     """The explanation of one failure; `handle` is None if the setting is no solution.
 
     `reasons` state why the failure was chosen. `safety_degree` is in m, or -m/s. `necessary` are the `changed` characteristics that every
-    minimal cause contains. `because` compares the failure with the original. `preventable` is the `PreventableBy` of a collision, as
-    text. `points` are the points of a matrix at which the setting is unsafe.
+    minimal cause contains. `because` states why it is less safe: the comparison of its braking with the original vehicle's. `preventable`
+    is the `PreventableBy` of a collision, as text. `points` are the names of the test points at which the setting is unsafe; in a rated
+    study, of the cells whose colour is worse than the original's.
     """
 
     handle: SolutionId | None
@@ -163,9 +168,9 @@ class Explained:
     necessity, distinct
         Statistics of all analysed failures: the frames that `necessity_frame` and `count_distinct_causes` return.
     looked_at, failures, analysed
-        Numbers of evaluated settings, of failures among these, and of failures that the statistics cover.
+        Number of evaluated settings, of failures among these, and of failures that the statistics cover.
     otherwise
-        Number of solutions whose outcome differs from the outcome in the results.
+        Number of solutions that ended otherwise than in the results: with another outcome than the recorded one.
     preventability
         Shares of the collisions that reference drivers avoid.
     """

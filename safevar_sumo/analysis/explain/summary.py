@@ -12,7 +12,7 @@ from safevar_sumo.analysis.evaluator import Evaluator
 from safevar_sumo.analysis.explain.causes import MinimalCause, find_minimal_causes
 from safevar_sumo.analysis.explain.compute import compare_at_points, points_in_words, unsafe_points_of
 from safevar_sumo.analysis.explain.necessity import Robustness, estimate_robustness, find_smallest_robust_failure
-from safevar_sumo.analysis.explain.result import REASONS, ROBUST
+from safevar_sumo.analysis.explain.result import DISTINCT_CAUSE, REASONS, ROBUST
 from safevar_sumo.analysis.preventability import Preventability, PreventableBy, assess_preventability
 from safevar_sumo.analysis.rating.summary import summarise_rated_solutions
 from safevar_sumo.analysis.words import OUTCOME_VERBS, join_phrases, list_of_changes, number_of, question_command
@@ -27,7 +27,7 @@ from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.vehicles import CharacteristicSet
 from safevar_sumo.workers.evaluation import Pool
 
-LABELS = {ROBUST: "robust with the fewest changes", REASONS["smallest"]: "smallest largest change", "a cause of its own": "distinct cause"}
+LABELS = {ROBUST: "robust with the fewest changes", REASONS["smallest"]: "smallest largest change", DISTINCT_CAUSE: "distinct cause"}
 """Titles of failures by the reason for their choice; any other reason is itself the title."""
 MAX_SIMULATIONS = 4000
 """Approximate maximum number of simulations that search for a robust failure at the end of a study; `explain` has a higher limit."""
@@ -79,12 +79,12 @@ def summarise_failures(study: Study, solutions: pd.DataFrame, original: Evaluati
 
 
 def _write_paragraph(evaluator: Evaluator, solutions: pd.DataFrame, is_unsafe: pd.Series[bool], original: Evaluations, unsafe: Unsafe,
-               point: str) -> str:
-    """One paragraph on the unsafe solutions; with `point`, on the solutions that are unsafe at this point of a matrix."""
+                     point: str) -> str:
+    """One paragraph on the unsafe solutions; with `point`, on those that are unsafe at this test point."""
     names, all_handles = evaluator.characteristics.names, handles_of(solutions)
     candidates = np.flatnonzero(is_unsafe.to_numpy() & ~solutions.duplicated(list(names)).to_numpy())
     if point:
-        evaluator = evaluator.for_study(study_at(evaluator.study, point, point))
+        evaluator = evaluator.for_study(study_at(evaluator.study, point, source=point))
         original = evaluator.evaluate_original()
     system = assemble(evaluator.study)
     evaluations = evaluator.evaluate(solutions.iloc[candidates][list(names)].to_numpy(dtype=float), "unsafe solutions")
@@ -110,13 +110,13 @@ def _write_paragraph(evaluator: Evaluator, solutions: pd.DataFrame, is_unsafe: p
 
 
 def _find_failing_points(study: Study, settings: FloatArray, unsafe: Unsafe) -> tuple[list[str], str]:
-    """A sentence for each setting on the points at which it fails, and the worst point of the first setting; empty without a matrix."""
+    """A sentence for each setting on the points where it fails, and the first setting's worst point; empty without a test matrix."""
     system = assemble(study)
     if not system.matrix:
         return [""] * len(settings), ""
-    at_points = simulate_all_points(system, settings)
-    sentences = [f" {points_in_words(points, len(system.matrix), limit=3)}" for points in unsafe_points_of(system, at_points, unsafe)]
-    return sentences, at_points[worst_points(at_points)[0]].point.name
+    results = simulate_all_points(system, settings)
+    sentences = [f" {points_in_words(points, len(system.matrix), limit=3)}" for points in unsafe_points_of(system, results, unsafe)]
+    return sentences, results[worst_points(results)[0]].point.name
 
 
 def _cause_in_words(evaluator: Evaluator, causes: list[MinimalCause]) -> str:
@@ -149,9 +149,9 @@ class FailureDescription(NamedTuple):
         Outcome and safety degree [m, or -m/s] of the failure.
     robustness
         Robustness of the failure.
-    sufficient
+    sufficient_count
         Number of changes that are enough: the size of the failure's minimal causes.
-    cause
+    cause_robustness
         Robustness of the first minimal cause by itself; None if it was not simulated.
     """
 
@@ -160,8 +160,8 @@ class FailureDescription(NamedTuple):
     outcome: str
     safety_degree: float | None
     robustness: Robustness
-    sufficient: int
-    cause: Robustness | None = None
+    sufficient_count: int
+    cause_robustness: Robustness | None = None
 
 
 def failures_paragraph(system: System, original: Evaluations, smallest: FailureDescription | None, robust: FailureDescription | None,
@@ -171,7 +171,7 @@ def failures_paragraph(system: System, original: Evaluations, smallest: FailureD
     Parameters
     ----------
     system
-        The study's system; in a matrix, with the points of the evaluations only.
+        The study's system; in a test matrix, with the points of the evaluations only.
     original
         The original vehicle's evaluation.
     smallest
@@ -185,10 +185,10 @@ def failures_paragraph(system: System, original: Evaluations, smallest: FailureD
     if smallest is None:
         return " ".join([*parts, "Nothing unsafe was found."])
     characteristics = CharacteristicSet(system.characteristics.members)
-    if not smallest.sufficient:
+    if not smallest.sufficient_count:
         return " ".join([*parts, "No change is needed for it to be unsafe."])
-    words = _failure_in_words(characteristics, smallest)
-    parts.append(f"{words[0].upper()}{words[1:]}")
+    sentence = _failure_in_words(characteristics, smallest)
+    parts.append(f"{sentence[0].upper()}{sentence[1:]}")
     if smallest.robustness.borderline:
         parts.append("None of the failures that were tried is robust." if robust is None else
                      f"The robust failure with the fewest changes, {robust.name}: {_failure_in_words(characteristics, robust)}")
@@ -215,15 +215,15 @@ def _original_ending_in_words(system: System, original: Evaluations) -> str:
     is_pedestrian = all(pre_crash_of(point.scenario).startswith("pedestrian") for point in system.points)
     if outcome == Outcome.STOPPED and is_pedestrian:
         return f"stops {degree:.2f} m short of the pedestrian"
-    return f"{OUTCOME_VERBS.get(outcome, outcome)}" + ("" if degree != degree else f" with a safety degree of {degree:.2f} m")
+    return f"{OUTCOME_VERBS.get(outcome, outcome)}" + ("" if np.isnan(degree) else f" with a safety degree of {degree:.2f} m")
 
 
 def _failure_in_words(characteristics: CharacteristicSet, failure: FailureDescription) -> str:
     """A sentence such as `a collision at 5 km/h (robust: ...) was found with ten changes: ...; three of them suffice`."""
-    number, sufficient, effect = len(failure.changes), failure.sufficient, f"{_outcome_in_words(failure)} ({failure.robustness})"
+    number, sufficient, effect = len(failure.changes), failure.sufficient_count, f"{_outcome_in_words(failure)} ({failure.robustness})"
     listed = _changes_in_words(characteristics, failure.changes)
     if sufficient < number:
-        cause = "" if failure.cause is None else f" ({failure.cause})"
+        cause = "" if failure.cause_robustness is None else f" ({failure.cause_robustness})"
         subset = f"{_count_in_words(sufficient)} of them {_verb_suffice(sufficient)}{cause}"
         return f"{effect} was found with {_count_in_words(number)} changes: {listed}; {subset}."
     return f"{_count_in_words(number)} {'change' if number == 1 else 'changes'} {_verb_suffice(number)} for {effect}: {listed}."
@@ -266,6 +266,6 @@ def _avoided_shares_in_words(preventable: Preventability) -> list[str]:
         return []
     words = {PreventableBy.COMPETENT_DRIVER: "a competent driver avoids {}", PreventableBy.FULL_BRAKING:
              "only full braking at the first possible moment avoids another {}", PreventableBy.NOBODY: "{} are physically unavoidable"}
-    parts = [text.format(f"{100 * (preventable.share(by) or 0.0):.0f} %") for by, text in words.items() if preventable.numbers.get(by)]
+    parts = [text.format(f"{100 * (preventable.share(by) or 0.0):.0f} %") for by, text in words.items() if preventable.counts.get(by)]
     sample = "" if preventable.looked_at == preventable.collisions else f"{preventable.looked_at} drawn at random from "
     return [f"In the same vehicle, of {sample}{preventable.collisions} collisions, {join_phrases(parts)}."]

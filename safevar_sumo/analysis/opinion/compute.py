@@ -81,14 +81,14 @@ def ask_for_opinions(source: Study | Case, options: OpinionOptions, *, pool: Poo
     explain_options = ExplainOptions(solutions=options.solutions, unsafe=options.unsafe, limit=SIMULATION_LIMIT)
     with open_evaluator(source.study, pool, jobs, progress) as evaluator:
         selection = choose_failures(source, explain_options, evaluator)
-        minimal_causes = [(str(selection.failures.handles[row]), cause) for row in selection.reasons for cause in selection.causes[row]]
-        limits = find_boundaries(evaluator, [cause for _, cause in minimal_causes], selection.failures.unsafe)
+        evaluated, rows = selection.evaluated, list(selection.choice_reasons)
+        minimal_causes = [(str(evaluated.handles[row]), cause) for row in rows for cause in selection.causes[row]]
+        limits = find_boundaries(evaluator, [cause for _, cause in minimal_causes], evaluated.unsafe)
     characteristic_names = evaluator.characteristics.names
     causes = [CauseToJudge(handle, {characteristic_names[column]: float(cause.setting[column]) for column in cause.columns}, limit.fraction)
               for (handle, cause), limit in zip(minimal_causes, limits, strict=True)]
-    opinions = judge_causes(source.study, causes, selection.failures.unsafe, progress)
-    return replace(opinions, without_cause=tuple(str(selection.failures.handles[row])
-                                                 for row in selection.reasons if not selection.causes[row]))
+    opinions = judge_causes(source.study, causes, evaluated.unsafe, progress)
+    return replace(opinions, without_cause=tuple(str(evaluated.handles[row]) for row in rows if not selection.causes[row]))
 
 
 def judge_causes(study: Study, causes: Sequence[CauseToJudge], unsafe: Unsafe, progress: Progress = show_no_progress) -> Opinions:

@@ -34,20 +34,20 @@ def draw_critical_differences(case: Case) -> Figure:
     frame = frame[frame["metric"].isin(list(INDICATOR_TITLES)) & frame["mean_rank"].notna()]
     if frame.empty:
         raise UnanswerableError(case.name, "has no run in which every algorithm has solutions", "results of three algorithms or more")
-    metrics, algorithms = list(dict.fromkeys(frame["metric"])), frame["algorithm"].nunique()
-    runs, difference = int(frame["runs"].iloc[0]), float(frame["critical_difference"].iloc[0])
-    title = f"{case.name}: mean ranks over {runs} runs, critical difference {difference:.2f}"
-    figure, axes = new_figure(title, len(metrics), 1, (6.8, 0.9 + len(metrics) * (0.75 + ALGORITHM_HEIGHT * algorithms)))
+    metrics, algorithm_count = list(dict.fromkeys(frame["metric"])), frame["algorithm"].nunique()
+    run_count, critical_difference = int(frame["runs"].iloc[0]), float(frame["critical_difference"].iloc[0])
+    title = f"{case.name}: mean ranks over {run_count} runs, critical difference {critical_difference:.2f}"
+    figure, axes = new_figure(title, len(metrics), 1, (6.8, 0.9 + len(metrics) * (0.75 + ALGORITHM_HEIGHT * algorithm_count)))
     for axis, metric in zip(axes.flat, metrics, strict=True):
         metric_ranks = frame[frame["metric"] == metric].sort_values("mean_rank", kind="stable")
-        _draw_mean_ranks(axis, metric_ranks["algorithm"].tolist(), metric_ranks["mean_rank"].to_numpy(dtype=float), difference)
+        _draw_mean_ranks(axis, metric_ranks["algorithm"].tolist(), metric_ranks["mean_rank"].to_numpy(dtype=float), critical_difference)
         axis.set_ylabel(INDICATOR_TITLES[metric])
         axis.set_xlabel("mean rank, 1 is best")
     figure.supxlabel(f"a bar joins ranks that differ by less than the critical difference (Nemenyi's test at {ALPHA:g})", fontsize=FONT)
     return figure
 
 
-def _draw_mean_ranks(axis: Axes, algorithms: list[str], mean_ranks: FloatArray, difference: float) -> None:
+def _draw_mean_ranks(axis: Axes, algorithms: list[str], mean_ranks: FloatArray, critical_difference: float) -> None:
     algorithm_count = len(algorithms)
     axis.set_xlim(0.85, algorithm_count + 0.25 * algorithm_count)
     axis.set_ylim(-0.6 * len(mean_ranks) - 0.4, algorithm_count)
@@ -57,7 +57,7 @@ def _draw_mean_ranks(axis: Axes, algorithms: list[str], mean_ranks: FloatArray, 
         axis.plot(rank, height, marker="o", markersize=4, color="#0072b2")
         axis.annotate(f"{escape_dollars(ALGORITHM_TITLES.get(name, name))} {rank:.2f}", (rank, height), xytext=(6, 0),
                       textcoords="offset points", va="center", fontsize=FONT)
-    for bar, (first, last) in enumerate(find_cliques(mean_ranks, difference)):
+    for bar, (first, last) in enumerate(find_cliques(mean_ranks, critical_difference)):
         axis.plot([mean_ranks[first] - 0.03, mean_ranks[last] + 0.03], [-0.6 - 0.5 * bar] * 2, color="#d55e00", linewidth=3,
                   solid_capstyle="round")
     axis.set_yticks([])
@@ -68,18 +68,18 @@ def _draw_mean_ranks(axis: Axes, algorithms: list[str], mean_ranks: FloatArray, 
     axis.xaxis.set_ticks_position("bottom")
 
 
-def find_cliques(mean_ranks: FloatArray, difference: float) -> list[tuple[int, int]]:
-    """First and last index of each largest group of sorted mean ranks that differ by less than the critical difference."""
+def find_cliques(mean_ranks: FloatArray, critical_difference: float) -> list[tuple[int, int]]:
+    """First and last index of each maximal group of sorted mean ranks that differ by less than the critical difference."""
     groups: list[tuple[int, int]] = []
     for first in range(len(mean_ranks)):
-        last = int(np.flatnonzero(mean_ranks - mean_ranks[first] < difference)[-1])
+        last = int(np.flatnonzero(mean_ranks - mean_ranks[first] < critical_difference)[-1])
         if last > first and (not groups or last > groups[-1][1]):
             groups.append((first, last))
     return groups
 
 
 def draw_attainment_surfaces(case: Case) -> Figure:
-    """The values of the first two objectives that one run, half of the runs and all runs of each algorithm attain.
+    """What at least one run, half of the runs and every run of each algorithm attain in the first two objectives.
 
     Raises
     ------
@@ -89,7 +89,7 @@ def draw_attainment_surfaces(case: Case) -> Figure:
     surfaces, objectives = compute_attainment(case), case.scoring.objectives[:2]
     columns = min(len(surfaces), 3)
     rows = -(-len(surfaces) // columns)
-    figure, axes = new_figure(f"{case.name}: empirical attainment", rows, columns, (max(3.0 * columns, 5.2), 0.8 + 3.1 * rows),)
+    figure, axes = new_figure(f"{case.name}: empirical attainment", rows, columns, (max(3.0 * columns, 5.2), 0.8 + 3.1 * rows))
     all_points = np.concatenate([points for surfaces_by_percentage in surfaces.values() for points in surfaces_by_percentage.values()])
     for axis, (algorithm, surfaces_by_percentage) in zip(axes.flat, surfaces.items(), strict=False):
         worst_values = np.array([np.min(all_points[:, i]) if objective.maximised else np.max(all_points[:, i])
@@ -108,9 +108,9 @@ def draw_attainment_surfaces(case: Case) -> Figure:
 
 
 def _staircase_corners(points: FloatArray, worst_values: FloatArray) -> FloatArray:
-    """K corners of the border of the region that the points dominate, from worst value to worst value; shape (K, 2)."""
+    """K corners of the border of the region that the points dominate, from the second objective's worst value to the first's; (K, 2)."""
     staircase = points[np.argsort(points[:, 0], kind="stable")]
-    if np.sign(worst_values[0] - np.mean(staircase[:, 0])) < 0:
+    if worst_values[0] < np.mean(staircase[:, 0]):  # the first objective is maximised
         staircase = staircase[::-1]
     border = [(staircase[0, 0], worst_values[1])]
     for index, (x, y) in enumerate(staircase):

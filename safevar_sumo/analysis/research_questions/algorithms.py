@@ -26,8 +26,9 @@ SURFACE_PERCENTAGES = (50.0, 100.0)
 def compare_pairs(case: Case) -> pd.DataFrame:
     """Every pair of algorithms, run against run: indicators and metrics' run means, Mann-Whitney U.
 
-    Columns: `PAIR_COLUMNS`. `effect_size` is A12, oriented so that higher values mean that `algorithm` is better than `other`. `p_holm` is
-    `p_value` corrected by Holm's method for all pairs and metrics of this setting. Undefined values are None.
+    Columns: `PAIR_COLUMNS`, where `setting` holds the case's name and `other` the other algorithm. `effect_size` is A12, oriented so that
+    higher values mean that `algorithm` is better than `other`. `p_holm` is `p_value` corrected by Holm's method for all pairs and metrics
+    of this case. Undefined values are None.
 
     Raises
     ------
@@ -48,9 +49,10 @@ def compare_pairs(case: Case) -> pd.DataFrame:
 def rank_algorithms(case: Case) -> pd.DataFrame:
     """Mean ranks of the algorithms over runs, metric by metric, with Friedman's test.
 
-    Runs with the same number form a block; a block in which an algorithm has no value is left out. Columns: `RANK_COLUMNS`. Rank 1 is the
-    best, `runs` counts blocks, `statistic` and `p_value` are Friedman's, `p_holm` is corrected for all metrics of this setting. Mean
-    ranks that differ by less than `critical_difference` are not distinguished (Nemenyi's test at 0.01; Demsar 2006).
+    Runs with the same number form a block; a block in which an algorithm has no value is left out. Columns: `RANK_COLUMNS`, where
+    `setting` holds the case's name. Rank 1 is the best, `runs` counts blocks, `statistic` and `p_value` are Friedman's, `p_holm` is
+    corrected for all metrics of this case. Mean ranks that differ by less than `critical_difference` are not distinguished (Nemenyi's test
+    at 0.01; Demsar 2006).
 
     Raises
     ------
@@ -73,10 +75,10 @@ def rank_algorithms(case: Case) -> pd.DataFrame:
     return pd.DataFrame([{**row, "p_holm": corrected_p_values[row["metric"]]} for row in rows], columns=RANK_COLUMNS, dtype=object)
 
 
-def critical_difference(algorithms: int, runs: int, alpha: float = ALPHA) -> float:
+def critical_difference(algorithm_count: int, run_count: int, alpha: float = ALPHA) -> float:
     """Least difference of mean ranks that the test distinguishes (Nemenyi 1963): q sqrt(k (k + 1) / (6 N)) for k algorithms and N runs."""
-    q = float(scipy.stats.studentized_range.ppf(1 - alpha, algorithms, np.inf)) / np.sqrt(2)
-    return float(q * np.sqrt(algorithms * (algorithms + 1) / (6 * runs)))
+    q = float(scipy.stats.studentized_range.ppf(1 - alpha, algorithm_count, np.inf)) / np.sqrt(2)
+    return float(q * np.sqrt(algorithm_count * (algorithm_count + 1) / (6 * run_count)))
 
 
 def compute_attainment(case: Case) -> dict[str, dict[float, FloatArray]]:

@@ -1,4 +1,7 @@
-"""Answers to the research questions, by name and over several cases: tidy frames, and notes on missing data."""
+"""Answers to the research questions, by name and over several cases: tidy frames, and notes on missing data.
+
+In the frames, the columns `setting` and `other` hold the names of cases.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +11,7 @@ from typing import NamedTuple
 import pandas as pd
 
 from safevar_sumo.analysis.research_questions.algorithms import compare_pairs, rank_algorithms
-from safevar_sumo.analysis.research_questions.case import NSGA2, Case, UnanswerableError, counted_solutions
+from safevar_sumo.analysis.research_questions.case import ALGORITHM_TITLES, NSGA2, Case, UnanswerableError, solutions_for_metric
 from safevar_sumo.analysis.research_questions.changes import (
     compare_weathers,
     count_collisions,
@@ -21,13 +24,13 @@ from safevar_sumo.analysis.research_questions.changes import (
     rq33_safety,
 )
 from safevar_sumo.analysis.research_questions.comparisons import rq1, rq2
-from safevar_sumo.analysis.research_questions.over_runs import difference_line, rq1_runs, rq2_runs
+from safevar_sumo.analysis.research_questions.over_runs import pooling_effect_line, rq1_runs, rq2_runs
 from safevar_sumo.errors import unknown_name
 from safevar_sumo.metrics import PUBLISHED_SCORING, MetricFacts
 
 Frames = dict[str, pd.DataFrame]
 SAFETY_TABLE = "rq3.3-safety"
-"""Name of the table of effects on safety, the footer of the paper's table of RQ3.3. An answer to RQ3.3 has both tables."""
+"""Name of the table of effects on safety, the footer of the paper's table of RQ3.3. The question rq3.3 is answered by both tables."""
 
 FRAMES_OF_ONE_CASE: Mapping[str, Callable[[Case], Frames]] = {
     "rq1": lambda case: {"rq1": rq1(case)},
@@ -67,8 +70,8 @@ def answer_questions(cases: Sequence[Case], question: str | None = None) -> list
         raise unknown_name("question", f"there is no question {question!r}", question, QUESTIONS)
     answers, all_errors, case_names = [], [], {case.name for case in cases}
     metrics = tuple({metric.name: metric for case in cases for metric in case.scoring.metrics}.values())
-    questions = (*FRAMES_OF_ONE_CASE, WEATHER)
-    for name in questions if question is None else ("rq3.3" if question == SAFETY_TABLE else question,):
+    all_questions = (*FRAMES_OF_ONE_CASE, WEATHER)
+    for name in all_questions if question is None else ("rq3.3" if question == SAFETY_TABLE else question,):
         tables, errors = _collect_frames(name, cases)
         all_errors += errors
         notes = [f"{error.source}: {error.problem}." for error in errors]
@@ -88,12 +91,13 @@ def _collect_frames(name: str, cases: Sequence[Case]) -> tuple[dict[str, list[pd
     """The frames of a question by table, and an error for each case without a frame."""
     tables: dict[str, list[pd.DataFrame]] = {}
     errors = []
-    for cases_asked in [cases] if name == WEATHER else [[case] for case in cases]:
+    case_groups = [cases] if name == WEATHER else [[case] for case in cases]  # weathers are compared over all cases at once
+    for group in case_groups:
         try:
             if name == WEATHER:
-                frames = {WEATHER: pd.concat([compare_weathers(*pair) for pair in find_weather_pairs(cases_asked)])}
+                frames = {WEATHER: pd.concat([compare_weathers(*pair) for pair in find_weather_pairs(group)])}
             else:
-                frames = FRAMES_OF_ONE_CASE[name](*cases_asked)
+                frames = FRAMES_OF_ONE_CASE[name](*group)
             for table, frame in frames.items():
                 tables.setdefault(table, []).append(frame)
         except UnanswerableError as error:
@@ -103,27 +107,29 @@ def _collect_frames(name: str, cases: Sequence[Case]) -> tuple[dict[str, list[pd
 
 def _notes(question: str, case: Case) -> list[str]:
     """Notes on a case for the readers of a table."""
-    notes = case.remarks
+    notes = list(case.remarks)
     if question in ("rq1", "rq2"):
         for metric in case.scoring.metrics:
-            rows = counted_solutions(case.solutions, metric)
+            rows = solutions_for_metric(case.solutions, metric)
             undefined_values = int(rows[metric.name].isna().sum())
             if undefined_values:
-                notes.append(f"{case.name}: {metric.name} is undefined in {undefined_values} of {len(rows)} solutions, which are omitted.")
+                notes.append(f"{case.name}: {metric.name} is undefined in {undefined_values} of {len(rows)} solutions; the tests omit "
+                             "those.")
     if question == "rq1":
         undefined_metrics = [name for name, value in case.original.items() if pd.isna(value)]
         if undefined_metrics:
             notes.append(f"{case.name}: the original vehicle's {', '.join(undefined_metrics)} is undefined, so that no test uses it.")
     if question in ("rq1-runs", "rq2-runs"):
-        notes.append(f"{case.name}: {difference_line(case)}")
+        notes.append(f"{case.name}: {pooling_effect_line(case)}")
     if question == "rq2" and not case.has_runs:
         notes.append(f"{case.name}: igd, igd_plus and hypervolume need runs, which imported solutions do not have.")
     if question == "rq2" and case.has_runs:
         empty_runs = len(set(case.finished_runs) - set(zip(case.solutions["algorithm"], case.solutions["run"], strict=True)))
         if empty_runs:
-            notes.append(f"{case.name}: {empty_runs} finished runs found no solution; they have no igd, igd_plus and hypervolume.")
+            notes.append(f"{case.name}: {empty_runs} finished runs found no solution; they have no igd, igd_plus or hypervolume.")
     if question.startswith("rq3") or question in ("combinations", WEATHER):
-        notes.append(f"{case.name}: {len(critical_solutions(case))} critical solutions of {len(case.solutions_of(NSGA2))} of {NSGA2}.")
+        notes.append(f"{case.name}: {len(critical_solutions(case))} of {ALGORITHM_TITLES[NSGA2]}'s {len(case.solutions_of(NSGA2))} "
+                     "solutions are critical.")
     if question == "combinations" and frequent_combinations(case).empty:
         notes.append(f"{case.name}: no critical solution has exactly four characteristics changed.")
     return notes

@@ -44,7 +44,7 @@ class Case:
         The original vehicle's metrics by name; NaN where undefined.
     solutions, evaluations
         Frames that `safevar_sumo.results.load_runs` returns.
-    finished
+    finished_runs
         Algorithm and number of every finished run.
     scoring
         The metrics and the minimised objectives.
@@ -131,14 +131,14 @@ class Case:
         return lines
 
 
-def counted_solutions(solutions: pd.DataFrame, metric: MetricFacts) -> pd.DataFrame:
-    """The solutions that count for a metric: for TET and TIT only those without collision (method section 4)."""
+def solutions_for_metric(solutions: pd.DataFrame, metric: MetricFacts) -> pd.DataFrame:
+    """The solutions that count for a metric: for TET and TIT only those without collision (docs/method.md, section 4)."""
     return solutions if metric.over_collisions else solutions[~are_collisions(solutions)]
 
 
 def defined_values(solutions: pd.DataFrame, metric: MetricFacts) -> FloatArray:
     """A metric's defined values over the solutions that count for it."""
-    column = counted_solutions(solutions, metric)[metric.name].to_numpy(dtype=float)
+    column = solutions_for_metric(solutions, metric)[metric.name].to_numpy(dtype=float)
     return np.asarray(column[~np.isnan(column)])
 
 

@@ -1,6 +1,7 @@
 """RQ3 and the discussion: number, kind and size of changes that make the vehicle unsafe, collisions, combinations, sun against rain.
 
-Functions of a case raise `UnanswerableError` as `critical_solutions` does; functions over runs also raise it if solutions belong to no run.
+Functions of a case raise `UnanswerableError` as `critical_solutions` does; `rq31` also raises it if solutions belong to no run.
+In the frames, the columns `setting` and `other` hold the names of cases.
 """
 
 from __future__ import annotations
@@ -39,21 +40,21 @@ def critical_solutions(case: Case) -> pd.DataFrame:
     return solutions[solutions[SAFETY_DEGREE] < case.original[SAFETY_DEGREE]]
 
 
-def change_matrix(case: Case, solutions: pd.DataFrame) -> FloatArray:
-    """Changes v'' - v of M solutions in n characteristics, in the characteristic's unit, shape (M, n)."""
+def changes_of(case: Case, solutions: pd.DataFrame) -> FloatArray:
+    """Changes of n characteristics in M solutions, each in its unit: filtered minus original value, the paper's v'' - v; shape (M, n)."""
     return np.asarray(solutions[list(case.characteristics.names)].to_numpy(dtype=float) - case.characteristics.original)
 
 
-def masks_by_change_count(case: Case, deltas: FloatArray) -> dict[str, BoolArray]:
+def masks_by_change_count(case: Case, changes: FloatArray) -> dict[str, BoolArray]:
     """For j = "1".."n" and "any": whether each solution has j characteristics changed, shape (M,)."""
-    change_counts = np.count_nonzero(deltas, axis=1)
-    return {**{str(j): change_counts == j for j in range(1, len(case.characteristics) + 1)}, ANY: np.ones(len(deltas), dtype=bool)}
+    change_counts = np.count_nonzero(changes, axis=1)
+    return {**{str(j): change_counts == j for j in range(1, len(case.characteristics) + 1)}, ANY: np.ones(len(changes), dtype=bool)}
 
 
 def rq31(case: Case) -> pd.DataFrame:
     """Number of critical solutions of each run with exactly j characteristics changed; columns setting, run, j, count."""
     solutions, runs = critical_solutions(case), case.runs_of(NSGA2)
-    change_counts, run_of_solution = np.count_nonzero(change_matrix(case, solutions), axis=1), solutions["run"].to_numpy()
+    change_counts, run_of_solution = np.count_nonzero(changes_of(case, solutions), axis=1), solutions["run"].to_numpy()
     rows = [(case.name, run, str(j), int(np.count_nonzero((run_of_solution == run) & (change_counts == j))))
             for run in runs for j in range(1, len(case.characteristics) + 1)]
     return pd.DataFrame(rows, columns=["setting", "run", "j", "count"])
@@ -65,13 +66,13 @@ def rq32(case: Case) -> pd.DataFrame:
     Columns setting, characteristic, j ("1".."n", "any"), percent (None without such a solution), rank (only for
     j = "any"; ties share the better rank and the next one is skipped).
     """
-    deltas = change_matrix(case, critical_solutions(case))
-    change_counts = np.count_nonzero(deltas, axis=0)
+    changes = changes_of(case, critical_solutions(case))
+    solution_counts = np.count_nonzero(changes, axis=0)  # solutions that change each characteristic
     rows = []
     for column, characteristic in enumerate(case.characteristics):
-        for j, mask in masks_by_change_count(case, deltas).items():
-            percent = 100 * float(np.mean(deltas[mask, column] != 0)) if mask.any() else None
-            rank = 1 + int(np.count_nonzero(change_counts > change_counts[column])) if j == ANY and len(deltas) else None
+        for j, mask in masks_by_change_count(case, changes).items():
+            percent = 100 * float(np.mean(changes[mask, column] != 0)) if mask.any() else None
+            rank = 1 + int(np.count_nonzero(solution_counts > solution_counts[column])) if j == ANY and len(changes) else None
             rows.append((case.name, characteristic.name, j, percent, rank))
     return pd.DataFrame(rows, columns=["setting", "characteristic", "j", "percent", "rank"], dtype=object)
 
@@ -79,28 +80,32 @@ def rq32(case: Case) -> pd.DataFrame:
 def rq33(case: Case) -> pd.DataFrame:
     """Size of increases and of decreases in the critical solutions with j characteristics changed.
 
-    Columns setting, characteristic, direction, j ("1".."n", "any"), pc (mean of |v - v''| / v, a fraction), delta (mean
-    signed change in the characteristic's unit), n (number of changes); pc and delta are None where n is 0.
+    Columns setting, characteristic, direction, j ("1".."n", "any"), pc (the paper's PC, a fraction: mean change relative to the
+    original value, without sign), delta (mean signed change in the characteristic's unit), n (number of changes); pc and delta are None
+    where n is 0.
     """
-    deltas = change_matrix(case, critical_solutions(case))
+    changes = changes_of(case, critical_solutions(case))
     rows = []
     for column, characteristic in enumerate(case.characteristics):
         for direction, sign in (("increase", 1), ("decrease", -1)):
-            for j, mask in masks_by_change_count(case, deltas).items():
-                delta = deltas[mask, column]
-                delta = delta[np.sign(delta) == sign]
-                mean = float(np.mean(delta)) if delta.size else None
-                pc = None if mean is None else abs(mean / characteristic.original)
-                rows.append((case.name, characteristic.name, direction, j, pc, mean, delta.size))
+            for j, mask in masks_by_change_count(case, changes).items():
+                sample = changes[mask, column]
+                sample = sample[np.sign(sample) == sign]
+                mean = float(np.mean(sample)) if sample.size else None
+                relative_change = None if mean is None else abs(mean / characteristic.original)
+                rows.append((case.name, characteristic.name, direction, j, relative_change, mean, sample.size))
     return pd.DataFrame(rows, columns=["setting", "characteristic", "direction", "j", "pc", "delta", "n"], dtype=object)
 
 
 def rq33_safety(case: Case) -> pd.DataFrame:
-    """Effect of the critical solutions with j characteristics changed on safety: the footer of RQ3.3's table.
+    """Effect on safety of the critical solutions with j characteristics changed: the footer of RQ3.3's table.
 
     Columns setting, quantity, j, value, percent (of the original's value), n; value is None where n is 0. Quantities:
-    avgSD_mD, mean reduction of the distance, without collisions [m]; avgSD_cS, mean speed of the collisions [m/s], without
-    percent; TET [s] and TIT [s^2], mean increase, without collisions; aveDece, mean decrease, over all [m/s^2].
+
+    - avgSD_mD: mean reduction of the distance over solutions without collision [m];
+    - avgSD_cS: mean collision speed over collisions [m/s]; it has no percent;
+    - TET [s], TIT [s^2]: mean increase over solutions without collision;
+    - aveDece: mean decrease over all solutions [m/s^2].
     """
     solutions = critical_solutions(case)
     has_collided = are_collisions(solutions).to_numpy()
@@ -114,7 +119,7 @@ def rq33_safety(case: Case) -> pd.DataFrame:
         "aveDece": (original["ave_dece"] - dece, original["ave_dece"])}
     rows = []
     for quantity, (differences, reference) in quantities.items():
-        for j, mask in masks_by_change_count(case, change_matrix(case, solutions)).items():
+        for j, mask in masks_by_change_count(case, changes_of(case, solutions)).items():
             sample = differences[mask & ~np.isnan(differences)]
             mean = float(np.mean(sample)) if sample.size else None
             percent = None if mean is None or np.isnan(reference) or reference == 0 else 100 * mean / abs(reference)
@@ -146,7 +151,7 @@ def frequent_combinations(case: Case) -> pd.DataFrame:
     where there is no such solution. Of combinations that are equally frequent, those with the earlier
     characteristics in the study come first.
     """
-    is_changed = change_matrix(case, critical_solutions(case)) != 0
+    is_changed = changes_of(case, critical_solutions(case)) != 0
     masks = is_changed[np.count_nonzero(is_changed, axis=1) == COMBINATION_SIZE]
     counts = Counter(tuple(np.flatnonzero(mask).tolist()) for mask in masks)
     ranking = sorted(counts.items(), key=lambda item: (-item[1], item[0]))[:COMBINATIONS_SHOWN]
@@ -164,15 +169,15 @@ def find_weather_pairs(cases: Sequence[Case]) -> list[tuple[Case, Case]]:
     UnanswerableError
         If there is no such pair.
     """
-    pairs = [(clear, wet) for clear, wet in permutations(cases, 2)
-             if _without_weather(clear) == _without_weather(wet) and _clearness(clear) > _clearness(wet)]
+    pairs = [(clearer, other) for clearer, other in permutations(cases, 2)
+             if _without_weather(clearer) == _without_weather(other) and _clearness(clearer) > _clearness(other)]
     if not pairs:
-        raise UnanswerableError(", ".join(clear.name for clear in cases), "two cases are needed that differ in the weather alone",
+        raise UnanswerableError(", ".join(case.name for case in cases), "two cases are needed that differ in the weather alone",
                                 "results such as those of sun and rain")
     return pairs
 
 
-def compare_weathers(clear: Case, wet: Case) -> pd.DataFrame:
+def compare_weathers(clearer: Case, other: Case) -> pd.DataFrame:
     """One weather against another, characteristic by characteristic, over the critical solutions.
 
     Columns setting, other, characteristic, percent and percent_other (share of the critical solutions that change
@@ -180,18 +185,18 @@ def compare_weathers(clear: Case, wet: Case) -> pd.DataFrame:
     increase, increase_other, decrease, decrease_other.
     """
     tables = []
-    for case in (clear, wet):
-        share, size = rq32(case), rq33(case)
-        columns_of_case = share[share["j"] == ANY].set_index("characteristic")[["percent", "rank"]]
+    for case in (clearer, other):
+        shares, change_sizes = rq32(case), rq33(case)
+        columns_of_case = shares[shares["j"] == ANY].set_index("characteristic")[["percent", "rank"]]
         for direction in ("increase", "decrease"):
-            group = size[(size["j"] == ANY) & (size["direction"] == direction)]
+            group = change_sizes[(change_sizes["j"] == ANY) & (change_sizes["direction"] == direction)]
             columns_of_case[direction] = group.set_index("characteristic")["delta"]
         tables.append(columns_of_case)
     table = tables[0].join(tables[1].add_suffix("_other"))
     difference = [None if a is None or b is None else b - a for a, b in zip(table["percent"], table["percent_other"], strict=True)]
     table.insert(0, "difference", pd.Series(difference, index=table.index, dtype=object))
-    table.insert(0, "other", wet.name)
-    table.insert(0, "setting", clear.name)
+    table.insert(0, "other", other.name)
+    table.insert(0, "setting", clearer.name)
     columns = ["setting", "other", "characteristic", "percent", "percent_other", "difference", "rank", "rank_other",
                "increase", "increase_other", "decrease", "decrease_other"]
     return table.reset_index()[columns]
@@ -199,9 +204,9 @@ def compare_weathers(clear: Case, wet: Case) -> pd.DataFrame:
 
 def list_changes(case: Case) -> pd.DataFrame:
     """Every change in every critical solution; columns setting, characteristic, change (signed, in the characteristic's unit)."""
-    deltas = change_matrix(case, critical_solutions(case))
+    changes = changes_of(case, critical_solutions(case))
     frames = [pd.DataFrame({"setting": case.name, "characteristic": name, "change": column[column != 0]})
-              for name, column in zip(case.characteristics.names, deltas.T, strict=True)]
+              for name, column in zip(case.characteristics.names, changes.T, strict=True)]
     return pd.concat(frames, ignore_index=True)
 
 

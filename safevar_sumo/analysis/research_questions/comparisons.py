@@ -1,4 +1,7 @@
-"""Comparison of two samples: Mann-Whitney U, and the size of the difference (method section 7)."""
+"""Comparison of two samples: Mann-Whitney U, and the size of the difference (docs/method.md, section 7).
+
+In the frames, the column `setting` holds the case's name, and `method` the name of the test.
+"""
 
 from __future__ import annotations
 
@@ -71,7 +74,7 @@ RQ1_COLUMNS = ["setting", "algorithm", "metric", "p_value", "effect_size", "magn
 
 
 def rq1(case: Case) -> pd.DataFrame:
-    """Every algorithm's solutions against the original's value, repeated to the sample's size, metric by metric.
+    """Every algorithm's solutions against the original's value, repeated once for each solution, metric by metric.
 
     Columns: `RQ1_COLUMNS`. `effect_size` is A12, oriented so that smaller values mean that the algorithm's solutions are
     more unsafe; `mean` is the mean over the algorithm's solutions, `original` the original vehicle's value. Undefined values are None.
@@ -123,17 +126,22 @@ def rq2(case: Case) -> pd.DataFrame:
     Raises
     ------
     UnanswerableError
-        If NSGA-II or every other algorithm is missing.
+        If NSGA-II is missing, or there is no other algorithm.
     """
-    case.solutions_of(NSGA2)  # raises UnanswerableError if there are none
-    if all(name == NSGA2 for name in case.algorithms):
-        raise UnanswerableError(case.name, f"only {NSGA2} has finished runs", "results of another algorithm to compare with, such as rs")
+    require_rq2(case)
     rows = rq2_rows(case, lambda algorithm, metric: defined_values(case.solutions_of(algorithm), metric))
     return pd.DataFrame(rows, columns=RQ2_COLUMNS, dtype=object)
 
 
+def require_rq2(case: Case) -> None:
+    """Raise `UnanswerableError` if NSGA-II is missing, or there is no other algorithm."""
+    case.solutions_of(NSGA2)  # raises if there are none
+    if all(name == NSGA2 for name in case.algorithms):
+        raise UnanswerableError(case.name, f"only {NSGA2} has finished runs", "results of another algorithm to compare with, such as rs")
+
+
 def rq2_rows(case: Case, sample_of: SampleFunction) -> list[dict[str, Any]]:
-    """Rows for each other algorithm: its runs' indicators and its samples of the metrics against those of NSGA-II, oriented as in `rq2`."""
+    """Rows for each other algorithm: NSGA-II's indicators of runs and samples of metrics against the algorithm's, oriented as in `rq2`."""
     quality = compute_indicators(case) if case.has_runs and len(case.solutions) else None
     rows = []
     for baseline in (name for name in case.algorithms if name != NSGA2):

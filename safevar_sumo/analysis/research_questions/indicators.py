@@ -1,4 +1,4 @@
-"""Quality of a run's front: IGD on the objectives in their units, IGD+ and hypervolume on normalised objectives (method section 7)."""
+"""Quality of a run's front (docs/method.md, section 7): IGD on the objectives in their units, IGD+ and hypervolume on normalised ones."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def titles_of(metrics: Iterable[MetricFacts]) -> dict[str, str]:
 
 
 def nondominated_points(points: FloatArray) -> FloatArray:
-    """The M distinct non-dominated points for minimisation of m objectives, shape (M, m)."""
+    """The distinct non-dominated points for minimisation of m objectives, with shape (M, m)."""
     return np.asarray(moocore.filter_dominated(_check_points(points, "the set of points")))
 
 
@@ -63,12 +63,12 @@ class Scale(NamedTuple):
 
 
 def objective_values(case: Case, frame: pd.DataFrame) -> FloatArray:
-    """The objectives' values, smaller being better, of the M rows in which all of them are defined; shape (M, objectives)."""
-    points = _values(case, frame)
+    """The objectives' values, smaller being better, of the rows in which all of them are defined, with shape (M, objectives)."""
+    points = _signed_objective_values(case, frame)
     return np.asarray(points[np.isfinite(points).all(axis=1)])
 
 
-def _values(case: Case, frame: pd.DataFrame) -> FloatArray:
+def _signed_objective_values(case: Case, frame: pd.DataFrame) -> FloatArray:
     signs = [objective.sign for objective in case.scoring.objectives]
     return np.asarray(frame[[objective.name for objective in case.scoring.objectives]].to_numpy(dtype=float) * signs)
 
@@ -97,10 +97,9 @@ def compute_indicators(case: Case) -> pd.DataFrame:
     """
     rows = []
     runs = [(algorithm, run) for algorithm in case.algorithms for run in case.runs_of(algorithm)]
-    if runs:
-        reference = reference_front(case)
-        scale = Scale.of(reference)
-        scaled_reference = scale.normalised(reference)
+    reference = reference_front(case)
+    scale = Scale.of(reference)
+    scaled_reference = scale.normalised(reference)
     by_run = dict(list(case.solutions.groupby(["algorithm", "run"])))
     for algorithm, run in runs:
         front = objective_values(case, by_run[algorithm, run]) if (algorithm, run) in by_run else np.zeros((0, 0))
@@ -110,10 +109,10 @@ def compute_indicators(case: Case) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=["algorithm", "run", *MORE_IS_BETTER])
 
 
-def compute_convergence(case: Case, points: int = 50) -> pd.DataFrame:
+def compute_convergence(case: Case, curve_points: int = 50) -> pd.DataFrame:
     """The hypervolume of each run's settings after a number of evaluations; columns algorithm, run, evaluations, hypervolume.
 
-    A run that ended early keeps its last hypervolume; a hypervolume is 0 while all settings lie beyond the reference point.
+    A run that ended early keeps its last hypervolume. The hypervolume is 0 as long as no setting dominates the reference point.
 
     Raises
     ------
@@ -123,7 +122,7 @@ def compute_convergence(case: Case, points: int = 50) -> pd.DataFrame:
     runs = [(algorithm, run) for algorithm in case.algorithms for run in case.runs_of(algorithm)]
     scale = Scale.of(reference_front(case))
     budget = case.study.search.evaluations
-    evaluation_counts = np.unique(np.linspace(min(case.study.search.population, budget), budget, points).astype(int))
+    evaluation_counts = np.unique(np.linspace(min(case.study.search.population, budget), budget, curve_points).astype(int))
     by_run = dict(list(case.evaluations.groupby(["algorithm", "run"])))
     frames = [pd.DataFrame({"algorithm": algorithm, "run": run, "evaluations": evaluation_counts,
                             "hypervolume": _hypervolumes_after(case, by_run[algorithm, run], scale, evaluation_counts)})
@@ -135,7 +134,7 @@ def compute_convergence(case: Case, points: int = 50) -> pd.DataFrame:
 
 def _hypervolumes_after(case: Case, evaluations: pd.DataFrame, scale: Scale, evaluation_counts: np.ndarray) -> list[float]:
     """Hypervolume of the first k evaluations, for each count k."""
-    scaled_points = scale.normalised(_values(case, evaluations))
+    scaled_points = scale.normalised(_signed_objective_values(case, evaluations))
     is_defined = np.isfinite(scaled_points).all(axis=1)
     scaled_points, evaluation_indices = scaled_points[is_defined], evaluations["evaluation"].to_numpy()[is_defined]
     ends = np.searchsorted(evaluation_indices, evaluation_counts, side="left")

@@ -1,4 +1,7 @@
-"""Lays answers out as tables of text, in full or in the paper's layout: headings, number formats, bold cells. `tables.py` renders them."""
+"""Lays answers out as tables of text, in full or in the paper's layout: headings, number formats, bold cells. `tables.py` renders them.
+
+In the frames, the columns `setting` and `other` hold the names of cases.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +28,7 @@ PAPER_CHANGE_COUNTS = ("2", "3", "4", "5", "6")
 """The numbers of changed characteristics in the paper's table of RQ3.3."""
 HOLM_LEGEND = f"bold or *: p < {ALPHA:g} after Holm"
 BOLD_NOTE = f"Bold (or *): p < {ALPHA:g}; A12 also of medium or large magnitude."
-HOLM_NOTE = f"Bold (or *): p < {ALPHA:g} after Holm's correction for all tests of a setting's RQ1 and RQ2."
+HOLM_NOTE = f"Bold (or *): p < {ALPHA:g} after Holm's correction for all tests of a case's RQ1 and RQ2."
 CELL_NOTE = f"Cells: p / A12; bold (or *) where p < {ALPHA:g} and A12 is of medium or large magnitude."
 TITLES = {
     "rq1": "RQ1: solutions against the original vehicle",
@@ -78,7 +81,7 @@ def lay_out(answer: Answer, layouts: Layouts | None = None) -> list[Table]:
 def pivot_table(title: str, frame: pd.DataFrame, labels: Sequence[str], cells: Callable[[Row], Sequence[str]],
                 headings: Sequence[str] = (), *, over: str = "setting", names: Mapping[str, str] | None = None,
                 notes: Sequence[str] = ()) -> Table:
-    """A row for each combination of `labels`, and a block of cells for each value of the column `over`.
+    """A row for each combination of `labels`, and a block of cells for each value of the column `over`, by default each case.
 
     Each block has one column per heading, below the value of `over` as a spanning heading; without `headings` a block is one column under
     that value. `names` are titles for the values of labels.
@@ -93,9 +96,9 @@ def pivot_table(title: str, frame: pd.DataFrame, labels: Sequence[str], cells: C
     return Table(title, (*labels, *(tuple(headings) * len(blocks) or blocks)), rows, len(labels), spans, tuple(notes))
 
 
-def layout_by_setting(layout: Callable[[str, pd.DataFrame], list[Table]]) -> Callable[[Answer], list[Table]]:
-    """A layout that makes tables for each setting from the rows of that setting."""
-    return lambda answer: [table for setting, group in answer.frame.groupby("setting", sort=False) for table in layout(str(setting), group)]
+def layout_by_case(layout: Callable[[str, pd.DataFrame], list[Table]]) -> Callable[[Answer], list[Table]]:
+    """A layout that makes tables for each case from the case's name and rows."""
+    return lambda answer: [table for case, group in answer.frame.groupby("setting", sort=False) for table in layout(str(case), group)]
 
 
 def units_note(metrics: Iterable[MetricFacts]) -> str:
@@ -149,14 +152,14 @@ def _lay_out_rq1(answer: Answer) -> list[Table]:
     test = _lay_out_tests(answer, "algorithm", sizes, (
         "A12 below 0.5: the algorithm's solutions are more unsafe than the original vehicle,",
         "whose value is repeated to the sample's size.", non_collision_note(metrics)))
-    settings, headings = list(dict.fromkeys(frame["setting"])), tuple(metric.title for metric in metrics)
+    cases, headings = list(dict.fromkeys(frame["setting"])), tuple(metric.title for metric in metrics)
     means = {(row["setting"], row["algorithm"], row["metric"]): row["mean"] for row in frame.to_dict("records")}
     means |= {(row["setting"], "original", row["metric"]): row["original"] for row in frame.to_dict("records")}
-    rows = [(names.get(name, name), *(_format_number(means.get((setting, name, metric.name)), ".2f")
-                                      for setting in settings for metric in metrics))
+    rows = [(names.get(name, name), *(_format_number(means.get((case, name, metric.name)), ".2f")
+                                      for case in cases for metric in metrics))
             for name in ("original", *dict.fromkeys(frame["algorithm"]))]
-    return [test, Table("RQ1: mean metrics", ("vehicle", *headings * len(settings)), rows, 1,
-                        tuple((setting, len(headings)) for setting in settings), (units_note(metrics), non_collision_note(metrics)))]
+    return [test, Table("RQ1: mean metrics", ("vehicle", *headings * len(cases)), rows, 1,
+                        tuple((case, len(headings)) for case in cases), (units_note(metrics), non_collision_note(metrics)))]
 
 
 def _lay_out_rq2(answer: Answer) -> list[Table]:
@@ -181,7 +184,7 @@ def _lay_out_rq2_runs(answer: Answer) -> list[Table]:
 def _lay_out_pairs(answer: Answer) -> list[Table]:
     """A table for each pair: its metrics, cases side by side."""
     notes = ("One value for each run; A12 above 0.5: the first is better (a better front, more unsafe solutions).",
-             non_collision_note(answer.metrics), "Holm's correction is for all pairs and metrics of a setting.")
+             non_collision_note(answer.metrics), "Holm's correction is for all pairs and metrics of a case.")
     return [pivot_table(TITLES["rq2-pairs"], answer.frame, ("algorithm", "other", "metric"), _format_test_cells,
                         ("p", "p Holm", "A12", "magnitude"), names=_titles(answer), notes=notes)]
 
@@ -189,7 +192,7 @@ def _lay_out_pairs(answer: Answer) -> list[Table]:
 def _lay_out_ranks(answer: Answer) -> list[Table]:
     """Mean ranks, one column per algorithm and one table per case."""
     names, tables = _titles(answer), []
-    for setting, group in answer.frame.groupby("setting", sort=False):
+    for case, group in answer.frame.groupby("setting", sort=False):
         algorithms = list(dict.fromkeys(group["algorithm"]))
         rows: list[tuple[str, ...]] = []
         for metric, metric_rows in group.groupby("metric", sort=False):
@@ -199,8 +202,8 @@ def _lay_out_ranks(answer: Answer) -> list[Table]:
             rows.append((names.get(str(metric), str(metric)), *(_format_number(rank, ".2f") for rank in metric_rows["mean_rank"]),
                          _format_number(first["critical_difference"], ".2f"), p, _bold_if(holm, is_significant), str(first["runs"])))
         headings = ("metric", *(names.get(name, name) for name in algorithms), "critical difference", "p", "p Holm", "runs")
-        tables.append(Table(f"{TITLES['rq2-ranks']}: {setting}", headings, rows, 1, notes=(
-            "p: Friedman's test; runs with the same number form a block. Holm's correction is for all metrics of a setting.",
+        tables.append(Table(f"{TITLES['rq2-ranks']}: {case}", headings, rows, 1, notes=(
+            "p: Friedman's test; runs with the same number form a block. Holm's correction is for all metrics of a case.",
             f"Mean ranks that differ by less than the critical difference are not distinguished (Nemenyi, {ALPHA:g}).",
             non_collision_note(answer.metrics))))
     return tables
@@ -216,8 +219,8 @@ def _lay_out_rq31(answer: Answer) -> list[Table]:
 
 def _lay_out_rq32(answer: Answer) -> list[Table]:
     tables = []
-    for setting, group in answer.frame.groupby("setting", sort=False):
-        table = pivot_table(f"{TITLES['rq3.2']}: {setting}", group, ("characteristic",), _format_column("percent", ".1f"), over="j",
+    for case, group in answer.frame.groupby("setting", sort=False):
+        table = pivot_table(f"{TITLES['rq3.2']}: {case}", group, ("characteristic",), _format_column("percent", ".1f"), over="j",
                             notes=("Columns: number of characteristics changed; ranked by 'any'.",))
         ranks = group.loc[group["j"] == ANY, "rank"]
         tables.append(table._replace(headings=(*table.headings, "rank"), rows=[(*row, _format_number(rank, "d")) for row, rank in
@@ -229,14 +232,15 @@ def _lay_out_rq32(answer: Answer) -> list[Table]:
                                  ("any", "rank"))]
 
 
-def _lay_out_rq33(setting: str, group: pd.DataFrame) -> list[Table]:
+def _lay_out_rq33(case: str, group: pd.DataFrame) -> list[Table]:
     labels, specs = ("characteristic", "direction"), {"pc": ".1%", "delta": "+.3g"}
     paper_rows = group[group["j"].isin(PAPER_CHANGE_COUNTS)]
     return [
-        pivot_table(f"{TITLES['rq3.3']}, 2 to 6 changed: {setting}", paper_rows.assign(j="j = " + paper_rows["j"]), labels,
+        pivot_table(f"{TITLES['rq3.3']}, 2 to 6 changed: {case}", paper_rows.assign(j="j = " + paper_rows["j"]), labels,
                     lambda row: [_format_number(row[name], spec) for name, spec in specs.items()], ("PC", "delta"), over="j",
-                    notes=("PC: mean of |v - v''| / v; delta: mean signed change in the characteristic's unit.",)),
-        *(pivot_table(f"RQ3.3: {title}, any number changed: {setting}", group, labels, _format_column(name, specs[name]), over="j")
+                    notes=("PC: mean of |v - v''| / v (v'': filtered, v: original value); delta: mean signed change in the "
+                           "characteristic's unit.",)),
+        *(pivot_table(f"RQ3.3: {title}, any number changed: {case}", group, labels, _format_column(name, specs[name]), over="j")
           for title, name in (("PC", "pc"), ("delta", "delta")))]
 
 
@@ -245,7 +249,7 @@ def _format_column(name: str, spec: str) -> Callable[[Row], tuple[str]]:
     return lambda row: (_format_number(row[name], spec),)
 
 
-def _lay_out_safety(setting: str, group: pd.DataFrame) -> list[Table]:
+def _lay_out_safety(case: str, group: pd.DataFrame) -> list[Table]:
     values, shares = (pivot_table("", group, ("quantity",), _format_column(name, spec), over="j")
                       for name, spec in (("value", ".2f"), ("percent", ".1f")))
     rows = []
@@ -253,7 +257,7 @@ def _lay_out_safety(setting: str, group: pd.DataFrame) -> list[Table]:
         rows.append((SAFETY_UNITS[name], *cells))
         if name != "avgSD_cS":
             rows.append(("  % of the original", *percent))
-    return [Table(f"{TITLES[SAFETY_TABLE]}: {setting}", ("mean of", *values.headings[1:]), rows, 1, notes=(
+    return [Table(f"{TITLES[SAFETY_TABLE]}: {case}", ("mean of", *values.headings[1:]), rows, 1, notes=(
         "Without collisions: avgSD_mD is the reduction of the distance, TET and TIT are increases.",
         "avgSD_cS is the speed of the collisions. aveDece is the decrease over all solutions."))]
 
@@ -267,17 +271,17 @@ def _lay_out_collisions(answer: Answer) -> list[Table]:
 def _lay_out_combinations(answer: Answer) -> list[Table]:
     rows: list[tuple[str, ...]] = [(row["setting"], str(row["rank"]), ", ".join(row["characteristics"]), f"{row['percent']:.1f}")
                                    for row in answer.frame.to_dict("records")]
-    return [Table(TITLES["combinations"], ("setting", "rank", "characteristics", "%"), rows, 3,
+    return [Table(TITLES["combinations"], ("case", "rank", "characteristics", "%"), rows, 3,
                   notes=("Percent of the critical solutions with exactly four characteristics changed.",))]
 
 
 def _lay_out_weather(answer: Answer) -> list[Table]:
     tables = []
-    for (setting, other_setting), group in answer.frame.groupby(["setting", "other"], sort=False):
+    for (case, other_case), group in answer.frame.groupby(["setting", "other"], sort=False):
         rows = [(row["characteristic"], *(_format_number(row[name], spec) for name, spec in WEATHER_COLUMNS.items()))
                 for row in group.to_dict("records")]
-        tables.append(Table(f"{TITLES['weather']}: {setting} against {other_setting}",
-                            ("characteristic", str(setting), str(other_setting), "diff.", *(str(setting), str(other_setting)) * 3), rows, 1,
+        tables.append(Table(f"{TITLES['weather']}: {case} against {other_case}",
+                            ("characteristic", str(case), str(other_case), "diff.", *(str(case), str(other_case)) * 3), rows, 1,
                             (("% changed", 3), ("rank", 2), ("mean increase", 2), ("mean decrease", 2)),
                             ("Over the critical solutions; increase and decrease in the characteristic's unit.",)))
     return tables
@@ -324,7 +328,7 @@ def format_p_value(value: float) -> str:
 LAYOUTS: Layouts = {
     "rq1": _lay_out_rq1, "rq2": _lay_out_rq2, "rq1-runs": _lay_out_rq1_runs, "rq2-runs": _lay_out_rq2_runs,
     "rq2-pairs": _lay_out_pairs, "rq2-ranks": _lay_out_ranks, "rq3.1": _lay_out_rq31, "rq3.2": _lay_out_rq32,
-    "rq3.3": layout_by_setting(_lay_out_rq33), SAFETY_TABLE: layout_by_setting(_lay_out_safety), "collisions": _lay_out_collisions,
+    "rq3.3": layout_by_case(_lay_out_rq33), SAFETY_TABLE: layout_by_case(_lay_out_safety), "collisions": _lay_out_collisions,
     "combinations": _lay_out_combinations, "weather": _lay_out_weather}
 PAPER_LAYOUTS: Layouts = {
     **LAYOUTS, "combinations": _lay_out_paper_combinations,

@@ -1,7 +1,10 @@
 """RQ1 and RQ2 over runs: one mean for each run, so that a test's values are independent; Holm's correction for the number of tests.
 
-The paper pools the solutions of all runs and repeats the original's value to the sample's size. Solutions of one run resemble each
-other, and a repeated value is no sample: p-values become too small. Here each run contributes one value.
+The paper pools the solutions of all runs and compares them with a second sample: the original's single value, repeated once for each
+solution. Solutions of one run resemble each other, and a repeated value is no sample: p-values become too small. Here each run
+contributes one value.
+
+In the frames, the column `setting` holds the case's name, and `method` the name of the test.
 """
 
 from __future__ import annotations
@@ -14,8 +17,17 @@ import numpy as np
 import pandas as pd
 import scipy
 
-from safevar_sumo.analysis.research_questions.case import ALGORITHM_TITLES, NSGA2, Case, UnanswerableError, counted_solutions
-from safevar_sumo.analysis.research_questions.comparisons import ALPHA, TwoSampleTest, magnitude_of, rq1, rq1_rows, rq2, rq2_rows
+from safevar_sumo.analysis.research_questions.case import ALGORITHM_TITLES, NSGA2, Case, UnanswerableError, solutions_for_metric
+from safevar_sumo.analysis.research_questions.comparisons import (
+    ALPHA,
+    TwoSampleTest,
+    magnitude_of,
+    require_rq2,
+    rq1,
+    rq1_rows,
+    rq2,
+    rq2_rows,
+)
 from safevar_sumo.analysis.research_questions.indicators import titles_of
 from safevar_sumo.metrics import MetricFacts
 from safevar_sumo.records import FloatArray
@@ -24,16 +36,16 @@ RQ1_COLUMNS = ["setting", "algorithm", "metric", "p_value", "p_holm", "effect_si
 RQ2_COLUMNS = ["setting", "baseline", "metric", "p_value", "p_holm", "effect_size", "magnitude", "n1", "n2", "method"]
 EXACT_SIGNED_TEST = "Wilcoxon signed-rank, two-sided, exact"
 ASYMPTOTIC_SIGNED_TEST = "Wilcoxon signed-rank, two-sided, normal approximation with correction for continuity"
-EXACT_RUNS = 50
-"""Without ties, the signed-rank test is exact for up to this many runs."""
+MAX_EXACT_RUNS = 50
+"""Without ties and differences of zero, the signed-rank test is exact for up to this many runs."""
 
 
 def rq1_runs(case: Case) -> pd.DataFrame:
     """Every algorithm's run means against the original's value, metric by metric: Wilcoxon's signed-rank test.
 
-    Columns: `RQ1_COLUMNS`. `effect_size` is the share of runs whose mean is greater than the original's value, plus half the share of
-    equal ones (A12 against one value), oriented so that smaller values mean more unsafe runs. `mean` is the mean of the run means.
-    `p_holm` is `p_value` corrected by Holm's method for all tests of RQ1 and RQ2 of this setting. Undefined values are None.
+    Columns: `RQ1_COLUMNS`. `effect_size` is the share of runs whose mean is safer than the original's value, plus half the share of equal
+    ones (A12 against one value): below 0.5 the runs are less safe. `mean` is the mean of the run means. `p_holm` is `p_value` corrected by
+    Holm's method for all tests of RQ1 and RQ2 of this case. Undefined values are None.
 
     Raises
     ------
@@ -51,12 +63,11 @@ def rq2_runs(case: Case) -> pd.DataFrame:
     Raises
     ------
     UnanswerableError
-        If the solutions belong to no run, or NSGA-II or every other algorithm is missing.
+        If the solutions belong to no run, NSGA-II is missing, or there is no other algorithm.
     """
     frame = _corrected_frames(case)[1]
-    if frame is None:
-        rq2(case)  # raises with the reason
-        raise UnanswerableError(case.name, "has no runs to compare", "results of nsga2 and another algorithm")
+    require_rq2(case)
+    assert frame is not None
     return frame
 
 
@@ -77,26 +88,30 @@ def signed_rank_test(sample: FloatArray, value: float) -> TwoSampleTest:
     """
     if not sample.size or np.isnan(value):
         return TwoSampleTest(None, None, None, len(sample), 0, None)
-    difference = sample - value
-    sizes = np.abs(difference[difference != 0])
-    effect = float(np.mean(difference > 0) + np.mean(difference == 0) / 2)
-    if not sizes.size:
+    differences = sample - value
+    absolute_differences = np.abs(differences[differences != 0])
+    effect = float(np.mean(differences > 0) + np.mean(differences == 0) / 2)
+    if not absolute_differences.size:
         return TwoSampleTest(1.0, effect, magnitude_of(effect), len(sample), 1, EXACT_SIGNED_TEST)
-    is_exact = np.unique(sizes).size == len(sample) <= EXACT_RUNS
-    test = scipy.stats.wilcoxon(difference, alternative="two-sided", correction=not is_exact, method="exact" if is_exact else "approx")
+    has_ties_or_zeros = np.unique(absolute_differences).size < len(sample)
+    is_exact = not has_ties_or_zeros and len(sample) <= MAX_EXACT_RUNS
+    test = scipy.stats.wilcoxon(differences, alternative="two-sided", correction=not is_exact, method="exact" if is_exact else "approx")
     method = EXACT_SIGNED_TEST if is_exact else ASYMPTOTIC_SIGNED_TEST
     return TwoSampleTest(float(test.pvalue), effect, magnitude_of(effect), len(sample), 1, method)
 
 
 def fewest_runs(question: str) -> int:
-    """Smallest number of runs with which a test of this question can be significant before any correction."""
+    """Smallest number of runs with which a test of this question can be significant before any correction.
+
+    The smallest two-sided p-value of n runs is 2 / 2^n by the signed-rank test of RQ1, and 2 / C(2n, n) by the U test of RQ2.
+    """
     return next(n for n in range(1, 100) if 2 / (2**n if question == "RQ1" else math.comb(2 * n, n)) < ALPHA)
 
 
-def difference_line(case: Case) -> str:
+def pooling_effect_line(case: Case) -> str:
     """One line: the tests that are significant (p < ALPHA) only for the paper's pooled solutions, or only over runs.
 
-    Example: "... RQ2 SafeFuzzer TET loses its star (p 3.8e-4 to 0.059, 0.23 after Holm)".
+    Example: "... RQ2 SafeFuzzer TET is no longer significant (p 3.8e-4 pooled, 0.059 over runs, 0.23 after Holm)."
 
     Raises
     ------
@@ -114,21 +129,23 @@ def difference_line(case: Case) -> str:
             if pooled_p is None or runs_p is None or (pooled_p < ALPHA) == (runs_p < ALPHA):
                 continue
             name = ALGORITHM_TITLES.get(pooled_row[group_column], pooled_row[group_column])
-            verb = "loses" if pooled_p < ALPHA else "gains"
-            changes.append(f"{question} {name} {titles[pooled_row['metric']]} {verb} its star (p {_rounded(pooled_p)} to "
-                           f"{_rounded(runs_row['p_value'])}, {_rounded(runs_p)} after Holm)")
-    return (f"One value for each run and Holm's correction for {test_count} tests, instead of the paper's pooled solutions: "
+            verb = "is no longer" if pooled_p < ALPHA else "becomes"
+            changes.append(f"{question} {name} {titles[pooled_row['metric']]} {verb} significant (p {_rounded(pooled_p)} pooled, "
+                           f"{_rounded(runs_row['p_value'])} over runs, {_rounded(runs_p)} after Holm)")
+    return (f"With one value for each run and Holm's correction for {test_count} tests, instead of the paper's pooled solutions, "
             f"{'; '.join(changes) or 'the same tests are significant'}.")
 
 
 def summary_lines(case: Case) -> list[str]:
-    """Lines on RQ1 and RQ2 for the end of a study: effect sizes over runs, significant ones with an asterisk, and `difference_line`.
+    """Lines on RQ1 and RQ2 for the end of a study: effect sizes over runs, significant ones with an asterisk, and `pooling_effect_line`.
 
     A line says so if there are too few runs for a significant difference.
     """
     titles = titles_of(case.scoring.metrics)
     lines, any_testable = [], False
-    for question, frame_of, group_column, meaning in SUMMARY_QUESTIONS:
+    questions = (("RQ1", rq1_runs, "algorithm", ("runs",), "A12 below 0.5: the runs are more unsafe than the original vehicle"),
+                 ("RQ2", rq2_runs, "baseline", ("n1", "n2"), "A12 above 0.5: NSGA-II is better"))
+    for question, frame_of, group_column, count_columns, meaning in questions:
         try:
             frame = frame_of(case)
         except UnanswerableError as error:
@@ -139,18 +156,14 @@ def summary_lines(case: Case) -> list[str]:
             rows = group.to_dict("records")
             defined_rows = [row for row in rows if row["effect_size"] is not None]
             untestable = [titles[row["metric"]] for row in defined_rows
-                          if min(row.get(size, np.inf) for size in ("runs", "n1", "n2")) < fewest_runs(question)]
+                          if min(row[column] for column in count_columns) < fewest_runs(question)]
             any_testable = any_testable or len(untestable) < len(defined_rows)
             subject = "" if len(untestable) == len(defined_rows) else f"{', '.join(untestable)}: "
             note = f"; {subject}too few runs for a test ({fewest_runs(question)} are needed)" if untestable else ""
             effects = ", ".join(f"{titles[row['metric']]} " + ("-" if row["effect_size"] is None or row["p_holm"] is None else
                                 f"{row['effect_size']:.2f}{'*' if row['p_holm'] < ALPHA else ''}") for row in rows)
             lines.append(f"  {ALGORITHM_TITLES.get(str(name), name)}: {effects}{note}")
-    return [*lines, difference_line(case)] if any_testable else lines
-
-
-SUMMARY_QUESTIONS = (("RQ1", rq1_runs, "algorithm", "A12 below 0.5: the runs are more unsafe than the original vehicle"),
-                     ("RQ2", rq2_runs, "baseline", "A12 above 0.5: NSGA-II is better"))
+    return [*lines, pooling_effect_line(case)] if any_testable else lines
 
 
 def _rounded(value: float) -> str:
@@ -183,7 +196,7 @@ def run_means(case: Case, algorithm: str, metric: MetricFacts) -> FloatArray:
 
 def run_mean_series(case: Case, algorithm: str, metric: MetricFacts) -> pd.Series[float]:
     """The means of `run_means`, indexed by the run's number."""
-    run_numbers, solutions = case.runs_of(algorithm), counted_solutions(case.solutions_of(algorithm), metric)
+    run_numbers, solutions = case.runs_of(algorithm), solutions_for_metric(case.solutions_of(algorithm), metric)
     runs, column = solutions["run"].to_numpy(), solutions[metric.name].to_numpy(dtype=float)
     defined = ~np.isnan(column)
     samples = {run: column[defined & (runs == run)] for run in run_numbers}

@@ -24,13 +24,15 @@ from safevar_sumo.vehicles import Characteristic
 from safevar_sumo.workers.evaluation import Pool
 
 SCAN_VALUES, RATED_SCAN_VALUES = 201, 33
-"""Number of values over the domain, besides the original value; fewer in a rated study, where each value takes a whole matrix."""
+"""Number of values over the domain, besides the original value; fewer in a rated study, where each value takes a whole test matrix."""
 PARTS_PER_ROUND, ROUNDS, RATED_ROUNDS = 8, 4, 1
 """Number of parts into which a round divides each interval with a change of state; number of rounds, and of rounds in a rated study."""
-WHOLE_POINT_LOSS, POINT_ROUNDING = 1 - 1e-6, 1e-9
-"""A loss of rating points above the first number counts as a whole point; a loss up to the second number is a rounding error."""
+WHOLE_POINT_LOSS = 1 - 1e-6
+"""A loss of more rating points than this counts as a whole point."""
+POINT_ROUNDING = 1e-9
+"""A loss of at most so many rating points is a rounding error."""
 SAFE_STATE, UNSAFE_STATE, NOT_SIMULATED_STATE, INFEASIBLE_STATE = range(4)
-"""States of a value."""
+"""States of a characteristic's value."""
 Interval = tuple[float, float]
 
 
@@ -119,8 +121,8 @@ def _interval_of(section: pd.DataFrame) -> Interval:
 def scan(evaluator: Evaluator, columns: Sequence[int], unsafe: Unsafe) -> list[OneAtATimeScan]:
     """Scan the domains of some characteristics, one at a time."""
     scanned = [evaluator.characteristics.members[column] for column in columns]
-    number, rounds = (RATED_SCAN_VALUES, RATED_ROUNDS) if is_rated(evaluator.study) else (SCAN_VALUES, ROUNDS)
-    values = [np.union1d(np.linspace(characteristic.lower, characteristic.upper, number), characteristic.original)
+    value_count, rounds = (RATED_SCAN_VALUES, RATED_ROUNDS) if is_rated(evaluator.study) else (SCAN_VALUES, ROUNDS)
+    values = [np.union1d(np.linspace(characteristic.lower, characteristic.upper, value_count), characteristic.original)
               for characteristic in scanned]
     profiles = _evaluate_profiles(evaluator, columns, values, unsafe)
     for _ in range(rounds):
@@ -135,7 +137,7 @@ def scan(evaluator: Evaluator, columns: Sequence[int], unsafe: Unsafe) -> list[O
 
 
 def _values_between_states(profile: pd.DataFrame) -> FloatArray:
-    """New values between each two neighbouring values of different states."""
+    """New values between neighbouring values of different states."""
     values, states = profile["value"].to_numpy(), _states(profile)
     rows = np.flatnonzero(states[1:] != states[:-1])
     inner = values[rows][:, np.newaxis] + np.diff(values)[rows][:, np.newaxis] * np.arange(1, PARTS_PER_ROUND) / PARTS_PER_ROUND
@@ -228,7 +230,7 @@ def find_tolerances(study: Study, options: ToleranceOptions, *, pool: Pool | Non
         unsafe = evaluator.choose_criterion(options.unsafe, original)
         scans = scan(evaluator, columns, unsafe)
         pairs = scan_pairs(evaluator, columns, unsafe) if options.pairs else None
-        needs_box = not unsafe.of(original)[0] and not is_rated(study)  # a box of a rated study would take thousands of whole matrices
+        needs_box = not unsafe.of(original)[0] and not is_rated(study)  # a box of a rated study would take thousands of whole test matrices
         box = (find_safe_box(evaluator, columns, unsafe, _unsafe_settings(evaluator, scans, pairs or [])) if needs_box
                else no_safe_box(evaluator, columns))
     return Tolerance(study=study, unsafe=unsafe, original=original, alone=scans, pairs=pairs, joint=box)

@@ -72,22 +72,22 @@ class Pair:
 def scan_pairs(evaluator: Evaluator, columns: Sequence[int], unsafe: Unsafe) -> list[Pair]:
     """The plane of every pair of characteristics, with the plane's unsafe setting nearest to the original."""
     characteristics, original = evaluator.characteristics.members, evaluator.characteristics.original
-    chosen = list(combinations(columns, 2))
+    column_pairs = list(combinations(columns, 2))
     axes = {column: np.linspace(characteristics[column].lower, characteristics[column].upper, GRID_VALUES) for column in columns}
-    settings = np.tile(original, (len(chosen), GRID_VALUES, GRID_VALUES, 1))
-    for grid, (first, second) in zip(settings, chosen, strict=True):
+    settings = np.tile(original, (len(column_pairs), GRID_VALUES, GRID_VALUES, 1))
+    for grid, (first, second) in zip(settings, column_pairs, strict=True):
         grid[:, :, first], grid[:, :, second] = axes[first][:, np.newaxis], axes[second]
     evaluations = evaluator.evaluate(settings.reshape(-1, len(original)), "two characteristics at a time")
-    shape = (len(chosen), GRID_VALUES, GRID_VALUES)
+    shape = (len(column_pairs), GRID_VALUES, GRID_VALUES)
     degrees, valid, infeasible = (values.reshape(shape) for values in (evaluations.f_safe, evaluations.valid, evaluations.infeasible))
     is_unsafe = unsafe.of(evaluations).reshape(shape)
-    nearest = _find_nearest_unsafe(evaluator, chosen, is_unsafe, unsafe)
+    nearest = _find_nearest_unsafe(evaluator, column_pairs, is_unsafe, unsafe)
     return [Pair(characteristics=(characteristics[first], characteristics[second]), values=np.stack([axes[first], axes[second]]),
                  safety_degree=degrees[plane], unsafe=is_unsafe[plane], valid=valid[plane], infeasible=infeasible[plane],
-                 nearest=nearest.get(plane)) for plane, (first, second) in enumerate(chosen)]
+                 nearest=nearest.get(plane)) for plane, (first, second) in enumerate(column_pairs)]
 
 
-def _find_nearest_unsafe(evaluator: Evaluator, chosen: Sequence[tuple[int, int]], is_unsafe: BoolArray,
+def _find_nearest_unsafe(evaluator: Evaluator, column_pairs: Sequence[tuple[int, int]], is_unsafe: BoolArray,
                          unsafe: Unsafe) -> dict[int, tuple[float, float]]:
     """The unsafe setting nearest to the original in every plane with unsafe settings; distances are in widths of the domains.
 
@@ -95,10 +95,10 @@ def _find_nearest_unsafe(evaluator: Evaluator, chosen: Sequence[tuple[int, int]]
     the nearest unsafe setting so far; each round divides the `MAX_SQUARES` nearest squares of each plane.
     """
     characteristics = evaluator.characteristics
-    columns = np.array(chosen, dtype=int).reshape(-1, 2)
+    columns = np.array(column_pairs, dtype=int).reshape(-1, 2)
     original, width = characteristics.original[columns], (characteristics.upper - characteristics.lower)[columns]
     lower, size = characteristics.lower[columns], width / (GRID_VALUES - 1)
-    best_distance, best_values = np.full(len(chosen), np.inf), np.zeros((len(chosen), 2))
+    best_distance, best_values = np.full(len(column_pairs), np.inf), np.zeros((len(column_pairs), 2))
 
     def improve(plane: npt.NDArray[np.intp], values: FloatArray) -> None:
         distances = np.sqrt(np.sum(((values - original[plane]) / width[plane]) ** 2, axis=1))
@@ -114,10 +114,11 @@ def _find_nearest_unsafe(evaluator: Evaluator, chosen: Sequence[tuple[int, int]]
     for _ in range(ROUNDS):
         offset = corner - original[square_planes]
         gap = np.maximum(np.maximum(offset, -offset - size[square_planes]), 0.0)
-        bound = np.sqrt(np.sum((gap / width[square_planes]) ** 2, axis=1))
-        rows = np.flatnonzero(bound < best_distance[square_planes])
+        least_distances = np.sqrt(np.sum((gap / width[square_planes]) ** 2, axis=1))
+        rows = np.flatnonzero(least_distances < best_distance[square_planes])
         groups = [rows[square_planes[rows] == k] for k in np.unique(square_planes[rows])]
-        squares = np.array([row for group in groups for row in group[np.argsort(bound[group], kind="stable")[:MAX_SQUARES]]], dtype=np.intp)
+        nearest = [group[np.argsort(least_distances[group], kind="stable")[:MAX_SQUARES]] for group in groups]
+        squares = np.array([row for group in nearest for row in group], dtype=np.intp)
         if not len(squares):
             break
         square_planes, corner, size = square_planes[squares], corner[squares], size / PARTS_PER_SIDE
@@ -138,9 +139,9 @@ def _with_unsafe_corner(grids: BoolArray) -> BoolArray:
 
 
 MAX_UNSAFE_SHARE = 0.003
-"""Share of a box that may be unsafe, with 95 % confidence, if every sampled setting is safe."""
-FIRST_SEARCH, SECOND_SEARCH = 256, 1024
-"""Number of Sobol points, and number of corners, in the first search of a box; the same in the second, after a first that finds nothing."""
+"""Upper bound of a box's unsafe share, with 95 % confidence, if every sampled setting is safe."""
+FIRST_SEARCH_POINTS, SECOND_SEARCH_POINTS = 256, 1024
+"""Number of Sobol points, and of corners, in the first search of a box, and in a second search if the first finds nothing unsafe."""
 MAX_LINES = 16
 """Maximum number of unsafe settings, the nearest first, from which the search goes back towards the original."""
 STEP_BACK = 0.999
@@ -150,7 +151,7 @@ MIN_FACTOR = 1e-6
 
 
 class SafeBox(NamedTuple):
-    """A box around the original, `factor` times the domain; no setting of a random sample in it is unsafe.
+    """A box around the original, `factor` times as wide as the domain; no setting of a random sample in it is unsafe.
 
     With `confidence`, at most `unsafe_at_most` of all settings in the box are unsafe or cannot be simulated: `failed` of the `samples`
     settings could not be simulated, and count as unsafe in that bound. `attempts` boxes were tested. Only `characteristics` vary; the
@@ -203,22 +204,24 @@ def find_safe_box(evaluator: Evaluator, columns: Sequence[int], unsafe: Unsafe, 
     for search in range(10**6):
         if factor < MIN_FACTOR:
             break
-        for number in (FIRST_SEARCH, SECOND_SEARCH):
-            sobol = sobol_points(number, len(columns), evaluator.study.search.seed + search)
+        for point_count in (FIRST_SEARCH_POINTS, SECOND_SEARCH_POINTS):
+            sobol = sobol_points(point_count, len(columns), evaluator.study.search.seed + search)
             points = np.concatenate([sobol, np.round(sobol)])  # and corners
             unsafe_found, _ = _unsafe_in_box(evaluator, factor, _settings_in_box(evaluator, columns, factor, points), unsafe)
             if len(unsafe_found):
                 break
         else:
             attempt += 1
-            error = (1 - CONFIDENCE) / 2**attempt
-            samples = math.ceil(math.log(error) / math.log1p(-MAX_UNSAFE_SHARE))
+            error_probability = (1 - CONFIDENCE) / 2**attempt
+            samples = math.ceil(math.log(error_probability) / math.log1p(-MAX_UNSAFE_SHARE))
             settings = _random_settings(evaluator, columns, factor, samples, np.random.default_rng((evaluator.study.search.seed, attempt)))
             samples = len(settings)
             unsafe_found, failed = _unsafe_in_box(evaluator, factor, settings, unsafe)
             if not len(unsafe_found):
-                share = float(scipy.stats.beta.ppf(1 - error, failed + 1, samples - failed)) if failed < samples else 1.0
-                return SafeBox(factor, CONFIDENCE, samples, failed, attempt, share,
+                unsafe_at_most = 1.0
+                if failed < samples:
+                    unsafe_at_most = float(scipy.stats.beta.ppf(1 - error_probability, failed + 1, samples - failed))
+                return SafeBox(factor, CONFIDENCE, samples, failed, attempt, unsafe_at_most,
                                tuple(evaluator.characteristics.names[column] for column in columns))
         nearest = unsafe_found[np.argsort(_box_factors(evaluator, unsafe_found), kind="stable")[:MAX_LINES]]
         lines = [Line(evaluator.characteristics.original, end, 0.0) for end in nearest]
