@@ -98,11 +98,12 @@ def _draw_line(axis: Axes, comparison: Comparison, row: int, values: FloatArray)
     axis.plot(time, values[:end], color=COLOURS[row], linestyle=DASHES[row], linewidth=1.6, zorder=3 + row)
 
 
-def _draw_mark(axis: Axes, row: int, point: tuple[float, float], mark: str, text: str = "", *, is_speed: bool = False) -> None:
-    """Draw a mark on a line. The original's mark is larger, to show behind the changed vehicle's mark; its text is above it."""
+def _draw_mark(axis: Axes, row: int, point: tuple[float, float], mark: str, text: str = "", *, is_speed: bool = False,
+               is_above: bool = False) -> None:
+    """Draw a mark on a line. The original's mark is larger, to show behind the changed vehicle's mark."""
     axis.plot(*point, marker=mark, color=COLOURS[row], markersize=12 - 4 * row + 2 * (mark == IMPACT_MARK), linestyle="", zorder=6 + row,
               markeredgecolor="white")
-    offset, alignment = ((3, 7), "left") if is_speed else ((0, 9 if row == ORIGINAL else -17), "center")
+    offset, alignment = ((3, 7), "left") if is_speed else ((0, 9 if is_above else -17), "center")
     axis.annotate(text, point, xytext=offset, textcoords="offset points", color=COLOURS[row], fontweight="bold", ha=alignment)
 
 
@@ -123,7 +124,9 @@ def _draw_gap(axis: Axes, comparison: Comparison, row: int) -> None:
     if key_moments.nearest is not None and not np.isnan(gap[key_moments.nearest]):
         gap_text = f"{gap[key_moments.nearest]:.2f} m"
         mark, text = (NEAREST_MARK, gap_text) if np.isnan(runs.collision_speed[row]) else (IMPACT_MARK, "impact")
-        _draw_mark(axis, row, (runs.trace.time[key_moments.nearest], gap[key_moments.nearest]), mark, text)
+        nearest_gaps = np.where(runs.trace.active, runs.trace.gap, np.inf).min(axis=0)
+        is_above = bool(np.argmax(nearest_gaps) == row)  # of the two texts, that of the larger gap
+        _draw_mark(axis, row, (runs.trace.time[key_moments.nearest], gap[key_moments.nearest]), mark, text, is_above=is_above)
 
 
 def _draw_pedals(axis: Axes, comparison: Comparison, row: int) -> None:

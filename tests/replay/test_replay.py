@@ -159,6 +159,19 @@ def test_the_words_of_the_figure_lie_within_their_axes_and_overlap_nothing(compa
     assert impact.y1 < figure.axes[1].transData.transform((0, 0))[1], "below the ground, where no line is"
 
 
+@pytest.mark.parametrize("friction", [1.1, 1.9])
+def test_the_larger_gap_has_its_number_above(friction: float) -> None:
+    study = load_study("smoke")
+    system = assemble(study)
+    setting = system.characteristics.original.copy()
+    setting[system.characteristics.names.index("tireFric")] = friction
+    shown = compare_setting(study, system, setting)
+    degrees = shown.evaluations.metrics["safety_degree"]
+    assert (degrees[1] > degrees[0]) == (friction == 1.9), "of the two one is safer than the original, or the test tells nothing"
+    heights = {text.get_text(): text.xyann[1] for text in draw_comparison(shown).axes[1].texts}
+    assert heights[f"{degrees.max():.2f} m"] > 0 > heights[f"{degrees.min():.2f} m"]
+
+
 def test_at_an_impact_the_pedals_are_those_that_were_in_force() -> None:
     """AEB releases the brake once there is no gap, which is after the collision."""
     study = study_at(load_study("euro_ncap_pedestrian"), "CPLA, speed 60, clear", "point")

@@ -84,6 +84,20 @@ def test_attainment_is_what_so_many_runs_reach() -> None:
     assert surface[100.0].tolist() == [[2.0, 0.4]]
 
 
+def test_attainment_panels_have_the_same_axes() -> None:
+    axes = [axis for axis in draw_attainment_surfaces(three_algorithms()).axes if axis.axison]
+    assert len(axes) == 3
+    assert len({(axis.get_xlim(), axis.get_ylim()) for axis in axes}) == 1
+
+
+def test_two_runs_have_no_figure_of_critical_differences() -> None:
+    """The largest difference of three mean ranks is 2; with two runs the critical difference is 2.9."""
+    degrees = {"nsga2": 1.0, "rs": 1.5, "mocell": 2.0}
+    case = made_up(*(row(name, run, (900.0, 2.0, 0.1), sd=sd) for name, sd in degrees.items() for run in (0, 1)))
+    with pytest.raises(UnanswerableError, match="2 runs are too few for a figure of critical differences"):
+        draw_critical_differences(case)
+
+
 def test_what_cannot_be_asked_says_why() -> None:
     two = made_up(row("nsga2"), row("rs"))
     for question in (rank_algorithms, draw_critical_differences):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import re
 from typing import Any
 
 import msgspec
@@ -210,6 +211,12 @@ def test_the_brief_lines_say_what_the_data_allows() -> None:
     assert any("NSGA-II: SD 0.00, " in line and line.endswith("too few runs for a test (8 are needed)") for line in lines)
     assert any("RS: IGD " in line and "too few" not in line for line in lines), "five runs against five can differ significantly"
     assert any("RQ2 over runs: only nsga2 has finished runs" in line for line in summary_lines(made_up(row())))
+    (rq1_answer,), (rq2_answer,) = (answer_questions([five], name) for name in ("rq1-runs", "rq2-runs"))
+    assert any("too few runs for all 8 tests of RQ1 (8 are needed)" in note for note in rq1_answer.notes)
+    assert not any("too few runs" in note for note in rq2_answer.notes)
+    two = answer_questions([made_up(*(row(name, run=run) for name in ("nsga2", "rs") for run in range(2)))], "rq2-runs")[0].notes
+    assert any("too few runs for all 7 tests of RQ2 (5 are needed)" in note for note in two)
+    assert not any("pooled" in note for note in two), "no test can be significant"
 
 
 def test_holms_correction_of_a_worked_example() -> None:
@@ -228,7 +235,12 @@ def test_solutions_of_one_run_are_not_taken_for_independent() -> None:
     assert (runs["n1"], runs["n2"]) == (8, 8)
     assert runs["effect_size"] == 1 - (0 + 0 + 0 + 0 + 0 + 1 + 1 + 3) / 64
     assert runs["p_value"] == scipy.stats.mannwhitneyu(ours, theirs, method="exact").pvalue > ALPHA / 10
-    assert "RQ2 RS SD is no longer significant" in pooling_effect_line(case)
+    line = pooling_effect_line(case)
+    assert re.search(r"\d+ of \d+ tests are no longer significant: .*; RQ2 RS .*SD", line)
+    assert line.count("significant") == 1
+    notes = {answer.name: "".join(answer.notes) for answer in answer_questions([case]) if answer.name.endswith("-runs")}
+    assert (line in notes["rq1-runs"], line in notes["rq2-runs"]) == (True, False), "once, not below both tables"
+    assert line in "".join(answer_questions([case], "rq2-runs")[0].notes)
     (original,) = (one for one in rq1_runs(case).to_dict("records") if (one["algorithm"], one["metric"]) == ("nsga2", "safety_degree"))
     assert original["p_value"] == 2 * 2 / 2**8, "signed ranks of which all but the smallest are negative: the second of 2^8 orders"
     assert original["effect_size"] == 1 / 8

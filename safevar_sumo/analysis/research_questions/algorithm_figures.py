@@ -12,6 +12,7 @@ from safevar_sumo.analysis.research_questions.case import ALGORITHM_TITLES, Case
 from safevar_sumo.analysis.research_questions.comparisons import ALPHA
 from safevar_sumo.analysis.research_questions.figures import COLOURS, add_legend_below, objective_title
 from safevar_sumo.analysis.research_questions.indicators import INDICATOR_TITLES
+from safevar_sumo.analysis.words import number_of
 from safevar_sumo.records import FloatArray
 
 if TYPE_CHECKING:
@@ -28,7 +29,7 @@ def draw_critical_differences(case: Case) -> Figure:
     Raises
     ------
     UnanswerableError
-        If there are fewer than three algorithms, or no run in which all of them have solutions.
+        If there are fewer than three algorithms, or too few runs in which all of them have solutions.
     """
     frame = rank_algorithms(case)
     frame = frame[frame["metric"].isin(list(INDICATOR_TITLES)) & frame["mean_rank"].notna()]
@@ -36,6 +37,9 @@ def draw_critical_differences(case: Case) -> Figure:
         raise UnanswerableError(case.name, "has no run in which every algorithm has solutions", "results of three algorithms or more")
     metrics, algorithm_count = list(dict.fromkeys(frame["metric"])), frame["algorithm"].nunique()
     run_count, critical_difference = int(frame["runs"].iloc[0]), float(frame["critical_difference"].iloc[0])
+    if critical_difference >= algorithm_count - 1:
+        raise UnanswerableError(case.name, f"{number_of(run_count, 'run')} are too few for a figure of critical differences: its bar would "
+                                "join all algorithms, whatever their ranks", "results of more runs")
     title = f"{case.name}: mean ranks over {run_count} runs, critical difference {critical_difference:.2f}"
     figure, axes = new_figure(title, len(metrics), 1, (6.8, 0.9 + len(metrics) * (0.75 + ALGORITHM_HEIGHT * algorithm_count)))
     for axis, metric in zip(axes.flat, metrics, strict=True):
@@ -89,7 +93,8 @@ def draw_attainment_surfaces(case: Case) -> Figure:
     surfaces, objectives = compute_attainment(case), case.scoring.objectives[:2]
     columns = min(len(surfaces), 3)
     rows = -(-len(surfaces) // columns)
-    figure, axes = new_figure(f"{case.name}: empirical attainment", rows, columns, (max(3.0 * columns, 5.2), 0.8 + 3.1 * rows))
+    figure, axes = new_figure(f"{case.name}: empirical attainment", rows, columns, (max(3.0 * columns, 5.2), 0.8 + 3.1 * rows),
+                              sharex=True, sharey=True)
     all_points = np.concatenate([points for surfaces_by_percentage in surfaces.values() for points in surfaces_by_percentage.values()])
     for axis, (algorithm, surfaces_by_percentage) in zip(axes.flat, surfaces.items(), strict=False):
         worst_values = np.array([np.min(all_points[:, i]) if objective.maximised else np.max(all_points[:, i])
@@ -101,6 +106,7 @@ def draw_attainment_surfaces(case: Case) -> Figure:
         axis.set_title(escape_dollars(ALGORITHM_TITLES.get(algorithm, algorithm)), fontsize=FONT)
         axis.set_xlabel(objective_title(objectives[0]))
         axis.set_ylabel(objective_title(objectives[1]))
+        axis.tick_params(labelbottom=True, labelleft=True)
     for axis in list(axes.flat)[len(surfaces):]:
         axis.set_axis_off()
     add_legend_below(figure, axes.flat[0])

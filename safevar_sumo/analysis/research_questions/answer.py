@@ -24,7 +24,7 @@ from safevar_sumo.analysis.research_questions.changes import (
     rq33_safety,
 )
 from safevar_sumo.analysis.research_questions.comparisons import rq1, rq2
-from safevar_sumo.analysis.research_questions.over_runs import pooling_effect_line, rq1_runs, rq2_runs
+from safevar_sumo.analysis.research_questions.over_runs import notes_over_runs, rq1_runs, rq2_runs
 from safevar_sumo.errors import unknown_name
 from safevar_sumo.metrics import PUBLISHED_SCORING, MetricFacts
 
@@ -80,7 +80,8 @@ def answer_questions(cases: Sequence[Case], question: str | None = None) -> list
         for table, frames in tables.items():
             frame = pd.concat(frames, ignore_index=True)
             answered_names = {*frame["setting"], *frame["other"]} if name == WEATHER else case_names - {error.source for error in errors}
-            case_notes = [note for case in cases if case.name in answered_names for note in _notes(name, case)]
+            case_notes = [note for case in cases if case.name in answered_names
+                          for note in _notes(name, case, alone=question is not None)]
             answers.append(Answer(table, frame, tuple(dict.fromkeys([*notes, *case_notes])), metrics))
     if all_errors and all(answer.frame.empty for answer in answers):
         raise all_errors[0]
@@ -105,8 +106,8 @@ def _collect_frames(name: str, cases: Sequence[Case]) -> tuple[dict[str, list[pd
     return tables, errors
 
 
-def _notes(question: str, case: Case) -> list[str]:
-    """Notes on a case for the readers of a table."""
+def _notes(question: str, case: Case, *, alone: bool) -> list[str]:
+    """Notes on a case for the readers of a table; `alone` if it is the only question asked."""
     notes = list(case.remarks)
     if question in ("rq1", "rq2"):
         for metric in case.scoring.metrics:
@@ -120,7 +121,8 @@ def _notes(question: str, case: Case) -> list[str]:
         if undefined_metrics:
             notes.append(f"{case.name}: the original vehicle's {', '.join(undefined_metrics)} is undefined, so that no test uses it.")
     if question in ("rq1-runs", "rq2-runs"):
-        notes.append(f"{case.name}: {pooling_effect_line(case)}")
+        over_runs = notes_over_runs(case, question[:3].upper(), pooling=alone or question == "rq1-runs")
+        notes += [f"{case.name}: {note}" for note in over_runs]
     if question == "rq2" and not case.has_runs:
         notes.append(f"{case.name}: igd, igd_plus and hypervolume need runs, which imported solutions do not have.")
     if question == "rq2" and case.has_runs:

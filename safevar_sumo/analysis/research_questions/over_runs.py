@@ -34,6 +34,8 @@ from safevar_sumo.records import FloatArray
 
 RQ1_COLUMNS = ["setting", "algorithm", "metric", "p_value", "p_holm", "effect_size", "magnitude", "runs", "method", "mean", "original"]
 RQ2_COLUMNS = ["setting", "baseline", "metric", "p_value", "p_holm", "effect_size", "magnitude", "n1", "n2", "method"]
+COUNT_COLUMNS = {"RQ1": ["runs"], "RQ2": ["n1", "n2"]}
+"""Columns of the numbers of runs that a test of each question compares."""
 EXACT_SIGNED_TEST = "Wilcoxon signed-rank, two-sided, exact"
 ASYMPTOTIC_SIGNED_TEST = "Wilcoxon signed-rank, two-sided, normal approximation with correction for continuity"
 MAX_EXACT_RUNS = 50
@@ -111,7 +113,7 @@ def fewest_runs(question: str) -> int:
 def pooling_effect_line(case: Case) -> str:
     """One line: the tests that are significant (p < ALPHA) only for the paper's pooled solutions, or only over runs.
 
-    Example: "... RQ2 SafeFuzzer TET is no longer significant (p 3.8e-4 pooled, 0.059 over runs, 0.23 after Holm)."
+    Example: "..., 3 of 28 tests are no longer significant: RQ1 NSGA-II SD, TET; RQ2 SafeFuzzer TET."
 
     Raises
     ------
@@ -121,7 +123,7 @@ def pooling_effect_line(case: Case) -> str:
     titles = titles_of(case.scoring.metrics)
     rq1_frame, rq2_frame = _corrected_frames(case)
     comparisons = [("RQ1", "algorithm", rq1(case), rq1_frame), *([] if rq2_frame is None else [("RQ2", "baseline", rq2(case), rq2_frame)])]
-    changes, test_count = [], 0
+    changes, test_count = {"no longer": dict[str, list[str]](), "now": dict[str, list[str]]()}, 0
     for question, group_column, pooled_frame, runs_frame in comparisons:
         for pooled_row, runs_row in zip(pooled_frame.to_dict("records"), runs_frame.to_dict("records"), strict=True):
             pooled_p, runs_p = pooled_row["p_value"], runs_row["p_holm"]
@@ -129,11 +131,31 @@ def pooling_effect_line(case: Case) -> str:
             if pooled_p is None or runs_p is None or (pooled_p < ALPHA) == (runs_p < ALPHA):
                 continue
             name = ALGORITHM_TITLES.get(pooled_row[group_column], pooled_row[group_column])
-            verb = "is no longer" if pooled_p < ALPHA else "becomes"
-            changes.append(f"{question} {name} {titles[pooled_row['metric']]} {verb} significant (p {_rounded(pooled_p)} pooled, "
-                           f"{_rounded(runs_row['p_value'])} over runs, {_rounded(runs_p)} after Holm)")
-    return (f"With one value for each run and Holm's correction for {test_count} tests, instead of the paper's pooled solutions, "
-            f"{'; '.join(changes) or 'the same tests are significant'}.")
+            group = changes["no longer" if pooled_p < ALPHA else "now"].setdefault(f"{question} {name}", [])
+            group.append(titles[pooled_row["metric"]])
+    texts = []
+    for word, groups in changes.items():
+        count = sum(map(len, groups.values()))
+        named = "; ".join(f"{name} {', '.join(metrics)}" for name, metrics in groups.items())
+        texts += [f"{count} of {test_count} tests {'is' if count == 1 else 'are'} {word} significant: {named}"] if count else []
+    return ("With one value for each run and Holm's correction for the number of tests, instead of the paper's pooled solutions, "
+            f"{'. '.join(texts) or 'the same tests are significant'}.")
+
+
+def notes_over_runs(case: Case, question: str, *, pooling: bool) -> list[str]:
+    """Notes on RQ1 or RQ2 over runs: how many tests have too few runs; with `pooling` the `pooling_effect_line`, if any has enough."""
+    enough_by_question = {name: _has_enough_runs(frame, name) for name, frame in zip(COUNT_COLUMNS, _corrected_frames(case), strict=True)
+                          if frame is not None}
+    enough = enough_by_question[question]
+    share = "all" if not any(enough) else f"{len(enough) - sum(enough)} of the"
+    notes = [] if all(enough) else [f"too few runs for {share} {len(enough)} tests of {question} ({fewest_runs(question)} are needed)."]
+    return [*notes, *([pooling_effect_line(case)] if pooling and any(map(any, enough_by_question.values())) else [])]
+
+
+def _has_enough_runs(frame: pd.DataFrame, question: str) -> list[bool]:
+    """Whether each defined test of a question has enough runs to be significant."""
+    defined_rows = frame[frame["effect_size"].notna()]
+    return list(defined_rows[COUNT_COLUMNS[question]].min(axis=1) >= fewest_runs(question))
 
 
 def summary_lines(case: Case) -> list[str]:
@@ -143,9 +165,9 @@ def summary_lines(case: Case) -> list[str]:
     """
     titles = titles_of(case.scoring.metrics)
     lines, any_testable = [], False
-    questions = (("RQ1", rq1_runs, "algorithm", ("runs",), "A12 below 0.5: the runs are more unsafe than the original vehicle"),
-                 ("RQ2", rq2_runs, "baseline", ("n1", "n2"), "A12 above 0.5: NSGA-II is better"))
-    for question, frame_of, group_column, count_columns, meaning in questions:
+    questions = (("RQ1", rq1_runs, "algorithm", "A12 below 0.5: the runs are more unsafe than the original vehicle"),
+                 ("RQ2", rq2_runs, "baseline", "A12 above 0.5: NSGA-II is better"))
+    for question, frame_of, group_column, meaning in questions:
         try:
             frame = frame_of(case)
         except UnanswerableError as error:
@@ -155,8 +177,8 @@ def summary_lines(case: Case) -> list[str]:
         for name, group in frame.groupby(group_column, sort=False):
             rows = group.to_dict("records")
             defined_rows = [row for row in rows if row["effect_size"] is not None]
-            untestable = [titles[row["metric"]] for row in defined_rows
-                          if min(row[column] for column in count_columns) < fewest_runs(question)]
+            untestable = [titles[row["metric"]] for row, enough in zip(defined_rows, _has_enough_runs(group, question), strict=True)
+                          if not enough]
             any_testable = any_testable or len(untestable) < len(defined_rows)
             subject = "" if len(untestable) == len(defined_rows) else f"{', '.join(untestable)}: "
             note = f"; {subject}too few runs for a test ({fewest_runs(question)} are needed)" if untestable else ""
@@ -164,10 +186,6 @@ def summary_lines(case: Case) -> list[str]:
                                 f"{row['effect_size']:.2f}{'*' if row['p_holm'] < ALPHA else ''}") for row in rows)
             lines.append(f"  {ALGORITHM_TITLES.get(str(name), name)}: {effects}{note}")
     return [*lines, pooling_effect_line(case)] if any_testable else lines
-
-
-def _rounded(value: float) -> str:
-    return f"{value:.1e}".replace("e-0", "e-") if value < 0.001 else f"{value:.2g}"
 
 
 def _corrected_frames(case: Case) -> tuple[pd.DataFrame, pd.DataFrame | None]:
