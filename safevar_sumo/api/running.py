@@ -10,12 +10,14 @@ from typing import TYPE_CHECKING
 from rich.console import Console
 
 from safevar_sumo.analysis.subject import Results, load
+from safevar_sumo.analysis.words import number_of
 from safevar_sumo.api.simulation import load_and_assemble
 from safevar_sumo.campaign import Campaign, Observer, RunKey, algorithm_of, all_runs, files_read_by_algorithms, run_campaign
 from safevar_sumo.errors import InputError, SafevarError, one_of, warn
 from safevar_sumo.progress import CampaignProgress
 from safevar_sumo.records import Evaluations
-from safevar_sumo.results import ResultsDirectory
+from safevar_sumo.results import MANIFEST, ResultsDirectory, read_manifest
+from safevar_sumo.results.files import RUNS
 from safevar_sumo.study import Study, StudyLike
 from safevar_sumo.sumo import Engine, reason_for_sumo, settings_per_batch
 from safevar_sumo.sumo.system import System
@@ -103,6 +105,8 @@ def carry_out_runs(study: Study, system: System, keys: list[RunKey], directory: 
     sources = {**source_digests(study, pool), **files_read_by_algorithms(study)}
     results = ResultsDirectory(directory, study, identity_of(study, system, sources), system.measuring.scoring)
     engine_used, reason = choose_engine(system, engine)
+    for remark in _extent_remarks(results, study):
+        observer.warned(remark)
     results.manifest["engine"] = {"name": ENGINE_NAMES[engine_used], "reason": reason}
     campaign = run_campaign(study, keys, results, pool, observer, batch or settings_per_batch(system, engine_used), engine=engine_used,
                             retry_failed=retry_failed)
@@ -111,6 +115,20 @@ def carry_out_runs(study: Study, system: System, keys: list[RunKey], directory: 
     if keys == all_runs(study):
         results.finish(campaign.solutions)
     return campaign
+
+
+def _extent_remarks(results: ResultsDirectory, study: Study) -> list[str]:
+    """Remarks on earlier results in a directory: runs of other lengths, and runs that the study no longer has."""
+    if not (results.path / MANIFEST).exists():
+        return []
+    earlier, now, remarks = read_manifest(results.path)["study"]["search"]["evaluations"], study.search.evaluations, list[str]()
+    if earlier != now:
+        remarks.append(f"{results.path}: each run had {earlier} evaluations before and has {now} now: an id such as nsga2:0:0 may "
+                       "name another solution than in earlier output and reports")
+    names = {path.stem for path in (results.path / RUNS).glob("*-*.journal")} - set(map(str, all_runs(study)))
+    if names:
+        remarks.append(f"{results.path}: {number_of(len(names), 'earlier run')} left out of the results: {', '.join(sorted(names))}")
+    return remarks
 
 
 def choose_engine(system: System, name: str) -> tuple[Engine, str]:

@@ -50,6 +50,16 @@ def test_more_runs_extend_what_is_there(copied: Path) -> None:
     pd.testing.assert_frame_equal(extended, load_runs("alone").solutions)
 
 
+def test_results_of_another_size_are_continued_with_a_warning(copied: Path) -> None:
+    assert "warning" not in study("--out", "out")
+    longer = study("--out", "out", "--evaluations", "160")
+    assert "out: each run had 150 evaluations before and has 160 now: an id such as nsga2:0:0 may name another solution" in longer
+    assert "left out" not in longer
+    fewer = study("--out", "out", "--evaluations", "160", "--runs", "1", "--algorithms", "nsga2,rs")
+    assert "out: 4 earlier runs left out of the results: nsga2-01, rs-01, safe_fuzzer-00, safe_fuzzer-01" in fewer
+    assert "evaluations before" not in fewer
+
+
 @pytest.mark.slow
 def test_a_run_in_the_hands_of_another_process_is_not_started_twice(whole: Path) -> None:
     chosen = load_study("small.toml")
