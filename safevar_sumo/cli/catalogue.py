@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import click
@@ -13,22 +13,26 @@ from rich.console import Console
 from safevar_sumo.ads import ADS
 from safevar_sumo.cli.program import commands
 from safevar_sumo.metrics import METRIC_OF_OBJECTIVE, METRICS, OPTIONAL_METRICS, RATING_POINTS
-from safevar_sumo.scenarios import SCENARIOS, WEATHERS
+from safevar_sumo.scenarios import SCENARIOS, WEATHERS, equals_clear
 from safevar_sumo.search import ALGORITHMS
 from safevar_sumo.study import Study, load_study, study_names
-from safevar_sumo.terminal import print_meanings, print_names
+from safevar_sumo.terminal import print_meanings, print_names, print_text
 from safevar_sumo.vehicles import CHANGES, VEHICLES, CharacteristicSet
+
+SECTIONS = ("studies", "vehicles", "ads", "scenarios", "weathers", "algorithms", "metrics", "objectives")
 
 
 @commands.command(name="list")
+@click.argument("section", required=False, type=click.Choice(SECTIONS), metavar="[SECTION]")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
-def list_command(as_json: bool) -> None:
-    """List studies, vehicles, ADSs, scenarios, weathers, algorithms, metrics and objectives."""
+def list_command(section: str | None, as_json: bool) -> None:
+    """List studies, vehicles, ADSs, scenarios, weathers, algorithms, metrics and objectives; with SECTION, such as weathers, only these."""
     studies = [load_study(name) for name in study_names()]
     if as_json:
-        click.echo(json.dumps(_catalogue(studies), indent=2))
+        catalogue = _catalogue(studies)
+        click.echo(json.dumps({section: catalogue[section]} if section else catalogue, indent=2))
     else:
-        _print_catalogue(Console(), studies)
+        _print_catalogue(Console(), studies, [section] if section else SECTIONS)
 
 
 def _catalogue(studies: list[Study]) -> dict[str, Any]:
@@ -64,10 +68,11 @@ def _name_and_description(name: str, model: Callable[..., Any]) -> dict[str, str
     return {"name": name, "description": (model.__doc__ or "").strip().partition("\n")[0]}
 
 
-def _print_catalogue(console: Console, studies: list[Study]) -> None:
-    catalogue = _catalogue(studies)
+def _print_catalogue(console: Console, studies: list[Study], sections: Sequence[str]) -> None:
+    catalogue = {key: rows if key in sections else [] for key, rows in _catalogue(studies).items()}
     study_rows = [(name, title, ", ".join(models)) for name, title, *models in map(dict.values, catalogue["studies"])]
-    print_names(console, "Studies", study_rows, ("name", "title", "vehicle, ADS, scenario, weather"))
+    if study_rows:
+        print_names(console, "Studies", study_rows, ("name", "title", "vehicle, ADS, scenario, weather"))
     sets_by_vehicle: dict[str, CharacteristicSet] = {}
     for study in studies:
         sets_by_vehicle.setdefault(study.vehicle.model, CharacteristicSet.of(study.vehicle.characteristics))
@@ -81,7 +86,11 @@ def _print_catalogue(console: Console, studies: list[Study]) -> None:
     number_keys = ("road_friction", "visibility", "recognition_delay")
     weather_rows = [(row["name"], *(f"{row[key]:g}" for key in number_keys), row["light"], "wet" if row["wet"] else "dry")
                 for row in catalogue["weathers"]]
-    print_names(console, "Weathers", weather_rows, ("name", "friction", "visibility", "recognition\ndelay, s", "light", "road"))
+    if weather_rows:
+        print_names(console, "Weathers", weather_rows, ("name", "friction", "visibility", "recognition\ndelay, s", "light", "road"))
+    for name in [row["name"] for row in catalogue["weathers"] if equals_clear(WEATHERS[row["name"]])]:
+        print_text(console, f"{name}: no effect on road and sensors; an ADS drives as in clear weather unless its parameters differ.")
     for title, key in (("ADSs", "ads"), ("Scenarios", "scenarios"), ("Algorithms", "algorithms"), ("Metrics", "metrics"),
                        ("Objectives (every metric can also be an objective)", "objectives")):
-        print_names(console, title, [(row["name"], row["description"]) for row in catalogue[key]], ("name", "description"))
+        if catalogue[key]:
+            print_names(console, title, [(row["name"], row["description"]) for row in catalogue[key]], ("name", "description"))

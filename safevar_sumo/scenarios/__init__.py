@@ -15,6 +15,7 @@ from safevar_sumo.scenarios.base import (
     Scenario,
     Scene,
     World,
+    equals_clear,
     pre_crash_sentence,
     weather_of,
 )
@@ -33,4 +34,4 @@ SCENARIOS: Mapping[str, type[Any]] = {
 
 __all__ = [
     "SCENARIOS", "SCENARIO_CONTRACT", "VUT", "WEATHERS", "GuardedScenario", "Lane", "Point", "PreCrash", "Scenario", "Scene", "World",
-    "pre_crash_sentence", "weather_of"]
+    "equals_clear", "pre_crash_sentence", "weather_of"]

@@ -170,6 +170,12 @@ def weather_of(choice: str | Weather, source: object) -> Weather:
     return WEATHERS[choice]
 
 
+def equals_clear(weather: Weather) -> bool:
+    """Whether a weather has the effects of clear weather under another name."""
+    clear = WEATHERS["clear"]
+    return weather.name != clear.name and weather.light == clear.light and msgspec.structs.replace(weather, name=clear.name) == clear
+
+
 class PreCrash(StrEnum):
     """Pre-crash types by NHTSA's names (Najm, Smith, Yanagisawa: Pre-Crash Scenario Typology for Crash Avoidance Research, 2007)."""
 

@@ -22,7 +22,7 @@ from safevar_sumo.metrics import METRIC_OF_OBJECTIVE, METRICS, OPTIONAL_METRICS,
 from safevar_sumo.plugins import Guard, Lookup, Member, ModuleCopies, check_parameters, guard_process_state, instance_of
 from safevar_sumo.protocol.rater import Rater, expand_protocol, is_rated, rater_of
 from safevar_sumo.records import FloatArray, Nominal
-from safevar_sumo.scenarios import SCENARIO_CONTRACT, SCENARIOS, WEATHERS, GuardedScenario, Point, Scenario, weather_of
+from safevar_sumo.scenarios import SCENARIO_CONTRACT, SCENARIOS, GuardedScenario, Point, Scenario, equals_clear, weather_of
 from safevar_sumo.study import MatrixTest, MetricsTable, ModelTable, Study, VehicleTable, Weather, user_code_names
 from safevar_sumo.sumo.network import check_network, network_remarks
 from safevar_sumo.sumo.sources import is_network, is_shipped
@@ -178,7 +178,7 @@ class System:
         if not any(getattr(self.ads, name, 0.0) for name in REACTION_PARAMETERS):
             remarks += [f"weather {name!r} has no effect: its road and its visibility are those of clear weather, and no key of "
                       "[ads.parameters] delays the ADS in it"
-                      for name in dict.fromkeys(point.weather.name for point in self.points if _equals_clear(point.weather))]
+                      for name in dict.fromkeys(point.weather.name for point in self.points if equals_clear(point.weather))]
         return remarks
 
     def _has_limited_range(self) -> bool:
@@ -186,12 +186,6 @@ class System:
         original = dict(zip(self.characteristics.names, self.characteristics.original[:, np.newaxis], strict=True))
         values = None if sensors is None else sensors(self.vehicle.prepare(original, 1.0, 0.1))
         return values is not None and bool(np.isfinite(values.reach).all())
-
-
-def _equals_clear(weather: Weather) -> bool:
-    """Whether a weather has the effects of clear weather under another name."""
-    clear = WEATHERS["clear"]
-    return weather.name != clear.name and weather.light == clear.light and msgspec.structs.replace(weather, name=clear.name) == clear
 
 
 def assemble(study: Study, source: str = "") -> System:

@@ -7,6 +7,7 @@ import re
 from io import StringIO
 from itertools import combinations
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -329,3 +330,13 @@ def test_the_paragraph_says_how_robust_the_changes_that_suffice_are_by_themselve
     paragraph = failures_paragraph(system, original, finding, finding, Preventability(counts={}, collisions=0))
     assert "a collision at 5 km/h (robust: 98 % of" in paragraph.lower()
     assert "; two of them suffice (borderline: only 44 % of the neighbours are unsafe too)." in paragraph
+
+
+@pytest.mark.parametrize(("weather", "words"), [
+    ("hard_rain", "In hard rain, the original"),
+    ("carla_hard_rain", "With the weather 'carla_hard_rain' (no effect on road and sensors), the"),
+    ({"name": "black ice", "road_friction": 0.2, "visibility": 1.0}, "With the weather 'black ice', the original")])
+def test_a_weather_without_a_phrase_is_named(weather: str | dict[str, Any], words: str) -> None:
+    system = assemble(load_study("smoke", weather=weather))
+    original = evaluate(system, system.characteristics.original[np.newaxis])
+    assert failures_paragraph(system, original, None, None, Preventability(counts={}, collisions=0)).startswith(words)

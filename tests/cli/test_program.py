@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import importlib
+import json
 import os
 import pkgutil
 import re
@@ -172,6 +173,17 @@ def test_every_name_of_the_list_can_be_read_and_typed(monkeypatch: pytest.Monkey
         study = load_study(name)
         for text in (name, study.vehicle.model, study.ads.model, study.scenario.model, *study.vehicle.characteristics):
             assert text in output
+
+
+def test_a_section_of_the_list_comes_alone() -> None:
+    def listed(*arguments: str) -> str:
+        return CliRunner().invoke(commands, ["list", *arguments], catch_exceptions=False).stdout
+
+    assert re.findall(r"^(\w+)", listed("weathers"), re.MULTILINE) == ["Weathers", "carla_hard_rain"]
+    assert "carla_hard_rain: no effect on road and sensors" in listed("weathers")
+    assert re.findall(r"^(\w+)", listed("ads"), re.MULTILINE) == ["ADSs"]
+    assert list(json.loads(listed("studies", "--json"))) == ["studies"]
+    assert "'weathers'" in str(CliRunner().invoke(commands, ["list", "weather"], standalone_mode=False).exception)
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="POSIX alone has named pipes")

@@ -29,7 +29,8 @@ class ExplainOptions(Options):
         (), "Explain the N-th solution of a run, from 0; may be repeated.  [default: the failures that matter]",
         flag="--solution", metavar="ALG:RUN:N", form="repeated",
         python='Handles of solutions, such as "nsga2:3:0". By default the robust failure with the fewest changes, the failures with the '
-               "fewest and the smallest changes, the most severe failure, and one failure of each distinct cause, the most frequent first.")
+               "fewest changes and with the smallest largest change, the most severe failure, and one failure of each distinct cause, the "
+               "most frequent first.")
     unsafe: str | None = unsafe_option()
     top: int = option(8, "Maximum number of failures explained in full.", kind=int, low=1, high=1000)
     limit: int = option(40_000, "Approximate number of simulations for the minimal causes of all failures; if all failures would take "
