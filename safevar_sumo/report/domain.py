@@ -50,7 +50,7 @@ def make_rules_section(data: ReportInput, jobs: int | None, progress: Progress) 
         significant = [rule for rule in regions.rules if rule.is_denser_than(regions.unsafe_share)]
         words = [superscript_powers(rule_in_words(rule, data.case.characteristics, regions.unsafe)) for rule in significant]
         omitted_rules = number_of(len(regions.rules) - len(significant), "rule")
-        remark = regions.remark if len(significant) == len(regions.rules) else (
+        remark = (regions.remark and f"{regions.remark}.") if len(significant) == len(regions.rules) else (
             f"Left out: {omitted_rules} that may be chance with so few vehicles; the command rules simulates more.")
         return {"words": words, "samples": regions.samples, "share": regions.unsafe_share, "remark": remark, "unsafe": str(regions.unsafe)}
 

@@ -23,7 +23,7 @@ from safevar_sumo.reference import Totals, shipped_totals_of
 from safevar_sumo.replay.comparison import format_number, superscript_powers
 from safevar_sumo.report.causes import FIRST_CHOICES, Explanations
 from safevar_sumo.report.input import ChangeRow, FailingPointsTable, ReportInput, load_or_compute
-from safevar_sumo.scenarios import SCENARIOS, Point, pre_crash_sentence
+from safevar_sumo.scenarios import SCENARIOS, Point, equals_clear, pre_crash_sentence
 from safevar_sumo.study import SAFETY_DEGREE
 from safevar_sumo.sumo.matrix import vehicle_remarks
 from safevar_sumo.vehicles import VEHICLES
@@ -62,7 +62,8 @@ def _describe_conditions(data: ReportInput) -> str:
     if data.point:
         return f"only at the point {data.point} of its matrix, at which all solutions are simulated again"
     if not points:
-        return f"weather: {data.case.weather.name}"
+        no_effect = " (no effect on road and sensors; a driving system may have other parameters in it)"
+        return f"weather: {data.case.weather.name}{no_effect if equals_clear(data.case.weather) else ''}"
     return f"every vehicle at all {len(points)} points of a matrix: {', '.join(_describe_tests(points))}"
 
 
@@ -97,8 +98,8 @@ def _first_sentence(models: Mapping[str, Any], name: str) -> str:
     return sentence[:1].lower() + sentence[1:] if not sentence[1:2].isupper() else sentence
 
 
-REASON_TITLES = {ROBUST: "Smallest robust failure", REASONS["fewest"]: "Fewest changes", REASONS["smallest"]: "Smallest changes",
-          REASONS["most_severe"]: "Most severe"}
+REASON_TITLES = {ROBUST: "Robust with the fewest changes", REASONS["fewest"]: "Fewest changes",
+                 REASONS["smallest"]: "Smallest largest change", REASONS["most_severe"]: "Most severe"}
 NO_VALUE = "–"  # noqa: RUF001
 
 
@@ -147,7 +148,7 @@ class PublishedAgreement(NamedTuple):
 
 
 class Verdict(NamedTuple):
-    """The verdict on a study; in `failures`, the smallest robust failure comes first."""
+    """The verdict on a study; in `failures`, the robust failure with the fewest changes comes first."""
 
     headline: str
     unsafe_count: int
@@ -242,7 +243,7 @@ def _changes_lead_to(failure: SelectedFailure, outcome: str) -> str:
 
 def _key_figures(data: ReportInput, failures: Sequence[SelectedFailure], explanations: Explanations | None,
              tolerance: Mapping[str, Any] | None) -> list[KeyFigure]:
-    """The key figures: smallest robust failure, severity, preventability, joint tolerance."""
+    """The key figures: robust failure with the fewest changes, severity, preventability, joint tolerance."""
     by_reason = {reason: failure for failure in failures for reason in failure.reasons}
     return [_robustness_figure(by_reason.get(ROBUST), explanations, data), _severity_figure(by_reason.get(REASONS["most_severe"]), data),
             _preventability_figure(explanations.summary.preventable if explanations else None, data), _tolerance_figure(tolerance)]
@@ -291,15 +292,18 @@ def describe_agreement(data: ReportInput) -> PublishedAgreement:
     if not totals:
         return PublishedAgreement("This study was not compared with published data: how far another simulator or a real vehicle does the "
                                   "same is unknown.", [])
-    largest = max(totals, key=lambda entry: (entry.reference, entry.rows))
-    collisions = "no published collision is among them" if largest.recall is None else (
-        f"{largest.both} of the {largest.reference} published collisions collide here too (recall {largest.recall:.2f})")
-    if largest.precision is not None:
-        collisions += f", and {largest.both} of the {largest.here} collisions here are published ones (precision {largest.precision:.2f})"
-    rho = largest.spearman.get(SAFETY_DEGREE)
+    sentences = map(_agreement_sentence, sorted(totals, key=lambda entry: (-entry.reference, -entry.rows)))
+    return PublishedAgreement(f"Agreement with published data. {' '.join(sentences)}", list(map(_agreement_row, totals)))
+
+
+def _agreement_sentence(totals: Totals) -> str:
+    collisions = "no published collision is among them" if totals.recall is None else (
+        f"{totals.both} of the {totals.reference} published collisions collide here too (recall {totals.recall:.2f})")
+    if totals.precision is not None:
+        collisions += f", and {totals.both} of the {totals.here} collisions here are published ones (precision {totals.precision:.2f})"
+    rho = totals.spearman.get(SAFETY_DEGREE)
     order = "" if rho is None else f" safety degrees are in the same order with a rank correlation of {rho:.2f} (1 is perfect);"
-    sentence = f"Agreement with published data, {largest.rows} vehicles simulated again:{order} {collisions}."
-    return PublishedAgreement(sentence, list(map(_agreement_row, totals)))
+    return f"{totals.file}, {totals.rows} vehicles simulated again:{order} {collisions}."
 
 
 def _agreement_row(totals: Totals) -> list[str]:

@@ -63,7 +63,7 @@ def test_nothing_everything_and_too_little() -> None:
     assert (dict(rule.limits), rule.density, rule.coverage) == ({}, 1.0, 1.0)
     few = of(lambda settings: (settings > 9.5).all(axis=1), n=2, samples=400)
     assert few.rules == []
-    assert "--samples" in few.remark
+    assert "the command rules --samples N" in few.remark
 
 
 def test_a_rule_is_denser_than_a_share_below_its_interval() -> None:

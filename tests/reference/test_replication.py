@@ -156,6 +156,14 @@ def test_the_page_says_how_well_the_study_agrees() -> None:
     assert page.rows == [["made_up.csv", "80", "0.61", "0.25", "40", "20", "10", "0.25", "0.50"]]
 
 
+def test_the_page_quotes_every_file_and_not_only_the_best(totals: Path) -> None:
+    worse = Agreement(**{**MADE_UP.to_dict(), "rows": 90, "spearman": {"safety_degree": 0.1}})
+    write_totals(totals, load_study("rain"), "worse.csv", worse)
+    sentence = page_of(load_study("rain")).sentence
+    for words in ("made_up.csv, 80 vehicles simulated again", "correlation of 0.61", "worse.csv, 90 vehicles", "correlation of 0.10"):
+        assert words in sentence
+
+
 @pytest.mark.usefixtures("totals")
 def test_nobody_elses_agreement_is_claimed() -> None:
     """Another weather, or the same study with another parameter, simulates something else."""

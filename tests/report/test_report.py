@@ -24,18 +24,19 @@ from safevar_sumo.analysis.research_questions.case import load_cases
 from safevar_sumo.cli.program import commands
 from safevar_sumo.errors import InputError
 from safevar_sumo.replay.comparison import changes_in_words
+from safevar_sumo.replay.page import template_environment
 from safevar_sumo.report import SECTIONS, causes, make_report
 from safevar_sumo.report import input as report_input
 from safevar_sumo.report import verdict as what
 from safevar_sumo.report.causes import Explanations
 from safevar_sumo.report.domain import DOMAIN_SECTIONS, _estimate_text
 from safevar_sumo.report.input import AVOIDED_TEXT, load_or_compute, tabulate_failing_points
-from safevar_sumo.report.page import COMMAND_OF_SECTION, read_inputs
+from safevar_sumo.report.page import COMMAND_OF_SECTION, TEMPLATE_FOLDER, read_inputs
 from safevar_sumo.report.svg import Dot, draw_scatter
 from safevar_sumo.report.verdict import reach_verdict
 from safevar_sumo.results import SolutionId
 from safevar_sumo.results.manifest import write_manifest
-from safevar_sumo.scenarios import Point
+from safevar_sumo.scenarios import Point, weather_of
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.workers import local
 from tests.analysis.known_regions import Plant
@@ -170,7 +171,7 @@ def test_the_verdict_leads_with_the_robust_failure_and_calls_the_others_borderli
         entry, reasons=[reason], robustness=share, **dict(zip(("algorithm", "run", "index"), SolutionId.parse(row["handle"]), strict=True)))
         for reason, share, row in zip(("fewest changes", "smallest robust"), (0.79, 0.81), failing, strict=False))
     result = reach_verdict(data, Explanations([fewest, robust], summary), {"joint": {"factor": 0.42, "samples": 1024}})
-    assert [(one.title, one.borderline) for one in result.failures] == [("Smallest robust failure", False), ("Fewest changes", True)]
+    assert [(one.title, one.borderline) for one in result.failures] == [("Robust with the fewest changes", False), ("Fewest changes", True)]
     first = result.failures[0]
     assert [one.text for one in first.changes] == changes_in_words(data.case.characteristics, data.setting_of(first.handle))
     number, needed = len(first.changes), len(robust.minimal_causes[0].changes)
@@ -370,3 +371,23 @@ def test_user_code_is_called_by_its_name_once(slippery: Path) -> None:
 def test_an_estimate_stands_beside_its_error_and_just_below_nothing_it_is_nothing() -> None:
     estimates = [(-0.002, (-0.01, 0.006)), (0.126, (0.106, 0.146)), (1.04, (0.94, 1.14)), (0.3, (None, None)), (None, (None, None))]
     assert [_estimate_text(share, interval) for share, interval in estimates] == ["0 % ± 1", "13 % ± 2", "104 % ± 10", "30 %", "-"]
+
+
+@pytest.mark.parametrize(("weather", "has_effect"), [("carla_hard_rain", False), ("clear", True), ("hard_rain", True), ("night", True)])
+def test_a_weather_without_effect_is_called_so(weather: str, has_effect: bool) -> None:
+    material: Any = SimpleNamespace(system=None, point="", case=SimpleNamespace(weather=weather_of(weather, "weather")))
+    assert what._describe_conditions(material).startswith(f"weather: {weather}")
+    assert ("no effect on road and sensors" not in what._describe_conditions(material)) is has_effect
+    points = (point("x clear", test="x")._replace(weather=weather_of("clear", "weather")),)
+    matrix: Any = SimpleNamespace(system=SimpleNamespace(matrix=points), point="")
+    assert what._describe_conditions(matrix).endswith("at all 1 points of a matrix: x (1, clear)")
+
+
+def test_a_section_without_rules_promises_none() -> None:
+    def section(**rules: object) -> str:
+        template = template_environment(TEMPLATE_FOLDER).get_template("rules.html.j2")
+        return template.render(studies=[{"name": "x", "rules": {"samples": 4000, "share": 0.003, "unsafe": "collision", **rules}}])
+
+    assert "the shares below" not in section(words=[], remark="").lower()
+    assert "<p>Too few.</p>" in section(words=[], remark="Too few.")
+    assert "the shares below" in section(words=["a rule"], remark="").lower()

@@ -137,7 +137,7 @@ def find_rules(study: Study, options: RulesOptions, *, pool: Pool | None = None,
         boxes = [{}]
     elif min(unsafe_count, len(is_unsafe) - unsafe_count) < MIN_SETTINGS:
         remark = (f"{unsafe_count} of {len(is_unsafe)} settings are unsafe: rules need at least {MIN_SETTINGS} unsafe and as many safe "
-                  "settings (run `rules --samples N` for more)")
+                  "settings (the command rules --samples N simulates more)")
     else:
         boxes = _find_boxes(training.settings, is_unsafe, characteristics)
     rules = [_validate_rule(limits, validation.settings, is_unsafe_validation, characteristics) for limits in boxes]
