@@ -204,7 +204,7 @@ def _select_failure(data: ReportInput, handle: str, reasons: list[str], failure:
         size=f"{len(changes)} of {len(setting)} characteristics changed, by at most {largest_change:.0%}",
         end=_describe_end(data, handle, setting), f_safe=data.solutions[handle]["f_safe"], failing_points=data.failing_points(setting),
         unsafe_share=failure.robustness if failure else None,
-        cause=failure.minimal_causes[0] if failure and failure.minimal_causes else None)
+        cause=max(failure.minimal_causes, key=lambda cause: cause.robustness or 0.0, default=None) if failure else None)
 
 
 def _describe_end(data: ReportInput, handle: str, setting: FloatArray) -> str:

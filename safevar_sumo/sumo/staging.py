@@ -40,7 +40,7 @@ def stage_network(scenario: Scenario) -> StagedNetwork:
 
 
 def stage_networks(scenarios: Sequence[Scenario]) -> list[StagedNetwork]:
-    """The networks of several scenarios, whose files are read once per network; raises the errors of `staged`."""
+    """The networks of several scenarios, whose files are read once per network; raises the errors of `stage_network`."""
     fingerprints = {name: network_fingerprint(name) for name in {scenario.network for scenario in scenarios}}
     def stage(scenario: Any) -> StagedNetwork:
         may_vary = isinstance(scenario, GuardedScenario)  # a user's scenario may return different changes in each call
