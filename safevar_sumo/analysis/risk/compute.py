@@ -13,7 +13,7 @@ import scipy
 
 from safevar_sumo.analysis.evaluator import Evaluator, Progress, clopper_pearson, open_evaluator, show_no_progress
 from safevar_sumo.analysis.risk import ENOUGH_FAILURES, PILOT_VEHICLES, RARE_BELOW, RiskOptions
-from safevar_sumo.analysis.risk.rare import Estimate, PlateauError, Response, estimate_rare, is_plateau, load_openturns
+from safevar_sumo.analysis.risk.rare import Estimate, RareMethodError, Response, estimate_rare, is_plateau, load_openturns
 from safevar_sumo.errors import InputError, SimulationError
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import FloatArray, finite_or_none
@@ -313,8 +313,8 @@ def _try_rare_method(response: Response, responses: FloatArray, options: RiskOpt
         return None
     try:
         return estimate_rare(response, _rare_method(options), options.confidence, seed)
-    except PlateauError:
-        counts.remark = "the response is a plateau before failures, which methods for rare failures cannot cross; plain Monte Carlo is used"
+    except RareMethodError as error:
+        counts.remark = f"{error}; plain Monte Carlo is used"
         return None
 
 

@@ -42,6 +42,7 @@ MIN_RESPONSE = 1e-9
 """Smallest absolute value of a response, so that its sign always shows whether the vehicle is unsafe."""
 PLATEAU_SHARE = 0.5
 """The response is a plateau if at least this share of the vehicles nearest to failure have the same response."""
+PLATEAU = "the response is a plateau before failures, which methods for rare failures cannot cross"
 PATH_POINTS = 9
 """Number of points evaluated on the straight path between two failures."""
 COMPARED_FAILURES = 14
@@ -53,8 +54,8 @@ SettingsFunction = Callable[[FloatArray], FloatArray]
 """Turns points of standard normal space into settings."""
 
 
-class PlateauError(Exception):
-    """The response does not show which vehicles are nearer to failure."""
+class RareMethodError(Exception):
+    """A method for rare failures does not find its way to a failure; the text says why."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -142,8 +143,8 @@ def estimate_rare(response: Response, method: str, confidence: float, seed: int)
 
     Raises
     ------
-    PlateauError
-        If the response does not show which vehicles are nearer to failure.
+    RareMethodError
+        If the response does not show which vehicles are nearer to failure, or cross-entropy sampling loses all failures.
     """
     estimate_once = _run_subset_simulation if method == "subset_simulation" else _run_cross_entropy
     probabilities, variations, thresholds = [], [], list[float]()
@@ -214,9 +215,13 @@ def _run_subset_simulation(response: Response, seed: int) -> tuple[float, float,
         if "variance estimate" not in str(error):
             raise
         return _run_subset_simulation(response, seed + 1)
+    except RuntimeError as error:  # the probability of a level is below MIN_PROBABILITY
+        if "estimate too small" not in str(error):
+            raise
+        return 0.0, 0.0, []
     thresholds = [float(value) for value in algorithm.getThresholdPerStep()]
     if is_stagnant:
-        raise PlateauError
+        raise RareMethodError(PLATEAU)
     if thresholds[-1] > 0:
         return 0.0, 0.0, thresholds
     result = algorithm.getResult()
@@ -231,7 +236,12 @@ def _run_cross_entropy(response: Response, seed: int) -> tuple[float, float, lis
     algorithm.setMaximumOuterSampling(1)
     algorithm.setMaximumCoefficientOfVariation(-1.0)
     ot.RandomGenerator.SetSeed(seed)
-    algorithm.run()
+    try:
+        algorithm.run()
+    except RuntimeError as error:
+        if "sumPdfCritic is equal to zero" not in str(error):
+            raise
+        raise RareMethodError("cross-entropy sampling lost all failures") from None
     result = algorithm.getResult()
     probability = float(result.getProbabilityEstimate())
     return probability, float(result.getCoefficientOfVariation()) if probability > 0 else 0.0, []
