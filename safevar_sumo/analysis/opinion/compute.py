@@ -14,7 +14,7 @@ from safevar_sumo.analysis.explain.causes import RESOLUTION, find_boundaries
 from safevar_sumo.analysis.explain.compute import choose_failures
 from safevar_sumo.analysis.opinion import OpinionOptions
 from safevar_sumo.analysis.opinion.mapping import VehicleMapping, map_vehicle
-from safevar_sumo.analysis.opinion.multi_body import load_commonroad
+from safevar_sumo.analysis.opinion.multi_body import load_bmw_parameters
 from safevar_sumo.analysis.opinion.result import Opinion, Opinions, OpinionVerdict, RunEnd
 from safevar_sumo.analysis.opinion.second_vehicle import SecondVehicle
 from safevar_sumo.analysis.research_questions.case import Case
@@ -59,7 +59,7 @@ def assemble_both_systems(study: Study) -> tuple[System, System, VehicleMapping]
     InputError
         If commonroad-vehicle-models is not installed, or the second model cannot represent the vehicle at all.
     """
-    load_commonroad()
+    load_bmw_parameters()
     system = assemble(study)
     mapping = map_vehicle(study, system.vehicle)
     return system, replace(system, vehicle=SecondVehicle(system.vehicle, mapping, study)), mapping

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from safevar_sumo.analysis.opinion.mapping import SecondParameters, Surface, VehicleMapping
+from safevar_sumo.analysis.opinion.mapping import SecondModelParameters, Surface, VehicleMapping
 from safevar_sumo.analysis.opinion.multi_body import LONGEST_STEP, WHEEL_COUNT, MultiBodyState, advance, at_speed
 from safevar_sumo.records import BoolArray, Command, FloatArray, Observation
 from safevar_sumo.study import Study, load_study
@@ -32,7 +32,7 @@ class _Prepared(NamedTuple):
 
     vehicle: Any
     original: Any
-    parameters: SecondParameters
+    parameters: SecondModelParameters
     engine_mass: FloatArray
     engine_radius: FloatArray
     slope: Slope
@@ -70,7 +70,7 @@ class SecondVehicle:
         self.UNITS = vehicle.UNITS
         shipped_tables = load_study(mapping.table.study).vehicle.characteristics
         tables = {**shipped_tables, **{name: table for name, table in study.vehicle.characteristics.items()
-                                       if name not in mapping.unknown_names}}
+                                       if name not in mapping.unmatched_names}}
         self._original = {characteristic.name: characteristic.original
                           for characteristic in CharacteristicSet.of({name: tables[name] for name in mapping.vehicle.UNITS})}
 
@@ -145,7 +145,7 @@ class SecondVehicle:
                 engine.speed > CREEP_SPEED, engine.wheel_speed * speed / np.maximum(engine.speed, CREEP_SPEED), engine.wheel_speed))
         next_engine = self._mapping.vehicle.advance(prepared.original, engine, Command(throttle, np.zeros_like(throttle)))
         torque = prepared.engine_mass * ((next_engine.speed - speed) / prepared.step + prepared.slope.back) * prepared.engine_radius
-        torque = np.where(torque > 0, torque * parameters.drive, torque)
+        torque = np.where(torque > 0, torque * parameters.drive_ratio, torque)
         resistance = (radius * (parameters.drag + parameters.air_drag * state.speed) * state.speed
                       + parameters.wheel_damping * state.speed / radius)
         return next_engine, torque - resistance
