@@ -73,12 +73,11 @@ def _fill_parameters(plant: Plant, **values: Any) -> SecondModelParameters:
 
 def _represent_worn(vehicle: WornVehicle, setting: Characteristics, original: Mapping[str, float],
                     surface: Surface) -> SecondModelParameters:
-    # Of the prepared constants only mass, shares of weight and grip are used; they do not depend on the step.
+    # Mass, grip and rear_load, the rear axle's share of the weight, do not depend on the step.
     bmw, prepared = load_bmw_parameters(), vehicle.prepare(setting, surface.friction, step=1.0, slope=surface.slope, wet=surface.wet)
-    rear_weight_share = prepared.rear_load
     brake_torque = _brake_torque_for(setting["brakeTorque"] * vehicle.brake_force, vehicle.kerb_mass + original["payload"])
     return _fill_parameters(
-        build_plant(prepared.mass, unladen_mass=vehicle.kerb_mass, slope=surface.slope, centre=rear_weight_share * vehicle.wheelbase,
+        build_plant(prepared.mass, unladen_mass=vehicle.kerb_mass, slope=surface.slope, centre=prepared.rear_load * vehicle.wheelbase,
                     wheelbase=vehicle.wheelbase, height=vehicle.centre_height, radius=bmw.R_w, wheel_inertia=bmw.I_y_w,
                     friction=prepared.grip, front_brake_share=vehicle.front_share, front_drive_share=bmw.T_se, brake_torque=brake_torque),
         brake_delay=setting["brakeResponse"])
