@@ -224,7 +224,7 @@ def _assemble(study: Study, source: str) -> System:
     nominal = calibration_drive(models.vehicle, characteristics)
     if isinstance(models.ads, TraciController) and isinstance(models.vehicle, GuardedVehicle):
         extremes = np.stack([characteristics.original, characteristics.lower, characteristics.upper])
-        models.vehicle.refuse_unknown_sensors(dict(zip(characteristics.names, np.ascontiguousarray(extremes.T), strict=True)))
+        models.vehicle.refuse_sense_without_sensors(dict(zip(characteristics.names, np.ascontiguousarray(extremes.T), strict=True)))
     if not is_shipped_vehicle:
         nominal.tables()  # so that errors of a user's vehicle do not depend on the ADS
     return System(
