@@ -24,7 +24,7 @@ class _TestRow(NamedTuple):
     pre_crash: PreCrash
 
 
-TESTS = {
+TESTS = {  # target, its speed, acceleration distance, range (slowest, fastest, impact locations), pre-crash type
     "CPLA": _TestRow("adult", 5.0, 1.0, ProtocolRange(10, 80, IMPACT_LOCATIONS), PreCrash.PEDESTRIAN),
     "CBLA": _TestRow("cyclist", 15.0, 0.0, ProtocolRange(20, 80, IMPACT_LOCATIONS), PreCrash.CYCLIST),
 }

@@ -31,7 +31,7 @@ class _TestRow(NamedTuple):
     pre_crash: PreCrash
 
 
-TESTS = {
+TESTS = {  # target, range (slowest, fastest, impact locations), headway, pre-crash type
     "CCRs": _TestRow("car", ProtocolRange(10, 80, CAR_LOCATIONS), 5.0, PreCrash.LEAD_STOPPED),
     "CCRm": _TestRow("car", ProtocolRange(30, 130, CAR_LOCATIONS), 5.0, PreCrash.LEAD_SLOWER),
     "CCRb": _TestRow("car", ProtocolRange(30, 130, CAR_LOCATIONS), 1.0, PreCrash.LEAD_DECELERATING),
@@ -131,7 +131,7 @@ class CarToCar(TargetAheadTest, frozen=True, kw_only=True):
     def _time_to_impact(self) -> float:
         """Time to the impact if the vehicle does not brake [s].
 
-        The gap closes at a constant speed; with a braking target, first at a rising speed (by b t^2 / 2), then at a constant one.
+        The gap closes at a constant speed. A target that brakes at b m/s^2 makes this speed rise by b per second until it stops braking.
         """
         closing_speed, gap = self.speed * KMH - self._target_speed, self._gap
         if not self._target_brakes:

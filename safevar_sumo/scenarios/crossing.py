@@ -59,7 +59,7 @@ class _TestRow(NamedTuple):
     protocol_range: ProtocolRange
 
 
-TESTS = {
+TESTS = {  # side, target, its speed, lateral start, acceleration distance, hidden, range (slowest, fastest, impact locations)
     "CPFA": _TestRow("far", "adult", 8.0, 6.0, 1.5, False, ProtocolRange(10, 60, IMPACT_LOCATIONS)),
     "CPNA": _TestRow("near", "adult", 5.0, 4.0, 1.0, False, ProtocolRange(10, 60, IMPACT_LOCATIONS)),
     "CPNCO": _TestRow("near", "child", 5.0, 4.0, 1.0, True, ProtocolRange(10, 60, IMPACT_LOCATIONS)),

@@ -51,7 +51,7 @@ class PointResult(NamedTuple):
 
 
 def point_record(result: PointResult, row: int = 0) -> dict[str, Any]:
-    """Plain values of one setting at one point; a value is None if it is undefined.
+    """Plain values of the setting in row `row` of a result; a value is None if it is undefined.
 
     Keys: the point and the outcome; impact speeds [m/s]; the largest deviation from the test speed before the ADS acted [km/h]; the time to
     collision at the first warning [s]; the side of the contact, and the position along that side [%].
