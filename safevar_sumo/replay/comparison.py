@@ -162,7 +162,7 @@ def compare_setting(study: Study, system: System, setting: FloatArray) -> Compar
                    if (point.scenario, point.weather) == (worst_system.scenario, worst_system.weather)]
     recording = record_film(worst_system, settings)
     return Comparison(title=study.title + "".join(point_names[:1]), characteristics=system.characteristics,
-                      ttc_threshold=system.metrics.ttc_threshold, network=stage_network(worst_system.scenario).folder,
+                      ttc_threshold=system.metrics_table.ttc_threshold, network=stage_network(worst_system.scenario).folder,
                       evaluations=score(worst_system, settings, recording.runs),
                       film=replace(recording, runs=_with_pedals_before_impacts(recording.runs)),
                       objectives=_further_objectives(worst_system.measuring))

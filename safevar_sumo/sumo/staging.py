@@ -22,7 +22,7 @@ from safevar_sumo.sumo.sources import OPTIONS_FILE, TRAFFIC_FILE, Sources, optio
 
 
 class StagedNetwork(NamedTuple):
-    """The folder of a network with a scenario's lanes and traffic, and a digest of the network's content."""
+    """A network with a scenario's lanes and traffic: its folder (or `.net.xml` file), and a digest of its content."""
 
     folder: str
     fingerprint: str

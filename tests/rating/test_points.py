@@ -25,7 +25,7 @@ from safevar_sumo.protocol.rater import darken
 from safevar_sumo.records import CellResults
 from safevar_sumo.scenarios import WEATHERS
 from safevar_sumo.study import load_study
-from safevar_sumo.sumo.matrix import evaluate, in_cells, simulate_all_points, study_at
+from safevar_sumo.sumo.matrix import evaluate, evaluate_cells, simulate_all_points, study_at
 from safevar_sumo.sumo.system import assemble
 
 PROTOCOL = protocol_of(EURO_NCAP_2026)
@@ -139,7 +139,7 @@ def test_a_cell_has_equal_results_alone_and_in_any_batch() -> None:
     study = load_study("euro_ncap_rating")
     system = assemble(study)
     settings_ = np.array([system.characteristics.original, system.characteristics.lower])
-    found, numbers_ = in_cells(system, settings_, (7, 620)), cells_of_part(PROTOCOL, 7, 620)
+    found, numbers_ = evaluate_cells(system, settings_, (7, 620)), cells_of_part(PROTOCOL, 7, 620)
     assert found.cells is not None
     assert sorted(number for k in range(620) for number in cells_of_part(PROTOCOL, k, 620)) == list(range(N))
     points = [system.matrix[number] for number in numbers_]
