@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 class Failure(NamedTuple):
-    """A setting that could not be simulated: its algorithm, run and position in the run, and the reason."""
+    """A setting that could not be simulated: its algorithm, run, number of the evaluation in the run (from 0), and the reason."""
 
     algorithm: str
     run: int
@@ -34,10 +34,10 @@ class Failure(NamedTuple):
 
 def failure_lines(failures: Sequence[Failure]) -> list[str]:
     """A line for each distinct reason: the first failure with this reason, and the number of further failures."""
-    reasons: dict[str, list[Failure]] = {}
+    failures_by_reason: dict[str, list[Failure]] = {}
     for failure in failures:
-        reasons.setdefault(failure.reason, []).append(failure)
-    return [str(first) if not others else f"{first} (and {len(others)} more)" for first, *others in reasons.values()]
+        failures_by_reason.setdefault(failure.reason, []).append(failure)
+    return [str(first) if not others else f"{first} (and {len(others)} more)" for first, *others in failures_by_reason.values()]
 
 
 class StoredResults(NamedTuple):
@@ -66,9 +66,9 @@ class StoredResults(NamedTuple):
 
 
 class RunStatus(NamedTuple):
-    """Progress of one run: numbers of distinct settings simulated, of collisions and failures among them, and the lowest safety degree.
+    """Progress of one run: how many distinct settings were simulated, collided, and failed; and the `best`, the lowest safety degree.
 
-    `state` is waiting, begun or finished; `best` is in m, or -m/s, None before the first simulation.
+    `state` is waiting, begun or finished; `best` is a distance [m] or minus a collision speed [m/s], None before the first simulation.
     """
 
     algorithm: str
@@ -129,7 +129,7 @@ def _read_search(folder: Path, manifest: Mapping[str, Any]) -> _Search:
         runs = [(name, run) for name in dict.fromkeys(map(label_of, search["algorithms"])) for run in range(search["runs"])]
         return _Search(runs, int(search["evaluations"]), tuple(manifest["study"]["vehicle"]["characteristics"]))
     except (KeyError, TypeError, ValueError):
-        raise InputError(folder / MANIFEST, "has no characteristics or no search", "what the command study has written") from None
+        raise InputError(folder / MANIFEST, "has no characteristics or no search", "what the command `study` has written") from None
 
 
 def _read_journals(folder: Path, manifest: Mapping[str, Any],
@@ -160,8 +160,8 @@ def load_runs(directory: str | Path) -> StoredResults:
     evaluations_of_runs, solutions_of_runs, positions, failures = [], [], [], []
     for algorithm, run, content in _read_journals(folder, manifest, search.runs):
         if content is not None and content.tail_size and content.result(search.budget) is None:
-            warn(f"{journal_file(folder, f'{algorithm}-{run:02d}')}: the last {content.tail_size} bytes are torn, so the run is left out; "
-                 "running the same study again simulates the lost evaluations")
+            warn(f"{journal_file(folder, f'{algorithm}-{run:02d}')}: the last {content.tail_size} bytes are torn, "
+                 "so the run counts as unfinished; running the same study again simulates the lost evaluations")
         if content is None or content.evaluations is None:
             continue
         requests = sorted((position, row) for row, position in enumerate(content.positions) if 0 <= position < search.budget)
@@ -189,7 +189,7 @@ def status(directory: str | Path) -> Status:
     folder = Path(directory)
     manifest = read_manifest(folder)
     if "imported" in manifest:
-        raise InputError(folder, "holds imported solutions, which have no runs", "results of the command study")
+        raise InputError(folder, "holds imported solutions, which have no runs", "results of the command `study`")
     search = _read_search(folder, manifest)
     runs = [_summarise_run(*journal, search.budget) for journal in _read_journals(folder, manifest, search.runs)]
     table = folder / SOLUTIONS
