@@ -84,7 +84,7 @@ def run_campaign(study: Study, keys: Iterable[RunKey], results: ResultsDirectory
     results.begin(original)
     problem = Problem(characteristics=characteristics, original=original, evaluations=study.search.evaluations,
                       population=study.search.population, scoring=results.scoring, region=region_of(study))
-    campaign = Campaign(original, {}, [], [], {}, {}, results.scoring)
+    campaign = Campaign(original, solutions={}, failures=[], busy=[], collisions={}, invalid_tests={}, scoring=results.scoring)
     keys_left, runs = deque(keys), set[Run]()
 
     def begin_search(key: RunKey) -> Search:

@@ -75,7 +75,7 @@ class Verification:
         expected = run.sample_for_sumo(rng) if self._uses_recorded_scenes else None
         if not expected:
             return False
-        if self._sumo_study is not self._study:  # SUMO repeats only a few cells of a rating, so these cells need values to compare with
+        if self._sumo_study is not self._study:  # SUMO repeats a few cells of a rating; the run has no values of single cells
             expected = evaluate(assemble(self._sumo_study), expected.settings)
         self._unverified[run] = expected, len(expected)
         self._sumo_batcher.add(run, expected.settings)

@@ -131,7 +131,7 @@ MIN_RHO, MIN_RHO_IN_DIRECTION = 0.7, 0.4
 MAX_FACTOR = 1.5
 """Largest factor between two shares, or two means, that count as equal."""
 MIN_SHARE, MIN_SHARE_IN_DIRECTION = 0.8, 0.6
-"""Least share of characteristics that lean to the same direction, for directions to hold, and to hold in direction."""
+"""Least share of characteristics that lean to the published direction, for directions to hold, and to hold in direction."""
 MIN_LEAN = 0.2
 """Least difference between the shares of increases and decreases for a characteristic to lean to one direction."""
 RULES = (
@@ -291,9 +291,10 @@ def _float_or_none(value: object) -> float | None:
 
 
 TABLE_READERS: Mapping[str, TableReader] = {
-    "rq1": _make_test_reader("RQ1", "algorithm", "safer than the original vehicle", "more unsafe than the original vehicle"),
-    "rq2": _make_test_reader("RQ2", "baseline", "NSGA-II does better", "NSGA-II does worse"),
+    "rq1": _make_test_reader("RQ1", "algorithm", if_larger="safer than the original vehicle",
+                             if_smaller="more unsafe than the original vehicle"),
+    "rq2": _make_test_reader("RQ2", "baseline", if_larger="NSGA-II does better", if_smaller="NSGA-II does worse"),
     "rq3.1": _read_change_numbers, "rq3.2": _read_orders, "rq3.3": _read_directions,
-    "rq3.3-safety": _make_ratio_reader("RQ3.3", "quantity", "value", "mean change of safety in critical solutions"),
-    "collisions": _make_ratio_reader("collisions", "algorithm", "share", "share of the solutions that collide"),
+    "rq3.3-safety": _make_ratio_reader("RQ3.3", "quantity", value_column="value", value_name="mean change of safety in critical solutions"),
+    "collisions": _make_ratio_reader("collisions", "algorithm", value_column="share", value_name="share of the solutions that collide"),
     "combinations": _read_combinations, "weather": _read_weathers}

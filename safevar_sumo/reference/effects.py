@@ -99,7 +99,7 @@ class Coverage(NamedTuple):
     def __str__(self) -> str:
         return (f"The {BAND_SHARE:.0%} band of {self.sets} parameter sets, of repeats and of the model's error is {self.width:.2f} m wide "
                 f"(median) and covers {self.all_rows:.0%} of {self.rows} rows, {self.held_back:.0%} of the rows held back; "
-                f"{self.needed:.2f} m more on each side would cover {BAND_SHARE:.0%} of the latter.")
+                f"{self.needed:.2f} m more on each side would cover {BAND_SHARE:.0%} of the rows held back.")
 
 
 def measure_coverage(data: ReferenceData, study: Study) -> Coverage:

@@ -58,7 +58,7 @@ class Batch(msgspec.Struct, frozen=True, tag="batch", omit_defaults=True):
 
 
 class Result(msgspec.Struct, frozen=True, tag="result", omit_defaults=True):
-    """Solutions of a run by `positions` of their evaluations; the run requested `asked` of `budget` evaluations (0 in format 1)."""
+    """Solutions of a run by `positions` of their evaluations; the run requested `asked` of `budget` evaluations (format 1: budget 0)."""
 
     positions: list[int]
     asked: int

@@ -194,17 +194,18 @@ def status(directory: str | Path) -> Status:
     runs = [_summarise_run(*journal, search.budget) for journal in _read_journals(folder, manifest, search.runs)]
     table = folder / SOLUTIONS
     remarks = [f"{table} was edited: it no longer holds the computed solutions"] if is_edited(table, manifest) else []
-    return Status(str(manifest["study"].get("name")), str(manifest["study"].get("title")), search.budget, tuple(run for run, _ in runs),
-                  np.concatenate([points for _, points in runs]), tuple(remarks))
+    return Status(study=str(manifest["study"].get("name")), title=str(manifest["study"].get("title")), budget=search.budget,
+                  runs=tuple(run for run, _ in runs), points=np.concatenate([objectives for _, objectives in runs]), remarks=tuple(remarks))
 
 
 def _summarise_run(algorithm: str, run: int, content: JournalContent | None, budget: int) -> tuple[RunStatus, np.ndarray]:
     """Progress of a run, and objectives of its valid evaluations."""
     evaluations = content.requested_within(budget) if content is not None else None
     if content is None or evaluations is None:
-        return RunStatus(algorithm, run, "waiting" if content is None else "begun", 0, 0, 0, None), np.zeros((0, 3))
+        state = "waiting" if content is None else "begun"
+        return RunStatus(algorithm, run, state, simulated=0, collisions=0, simulator_errors=0, best=None), np.zeros((0, 3))
     valid_evaluations = evaluations.take(evaluations.valid)
     state = "finished" if content.result(budget) is not None else "begun"
     best = float(np.min(valid_evaluations.f_safe)) if len(valid_evaluations) else None
-    return (RunStatus(algorithm, run, state, len(evaluations), int(np.count_nonzero(evaluations.collided)),
-                      int(np.count_nonzero(evaluations.failed)), best), valid_evaluations.objectives)
+    return (RunStatus(algorithm, run, state, simulated=len(evaluations), collisions=int(np.count_nonzero(evaluations.collided)),
+                      simulator_errors=int(np.count_nonzero(evaluations.failed)), best=best), valid_evaluations.objectives)

@@ -37,7 +37,7 @@ def fitness_class(objective_count: int) -> type[Any]:
 
 
 class Individual(list[float]):
-    """Unfiltered values of a setting; once evaluated, also its fitness and its `evaluation`: a batch of evaluations and a row of it.
+    """Unfiltered values of a setting; once evaluated, also its fitness and its `evaluation`: a batch of evaluations and a row in it.
 
     `has_failed` is true if the evaluation is not valid. `standing` is the value by which an algorithm compares survivors: less is better.
     """

@@ -57,15 +57,15 @@ class MapElites(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         InputError
             If there are too many cells, or pyribs is not installed.
         """
-        number = 2**characteristic_count if self.behaviour == "changes" else characteristic_count * (self.speeds + 1)
-        if number > MAX_CELLS:
+        cell_count = 2**characteristic_count if self.behaviour == "changes" else characteristic_count * (self.speeds + 1)
+        if cell_count > MAX_CELLS:
             raise InputError(source, f"search.map_elites.behaviour = 'changes' has 2^{characteristic_count} cells", "'speed'")
         try:
             import ribs  # noqa: F401
         except ImportError:
             raise InputError(source, "search.algorithms = 'map_elites' needs pyribs, which is not installed",
                              "pip install 'safevar_sumo[qd]'") from None
-        return number
+        return cell_count
 
     def search(self, problem: Problem, rng: np.random.Generator) -> Search:
         cell_count = self.count_cells(len(problem.characteristics))

@@ -29,7 +29,7 @@ CONNECT_TIMEOUT = 10.0
 """Longest time for the scheduler to answer [s]."""
 SECONDS_BETWEEN_COUNTS = 5.0
 VERSIONED_PACKAGES = ("safevar_sumo", "libsumo", "numpy")
-"""Packages that must have the same version here and on every worker."""
+"""Packages that must have the same version in this process and on every worker."""
 _libsumo_lock = threading.Lock()
 
 
