@@ -272,7 +272,7 @@ def replicate(directories: tuple[str, ...], published: tuple[str, ...], out: Pat
         check_writable(out)
     for directory in published:
         if Path(directory).resolve() in [Path(other).resolve() for other in directories]:
-            raise InputError("--published", f"{directory} is given as results too", "results that the command import has written")
+            raise InputError("--published", f"{directory} is given as results too", "results that the command `import` has written")
     pairs = pair_cases(load_cases(directories), load_cases(published))
     page = render_replication(pairs, _compare_nearby(pairs.here, references))
     if out is None:

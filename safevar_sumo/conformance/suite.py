@@ -85,7 +85,7 @@ def refuse_defects(study: Study) -> list[str]:
             problem = f"{report.key} {finding.got}{'' if location in finding.got else f' ({location})'}"
             if finding.check in BLOCKING_CHECKS:
                 command = f"python -m safevar_sumo check {shlex.quote(study.origin.called or study.name)}"
-                raise UserCodeError(study.source, f"{problem}; again by: {command}", f"{finding.expected}; {finding.advice}")
+                raise UserCodeError(study.source, f"{problem}; to reproduce it: {command}", f"{finding.expected}; {finding.advice}")
             remarks.append(f"{problem}; expected: {finding.expected}")
     return remarks
 

@@ -39,7 +39,7 @@ class Pool(Protocol):
     def workers(self) -> int:
         """Number of batches that are computed at the same time."""
 
-    def submit(self, study: bytes, settings: FloatArray) -> Future[Evaluations]:
+    def submit(self, work: bytes, settings: FloatArray) -> Future[Evaluations]:
         """Evaluate k filtered settings of n characteristics, shape (k, n), of a packed study."""
 
 
@@ -105,7 +105,7 @@ def evaluate_batch(work: bytes, settings: FloatArray) -> Evaluations:
         return replace(Evaluations.none(settings.shape[1], METRICS), reasons={remark.encode(): remark for remark in remarks})
     if mode.afresh:
         unload_user_modules()
-        assembler = _task_and_system.__wrapped__
+        assembler = _task_and_system.__wrapped__  # the function without its cache
     else:
         assembler = _task_and_system
     with note_inputs() as reading:

@@ -76,7 +76,7 @@ def ask_for_opinions(source: Study | Case, options: OpinionOptions, *, pool: Poo
     """
     if isinstance(source, Study):
         raise InputError(source.origin.called or source.name, "is a study and has no solutions",
-                         "a directory that the command study has written")
+                         "a directory that the command `study` has written")
     assemble_both_systems(source.study)
     explain_options = ExplainOptions(solutions=options.solutions, unsafe=options.unsafe, limit=SIMULATION_LIMIT)
     with open_evaluator(source.study, pool, jobs, progress) as evaluator:

@@ -110,7 +110,7 @@ class Case:
             If the solutions are imported and belong to no run.
         """
         if not self.has_runs:
-            raise UnanswerableError(self.name, "is imported: the runs of its solutions are unknown", "results of the command study")
+            raise UnanswerableError(self.name, "is imported: the runs of its solutions are unknown", "results of the command `study`")
         return sorted(run for name, run in self.finished_runs if name == algorithm)
 
     @property
@@ -168,7 +168,7 @@ def _load_or_refuse(path: Path) -> Case:
     try:
         return load_case(path)
     except (TypeError, ValueError, KeyError, ArithmeticError) as error:
-        raise InputError(path, f"is damaged: {describe_error(error)}", "an unchanged directory of the command study") from error
+        raise InputError(path, f"is damaged: {describe_error(error)}", "an unchanged directory of the command `study`") from error
 
 
 def load_case(directory: Path) -> Case:
@@ -181,7 +181,7 @@ def load_case(directory: Path) -> Case:
         raise error_with_key(directory / MANIFEST, manifest["study"], error, "study") from None
     original = manifest.get("original")
     if not isinstance(original, dict):
-        raise InputError(directory / MANIFEST, "does not describe the original vehicle", "a manifest of the command study")
+        raise InputError(directory / MANIFEST, "does not describe the original vehicle", "a manifest of the command `study`")
     try:
         scoring = msgspec.convert(manifest["scoring"], Scoring) if "scoring" in manifest else PUBLISHED_SCORING
     except msgspec.ValidationError as error:
