@@ -100,7 +100,8 @@ def rq33(case: Case) -> pd.DataFrame:
 def rq33_safety(case: Case) -> pd.DataFrame:
     """Effect on safety of the critical solutions with j characteristics changed: the footer of RQ3.3's table.
 
-    Columns setting, quantity, j, value, percent (of the original's value), n; value is None where n is 0. Quantities:
+    Columns setting, quantity, j, value, percent (of the original's value), n (number of solutions in the mean); value is None where n
+    is 0. Quantities:
 
     - avgSD_mD: mean reduction of the distance over solutions without collision [m];
     - avgSD_cS: mean collision speed over collisions [m/s]; it has no percent;
