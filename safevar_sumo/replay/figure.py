@@ -109,8 +109,8 @@ def _draw_mark(axis: Axes, row: int, point: tuple[float, float], mark: str, text
 def _draw_speed(axis: Axes, comparison: Comparison, row: int) -> None:
     trace, key_moments = comparison.film.runs.trace, find_moments(comparison.film.runs, row)
     _draw_line(axis, comparison, row, trace.speed[:, row])
-    if key_moments.brake is not None:
-        _draw_mark(axis, row, (trace.time[key_moments.brake], trace.speed[key_moments.brake, row]), BRAKING_MARK)
+    if key_moments.braking_start is not None:
+        _draw_mark(axis, row, (trace.time[key_moments.braking_start], trace.speed[key_moments.braking_start, row]), BRAKING_MARK)
     impact_speed = float(comparison.film.runs.collision_speed[row])
     if not np.isnan(impact_speed):
         _draw_mark(axis, row, (trace.time[key_moments.end], impact_speed), IMPACT_MARK, f"{impact_speed:.1f} m/s", is_speed=True)
