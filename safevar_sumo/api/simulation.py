@@ -202,9 +202,9 @@ def simulate_with_original(study: Study, system: System, requested: FloatArray, 
     """Simulate a setting, shape (n,), that is yet to be filtered, and the original vehicle."""
     characteristics = system.characteristics
     setting = characteristics.filter(requested) if filtered else requested
-    original = _simulate_one(study, system, characteristics.original, characteristics.original)
+    original = _simulate_one(study, system, requested=characteristics.original, setting=characteristics.original)
     if np.array_equal(setting, characteristics.original) and not gui:
-        return replace(original, put_back=_put_back(system, requested, setting))
+        return replace(original, put_back=_values_put_back(system, requested, setting))
     return replace(_simulate_one(study, system, requested, setting, Engine.GUI if gui else Engine.LIBSUMO), _original=original)
 
 
@@ -220,11 +220,11 @@ def _simulate_one(study: Study, system: System, requested: FloatArray, setting: 
     runs = simulate_settings(replace(system_at_worst_point(system, settings), ads=recording), settings, engine)  # in SUMO itself
     return Simulation(
         study=study, setting=dict(zip(system.characteristics.names, setting.tolist(), strict=True)),
-        put_back=_put_back(system, requested, setting), evaluation=score(system, settings, runs), runs=runs,
+        put_back=_values_put_back(system, requested, setting), evaluation=score(system, settings, runs), runs=runs,
         scoring=system.measuring.scoring, _recording=recording)
 
 
-def _put_back(system: System, requested: FloatArray, setting: FloatArray) -> dict[str, float]:
+def _values_put_back(system: System, requested: FloatArray, setting: FloatArray) -> dict[str, float]:
     values = zip(system.characteristics.names, requested, setting, strict=True)
     return {name: float(requested_value) for name, requested_value, filtered_value in values if requested_value != filtered_value}
 
@@ -280,7 +280,8 @@ def evaluate(study: StudyLike, settings: pd.DataFrame | Sequence[Mapping[str, fl
     simulated_settings = characteristics.filter(requested) if filtered else requested
     with open_progress(progress) as report_progress:
         evaluations = evaluate_settings(loaded_study, simulated_settings, pool, jobs, report_progress)
-    frame = evaluations_frame(characteristics.names, [(("", 0), evaluations)]).drop(columns=["algorithm", "run"])
+    no_run = "", 0
+    frame = evaluations_frame(characteristics.names, [(no_run, evaluations)]).drop(columns=["algorithm", "run"])
     frame.insert(len(frame.columns) - 1, "collision_speed", evaluations.collision_speed)
     return frame.set_axis(index)
 

@@ -168,13 +168,15 @@ def print_summary(console: Console, study: Study, campaign: Campaign, directory:
         if solutions_of_runs:
             evaluations_by_vehicle[algorithm] = Evaluations.concatenate(solutions_of_runs)
     table = WholeTable("", right=evaluations_by_vehicle, title=study.title)
-    table.add_row("solutions", "-", *(str(len(rows)) for rows in list(evaluations_by_vehicle.values())[1:]))
-    table.add_row("solutions that collide", *(str(int(np.count_nonzero(rows.collided))) for rows in evaluations_by_vehicle.values()))
+    table.add_row("solutions", "-", *(str(len(evaluations)) for evaluations in list(evaluations_by_vehicle.values())[1:]))
+    table.add_row("solutions that collide", *(
+        str(int(np.count_nonzero(evaluations.collided))) for evaluations in evaluations_by_vehicle.values()))
     collisions = [sum(count for key, count in campaign.collisions.items() if key.algorithm == name)
                   for name in list(evaluations_by_vehicle)[1:]]
     table.add_row("collisions simulated", *map(str, [int(campaign.original.collided[0]), *collisions]))
     for metric in campaign.scoring.metrics:
-        table.add_row(f"mean {metric.heading}", *(_mean_text(rows.metrics[metric.name]) for rows in evaluations_by_vehicle.values()))
+        table.add_row(f"mean {metric.heading}", *(
+            _mean_text(evaluations.metrics[metric.name]) for evaluations in evaluations_by_vehicle.values()))
     console.print(table)
     console.print(SAFETY_NOTE)
     if campaign.failures:

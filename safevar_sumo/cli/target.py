@@ -62,7 +62,8 @@ def load_target(source: str, solution: str | None, choice: str | None) -> Comman
     handle = requested_handle or choose_handle(case.solutions, case.unsafe, str(choice), source)
     row = case.solutions.iloc[row_of_handle(case.solutions, handle)]
     setting = row[list(case.characteristics.names)].to_numpy(dtype=float)
-    return CommandTarget(case.study, source, handle, setting, {str(name): value for name, value in row.items()})
+    return CommandTarget(study=case.study, source=source, handle=handle, setting=setting,
+                         row={str(name): value for name, value in row.items()})
 
 
 jobs_option = click.option("--jobs", type=click.IntRange(1, 1024), help="Worker processes.  [default: the cores of this machine]")
@@ -141,7 +142,7 @@ def results_or_study(source: str, point: str | None = None, *, results_only: boo
 def _restrict_to_point(study: Study, point: str) -> Study:
     from safevar_sumo.sumo.matrix import study_at
 
-    return study_at(study, point, "--point")
+    return study_at(study, point, source="--point")
 
 
 def study_at_point(source: str, point: str | None = None) -> Study:

@@ -62,7 +62,7 @@ class Estimate:
     """A probability, its coefficient of variation and interval, the most probable failure in standard normal space, and a remark."""
 
     probability: float
-    variation: float
+    coefficient_of_variation: float
     interval: tuple[float, float]
     failures: int
     errors: int
@@ -161,8 +161,8 @@ def estimate_rare(response: Response, method: str, confidence: float, seed: int)
                 response.expected_simulations = response.simulations * repeats // REPEATS
     mean = float(np.mean(probabilities))
     if mean <= 0:
-        return Estimate(probability=0.0, variation=math.nan, interval=(0.0, MIN_PROBABILITY), failures=response.failure_count,
-                        errors=response.errors, simulations=response.simulations, design_point=None,
+        return Estimate(probability=0.0, coefficient_of_variation=math.nan, interval=(0.0, MIN_PROBABILITY),
+                        failures=response.failure_count, errors=response.errors, simulations=response.simulations, design_point=None,
                         remark="no failure was found: either there is none, or the response does not lead to it")
     spread = float(np.std(probabilities, ddof=1)) / mean / math.sqrt(repeats)
     variation = max(spread, INFLATION * math.sqrt(float(np.mean(np.square(variations))) / repeats))
@@ -170,7 +170,7 @@ def estimate_rare(response: Response, method: str, confidence: float, seed: int)
     factor = math.exp(quantile * math.sqrt(math.log1p(variation**2)))
     rng = np.random.default_rng(seed)
     remark = _remark_on_islands(response, thresholds, rng)
-    return Estimate(probability=mean, variation=variation, interval=(mean / factor, min(mean * factor, 1.0)),
+    return Estimate(probability=mean, coefficient_of_variation=variation, interval=(mean / factor, min(mean * factor, 1.0)),
                     failures=response.failure_count, errors=response.errors, design_point=_find_design_point(response, rng), remark=remark,
                     simulations=response.simulations)
 
@@ -224,7 +224,7 @@ def _run_subset_simulation(response: Response, seed: int) -> tuple[float, float,
 
 
 def _run_cross_entropy(response: Response, seed: int) -> tuple[float, float, list[float]]:
-    """As `_run_subset_simulation`, by cross-entropy importance sampling with one normal distribution of independent components."""
+    """Probability and coefficient of variation by cross-entropy importance sampling with independent normal variables; no thresholds."""
     ot = load_openturns()
     algorithm = ot.StandardSpaceCrossEntropyImportanceSampling(_failure_event(ot, response, response.dimensions), 2 * LEVEL_SHARE)
     algorithm.setBlockSize(LEVEL_SIZE)
