@@ -155,7 +155,7 @@ class Simulation:
 
     def to_dict(self) -> dict[str, Any]:
         """The JSON of `simulate`: plain values, None where undefined."""
-        return {"study": self.study.name, "vcs": dict(self.setting), **record(self.evaluation, 0)}
+        return {"study": self.study.name, "vcs": dict(self.setting), **record(self.evaluation, row=0)}
 
     def __repr__(self) -> str:
         metrics = ", ".join(f"{name}={value:.4g}" for name, value in self.metrics.items())

@@ -12,7 +12,7 @@ from rich.console import Console
 from safevar_sumo.analysis.rating import RatingOptions
 from safevar_sumo.cli.arguments import PICTURE_ENDINGS, check_output, read_changes
 from safevar_sumo.cli.program import commands
-from safevar_sumo.cli.target import add_flags, as_it_is_now_option, jobs_option, json_option, results_or_study
+from safevar_sumo.cli.target import add_flags, as_it_is_now_option, jobs_option, json_option, load_results_or_study
 from safevar_sumo.errors import InputError
 from safevar_sumo.study import Study
 from safevar_sumo.terminal import show_stages
@@ -43,7 +43,7 @@ def rating(source: str, changes: tuple[str, ...], solution: str | None, matrix: 
     from safevar_sumo.analysis.rating.compute import rate_variant, remarks
     from safevar_sumo.analysis.rating.render import matrices_figure, print_matrices, print_rating
 
-    subject = results_or_study(source)
+    subject = load_results_or_study(source)
     study = subject if isinstance(subject, Study) else subject.study
     options = RatingOptions(changes=_read_single_changes(study, changes), solution=solution)
     if force and xlsx is None and preprocessed is None and plot is None:

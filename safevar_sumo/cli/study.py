@@ -125,9 +125,9 @@ def status(directory: str, watch: bool, every: float, as_json: bool) -> None:
             click.echo(json.dumps(progress.record()))
         return
     if not watch:
-        Console().print(status_view(progress, None))
+        Console().print(status_view(progress, rate=None))
         return
-    with Live(status_view(progress, None), console=Console(), auto_refresh=False) as live:
+    with Live(status_view(progress, rate=None), console=Console(), auto_refresh=False) as live:
         while not progress.finished:
             time.sleep(every)
             progress = read_status(directory)
@@ -188,7 +188,7 @@ def print_summary(console: Console, study: Study, campaign: Campaign, directory:
         print_text(console, f"{invalid} settings leave the tolerance of a test's speed before the ADS acts (invalid-test): "
                             "they are neither failures nor successes, and no result contains them.")
     _print_most_critical(console, study, campaign)
-    case = build_case(study, record(campaign.original, 0), solutions, solutions_frame(names, []), tuple(campaign.solutions),
+    case = build_case(study, record(campaign.original, row=0), solutions, solutions_frame(names, []), tuple(campaign.solutions),
                       scoring=campaign.scoring)
     for line in summary_lines(case):
         print_text(console, line)

@@ -101,7 +101,7 @@ def _lane_data(lane: Any) -> dict[str, Any]:
 def _moving_body_data(body: FlatBody) -> dict[str, Any]:
     degrees = -np.rad2deg(np.unwrap(body.heading)) if np.isfinite(body.heading).all() else -np.rad2deg(body.heading)
     return {"drive": body.row if body.is_vut else None, "x": _rounded_or_constant(body.x), "y": _rounded_or_constant(-body.y),
-            "heading": _rounded_or_constant(degrees, 1)}
+            "heading": _rounded_or_constant(degrees, decimals=1)}
 
 
 def _still_body_data(body: FlatBody, scene: FlatScene) -> dict[str, Any]:

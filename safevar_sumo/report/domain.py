@@ -51,7 +51,7 @@ def make_rules_section(data: ReportInput, jobs: int | None, progress: Progress) 
         words = [superscript_powers(rule_in_words(rule, data.case.characteristics, found.unsafe)) for rule in significant]
         omitted_rules = number_of(len(found.rules) - len(significant), "rule")
         remark = found.remark if len(significant) == len(found.rules) else (
-            f"Left out: {omitted_rules} that may be chance with so few vehicles; the command rules simulates more.")
+            f"Left out: {omitted_rules} that may be due to chance, as few vehicles were simulated; `rules` simulates more.")
         return {"words": words, "samples": found.samples, "share": found.unsafe_share, "remark": remark, "unsafe": str(found.unsafe)}
 
     result: Section = load_or_compute(data, "rules", compute)

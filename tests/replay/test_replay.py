@@ -63,7 +63,7 @@ def test_the_most_severe_the_smallest_and_the_fewest(flag: str, column: str, sli
 def test_a_replay_that_differs_from_its_row_is_reported(slippery: Path, case: Case) -> None:
     comparison = compare_setting(case.study, assemble(case.study), case.characteristics.original)
     result = list_differences(comparison.evaluations, {"safety_degree": 1.0, "tet": np.nan, "outcome": "collision"})
-    assert [one.split(" is ")[0] for one in result] == ["the outcome", "safety_degree", "tet"]
+    assert [one.split(" was ")[0] for one in result] == ["the outcome", "safety_degree", "tet"]
 
 
 @pytest.mark.parametrize(("arguments", "legal"), [

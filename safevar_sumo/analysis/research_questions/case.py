@@ -131,7 +131,7 @@ class Case:
                 lines.append(f"{self.name}: unfinished, {', '.join(shortfalls)}; tables use the finished runs.")
         if self.failures:
             lines.append(f"{self.name}: {len(self.failures)} settings could not be simulated (simulator-error) and are in no result: "
-                        f"{'; '.join(failure_lines(self.failures))}. study --retry-failed simulates them again.")
+                        f"{'; '.join(failure_lines(self.failures))}. `study --retry-failed` simulates them again.")
         return lines
 
 

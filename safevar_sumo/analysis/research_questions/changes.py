@@ -148,8 +148,8 @@ def count_collisions(case: Case) -> pd.DataFrame:
 def frequent_combinations(case: Case) -> pd.DataFrame:
     """The most frequent combinations among the critical solutions with exactly four characteristics changed.
 
-    Columns setting, rank (ties share the better one), characteristics (a list), percent of those solutions; no row
-    where there is no such solution. Of combinations that are equally frequent, those with the earlier
+    Columns setting, rank (ties share the better one), characteristics (a list), percent (of the solutions with exactly four
+    changes); no row where there is no such solution. Of combinations that are equally frequent, those with the earlier
     characteristics in the study come first.
     """
     is_changed = changes_of(case, critical_solutions(case)) != 0

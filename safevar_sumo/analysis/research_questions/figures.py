@@ -44,7 +44,7 @@ def draw_change_counts(cases: Sequence[Case]) -> Figure:
     Raises
     ------
     UnanswerableError
-        As `rq31`, for the first case that has no answer.
+        If `rq31` raises it for a case.
     """
     import seaborn as sns
 

@@ -56,9 +56,9 @@ def rq1_runs(case: Case) -> pd.DataFrame:
 
 
 def rq2_runs(case: Case) -> pd.DataFrame:
-    """NSGA-II's runs against those of every other algorithm: indicators and metrics' run means, Mann-Whitney U.
+    """Compare NSGA-II with every other algorithm by Mann-Whitney U, with one value per run: indicators, and metrics' means over solutions.
 
-    Columns: `RQ2_RUNS_COLUMNS`. `effect_size` is A12, oriented as in `rq2`; `n1` and `n2` count runs; `p_holm` as in `rq1_runs`.
+    Columns: `RQ2_RUNS_COLUMNS`. `effect_size` is A12, oriented as in `rq2`; `n1` and `n2` count runs; `p_holm` is defined as in `rq1_runs`.
 
     Raises
     ------
@@ -118,7 +118,7 @@ def significance_change_line(case: Case) -> str:
     Raises
     ------
     UnanswerableError
-        As `rq1_runs`.
+        If `rq1_runs` raises it.
     """
     titles = titles_of(case.scoring.metrics)
     rq1_runs_frame, rq2_runs_frame = _corrected_frames(case)

@@ -74,4 +74,4 @@ def risk(study: StudyLike | Results, *, samples: int = RiskOptions.samples, conf
     """
     from safevar_sumo.analysis.risk.compute import estimate_risk
 
-    return answer_question(estimate_risk, study_of(study, as_it_is_now=as_it_is_now), RiskOptions, arguments=locals())
+    return answer_question(estimate_risk, study_of(study, as_it_is_now=as_it_is_now), RiskOptions, locals())  # the arguments

@@ -167,7 +167,7 @@ class Risk:
     remark: str
 
     @property
-    def of_domain(self) -> bool:
+    def is_share_of_domain(self) -> bool:
         """Whether the probability is a share of the domain, because the study does not say how vehicles vary."""
         return not self.study.variation
 

@@ -80,13 +80,13 @@ class Response:
         self.simulations = self.errors = self.failure_count = 0
         self.stage = "rare failures"
         self.expected_simulations = 1
-        self._failure_points: list[FloatArray] = []
+        self._failure_batches: list[FloatArray] = []
         """Points of unsafe vehicles in each call, shape (k, n) each."""
 
     @property
-    def failures(self) -> FloatArray:
+    def failure_points(self) -> FloatArray:
         """Distinct points of unsafe vehicles, shape (k, n)."""
-        return np.unique(np.concatenate([np.zeros((0, self.dimensions)), *self._failure_points]), axis=0)
+        return np.unique(np.concatenate([np.zeros((0, self.dimensions)), *self._failure_batches]), axis=0)
 
     def __call__(self, points: Any) -> FloatArray:
         """The response at points, shape (N, n)."""
@@ -103,7 +103,7 @@ class Response:
         self.simulations += len(points)
         self.errors += int(np.count_nonzero(~evaluations.valid))
         self.failure_count += int(np.count_nonzero(is_unsafe))
-        self._failure_points.append(points[is_unsafe])
+        self._failure_batches.append(points[is_unsafe])
         return np.where(is_unsafe, np.minimum(margin, -MIN_RESPONSE), np.maximum(margin, MIN_RESPONSE))
 
 
@@ -239,7 +239,7 @@ def _run_cross_entropy(response: Response, seed: int) -> tuple[float, float, lis
 
 def _remark_on_islands(response: Response, thresholds: list[float], rng: np.random.Generator) -> str:
     """A remark if failures lie on islands with safe settings between them: straight paths between islands do not stay near failure."""
-    failures = response.failures
+    failures = response.failure_points
     if len(failures) < 2:
         return ""
     nodes = _select_distant_points(failures[rng.permutation(len(failures))[:2000]])
@@ -271,9 +271,9 @@ def _select_distant_points(points: FloatArray) -> FloatArray:
 
 def _find_design_point(response: Response, rng: np.random.Generator) -> FloatArray | None:
     """The failure nearest to the origin, searched between the nearest known failure and the origin, and around that failure."""
-    if not len(response.failures):
+    if not len(response.failure_points):
         return None
-    nearest, response.stage = _nearest_point(response.failures), "most probable failure"
+    nearest, response.stage = _nearest_point(response.failure_points), "most probable failure"
     for search_round in range(SEARCH_ROUNDS):
         inner_points = nearest * np.linspace(0.5, 1.0, SEARCH_SETTINGS)[:, np.newaxis]
         random_points = (nearest * (1 - 0.05 * rng.random((SEARCH_SETTINGS, 1)))

@@ -41,4 +41,4 @@ def rules(study: StudyLike | Results, *, samples: int = RulesOptions.samples, un
     """
     from safevar_sumo.analysis.rules.compute import find_rules
 
-    return answer_question(find_rules, study_of(study, as_it_is_now=as_it_is_now), RulesOptions, arguments=locals())
+    return answer_question(find_rules, study_of(study, as_it_is_now=as_it_is_now), RulesOptions, locals())  # the arguments
