@@ -153,8 +153,10 @@ class Trace:
     """T samples of N vehicles, `step` seconds apart; arrays of shape (T, N), `time` (T,).
 
     A vehicle's samples count while `active`; later samples are meaningless, as SUMO continues with the rest of the batch.
-    `vehicle_length`, `position` along the path, `gap` and `lateral` in m, speeds in m/s, `throttle` and `brake` as commanded,
-    `pedal` is the brake pedal's position; `obstacle_speed` is the obstacle's speed along the vehicle's path.
+
+    - `vehicle_length`, `position` along the path, `gap` and `lateral` are in m, all speeds in m/s.
+    - `throttle` and `brake` are the pedals as commanded, `pedal` is the brake pedal's position.
+    - `obstacle_speed` is the obstacle's speed along the vehicle's path.
     """
 
     step: float
@@ -181,8 +183,9 @@ class Trace:
 class Contact(NamedTuple):
     """The position of the first contact on the outline of each of N vehicles, shape (N,).
 
-    `side` is one of `SIDES`, empty without a contact. `place` is the position of the obstacle's middle [% of the vehicle's width from the
-    side on which `lateral` is negative, or of its length from the front], within 0 to 100, NaN without a contact.
+    `side` is front, left, right or rear; empty without a contact. `place` is the position of the obstacle's middle, 0 to 100; NaN without a
+    contact. At the front or rear it is in % of the vehicle's width, from the side on which `lateral` is negative; at the left or right in %
+    of its length, from the front.
     """
 
     side: npt.NDArray[np.str_]

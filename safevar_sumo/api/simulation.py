@@ -56,8 +56,8 @@ class RecordingAds:
 def trace_frame(runs: SimulationRuns, recording: RecordingAds) -> pd.DataFrame:
     """One row per step of the only vehicle while its simulation counts.
 
-    The columns `gap` (along the vehicle's path) and `lateral` (from the middle of its lane) hold the obstacle's true position, the columns
-    that begin with "seen" the values that the ADS observed. `ttc` is empty while no gap closes or the vehicle stands, `gap` while no
+    The columns `gap` (along the vehicle's path) and `lateral` (from the middle of its lane) hold the obstacle's true position; the columns
+    that begin with "seen" hold what the ADS observed. `ttc` is empty while no gap closes or the vehicle stands, `gap` while no
     obstacle is ahead.
     """
     import pandas as pd  # takes longer to load than the simulation
@@ -242,9 +242,11 @@ def evaluate(study: StudyLike, settings: pd.DataFrame | Sequence[Mapping[str, fl
     study
         A study, or anything that `load_study` accepts.
     settings
-        M settings: a mapping for each setting with the changed characteristics, or a frame with a column for each of them, where a
-        missing value (no key, None or NaN) means the original's value; or an array of shape (M, n) without missing values, with the n
-        characteristics in the study's order. Values are in the characteristics' table units.
+        M settings, with values in the characteristics' table units, in one of these forms:
+
+        - a list with a mapping for each setting, or a frame with a row for each setting, of the characteristics that are changed; a
+          missing value (no key, None or NaN) means the original's value;
+        - an array of shape (M, n) without missing values, with the n characteristics in the study's order.
     filtered
         Put changes that are smaller than their thresholds back to the original, as every search does.
     beyond

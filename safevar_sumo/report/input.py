@@ -240,8 +240,8 @@ def _at_point(case: Case, point: str) -> Case:
 def load_or_compute(data: ReportInput, name: str, compute: Callable[[], Any]) -> Any:
     """The result of `compute` as plain values: stored in the results directory, and read from there the next time.
 
-    Nothing is stored if the directory cannot be written, if inputs have changed since the study, or if imported results need user code,
-    of which they record no digest.
+    Nothing is stored if the directory cannot be written, or if inputs have changed since the study. Nothing is stored for imported results
+    of a study with user code either, as they record no digest of this code.
     """
     if data.later_changes or ("imported" in data.manifest and user_code_names(data.case.study)):
         return json.loads(json.dumps(compute(), allow_nan=False))

@@ -181,9 +181,9 @@ def find_weather_pairs(cases: Sequence[Case]) -> list[tuple[Case, Case]]:
 def compare_weathers(clearer: Case, other: Case) -> pd.DataFrame:
     """One weather against another, characteristic by characteristic, over the critical solutions.
 
-    Columns setting, other, characteristic, percent and percent_other (share of the critical solutions that change
-    it), difference (percent_other - percent), rank and rank_other, and the mean signed change in the characteristic's unit:
-    increase, increase_other, decrease, decrease_other.
+    The column setting names the clearer weather's case. Columns without the suffix "_other" belong to this case.
+    Columns: setting, other, characteristic; percent, percent_other (of the critical solutions that change it); difference (percent_other -
+    percent); rank, rank_other; increase, increase_other, decrease, decrease_other (mean signed change in the characteristic's unit).
     """
     tables = []
     for case in (clearer, other):
