@@ -170,5 +170,5 @@ def answer_question(compute: Callable[..., Answer], subject: Study | Case, optio
     values = {name: arguments[name] for name in options.definitions()}
     if values.get("unsafe") is not None:
         values["unsafe"] = str(Unsafe.parse(values["unsafe"]))
-    with open_progress(arguments["progress"]) as show:
-        return compute(subject, options(**values), pool=arguments["pool"], jobs=arguments["jobs"], progress=show)
+    with open_progress(arguments["progress"]) as show_progress:
+        return compute(subject, options(**values), pool=arguments["pool"], jobs=arguments["jobs"], progress=show_progress)

@@ -25,7 +25,7 @@ from safevar_sumo.analysis.research_questions.changes import (
     rq33_safety,
 )
 from safevar_sumo.analysis.research_questions.comparisons import ALPHA, rq1, rq2
-from safevar_sumo.analysis.research_questions.over_runs import correct_by_holm, pooling_effect_line, rq1_runs, rq2_runs, summary_lines
+from safevar_sumo.analysis.research_questions.over_runs import correct_by_holm, rq1_runs, rq2_runs, significance_change_line, summary_lines
 from safevar_sumo.errors import InputError
 from safevar_sumo.study import CharacteristicTable
 from tests.research_questions.made_up import CHARACTERISTICS, ORIGINAL, made_up, made_up_study, row
@@ -228,7 +228,7 @@ def test_solutions_of_one_run_are_not_taken_for_independent() -> None:
     assert (runs["n1"], runs["n2"]) == (8, 8)
     assert runs["effect_size"] == 1 - (0 + 0 + 0 + 0 + 0 + 1 + 1 + 3) / 64
     assert runs["p_value"] == scipy.stats.mannwhitneyu(ours, theirs, method="exact").pvalue > ALPHA / 10
-    assert "RQ2 RS SD is no longer significant" in pooling_effect_line(case)
+    assert "RQ2 RS SD is no longer significant" in significance_change_line(case)
     (original,) = (one for one in rq1_runs(case).to_dict("records") if (one["algorithm"], one["metric"]) == ("nsga2", "safety_degree"))
     assert original["p_value"] == 2 * 2 / 2**8, "signed ranks of which all but the smallest are negative: the second of 2^8 orders"
     assert original["effect_size"] == 1 / 8

@@ -24,7 +24,7 @@ from safevar_sumo.analysis.research_questions.changes import (
     rq33_safety,
 )
 from safevar_sumo.analysis.research_questions.comparisons import rq1, rq2
-from safevar_sumo.analysis.research_questions.over_runs import pooling_effect_line, rq1_runs, rq2_runs
+from safevar_sumo.analysis.research_questions.over_runs import rq1_runs, rq2_runs, significance_change_line
 from safevar_sumo.errors import unknown_name
 from safevar_sumo.metrics import PUBLISHED_SCORING, MetricFacts
 
@@ -113,14 +113,14 @@ def _notes(question: str, case: Case) -> list[str]:
             rows = solutions_for_metric(case.solutions, metric)
             undefined_values = int(rows[metric.name].isna().sum())
             if undefined_values:
-                notes.append(f"{case.name}: {metric.name} is undefined in {undefined_values} of {len(rows)} solutions; the tests omit "
-                             "those.")
+                notes.append(f"{case.name}: {metric.name} is undefined in {undefined_values} of {len(rows)} solutions, which the "
+                             "tests omit.")
     if question == "rq1":
         undefined_metrics = [name for name, value in case.original.items() if pd.isna(value)]
         if undefined_metrics:
             notes.append(f"{case.name}: the original vehicle's {', '.join(undefined_metrics)} is undefined, so that no test uses it.")
     if question in ("rq1-runs", "rq2-runs"):
-        notes.append(f"{case.name}: {pooling_effect_line(case)}")
+        notes.append(f"{case.name}: {significance_change_line(case)}")
     if question == "rq2" and not case.has_runs:
         notes.append(f"{case.name}: igd, igd_plus and hypervolume need runs, which imported solutions do not have.")
     if question == "rq2" and case.has_runs:

@@ -63,7 +63,7 @@ class Estimate:
     """A probability, its coefficient of variation and interval, the most probable failure in standard normal space, and a remark."""
 
     probability: float
-    variation: float
+    coefficient_of_variation: float
     interval: tuple[float, float]
     failures: int
     errors: int
@@ -81,13 +81,13 @@ class Response:
         self.simulations = self.errors = self.failure_count = 0
         self.stage = "rare failures"
         self.expected_simulations = 1
-        self._failure_points: list[FloatArray] = []
+        self._failure_batches: list[FloatArray] = []
         """Points of unsafe vehicles in each call, shape (k, n) each."""
 
     @property
-    def failures(self) -> FloatArray:
+    def failure_points(self) -> FloatArray:
         """Distinct points of unsafe vehicles, shape (k, n)."""
-        return np.unique(np.concatenate([np.zeros((0, self.dimensions)), *self._failure_points]), axis=0)
+        return np.unique(np.concatenate([np.zeros((0, self.dimensions)), *self._failure_batches]), axis=0)
 
     def __call__(self, points: Any) -> FloatArray:
         """The response at points, shape (N, n)."""
@@ -104,7 +104,7 @@ class Response:
         self.simulations += len(points)
         self.errors += int(np.count_nonzero(~evaluations.valid))
         self.failure_count += int(np.count_nonzero(is_unsafe))
-        self._failure_points.append(points[is_unsafe])
+        self._failure_batches.append(points[is_unsafe])
         return np.where(is_unsafe, np.minimum(margin, -MIN_RESPONSE), np.maximum(margin, MIN_RESPONSE))
 
 
@@ -162,8 +162,8 @@ def estimate_rare(response: Response, method: str, confidence: float, seed: int)
                 response.expected_simulations = response.simulations * repeats // REPEATS
     mean = float(np.mean(probabilities))
     if mean <= 0:
-        return Estimate(probability=0.0, variation=math.nan, interval=(0.0, MIN_PROBABILITY), failures=response.failure_count,
-                        errors=response.errors, simulations=response.simulations, design_point=None,
+        return Estimate(probability=0.0, coefficient_of_variation=math.nan, interval=(0.0, MIN_PROBABILITY),
+                        failures=response.failure_count, errors=response.errors, simulations=response.simulations, design_point=None,
                         remark="no failure was found: either there is none, or the response does not lead to it")
     spread = float(np.std(probabilities, ddof=1)) / mean / math.sqrt(repeats)
     variation = max(spread, INFLATION * math.sqrt(float(np.mean(np.square(variations))) / repeats))
@@ -171,7 +171,7 @@ def estimate_rare(response: Response, method: str, confidence: float, seed: int)
     factor = math.exp(quantile * math.sqrt(math.log1p(variation**2)))
     rng = np.random.default_rng(seed)
     remark = _remark_on_islands(response, thresholds, rng)
-    return Estimate(probability=mean, variation=variation, interval=(mean / factor, min(mean * factor, 1.0)),
+    return Estimate(probability=mean, coefficient_of_variation=variation, interval=(mean / factor, min(mean * factor, 1.0)),
                     failures=response.failure_count, errors=response.errors, design_point=_find_design_point(response, rng), remark=remark,
                     simulations=response.simulations)
 
@@ -229,7 +229,7 @@ def _run_subset_simulation(response: Response, seed: int) -> tuple[float, float,
 
 
 def _run_cross_entropy(response: Response, seed: int) -> tuple[float, float, list[float]]:
-    """As `_run_subset_simulation`, by cross-entropy importance sampling with one normal distribution of independent components."""
+    """Probability and coefficient of variation by cross-entropy importance sampling with independent normal variables; no thresholds."""
     ot = load_openturns()
     algorithm = ot.StandardSpaceCrossEntropyImportanceSampling(_failure_event(ot, response, response.dimensions), 2 * LEVEL_SHARE)
     algorithm.setBlockSize(LEVEL_SIZE)
@@ -249,7 +249,7 @@ def _run_cross_entropy(response: Response, seed: int) -> tuple[float, float, lis
 
 def _remark_on_islands(response: Response, thresholds: list[float], rng: np.random.Generator) -> str:
     """A remark if failures lie on islands with safe settings between them: straight paths between islands do not stay near failure."""
-    failures = response.failures
+    failures = response.failure_points
     if len(failures) < 2:
         return ""
     nodes = _select_distant_points(failures[rng.permutation(len(failures))[:2000]])
@@ -281,9 +281,9 @@ def _select_distant_points(points: FloatArray) -> FloatArray:
 
 def _find_design_point(response: Response, rng: np.random.Generator) -> FloatArray | None:
     """The failure nearest to the origin, searched between the nearest known failure and the origin, and around that failure."""
-    if not len(response.failures):
+    if not len(response.failure_points):
         return None
-    nearest, response.stage = _nearest_point(response.failures), "most probable failure"
+    nearest, response.stage = _nearest_point(response.failure_points), "most probable failure"
     for search_round in range(SEARCH_ROUNDS):
         inner_points = nearest * np.linspace(0.5, 1.0, SEARCH_SETTINGS)[:, np.newaxis]
         random_points = (nearest * (1 - 0.05 * rng.random((SEARCH_SETTINGS, 1)))
