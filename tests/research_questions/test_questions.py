@@ -26,7 +26,7 @@ from safevar_sumo.analysis.research_questions.changes import (
     rq33_safety,
 )
 from safevar_sumo.analysis.research_questions.comparisons import ALPHA, rq1, rq2
-from safevar_sumo.analysis.research_questions.over_runs import correct_by_holm, pooling_effect_line, rq1_runs, rq2_runs, summary_lines
+from safevar_sumo.analysis.research_questions.over_runs import correct_by_holm, rq1_runs, rq2_runs, significance_change_line, summary_lines
 from safevar_sumo.errors import InputError
 from safevar_sumo.study import CharacteristicTable
 from tests.research_questions.made_up import CHARACTERISTICS, ORIGINAL, made_up, made_up_study, row
@@ -235,7 +235,7 @@ def test_solutions_of_one_run_are_not_taken_for_independent() -> None:
     assert (runs["n1"], runs["n2"]) == (8, 8)
     assert runs["effect_size"] == 1 - (0 + 0 + 0 + 0 + 0 + 1 + 1 + 3) / 64
     assert runs["p_value"] == scipy.stats.mannwhitneyu(ours, theirs, method="exact").pvalue > ALPHA / 10
-    line = pooling_effect_line(case)
+    line = significance_change_line(case)
     assert re.search(r"\d+ of \d+ tests are no longer significant: .*; RQ2 RS .*SD", line)
     assert line.count("significant") == 1
     notes = {answer.name: "".join(answer.notes) for answer in answer_questions([case]) if answer.name.endswith("-runs")}

@@ -41,7 +41,8 @@ def draw_critical_differences(case: Case) -> Figure:
         raise UnanswerableError(case.name, f"{number_of(run_count, 'run')} are too few for a figure of critical differences: its bar would "
                                 "join all algorithms, whatever their ranks", "results of more runs")
     title = f"{case.name}: mean ranks over {run_count} runs, critical difference {critical_difference:.2f}"
-    figure, axes = new_figure(title, len(metrics), 1, (6.8, 0.9 + len(metrics) * (0.75 + ALGORITHM_HEIGHT * algorithm_count)))
+    figure, axes = new_figure(title, len(metrics), columns=1,
+                              size=(6.8, 0.9 + len(metrics) * (0.75 + ALGORITHM_HEIGHT * algorithm_count)))
     for axis, metric in zip(axes.flat, metrics, strict=True):
         metric_ranks = frame[frame["metric"] == metric].sort_values("mean_rank", kind="stable")
         _draw_mean_ranks(axis, metric_ranks["algorithm"].tolist(), metric_ranks["mean_rank"].to_numpy(dtype=float), critical_difference)

@@ -22,7 +22,7 @@ from safevar_sumo.analysis.research_questions.comparisons import (
     ALPHA,
     TwoSampleTest,
     magnitude_of,
-    require_rq2,
+    require_rq2_algorithms,
     rq1,
     rq1_rows,
     rq2,
@@ -32,8 +32,8 @@ from safevar_sumo.analysis.research_questions.indicators import titles_of
 from safevar_sumo.metrics import MetricFacts
 from safevar_sumo.records import FloatArray
 
-RQ1_COLUMNS = ["setting", "algorithm", "metric", "p_value", "p_holm", "effect_size", "magnitude", "runs", "method", "mean", "original"]
-RQ2_COLUMNS = ["setting", "baseline", "metric", "p_value", "p_holm", "effect_size", "magnitude", "n1", "n2", "method"]
+RQ1_RUNS_COLUMNS = ["setting", "algorithm", "metric", "p_value", "p_holm", "effect_size", "magnitude", "runs", "method", "mean", "original"]
+RQ2_RUNS_COLUMNS = ["setting", "baseline", "metric", "p_value", "p_holm", "effect_size", "magnitude", "n1", "n2", "method"]
 COUNT_COLUMNS = {"RQ1": ["runs"], "RQ2": ["n1", "n2"]}
 """Columns of the numbers of runs that a test of each question compares."""
 EXACT_SIGNED_TEST = "Wilcoxon signed-rank, two-sided, exact"
@@ -45,9 +45,9 @@ MAX_EXACT_RUNS = 50
 def rq1_runs(case: Case) -> pd.DataFrame:
     """Every algorithm's run means against the original's value, metric by metric: Wilcoxon's signed-rank test.
 
-    Columns: `RQ1_COLUMNS`. `effect_size` is the share of runs whose mean is safer than the original's value, plus half the share of equal
-    ones (A12 against one value): below 0.5 the runs are less safe. `mean` is the mean of the run means. `p_holm` is `p_value` corrected by
-    Holm's method for all tests of RQ1 and RQ2 of this case. Undefined values are None.
+    Columns: `RQ1_RUNS_COLUMNS`. `effect_size` is the share of runs whose mean is safer than the original's value, plus half the share of
+    equal ones (A12 against one value): below 0.5 the runs are less safe. `mean` is the mean of the run means. `p_holm` is `p_value`
+    corrected by Holm's method for all tests of RQ1 and RQ2 of this case. Undefined values are None.
 
     Raises
     ------
@@ -58,9 +58,9 @@ def rq1_runs(case: Case) -> pd.DataFrame:
 
 
 def rq2_runs(case: Case) -> pd.DataFrame:
-    """NSGA-II's runs against those of every other algorithm: indicators and metrics' run means, Mann-Whitney U.
+    """Compare NSGA-II with every other algorithm by Mann-Whitney U, with one value per run: indicators, and metrics' means over solutions.
 
-    Columns: `RQ2_COLUMNS`. `effect_size` is A12, oriented as in `rq2`; `n1` and `n2` count runs; `p_holm` as in `rq1_runs`.
+    Columns: `RQ2_RUNS_COLUMNS`. `effect_size` is A12, oriented as in `rq2`; `n1` and `n2` count runs; `p_holm` is defined as in `rq1_runs`.
 
     Raises
     ------
@@ -68,7 +68,7 @@ def rq2_runs(case: Case) -> pd.DataFrame:
         If the solutions belong to no run, NSGA-II is missing, or there is no other algorithm.
     """
     frame = _corrected_frames(case)[1]
-    require_rq2(case)
+    require_rq2_algorithms(case)
     assert frame is not None
     return frame
 
@@ -89,17 +89,19 @@ def signed_rank_test(sample: FloatArray, value: float) -> TwoSampleTest:
     The test drops values equal to `value` (as Wilcoxon did); the effect size counts them by half.
     """
     if not sample.size or np.isnan(value):
-        return TwoSampleTest(None, None, None, len(sample), 0, None)
+        return TwoSampleTest(p_value=None, effect_size=None, magnitude=None, n1=len(sample), n2=0, method=None)
     differences = sample - value
     absolute_differences = np.abs(differences[differences != 0])
     effect = float(np.mean(differences > 0) + np.mean(differences == 0) / 2)
     if not absolute_differences.size:
-        return TwoSampleTest(1.0, effect, magnitude_of(effect), len(sample), 1, EXACT_SIGNED_TEST)
+        return TwoSampleTest(p_value=1.0, effect_size=effect, magnitude=magnitude_of(effect), n1=len(sample), n2=1,
+                             method=EXACT_SIGNED_TEST)
     has_ties_or_zeros = np.unique(absolute_differences).size < len(sample)
     is_exact = not has_ties_or_zeros and len(sample) <= MAX_EXACT_RUNS
     test = scipy.stats.wilcoxon(differences, alternative="two-sided", correction=not is_exact, method="exact" if is_exact else "approx")
     method = EXACT_SIGNED_TEST if is_exact else ASYMPTOTIC_SIGNED_TEST
-    return TwoSampleTest(float(test.pvalue), effect, magnitude_of(effect), len(sample), 1, method)
+    return TwoSampleTest(p_value=float(test.pvalue), effect_size=effect, magnitude=magnitude_of(effect), n1=len(sample), n2=1,
+                         method=method)
 
 
 def fewest_runs(question: str) -> int:
@@ -110,7 +112,7 @@ def fewest_runs(question: str) -> int:
     return next(n for n in range(1, 100) if 2 / (2**n if question == "RQ1" else math.comb(2 * n, n)) < ALPHA)
 
 
-def pooling_effect_line(case: Case) -> str:
+def significance_change_line(case: Case) -> str:
     """One line: the tests that are significant (p < ALPHA) only for the paper's pooled solutions, or only over runs.
 
     Example: "..., 3 of 28 tests are no longer significant: RQ1 NSGA-II SD, TET; RQ2 SafeFuzzer TET."
@@ -118,11 +120,12 @@ def pooling_effect_line(case: Case) -> str:
     Raises
     ------
     UnanswerableError
-        As `rq1_runs`.
+        If `rq1_runs` raises it.
     """
     titles = titles_of(case.scoring.metrics)
-    rq1_frame, rq2_frame = _corrected_frames(case)
-    comparisons = [("RQ1", "algorithm", rq1(case), rq1_frame), *([] if rq2_frame is None else [("RQ2", "baseline", rq2(case), rq2_frame)])]
+    rq1_runs_frame, rq2_runs_frame = _corrected_frames(case)
+    comparisons = [("RQ1", "algorithm", rq1(case), rq1_runs_frame), *(
+        [] if rq2_runs_frame is None else [("RQ2", "baseline", rq2(case), rq2_runs_frame)])]
     changes, test_count = {"no longer": dict[str, list[str]](), "now": dict[str, list[str]]()}, 0
     for question, group_column, pooled_frame, runs_frame in comparisons:
         for pooled_row, runs_row in zip(pooled_frame.to_dict("records"), runs_frame.to_dict("records"), strict=True):
@@ -143,13 +146,13 @@ def pooling_effect_line(case: Case) -> str:
 
 
 def notes_over_runs(case: Case, question: str, *, pooling: bool) -> list[str]:
-    """Notes on RQ1 or RQ2 over runs: how many tests have too few runs; with `pooling` the `pooling_effect_line`, if any has enough."""
+    """Notes on RQ1 or RQ2 over runs: how many tests have too few runs; with `pooling` the `significance_change_line`, if any has enough."""
     enough_by_question = {name: _has_enough_runs(frame, name) for name, frame in zip(COUNT_COLUMNS, _corrected_frames(case), strict=True)
                           if frame is not None}
     enough = enough_by_question[question]
     share = "all" if not any(enough) else f"{len(enough) - sum(enough)} of the"
     notes = [] if all(enough) else [f"too few runs for {share} {len(enough)} tests of {question} ({fewest_runs(question)} are needed)."]
-    return [*notes, *([pooling_effect_line(case)] if pooling and any(map(any, enough_by_question.values())) else [])]
+    return [*notes, *([significance_change_line(case)] if pooling and any(map(any, enough_by_question.values())) else [])]
 
 
 def _has_enough_runs(frame: pd.DataFrame, question: str) -> list[bool]:
@@ -159,9 +162,9 @@ def _has_enough_runs(frame: pd.DataFrame, question: str) -> list[bool]:
 
 
 def summary_lines(case: Case) -> list[str]:
-    """Lines on RQ1 and RQ2 for the end of a study: effect sizes over runs, significant ones with an asterisk, and `pooling_effect_line`.
+    """Lines on RQ1 and RQ2 for the end of a study: effect sizes over runs, significant ones with an asterisk.
 
-    A line says so if there are too few runs for a significant difference.
+    A line says so if there are too few runs for a significant difference. The last line is `significance_change_line`.
     """
     titles = titles_of(case.scoring.metrics)
     lines, any_testable = [], False
@@ -180,25 +183,25 @@ def summary_lines(case: Case) -> list[str]:
             untestable = [titles[row["metric"]] for row, enough in zip(defined_rows, _has_enough_runs(group, question), strict=True)
                           if not enough]
             any_testable = any_testable or len(untestable) < len(defined_rows)
-            subject = "" if len(untestable) == len(defined_rows) else f"{', '.join(untestable)}: "
-            note = f"; {subject}too few runs for a test ({fewest_runs(question)} are needed)" if untestable else ""
+            named_metrics = "" if len(untestable) == len(defined_rows) else f"{', '.join(untestable)}: "
+            note = f"; {named_metrics}too few runs for a test ({fewest_runs(question)} are needed)" if untestable else ""
             effects = ", ".join(f"{titles[row['metric']]} " + ("-" if row["effect_size"] is None or row["p_holm"] is None else
                                 f"{row['effect_size']:.2f}{'*' if row['p_holm'] < ALPHA else ''}") for row in rows)
             lines.append(f"  {ALGORITHM_TITLES.get(str(name), name)}: {effects}{note}")
-    return [*lines, pooling_effect_line(case)] if any_testable else lines
+    return [*lines, significance_change_line(case)] if any_testable else lines
 
 
 def _corrected_frames(case: Case) -> tuple[pd.DataFrame, pd.DataFrame | None]:
     """The frames of RQ1 and RQ2 over runs, with p-values corrected as one family; None if RQ2 has no answer."""
     case.require_solutions()
     means = partial(run_means, case)
-    rows_of_rq1 = rq1_rows(case, means, signed_rank_test)
+    rows_of_rq1 = [{**row, "runs": row["n1"]} for row in rq1_rows(case, means, signed_rank_test)]
     has_rq2 = NSGA2 in case.algorithms and len(case.algorithms) > 1
     rows_of_rq2 = rq2_rows(case, means) if has_rq2 else []
     for row, p in zip([*rows_of_rq1, *rows_of_rq2], correct_by_holm([row["p_value"] for row in [*rows_of_rq1, *rows_of_rq2]]), strict=True):
         row["p_holm"] = p
-    return (pd.DataFrame(rows_of_rq1, columns=RQ1_COLUMNS, dtype=object),
-            pd.DataFrame(rows_of_rq2, columns=RQ2_COLUMNS, dtype=object) if has_rq2 else None)
+    return (pd.DataFrame(rows_of_rq1, columns=RQ1_RUNS_COLUMNS, dtype=object),
+            pd.DataFrame(rows_of_rq2, columns=RQ2_RUNS_COLUMNS, dtype=object) if has_rq2 else None)
 
 
 def run_means(case: Case, algorithm: str, metric: MetricFacts) -> FloatArray:
@@ -214,7 +217,8 @@ def run_means(case: Case, algorithm: str, metric: MetricFacts) -> FloatArray:
 
 def run_mean_series(case: Case, algorithm: str, metric: MetricFacts) -> pd.Series[float]:
     """The means of `run_means`, indexed by the run's number."""
-    run_numbers, solutions = case.runs_of(algorithm), solutions_for_metric(case.solutions_of(algorithm), metric)
+    run_numbers = case.runs_of(algorithm)
+    solutions = solutions_for_metric(case.solutions_of(algorithm), metric)  # for TET and TIT without collisions
     runs, column = solutions["run"].to_numpy(), solutions[metric.name].to_numpy(dtype=float)
     defined = ~np.isnan(column)
     samples = {run: column[defined & (runs == run)] for run in run_numbers}
