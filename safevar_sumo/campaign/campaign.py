@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from safevar_sumo.campaign.batcher import Batcher
-from safevar_sumo.campaign.keys import RunKey, make_search
+from safevar_sumo.campaign.keys import RunKey, all_runs, make_search
 from safevar_sumo.campaign.run import Observer, Run
 from safevar_sumo.campaign.verification import Verification
 from safevar_sumo.errors import InputError
@@ -81,7 +81,8 @@ def run_campaign(study: Study, keys: Iterable[RunKey], results: ResultsDirectory
                          "(invalid-test): nothing can be compared with it", "tests whose speed the vehicle can hold")
     if original.collided[0] and not is_rated(study):
         observer.warned(f"study {study.name!r}: the original vehicle itself collides, no change is needed for that")
-    results.begin(original)
+    for remark in results.begin(original, map(str, all_runs(study))):
+        observer.warned(remark)
     problem = Problem(characteristics=characteristics, original=original, evaluations=study.search.evaluations,
                       population=study.search.population, scoring=results.scoring, region=region_of(study))
     campaign = Campaign(original, {}, [], [], {}, {}, results.scoring)

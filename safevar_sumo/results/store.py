@@ -16,6 +16,7 @@ from safevar_sumo.metrics import METRICS, PUBLISHED_SCORING, Scoring
 from safevar_sumo.records import Evaluations, finite_or_none
 from safevar_sumo.results.files import (
     MANIFEST,
+    ORIGINAL,
     RUNS,
     SOLUTIONS,
     journal_file,
@@ -108,8 +109,11 @@ class ResultsDirectory:
             self._refuse_another_owner(path)
             raise
 
-    def begin(self, original: Evaluations) -> None:
-        """Write the manifest with the original vehicle's evaluation; remove solutions of other runs."""
+    def begin(self, original: Evaluations, runs: Iterable[str] = ()) -> list[str]:
+        """Write the manifest with the original vehicle's evaluation; remove solutions of other runs.
+
+        Returns remarks on stored runs of another length, and on those that are not among `runs`, the names of all runs of the study.
+        """
         manifest = {**self.manifest, "original": record(original, 0)}
         earlier_manifest = read_manifest(self.path) if (self.path / MANIFEST).exists() else manifest
         is_outdated = search_extent_of(earlier_manifest) != search_extent_of(manifest)
@@ -119,6 +123,14 @@ class ResultsDirectory:
         write_folders(self.path, self._study)
         if is_outdated:
             self._remove(self.path / SOLUTIONS)
+        remarks, (before, now) = [], (one["study"]["search"]["evaluations"] for one in (earlier_manifest, manifest))
+        if before != now:
+            remarks.append(f"{self.path}: the runs {'continue' if now > before else 'shorten'} from {before} to {now} evaluations: ids of "
+                           "solutions, such as nsga2:0:0, may now name other vehicles")
+        left_out = sorted({path.stem for path in (self.path / RUNS).glob("*.journal")} - {ORIGINAL, *runs})
+        if left_out:
+            remarks.append(f"{self.path}: the study no longer has these runs; they stay in {RUNS} and are left out: {', '.join(left_out)}")
+        return remarks
 
     def finish(self, solutions: Mapping[Any, Evaluations]) -> None:
         """Write the solutions of every run, by (algorithm, run)."""

@@ -118,9 +118,20 @@ def test_more_runs_extend_and_fewer_leave_out(study: Study, tmp_path: Path) -> N
     pools = [FormulaPool() for _ in range(3)]
     carried_out(with_search(study, runs=3), tmp_path / "whole", pools[0])
     carried_out(with_search(study, runs=1), tmp_path / "grown", pools[1])
-    carried_out(with_search(study, runs=3), tmp_path / "grown", pools[2])
+    assert not carried_out(with_search(study, runs=3), tmp_path / "grown", pools[2])[1].warnings
     assert solutions(tmp_path / "grown") == solutions(tmp_path / "whole")
     assert len(pools[1].simulated) + len(pools[2].simulated) == len(pools[0].simulated), "each setting once"
+
+
+def test_a_study_of_another_length_says_what_becomes_of_stored_runs(study: Study, tmp_path: Path) -> None:
+    search: dict[str, object] = {"algorithms": ["rs"], "evaluations": 60}
+    assert not carried_out(with_search(study, runs=2, **search), tmp_path)[1].warnings
+    fewer, longer, again = (carried_out(with_search(study, runs=1, **{**search, **changes}), tmp_path)[1].warnings
+                            for changes in ({}, {"evaluations": 100}, {"evaluations": 100}))
+    left_out = f"{tmp_path}: the study no longer has these runs; they stay in runs and are left out: rs-01"
+    assert fewer == again == [left_out]
+    assert longer == [f"{tmp_path}: the runs continue from 60 to 100 evaluations: ids of solutions, such as nsga2:0:0, may now name other "
+                      "vehicles", left_out]
 
 
 @pytest.mark.parametrize("key", [RunKey("nsga2", 1), RunKey("rs", 0), RunKey("safe_fuzzer", 1)])

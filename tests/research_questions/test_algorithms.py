@@ -86,6 +86,9 @@ def test_attainment_is_what_so_many_runs_reach() -> None:
 
 def test_what_cannot_be_asked_says_why() -> None:
     two = made_up(row("nsga2"), row("rs"))
+    few = [row(name, run, (900.0, 2.0, 0.1)) for name in ("nsga2", "rs", "spea2") for run in (0, 1)]
+    with pytest.raises(UnanswerableError, match="has 2 runs in which all 3 algorithms have solutions: too few"):
+        draw_critical_differences(made_up(*few))
     for question in (rank_algorithms, draw_critical_differences):
         with pytest.raises(UnanswerableError, match="of 2 algorithms"):
             question(two)

@@ -207,9 +207,23 @@ def test_several_cases_stand_in_one_frame_and_the_refused_in_the_notes() -> None
 def test_the_brief_lines_say_what_the_data_allows() -> None:
     five = made_up(*(row(name, run=run, sd=sd + run / 10) for name, sd in (("nsga2", 1.0), ("rs", 2.5)) for run in range(5)))
     lines = summary_lines(five)
-    assert any("NSGA-II: SD 0.00, " in line and line.endswith("too few runs for a test (8 are needed)") for line in lines)
-    assert any("RS: IGD " in line and "too few" not in line for line in lines), "five runs against five can differ significantly"
+    assert any("A12 of NSGA-II against the original vehicle: SD 0.00, " in line
+               and line.endswith("too few runs for a test (8 are needed)") for line in lines)
+    assert any("A12 of NSGA-II against RS: IGD " in line and "too few" not in line for line in lines), "five runs can differ significantly"
     assert any("RQ2 over runs: only nsga2 has finished runs" in line for line in summary_lines(made_up(row())))
+
+
+@pytest.mark.parametrize(("question", "needed"), [("rq1-runs", 8), ("rq2-runs", 5)])
+def test_tables_over_too_few_runs_say_so(question: str, needed: int) -> None:
+    case = made_up(*(row(name, run=run, sd=sd + run / 10) for name, sd in (("nsga2", 1.0), ("rs", 2.5)) for run in range(2)))
+    notes = " ".join(answer_questions([case], question)[0].notes)
+    assert f"({needed} are needed)" in notes
+    assert "no longer significant" not in notes
+
+
+def test_the_table_of_the_sizes_of_changes_names_their_units() -> None:
+    answers = answer_questions([made_up(row(values=(900.0, 2.0, 0.1)))], "rq3.3")
+    assert ["Units of delta: mass kg, lag s." in answer.notes for answer in answers] == [True, False]
 
 
 def test_holms_correction_of_a_worked_example() -> None:
@@ -228,7 +242,11 @@ def test_solutions_of_one_run_are_not_taken_for_independent() -> None:
     assert (runs["n1"], runs["n2"]) == (8, 8)
     assert runs["effect_size"] == 1 - (0 + 0 + 0 + 0 + 0 + 1 + 1 + 3) / 64
     assert runs["p_value"] == scipy.stats.mannwhitneyu(ours, theirs, method="exact").pvalue > ALPHA / 10
-    assert "RQ2 RS SD is no longer significant" in pooling_effect_line(case)
+    assert pooling_effect_line(case, ["RQ2"]).endswith(", 4 tests are no longer significant (RQ2 RS: IGD, IGD+, HV, SD).")
+    assert "RQ1 NSGA-II: " in pooling_effect_line(case, ["RQ1"])
+    notes = {name: answer_questions([case], name)[0].notes for name in ("rq1-runs", "rq2-runs")}
+    assert "RQ2" not in "".join(notes["rq1-runs"])
+    assert "RQ1" not in "".join(notes["rq2-runs"])
     (original,) = (one for one in rq1_runs(case).to_dict("records") if (one["algorithm"], one["metric"]) == ("nsga2", "safety_degree"))
     assert original["p_value"] == 2 * 2 / 2**8, "signed ranks of which all but the smallest are negative: the second of 2^8 orders"
     assert original["effect_size"] == 1 / 8

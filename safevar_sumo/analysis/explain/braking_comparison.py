@@ -58,7 +58,7 @@ class Braking(NamedTuple):
     speed_deficit: float
     speed_lost: float
     deceleration: float
-    gears: tuple[int, int] = (0, 0)
+    gears: tuple[float, float] = (0, 0)
 
     @property
     def stopping_distance(self) -> float:
@@ -158,7 +158,7 @@ def _measure_braking(runs: SimulationRuns, column: int, first: int, last: int) -
         time=float(trace.time[first]), gap=float(trace.gap[first, column]), speed=initial_speed, delay=delay,
         speed_deficit=initial_speed - float(position[end_of_delay] - position[first]) / delay if end_of_delay > first else 0.0,
         speed_lost=initial_speed - float(speed[end_of_delay]), deceleration=specific_energy / distance,
-        gears=(int(trace.gear[first, column]), int(trace.gear[end_of_delay, column])))
+        gears=(float(trace.gear[first, column]), float(trace.gear[end_of_delay, column])))
 
 
 def compare_braking(original: RunSummary, changed: RunSummary, point: str = "") -> BrakingComparison:
@@ -249,7 +249,8 @@ def _phrase_of(comparison: BrakingComparison, part: str) -> str:
     if part == "slowing" and changed is not None and original is not None and min(changed.speed_lost, original.speed_lost) < 0:
         if changed.speed_lost >= 0:
             return "it does not speed up while the pedal moves"
-        gear = "" if changed.gears[0] == changed.gears[1] else " and the gear changes from {} to {}".format(*changed.gears)
+        before, after = changed.gears
+        gear = "" if before == after else f" and the gear changes from {before:g} to {after:g}"
         return f"it speeds up {'' if original.speed_lost >= 0 else 'less ' if gains else 'more '}while the pedal moves{gear}"
     return PART_PHRASES[part][gains]
 
@@ -260,7 +261,7 @@ def _quantities_in_words(comparison: BrakingComparison, part: str) -> str:
     if original_braking is None or changed_braking is None:
         return ""
     if part == "slowing":
-        changes = [f"from {braking.speed:.2f} to {braking.speed - braking.speed_lost:.2f}" for braking in (changed_braking, original_braking)]
+        changes = [f"from {one.speed:.2f} to {one.speed - one.speed_lost:.2f}" for one in (changed_braking, original_braking)]
         return f" ({' instead of '.join(changes)} m/s)"
     quantities = {"gap": (changed_braking.gap, original_braking.gap, "m"),
                   "speed": (changed_braking.speed, original_braking.speed, "m/s at the command"),

@@ -36,6 +36,9 @@ def draw_critical_differences(case: Case) -> Figure:
         raise UnanswerableError(case.name, "has no run in which every algorithm has solutions", "results of three algorithms or more")
     metrics, algorithm_count = list(dict.fromkeys(frame["metric"])), frame["algorithm"].nunique()
     run_count, critical_difference = int(frame["runs"].iloc[0]), float(frame["critical_difference"].iloc[0])
+    if critical_difference >= algorithm_count - 1:
+        raise UnanswerableError(case.name, f"has {run_count} runs in which all {algorithm_count} algorithms have solutions: too few for "
+                                "critical differences, which no mean ranks exceed", "results of more runs")
     title = f"{case.name}: mean ranks over {run_count} runs, critical difference {critical_difference:.2f}"
     figure, axes = new_figure(title, len(metrics), 1, (6.8, 0.9 + len(metrics) * (0.75 + ALGORITHM_HEIGHT * algorithm_count)))
     for axis, metric in zip(axes.flat, metrics, strict=True):

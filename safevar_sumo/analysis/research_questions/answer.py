@@ -24,7 +24,7 @@ from safevar_sumo.analysis.research_questions.changes import (
     rq33_safety,
 )
 from safevar_sumo.analysis.research_questions.comparisons import rq1, rq2
-from safevar_sumo.analysis.research_questions.over_runs import pooling_effect_line, rq1_runs, rq2_runs
+from safevar_sumo.analysis.research_questions.over_runs import notes_on_runs, rq1_runs, rq2_runs
 from safevar_sumo.errors import unknown_name
 from safevar_sumo.metrics import PUBLISHED_SCORING, MetricFacts
 
@@ -80,7 +80,7 @@ def answer_questions(cases: Sequence[Case], question: str | None = None) -> list
         for table, frames in tables.items():
             frame = pd.concat(frames, ignore_index=True)
             answered_names = {*frame["setting"], *frame["other"]} if name == WEATHER else case_names - {error.source for error in errors}
-            case_notes = [note for case in cases if case.name in answered_names for note in _notes(name, case)]
+            case_notes = [note for case in cases if case.name in answered_names for note in _notes(table, case)]
             answers.append(Answer(table, frame, tuple(dict.fromkeys([*notes, *case_notes])), metrics))
     if all_errors and all(answer.frame.empty for answer in answers):
         raise all_errors[0]
@@ -120,7 +120,7 @@ def _notes(question: str, case: Case) -> list[str]:
         if undefined_metrics:
             notes.append(f"{case.name}: the original vehicle's {', '.join(undefined_metrics)} is undefined, so that no test uses it.")
     if question in ("rq1-runs", "rq2-runs"):
-        notes.append(f"{case.name}: {pooling_effect_line(case)}")
+        notes += [f"{case.name}: {line}" for line in notes_on_runs(case, question[:3].upper())]
     if question == "rq2" and not case.has_runs:
         notes.append(f"{case.name}: igd, igd_plus and hypervolume need runs, which imported solutions do not have.")
     if question == "rq2" and case.has_runs:
@@ -130,6 +130,9 @@ def _notes(question: str, case: Case) -> list[str]:
     if question.startswith("rq3") or question in ("combinations", WEATHER):
         notes.append(f"{case.name}: {len(critical_solutions(case))} of {ALGORITHM_TITLES[NSGA2]}'s {len(case.solutions_of(NSGA2))} "
                      "solutions are critical.")
+    if question == "rq3.3":
+        units = [f"{characteristic.name} {characteristic.unit}" for characteristic in case.characteristics if characteristic.unit != "-"]
+        notes.append(f"Units of delta: {', '.join(units)}.")
     if question == "combinations" and frequent_combinations(case).empty:
         notes.append(f"{case.name}: no critical solution has exactly four characteristics changed.")
     return notes

@@ -10,7 +10,7 @@ In the frames, the column `setting` holds the case's name, and `method` the name
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from functools import partial
 
 import numpy as np
@@ -29,6 +29,7 @@ from safevar_sumo.analysis.research_questions.comparisons import (
     rq2_rows,
 )
 from safevar_sumo.analysis.research_questions.indicators import titles_of
+from safevar_sumo.analysis.words import number_of
 from safevar_sumo.metrics import MetricFacts
 from safevar_sumo.records import FloatArray
 
@@ -108,10 +109,10 @@ def fewest_runs(question: str) -> int:
     return next(n for n in range(1, 100) if 2 / (2**n if question == "RQ1" else math.comb(2 * n, n)) < ALPHA)
 
 
-def pooling_effect_line(case: Case) -> str:
-    """One line: the tests that are significant (p < ALPHA) only for the paper's pooled solutions, or only over runs.
+def pooling_effect_line(case: Case, questions: Collection[str] = ("RQ1", "RQ2")) -> str:
+    """One line: the tests of these questions that are significant (p < ALPHA) only for the paper's pooled solutions, or only over runs.
 
-    Example: "... RQ2 SafeFuzzer TET is no longer significant (p 3.8e-4 pooled, 0.059 over runs, 0.23 after Holm)."
+    Example: "... 2 tests are no longer significant (RQ2 SafeFuzzer: TET, TIT)."
 
     Raises
     ------
@@ -121,19 +122,36 @@ def pooling_effect_line(case: Case) -> str:
     titles = titles_of(case.scoring.metrics)
     rq1_frame, rq2_frame = _corrected_frames(case)
     comparisons = [("RQ1", "algorithm", rq1(case), rq1_frame), *([] if rq2_frame is None else [("RQ2", "baseline", rq2(case), rq2_frame)])]
-    changes, test_count = [], 0
+    changes: dict[str, dict[str, list[str]]] = {"no longer": {}, "now": {}}
+    test_count = 0
     for question, group_column, pooled_frame, runs_frame in comparisons:
         for pooled_row, runs_row in zip(pooled_frame.to_dict("records"), runs_frame.to_dict("records"), strict=True):
             pooled_p, runs_p = pooled_row["p_value"], runs_row["p_holm"]
             test_count += runs_p is not None
-            if pooled_p is None or runs_p is None or (pooled_p < ALPHA) == (runs_p < ALPHA):
-                continue
-            name = ALGORITHM_TITLES.get(pooled_row[group_column], pooled_row[group_column])
-            verb = "is no longer" if pooled_p < ALPHA else "becomes"
-            changes.append(f"{question} {name} {titles[pooled_row['metric']]} {verb} significant (p {_rounded(pooled_p)} pooled, "
-                           f"{_rounded(runs_row['p_value'])} over runs, {_rounded(runs_p)} after Holm)")
+            if question in questions and pooled_p is not None and runs_p is not None and (pooled_p < ALPHA) != (runs_p < ALPHA):
+                subject = f"{question} {ALGORITHM_TITLES.get(pooled_row[group_column], pooled_row[group_column])}"
+                changes["no longer" if pooled_p < ALPHA else "now"].setdefault(subject, []).append(titles[pooled_row["metric"]])
+    parts = []
+    for word, subjects in changes.items():
+        if count := sum(map(len, subjects.values())):
+            listed = "; ".join(f"{subject}: {', '.join(metrics)}" for subject, metrics in subjects.items())
+            parts.append(f"{number_of(count, 'test')} {'is' if count == 1 else 'are'} {word} significant ({listed})")
     return (f"With one value for each run and Holm's correction for {test_count} tests, instead of the paper's pooled solutions, "
-            f"{'; '.join(changes) or 'the same tests are significant'}.")
+            f"{' and '.join(parts) or 'the same tests are significant'}.")
+
+
+def notes_on_runs(case: Case, question: str) -> list[str]:
+    """Notes on the table of RQ1 or RQ2 over runs: `pooling_effect_line`, and a warning if there are too few runs for a test."""
+    frame = _corrected_frames(case)[question != "RQ1"]
+    if frame is None:
+        return []
+    tests = frame[frame["p_value"].notna()]
+    is_untestable = tests[["runs"] if question == "RQ1" else ["n1", "n2"]].min(axis=1) < fewest_runs(question)
+    lines = [] if is_untestable.all() else [pooling_effect_line(case, (question,))]
+    if is_untestable.any():
+        lines.append(f"too few runs for {number_of(int(is_untestable.sum()), 'test')} ({fewest_runs(question)} are needed): "
+                     "no difference there can be significant.")
+    return lines
 
 
 def summary_lines(case: Case) -> list[str]:
@@ -143,9 +161,10 @@ def summary_lines(case: Case) -> list[str]:
     """
     titles = titles_of(case.scoring.metrics)
     lines, any_testable = [], False
-    questions = (("RQ1", rq1_runs, "algorithm", ("runs",), "A12 below 0.5: the runs are more unsafe than the original vehicle"),
-                 ("RQ2", rq2_runs, "baseline", ("n1", "n2"), "A12 above 0.5: NSGA-II is better"))
-    for question, frame_of, group_column, count_columns, meaning in questions:
+    questions = (("RQ1", rq1_runs, "algorithm", ("runs",), "A12 below 0.5: the runs are more unsafe than the original vehicle",
+                  "  A12 of {} against the original vehicle: "),
+                 ("RQ2", rq2_runs, "baseline", ("n1", "n2"), "A12 above 0.5: NSGA-II is better", "  A12 of NSGA-II against {}: "))
+    for question, frame_of, group_column, count_columns, meaning, heading in questions:
         try:
             frame = frame_of(case)
         except UnanswerableError as error:
@@ -162,12 +181,8 @@ def summary_lines(case: Case) -> list[str]:
             note = f"; {subject}too few runs for a test ({fewest_runs(question)} are needed)" if untestable else ""
             effects = ", ".join(f"{titles[row['metric']]} " + ("-" if row["effect_size"] is None or row["p_holm"] is None else
                                 f"{row['effect_size']:.2f}{'*' if row['p_holm'] < ALPHA else ''}") for row in rows)
-            lines.append(f"  {ALGORITHM_TITLES.get(str(name), name)}: {effects}{note}")
+            lines.append(f"{heading.format(ALGORITHM_TITLES.get(str(name), name))}{effects}{note}")
     return [*lines, pooling_effect_line(case)] if any_testable else lines
-
-
-def _rounded(value: float) -> str:
-    return f"{value:.1e}".replace("e-0", "e-") if value < 0.001 else f"{value:.2g}"
 
 
 def _corrected_frames(case: Case) -> tuple[pd.DataFrame, pd.DataFrame | None]:

@@ -39,12 +39,13 @@ def print_risk(console: Console, result: Risk) -> None:
         print_text(console, f"Of {FLEET_VEHICLES:,} vehicles that vary independently at least one is unsafe with probability "
                             f"{result.of_fleet(FLEET_VEHICLES):.2g}.")
     if result.of_domain:
-        print_text(console, "warning: this is no probability in the field: the study has no [variation] table for how real vehicles vary.")
+        print_text(console, "warning: this is not a probability in the field: the study has no [variation] table for how real vehicles "
+                            "vary.")
     print_text(console, _how_vehicles_vary(result.study))
     print_constraints(console, result.study)
     if result.sensitivity is None or result.sensitivity_of_unsafe is None:
         return
-    table = WholeTable("characteristic", right=("SD: alone", "in all", "unsafe: alone", "in all"),
+    table = WholeTable("characteristic", right=("SD alone", "SD in all", "unsafe alone", "unsafe in all"),
                        title="What decides: share of the variance")
     unsafe_indices = result.sensitivity_of_unsafe.set_index("characteristic")
     for row in result.sensitivity.sort_values("total", ascending=False, kind="stable").to_dict("records"):
