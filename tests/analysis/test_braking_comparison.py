@@ -90,7 +90,7 @@ def test_a_creeping_deceleration_is_no_late_pedal() -> None:
     assert comparison.parts["delay"] == 0
     assert comparison.parts["deceleration"] == pytest.approx(comparison.lost_margin)
     assert "later" not in sentence(comparison)
-    assert "then decelerates less" in sentence(comparison)
+    assert "decelerates less with the pedal down" in sentence(comparison)
 
 
 @pytest.mark.parametrize(("original_gain", "changed_gain", "phrase"), [

@@ -180,7 +180,7 @@ def test_the_verdict_leads_with_the_robust_failure_and_calls_the_others_borderli
     whole_cause = msgspec.structs.replace(robust, minimal_causes=[all_changes])
     every = reach_verdict(data, Explanations([fewest, whole_cause], summary), None).headline
     assert every.startswith(f"{number} changes suffice for a collision that is robust: the vehicle collides")
-    assert [one.value for one in result.key_figures[2:]] == ["14% of the collisions", "42.0% of the way"]
+    assert [one.value for one in result.key_figures[2:]] == ["14 % of the collisions", "42.0 % of the way"]
     assert result.key_figures[0].value.startswith(f"{number} changes")
 
 
@@ -370,3 +370,7 @@ def test_user_code_is_called_by_its_name_once(slippery: Path) -> None:
 def test_an_estimate_stands_beside_its_error_and_just_below_nothing_it_is_nothing() -> None:
     estimates = [(-0.002, (-0.01, 0.006)), (0.126, (0.106, 0.146)), (1.04, (0.94, 1.14)), (0.3, (None, None)), (None, (None, None))]
     assert [_estimate_text(share, interval) for share, interval in estimates] == ["0 % ± 1", "13 % ± 2", "104 % ± 10", "30 %", "-"]
+
+
+def test_no_way_at_all_is_a_number() -> None:
+    assert what._tolerance_figure({"joint": {"factor": 0.0, "samples": 100}}).value == "0 % of the way"

@@ -206,7 +206,7 @@ PART_PHRASES = {
     "gap": ("it begins to brake at a smaller gap", "it begins to brake at a larger gap"), "speed": ("it is faster", "it is slower"),
     "delay": ("its brake pedal follows later", "its brake pedal follows sooner"),
     "slowing": ("it slows less while the pedal moves", "it slows more while the pedal moves"),
-    "deceleration": ("it then decelerates less", "it then decelerates more")}
+    "deceleration": ("it decelerates less with the pedal down", "it decelerates more with the pedal down")}
 """Phrases for each part: if it costs distance, and if it gains distance."""
 
 

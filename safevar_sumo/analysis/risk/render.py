@@ -26,9 +26,9 @@ def print_risk(console: Console, result: Risk) -> None:
     low, high = result.interval
     print_text(console, result.study.title)
     sampling = "" if result.method == "monte_carlo" else f", drawn by {result.method.replace('_', ' ')}"
-    print_text(console, f"Unsafe: {result.unsafe}. {result.failures} of {result.samples} vehicles{sampling}.")
+    print_text(console, f"Unsafe: {result.unsafe.description}. {result.failures} of {result.samples} vehicles{sampling}.")
     label = "Share of the domain that is unsafe:" if result.of_domain else "Probability"
-    print_text(console, f"{label} {result.probability:.4g}, with {result.confidence:.0%} confidence from {low:.4g} to {high:.4g}.")
+    print_text(console, f"{label} {result.probability:.4g}, with {100 * result.confidence:.0f} % confidence from {low:.4g} to {high:.4g}.")
     if result.remark:
         print_text(console, f"note: {result.remark}.")
     if result.design_point is not None:
@@ -56,8 +56,8 @@ def print_risk(console: Console, result: Risk) -> None:
     if result.sensitivity_of_unsafe["total"].isna().all():
         print_text(console, "Too few settings are unsafe, or safe, for indices of being unsafe; see those of the safety degree.")
     print_meanings(console, CharacteristicSet.of(result.study.vehicle.characteristics))
-    print_text(console, f"Sobol indices, first order and total, with half of their {result.confidence:.0%} intervals: estimates, which may "
-                        "exceed 1 or fall below 0 by their error.")
+    print_text(console, f"Sobol indices, first order and total, with half of their {100 * result.confidence:.0f} % intervals: estimates, "
+                        "which may exceed 1 or fall below 0 by their error.")
 
 
 def _how_vehicles_vary(study: Study) -> str:
@@ -86,7 +86,7 @@ def sensitivity_figure(result: Risk) -> Figure:
         raise InputError("correlations", "there are no sensitivity indices of characteristics that are correlated or bound by constraints",
                          "a study without correlations and constraints")
     names = result.sensitivity.sort_values("total", kind="stable")["characteristic"].to_list()
-    title = f"{result.study.name}: what decides ({result.confidence:.0%} intervals)"
+    title = f"{result.study.name}: what decides ({100 * result.confidence:.0f} % intervals)"
     figure, (axes,) = new_figure(title, 1, 2, (7.2, 1.5 + 0.28 * max(len(names), 4)))
     frames = {"safety degree": result.sensitivity, f"unsafe ({result.unsafe})": result.sensitivity_of_unsafe}
     for axis, (output, frame) in zip(axes, frames.items(), strict=True):
