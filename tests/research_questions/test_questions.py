@@ -217,7 +217,7 @@ def test_the_brief_lines_say_what_the_data_allows() -> None:
 def test_tables_over_too_few_runs_say_so(question: str, needed: int) -> None:
     case = made_up(*(row(name, run=run, sd=sd + run / 10) for name, sd in (("nsga2", 1.0), ("rs", 2.5)) for run in range(2)))
     notes = " ".join(answer_questions([case], question)[0].notes)
-    assert f"({needed} are needed)" in notes
+    assert f"({needed} runs are needed)" in notes
     assert "no longer significant" not in notes
 
 

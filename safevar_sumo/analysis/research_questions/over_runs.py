@@ -149,7 +149,7 @@ def notes_on_runs(case: Case, question: str) -> list[str]:
     is_untestable = tests[["runs"] if question == "RQ1" else ["n1", "n2"]].min(axis=1) < fewest_runs(question)
     lines = [] if is_untestable.all() else [pooling_effect_line(case, (question,))]
     if is_untestable.any():
-        lines.append(f"too few runs for {number_of(int(is_untestable.sum()), 'test')} ({fewest_runs(question)} are needed): "
+        lines.append(f"too few runs for {number_of(int(is_untestable.sum()), 'test')} ({fewest_runs(question)} runs are needed): "
                      "no difference there can be significant.")
     return lines
 
