@@ -35,7 +35,7 @@ class CampaignProgress:
         self._text_width -= len(bar) * (BAR_WIDTH + 1)
         self._bar = Progress(TextColumn("{task.description}", markup=False), *bar, TextColumn("{task.fields[summary]}", markup=False),
                              console=console, disable=not has_bar)
-        self._tally = _Tally(len(keys), study.search.evaluations)
+        self._tally = _Tally(run_count=len(keys), run_budget=study.search.evaluations)
         self._task = self._bar.add_task(study.name, total=self._tally.total, summary="waiting")
         self._last_line = time.monotonic()
 
@@ -71,9 +71,9 @@ class CampaignProgress:
 class _Tally:
     """Progress of all runs of a study together."""
 
-    def __init__(self, runs: int, evaluations: int) -> None:
-        self.done, self.total = 0, runs * evaluations
-        self._evaluations, self._runs = evaluations, runs
+    def __init__(self, run_count: int, run_budget: int) -> None:
+        self.done, self.total = 0, run_count * run_budget
+        self._run_budget, self._run_count = run_budget, run_count
         self._finished_runs = self._timed_simulations = self._timed_evaluations = self._collisions = 0
         self._lowest_degree = np.inf
         self._start_time: float | None = None
@@ -102,7 +102,7 @@ class _Tally:
         evaluation_count, _ = self._by_run.pop(key, (0, set()))
         self._finished_runs += 1
         self.done += asked - evaluation_count
-        self.total -= self._evaluations - asked
+        self.total -= self._run_budget - asked
 
     def text(self, width: int | None = None) -> str:
         """The progress as text of at most `width` characters; what matters most comes first."""
@@ -110,7 +110,7 @@ class _Tally:
         best = [] if np.isinf(self._lowest_degree) else [f"best SD {self._lowest_degree:.2f}"]
         rate = [f"{self._timed_simulations / self._seconds:.0f}/s"] if self._timed_simulations and self._seconds >= SETTLING_TIME else []
         text = ""
-        for item in (*rate, self._time_left(), *collisions, f"runs {self._finished_runs}/{self._runs}", *best):
+        for item in (*rate, self._time_left(), *collisions, f"runs {self._finished_runs}/{self._run_count}", *best):
             extended_text = f"{text}, {item}" if text else item
             if width is not None and len(extended_text) > width:
                 break

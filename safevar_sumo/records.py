@@ -153,8 +153,10 @@ class Trace:
     """T samples of N vehicles, `step` seconds apart; arrays of shape (T, N), `time` (T,).
 
     A vehicle's samples count while `active`; later samples are meaningless, as SUMO continues with the rest of the batch.
-    `vehicle_length`, `position` along the path, `gap` and `lateral` in m, speeds in m/s, `throttle` and `brake` as commanded,
-    `pedal` is the brake pedal's position; `obstacle_speed` is the obstacle's speed along the vehicle's path.
+
+    - `vehicle_length`, `position` along the path, `gap` and `lateral` are in m, all speeds in m/s.
+    - `throttle` and `brake` are the pedals as commanded, `pedal` is the brake pedal's position.
+    - `obstacle_speed` is the obstacle's speed along the vehicle's path.
     """
 
     step: float
@@ -181,8 +183,9 @@ class Trace:
 class Contact(NamedTuple):
     """The position of the first contact on the outline of each of N vehicles, shape (N,).
 
-    `side` is one of `SIDES`, empty without a contact. `place` is the position of the obstacle's middle [% of the vehicle's width from the
-    side on which `lateral` is negative, or of its length from the front], within 0 to 100, NaN without a contact.
+    `side` is front, left, right or rear; empty without a contact. `place` is the position of the obstacle's middle, 0 to 100; NaN without a
+    contact. At the front or rear it is in % of the vehicle's width, from the side on which `lateral` is negative; at the left or right in %
+    of its length, from the front.
     """
 
     side: npt.NDArray[np.str_]
@@ -224,20 +227,20 @@ class SimulationRuns:
             contact=Contact._make(map(select, self.contact)), test_speed_error=select(self.test_speed_error),
             warning_ttc=select(self.warning_ttc))
 
-    def nearest(self, column: int) -> int | None:
+    def nearest(self, vehicle: int) -> int | None:
         """The sample of the impact or, without a collision, of the smallest separation in conflict; None if never in conflict."""
-        active = self.trace.active[:, column]
-        if np.isfinite(self.collision_speed[column]):
+        active = self.trace.active[:, vehicle]
+        if np.isfinite(self.collision_speed[vehicle]):
             return int(np.flatnonzero(active)[-1])
-        in_conflict = active & self.encounter.in_conflict[:, column]
-        return int(np.argmin(np.where(in_conflict, self.encounter.separation[:, column], np.inf))) if in_conflict.any() else None
+        in_conflict = active & self.encounter.in_conflict[:, vehicle]
+        return int(np.argmin(np.where(in_conflict, self.encounter.separation[:, vehicle], np.inf))) if in_conflict.any() else None
 
     @property
     def relative_speed(self) -> FloatArray:
         """Speed of a collision relative to the obstacle along the vehicle's path [m/s], shape (N,); NaN without a collision.
 
         A gap d that closes within a time step, from the relative speed v at the relative acceleration a, closes at sqrt(v^2 + 2 a d);
-        `collision_speed` holds only the speed at the end of the step, which counts where no gap closes.
+        Where no gap closes, the speed at the end of the step counts: `collision_speed` minus the obstacle's speed.
         """
         trace, vehicles = self.trace, np.arange(len(self.collision_speed))
         last_sample = len(trace.time) - 1 - np.argmax(trace.active[::-1], axis=0)

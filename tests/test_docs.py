@@ -154,7 +154,8 @@ def test_every_test_file_that_is_named_exists() -> None:
 def test_the_numbers_of_a_reports_questions_are_those_that_the_page_about_it_gives() -> None:
     paragraph = re.search(r"A report asks all questions.*?\n\n", (ROOT / "docs" / "gallery.md").read_text(), flags=re.DOTALL)
     assert paragraph is not None
-    numbers = (report_input.SAMPLES, RiskOptions.samples, RulesOptions.samples, report_input.LIMIT, ExplainOptions.limit)
+    numbers = (report_input.SAMPLED_VEHICLES, RiskOptions.samples, RulesOptions.samples, report_input.EXPLAIN_SIMULATIONS,
+               ExplainOptions.limit)
     assert re.findall(r"\d+,\d+", paragraph[0]) == [f"{number:,}" for number in numbers]
 
 

@@ -54,5 +54,5 @@ def _standing_distance(speed: FloatArray) -> FloatArray:
     return np.minimum(np.maximum(75 / np.maximum(speed, 1.0) - 5, 0.0), 2.0)
 
 
-def _acceleration_law(gains: tuple[float, float], speed_error: FloatArray, gap_error: FloatArray) -> FloatArray:
-    return gains[0] * speed_error + gains[1] * gap_error
+def _acceleration_law(gains: tuple[float, float], relative_speed: FloatArray, gap_error: FloatArray) -> FloatArray:
+    return gains[0] * relative_speed + gains[1] * gap_error

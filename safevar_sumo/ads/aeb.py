@@ -33,8 +33,8 @@ class Aeb(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Holds its speed; brakes in part, then fully, when the gap to an obstacle in its way falls below its braking distances.
 
     distance = v rt + max(v_rel^2 / (2 b), v^2 / (2 b) - u^2 / (2 b_u)) + margin, with
-    speed v and deceleration b of the vehicle, u and b_u of the obstacle, and their closing speed v_rel.
-    After braking it never accelerates again.
+    speed v and deceleration b of the vehicle, u and b_u of the obstacle, their closing speed v_rel, and `response_time` rt; b is
+    `braking_share` of the original vehicle's greatest deceleration. After braking it never accelerates again.
 
     It warns its driver while gap / closing speed of an obstacle in its way is below `warning_time`, and while it brakes. The simulated
     driver does not react to warnings.
@@ -46,7 +46,7 @@ class Aeb(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     response_time
         Response time assumed in planning [s].
     braking_share
-        Share of the original vehicle's greatest deceleration assumed in planning [-].
+        Share of the original vehicle's greatest deceleration with which it plans to brake [-].
     margin
         Gap to keep at the stop [m].
     partial_share, partial_time
@@ -77,8 +77,8 @@ class Aeb(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     warning_time: NonNegativeParameter = 2.0
 
     def start(self, n: int, nominal: Nominal, step: float) -> _Memory:
-        zeros = np.zeros(n)
-        return _Memory(nominal, step, None, zeros, zeros > 0, zeros, zeros > 0)
+        zeros, nobody = np.zeros(n), np.zeros(n, dtype=bool)
+        return _Memory(nominal, step, cruise=None, stage=zeros, intervened=nobody, obstacle_speed=zeros, warns=nobody)
 
     def drive(self, seen: Observation, memory: _Memory) -> tuple[Command, _Memory]:
         nominal = memory.nominal

@@ -69,7 +69,7 @@ class Apollo(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
     def start(self, n: int, nominal: Nominal, step: float) -> _Memory:
         zeros = np.zeros(n)
-        return _Memory(nominal, step, zeros > 0, zeros, zeros, zeros)
+        return _Memory(nominal, step, stops=zeros > 0, planned_deceleration=zeros, commanded_acceleration=zeros, creeping_time=zeros)
 
     def drive(self, seen: Observation, memory: _Memory) -> tuple[Command, _Memory]:
         plan = self._plan(seen, memory)
@@ -77,8 +77,8 @@ class Apollo(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         if seen.time >= self.first_command - FIRST_COMMAND_ROUNDING:
             return command, plan
         is_waiting = seen.speed == 0
-        fields = (np.where(is_waiting, old, new) for old, new in zip(memory[2:], plan[2:], strict=True))
-        return Command(*(np.where(is_waiting, 0.0, pedal) for pedal in command)), _Memory(memory.nominal, memory.step, *fields)
+        array_fields = (np.where(is_waiting, old, new) for old, new in zip(memory[2:], plan[2:], strict=True))
+        return Command(*(np.where(is_waiting, 0.0, pedal) for pedal in command)), _Memory(memory.nominal, memory.step, *array_fields)
 
     def _plan(self, seen: Observation, memory: _Memory) -> _Memory:
         """Plan an acceleration: cruise, or brake with v^2 / (2 d) to stop within the distance d; then creep and hold."""

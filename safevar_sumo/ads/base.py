@@ -17,8 +17,6 @@ PositiveParameter = Annotated[float, Meta(gt=0, le=1e3)]
 """A driver's parameter above 0, in SI units."""
 NonNegativeParameter = Annotated[float, Meta(ge=0, le=1e3)]
 """A driver's parameter that may be 0, in SI units."""
-
-
 REACTION_PARAMETERS = ("recognition_delay", "hesitation")
 """Names of the parameters of an ADS that delay its reaction [s]; a study may raise them in bad weather."""
 
@@ -86,7 +84,7 @@ class GuardedAds:
         return Command(self._checked_pedal("throttle", throttle, seen), self._checked_pedal("brake", brake, seen)), memory
 
     def _checked_pedal(self, name: str, value: Any, seen: Observation) -> FloatArray:
-        return self._guard.numbers("drive", name, value, seen.speed.shape, 0.0, 1.0)
+        return self._guard.numbers("drive", name, value, seen.speed.shape, lowest=0.0, highest=1.0)
 
 
 class PerVehicleAds:
@@ -115,11 +113,11 @@ class PerVehicleAds:
             if type(throttle) is type(brake) is float and 0 <= throttle <= 1 and 0 <= brake <= 1:
                 return throttle, brake  # the fast path: this runs for every vehicle in every step
         throttle, brake = self._guard.elements("drive", command, "(throttle, brake), each in [0, 1]")
-        return (float(self._guard.numbers("drive", "throttle", throttle, (), 0.0, 1.0)),
-                float(self._guard.numbers("drive", "brake", brake, (), 0.0, 1.0)))
+        return (float(self._guard.numbers("drive", "throttle", throttle, (), lowest=0.0, highest=1.0)),
+                float(self._guard.numbers("drive", "brake", brake, (), lowest=0.0, highest=1.0)))
 
 
 def _scalar_observations(seen: Observation) -> Iterator[Observation]:
     """The observation of each vehicle, as plain numbers."""
     columns = [value.tolist() if isinstance(value, np.ndarray) and value.ndim else repeat(float(value)) for value in seen]
-    return map(Observation._make, zip(*columns, strict=False))
+    return map(Observation._make, zip(*columns, strict=False))  # a repeated number is endless

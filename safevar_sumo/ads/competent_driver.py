@@ -60,7 +60,8 @@ class CompetentDriver(Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     start_throttle: StartThrottle = ()
 
     def start(self, n: int, nominal: Nominal, step: float) -> _Memory:
-        return _Memory(initial_reaction(n, nominal, step), np.full(n, np.inf), np.zeros(n, dtype=bool), np.full(n, -1.0))
+        return _Memory(initial_reaction(n, nominal, step), first_lateral=np.full(n, np.inf), first_in_way=np.zeros(n, dtype=bool),
+                       stray_time=np.full(n, -1.0))
 
     def drive(self, seen: Observation, memory: _Memory) -> tuple[Command, _Memory]:
         is_perceived, memory = self._perceive(seen, memory)
@@ -78,6 +79,7 @@ class CompetentDriver(Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
         return np.where(has_leader & (seen.obstacle_speed > 0), np.maximum(gap_control, -self.lets_go), np.inf)
 
     def _perceive(self, seen: Observation, memory: _Memory) -> tuple[BoolArray, _Memory]:
+        """Whether the obstacle is perceived: it was in the way at first, or strayed from its first position `perception_time` ago."""
         is_sighted = np.isfinite(seen.gap) & np.isfinite(seen.lateral)
         lateral = np.where(is_sighted, seen.lateral, 0.0)
         appears = is_sighted & ~np.isfinite(memory.first_lateral)

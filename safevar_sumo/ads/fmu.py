@@ -85,10 +85,10 @@ class FmuAds:
         inputs = self._input_values(seen, memory.constants)
         try:
             history = memory.history or memory.fleet.start(inputs)[1]
-            values, history = memory.fleet.advance(history, inputs)
+            (values, _), history = memory.fleet.advance(history, inputs)
         except Fault as fault:
             raise UserCodeError(self._guard.source, f"{self._guard.name} {fault}") from None
-        outputs = dict(zip(self._outputs, values[0], strict=True))
+        outputs = dict(zip(self._outputs, values, strict=True))
         warns = None if "warns" not in outputs else outputs["warns"] > 0.5
         memory = memory._replace(history=history, warns=warns)
         if "acceleration" in outputs:
@@ -96,7 +96,7 @@ class FmuAds:
             initial_trim = memory.trim or trim_at(memory.nominal, seen)
             return pedals_for(memory.nominal, seen.speed, acceleration, initial_trim), memory._replace(trim=initial_trim)
         zeros = np.zeros_like(seen.speed)
-        return Command(*(self._guard.numbers("doStep", name, outputs.get(name, zeros), seen.speed.shape, 0.0, 1.0)
+        return Command(*(self._guard.numbers("doStep", name, outputs.get(name, zeros), seen.speed.shape, lowest=0.0, highest=1.0)
                          for name in Command._fields)), memory
 
     def _input_values(self, seen: Observation, constants: Mapping[str, float]) -> FloatArray:

@@ -23,7 +23,7 @@ class _Memory(NamedTuple):
 
 
 class FuzzySafety(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Holds its speed; brakes according to two fuzzy metrics: PFS, whether a stop is still safe, and CFS, whether a collision is imminent.
+    """Holds its speed; brakes according to two fuzzy metrics: PFS rises as the gap falls below the safe distance, CFS as a collision nears.
 
     Parameters
     ----------

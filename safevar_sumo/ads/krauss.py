@@ -7,6 +7,7 @@ from typing import Annotated, NamedTuple
 import numpy as np
 from msgspec import Meta, Struct
 
+from safevar_sumo.ads.driver import LARGEST_GAP
 from safevar_sumo.records import Command, Nominal, Observation
 
 
@@ -48,7 +49,7 @@ class Krauss(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         nominal = memory.nominal
         deceleration = self.braking_share * nominal.decel
         reaction_speed = deceleration * self.reaction_time
-        gap = np.minimum(np.maximum(seen.gap - self.standing_gap, 0.0), 1e6)
+        gap = np.minimum(np.maximum(seen.gap - self.standing_gap, 0.0), LARGEST_GAP)
         safe_speed = np.sqrt(reaction_speed * reaction_speed + 2 * deceleration * gap) - reaction_speed
         acceleration = (np.minimum(safe_speed, self.cruise_speed) - seen.speed) / (memory.step + nominal.actuator_lag)
         throttle = np.minimum(np.maximum(acceleration / nominal.accel, 0.0), 1.0)

@@ -91,7 +91,7 @@ class WorldOnRails(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
         return Command(command.throttle, np.minimum(command.brake, delayed_brake)), memory
 
     def _decide_to_brake(self, seen: Observation, gap: FloatArray, lateral: FloatArray, was_braking: BoolArray) -> BoolArray:
-        """Whether to brake: the recognised obstacle is near and in the corridor: the policy's brake probability exceeds one half."""
+        """Whether the recognised obstacle is near and in the corridor; then the policy's probability of braking exceeds one half."""
         offset = lateral - self.brake_place
         reduction = self.brake_gap_past * np.maximum(offset, 0.0) + self.brake_gap_before * np.maximum(-offset, 0.0)
         braking_gap = seen.visibility * (self.brake_gap + self.brake_gap_per_speed * seen.speed - reduction)

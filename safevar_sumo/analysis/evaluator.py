@@ -66,9 +66,9 @@ class Evaluator:
         if self.region and not ignore_constraints:
             feasible = self.region.feasible(settings)
             if not feasible.all():
-                parts = [self.evaluate(settings[feasible], stage, done_before, total), self._infeasible_evaluations(settings[~feasible])]
+                groups = [self.evaluate(settings[feasible], stage, done_before, total), self._infeasible_evaluations(settings[~feasible])]
                 order = np.argsort(np.argsort(~feasible, kind="stable"), kind="stable")
-                return Evaluations.concatenate(parts).take(order)  # restores the order of the settings
+                return Evaluations.concatenate(groups).take(order)  # restores the order of the settings
         if not len(settings):
             return Evaluations.none(len(self.characteristics), METRICS)
         done, distinct_settings = done_before, len(np.unique(settings, axis=0))
@@ -153,7 +153,7 @@ class Evaluator:
             return self.parse_criterion(text)
         original = self.evaluate_original() if original is None else original
         if RATING_POINTS.name in original.metrics:
-            return Unsafe.default_among(original, original)
+            return Unsafe.default_among(original, original)  # a lost point: it depends on the original vehicle alone
         return Unsafe.default_among(self.evaluate(self.feasible_settings(CRITERION_SETTINGS), "settings over the whole domain"), original)
 
     def parse_criterion(self, text: str) -> Unsafe:

@@ -97,7 +97,7 @@ def prediction_band(safety_degrees: FloatArray, repeatability: float, error: Flo
 def evaluate_sets(study: Study, settings: FloatArray, point: str = "") -> list[Evaluations]:
     """Evaluate settings, shape (M, n), in this process with each parameter set, first with the study's values."""
     systems = [assemble(variant) for variant in studies_of_sets(study)]
-    return [evaluate(system_at_point(system, point, "point") if point else system, settings) for system in systems]
+    return [evaluate(system_at_point(system, point, source="point") if point else system, settings) for system in systems]
 
 
 def studies_of_sets(study: Study) -> list[Study]:
@@ -110,7 +110,7 @@ def studies_of_sets(study: Study) -> list[Study]:
     """
     if not study.spread:
         raise InputError(study.source, "has no table [spread]", "a study that `calibrate` has fitted, such as sun or rain")
-    sets = {key: values for key, values in study.spread.items()
-            if np.isclose(value_of(study, key), values[0], rtol=ROUNDING_TOLERANCE, atol=0)}
-    count = len(next(iter(study.spread.values())))
-    return [study, *(with_values(study, {key: values[k] for key, values in sets.items()}) for k in range(1, count))]
+    values_of_sets = {key: values for key, values in study.spread.items()
+                      if np.isclose(value_of(study, key), values[0], rtol=ROUNDING_TOLERANCE, atol=0)}
+    set_count = len(next(iter(study.spread.values())))
+    return [study, *(with_values(study, {key: values[k] for key, values in values_of_sets.items()}) for k in range(1, set_count))]

@@ -23,9 +23,10 @@ from safevar_sumo.shipped import PROGRAM_COMMAND
 class Option(NamedTuple):
     """One option: its help text, its legal range, and the name and form of its flag.
 
-    `kind` is the type of one value. `form` is "one" for a single value, "commas" for several values separated by commas, or "repeated"
-    for one flag per value. The ends `low` and `high` belong to the range unless the end's entry in `is_open` is true. `python`
-    describes the argument of the Python function if this argument differs from the flag.
+    - `kind` is the type of one value.
+    - `low` and `high` are the ends of the range; an end belongs to the range unless its entry in `is_open` is true.
+    - `form` is "one" for a single value, "commas" for several values separated by commas, or "repeated" for one flag per value.
+    - `python` is the help text of the Python function's argument, if this argument differs from the flag.
     """
 
     help: str

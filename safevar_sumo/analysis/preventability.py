@@ -111,15 +111,15 @@ class Preventability:
         return f"Preventability in the same vehicle ({sample}{number_of(self.collisions, 'collision')}): {', '.join(parts)}."
 
 
-def assess_preventability(evaluator: Evaluator, settings: FloatArray, limit: int = MAX_SIMULATIONS) -> Preventability:
+def assess_preventability(evaluator: Evaluator, settings: FloatArray, max_simulations: int = MAX_SIMULATIONS) -> Preventability:
     """Classify settings that collide, shape (M, n), by the weakest driver that avoids the collision; equal settings count once.
 
-    If that takes more than about `limit` simulations, only a random sample is simulated, drawn with the study's seed.
+    If that takes more than about `max_simulations` simulations, only a random sample is simulated, drawn with the study's seed.
     A setting that cannot be simulated with a reference driver is not counted.
     """
     unique = np.unique(settings, axis=0)
     simulations_per_setting = len(REFERENCE_DRIVERS) + len(assemble(evaluator.study).matrix)
-    sample_size = max(limit // simulations_per_setting, 1)
+    sample_size = max(max_simulations // simulations_per_setting, 1)
     rows = np.random.default_rng(evaluator.study.search.seed).permutation(len(unique))[:sample_size]
     return Preventability(counts=Counter(filter(None, classify_collisions(evaluator, unique[rows]))), collisions=len(unique))
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from safevar_sumo.analysis.options import Options
 from safevar_sumo.errors import InputError, did_you_mean, one_of, warn
-from safevar_sumo.results import MANIFEST, differences_now, later_files, make_inputs_comparable, manifest_of, read_manifest
+from safevar_sumo.results import MANIFEST, differences_now, make_inputs_comparable, manifest_of, read_late_files, read_manifest
 from safevar_sumo.study import Study, StudyLike, load_study, study_names
 from safevar_sumo.terminal import open_progress
 
@@ -108,11 +108,11 @@ def study_or_case(source: StudyLike | Results, *, as_it_is_now: bool = False, re
     if isinstance(source, str | Path):
         is_directory, is_study = os.path.isdir(source), str(source) in study_names()  # `os.path` accepts any text, unlike paths
         if results_only and not is_directory and (is_study or os.path.isfile(source)):
-            raise InputError(source, "is a study and has no solutions", "a directory that the command study has written")
+            raise InputError(source, "is a study and has no solutions", "a directory that the command `study` has written")
         if results_only or (is_directory and not is_study):
             source = load(source)
         elif not (is_study or os.path.lexists(source)):
-            expected = f"a directory that the command study has written, {one_of(study_names())}, or the path of a study file (TOML)"
+            expected = f"a directory that the command `study` has written, {one_of(study_names())}, or the path of a study file (TOML)"
             problem = f"is neither a results directory, a study nor a file{did_you_mean(source, study_names())}"
             raise InputError(source, problem, expected)
     if isinstance(source, Results):
@@ -150,7 +150,7 @@ def changes_since(directory: Path, case: Case, *, as_it_is_now: bool = False) ->
     system = assemble(study, str(directory))
     with local_pool(1, study.search.time_limit) as pool:
         sources = {**source_digests(study, pool), **files_read_by_algorithms(study)}
-    manifest, sources = make_inputs_comparable(manifest, sources, later_files(directory), study.origin.places)
+    manifest, sources = make_inputs_comparable(manifest, sources, read_late_files(directory), study.origin.places)
     changes = differences_now(manifest, manifest_of(study, identity_of(study, system, sources)))
     if changes and not as_it_is_now:
         rest = f" (and {len(changes) - MAX_CHANGES_NAMED} more)" if len(changes) > MAX_CHANGES_NAMED else ""
@@ -170,5 +170,5 @@ def answer_question(compute: Callable[..., Answer], subject: Study | Case, optio
     values = {name: arguments[name] for name in options.definitions()}
     if values.get("unsafe") is not None:
         values["unsafe"] = str(Unsafe.parse(values["unsafe"]))
-    with open_progress(arguments["progress"]) as show:
-        return compute(subject, options(**values), pool=arguments["pool"], jobs=arguments["jobs"], progress=show)
+    with open_progress(arguments["progress"]) as show_progress:
+        return compute(subject, options(**values), pool=arguments["pool"], jobs=arguments["jobs"], progress=show_progress)

@@ -56,8 +56,8 @@ class RecordingAds:
 def trace_frame(runs: SimulationRuns, recording: RecordingAds) -> pd.DataFrame:
     """One row per step of the only vehicle while its simulation counts.
 
-    The columns `gap` (along the vehicle's path) and `lateral` (from the middle of its lane) hold the obstacle's true position, the columns
-    that begin with "seen" the values that the ADS observed. `ttc` is empty while no gap closes or the vehicle stands, `gap` while no
+    The columns `gap` (along the vehicle's path) and `lateral` (from the middle of its lane) hold the obstacle's true position; the columns
+    that begin with "seen" hold what the ADS observed. `ttc` is empty while no gap closes or the vehicle stands, `gap` while no
     obstacle is ahead.
     """
     import pandas as pd  # takes longer to load than the simulation
@@ -155,7 +155,7 @@ class Simulation:
 
     def to_dict(self) -> dict[str, Any]:
         """The JSON of `simulate`: plain values, None where undefined."""
-        return {"study": self.study.name, "vcs": dict(self.setting), **record(self.evaluation, 0)}
+        return {"study": self.study.name, "vcs": dict(self.setting), **record(self.evaluation, row=0)}
 
     def __repr__(self) -> str:
         metrics = ", ".join(f"{name}={value:.4g}" for name, value in self.metrics.items())
@@ -202,9 +202,9 @@ def simulate_with_original(study: Study, system: System, requested: FloatArray, 
     """Simulate a setting, shape (n,), that is yet to be filtered, and the original vehicle."""
     characteristics = system.characteristics
     setting = characteristics.filter(requested) if filtered else requested
-    original = _simulate_one(study, system, characteristics.original, characteristics.original)
+    original = _simulate_one(study, system, requested=characteristics.original, setting=characteristics.original)
     if np.array_equal(setting, characteristics.original) and not gui:
-        return replace(original, put_back=_put_back(system, requested, setting))
+        return replace(original, put_back=_values_put_back(system, requested, setting))
     return replace(_simulate_one(study, system, requested, setting, Engine.GUI if gui else Engine.LIBSUMO), _original=original)
 
 
@@ -220,11 +220,11 @@ def _simulate_one(study: Study, system: System, requested: FloatArray, setting: 
     runs = simulate_settings(replace(system_at_worst_point(system, settings), ads=recording), settings, engine)  # in SUMO itself
     return Simulation(
         study=study, setting=dict(zip(system.characteristics.names, setting.tolist(), strict=True)),
-        put_back=_put_back(system, requested, setting), evaluation=score(system, settings, runs), runs=runs,
+        put_back=_values_put_back(system, requested, setting), evaluation=score(system, settings, runs), runs=runs,
         scoring=system.measuring.scoring, _recording=recording)
 
 
-def _put_back(system: System, requested: FloatArray, setting: FloatArray) -> dict[str, float]:
+def _values_put_back(system: System, requested: FloatArray, setting: FloatArray) -> dict[str, float]:
     values = zip(system.characteristics.names, requested, setting, strict=True)
     return {name: float(requested_value) for name, requested_value, filtered_value in values if requested_value != filtered_value}
 
@@ -242,9 +242,11 @@ def evaluate(study: StudyLike, settings: pd.DataFrame | Sequence[Mapping[str, fl
     study
         A study, or anything that `load_study` accepts.
     settings
-        M settings: a mapping for each setting with the changed characteristics, or a frame with a column for each of them, where a
-        missing value (no key, None or NaN) means the original's value; or an array of shape (M, n) without missing values, with the n
-        characteristics in the study's order. Values are in the characteristics' table units.
+        M settings, with values in the characteristics' table units, in one of these forms:
+
+        - a list with a mapping for each setting, or a frame with a row for each setting, of the characteristics that are changed; a
+          missing value (no key, None or NaN) means the original's value;
+        - an array of shape (M, n) without missing values, with the n characteristics in the study's order.
     filtered
         Put changes that are smaller than their thresholds back to the original, as every search does.
     beyond
@@ -280,7 +282,8 @@ def evaluate(study: StudyLike, settings: pd.DataFrame | Sequence[Mapping[str, fl
     simulated_settings = characteristics.filter(requested) if filtered else requested
     with open_progress(progress) as report_progress:
         evaluations = evaluate_settings(loaded_study, simulated_settings, pool, jobs, report_progress)
-    frame = evaluations_frame(characteristics.names, [(("", 0), evaluations)]).drop(columns=["algorithm", "run"])
+    no_run = "", 0
+    frame = evaluations_frame(characteristics.names, [(no_run, evaluations)]).drop(columns=["algorithm", "run"])
     frame.insert(len(frame.columns) - 1, "collision_speed", evaluations.collision_speed)
     return frame.set_axis(index)
 

@@ -28,14 +28,15 @@ class Batcher:
     ----------
     work
         The packed study.
-    size
+    max_size
         Maximum number of settings per batch.
     """
 
-    def __init__(self, pool: RetryingPool, work: bytes, size: int) -> None:
-        self._pool, self._work, self._max_size = pool, work, size
+    def __init__(self, pool: RetryingPool, work: bytes, max_size: int) -> None:
+        self._pool, self._work, self._max_size = pool, work, max_size
         self._queue: deque[tuple[Run, FloatArray]] = deque()
         self.under_way: dict[Future[Evaluations], list[Run]] = {}
+        """By batch: the run of each of its settings."""
 
     def wanted_run_count(self, population: int) -> int:
         """The number of runs, each with `population` settings at a time, that keep all workers busy."""
@@ -65,4 +66,4 @@ class Batcher:
         """Yield each run of a computed batch, with the evaluations of its settings."""
         runs, evaluations = self.under_way.pop(batch), batch.result()
         for run in dict.fromkeys(runs):
-            yield run, evaluations.take([row for row, owning_run in enumerate(runs) if owning_run is run])
+            yield run, evaluations.take([row for row, run_of_row in enumerate(runs) if run_of_row is run])

@@ -62,7 +62,7 @@ def run_campaign(study: Study, keys: Iterable[RunKey], results: ResultsDirectory
     pool
         Computes batches.
     batch
-        Maximum number of settings of several runs in a batch.
+        Maximum number of settings in a batch, which may hold settings of several runs.
     engine
         What moves the vehicles; before a run is finished, results from recorded scenes are verified in SUMO.
     retry_failed
@@ -74,22 +74,22 @@ def run_campaign(study: Study, keys: Iterable[RunKey], results: ResultsDirectory
         If a journal cannot be written, or the study is at fault.
     """
     characteristics = CharacteristicSet.of(study.vehicle.characteristics)
-    retrying_pool, work = RetryingPool(pool, study, results.note), pack_study(study, results.inputs, engine=engine)
+    retrying_pool, work = RetryingPool(pool, study, results.record_late_files), pack_study(study, results.inputs, engine=engine)
     original = _evaluate_original(study, work, characteristics, results, retrying_pool, observer)
     if not original.valid[0]:
         raise InputError(study.source, "the original vehicle leaves the tolerance of a test's speed before the ADS acts "
                          "(invalid-test): nothing can be compared with it", "tests whose speed the vehicle can hold")
     if original.collided[0] and not is_rated(study):
-        observer.warned(f"study {study.name!r}: the original vehicle itself collides, no change is needed for that")
+        observer.warned(f"study {study.name!r}: the original vehicle itself collides: no change is needed")
     for remark in results.begin(original, map(str, all_runs(study))):
         observer.warned(remark)
     problem = Problem(characteristics=characteristics, original=original, evaluations=study.search.evaluations,
                       population=study.search.population, scoring=results.scoring, region=region_of(study))
-    campaign = Campaign(original, {}, [], [], {}, {}, results.scoring)
+    campaign = Campaign(original, solutions={}, failures=[], busy=[], collisions={}, invalid_tests={}, scoring=results.scoring)
     keys_left, runs = deque(keys), set[Run]()
 
     def begin_search(key: RunKey) -> Search:
-        return make_search(key, study, problem, results.note)
+        return make_search(key, study, problem, results.record_late_files)
 
     batcher = Batcher(retrying_pool, work, batch or MAX_COPIES)
     verification = Verification(study, results, retrying_pool, begin_search, engine, observer)
@@ -129,7 +129,7 @@ def run_campaign(study: Study, keys: Iterable[RunKey], results: ResultsDirectory
                         finish(run)
                     continue
                 runs_of_batch, evaluations_of_runs = zip(*batcher.collect(future), strict=True)
-                for run, is_complete in zip(runs_of_batch, journalling.map(Run.take, runs_of_batch, evaluations_of_runs), strict=True):
+                for run, is_complete in zip(runs_of_batch, journalling.map(Run.receive, runs_of_batch, evaluations_of_runs), strict=True):
                     if is_complete:
                         advance(run)
     finally:
@@ -158,7 +158,7 @@ def _evaluate_original(study: Study, work: bytes, characteristics: Characteristi
         evaluations = simulate()
         for remark in check_code(study, results.inputs, pool):
             observer.warned(remark)
-        journal.append([0], evaluations)
+        journal.append(positions=[0], evaluations=evaluations)
         return evaluations
     finally:
         journal.close()

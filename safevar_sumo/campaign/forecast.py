@@ -23,7 +23,7 @@ NUMBERS_BESIDE_METRICS = 4
 
 
 class Forecast(NamedTuple):
-    """Upper limits for a campaign: evaluations, `seconds` and `size` of the results [bytes]; `rate` are evaluations per second."""
+    """Upper limits for a campaign: evaluations, `seconds`, and `size` of the results [bytes]; `rate` is in evaluations per second."""
 
     evaluations: int
     rate: float
@@ -33,13 +33,14 @@ class Forecast(NamedTuple):
 
 def forecast(study: Study, runs: int, pool: Pool, batch: int = MAX_COPIES, engine: Engine = Engine.LIBSUMO) -> Forecast:
     """Estimate upper limits for a number of runs, from a short measurement of the pool that will carry out the runs."""
-    characteristics, size = CharacteristicSet.of(study.vehicle.characteristics), min(batch, max(runs, 1) * study.search.population)
+    characteristics = CharacteristicSet.of(study.vehicle.characteristics)
+    batch_size = min(batch, max(runs, 1) * study.search.population)
     retrying_pool, work, rng = RetryingPool(pool, study), pack_study(study, engine=engine), np.random.default_rng(study.search.seed)
 
     def measure_time(batches_per_worker: int) -> float:
         """Time for a number of batches on every worker [s]."""
         start = time.perf_counter()
-        batches = [characteristics.filter(rng.uniform(characteristics.lower, characteristics.upper, (size, len(characteristics))))
+        batches = [characteristics.filter(rng.uniform(characteristics.lower, characteristics.upper, (batch_size, len(characteristics))))
                    for _ in range(batches_per_worker * pool.workers)]
         for future in [retrying_pool.submit(work, settings) for settings in batches]:
             wait_for_result(future)
@@ -47,7 +48,7 @@ def forecast(study: Study, runs: int, pool: Pool, batch: int = MAX_COPIES, engin
 
     wait_for_result(retrying_pool.submit(work, characteristics.original[np.newaxis], must_succeed=True))
     measure_time(1)  # starts the workers and builds the network
-    rate = PROBE_BATCHES * pool.workers * size / measure_time(PROBE_BATCHES)
+    rate = PROBE_BATCHES * pool.workers * batch_size / measure_time(PROBE_BATCHES)
     evaluations = runs * study.search.evaluations
     row_size = 8 * (len(characteristics) + len(METRICS) + NUMBERS_BESIDE_METRICS)
-    return Forecast(evaluations, rate, evaluations / rate, evaluations * row_size)
+    return Forecast(evaluations, rate, seconds=evaluations / rate, size=evaluations * row_size)

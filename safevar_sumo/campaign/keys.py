@@ -25,7 +25,7 @@ class RunKey(NamedTuple):
 
 
 def all_runs(study: Study) -> list[RunKey]:
-    """Every run of a study."""
+    """The keys of all runs of a study."""
     return [RunKey(label, run) for label in study.search.labels for run in range(study.search.runs)]
 
 
@@ -50,9 +50,9 @@ def algorithm_of(label: str, study: Study) -> Algorithm:
         parameters = Lookup(source, study.origin.places).with_paths(member, search.parameters.get(label, {}), key)
         algorithm = instance_of(member, parameters, f"search.algorithms: {name!r}", key, source)
     if isinstance(algorithm, MoCell):
-        algorithm.grid_sides(search.population, source)
+        algorithm.grid_sides(search.population, source)  # raises for a grid of another size
     if isinstance(algorithm, MapElites):
-        algorithm.count_cells(len(study.vehicle.characteristics), source)
+        algorithm.count_cells(len(study.vehicle.characteristics), source)  # raises for too many cells
     return algorithm if member.guard is None else GuardedAlgorithm(algorithm, member.guard)
 
 
@@ -68,8 +68,8 @@ def files_read_by_algorithms(study: Study) -> Files:
     return digests(reading.files(packages), study.origin.places)
 
 
-def make_search(key: RunKey, study: Study, problem: Problem, note: Callable[[Files], None]) -> Search:
-    """Make the search of a run; after each step, calls `note` with the files that a user's algorithm has read."""
+def make_search(key: RunKey, study: Study, problem: Problem, note_files: Callable[[Files], None]) -> Search:
+    """Make the search of a run; after each step, calls `note_files` with the files that a user's algorithm has read."""
     packages, rng, ended = _user_packages(study), random_generator_of(study, key), False
     search: Search | None = None
     answer: Any = None  # None starts a generator
@@ -77,14 +77,14 @@ def make_search(key: RunKey, study: Study, problem: Problem, note: Callable[[Fil
         with note_inputs() as reading:
             try:
                 search = search or algorithm_of(key.algorithm, study).search(problem, rng)
-                step: Any = search.send(answer)
+                output: Any = search.send(answer)  # settings, or the result at the end
             except StopIteration as end:
-                ended, step = True, end.value
+                ended, output = True, end.value
         if packages:
-            note(digests(reading.files(packages), study.origin.places))
+            note_files(digests(reading.files(packages), study.origin.places))
         if ended:
-            return step  # type: ignore[no-any-return]
-        answer = yield step
+            return output  # type: ignore[no-any-return]
+        answer = yield output
 
 
 def _user_packages(study: Study) -> list[str]:
@@ -99,6 +99,6 @@ def algorithm_class(name: str, study: Study) -> Member:
 
 
 def random_generator_of(study: Study, key: RunKey) -> np.random.Generator:
-    """The random numbers of a run, independent of other runs."""
+    """The random generator of a run, independent of those of other runs."""
     sequence = np.random.SeedSequence(study.search.seed, spawn_key=(zlib.crc32(key.algorithm.encode()), key.run))
     return np.random.Generator(np.random.PCG64(sequence))

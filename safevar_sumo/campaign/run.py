@@ -18,7 +18,7 @@ RANDOM_SAMPLES = 10
 """Number of random evaluations of a run that are simulated again. 30 runs then reveal an error in 1 % of the evaluations with a
 probability of 1 - 0.99^300 = 95 %."""
 
-FAILED = Outcome.SIMULATOR_ERROR.value
+SIMULATOR_ERROR = Outcome.SIMULATOR_ERROR.value
 
 
 class Observer(Protocol):
@@ -90,7 +90,7 @@ class Run:
     def failures(self) -> list[Failure]:
         """Settings of this run that could not be simulated."""
         return [Failure(self.key.algorithm, self.key.run, position, evaluations.reason(row))
-                for position, evaluations, row in self._requested_entries() if evaluations.outcome[row] == FAILED]
+                for position, evaluations, row in self._requested_entries() if evaluations.outcome[row] == SIMULATOR_ERROR]
 
     def _requested_entries(self) -> list[_EvaluatedSetting]:
         """The known settings that this run requested, in the order of their positions."""
@@ -112,7 +112,7 @@ class Run:
                    if 0 <= position < self._budget)
 
     def advance(self) -> bool:
-        """Answer the search as long as all requested evaluations are known; returns whether the search has ended."""
+        """Answer the search while all requested evaluations are known, or read its journalled result; returns whether it has ended."""
         stored_result = self._journal.content.result(self._budget)
         if stored_result is not None:
             self.result = self._journal.content.take_positions(stored_result.positions)
@@ -136,7 +136,7 @@ class Run:
         return False
 
     def sample_evaluations(self, rng: np.random.Generator) -> list[Evaluations]:
-        """Sample the worst evaluation, at which users look; the last one, into which most state may have leaked; and random ones."""
+        """Sample the worst evaluation, at which users look; the last one, where leaked state accumulates; and random ones."""
         entries = [entry for entry in self._requested_entries() if entry.evaluations.valid[entry.row]]
         if not entries:
             return []
@@ -148,7 +148,8 @@ class Run:
     def sample_for_sumo(self, rng: np.random.Generator) -> Evaluations:
         """Sample the evaluations to verify in SUMO: all solutions, and `VERIFIED_SETTINGS` random other settings."""
         solutions = {setting.tobytes() for setting in self.result.settings}
-        settings = [evaluations.settings[row] for _, evaluations, row in self._requested_entries() if evaluations.outcome[row] != FAILED]
+        settings = [evaluations.settings[row] for _, evaluations, row in self._requested_entries()
+                    if evaluations.outcome[row] != SIMULATOR_ERROR]
         sample = [setting for setting in settings if setting.tobytes() in solutions]
         other_settings = [setting for setting in settings if setting.tobytes() not in solutions]
         sample += [other_settings[i] for i in rng.permutation(len(other_settings))[:VERIFIED_SETTINGS].tolist()]
@@ -176,7 +177,7 @@ class Run:
         self.finished = True
         self._observer.finished(self.key, self._requested)
 
-    def take(self, evaluations: Evaluations) -> bool:
+    def receive(self, evaluations: Evaluations) -> bool:
         """Journal and remember new evaluations; returns whether all requested settings are known."""
         self._store(evaluations)
         self._simulated += len(evaluations)

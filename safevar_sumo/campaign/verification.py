@@ -75,7 +75,7 @@ class Verification:
         expected = run.sample_for_sumo(rng) if self._uses_recorded_scenes else None
         if not expected:
             return False
-        if self._sumo_study is not self._study:  # SUMO repeats only a few cells of a rating, so these cells need values to compare with
+        if self._sumo_study is not self._study:  # SUMO repeats a few cells of a rating; the run has no values of single cells
             expected = evaluate(assemble(self._sumo_study), expected.settings)
         self._unverified[run] = expected, len(expected)
         self._sumo_batcher.add(run, expected.settings)
@@ -88,8 +88,9 @@ class Verification:
     def _verify(self, run: Run, sumo_evaluations: Evaluations) -> bool:
         """Compare evaluations from SUMO with those of a run; returns whether the run is verified completely."""
         expected, settings_left = self._unverified.pop(run)
-        rows = {row.tobytes(): i for i, row in enumerate(expected.settings)}
-        refuse_unlike_sumo(self._study, expected.take([rows[row.tobytes()] for row in sumo_evaluations.settings]), sumo_evaluations)
+        row_of = {setting.tobytes(): row for row, setting in enumerate(expected.settings)}
+        recorded = expected.take([row_of[setting.tobytes()] for setting in sumo_evaluations.settings])
+        refuse_unlike_sumo(self._study, recorded, sumo_evaluations)
         failed_rows = np.flatnonzero(sumo_evaluations.failed).tolist()
         if failed_rows:
             self._observer.warned(f"run {run.key}: {len(failed_rows)} of {len(expected)} settings could not be verified in SUMO: "
@@ -100,7 +101,7 @@ class Verification:
 
     def _refuse_unrepeatable(self, run: Run) -> None:
         name = self._user_algorithm(run.key)
-        if name and run.key.run == self._study.search.runs - 1:
+        if name and run.key.run == self._study.search.runs - 1:  # only the last run of each algorithm is repeated
             unload_user_modules()
             if not run.is_repeated_by(self._begin_search(run.key)):
                 raise self._repetition_error(name, run.key)

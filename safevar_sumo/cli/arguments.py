@@ -103,11 +103,11 @@ def read_changes(changes: tuple[str, ...], characteristics: CharacteristicSet, b
     return values_by_name
 
 
-def combine_values(changes: dict[str, list[float]], base: FloatArray, characteristics: CharacteristicSet) -> FloatArray:
+def combine_values(values_by_name: dict[str, list[float]], base: FloatArray, characteristics: CharacteristicSet) -> FloatArray:
     """Make M settings, shape (M, n): `base`, shape (n,), with each of the M combinations of values in turn."""
-    columns = [characteristics.names.index(name) for name in changes]
+    columns = [characteristics.names.index(name) for name in values_by_name]
     settings = []
-    for values in product(*changes.values()):
+    for values in product(*values_by_name.values()):
         setting = base.copy()
         setting[columns] = values
         settings.append(setting)

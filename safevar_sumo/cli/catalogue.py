@@ -35,9 +35,9 @@ def _catalogue(studies: list[Study]) -> dict[str, Any]:
     characteristics: dict[str, list[dict[str, Any]]] = {}
     for study in studies:
         characteristics.setdefault(study.vehicle.model, [
-            {"name": row.name, "unit": row.unit, "original": row.original, "lower": row.lower, "upper": row.upper,
-             "threshold": row.threshold, "meaning": row.meaning, "counterpart": row.counterpart}
-            for row in CharacteristicSet.of(study.vehicle.characteristics)])
+            {"name": item.name, "unit": item.unit, "original": item.original, "lower": item.lower, "upper": item.upper,
+             "threshold": item.threshold, "meaning": item.meaning, "counterpart": item.counterpart}
+            for item in CharacteristicSet.of(study.vehicle.characteristics)])
     return {
         "studies": [{"name": study.name, "title": study.title, "vehicle": study.vehicle.model, "ads": study.ads.model,
                      "scenario": study.scenario.model, "weather": _weather_name(study)} for study in studies],

@@ -24,16 +24,16 @@ from safevar_sumo.cli.target import (
     as_it_is_now_option,
     jobs_option,
     json_option,
+    load_results_or_study,
+    load_study_at_point,
     point_option,
-    results_or_study,
-    study_at_point,
 )
 from safevar_sumo.errors import InputError
 from safevar_sumo.results import make_directory, write_whole
 from safevar_sumo.terminal import show_stages
 
 
-def question_with(options: type[Options], metavar: str, *further_decorators: Callable[[CommandFunction], CommandFunction]
+def add_question(options: type[Options], metavar: str, *further_decorators: Callable[[CommandFunction], CommandFunction]
                   ) -> Callable[[CommandFunction], click.Command]:
     """Decorator of a question's command: adds flags for its options, and flags that all questions share."""
     def add(command: CommandFunction) -> click.Command:
@@ -61,7 +61,7 @@ def _plot_option(help_text: str) -> Callable[[CommandFunction], CommandFunction]
     return click.option("--plot", type=click.Path(path_type=Path), metavar="FILE", help=help_text)
 
 
-@question_with(ExplainOptions, "DIR|STUDY",
+@add_question(ExplainOptions, "DIR|STUDY",
                click.option("--full", is_flag=True, help="Print every explanation in full, not only the answer."),
                click.option("--out", type=click.Path(path_type=Path), metavar="DIR",
                             help="Write causes.json, causes.csv and a figure there."))
@@ -71,7 +71,7 @@ def explain(source: str, full: bool, point: str | None, jobs: int | None, as_jso
     from safevar_sumo.analysis.explain.render import necessity_figure, print_explained
     from safevar_sumo.analysis.figures import save
 
-    subject = results_or_study(source, point)
+    subject = load_results_or_study(source, point)
     if out is not None:
         make_directory(out)
     result = _compute_with_bar(explain_failures, subject, ExplainOptions(**values), jobs)
@@ -86,14 +86,14 @@ def explain(source: str, full: bool, point: str | None, jobs: int | None, as_jso
         click.echo(f"Causes: {out}", err=as_json)
 
 
-@question_with(OpinionOptions, "DIR", click.argument("handles", nargs=-1, metavar=""))
+@add_question(OpinionOptions, "DIR", click.argument("handles", nargs=-1, metavar=""))
 def opinion(source: str, handles: tuple[str, ...], point: str | None, jobs: int | None, as_json: bool, **values: Any) -> None:
     """Have another vehicle model confirm or contradict the minimal causes of failures of results in DIR."""
     from safevar_sumo.analysis.opinion.compute import ask_for_opinions
     from safevar_sumo.analysis.opinion.render import print_opinions
 
     options = OpinionOptions(**{**values, "solutions": (*values["solutions"], *handles)})
-    result = _compute_with_bar(ask_for_opinions, results_or_study(source, point, results_only=True), options, jobs)
+    result = _compute_with_bar(ask_for_opinions, load_results_or_study(source, point, results_only=True), options, jobs)
     if not as_json:
         print_opinions(Console(), result)
         return
@@ -102,7 +102,7 @@ def opinion(source: str, handles: tuple[str, ...], point: str | None, jobs: int 
     click.echo(_to_json(result))
 
 
-@question_with(ToleranceOptions, "STUDY|DIR",
+@add_question(ToleranceOptions, "STUDY|DIR",
                _plot_option("Draw the profiles to this file: png, pdf or svg; with --pairs, the worst pairs to a second file beside it."))
 def tolerance(source: str, point: str | None, jobs: int | None, as_json: bool, plot: Path | None, **values: Any) -> None:
     """Find how far each characteristic of STUDY may go: alone, in pairs, and all together."""
@@ -110,7 +110,7 @@ def tolerance(source: str, point: str | None, jobs: int | None, as_json: bool, p
     from safevar_sumo.analysis.tolerance.compute import find_tolerances
     from safevar_sumo.analysis.tolerance.render import pairs_figure, print_tolerance, profiles_figure
 
-    options, study = ToleranceOptions(**values), study_at_point(source, point)
+    options, study = ToleranceOptions(**values), load_study_at_point(source, point)
     pairs_plot = None if plot is None else plot.with_stem(f"{plot.stem}-pairs")
     for path in (plot, pairs_plot if options.pairs else None):
         if path is not None:
@@ -126,14 +126,14 @@ def tolerance(source: str, point: str | None, jobs: int | None, as_json: bool, p
             save(pairs_figure(result), pairs_plot, "--plot")
 
 
-@question_with(RiskOptions, "STUDY|DIR", _plot_option("Draw the sensitivity indices to this file: png, pdf or svg."))
+@add_question(RiskOptions, "STUDY|DIR", _plot_option("Draw the sensitivity indices to this file: png, pdf or svg."))
 def risk(source: str, point: str | None, jobs: int | None, as_json: bool, plot: Path | None, **values: Any) -> None:
     """Estimate how likely an unsafe outcome is if vehicles vary as [variation] of STUDY says, and which characteristics decide it."""
     from safevar_sumo.analysis.figures import save
     from safevar_sumo.analysis.risk.compute import estimate_risk
     from safevar_sumo.analysis.risk.render import print_risk, sensitivity_figure
 
-    options, study = RiskOptions(**values), study_at_point(source, point)
+    options, study = RiskOptions(**values), load_study_at_point(source, point)
     if plot is not None:
         check_output(plot, "--plot", PICTURE_ENDINGS)
         if study.correlations:
@@ -153,12 +153,12 @@ def risk(source: str, point: str | None, jobs: int | None, as_json: bool, plot: 
         save(sensitivity_figure(result), plot, "--plot")
 
 
-@question_with(RulesOptions, "STUDY|DIR")
+@add_question(RulesOptions, "STUDY|DIR")
 def rules(source: str, point: str | None, jobs: int | None, as_json: bool, **values: Any) -> None:
     """Find rules, in physical units, that describe the unsafe settings of STUDY, from evenly spread settings instead of a search."""
     from safevar_sumo.analysis.rules.compute import find_rules, print_rules
 
-    result = _compute_with_bar(find_rules, study_at_point(source, point), RulesOptions(**values), jobs)
+    result = _compute_with_bar(find_rules, load_study_at_point(source, point), RulesOptions(**values), jobs)
     if not as_json:
         print_rules(Console(), result)
         return

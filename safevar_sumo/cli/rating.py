@@ -12,7 +12,7 @@ from rich.console import Console
 from safevar_sumo.analysis.rating import RatingOptions
 from safevar_sumo.cli.arguments import PICTURE_ENDINGS, check_output, read_changes
 from safevar_sumo.cli.program import commands
-from safevar_sumo.cli.target import add_flags, as_it_is_now_option, jobs_option, json_option, results_or_study
+from safevar_sumo.cli.target import add_flags, as_it_is_now_option, jobs_option, json_option, load_results_or_study
 from safevar_sumo.errors import InputError
 from safevar_sumo.study import Study
 from safevar_sumo.terminal import show_stages
@@ -43,7 +43,7 @@ def rating(source: str, changes: tuple[str, ...], solution: str | None, matrix: 
     from safevar_sumo.analysis.rating.compute import rate_variant, remarks
     from safevar_sumo.analysis.rating.render import matrices_figure, print_matrices, print_rating
 
-    subject = results_or_study(source)
+    subject = load_results_or_study(source)
     study = subject if isinstance(subject, Study) else subject.study
     options = RatingOptions(changes=_read_single_changes(study, changes), solution=solution)
     if force and xlsx is None and preprocessed is None and plot is None:
@@ -72,7 +72,7 @@ def rating(source: str, changes: tuple[str, ...], solution: str | None, matrix: 
 
 def _read_single_changes(study: Study, changes: tuple[str, ...]) -> dict[str, float]:
     """Parse --set into the value of each changed characteristic."""
-    values = read_changes(changes, CharacteristicSet.of(study.vehicle.characteristics), False, single=True)
+    values = read_changes(changes, CharacteristicSet.of(study.vehicle.characteristics), beyond=False, single=True)
     return {name: value for name, (value,) in values.items()}
 
 
@@ -85,16 +85,16 @@ def _open_spreadsheet(xlsx: Path | None, template: Path | None, preprocessed: Pa
     """The spreadsheet to fill, read and checked before any simulation; None without --xlsx and --preprocessed."""
     if template is not None and preprocessed is not None:
         raise InputError("--template", "--preprocessed is given too", "one of them: --preprocessed already holds the template's sheets")
-    sheets = template if template is not None else preprocessed
-    if sheets is None:
+    source_file = template if template is not None else preprocessed
+    if source_file is None:
         if xlsx is not None:
-            raise InputError("--xlsx", f"{xlsx} needs the official template; to make it: pip install 'euroncap-rating-2026', then "
-                                       "euroncap_rating_2026 crash_avoidance generate-template",
+            raise InputError("--xlsx", f"{xlsx} needs the official template; to make it, run `pip install euroncap-rating-2026` and "
+                                       "`euroncap_rating_2026 crash_avoidance generate-template`",
                              "--template FILE, or --preprocessed FILE")
         return None
     if template is not None and xlsx is None:
         raise InputError("--template", "there is no --xlsx to write to", "--xlsx FILE")
-    output = xlsx if xlsx is not None else sheets
+    output = xlsx if xlsx is not None else source_file
     flag = "--xlsx" if xlsx is not None else "--preprocessed"
     _refuse_existing(output, flag, force)
     check_output(output, flag, SPREADSHEET_ENDINGS)
@@ -102,4 +102,4 @@ def _open_spreadsheet(xlsx: Path | None, template: Path | None, preprocessed: Pa
         from safevar_sumo.analysis.rating.workbook import PreprocessedFile, Template
     except ModuleNotFoundError:
         raise InputError(flag, "openpyxl is not installed", "pip install 'safevar_sumo[rating]'") from None
-    return (PreprocessedFile if template is None else Template)(sheets, output)
+    return (PreprocessedFile if template is None else Template)(source_file, output)

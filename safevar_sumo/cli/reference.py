@@ -75,16 +75,16 @@ def validate(study: str, reference: Path, jobs: int | None, plot: Path | None, a
     with (local_pool(jobs or available_cores(), loaded_study.search.time_limit) as pool,
           show_counting_bar(Console(stderr=True), "settings", len(np.unique(settings, axis=0))) as count_settings):
         evaluations = evaluate_all(loaded_study, settings, pool, count_settings)
-    data, rows = _simulated_rows(reference, data, evaluations.take(np.arange(1, len(settings))))
+    data, simulated = _simulated_rows(reference, data, evaluations.take(np.arange(1, len(settings))))
     if not evaluations.valid[0]:
         raise SimulationError(f"study {study!r} cannot be simulated with the original vehicle")
-    result = measure_agreement(data, rows, loaded_study, evaluations.take([0]))
+    result = measure_agreement(data, simulated, loaded_study, evaluations.take([0]))
     if plot is not None:
-        plot_agreement(plot, f"{loaded_study.title}\nagainst {reference.name}", system.characteristics, data, rows,
+        plot_agreement(plot, f"{loaded_study.title}\nagainst {reference.name}", system.characteristics, data, simulated,
                        loaded_study.repeatability.get(SAFETY_DEGREE))
     if totals is not None:
         write_totals(totals, loaded_study, reference.name, result)
-    effects = effects_of(data, rows, system.characteristics) if with_effects else []
+    effects = effects_of(data, simulated, system.characteristics) if with_effects else []
     coverage = measure_coverage(data, loaded_study) if with_spread else None
     if as_json:
         by_name = {effect.name: {"reference": effect.reference, "here": effect.here, "agrees": effect.agrees} for effect in effects}
@@ -272,7 +272,7 @@ def replicate(directories: tuple[str, ...], published: tuple[str, ...], out: Pat
         check_writable(out)
     for directory in published:
         if Path(directory).resolve() in [Path(other).resolve() for other in directories]:
-            raise InputError("--published", f"{directory} is given as results too", "results that the command import has written")
+            raise InputError("--published", f"{directory} is given as results too", "results that the command `import` has written")
     pairs = pair_cases(load_cases(directories), load_cases(published))
     page = render_replication(pairs, _compare_nearby(pairs.here, references))
     if out is None:
@@ -284,30 +284,30 @@ def replicate(directories: tuple[str, ...], published: tuple[str, ...], out: Pat
 
 def _compare_nearby(cases: Sequence[Case], references: Sequence[str]) -> list[Nearness]:
     """Compare the solutions of each case with the nearest rows of its published files."""
-    rows: dict[str, list[ReferenceData]] = {}
+    data_by_case: dict[str, list[ReferenceData]] = {}
     for reference in references:
         name, _, file = reference.rpartition("=")
         candidates = [case for case in cases if name in ("", case.study.name)]
-        rows_by_case = _rows_by_case(Path(file), candidates) if candidates else {}
-        if len(rows_by_case) != 1:
-            relation = "may belong to any of" if rows_by_case else "belongs to none of"
-            names = ", ".join(rows_by_case or (case.study.name for case in cases))
+        matches = _read_for_cases(Path(file), candidates) if candidates else {}
+        if len(matches) != 1:
+            relation = "may belong to any of" if matches else "belongs to none of"
+            names = ", ".join(matches or (case.study.name for case in cases))
             raise InputError("--reference", f"{reference} {relation} {names}", "STUDY=FILE.csv")
-        for case, data in rows_by_case.items():
-            rows.setdefault(case, []).append(data)
-    return [result for case in cases if case.name in rows for result in compare_with_nearest_rows(case, rows[case.name])]
+        for case_name, data in matches.items():
+            data_by_case.setdefault(case_name, []).append(data)
+    return [result for case in cases if case.name in data_by_case for result in compare_with_nearest_rows(case, data_by_case[case.name])]
 
 
-def _rows_by_case(path: Path, cases: Sequence[Case]) -> dict[str, ReferenceData]:
-    """The rows of a file for each case, by name, if the file has the characteristics of the case."""
-    rows: dict[str, ReferenceData] = {}
+def _read_for_cases(path: Path, cases: Sequence[Case]) -> dict[str, ReferenceData]:
+    """Read a file for each case whose characteristics it has; returns the rows by the case's name."""
+    data_by_case: dict[str, ReferenceData] = {}
     for case in cases:
         try:
-            rows[case.name] = read_reference(path, case.characteristics)
+            data_by_case[case.name] = read_reference(path, case.characteristics)
         except InputError as error:
             if len(cases) == 1 or not ("lacks the columns" in error.problem or "in the domains" in error.problem):
                 raise
-    return rows
+    return data_by_case
 
 
 def print_agreement(console: Console, study: Study, result: Agreement) -> None:

@@ -39,16 +39,16 @@ def tables(directories: tuple[str, ...], question: str | None, format_name: str,
              else FORMATS[format_name])
     answers = answer_questions(load_cases(directories), question)
     if format_name in FORMATS_WITHOUT_NOTES:
-        _print_notes(list(dict.fromkeys(note for table in answers for note in table.notes)))
+        _print_notes(list(dict.fromkeys(note for answer in answers for note in answer.notes)))
     if out is not None:
         make_directory(out)
-        for table in answers:
-            if not table.frame.empty:
-                write_whole(out / f"{table.name}.{ENDINGS[format_name]}", write([table]))
+        for answer in answers:
+            if not answer.frame.empty:
+                write_whole(out / f"{answer.name}.{ENDINGS[format_name]}", write([answer]))
         click.echo(f"Tables: {out}")
         return
     if question is not None and format_name in FORMATS_WITHOUT_NOTES:
-        answers = [table for table in answers if table.name == question]
+        answers = [answer for answer in answers if answer.name == question]
     click.echo(write(answers), nl=False)
 
 

@@ -64,7 +64,7 @@ def simulate_command(study: str, solution: str | None, choice: str | None, chang
     target, outputs = load_target(study, solution, choice), ReplayOutputs(**replay_outputs)
     system = assemble(target.study, target.source)
     if point is not None:
-        system = system_at_point(system, point, "--point")
+        system = system_at_point(system, point, source="--point")
     values_by_name = read_changes(changes, system.characteristics, beyond)
     base = system.characteristics.original if target.setting is None else target.setting
     requested_settings = combine_values(values_by_name, base, system.characteristics)
@@ -73,7 +73,7 @@ def simulate_command(study: str, solution: str | None, choice: str | None, chang
     _check_outputs(study, trace, outputs)
     if any(len(values) > 1 for values in values_by_name.values()):
         if trace is not None or outputs.are_requested or spread:
-            expected = "one value for each with --trace, --plot, --animate, --gui or --spread"
+            expected = "one value for each characteristic with --trace, --plot, --animate, --gui or --spread"
             raise InputError("--set", f"{' '.join(changes)} is a sweep", expected)
         _simulate_sweep(target, system, requested_settings, tuple(values_by_name), not no_filter, as_json)
         return
@@ -117,10 +117,11 @@ def _simulate_sweep(target: CommandTarget, system: System, requested_settings: F
 
 
 def _print_results(target: CommandTarget, system: System, simulation: Simulation, spreads: Sequence[ModelSpread], as_json: bool) -> None:
-    at_points = simulate_all_points(system, simulation.evaluation.settings) if system.matrix and (as_json or system.rater is None) else []
+    shows_points = system.matrix and (as_json or system.rater is None)
+    results_at_points = simulate_all_points(system, simulation.evaluation.settings) if shows_points else []
     if as_json:
         solution = {} if target.handle is None else {"solution": str(target.handle)}
-        matrix = {"points": [point_record(result) for result in at_points]} if at_points else {}
+        matrix = {"points": [point_record(result) for result in results_at_points]} if results_at_points else {}
         spread = {"spread": {**spreads[0].to_dict(), "original": spreads[1].to_dict()}} if spreads else {}
         click.echo(json.dumps({**simulation.to_dict(), **solution, **matrix, **spread}, indent=2, allow_nan=False))
     else:
@@ -128,9 +129,9 @@ def _print_results(target: CommandTarget, system: System, simulation: Simulation
         for vehicle, model_spread in zip(("the simulated vehicle", "the original"), spreads, strict=False):
             print_text(Console(), f"The vehicle model's own uncertainty, {vehicle}: {model_spread}.")
         if system.rater is None:
-            print_matrix(Console(), at_points)
+            print_matrix(Console(), results_at_points)
         else:
-            print_text(Console(), f"{len(system.matrix)} cells and variations: {question_command('rating', target.source)} --matrix")
+            print_text(Console(), f"{len(system.matrix)} cells and variations: run `{question_command('rating', target.source)} --matrix`")
         if types := pre_crash_sentence(system.points):
             print_text(Console(), types)
     remarks = [remark for point in system.points for remark in remarks_of(point.scenario)]
@@ -278,11 +279,11 @@ def print_matrix(console: Console, results: Sequence[PointResult], row: int = 0)
     for (test, weather), cells in tables.items():
         _print_test_table(console, f"{test}, {weather}", cells)
     if records:
-        collision_points = [result["point"] for result in records if result["impact_speed"] is not None]
+        collision_points = [entry["point"] for entry in records if entry["impact_speed"] is not None]
         rest = f" and {len(collision_points) - MAX_POINTS_NAMED} more" if len(collision_points) > MAX_POINTS_NAMED else ""
         names = "; ".join(collision_points[:MAX_POINTS_NAMED]) + rest
         summary = f"{len(collision_points)} of {len(records)} points fail{': ' + names if collision_points else ''}."
-        invalid = sum(result["outcome"] == Outcome.INVALID_TEST for result in records)
+        invalid = sum(entry["outcome"] == Outcome.INVALID_TEST for entry in records)
         if invalid:
             summary += f" {invalid} are invalid tests: the vehicle leaves the tolerance of the test's speed before the ADS acts."
         print_text(console, summary)

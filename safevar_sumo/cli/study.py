@@ -125,9 +125,9 @@ def status(directory: str, watch: bool, every: float, as_json: bool) -> None:
             click.echo(json.dumps(progress.record()))
         return
     if not watch:
-        Console().print(status_view(progress, None))
+        Console().print(status_view(progress, rate=None))
         return
-    with Live(status_view(progress, None), console=Console(), auto_refresh=False) as live:
+    with Live(status_view(progress, rate=None), console=Console(), auto_refresh=False) as live:
         while not progress.finished:
             time.sleep(every)
             progress = read_status(directory)
@@ -168,13 +168,15 @@ def print_summary(console: Console, study: Study, campaign: Campaign, directory:
         if solutions_of_runs:
             evaluations_by_vehicle[algorithm] = Evaluations.concatenate(solutions_of_runs)
     table = WholeTable("", right=evaluations_by_vehicle, title=study.title)
-    table.add_row("solutions", "-", *(str(len(rows)) for rows in list(evaluations_by_vehicle.values())[1:]))
-    table.add_row("solutions that collide", *(str(int(np.count_nonzero(rows.collided))) for rows in evaluations_by_vehicle.values()))
+    table.add_row("solutions", "-", *(str(len(evaluations)) for evaluations in list(evaluations_by_vehicle.values())[1:]))
+    table.add_row("solutions that collide", *(
+        str(int(np.count_nonzero(evaluations.collided))) for evaluations in evaluations_by_vehicle.values()))
     collisions = [sum(count for key, count in campaign.collisions.items() if key.algorithm == name)
                   for name in list(evaluations_by_vehicle)[1:]]
     table.add_row("collisions simulated", *map(str, [int(campaign.original.collided[0]), *collisions]))
     for metric in campaign.scoring.metrics:
-        table.add_row(f"mean {metric.heading}", *(_mean_text(rows.metrics[metric.name]) for rows in evaluations_by_vehicle.values()))
+        table.add_row(f"mean {metric.heading}", *(
+            _mean_text(evaluations.metrics[metric.name]) for evaluations in evaluations_by_vehicle.values()))
     console.print(table)
     console.print(SAFETY_NOTE)
     if campaign.failures:
@@ -186,7 +188,7 @@ def print_summary(console: Console, study: Study, campaign: Campaign, directory:
         print_text(console, f"{invalid} settings leave the tolerance of a test's speed before the ADS acts (invalid-test): "
                             "they are neither failures nor successes, and no result contains them.")
     _print_most_critical(console, study, campaign)
-    case = build_case(study, record(campaign.original, 0), solutions, solutions_frame(names, []), tuple(campaign.solutions),
+    case = build_case(study, record(campaign.original, row=0), solutions, solutions_frame(names, []), tuple(campaign.solutions),
                       scoring=campaign.scoring)
     for line in summary_lines(case):
         print_text(console, line)

@@ -55,14 +55,15 @@ def load_target(source: str, solution: str | None, choice: str | None) -> Comman
     if solution is not None and choice is not None:
         raise InputError("--solution", f"{solution!r} and --{choice.replace('_', '-')} both choose a solution", "one of them")
     if solution is None and choice is None:
-        return CommandTarget(study_at_point(source), source)
-    case = results_or_study(source, results_only=True)
+        return CommandTarget(load_study_at_point(source), source)
+    case = load_results_or_study(source, results_only=True)
     assert not isinstance(case, Study)
     requested_handle = None if solution is None else SolutionId.parse(solution)
     handle = requested_handle or choose_handle(case.solutions, case.unsafe, str(choice), source)
     row = case.solutions.iloc[row_of_handle(case.solutions, handle)]
     setting = row[list(case.characteristics.names)].to_numpy(dtype=float)
-    return CommandTarget(case.study, source, handle, setting, {str(name): value for name, value in row.items()})
+    return CommandTarget(study=case.study, source=source, handle=handle, setting=setting,
+                         row={str(name): value for name, value in row.items()})
 
 
 jobs_option = click.option("--jobs", type=click.IntRange(1, 1024), help="Worker processes.  [default: the cores of this machine]")
@@ -116,7 +117,7 @@ def _split_names(text: str | None) -> tuple[str, ...] | None:
     return None if text is None else tuple(name.strip() for name in text.split(","))
 
 
-def results_or_study(source: str, point: str | None = None, *, results_only: bool = False) -> Study | Case:
+def load_results_or_study(source: str, point: str | None = None, *, results_only: bool = False) -> Study | Case:
     """Load a results directory or, unless `results_only`, a study by name or path; `point` restricts it to a point of its matrix.
 
     Raises
@@ -141,10 +142,10 @@ def results_or_study(source: str, point: str | None = None, *, results_only: boo
 def _restrict_to_point(study: Study, point: str) -> Study:
     from safevar_sumo.sumo.matrix import study_at
 
-    return study_at(study, point, "--point")
+    return study_at(study, point, source="--point")
 
 
-def study_at_point(source: str, point: str | None = None) -> Study:
-    """Load a study, or the study recorded in a results directory; raises the errors of `results_or_study`."""
-    subject = results_or_study(source, point)
+def load_study_at_point(source: str, point: str | None = None) -> Study:
+    """Load a study, or the study recorded in a results directory, at one point or at all; raises what `load_results_or_study` raises."""
+    subject = load_results_or_study(source, point)
     return subject if isinstance(subject, Study) else subject.study

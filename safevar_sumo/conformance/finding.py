@@ -47,7 +47,7 @@ class Finding:
 
 @dataclass(kw_only=True)
 class Report:
-    """The findings on a subject. `key` is its key and name in a study, `remarks` state assumptions, `speed` is a sentence on speed."""
+    """The findings on a subject; `key` is its key and name in a study, `remarks` state assumptions, `speed` is a sentence."""
 
     subject: str
     kind: str
@@ -68,7 +68,7 @@ class Report:
 
 
 class UserCodeTimeout(BaseException):
-    """User code exceeds its time limit. The error is raised inside that code, so it is no `Exception`, which the code may catch."""
+    """User code exceeds its time limit. It is raised inside that code, which may catch every `Exception`; hence it is none."""
 
 
 def load_factor() -> float:
@@ -78,7 +78,7 @@ def load_factor() -> float:
 
 
 TICKS = 10
-"""Number of intervals of a time limit; intervals that end during an import do not count."""
+"""Number of intervals into which a time limit is divided; an interval that ends during an import does not count."""
 
 
 @contextmanager
@@ -101,7 +101,8 @@ def time_limit(seconds: float) -> Iterator[None]:
             raise UserCodeTimeout
 
     previous_handler = signal.signal(signal.SIGALRM, tick)
-    signal.setitimer(signal.ITIMER_REAL, *[seconds * load_factor() / TICKS] * 2)
+    interval = seconds * load_factor() / TICKS
+    signal.setitimer(signal.ITIMER_REAL, interval, interval)
     try:
         yield
     finally:

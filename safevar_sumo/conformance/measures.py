@@ -69,7 +69,7 @@ def _simulate_runs(study: Study) -> SimulationRuns:
 
 
 class _RecklessAds:
-    """An ADS, but with full throttle in every fourth vehicle."""
+    """An ADS whose commands are replaced by full throttle in every fourth vehicle."""
 
     def __init__(self, ads: Ads) -> None:
         self._ads = ads
@@ -79,8 +79,8 @@ class _RecklessAds:
 
     def drive(self, seen: Observation, memory: Any) -> tuple[Command, Any]:
         command, memory = self._ads.drive(seen, memory)
-        reckless = np.arange(len(seen.speed)) % 4 == 1
-        return Command(np.where(reckless, 1.0, command.throttle), np.where(reckless, 0.0, command.brake)), memory
+        is_reckless = np.arange(len(seen.speed)) % 4 == 1
+        return Command(np.where(is_reckless, 1.0, command.throttle), np.where(is_reckless, 0.0, command.brake)), memory
 
 
 class ObjectiveProbe(Probe):
@@ -112,8 +112,8 @@ class AlgorithmProbe(Probe):
 
     methods = ("search",)
     vehicle_count = 1
-    EVALUATIONS = 57
-    POPULATION = 20
+    MAX_EVALUATIONS = 57
+    MAX_POPULATION = 20
 
     def __init__(self, subject: Subject) -> None:
         super().__init__(subject)
@@ -121,8 +121,8 @@ class AlgorithmProbe(Probe):
         self._characteristics = CharacteristicSet.of(study.vehicle.characteristics)
         self._scoring = assemble(study).measuring.scoring
         self._problem = Problem(characteristics=self._characteristics, original=self._evaluate(self._characteristics.original[np.newaxis]),
-                                evaluations=min(study.search.evaluations, self.EVALUATIONS),
-                                population=min(study.search.population, self.POPULATION), scoring=self._scoring)
+                                evaluations=min(study.search.evaluations, self.MAX_EVALUATIONS),
+                                population=min(study.search.population, self.MAX_POPULATION), scoring=self._scoring)
 
     def load(self) -> Any:
         unload_user_modules()
@@ -137,7 +137,7 @@ class AlgorithmProbe(Probe):
         return GuardedAlgorithm(instance_of(member, parameters, subject.key, f"search.{subject.name}", "check"), guard_of(subject))
 
     def run(self, model: Any, vehicles: Indices, seed: int = 1) -> Outputs:
-        """All settings that a run requests, and the solutions of the run."""
+        """All settings that a run requests to be evaluated, and those that it returns."""
         search = model.search(self._problem, np.random.default_rng(seed))
         requested, evaluations = list[FloatArray](), None
         while True:
@@ -155,26 +155,26 @@ class AlgorithmProbe(Probe):
         return self.run(self._instance(), vehicles)
 
     def _evaluate(self, settings: FloatArray) -> Evaluations:
-        """Evaluate a smooth function: the safety degree falls towards the upper ends of the domains; below 0 it is a collision."""
+        """Evaluate a smooth function: the safety degree falls from 1 at the lower ends of the domains to -0.5 at the upper ends."""
         characteristics = self._characteristics
         share = (settings - characteristics.lower) / (characteristics.upper - characteristics.lower)
         safety_degree = 1.0 - np.add.accumulate(share, axis=1)[:, -1] / len(characteristics) * 1.5
         metrics = {metric.name: safety_degree if metric.name == "safety_degree" else np.abs(safety_degree)
                    for metric in self._scoring.metrics}
-        extra = {objective.name: np.abs(safety_degree) for objective in self._scoring.objectives
-                 if objective.name not in metrics and not objective.name.startswith("f_")}
+        other_objectives = {objective.name: np.abs(safety_degree) for objective in self._scoring.objectives
+                            if objective.name not in metrics and not objective.name.startswith("f_")}
         collided = safety_degree < 0
         return Evaluations(
-            settings=settings, outcome=np.where(collided, "collision", "stopped").astype("U16"), metrics={**metrics, **extra},
-            collision_speed=np.where(collided, -safety_degree, np.nan), f_diff=characteristics.largest_change(settings),
-            f_num_diff=characteristics.number_changed(settings))
+            settings=settings, outcome=np.where(collided, "collision", "stopped").astype("U16"),
+            metrics={**metrics, **other_objectives}, collision_speed=np.where(collided, -safety_degree, np.nan),
+            f_diff=characteristics.largest_change(settings), f_num_diff=characteristics.number_changed(settings))
 
     def missing_reactions(self, model: Any, outputs: Outputs) -> Iterator[MissingReaction]:
         other_outputs = self.run(model, np.arange(1), seed=2)
         if np.array_equal(outputs["settings requested"], other_outputs["settings requested"]):
             yield MissingReaction(("search",), "other settings with other random numbers `rng`", "the same settings in every run")
         if not outputs["settings returned"].size:
-            yield MissingReaction(("search",), "a result: settings that the run was sent evaluations of",
+            yield MissingReaction(("search",), "a result: settings whose evaluations the run received",
                                   f"nothing, after {len(outputs['settings requested'])} evaluations")
 
 

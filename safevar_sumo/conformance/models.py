@@ -22,6 +22,7 @@ from safevar_sumo.vehicles.sumo import SumoVehicle
 
 STEP = 0.05  # s
 STEPS = 100
+STEPS_FROM_SPEED = 5  # that a vehicle that can start moving drives before it starts from rest
 
 
 class _Traffic(NamedTuple):
@@ -72,7 +73,7 @@ class AdsProbe(Probe):
         self._traffic = _build_traffic()
 
     def load(self) -> Ads:
-        system = self.system()
+        system = self.reload_system()
         self._nominal = system.nominal
         self._nominal.tables()
         return system.ads if self.subject.is_user_code else GuardedAds(system.ads, guard_of(self.subject))
@@ -83,7 +84,8 @@ class AdsProbe(Probe):
         pedals = np.zeros((2, STEPS, n))
         for step in range(STEPS):
             speed, gap, closing, lateral, lateral_speed, obstacle = (column[step, vehicles] for column in self._traffic)
-            seen = Observation(step * STEP, speed, gap, closing, lateral, lateral_speed, 0.9, obstacle, command.throttle, command.brake)
+            seen = Observation(step * STEP, speed, gap, closing, lateral, lateral_speed, visibility=0.9, obstacle_speed=obstacle,
+                               throttle=command.throttle, brake=command.brake)
             command, memory = model.drive(seen, memory)
             pedals[:, step] = command.throttle, command.brake
         return {"throttle": pedals[0], "brake": pedals[1]}
@@ -116,33 +118,35 @@ class VehicleProbe(Probe):
         self.vehicle_count = len(self.settings)
 
     def load(self) -> Any:
-        vehicle = self.system().vehicle
+        vehicle = self.reload_system().vehicle
         return vehicle if self.subject.is_user_code else GuardedVehicle(vehicle, guard_of(self.subject))
 
     def run(self, model: Any, vehicles: Indices) -> Outputs:
         n, outputs = len(vehicles), dict[str, list[np.ndarray]]()
         values = dict(zip(self._characteristics.names, np.ascontiguousarray(self.settings[vehicles].T), strict=True))
         slope = slope_of(np.full(n, 5.0)) if model.takes_slope else LEVEL
-        for surface in ((1.0, self.STEP), (0.5, self.STEP, slope, np.ones(n, dtype=bool))):  # dry and level; wet and, if possible, steep
-            prepared = model.prepare(values, *surface)
+        dry_level_road, wet_steep_road = (1.0, self.STEP), (0.5, self.STEP, slope, np.ones(n, dtype=bool))  # steep if the model can
+        for road in (dry_level_road, wet_steep_road):
+            prepared = model.prepare(values, *road)
             for name, column in zip(model.sumo_type(prepared)._fields, model.sumo_type(prepared), strict=True):
                 outputs.setdefault(f"{name} of sumo_type", []).append(column)
             state, first_step = model.at_rest(prepared), 0
             if model.can_start_moving:
-                self._drive(model, prepared, model.at_speed(prepared, np.full(n, 5.0)), 5, 0.0, 0.5, outputs)
+                self._drive(model, prepared, model.at_speed(prepared, np.full(n, 5.0)), outputs, STEPS_FROM_SPEED,
+                            throttle=0.0, brake=0.5)
             for throttle, brake, steps in self.PHASES:
-                state = self._drive(model, prepared, state, steps, throttle, brake, outputs, first_step)
+                state = self._drive(model, prepared, state, outputs, steps, throttle, brake, first_step)
                 first_step += steps
         return {name: np.stack(columns) for name, columns in outputs.items()}
 
-    def _drive(self, model: Any, prepared: Any, state: Any, steps: int, throttle: float, brake: float,
-               outputs: dict[str, list[np.ndarray]], first_step: int = 0) -> Any:
-        n = len(state.speed)
-        zeros = np.zeros(n)
+    def _drive(self, model: Any, prepared: Any, state: Any, outputs: dict[str, list[np.ndarray]], steps: int, throttle: float,
+               brake: float, first_step: int = 0) -> Any:
+        """The state after steps with constant pedals; adds the state and the observation in every step to `outputs`."""
+        zeros = np.zeros(len(state.speed))
         for step in range(first_step, first_step + steps):
             gap = 100.0 - step + zeros
-            seen = Observation(step * self.STEP, state.speed, gap, state.speed, zeros + 2 - 0.02 * step, zeros - 0.2, 0.9, zeros,
-                               state.throttle, state.brake)
+            seen = Observation(step * self.STEP, state.speed, gap, closing_speed=state.speed, lateral=zeros + 2 - 0.02 * step,
+                               lateral_speed=zeros - 0.2, visibility=0.9, obstacle_speed=zeros, throttle=state.throttle, brake=state.brake)
             sensed, state = model.sense(prepared, state, seen)
             state = model.advance(prepared, state, Command(zeros + throttle, zeros + brake))
             for name in ("speed", "throttle", "brake", "gear"):
@@ -152,7 +156,7 @@ class VehicleProbe(Probe):
         return state
 
     def missing_reactions(self, model: Any, outputs: Outputs) -> Iterator[MissingReaction]:
-        start = 5 if model.can_start_moving else 0
+        start = STEPS_FROM_SPEED if model.can_start_moving else 0
         speed, braking_start = outputs["speed"][start:, 0], sum(steps for *_, steps in self.PHASES[:5])
         throttle_steps, braking_steps = self.PHASES[0][-1], self.PHASES[5][-1]
         top_speed = speed[throttle_steps - 1]
@@ -169,7 +173,7 @@ class VehicleProbe(Probe):
                                       "are the same to the bit")
 
     def cost(self, model: Any, seconds: float) -> tuple[float, str]:
-        steps = 2 * sum(phase[-1] for phase in self.PHASES) + 10 * model.can_start_moving
+        steps = 2 * (sum(phase[-1] for phase in self.PHASES) + STEPS_FROM_SPEED * model.can_start_moving)  # on two roads
         return cost_of(seconds, measure_time(lambda: _drive_example(self.vehicle_count, steps)), "sumo", self.vehicle_count, steps)
 
 
@@ -178,10 +182,10 @@ def _drive_example(n: int, steps: int) -> None:
     values = {"mass": 1500.0, "accel": 3.0, "decel": 8.0, "maxSpeed": 40.0, "tau": 0.1, "sensorRange": 100.0, "reactionTime": 0.1,
               "brakeDelay": 0.1, "brakeGain": 1.0}
     vehicle = SumoVehicle()
-    prepared = vehicle.prepare({name: np.full(n, value) for name, value in values.items()}, 1.0, STEP)
+    prepared = vehicle.prepare({name: np.full(n, value) for name, value in values.items()}, road_friction=1.0, step=STEP)
     state, command = vehicle.at_rest(prepared), Command(np.full(n, 0.5), np.zeros(n))
     ten = np.full(n, 10.0)
-    seen = Observation(0.0, ten, ten, ten, ten, ten, 1.0)
+    seen = Observation(time=0.0, speed=ten, gap=ten, closing_speed=ten, lateral=ten, lateral_speed=ten, visibility=1.0)
     for _ in range(steps):
         _, state = vehicle.sense(prepared, state, seen)
         state = vehicle.advance(prepared, state, command)
@@ -199,7 +203,7 @@ class StudyProbe(Probe):
         self.settings = characteristics.filter(corners_of(characteristics)[:5])
 
     def load(self) -> System:
-        return self.system()
+        return self.reload_system()
 
     def run(self, model: System, vehicles: Indices) -> Outputs:
         evaluations = evaluate(model, self.settings[vehicles])
@@ -230,7 +234,7 @@ class StudyProbe(Probe):
             yield from self._undeclared_reactive_actors(model, outputs)
 
     def _undeclared_reactive_actors(self, model: System, outputs: Outputs) -> Iterator[MissingReaction]:
-        """A missing declaration: actors react, as SUMO gives other results than the recorded scene, but the scenario denies it."""
+        """Actors that react, since SUMO gives other results than the recorded scene, although the scenario does not declare it."""
         in_sumo = evaluate(model, self.settings, Engine.LIBSUMO)
         for name, values in {"outcome": in_sumo.outcome, **in_sumo.metrics}.items():
             if not (np.array_equal(outputs[name], values) if values.dtype.kind == "U" else

@@ -24,7 +24,7 @@ Indices = npt.NDArray[np.intp]
 Outputs = Mapping[str, np.ndarray]
 """Results by name; the last axis runs over the vehicles."""
 MATRIX_POINTS = 2
-"""Approximate number of points of a study's matrix that are simulated."""
+"""Approximate number of a study's test points that are simulated."""
 
 
 class MissingReaction(NamedTuple):
@@ -36,7 +36,7 @@ class MissingReaction(NamedTuple):
 
 
 class Probe(ABC):
-    """Tries a subject with `vehicle_count` vehicles; `methods` names the methods of the subject that a run calls."""
+    """Tries a subject with `vehicle_count` vehicles; `methods` names the methods of the subject that the probe calls."""
 
     methods: tuple[str, ...] = ()
     vehicle_count: int
@@ -44,8 +44,8 @@ class Probe(ABC):
     def __init__(self, subject: Subject) -> None:
         self.subject = subject
 
-    def system(self) -> System:
-        """The system of the subject's study, with all user code reloaded."""
+    def reload_system(self) -> System:
+        """The system of the subject's study, with all user code reloaded and only a few points of the matrix."""
         unload_user_modules()
         system = assemble(self.subject.study, self.subject.study.source)
         return replace(system, matrix=system.matrix[::max(len(system.matrix) // MATRIX_POINTS, 1)], rater=None)
@@ -63,7 +63,6 @@ class Probe(ABC):
         return self.run(model, vehicles)
 
     def missing_reactions(self, model: Any, outputs: Outputs) -> Iterator[MissingReaction]:
-        """The missing reactions."""
         yield from ()
 
     def cost(self, model: Any, seconds: float) -> tuple[float, str]:
@@ -90,9 +89,9 @@ def measure_time(run: Callable[[], Any]) -> float:
     return (time.perf_counter() - start) / load_factor()
 
 
-def cost_of(seconds: float, reference: float, example: str, n: int, steps: int) -> tuple[float, str]:
-    """Time per vehicle and step [s] of a run of n vehicles in `seconds`, and a sentence that compares it with `example` (`reference` s)."""
-    cost, example_cost = seconds / (n * steps), reference / (n * steps)
+def cost_of(seconds: float, example_seconds: float, example: str, n: int, steps: int) -> tuple[float, str]:
+    """Time per vehicle and step [s] of a run of n vehicles, and a sentence that compares it with a shipped example's time."""
+    cost, example_cost = seconds / (n * steps), example_seconds / (n * steps)
     return cost, f"{cost * 1e6:.2g} microseconds per vehicle and step, {n} at once; ours ({example}) takes {example_cost * 1e6:.2g}"
 
 

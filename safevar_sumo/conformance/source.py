@@ -1,4 +1,4 @@
-"""The source of user code: the last line that returned, the line that raised, and lines that may cause a defect."""
+"""Locations (file and line) in user code: where it raised, where it returned last, and what may cause a defect."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Source:
         self._object = getattr(member.target, "function", member.target)
         self._is_fmu, self.file = bool(member.file), member.file or self._file()
         self._folder = str(Path(self.file).parent)
-        self._last_line: tuple[str, int] | None = None
+        self._last_location: tuple[str, int] | None = None
         self._user_code_flags: dict[CodeType, bool] = {}
 
     def _file(self) -> str:
@@ -54,17 +54,17 @@ class Source:
             return
         code = frame.f_code
         if self._is_user_code(code):
-            self._last_line = code.co_filename, frame.f_lineno
+            self._last_location = code.co_filename, frame.f_lineno
 
     def _is_user_code(self, code: CodeType) -> bool:
         if code not in self._user_code_flags:
             self._user_code_flags[code] = code.co_filename.startswith(self._folder) and "site-packages" not in code.co_filename
         return self._user_code_flags[code]
 
-    def line_of_error(self, error: BaseException) -> tuple[str, int]:
-        """The innermost line of user code that raised an exception; else the last line that returned."""
+    def location_of_error(self, error: BaseException) -> tuple[str, int]:
+        """File and innermost line of user code in which an exception arose; without one, `last_location`."""
         if self._is_fmu:
-            return self.line_of_definition()
+            return self.location_of_definition()
         exception: BaseException | None = error
         while exception is not None:
             frame, location = exception.__traceback__, None
@@ -75,14 +75,15 @@ class Source:
             if location is not None and not isinstance(exception, InputError):
                 return location
             exception = exception.__cause__ or exception.__context__
-        return self._last_line or self.line_of_definition()
+        return self.last_location
 
     @property
-    def last_line(self) -> tuple[str, int]:
-        return self._last_line or self.line_of_definition()
+    def last_location(self) -> tuple[str, int]:
+        """File and line of user code that returned last; the definition if none did."""
+        return self._last_location or self.location_of_definition()
 
-    def line_of_definition(self, *methods: str) -> tuple[str, int]:
-        """The line that defines the first existing method of `methods`, or else the subject; line 1 of an FMU."""
+    def location_of_definition(self, *methods: str) -> tuple[str, int]:
+        """File and line that define the first existing method of `methods`, or else the subject; line 1 of an FMU."""
         if self._is_fmu:
             return self.file, 1
         for name in methods:
@@ -95,13 +96,13 @@ class Source:
         except (OSError, TypeError):
             return self.file, 1
 
-    def line_of_text(self, pattern: str) -> tuple[str, int] | None:
-        """The first line of the file that matches a pattern."""
+    def location_of_text(self, pattern: str) -> tuple[str, int] | None:
+        """The file, and its first line that matches a pattern; None without such a line."""
         text = _read_text(self.file).splitlines()
         return next(((self.file, number) for number, line in enumerate(text, 1) if re.search(pattern, line)), None)
 
-    def line_of_suspect(self, check: str) -> tuple[str, int] | None:
-        """The first line of the file that may cause a failure of `check`; None without such a line."""
+    def location_of_suspect(self, check: str) -> tuple[str, int] | None:
+        """The file, and its first line that may cause a failure of `check`; None without such a line."""
         if self._is_fmu:
             return None
         try:

@@ -164,7 +164,7 @@ def kind_of(target: Any) -> str:
 
 
 def contract_violation(subject: Subject) -> tuple[str, str]:
-    """How a subject breaks its contract, by inspection alone, or ""; and what the contract expects."""
+    """A subject's violation of its contract, found by inspection only ("" without one), and what the contract expects."""
     target, kind = subject.member.target, subject.kind
     if kind in ("metric", "objective"):
         record = Metric if kind == "metric" else Change
@@ -176,7 +176,7 @@ def contract_violation(subject: Subject) -> tuple[str, str]:
         expected = "a function step(traci, vehicle_id), or a class with that method"
         if not callable(function):
             return "has no step", expected
-        return _step_violation(function, 2 + inspect.isclass(target), len(subject.parameters)), expected
+        return _step_violation(function, positional_count=2 + inspect.isclass(target), keyword_count=len(subject.parameters)), expected
     contracts: Mapping[str, tuple[Contract, ...]] = {
         "ads": (SCALAR_ADS_CONTRACT, ADS_CONTRACT), "vehicle": (VEHICLE_CONTRACT,), "scenario": (SCENARIO_CONTRACT,),
         "algorithm": (ALGORITHM_CONTRACT,)}
@@ -184,8 +184,8 @@ def contract_violation(subject: Subject) -> tuple[str, str]:
     return contract.violation(target), str(contract)
 
 
-def _step_violation(function: Callable[..., Any], passed: int, named: int) -> str:
-    """Why the function cannot be called with `passed` arguments by position and `named` arguments by name; "" if it can."""
+def _step_violation(function: Callable[..., Any], positional_count: int, keyword_count: int) -> str:
+    """Why the function cannot be called with so many positional and keyword arguments; "" if it can."""
     try:
         parameters = list(inspect.signature(function).parameters.values())
     except (TypeError, ValueError):
@@ -194,7 +194,7 @@ def _step_violation(function: Callable[..., Any], passed: int, named: int) -> st
     positional = [parameter for parameter in parameters if parameter.kind in (parameter.POSITIONAL_ONLY, parameter.POSITIONAL_OR_KEYWORD)]
     names = ", ".join(parameter.name for parameter in parameters)
     required = [parameter for parameter in positional if parameter.default is parameter.empty]
-    if takes_any_number or len(positional) >= passed >= len(required) - named:
+    if takes_any_number or len(positional) >= positional_count >= len(required) - keyword_count:
         return ""
     return f"has a step that takes ({names}), not (traci, vehicle_id)"
 

@@ -85,7 +85,7 @@ def refuse_defects(study: Study) -> list[str]:
             problem = f"{report.key} {finding.got}{'' if location in finding.got else f' ({location})'}"
             if finding.check in BLOCKING_CHECKS:
                 command = f"python -m safevar_sumo check {shlex.quote(study.origin.called or study.name)}"
-                raise UserCodeError(study.source, f"{problem}; again by: {command}", f"{finding.expected}; {finding.advice}")
+                raise UserCodeError(study.source, f"{problem}; to reproduce it: {command}", f"{finding.expected}; {finding.advice}")
             remarks.append(f"{problem}; expected: {finding.expected}")
     return remarks
 
@@ -121,9 +121,9 @@ class _Suite:
 
     def findings(self) -> Iterator[Finding]:
         """The findings on the subject; no probe runs after a probe with findings."""
-        got, expected = contract_violation(self._subject)
-        if got:
-            yield self._finding("contract", got, expected, self._source.line_of_definition(*_method_names(got)))
+        violation, expected = contract_violation(self._subject)
+        if violation:
+            yield self._finding("contract", violation, expected, self._source.location_of_definition(*_method_names(violation)))
             return
         for probe_type in self._probes:
             has_findings = False
@@ -145,27 +145,28 @@ class _Suite:
                 if not findings:
                     with self._source.watch_returns(), time_limit(RUN_LIMIT):
                         findings = [self._finding("reaction", missing.got, missing.expected,
-                                                  self._source.line_of_definition(*missing.methods))
+                                                  self._source.location_of_definition(*missing.methods))
                                     for missing in probe.missing_reactions(model, outputs)]
                     findings += self._cost_findings(probe, model)
             yield from findings
         except UserCodeError as error:
             yield self._error_finding(error)
         except UserCodeTimeout as error:
-            location = self._source.line_of_error(error)
-            yield self._finding("speed", f"does not come back within {RUN_LIMIT:g} s", "microseconds per vehicle and step", location)
+            location = self._source.location_of_error(error)
+            yield self._finding("speed", f"does not return within {RUN_LIMIT:g} s", "microseconds per vehicle and step", location)
         except InputError as error:
             if self._subject.kind == "vehicle" and "vehicle.characteristics" in error.problem:
-                yield self._finding("units", error.problem, error.legal, self._source.line_of_text(r"\bUNITS\b") or self._source.last_line)
+                location = self._source.location_of_text(r"\bUNITS\b") or self._source.last_location
+                yield self._finding("units", error.problem, error.legal, location)
             elif self._subject.kind == "vehicle" and error.source == "vehicle":
-                yield self._finding("finite", error.problem, error.legal, self._source.last_line)
+                yield self._finding("finite", error.problem, error.legal, self._source.last_location)
             elif self._subject.kind in ("metric", "objective") and error.source == "check":
-                yield self._finding("contract", error.problem, error.legal, self._source.line_of_definition())
+                yield self._finding("contract", error.problem, error.legal, self._source.location_of_definition())
             else:
                 raise
 
     def _compare_runs(self, probe: Probe, model: Any, outputs: Outputs) -> Iterator[Finding]:
-        """A finding for the first repetition, or grouping of vehicles, with other results than the first run of all vehicles."""
+        """A finding if a repeated run, or a run of some of the vehicles, gives other results than the first run of all vehicles."""
         vehicles = np.arange(probe.vehicle_count)
         difference = _difference(outputs, probe.run(probe.load(), vehicles), vehicles)
         if difference:
@@ -186,12 +187,13 @@ class _Suite:
             for group in groups:
                 difference = _difference({name: values[..., group] for name, values in outputs.items()}, probe.run(model, group), group)
                 if difference:
-                    check = "batch" if self._source.line_of_suspect("batch") or not self._source.line_of_suspect("state") else "state"
+                    suspects_state = self._source.location_of_suspect("state") and not self._source.location_of_suspect("batch")
+                    check = "state" if suspects_state else "batch"
                     yield self._difference_finding(check, probe, f"{difference} {grouping}", "the same as all together, to the bit")
                     return
 
     def _difference_finding(self, check: str, probe: Probe, got: str, expected: str) -> Finding:
-        location = self._source.line_of_suspect(check) or self._source.line_of_definition(*probe.methods)
+        location = self._source.location_of_suspect(check) or self._source.location_of_definition(*probe.methods)
         return self._finding(check, got, expected, location)
 
     def _cost_findings(self, probe: Probe, model: Any) -> Iterator[Finding]:
@@ -200,26 +202,26 @@ class _Suite:
         limit = COST_LIMIT * (10 if self._subject.kind == "traci" else 1)  # this includes the time of SUMO
         if seconds > limit:
             yield self._finding("speed", sentence, f"below {limit * 1e6:g} microseconds per vehicle and step",
-                                self._source.line_of_definition(*probe.methods))
+                                self._source.location_of_definition(*probe.methods))
 
     def _pickling_findings(self) -> Iterator[Finding]:
         """A finding if the object cannot be pickled for a worker process; a metric or objective is pickled as its function."""
         if self._subject.member.file:
             return  # an FMU is sent as a file
-        subject = target_of(self._subject)
-        payload: Any = subject
-        if isinstance(subject, type) and self._subject.kind != "traci":
+        target = target_of(self._subject)
+        payload: Any = target
+        if isinstance(target, type) and self._subject.kind != "traci":
             try:
-                payload = subject(**self._subject.parameters)
+                payload = target(**self._subject.parameters)
             except Exception:
-                payload = subject  # the probes have instantiated it with parameters
+                payload = target  # the probes have instantiated it with parameters
         if getattr(payload, "function", None) is not None and self._subject.kind in ("metric", "objective"):
             payload = payload.function
         try:
             pickle.dumps(payload)
         except Exception as error:
             problem = f"{type(error).__name__}: {str(error).splitlines()[0] if str(error) else ''}"
-            location = self._source.line_of_definition("__init__") if isinstance(subject, type) else self._source.line_of_definition()
+            location = self._source.location_of_definition(*["__init__"] if isinstance(target, type) else [])
             yield self._finding("picklable", problem, "an object that pickle can send to a worker process", location)
 
     def _error_finding(self, error: UserCodeError) -> Finding:
@@ -233,7 +235,7 @@ class _Suite:
         expected = error.legal or "no exception"
         if check == "inputs":
             expected = "arguments that stay as they are"
-        return self._finding(check, text, expected, self._source.line_of_error(error))
+        return self._finding(check, text, expected, self._source.location_of_error(error))
 
     def _finding(self, check: str, got: str, expected: str, location: tuple[str, int]) -> Finding:
         advice = ADVICE[check].format(base=CONTRACT_FILES[self._subject.kind])

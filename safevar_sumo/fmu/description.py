@@ -43,7 +43,7 @@ class Variable(NamedTuple):
     meaning: str
 
     @property
-    def is_tunable(self) -> bool:
+    def can_be_characteristic(self) -> bool:
         """Whether this is a real parameter with the original value and the domain that a characteristic needs."""
         return self.causality == "parameter" and self.variability != "constant" and self.type in REAL_TYPES and None not in (
             self.start, self.lower, self.upper) and self.lower < self.upper and self.start != 0  # type: ignore[operator]
@@ -53,6 +53,7 @@ class Variable(NamedTuple):
 class Description:
     """An FMU: its file, the digest of the file, and the declarations in it.
 
+    `identifier` is the name of its library, `token` its GUID (FMI 2.0) or instantiation token (FMI 3.0).
     `step` is the step that the FMU requires [s], None if any step will do; with `single_instance` a process may hold only one instance.
     """
 
@@ -87,9 +88,10 @@ class Description:
             raise InputError(source, f"{key} = {name!r}: that variable is of type {variable.type}", f"a type among {', '.join(types)}")
         return variable
 
-    def table_rows(self, fixed: Collection[str]) -> dict[str, dict[str, Any]]:
-        """Rows of the characteristics' table for all tunable parameters whose names are not in `fixed`."""
-        return {name: self.table_row(name) for name, variable in self.variables.items() if variable.is_tunable and name not in fixed}
+    def table_rows(self, fixed_names: Collection[str]) -> dict[str, dict[str, Any]]:
+        """Rows of the characteristics' table for all parameters that can be characteristics, except those of `fixed_names`."""
+        return {name: self.table_row(name) for name, variable in self.variables.items()
+                if variable.can_be_characteristic and name not in fixed_names}
 
     def table_row(self, name: str, unit: str = "") -> dict[str, Any]:
         """The table row that a parameter declares, converted to `unit` if a unit is given; empty if the variable is no parameter."""
@@ -153,7 +155,7 @@ def description_of(model: str, folders: Sequence[str], source: str, key: str) ->
 
 
 @lru_cache(maxsize=32)
-def _read_description(path: str, *_: int) -> Description:
+def _read_description(path: str, *_: int) -> Description:  # also cached by the file's time, size and inode
     try:
         from fmpy import platform, platform_tuple, sharedLibraryExtension
         from fmpy.model_description import read_model_description
@@ -184,9 +186,9 @@ def _read_description(path: str, *_: int) -> Description:
     units = {unit.name: Unit(tuple(int(getattr(unit.baseUnit, base)) for base in BASE_UNITS), float(unit.baseUnit.factor),
                              float(unit.baseUnit.offset)) for unit in model.unitDefinitions if unit.baseUnit is not None}
     return Description(
-        path, sha256(Path(path).read_bytes()).hexdigest(), model.fmiVersion, simulation.modelIdentifier, model.guid or "",
-        _required_step(model), simulation.canBeInstantiatedOnlyOncePerProcess, units,
-        {variable.name: _variable_of(variable, units) for variable in model.modelVariables if not variable.dimensions})
+        path, sha256(Path(path).read_bytes()).hexdigest(), model.fmiVersion, identifier=simulation.modelIdentifier, token=model.guid or "",
+        step=_required_step(model), single_instance=simulation.canBeInstantiatedOnlyOncePerProcess, units=units,
+        variables={variable.name: _variable_of(variable, units) for variable in model.modelVariables if not variable.dimensions})
 
 
 def _required_step(model: Any) -> float | None:
@@ -207,8 +209,8 @@ def _variable_of(variable: Any, units: Mapping[str, Unit]) -> Variable:
         unit = unit._replace(offset=0.0)
     variability = variable.variability or ("continuous" if variable.type in REAL_TYPES else "discrete")
     return Variable(variable.name, variable.valueReference, variable.type, variable.causality or "local", variability, unit_name, unit,
-                    _to_float(start) if variable.type in REAL_TYPES else start, _to_float(attribute("min")), _to_float(attribute("max")),
-                    " ".join((variable.description or "").split()))
+                    start=_to_float(start) if variable.type in REAL_TYPES else start, lower=_to_float(attribute("min")),
+                    upper=_to_float(attribute("max")), meaning=" ".join((variable.description or "").split()))
 
 
 def _to_float(text: Any) -> float | None:

@@ -33,8 +33,8 @@ FUNCTION_NAMES = {"Real": "Real", "Integer": "Integer", "Enumeration": "Integer"
 class HostSetup(NamedTuple):
     """Facts that all instances of an FMU share; the arguments of the first request.
 
-    `path` and `digest` identify the FMU's file; `inputs`, `parameters` and `outputs` are types and value references; `limit` is the
-    longest time that one instance may take for a request [s].
+    `path` and `digest` identify the FMU's file; `identifier` and `token` are as in `Description`; `inputs`, `parameters` and `outputs`
+    are types and value references; `time_limit` is the longest time that one instance may take for a request [s].
     """
 
     path: str
@@ -45,11 +45,11 @@ class HostSetup(NamedTuple):
     inputs: tuple[tuple[str, int], ...]
     parameters: tuple[tuple[str, int], ...]
     outputs: tuple[tuple[str, int], ...]
-    limit: float
+    time_limit: float
 
 
 class Activity(NamedTuple):
-    """What an instance does since `start` [s]; `description` continues a sentence."""
+    """What an instance does since `start` [s]; `description` completes "while it ..."."""
 
     start: float
     description: str
@@ -60,7 +60,7 @@ class InstanceFailure(Exception):
 
 
 class HostedInstances:
-    """All instances in this process, by the numbers that requests give them."""
+    """All instances in this process, by the numbers by which requests name them."""
 
     def __init__(self, setup: HostSetup, folder: str) -> None:
         from fmpy.fmi2 import FMU2Slave
@@ -80,18 +80,18 @@ class HostedInstances:
         """Initialise N instances, new or reset; returns their m outputs, shape (N, m)."""
         return self._on_each_instance(numbers, "is initialised", lambda i, instance: self._start(instance, parameters[i], inputs[i]))
 
-    def step(self, numbers: list[int], times: list[tuple[float, float]], inputs: list[list[float]], kept_steps: int) -> np.ndarray:
-        """Advance N instances by steps with constant inputs; returns m outputs after the last `kept_steps`, shape (N, kept_steps, m)."""
+    def step(self, numbers: list[int], steps: list[tuple[float, float]], inputs: list[list[float]], kept_steps: int) -> np.ndarray:
+        """Advance N instances by (start, length) steps [s]; returns m outputs after the last `kept_steps`, shape (N, kept_steps, m)."""
         def advance(position: int, instance: Any) -> list[list[float]]:
             self._set(instance, self._inputs, inputs[position])
             outputs = []
-            for count, (start, step) in enumerate(times, 1):
-                self._step(instance, start, step)
-                if count > len(times) - kept_steps:
+            for count, (start, length) in enumerate(steps, 1):
+                self._step(instance, start, length)
+                if count > len(steps) - kept_steps:
                     outputs.append(self._read_outputs(instance))
             return outputs
 
-        return self._on_each_instance(numbers, f"is at {times[0][0]:g} s", advance)
+        return self._on_each_instance(numbers, f"is at {steps[0][0]:g} s", advance)
 
     def _on_each_instance(self, numbers: list[int], description: str, work: Callable[[int, Any], Any]) -> np.ndarray:
         results = []
@@ -103,7 +103,7 @@ class HostedInstances:
                     instance = self._instances[number] = self._new_instance()
                 results.append(work(position, instance))
             except Exception as error:  # any error of FMPy about an FMU
-                self._forget(number)
+                self._instances.pop(number, None)  # any further call of an instance that failed, even freeing it, is undefined
                 raise InstanceFailure(f"{self._reason(error)} while it {description}") from error
             finally:
                 self.activity = None
@@ -133,8 +133,8 @@ class HostedInstances:
         instance.exitInitializationMode()
         return self._read_outputs(instance)
 
-    def _step(self, instance: Any, start: float, step: float) -> None:
-        result = instance.doStep(start, step)
+    def _step(self, instance: Any, start: float, length: float) -> None:
+        result = instance.doStep(start, length)
         if not self._is_3:
             return
         _, termination, early_return, end_time = result
@@ -169,10 +169,6 @@ class HostedInstances:
             positions.append(position)
         return [(name, *group) for name, group in groups.items()]
 
-    def _forget(self, number: int) -> None:
-        """Forget an instance that failed: any further call, even freeing it, is undefined."""
-        self._instances.pop(number, None)
-
     def _callbacks_of_fmi_2(self) -> Any:
         from fmpy.fmi2 import defaultCallbacks, fmi2CallbackFunctions, fmi2CallbackLoggerTYPE
         from fmpy.logging import addLoggerProxy
@@ -205,19 +201,19 @@ def unpack(setup: HostSetup) -> str:
     return folder
 
 
-def end_when_hung(instances: HostedInstances, limit: float, folder: str, parent: int, answers: BinaryIO) -> None:
+def end_when_hung_or_orphaned(instances: HostedInstances, time_limit: float, folder: str, parent: int, answers: BinaryIO) -> None:
     """End the process when an instance takes too long, or when the parent process has ended."""
     while os.getppid() == parent:
         time.sleep(CHECK_INTERVAL)
         activity = instances.activity
-        if activity is not None and time.monotonic() - activity.start > limit:
-            send(answers, ("hangs", f"takes longer than {limit:g} s while it {activity.description}"))
+        if activity is not None and time.monotonic() - activity.start > time_limit:
+            send(answers, ("hangs", f"takes longer than {time_limit:g} s while it {activity.description}"))
             break
     exit_at_once(folder)
 
 
 def exit_at_once(folder: str) -> NoReturn:
-    """End at once: to unload the library could run code of the FMU."""
+    """End without unloading the FMU's library, which could run code of the FMU."""
     shutil.rmtree(folder, ignore_errors=True)
     os._exit(1)
 
@@ -247,7 +243,8 @@ def main() -> None:
                 folder = unpack(setup)
                 send(answers, ("done", folder))
                 instances = HostedInstances(setup, folder)
-                threading.Thread(target=end_when_hung, args=(instances, setup.limit, folder, parent, answers), daemon=True).start()
+                arguments = [instances, setup.time_limit, folder, parent, answers]
+                threading.Thread(target=end_when_hung_or_orphaned, args=arguments, daemon=True).start()
                 send(answers, ("done", None))
             else:
                 send(answers, ("done", getattr(instances, name)(*arguments)))

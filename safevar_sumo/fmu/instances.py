@@ -108,21 +108,23 @@ class Instances:
         The FMU's ports, in the order of the values. Ports for parameters are set once, at the start.
     constants
         Further parameters and their values.
-    limit
+    time_limit
         Longest time that an instance may take for one request [s].
     """
 
     def __init__(self, description: Description, inputs: Sequence[Port], outputs: Sequence[Port],
-                 constants: Sequence[tuple[Variable, Any]], limit: float) -> None:
+                 constants: Sequence[tuple[Variable, Any]], time_limit: float) -> None:
         self.description, self.inputs, self.outputs = description, tuple(inputs), tuple(outputs)
         self._constants = [value for _, value in constants]
         self._parameter_indices = [k for k, port in enumerate(inputs) if not port.is_input]
         self._input_indices = [k for k, port in enumerate(inputs) if port.is_input]
-        self._slots = (tuple(inputs[k].slot for k in self._input_indices),
-                       (*(inputs[k].slot for k in self._parameter_indices),
-                        *((variable.type, variable.reference) for variable, _ in constants)),
-                       tuple(port.slot for port in outputs))
-        self._limit, self._hosts = limit, dict[int, _Host]()
+        constant_references = ((variable.type, variable.reference) for variable, _ in constants)
+        self._setup = HostSetup(
+            description.path, description.digest, description.version, description.identifier, description.token,
+            inputs=tuple(inputs[k].typed_reference for k in self._input_indices),
+            parameters=(*(inputs[k].typed_reference for k in self._parameter_indices), *constant_references),
+            outputs=tuple(port.typed_reference for port in outputs), time_limit=time_limit)
+        self._hosts = dict[int, _Host]()
         self._free_numbers, self._next_number = list[int](), 0
         self.generation = 0
         """Number of times that all instances were lost."""
@@ -151,16 +153,16 @@ class Instances:
                                 lambda positions: ([parameters[i] for i in positions], [inputs[i] for i in positions]))
         return np.asarray(self._outputs_of(answers[:, np.newaxis])[-1])
 
-    def step(self, numbers: Sequence[int], times: Sequence[tuple[float, float]], values: FloatArray) -> FloatArray:
+    def step(self, numbers: Sequence[int], steps: Sequence[tuple[float, float]], values: FloatArray) -> FloatArray:
         """Advance N instances by one or more steps, each given by its start and length [s].
 
         Returns the m outputs after the last two steps, shape (2, m, N), or after a single step, shape (1, m, N).
         """
         fmu_values = [self.inputs[k].to_fmu(values[k]).tolist() for k in self._input_indices]
         inputs = list(map(list, zip(*fmu_values, strict=True))) or [[] for _ in numbers]
-        kept_steps = min(len(times), 2)
-        return self._outputs_of(self._request("step", numbers, f"is at {times[0][0]:g} s",
-                                             lambda positions: (times, [inputs[i] for i in positions], kept_steps)))
+        kept_steps = min(len(steps), 2)
+        return self._outputs_of(self._request("step", numbers, f"is at {steps[0][0]:g} s",
+                                             lambda positions: (steps, [inputs[i] for i in positions], kept_steps)))
 
     def _outputs_of(self, answers: FloatArray) -> FloatArray:
         """Answers, shape (N, steps, m), as outputs in the outer units of the ports, shape (steps, m, N)."""
@@ -169,11 +171,11 @@ class Instances:
 
     def _request(self, name: str, numbers: Sequence[int], activity: str, arguments: Any) -> FloatArray:
         """Answers of N instances, shape (N, ...). All instances run in one process, or each runs in its own process."""
-        groups = {key: [i] for i, key in enumerate(numbers)} if self.description.single_instance else {0: [*range(len(numbers))]}
+        groups = {number: [i] for i, number in enumerate(numbers)} if self.description.single_instance else {0: [*range(len(numbers))]}
         hosts = {}
         try:
-            for key, positions in groups.items():
-                hosts[key] = host = self._host(key)
+            for host_number, positions in groups.items():
+                hosts[host_number] = host = self._host(host_number)
                 host.activity = activity
                 host.send((name, [numbers[i] for i in positions], *arguments(positions)))
             return np.concatenate([host.receive() for host in hosts.values()])
@@ -181,11 +183,10 @@ class Instances:
             self.close()  # answers of other processes may be pending
             raise
 
-    def _host(self, key: int) -> _Host:
-        if key not in self._hosts:
-            fmu = self.description
-            self._hosts[key] = _Host(HostSetup(fmu.path, fmu.digest, fmu.version, fmu.identifier, fmu.token, *self._slots, self._limit))
-        return self._hosts[key]
+    def _host(self, number: int) -> _Host:
+        if number not in self._hosts:
+            self._hosts[number] = _Host(self._setup)
+        return self._hosts[number]
 
     def close(self) -> None:
         """End the processes. A vehicle that continues is simulated again from its start."""
@@ -219,7 +220,7 @@ class Fleet:
         """Initialise the vehicles with k inputs, shape (k, N); returns the m outputs, shape (m, N), and the history."""
         outputs = self._instances.start(self._numbers, inputs)
         self._generation = self._instances.generation
-        self._last_outputs, self._history = np.stack([outputs, outputs]), History(None, inputs, -1)
+        self._last_outputs, self._history = np.stack([outputs, outputs]), History(previous=None, inputs=inputs, step_number=-1)
         return outputs, self._history
 
     def advance(self, history: History, inputs: FloatArray) -> tuple[FloatArray, History]:
@@ -246,9 +247,9 @@ class Fleet:
     def _drive(self, step_number: int, inputs: FloatArray) -> None:
         """Advance to the last communication point in a step, if the step contains any."""
         interval = self._communication_step or self._step
-        times = [(point * interval, interval) for point in range(self._first_point_in(step_number), self._first_point_in(step_number + 1))]
-        if times:
-            outputs = self._instances.step(self._numbers, times, inputs)
+        points = range(self._first_point_in(step_number), self._first_point_in(step_number + 1))
+        if points:
+            outputs = self._instances.step(self._numbers, [(point * interval, interval) for point in points], inputs)
             self._last_outputs = outputs if len(outputs) == 2 else np.stack([self._last_outputs[1], outputs[0]])
 
     def _first_point_in(self, step_number: int) -> int:
@@ -257,7 +258,7 @@ class Fleet:
 
     def _end_outputs(self, step_number: int) -> FloatArray:
         interval = self._communication_step or self._step
-        # by which the last communication point lies beyond the step's end [-]
+        # how far the last communication point lies beyond the end of the step [intervals]
         overshoot = self._first_point_in(step_number + 1) - (step_number + 1) * self._step / interval
         if abs(overshoot) <= POINT_TOLERANCE:
             return np.asarray(self._last_outputs[1])

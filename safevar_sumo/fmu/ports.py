@@ -29,7 +29,7 @@ class Port(NamedTuple):
         return self.variable.causality == "input"
 
     @property
-    def slot(self) -> tuple[str, int]:
+    def typed_reference(self) -> tuple[str, int]:
         """Type and value reference of the variable."""
         return self.variable.type, self.variable.reference
 
@@ -71,7 +71,7 @@ def ports_of(description: Description, variable_names: Mapping[str, str], units:
         legal_causalities = (*causalities, "parameter") if quantity in constants else causalities
         variable = description.variable(name, legal_causalities, source, f"{key}.{quantity}")
         first_quantity = next((mapped_quantity for mapped_quantity, port in ports.items() if port.variable.name == name), None)
-        if first_quantity and "parameter" not in causalities:  # an output may hold several quantities
+        if first_quantity and "parameter" not in causalities:  # variables of sumo_type may hold several quantities
             raise InputError(source, f"{key}.{quantity} = {name!r}: that variable is {key}.{first_quantity} already", "each variable once")
         outer_unit = SI[units[quantity]]
         ports[quantity] = Port(variable, description.unit_for(variable, outer_unit, units[quantity], source, f"{key}.{quantity}"),

@@ -63,7 +63,7 @@ def weight_acceleration(acceleration: FloatArray, step: float) -> FloatArray:
 def max_jerk(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
     """Largest magnitude of the jerk over a second [m/s^3]; shape (N,), NaN on a collision."""
     accelerations, is_counted = _accelerations(runs)
-    steps = _step_count(JERK_TIME, runs.trace.step, len(accelerations) - 1)
+    steps = _step_count(JERK_TIME, runs.trace.step, largest_count=len(accelerations) - 1)
     jerk = np.abs(accelerations[steps:] - accelerations[:-steps]) / (steps * runs.trace.step)
     return mask_collisions(runs, np.max(np.where(is_counted[steps:], jerk, 0.0), axis=0, initial=0.0))
 
@@ -78,7 +78,7 @@ def rms_acceleration(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArr
 def brake_harshness(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
     """Largest deceleration over half a second [m/s^2]; shape (N,), NaN on a collision."""
     speed, active = runs.trace.speed, runs.trace.active
-    steps = _step_count(BRAKING_TIME, runs.trace.step, len(speed) - 1)
+    steps = _step_count(BRAKING_TIME, runs.trace.step, largest_count=len(speed) - 1)
     decelerations = (speed[:-steps] - speed[steps:]) / (steps * runs.trace.step)
     return mask_collisions(runs, np.max(np.where(active[steps:], decelerations, 0.0), axis=0, initial=0.0))
 
@@ -88,9 +88,9 @@ def _accelerations(runs: SimulationRuns) -> tuple[FloatArray, BoolArray]:
     return np.diff(runs.trace.speed, axis=0) / runs.trace.step, runs.trace.active[1:]
 
 
-def _step_count(time: float, step: float, limit: int) -> int:
-    """Number of steps in a time [s], from 1 to `step_count`."""
-    return max(1, min(round(time / step), limit))
+def _step_count(time: float, step: float, largest_count: int) -> int:
+    """Number of steps of `step` [s] in a time [s], from 1 to `largest_count`."""
+    return max(1, min(round(time / step), largest_count))
 
 
 MAX_JERK = Metric(

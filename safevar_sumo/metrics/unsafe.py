@@ -66,7 +66,7 @@ class Unsafe:
         return np.asarray(self._holds(evaluations.outcome, evaluations.column))
 
     def rows(self, solutions: pd.DataFrame) -> pd.Series[bool]:
-        """Which rows of a data frame of solutions are unsafe, as returned by `safevar_sumo.results.load_runs`."""
+        """Which rows of `solutions`, a data frame from `safevar_sumo.results.load_runs`, are unsafe."""
         return self._holds(solutions["outcome"], solutions.__getitem__)  # type: ignore[no-any-return]
 
     def _holds(self, outcome: Any, column: Callable[[str], Any]) -> Any:

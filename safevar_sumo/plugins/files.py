@@ -47,7 +47,7 @@ class InputFiles:
         self.modules: set[str] = set()
 
     def files(self, packages: Sequence[str] = ()) -> set[str]:
-        """Every input file: sources in place of Python's caches; files of an installed package only if `packages` names the package."""
+        """Every input file: sources in place of Python's caches, and of installed packages only the files of `packages`."""
         installed = {file for name in list(sys.modules) if name.partition(".")[0] in packages and not is_user_file(file := _file_of(name))}
         files = {*self.paths, *map(_file_of, self.modules), *installed} - {""}
         return {path for path in map(_source_of, files) if _is_input(path, packages)}
@@ -60,13 +60,13 @@ def _file_of(module: str) -> str:
 class _AuditHook:
     """The process's only audit hook, which cannot be removed.
 
-    `call_depth` is the number of calls of user code under way; `written_files` are files that such code wrote, hence no inputs;
-    `imported_modules` are the names of all modules that such code has loaded.
+    `call_depth` is the number of calls of user code under way; `recordings` are those of `note_inputs` that are not over.
+    `written_files` are files that user code wrote, hence no inputs; `imported_modules` are the names of all modules that it has loaded.
     """
 
     def __init__(self) -> None:
         self.call_depth, self._is_installed = 0, False
-        self.readings: list[InputFiles] = []
+        self.recordings: list[InputFiles] = []
         self.written_files: set[str] = set()
         self.imported_modules: set[str] = set()
 
@@ -81,8 +81,8 @@ class _AuditHook:
         target = arguments[0]
         if event == "import":
             self.imported_modules.add(target)
-            for reading in self.readings:
-                reading.modules.add(target)
+            for recording in self.recordings:
+                recording.modules.add(target)
             target = arguments[1]
         if not isinstance(target, str | bytes | os.PathLike):
             return
@@ -93,8 +93,8 @@ class _AuditHook:
         if event == "open" and isinstance(arguments[2], int) and arguments[2] & WRITE_FLAGS:
             self.written_files.add(path)
             return
-        for reading in self.readings:
-            reading.paths.add(path)
+        for recording in self.recordings:
+            recording.paths.add(path)
 
 
 audit_hook = _AuditHook()
@@ -104,16 +104,16 @@ audit_hook = _AuditHook()
 def note_inputs() -> Iterator[InputFiles]:
     """Record the files and modules that user code opens and loads while a guard calls it."""
     audit_hook.install()
-    reading = InputFiles()
-    audit_hook.readings.append(reading)
+    recording = InputFiles()
+    audit_hook.recordings.append(recording)
     try:
-        yield reading
+        yield recording
     finally:
-        audit_hook.readings[:] = [other for other in audit_hook.readings if other is not reading]
+        audit_hook.recordings[:] = [other for other in audit_hook.recordings if other is not recording]
 
 
 def is_user_file(path: str) -> bool:
-    """Whether a file lies outside the interpreter, installed libraries, this package and the operating system."""
+    """Whether a file belongs neither to the interpreter or an installed library nor to this package or the operating system."""
     return not path.startswith(KNOWN_FOLDERS) and not any(name in Path(path).parts for name in LIBRARY_FOLDERS)
 
 
@@ -136,7 +136,7 @@ def _is_input(path: str, packages: Sequence[str]) -> bool:
 def digest_of(path: Path | str) -> str:
     """Digest of a file's content; "" for a missing file.
 
-    The digest of a Python file covers its syntax tree without docstrings; any other digest does not depend on the kind of line ends.
+    The digest of a Python file covers its syntax tree without docstrings; digests of other files do not depend on the kind of line ends.
     """
     try:
         status = os.stat(path)
@@ -207,7 +207,7 @@ def _name_of(path: str, folders: Sequence[str], extra_parts: int = 0) -> str:
 
 
 def file_by_name(name: str, folders: Sequence[str]) -> str:
-    """The path of the file to which `digests` gives a name; "" if there is no such file."""
+    """The path of the file that `digests` calls `name`; "" if there is no such file."""
     return next((str(path) for folder in (*folders, *_import_folders()) if (path := Path(folder, name)).is_file()), "")
 
 

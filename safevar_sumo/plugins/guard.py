@@ -1,4 +1,4 @@
-"""The contracts of users' classes, the guard that calls user code, and checks of the results."""
+"""The contracts of users' classes, and the guard that calls user code and checks its results."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Contract(NamedTuple):
     title
         Words for an instance, such as "an ADS".
     methods, optional
-        By name of a required or an optional method: the method's parameters.
+        Required and optional methods: by a method's name, the names of its parameters without default.
     attributes
         Attributes of an instance besides its methods.
     base
@@ -121,7 +121,7 @@ def read_only_copy(value: Any) -> Any:
 
 @contextmanager
 def guard_process_state(source: str, names: Sequence[str]) -> Iterator[None]:
-    """Restore the working directory, environment variables and numpy's error state after a block, unless `names` is empty."""
+    """Restore the working directory, environment variables and numpy's error state after a block with user code of these names, if any."""
     if not names:
         yield
         return

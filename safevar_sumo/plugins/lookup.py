@@ -33,7 +33,7 @@ class Member(NamedTuple):
     """The class or record that a name in a study stands for.
 
     For user code, `guard` calls the member, `module` is the name of its module, and `folder` the folder of the module's top package. For
-    a member of this package, they are None and "". For an FMU, `file` is its path and `target` the class that simulates it.
+    a member of this package, `guard` is None and the texts are "". For an FMU, `file` is its path and `target` the class that simulates it.
     """
 
     target: Any
@@ -92,7 +92,7 @@ class Lookup(NamedTuple):
     def class_of(self, shipped: Mapping[str, Any], name: str, key: str, *contracts: Contract, otherwise: str = "") -> Member:
         """A class by name; a user's class must meet the first contract that applies to it.
 
-        `otherwise` names further expected values, which are no classes.
+        `otherwise` is what the study may give in place of a class, for the error.
         """
         member = self.find(shipped, name, key)
         contract = next(contract for contract in contracts if contract.applies_to(member.target))
@@ -132,7 +132,7 @@ class Lookup(NamedTuple):
         top = name.partition(".")[0]
         if top == "__main__":
             raise InputError(self.source, f"{guard.name}: other processes cannot import from __main__", "a module in a file of its own")
-        folder = _module_folder(top, folders)
+        folder = _find_module_folder(top, folders)
         _unload_stale_modules(folders)
         add_import_folders(folders)
         if folder:
@@ -162,7 +162,7 @@ class Lookup(NamedTuple):
             del sys.modules[top]
 
 
-def _module_folder(top: str, folders: Iterable[str]) -> str:
+def _find_module_folder(top: str, folders: Iterable[str]) -> str:
     """The first folder with a module or package named `top`; "" if only an installed module can have this name.
 
     An installed module takes precedence over a package without __init__.py.
@@ -182,7 +182,7 @@ def _folder_of(module: ModuleType) -> str:
 
 
 def add_import_folders(folders: Iterable[str]) -> None:
-    """Let modules import from `folders` and the working directory; folders before the working directory in Python's path come first."""
+    """Let modules import from `folders` and the working directory; folders that Python's path lists before the latter keep precedence."""
     sys.path[:] = [folder for folder in sys.path if folder not in _added_folders]
     _added_folders[:] = [folder for folder in dict.fromkeys((*folders, os.getcwd())) if folder not in sys.path]
     indices = [i for i, folder in enumerate(sys.path) if folder in ("", os.getcwd())]
@@ -196,12 +196,12 @@ def added_import_folders() -> list[str]:
 
 
 def inherit_import_folders(folders: Iterable[str]) -> None:
-    """Record the folders that `add_import_folders` added in another process, from which this process inherited its path."""
+    """Record the folders that `add_import_folders` added in the process from which this one inherited Python's path."""
     _added_folders[:] = folders
 
 
 def unload_user_modules() -> None:
-    """Unload all user modules: the next lookup loads them again."""
+    """Unload all user modules, so that the next lookup loads them again."""
     _unload(list(_loaded_modules))
     for name in sorted(audit_hook.imported_modules):
         module = sys.modules.get(name)
@@ -287,7 +287,7 @@ def check_parameters(function: Callable[..., Any], arguments: tuple[Any, ...], p
 
 
 class ModuleCopies:
-    """Copies of the user's modules for one of many vehicles, so that the vehicles share no variables of these modules.
+    """Copies of the user's modules for one vehicle, so that the vehicles of a batch share no variables of these modules.
 
     Parameters
     ----------

@@ -4,8 +4,8 @@ from safevar_sumo.protocol.cells import (
     EURO_NCAP_2026,
     NOT_RED,
     PROTOCOLS,
-    Block,
     Cell,
+    CellMatrix,
     CellScenario,
     Layer,
     Protocol,
@@ -15,5 +15,5 @@ from safevar_sumo.protocol.cells import (
 from safevar_sumo.protocol.points import COLOURS, RED, Points, points_of
 
 __all__ = [
-    "COLOURS", "EURO_NCAP_2026", "NOT_RED", "PROTOCOLS", "RED", "Block", "Cell", "CellScenario", "Layer", "Points", "Protocol",
+    "COLOURS", "EURO_NCAP_2026", "NOT_RED", "PROTOCOLS", "RED", "Cell", "CellMatrix", "CellScenario", "Layer", "Points", "Protocol",
     "cells_of_part", "points_of", "protocol_of"]

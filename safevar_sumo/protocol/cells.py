@@ -28,64 +28,73 @@ TARGET_DECELERATION, TARGET_HEADWAY = 4.0, 1.0
 """The target's deceleration [m/s^2] and its headway at the start [s] in CCRb and CMRb; robustness layers vary both."""
 
 
-class CellRow(Struct, frozen=True, forbid_unknown_fields=True):
-    """A row of a matrix: speeds of vehicle and target [km/h], and a letter per column: S (standard), E (extended) or - (no cell)."""
+class CellRow(Struct, frozen=True, forbid_unknown_fields=True,
+              rename={"vut_speed": "vut", "range_letters": "ranges", "target_speed": "target", "has_function_choice": "choice"}):
+    """A row of a matrix: speeds of the vehicle under test (VUT) and of the target [km/h].
 
-    vut: float
-    ranges: str
-    target: float | None = None
-    choice: bool = False
-
-
-class Block(Struct, frozen=True, forbid_unknown_fields=True):
-    """A matrix of a test; a test that is driven by day and by night has one matrix for each `light`.
-
-    `sheet`, `label`, `first` and `function` locate the matrix in the official template: sheet, name, first cell, column of functions.
+    Letters of columns: S (standard range), E (extended range), - (no cell); `has_function_choice`: the manufacturer chooses AEB or FCW.
     """
 
-    test: str
+    vut_speed: float
+    range_letters: str
+    target_speed: float | None = None
+    has_function_choice: bool = False
+
+    def has_cell(self, column: int) -> bool:
+        return self.range_letters[column] != "-"
+
+
+class CellMatrix(Struct, frozen=True, forbid_unknown_fields=True,
+                 rename={"test_name": "test", "name_cell": "label", "first_cell": "first", "function_column": "function"}):
+    """A matrix of a test; a test that is driven by day and by night has one matrix for each `light`.
+
+    In the official template the matrix is on `sheet`, its name in `name_cell`, its first colour in `first_cell`, and the function of each
+    row (AEB or FCW) in the column with the letter `function_column`. `points`: of the standard range, the extended range and robustness.
+    """
+
+    test_name: str
     criterion: Literal["mitigation", "avoidance"]
     sheet: str
-    label: str
-    first: str
+    name_cell: str
+    first_cell: str
     points: tuple[float, float, float]
     rows: tuple[CellRow, ...]
     light: Literal["day", "night"] | None = None
-    function: str = ""
+    function_column: str = ""
     impact_locations: tuple[float, ...] = ()
     target_speeds: tuple[float, ...] = ()
 
     @property
     def name(self) -> str:
-        return self.test if self.light is None else f"{self.test} {self.light}"
+        return self.test_name if self.light is None else f"{self.test_name} {self.light}"
 
-    def is_warning(self, row: int) -> bool:
+    def is_rated_by_warning(self, row: int) -> bool:
         """Whether a row is rated by the time to collision at the warning."""
-        return self.rows[row].choice and self.test in WARNING_TESTS
+        return self.rows[row].has_function_choice and self.test_name in WARNING_TESTS
 
 
-class Condition(Struct, frozen=True, forbid_unknown_fields=True):
+class Condition(Struct, frozen=True, forbid_unknown_fields=True, rename={"text": "condition"}):
     """A variation of a robustness layer in the calculator's words, and the criterion that must hold."""
 
-    condition: str
+    text: str
     criterion: str
 
 
-class Layer(Struct, frozen=True, forbid_unknown_fields=True):
-    """A robustness layer that counts for a test, and the cell of the official template that claims it."""
+class Layer(Struct, frozen=True, forbid_unknown_fields=True, rename={"test_name": "test", "name": "layer", "claim_cell": "cell"}):
+    """A robustness layer that counts for a test; in the official template, `claim_cell` on `sheet` states whether the layer holds."""
 
-    test: str
-    layer: str
+    test_name: str
+    name: str
     sheet: str
-    cell: str
+    claim_cell: str
     conditions: tuple[Condition, ...]
 
     @property
     def simulated_conditions(self) -> tuple[Condition, ...]:
-        """The layer's variations if they can be simulated; the calculator lists none for CBLA by night, which is rated like other tests."""
-        if self.layer == NIGHT:
+        """The layer's conditions if they can be simulated, else none."""
+        if self.name == NIGHT:  # the calculator lists no condition for CBLA by night, which is rated like other tests
             return self.conditions or (Condition(IN_DARKNESS, NOT_RED),)
-        return self.conditions if self.layer in (SPEED, ACCELERATION, OFFSET, HEADING) else ()
+        return self.conditions if self.name in (SPEED, ACCELERATION, OFFSET, HEADING) else ()
 
 
 class CellScenario(NamedTuple):
@@ -99,66 +108,60 @@ class CellScenario(NamedTuple):
 class Cell(NamedTuple):
     """One simulation of a rating.
 
-    Attributes
-    ----------
-    block, row, column
-        The cell's position in the matrices.
-    range
-        `standard`, `extended`, or the name of the robustness layer that the cell belongs to.
-    condition, criterion
-        The layer's variation in the calculator's words, and the criterion that must hold; "" for a cell of a matrix.
-    judged
-        Measure that determines the cell's colour: `mitigation`, `avoidance` or `warning`.
-    target
-        Speed of the target [km/h].
+    - `matrix`, `row`, `column`: the cell's position; a robustness cell has that of the matrix cell that it varies.
+    - `range_or_layer`: of a matrix cell `standard` or `extended`; of a robustness cell the name of the layer.
+    - `condition`, `criterion`: of a robustness cell as in `Condition`; of a matrix cell "".
+    - `judged_by`: the measure that determines the colour: `mitigation`, `avoidance` or `warning`.
+    - `target_speed`: of the target [km/h].
     """
 
-    block: Block
+    matrix: CellMatrix
     row: int
     column: int
-    range: str
+    range_or_layer: str
     condition: str
     criterion: str
-    judged: str
-    target: float
+    judged_by: str
+    target_speed: float
 
     @property
-    def vut(self) -> float:
+    def vut_speed(self) -> float:
         """Speed of the vehicle under test [km/h]."""
-        return self.block.rows[self.row].vut
+        return self.matrix.rows[self.row].vut_speed
 
     @property
-    def location(self) -> float | None:
+    def impact_location(self) -> float | None:
         """Impact location [% of the width]; None in a matrix whose columns are target speeds."""
-        return self.block.impact_locations[self.column] if self.block.impact_locations else None
+        return self.matrix.impact_locations[self.column] if self.matrix.impact_locations else None
 
     @property
-    def is_varied(self) -> bool:
+    def is_robustness_cell(self) -> bool:
         return bool(self.condition)
 
     @property
     def name(self) -> str:
         """The cell in words, such as `CPNA night, 40 km/h, 75 %, Speed +3 km/h`."""
-        column = f"target {self.block.target_speeds[self.column]:g} km/h" if self.location is None else f"{self.location:g} %"
-        choice = " FCW" if self.judged == WARNING else ""
-        variation = f", {self.range} {self.condition}" if self.is_varied else ""
-        return f"{self.block.name}, {self.vut:g} km/h{choice}, {column}{variation}"
+        location = self.impact_location
+        column = f"target {self.matrix.target_speeds[self.column]:g} km/h" if location is None else f"{location:g} %"
+        function = " FCW" if self.judged_by == WARNING else ""
+        variation = f", {self.range_or_layer} {self.condition}" if self.is_robustness_cell else ""
+        return f"{self.matrix.name}, {self.vut_speed:g} km/h{function}, {column}{variation}"
 
     @property
     def scenario(self) -> CellScenario:
-        test = self.block.test
+        test = self.matrix.test_name
         model = next((model for prefix, model in MODELS.items() if test.startswith(prefix)), "crossing")
-        parameters: dict[str, Any] = {"test": test, "speed": self.vut, "target_speed": self.target}
-        if self.location is not None:
-            parameters["impact_location"] = self.location
-        night = self.block.light == "night" or self.range == NIGHT
-        if self.range == ACCELERATION:
+        parameters: dict[str, Any] = {"test": test, "speed": self.vut_speed, "target_speed": self.target_speed}
+        if self.impact_location is not None:
+            parameters["impact_location"] = self.impact_location
+        night = self.matrix.light == "night" or self.range_or_layer == NIGHT
+        if self.range_or_layer == ACCELERATION:
             parameters["target_deceleration"] = TARGET_DECELERATION - _leading_number(self.condition)
-        elif self.range == OFFSET and "headway" in self.condition:
+        elif self.range_or_layer == OFFSET and "headway" in self.condition:
             parameters["headway"] = TARGET_HEADWAY + _leading_number(self.condition)
-        elif self.range == OFFSET:
+        elif self.range_or_layer == OFFSET:
             parameters["start_share"] = 1 + _leading_number(self.condition) / 100
-        elif self.range == HEADING:
+        elif self.range_or_layer == HEADING:
             parameters["heading"] = _leading_number(self.condition)
         return CellScenario(model, parameters, night)
 
@@ -170,69 +173,75 @@ def _leading_number(condition: str) -> float:
     return float(match[1])
 
 
-class Protocol(Struct, frozen=True, eq=False, forbid_unknown_fields=True, dict=True):
-    """A protocol; `mitigation` and `criteria` hold the value at which each colour begins, `scenarios` the points of every test."""
+class Protocol(Struct, frozen=True, eq=False, forbid_unknown_fields=True, dict=True, rename={
+        "calculator_version": "calculator", "starts_by_vut_speed": "mitigation", "starts_by_measure": "criteria",
+        "points_by_test": "scenarios", "matrices": "blocks"}):
+    """A protocol; `points_by_test` holds the points of every test, simulated or not, as in `CellMatrix.points`.
 
-    calculator: str
+    Measured values at which colours begin: for `mitigation` in `starts_by_vut_speed`, for other measures in `starts_by_measure`.
+    """
+
+    calculator_version: str
     colours: dict[str, str]
-    mitigation: dict[str, dict[str, float]]
-    criteria: dict[str, dict[str, float]]
-    scenarios: dict[str, tuple[float, float, float]]
-    blocks: tuple[Block, ...]
+    starts_by_vut_speed: dict[str, dict[str, float]]
+    starts_by_measure: dict[str, dict[str, float]]
+    points_by_test: dict[str, tuple[float, float, float]]
+    matrices: tuple[CellMatrix, ...]
     layers: tuple[Layer, ...]
 
     @cached_property
     def cells(self) -> tuple[Cell, ...]:
-        """All simulations: the cells of the matrices, then the cells of the layers, which vary the standard range only."""
-        return (*self._matrix_cells(), *self._layer_cells())
+        """All simulations: the cells of the matrices, then the robustness cells, which vary cells of the standard range only."""
+        return (*self._iterate_matrix_cells(), *self._iterate_robustness_cells())
 
     @cached_property
     def matrix_cell_numbers(self) -> dict[tuple[str, int, int], int]:
-        """Indices in `cells` of the cells of the matrices, by block name, row and column."""
-        return {(cell.block.name, cell.row, cell.column): number for number, cell in enumerate(self.cells) if not cell.is_varied}
+        """Indices in `cells` of the cells of the matrices, by matrix name, row and column."""
+        return {(cell.matrix.name, cell.row, cell.column): number for number, cell in enumerate(self.cells)
+                if not cell.is_robustness_cell}
 
     @property
-    def tests(self) -> dict[str, list[Block]]:
-        """The blocks of every simulated test: one, or two if the test is driven by day and by night."""
-        tests: dict[str, list[Block]] = {}
-        for block in self.blocks:
-            tests.setdefault(block.test, []).append(block)
+    def tests(self) -> dict[str, list[CellMatrix]]:
+        """The matrices of every simulated test: one, or two if the test is driven by day and by night."""
+        tests: dict[str, list[CellMatrix]] = {}
+        for matrix in self.matrices:
+            tests.setdefault(matrix.test_name, []).append(matrix)
         return tests
 
     def layers_of(self, test: str) -> list[Layer]:
-        return [layer for layer in self.layers if layer.test == test]
+        return [layer for layer in self.layers if layer.test_name == test]
 
     @property
     def points_not_simulated(self) -> dict[str, float]:
-        """Points of tests that cannot be simulated here, by test."""
-        return {test: sum(points) for test, points in self.scenarios.items() if test not in self.tests}
+        """Points of tests that this package cannot simulate, by test."""
+        return {test: sum(points) for test, points in self.points_by_test.items() if test not in self.tests}
 
-    def _matrix_cells(self) -> Iterator[Cell]:
-        for block in self.blocks:
-            for row, cell_row in enumerate(block.rows):
-                for column, letter in enumerate(cell_row.ranges):
-                    if letter != "-":
-                        yield Cell(block, row, column, STANDARD if letter == "S" else EXTENDED, "", "",
-                                   WARNING if block.is_warning(row) else block.criterion,
-                                   block.target_speeds[column] if cell_row.target is None else cell_row.target)
+    def _iterate_matrix_cells(self) -> Iterator[Cell]:
+        for matrix in self.matrices:
+            for row_number, row in enumerate(matrix.rows):
+                for column, letter in enumerate(row.range_letters):
+                    if row.has_cell(column):
+                        yield Cell(matrix, row_number, column, range_or_layer=STANDARD if letter == "S" else EXTENDED, condition="",
+                                   criterion="", judged_by=WARNING if matrix.is_rated_by_warning(row_number) else matrix.criterion,
+                                   target_speed=matrix.target_speeds[column] if row.target_speed is None else row.target_speed)
 
-    def _layer_cells(self) -> Iterator[Cell]:
-        standard_cells = [cell for cell in self._matrix_cells() if cell.range == STANDARD]
+    def _iterate_robustness_cells(self) -> Iterator[Cell]:
+        standard_cells = [cell for cell in self._iterate_matrix_cells() if cell.range_or_layer == STANDARD]
         for layer in self.layers:
             for condition in layer.simulated_conditions:
-                speed_increase = _leading_number(condition.condition) if layer.layer == SPEED else 0.0
+                speed_increase = _leading_number(condition.text) if layer.name == SPEED else 0.0
                 for cell in standard_cells:
-                    if cell.block.test == layer.test:
-                        yield cell._replace(range=layer.layer, condition=condition.condition, criterion=condition.criterion,
-                                            target=cell.target + speed_increase)
+                    if cell.matrix.test_name == layer.test_name:
+                        yield cell._replace(range_or_layer=layer.name, condition=condition.text, criterion=condition.criterion,
+                                            target_speed=cell.target_speed + speed_increase)
 
 
 def cells_of_part(protocol: Protocol, part: int, parts: int) -> list[int]:
-    """Numbers of the cells in part `part` of `parts`, counted from 0; cells with the same network share a part as far as possible."""
+    """Numbers of the cells in one of `parts` parts; cells with the same network share a part as far as possible."""
     def network_of(number: int) -> tuple[Any, ...]:
         cell = protocol.cells[number]
         variation = (cell.scenario.parameters.get("heading", 0.0), "start_share" in cell.scenario.parameters)
-        return cell.scenario.model, cell.block.test in ("CPNA", "CPFA", "CPNCO"), variation, cell.block.test
+        return cell.scenario.model, cell.matrix.test_name in ("CPNA", "CPFA", "CPNCO"), variation, cell.matrix.test_name
 
     numbers = sorted(range(len(protocol.cells)), key=network_of)
     return numbers[len(numbers) * part // parts:len(numbers) * (part + 1) // parts]

@@ -21,19 +21,19 @@ ACTION_THRESHOLD = 0.03
 
 
 class DrivingRobot:
-    """Holds N vehicles at the speeds of their tests by accelerator and brake, in their initial gear.
+    """Holds N vehicles at the speeds of their tests, by accelerator and brake and in their initial gear.
 
-    The robot drives as long as the system under test neither brakes nor eases off an accelerator that the system had pressed; once the
-    system has braked, the system controls the vehicle and its automatic gearbox. Euro NCAP (AEB car-to-car, "test execution") requires a
-    steady speed, with an automatic gearbox in D and a manual gearbox in the highest gear of at least 1,500 r/min, and allows a cruise
-    control; the robot holds the gear, since a gearbox that hunts between two gears would not keep the speed steady.
+    The robot drives as long as the system under test neither brakes nor eases off an accelerator that the system had pressed. Once the
+    system has braked, it controls the vehicle and its automatic gearbox. Euro NCAP (AEB car-to-car, "test execution") requires a steady
+    speed and allows a cruise control; an automatic gearbox is in D, a manual one in the highest gear of at least 1,500 r/min. The robot
+    holds the gear, since a gearbox that hunts between two gears would not keep the speed steady.
 
     Parameters
     ----------
     points
         Scenario points, each with an equal part of the vehicles; the robot drives only where the scenario has a `test_speed`.
     vehicle, prepared, state
-        The vehicle model, its prepared settings, and the state at the start, whose pedals hold the speed and are the first command.
+        The vehicle model, its prepared settings, and the state at the start; the pedals in this state hold the speed.
     step
         Time between two commands [s].
     """
@@ -41,15 +41,15 @@ class DrivingRobot:
     def __init__(self, points: Sequence[Point], vehicle: Vehicle, prepared: Any, state: VehicleState, step: float) -> None:
         n = len(state.speed)
         speeds = [getattr(point.scenario, "test_speed", None) for point in points]
-        self._target = np.repeat([np.nan if speed is None else speed for speed in speeds], n // len(points))
-        self.has_test_speed: BoolArray = ~np.isnan(self._target)
+        self._test_speed = np.repeat([np.nan if speed is None else speed for speed in speeds], n // len(points))
+        self.has_test_speed: BoolArray = ~np.isnan(self._test_speed)
         """Which vehicles are in a scenario with a `test_speed`."""
         self._is_driving = self.has_test_speed.copy()
         self._is_needed = bool(self.has_test_speed.any())
         self._prepared, self._hold_gear = prepared, getattr(vehicle, "hold_gear", None)
-        self._pedal, self._least_brake = state.throttle - state.brake, state.brake + ACTION_THRESHOLD
+        self._start_pedal, self._brake_threshold = state.throttle - state.brake, state.brake + ACTION_THRESHOLD
         self._step, self._integral = step, np.zeros(n)
-        self._has_braked, self._highest_pedal = ~self.has_test_speed, np.full(n, -np.inf)
+        self._has_braked, self._max_system_pedal = ~self.has_test_speed, np.full(n, -np.inf)
         self.error = np.where(self.has_test_speed, 0.0, np.nan)
         """Deviation from the test speed [m/s] that was largest relative to the tolerance while the robot drove; NaN without a test."""
 
@@ -60,15 +60,15 @@ class DrivingRobot:
         """
         if not self._is_needed:
             return command, state
-        error = np.where(self._is_driving, state.speed - self._target, 0.0)
+        error = np.where(self._is_driving, state.speed - self._test_speed, 0.0)
         self.error = np.where(is_open & (_tolerance_share(error) > _tolerance_share(self.error)), error, self.error)
-        self._has_braked |= command.brake > self._least_brake
+        self._has_braked |= command.brake > self._brake_threshold
         system_pedal = command.throttle - command.brake
-        self._highest_pedal = np.maximum(self._highest_pedal, system_pedal)
-        self._is_driving = ~self._has_braked & (system_pedal >= np.minimum(self._highest_pedal, self._pedal) - ACTION_THRESHOLD)
+        self._max_system_pedal = np.maximum(self._max_system_pedal, system_pedal)
+        self._is_driving = ~self._has_braked & (system_pedal >= np.minimum(self._max_system_pedal, self._start_pedal) - ACTION_THRESHOLD)
         error = np.where(self._is_driving, error, 0.0)
         self._integral = np.minimum(np.maximum(self._integral - error * self._step, -1 / INTEGRAL_GAIN), 1 / INTEGRAL_GAIN)
-        pedal = self._pedal - PROPORTIONAL_GAIN * error + INTEGRAL_GAIN * self._integral
+        pedal = self._start_pedal - PROPORTIONAL_GAIN * error + INTEGRAL_GAIN * self._integral
         robot_command = Command(np.where(self._is_driving, np.minimum(np.maximum(pedal, 0.0), 1.0), command.throttle),
                                 np.where(self._is_driving, np.minimum(np.maximum(-pedal, 0.0), 1.0), command.brake))
         return robot_command, state if self._hold_gear is None else self._hold_gear(self._prepared, state, self._is_driving)

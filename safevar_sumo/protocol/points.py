@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from safevar_sumo.protocol.cells import EXTENDED, NO_WORSE, NOT_RED, STANDARD, WARNING, Block, Layer, Protocol
+from safevar_sumo.protocol.cells import EXTENDED, MITIGATION, NO_WORSE, NOT_RED, STANDARD, WARNING, CellMatrix, Layer, Protocol
 from safevar_sumo.records import BoolArray, CellResults, FloatArray
 
 COLOURS = ("green", "yellow", "orange", "brown", "red")
@@ -19,9 +19,9 @@ GREEN, RED = 0, len(COLOURS) - 1
 UNKNOWN = -1
 """Colour of a cell whose test is invalid; it earns nothing."""
 WEIGHTS = np.array([1.0, 0.75, 0.5, 0.25, 0.0, 0.0])
-"""Weight of a cell of the standard range, by colour (protocol 5.2); the last weight is for an unknown colour."""
+"""Weight of a standard-range cell by its colour's index (protocol 5.2); UNKNOWN is -1 and so takes the last one."""
 EXTENDED_STEPS = ((1.0, 1.0), (0.75, 0.75), (0.5, 0.5))
-"""Minimum share of extended-range cells that are not red, and the share of the range's points that it earns; below, no points."""
+"""Minimum share of extended-range cells that are not red, and the share of the range's points earned from it on; below 0.5, none."""
 ROBUSTNESS_SHARE = 0.5
 """Share of the standard range's points from which on robustness earns points."""
 DECIMALS = 2
@@ -39,16 +39,10 @@ The calculator also intends to require CPNA at 10 km/h and 75 %, but version 5.4
 class Points:
     """Points of M vehicles.
 
-    Attributes
-    ----------
-    colours
-        Indices of `COLOURS`, shape (M, cells).
-    tests
-        By block name: points of the standard range, the extended range and robustness, shape (M, 3).
-    layers
-        By test and layer, for simulated layers only: whether the layer holds, shape (M,).
-    fails
-        Whether a required cell is not green, so that the vehicle earns nothing, shape (M,).
+    - `colours`: indices of `COLOURS`, shape (M, cells).
+    - `tests`: by matrix name the points of the standard range, the extended range and robustness, shape (M, 3).
+    - `layers`: by test and layer, for simulated layers only, whether the layer holds, shape (M,).
+    - `fails`: whether a required cell is not green, so that the vehicle earns nothing, shape (M,).
     """
 
     colours: npt.NDArray[np.int8]
@@ -73,7 +67,11 @@ def round_half_up(values: FloatArray, decimals: int) -> FloatArray:
 
 
 class _Columns(NamedTuple):
-    """Columns of the cells, grouped by the rules that apply to them."""
+    """Columns of the arrays of cells, grouped by the rules that apply to the cells.
+
+    - `bands`: columns whose colours begin at the same values, with each colour's index and start, and whether the warning is rated.
+    - `nominal_cells`: for every cell the matrix cell that it varies, or itself. `ranges`: by matrix name and range.
+    """
 
     bands: Sequence[tuple[npt.NDArray[np.intp], Sequence[tuple[int, float]], bool]]
     nominal_cells: npt.NDArray[np.intp]
@@ -87,28 +85,29 @@ def _columns_of(protocol: Protocol) -> _Columns:
     cells = protocol.cells
     numbers_by_measure: dict[tuple[str, str], list[int]] = {}
     for number, cell in enumerate(cells):
-        slowest = str(int(min(cell.vut, max(float(speed) for speed in protocol.mitigation))))
-        numbers_by_measure.setdefault((cell.judged, slowest if cell.judged == "mitigation" else ""), []).append(number)
+        listed_speed = str(int(min(cell.vut_speed, max(float(speed) for speed in protocol.starts_by_vut_speed))))
+        numbers_by_measure.setdefault((cell.judged_by, listed_speed if cell.judged_by == MITIGATION else ""), []).append(number)
     bands = []
-    for (judged, speed), numbers in numbers_by_measure.items():
-        starts = protocol.mitigation[speed] if speed else protocol.criteria[judged]
-        bands.append((np.array(numbers), [(COLOURS.index(name), start) for name, start in starts.items()], judged == WARNING))
+    for (judged_by, speed), numbers in numbers_by_measure.items():
+        starts = protocol.starts_by_vut_speed[speed] if speed else protocol.starts_by_measure[judged_by]
+        bands.append((np.array(numbers), [(COLOURS.index(name), start) for name, start in starts.items()], judged_by == WARNING))
 
     def cells_where(condition: object) -> npt.NDArray[np.intp]:
         return np.array([number for number, cell in enumerate(cells) if condition(cell)], dtype=np.intp)  # type: ignore[operator]
 
-    ranges = {(block.name, name): cells_where(lambda cell, b=block, n=name: cell.block is b and cell.range == n)
-              for block in protocol.blocks for name in (STANDARD, EXTENDED)}
-    variations = [(layer, condition.criterion, cells_where(lambda cell, varied_by=layer, c=condition: cell.block.test == varied_by.test
-                                                          and cell.range == varied_by.layer and cell.condition == c.condition))
+    ranges = {(matrix.name, name): cells_where(lambda cell, b=matrix, n=name: cell.matrix is b and cell.range_or_layer == n)
+              for matrix in protocol.matrices for name in (STANDARD, EXTENDED)}
+    variations = [(layer, condition.criterion, cells_where(lambda cell, key=(layer.test_name, layer.name, condition.text): (
+        cell.matrix.test_name, cell.range_or_layer, cell.condition) == key))
               for layer in protocol.layers for condition in layer.simulated_conditions]
-    nominal_cells = np.array([protocol.matrix_cell_numbers[cell.block.name, cell.row, cell.column] for cell in cells])
-    required_cells = cells_where(lambda cell: cell.block.test == REQUIRED_TEST and cell.range == STANDARD and cell.vut <= REQUIRED_SPEED)
+    nominal_cells = np.array([protocol.matrix_cell_numbers[cell.matrix.name, cell.row, cell.column] for cell in cells])
+    required_cells = cells_where(
+        lambda cell: cell.matrix.test_name == REQUIRED_TEST and cell.range_or_layer == STANDARD and cell.vut_speed <= REQUIRED_SPEED)
     return _Columns(bands, nominal_cells, ranges, variations, required_cells)
 
 
 def colours_of(protocol: Protocol, results: CellResults) -> npt.NDArray[np.int8]:
-    """The colour of every cell, shape (M, cells); at a bound between two colours, an impact has the worse and a warning the better one."""
+    """The colour of every cell, shape (M, cells); a value at which two colours meet makes an impact the worse one, a warning the better."""
     colours = np.full(results.impact.shape, UNKNOWN, dtype=np.int8)
     impact = round_half_up(np.maximum(np.nan_to_num(results.impact, nan=0.0), 0.0), DECIMALS)
     warning = round_half_up(np.nan_to_num(results.warning, nan=-1.0), DECIMALS)
@@ -122,38 +121,38 @@ def colours_of(protocol: Protocol, results: CellResults) -> npt.NDArray[np.int8]
 
 
 def points_of(protocol: Protocol, results: CellResults, claims: Mapping[str, Sequence[str]] | None = None) -> Points:
-    """Points of M vehicles; `claims` are, by test, layers that are not simulated and count as if they held."""
+    """Points of M vehicles; `claims` lists, for each test, layers that are not simulated and count as if they held."""
     colours, columns = colours_of(protocol, results), _columns_of(protocol)
     layers = _which_layers_hold(protocol, colours)
     fails = (colours[:, columns.required_cells] != GREEN).any(axis=1)
     tests = {}
-    for test, blocks in protocol.tests.items():
-        shares = _layer_share(protocol, test, layers, (claims or {}).get(test, ()), len(colours))
-        for block in blocks:
-            points = np.stack([*_range_points(block, colours, columns), shares * block.points[2]], axis=1)
-            points[:, 2] = np.where(_rounded_share(points[:, 0]) >= _rounded_share(ROBUSTNESS_SHARE * block.points[0]), points[:, 2], 0.0)
-            tests[block.name] = np.where(fails[:, np.newaxis], 0.0, points)
+    for test, matrices in protocol.tests.items():
+        shares = _layer_share(protocol, test, layers, claimed=(claims or {}).get(test, ()), m=len(colours))
+        for matrix in matrices:
+            points = np.stack([*_range_points(matrix, colours, columns), shares * matrix.points[2]], axis=1)
+            points[:, 2] = np.where(_rounded_share(points[:, 0]) >= _rounded_share(ROBUSTNESS_SHARE * matrix.points[0]), points[:, 2], 0.0)
+            tests[matrix.name] = np.where(fails[:, np.newaxis], 0.0, points)
     return Points(colours=colours, tests=tests, layers=layers, fails=fails)
 
 
-def _range_points(block: Block, colours: npt.NDArray[np.int8], columns: _Columns) -> tuple[FloatArray, FloatArray]:
+def _range_points(matrix: CellMatrix, colours: npt.NDArray[np.int8], columns: _Columns) -> tuple[FloatArray, FloatArray]:
     """Points of the standard range and of the extended range, shape (M,) each."""
-    weights = WEIGHTS[colours[:, columns.ranges[block.name, STANDARD]]]
+    weights = WEIGHTS[colours[:, columns.ranges[matrix.name, STANDARD]]]
     total = np.zeros(len(colours))
     for column in range(weights.shape[1]):  # column by column: the order of numpy's own sum depends on the shape
         total = total + weights[:, column]
-    extended = colours[:, columns.ranges[block.name, EXTENDED]]
+    extended = colours[:, columns.ranges[matrix.name, EXTENDED]]
     share = np.count_nonzero((extended != RED) & (extended != UNKNOWN), axis=1) / extended.shape[1]
-    share_points = _rounded_share(share * block.points[1])
+    share_points = _rounded_share(share * matrix.points[1])
     earned_points = np.zeros(len(colours))
     for minimum, earned_share in reversed(EXTENDED_STEPS):
-        earned_points = np.where(share_points >= _rounded_share(np.array(minimum * block.points[1])), earned_share * block.points[1],
+        earned_points = np.where(share_points >= _rounded_share(np.array(minimum * matrix.points[1])), earned_share * matrix.points[1],
                                  earned_points)
-    return total / weights.shape[1] * block.points[0], earned_points
+    return total / weights.shape[1] * matrix.points[0], earned_points
 
 
 def _which_layers_hold(protocol: Protocol, colours: npt.NDArray[np.int8]) -> dict[tuple[str, str], BoolArray]:
-    """Whether simulated layers hold: all standard-range cells that are not red, at least one, pass in every variation; shape (M,) each."""
+    """Whether simulated layers hold, shape (M,) each: some standard-range cell is not red, and every such cell passes in all variations."""
     columns = _columns_of(protocol)
     holds: dict[tuple[str, str], BoolArray] = {}
     for layer, criterion, numbers in columns.variations:
@@ -162,7 +161,7 @@ def _which_layers_hold(protocol: Protocol, colours: npt.NDArray[np.int8]) -> dic
         assert criterion in (NOT_RED, NO_WORSE)
         passes = (varied != UNKNOWN) & ((varied != RED) if criterion == NOT_RED else (varied <= nominal))
         condition_holds = (passes | ~is_counted).all(axis=1) & is_counted.any(axis=1)
-        key = (layer.test, layer.layer)
+        key = (layer.test_name, layer.name)
         holds[key] = condition_holds & holds[key] if key in holds else condition_holds
     return holds
 
@@ -171,7 +170,7 @@ def _layer_share(protocol: Protocol, test: str, layers: Mapping[tuple[str, str],
     """Share of a test's layers that hold or are claimed, for M = `m` vehicles; shape (M,)."""
     test_layers, count = protocol.layers_of(test), np.zeros(m)
     for layer in test_layers:
-        count = count + layers.get((test, layer.layer), np.full(m, layer.layer in claimed))
+        count = count + layers.get((test, layer.name), np.full(m, layer.name in claimed))
     return np.asarray(count / len(test_layers))
 
 

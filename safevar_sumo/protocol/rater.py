@@ -1,4 +1,4 @@
-"""Turns the matrix of a protocol into tests to simulate, and rates the simulated vehicles."""
+"""Turns the cells of a protocol into tests to simulate, and rates the simulated vehicles."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from safevar_sumo.study import OBJECTIVES, MatrixTable, MatrixTest, RatingTable,
 SHARED_PARAMETERS = ("vut_length", "vut_width", "grade")
 """Parameters of a study's scenario that apply to every cell."""
 SUMO_CELLS = 8
-"""Number of a protocol's cells that a check simulates in SUMO: all cells would take hours."""
+"""Number of a protocol's cells that a check in SUMO simulates: all cells would take hours."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,7 +48,7 @@ def is_rated(study: Study) -> bool:
 
 
 def with_protocol(study: Study, protocol: str) -> Study:
-    """The study with the matrix of a protocol; a rated study as it is."""
+    """The study with the matrix of a protocol; a study that is rated already stays unchanged."""
     return study if is_rated(study) else replace(study, matrix=MatrixTable(protocol=protocol))  # type: ignore[arg-type]
 
 
@@ -67,12 +67,12 @@ def rater_of(study: Study, source: str) -> Rater | None:
         key = f"rating.claims.{test}"
         if test not in protocol.tests:
             raise unknown_name(source, f"{key}: there is no such test, or it is not simulated", test, protocol.tests)
-        is_simulated = {layer.layer: bool(layer.simulated_conditions) for layer in protocol.layers_of(test)}
-        for layer in layers:
-            if layer not in is_simulated:
-                raise unknown_name(source, f"{key}: {layer!r} does not count for {test}", layer, is_simulated)
-            if is_simulated[layer]:
-                raise InputError(source, f"{key}: {layer!r} is simulated for {test} and cannot be claimed",
+        is_simulated = {layer.name: bool(layer.simulated_conditions) for layer in protocol.layers_of(test)}
+        for claimed in layers:
+            if claimed not in is_simulated:
+                raise unknown_name(source, f"{key}: {claimed!r} does not count for {test}", claimed, is_simulated)
+            if is_simulated[claimed]:
+                raise InputError(source, f"{key}: {claimed!r} is simulated for {test} and cannot be claimed",
                                  "one of " + ", ".join(name for name in is_simulated if not is_simulated[name]))
     return Rater(protocol=protocol, claims=study.rating.claims)
 

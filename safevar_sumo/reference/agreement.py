@@ -33,7 +33,7 @@ SCATTER_WIDTH = 2.0
 
 @dataclass(frozen=True, kw_only=True)
 class Agreement:
-    """Comparison of simulated values with reference values; None if there are no values to compare.
+    """Comparison of values simulated by this package ("here") with reference values; None if there are no values to compare.
 
     Attributes
     ----------
@@ -41,7 +41,7 @@ class Agreement:
         Number of settings.
     spearman, mean_absolute_error, bias
         By metric: rank correlation; mean |here - reference|; mean here - reference, both in the unit of the metric.
-        TET and TIT are compared over settings without a collision on either side.
+        TET and TIT are compared over settings that collide neither here nor in the reference.
     collisions
         Number of settings that collide in the reference, here, and in both.
     original
@@ -79,16 +79,16 @@ class Agreement:
 
 def measure_agreement(reference: ReferenceData, evaluations: Evaluations, study: Study, original: Evaluations) -> Agreement:
     """Compare evaluations of the reference's settings with the reference, row by row, and the original vehicle with the study's values."""
-    rows_of = {name: _is_defined(reference, evaluations, name) for name in reference.metrics}
-    differences = {name: evaluations.metrics[name][rows] - reference.metrics[name][rows] for name, rows in rows_of.items()}
+    defined_rows = {name: _is_defined(reference, evaluations, name) for name in reference.metrics}
+    differences = {name: evaluations.metrics[name][rows] - reference.metrics[name][rows] for name, rows in defined_rows.items()}
     errors = {name: _mean(np.abs(values)) for name, values in differences.items()}
-    collide = reference.collided & evaluations.collided
+    both_collide = reference.collided & evaluations.collided
     counts = {"reference": int(np.count_nonzero(reference.collided)), "here": int(np.count_nonzero(evaluations.collided)),
-              "both": int(np.count_nonzero(collide))}
+              "both": int(np.count_nonzero(both_collide))}
     return Agreement(
         rows=len(evaluations),
         spearman={name: rank_correlation(reference.metrics[name][rows], evaluations.metrics[name][rows])
-                  for name, rows in rows_of.items()},
+                  for name, rows in defined_rows.items()},
         mean_absolute_error=errors,
         bias={name: _mean(values) for name, values in differences.items()},
         collisions=counts,
@@ -96,8 +96,8 @@ def measure_agreement(reference: ReferenceData, evaluations: Evaluations, study:
                   for name, values in original.metrics.items()},
         precision=counts["both"] / counts["here"] if counts["here"] else None,
         recall=counts["both"] / counts["reference"] if counts["reference"] else None,
-        collision_speed={"reference": _mean(-reference.metrics[SAFETY_DEGREE][collide]),
-                         "here": _mean(evaluations.collision_speed[collide])},
+        collision_speed={"reference": _mean(-reference.metrics[SAFETY_DEGREE][both_collide]),
+                         "here": _mean(evaluations.collision_speed[both_collide])},
         in_repeats={name: _error_in_repeats(error, study.repeatability.get(name)) for name, error in errors.items()},
         undecided=_count_undecided(reference, evaluations, study.repeatability.get(SAFETY_DEGREE)),
         by_predicted=_error_by_bin(evaluations.f_safe, evaluations.f_safe - reference.metrics[SAFETY_DEGREE]))
@@ -163,9 +163,10 @@ def plot_agreement(path: Path, title: str, characteristics: CharacteristicSet, r
     InputError
         If the file cannot be written or its ending names no picture format.
     """
-    columns = 4
-    rows = 2 + -(-len(characteristics) // columns)
-    figure, axes = new_figure(title, rows, columns, (12, 2.4 * rows + 0.8), gridspec_kw={"height_ratios": [1.5] + [1] * (rows - 1)})
+    axes_per_row = 4
+    axes_rows = 2 + -(-len(characteristics) // axes_per_row)
+    figure, axes = new_figure(title, axes_rows, axes_per_row, (12, 2.4 * axes_rows + 0.8),
+                              gridspec_kw={"height_ratios": [1.5] + [1] * (axes_rows - 1)})
     undecided = np.zeros(len(evaluations), dtype=bool) if repeatability is None else may_be_scatter(reference, evaluations, repeatability)
     for axis, error_axis, metric in zip(axes[0], axes[1], reference.metrics, strict=False):
         _draw_scatter(axis, metric, reference, evaluations, undecided)
@@ -178,15 +179,15 @@ def plot_agreement(path: Path, title: str, characteristics: CharacteristicSet, r
         if i >= len(characteristics):
             axis.set_axis_off()
             continue
-        lowest_here, highest_here = _draw_error(axis, evaluations.settings[:, i], error)
-        lowest.append(lowest_here)
-        highest.append(highest_here)
+        lowest_on_axis, highest_on_axis = _draw_error(axis, evaluations.settings[:, i], error)
+        lowest.append(lowest_on_axis)
+        highest.append(highest_on_axis)
         characteristic = characteristics.members[i]
         axis.set_xlabel(characteristic.name + ("" if characteristic.unit == "-" else f" [{as_formula(characteristic.unit)}]"))
     margin = 0.1 * (max(highest) - min(lowest)) + 1e-6
     for i, axis in enumerate(axes[2:].flat):
         axis.set_ylim(min(lowest) - margin, max(highest) + margin)
-        if i % columns == 0:
+        if i % axes_per_row == 0:
             axis.set_ylabel("error of SD")
     save(figure, path, "plot")
 

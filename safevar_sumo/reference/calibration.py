@@ -30,7 +30,7 @@ START_DEVIATION = 0.02
 """Initial standard deviation of a search that begins at known values, as a share of the bounds' width."""
 POPULATION_DIVISOR = 3
 """Factor by which the population of a search from known values is smaller: the search adapts once a generation, and need not explore."""
-STAGES = (64, 16)
+STAGE_PERCENTAGES = (64, 16)
 """Percentages of the trials of a fit from scratch: for the first study, then for parameters of the other studies; the rest fit all."""
 ERROR_DECIMALS = 3
 """Decimals of a study's model error [m]."""
@@ -51,7 +51,7 @@ def calibrate(study: Study, references: Mapping[str, ReferenceData], pool: Pool,
 
 def calibrate_together(subjects: Sequence[FitSubject], pool: Pool, done: Callable[[float, StudyGroup], None] = lambda loss, best: None, *,
                        from_scratch: bool = False) -> list[Calibration]:
-    """Fit studies by CMA-ES (Hansen 2016), as their tables [fit] say; the first study sets trials, seed, starts and population.
+    """Fit studies by CMA-ES (Hansen 2016), as their tables [fit] state; the first study's table sets trials, seed, starts and population.
 
     Parameters
     ----------
@@ -93,29 +93,31 @@ def calibrate_together(subjects: Sequence[FitSubject], pool: Pool, done: Callabl
     searches = [] if has_stages else race.begin_at_random_places(_first_indices(parameters), fit.starts, fit.screened, fit.width, rng)
     if has_stages or not from_scratch:
         population = _refining_population(fit.population, len(parameters))
-        searches.append(race.begin(space.place_of(start_studies), START_DEVIATION, fit.seed + 1, population))
+        searches.append(race.begin(space.place_of(start_studies), START_DEVIATION, seed=fit.seed + 1, population=population))
     race.run(searches)
     assert race.best is not None, "there is at least one trial"
-    lowest_losses, results = [search.lowest for search in searches if search.lowest < np.inf], []
+    lowest_losses, results = [search.lowest_loss for search in searches if search.lowest_loss < np.inf], []
     profiles = Profiles.of(parameters, space, race, space.place_of(race.best))
     for k, best_study in enumerate(race.best):
-        study_parameters = [parameter for parameter in parameters if k in parameter.studies]
+        study_parameters = [parameter for parameter in parameters if k in parameter.study_indices]
         best = msgspec.structs.replace(best_study, spread=profiles.spread(k))
         error = {SAFETY_DEGREE: round(error_beyond_spread(best, fit_data[k]), ERROR_DECIMALS)} if fit_data[k] else {}
         best = msgspec.structs.replace(best, model_error=error)
         results.append(Calibration(
-            {parameter.key: value_of(best, parameter.key) for parameter in study_parameters}, best, race.loss, lowest_losses,
-            _measure_agreements(best, fit_data[k], pool), _measure_agreements(best, test_data[k], pool),
-            {parameter.key: parameter.bounds for parameter in study_parameters}, fit,
-            tuple(study.name for study in studies if study is not studies[k]),
-            frozenset(parameter.key for parameter in study_parameters if len(parameter.studies) > 1),
-            {parameter.key: profiles.interval(i) for i, parameter in enumerate(parameters) if k in parameter.studies}, profiles))
+            values={parameter.key: value_of(best, parameter.key) for parameter in study_parameters}, study=best, loss=race.lowest_loss,
+            reached=lowest_losses, used=_measure_agreements(best, fit_data[k], pool),
+            held_back=_measure_agreements(best, test_data[k], pool),
+            bounds={parameter.key: parameter.bounds for parameter in study_parameters}, search=fit,
+            together=tuple(study.name for study in studies if study is not studies[k]),
+            shared=frozenset(parameter.key for parameter in study_parameters if len(parameter.study_indices) > 1),
+            intervals={parameter.key: profiles.interval(i) for i, parameter in enumerate(parameters) if k in parameter.study_indices},
+            profiles=profiles))
     return results
 
 
-def _refining_population(population: int, parameters: int) -> int:
+def _refining_population(population: int, parameter_count: int) -> int:
     """A population `POPULATION_DIVISOR` times smaller, but at least the default population of CMA-ES (Hansen 2016)."""
-    return min(population, max(population // POPULATION_DIVISOR, 4 + int(3 * math.log(parameters))))
+    return min(population, max(population // POPULATION_DIVISOR, 4 + int(3 * math.log(parameter_count))))
 
 
 def _first_indices(parameters: Sequence[FittedParameter]) -> list[int]:
@@ -129,10 +131,10 @@ def _fit_in_stages(subjects: Sequence[FitSubject], parameters: Sequence[FittedPa
     """Fit the first study from random places, then the parameters of other studies, on thinned rows; also returns the trials left."""
     studies = tuple(subject.study for subject in subjects)
     fit, trials_left = studies[0].fit, studies[0].fit.trials
-    first_parameters = [parameter._replace(studies=(0,)) for parameter in parameters if 0 in parameter.studies]
-    other_parameters = [parameter._replace(studies=tuple(k - 1 for k in parameter.studies))
-                        for parameter in parameters if 0 not in parameter.studies]
-    stages = zip((first_parameters, other_parameters), ([0], list(range(1, len(studies)))), STAGES, strict=True)
+    first_parameters = [parameter._replace(study_indices=(0,)) for parameter in parameters if 0 in parameter.study_indices]
+    other_parameters = [parameter._replace(study_indices=tuple(k - 1 for k in parameter.study_indices))
+                        for parameter in parameters if 0 not in parameter.study_indices]
+    stages = zip((first_parameters, other_parameters), ([0], list(range(1, len(studies)))), STAGE_PERCENTAGES, strict=True)
     for stage_parameters, indices, percentage in stages:
         trials = fit.trials * percentage // 100
         if stage_parameters and trials:
@@ -142,8 +144,8 @@ def _fit_in_stages(subjects: Sequence[FitSubject], parameters: Sequence[FittedPa
             race.run(race.begin_at_random_places(_first_indices(stage_parameters), fit.starts, fit.screened, fit.width, rng))
             assert race.best is not None, "there is at least one trial"
             studies, trials_left = _with_replacements(studies, indices, race.best), trials_left - trials
-            values = [(parameter, value_of(studies[0], parameter.key)) for parameter in parameters if 0 in parameter.studies]
-            studies = tuple(with_values(study, {parameter.key: value for parameter, value in values if k in parameter.studies})
+            values = [(parameter, value_of(studies[0], parameter.key)) for parameter in parameters if 0 in parameter.study_indices]
+            studies = tuple(with_values(study, {parameter.key: value for parameter, value in values if k in parameter.study_indices})
                             for k, study in enumerate(studies))
     return studies, trials_left
 

@@ -52,17 +52,18 @@ def pair_cases(here: Sequence[Case], published: Sequence[Case]) -> Pairs:
     InputError
         If one side has two results of a study, or no study has results on both sides.
     """
-    by_study, published_by_study = _index_by_study(here, "directories"), _index_by_study(published, "published")
-    common_names = [name for name in by_study if name in published_by_study]
+    here_by_study, published_by_study = _index_by_study(here, "directories"), _index_by_study(published, "published")
+    common_names = [name for name in here_by_study if name in published_by_study]
     if not common_names:
-        raise InputError("published", f"has {', '.join(published_by_study)} and none of {', '.join(by_study)}",
-                         "imported results of a study that DIR has results of (command import)")
+        raise InputError("published", f"has {', '.join(published_by_study)} and none of {', '.join(here_by_study)}",
+                         "published results of a study in DIR (the command `import` makes them)")
     for name in common_names:
-        vehicle, published_vehicle = by_study[name].characteristics, published_by_study[name].characteristics
+        vehicle, published_vehicle = here_by_study[name].characteristics, published_by_study[name].characteristics
         if vehicle.names != published_vehicle.names or not np.array_equal(vehicle.original, published_vehicle.original):
             raise InputError("published", f"{name} has another vehicle in the published results", "results of the same study")
-    return Pairs([by_study[name] for name in common_names], [published_by_study[name] for name in common_names],
-                 [name for name in by_study if name not in common_names], [name for name in published_by_study if name not in common_names])
+    return Pairs([here_by_study[name] for name in common_names], [published_by_study[name] for name in common_names],
+                 [name for name in here_by_study if name not in common_names],
+                 [name for name in published_by_study if name not in common_names])
 
 
 def _index_by_study(cases: Sequence[Case], argument: str) -> dict[str, Case]:
@@ -130,13 +131,13 @@ MIN_RHO, MIN_RHO_IN_DIRECTION = 0.7, 0.4
 MAX_FACTOR = 1.5
 """Largest factor between two shares, or two means, that count as equal."""
 MIN_SHARE, MIN_SHARE_IN_DIRECTION = 0.8, 0.6
-"""Least share of characteristics that lean to the same direction, for directions to hold, and to hold in direction."""
+"""Least share of characteristics that lean to the published direction, for directions to hold, and to hold in direction."""
 MIN_LEAN = 0.2
 """Least difference between the shares of increases and decreases for a characteristic to lean to one direction."""
 RULES = (
-    f"Tests (RQ1, RQ2): *{HOLDS}* if both are significant (p < {ALPHA:g}) or neither is, both effect sizes are of the same magnitude "
-    f"(Kitchenham's negligible, small, medium, large) and, where they are significant and not negligible, on the same side of 0.5; "
-    f"*{IN_DIRECTION}* if they only lie on the same side of 0.5; else *{DIFFERS}*.",
+    f"Tests (RQ1, RQ2): *{HOLDS}* if both are significant (p < {ALPHA:g}) or neither is, if both effect sizes are of the same magnitude "
+    "(Kitchenham's negligible, small, medium, large), and if they lie on the same side of 0.5 unless they are negligible or not "
+    f"significant; else *{IN_DIRECTION}* if they lie on the same side of 0.5; else *{DIFFERS}*.",
     f"Numbers of changes (RQ3.1): *{HOLDS}* if the most frequent number is the same, *{IN_DIRECTION}* if the means differ by at most 1.",
     f"Orders (RQ3.2, weather): *{HOLDS}* from a rank correlation of {MIN_RHO:g}, *{IN_DIRECTION}* from {MIN_RHO_IN_DIRECTION:g}.",
     f"Directions of changes (RQ3.3): *{HOLDS}* if at least {100 * MIN_SHARE:.0f} % of the characteristics that lean to one direction "
@@ -290,9 +291,10 @@ def _float_or_none(value: object) -> float | None:
 
 
 TABLE_READERS: Mapping[str, TableReader] = {
-    "rq1": _make_test_reader("RQ1", "algorithm", "safer than the original vehicle", "more unsafe than the original vehicle"),
-    "rq2": _make_test_reader("RQ2", "baseline", "NSGA-II does better", "NSGA-II does worse"),
+    "rq1": _make_test_reader("RQ1", "algorithm", if_larger="safer than the original vehicle",
+                             if_smaller="more unsafe than the original vehicle"),
+    "rq2": _make_test_reader("RQ2", "baseline", if_larger="NSGA-II does better", if_smaller="NSGA-II does worse"),
     "rq3.1": _read_change_numbers, "rq3.2": _read_orders, "rq3.3": _read_directions,
-    "rq3.3-safety": _make_ratio_reader("RQ3.3", "quantity", "value", "mean change of safety in critical solutions"),
-    "collisions": _make_ratio_reader("collisions", "algorithm", "share", "share of the solutions that collide"),
+    "rq3.3-safety": _make_ratio_reader("RQ3.3", "quantity", value_column="value", value_name="mean change of safety in critical solutions"),
+    "collisions": _make_ratio_reader("collisions", "algorithm", value_column="share", value_name="share of the solutions that collide"),
     "combinations": _read_combinations, "weather": _read_weathers}

@@ -1,4 +1,4 @@
-"""Effects of characteristics on the safety degree, in a reference and here; and the share of rows within the model's uncertainty."""
+"""Effects of characteristics on the safety degree, in a reference and here, and the share of rows within the model's uncertainty."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ class Coverage(NamedTuple):
     def __str__(self) -> str:
         return (f"The {BAND_SHARE:.0%} band of {self.sets} parameter sets, of repeats and of the model's error is {self.width:.2f} m wide "
                 f"(median) and covers {self.all_rows:.0%} of {self.rows} rows, {self.held_back:.0%} of the rows held back; "
-                f"{self.needed:.2f} m more on each side would cover {BAND_SHARE:.0%} of the latter.")
+                f"{self.needed:.2f} m more on each side would cover {BAND_SHARE:.0%} of the rows held back.")
 
 
 def measure_coverage(data: ReferenceData, study: Study) -> Coverage:
@@ -115,9 +115,10 @@ def measure_coverage(data: ReferenceData, study: Study) -> Coverage:
     published = data.metrics[SAFETY_DEGREE]
     distances = _distance_from_band(published, lower, upper)
     held_back = np.arange(len(published)) % study.fit.hold_out == study.fit.hold_out - 1
-    rows = held_back if held_back.any() else np.ones(len(published), dtype=bool)
-    return Coverage(len(evaluations), len(published), float(np.mean(distances == 0)), float(np.mean(distances[rows] == 0)),
-                    float(np.median(upper - lower)), float(np.quantile(distances[rows], BAND_SHARE)))
+    new_rows = held_back if held_back.any() else np.ones(len(published), dtype=bool)
+    return Coverage(sets=len(evaluations), rows=len(published), all_rows=float(np.mean(distances == 0)),
+                    held_back=float(np.mean(distances[new_rows] == 0)), width=float(np.median(upper - lower)),
+                    needed=float(np.quantile(distances[new_rows], BAND_SHARE)))
 
 
 def _distance_from_band(values: FloatArray, lower: FloatArray, upper: FloatArray) -> FloatArray:

@@ -54,8 +54,8 @@ class Calibration(NamedTuple):
     def comment(self, study: Study, references: Mapping[str, ReferenceData], *, from_scratch: bool) -> str:
         """The fit in words: search, data with fingerprints, shared parameters, loss, agreement, and values on a bound."""
         fit = self.search
-        start = "its own values" + (f" and {fit.starts} random places" if fit.starts else "")
-        start = "random places only" if from_scratch else start
+        random_starts = f" and {fit.starts} random places" if fit.starts else ""
+        start = "random places only" if from_scratch else f"its own values{random_starts}"
         agreement_lines = [
             f"  {name}: rho of the safety degree {_rho_text(used)} on the rows used, {_rho_text(self.held_back[name])} on those held back"
             for name, used in self.used.items()]
@@ -75,8 +75,8 @@ def _format_ordinal(number: int) -> str:
 
 
 def _describe_data(name: str, data: ReferenceData) -> str:
-    without = f", without {data.skipped} rows outside the domains" if data.skipped else ""
-    return f"  {name}, SHA-256 {data.fingerprint}{without}"
+    skipped_rows = f", without {data.skipped} rows outside the domains" if data.skipped else ""
+    return f"  {name}, SHA-256 {data.fingerprint}{skipped_rows}"
 
 
 def _rho_text(result: Agreement) -> str:

@@ -46,12 +46,12 @@ class FitSpace:
         values = self.values(place).tolist()
         return tuple(
             with_values(fit.study, {parameter.key: value for parameter, value in zip(self._parameters, values, strict=True)
-                                    if k in parameter.studies})
+                                    if k in parameter.study_indices})
             for k, fit in enumerate(self._fits))
 
     def place_of(self, studies: StudyGroup) -> FloatArray:
         """The place at which the parameters have the values of the studies."""
-        values = np.array([value_of(studies[parameter.studies[0]], parameter.key) for parameter in self._parameters])
+        values = np.array([value_of(studies[parameter.study_indices[0]], parameter.key) for parameter in self._parameters])
         return np.asarray(np.clip((self._scaled(values) - self._start) / self._width, 0, 1))
 
     def losses(self, groups: Sequence[StudyGroup]) -> list[float]:

@@ -21,7 +21,7 @@ MAX_DEVIATION = 10.0
 
 
 def original_loss(original: Evaluations, published: Mapping[str, float], fit: FitTable) -> float:
-    """Mean excess of the original vehicle's deviations from the published values over the tolerance, weighted by metric.
+    """How far the original vehicle's metrics deviate from the published values beyond the tolerance; a mean, weighted by metric.
 
     Deviations within the tolerance cost nothing (Vapnik 1995): the published values come from a single simulation of the original
     vehicle, and the many rows of similar vehicles are stronger evidence.
@@ -33,16 +33,19 @@ def original_loss(original: Evaluations, published: Mapping[str, float], fit: Fi
 
 def _excess(deviation: float, tolerance: float) -> float:
     """Excess of a relative deviation over the tolerance, in units of half a tolerance; 0 within the tolerance."""
-    tolerances = min(abs(deviation) / tolerance, MAX_DEVIATION) if np.isfinite(deviation) else MAX_DEVIATION
-    return 2 * max(tolerances - 1, 0.0)
+    multiple = min(abs(deviation) / tolerance, MAX_DEVIATION) if np.isfinite(deviation) else MAX_DEVIATION
+    return 2 * max(multiple - 1, 0.0)
 
 
 class ReferenceLoss:
-    """The loss of a study in comparison with one reference.
+    """The loss of a study in comparison with one reference, the sum of:
 
-    The loss adds four parts: 1 minus the rank correlation and the mean absolute error, both weighted by metric; differences between
-    the effects of characteristics; and the share of rows that collide on one side only. The unit of errors is the standard deviation of
-    repeats of one setting in the reference or, if the study does not give it, of all values in the reference.
+    - 1 minus the rank correlation, and the mean absolute error, both weighted by metric;
+    - differences between the effects of characteristics;
+    - the share of rows that collide only in the reference, or only here.
+
+    The unit of errors is the standard deviation of repeats of one setting in the reference or, if the study does not give it, of all
+    values in the reference.
     """
 
     def __init__(self, data: ReferenceData, study: Study) -> None:
@@ -65,5 +68,5 @@ class ReferenceLoss:
                 differences = np.nan_to_num(self._regression.effects(evaluations.f_safe) - self._effects)
                 loss += fit.effects * float(np.mean(np.abs(differences))) / unit
         collisions = result.collisions
-        difference = collisions["reference"] + collisions["here"] - 2 * collisions["both"]
-        return min(loss, MAX_LOSS) + fit.collisions * difference / max(result.rows, 1)
+        one_sided = collisions["reference"] + collisions["here"] - 2 * collisions["both"]
+        return min(loss, MAX_LOSS) + fit.collisions * one_sided / max(result.rows, 1)

@@ -15,12 +15,13 @@ class FittedParameter(NamedTuple):
     """A free parameter: its key, the indices of the studies that take its value, and its bounds."""
 
     key: str
-    studies: tuple[int, ...]
+    study_indices: tuple[int, ...]
     bounds: FreeParameter
 
     def label(self, studies: Sequence[Study]) -> str:
-        """The key; if not all studies share the parameter, `STUDY, STUDY: KEY` with the names of those that do."""
-        return self.key if len(self.studies) == len(studies) else f"{', '.join(studies[k].name for k in self.studies)}: {self.key}"
+        """The key; if not all studies share the parameter, with the names of those that do: `STUDY, STUDY: KEY`."""
+        names = ", ".join(studies[k].name for k in self.study_indices)
+        return self.key if len(self.study_indices) == len(studies) else f"{names}: {self.key}"
 
 
 def free_parameters(studies: Sequence[Study]) -> list[FittedParameter]:
@@ -37,15 +38,15 @@ def free_parameters(studies: Sequence[Study]) -> list[FittedParameter]:
     parameters: list[FittedParameter] = []
     for index, study in enumerate(studies):
         for key, bounds in study.calibration.items():
-            if any(key == parameter.key and index in parameter.studies for parameter in parameters):
+            if any(key == parameter.key and index in parameter.study_indices for parameter in parameters):
                 continue
             value = value_of(study, key)
             if not bounds.lower <= value <= bounds.upper:
                 legal = f"a value in its bounds, [{bounds.lower:g}, {bounds.upper:g}]"
                 raise InputError(study.source, f"{key} = {value}", legal)
             check_bounds(study, key, bounds)
-            sharers = (k for k, other in enumerate(studies) if k > index and not bounds.own and _is_shared_by(other, key, value))
-            parameters.append(FittedParameter(key, (index, *sharers), bounds))
+            sharing_indices = (k for k, other in enumerate(studies) if k > index and not bounds.own and _is_shared_by(other, key, value))
+            parameters.append(FittedParameter(key, (index, *sharing_indices), bounds))
     return parameters
 
 
@@ -60,15 +61,15 @@ def _is_shared_by(study: Study, key: str, value: float) -> bool:
         return False
 
 
-def check_bounds(study: Study, name: str, bounds: FreeParameter) -> None:
+def check_bounds(study: Study, key: str, bounds: FreeParameter) -> None:
     """Refuse bounds if the models do not accept a value at one of their ends: the search may try both ends."""
     if bounds.log and bounds.lower <= 0:
-        raise InputError(study.source, f"calibration.{name!r} has log = true and lower = {bounds.lower:g}",
+        raise InputError(study.source, f"calibration.{key!r} has log = true and lower = {bounds.lower:g}",
                          "a lower bound above 0")
     for end in ("lower", "upper"):
         bound = getattr(bounds, end)
         try:
-            models_of(with_values(study, {name: bound}), name)
+            models_of(with_values(study, {key: bound}), key)
         except InputError as error:
             legal = error.legal or error.problem
-            raise InputError(study.source, f"calibration.{name!r}.{end} = {bound:g}", legal) from None
+            raise InputError(study.source, f"calibration.{key!r}.{end} = {bound:g}", legal) from None

@@ -49,17 +49,17 @@ class Profiles(NamedTuple):
 
     @classmethod
     def of(cls, parameters: Sequence[FittedParameter], space: ParameterSpace, race: SearchRace, best_place: FloatArray) -> Profiles:
-        """The profiles of a finished race, whose best trial was at `best_place`."""
-        limit = race.loss * (1 + race.alike)
-        trials = sorted((trial for trial in race.kept if race.loss < trial.loss), key=lambda trial: trial.loss)
-        losses = np.array([race.loss, *(trial.loss for trial in trials)])
+        """The profiles of a finished race whose best trial was at `best_place`."""
+        limit = race.lowest_loss * (1 + race.alike)
+        trials = sorted((trial for trial in race.kept if race.lowest_loss < trial.loss), key=lambda trial: trial.loss)
+        losses = np.array([race.lowest_loss, *(trial.loss for trial in trials)])
         places = np.array([best_place, *(trial.place for trial in trials)])
         return cls(parameters, losses, space.values(places), _distant_trials(places[losses <= limit]), limit)
 
     def spread(self, study: int) -> dict[str, list[float]]:
         """Values of each parameter of the study with this index, one for each of the `sets`: the table [spread]."""
         return {parameter.key: [float(f"{value:.{SIGNIFICANT_DIGITS}g}") for value in self.values[self.sets, k]]
-                for k, parameter in enumerate(self.parameters) if study in parameter.studies}
+                for k, parameter in enumerate(self.parameters) if study in parameter.study_indices}
 
     def interval(self, k: int) -> tuple[float, float]:
         """Least and greatest value of parameter k in the trials that fit as well as the best."""

@@ -30,7 +30,7 @@ from safevar_sumo.reference.conclusions import (
 from safevar_sumo.reference.rows import ReferenceData
 from safevar_sumo.study import SAFETY_DEGREE
 
-NEIGHBOURS = 5
+NEAREST_ROWS = 5
 """Number of published rows that a solution is compared with."""
 
 
@@ -59,7 +59,7 @@ def compare_with_nearest_rows(case: Case, references: Sequence[ReferenceData]) -
     width = domains.upper - domains.lower
     scaled_rows = np.concatenate([data.settings for data in references]) / width
     safety = np.concatenate([data.metrics[SAFETY_DEGREE] for data in references])
-    tree, count = scipy.spatial.cKDTree(scaled_rows), min(NEIGHBOURS, len(scaled_rows))
+    tree, count = scipy.spatial.cKDTree(scaled_rows), min(NEAREST_ROWS, len(scaled_rows))
     published_distances = tree.query(scaled_rows, count + 1)[0][:, 1:] if len(scaled_rows) > count else np.full((1, 1), np.nan)
     results = []
     for algorithm in case.algorithms:
@@ -70,9 +70,10 @@ def compare_with_nearest_rows(case: Case, references: Sequence[ReferenceData]) -
         distances, nearest_rows = (np.reshape(array, (len(scaled_solutions), count)) for array in tree.query(scaled_solutions, count))
         is_collision = are_collisions(solutions).to_numpy()
         results.append(Nearness(
-            case.name, algorithm, len(solutions), float(np.median(distances)), float(np.median(published_distances)),
-            float(np.nanmean(solutions[SAFETY_DEGREE])), float(safety[nearest_rows].mean()), int(is_collision.sum()),
-            float((safety[nearest_rows[is_collision]] <= 0).mean()) if is_collision.any() else None))
+            setting=case.name, algorithm=algorithm, solutions=len(solutions), distance=float(np.median(distances)),
+            distance_published=float(np.median(published_distances)), safety_here=float(np.nanmean(solutions[SAFETY_DEGREE])),
+            safety_published=float(safety[nearest_rows].mean()), collisions=int(is_collision.sum()),
+            also_collide=float((safety[nearest_rows[is_collision]] <= 0).mean()) if is_collision.any() else None))
     return results
 
 
@@ -92,7 +93,7 @@ def render_replication(pairs: Pairs, comparisons: Sequence[Nearness]) -> str:
     sections = [_render_head(pairs, conclusions), _render_conclusions(conclusions)]
     if comparisons:
         sections.append(_render_nearest_rows(comparisons))
-    return "\n".join([*sections, "## Cell beside cell\n", *(_render_table(table) for table in tables)])
+    return "\n".join([*sections, "## Tables side by side\n", *(_render_table(table) for table in tables)])
 
 
 def _render_head(pairs: Pairs, conclusions: Sequence[Conclusion]) -> str:
@@ -105,8 +106,8 @@ def _render_head(pairs: Pairs, conclusions: Sequence[Conclusion]) -> str:
     lines += [f"- {name}: results here, none published given." for name in pairs.only_here]
     lines += [f"- {name}: published results given, none here." for name in pairs.only_published]
     for case, published_case in zip(pairs.here, pairs.published, strict=True):
-        for side, full_case, other_case in ((PUBLISHED, case, published_case), (HERE, published_case, case)):
-            for name in [name for name in full_case.algorithms if name not in other_case.algorithms]:
+        for side, case_with_solutions, other_case in ((PUBLISHED, case, published_case), (HERE, published_case, case)):
+            for name in [name for name in case_with_solutions.algorithms if name not in other_case.algorithms]:
                 effect = "; RQ2, RQ3 and the weathers need them and are not compared" if name == NSGA2 else ""
                 lines.append(f"- {case.study.name}: no solutions of {name} {side}{effect}.")
     lines += [f"- {note}" for case in pairs.here for note in case.remarks]
@@ -130,7 +131,7 @@ def _render_nearest_rows(comparisons: Sequence[Nearness]) -> str:
              "mean SD published", "collisions here", "published rows next to them that collide [%]")
     return "\n".join([
         "## Does the search exploit the model?", "",
-        f"Each solution beside its {NEIGHBOURS} nearest published rows; distances are medians, in widths of the domains. If the search "
+        f"Each solution beside its {NEAREST_ROWS} nearest published rows; distances are medians, in widths of the domains. If the search "
         "found holes in the model, the published rows next to its solutions would be as safe as others.", "",
         _markdown_table(headings, rows), ""])
 
@@ -141,7 +142,7 @@ def _render_table(table: ComparedTable) -> str:
         keys = [column for column in table.frame if column not in _column_names(table.quantities)]
         headings = [*map(str, keys), *(f"{name} {HERE} / {PUBLISHED}" for name in table.quantities)]
         rows = [(*(row[key] for key in keys),
-                 *(" / ".join(_cell(row[f"{name} {side}"]) for side in COMPARED_SIDES) for name in table.quantities))
+                 *(" / ".join(_cell_text(row[f"{name} {side}"]) for side in COMPARED_SIDES) for name in table.quantities))
                 for row in table.frame.to_dict("records")]
         lines += [_markdown_table(headings, rows), ""]
     return "\n".join([*lines, *(f"{note}  " for note in table.notes), ""])
@@ -153,10 +154,10 @@ def _column_names(quantities: Iterable[str]) -> set[str]:
 
 def _markdown_table(headings: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
     lines = [headings, [":---"] * len(headings), *rows]
-    return "\n".join(f"| {' | '.join(_cell(cell) for cell in line)} |" for line in lines)
+    return "\n".join(f"| {' | '.join(_cell_text(cell) for cell in line)} |" for line in lines)
 
 
-def _cell(value: object) -> str:
+def _cell_text(value: object) -> str:
     if value is None or (isinstance(value, float) and pd.isna(value)):
         return "-"
     return f"{value:.3g}" if isinstance(value, float) else str(value).replace("|", r"\|").replace("\n", " ")

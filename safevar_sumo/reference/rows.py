@@ -30,9 +30,9 @@ RANGES = {SAFETY_DEGREE: (-300.0, 1e4), "tet": (0.0, 1e4), "tit": (0.0, 1e5), "a
 """Accepted values, wider than those of any road vehicle: m or -m/s; s; s^2; m/s^2 of either sign."""
 OPTIONAL_METRIC = "ave_dece"
 ALIASES = {"dampratezeroce": "dampratezerotce", "dampratezerocd": "dampratezerotcd", "wheelradius": "radius"}
-"""Names of characteristics in the files of the package -> names in its paper; in lower case, without underscores."""
+"""Names of characteristics in the files of the published package -> names in its paper; in lower case, without underscores."""
 SHARE_DECIMALS = 3
-"""Decimals to which the package rounds the ratio of change to domain width before it compares the ratio with beta."""
+"""Decimals to which the published package rounds the ratio of change to domain width before it compares the ratio with beta."""
 
 
 class ReferenceData(NamedTuple):
@@ -41,7 +41,7 @@ class ReferenceData(NamedTuple):
     Attributes
     ----------
     settings
-        M settings of n characteristics after the filter of the package; shape (M, n), units of the study's table.
+        M settings of n characteristics after the filter of the published package; shape (M, n), units of the study's table.
     metrics
         Name -> values, shape (M,). TET and TIT of a collision are NaN, and so are metrics without a column.
     skipped
@@ -95,7 +95,7 @@ def read_reference(path: Path, characteristics: CharacteristicSet) -> ReferenceD
 
 
 def package_filter(characteristics: CharacteristicSet, settings: FloatArray) -> FloatArray:
-    """The filter of the package, which keeps a change if its share of the domain, rounded to three decimals, is at least beta."""
+    """The published package's filter: it keeps a change if its share of the domain, rounded to three decimals, is at least beta."""
     width = characteristics.upper - characteristics.lower
     share = np.round(np.abs(settings - characteristics.original) / width, SHARE_DECIMALS)
     return np.where(share >= characteristics.threshold / width - 1e-12, settings, characteristics.original)
@@ -167,7 +167,7 @@ def _parse_numbers(path: Path, table: pd.DataFrame, column: str, lowest: float =
     return np.asarray(values)
 
 
-METRIC_NAMES = {short: metric.name for metric in METRICS.values() for short in (metric.name, metric.title.lower())}
+METRIC_NAMES = {accepted_name: metric.name for metric in METRICS.values() for accepted_name in (metric.name, metric.title.lower())}
 """Names of metrics by each name that a command accepts."""
 ORIGINAL_FORM = "sd=NUMBER,tet=NUMBER,tit=NUMBER,ave_dece=NUMBER"
 

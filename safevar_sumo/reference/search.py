@@ -51,7 +51,7 @@ class SearchRace:
     def __init__(self, space: Space, population: int, trials: int, done: Callable[[float, StudyGroup], None], alike: float = 0.0) -> None:
         self.alike = alike
         self.best: StudyGroup | None = None
-        self.loss, self.trials_left = np.inf, trials
+        self.lowest_loss, self.trials_left = np.inf, trials
         self.kept: list[Trial] = []
         """Trials of searches with a loss of at most `MAX_KEPT_RATIO` times the lowest loss at the time of the trial."""
         self.space, self.population, self._done = space, population, done
@@ -61,9 +61,9 @@ class SearchRace:
         losses = self.space.losses(groups)
         self.trials_left -= len(losses)
         for group, loss in zip(groups, losses, strict=True):
-            if self.best is None or loss < self.loss:
-                self.best, self.loss = group, loss
-            self._done(self.loss, self.best)
+            if self.best is None or loss < self.lowest_loss:
+                self.best, self.lowest_loss = group, loss
+            self._done(self.lowest_loss, self.best)
         return losses
 
     def begin(self, place: FloatArray, deviation: float, seed: int, population: int | None = None) -> CmaSearch:
@@ -72,9 +72,10 @@ class SearchRace:
 
     def begin_at_random_places(self, first_indices: Sequence[int], starts: int, screened: int, deviation: float,
                                rng: np.random.Generator) -> list[CmaSearch]:
-        """Begin `starts` searches at random places, or at the best of `screened` random places, whose number `SCREENING_DIVISOR` limits.
+        """Begin `starts` searches at random places, or at the best of `screened` random places.
 
-        Parameter i starts at the same share of its bounds as parameter `first_indices[i]`.
+        Screening takes at most 1 / `SCREENING_DIVISOR` of the trials left. Parameter i starts at the same share of its bounds as parameter
+        `first_indices[i]`.
         """
         size = len(first_indices)
         screened = min(screened, self.trials_left // SCREENING_DIVISOR) if starts else 0
@@ -97,17 +98,17 @@ class SearchRace:
             trials = trials_per_round // len(competitors)
             for search in competitors:
                 search.advance(trials - trials % search.population if trials > search.population else trials)
-            competitors = sorted(competitors, key=lambda search: search.lowest)[:(len(competitors) + 1) // 2]
+            competitors = sorted(competitors, key=lambda search: search.lowest_loss)[:(len(competitors) + 1) // 2]
         competitors[0].advance(self.trials_left)
 
 
 class CmaSearch:
-    """One search by CMA-ES (Hansen 2016); `lowest` is its lowest loss so far."""
+    """One search by CMA-ES (Hansen 2016); `lowest_loss` is that of its trials so far."""
 
     def __init__(self, race: SearchRace, place: FloatArray, deviation: float, seed: int, population: int) -> None:
         import cma  # slow to import
 
-        self._race, self.lowest, self.population = race, np.inf, population
+        self._race, self.lowest_loss, self.population = race, np.inf, population
         self._strategy: Any = cma.CMAEvolutionStrategy(place, deviation, {
             "bounds": [0, 1], "seed": seed, "verbose": -9, "popsize": population, "maxstd": np.inf})
 
@@ -117,7 +118,8 @@ class CmaSearch:
         for trials_left in range(trials, 0, -self.population):
             places = self._strategy.ask()
             losses = race.try_studies([race.space.studies_at(place) for place in places[:trials_left]])
-            race.kept += [Trial(loss, place) for loss, place in zip(losses, places, strict=False) if loss <= MAX_KEPT_RATIO * race.loss]
-            self.lowest = min(self.lowest, min(losses))
+            max_loss = MAX_KEPT_RATIO * race.lowest_loss
+            race.kept += [Trial(loss, place) for loss, place in zip(losses, places, strict=False) if loss <= max_loss]
+            self.lowest_loss = min(self.lowest_loss, min(losses))
             if len(losses) == len(places):
                 self._strategy.tell(places, losses)

@@ -43,7 +43,7 @@ STRIPE_LENGTH = 0.5
 def draw_frames(scene: FlatScene, stride: int) -> Iterator[Image]:
     """Draw every `stride`-th sample of a scene, and the last one."""
     canvas = _Canvas(scene)
-    for sample in [*range(0, scene.length - 1, stride), scene.length - 1]:
+    for sample in [*range(0, scene.sample_count - 1, stride), scene.sample_count - 1]:
         yield canvas.picture(sample)
 
 
@@ -205,7 +205,7 @@ def require_ffmpeg(path: Path) -> None:
 def _write_gif(scene: FlatScene, path: Path) -> None:
     """Write a gif with as many frames as `MAX_GIF_SIZE` allows."""
     stride = max(1, round(SECONDS_PER_FRAME / scene.step))
-    while len(content := _encode_gif(scene, stride)) > MAX_GIF_SIZE and stride < scene.length:
+    while len(content := _encode_gif(scene, stride)) > MAX_GIF_SIZE and stride < scene.sample_count:
         stride *= 2
     path.write_bytes(content)
 
@@ -223,7 +223,7 @@ def _encode_gif(scene: FlatScene, stride: int) -> bytes:
 
 
 def _write_mp4(scene: FlatScene, path: Path) -> None:
-    frames = list(draw_frames(scene, 1))
+    frames = list(draw_frames(scene, stride=1))
     frames += frames[-1:] * round(LAST_FRAME_DURATION / scene.step)
     width, height = frames[0].size
     command = [_find_ffmpeg(), "-y", "-loglevel", "error", "-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}",

@@ -30,18 +30,20 @@ MIN_DIVERGENCE = 0.1
 class Moments(NamedTuple):
     """Indices of a run's samples; None where there is no such moment.
 
-    `brake`: the vehicle begins to brake for the obstacle; `nearest`: the obstacle is nearest (the impact, on a collision); `end`: the last
-    sample of the run.
+    - `braking_start`: the vehicle begins to brake for the obstacle;
+    - `nearest`: the obstacle is nearest (on a collision, the impact);
+    - `end`: the last sample of the run.
     """
 
-    brake: int | None
+    braking_start: int | None
     nearest: int | None
     end: int
 
 
 def find_moments(runs: SimulationRuns, row: int) -> Moments:
     """Find the moments of one of N runs."""
-    return Moments(brake_onset(runs, row), runs.nearest(row), int(np.flatnonzero(runs.trace.active[:, row])[-1]))
+    return Moments(braking_start=brake_onset(runs, row), nearest=runs.nearest(row),
+                   end=int(np.flatnonzero(runs.trace.active[:, row])[-1]))
 
 
 def find_divergence(runs: SimulationRuns, first: int = 0, second: int = 1) -> int | None:
@@ -101,9 +103,9 @@ class Comparison:
 
 def changes_in_words(characteristics: CharacteristicSet, setting: FloatArray) -> list[str]:
     """The changes from the original: `tireFric 3.5 → 1.1 (-69 %)`."""
-    return [f"{member.name} {format_number(member.original)} → {quantity_text(value, member.unit)} "
-            f"({(value - member.original) / abs(member.original) * 100:+.0f}\N{NO-BREAK SPACE}%)"
-            for member, value in zip(characteristics, setting.tolist(), strict=True) if value != member.original]
+    return [f"{item.name} {format_number(item.original)} → {quantity_text(value, item.unit)} "
+            f"({(value - item.original) / abs(item.original) * 100:+.0f}\N{NO-BREAK SPACE}%)"
+            for item, value in zip(characteristics, setting.tolist(), strict=True) if value != item.original]
 
 
 def format_number(value: float) -> str:
@@ -162,7 +164,7 @@ def compare_setting(study: Study, system: System, setting: FloatArray) -> Compar
                    if (point.scenario, point.weather) == (worst_system.scenario, worst_system.weather)]
     recording = record_film(worst_system, settings)
     return Comparison(title=study.title + "".join(point_names[:1]), characteristics=system.characteristics,
-                      ttc_threshold=system.metrics.ttc_threshold, network=stage_network(worst_system.scenario).folder,
+                      ttc_threshold=system.metrics_table.ttc_threshold, network=stage_network(worst_system.scenario).folder,
                       evaluations=score(worst_system, settings, recording.runs),
                       film=replace(recording, runs=_with_pedals_before_impacts(recording.runs)),
                       objectives=_further_objectives(worst_system.measuring))
@@ -188,8 +190,8 @@ def _with_pedals_before_impacts(runs: SimulationRuns) -> SimulationRuns:
 def list_differences(replayed: Evaluations, recorded: Mapping[str, Any]) -> list[str]:
     """List where the replay of a solution differs from its row of solutions.csv, with both values."""
     differing_metrics = [
-        f"{name} is {recorded[name]:.6g} there and {values[0]:.6g} here" for name, values in replayed.metrics.items()
+        f"{name} was {recorded[name]:.6g} and is {values[0]:.6g} now" for name, values in replayed.metrics.items()
         if name in recorded and not np.array_equal(float(recorded[name]), float(values[0]), equal_nan=True)]
     if recorded["outcome"] not in (replayed.outcome[0], UNKNOWN):
-        return [f"the outcome is {recorded['outcome']} there and {replayed.outcome[0]} here", *differing_metrics]
+        return [f"the outcome was {recorded['outcome']} and is {replayed.outcome[0]} now", *differing_metrics]
     return differing_metrics

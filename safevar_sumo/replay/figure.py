@@ -36,25 +36,26 @@ def draw_comparison(comparison: Comparison) -> Figure:
     with matplotlib.style.context(["seaborn-v0_8-whitegrid", {"font.size": FONT_SIZE, "axes.labelsize": FONT_SIZE}]):
         figure = Figure(figsize=(9.6, 6.2), layout=ConstrainedLayoutEngine(h_pad=0.06, w_pad=0.08))
         axes = figure.subplots(2, 2, sharex=True).ravel()
+    speed_axis, gap_axis, pedal_axis, ttc_axis = axes
     ttc = time_to_collision(comparison.film.runs)
     for row in comparison.rows:
-        _draw_speed(axes[0], comparison, row)
-        _draw_gap(axes[1], comparison, row)
-        _draw_pedals(axes[2], comparison, row)
-        _draw_line(axes[3], comparison, row, np.where(ttc[:, row] <= MAX_TTC, ttc[:, row], np.nan))
-    axes[0].set_ylabel("speed [m/s]")
-    axes[1].set_ylabel("gap to the obstacle [m]")
-    axes[2].set_ylabel("brake     |     throttle")
-    axes[3].set_ylabel("time to collision [s]")
-    axes[1].axhline(0, color="black", linewidth=0.8)
-    axes[0].margins(y=0.1)
-    axes[1].set_ylim(-0.22 * axes[1].get_ylim()[1], None)
-    axes[2].set_ylim(-1.08, 1.08)
-    axes[2].set_yticks([-1, -0.5, 0, 0.5, 1], ["1", "0.5", "0", "0.5", "1"])
-    axes[3].set_ylim(0, None)
-    axes[3].set_xlim(right=_end_time(comparison) * 1.25)
-    axes[3].axhline(comparison.ttc_threshold, color="0.4", linewidth=0.9, linestyle=":")
-    for axis in axes[2:]:
+        _draw_speed(speed_axis, comparison, row)
+        _draw_gap(gap_axis, comparison, row)
+        _draw_pedals(pedal_axis, comparison, row)
+        _draw_line(ttc_axis, comparison, row, np.where(ttc[:, row] <= MAX_TTC, ttc[:, row], np.nan))
+    speed_axis.set_ylabel("speed [m/s]")
+    gap_axis.set_ylabel("gap to the obstacle [m]")
+    pedal_axis.set_ylabel("brake     |     throttle")
+    ttc_axis.set_ylabel("time to collision [s]")
+    gap_axis.axhline(0, color="black", linewidth=0.8)
+    speed_axis.margins(y=0.1)
+    gap_axis.set_ylim(-0.22 * gap_axis.get_ylim()[1], None)
+    pedal_axis.set_ylim(-1.08, 1.08)
+    pedal_axis.set_yticks([-1, -0.5, 0, 0.5, 1], ["1", "0.5", "0", "0.5", "1"])
+    ttc_axis.set_ylim(0, None)
+    ttc_axis.set_xlim(right=_end_time(comparison) * 1.25)
+    ttc_axis.axhline(comparison.ttc_threshold, color="0.4", linewidth=0.9, linestyle=":")
+    for axis in (pedal_axis, ttc_axis):
         axis.set_xlabel("time [s]")
     if len(comparison.rows) > 1:
         _mark_divergence(axes, comparison)
@@ -109,8 +110,8 @@ def _draw_mark(axis: Axes, row: int, point: tuple[float, float], mark: str, text
 def _draw_speed(axis: Axes, comparison: Comparison, row: int) -> None:
     trace, key_moments = comparison.film.runs.trace, find_moments(comparison.film.runs, row)
     _draw_line(axis, comparison, row, trace.speed[:, row])
-    if key_moments.brake is not None:
-        _draw_mark(axis, row, (trace.time[key_moments.brake], trace.speed[key_moments.brake, row]), BRAKING_MARK)
+    if key_moments.braking_start is not None:
+        _draw_mark(axis, row, (trace.time[key_moments.braking_start], trace.speed[key_moments.braking_start, row]), BRAKING_MARK)
     impact_speed = float(comparison.film.runs.collision_speed[row])
     if not np.isnan(impact_speed):
         _draw_mark(axis, row, (trace.time[key_moments.end], impact_speed), IMPACT_MARK, f"{impact_speed:.1f} m/s", is_speed=True)

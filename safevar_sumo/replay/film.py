@@ -113,7 +113,7 @@ def read_road(network: str) -> tuple[LaneLine, ...]:
 def _lane(function: str, lane: ElementTree.Element) -> LaneLine:
     line = np.array([[float(number) for number in point.split(",")[:2]] for point in lane.attrib["shape"].split()])
     if function == "walkingarea":
-        return LaneLine("area", line, 0.0)
+        return LaneLine("area", line, width=0.0)
     for_persons = lane.get("allow", "").split() == ["pedestrian"]
     kind = "crossing" if function == "crossing" else "path" if for_persons else "road"
-    return LaneLine(kind, line, float(lane.get("width", 3.2)))  # SUMO's default width
+    return LaneLine(kind, line, width=float(lane.get("width", 3.2)))  # SUMO's default width

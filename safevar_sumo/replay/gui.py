@@ -50,9 +50,9 @@ def show_in_gui(comparison: Comparison, network: str | None = None, *, slower: f
     with open_window(network or comparison.network, scene.step) as window:
         for row in comparison.rows:
             _add_road_and_actors(window, scene, row, layout)
-        pauses = {moments.nearest for moments in scene.moments if moments.nearest is not None} | {scene.length - 1}
+        pauses = {moments.nearest for moments in scene.moments if moments.nearest is not None} | {scene.sample_count - 1}
         start = time.monotonic()
-        for sample in range(scene.length):
+        for sample in range(scene.sample_count):
             _show_sample(window, scene, sample, layout)
             if sample in pauses:
                 if pictures is not None:

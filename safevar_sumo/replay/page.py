@@ -53,7 +53,7 @@ def player_data(scene: FlatScene) -> dict[str, Any]:
     left_ends = _rounded_or_constant(view.left_ends)
     box = {"left": left_ends, "top": round(-view.bottom - view.height, DECIMALS), "width": round(view.width, DECIMALS),
            "height": round(view.height, DECIMALS)}
-    common_data = {"step": scene.step, "length": scene.length, "key": key_sample, "view": box, "drives": drives}
+    common_data = {"step": scene.step, "length": scene.sample_count, "key": key_sample, "view": box, "drives": drives}
     return {
         **common_data,
         "description": _describe_scene(scene), "moments": _list_jumps(scene), "bottom": round(-view.bottom, DECIMALS),
@@ -77,8 +77,8 @@ def _list_jumps(scene: FlatScene) -> list[dict[str, Any]]:
     jumps = []
     for row, moments in enumerate(scene.moments):
         name = scene.comparison.name(row)
-        if moments.brake is not None:
-            jumps.append({"name": f"{name} brakes", "sample": moments.brake})
+        if moments.braking_start is not None:
+            jumps.append({"name": f"{name} brakes", "sample": moments.braking_start})
         if moments.nearest is not None:
             is_impact = not np.isnan(scene.comparison.film.runs.collision_speed[row])
             jumps.append({"name": f"{name} {'collides' if is_impact else 'is nearest'}", "sample": moments.nearest})
@@ -101,7 +101,7 @@ def _lane_data(lane: Any) -> dict[str, Any]:
 def _moving_body_data(body: FlatBody) -> dict[str, Any]:
     degrees = -np.rad2deg(np.unwrap(body.heading)) if np.isfinite(body.heading).all() else -np.rad2deg(body.heading)
     return {"drive": body.row if body.is_vut else None, "x": _rounded_or_constant(body.x), "y": _rounded_or_constant(-body.y),
-            "heading": _rounded_or_constant(degrees, 1)}
+            "heading": _rounded_or_constant(degrees, decimals=1)}
 
 
 def _still_body_data(body: FlatBody, scene: FlatScene) -> dict[str, Any]:

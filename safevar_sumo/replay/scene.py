@@ -63,11 +63,11 @@ class View(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class FlatScene:
-    """A comparison laid out for drawing; `length` samples, `step` seconds apart."""
+    """A comparison laid out for drawing; `sample_count` samples, `step` seconds apart."""
 
     comparison: Comparison
     step: float
-    length: int
+    sample_count: int
     road: tuple[LaneLine, ...]
     bodies: tuple[FlatBody, ...]
     moments: tuple[Moments, ...]
@@ -93,22 +93,22 @@ def lay_out_scene(comparison: Comparison) -> FlatScene:
     rotation = np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
     start = np.array([vut.x[0, 0], vut.y[0, 0]])
     all_moments = tuple(find_moments(film.runs, row) for row in comparison.rows)
-    length = max(run_moments.end for run_moments in all_moments) + 1
-    bodies = tuple(_lay_out_body(name, track, row, all_moments[row].end, length, rotation, start, turn)
+    sample_count = max(run_moments.end for run_moments in all_moments) + 1
+    bodies = tuple(_lay_out_body(name, track, row, all_moments[row].end, sample_count, rotation, start, turn)
                    for name, track in film.tracks.items() for row in comparison.rows
                    if name == VUT or (_is_near(film, name, row) and not _is_duplicate(comparison, name, row)))
     road = tuple(lane._replace(line=(lane.line - start) @ rotation.T) for lane in film.road)
-    return FlatScene(comparison=comparison, step=film.runs.trace.step, length=length, road=road, bodies=bodies, moments=all_moments,
-                 view=_choose_view(bodies, length))
+    return FlatScene(comparison=comparison, step=film.runs.trace.step, sample_count=sample_count, road=road, bodies=bodies,
+                     moments=all_moments, view=_choose_view(bodies, sample_count))
 
 
-def _lay_out_body(name: str, track: ActorTrack, row: int, end: int, length: int, rotation: FloatArray, start: FloatArray, turn: float
-                 ) -> FlatBody:
+def _lay_out_body(name: str, track: ActorTrack, row: int, end: int, sample_count: int, rotation: FloatArray, start: FloatArray,
+                 turn: float) -> FlatBody:
     """An actor until its simulation ends; afterwards the actor stays in place."""
-    samples = np.minimum(np.arange(length), end)
+    samples = np.minimum(np.arange(sample_count), end)
     x, y = rotation @ (np.stack([track.x[samples, row], track.y[samples, row]]) - start[:, np.newaxis])
-    return FlatBody(name, row, name == VUT, track.is_person, track.length, track.width, x, y,
-                np.deg2rad(90 - track.angle[samples, row]) - turn)
+    return FlatBody(name=name, row=row, is_vut=name == VUT, is_person=track.is_person, length=track.length, width=track.width, x=x, y=y,
+                    heading=np.deg2rad(90 - track.angle[samples, row]) - turn)
 
 
 def _is_near(film: Film, name: str, row: int) -> bool:
@@ -127,7 +127,7 @@ def _is_duplicate(comparison: Comparison, name: str, row: int) -> bool:
     return _is_near(comparison.film, name, CHANGED) and bool(np.all((offset < MAX_OFFSET) | np.isnan(offset)))
 
 
-def _choose_view(bodies: tuple[FlatBody, ...], length: int) -> View:
+def _choose_view(bodies: tuple[FlatBody, ...], sample_count: int) -> View:
     """The whole road or, in a long scene, the view of a camera that follows the vehicles."""
     left_end = min(float(np.nanmin(body.x)) - body.length for body in bodies) - MARGIN / 2
     right_end = max(float(np.nanmax(body.x)) + (0 if body.is_vut else body.length) for body in bodies) + MARGIN
@@ -135,7 +135,7 @@ def _choose_view(bodies: tuple[FlatBody, ...], length: int) -> View:
     bottom, top = float(min(edges)) - MARGIN / 2, float(max(edges)) + MARGIN / 2
     padding = max(0.0, MIN_HEIGHT - (top - bottom)) / 2
     if right_end - left_end <= MAX_LENGTH:
-        return View(np.full(length, left_end), bottom - padding, right_end - left_end, top - bottom + 2 * padding)
+        return View(np.full(sample_count, left_end), bottom - padding, right_end - left_end, top - bottom + 2 * padding)
     front = np.mean([body.x for body in bodies if body.is_vut], axis=0)
     left = np.clip(front - CAMERA_LENGTH * 0.45, left_end, max(left_end, right_end - CAMERA_LENGTH))
     return View(left, bottom - padding, CAMERA_LENGTH, top - bottom + 2 * padding)

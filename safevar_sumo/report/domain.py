@@ -47,13 +47,13 @@ def make_risk_section(data: ReportInput, jobs: int | None, progress: Progress) -
 def make_rules_section(data: ReportInput, jobs: int | None, progress: Progress) -> Section:
     """Rules in words, with their density and coverage among vehicles held back while the rules were found."""
     def compute() -> Section:
-        regions = find_rules(data.case.study, data.options["rules"], jobs=jobs, progress=progress)
-        significant = [rule for rule in regions.rules if rule.is_denser_than(regions.unsafe_share)]
-        words = [superscript_powers(rule_in_words(rule, data.case.characteristics, regions.unsafe)) for rule in significant]
-        omitted_rules = number_of(len(regions.rules) - len(significant), "rule")
-        remark = regions.remark if len(significant) == len(regions.rules) else (
-            f"Left out: {omitted_rules} that may be chance with so few vehicles; the command rules simulates more.")
-        return {"words": words, "samples": regions.samples, "share": regions.unsafe_share, "remark": remark, "unsafe": str(regions.unsafe)}
+        found = find_rules(data.case.study, data.options["rules"], jobs=jobs, progress=progress)
+        significant = [rule for rule in found.rules if rule.is_denser_than(found.unsafe_share)]
+        words = [superscript_powers(rule_in_words(rule, data.case.characteristics, found.unsafe)) for rule in significant]
+        omitted_rules = number_of(len(found.rules) - len(significant), "rule")
+        remark = found.remark if len(significant) == len(found.rules) else (
+            f"Left out: {omitted_rules} that may be due to chance, as few vehicles were simulated; `rules` simulates more.")
+        return {"words": words, "samples": found.samples, "share": found.unsafe_share, "remark": remark, "unsafe": str(found.unsafe)}
 
     return _with_criterion_in_words(load_or_compute(data, "rules", compute))
 
@@ -69,9 +69,9 @@ DOMAIN_SECTIONS: Mapping[str, Callable[[ReportInput, int | None, Progress], Sect
 """Functions that make the sections about the whole domain, by name."""
 
 
-def _draw_intervals(data: ReportInput, scans: list[Section]) -> Markup:
+def _draw_intervals(data: ReportInput, scans: list[dict[str, Any]]) -> Markup:
     characteristics = {characteristic.name: characteristic for characteristic in data.case.characteristics}
-    names, bars, marks, end_labels = [], [], [], []
+    names, bars, mark_positions, end_labels = [], [], [], []
     for scan in scans:
         characteristic = characteristics[scan["characteristic"]]
         safe, unsafe = scan["safe"], scan["unsafe"]
@@ -79,11 +79,11 @@ def _draw_intervals(data: ReportInput, scans: list[Section]) -> Markup:
         names.append(characteristic.name)
         bars.append([*safe_bars, *(_interval_bar(characteristic, interval, "unsafe") for interval in unsafe),
                      *(_interval_bar(characteristic, interval, "weak", "could not be simulated") for interval in scan["not_simulated"])])
-        marks.append(_fraction_of_domain(characteristic, characteristic.original))
+        mark_positions.append(_fraction_of_domain(characteristic, characteristic.original))
         low_label, high_label = (quantity_text(end, characteristic.unit) for end in (characteristic.lower, characteristic.upper))
         end_labels.append((low_label, high_label))
     description = f"{data.case.name}: where each characteristic alone is safe and where it is unsafe; a mark at the original"
-    return draw_bars(description, names, bars, marks, end_labels)
+    return draw_bars(description, names, bars, mark_positions, end_labels)
 
 
 def _interval_bar(characteristic: Characteristic, interval: Sequence[float], css_class: str, state: str = "") -> Bar:
@@ -110,7 +110,7 @@ def _fraction_of_domain(characteristic: Characteristic, value: float) -> float:
     return (value - characteristic.lower) / (characteristic.upper - characteristic.lower)
 
 
-def _draw_sensitivities(data: ReportInput, sensitivity: list[Section]) -> Markup | None:
+def _draw_sensitivities(data: ReportInput, sensitivity: list[dict[str, Any]]) -> Markup | None:
     entries = sorted((entry for entry in sensitivity if entry["total"] is not None),
                      key=lambda entry: (-entry["total"], entry["characteristic"]))
     if not entries:

@@ -79,9 +79,9 @@ def tabulate_failing_points(matrix: Sequence[Point], failing: Collection[str]) -
               for name, cells in rows.items() if any(cells.values())])
 
 
-SAMPLES = 4000
+SAMPLED_VEHICLES = 4000
 """Number of vehicles sampled for the section on risk, and for the one on rules."""
-LIMIT = 12_000
+EXPLAIN_SIMULATIONS = 12_000
 """Approximate number of simulations for the minimal causes of all failures."""
 
 
@@ -158,8 +158,9 @@ class ReportInput:
         assert self.system is not None
         batch = {setting.tobytes(): setting for setting in settings if setting.tobytes() not in self._resimulations}
         if batch:
-            at_points = simulate_all_points(self.system, np.stack(list(batch.values())))
-            evaluations, unsafe_points = evaluations_at_worst_points(at_points), unsafe_points_of(self.system, at_points, self.case.unsafe)
+            results_at_points = simulate_all_points(self.system, np.stack(list(batch.values())))
+            evaluations = evaluations_at_worst_points(results_at_points)
+            unsafe_points = unsafe_points_of(self.system, results_at_points, self.case.unsafe)
             for row, key in enumerate(batch):
                 self._resimulations[key] = Resimulation(evaluations.take([row]), unsafe_points[row])
         return [self._resimulations[setting.tobytes()] for setting in settings]
@@ -169,8 +170,8 @@ class ReportInput:
         """Each question's options on the page: one criterion for all questions, and smaller samples than the commands take."""
         unsafe = None if self.case.solutions.empty else str(self.case.unsafe)
         all_options: tuple[Options, ...] = (
-            ExplainOptions(unsafe=unsafe, limit=LIMIT), OpinionOptions(unsafe=unsafe), ToleranceOptions(unsafe=unsafe),
-            RiskOptions(unsafe=unsafe, samples=SAMPLES), RulesOptions(unsafe=unsafe, samples=SAMPLES))
+            ExplainOptions(unsafe=unsafe, limit=EXPLAIN_SIMULATIONS), OpinionOptions(unsafe=unsafe), ToleranceOptions(unsafe=unsafe),
+            RiskOptions(unsafe=unsafe, samples=SAMPLED_VEHICLES), RulesOptions(unsafe=unsafe, samples=SAMPLED_VEHICLES))
         return {options.question: options for options in all_options}
 
     @property
@@ -224,7 +225,7 @@ def read_inputs(directories: Iterable[str | Path], point: str | None = None, *, 
 
 def _at_point(case: Case, point: str) -> Case:
     """The case with its solutions and original vehicle simulated again at one point of the study's matrix."""
-    study = study_at(case.study, point, "--point")
+    study = study_at(case.study, point, source="--point")
     system = assemble(study)
     settings = np.concatenate([case.characteristics.original[np.newaxis], case.solutions[list(case.characteristics.names)].to_numpy(float)])
     evaluations = evaluate(system, settings)
@@ -239,7 +240,8 @@ def _at_point(case: Case, point: str) -> Case:
 def load_or_compute(data: ReportInput, name: str, compute: Callable[[], Any]) -> Any:
     """The result of `compute` as plain values: stored in the results directory, and read from there the next time.
 
-    Nothing is stored if the directory cannot be written, or if the code that computes the result has no identity.
+    Nothing is stored if the directory cannot be written, or if inputs have changed since the study. Nothing is stored for imported results
+    of a study with user code either, as they record no digest of this code.
     """
     if data.later_changes or ("imported" in data.manifest and user_code_names(data.case.study)):
         return json.loads(json.dumps(compute(), allow_nan=False))

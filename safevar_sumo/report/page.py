@@ -100,7 +100,8 @@ def draw_front(data: ReportInput, handles: Sequence[str]) -> Markup:
     selection = [best[index] for index in evenly_spaced_indices(len(best), MAX_DOTS)] + [row for row in rows if row["handle"] in handles]
     dots = {row["handle"]: _dot(data, row, row["handle"] in handles) for row in selection}
     return draw_scatter(f"{data.case.name}: safety degree over the largest change of the solutions that no other solution beats",
-                   list(dots.values()), "largest change [% of the original]", "safety degree [m, or -m/s]", 0.0, "collision below")
+                        list(dots.values()), "largest change [% of the original]", "safety degree [m, or -m/s]", line=0.0,
+                        line_title="collision below")
 
 
 def _dot(data: ReportInput, row: dict[Any, Any], has_replay: bool) -> Dot:

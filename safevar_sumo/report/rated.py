@@ -13,12 +13,12 @@ from safevar_sumo.analysis.evaluator import Progress
 from safevar_sumo.analysis.rating import RatingOptions
 from safevar_sumo.analysis.rating.compute import Rating, rate, remarks
 from safevar_sumo.analysis.rating.render import (
+    colour_changes_in_words,
     lost_by_test,
     matrices_figure,
     not_simulated,
     rating_in_words,
     test_in_words,
-    turned_in_words,
 )
 from safevar_sumo.analysis.words import question_command
 from safevar_sumo.report.input import ReportInput
@@ -40,18 +40,18 @@ def rated_study_data(data: ReportInput, jobs: int | None, progress: Progress) ->
     rating = rate(case.study, variants, jobs=jobs, progress=progress)
     rating_command = RatingOptions(solution=None if handle is None else str(handle)).command_line(str(data.directory))
     return {"title": case.study.title, "sentence": rating_in_words(rating), "notes": remarks(rating), "points": _point_rows(rating),
-            "lost": [(test_in_words(test), f"{lost:.2f}") for test, lost in lost_by_test(rating)], "turned": turned_in_words(rating),
-            "picture": draw_matrices(rating), "names": [variant.name for variant in rating.variants],
-            "not_simulated": not_simulated(rating),
+            "lost": [(test_in_words(test), f"{lost:.2f}") for test, lost in lost_by_test(rating)],
+            "turned": colour_changes_in_words(rating), "picture": draw_matrices(rating),
+            "names": [vehicle.name for vehicle in rating.vehicles], "not_simulated": not_simulated(rating),
             "commands": [rating_command, *(question_command(question, str(data.directory)) for question in ("tolerance", "explain"))]}
 
 
 def _point_rows(rating: Rating) -> Sequence[tuple[str, Sequence[str], str]]:
     """Rows of texts: a test, the points of each vehicle, and the points available."""
-    rows = [(tests[0].block.name, [f"{test.total:.2f}" for test in tests], f"{sum(tests[0].block.points):g}")
-            for tests in zip(*(variant.tests for variant in rating.variants), strict=True)]
-    available = sum(sum(block.points) for block in rating.protocol.blocks)
-    return [*rows, ("all", [f"{variant.points:.2f}" for variant in rating.variants], f"{available:g}")]
+    rows = [(tests[0].matrix.name, [f"{test.total:.2f}" for test in tests], f"{sum(tests[0].matrix.points):g}")
+            for tests in zip(*(vehicle.tests for vehicle in rating.vehicles), strict=True)]
+    available = sum(sum(matrix.points) for matrix in rating.protocol.matrices)
+    return [*rows, ("all", [f"{vehicle.points:.2f}" for vehicle in rating.vehicles], f"{available:g}")]
 
 
 def draw_matrices(rating: Rating) -> Markup:

@@ -1,4 +1,4 @@
-"""Charts as SVG to embed in the page; without a script, values appear when the pointer rests on a mark."""
+"""Charts as SVG to embed in the page; without a script, values appear when the pointer rests on a shape."""
 
 from __future__ import annotations
 
@@ -36,49 +36,50 @@ class Bar(NamedTuple):
     tooltip: str
 
 
-def draw_bars(description: str, names: Sequence[str], bars_of_rows: Sequence[Sequence[Bar]], marks: Sequence[float | None],
-              end_labels: Sequence[tuple[str, str]]) -> Markup:
+def draw_bars(description: str, names: Sequence[str], bars_of_rows: Sequence[Sequence[Bar]],
+              mark_positions: Sequence[float | None], end_labels: Sequence[tuple[str, str]]) -> Markup:
     """Draw rows of bars; `description` is the chart in words, `end_labels` are the texts below the left and right end of each row.
 
-    `marks` has the place of each row's mark, as a fraction of the row.
+    `mark_positions` has the position of a vertical mark in each row, such as the original value, as a fraction of the row.
     """
     elements, track_width = [], WIDTH - NAME_WIDTH - RIGHT_MARGIN
-    for row, (name, bars, mark, (left, right)) in enumerate(zip(names, bars_of_rows, marks, end_labels, strict=True)):
-        y = row * ROW_PITCH
+    for row_number, (name, bars, mark_position, (left_label, right_label)) in enumerate(
+            zip(names, bars_of_rows, mark_positions, end_labels, strict=True)):
+        y = row_number * ROW_PITCH
         elements.append(_text(NAME_WIDTH - 8, y + 17, name, "name"))
         elements.append(f'<rect class="track" x="{NAME_WIDTH}" y="{y + 4:.1f}" width="{track_width}" height="{ROW_HEIGHT - 8}" rx="3"/>')
         for bar in bars:
             x, width = NAME_WIDTH + track_width * bar.start, max(track_width * (bar.end - bar.start), 1.5)
             elements.append(f'<rect class="{bar.css_class}" x="{x:.1f}" y="{y + 4:.1f}" width="{width:.1f}" height="{ROW_HEIGHT - 8}">'
                          f"<title>{escape(bar.tooltip)}</title></rect>")
-        if mark is not None:
-            elements.append(f'<path class="mark" d="M{NAME_WIDTH + track_width * mark:.1f} {y:.1f}v{ROW_HEIGHT}"/>')
-        elements.append(_text(NAME_WIDTH, y + ROW_HEIGHT + 8, left, "anchor-start"))
-        elements.append(_text(WIDTH - RIGHT_MARGIN, y + ROW_HEIGHT + 8, right, "anchor-end"))
+        if mark_position is not None:
+            elements.append(f'<path class="mark" d="M{NAME_WIDTH + track_width * mark_position:.1f} {y:.1f}v{ROW_HEIGHT}"/>')
+        elements.append(_text(NAME_WIDTH, y + ROW_HEIGHT + 8, left_label, "anchor-start"))
+        elements.append(_text(WIDTH - RIGHT_MARGIN, y + ROW_HEIGHT + 8, right_label, "anchor-end"))
     return _svg(description, ROW_PITCH * len(names) + 4, elements)
 
 
 def draw_scatter(description: str, dots: Sequence[Dot], x_title: str, y_title: str, line: float | None, line_title: str) -> Markup:
     """Draw a scatter chart; `line` is the y of a horizontal line, if any."""
-    height, left, bottom = 330, 62, 44
+    height, left_margin, bottom_margin = 330, 62, 44
     xs, ys = [dot.x for dot in dots], [dot.y for dot in dots] + ([] if line is None else [line])
-    x_scale, y_scale = _ticks(min([0.0, *xs]), max(xs)), _ticks(min(ys), max([0.0, *ys]))
+    x_ticks, y_ticks = _ticks(min([0.0, *xs]), max(xs)), _ticks(min(ys), max([0.0, *ys]))
 
     def pixel_x(x: float) -> float:
-        return left + (WIDTH - left - RIGHT_MARGIN) * (x - x_scale[0]) / (x_scale[-1] - x_scale[0])
+        return left_margin + (WIDTH - left_margin - RIGHT_MARGIN) * (x - x_ticks[0]) / (x_ticks[-1] - x_ticks[0])
 
     def pixel_y(y: float) -> float:
-        return height - bottom - (height - bottom - 14) * (y - y_scale[0]) / (y_scale[-1] - y_scale[0])
+        return height - bottom_margin - (height - bottom_margin - 14) * (y - y_ticks[0]) / (y_ticks[-1] - y_ticks[0])
 
-    elements = [f'<path class="grid" d="M{left} {pixel_y(y):.1f}H{WIDTH - RIGHT_MARGIN}"/>'
-             + _text(left - 7, pixel_y(y) + 4, f"{y:g}", "anchor-end") for y in y_scale]
-    elements += [f'<path class="grid" d="M{pixel_x(x):.1f} 14V{height - bottom}"/>'
-              + _text(pixel_x(x), height - bottom + 17, f"{x:g}", "anchor-middle")
-              for x in x_scale]
-    elements += [_text((WIDTH + left) / 2, height - 8, x_title, "anchor-middle title"),
-              f'<g transform="translate(14 {(height - bottom) / 2}) rotate(-90)">{_text(0, 0, y_title, "anchor-middle title")}</g>']
+    elements = [f'<path class="grid" d="M{left_margin} {pixel_y(y):.1f}H{WIDTH - RIGHT_MARGIN}"/>'
+             + _text(left_margin - 7, pixel_y(y) + 4, f"{y:g}", "anchor-end") for y in y_ticks]
+    elements += [f'<path class="grid" d="M{pixel_x(x):.1f} 14V{height - bottom_margin}"/>'
+              + _text(pixel_x(x), height - bottom_margin + 17, f"{x:g}", "anchor-middle")
+              for x in x_ticks]
+    elements += [_text((WIDTH + left_margin) / 2, height - 8, x_title, "anchor-middle title"),
+              f'<g transform="translate(14 {(height - bottom_margin) / 2}) rotate(-90)">{_text(0, 0, y_title, "anchor-middle title")}</g>']
     if line is not None:
-        elements += [f'<path class="level" d="M{left} {pixel_y(line):.1f}H{WIDTH - RIGHT_MARGIN}"/>',
+        elements += [f'<path class="level" d="M{left_margin} {pixel_y(line):.1f}H{WIDTH - RIGHT_MARGIN}"/>',
                   _text(WIDTH - RIGHT_MARGIN, pixel_y(line) - 5, line_title, "anchor-end")]
     for dot in dots:
         centre = f'cx="{pixel_x(dot.x):.1f}" cy="{pixel_y(dot.y):.1f}"'

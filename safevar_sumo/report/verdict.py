@@ -204,7 +204,7 @@ def _select_failure(data: ReportInput, handle: str, reasons: list[str], failure:
         size=f"{len(changes)} of {len(setting)} characteristics changed, by at most {100 * largest_change:.0f} %",
         end=_describe_end(data, handle, setting), f_safe=data.solutions[handle]["f_safe"], failing_points=data.failing_points(setting),
         unsafe_share=failure.robustness if failure else None,
-        cause=failure.minimal_causes[0] if failure and failure.minimal_causes else None)
+        cause=max(failure.minimal_causes, key=lambda cause: cause.robustness or 0.0, default=None) if failure else None)
 
 
 def _describe_end(data: ReportInput, handle: str, setting: FloatArray) -> str:
@@ -275,12 +275,12 @@ def _preventability_figure(preventable: PreventedShares | None, data: ReportInpu
 
 
 def _tolerance_figure(tolerance: Mapping[str, Any] | None) -> KeyFigure:
-    title = "All characteristics together may go"
+    title = "Joint tolerance of all characteristics"
     if tolerance is None:
         return KeyFigure(title, NO_VALUE, "not computed")
     factor, samples = tolerance["joint"]["factor"], tolerance["joint"]["samples"]
     if not factor:
-        return KeyFigure(title, "0 % of the way", "no box around the original is safe")
+        return KeyFigure(title, "none", "no box around the original is safe")
     return KeyFigure(title, f"{100 * factor:.1f} % of the way",
                      f"from the original to the ends of their domains; none of {samples} vehicles sampled there is unsafe")
 
@@ -289,8 +289,8 @@ def describe_agreement(data: ReportInput) -> PublishedAgreement:
     """Describe how well the study agrees with published data."""
     totals = shipped_totals_of(data.case.study)
     if not totals:
-        return PublishedAgreement("This study was not compared with published data: how far another simulator or a real vehicle does the "
-                                  "same is unknown.", [])
+        return PublishedAgreement("This study was not compared with published data: whether another simulator or a real vehicle behaves in "
+                                  "the same way is unknown.", [])
     largest = max(totals, key=lambda entry: (entry.reference, entry.rows))
     collisions = "no published collision is among them" if largest.recall is None else (
         f"{largest.both} of the {largest.reference} published collisions collide here too (recall {largest.recall:.2f})")

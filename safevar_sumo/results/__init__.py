@@ -7,8 +7,8 @@ from safevar_sumo.results.files import (
     ORIGINAL,
     SOLUTIONS,
     folders_of,
-    later_files,
     make_directory,
+    read_late_files,
     write_whole,
 )
 from safevar_sumo.results.imported import UNKNOWN, write_imported
@@ -43,11 +43,11 @@ __all__ = [
     "failure_lines",
     "folders_of",
     "handles_of",
-    "later_files",
     "load_runs",
     "make_directory",
     "make_inputs_comparable",
     "manifest_of",
+    "read_late_files",
     "read_manifest",
     "record",
     "row_of_handle",

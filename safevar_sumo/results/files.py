@@ -50,7 +50,7 @@ def journal_file(directory: Path, run: str) -> Path:
 
 
 def make_directory(path: Path) -> None:
-    """Make a directory for results, if there is none.
+    """Make a directory for results, if there is none, and check that it can be written.
 
     Raises
     ------
@@ -58,14 +58,14 @@ def make_directory(path: Path) -> None:
         If the directory cannot be written.
     """
     try:
-        make_durable(path)
+        make_synced_directory(path)
         with tempfile.TemporaryFile(dir=path):
             pass
     except OSError as error:
         raise InputError("out", f"cannot write to {path}: {error.strerror}", "a directory that can be written") from None
 
 
-def make_durable(path: Path) -> None:
+def make_synced_directory(path: Path) -> None:
     """Make a directory and those above it, and sync them to the disk."""
     new_folders = [folder for folder in (path, *path.parents) if not folder.is_dir()]
     path.mkdir(parents=True, exist_ok=True)
@@ -115,7 +115,7 @@ def sync_directory(path: Path) -> None:
 def write_folders(directory: Path, study: Study) -> None:
     """Record the folders of a study's files, relative to the directory; the manifest does not depend on them."""
     if study.origin.places:
-        make_durable(directory / RUNS)
+        make_synced_directory(directory / RUNS)
         folders = [_relative_path(folder, directory.resolve()) for folder in study.origin.places]
         write_whole(directory / RUNS / FOLDERS_FILE, json.dumps(folders) + "\n")
 
@@ -128,12 +128,12 @@ def folders_of(directory: Path) -> tuple[str, ...]:
 
 def record_late_file(directory: Path, name: str, digest: str) -> None:
     """Record a file that was read after the study began, in a separate JSON file, because several processes may record files."""
-    make_durable(directory / RUNS)
+    make_synced_directory(directory / RUNS)
     file_name = LATE_FILE_PATTERN.replace("*", sha256(name.encode()).hexdigest()[:DIGEST_LENGTH])
     write_whole(directory / RUNS / file_name, json.dumps({name: digest}) + "\n")
 
 
-def later_files(directory: Path) -> Files:
+def read_late_files(directory: Path) -> Files:
     """Digests, by file name, of the files that were read after the study began."""
     return {name: digest for path in sorted((directory / RUNS).glob(LATE_FILE_PATTERN)) for name, digest in _read_json(path, {}).items()}
 

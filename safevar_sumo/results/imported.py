@@ -47,14 +47,15 @@ def write_imported(path: Path, study: Study, solutions: Mapping[str, Evaluations
     import pandas as pd
 
     make_directory(path)
-    tables, names = tables_of(study), tuple(study.vehicle.characteristics)
+    tables, characteristics = tables_of(study), tuple(study.vehicle.characteristics)
     earlier_manifest = _earlier_manifest(path, tables)
-    frame = solutions_frame(names, [((name, 0), evaluations) for name, evaluations in solutions.items()]).drop(columns="run")
+    frame = solutions_frame(characteristics, [((algorithm, 0), evaluations) for algorithm, evaluations in solutions.items()])
+    frame = frame.drop(columns="run")
     if earlier_manifest:
         refuse_edited_table(path / SOLUTIONS, earlier_manifest, "the file as it was, or another directory")
-        stored = read_imported(path, names)
+        stored = read_imported(path, characteristics)
         frame = pd.concat([stored[~stored["algorithm"].isin(list(solutions))], frame], ignore_index=True)
-        frame = frame.sort_values(["algorithm", "f_safe", "f_diff", "f_num_diff", *names], kind="stable", ignore_index=True)
+        frame = frame.sort_values(["algorithm", "f_safe", "f_diff", "f_num_diff", *characteristics], kind="stable", ignore_index=True)
     text = frame.to_csv(index=False, lineterminator="\n")
     manifest: dict[str, Any] = {
         "format": FORMAT, "study": tables, "imported": {"files": {**earlier_manifest.get("imported", {}).get("files", {}), **files}},
@@ -95,11 +96,11 @@ def read_imported(path: Path, characteristics: tuple[str, ...]) -> pd.DataFrame:
         frame = pd.read_csv(file, dtype=str, keep_default_na=False)[["algorithm", *numeric_columns, "outcome"]]
         table = frame.replace({name: {"": "nan"} for name in numeric_columns}).astype(dict.fromkeys(numeric_columns, float))
     except OSError as error:
-        raise InputError(file, f"cannot be read: {error.strerror or error}", "what the command import has written") from None
+        raise InputError(file, f"cannot be read: {error.strerror or error}", "what the command `import` has written") from None
     except (KeyError, ValueError) as error:
-        raise InputError(file, f"is damaged: {str(error).splitlines()[0]}", "what the command import has written") from None
+        raise InputError(file, f"is damaged: {str(error).splitlines()[0]}", "what the command `import` has written") from None
     required_columns = [name for name in numeric_columns if name not in METRICS]
     if not np.isfinite(table[required_columns].to_numpy()).all():
-        raise InputError(file, f"is damaged: no number in one of the columns {', '.join(required_columns)}",
-                         "what the command import has written")
+        raise InputError(file, f"is damaged: a value in the columns {', '.join(required_columns)} is missing or infinite",
+                         "what the command `import` has written")
     return table.astype({"f_num_diff": int})

@@ -22,18 +22,18 @@ import portalocker
 
 from safevar_sumo.errors import InputError, SafevarError
 from safevar_sumo.records import Evaluations, FloatArray, Outcome
-from safevar_sumo.results.files import make_durable, sync_directory
+from safevar_sumo.results.files import make_synced_directory, sync_directory
 from safevar_sumo.study import refuse_other_than_file
 
 FORMAT = 2
 READABLE_FORMATS = (1, FORMAT)
 MAGIC = b"SVJ\n"
 FRAME_HEAD = struct.Struct("<4sII")
-OUTCOMES = {
+OUTCOME_CODES = {
     Outcome.STOPPED: 0, Outcome.PASSED: 1, Outcome.COLLISION: 2, Outcome.TIMEOUT: 3, Outcome.NEVER_MOVED: 4, Outcome.SIMULATOR_ERROR: 5,
     Outcome.INVALID_TEST: 6, Outcome.INFEASIBLE: 7}
 """Codes of outcomes in journals; a code never changes its meaning."""
-_OUTCOME_BY_CODE = {code: outcome.value for outcome, code in OUTCOMES.items()}
+_OUTCOME_BY_CODE = {code: outcome.value for outcome, code in OUTCOME_CODES.items()}
 NON_METRIC_COLUMNS = ("collision_speed", "f_diff", "f_num_diff")
 SPARE_POSITION = -1
 """Position of an evaluation that the search has not requested yet, or not again after `Retry`."""
@@ -58,7 +58,7 @@ class Batch(msgspec.Struct, frozen=True, tag="batch", omit_defaults=True):
 
 
 class Result(msgspec.Struct, frozen=True, tag="result", omit_defaults=True):
-    """Solutions of a run by `positions` of their evaluations; the run requested `asked` of `budget` evaluations (0 in format 1)."""
+    """Solutions of a run by `positions` of their evaluations; the run requested `asked` of `budget` evaluations (format 1: budget 0)."""
 
     positions: list[int]
     asked: int
@@ -109,7 +109,8 @@ def make_batch(positions: list[int], evaluations: Evaluations) -> Batch:
     reasons = {row: evaluations.reasons[setting.tobytes()] for row, setting in enumerate(evaluations.settings)
                if setting.tobytes() in evaluations.reasons}
     return Batch(
-        positions=np.array(positions, dtype="<i4").tobytes(), outcome=bytes(OUTCOMES[outcome] for outcome in evaluations.outcome.tolist()),
+        positions=np.array(positions, dtype="<i4").tobytes(),
+        outcome=bytes(OUTCOME_CODES[outcome] for outcome in evaluations.outcome.tolist()),
         settings=evaluations.settings.astype("<f8").tobytes(),
         numbers={name: values.astype("<f8").tobytes() for name, values in numbers.items()}, reasons=reasons)
 
@@ -207,7 +208,7 @@ class Journal:
     ----------
     content
         The journal's contents when it was opened.
-    cut
+    cut_bytes
         Number of bytes of a torn tail that were cut off.
 
     Raises
@@ -222,7 +223,7 @@ class Journal:
         self.path, self.cut_bytes = path, 0
         self._file = _open_and_lock(path)
         try:
-            self.content = self._read(Owner(format=FORMAT, study=study, run=run))
+            self.content = self._read_and_claim(Owner(format=FORMAT, study=study, run=run))
         except OSError as error:
             self.close()
             raise SafevarError(f"{path}: cannot be read: {error.strerror}; earlier data stays valid") from None
@@ -235,7 +236,7 @@ class Journal:
         self._write(make_batch(positions, evaluations))
 
     def finish(self, positions: list[int], asked: int, budget: int) -> None:
-        """Add the result of the run with a budget of evaluations."""
+        """Add the result: the positions of the solutions, the number of evaluations that the run asked for, and its budget."""
         self._write(Result(positions=positions, asked=asked, budget=budget))
 
     def retry(self) -> None:
@@ -248,7 +249,8 @@ class Journal:
         """Release the lock."""
         self._file.close()
 
-    def _read(self, owner: Owner) -> JournalContent:
+    def _read_and_claim(self, owner: Owner) -> JournalContent:
+        """Read the contents, cut off a torn tail, and write the owner into a journal without evaluations."""
         data = self._file.read()
         size = len(data)
         frames, end = decode_frames(data, self.path)
@@ -337,7 +339,7 @@ def _read_frames(path: Path) -> tuple[list[JournalFrame], int]:
 def _open_and_lock(path: Path) -> IO[bytes]:
     try:
         refuse_other_than_file(path)
-        make_durable(path.parent)
+        make_synced_directory(path.parent)
         file = open(path, "a+b", buffering=0)  # noqa: SIM115
     except OSError as error:
         raise SafevarError(f"{path}: cannot be opened: {error.strerror}") from None

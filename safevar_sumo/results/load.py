@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 class Failure(NamedTuple):
-    """A setting that could not be simulated: its algorithm, run and position in the run, and the reason."""
+    """A setting that could not be simulated: its algorithm, run, number of the evaluation in the run (from 0), and the reason."""
 
     algorithm: str
     run: int
@@ -34,10 +34,10 @@ class Failure(NamedTuple):
 
 def failure_lines(failures: Sequence[Failure]) -> list[str]:
     """A line for each distinct reason: the first failure with this reason, and the number of further failures."""
-    reasons: dict[str, list[Failure]] = {}
+    failures_by_reason: dict[str, list[Failure]] = {}
     for failure in failures:
-        reasons.setdefault(failure.reason, []).append(failure)
-    return [str(first) if not others else f"{first} (and {len(others)} more)" for first, *others in reasons.values()]
+        failures_by_reason.setdefault(failure.reason, []).append(failure)
+    return [str(first) if not others else f"{first} (and {len(others)} more)" for first, *others in failures_by_reason.values()]
 
 
 class StoredResults(NamedTuple):
@@ -66,9 +66,9 @@ class StoredResults(NamedTuple):
 
 
 class RunStatus(NamedTuple):
-    """Progress of one run: numbers of distinct settings simulated, of collisions and failures among them, and the lowest safety degree.
+    """Progress of one run: how many distinct settings were simulated, collided, and failed; and the `best`, the lowest safety degree.
 
-    `state` is waiting, begun or finished; `best` is in m, or -m/s, None before the first simulation.
+    `state` is waiting, begun or finished; `best` is a distance [m] or minus a collision speed [m/s], None before the first simulation.
     """
 
     algorithm: str
@@ -129,7 +129,7 @@ def _read_search(folder: Path, manifest: Mapping[str, Any]) -> _Search:
         runs = [(name, run) for name in dict.fromkeys(map(label_of, search["algorithms"])) for run in range(search["runs"])]
         return _Search(runs, int(search["evaluations"]), tuple(manifest["study"]["vehicle"]["characteristics"]))
     except (KeyError, TypeError, ValueError):
-        raise InputError(folder / MANIFEST, "has no characteristics or no search", "what the command study has written") from None
+        raise InputError(folder / MANIFEST, "has no characteristics or no search", "what the command `study` has written") from None
 
 
 def _read_journals(folder: Path, manifest: Mapping[str, Any],
@@ -160,8 +160,8 @@ def load_runs(directory: str | Path) -> StoredResults:
     evaluations_of_runs, solutions_of_runs, positions, failures = [], [], [], []
     for algorithm, run, content in _read_journals(folder, manifest, search.runs):
         if content is not None and content.tail_size and content.result(search.budget) is None:
-            warn(f"{journal_file(folder, f'{algorithm}-{run:02d}')}: the last {content.tail_size} bytes are torn, so the run is left out; "
-                 "running the same study again simulates the lost evaluations")
+            warn(f"{journal_file(folder, f'{algorithm}-{run:02d}')}: the last {content.tail_size} bytes are torn, "
+                 "so the run counts as unfinished; running the same study again simulates the lost evaluations")
         if content is None or content.evaluations is None:
             continue
         requests = sorted((position, row) for row, position in enumerate(content.positions) if 0 <= position < search.budget)
@@ -189,22 +189,23 @@ def status(directory: str | Path) -> Status:
     folder = Path(directory)
     manifest = read_manifest(folder)
     if "imported" in manifest:
-        raise InputError(folder, "holds imported solutions, which have no runs", "results of the command study")
+        raise InputError(folder, "holds imported solutions, which have no runs", "results of the command `study`")
     search = _read_search(folder, manifest)
     runs = [_summarise_run(*journal, search.budget) for journal in _read_journals(folder, manifest, search.runs)]
     table = folder / SOLUTIONS
     remarks = [f"{table} was edited: it no longer holds the computed solutions"] if is_edited(table, manifest) else []
-    return Status(str(manifest["study"].get("name")), str(manifest["study"].get("title")), search.budget, tuple(run for run, _ in runs),
-                  np.concatenate([points for _, points in runs]), tuple(remarks))
+    return Status(study=str(manifest["study"].get("name")), title=str(manifest["study"].get("title")), budget=search.budget,
+                  runs=tuple(run for run, _ in runs), points=np.concatenate([objectives for _, objectives in runs]), remarks=tuple(remarks))
 
 
 def _summarise_run(algorithm: str, run: int, content: JournalContent | None, budget: int) -> tuple[RunStatus, np.ndarray]:
     """Progress of a run, and objectives of its valid evaluations."""
     evaluations = content.requested_within(budget) if content is not None else None
     if content is None or evaluations is None:
-        return RunStatus(algorithm, run, "waiting" if content is None else "begun", 0, 0, 0, None), np.zeros((0, 3))
+        state = "waiting" if content is None else "begun"
+        return RunStatus(algorithm, run, state, simulated=0, collisions=0, simulator_errors=0, best=None), np.zeros((0, 3))
     valid_evaluations = evaluations.take(evaluations.valid)
     state = "finished" if content.result(budget) is not None else "begun"
     best = float(np.min(valid_evaluations.f_safe)) if len(valid_evaluations) else None
-    return (RunStatus(algorithm, run, state, len(evaluations), int(np.count_nonzero(evaluations.collided)),
-                      int(np.count_nonzero(evaluations.failed)), best), valid_evaluations.objectives)
+    return (RunStatus(algorithm, run, state, simulated=len(evaluations), collisions=int(np.count_nonzero(evaluations.collided)),
+                      simulator_errors=int(np.count_nonzero(evaluations.failed)), best=best), valid_evaluations.objectives)

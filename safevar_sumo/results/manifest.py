@@ -27,7 +27,7 @@ KEYS_WITHOUT_EFFECT_ON_EVALUATIONS = ("runs", "algorithms", "evaluations", "time
 LAYERS = {
     "resolved": "the same study and options", "network": "the network's file as it was", "sources": "the file as it was",
     "results": "that version", "versions": "those versions", "platform": "such a machine"}
-"""Inputs that results depend on, each with the remedy if it has changed; an error adds the remedy to "expected: another --out, or "."""
+"""Inputs that results depend on, each with the remedy if it has changed; an error says "expected: another --out, or REMEDY"."""
 LAYERS_OF_FILES = ("network", "sources")
 """Layers that hold a digest for each file."""
 LAYERS_OF_FORMAT_2 = ("resolved", "network", "sources", "code", "versions", "platform")
@@ -122,7 +122,7 @@ def read_manifest(directory: Path) -> dict[str, Any]:
         If there is no manifest, or its file is something else or was edited.
     """
     file = directory / MANIFEST
-    expected = "a directory written by the command study"
+    expected = "a directory written by the command `study`"
     try:
         refuse_other_than_file(file)
         manifest = json.loads(file.read_text(encoding="utf-8", errors="replace"))

@@ -81,7 +81,7 @@ CHOICES = {
 
 
 def choose_handle(solutions: pd.DataFrame, unsafe: Unsafe, choice: str, source: object) -> SolutionId:
-    """The handle of the most severe solution, or of the unsafe solution that is first in the order of another choice.
+    """The handle of the solution that a choice selects: `most_severe` among all solutions, any other choice among the unsafe ones.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""The results directory of a study, with the same bytes for the same study and seed, and tables of evaluations and solutions."""
+"""The results directory of a study (the same study and seed give the same bytes), and tables of evaluations and solutions."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from safevar_sumo.results.files import (
     RUNS,
     SOLUTIONS,
     journal_file,
-    later_files,
     make_directory,
+    read_late_files,
     record_late_file,
     sync_directory,
     write_folders,
@@ -75,15 +75,15 @@ class ResultsDirectory:
         if scoring != PUBLISHED_SCORING:
             self.manifest["scoring"] = msgspec.to_builtins(scoring)
         make_directory(path)
-        self._digests: dict[str, str] = dict(self.manifest.get("sources", {}))
+        self._source_digests: dict[str, str] = dict(self.manifest.get("sources", {}))
         self._refuse_another_study()
 
     @property
     def inputs(self) -> dict[str, Any]:
         """Digests, by layer, of the files that all workers must share; `sources` include files that were read after the study began."""
-        return {"network": self.manifest.get("network", {}), "sources": self._digests}
+        return {"network": self.manifest.get("network", {}), "sources": self._source_digests}
 
-    def note(self, files: Mapping[str, str]) -> None:
+    def record_late_files(self, files: Mapping[str, str]) -> None:
         """Record files that user code has read since the study began; must be called before evaluations that use the files are journalled.
 
         Raises
@@ -92,13 +92,13 @@ class ResultsDirectory:
             If a file has changed since it was first read.
         """
         for name, digest in files.items():
-            stored_digest = self._digests.get(name) or later_files(self.path).get(name, digest)
+            stored_digest = self._source_digests.get(name) or read_late_files(self.path).get(name, digest)
             if stored_digest != digest:
                 raise InputError(name, "is not the file that this study began with: it was changed meanwhile",
                                  "the file as it was, and the same command; or another --out")
-            if name not in self._digests:
+            if name not in self._source_digests:
                 record_late_file(self.path, name, digest)
-                self._digests[name] = digest
+                self._source_digests[name] = digest
 
     def journal(self, run: str) -> Journal:
         """Open and lock the journal of a run, such as nsga2-03."""
@@ -110,11 +110,11 @@ class ResultsDirectory:
             raise
 
     def begin(self, original: Evaluations, runs: Iterable[str] = ()) -> list[str]:
-        """Write the manifest with the original vehicle's evaluation; remove solutions of other runs.
+        """Write the manifest with the original vehicle's evaluation; remove a table of solutions that covers other runs.
 
         Returns remarks on stored runs of another length, and on those that are not among `runs`, the names of all runs of the study.
         """
-        manifest = {**self.manifest, "original": record(original, 0)}
+        manifest = {**self.manifest, "original": record(original, row=0)}
         earlier_manifest = read_manifest(self.path) if (self.path / MANIFEST).exists() else manifest
         is_outdated = search_extent_of(earlier_manifest) != search_extent_of(manifest)
         if not is_outdated and DIGESTS_KEY in earlier_manifest:
@@ -140,17 +140,18 @@ class ResultsDirectory:
         write_manifest(self.path, {**read_manifest(self.path), DIGESTS_KEY: {SOLUTIONS: digest_of_table(text)}})
 
     def _refuse_another_study(self) -> None:
+        """Refuse results of another study; else take over the digests of files that were read after the study began."""
         if not (self.path / MANIFEST).exists():
             other_files = sorted(name for path in self.path.iterdir() if (name := path.name) not in (RUNS, SOLUTIONS) and name[0] != ".")
             if other_files and not (self.path / RUNS).exists():  # if there are journals, their owner decides whose directory this is
                 raise InputError("out", f"{self.path} holds other files: {other_files[0]}", "an empty directory, or one of this study")
             return
-        stored_manifest, late_files = read_manifest(self.path), later_files(self.path)
+        stored_manifest, late_files = read_manifest(self.path), read_late_files(self.path)
         if "imported" not in stored_manifest and late_files:
             folders = self._study.origin.places
-            stored_manifest, self.manifest["sources"] = make_inputs_comparable(stored_manifest, self._digests, late_files, folders)
+            stored_manifest, self.manifest["sources"] = make_inputs_comparable(stored_manifest, self._source_digests, late_files, folders)
         problem, remedy = ("they are imported", "") if "imported" in stored_manifest else first_difference(stored_manifest, self.manifest)
-        self._digests = {**self.manifest.get("sources", {}), **late_files}
+        self._source_digests = {**self.manifest.get("sources", {}), **late_files}
         if problem:
             expected = f"another --out, or {remedy}" if remedy else "another --out"
             raise InputError(self.path, f"holds results of another study: {problem}", expected)
@@ -181,19 +182,19 @@ def solutions_frame(characteristics: tuple[str, ...], solutions: Iterable[tuple[
 def evaluations_frame(characteristics: tuple[str, ...], runs: Iterable[tuple[tuple[str, int], Evaluations]]) -> pd.DataFrame:
     """One row per evaluation.
 
-    Columns: algorithm, run, the characteristics' filtered values in their table units, f_safe, f_diff [fraction],
+    Columns: algorithm, run, the characteristics' filtered values in the units of the study, f_safe, f_diff [fraction],
     f_num_diff, safety_degree [m or -m/s], tet [s], tit [s^2], ave_dece [m/s^2], further metrics, outcome.
     """
     import pandas as pd
 
     all_runs = list(runs)
     metrics = dict.fromkeys([*METRICS, *(name for _, evaluations in all_runs for name in evaluations.metrics)])
-    frames = [_frame("", 0, characteristics, Evaluations.none(len(characteristics), metrics))]
-    frames += [_frame(algorithm, run, characteristics, evaluations) for (algorithm, run), evaluations in all_runs]
+    frames = [_frame_of_run("", 0, characteristics, Evaluations.none(len(characteristics), metrics))]  # all columns even without runs
+    frames += [_frame_of_run(algorithm, run, characteristics, evaluations) for (algorithm, run), evaluations in all_runs]
     return pd.concat(frames, ignore_index=True)
 
 
-def _frame(algorithm: str, run: int, characteristics: tuple[str, ...], evaluations: Evaluations) -> pd.DataFrame:
+def _frame_of_run(algorithm: str, run: int, characteristics: tuple[str, ...], evaluations: Evaluations) -> pd.DataFrame:
     import pandas as pd
 
     return pd.DataFrame({

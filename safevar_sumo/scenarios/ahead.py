@@ -40,7 +40,7 @@ FRONT_POSITION = 0.5
 
 
 class TargetAhead(NamedTuple):
-    """A target `gap` metres ahead of the vehicle under test; the function `speed` maps a time [s] to the target's speed [m/s].
+    """A target `gap` metres ahead of the vehicle under test; the function `speed_at` maps a time [s] to the target's speed [m/s].
 
     The middle of the target's rear is `offset` metres right of the lane's middle. A standing target may be rotated around that point.
     """
@@ -49,11 +49,11 @@ class TargetAhead(NamedTuple):
     vut: BodySize
     gap: float
     offset: float
-    speed: Callable[[float], float]
+    speed_at: Callable[[float], float]
     direction: Direction = SAME_DIRECTION
 
     def lanes(self, roads: Roads) -> XmlChanges:
-        """Turn the lanes into the direction of a rotated target, whose rear is on the junction and whose front is on the exit lane."""
+        """Changes that turn the lanes into a rotated target's direction; its rear is on the junction, and its front on the exit lane."""
         if not self._is_rotated:
             return {}
         frame, (along, left), length = Frame.of(roads.lane(VUT_LANE)), self.direction, self._body.length
@@ -61,14 +61,14 @@ class TargetAhead(NamedTuple):
         entry, exit_ = ((rear[0] + distance * along, rear[1] + distance * left) for distance in (-length, length - FRONT_POSITION))
         return change_target_lanes(frame, entry, exit_, self.direction)
 
-    def actors(self, speed: float, roads: Roads) -> XmlChanges:
-        """The vehicle at `speed` [m/s], and the target ahead of it."""
+    def actors(self, vut_speed: float, roads: Roads) -> XmlChanges:
+        """The vehicle at `vut_speed` [m/s], and the target ahead of it."""
         if self.gap <= 0:
             raise InputError("scenario.parameters", f"the target begins {-self.gap:.2f} m inside the vehicle", "a target ahead")
         start, target = self._place_at_junction(roads) if self._is_rotated else self._place_in_lane()
         return {
             "vType[@id='vut']": {"length": repr(self.vut.length), "width": repr(self.vut.width)},
-            "vehicle[@id='vut']": {"departPos": repr(start), "departSpeed": repr(speed)},
+            "vehicle[@id='vut']": {"departPos": repr(start), "departSpeed": repr(vut_speed)},
             **target,
         }
 
@@ -78,7 +78,7 @@ class TargetAhead(NamedTuple):
         new_type = {f"vType[@id='{old_type}']": target_type(self.target)} if old_type != self.target else {}
         return START_POSITION, {**new_type, "vehicle[@id='target']": {
             "type": self.target, "departPos": repr(START_POSITION + self.gap + self._body.length), "departPosLat": repr(-self.offset),
-            "departSpeed": repr(self.speed(0.0))}}
+            "departSpeed": repr(self.speed_at(0.0))}}
 
     def _place_at_junction(self, roads: Roads) -> tuple[float, XmlChanges]:
         """The vehicle's start before the junction [m], and a rotated target on it."""
@@ -124,7 +124,7 @@ class _MotionAhead(NamedTuple):
     depth: float
 
     def begin(self, world: World) -> float:
-        speed = self.target_ahead.speed(0.0)
+        speed = self.target_ahead.speed_at(0.0)
         world.drive(TARGET, speed)
         return speed
 
@@ -133,10 +133,10 @@ class _MotionAhead(NamedTuple):
 
     def target(self, positions: FloatArray, times: Times) -> Target:
         along = self.frame.along(positions)
-        return Target(along - self.depth, np.full_like(along, self.target_ahead.offset), speed=value_at(times, self.target_ahead.speed))
+        return Target(along - self.depth, np.full_like(along, self.target_ahead.offset), speed=value_at(times, self.target_ahead.speed_at))
 
     def next_speed(self, sample: int, step: float) -> float:
-        return self.target_ahead.speed((sample + 1) * step)
+        return self.target_ahead.speed_at((sample + 1) * step)
 
     def set_speed(self, world: World, speed: float) -> None:
         world.drive(TARGET, speed)
@@ -199,11 +199,11 @@ class TargetAheadTest(TargetTest, frozen=True, kw_only=True, forbid_unknown_fiel
         """Speed that the vehicle holds until it brakes [m/s]."""
         return self.speed * KMH
 
-    def _target_at_impact_location(self, target: str, gap: float, speed: Callable[[float], float],
+    def _target_at_impact_location(self, target: str, gap: float, speed_at: Callable[[float], float],
                                    direction: Direction = SAME_DIRECTION) -> TargetAhead:
         """The target with the middle of its rear at the impact location."""
         vut = BodySize(self.vut_length, self.vut_width)
-        return TargetAhead(target, vut, gap, lateral_offset(self.impact_location, self.vut_width), speed, direction)
+        return TargetAhead(target, vut, gap, lateral_offset(self.impact_location, self.vut_width), speed_at, direction)
 
     @property
     def _target_ahead(self) -> TargetAhead:

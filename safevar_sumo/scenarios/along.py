@@ -24,7 +24,7 @@ class _TestRow(NamedTuple):
     pre_crash: PreCrash
 
 
-TESTS = {
+TESTS = {  # target, its speed, acceleration distance, range (slowest, fastest, impact locations), pre-crash type
     "CPLA": _TestRow("adult", 5.0, 1.0, ProtocolRange(10, 80, IMPACT_LOCATIONS), PreCrash.PEDESTRIAN),
     "CBLA": _TestRow("cyclist", 15.0, 0.0, ProtocolRange(20, 80, IMPACT_LOCATIONS), PreCrash.CYCLIST),
 }
@@ -80,7 +80,7 @@ class Along(TargetAheadTest, frozen=True, kw_only=True):
 
     @property
     def _target_ahead(self) -> TargetAhead:
-        profile = SpeedProfile(0.0, self._parameter("target_speed") * KMH, self._parameter("acceleration_distance"))
+        profile = SpeedProfile(begin=0.0, speed=self._parameter("target_speed") * KMH, run_up=self._parameter("acceleration_distance"))
         gap = self.speed * KMH * self.time_to_impact - profile.travelled(self.time_to_impact)
         return self._target_at_impact_location(self._parameter("target"), gap, profile.speed_at)
 

@@ -120,11 +120,15 @@ class Scenario(Protocol):
 
     `network` is a folder of `sumo_nets/`, or the path of a folder with the same files; `duration` is the length of a run [s].
 
-    Optional: `reactive_actors = False` declares that no actor reacts to the vehicle under test, so that SUMO can play the scene once for
-    all vehicles; `grade`, the rise of the road [%] (SUMO's plane is then that road, and gravity acts in the vehicles); `pre_crash`, its
-    type in NHTSA's typology; `lanes(roads)` and `actors(roads)`, which return `XmlChanges` to the built network and to the traffic on it;
-    `remarks() -> list[str]` on its parameters for the user; `test_speed` [m/s]: a robot holds the vehicle at that speed until the ADS
-    brakes, a run that leaves the tolerance before that is an invalid test, and only contacts at the vehicle's front are collisions.
+    Optional members:
+
+    - `reactive_actors = False` declares that no actor reacts to the vehicle under test: SUMO can play the scene once for all vehicles.
+    - `grade` is the rise of the road [%]. SUMO's plane then stands for the inclined road; the vehicle models add the force of gravity.
+    - `pre_crash` is the scenario's type in NHTSA's typology.
+    - `lanes(roads)` and `actors(roads)` return `XmlChanges` to the built network and to the traffic on it.
+    - `remarks() -> list[str]` returns remarks for the user on the scenario's parameters.
+    - `test_speed` [m/s] is held by a robot until the ADS brakes. A run that leaves the tolerance before that is an invalid test. Only
+      contacts at the vehicle's front are collisions.
     """
 
     network: str
@@ -188,7 +192,7 @@ def pre_crash_of(scenario: Any) -> str:
 
 
 def pre_crash_sentence(points: Iterable[Point]) -> str:
-    """A sentence that lists the pre-crash types and the light of points; "" if no scenario has a type."""
+    """A sentence that lists the pre-crash types and the light of test points; "" if no scenario has a type."""
     points = tuple(points)
     types = dict.fromkeys(filter(None, (pre_crash_of(point.scenario) for point in points)))
     light = " and ".join(dict.fromkeys(f"by {point.weather.light}" for point in points))
@@ -211,12 +215,13 @@ class GuardedScenario:
         if not isinstance(network, str):
             raise guard.wrong_value("__init__", "network", network, "the name or path of a folder with a network")
         self.network = network
-        duration = guard.numbers("__init__", "duration", guard.field("__init__", scenario, "duration"), (), 0.0, MAX_DURATION, above=True)
+        duration = guard.numbers("__init__", "duration", guard.field("__init__", scenario, "duration"), shape=(),
+                                 lowest=0.0, highest=MAX_DURATION, above=True)
         self.duration = float(duration)
-        grade = guard.numbers("__init__", "grade", getattr(scenario, "grade", 0.0), (), -MAX_GRADE, MAX_GRADE)
+        grade = guard.numbers("__init__", "grade", getattr(scenario, "grade", 0.0), shape=(), lowest=-MAX_GRADE, highest=MAX_GRADE)
         speed = getattr(scenario, "test_speed", None)
         self.test_speed = speed if speed is None else float(
-            guard.numbers("__init__", "test_speed", speed, (), 0.0, MAX_TEST_SPEED, above=True))
+            guard.numbers("__init__", "test_speed", speed, shape=(), lowest=0.0, highest=MAX_TEST_SPEED, above=True))
         self.reactive_actors = bool(getattr(scenario, "reactive_actors", True))
         self.grade, self.pre_crash = float(grade), str(getattr(scenario, "pre_crash", ""))
 

@@ -31,7 +31,7 @@ class _TestRow(NamedTuple):
     pre_crash: PreCrash
 
 
-TESTS = {
+TESTS = {  # target, range (slowest, fastest, impact locations), headway, pre-crash type
     "CCRs": _TestRow("car", ProtocolRange(10, 80, CAR_LOCATIONS), 5.0, PreCrash.LEAD_STOPPED),
     "CCRm": _TestRow("car", ProtocolRange(30, 130, CAR_LOCATIONS), 5.0, PreCrash.LEAD_SLOWER),
     "CCRb": _TestRow("car", ProtocolRange(30, 130, CAR_LOCATIONS), 1.0, PreCrash.LEAD_DECELERATING),
@@ -52,7 +52,7 @@ class CarToCar(TargetAheadTest, frozen=True, kw_only=True):
     impact_location
         Point of the vehicle's front that would hit the middle of the target's rear, from the left corner [% of the width].
     headway
-        Gap at the start over the vehicle's speed [s].
+        Gap at the start divided by the vehicle's speed [s].
     brakes_at, target_deceleration
         Time at which the target of CCRb and CMRb begins to brake, and its deceleration, down to 2 km/h [s, m/s^2].
     heading
@@ -102,9 +102,10 @@ class CarToCar(TargetAheadTest, frozen=True, kw_only=True):
 
     @property
     def _target_ahead(self) -> TargetAhead:
-        if self.heading and self._speed_at(0.0):
+        if self.heading and self._target_speed_at(0.0):
             raise InputError("scenario.parameters", f"heading = {self.heading:g} with a moving target", "a heading for a standing target")
-        return self._target_at_impact_location(TESTS[self.test].target, self._gap, self._speed_at, SAME_DIRECTION.turned(self.heading))
+        direction = SAME_DIRECTION.turned(self.heading)
+        return self._target_at_impact_location(TESTS[self.test].target, self._gap, self._target_speed_at, direction)
 
     @property
     def _target_brakes(self) -> bool:
@@ -121,7 +122,7 @@ class CarToCar(TargetAheadTest, frozen=True, kw_only=True):
         default = {PreCrash.LEAD_STOPPED: 0.0, PreCrash.LEAD_SLOWER: slower_speed}.get(TESTS[self.test].pre_crash, self.speed)
         return (default if self.target_speed is None else self.target_speed) * KMH
 
-    def _speed_at(self, time: float) -> float:
+    def _target_speed_at(self, time: float) -> float:
         initial_speed = self._target_speed
         if not self._target_brakes:
             return initial_speed
@@ -130,7 +131,7 @@ class CarToCar(TargetAheadTest, frozen=True, kw_only=True):
     def _time_to_impact(self) -> float:
         """Time to the impact if the vehicle does not brake [s].
 
-        The gap closes at a constant speed; with a braking target, first at a rising speed (by b t^2 / 2), then at a constant one.
+        The gap closes at a constant speed. A target that brakes at b m/s^2 makes this speed rise by b per second until it stops braking.
         """
         closing_speed, gap = self.speed * KMH - self._target_speed, self._gap
         if not self._target_brakes:
@@ -140,7 +141,7 @@ class CarToCar(TargetAheadTest, frozen=True, kw_only=True):
         remaining_gap = gap - closing_speed * self.brakes_at
         if remaining_gap <= 0:
             return gap / closing_speed
-        b, speed_lost = self.target_deceleration, self._target_speed - self._speed_at(1e9)
+        b, speed_lost = self.target_deceleration, self._target_speed - self._target_speed_at(math.inf)
         gap_closed = (closing_speed + speed_lost / 2) * speed_lost / b
         if remaining_gap > gap_closed:
             return self.brakes_at + speed_lost / b + (remaining_gap - gap_closed) / (closing_speed + speed_lost)

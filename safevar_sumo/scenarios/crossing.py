@@ -59,7 +59,7 @@ class _TestRow(NamedTuple):
     protocol_range: ProtocolRange
 
 
-TESTS = {
+TESTS = {  # side, target, its speed, lateral start, acceleration distance, hidden, range (slowest, fastest, impact locations)
     "CPFA": _TestRow("far", "adult", 8.0, 6.0, 1.5, False, ProtocolRange(10, 60, IMPACT_LOCATIONS)),
     "CPNA": _TestRow("near", "adult", 5.0, 4.0, 1.0, False, ProtocolRange(10, 60, IMPACT_LOCATIONS)),
     "CPNCO": _TestRow("near", "child", 5.0, 4.0, 1.0, True, ProtocolRange(10, 60, IMPACT_LOCATIONS)),
@@ -82,7 +82,7 @@ class _Start(NamedTuple):
         How SUMO moves the target, the direction of motion, and the size of the target's body along the lane and across it [m].
     impact_left
         Distance of the impact to the left of the lane's middle [m].
-    distance, time
+    distance_to_impact, time_to_impact
         Distance and time from the target's start to the impact [m, s].
     profile
         The target's speed over time.
@@ -92,8 +92,8 @@ class _Start(NamedTuple):
     direction: Direction
     extent: BodySize
     impact_left: float
-    distance: float
-    time: float
+    distance_to_impact: float
+    time_to_impact: float
     profile: SpeedProfile
 
     @classmethod
@@ -113,7 +113,7 @@ class _Start(NamedTuple):
             if test.acceleration_distance is not None:
                 raise InputError("scenario.parameters", "acceleration_distance: the target starts at its speed", "lateral_start too")
             time = float(test.time_to_impact or TIME_TO_IMPACT) * test.start_share
-            distance, profile = speed * time, SpeedProfile(0.0, speed, 0.0)
+            distance, profile = speed * time, SpeedProfile(begin=0.0, speed=speed, run_up=0.0)
         else:
             distance, run_up = (lateral_start + impact_lateral) * test.start_share, test.parameter("acceleration_distance")
             shortest_time = (distance + run_up) / speed
@@ -124,11 +124,11 @@ class _Start(NamedTuple):
 
 
 class _CrossingMotion(NamedTuple):
-    """The motion of a target whose path crosses the vehicle's lane at the position `path` [m]; see `TargetMotion`."""
+    """The motion of a target that crosses the lane; `impact_position` is its middle's position along the lane at the impact [m]."""
 
     frame: Frame
     constants: EncounterConstants
-    path: float
+    impact_position: float
     start: _Start
     vut_width: float
 
@@ -142,8 +142,8 @@ class _CrossingMotion(NamedTuple):
         direction, extent, profile = self.start.direction, self.start.extent, self.start.profile
         along, left = self.start.mover.middle(self.frame, positions)
         lateral = left if direction.left > 0 else -left
-        ahead = np.zeros_like(left) if along is None else along - self.path
-        return Target(self.path - extent.length / 2 + ahead, lateral, has_left=lateral > (self.vut_width + extent.width) / 2,
+        ahead = np.zeros_like(left) if along is None else along - self.impact_position
+        return Target(self.impact_position - extent.length / 2 + ahead, lateral, is_clear=lateral > (self.vut_width + extent.width) / 2,
                       speed=value_at(times, lambda time: direction.along * profile.speed_at(time)) if direction.along else 0.0, ahead=ahead)
 
     def next_speed(self, sample: int, step: float) -> float:
@@ -195,11 +195,13 @@ class Crossing(TargetTest, frozen=True, kw_only=True, forbid_unknown_fields=True
     `lateral` refers to the target's middle, `gap` to the corner or side of its body that is nearest along the lane.
 
     Where the protocol leaves a choice, this class follows Euro NCAP's calculator (euroncap-rating-2026 5.4.9). `target_speed`,
-    `start_share` and `heading` express its robustness layers. Assumptions where the calculator leaves a choice too: with every layer
-    the target still arrives at the impact location; a faster target starts from the usual position or, if it starts at speed, from
-    correspondingly farther away. With a smaller `start_share` a standing target sets off later, and a moving target's run begins when
-    the target is there. At a junction the middle of the target meets the middle of the front, and the target comes from the near side,
-    where the calculator chooses a side at random.
+    `start_share` and `heading` express its robustness layers. Assumptions where the calculator leaves a choice too:
+
+    - With every layer the target still arrives at the impact location.
+    - A faster target starts from the usual position; if it starts at its speed, from correspondingly farther away.
+    - With a smaller `start_share` a standing target sets off later, and the run of a moving target begins with the target nearer.
+    - At a junction the middle of the target meets the middle of the front. The target comes from the near side; the calculator chooses a
+      side at random.
     """
 
     test: Literal["CPFA", "CPNA", "CPNCO", "CBNA", "CBFA", "CBNAO", "CCCscp", "CMCscp"] = "CPFA"
@@ -238,7 +240,7 @@ class Crossing(TargetTest, frozen=True, kw_only=True, forbid_unknown_fields=True
     @property
     def duration(self) -> float:
         """Length of a run [s]."""
-        return _Start.of(self).time + self.time_after
+        return _Start.of(self).time_to_impact + self.time_after
 
     def remarks(self) -> list[str]:
         """Remarks on parameters outside the protocol."""
@@ -251,23 +253,24 @@ class Crossing(TargetTest, frozen=True, kw_only=True, forbid_unknown_fields=True
     def actors(self, roads: Roads) -> XmlChanges:
         """The vehicle before the target's path, the target beside the vehicle's lane, and the parked cars, if any."""
         frame, start = Frame.of(roads.lane(VUT_LANE)), _Start.of(self)
-        path = start.mover.path(frame, roads, start.impact_left)
-        front = path - start.extent.length / 2 - self.speed * KMH * start.time
+        impact_position = start.mover.impact_position(frame, roads, start.impact_left)
+        front = impact_position - start.extent.length / 2 - self.speed * KMH * start.time_to_impact
         if front - self.vut_length < 0:
-            raise InputError("scenario.parameters", f"{self.speed:g} km/h for {start.time:g} s is longer than the road")
+            raise InputError("scenario.parameters", f"{self.speed:g} km/h for {start.time_to_impact:g} s is longer than the road")
         return {
             "vType[@id='vut']": {"length": repr(self.vut_length), "width": repr(self.vut_width)},
             "vehicle[@id='vut']": {"departPos": repr(front), "departSpeed": repr(self.speed * KMH)},
-            **start.mover.actors(frame, roads, start.impact_left, start.distance, start.profile),
-            **self._parked_cars(frame, path, roads),
+            **start.mover.actors(frame, roads, start.impact_left, start.distance_to_impact, start.profile),
+            **self._parked_cars(frame, impact_position, roads),
         }
 
-    def _parked_cars(self, frame: Frame, path: float, roads: Roads) -> XmlChanges:
+    def _parked_cars(self, frame: Frame, impact_position: float, roads: Roads) -> XmlChanges:
         """The parked cars beside the lane, if any."""
         if not self.parameter("hidden"):
             return {f"vehicle[@id='{car}']": None for car in PARKED_LENGTH}
         start, left = frame.lane_coordinates(roads.lane(KERB_LANE).start)
-        changes, end, across = dict[str, dict[str, str]](), path - PARKED_GAP - start, self._parked_edge - PARKED_WIDTH / 2 - left
+        changes, across = dict[str, dict[str, str]](), self._parked_edge - PARKED_WIDTH / 2 - left
+        end = impact_position - PARKED_GAP - start
         for car, length in PARKED_LENGTH.items():
             changes[f"vehicle[@id='{car}']"] = {"departPos": repr(end), "departPosLat": repr(across)}
             changes[f"vehicle[@id='{car}']/stop"] = {"endPos": repr(end)}
@@ -278,9 +281,9 @@ class Crossing(TargetTest, frozen=True, kw_only=True, forbid_unknown_fields=True
         frame, start = Frame.of(world.lane(VUT_LANE)), _Start.of(self)
         constants = EncounterConstants(passed_gap=-start.extent.length - self.vut_length)
         if self.parameter("hidden"):
-            constants = constants._replace(hidden=True, to_middle=start.extent.length / 2, setback=self.sensor_setback,
+            constants = constants._replace(hidden=True, edge_to_middle=start.extent.length / 2, setback=self.sensor_setback,
                                            parked_offset=-self._parked_edge)
-        return _CrossingMotion(frame, constants, start.mover.path(frame, world, start.impact_left), start, self.vut_width)
+        return _CrossingMotion(frame, constants, start.mover.impact_position(frame, world, start.impact_left), start, self.vut_width)
 
     def encounter(self, trace: Trace) -> Encounter:
         """Distance between the vehicle's front and the target's body, along and across the lane; TTC from its rate of change."""

@@ -37,10 +37,10 @@ class PersonMover(NamedTuple):
     start: float
 
     def lanes(self, frame: Frame, roads: Roads) -> XmlChanges:
-        """Change nothing: the pedestrian uses the network's footpath."""
+        """No changes: the pedestrian uses the network's footpath."""
         return {}
 
-    def path(self, frame: Frame, roads: Roads | World, impact_left: float) -> float:
+    def impact_position(self, frame: Frame, roads: Roads | World, impact_left: float) -> float:
         """Position of the target's middle along the lane when the target is `impact_left` metres to the left of the lane's middle [m]."""
         return frame.lane_coordinates(roads.lane(CROSSING_LANE).start)[0]
 
@@ -73,7 +73,7 @@ class PersonMover(NamedTuple):
         return world.person_positions(PEDESTRIAN)
 
     def middle(self, frame: Frame, positions: FloatArray) -> tuple[FloatArray | None, FloatArray]:
-        """Position of the target's middle along the lane (None: as `path` returns) and to the left [m], from `positions` of the front."""
+        """Position of the target's middle along the lane (None: the impact position) and to the left [m], from `positions` of the front."""
         return None, frame.left(positions) - self.sign * BODIES[self.target].length / 2
 
     def next_speed(self, profile: SpeedProfile, sample: int, step: float) -> float:
@@ -93,14 +93,14 @@ class VehicleMover(NamedTuple):
     direction: Direction
 
     def lanes(self, frame: Frame, roads: Roads) -> XmlChanges:
-        """Rotate the target's lanes around their crossing with the vehicle's lane; change nothing for a target from the right."""
+        """Changes that rotate the target's lanes around their crossing with the vehicle's lane; none for a target from the right."""
         if self.direction == FROM_RIGHT:
             return {}
         (along, entry), (_, exit_) = (frame.lane_coordinates(point) for point in roads.lane(JUNCTION_LANE))
         (forward, left), half = self.direction, (exit_ - entry) / 2
         return change_target_lanes(frame, (along - half * forward, -half * left), (along + half * forward, half * left), self.direction)
 
-    def path(self, frame: Frame, roads: Roads | World, impact_left: float) -> float:
+    def impact_position(self, frame: Frame, roads: Roads | World, impact_left: float) -> float:
         """Position of the target's middle along the lane when the target is `impact_left` metres to the left of the lane's middle [m]."""
         along, left = frame.lane_coordinates(roads.lane(ENTRY_LANE).end)
         return along + (impact_left - left) * self.direction.along / self.direction.left
@@ -109,8 +109,8 @@ class VehicleMover(NamedTuple):
         """The target on its lane, `distance` metres before the impact."""
         lane, (forward, left) = roads.lane(ENTRY_LANE), self.direction
         lane_start = self._along(frame, lane.start)
-        impact = self.path(frame, roads, impact_left) * forward + impact_left * left
-        front = impact - lane_start - distance + BODIES[self.target].length / 2
+        impact_on_path = self.impact_position(frame, roads, impact_left) * forward + impact_left * left
+        front = impact_on_path - lane_start - distance + BODIES[self.target].length / 2
         length = self._along(frame, lane.end) - lane_start
         if not 0 < front <= length:
             raise InputError("scenario.parameters", f"the target starts {distance:.2f} m before the impact, where it has no lane",

@@ -53,7 +53,7 @@ class Direction(NamedTuple):
     left: float
 
     def turned(self, heading: float) -> Direction:
-        """The direction turned counterclockwise by `heading` [degrees]; rounded, as the last bits of sine and cosine differ by machine."""
+        """The direction turned counterclockwise by `heading` [degrees]; rounded, as sines differ between machines in the last bits."""
         cosine, sine = (round(function(math.radians(heading)), 12) for function in (math.cos, math.sin))
         return Direction(self.along * cosine - self.left * sine, self.left * cosine + self.along * sine)
 
@@ -75,7 +75,7 @@ ENTRY_LANE, JUNCTION_LANE, EXIT_LANE = "across_0", ":junction_0_0", "across_on_0
 
 
 def change_target_lanes(frame: Frame, entry: Coordinates, exit_: Coordinates, direction: Direction, length: float = 300.0) -> XmlChanges:
-    """Make the target's lanes straight in a direction: from `entry` to `exit_` on the junction, and `length` metres before and after.
+    """Changes for straight lanes of the target in a direction: `entry` to `exit_` on the junction, and `length` metres before and after.
 
     Points are given along the vehicle's lane and to its left [m].
     """
@@ -104,8 +104,8 @@ class ProtocolRange(NamedTuple):
         if not self.slowest <= speed <= self.fastest:
             remarks.append(f"{test}: speed = {speed:g} km/h is outside the protocol's {self.slowest:g} to {self.fastest:g} km/h")
         if location not in self.locations:
-            locations = ", ".join(f"{location:g}" for location in self.locations)
-            remarks.append(f"{test}: impact_location = {location:g} % is none of the protocol's {locations} %")
+            legal = ", ".join(f"{protocol_location:g}" for protocol_location in self.locations)
+            remarks.append(f"{test}: impact_location = {location:g} % is none of the protocol's {legal} %")
         if grade:
             remarks.append(f"{test}: grade = {grade:g} %, and the protocol's road is level")
         return remarks
@@ -120,7 +120,7 @@ class SpeedProfile(NamedTuple):
 
     @classmethod
     def with_arrival(cls, distance: float, time: float, speed: float, run_up: float) -> SpeedProfile:
-        """The profile that covers `distance` [m] by `time` [s]: past the run-up, t seconds after `begin`, distance = speed t - run_up."""
+        """The profile that covers `distance` [m] by `time` [s]; past the run-up, distance = speed * (time - begin) - run_up."""
         if distance < run_up:
             raise InputError("scenario.parameters", f"acceleration_distance = {run_up:g} m is longer than the distance of {distance:g} m")
         begin = time - (distance + run_up) / speed
@@ -148,7 +148,7 @@ class SpeedProfile(NamedTuple):
 
 
 def lateral_offset(location: float, width: float) -> float:
-    """Distance of an impact location [% of the vehicle's width, from the left] to the right of the front's middle [m]."""
+    """Distance of an impact location from the front's middle [m]; below 0 on the side from which `location` counts [% of `width`]."""
     return (location / 100 - 0.5) * width
 
 

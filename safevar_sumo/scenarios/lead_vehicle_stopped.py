@@ -18,7 +18,7 @@ class _Memory(NamedTuple):
     """The frame of the lane, the parked vehicle's rear bumper along the lane [m], and zeros; arrays of shape (N,)."""
 
     frame: Frame
-    rear: FloatArray
+    parked_rear: FloatArray
     zeros: FloatArray
 
 
@@ -49,11 +49,11 @@ class LeadVehicleStopped(Struct, frozen=True, kw_only=True, forbid_unknown_field
         return _Memory(frame, rear, np.zeros_like(rear))
 
     def observe(self, world: World, step: float, memory: _Memory) -> tuple[Scene, _Memory]:
-        gap = memory.rear - memory.frame.along(world.vehicle_positions(VUT))
-        return Scene(gap, memory.zeros, memory.zeros, memory.zeros > 0), memory
+        gap = memory.parked_rear - memory.frame.along(world.vehicle_positions(VUT))
+        return Scene(gap, memory.zeros, memory.zeros, memory.zeros > 0), memory  # never over
 
     def encounter(self, trace: Trace) -> Encounter:
-        """Safety degree from centre to centre of two vehicles of equal length; TTC = (centre distance - length) / v (method section 4)."""
+        """Safety degree: distance between the centres of two vehicles of equal length; TTC = gap / v (docs/method.md, section 4)."""
         return Encounter(
             separation=trace.gap + trace.vehicle_length,
             distance=trace.gap,

@@ -25,7 +25,7 @@ class _Memory(NamedTuple):
     frame: Frame
     conflict_point: float
     clear_point: float
-    lateral: FloatArray
+    last_lateral: FloatArray
     has_turned: bool
 
 
@@ -58,34 +58,38 @@ class PedestrianCrossing(Struct, frozen=True, kw_only=True, forbid_unknown_field
 
     def begin(self, world: World) -> _Memory:
         frame, crossing = Frame.through_origin(world.lane_of(VUT)), world.lane(CROSSING_LANE)
-        (path, _), (end, _) = frame.lane_coordinates(crossing.start), frame.lane_coordinates(crossing.end)
-        if abs(end - path) > MAX_SKEW:
-            raise InputError("scenario.parameters.network", f"lane {CROSSING_LANE!r} leads {abs(end - path):.2f} m along the road",
+        (path_start, _), (path_end, _) = frame.lane_coordinates(crossing.start), frame.lane_coordinates(crossing.end)
+        skew = abs(path_end - path_start)
+        if skew > MAX_SKEW:
+            raise InputError("scenario.parameters.network", f"lane {CROSSING_LANE!r} leads {skew:.2f} m along the road",
                              "a crossing at right angles")
         lateral = frame.left(world.person_positions(PEDESTRIAN)) - frame.left(world.vehicle_positions(VUT))
         if self.turns_after is not None and lateral[0] > self.turns_after:
             raise InputError("scenario.parameters.network", f"the pedestrian begins {lateral[0]:.2f} m to the left of the vehicle",
                              "to the right of it, or turns_after = None")
         half_width = world.person_width(PEDESTRIAN) / 2
-        return _Memory(frame, path - half_width, path + half_width + world.vehicle_length(VUT), lateral, has_turned=False)
+        clear_point = path_start + half_width + world.vehicle_length(VUT)
+        return _Memory(frame, path_start - half_width, clear_point, lateral, has_turned=False)
 
     def observe(self, world: World, step: float, memory: _Memory) -> tuple[Scene, _Memory]:
         vehicle_positions = world.vehicle_positions(VUT)
         lateral = memory.frame.left(world.person_positions(PEDESTRIAN)) - memory.frame.left(vehicle_positions)
-        lateral_speed = (lateral - memory.lateral) / step
+        lateral_speed = (lateral - memory.last_lateral) / step
         goes_past = self.turns_after is not None and lateral[0] + step * lateral_speed[0] > self.turns_after
         if goes_past and not memory.has_turned:
             world.turn_back(PEDESTRIAN)
             memory = memory._replace(has_turned=True)
         front = memory.frame.along(vehicle_positions)
-        has_left = (np.abs(lateral) > self.lane_width / 2) & (lateral * lateral_speed > 0)
+        has_left_lane = (np.abs(lateral) > self.lane_width / 2) & (lateral * lateral_speed > 0)
         has_passed = front > memory.clear_point
-        return Scene(memory.conflict_point - front, lateral, lateral_speed, has_left | has_passed), memory._replace(lateral=lateral)
+        gap, over = memory.conflict_point - front, has_left_lane | has_passed
+        return Scene(gap, lateral, lateral_speed, over), memory._replace(last_lateral=lateral)
 
     def encounter(self, trace: Trace) -> Encounter:
         """Distance from the front bumper to the pedestrian's path; TTC along the line of sight from the vehicle's centre.
 
-        TTC = (centre distance - half length) / (v cos(theta) + v_ped sin(theta)) (method section 4).
+        TTC = (centre distance - half length) / (v cos(theta) + v_ped sin(theta)) (docs/method.md, section 4);
+        theta is the angle between the lane and the line of sight.
         """
         half_length = trace.vehicle_length / 2
         ahead = trace.gap + half_length

@@ -25,17 +25,20 @@ Times = float | Sequence[float]
 
 
 class Target(NamedTuple):
-    """Position and speed of a target: numbers, or arrays of shape (M,), of M copies at one time or of M samples.
+    """Position and speed of a target: numbers, or arrays of shape (M,), either of M copies at one time or of one target at M samples.
 
-    `edge` is the position along the lane of the side of the target's body that vehicles reach first, `ahead` the distance of the body's
-    middle beyond the point of impact [m]; `speed` is along the lane [m/s]; `has_left` is true once the target has left the vehicle's path.
+    - `edge`: position along the lane of the side of the target's body that vehicles reach first [m]
+    - `lateral`, `lateral_speed`: as in `Scene` [m, m/s]
+    - `speed`: speed along the lane [m/s]
+    - `is_clear`: true once the target has crossed the vehicle's path
+    - `ahead`: distance along the lane from the point of impact to the body's middle [m]
     """
 
     edge: FloatArray
     lateral: FloatArray
     lateral_speed: Any = 0.0
     speed: Any = 0.0
-    has_left: Any = False
+    is_clear: Any = False
     ahead: Any = 0.0
 
 
@@ -43,14 +46,14 @@ class EncounterConstants(NamedTuple):
     """Quantities that are constant during a run: numbers, or arrays of shape (N,).
 
     A vehicle has passed the target when the gap is below `passed_gap` [m]. A vehicle that `follows` the target cannot pass: it has avoided
-    the target once it has approached and is no longer faster. Parked cars hide a `hidden` target. Distances [m]: `to_middle` from the
-    target's edge to its middle, `setback` from the sensors to the front bumper, `parked_offset` from the lane's middle to the parked cars.
+    the target once it has approached and is no longer faster. Parked cars hide a `hidden` target. Distances [m]: `edge_to_middle` of the
+    target along the lane, `setback` from the sensors to the front bumper, `parked_offset` from the lane's middle to the parked cars.
     """
 
     passed_gap: Any = -np.inf
     follows: Any = False
     hidden: Any = False
-    to_middle: Any = 0.0
+    edge_to_middle: Any = 0.0
     setback: Any = 0.0
     parked_offset: Any = 0.0
 
@@ -86,9 +89,9 @@ class Memory(NamedTuple):
     """The target's motion, last lateral position [m], and speed set last [m/s]; the number of samples; which vehicles have approached."""
 
     motion: TargetMotion
-    lateral: FloatArray
+    last_lateral: FloatArray
     sample: int
-    speed: float
+    last_speed: float
     approached: BoolArray
 
 
@@ -99,32 +102,32 @@ class TargetTest(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
     def begin(self, world: World) -> Memory:
         motion = self._motion(world)
-        speed = motion.begin(world)
+        initial_speed = motion.begin(world)
         lateral = motion.target(motion.positions(world), 0.0).lateral
-        return Memory(motion, lateral, 0, speed, np.zeros(len(lateral), dtype=bool))
+        return Memory(motion, lateral, sample=0, last_speed=initial_speed, approached=np.zeros(len(lateral), dtype=bool))
 
     def observe(self, world: World, step: float, memory: Memory) -> tuple[Scene, Memory]:
         motion = memory.motion
         target = motion.target(motion.positions(world), memory.sample * step)
-        target = target._replace(lateral_speed=(target.lateral - memory.lateral) / step)
+        target = target._replace(lateral_speed=(target.lateral - memory.last_lateral) / step)
         front = motion.frame.along(world.vehicle_positions(VUT))
         scene, approached = scene_of(motion.constants, target, front, world.speeds(), memory.approached)
-        return scene, self.move(world, step, memory)._replace(lateral=target.lateral, approached=approached)
+        return scene, self.move(world, step, memory)._replace(last_lateral=target.lateral, approached=approached)
 
     def move(self, world: World, step: float, memory: Memory) -> Memory:
         """Set the target's next speed, as `observe` does, without computing the scene."""
         speed = memory.motion.next_speed(memory.sample, step)
-        if speed != memory.speed:
+        if speed != memory.last_speed:
             memory.motion.set_speed(world, speed)
-        return memory._replace(sample=memory.sample + 1, speed=speed)
+        return memory._replace(sample=memory.sample + 1, last_speed=speed)
 
-    def at_all_samples(self, world: World, samples: World, step: float) -> tuple[TargetMotion, Target]:
-        """The target's motion in a recorded scene, and the target at its T samples, which the world `samples` holds as T copies."""
+    def at_all_samples(self, world: World, sampled_world: World, step: float) -> tuple[TargetMotion, Target]:
+        """The target's motion in a recorded scene, and the target at its T samples, which are the T copies of `sampled_world`."""
         motion = self._motion(world)
-        positions = motion.positions(samples)
+        positions = motion.positions(sampled_world)
         target = motion.target(positions, [sample * step for sample in range(len(positions))])
-        previous = np.concatenate([target.lateral[:1], target.lateral[:-1]])
-        return motion, target._replace(lateral_speed=(target.lateral - previous) / step)
+        last_lateral = np.concatenate([target.lateral[:1], target.lateral[:-1]])
+        return motion, target._replace(lateral_speed=(target.lateral - last_lateral) / step)
 
     def _motion(self, world: World) -> TargetMotion:
         raise NotImplementedError
@@ -132,21 +135,22 @@ class TargetTest(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
 def scene_of(constants: EncounterConstants, target: Target, front: FloatArray, speed: FloatArray,
              approached: BoolArray) -> tuple[Scene, BoolArray]:
-    """The scene of N vehicles by the position of their fronts along the lane [m] and their speed [m/s], and which have approached."""
+    """The scene of N vehicles, and which of them have approached; `front` is their fronts' position along the lane [m]."""
     gap, zeros = target.edge - front, np.zeros_like(front)
-    over = np.asarray(target.has_left | (gap < constants.passed_gap))
+    over = np.asarray(target.is_clear | (gap < constants.passed_gap))
     if constants.follows is not False:
         approached = approached | (speed - target.speed > APPROACH_SPEED)
-        over = over | constants.follows & approached & (speed <= target.speed)
+        over = over | (constants.follows & approached & (speed <= target.speed))
     visible = ALL_TRUE if constants.hidden is False else _visible(constants, target, gap)
     return Scene(gap, zeros + target.lateral, zeros + target.lateral_speed, over, zeros + target.speed, visible), approached
 
 
 def _visible(constants: EncounterConstants, target: Target, gap: FloatArray) -> BoolArray:
-    """Whether the line from the sensors to the target's middle clears the front corner of the nearer parked car; shape (N,)."""
-    distance = gap + constants.to_middle + constants.setback
-    corner = distance - target.ahead - PARKED_GAP
-    return np.asarray(~np.asarray(constants.hidden) | (corner <= 0) | (-target.lateral * corner < constants.parked_offset * distance))
+    """Whether the parked car nearer to the target leaves the line from the sensors to the target's middle free; shape (N,)."""
+    to_middle = gap + constants.edge_to_middle + constants.setback
+    to_corner = to_middle - target.ahead - PARKED_GAP
+    is_free = (to_corner <= 0) | (-target.lateral * to_corner < constants.parked_offset * to_middle)
+    return np.asarray(~np.asarray(constants.hidden) | is_free)
 
 
 def value_at(times: Times, function: Callable[[float], float]) -> Any:

@@ -98,9 +98,9 @@ class GuardedAlgorithm:
         settings = self._guard.numbers("search", "settings", output, output.shape)
         for characteristic, values in zip(characteristics, settings.T, strict=True):
             self._guard.numbers("search", characteristic.name, values, (len(settings),), characteristic.lower, characteristic.upper)
-        unfiltered_cells = np.argwhere(characteristics.filter(settings) != settings)
-        if len(unfiltered_cells):
-            row, column = unfiltered_cells[0]
+        unfiltered_values = np.argwhere(characteristics.filter(settings) != settings)
+        if len(unfiltered_values):
+            row, column = unfiltered_values[0]
             raise self._guard.wrong_value("search", characteristics.names[column], float(settings[row, column]),
                                           "filtered settings: problem.characteristics.filter(settings)")
         if problem.region and not problem.region.feasible(settings).all():

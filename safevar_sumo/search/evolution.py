@@ -27,17 +27,17 @@ MAX_MISSES = 50
 
 
 @cache
-def fitness_of(objectives: int) -> type[Any]:
+def fitness_class(objective_count: int) -> type[Any]:
     """The class of a fitness with this number of objectives, all minimised."""
     def initialise(self: base.Fitness, values: tuple[float, ...] = ()) -> None:
         if values:  # DEAP's constructor also checks the type of the weights, which takes longer than everything else
             self.values = values
 
-    return type("Fitness", (base.Fitness,), {"weights": (-1.0,) * objectives, "__init__": initialise})
+    return type("Fitness", (base.Fitness,), {"weights": (-1.0,) * objective_count, "__init__": initialise})
 
 
 class Individual(list[float]):
-    """Unfiltered values of a setting; once evaluated, also its fitness and its `evaluation`: a batch of evaluations and a row of it.
+    """Unfiltered values of a setting; once evaluated, also its fitness and its `evaluation`: a batch of evaluations and a row in it.
 
     `has_failed` is true if the evaluation is not valid. `standing` is the value by which an algorithm compares survivors: less is better.
     """
@@ -62,7 +62,7 @@ class Operators(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
 
 class Variation:
-    """Draws offspring; sets the random state that DEAP uses before every draw and restores it afterwards."""
+    """Draws offspring. DEAP draws from the global `random`: see `randomness`."""
 
     def __init__(self, operators: Operators, problem: Problem, rng: np.random.Generator) -> None:
         characteristics, self._problem = problem.characteristics, problem
@@ -94,7 +94,7 @@ class Variation:
         return children[:number]
 
     def draw_distinct_offspring(self, population: list[Individual], number: int) -> list[Individual]:
-        """As `draw_offspring`, but all individuals enter equally many tournaments, and copies of existing individuals are drawn again."""
+        """Draw `number` new individuals; all parents enter equally many tournaments, and copies of existing individuals are drawn again."""
         existing, children, draws = set(map(tuple, population)), list[Individual](), 0
         self._candidates = []
         with self.randomness():
@@ -166,7 +166,7 @@ def initial_population(problem: Problem, rng: np.random.Generator) -> list[Indiv
 def request_evaluations(individuals: Sequence[Individual], problem: Problem) -> Generator[FloatArray, Evaluations, int]:
     """Request and store the evaluations of individuals; returns the number of evaluations."""
     evaluated = yield problem.characteristics.filter(np.array(individuals))
-    fitness, valid = fitness_of(len(problem.scoring.objectives)), problem.scoring.valid(evaluated).tolist()
+    fitness, valid = fitness_class(len(problem.scoring.objectives)), problem.scoring.valid(evaluated).tolist()
     for i, (individual, objectives) in enumerate(zip(individuals, problem.scoring.values(evaluated).tolist(), strict=True)):
         individual.evaluation, individual.fitness, individual.has_failed = (evaluated, i), fitness(tuple(objectives)), not valid[i]
     return len(individuals)
@@ -182,18 +182,18 @@ def sort_into_fronts(individuals: Sequence[Individual]) -> list[list[Individual]
     if not individuals:
         return []
     ranks = moocore.pareto_rank([individual.fitness.wvalues for individual in individuals], maximise=True).tolist()
-    ranked: list[list[Individual]] = [[] for _ in range(max(ranks) + 1)]
+    fronts: list[list[Individual]] = [[] for _ in range(max(ranks) + 1)]
     for individual, rank in zip(individuals, ranks, strict=True):
-        ranked[rank].append(individual)
-    return ranked
+        fronts[rank].append(individual)
+    return fronts
 
 
 def set_standings(individuals: Sequence[Individual]) -> list[list[Individual]]:
-    """The fronts of individuals; sets the `standing` of each to its rank, from 0, and its negative crowding distance."""
-    ranked = sort_into_fronts(individuals)
-    for rank, front in enumerate(ranked):
+    """Set the `standing` of individuals to rank, from 0, and negative crowding distance; return the fronts."""
+    fronts = sort_into_fronts(individuals)
+    for rank, front in enumerate(fronts):
         set_front_standings(front, rank)
-    return ranked
+    return fronts
 
 
 def set_front_standings(front: Sequence[Individual], rank: int) -> None:
@@ -216,5 +216,5 @@ def run_tournament(population: list[Individual], size: int = 2) -> Individual:
 
 def join_evaluations(individuals: Sequence[Individual], problem: Problem) -> Evaluations:
     """Join the evaluations of individuals in one batch."""
-    rows = [evaluations.take([row]) for evaluations, row in (individual.evaluation for individual in individuals)]
-    return Evaluations.concatenate(rows) if rows else problem.original.take([])
+    evaluations_of_individuals = [evaluations.take([row]) for evaluations, row in (individual.evaluation for individual in individuals)]
+    return Evaluations.concatenate(evaluations_of_individuals) if individuals else problem.original.take([])

@@ -25,7 +25,7 @@ class MapElites(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """An atlas of distinct failures, an elite for every cell; needs the extra `qd`.
 
     The elite of a cell is the collision whose largest change is smallest or, without a collision, the most severe setting. A child has an
-    elite's changes: one may be removed or added, the others are moved. The result is all elites that collide or, if none collides, the
+    elite's changes: one may be removed, one added; the others mutate. The result is all elites that collide or, if none collides, the
     elites that are more severe than the original.
 
     Parameters
@@ -57,15 +57,15 @@ class MapElites(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         InputError
             If there are too many cells, or pyribs is not installed.
         """
-        number = 2**characteristic_count if self.behaviour == "changes" else characteristic_count * (self.speeds + 1)
-        if number > MAX_CELLS:
+        cell_count = 2**characteristic_count if self.behaviour == "changes" else characteristic_count * (self.speeds + 1)
+        if cell_count > MAX_CELLS:
             raise InputError(source, f"search.map_elites.behaviour = 'changes' has 2^{characteristic_count} cells", "'speed'")
         try:
             import ribs  # noqa: F401
         except ImportError:
             raise InputError(source, "search.algorithms = 'map_elites' needs pyribs, which is not installed",
                              "pip install 'safevar_sumo[qd]'") from None
-        return number
+        return cell_count
 
     def search(self, problem: Problem, rng: np.random.Generator) -> Search:
         cell_count = self.count_cells(len(problem.characteristics))
@@ -75,10 +75,11 @@ class MapElites(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         batches, settings, used = list[Evaluations](), np.zeros((problem.evaluations, len(problem.characteristics))), 0
         quality = np.full(problem.evaluations, -np.inf)
         while used < problem.evaluations:
-            number, generation = min(problem.population, problem.evaluations - used), problem.population
+            number, generation_size = min(problem.population, problem.evaluations - used), problem.population
             elites = np.sort(archive.data("solution")[:, 0]).astype(int) if len(archive) else np.zeros(0, dtype=int)
-            parents = settings[self._parents(elites, quality, generation, rng)] if len(elites) else None
-            children = self._children(parents, generation, problem, rng)  # a whole generation, so that a run does not depend on its budget
+            parents = settings[self._draw_parents(elites, quality, generation_size, rng)] if len(elites) else None
+            # A whole generation, so that a run does not depend on its budget:
+            children = self._draw_children(parents, generation_size, problem, rng)
             evaluated = yield problem.characteristics.filter(children[:number])
             batches.append(evaluated)
             settings[used:used + number] = evaluated.settings
@@ -91,15 +92,15 @@ class MapElites(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         evaluations = Evaluations.concatenate(batches)
         rows = np.sort(archive.data("solution")[:, 0]).astype(int) if len(archive) else np.zeros(0, dtype=int)
         atlas = evaluations.take(rows)
-        is_better = problem.scoring.values(atlas)[:, 0] < problem.scoring.values(problem.original)[0, 0]
-        return atlas.take(atlas.collided if atlas.collided.any() else is_better)
+        is_more_severe = problem.scoring.values(atlas)[:, 0] < problem.scoring.values(problem.original)[0, 0]
+        return atlas.take(atlas.collided if atlas.collided.any() else is_more_severe)
 
-    def _parents(self, elites: IntArray, quality: FloatArray, number: int, rng: np.random.Generator) -> IntArray:
+    def _draw_parents(self, elites: IntArray, quality: FloatArray, number: int, rng: np.random.Generator) -> IntArray:
         """`number` parents, each the best of `tournament_size` elites drawn at random."""
         candidates = rng.choice(elites, (number, self.tournament_size))
         return np.asarray(candidates[np.arange(number), np.argmax(quality[candidates], axis=1)])
 
-    def _children(self, parents: FloatArray | None, number: int, problem: Problem, rng: np.random.Generator) -> FloatArray:
+    def _draw_children(self, parents: FloatArray | None, number: int, problem: Problem, rng: np.random.Generator) -> FloatArray:
         """Unfiltered settings, feasible after the filter; without parents, each setting has random changes."""
         characteristics = problem.characteristics
         size, width = len(characteristics), characteristics.upper - characteristics.lower
@@ -123,8 +124,8 @@ class MapElites(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
             return np.asarray(changed @ (1 << np.arange(changed.shape[1])))
         speed = np.nan_to_num(evaluated.collision_speed, nan=-1.0)
         interval = np.where(speed < 0, 0, 1 + np.minimum(np.floor(np.maximum(speed, 0) / FASTEST_COLLISION * self.speeds), self.speeds - 1))
-        number = np.maximum(changed.sum(axis=1) - 1, 0)
-        return np.asarray(number * (self.speeds + 1) + interval.astype(int))
+        further_changes = np.maximum(changed.sum(axis=1) - 1, 0)
+        return np.asarray(further_changes * (self.speeds + 1) + interval.astype(int))
 
 
 def _qualities(evaluated: Evaluations, problem: Problem) -> FloatArray:

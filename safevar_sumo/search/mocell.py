@@ -84,8 +84,8 @@ class MoCell(Operators, frozen=True, kw_only=True, forbid_unknown_fields=True):
             with variation.randomness():
                 offspring = [variation.draw_child(mates or archive, archive) for mates in neighbourhoods[:problem.evaluations - used]]
             used += yield from request_evaluations(offspring, problem)
-            generation = zip(cells, offspring, neighbourhoods, strict=False)  # the last generation may be incomplete
-            cells[:len(offspring)] = [choose_survivor(cell, child, mates) for cell, child, mates in generation]
+            families = zip(cells, offspring, neighbourhoods, strict=False)  # the last generation may be incomplete
+            cells[:len(offspring)] = [choose_survivor(cell, child, mates) for cell, child, mates in families]
             archive = update_archive(archive, offspring, size)
         return join_evaluations(archive, problem)
 

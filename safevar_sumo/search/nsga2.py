@@ -33,11 +33,11 @@ class Nsga2(Operators, frozen=True, kw_only=True, forbid_unknown_fields=True):
             valid_offspring = [individual for individual in offspring if not individual.has_failed]
             population = select_survivors(population + valid_offspring, problem.population)
             offspring = variation.draw_offspring(population, min(problem.population, problem.evaluations - used))
-        return join_evaluations([best for best in population if best.standing[0] == 0], problem)
+        return join_evaluations([individual for individual in population if individual.standing[0] == 0], problem)
 
 
 def select_survivors(individuals: list[Individual], number: int) -> list[Individual]:
-    """Select the best `number` by rank, then by crowding distance, as DEAP's `selNSGA2`, sorted by compiled code."""
+    """Select the best `number` by rank, then by crowding distance, as DEAP's `selNSGA2` does; compiled code sorts faster."""
     sorted_individuals = sorted(individuals, key=lambda individual: individual.fitness.wvalues, reverse=True)
     best: list[Individual] = []
     for rank, front in enumerate(sort_into_fronts(sorted_individuals)):

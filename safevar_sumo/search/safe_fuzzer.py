@@ -69,7 +69,7 @@ class _Ranges:
 
     def __init__(self, problem: Problem) -> None:
         self._problem, self._characteristics, self._scoring = problem, problem.characteristics, problem.scoring
-        self._original = problem.scoring.values(problem.original)[0, 0]
+        self._original_objective = problem.scoring.values(problem.original)[0, 0]
         self.lower, self.upper = problem.characteristics.lower.copy(), problem.characteristics.upper.copy()
         self.max_changes = len(problem.characteristics)
 
@@ -105,7 +105,7 @@ class _Ranges:
 
     def narrow(self, window: Evaluations) -> None:
         """Narrow each range to the mean increase and mean decrease in the settings of `window` that are less safe than the original."""
-        less_safe = window.take(self._scoring.valid(window) & (self._scoring.values(window)[:, 0] < self._original))
+        less_safe = window.take(self._scoring.valid(window) & (self._scoring.values(window)[:, 0] < self._original_objective))
         if not len(less_safe):
             return
         for i, original in enumerate(self._characteristics.original):
@@ -128,9 +128,10 @@ def _improves(generation: Evaluations, earlier: Evaluations, scoring: Scoring = 
 
 
 def _scores(evaluations: Evaluations, scoring: Scoring = PUBLISHED_SCORING, safety_weight: float = SAFETY_WEIGHT) -> FloatArray:
-    """(6 SD_norm + f_diff + num_norm) / 8, lower is better; SD is normalised by min-max over `evaluations`; NaN where invalid.
+    """The score (6 SD_norm + f_diff + num_norm) / 8, of which the search prefers low values; NaN where invalid.
 
-    With other objectives, the first objective takes the place of SD; further objectives are normalised by min-max, too.
+    SD_norm is the safety degree scaled to [0, 1] over `evaluations`; num_norm = (f_num_diff - 1) / (n - 1) for n characteristics.
+    The first of other objectives takes the place of the safety degree; further ones are scaled to [0, 1], too.
     """
     values = np.where(scoring.valid(evaluations)[:, np.newaxis], scoring.values(evaluations), np.nan)
     score = safety_weight * _normalise(values[:, 0])

@@ -50,10 +50,10 @@ class Spea2(Operators, frozen=True, kw_only=True, forbid_unknown_fields=True):
             valid_offspring = [individual for individual in offspring if not individual.has_failed]
             archive = select_archive(archive + valid_offspring, size, normalised=self.normalised)
             offspring = variation.draw_distinct_offspring(archive, min(problem.population, problem.evaluations - used))
-        return join_evaluations([best for best in archive if best.standing[0] < 1], problem)
+        return join_evaluations([individual for individual in archive if individual.standing[0] < 1], problem)
 
 
-def select_archive(individuals: list[Individual], number: int, *, normalised: bool = False) -> list[Individual]:
+def select_archive(individuals: list[Individual], size: int, *, normalised: bool = False) -> list[Individual]:
     """The publication's environmental selection; sets `standing` to the fitness, which is below 1 for non-dominated individuals."""
     if not individuals:
         return []
@@ -64,9 +64,9 @@ def select_archive(individuals: list[Individual], number: int, *, normalised: bo
     for individual, value in zip(individuals, fitness.tolist(), strict=True):
         individual.standing = (value,)
     is_nondominated = ~dominates.any(axis=0)
-    selection = _truncate(np.flatnonzero(is_nondominated), distances, number)
+    selection = _truncate(np.flatnonzero(is_nondominated), distances, size)
     dominated = np.flatnonzero(~is_nondominated)
-    selection += dominated[np.argsort(fitness[dominated], kind="stable")][:number - len(selection)].tolist()
+    selection += dominated[np.argsort(fitness[dominated], kind="stable")][:size - len(selection)].tolist()
     return [individuals[i] for i in selection]
 
 

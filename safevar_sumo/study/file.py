@@ -120,7 +120,7 @@ def _read_file(path: Path, visited_paths: tuple[Path, ...]) -> _RawStudy:
     except tomllib.TOMLDecodeError as error:
         raise InputError(path, f"is not TOML: {error}") from None
     except (RecursionError, OverflowError):
-        raise InputError(path, "is nested too deeply", "a study as in studies/") from None
+        raise InputError(path, "is nested too deeply", "a study such as those in studies/") from None
     except UnicodeDecodeError as error:
         raise InputError(path, f"is not UTF-8 text: {error}") from None
     except ValueError as error:  # an integer of too many digits
@@ -162,7 +162,7 @@ def _with_overrides(base: _RawStudy, overrides: Mapping[str, Any], source: objec
                     if _model_and_network(tables.get(key)) != _model_and_network(base.tables.get(key))]
     remarks = base.origin.remarks
     if changed_keys:
-        omitted_keys = [key for key in SYSTEM_KEYS[:2] if key in base.tables and key not in overrides]
+        omitted_keys = [key for key in ("title", "published") if key in base.tables and key not in overrides]
         tables = {**{key: value for key, value in tables.items() if key not in SYSTEM_KEYS}, "title": tables.get("name", ""),
                   **{key: overrides[key] for key in SYSTEM_KEYS if key in overrides}}
         if "vehicle" in changed_keys or "ads" in changed_keys:  # spread and model_error concern their parameters
@@ -194,7 +194,7 @@ def _refines(key: str, base_value: object, override: object) -> bool:
     """Whether an override changes single keys of the table that it overrides."""
     if key in WHOLE_TABLES or not (isinstance(base_value, dict) and isinstance(override, dict)):
         return False
-    return all(override.get(kind, base_value.get(kind)) == base_value.get(kind) for kind in ("model", "distribution"))
+    return all(override.get(choice, base_value.get(choice)) == base_value.get(choice) for choice in ("model", "distribution"))
 
 
 def drop_nulls(raw: Any) -> Any:

@@ -29,7 +29,7 @@ OBJECTIVES = (SAFETY_DEGREE, "f_diff", "f_num_diff")
 MAX_DESCRIPTION_LENGTH = 200
 """Largest number of characters of a characteristic's description."""
 FMU_KEYS = ("kind", "inputs", "outputs", "sensors", "sumo_type", "step")
-"""Keys of a model's table that only an FMU's table has; `kind` is also a key of an ADS."""
+"""Keys of a model's table that only FMUs use; an ADS that is no FMU has only `kind`."""
 DESCRIPTION_KEYS = ("meaning", "counterpart")
 """Keys that describe a characteristic to people; no result depends on them."""
 
@@ -162,7 +162,7 @@ class RatingTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
 
 
 class MatrixTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Several scenario points in which every setting is simulated: `tests`, or all cells of a `protocol`, which then rates every setting.
+    """The test points at which every setting is simulated: those of `tests`, or all cells of a `protocol`, which then rates every setting.
 
     `aggregate` combines the points' safety degrees: `worst` takes the lowest one. (`mean` would average distances with negative speeds.)
     """
@@ -202,19 +202,25 @@ class Origin(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 class FitTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """How free parameters are fitted: the weights in the loss, the rows used, and the starts of the search.
 
-    The loss is `original` * mean_m(w_m 2 max(miss / (`tolerance` * published) - 1, 0)), miss being |value - published| of the original
-    vehicle, + mean over the files of published data of sum_m(w_m (`rank` (1 - rho_m) + mean |error| / unit)) + `effects` * mean_c
-    |difference of the safety degree's linear effects over the domain of characteristic c| / unit + `collisions` * share of rows that
-    collide on one side only. For a metric m, w_m is the weight in `weights` and rho_m the rank correlation; a unit is the study's
-    repeatability or, if unknown, the standard deviation of the data. The loss of studies that are fitted together is the mean of their
-    losses. One of every `hold_out` rows is only reported, not fitted. Sets of parameters whose loss is within the share `alike` of the
-    lowest loss fit equally well: they become the study's `spread`. `trials` sets of parameters are tried, in generations of `population`:
-    in a race of searches from the study's own values and from `starts` random places in the bounds; the worse half gives up after every
-    round. With `screened`, the random places are the best of `screened` places, but at most a quarter of the trials is spent on them. A
-    search from a random place begins with a standard deviation of `width` of the bounds; a search around known values has a third of the
-    `population`. `seed` is the seed of all random numbers. A fit from scratch of several studies has three stages: the first study alone;
-    the other studies' own parameters; all parameters, beginning at the values of the first two stages. All stages but the last use one row
-    in `thinning`.
+    The loss adds two parts; for a metric m, w_m is the weight in `weights`:
+
+    - `original` * mean_m(w_m 2 max(miss_m / (`tolerance` * published_m) - 1, 0)), where miss_m is |value - published_m| of the original
+      vehicle;
+    - the mean, over the files of published data, of sum_m(w_m (`rank` (1 - rho_m) + mean |error_m| / unit_m)) + `effects` * mean_c
+      |difference of the safety degree's linear effects over the domain of characteristic c| / unit + `collisions` * share of rows that
+      collide on one side only. rho_m is the rank correlation; a unit is the study's repeatability or, if unknown, the standard deviation
+      of the data.
+
+    The loss of studies that are fitted together is the mean of their losses. One of every `hold_out` rows is only reported, not fitted.
+    Sets of parameters whose loss is within the share `alike` of the lowest loss fit equally well: they become the study's `spread`.
+
+    `trials` sets of parameters are tried, in generations of `population`: in a race of searches from the study's own values and from
+    `starts` random places in the bounds; the worse half gives up after every round. With `screened`, the random places are the best of
+    `screened` places, but at most a quarter of the trials is spent on them. A search from a random place begins with a standard deviation
+    of `width` of the bounds; a search around known values has a third of the `population`. `seed` is the seed of all random numbers.
+
+    A fit from scratch of several studies has three stages: the first study alone; the other studies' own parameters; all parameters,
+    beginning at the values of the first two stages. All stages but the last use one row in `thinning`.
     """
 
     trials: PositiveInt = 1200
@@ -238,7 +244,7 @@ class FitTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 class Study(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A complete study, as in its TOML file; `load_study` reads one.
 
-    `matrix` are the scenario points in which the study is simulated, if there are several;
+    `matrix` are the test points at which the study is simulated, if there are several;
     `rating` are the user's claims for a rating;
     `step_length` is the simulation's time step [s], by default the time step in the network's options;
     `published` are the original vehicle's metrics in the published study, by name, as far as known;

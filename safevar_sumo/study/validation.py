@@ -125,8 +125,8 @@ def _unknown_choice(source: object, key_path: str, value: object, names: Iterabl
 
 
 def _path_within(key_path: str, key: str) -> str:
-    shown = repr(key) if "." in key or not key.isprintable() else key
-    return f"{key_path}.{shown}" if key_path else shown
+    key_text = repr(key) if "." in key or not key.isprintable() else key
+    return f"{key_path}.{key_text}" if key_path else key_text
 
 
 def error_with_key(source: object, raw: object, error: msgspec.ValidationError, prefix: str = "") -> InputError:
@@ -196,7 +196,7 @@ def _reason_against(value: object, key_path: str) -> tuple[str, str] | None:
 
 
 def contradictions(source: object, study: Study) -> Iterator[InputError]:
-    """Errors for numbers of a study that contradict each other."""
+    """Errors for values of a study that contradict each other, or that leave nothing to simulate or compare."""
     characteristics = study.vehicle.characteristics
     if not characteristics:
         yield InputError(source, "vehicle.characteristics: none", "at least one")
@@ -213,13 +213,13 @@ def contradictions(source: object, study: Study) -> Iterator[InputError]:
     if len({len(values) for values in study.spread.values()}) > 1 or not all(study.spread.values()):
         yield InputError(source, "spread: its lists differ in length or are empty", "a list for each parameter, all of one length")
     if study.matrix is not None and study.matrix.aggregate == "mean":
-        yield InputError(source, "matrix.aggregate = 'mean' would average distances [m] with minus the speeds of collisions [m/s]",
+        yield InputError(source, "matrix.aggregate = 'mean' would average distances [m] and negative collision speeds [m/s]",
                          "'worst', the safety degree at a setting's worst point")
     for name, count in Counter(study.metrics.also).items():
         if count > 1:
             yield InputError(source, f"metrics.also = {study.metrics.also}: {name!r} is listed {count} times", "each metric once")
-    for name, number in study.published.items():
-        if number == 0:
+    for name, value in study.published.items():
+        if value == 0:
             yield InputError(source, f"published.{name} = 0", "a number other than 0")
 
 

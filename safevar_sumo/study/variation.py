@@ -79,29 +79,31 @@ def variation_mistakes(source: object, rows: Mapping[str, CharacteristicTable], 
 
 
 def _distribution_mistakes(source: object, key: str, row: CharacteristicTable, distribution: Distribution) -> Iterator[InputError]:
-    low, high, unit = row.lower, row.upper, "" if row.unit == "-" else f" {row.unit}"
+    domain_lower, domain_upper, unit = row.lower, row.upper, "" if row.unit == "-" else f" {row.unit}"
     for field, value in msgspec.structs.asdict(distribution).items():
-        if field not in ("deviation", "sigma") and value is not None and not low <= value <= high:
-            yield InputError(source, f"{key}.{field} = {value:g}", f"a number in [{low:g}, {high:g}]{unit}")
+        if field not in ("deviation", "sigma") and value is not None and not domain_lower <= value <= domain_upper:
+            yield InputError(source, f"{key}.{field} = {value:g}", f"a number in [{domain_lower:g}, {domain_upper:g}]{unit}")
     if isinstance(distribution, Uniform | Triangular):
-        lower, upper = low if distribution.lower is None else distribution.lower, high if distribution.upper is None else distribution.upper
+        lower = domain_lower if distribution.lower is None else distribution.lower
+        upper = domain_upper if distribution.upper is None else distribution.upper
         if lower >= upper:
             yield InputError(source, f"{key}: lower = {lower:g} and upper = {upper:g}", "lower < upper")
         elif isinstance(distribution, Triangular) and not (
                 lower <= (mode := row.original if distribution.mode is None else distribution.mode) <= upper):
             yield InputError(source, f"{key}.mode = {mode:g}", f"a number in [{lower:g}, {upper:g}]{unit}")
-    elif isinstance(distribution, Lognormal) and low <= 0:
-        yield InputError(source, f"{key}: lognormal, with a domain that begins at {low:g}", "a domain above 0")
-    elif isinstance(distribution, Normal | Lognormal) and high > low:
-        field, width = ("deviation", high - low) if isinstance(distribution, Normal) else ("sigma", math.log(high / low))
+    elif isinstance(distribution, Lognormal) and domain_lower <= 0:
+        yield InputError(source, f"{key}: lognormal, with a domain that begins at {domain_lower:g}", "a domain above 0")
+    elif isinstance(distribution, Normal | Lognormal) and domain_upper > domain_lower:
+        field, width = (("deviation", domain_upper - domain_lower) if isinstance(distribution, Normal)
+                        else ("sigma", math.log(domain_upper / domain_lower)))
         if (deviation := getattr(distribution, field)) > MAX_WIDTHS * width:
             yield InputError(source, f"{key}.{field} = {deviation:g}",
                              f"at most {MAX_WIDTHS * width:g}, {MAX_WIDTHS} times the domain's width; "
-                             "for more take distribution = \"uniform\"")
+                             "beyond that, use distribution = \"uniform\"")
 
 
 def _correlation_mistakes(source: object, names: Sequence[str], correlations: Sequence[Correlation]) -> Iterator[InputError]:
-    values: dict[frozenset[str], float] = {}
+    value_of_pair: dict[frozenset[str], float] = {}
     for correlation in correlations:
         between, pair = correlation.between, frozenset(correlation.between)
         unknown_names = [name for name in between if name not in names]
@@ -109,7 +111,7 @@ def _correlation_mistakes(source: object, names: Sequence[str], correlations: Se
             yield unknown_name(source, f"correlations.between: there is no characteristic {unknown_names[0]!r}", unknown_names[0], names)
         elif len(pair) == 1:
             yield InputError(source, f"correlations.between = {list(between)}", "two different characteristics")
-        elif pair in values:
+        elif pair in value_of_pair:
             yield InputError(source, f"correlations: {between[0]} and {between[1]} are given twice, "
-                             f"with {values[pair]:g} and {correlation.value:g}", "each pair once")
-        values.setdefault(pair, correlation.value)
+                             f"with {value_of_pair[pair]:g} and {correlation.value:g}", "each pair once")
+        value_of_pair.setdefault(pair, correlation.value)

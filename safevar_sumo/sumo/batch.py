@@ -31,16 +31,16 @@ Watcher = Callable[[SumoWorld], None]
 
 
 @np.errstate(all="ignore")
-def score(system: System, settings: FloatArray, run: SimulationRuns) -> Evaluations:
-    """The metrics and objectives of settings that have been simulated in `run`."""
-    metrics = {name: metric(run, system.metrics) for name, metric in system.measuring.metrics.items()}
-    invalid = run.outcome == Outcome.INVALID_TEST
+def score(system: System, settings: FloatArray, runs: SimulationRuns) -> Evaluations:
+    """The metrics and objectives of settings that have been simulated in `runs`."""
+    metrics = {name: metric(runs, system.metrics_table) for name, metric in system.measuring.metrics.items()}
+    invalid = runs.outcome == Outcome.INVALID_TEST
     if invalid.any():
         metrics = {name: np.where(invalid, np.nan, values) for name, values in metrics.items()}
     return Evaluations(
         settings=settings,
-        outcome=run.outcome,
-        collision_speed=run.collision_speed,
+        outcome=runs.outcome,
+        collision_speed=runs.collision_speed,
         metrics={**metrics,
                  **{name: change.function(settings, system.characteristics) for name, change in system.measuring.changes.items()}},
         f_diff=system.characteristics.largest_change(settings),
@@ -51,17 +51,16 @@ def reason_for_sumo(system: System) -> str:
     """The reason why a system is simulated in SUMO, in one copy of the network per vehicle; "" if recorded scenes suffice."""
     if isinstance(system.ads, TraciController):
         return "a controller written for TraCI reads the running simulation"
-    scenes = record_scenes([point.scenario for point in system.points], step_options(system))
-    return next((scene for scene in scenes if isinstance(scene, str)), "")
+    scenes_or_reasons = record_scenes([point.scenario for point in system.points], step_options(system))
+    return next((reason for reason in scenes_or_reasons if isinstance(reason, str)), "")
 
 
 def drive_all(system: System, settings: FloatArray, engine: Engine = Engine.RECORDED, options: tuple[str, ...] = (),
               watch: Watcher | None = None) -> SimulationRuns:
     """Simulate N settings of n characteristics, shape (N, n), at every point; `watch` is called with SUMO's world at every sample.
 
-    Several points must share a network and have recorded scenes; SUMO simulates only one point at once.
-
-    The result holds the runs at the first point, then the runs at the second point, and so on.
+    Several points must share a network and have recorded scenes; SUMO simulates only one point at once. The result holds the
+    runs at the first point, then the runs at the second point, and so on.
 
     Raises
     ------
@@ -70,15 +69,15 @@ def drive_all(system: System, settings: FloatArray, engine: Engine = Engine.RECO
     InputError
         If a user's ADS fails.
     """
-    scenarios, options = [point.scenario for point in system.points], (*step_options(system), *options)
+    scenarios, sumo_options = [point.scenario for point in system.points], (*step_options(system), *options)
     if engine is Engine.RECORDED:
         if watch is None and not reason_for_sumo(system):
-            scenes = record_scenes(scenarios, options)
+            scenes = record_scenes(scenarios, sumo_options)
             world = RecordedWorld([scene for scene in scenes if isinstance(scene, Recording)], len(settings))
             return drive(system, np.tile(settings, (len(system.points), 1)), world)
         engine = Engine.LIBSUMO
     (scenario,) = scenarios
-    with open_world(copied_network(stage_network(scenario).folder, len(settings)), len(settings), engine, options) as sumo_world:
+    with open_world(copied_network(stage_network(scenario).folder, len(settings)), len(settings), engine, sumo_options) as sumo_world:
         return drive(system, settings, sumo_world, watch)
 
 
@@ -111,7 +110,7 @@ def _simulate(system: System, settings: FloatArray, world: Any, watch: Watcher |
     state = at_start(vehicle, prepared, world.speeds())
     if isinstance(system.ads, TraciController):  # other ADSs get observations instead of reading the world
         world.sensors = _sensors_in_weather(system, prepared, n)
-    driver = system.ads.start(n, system.nominal, step)
+    ads_memory = system.ads.start(n, system.nominal, step)
     batch = PointBatch(system.points, world, n)
     log = _Log(n, int(batch.last_step.max()) + 1, frame)
     outcomes, robot = _Outcomes(n), DrivingRobot(system.points, vehicle, prepared, state, step)
@@ -125,8 +124,8 @@ def _simulate(system: System, settings: FloatArray, world: Any, watch: Watcher |
         active = outcomes.judge(speed, scene.over, collisions, last=sample >= batch.last_step)
         observation = batch.observe(sample * step, speed, scene)._replace(throttle=state.throttle, brake=state.brake)
         observation, state = vehicle.sense(prepared, state, observation)
-        command, driver = system.ads.drive(observation, driver)
-        warnings.update(driver, speed, scene, outcomes.is_open)
+        command, ads_memory = system.ads.drive(observation, ads_memory)
+        warnings.update(ads_memory, speed, scene, outcomes.is_open)
         command, state = robot.drive(command, state, outcomes.is_open)
         log.write(sample, position=world.vehicle_positions(VUT), speed=speed, gap=scene.gap, lateral=scene.lateral,
                   lateral_speed=scene.lateral_speed, throttle=command.throttle, brake=command.brake, gear=state.gear, active=active,
@@ -185,18 +184,18 @@ def _sensors_in_weather(system: System, prepared: Any, n: int) -> Sensors:
 
 
 class _FirstWarnings:
-    """The times to collision at which the ADSs of N vehicles first warn the driver [s]; NaN if an ADS never does, or lacks `warns`."""
+    """The times to collision at which the ADSs of N vehicles first warn the driver [s]; NaN if an ADS never does, or has no `warns`."""
 
     def __init__(self, ads: Any, n: int) -> None:
         self._warns = getattr(ads, "warns", None)
         self.time_to_collision = np.full(n, np.nan)
 
-    def update(self, memory: Any, speed: FloatArray, scene: Scene, is_open: BoolArray) -> None:
+    def update(self, ads_memory: Any, speed: FloatArray, scene: Scene, is_open: BoolArray) -> None:
         """Process one sample; `scene` holds the true position of the obstacle, not the sensed position."""
         if self._warns is None:
             return
         closing_speed = speed - scene.obstacle_speed
-        is_first = self._warns(memory) & is_open & np.isnan(self.time_to_collision) & (closing_speed > 0)
+        is_first = self._warns(ads_memory) & is_open & np.isnan(self.time_to_collision) & (closing_speed > 0)
         if is_first.any():
             self.time_to_collision = np.where(is_first, scene.gap / closing_speed, self.time_to_collision)
 
@@ -223,7 +222,7 @@ class _Log:
 
 
 class _Outcomes:
-    """Outcomes of N runs (method section 4): `is_open` is true where an outcome can change; `ended_copies` ended in this step."""
+    """Outcomes of N runs (docs/method.md, section 4): `is_open` is true where an outcome can change; `ended_copies` ended in this step."""
 
     def __init__(self, n: int) -> None:
         self.is_open = np.ones(n, dtype=bool)
@@ -234,7 +233,7 @@ class _Outcomes:
         self._is_over = np.zeros(n, dtype=bool)
 
     def judge(self, speed: FloatArray, over: BoolArray, collisions: dict[int, float], *, last: BoolArray | bool) -> BoolArray:
-        """Process one sample; returns which vehicles' runs it belongs to."""
+        """Process one sample; returns for which vehicles the sample is part of the run."""
         was_open, active = self.is_open.copy(), self.is_open & ~over
         for copy, collision_speed in collisions.items():
             if self.is_open[copy]:

@@ -20,14 +20,14 @@ class Touch(NamedTuple):
 
     side: npt.NDArray[np.str_]
     age: FloatArray
-    front_distance: FloatArray
+    distance_behind_front: FloatArray
 
 
 class Contacts:
-    """First contacts of N vehicles; for `tested` vehicles only contacts of the front are collisions, as in a Euro NCAP test."""
+    """First contacts of N vehicles; in a Euro NCAP test (`is_tested`) only contacts of the vehicle's front are collisions."""
 
-    def __init__(self, n: int, tested: BoolArray) -> None:
-        self._is_tested, self._side, self._position_on_side = tested, np.full(n, "", dtype="U5"), np.full(n, np.nan)
+    def __init__(self, n: int, is_tested: BoolArray) -> None:
+        self._is_tested, self._side, self._position_on_side = is_tested, np.full(n, "", dtype="U5"), np.full(n, np.nan)
 
     def record_collisions(self, world: Any, is_open: BoolArray, scene: Scene) -> dict[int, float]:
         """Process one sample; returns the speeds [m/s] of the vehicles of open runs that collide, by vehicle number."""
@@ -42,7 +42,7 @@ class Contacts:
         touch = find_touches(own, other)
         self._side[copies] = touch.side
         lateral = scene.lateral[copies] - np.broadcast_to(scene.lateral_speed, scene.lateral.shape)[copies] * touch.age
-        share = np.where(np.isin(touch.side, (FRONT, REAR)), lateral / own.width + 0.5, touch.front_distance / own.length)
+        share = np.where(np.isin(touch.side, (FRONT, REAR)), lateral / own.width + 0.5, touch.distance_behind_front / own.length)
         self._position_on_side[copies] = 100 * np.minimum(np.maximum(share, 0.0), 1.0)
 
     def first_contacts(self) -> Contact:
@@ -52,9 +52,10 @@ class Contacts:
 def find_touches(own: Body, other: Body) -> Touch:
     """The first touches of M pairs of overlapping bodies, if their velocities were constant.
 
-    Along the vehicle, two bodies have the joint half extent r = (l + l' |cos| + w' |sin|) / 2 (across it: w instead of l, sin and cos
-    exchanged). If their middles are x apart and approach each other at v, the overlap began (r - |x|) / v ago. The bodies touched in the
-    direction in which the overlap began last, or in that of the smaller overlap if they approach in neither direction.
+    Two bodies of length l, l' and width w, w' at an angle a have the joint half extent r = (l + l' |cos a| + w' |sin a|) / 2 along the
+    first one and (w + l' |sin a| + w' |cos a|) / 2 across it. If their middles are x apart in such a direction and approach each other
+    at v, the overlap in it began (r - |x|) / v ago. The bodies touched in the direction in which the overlap began last, or, if they
+    approach each other in neither direction, in the one with the smaller overlap.
     """
     across = np.stack([-own.along[:, 1], own.along[:, 0]], axis=1)
     to_other = other.middle - own.middle

@@ -69,10 +69,10 @@ def _check_surface(lanes: list[ElementTree.Element], file: Path) -> None:
         climb = max(heights, default=0.0) - min(heights, default=0.0)
         if climb > MAX_SLOPE * float(lane.get("length", 0)):
             raise InputError(file, f"vehicle {VUT!r} is to drive on lane {lane.get('id')!r}, which climbs {climb:.2f} m",
-                             "a level road, and a scenario's grade; netconvert's option flatten makes one")
+                             "a level road, as netconvert's option `flatten` makes it; the scenario's `grade` sets a slope")
         if float(lane.get("friction", 1)) != 1:
             raise InputError(file, f"vehicle {VUT!r} is to drive on lane {lane.get('id')!r} of friction {lane.get('friction')}",
-                             "1, and road_friction of the study's [weather]")
+                             "friction 1; `road_friction` of the study's [weather] sets another one")
 
 
 def is_number(text: str) -> bool:
@@ -216,6 +216,7 @@ def _check_randomness(root: ElementTree.Element, file: Path, options: Mapping[st
 
 def _random_parameters(vehicle_type: ElementTree.Element, actor: ElementTree.Element,
                        options: Mapping[str, str]) -> Iterator[tuple[str, str]]:
+    """Yield each parameter that makes an actor draw random numbers, and a legal value."""
     deviation = vehicle_type.get("speedDev", options.get("default.speeddev"))
     if not is_number(vehicle_type.get("speedFactor", "1")):
         yield f"speedFactor = {vehicle_type.get('speedFactor')!r}", "a number"
@@ -255,7 +256,7 @@ def unused_attribute_remarks(root: ElementTree.Element, roads: ElementTree.Eleme
         attributes.append(f"the speed limit of lane {slow_lanes[0].get('id')!r} ({float(slow_lanes[0].get('speed', 'nan')):g} m/s)"
                          f"{f' and of {len(slow_lanes) - 1} more' if len(slow_lanes) > 1 else ''}")
     reason = "the study's vehicle and ADS determine how it drives"
-    return [f"not used of vehicle {VUT!r}: {', '.join(dict.fromkeys(attributes))}; {reason}"] if attributes else []
+    return [f"no effect on vehicle {VUT!r}: {', '.join(dict.fromkeys(attributes))}; {reason}"] if attributes else []
 
 
 def _has_no_effect(name: str, value: str) -> bool:

@@ -24,8 +24,8 @@ CONNECTION_ATTEMPTS = 15
 
 
 class Engine(StrEnum):
-    """What moves the vehicles: numpy in recorded scenes (SUMO in this process if an actor may react to the vehicles), or SUMO in this
-    process, in another process, or in another process with a window.
+    """What moves the vehicles: numpy in recorded scenes (RECORDED; the same as LIBSUMO if an actor may react to the vehicles), or SUMO: in
+    this process (LIBSUMO), in another process (TRACI), or in another process with a window (GUI).
     """
 
     RECORDED = "recorded"

@@ -51,7 +51,7 @@ class PointResult(NamedTuple):
 
 
 def point_record(result: PointResult, row: int = 0) -> dict[str, Any]:
-    """Plain values of one setting at one point; a value is None if it is undefined.
+    """Plain values of the setting in row `row` of a result; a value is None if it is undefined.
 
     Keys: the point and the outcome; impact speeds [m/s]; the largest deviation from the test speed before the ADS acted [km/h]; the time to
     collision at the first warning [s]; the side of the contact, and the position along that side [%].
@@ -83,8 +83,8 @@ def vehicle_remarks(system: System) -> list[str]:
     speed = min(max(speeds), float(tables.speeds[-1]))
     drag = float(np.interp(speed, tables.speeds, tables.coasting))
     return [f"the vehicle was fitted to drives of up to {fitted_speed / KMH:.0f} km/h, and is tested at up to {max(speeds) / KMH:.0f} "
-            f"km/h: beyond that speed only its equations apply, such as losing {drag:.1f} m/s^2 at {speed / KMH:.0f} km/h with the "
-            "accelerator released"]
+            f"km/h. Beyond its fit the model extrapolates: with the accelerator released, it loses {drag:.1f} m/s^2 at "
+            f"{speed / KMH:.0f} km/h"]
 
 
 def evaluate(system: System, settings: FloatArray, engine: Engine = Engine.RECORDED) -> Evaluations:
@@ -112,19 +112,19 @@ def rate_settings(system: System, settings: FloatArray, engine: Engine = Engine.
 
     Traces are dropped, as they would take gigabytes.
     """
-    scored, columns = dict[str, PointEvaluations](), dict[str, Any]()
+    scored, quantities = dict[str, PointEvaluations](), dict[str, Any]()
     for group in _simulate_groups(system, settings, engine):
         for result in group:
             name = result.point.name
-            scored[name], columns[name] = PointEvaluations(result.point, result.evaluations), rated_quantities(result.runs)
-    cells = join_cells([columns[point.name] for point in system.points])
+            scored[name], quantities[name] = PointEvaluations(result.point, result.evaluations), rated_quantities(result.runs)
+    cells = join_cells([quantities[point.name] for point in system.points])
     evaluations = evaluations_at_worst_points([scored[point.name] for point in system.points])
     if system.rater is None:  # the system has only some of the protocol's cells
         return evaluations, cells
     return replace(evaluations, metrics={**evaluations.metrics, RATING_POINTS.name: system.rater.points(cells).total}), cells
 
 
-def in_cells(system: System, settings: FloatArray, part: tuple[int, int], engine: Engine = Engine.RECORDED) -> Evaluations:
+def evaluate_cells(system: System, settings: FloatArray, part: tuple[int, int], engine: Engine = Engine.RECORDED) -> Evaluations:
     """Evaluations, including `cells`, of settings, shape (N, n), in the k-th of m parts of a protocol's cells; `part` is (k, m)."""
     assert system.rater is not None
     points = tuple(system.matrix[number] for number in cells_of_part(system.rater.protocol, *part))
@@ -158,9 +158,9 @@ def _batch_size(system: System, engine: Engine) -> int:
 def evaluations_at_worst_points(at_points: Sequence[PointResult | PointEvaluations]) -> Evaluations:
     """The evaluations of N settings, each at its worst point."""
     settings = at_points[0].evaluations.settings
-    point_numbers, columns = worst_points(at_points), np.arange(len(settings))
+    point_numbers, setting_numbers = worst_points(at_points), np.arange(len(settings))
     evaluations = Evaluations.concatenate([result.evaluations for result in at_points])
-    return evaluations.take(point_numbers * len(settings) + columns)
+    return evaluations.take(point_numbers * len(settings) + setting_numbers)
 
 
 def simulate(system: System, settings: FloatArray, engine: Engine = Engine.RECORDED, options: tuple[str, ...] = (),
@@ -218,7 +218,7 @@ def _find_point(system: System, name: str, source: object) -> Point:
 
 
 def _list_similar_points(name: str, names: Sequence[str]) -> str:
-    """Points similar to an unknown name, sorted by the number of words between commas that they share, then by similarity of the text."""
+    """The points most similar to an unknown name: those that share most parts between commas with it, then those with the closest text."""
     if not names:
         return "a study with a matrix"
     words = {word.strip() for word in name.split(",")}
@@ -240,8 +240,8 @@ def study_at(study: Study, name: str, source: object) -> Study:
     assert study.matrix is not None
     if system.rater is not None:
         return reduce_to_cells(study, system.weather, [[point.name for point in system.matrix].index(name)])
-    title, weather = parameters.pop("test"), parameters.pop("weather")
-    test = next(test for test in study.matrix.tests if test.name == title and test.over.keys() == parameters.keys()
+    test_name, weather = parameters.pop("test"), parameters.pop("weather")
+    test = next(test for test in study.matrix.tests if test.name == test_name and test.over.keys() == parameters.keys()
                 and all(value in test.over[key] for key, value in parameters.items()))
     reduced_test = replace_in(test, over={key: [value] for key, value in parameters.items()}, weathers=[weather] if test.weathers else [])
     return replace_in(study, matrix=replace_in(study.matrix, tests=[reduced_test]))
@@ -276,14 +276,14 @@ def worst_points(at_points: Sequence[PointResult | PointEvaluations]) -> npt.NDA
 
 def _select_runs(runs_at_points: Sequence[SimulationRuns], point_numbers: npt.NDArray[np.intp]) -> SimulationRuns:
     """Every vehicle's run at its own point; shorter runs repeat their last sample, which is marked as inactive."""
-    length, columns = max(len(runs.trace.time) for runs in runs_at_points), np.arange(len(point_numbers))
+    length, vehicle_numbers = max(len(runs.trace.time) for runs in runs_at_points), np.arange(len(point_numbers))
 
     def select_samples(values: Sequence[np.ndarray]) -> np.ndarray:
         padded = [np.concatenate([samples, np.repeat(samples[-1:], length - len(samples), axis=0)]) for samples in values]
-        return np.stack(padded)[point_numbers, :, columns].T
+        return np.stack(padded)[point_numbers, :, vehicle_numbers].T
 
     def select(values: Iterable[np.ndarray]) -> np.ndarray:
-        return np.stack([np.broadcast_to(column, point_numbers.shape) for column in values])[point_numbers, columns]
+        return np.stack([np.broadcast_to(column, point_numbers.shape) for column in values])[point_numbers, vehicle_numbers]
 
     longest_trace = max((runs.trace for runs in runs_at_points), key=lambda trace: len(trace.time))
     names = [field.name for field in fields(Trace) if np.ndim(getattr(longest_trace, field.name)) == 2]

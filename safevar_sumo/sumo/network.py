@@ -27,7 +27,7 @@ from safevar_sumo.sumo.sources import OPTIONS_FILE, TRAFFIC_FILE, Sources, check
 NETWORK_FILE = "network.net.xml"
 LOAD_MARK_FILE = "tried.txt"
 RECIPE_OPTIONS = ("--xml-validation", "never")
-"""Options of netconvert for every network."""
+"""Options of netconvert and SUMO for every network."""
 
 
 class CopiedNetwork(NamedTuple):
@@ -156,18 +156,18 @@ def _run_program(sources: Sources, program: str, *arguments: str) -> tuple[int, 
 def _try_roads(sources: Sources, into: Path) -> None:
     """Load a network built by the user, in a separate SUMO process because some broken networks crash SUMO."""
     _read_roads(sources.folder / sources.network_file)
-    code, errors = _run_program(sources, "sumo", "-n", sources.network_file, "--no-step-log", "true", "--end", "0")
-    if code != 0:
-        raise InputError(sources.folder / sources.network_file, f"SUMO cannot load it: {errors or f'it dies with exit code {code}'}",
+    exit_code, errors = _run_program(sources, "sumo", "-n", sources.network_file, "--no-step-log", "true", "--end", "0")
+    if exit_code != 0:
+        raise InputError(sources.folder / sources.network_file, f"SUMO cannot load it: {errors or f'exit code {exit_code}'}",
                          "a network of SUMO")
     (into / LOAD_MARK_FILE).write_text("SUMO loads it.\n", encoding="ascii")
 
 
 def _try_traffic(sources: Sources, network_file: Path, into: Path) -> None:
-    code, errors = _run_program(sources, "sumo", "-c", OPTIONS_FILE, "-n", str(network_file.absolute()), "-r", TRAFFIC_FILE, "--begin", "0",
-                        "--end", "0", "--no-step-log", "true")
-    if code != 0 or errors:
-        raise InputError(sources.folder, f"SUMO refuses {OPTIONS_FILE} or {TRAFFIC_FILE}: {errors or f'it dies with exit code {code}'}",
+    exit_code, errors = _run_program(sources, "sumo", "-c", OPTIONS_FILE, "-n", str(network_file.absolute()), "-r", TRAFFIC_FILE, "--begin",
+                             "0", "--end", "0", "--no-step-log", "true")
+    if exit_code != 0 or errors:
+        raise InputError(sources.folder, f"SUMO refuses {OPTIONS_FILE} or {TRAFFIC_FILE}: {errors or f'exit code {exit_code}'}",
                          "options and traffic that SUMO loads without an error")
     (into / LOAD_MARK_FILE).write_text("SUMO loads it.\n", encoding="ascii")
 
@@ -178,10 +178,10 @@ def _build(sources: Sources, into: Path) -> None:
         command += [f"--{option}", ",".join(names)]
     for option, value in sources.options:
         command += [f"--{option}", value]
-    code, errors = _run_program(sources, "netconvert", *command, "-o", str(into / NETWORK_FILE))
-    if code != 0:
-        if code < 0 or not errors or ("Could not" in errors and "output" in errors) or "bad_alloc" in errors:
-            raise EnvironmentFault(f"{sources.folder}: netconvert fails: {errors or f'exit code {code}'}")
+    exit_code, errors = _run_program(sources, "netconvert", *command, "-o", str(into / NETWORK_FILE))
+    if exit_code != 0:
+        if exit_code < 0 or not errors or ("Could not" in errors and "output" in errors) or "bad_alloc" in errors:
+            raise EnvironmentFault(f"{sources.folder}: netconvert fails: {errors or f'exit code {exit_code}'}")
         raise InputError(sources.folder, f"netconvert refuses the network: {errors}", "sources that netconvert builds a network from")
     _drop_header(into / NETWORK_FILE)
 
@@ -259,8 +259,8 @@ def _check_edits(sources: Sources, built_text: str) -> None:
         return
     header, _, network = file.read_text(encoding="utf-8", errors="replace").partition("<net ")
     if "netedit" in header and f"<net {network}".strip() != built_text.strip():
-        raise InputError(file, f"was saved by netedit after {', '.join(names)}, which build another network",
-                         "plain XML saved from netedit, too; or a folder without those files, to use the network as it is")
+        raise InputError(file, f"has edits by netedit that {', '.join(names)} do not have",
+                         "those files saved from netedit as plain XML, too; or a folder without those files, so that this network is used")
 
 
 def _check_step(file: Path) -> None:

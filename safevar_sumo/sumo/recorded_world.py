@@ -118,8 +118,7 @@ class RecordedWorldSlice:
         return self.lane(self._look_up(self._recording.lane_of, vehicle))
 
     def _track(self, actor: str) -> Track:
-        track: Track = self._look_up(self._recording.tracks, actor)
-        return track
+        return self._look_up(self._recording.tracks, actor)  # type: ignore[no-any-return]
 
     @staticmethod
     def _look_up(table: dict[str, Any], name: str) -> Any:
@@ -209,7 +208,7 @@ class RecordedWorld:
                 self._struck_bodies[vehicle] = Body._make(column[body] for column in others)
         return dict(sorted(collision_speeds.items()))
 
-    def _overlaps(self, fronts: FloatArray, is_open: BoolArray, scenes: Any, others: Body, persons: BoolArray, *,
+    def _overlaps(self, fronts: FloatArray, is_open: BoolArray, scene_numbers: Any, others: Body, persons: BoolArray, *,
                   only_persons: bool) -> Iterator[tuple[int, int]]:
         """Yield the numbers of a body of `others` and of a vehicle that overlap: no edge of either rectangle separates them.
 
@@ -221,14 +220,14 @@ class RecordedWorld:
         min_overlap = np.where(persons | (cosine < PARALLEL_COSINE), 0.0, NUMERICAL_EPS)
         max_distance = (length + others.length * cosine + others.width * sine) / 2 - min_overlap
         front_targets = others.middle + direction * (length / 2)  # where a vehicle's front is if its middle is the other body's middle
-        candidates = is_open.reshape(-1, self._size)[scenes]
+        candidates = is_open.reshape(-1, self._size)[scene_numbers]
         if only_persons:
             candidates = candidates & persons[:, np.newaxis]
-        distance = np.abs((front_targets[:, np.newaxis] - fronts.reshape(-1, self._size, 2)[scenes]) @ direction)
+        distance = np.abs((front_targets[:, np.newaxis] - fronts.reshape(-1, self._size, 2)[scene_numbers]) @ direction)
         body, vehicle_in_scene = np.nonzero(candidates & (distance < max_distance[:, np.newaxis]))
         if not len(body):
             return
-        vehicle = scenes[body] * self._size + vehicle_in_scene
+        vehicle = scene_numbers[body] * self._size + vehicle_in_scene
         to_other, cosine, sine, min_overlap = front_targets[body] - fronts[vehicle], cosine[body], sine[body], min_overlap[body]
         other_length, other_width = others.length[body], others.width[body]
         is_separated = np.abs(to_other @ normal) >= (width + other_length * sine + other_width * cosine) / 2 - min_overlap
@@ -268,5 +267,5 @@ def _joined_extents(recordings: Sequence[Recording]) -> FloatArray:
 
 
 def _body_at(track: Track, sample: int) -> Body:
-    return Body.behind(track.position[sample], direction_of(float(track.angle[sample])), track.length, track.width,
-                       float(track.speed[sample]))
+    along = direction_of(float(track.angle[sample]))
+    return Body.behind(track.position[sample], along, track.length, track.width, float(track.speed[sample]))

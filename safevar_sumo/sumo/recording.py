@@ -77,8 +77,9 @@ class LaneSequence(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Recording:
-    """A recorded scene: the vehicle under test departs at position `start` on the first lane of its `way` [m], at `speed` [m/s].
+    """A recorded scene, in which the vehicle under test departs at position `start` on the first lane of its `way` [m], at `speed` [m/s].
 
+    `length` and `width` are the vehicle's [m], `lanes` the shapes of all lanes, `lane_of` each vehicle's first lane.
     `extents`, shape (2, T, A): at step t, the vehicle is beside actor a while its front is between these coordinates `along` the lanes [m].
     """
 
@@ -125,8 +126,8 @@ def record_scenes(scenarios: Sequence[Scenario], options: Sequence[str]) -> list
 
 def _reason_for_sumo(scenario: Scenario) -> str:
     if getattr(scenario, "reactive_actors", True):
-        return "somebody in the scenario may react to the vehicle under test"
-    if not isinstance(scenario, GuardedScenario) and not is_shipped(scenario.network):  # shipped scenarios vouch for these
+        return "an actor of the scenario may react to the vehicle under test"
+    if not isinstance(scenario, GuardedScenario) and not is_shipped(scenario.network):  # shipped scenarios know only shipped networks
         return f"the traffic of the network {scenario.network!r} may react to the vehicle under test"
     return ""
 

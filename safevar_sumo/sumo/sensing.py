@@ -127,8 +127,8 @@ def _scale_values(values: Values, own_values: Values, scale: float) -> Values:
     if scale == 1:
         return values
     result = dict(values)
-    for name in ("getPosition", "getPosition3D"):
-        result[name] = tuple(own + scale * (other - own) for own, other in zip(own_values[name], values[name], strict=True))
+    for function in ("getPosition", "getPosition3D"):
+        result[function] = tuple(own + scale * (other - own) for own, other in zip(own_values[function], values[function], strict=True))
     if values["getRoadID"] == own_values["getRoadID"]:
         result["getLanePosition"] = own_values["getLanePosition"] + scale * (values["getLanePosition"] - own_values["getLanePosition"])
     return result
@@ -143,16 +143,16 @@ def _delay_snapshot(snapshots: deque[Snapshot], age: float) -> Snapshot:
         return after
     actors = {domain: {name: _interpolate_values(after.actors(domain).get(name, values), values, fraction)
                      for name, values in before.actors(domain).items()} for domain in SENSED_FUNCTIONS}
-    is_same = after.leader and before.leader and after.leader[0] == before.leader[0]
-    leader = (before.leader[0], _interpolate(after.leader[1], before.leader[1], fraction)) if is_same else before.leader  # type: ignore[index]
+    same_leader = after.leader and before.leader and after.leader[0] == before.leader[0]
+    leader = (before.leader[0], _interpolate(after.leader[1], before.leader[1], fraction)) if same_leader else before.leader  # type: ignore[index]
     own_values = _interpolate_values(after.own_values, before.own_values, fraction)
     return Snapshot(own_values, actors["vehicle"], actors["person"], leader)
 
 
 def _interpolate_values(after: Values, before: Values, fraction: float) -> Values:
     is_same_lane = after["getLaneID"] == before["getLaneID"]
-    held_functions = HELD_FUNCTIONS if is_same_lane else (*HELD_FUNCTIONS, "getLanePosition", "getLateralLanePosition")
-    return {name: old if name in held_functions else _interpolate(after[name], old, fraction) for name, old in before.items()}
+    held = HELD_FUNCTIONS if is_same_lane else (*HELD_FUNCTIONS, "getLanePosition", "getLateralLanePosition")
+    return {function: old if function in held else _interpolate(after[function], old, fraction) for function, old in before.items()}
 
 
 def _interpolate(after: Any, before: Any, fraction: float) -> Any:

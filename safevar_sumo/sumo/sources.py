@@ -88,20 +88,20 @@ def recipe_of(file: Path) -> tuple[dict[str, tuple[str, ...]], dict[str, str], s
     InputError
         Naming the file and the illegal option.
     """
-    sources, options = dict[str, tuple[str, ...]](), dict[str, str]()
+    files_by_option, options = dict[str, tuple[str, ...]](), dict[str, str]()
     recipe = options_of(file)
     for name, value in recipe.items():
         if name in SOURCE_OPTIONS:
-            sources[name] = local_files(file, name, value)
+            files_by_option[name] = local_files(file, name, value)
         elif NETCONVERT_OPTIONS.fullmatch(name):
             options[name] = value
         elif not IGNORED_OPTIONS.fullmatch(name):
             raise InputError(file, f"sets netconvert's option {name!r}", f"options that shape the network, such as junctions.*, tls.* and "
                              f"no-turnarounds, and its sources: {', '.join(SOURCE_OPTIONS)}")
-    return sources, options, recipe.get("output-file", "")
+    return files_by_option, options, recipe.get("output-file", "")
 
 
-def local_files(file: Path, name: str, value: str) -> tuple[str, ...]:
+def local_files(file: Path, option: str, value: str) -> tuple[str, ...]:
     """The files that an option names; they must be in the folder of the configuration.
 
     Raises
@@ -112,9 +112,9 @@ def local_files(file: Path, name: str, value: str) -> tuple[str, ...]:
     files = tuple(part.strip() for part in value.split(",") if part.strip())
     for file_name in files:
         if Path(file_name).name != file_name or "\\" in file_name:
-            raise InputError(file, f"{name} = {file_name!r} is in another folder", "the name of a file in the same folder")
-        if name in SOURCE_OPTIONS and not (file.parent / file_name).is_file():
-            raise InputError(file, f"{name}: {file_name} is missing", "a file in the same folder")
+            raise InputError(file, f"{option} = {file_name!r} is in another folder", "the name of a file in the same folder")
+        if option in SOURCE_OPTIONS and not (file.parent / file_name).is_file():
+            raise InputError(file, f"{option}: {file_name} is missing", "a file in the same folder")
     return files
 
 
@@ -201,11 +201,11 @@ def _list_files(folder: Path) -> tuple[tuple[str, int, int], ...]:
 @lru_cache(maxsize=256)
 def _folder_sources(folder: Path, listing: tuple[tuple[str, int, int], ...]) -> Sources:
     """The sources in a folder; they are read again when the folder's `listing` changes."""
-    plain, name = _plain_sources(folder), _configured_network(folder)
-    if plain is not None and (not plain.output_file or name in ("", plain.output_file) or not (folder / name).is_file()):
+    plain, network_file = _plain_sources(folder), _configured_network(folder)
+    if plain is not None and (not plain.output_file or network_file in ("", plain.output_file) or not (folder / network_file).is_file()):
         sources = plain
-    elif name and (folder / name).is_file():
-        sources = Sources(folder, network_file=name)
+    elif network_file and (folder / network_file).is_file():
+        sources = Sources(folder, network_file=network_file)
     else:
         sources = Sources(folder, network_file=_only_network(folder))
     names = sources.road_files
@@ -221,21 +221,21 @@ def _plain_sources(folder: Path) -> Sources | None:
     """The plain sources in a folder, given by a recipe or by their file names; None if the folder has no plain sources."""
     recipes = sorted(folder.glob("*.netccfg"))
     if len(recipes) > 1:
-        raise InputError(folder, f"has {' and '.join(file.name for file in recipes)}", "one recipe")
+        raise InputError(folder, f"has {' and '.join(file.name for file in recipes)}", "one .netccfg file")
     if recipes:
         (recipe,) = recipes
-        sources, options, output_file = recipe_of(recipe)
-        if not sources:
+        files, options, output = recipe_of(recipe)
+        if not files:
             raise InputError(recipe, "names no sources", "node-files, edge-files and connection-files, or another network")
-        return Sources(folder, "", tuple(sources.items()), tuple(options.items()), recipe.name, output_file)
+        return Sources(folder, plain_files=tuple(files.items()), options=tuple(options.items()), recipe=recipe.name, output_file=output)
     names = {option: f"network.{ending}.xml" for option, ending in PLAIN_ENDINGS.items()}
     files = {option: (name,) for option, name in names.items() if (folder / name).is_file()}
     if not files:
         return None
-    for name in REQUIRED_FILES[:3]:
+    for name in REQUIRED_FILES[:3]:  # the plain sources
         if not (folder / name).is_file():
             raise InputError(folder, f"{name} is missing", LEGAL_FOLDERS)
-    return Sources(folder, "", tuple(files.items()), tuple(DEFAULT_OPTIONS.items()), "", f"network{NETWORK_ENDING}")
+    return Sources(folder, plain_files=tuple(files.items()), options=tuple(DEFAULT_OPTIONS.items()), output_file=f"network{NETWORK_ENDING}")
 
 
 def _configured_network(folder: Path) -> str:

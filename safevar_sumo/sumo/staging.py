@@ -22,7 +22,7 @@ from safevar_sumo.sumo.sources import OPTIONS_FILE, TRAFFIC_FILE, Sources, optio
 
 
 class StagedNetwork(NamedTuple):
-    """The folder of a network with a scenario's lanes and traffic, and a digest of the network's content."""
+    """A network with a scenario's lanes and traffic: its folder (or `.net.xml` file), and a digest of its content."""
 
     folder: str
     fingerprint: str
@@ -40,7 +40,7 @@ def stage_network(scenario: Scenario) -> StagedNetwork:
 
 
 def stage_networks(scenarios: Sequence[Scenario]) -> list[StagedNetwork]:
-    """The networks of several scenarios, whose files are read once per network; raises the errors of `staged`."""
+    """The networks of several scenarios, whose files are read once per network; raises the errors of `stage_network`."""
     fingerprints = {name: network_fingerprint(name) for name in {scenario.network for scenario in scenarios}}
     def stage(scenario: Any) -> StagedNetwork:
         may_vary = isinstance(scenario, GuardedScenario)  # a user's scenario may return different changes in each call

@@ -132,8 +132,8 @@ class Models(NamedTuple):
 class System:
     """A study's models, points, metrics and constraints, ready to simulate.
 
-    `step_length` [s] is None if the network determines the time step; `rater` rates results in the matrix of a protocol; `metrics` contains
-    thresholds, and `measuring` the metrics that are computed with them; `members` define all models, metrics and constraints.
+    `step_length` [s] is None if the network determines the time step; `rater` rates results in the matrix of a protocol; `metrics_table`
+    has the thresholds of the metrics in `measuring`; `members` define all models, metrics and constraints.
     """
 
     characteristics: CharacteristicSet
@@ -141,7 +141,7 @@ class System:
     ads: Ads
     scenario: Scenario
     weather: Weather
-    metrics: MetricsTable
+    metrics_table: MetricsTable
     nominal: Nominal
     members: tuple[Member, ...]
     measuring: Measuring
@@ -184,7 +184,7 @@ class System:
     def _has_limited_range(self) -> bool:
         sensors = getattr(self.vehicle, "sensors", None)
         original = dict(zip(self.characteristics.names, self.characteristics.original[:, np.newaxis], strict=True))
-        values = None if sensors is None else sensors(self.vehicle.prepare(original, 1.0, 0.1))
+        values = None if sensors is None else sensors(self.vehicle.prepare(original, 1.0, 0.1))  # road friction 1, time step 0.1 s
         return values is not None and bool(np.isfinite(values.reach).all())
 
 
@@ -224,12 +224,12 @@ def _assemble(study: Study, source: str) -> System:
     nominal = calibration_drive(models.vehicle, characteristics)
     if isinstance(models.ads, TraciController) and isinstance(models.vehicle, GuardedVehicle):
         extremes = np.stack([characteristics.original, characteristics.lower, characteristics.upper])
-        models.vehicle.refuse_unknown_sensors(dict(zip(characteristics.names, np.ascontiguousarray(extremes.T), strict=True)))
+        models.vehicle.refuse_sense_without_sensors(dict(zip(characteristics.names, np.ascontiguousarray(extremes.T), strict=True)))
     if not is_shipped_vehicle:
         nominal.tables()  # so that errors of a user's vehicle do not depend on the ADS
     return System(
         characteristics=characteristics, vehicle=models.vehicle, ads=models.ads, scenario=models.scenario, weather=models.weather,
-        metrics=study.metrics, nominal=nominal, members=(*models.members, *measuring.members, *region.members),
+        metrics_table=study.metrics, nominal=nominal, members=(*models.members, *measuring.members, *region.members),
         measuring=measuring, region=region, step_length=study.step_length, matrix=matrix, rater=rater)
 
 
@@ -260,9 +260,9 @@ def _create_traci_controller(table: ModelTable, lookup: Lookup) -> tuple[Ads, Me
                 return partial(target, **parameters)
             return instance_of(member._replace(target=target), parameters, name, "ads.parameters", lookup.source)
 
-        controller_of(controller)
+        controller_of(controller)  # so that wrong parameters raise errors here
     folders, attribute = [*lookup.folders, os.getcwd()], table.model.partition(":")[2]
-    modules = partial(ModuleCopies, member, attribute, folders, set())
+    modules = partial(ModuleCopies, member, attribute, folders, other_names=set())
     return TraciController(modules, controller_of, member.guard or Guard(lookup.source, name)), member
 
 
@@ -358,8 +358,8 @@ def _create_ads(table: ModelTable, lookup: Lookup, time_limit: float) -> tuple[A
                              otherwise=f'with ads.kind = "traci" {CONTROLLER_FORMS}')
     name = f"ads.model = {table.model!r}"
     parameters = lookup.with_paths(member, table.parameters, "ads.parameters")
-    make = partial(instance_of, member, parameters, name, "ads.parameters", lookup.source)
-    driver = make()  # also for a ScalarAds, so that wrong parameters raise errors here
+    create_ads = partial(instance_of, member, parameters, name, "ads.parameters", lookup.source)
+    ads = create_ads()  # also for a ScalarAds, so that wrong parameters raise errors here
     if issubclass(member.target, ScalarAds):
-        return PerVehicleAds(make, member.guard or Guard(lookup.source, name)), member
-    return (driver if member.guard is None else GuardedAds(driver, member.guard)), member
+        return PerVehicleAds(create_ads, member.guard or Guard(lookup.source, name)), member
+    return (ads if member.guard is None else GuardedAds(ads, member.guard)), member

@@ -45,7 +45,7 @@ class TraciController:
         traffic.record_step()
         with substitute_traci():
             drivers = [_Driver(view, self._modules(), self._controller_of, self._guard) for view in views]
-        return _Memory(nominal, traffic, drivers, None)
+        return _Memory(nominal, traffic, drivers, initial_trim=None)
 
     def drive(self, seen: Observation, memory: _Memory) -> tuple[Command, _Memory]:
         initial_trim = trim_at(memory.nominal, seen) if memory.initial_trim is None else memory.initial_trim

@@ -46,7 +46,7 @@ class Subscriptions:
             "subscribe": self._subscribe, "subscribeLeader": self._subscribe_to_leader, "unsubscribe": self._unsubscribe,
             "subscribeContext": self._subscribe_around, "unsubscribeContext": self._unsubscribe_around}
         if name not in functions:
-            raise InputError(f"traci.{domain}.{name}", "is not for a controller", "subscribe, subscribeContext, and your own selection")
+            raise InputError(f"traci.{domain}.{name}", "is not for a controller", "subscribe, subscribeContext, and filters in your code")
         positional = positional_arguments(domain, name, arguments, named)
         functions[name](domain, *(("", *positional) if domain == "simulation" else positional))
         return None

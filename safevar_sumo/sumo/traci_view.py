@@ -25,7 +25,7 @@ COMMANDS: Mapping[str, tuple[str, ...]] = {
     "setSpeed": ("speed",), "slowDown": ("speed", "duration"), "setAcceleration": ("acceleration", "duration"), "setAccel": ("accel",),
     "setDecel": ("decel",), "setMaxSpeed": ("speed",), "setSpeedMode": ("mode",)}
 """The commands that a controller may give, each with its numeric arguments."""
-EXPECTED_CALLS = "a controller reads and commands in its step"
+EXPECTED_CALLS = "only queries and commands in a controller's step"
 SUMO_CONTROL = -1.0
 """Value of a speed or speed mode with which a command returns control to SUMO's own driver."""
 QUERY_FUNCTIONS = re.compile("(get|is|has|find|convert|couldChangeLane).*")
@@ -242,10 +242,10 @@ class TraciView:
     def _to_original_ids(self, value: Any) -> Any:
         """A result with the ids of the traffic file, and without elements of other copies."""
         if isinstance(value, str):
-            for mark in ("", ":", "!"):
-                if value.startswith(f"{mark}{self._copy}."):
-                    name = value.removeprefix(f"{mark}{self._copy}.")
-                    return value if name.isdecimal() and name not in self._names else mark + name
+            for prefix in ("", ":", "!"):
+                if value.startswith(f"{prefix}{self._copy}."):
+                    name = value.removeprefix(f"{prefix}{self._copy}.")
+                    return value if name.isdecimal() and name not in self._names else prefix + name
             return value
         if value is None or isinstance(value, bool | int | float | bytes):
             return value

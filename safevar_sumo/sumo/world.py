@@ -61,7 +61,7 @@ class SumoWorld:
         """Ids of the actors that the vehicles under test collided with last, by copy."""
         self._ids: dict[str, list[str]] = {}
         self._positions: dict[str, FloatArray] = {}
-        self._copy_of = {name: copy for copy, name in enumerate(self.ids(VUT))}
+        self._copy_of = {id_: copy for copy, id_ in enumerate(self.ids(VUT))}
         self._driving_copies, self._driving_numbers = dict(self._copy_of), np.arange(len(self._copy_of))
         """Numbers of the copies whose vehicle under test is on the road: by the vehicle's id, and as an array."""
         self._commanded_speeds = np.full(len(self._driving_numbers), np.nan)
@@ -80,24 +80,24 @@ class SumoWorld:
     def set_types(self, types: SumoType) -> None:
         vehicletype = self._api.vehicletype
         columns = (values.tolist() for values in (types.mass, types.accel, types.max_speed, types.tau))
-        for name, mass, accel, max_speed, tau in zip(self.ids(VUT), *columns, strict=True):
-            vehicletype.setMass(name, mass)
-            vehicletype.setAccel(name, accel)
-            vehicletype.setMaxSpeed(name, max_speed)
-            vehicletype.setTau(name, tau)
+        for id_, mass, accel, max_speed, tau in zip(self.ids(VUT), *columns, strict=True):
+            vehicletype.setMass(id_, mass)
+            vehicletype.setAccel(id_, accel)
+            vehicletype.setMaxSpeed(id_, max_speed)
+            vehicletype.setTau(id_, tau)
         self.set_decelerations(types.decel)
 
     def allow_departure(self) -> None:
         """Set SUMO vehicle types that let SUMO insert the vehicles under test at any speed."""
-        for name in self.ids(VUT):
-            self._api.vehicletype.setMaxSpeed(name, MAX_DEPARTURE_SPEED)
+        for id_ in self.ids(VUT):
+            self._api.vehicletype.setMaxSpeed(id_, MAX_DEPARTURE_SPEED)
         self.set_decelerations(np.full(self.n, INSERTION_DECELERATION))
 
     def set_decelerations(self, decel: FloatArray) -> None:
         """Set the largest decelerations of the vehicles under test, also in emergencies [m/s^2]."""
-        for name, value in zip(self.ids(VUT), decel.tolist(), strict=True):
-            self._api.vehicletype.setDecel(name, value)
-            self._api.vehicletype.setEmergencyDecel(name, value)
+        for id_, value in zip(self.ids(VUT), decel.tolist(), strict=True):
+            self._api.vehicletype.setDecel(id_, value)
+            self._api.vehicletype.setEmergencyDecel(id_, value)
 
     def depart(self) -> None:
         """Insert all actors, and take control of the vehicles under test.
@@ -111,18 +111,18 @@ class SumoWorld:
         _current_world = self
         self._api.simulationStep()
         departed = set(self._api.vehicle.getIDList())
-        for name in self.ids(VUT):
-            if name not in departed:
-                raise SimulationError(f"SUMO found no place for vehicle {name!r}: look at the network's traffic file")
-            self._api.vehicle.setSpeedMode(name, SPEED_MODE)
-            self._api.vehicle.setLaneChangeMode(name, LANE_CHANGE_MODE)
+        for id_ in self.ids(VUT):
+            if id_ not in departed:
+                raise SimulationError(f"SUMO found no place for vehicle {id_!r}: look at the network's traffic file")
+            self._api.vehicle.setSpeedMode(id_, SPEED_MODE)
+            self._api.vehicle.setLaneChangeMode(id_, LANE_CHANGE_MODE)
 
     def advance(self, speeds: FloatArray) -> None:
         """Simulate one step, in which the vehicles under test reach `speeds` [m/s]."""
-        set_speed, names = self._set_speed, self.ids(VUT)
+        set_speed, ids = self._set_speed, self.ids(VUT)
         changed_copies = self._driving_numbers[(speeds != self._commanded_speeds)[self._driving_numbers]]
         for copy, speed in zip(changed_copies.tolist(), speeds[changed_copies].tolist(), strict=True):
-            set_speed(names[copy], speed)
+            set_speed(ids[copy], speed)
         self._commanded_speeds = speeds
         self._api.simulationStep()
         self._positions.clear()
@@ -140,9 +140,9 @@ class SumoWorld:
             pairs = [(collision.collider, collision.colliderSpeed, collision.victim)]
             if collision.type == "junction":
                 pairs.append((collision.victim, collision.victimSpeed, collision.collider))
-            for name, speed, other in pairs:
-                if (copy := self._copy_of.get(name)) is not None and is_open[copy]:
-                    speeds[copy], self._struck_ids[copy] = speed, other
+            for id_, speed, other_id in pairs:
+                if (copy := self._copy_of.get(id_)) is not None and is_open[copy]:
+                    speeds[copy], self._struck_ids[copy] = speed, other_id
         return speeds
 
     def bodies(self, copies: Sequence[int]) -> tuple[Body, Body]:
@@ -150,19 +150,19 @@ class SumoWorld:
         return (Body.columns([self._body_of(self.ids(VUT)[copy]) for copy in copies]),
                 Body.columns([self._body_of(self._struck_ids[copy]) for copy in copies]))
 
-    def _body_of(self, name: str) -> Body:
-        domain = self._api.person if name in self._api.person.getIDList() else self._api.vehicle
-        return Body.behind(np.array(domain.getPosition(name)), direction_of(domain.getAngle(name)), domain.getLength(name),
-                           domain.getWidth(name), domain.getSpeed(name))
+    def _body_of(self, id_: str) -> Body:
+        domain = self._api.person if id_ in self._api.person.getIDList() else self._api.vehicle
+        return Body.behind(np.array(domain.getPosition(id_)), direction_of(domain.getAngle(id_)), domain.getLength(id_),
+                           domain.getWidth(id_), domain.getSpeed(id_))
 
     def end_runs(self, copies: Sequence[int]) -> None:
         """Remove vehicles whose runs end from SUMO's simulation, and keep their last positions and speeds."""
         if not copies:
             return
         self._last_speeds[copies], self._last_positions[copies] = self.speeds()[copies], self.vehicle_positions(VUT)[copies]
-        for name in [self.ids(VUT)[copy] for copy in copies]:
-            self._api.vehicle.remove(name)
-            del self._driving_copies[name]
+        for id_ in [self.ids(VUT)[copy] for copy in copies]:
+            self._api.vehicle.remove(id_)
+            del self._driving_copies[id_]
         self._driving_numbers = np.array([*self._driving_copies.values()], dtype=np.intp)
 
     def speeds(self) -> FloatArray:
@@ -181,9 +181,9 @@ class SumoWorld:
     def _positions_of(self, actor: str, position: Callable[[str], tuple[float, float]]) -> FloatArray:
         """The actor's positions in this step; repeated calls return the same array."""
         if actor not in self._positions:
-            names = self._driving_copies if actor == VUT else self.ids(actor)
-            positions = np.fromiter(chain.from_iterable(map(position, names)), float, 2 * len(names)).reshape(-1, 2)
-            if len(names) < self.n:
+            ids = self._driving_copies if actor == VUT else self.ids(actor)
+            positions = np.fromiter(chain.from_iterable(map(position, ids)), float, 2 * len(ids)).reshape(-1, 2)
+            if len(ids) < self.n:
                 positions, new_positions = self._last_positions.copy(), positions
                 positions[self._driving_numbers] = new_positions
             self._positions[actor] = positions
@@ -199,26 +199,26 @@ class SumoWorld:
         """The module libsumo or traci."""
         return self._api
 
-    def has_left(self, name: str) -> bool:
-        """Whether a vehicle under test has left the road; it never returns."""
-        return name not in self._driving_copies
+    def has_left(self, id_: str) -> bool:
+        """Whether a vehicle under test has left the road, for good."""
+        return id_ not in self._driving_copies
 
     def names(self) -> frozenset[str]:
         """Names of vehicles, persons, roads and types in the original network."""
         api = self._api
         domains = (api.vehicle, api.person, api.edge, api.lane, api.route, api.vehicletype, api.junction)
-        return frozenset(name.removeprefix(":").partition(".")[2] for domain in domains for name in domain.getIDList())
+        return frozenset(id_.removeprefix(":").partition(".")[2] for domain in domains for id_ in domain.getIDList())
 
     def actor_poses(self) -> dict[str, tuple[float, float, float]]:
         """x and y of the front bumper or person [m], and heading clockwise from north [degrees], of all actors on the road, by id."""
         domains = (self._api.vehicle, self._api.person)
-        return {name: (*domain.getPosition(name), domain.getAngle(name)) for domain in domains for name in domain.getIDList()}
+        return {id_: (*domain.getPosition(id_), domain.getAngle(id_)) for domain in domains for id_ in domain.getIDList()}
 
-    def actor_size(self, name: str) -> tuple[bool, float, float]:
+    def actor_size(self, id_: str) -> tuple[bool, float, float]:
         """Whether an actor is a person, and its length and width [m]."""
-        is_person = name in self._api.person.getIDList()
+        is_person = id_ in self._api.person.getIDList()
         domain = self._api.person if is_person else self._api.vehicle
-        return is_person, domain.getLength(name), domain.getWidth(name)
+        return is_person, domain.getLength(id_), domain.getWidth(id_)
 
     def vehicle_length(self, actor: str) -> float:
         return float(self._api.vehicle.getLength(self.ids(actor)[0]))
@@ -240,20 +240,20 @@ class SumoWorld:
         return float(self._api.person.getWidth(self.ids(actor)[0]))
 
     def walk(self, person: str, speed: float) -> None:
-        for name in self.ids(person):
-            self._api.person.setSpeed(name, speed)
+        for id_ in self.ids(person):
+            self._api.person.setSpeed(id_, speed)
 
     def drive(self, vehicle: str, speed: float) -> None:
-        for name in self.ids(vehicle):
-            self._api.vehicle.setSpeedMode(name, SPEED_MODE)
-            self._api.vehicle.setSpeed(name, speed)
+        for id_ in self.ids(vehicle):
+            self._api.vehicle.setSpeedMode(id_, SPEED_MODE)
+            self._api.vehicle.setSpeed(id_, speed)
 
     def turn_back(self, person: str) -> None:
         api = self._api.person
-        for name in self.ids(person):
-            back = [api.getRoadID(name), api.getEdges(name)[0]]
-            api.appendWalkingStage(name, back, 0.0, speed=api.getSpeed(name))
-            api.removeStage(name, 0)
+        for id_ in self.ids(person):
+            back = [api.getRoadID(id_), api.getEdges(id_)[0]]
+            api.appendWalkingStage(id_, back, 0.0, speed=api.getSpeed(id_))
+            api.removeStage(id_, 0)
 
 
 def begin(scenario: Scenario, world: Any) -> Any:

@@ -174,15 +174,15 @@ class GuardedVehicle:
         constants = self._guard.call("prepare", method, *arguments)
         types = self._guard.call("sumo_type", self.model.sumo_type, constants)
         return _Prepared(n, constants, SumoType(*(
-            self._guard.numbers("sumo_type", name, self._guard.field("sumo_type", types, name), (n,), 0.0, above=True)
+            self._guard.numbers("sumo_type", name, self._guard.field("sumo_type", types, name), (n,), lowest=0.0, above=True)
             for name in SumoType._fields)))
 
     def sumo_type(self, prepared: _Prepared) -> SumoType:
         return prepared.types
 
     def at_rest(self, prepared: _Prepared) -> _State:
-        state = self._state("at_rest", prepared.n, self._guard.call("at_rest", self.model.at_rest, prepared.constants))
-        self._guard.numbers("at_rest", "speed", state.speed, (prepared.n,), 0.0, 0.0)
+        state = self._checked_state("at_rest", prepared.n, self._guard.call("at_rest", self.model.at_rest, prepared.constants))
+        self._guard.numbers("at_rest", "speed", state.speed, (prepared.n,), lowest=0.0, highest=0.0)
         return state
 
     def at_speed(self, prepared: _Prepared, speed: FloatArray) -> _State:
@@ -190,31 +190,32 @@ class GuardedVehicle:
             problem = f"{self._guard.name} has no method at_speed(prepared, speed), and the traffic puts it onto the road in motion"
             raise UserCodeError(self._guard.source, problem, "a vehicle with that method, or traffic that departs with speed 0")
         state = self._guard.call("at_speed", self.model.at_speed, prepared.constants, read_only_copy(speed))
-        return self._state("at_speed", prepared.n, state)
+        return self._checked_state("at_speed", prepared.n, state)
 
     def hold_gear(self, prepared: _Prepared, state: _State, holds: BoolArray) -> _State:
         if not hasattr(self.model, "hold_gear"):
             return state
         held = self._guard.call("hold_gear", self.model.hold_gear, prepared.constants, state.model_state, read_only_copy(holds))
-        return self._state("hold_gear", prepared.n, held)
+        return self._checked_state("hold_gear", prepared.n, held)
 
     def sensors(self, prepared: _Prepared) -> Sensors | None:
         """The model's sensors; None for a model without that method."""
         if not hasattr(self.model, "sensors"):
             return None
         sensors = self._guard.call("sensors", self.model.sensors, prepared.constants)
-        return Sensors(*(self._guard.numbers("sensors", name, self._guard.field("sensors", sensors, name), (prepared.n,), 0.0,
+        return Sensors(*(self._guard.numbers("sensors", name, self._guard.field("sensors", sensors, name), (prepared.n,), lowest=0.0,
                                              above=name == "scale", infinite=name == "reach") for name in Sensors._fields))
 
-    def refuse_unknown_sensors(self, characteristics: Characteristics) -> None:
+    def refuse_sense_without_sensors(self, characteristics: Characteristics) -> None:
         """Refuse a model that changes observations in `sense` but has no method `sensors`, because a TraCI controller bypasses `sense`."""
         if hasattr(self.model, "sensors"):
             return
-        prepared = self.prepare(characteristics, 1.0, PROBE_STEP)
+        prepared = self.prepare(characteristics, road_friction=1.0, step=PROBE_STEP)
         state, zeros = self.at_rest(prepared), np.zeros(prepared.n)
         for sample, gap in enumerate((60.0, 5.0, 2000.0)):
-            seen = Observation(sample * PROBE_STEP, zeros, zeros + gap, zeros + sample, zeros - 1 - sample, zeros + sample, 0.5,
-                               zeros - sample, zeros, zeros)
+            seen = Observation(time=sample * PROBE_STEP, speed=zeros, gap=zeros + gap, closing_speed=zeros + sample,
+                               lateral=zeros - 1 - sample, lateral_speed=zeros + sample, visibility=0.5, obstacle_speed=zeros - sample,
+                               throttle=zeros, brake=zeros)
             sensed, state = self.sense(prepared, state, seen)
             for name, value in seen._asdict().items():
                 if not np.array_equal(getattr(sensed, name), value):
@@ -231,16 +232,16 @@ class GuardedVehicle:
             shape = (prepared.n,) if hasattr(value, "shape") else ()
             numbers = self._guard.numbers("sense", name, self._guard.field("sense", sensed, name), shape, infinite=name in _MAY_BE_INFINITE)
             values[name] = numbers if shape else float(numbers)
-        return Observation(**values), self._state("sense", prepared.n, next_state)
+        return Observation(**values), self._checked_state("sense", prepared.n, next_state)
 
     def advance(self, prepared: _Prepared, state: _State, command: Command) -> _State:
         result = self._guard.call("advance", self.model.advance, prepared.constants, state.model_state, read_only_copy(command))
-        state, max_speed = self._state("advance", prepared.n, result), prepared.types.max_speed
+        state, max_speed = self._checked_state("advance", prepared.n, result), prepared.types.max_speed
         for i in np.flatnonzero(state.speed > max_speed * (1 + SPEED_ROUNDING))[:1]:  # SUMO itself accepts any speed
             raise self._guard.wrong_value("advance", "speed", float(state.speed[i]), f"up to max_speed = {max_speed[i]:g} of its sumo_type")
         return state
 
-    def _state(self, method: str, n: int, model_state: Any) -> _State:
+    def _checked_state(self, method: str, n: int, model_state: Any) -> _State:
         columns = {name: self._guard.numbers(method, name, self._guard.field(method, model_state, name), (n,), *_LEGAL_RANGES.get(name, ()))
                 for name in _State._fields[:-1]}
         return _State(**columns, model_state=model_state)

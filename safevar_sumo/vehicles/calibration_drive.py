@@ -10,7 +10,7 @@ from safevar_sumo.records import Command, FloatArray, Nominal, PedalTables
 from safevar_sumo.vehicles.base import Vehicle
 from safevar_sumo.vehicles.characteristics import CharacteristicSet
 
-STEP = 0.1  # s
+DRY_ROAD_FRICTION, STEP = 1.0, 0.1  # -, s
 SPEEDS = np.arange(0.0, 20.5, 0.5)  # m/s, of the tables
 LONGEST_DRIVE = 60.0  # s
 LIGHT_BRAKE = 0.1  # pedal position while braking, far from the limit of the tyres
@@ -18,7 +18,7 @@ LIGHT_BRAKE = 0.1  # pedal position while braking, far from the limit of the tyr
 
 def calibration_drive(vehicle: Vehicle, characteristics: CharacteristicSet) -> Nominal:
     """The original vehicle on a dry road; the drive is simulated when its tables are first used."""
-    types = vehicle.sumo_type(vehicle.prepare(_original_values(characteristics), 1.0, STEP))
+    types = vehicle.sumo_type(vehicle.prepare(_original_values(characteristics), DRY_ROAD_FRICTION, STEP))
     simulate_tables = cache(partial(_simulated_tables, vehicle, characteristics))  # type: ignore[arg-type]
     mass, accel, decel, max_speed, lag = (float(values[0]) for values in types)
     return Nominal(mass=mass, accel=accel, decel=decel, max_speed=max_speed, actuator_lag=lag, tables=simulate_tables)
@@ -31,7 +31,7 @@ def _original_values(characteristics: CharacteristicSet) -> dict[str, FloatArray
 @lru_cache(maxsize=4)
 def _simulated_tables(vehicle: Vehicle, characteristics: CharacteristicSet) -> PedalTables:
     """Accelerate at full throttle to the highest speed of the tables; from there, coast in one drive and brake lightly in another."""
-    prepared = vehicle.prepare(_original_values(characteristics), 1.0, STEP)
+    prepared = vehicle.prepare(_original_values(characteristics), DRY_ROAD_FRICTION, STEP)
     rest = vehicle.at_rest(prepared)
 
     def drive(state: object, throttle: float, brake: float) -> tuple[list[float], object]:
@@ -41,13 +41,14 @@ def _simulated_tables(vehicle: Vehicle, characteristics: CharacteristicSet) -> P
         for _ in range(round(LONGEST_DRIVE / STEP)):
             state = vehicle.advance(prepared, state, command)
             speeds.append(float(state.speed[0]))  # type: ignore[attr-defined]
-            if speeds[-1] >= SPEEDS[-1] + 1 if throttle else speeds[-1] < SPEEDS[1]:
+            if (throttle and speeds[-1] >= SPEEDS[-1] + 1) or (not throttle and speeds[-1] < SPEEDS[1]):
                 break
         return speeds, state
 
-    launch, fast_state = drive(rest, 1.0, 0.0)
-    coasting = _accelerations(drive(fast_state, 0.0, 0.0)[0][::-1])
-    braking = _accelerations(drive(fast_state, 0.0, LIGHT_BRAKE)[0][::-1])
+    launch, fast_state = drive(rest, throttle=1.0, brake=0.0)
+    coasting_speeds, _ = drive(fast_state, throttle=0.0, brake=0.0)
+    braking_speeds, _ = drive(fast_state, throttle=0.0, brake=LIGHT_BRAKE)
+    coasting, braking = _accelerations(coasting_speeds[::-1]), _accelerations(braking_speeds[::-1])  # decelerations: time reversed
     tables = PedalTables(speeds=SPEEDS, full_throttle=_accelerations(launch), coasting=coasting,
                          braking=float(np.median(braking - coasting)) / LIGHT_BRAKE)
     for table in tables[:3]:

@@ -48,7 +48,8 @@ class _Prepared(NamedTuple):
 
     `throttle_rates` and `brake_rates` are the largest fall and rise of a pedal in a substep. Quantities with names in `per_step`
     are divided by the tyre step. In a tyre step the speed changes by `speed_by_force` per unit of force and by `speed_by_air` per unit of
-    squared speed; the slope, which pulls with `pull` [N], takes `speed_by_slope`. Below `standstill` the tyres hold a braked vehicle.
+    squared speed; the slope pulls with `pull` [N] and reduces it by `speed_by_slope`. Below the speed `standstill` the tyres hold a braked
+    vehicle. `grip` is the largest tyre force [N], `assumed_height` the camera's assumed height over its actual height [-].
     """
 
     substeps: int
@@ -191,7 +192,7 @@ class Carla(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
             pull=c["mass"] * slope.back, speed_by_slope=np.zeros_like(radius) + slope.back * tyre_step,
             assumed_height=self.camera_height / (self.camera_height + (radius - self.camera_design_radius)),
             slip_offset=np.full_like(radius, self.slip_offset), zeros=np.zeros_like(radius), standstill=np.zeros_like(radius))
-        creep_speed = self._rim_at(prepared._replace(pull=np.abs(prepared.pull)), prepared.zeros)[0]
+        creep_speed, _ = self._rim_at(prepared._replace(pull=np.abs(prepared.pull)), prepared.zeros)
         return prepared._replace(standstill=HOLD_SPEED + creep_speed)
 
     def sumo_type(self, prepared: _Prepared) -> SumoType:
@@ -220,7 +221,7 @@ class Carla(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
         def engine_in(ratio: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
             """Torque through the clutch and torque that remains for the brake [N m], and engine speed [rad/s]."""
-            # Downhill the engine brakes and the brake supplies the rest; then w_e = G w_w + m / k_c with m = -c_e w_e.
+            # Downhill the engine brakes and the brake supplies the rest; then w_e = G w_w + m / k_c with the clutch torque m = -c_e w_e.
             engine_drag = -p.damping_engaged * ratio * wheel_speed / (1 + p.damping_engaged / p.clutch)
             clutch_torque = np.maximum(resistance / ratio, engine_drag)
             return (clutch_torque, ratio * (engine_drag - resistance / ratio),

@@ -157,7 +157,7 @@ class CharacteristicSet:
         return np.asarray(filtered != self.original)
 
     def largest_change(self, filtered: FloatArray) -> FloatArray:
-        """f_diff = max_i w_i |v_i - v''_i| / v_i, a fraction, shape (N,); v'' is filtered (method section 3, where all weights w are 1)."""
+        """f_diff = max_i w_i |v_i - v''_i| / |v_i|, shape (N,): original v, filtered v'', weights w (method section 3, where w = 1)."""
         return np.asarray(np.max(self.weight * (np.abs(self.original - filtered) / np.abs(self.original)), axis=1))
 
     def number_changed(self, filtered: FloatArray) -> FloatArray:

@@ -23,6 +23,7 @@ TYPE_UNITS: Mapping[str, str] = {"mass": "kg", "accel": "m/s^2", "decel": "m/s^2
 DEFAULT_LAG = 0.1
 """Actuator lag that a driving system assumes if the study gives no `tau` [s]."""
 SENSOR_UNITS: Mapping[str, str] = {"latency": "s", "range": "m"}
+SENSOR_FIELDS = {"latency": "latency", "range": "reach"}  # fields of `Sensors` by the study's names
 LEGAL_ENTRIES = {
     "inputs": "the input for that pedal", "outputs": "the output that holds the speed",
     "sumo_type": "a number in SI units; or a characteristic, or an output or parameter of the FMU"}
@@ -61,7 +62,7 @@ class FmuVehicle:
     units
         The characteristics of the study and their units.
     table
-        Keys `inputs`, `outputs`, `parameters`, `sensors`, `sumo_type` and `step` of the study.
+        The study's table `vehicle`.
     guard
         Checks the results of the FMU.
     limit
@@ -78,8 +79,8 @@ class FmuVehicle:
     def __init__(self, description: Description, units: Mapping[str, str], table: Mapping[str, Any], guard: Guard, limit: float) -> None:
         source, self._guard, self._communication_step = guard.source, guard, table["step"] or description.step
         self.UNITS = dict(units)
-        self._sensors, self._type = dict(table["sensors"]), {"tau": DEFAULT_LAG, **table["sumo_type"]}
-        for key, entries, quantities in (("sensors", self._sensors, SENSOR_UNITS), ("sumo_type", self._type, TYPE_UNITS)):
+        self._sensor_entries, self._type_entries = dict(table["sensors"]), {"tau": DEFAULT_LAG, **table["sumo_type"]}
+        for key, entries, quantities in (("sensors", self._sensor_entries, SENSOR_UNITS), ("sumo_type", self._type_entries, TYPE_UNITS)):
             for name, entry in entries.items():
                 if name not in quantities:
                     raise unknown_name(source, f"vehicle.{key}.{name}: there is no such quantity", name, quantities)
@@ -87,33 +88,35 @@ class FmuVehicle:
                     raise unknown_name(source, f"vehicle.{key}.{name} = {entry!r}: there is no such characteristic", entry, units,
                                        ", or a number")
                 self._refuse_too_small(table["characteristics"], f"vehicle.{key}.{name}", entry, may_be_0=name == "latency")
-        inputs = ports_of(description, table["inputs"], {**PEDALS, **CONSTANTS}, ("input",), source, "vehicle.inputs", constants=CONSTANTS)
-        outputs = ports_of(description, table["outputs"], OUTPUTS, ("output",), source, "vehicle.outputs")
-        for key, entries, required in (("inputs", inputs, PEDALS), ("outputs", outputs, ("speed",)), ("sumo_type", self._type, TYPE_UNITS)):
+        input_ports = ports_of(description, table["inputs"], {**PEDALS, **CONSTANTS}, ("input",), source, "vehicle.inputs",
+                               constants=CONSTANTS)
+        output_ports = ports_of(description, table["outputs"], OUTPUTS, ("output",), source, "vehicle.outputs")
+        for key, entries, required in (("inputs", input_ports, PEDALS), ("outputs", output_ports, ("speed",)),
+                                       ("sumo_type", self._type_entries, TYPE_UNITS)):
             for name in required:
                 if name not in entries:
                     raise InputError(source, f"vehicle.{key}.{name} is missing", LEGAL_ENTRIES[key])
         self._characteristic_units = {
             entry: self._unit_pair(description, entry, units[entry], unit, f"vehicle.{key}.{name}")
-            for key, entries, quantities in (("sensors", self._sensors, SENSOR_UNITS), ("sumo_type", self._type, TYPE_UNITS))
+            for key, entries, quantities in (("sensors", self._sensor_entries, SENSOR_UNITS), ("sumo_type", self._type_entries, TYPE_UNITS))
             for name, unit in quantities.items() if isinstance(entry := entries.get(name), str) and entry in units}
-        characteristics = {name: self._characteristic_port(description, name, unit) for name, unit in units.items()
-                           if name in description.variables or name not in self._sensors.values()}
-        for quantity, port in inputs.items():
-            if port.variable.name in characteristics:
+        characteristic_ports = {name: self._characteristic_port(description, name, unit) for name, unit in units.items()
+                                if name in description.variables or name not in self._sensor_entries.values()}
+        for quantity, port in input_ports.items():
+            if port.variable.name in characteristic_ports:
                 raise InputError(source, f"vehicle.inputs.{quantity} = {port.variable.name!r}: that variable is also a characteristic",
                                  "a separate variable for each")
-        variables = {name: entry for name, entry in self._type.items() if isinstance(entry, str) and entry not in units}
-        types = ports_of(description, variables, TYPE_UNITS, READABLE_CAUSALITIES, source, "vehicle.sumo_type")
-        self._quantities, self._characteristics, self._outputs = tuple(inputs), tuple(characteristics), (*outputs, *types)
-        self._reads_type = bool(types)
-        ports = [*inputs.values(), *characteristics.values()]
+        type_variables = {name: entry for name, entry in self._type_entries.items() if isinstance(entry, str) and entry not in units}
+        type_ports = ports_of(description, type_variables, TYPE_UNITS, READABLE_CAUSALITIES, source, "vehicle.sumo_type")
+        self._inputs, self._characteristics, self._outputs = tuple(input_ports), tuple(characteristic_ports), (*output_ports, *type_ports)
+        self._reads_type = bool(type_ports)
+        ports = [*input_ports.values(), *characteristic_ports.values()]
         mapped_names = [port.variable.name for port in ports]
         constants = list(constants_of(description, table["parameters"], mapped_names, source, "vehicle.parameters"))
-        self._instances = Instances(description, ports, [*outputs.values(), *types.values()], constants, limit)
+        self._instances = Instances(description, ports, [*output_ports.values(), *type_ports.values()], constants, limit)
         self.max_vehicles = self._instances.max_vehicles
-        self.takes_slope, self.can_start_moving = "grade" in inputs, "initial_speed" in inputs
-        self._takes_friction = "road_friction" in inputs
+        self.takes_slope, self.can_start_moving = "grade" in input_ports, "initial_speed" in input_ports
+        self._takes_friction = "road_friction" in input_ports
 
     def _refuse_too_small(self, table: Mapping[str, CharacteristicTable], key: str, entry: str | float, *, may_be_0: bool) -> None:
         """Refuse a negative number, or a characteristic with a negative lower end; 0 is legal only with `may_be_0`."""
@@ -155,6 +158,7 @@ class FmuVehicle:
             outputs = dict(zip(self._outputs, self._start_fleet(fleet, self._input_array(inputs, characteristics))[0], strict=True))
 
         def quantity_values(entry: str | float, name: str) -> FloatArray:
+            """Values of the quantity `name`, shape (n,): its entry is a number, a characteristic, or an output of the FMU."""
             if not isinstance(entry, str):
                 return zeros + entry
             if entry not in characteristics:
@@ -162,10 +166,10 @@ class FmuVehicle:
             unit, quantity_unit = self._characteristic_units[entry]
             return np.asarray(unit.to(quantity_unit, characteristics[entry]))
 
-        types = SumoType(*(self._guard.numbers("sumo_type", name, quantity_values(self._type[name], name), (n,), 0.0, above=True)
+        types = SumoType(*(self._guard.numbers("sumo_type", name, quantity_values(self._type_entries[name], name), (n,), 0.0, above=True)
                            for name in TYPE_UNITS))
-        sensors = Sensors.perfect(n)._replace(**{{"latency": "latency", "range": "reach"}[name]: quantity_values(entry, name)
-                                                 for name, entry in self._sensors.items()})
+        sensors = Sensors.perfect(n)._replace(**{SENSOR_FIELDS[name]: quantity_values(entry, name)
+                                                 for name, entry in self._sensor_entries.items()})
         return _Prepared(fleet, inputs, characteristics, types, sensors, step)
 
     def sumo_type(self, prepared: _Prepared) -> SumoType:
@@ -195,7 +199,7 @@ class FmuVehicle:
 
     def sense(self, prepared: _Prepared, state: _State, seen: Observation) -> tuple[Observation, _State]:
         """Sensors report the scene as it was one latency ago, and nothing beyond their range times the visibility."""
-        if not self._sensors:
+        if not self._sensor_entries:
             return seen, state
         sensed, past = sensed_observation(seen, state.seen, prepared.sensors.latency, prepared.sensors.reach, prepared.step)
         return sensed, state._replace(seen=past)
@@ -230,7 +234,7 @@ class FmuVehicle:
         return UserCodeError(self._guard.source, f"{self._guard.name} {fault}")
 
     def _input_array(self, inputs: Mapping[str, FloatArray], characteristics: Characteristics) -> FloatArray:
-        return np.stack([*(inputs[name] for name in self._quantities), *(characteristics[name] for name in self._characteristics)])
+        return np.stack([*(inputs[name] for name in self._inputs), *(characteristics[name] for name in self._characteristics)])
 
     def _state(self, outputs: Mapping[str, FloatArray], command: Command, seen: FloatArray | None, history: History) -> _State:
         n = command.throttle.shape

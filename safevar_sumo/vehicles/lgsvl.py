@@ -50,6 +50,7 @@ class _Prepared(NamedTuple):
 
     `pedal_share` is the share of its error that a pedal makes up in a step, `engine_share` the share that the engine speed makes up in a
     substep. In a substep the traction control raises or lowers its torque by `traction_change` [N m].
+    `body` is the mass of body and wheels, `steering` the full steering angle.
     """
 
     step: FloatArray

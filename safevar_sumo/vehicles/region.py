@@ -24,11 +24,11 @@ REJECTIONS = 1000
 N_PROBES = 512
 """Number of random settings among which a feasible change is sought, besides vertices of the region and ends of the domains."""
 DrawSettings = Callable[[int], FloatArray]
-"""A function that draws a number of settings."""
+"""A function that draws the given number of settings."""
 
 
 class _Bounds(NamedTuple):
-    """A constraint as a computation: `quantity` maps settings, shape (N, n), to values, shape (N,), in a range of size `range`."""
+    """A constraint as a computation: `quantity` maps settings, shape (N, n), to values, shape (N,), in a range of size `width`."""
 
     constraint: Constraint
     condition: str
@@ -36,12 +36,12 @@ class _Bounds(NamedTuple):
     quantity: Callable[[FloatArray], FloatArray]
     minimum: float
     maximum: float
-    range: float
+    width: float
 
     def excess(self, settings: FloatArray) -> FloatArray:
-        """By how much each setting violates the bounds, as a share of `range`, shape (N,)."""
+        """By how much each setting violates the bounds, as a share of `width`, shape (N,)."""
         values = self.quantity(settings)
-        return np.asarray(np.maximum(np.maximum(self.minimum - values, values - self.maximum), 0.0) / self.range)
+        return np.asarray(np.maximum(np.maximum(self.minimum - values, values - self.maximum), 0.0) / self.width)
 
     def __str__(self) -> str:
         return f"{self.constraint.quantity} {self.condition}"
@@ -51,7 +51,8 @@ class _Bounds(NamedTuple):
 class FeasibleRegion:
     """Settings that satisfy all constraints of a study; without constraints, all settings.
 
-    `vertices` are vertices of the polytope of the linear constraints, shape (V, n); empty without linear constraints.
+    `vertices` are vertices of the polytope of the linear constraints, shape (V, n), empty without such constraints; `members` are the
+    constraints' functions, which are user code.
     """
 
     characteristics: CharacteristicSet
@@ -229,14 +230,15 @@ def _vertices(linear: tuple[Any, ...], lower: tuple[float, ...], upper: tuple[fl
 def _has_feasible_change(region: FeasibleRegion) -> bool:
     """Whether a feasible setting still differs from the original after the filter."""
     characteristics = region.characteristics
-    for settings in _candidates(region):
+    for settings in _candidate_changes(region):
         filtered = characteristics.filter(settings)
         if (characteristics.changed(filtered).any(axis=1) & region.feasible(filtered)).any():
             return True
     return False
 
 
-def _candidates(region: FeasibleRegion) -> Iterator[FloatArray]:
+def _candidate_changes(region: FeasibleRegion) -> Iterator[FloatArray]:
+    """Settings to try: vertices and ends of the domains first, then random settings."""
     characteristics, original = region.characteristics, region.characteristics.original
     size = len(characteristics)
     yield np.concatenate([region.vertices, *(np.where(np.eye(size, dtype=bool), end, original)

@@ -23,7 +23,10 @@ Positive = Annotated[float, Meta(gt=0, le=1e5)]
 
 
 class _Prepared(NamedTuple):
-    """Constants of a run, SI, shape (N,)."""
+    """Constants of a run, SI, shape (N,): `drive` and `brake` are the accelerations by full pedals, `grip` is the friction coefficient.
+
+    `front_load` and `rear_load` are the axles' shares of the weight at rest [-]; `response` is the dead time of the brakes.
+    """
 
     step: float
     mass: FloatArray
@@ -73,9 +76,11 @@ class WornVehicle(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     from 3 mm to 1.6 mm continues below 1.6 mm (assumption). The loss was measured from 50 mph and acts at every speed (assumption; tyres
     lose less at lower speeds). The weather determines whether a road is wet; on a dry road the tread has no effect.
 
-    The deceleration a is the smallest of a = F / m, a = mu g, and, for each axle, the a at which that axle reaches its limit
-    mu m (g x -+ a h) / L while the other axle brakes with its share. On a slope, g stands for the component of gravity onto the
-    road, and the component along the road acts in addition to a. The vehicle never rolls back.
+    Brakes act on the command of `brakeResponse` ago, a dead time without lag. The deceleration a is the smallest of F / m (brake force
+    and mass), mu g, and, for each axle, the a at which that axle reaches its limit while the other axle brakes with its share. With
+    the centre of mass at the height h and the distance x behind the front axle, and the wheelbase L, the limits are
+    mu m (g (L - x) + a h) / L at the front axle and mu m (g x - a h) / L at the rear axle. On a slope, g stands for the
+    component of gravity onto the road, and the component along the road acts in addition to a. The vehicle never rolls back.
     """
 
     UNITS = {
@@ -98,12 +103,12 @@ class WornVehicle(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
                 wet: bool | BoolArray = False) -> _Prepared:
         c = characteristics
         mass = self.kerb_mass + c["payload"]
-        centre = (self.kerb_mass * self.kerb_centre + c["payload"] * c["payloadCentre"]) / mass / self.wheelbase
+        rear_load = (self.kerb_mass * self.kerb_centre + c["payload"] * c["payloadCentre"]) / mass / self.wheelbase
         grip_share = np.where(wet, 1 - self.tread_loss * _loss_share(np.maximum(c["treadDepth"], 0.0)), 1.0)
         return _Prepared(
             step=step, mass=mass, drive=self.drive_force / mass,
             brake=c["brakeTorque"] * (self.brake_force / mass), grip=self.tyre_friction * road_friction * grip_share,
-            front_load=1 - centre, rear_load=centre, response=c["brakeResponse"], sensor_range=c["sensorRange"],
+            front_load=1 - rear_load, rear_load=rear_load, response=c["brakeResponse"], sensor_range=c["sensorRange"],
             latency=c["sensorLatency"], slope=slope)
 
     def sumo_type(self, prepared: _Prepared) -> SumoType:

@@ -28,7 +28,7 @@ BATCHES_PER_CALL_AND_WORKER = 4
 MIN_BATCH = 100
 """Minimum number of settings of a batch: a smaller batch takes as long."""
 VERIFIED_SETTINGS = 50
-"""Number of settings of a study, over all calls, and number of evaluations of each run, that are verified in SUMO."""
+"""Number of settings to verify in SUMO: of a study, over all calls of `evaluate_all`; and of each run of a campaign."""
 _batch_sizes: dict[bytes, tuple[int, bool]] = {}
 """Results of `choose_batch_size`, by packed study."""
 _verified_counts: dict[bytes, int] = {}
@@ -61,22 +61,22 @@ def evaluate_all(study: Study, settings: FloatArray, pool: Pool, done: Callable[
     futures = {retrying_pool.submit(work, distinct_settings[start:start + size]): start for start in starts}
     sample_size = min(VERIFIED_SETTINGS - _verified_counts.get(work, 0), len(distinct_settings))
     sample = np.linspace(0, len(distinct_settings) - 1, sample_size).astype(int)
-    in_sumo = in_scenes = None
+    sumo_future = recorded_future = None
     if is_recorded and len(sample):
         sumo_study = study_for_sumo_check(study, assemble(study).weather)
         sumo_inputs = inputs if sumo_study is study else inputs_of(sumo_study, pool)
-        in_sumo = retrying_pool.submit(pack_study(sumo_study, sumo_inputs, engine=Engine.LIBSUMO), distinct_settings[sample])
+        sumo_future = retrying_pool.submit(pack_study(sumo_study, sumo_inputs, engine=Engine.LIBSUMO), distinct_settings[sample])
         if sumo_study is not study:
-            in_scenes = retrying_pool.submit(pack_study(sumo_study, sumo_inputs), distinct_settings[sample])
+            recorded_future = retrying_pool.submit(pack_study(sumo_study, sumo_inputs), distinct_settings[sample])
     evaluations_by_start: dict[int, Evaluations] = {}
     while len(evaluations_by_start) < len(futures):
         for future in wait_for_first([future for future, start in futures.items() if start not in evaluations_by_start]):
             batch = evaluations_by_start[futures[future]] = future.result()
             done(len(batch))
     evaluations = Evaluations.concatenate([evaluations_by_start[start] for start in starts])
-    if in_sumo is not None:
-        expected = evaluations.take(sample) if in_scenes is None else wait_for_result(in_scenes)
-        refuse_unlike_sumo(study, expected.take(~expected.failed), wait_for_result(in_sumo).take(~expected.failed))
+    if sumo_future is not None:
+        expected = evaluations.take(sample) if recorded_future is None else wait_for_result(recorded_future)
+        refuse_unlike_sumo(study, expected.take(~expected.failed), wait_for_result(sumo_future).take(~expected.failed))
         _verified_counts[work] = _verified_counts.get(work, 0) + len(sample)
     return evaluations.take(row_of.ravel())
 
@@ -89,7 +89,7 @@ def inputs_of(study: Study, pool: Pool) -> Inputs:
 def source_digests(study: Study, pool: Pool) -> Files:
     """Digests, by name, of files that parameters name, and of files that user code reads while a worker simulates the original vehicle.
 
-    The worker reloads all user code before.
+    The worker reloads all user code first.
 
     Raises
     ------
@@ -100,7 +100,7 @@ def source_digests(study: Study, pool: Pool) -> Files:
     if user_code_names(study):
         work = pack_study(study, {}, afresh=True)
         key = work, os.getcwd()
-        files_read = _files_read.get(key, {"": "never read"})
+        files_read = _files_read.get(key, {"": "never read"})  # without an entry, a file that does not exist: its digest differs
         if any(digest_of(file_by_name(name, study.origin.places)) != digest for name, digest in files_read.items()):
             original = CharacteristicSet.of(study.vehicle.characteristics).original[np.newaxis]
             _files_read[key] = dict(wait_for_result(RetryingPool(pool, study).submit(work, original, must_succeed=True)).files)

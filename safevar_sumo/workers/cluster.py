@@ -29,7 +29,7 @@ CONNECT_TIMEOUT = 10.0
 """Longest time for the scheduler to answer [s]."""
 SECONDS_BETWEEN_COUNTS = 5.0
 VERSIONED_PACKAGES = ("safevar_sumo", "libsumo", "numpy")
-"""Packages that must have the same version here and on every worker."""
+"""Packages that must have the same version in this process and on every worker."""
 _libsumo_lock = threading.Lock()
 
 
@@ -91,24 +91,24 @@ class ClusterPool:
             self._time_of_count = now
         return self._workers
 
-    def submit(self, study: bytes, settings: FloatArray) -> Future[Evaluations]:
+    def submit(self, work: bytes, settings: FloatArray) -> Future[Evaluations]:
         future: Future[Evaluations] = Future()
         try:
-            dask_future = self._executor.submit(_evaluate_in_time, self._time_limit, _versions(), study, settings)
+            dask_future = self._executor.submit(_evaluate_in_time, self._time_limit, _versions(), work, settings)
         except RuntimeError as error:
             raise PoolLostError(f"the cluster does not answer any more: {error}") from None
         dask_future.add_done_callback(lambda source: _forward_result(source, future))
         return future
 
 
-def _evaluate_in_time(time_limit: float, versions: dict[str, str], study: bytes, settings: FloatArray) -> Evaluations:
+def _evaluate_in_time(time_limit: float, versions: dict[str, str], work: bytes, settings: FloatArray) -> Evaluations:
     """Evaluate a batch in a worker, one at a time because a process has one libsumo; end a worker that hangs."""
     if _versions() != versions:
         raise PoolLostError(f"a worker of the cluster has other versions: {_versions()} there, {versions} here")
     with _libsumo_lock, open(os.devnull, "w") as null_file:
         faulthandler.dump_traceback_later(time_limit, exit=True, file=null_file)
         try:
-            return evaluate_batch(study, settings)
+            return evaluate_batch(work, settings)
         finally:
             faulthandler.cancel_dump_traceback_later()
 

@@ -16,7 +16,7 @@ from safevar_sumo.plugins import Files, changed_files, digests, note_inputs, unl
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.study import Study, user_code_packages
 from safevar_sumo.sumo.engine import Engine
-from safevar_sumo.sumo.matrix import evaluate, in_cells
+from safevar_sumo.sumo.matrix import evaluate, evaluate_cells
 from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.workers.identity import Inputs, network_digests
 
@@ -39,7 +39,7 @@ class Pool(Protocol):
     def workers(self) -> int:
         """Number of batches that are computed at the same time."""
 
-    def submit(self, study: bytes, settings: FloatArray) -> Future[Evaluations]:
+    def submit(self, work: bytes, settings: FloatArray) -> Future[Evaluations]:
         """Evaluate k filtered settings of n characteristics, shape (k, n), of a packed study."""
 
 
@@ -105,14 +105,14 @@ def evaluate_batch(work: bytes, settings: FloatArray) -> Evaluations:
         return replace(Evaluations.none(settings.shape[1], METRICS), reasons={remark.encode(): remark for remark in remarks})
     if mode.afresh:
         unload_user_modules()
-        assembler = _task_and_system.__wrapped__
+        assembler = _task_and_system.__wrapped__  # the function without its cache
     else:
         assembler = _task_and_system
     with note_inputs() as reading:
         cells = mode.cells
         task, system = assembler(work if cells is None else _work_for_all_cells(work))
         _refuse_changed_networks(task.inputs, system)
-        evaluations = evaluate(system, settings, task.engine) if cells is None else in_cells(system, settings, cells, task.engine)
+        evaluations = evaluate(system, settings, task.engine) if cells is None else evaluate_cells(system, settings, cells, task.engine)
     _refuse_changed_networks(task.inputs, system)
     files_read = digests(reading.files(user_code_packages(task.study)), task.study.origin.places)
     return replace(evaluations, files=_find_unknown_files(task, files_read))

@@ -40,9 +40,9 @@ def identity_of(study: Study, system: System, sources: Mapping[str, str] = Mappi
     resolved = evaluation_keys(study)
     for table, model in (("vehicle", system.vehicle), ("ads", system.ads), ("scenario", system.scenario)):
         if isinstance(model, msgspec.Struct):
-            names = {key: value for key, value in resolved[table]["parameters"].items()
-                     if isinstance(value, str) or any(files_named_in(value, study.origin.places))}
-            resolved[table] = {**resolved[table], "parameters": {**msgspec.to_builtins(model), **names}}
+            texts_and_paths = {key: value for key, value in resolved[table]["parameters"].items()
+                               if isinstance(value, str) or any(files_named_in(value, study.origin.places))}
+            resolved[table] = {**resolved[table], "parameters": {**msgspec.to_builtins(model), **texts_and_paths}}
     resolved["weather"] = msgspec.to_builtins(system.weather)
     if system.matrix and system.rater is None:
         resolved["weathers"] = [msgspec.to_builtins(point.weather) for point in system.matrix]

@@ -58,7 +58,7 @@ def _raise_pending_interrupt() -> None:
 
 def block_interrupts() -> None:
     """Block Ctrl-C in this thread and, because the mask is inherited, in the processes that the thread starts."""
-    if sys.platform == "win32":  # without signal masks; `_serve` ignores interrupts
+    if sys.platform == "win32":  # Windows has no signal masks; `_serve` in local.py ignores interrupts
         return
     from multiprocessing import resource_tracker
 

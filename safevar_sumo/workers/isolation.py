@@ -53,25 +53,25 @@ def check_code(study: Study, inputs: Inputs, pool: RetryingPool) -> list[str]:
     return remarks
 
 
-def refuse_difference(study: Study, run: str, in_run: Evaluations, alone: Evaluations, repetition_command: str) -> None:
-    """Refuse a setting whose evaluation in a run differs from its evaluation alone, which `repetition_command` repeats.
+def refuse_difference(study: Study, run: str, evaluation_in_run: Evaluations, isolated_evaluation: Evaluations, command: str) -> None:
+    """Refuse a setting whose evaluation in a run differs from its isolated evaluation, which `command` reproduces.
 
     Raises
     ------
     UserCodeError
         With the models, the first result that differs, and the contract.
     """
-    difference = find_difference(in_run, alone)
+    difference = find_difference(evaluation_in_run, isolated_evaluation)
     if difference:
-        name, value, value_alone = difference
+        name, value, isolated_value = difference
         problem = (f"with {' and '.join(user_code_names(study))} a result depends on what else is simulated: "
-                   f"{name} is {value} in run {run} and {value_alone} alone; again by: {repetition_command}")
+                   f"{name} is {value} in run {run} and {isolated_value} alone; to reproduce it: {command}")
         raise UserCodeError(f"study {study.name!r}", problem, EXPECTED_RESULTS)
 
 
 def find_difference(evaluations: Evaluations, other_evaluations: Evaluations,
-                     tolerance: float = 0.0) -> tuple[str, object, object] | None:
-    """Name and both values of the first quantity that differs by more than `tolerance`; None if a simulation failed."""
+                    tolerance: float = 0.0) -> tuple[str, object, object] | None:
+    """Name and both values of the first quantity that differs by more than `tolerance`; None if all agree or a simulation failed."""
     if evaluations.failed[0] or other_evaluations.failed[0]:
         return None
     if evaluations.outcome[0] != other_evaluations.outcome[0]:

@@ -65,9 +65,9 @@ class LocalPool:
         self._live_workers: set[_Worker] = set()
         self._closed = False
 
-    def submit(self, study: bytes, settings: FloatArray) -> Future[Evaluations]:
+    def submit(self, work: bytes, settings: FloatArray) -> Future[Evaluations]:
         try:
-            return self._threads.submit(self._compute, study, settings)
+            return self._threads.submit(self._compute, work, settings)
         except RuntimeError:
             raise PoolLostError("the worker processes are closed down") from None
 
@@ -80,12 +80,12 @@ class LocalPool:
                 self._end(worker)
         self._threads.shutdown()
 
-    def _compute(self, study: bytes, settings: FloatArray) -> Evaluations:
+    def _compute(self, work: bytes, settings: FloatArray) -> Evaluations:
         worker: _Worker | None = getattr(self._thread_data, "worker", None)
         if worker is None or not worker.alive:
             worker = self._thread_data.worker = self._new_worker()
         try:
-            return worker.compute(study, settings, self._time_limit)
+            return worker.compute(work, settings, self._time_limit)
         except WorkerLostError:
             self._end(worker)
             self._thread_data.worker = None
@@ -135,10 +135,10 @@ class _Worker:
         """Wait for the first message of the process; raises WorkerLostError without a message."""
         self._receive(MAX_START_TIME, "start")
 
-    def compute(self, study: bytes, settings: FloatArray, time_limit: float) -> Evaluations:
+    def compute(self, work: bytes, settings: FloatArray, time_limit: float) -> Evaluations:
         """Compute a batch; raises the error of the batch, or WorkerLostError."""
         with suppress(OSError):  # `_receive` notices a dead worker
-            self._pipe.send((study, settings))
+            self._pipe.send((work, settings))
         answer = self._receive(time_limit, "simulation")
         if isinstance(answer, Exception):
             raise answer
@@ -185,9 +185,9 @@ def _serve(pipe: connection.Connection[Any, Any], folders: list[str]) -> None:
         return
 
 
-def _evaluate_or_return_error(study: bytes, settings: FloatArray) -> Evaluations | Exception:
+def _evaluate_or_return_error(work: bytes, settings: FloatArray) -> Evaluations | Exception:
     try:
-        return evaluate_batch(study, settings)
+        return evaluate_batch(work, settings)
     except SafevarError as error:
         return error
     except (OSError, MemoryError) as error:

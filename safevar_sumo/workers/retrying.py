@@ -28,7 +28,7 @@ ATTEMPTS = 2
 """Number of attempts for a whole batch, and for a single setting in a part: another process may have killed the worker."""
 PARTS_PER_SPLIT = 8
 """Number of parts of a failing batch: with 8, one fatal setting among 200 costs five time limits."""
-COMMAND_PREFIX = "; again by: "
+COMMAND_PREFIX = "; to reproduce it: "
 MAX_FAILURES_IN_A_ROW = 20
 """Number of failing settings in a row from which on the study is at fault."""
 
@@ -42,7 +42,7 @@ class RetryingPool:
         Computes batches.
     study
         The study of the settings.
-    note
+    note_files
         Called with files that user code has read and that were unknown when the study began; may raise an error.
     """
 
@@ -62,7 +62,7 @@ class RetryingPool:
         self._attempt(work, settings, 2 * ATTEMPTS if is_single else ATTEMPTS, result, must_succeed)
         return result
 
-    def _attempt(self, work: bytes, settings: FloatArray, attempts: int, result: Future[Evaluations], must_succeed: bool) -> None:
+    def _attempt(self, work: bytes, settings: FloatArray, attempts_left: int, result: Future[Evaluations], must_succeed: bool) -> None:
         def accept_or_retry(evaluations: Evaluations | None, error: BaseException | None) -> None:
             if evaluations is not None:
                 self._failures_in_a_row = 0
@@ -71,8 +71,8 @@ class RetryingPool:
                 self._locate_failure(work, settings, error, result)
             elif not isinstance(error, SimulationError | WorkerLostError | EnvironmentFault):
                 result.set_exception(error)
-            elif attempts > 1:
-                self._attempt(work, settings, attempts - 1, result, must_succeed)
+            elif attempts_left > 1:
+                self._attempt(work, settings, attempts_left - 1, result, must_succeed)
             elif isinstance(error, EnvironmentFault):
                 result.set_exception(error)
             elif len(settings) > 1:
@@ -129,7 +129,7 @@ class RetryingPool:
 
     def _confirm_failure(self, work: bytes, setting: FloatArray, error: SafevarError, result: Future[Evaluations]) -> None:
         """Simulate the original vehicle, then the setting again; a setting that fails once more has the outcome `simulator-error`."""
-        def repetition_done(evaluations: Evaluations | None, last_error: BaseException | None) -> None:
+        def after_repetition(evaluations: Evaluations | None, last_error: BaseException | None) -> None:
             if evaluations is not None:
                 result.set_result(evaluations)
             elif isinstance(last_error, SimulationError | WorkerLostError):
@@ -141,14 +141,14 @@ class RetryingPool:
             else:
                 result.set_exception(last_error)
 
-        def original_done(evaluations: Evaluations | None, fault: BaseException | None) -> None:
+        def after_original(evaluations: Evaluations | None, fault: BaseException | None) -> None:
             if evaluations is not None:
-                self._compute(work, setting, repetition_done)
+                self._compute(work, setting, after_repetition)
             else:
                 result.set_exception(EnvironmentFault(f"{error}; the original vehicle cannot be simulated either: {fault}")
                                    if isinstance(fault, SimulationError | WorkerLostError) else fault)
 
-        self._compute(work, self._characteristics.original[np.newaxis], original_done)
+        self._compute(work, self._characteristics.original[np.newaxis], after_original)
 
     def _failed_evaluation(self, setting: FloatArray, error: SafevarError) -> Evaluations:
         undefined = np.full(1, np.nan)
@@ -164,23 +164,23 @@ class RetryingPool:
             return
         halves = settings[:len(settings) // 2], settings[len(settings) // 2:]
 
-        def second_done(_: Evaluations | None, part_error: BaseException | None) -> None:
+        def after_second_half(_: Evaluations | None, part_error: BaseException | None) -> None:
             if isinstance(part_error, UserCodeError):
                 self._locate_failure(work, halves[1], part_error, result)
             else:
                 result.set_exception(error)
 
-        def first_done(_: Evaluations | None, part_error: BaseException | None) -> None:
+        def after_first_half(_: Evaluations | None, part_error: BaseException | None) -> None:
             if isinstance(part_error, UserCodeError):
                 self._locate_failure(work, halves[0], part_error, result)
             else:
-                self._compute(work, halves[1], second_done)
+                self._compute(work, halves[1], after_second_half)
 
-        self._compute(work, halves[0], first_done)
+        self._compute(work, halves[0], after_first_half)
 
     def _error_of_lost_workers(self, error: WorkerLostError) -> UserCodeError:
         """The error for workers that repeatedly end or hang in user code."""
-        problem = f"{error}, again and again, with {' and '.join(self._user_code)} in it; a dead process cannot report file and line"
+        problem = f"{error} at every attempt, probably in {' and '.join(self._user_code)}; a dead process cannot report file and line"
         return UserCodeError(f"study {self._study.name!r}", problem)
 
     def _with_command(self, error: UserCodeError, setting: FloatArray) -> UserCodeError:

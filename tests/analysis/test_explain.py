@@ -38,8 +38,8 @@ from safevar_sumo.analysis.explain.necessity import (
     find_smallest_robust_failure,
     necessity_frame,
 )
-from safevar_sumo.analysis.explain.render import _print_explanation, _sample_in_words, print_explained
-from safevar_sumo.analysis.explain.result import Explained, Explanation
+from safevar_sumo.analysis.explain.render import _print_explanation, _sample_in_words, most_robust, print_explained
+from safevar_sumo.analysis.explain.result import Cause, Explained, Explanation
 from safevar_sumo.analysis.explain.summary import NUMBER_WORDS, FailureDescription, failures_paragraph, summarise_failures
 from safevar_sumo.analysis.preventability import Preventability
 from safevar_sumo.analysis.research_questions.case import Case, load_cases
@@ -187,7 +187,8 @@ def assert_tells_a_manager(paragraph: str, explained: Explained) -> None:
     fewest, robust = by_reason["fewest changes"], by_reason["smallest robust"]
     degree = float(explained.original.f_safe[0])
     assert paragraph.startswith(f"In wet leaves, the original vehicle stops {degree:.2f} m short of the pedestrian. ")
-    for one in (fewest, robust):
+    as_few = len(robust.changed) == len(fewest.changed)
+    for one in (robust,) if as_few else (fewest, robust):
         word = "borderline: only" if one.robustness.borderline else "robust:"
         share = f"{word} {100 * one.robustness.share:.0f} % of the neighbours are unsafe too"
         needed, number = len(one.causes[0].changes), len(one.changed)
@@ -198,8 +199,9 @@ def assert_tells_a_manager(paragraph: str, explained: Explained) -> None:
                              paragraph, re.IGNORECASE)
         else:
             assert f"for {collision}: " in paragraph
-    assert f"The robust failure with the fewest changes, {robust.handle}: " in paragraph
+    assert (f"The robust failure with the fewest changes, {robust.handle}: " in paragraph) is not as_few
     members = CharacteristicSet.of(explained.study.vehicle.characteristics)
+    fewest = robust if as_few else fewest
     largest = max((member for member in members if member.name in fewest.changed),
                   key=lambda member: abs(fewest.setting[member.name] / member.original - 1))
     assert f"{largest.short_name} {100 * (fewest.setting[largest.name] / largest.original - 1):+.0f} %" in paragraph
@@ -350,3 +352,24 @@ def test_the_paragraph_says_how_robust_the_changes_that_suffice_are_by_themselve
     paragraph = failures_paragraph(system, original, finding, finding, Preventability(counts={}, collisions=0))
     assert "a collision at 5 km/h (robust: 98 % of" in paragraph.lower()
     assert "; two of them suffice (borderline: only 44 % of the neighbours are unsafe too)." in paragraph
+
+
+def test_the_paragraph_leads_with_the_robust_failure_if_it_has_as_few_changes() -> None:
+    system = assemble(load_study("smoke"))
+    original = evaluate(system, system.characteristics.original[None])
+    severe, robust, larger = (
+        FailureDescription(name, changes, "collision", degree, Robustness({0.05: 0.98}), len(changes))
+        for name, changes, degree in (("rs:0:1", {"radius": 32.0}, -3.0), ("rs:0:4", {"radius": 33.0}, -1.0),
+                                      ("rs:0:7", {"radius": 34.0, "mass": 2600.0}, -1.0)))
+    nobody = Preventability(counts={}, collisions=0)
+    assert failures_paragraph(system, original, severe, robust, nobody) == failures_paragraph(system, original, robust, robust, nobody)
+    assert failures_paragraph(system, original, severe, larger, nobody) == failures_paragraph(system, original, severe, None, nobody)
+
+
+def test_of_several_causes_the_most_robust_is_named() -> None:
+    causes = [Cause(changes={"mass": 2600.0}, boundary={}, fraction=1.0, alone={}, outcome="collision", safety_degree=-1.0,
+                    neighbours=neighbours)
+              for neighbours in (None, Robustness({0.05: 0.02}), Robustness({0.05: 0.75}))]
+    assert most_robust(causes) is causes[2]
+    assert most_robust(causes[:1]) is causes[0]
+    assert most_robust([]) is None

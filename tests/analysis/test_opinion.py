@@ -35,7 +35,7 @@ def bmw() -> Plant:
     """The package's vehicle 2 with its own masses."""
     p = parameters_vehicle2()
     plant = build_plant(p.m * ONE, p.m, LEVEL, radius=p.R_w, wheel_inertia=p.I_y_w, friction=p.tire.p_dx1,
-                        brake_torque=9 * p.m * p.R_w, brake_front=p.T_sb, drive_front=p.T_se)
+                        brake_torque=9 * p.m * p.R_w, front_brake_share=p.T_sb, front_drive_share=p.T_se)
     return plant._replace(sprung_mass=p.m_s * ONE, unsprung_mass=p.m_uf * ONE, height=p.h_s * ONE)
 
 
@@ -235,7 +235,7 @@ def test_a_report_has_a_badge_for_each_cause_or_says_how_to_install(slippery: Pa
 
 @pytest.mark.parametrize(("typed", "told"), [
     (("smoke",), "smoke: is a study and has no solutions\nexpected: a directory"),
-    (("nowhere",), "nowhere: is not a results directory: there is no manifest.json\nexpected: a directory written by the command study"),
+    (("nowhere",), "nowhere: is not a results directory: there is no manifest.json\nexpected: a directory written by the command `study`"),
     (("{}", "--solutions", "nsga2:0:999"), "--solutions: there is no solution nsga2:0:999"), (("{}", "--solutions", "first"), "'first'")])
 def test_bad_input_is_refused(typed: tuple[str, ...], told: str, slippery: Path) -> None:
     refused("opinion", *(part.format(slippery) for part in typed), message=(told,))

@@ -75,9 +75,9 @@ def test_shares_are_those_of_all_collisions_and_a_sample_is_random() -> None:
     whole = msgspec.structs.asdict(assess_preventability(here, np.concatenate([collisions, collisions])).shares)
     assert whole == {"competent_driver": pytest.approx(1 / 3), "full_braking": 0, "nobody": pytest.approx(2 / 3), "looked_at": 60,
                      "interval_competent_driver": [pytest.approx(1 / 3)] * 2}
-    sample = msgspec.structs.asdict(assess_preventability(here, collisions, limit=60).shares)
+    sample = msgspec.structs.asdict(assess_preventability(here, collisions, max_simulations=60).shares)
     assert sample["looked_at"] == 30
-    assert sample == msgspec.structs.asdict(assess_preventability(here, collisions[::-1], limit=60).shares)
+    assert sample == msgspec.structs.asdict(assess_preventability(here, collisions[::-1], max_simulations=60).shares)
     hits = round(sample["competent_driver"] * 30)
     expected = scipy.stats.beta.ppf(0.025, hits, 31 - hits), scipy.stats.beta.ppf(0.975, hits + 1, 30 - hits)
     assert sample["interval_competent_driver"] == pytest.approx(expected)

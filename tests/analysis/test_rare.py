@@ -89,6 +89,16 @@ def test_two_islands_are_told() -> None:
     assert "2 islands" in estimate.remark
 
 
+def test_where_no_failure_is_within_reach_a_number_comes_out_all_the_same() -> None:
+    """OpenTURNS raises an error for a probability below the smallest that it estimates, and for samples without any failure."""
+    beyond = rare(linear(9.0), 2, method="subset_simulation")
+    assert (beyond.method, beyond.probability) == ("subset_simulation", 0)
+    assert "no failure was found" in beyond.remark
+    lost = rare(lambda u: np.where(u[:, 0] > 9.0, -1.0, 5.0 + 0.001 * u[:, 1]), 2, method="cross_entropy")
+    assert (lost.method, lost.failures) == ("monte_carlo", 0)
+    assert "lost all failures" in lost.remark
+
+
 def test_a_plateau_and_a_frequent_failure_are_left_to_monte_carlo() -> None:
     plateau = rare(lambda u: np.where(u[:, 0] > beta_of(1e-3), -1.0, 2.0), 2)
     assert plateau.method == "monte_carlo"

@@ -227,7 +227,7 @@ def test_a_setting_that_is_asked_for_twice_stands_where_it_was_asked_for_first(t
 
     run = Run(RunKey("nsga2", 0), twice(), Journal(tmp_path / "a.journal", "study", "nsga2-00"), EventLog(), budget=3)
     assert not run.advance()
-    assert run.take(evaluated(run.missing_settings))
+    assert run.receive(evaluated(run.missing_settings))
     run.advance()
     run.close()
     assert read_journal(tmp_path / "a.journal", "study", "nsga2-00").positions == [0, 1]

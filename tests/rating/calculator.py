@@ -30,7 +30,7 @@ class Calculator:
             return cls(Path(os.environ[ENVIRONMENT]))
         venv.create(folder, with_pip=True)
         calculator = cls(folder)
-        version = protocol_of(EURO_NCAP_2026).calculator
+        version = protocol_of(EURO_NCAP_2026).calculator_version
         packages = [f"euroncap-rating-2026=={version}", "pandas<3"]
         subprocess.run([calculator.python, "-m", "pip", "install", "-q", *packages], check=True, timeout=900)
         return calculator

@@ -43,10 +43,10 @@ def agrees(rated: RatedVehicle, calculator: Calculator, template: Path, place: P
     theirs = calculator.scores(place / "measured.xlsx", place / "scored")
     ours: dict[str, np.ndarray] = {}
     for test in rated.tests:
-        ours[test.block.test] = ours.get(test.block.test, np.zeros(3)) + np.array(test.points)
+        ours[test.matrix.test_name] = ours.get(test.matrix.test_name, np.zeros(3)) + np.array(test.points)
     for name, points in ours.items():
         assert theirs.points[name] == pytest.approx(points, abs=0.01), name
-    simulated = {block.name for block in PROTOCOL.blocks}
+    simulated = {matrix.name for matrix in PROTOCOL.matrices}
     verified = [row for row in theirs.verified if row["Scenario"] in simulated]
     assert verified or rated.points == 0
     for row in verified:
@@ -66,11 +66,11 @@ def test_vehicles_with_any_colours_score_alike(seed: int, calculator: Calculator
     speeds = rng.choice([0.004, 5, 9.996, 10, 15, 20, 25, 30, 40], (1, N))
     impact = np.where(rng.random((1, N)) < rng.choice([0.1, 0.3, 0.7]), speeds, np.nan)
     if seed:
-        impact[:, [k for k, cell in enumerate(PROTOCOL.cells) if cell.block.test == "CCRs" and cell.vut <= 20]] = np.nan
+        impact[:, [k for k, cell in enumerate(PROTOCOL.cells) if cell.matrix.test_name == "CCRs" and cell.vut_speed <= 20]] = np.nan
     warning = np.where(rng.random((1, N)) < 0.7, 1.9, rng.choice([np.nan, 1.2, 1.696], (1, N)))
     nominal = list(range(N))
     if seed % 2:
-        nominal = [PROTOCOL.matrix_cell_numbers[cell.block.name, cell.row, cell.column] for cell in PROTOCOL.cells]
+        nominal = [PROTOCOL.matrix_cell_numbers[cell.matrix.name, cell.row, cell.column] for cell in PROTOCOL.cells]
     cells, claims = CellResults(impact[:, nominal], warning[:, nominal], np.ones((1, N), dtype=bool)), CLAIMS if seed % 3 else {}
     rated = RatedVehicle(name="any", setting={}, protocol=PROTOCOL, cells=cells, scores=points_of(PROTOCOL, cells, claims), claims=claims)
     assert rated.fails == (seed == 0)
@@ -85,9 +85,9 @@ def test_the_original_half_the_brakes_the_worst_wear_and_who_never_brakes(calcul
     result = rate(study, {"half": characteristics.setting({"brakeTorque": 0.5}, "half"), "worst": worst})
     idle = rate(load_study(
         study, ads={"model": "aeb", "parameters": {"reach": 0.001}}), {})
-    for number, vehicle in enumerate([*result.variants, idle.original]):
+    for number, vehicle in enumerate([*result.vehicles, idle.original]):
         agrees(vehicle, calculator, template, tmp_path / str(number))
-    assert result.original.points > result.variants[1].points > result.variants[2].points
+    assert result.original.points > result.vehicles[1].points > result.vehicles[2].points
     assert idle.original.points == 0
 
 

@@ -43,18 +43,19 @@ def test_wear_never_gains_points_in_a_monotone_matrix() -> None:
                 settings[names[-1]] = setting
             ladders += pairwise(names)
     rating = rate(STUDY, settings)
-    rated = {one.name: one for one in rating.variants}
-    cells = {block.name: [number for number, cell in enumerate(rating.protocol.cells) if cell.block is block and cell.range in MATRIX]
-             for block in rating.protocol.blocks}
+    rated = {one.name: one for one in rating.vehicles}
+    cells = {matrix.name: [number for number, cell in enumerate(rating.protocol.cells)
+                           if cell.matrix is matrix and cell.range_or_layer in MATRIX]
+             for matrix in rating.protocol.matrices}
     matrices, pairs, losses = 0, 0, 0
     for better, worse in ((rated[first], rated[then]) for first, then in ladders):
         for before, after in zip(better.tests, worse.tests, strict=True):
             pairs += 1
-            if not monotone(better, worse, cells[before.block.name]):
+            if not monotone(better, worse, cells[before.matrix.name]):
                 continue
             matrices += 1
-            assert after.points[0] <= before.points[0], (better.name, worse.name, before.block.name)
-            assert after.points[1] <= before.points[1], (better.name, worse.name, before.block.name)
+            assert after.points[0] <= before.points[0], (better.name, worse.name, before.matrix.name)
+            assert after.points[1] <= before.points[1], (better.name, worse.name, before.matrix.name)
             losses += after.points[:2] != before.points[:2]
     assert matrices >= 0.95 * pairs, f"{matrices} of {pairs} matrices are monotone"
     assert losses >= 20
@@ -63,8 +64,8 @@ def test_wear_never_gains_points_in_a_monotone_matrix() -> None:
 def test_a_layer_may_be_gained_where_its_cell_is_lost() -> None:
     """The case that docs/rating.md explains, with its numbers."""
     rating = rate(STUDY, {str(tread): MEMBERS.setting({**GAIN, "treadDepth": tread}, "it") for tread in (5.1, 4.2)})
-    newer, older = rating.variants[1:]
-    before, after = (next(test for test in one.tests if test.block.name == "CPNCO day") for one in (newer, older))
+    newer, older = rating.vehicles[1:]
+    before, after = (next(test for test in one.tests if test.matrix.name == "CPNCO day") for one in (newer, older))
     assert [round(one.points, 2) for one in (newer, older)] == [33.64, 32.64]
     assert [round(one.points[0], 3) for one in (before, after)] == [0.792, 0.667]
     assert [round(one.points[2], 3) for one in (before, after)] == [0.025, 0.05]

@@ -25,7 +25,7 @@ from safevar_sumo.protocol.rater import darken
 from safevar_sumo.records import CellResults
 from safevar_sumo.scenarios import WEATHERS
 from safevar_sumo.study import load_study
-from safevar_sumo.sumo.matrix import evaluate, in_cells, simulate_all_points, study_at
+from safevar_sumo.sumo.matrix import evaluate, evaluate_cells, simulate_all_points, study_at
 from safevar_sumo.sumo.system import assemble
 
 PROTOCOL = protocol_of(EURO_NCAP_2026)
@@ -41,8 +41,8 @@ def results(impact: Any = np.nan, warning: Any = 2.0, vehicles: int = 1) -> Cell
 
 
 def numbers(test: str, kind: str = "", light: str | None = None) -> list[int]:
-    return [number for number, cell in enumerate(CELLS) if cell.block.test == test and (not kind or cell.range == kind)
-            and (light is None or cell.block.light == light)]
+    return [number for number, cell in enumerate(CELLS) if cell.matrix.test_name == test and (not kind or cell.range_or_layer == kind)
+            and (light is None or cell.matrix.light == light)]
 
 
 def rated(cells: CellResults, name: str = "original", claims: dict[str, list[str]] | None = None) -> RatedVehicle:
@@ -52,7 +52,7 @@ def rated(cells: CellResults, name: str = "original", claims: dict[str, list[str
 
 @pytest.mark.parametrize("vut", BANDS)
 def test_a_bound_belongs_to_the_worse_colour(vut: int) -> None:
-    number = next(k for k in numbers("CCRb" if vut > 20 else "CCRs") if CELLS[k].vut == vut)
+    number = next(k for k in numbers("CCRb" if vut > 20 else "CCRs") if CELLS[k].vut_speed == vut)
     bounds = BANDS[vut] if len(BANDS[vut]) > 1 else [None, None, None, BANDS[vut][0]]
     for colour, bound in zip(COLOURS[1:], bounds, strict=True):
         if bound is not None:
@@ -61,14 +61,14 @@ def test_a_bound_belongs_to_the_worse_colour(vut: int) -> None:
 
 
 def test_a_warning_is_green_from_1_7_s_and_measured_values_have_two_decimals() -> None:
-    (row,) = {CELLS[k].row for k in numbers("CBLA") if CELLS[k].judged == "warning" and CELLS[k].vut == 70}
+    (row,) = {CELLS[k].row for k in numbers("CBLA") if CELLS[k].judged_by == "warning" and CELLS[k].vut_speed == 70}
     number = next(k for k in numbers("CBLA", "standard") if CELLS[k].row == row)
     shown = [COLOURS[colours_of(PROTOCOL, results(50.0, warning))[0, number]] for warning in (1.7, 1.695, 1.694, np.nan)]
     assert shown == ["green", "green", "red", "red"]
 
 
 def test_a_vehicle_that_avoids_every_impact_earns_all_simulated_points_and_one_that_never_brakes_none() -> None:
-    whole = points_of(PROTOCOL, results(vehicles=2), {test: [one.layer for one in PROTOCOL.layers_of(test) if not one.simulated_conditions]
+    whole = points_of(PROTOCOL, results(vehicles=2), {test: [one.name for one in PROTOCOL.layers_of(test) if not one.simulated_conditions]
                                                       for test in PROTOCOL.tests})
     assert whole.total.tolist() == [40.0, 40.0]
     assert sum(PROTOCOL.points_not_simulated.values()) + whole.total[0] == 100
@@ -91,14 +91,14 @@ def test_robustness_counts_from_half_of_the_standard_range_and_claims_count_as_h
         assert points[0] == pytest.approx(1 - red / 12)
         assert (points[2] > 0) == earned
     layers = PROTOCOL.layers_of("CBNA")
-    held, claim = sum(bool(one.simulated_conditions) for one in layers), next(one.layer for one in layers if not one.simulated_conditions)
+    held, claim = sum(bool(one.simulated_conditions) for one in layers), next(one.name for one in layers if not one.simulated_conditions)
     shares = [points_of(PROTOCOL, results(), claims).tests["CBNA"][0, 2] / 0.125 for claims in ({}, {"CBNA": [claim]})]
     assert shares == pytest.approx([held / len(layers), (held + 1) / len(layers)])
 
 
 def test_a_layer_of_a_test_whose_cells_are_all_red_does_not_hold() -> None:
     """No cell has variations that could hold; a single cell that is not red is enough."""
-    layers = [("CBNA", one.layer) for one in PROTOCOL.layers_of("CBNA") if one.simulated_conditions]
+    layers = [("CBNA", one.name) for one in PROTOCOL.layers_of("CBNA") if one.simulated_conditions]
     for red, holds in ((12, False), (11, True)):
         impact = np.full(N, np.nan)
         impact[numbers("CBNA", "standard")[:red]] = 50.0
@@ -139,7 +139,7 @@ def test_a_cell_has_equal_results_alone_and_in_any_batch() -> None:
     study = load_study("euro_ncap_rating")
     system = assemble(study)
     settings_ = np.array([system.characteristics.original, system.characteristics.lower])
-    found, numbers_ = in_cells(system, settings_, (7, 620)), cells_of_part(PROTOCOL, 7, 620)
+    found, numbers_ = evaluate_cells(system, settings_, (7, 620)), cells_of_part(PROTOCOL, 7, 620)
     assert found.cells is not None
     assert sorted(number for k in range(620) for number in cells_of_part(PROTOCOL, k, 620)) == list(range(N))
     points = [system.matrix[number] for number in numbers_]
@@ -172,14 +172,14 @@ def test_unknown_claims_and_protocols_are_refused_by_name(changes: dict[str, Any
 def test_the_verdict_names_what_is_lost_and_where() -> None:
     impact = np.full(N, np.nan)
     impact[numbers("CPNCO", "standard", "night")] = 40.0
-    result = Rating(study=load_study("euro_ncap_rating"), protocol=PROTOCOL, variants=[rated(results()), rated(results(impact), "variant")])
-    result.variants[0].__dict__["setting"] = {name: row.original for name, row in result.study.vehicle.characteristics.items()}
-    result.variants[1].__dict__["setting"] = {**result.variants[0].setting, "treadDepth": 3.0}
+    result = Rating(study=load_study("euro_ncap_rating"), protocol=PROTOCOL, vehicles=[rated(results()), rated(results(impact), "variant")])
+    result.vehicles[0].__dict__["setting"] = {name: row.original for name, row in result.study.vehicle.characteristics.items()}
+    result.vehicles[1].__dict__["setting"] = {**result.vehicles[0].setting, "treadDepth": 3.0}
     assert rating_in_words(result).startswith("With tread depth of the tyres 3 mm the vehicle loses 1.")
     assert rating_in_words(result).endswith("all of them in CPNCO by night.")
     elsewhere = np.full(N, np.nan)
     elsewhere[numbers("CPNCO", "standard", "day")[:3]] = 40.0
-    gains = replace(result, variants=[rated(results(elsewhere)), result.variants[1]])
+    gains = replace(result, vehicles=[rated(results(elsewhere)), result.vehicles[1]])
     gains.original.__dict__["setting"] = result.original.setting
     assert rating_in_words(gains).endswith("most of them in CPNCO by night."), "in another test the variant gains"
     record = json.loads(json.dumps(result.to_dict(), allow_nan=False))

@@ -19,7 +19,7 @@ from safevar_sumo.analysis.explain.compute import compare_at_cells, explain_fail
 from safevar_sumo.analysis.explain.render import print_explained
 from safevar_sumo.analysis.explain.summary import summarise_failures
 from safevar_sumo.analysis.rating import RatingOptions, compute
-from safevar_sumo.analysis.rating.render import matrices_figure, print_matrices, print_rating, turned_in_words
+from safevar_sumo.analysis.rating.render import colour_changes_in_words, matrices_figure, print_matrices, print_rating
 from safevar_sumo.analysis.research_questions.case import build_case
 from safevar_sumo.analysis.risk.rare import Response
 from safevar_sumo.analysis.tolerance import ToleranceOptions
@@ -47,14 +47,14 @@ class TwoWorkers(InlinePool):
 @pytest.fixture(autouse=True)
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
     """CCRs at 10, 50 and 80 km/h, and CPNA by day and night at 50 km/h."""
-    blocks = []
-    for block in WHOLE.blocks:
-        speeds = {"CCRs": (10, 50, 80), "CPNA": (50,)}.get(block.test, ())
-        rows = tuple(row for row in block.rows if row.vut in speeds)
+    matrices = []
+    for matrix in WHOLE.matrices:
+        speeds = {"CCRs": (10, 50, 80), "CPNA": (50,)}.get(matrix.test_name, ())
+        rows = tuple(row for row in matrix.rows if row.vut_speed in speeds)
         if rows:
-            blocks.append(msgspec.structs.replace(block, rows=rows))
-    layers = tuple(layer for layer in WHOLE.layers if layer.test in ("CCRs", "CPNA") and layer.layer not in ("Trajectory/Heading",))
-    protocol = msgspec.structs.replace(WHOLE, blocks=tuple(blocks), layers=layers)
+            matrices.append(msgspec.structs.replace(matrix, rows=rows))
+    layers = tuple(layer for layer in WHOLE.layers if layer.test_name in ("CCRs", "CPNA") and layer.name not in ("Trajectory/Heading",))
+    protocol = msgspec.structs.replace(WHOLE, matrices=tuple(matrices), layers=layers)
     monkeypatch.setattr(rater, "protocol_of", lambda name: protocol)
 
 
@@ -120,8 +120,8 @@ def test_only_cells_of_a_worse_colour_explain_a_failure(monkeypatch: pytest.Monk
 def test_a_rating_prints_draws_and_stands_in_a_page() -> None:
     result = compute.rate_variant(STUDY, RatingOptions(changes={"brakeTorque": 0.5}), pool=TwoWorkers())
     assert result.lost > 0
-    turned = dict(turned_in_words(result))
-    assert set(turned) <= {block.name for block in result.protocol.blocks}
+    turned = dict(colour_changes_in_words(result))
+    assert set(turned) <= {matrix.name for matrix in result.protocol.matrices}
     assert re.search(r"green to \w+ at (\d+ and )?80 km/h \(\d+ cells\)", turned["CCRs"])
     console = Console(record=True, width=80, file=StringIO())
     print_rating(console, result)

@@ -131,9 +131,9 @@ def with_hesitation(study: Study, hesitation: float) -> Study:
 
 def test_what_another_study_gives_another_value_is_not_shared() -> None:
     near, far = mine(0.8), mine(1.2)
-    assert [free.studies for free in free_parameters([near, near])] == [(0, 1)]
-    assert [free.studies for free in free_parameters([near, far])] == [(0,), (1,)]
-    assert [free.studies for free in free_parameters([near, load_study("lgsvl")]) if free.key == GAP] == [(0,)]
+    assert [free.study_indices for free in free_parameters([near, near])] == [(0, 1)]
+    assert [free.study_indices for free in free_parameters([near, far])] == [(0,), (1,)]
+    assert [free.study_indices for free in free_parameters([near, load_study("lgsvl")]) if free.key == GAP] == [(0,)]
 
 
 def test_errors_count_in_repeats_and_effects_in_the_safety_degrees(data: ReferenceData) -> None:
@@ -214,7 +214,7 @@ class Runner:
     """Has found what it has found, and counts its trials."""
 
     def __init__(self, lowest: float) -> None:
-        self.lowest, self.population, self.rounds = lowest, 1, list[int]()
+        self.lowest_loss, self.population, self.rounds = lowest, 1, list[int]()
 
     def advance(self, trials: int) -> None:
         self.rounds.append(trials)

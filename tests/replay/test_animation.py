@@ -36,13 +36,13 @@ def where(picture: Image.Image, colour: str) -> tuple[np.ndarray, np.ndarray]:
 
 def test_both_vehicles_are_drawn_at_their_positions_to_scale(crash: Comparison) -> None:
     scene = lay_out_scene(crash)
-    picture = next(draw_frames(scene, scene.length))  # the start: the changed vehicle stands on the original's place
+    picture = next(draw_frames(scene, scene.sample_count))  # the start: the changed vehicle stands on the original's place
     scale = WIDTH / scene.view.width
     rows, columns = where(picture, VEHICLE_COLOURS[0])
     vut = next(body for body in scene.bodies if body.is_vut)
     assert columns.max() - columns.min() == pytest.approx(vut.length * scale, abs=4)
     assert rows.max() - rows.min() == pytest.approx(vut.width * scale, abs=4)
-    end = list(draw_frames(scene, scene.length))[-1]
+    end = list(draw_frames(scene, scene.sample_count))[-1]
     for row, body in enumerate(one for one in scene.bodies if one.is_vut):
         _, columns = where(end, VEHICLE_COLOURS[row])
         assert columns.max() == pytest.approx((body.x[-1] - scene.view.left_ends[-1]) * scale, abs=4)

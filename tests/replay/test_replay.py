@@ -63,7 +63,7 @@ def test_the_most_severe_the_smallest_and_the_fewest(flag: str, column: str, sli
 def test_a_replay_that_differs_from_its_row_is_reported(slippery: Path, case: Case) -> None:
     comparison = compare_setting(case.study, assemble(case.study), case.characteristics.original)
     result = list_differences(comparison.evaluations, {"safety_degree": 1.0, "tet": np.nan, "outcome": "collision"})
-    assert [one.split(" is ")[0] for one in result] == ["the outcome", "safety_degree", "tet"]
+    assert [one.split(" was ")[0] for one in result] == ["the outcome", "safety_degree", "tet"]
 
 
 @pytest.mark.parametrize(("arguments", "legal"), [
@@ -108,9 +108,9 @@ def test_moments_of_a_drive(case: Case) -> None:
     comparison = compare_setting(case.study, assemble(case.study), case.solutions[list(case.characteristics.names)].to_numpy()[0])
     runs = comparison.film.runs
     trace, original, hit = runs.trace, find_moments(runs, 0), find_moments(runs, 1)
-    assert original.brake is not None
-    assert trace.brake[original.brake, 0] > 0
-    assert not trace.brake[trace.time < trace.time[original.brake], 0].any()
+    assert original.braking_start is not None
+    assert trace.brake[original.braking_start, 0] > 0
+    assert not trace.brake[trace.time < trace.time[original.braking_start], 0].any()
     assert trace.gap[original.nearest, 0] == comparison.evaluations.f_safe[0]
     assert hit.nearest == hit.end
     assert comparison.verdict(0) == f"stops with {comparison.evaluations.f_safe[0]:.2f} m to spare"

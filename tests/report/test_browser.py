@@ -45,7 +45,7 @@ def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Chrome]:
 def report(slippery: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     file = tmp_path_factory.mktemp("page") / "report.html"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(report_input, "SAMPLES", 256)
+        patch.setattr(report_input, "SAMPLED_VEHICLES", 256)
         file.write_text(make_report([slippery]), encoding="utf-8")
     return file
 

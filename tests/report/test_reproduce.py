@@ -59,7 +59,7 @@ def test_any_other_study_is_carried_out_from_what_its_results_record(
 def test_every_printed_command_gives_the_numbers_of_the_page(
         slippery: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Made from what its own printed commands print, the page is the same to the last byte; the tables' numbers are those of `tables`."""
-    monkeypatch.setattr(report_input, "SAMPLES", 300)
+    monkeypatch.setattr(report_input, "SAMPLED_VEHICLES", 300)
     place = tmp_path / "results"
     shutil.copytree(slippery, place, ignore=shutil.ignore_patterns("answers"))
     page = make_report([place], jobs=2)

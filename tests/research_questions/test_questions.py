@@ -25,7 +25,7 @@ from safevar_sumo.analysis.research_questions.changes import (
     rq33_safety,
 )
 from safevar_sumo.analysis.research_questions.comparisons import ALPHA, rq1, rq2
-from safevar_sumo.analysis.research_questions.over_runs import correct_by_holm, pooling_effect_line, rq1_runs, rq2_runs, summary_lines
+from safevar_sumo.analysis.research_questions.over_runs import correct_by_holm, rq1_runs, rq2_runs, significance_change_line, summary_lines
 from safevar_sumo.errors import InputError
 from safevar_sumo.study import CharacteristicTable
 from tests.research_questions.made_up import CHARACTERISTICS, ORIGINAL, made_up, made_up_study, row
@@ -242,8 +242,8 @@ def test_solutions_of_one_run_are_not_taken_for_independent() -> None:
     assert (runs["n1"], runs["n2"]) == (8, 8)
     assert runs["effect_size"] == 1 - (0 + 0 + 0 + 0 + 0 + 1 + 1 + 3) / 64
     assert runs["p_value"] == scipy.stats.mannwhitneyu(ours, theirs, method="exact").pvalue > ALPHA / 10
-    assert pooling_effect_line(case, ["RQ2"]).endswith(", 4 tests are no longer significant (RQ2 RS: IGD, IGD+, HV, SD).")
-    assert "RQ1 NSGA-II: " in pooling_effect_line(case, ["RQ1"])
+    assert significance_change_line(case, ["RQ2"]).endswith(", 4 tests are no longer significant (RQ2 RS: IGD, IGD+, HV, SD).")
+    assert "RQ1 NSGA-II: " in significance_change_line(case, ["RQ1"])
     notes = {name: answer_questions([case], name)[0].notes for name in ("rq1-runs", "rq2-runs")}
     assert "RQ2" not in "".join(notes["rq1-runs"])
     assert "RQ1" not in "".join(notes["rq2-runs"])

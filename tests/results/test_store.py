@@ -343,7 +343,7 @@ def test_reading_a_torn_run_warns(slippery: Path, tmp_path: Path) -> None:
     shutil.copytree(slippery, tmp_path / "it")
     journal = tmp_path / "it/runs/nsga2-00.journal"
     journal.write_bytes(journal.read_bytes()[:-7])
-    with pytest.warns(UserWarning, match=r"nsga2-00\.journal: the last \d+ bytes are torn, so the run is left out"):
+    with pytest.warns(UserWarning, match=r"nsga2-00\.journal: the last \d+ bytes are torn, so the run counts as unfinished"):
         (case,) = load_cases([tmp_path / "it"])
     assert ("nsga2", 0) not in case.finished_runs
 

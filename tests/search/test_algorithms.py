@@ -24,7 +24,7 @@ from safevar_sumo.api.running import load_for_search
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import Evaluations, Outcome
 from safevar_sumo.search import ALGORITHMS, MapElites, MoCell, Problem
-from safevar_sumo.search.evolution import Individual, fitness_of, run_tournament
+from safevar_sumo.search.evolution import Individual, fitness_class, run_tournament
 from safevar_sumo.search.mocell import choose_survivor
 from safevar_sumo.search.nsga2 import select_survivors
 from safevar_sumo.search.safe_fuzzer import _improves, _Ranges, _scores
@@ -217,7 +217,7 @@ def individuals(*objectives: tuple[float, float, float]) -> list[Individual]:
     population = []
     for values in objectives:
         one = Individual(list(values))
-        one.fitness = fitness_of(3)(values)
+        one.fitness = fitness_class(3)(values)
         population.append(one)
     return population
 

@@ -27,7 +27,7 @@ from pymoo.optimize import minimize
 from safevar_sumo.metrics import PUBLISHED_SCORING
 from safevar_sumo.records import Evaluations
 from safevar_sumo.search import ALGORITHMS, Problem
-from safevar_sumo.search.evolution import Individual, fitness_of
+from safevar_sumo.search.evolution import Individual, fitness_class
 from safevar_sumo.search.spea2 import select_archive
 from safevar_sumo.vehicles import Characteristic, CharacteristicSet
 from tests.search.problems import evaluated
@@ -159,7 +159,7 @@ def individuals(objectives: np.ndarray) -> list[Individual]:
     population = []
     for values in objectives.tolist():
         population.append(Individual(values))
-        population[-1].fitness = fitness_of(len(values))(tuple(values))
+        population[-1].fitness = fitness_class(len(values))(tuple(values))
     return population
 
 

@@ -214,7 +214,7 @@ def test_bodies_touch_at_the_side_where_the_overlap_began_last(
     assert touch.side == contact[0]
     assert touch.age == pytest.approx(contact[1])
     if contact[2] is not None:
-        assert touch.front_distance == pytest.approx(contact[2] - 0.2)
+        assert touch.distance_behind_front == pytest.approx(contact[2] - 0.2)
 
 
 def test_a_remark_says_that_tests_are_faster_than_the_vehicle_was_fitted_to() -> None:

@@ -125,7 +125,7 @@ def test_a_remark_lists_the_networks_attributes_of_the_vehicle_that_are_not_used
               'id="approach" from="west" to="crossing" numLanes="1" width="4" speed="8.33"')
     rewritten(mine / "traffic.rou.xml", '<vType id="vut"', '<vType id="vut" carFollowModel="IDM" speedFactor="0.8" accel="3"')
     (remark,) = on("sun", mine).remarks
-    assert remark.startswith(f"{mine / 'traffic.rou.xml'}: not used of vehicle 'vut': carFollowModel = IDM, speedFactor = 0.8, accel = 3, "
+    assert remark.startswith(f"{mine / 'traffic.rou.xml'}: no effect on vehicle 'vut': carFollowModel = IDM, speedFactor = 0.8, accel = 3, "
                              "the speed limit of lane 'approach_0' (8.33 m/s)")
 
 

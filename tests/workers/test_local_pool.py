@@ -209,7 +209,7 @@ def test_what_a_users_code_does_on_one_setting_is_an_error_that_names_it() -> No
     pool = ToldPool(fault)
     with pytest.raises(UserCodeError) as caught:
         RetryingPool(pool, WITH_USER_CODE).submit(b"", settings(50)).result(timeout=5)
-    assert "ZeroDivisionError; again by: python -m safevar_sumo simulate 'my study.toml' --set " in str(caught.value)
+    assert "ZeroDivisionError; to reproduce it: python -m safevar_sumo simulate 'my study.toml' --set " in str(caught.value)
     assert f"--set {SUN.names[0]}=4313.0" in str(caught.value)
     assert str(caught.value).count("--set") == 1, "what is not changed need not be set"
     assert len(pool.tried) < 15

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -70,7 +70,7 @@ def _print_answer(console: Console, command_for: CommandFor, result: Explained, 
     print_text(console, failures_paragraph(assemble(result.study), result.original, *descriptions, result.preventability))
     name = str(first.handle or "the first setting")
     print_text(console, f"Why {name} fails: {sentence(first.because, full=True)}")
-    for cause in [cause for cause in first.causes if cause.changes][:1]:
+    if cause := most_robust(cause for cause in first.causes if cause.changes):
         limits = [f"{_full_name(characteristic)} {characteristic.original:g} -> "
                   f"{characteristic.text(cause.boundary[characteristic.name])}{characteristic.suffix}"
                   for characteristic in characteristics if characteristic.name in cause.boundary]
@@ -86,10 +86,15 @@ def _describe(failure: Explanation | None) -> FailureDescription | None:
     """The description of a failure for the paragraph; None without a failure, or if its setting is not unsafe."""
     if failure is None or not failure.causes:
         return None
-    changes = {name: failure.setting[name] for name in failure.changed}
+    changes, cause = {name: failure.setting[name] for name in failure.changed}, most_robust(failure.causes)
     return FailureDescription(
         str(failure.handle or "a sampled setting"), changes, failure.outcome, failure.safety_degree, failure.robustness,
-        len(failure.causes[0].changes), failure.causes[0].neighbours)
+        len(failure.causes[0].changes), None if cause is None else cause.neighbours)
+
+
+def most_robust(causes: Iterable[Cause]) -> Cause | None:
+    """The cause with the largest share of unsafe neighbours; the first of several, or in a rated study, whose causes have no shares."""
+    return max(causes, key=lambda cause: 0.0 if cause.neighbours is None else cause.neighbours.share, default=None)
 
 
 def _most_necessary_in_words(result: Explained, characteristics: CharacteristicSet) -> str:

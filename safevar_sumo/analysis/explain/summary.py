@@ -31,6 +31,8 @@ LABELS = {ROBUST: "robust with the fewest changes", REASONS["smallest"]: "smalle
 """Titles of failures by the reason for their choice; any other reason is itself the title."""
 MAX_SIMULATIONS = 4000
 """Approximate maximum number of simulations that search for a robust failure at the end of a study; `explain` has a higher limit."""
+MAX_CAUSES = 8
+"""Maximum number of minimal causes of a failure whose robustness is estimated at the end of a study."""
 
 
 def summarise_failures(study: Study, solutions: pd.DataFrame, original: Evaluations, pool: Pool, directory: str) -> list[str]:
@@ -98,14 +100,17 @@ def _write_paragraph(evaluator: Evaluator, solutions: pd.DataFrame, is_unsafe: p
     fewest_row = int(np.lexsort([getattr(failures, name) for name in reversed(CHOICES["fewest"])])[0])
     rows = [fewest_row] if robust_row is None else [fewest_row, robust_row]
     descriptions, chosen = [], failures.take(rows)
-    causes = find_minimal_causes(evaluator, chosen.settings, unsafe)
-    robustnesses = estimate_robustness(evaluator, np.array([*chosen.settings, *(group[0].setting for group in causes)]), step, unsafe)
+    causes = [group[:MAX_CAUSES] for group in find_minimal_causes(evaluator, chosen.settings, unsafe)]
+    cause_settings = [cause.setting for group in causes for cause in group]
+    robustnesses = iter(estimate_robustness(evaluator, np.array([*chosen.settings, *cause_settings]), step, unsafe))
+    failure_robustnesses = [next(robustnesses) for _ in rows]
     for index, row in enumerate(rows):
         changed = np.flatnonzero(evaluator.characteristics.changed(chosen.settings[index]))
         changes = {names[column]: float(chosen.settings[index, column]) for column in changed}
         name, degree = str(all_handles[candidates[failing_rows[row]]]), finite_or_none(chosen.f_safe[index])
-        descriptions.append(FailureDescription(name, changes, str(chosen.outcome[index]), degree, robustnesses[index],
-                                               len(causes[index][0].columns), robustnesses[len(rows) + index]))
+        cause_robustness = max((next(robustnesses) for _ in causes[index]), key=lambda robustness: robustness.share)
+        descriptions.append(FailureDescription(name, changes, str(chosen.outcome[index]), degree, failure_robustnesses[index],
+                                               len(causes[index][0].columns), cause_robustness))
     return failures_paragraph(system, original, descriptions[0], descriptions[1] if len(descriptions) > 1 else None, preventable)
 
 
@@ -175,9 +180,10 @@ def failures_paragraph(system: System, original: Evaluations, smallest: FailureD
     original
         The original vehicle's evaluation.
     smallest
-        The failure with the fewest changes; None if nothing is unsafe.
+        The most severe of the failures with the fewest changes; None if nothing is unsafe.
     robust
-        The robust failure with the fewest changes; None if no tried failure is robust.
+        The robust failure with the fewest changes, and among these the smallest largest change; None if no tried failure is robust. It
+        leads the paragraph if it has as few changes as `smallest`.
     preventable
         Shares of the collisions that reference drivers avoid.
     """
@@ -187,6 +193,8 @@ def failures_paragraph(system: System, original: Evaluations, smallest: FailureD
     characteristics = CharacteristicSet(system.characteristics.members)
     if not smallest.sufficient_count:
         return " ".join([*parts, "No change is needed for it to be unsafe."])
+    if robust is not None and len(robust.changes) == len(smallest.changes):
+        smallest = robust
     sentence = _failure_in_words(characteristics, smallest)
     parts.append(f"{sentence[0].upper()}{sentence[1:]}")
     if smallest.robustness.borderline:

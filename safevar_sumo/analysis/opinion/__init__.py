@@ -1,6 +1,6 @@
 """Does another vehicle model confirm the failures: is each minimal cause unsafe with that model too?
 
-The options and the function of the library are defined here, so that a command's help can be shown without loading the computation.
+The command's options and the Python function `opinion` are defined here, so that help can be shown without loading the computation.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Drives the minimal causes of failures, and the nearest safe setting below each, again with the second vehicle model."""
+"""Simulates the minimal causes of failures, and the nearest safe setting below each, again with the second vehicle model."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from safevar_sumo.analysis.explain.causes import RESOLUTION, find_boundaries
 from safevar_sumo.analysis.explain.compute import choose_failures
 from safevar_sumo.analysis.opinion import OpinionOptions
 from safevar_sumo.analysis.opinion.mapping import VehicleMapping, map_vehicle
-from safevar_sumo.analysis.opinion.multi_body import load_commonroad
+from safevar_sumo.analysis.opinion.multi_body import load_bmw_parameters
 from safevar_sumo.analysis.opinion.result import Opinion, Opinions, OpinionVerdict, RunEnd
 from safevar_sumo.analysis.opinion.second_vehicle import SecondVehicle
 from safevar_sumo.analysis.research_questions.case import Case
@@ -59,7 +59,7 @@ def assemble_both_systems(study: Study) -> tuple[System, System, VehicleMapping]
     InputError
         If commonroad-vehicle-models is not installed, or the second model cannot represent the vehicle at all.
     """
-    load_commonroad()
+    load_bmw_parameters()
     system = assemble(study)
     mapping = map_vehicle(study, system.vehicle)
     return system, replace(system, vehicle=SecondVehicle(system.vehicle, mapping, study)), mapping
@@ -72,11 +72,11 @@ def ask_for_opinions(source: Study | Case, options: OpinionOptions, *, pool: Poo
     Raises
     ------
     InputError
-        As `assemble_both_systems` and `choose_failures`, and if `source` is a study, which has no failures yet.
+        If `assemble_both_systems` or `choose_failures` raises it, or if `source` is a study, which has no failures yet.
     """
     if isinstance(source, Study):
         raise InputError(source.origin.called or source.name, "is a study and has no solutions",
-                         "a directory that the command study has written")
+                         "a directory that the command `study` has written")
     assemble_both_systems(source.study)
     explain_options = ExplainOptions(solutions=options.solutions, unsafe=options.unsafe, limit=SIMULATION_LIMIT)
     with open_evaluator(source.study, pool, jobs, progress) as evaluator:
@@ -92,7 +92,7 @@ def ask_for_opinions(source: Study | Case, options: OpinionOptions, *, pool: Poo
 
 
 def judge_causes(study: Study, causes: Sequence[CauseToJudge], unsafe: Unsafe, progress: Progress = show_no_progress) -> Opinions:
-    """Simulate minimal causes with both models and judge them; raises as `assemble_both_systems`."""
+    """Simulate minimal causes with both models and judge them; raises the errors of `assemble_both_systems`."""
     system, second, mapping = assemble_both_systems(study)
     characteristics = system.characteristics
     settings = np.stack([characteristics.original, *(characteristics.setting(cause.changes, "cause", beyond=True) for cause in causes)])
@@ -110,9 +110,10 @@ def judge_causes(study: Study, causes: Sequence[CauseToJudge], unsafe: Unsafe, p
     fails_below = fails_with_second[setting_count:setting_count + len(causes)]
     scaled_fails = fails_with_second[setting_count + len(causes):].reshape(len(CHANGE_SHARES), len(causes))
     opinions = []
-    for row, (cause, safe_setting) in enumerate(zip(causes, safe_settings, strict=True), 1):
+    for index, (cause, safe_setting) in enumerate(zip(causes, safe_settings, strict=True)):
+        row = index + 1  # row 0 is the original vehicle
         comparison = (f"The nearest setting that is safe with our model, {safe_setting.share:.1%} of the changes, is "
-                      f"{'unsafe' if fails_below[row - 1] else 'safe'} with the second. {_failing_shares(scaled_fails[:, row - 1])} "
+                      f"{'unsafe' if fails_below[index] else 'safe'} with the second. {_failing_shares(scaled_fails[:, index])} "
                       f"of the changes are enough with the second model, {cause.fraction:.1%} with ours.")
         fails = bool(fails_with_second[row]) if second_runs.valid[row] else None
         opinions.append(_judge(cause, mapping, original, our_ends[row], second_ends[row], fails, comparison))

@@ -18,9 +18,9 @@ from safevar_sumo.vehicles import Slope
 
 WHEEL_COUNT = 4
 LONGEST_STEP = 1e-3
-"""Longest step of the integration [s]: 0.08 rad of the fastest motion, an axle between its springs and its tyres (75 rad/s)."""
+"""Longest step of the integration [s]; in it the fastest motion, an axle between springs and tyres (75 rad/s), turns by 0.08 rad."""
 LEAST_SPEED = 0.1
-"""Smallest speed to which slip is relative [m/s]: half of `v_s` in the package's `vehicle_dynamics_std`."""
+"""Smallest denominator of a slip [m/s]: half of `v_s` in the package's `vehicle_dynamics_std`."""
 SLIP_LIMIT, LEAST_CONTROL_SPEED = 0.1, 2.0
 """Slip above which the anti-lock controller releases brake pressure [-], and speed above which the controller acts [m/s].
 
@@ -34,7 +34,7 @@ Chosen values: braking uses at least 0.78 of the friction, for coefficients from
 """
 
 
-def load_commonroad() -> Any:
+def load_bmw_parameters() -> Any:
     """Parameters of the package's vehicle 2, a BMW 320i, and of its tyres.
 
     Raises
@@ -57,7 +57,7 @@ def _parameters(load_parameters: Any) -> Any:
 
 @cache
 def _tyre() -> Any:
-    return load_commonroad().tire
+    return load_bmw_parameters().tire
 
 
 class Plant(NamedTuple):
@@ -88,15 +88,15 @@ class Plant(NamedTuple):
     down: FloatArray
 
 
-def build_plant(mass: FloatArray, unladen_mass: float, slope: Slope, *, brake_front: float, drive_front: float,
+def build_plant(mass: FloatArray, unladen_mass: float, slope: Slope, *, front_brake_share: float, front_drive_share: float,
                 centre: FloatArray | None = None, wheelbase: float | None = None, height: float | None = None, **constants: Any) -> Plant:
     """Vehicles with masses [kg] that differ from the package's vehicle.
 
     Unsprung masses, springs, dampers, tyres and inertia grow with `unladen_mass` [kg], so that all frequencies stay the package's;
-    a load rests on the springs. `centre` is the whole vehicle's centre of mass behind the front axle [m], `height` its height above the
-    road [m]; the package's values replace None.
+    a load rests on the springs. `centre` is the distance from the front axle to the whole vehicle's centre of mass [m], `height` the
+    height of that centre above the road [m]; the package's values replace None.
     """
-    bmw = load_commonroad()
+    bmw = load_bmw_parameters()
     ones, scale = np.ones_like(mass), unladen_mass / bmw.m
     unsprung_mass = scale * bmw.m_uf * ones
     sprung_mass, length = mass - 2 * unsprung_mass, bmw.a + bmw.b if wheelbase is None else wheelbase
@@ -107,8 +107,9 @@ def build_plant(mass: FloatArray, unladen_mass: float, slope: Slope, *, brake_fr
         static_shares=np.stack([length - front_arm, front_arm]) / length, height=(bmw.h_s if height is None else height) * ones,
         pitch_inertia=scale * bmw.I_y_s * ones * (length / (bmw.a + bmw.b)) ** 2, tyre_spring=scale * bmw.K_zt * ones,
         springs=scale * np.stack([bmw.K_sf * ones, bmw.K_sr * ones]), dampers=scale * np.stack([bmw.K_sdf * ones, bmw.K_sdr * ones]),
-        brake_shares=np.stack([brake_front * ones, (1 - brake_front) * ones]),
-        drive_shares=np.stack([drive_front * ones, (1 - drive_front) * ones]), back=slope.back * ones, down=slope.down * ones, **values)
+        brake_shares=np.stack([front_brake_share * ones, (1 - front_brake_share) * ones]),
+        drive_shares=np.stack([front_drive_share * ones, (1 - front_drive_share) * ones]),
+        back=slope.back * ones, down=slope.down * ones, **values)
     return plant._replace(height=plant.height + at_speed(plant, ones).heave)  # the body's heights count from unloaded tyres
 
 

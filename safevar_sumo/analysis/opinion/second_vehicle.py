@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from safevar_sumo.analysis.opinion.mapping import SecondParameters, Surface, VehicleMapping
+from safevar_sumo.analysis.opinion.mapping import SecondModelParameters, Surface, VehicleMapping
 from safevar_sumo.analysis.opinion.multi_body import LONGEST_STEP, WHEEL_COUNT, MultiBodyState, advance, at_speed
 from safevar_sumo.records import BoolArray, Command, FloatArray, Observation
 from safevar_sumo.study import Study, load_study
@@ -32,7 +32,7 @@ class _Prepared(NamedTuple):
 
     vehicle: Any
     original: Any
-    parameters: SecondParameters
+    parameters: SecondModelParameters
     engine_mass: FloatArray
     engine_radius: FloatArray
     slope: Slope
@@ -70,7 +70,7 @@ class SecondVehicle:
         self.UNITS = vehicle.UNITS
         shipped_tables = load_study(mapping.table.study).vehicle.characteristics
         tables = {**shipped_tables, **{name: table for name, table in study.vehicle.characteristics.items()
-                                       if name not in mapping.unknown_names}}
+                                       if name not in mapping.unmatched_names}}
         self._original = {characteristic.name: characteristic.original
                           for characteristic in CharacteristicSet.of({name: tables[name] for name in mapping.vehicle.UNITS})}
 
@@ -79,17 +79,17 @@ class SecondVehicle:
         ones = np.ones_like(next(iter(characteristics.values())))
         original = {name: value * ones for name, value in self._original.items()}
         surface = Surface(road_friction, slope, wet)
-        road_arguments = () if slope is LEVEL and not np.any(wet) else (slope, wet) if np.any(wet) else (slope,)
+        road_arguments = (slope, wet) if np.any(wet) else () if slope is LEVEL else (slope,)  # a user's vehicle may lack slope and wet
         original_vehicle, represent = self._mapping.vehicle, self._mapping.table.represent
-        engine = represent(original_vehicle, original, self._original, surface).plant
+        original_plant = represent(original_vehicle, original, self._original, surface).plant
         return _Prepared(
             vehicle=self._vehicle.prepare(characteristics, road_friction, step, *road_arguments),
             original=original_vehicle.prepare(original, road_friction, step, slope, wet),
             parameters=represent(
                 original_vehicle, {**original, **{name: characteristics[name] for name in original if name in characteristics}},
                 self._original, surface),
-            engine_mass=engine.mass + WHEEL_COUNT * engine.wheel_inertia / engine.radius**2, engine_radius=engine.radius,
-            slope=slope, step=step)
+            engine_mass=original_plant.mass + WHEEL_COUNT * original_plant.wheel_inertia / original_plant.radius**2,
+            engine_radius=original_plant.radius, slope=slope, step=step)
 
     def sumo_type(self, prepared: _Prepared) -> SumoType:
         return self._vehicle.sumo_type(prepared.vehicle)
@@ -129,23 +129,23 @@ class SecondVehicle:
         demand, body, brake = delay_signal(commands, parameters.brake_delay, prepared.step), state.body, state.brake
         step_count = math.ceil(prepared.step / LONGEST_STEP)
         step = prepared.step / step_count
-        response = step / (step + parameters.brake_lag)
+        lag_share = step / (step + parameters.brake_lag)
         for _ in range(step_count):
-            change = np.maximum((demand - brake) * response, -parameters.brake_fall * step)
+            change = np.maximum((demand - brake) * lag_share, -parameters.brake_fall * step)
             brake = brake + np.minimum(change, parameters.brake_rise * step)
             body = advance(parameters.plant, body, brake, drive_torque, step)
         return SecondState(body.speed, original.throttle, brake, original.gear, state.vehicle, original, body, commands)
 
     def _advance_engine(self, prepared: _Prepared, state: SecondState, throttle: FloatArray) -> tuple[Any, FloatArray]:
         """The original vehicle one step later, and the torque of its engine and drags on all wheels at their speed [N m]."""
-        parameters, engine, radius = prepared.parameters, state.original, prepared.parameters.plant.radius
+        parameters, original, radius = prepared.parameters, state.original, prepared.parameters.plant.radius
         speed = state.speed * prepared.engine_radius / radius
-        engine = engine._replace(speed=speed) if not hasattr(engine, "wheel_speed") else engine._replace(
+        original = original._replace(speed=speed) if not hasattr(original, "wheel_speed") else original._replace(
             speed=speed, wheel_speed=np.where(
-                engine.speed > CREEP_SPEED, engine.wheel_speed * speed / np.maximum(engine.speed, CREEP_SPEED), engine.wheel_speed))
-        next_engine = self._mapping.vehicle.advance(prepared.original, engine, Command(throttle, np.zeros_like(throttle)))
-        torque = prepared.engine_mass * ((next_engine.speed - speed) / prepared.step + prepared.slope.back) * prepared.engine_radius
-        torque = np.where(torque > 0, torque * parameters.drive, torque)
+                original.speed > CREEP_SPEED, original.wheel_speed * speed / np.maximum(original.speed, CREEP_SPEED), original.wheel_speed))
+        next_original = self._mapping.vehicle.advance(prepared.original, original, Command(throttle, brake=np.zeros_like(throttle)))
+        torque = prepared.engine_mass * ((next_original.speed - speed) / prepared.step + prepared.slope.back) * prepared.engine_radius
+        torque = np.where(torque > 0, torque * parameters.drive_ratio, torque)
         resistance = (radius * (parameters.drag + parameters.air_drag * state.speed) * state.speed
                       + parameters.wheel_damping * state.speed / radius)
-        return next_engine, torque - resistance
+        return next_original, torque - resistance

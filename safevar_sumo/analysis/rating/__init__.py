@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class RatingOptions(Options):
-    """The variant that is rated beside the original vehicle: changed characteristics, or a solution of results."""
+    """The variant that is rated beside the original vehicle: a solution of results, changed characteristics, or both."""
 
     question: ClassVar[str] = "rating"
     changes: Mapping[str, float] | None = option(

@@ -40,7 +40,8 @@ def draw_critical_differences(case: Case) -> Figure:
         raise UnanswerableError(case.name, f"has {run_count} runs in which all {algorithm_count} algorithms have solutions: too few for "
                                 "critical differences, which no mean ranks exceed", "results of more runs")
     title = f"{case.name}: mean ranks over {run_count} runs, critical difference {critical_difference:.2f}"
-    figure, axes = new_figure(title, len(metrics), 1, (6.8, 0.9 + len(metrics) * (0.75 + ALGORITHM_HEIGHT * algorithm_count)))
+    figure, axes = new_figure(title, len(metrics), columns=1,
+                              size=(6.8, 0.9 + len(metrics) * (0.75 + ALGORITHM_HEIGHT * algorithm_count)))
     for axis, metric in zip(axes.flat, metrics, strict=True):
         metric_ranks = frame[frame["metric"] == metric].sort_values("mean_rank", kind="stable")
         _draw_mean_ranks(axis, metric_ranks["algorithm"].tolist(), metric_ranks["mean_rank"].to_numpy(dtype=float), critical_difference)

@@ -13,29 +13,30 @@ import scipy
 
 from safevar_sumo.analysis.research_questions.case import Case, UnanswerableError
 from safevar_sumo.analysis.research_questions.comparisons import ALPHA, compare_samples, reverse_effect
-from safevar_sumo.analysis.research_questions.indicators import MORE_IS_BETTER, compute_indicators, objective_values
+from safevar_sumo.analysis.research_questions.indicators import MORE_IS_BETTER, compute_indicators, defined_minimised_values
 from safevar_sumo.analysis.research_questions.over_runs import correct_by_holm, run_mean_series
+from safevar_sumo.analysis.words import number_of
 from safevar_sumo.records import FloatArray
 
 PAIR_COLUMNS = ["setting", "algorithm", "other", "metric", "p_value", "p_holm", "effect_size", "magnitude", "n1", "n2", "method"]
 RANK_COLUMNS = ["setting", "metric", "algorithm", "mean_rank", "median", "runs", "statistic", "p_value", "p_holm", "critical_difference"]
 SURFACE_PERCENTAGES = (50.0, 100.0)
-"""Percentages of the runs whose attainment surfaces are computed, in addition to a single run's."""
+"""An attainment surface is computed for each of these percentages of the runs, and for the percentage that one run is (the best of all)."""
 
 
 def compare_pairs(case: Case) -> pd.DataFrame:
-    """Every pair of algorithms, run against run: indicators and metrics' run means, Mann-Whitney U.
+    """Compare every pair of algorithms by Mann-Whitney U, with one value per run: each indicator, and each metric's mean over solutions.
 
     Columns: `PAIR_COLUMNS`, where `setting` holds the case's name and `other` the other algorithm. `effect_size` is A12, oriented so that
-    higher values mean that `algorithm` is better than `other`. `p_holm` is `p_value` corrected by Holm's method for all pairs and metrics
-    of this case. Undefined values are None.
+    higher values mean that `algorithm` is better than `other`: a better front, more unsafe solutions. `p_holm` is `p_value` corrected by
+    Holm's method for all pairs and metrics of this case. Undefined values are None.
 
     Raises
     ------
     UnanswerableError
         If there are no runs, or runs of only one algorithm.
     """
-    samples, rows = _collect_samples(case, 2), list[dict[str, Any]]()
+    samples, rows = _collect_samples(case, min_algorithms=2), list[dict[str, Any]]()
     for first, second in combinations(case.algorithms, 2):
         for metric, (more_is_better, by_algorithm) in samples.items():
             test = compare_samples(*(by_algorithm[name].dropna() for name in (first, second)))
@@ -60,7 +61,7 @@ def rank_algorithms(case: Case) -> pd.DataFrame:
         If there are no runs, or fewer than three algorithms.
     """
     p_values, rows = dict[str, float | None](), list[dict[str, Any]]()
-    for metric, (more_is_better, by_algorithm) in _collect_samples(case, 3).items():
+    for metric, (more_is_better, by_algorithm) in _collect_samples(case, min_algorithms=3).items():
         blocks = pd.DataFrame(by_algorithm).dropna()
         values = blocks.to_numpy(dtype=float)
         ranks_of_runs = scipy.stats.rankdata(-values if more_is_better else values, axis=1)
@@ -96,34 +97,34 @@ def compute_attainment(case: Case) -> dict[str, dict[float, FloatArray]]:
     signs = np.array([objective.sign for objective in case.scoring.objectives[:2]])
     for algorithm in case.algorithms:
         solutions = case.solutions_of(algorithm)
-        fronts = [objective_values(case, solutions[solutions["run"] == run])[:, :2] for run in case.runs_of(algorithm)]
+        fronts = [defined_minimised_values(case, solutions[solutions["run"] == run])[:, :2] for run in case.runs_of(algorithm)]
         fronts = [front for front in fronts if len(front)]
         if fronts:
             run_indices = np.repeat(np.arange(len(fronts)), [len(front) for front in fronts])
             percentages = sorted({100 / len(fronts), *SURFACE_PERCENTAGES})
             points = moocore.eaf(np.concatenate(fronts), run_indices, percentiles=percentages)
             surfaces[algorithm] = {
-                percentage: (surface := points[points[:, 2] == percentage, :2])[np.argsort(surface[:, 0], kind="stable")] * signs
+                percentage: (minimised := points[points[:, 2] == percentage, :2])[np.argsort(minimised[:, 0], kind="stable")] * signs
                 for percentage in np.unique(points[:, 2]).tolist()}
     if not surfaces:
         raise UnanswerableError(case.name, "has no solution", "results with at least one finished run")
     return surfaces
 
 
-def _collect_samples(case: Case, minimum: int) -> Mapping[str, tuple[bool, dict[str, pd.Series[float]]]]:
-    """For each indicator and metric: whether more is better, and for each algorithm the series of values over the runs."""
-    if not case.has_runs:
-        case.runs_of(next(iter(case.algorithms), ""))  # raises with the reason
-    if len(case.algorithms) < minimum:
+def _collect_samples(case: Case, *, min_algorithms: int) -> Mapping[str, tuple[bool, dict[str, pd.Series[float]]]]:
+    """For each indicator and metric: whether more is better (a metric: more unsafe), and each algorithm's values by run."""
+    case.require_runs()
+    if len(case.algorithms) < min_algorithms:
         names = ", ".join(case.algorithms) or "none"
-        raise UnanswerableError(case.name, f"has finished runs of {len(case.algorithms)} algorithms ({names})",
-                                f"results of {minimum} algorithms or more")
+        raise UnanswerableError(case.name, f"has finished runs of {number_of(len(case.algorithms), 'algorithm')} ({names})",
+                                f"results of {min_algorithms} algorithms or more")
     samples: dict[str, tuple[bool, dict[str, pd.Series[float]]]] = {}
     if len(case.solutions):
-        quality = compute_indicators(case).set_index(["algorithm", "run"])
+        indicators = compute_indicators(case).set_index(["algorithm", "run"])
         for name, more_is_better in MORE_IS_BETTER.items():
             samples[name] = more_is_better, {
-                algorithm: quality.loc[quality.index.get_level_values(0) == algorithm, name].droplevel(0) for algorithm in case.algorithms}
+                algorithm: indicators.loc[indicators.index.get_level_values(0) == algorithm, name].droplevel(0)
+                for algorithm in case.algorithms}
     for metric in case.scoring.metrics:
         samples[metric.name] = metric.more_is_unsafe, {
             algorithm: run_mean_series(case, algorithm, metric) for algorithm in case.algorithms}

@@ -113,8 +113,8 @@ def _notes(question: str, case: Case) -> list[str]:
             rows = solutions_for_metric(case.solutions, metric)
             undefined_values = int(rows[metric.name].isna().sum())
             if undefined_values:
-                notes.append(f"{case.name}: {metric.name} is undefined in {undefined_values} of {len(rows)} solutions; the tests omit "
-                             "those.")
+                notes.append(f"{case.name}: {metric.name} is undefined in {undefined_values} of {len(rows)} solutions, which the "
+                             "tests omit.")
     if question == "rq1":
         undefined_metrics = [name for name, value in case.original.items() if pd.isna(value)]
         if undefined_metrics:

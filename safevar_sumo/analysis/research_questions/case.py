@@ -88,6 +88,11 @@ class Case:
         if not self.algorithms:
             raise UnanswerableError(self.name, "has no finished run", "results with at least one finished run")
 
+    def require_runs(self) -> None:
+        """Raise `UnanswerableError` if the solutions are imported and belong to no run."""
+        if not self.has_runs:
+            raise UnanswerableError(self.name, "is imported: the runs of its solutions are unknown", "results of the command `study`")
+
     def solutions_of(self, algorithm: str) -> pd.DataFrame:
         """Pooled solutions of all finished runs of an algorithm.
 
@@ -109,8 +114,7 @@ class Case:
         UnanswerableError
             If the solutions are imported and belong to no run.
         """
-        if not self.has_runs:
-            raise UnanswerableError(self.name, "is imported: the runs of its solutions are unknown", "results of the command study")
+        self.require_runs()
         return sorted(run for name, run in self.finished_runs if name == algorithm)
 
     @property
@@ -127,7 +131,7 @@ class Case:
                 lines.append(f"{self.name}: unfinished, {', '.join(shortfalls)}; tables use the finished runs.")
         if self.failures:
             lines.append(f"{self.name}: {len(self.failures)} settings could not be simulated (simulator-error) and are in no result: "
-                        f"{'; '.join(failure_lines(self.failures))}. study --retry-failed simulates them again.")
+                        f"{'; '.join(failure_lines(self.failures))}. `study --retry-failed` simulates them again.")
         return lines
 
 
@@ -168,7 +172,7 @@ def _load_or_refuse(path: Path) -> Case:
     try:
         return load_case(path)
     except (TypeError, ValueError, KeyError, ArithmeticError) as error:
-        raise InputError(path, f"is damaged: {describe_error(error)}", "an unchanged directory of the command study") from error
+        raise InputError(path, f"is damaged: {describe_error(error)}", "an unchanged directory of the command `study`") from error
 
 
 def load_case(directory: Path) -> Case:
@@ -181,12 +185,13 @@ def load_case(directory: Path) -> Case:
         raise error_with_key(directory / MANIFEST, manifest["study"], error, "study") from None
     original = manifest.get("original")
     if not isinstance(original, dict):
-        raise InputError(directory / MANIFEST, "does not describe the original vehicle", "a manifest of the command study")
+        raise InputError(directory / MANIFEST, "does not describe the original vehicle", "a manifest of the command `study`")
     try:
         scoring = msgspec.convert(manifest["scoring"], Scoring) if "scoring" in manifest else PUBLISHED_SCORING
     except msgspec.ValidationError as error:
         raise error_with_key(directory / MANIFEST, manifest["scoring"], error, "scoring") from None
-    return build_case(study, original, solutions, evaluations, finished, "imported" not in manifest, failures, scoring)
+    return build_case(study, original, solutions, evaluations, finished, has_runs="imported" not in manifest, failures=failures,
+                      scoring=scoring)
 
 
 def build_case(study: Study, original: Mapping[str, Any], solutions: pd.DataFrame, evaluations: pd.DataFrame,

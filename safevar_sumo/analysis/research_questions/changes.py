@@ -100,7 +100,8 @@ def rq33(case: Case) -> pd.DataFrame:
 def rq33_safety(case: Case) -> pd.DataFrame:
     """Effect on safety of the critical solutions with j characteristics changed: the footer of RQ3.3's table.
 
-    Columns setting, quantity, j, value, percent (of the original's value), n; value is None where n is 0. Quantities:
+    Columns setting, quantity, j, value, percent (of the original's value), n (number of solutions in the mean); value is None where n
+    is 0. Quantities:
 
     - avgSD_mD: mean reduction of the distance over solutions without collision [m];
     - avgSD_cS: mean collision speed over collisions [m/s]; it has no percent;
@@ -147,8 +148,8 @@ def count_collisions(case: Case) -> pd.DataFrame:
 def frequent_combinations(case: Case) -> pd.DataFrame:
     """The most frequent combinations among the critical solutions with exactly four characteristics changed.
 
-    Columns setting, rank (ties share the better one), characteristics (a list), percent of those solutions; no row
-    where there is no such solution. Of combinations that are equally frequent, those with the earlier
+    Columns setting, rank (ties share the better one), characteristics (a list), percent (of the solutions with exactly four
+    changes); no row where there is no such solution. Of combinations that are equally frequent, those with the earlier
     characteristics in the study come first.
     """
     is_changed = changes_of(case, critical_solutions(case)) != 0
@@ -180,9 +181,9 @@ def find_weather_pairs(cases: Sequence[Case]) -> list[tuple[Case, Case]]:
 def compare_weathers(clearer: Case, other: Case) -> pd.DataFrame:
     """One weather against another, characteristic by characteristic, over the critical solutions.
 
-    Columns setting, other, characteristic, percent and percent_other (share of the critical solutions that change
-    it), difference (percent_other - percent), rank and rank_other, and the mean signed change in the characteristic's unit:
-    increase, increase_other, decrease, decrease_other.
+    The column setting names the clearer weather's case. Columns without the suffix "_other" belong to this case.
+    Columns: setting, other, characteristic; percent, percent_other (of the critical solutions that change it); difference (percent_other -
+    percent); rank, rank_other; increase, increase_other, decrease, decrease_other (mean signed change in the characteristic's unit).
     """
     tables = []
     for case in (clearer, other):

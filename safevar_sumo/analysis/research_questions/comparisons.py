@@ -26,7 +26,7 @@ EXACT_SAMPLE_SIZE = 8
 EXACT_TEST = "Mann-Whitney U, two-sided, exact"
 ASYMPTOTIC_TEST = "Mann-Whitney U, two-sided, normal approximation with corrections for ties and continuity"
 MAGNITUDES = ((0.714, "large"), (0.638, "medium"), (0.556, "small"))
-"""Kitchenham's magnitudes: the least max(A12, 1 - A12) for each."""
+"""Kitchenham's magnitudes; each holds from this value of max(A12, 1 - A12) on."""
 NOTABLE_MAGNITUDES = ("medium", "large")
 
 
@@ -56,7 +56,7 @@ def compare_samples(x: ArrayLike, y: ArrayLike) -> TwoSampleTest:
     if np.isnan(first).any() or np.isnan(second).any():
         raise InputError("Mann-Whitney U", "a value is NaN", "samples without undefined values")
     if not first.size or not second.size:
-        return TwoSampleTest(None, None, None, first.size, second.size, None)
+        return TwoSampleTest(p_value=None, effect_size=None, magnitude=None, n1=first.size, n2=second.size, method=None)
     pooled = np.concatenate([first, second])
     is_exact = min(first.size, second.size) <= EXACT_SAMPLE_SIZE and np.unique(pooled).size == pooled.size
     test = scipy.stats.mannwhitneyu(first, second, alternative="two-sided", method="exact" if is_exact else "asymptotic")
@@ -66,8 +66,8 @@ def compare_samples(x: ArrayLike, y: ArrayLike) -> TwoSampleTest:
 
 def magnitude_of(effect_size: float) -> str:
     """The magnitude of an effect size, by Kitchenham's intervals."""
-    distance = round(max(effect_size, 1 - effect_size), 12)
-    return next((name for limit, name in MAGNITUDES if distance >= limit), "negligible")
+    folded_effect = round(max(effect_size, 1 - effect_size), 12)
+    return next((name for limit, name in MAGNITUDES if folded_effect >= limit), "negligible")
 
 
 RQ1_COLUMNS = ["setting", "algorithm", "metric", "p_value", "effect_size", "magnitude", "n1", "n2", "method", "mean", "original"]
@@ -102,7 +102,7 @@ def rq1_rows(case: Case, sample_of: SampleFunction, test: Callable[[FloatArray, 
             sample, original = sample_of(algorithm, metric), case.original[metric.name]
             comparison = test(sample, original)
             rows.append({"setting": case.name, "algorithm": algorithm, "metric": metric.name,
-                         **(reverse_effect(comparison) if metric.more_is_unsafe else comparison)._asdict(), "runs": len(sample),
+                         **(reverse_effect(comparison) if metric.more_is_unsafe else comparison)._asdict(),
                          "mean": float(np.mean(sample)) if sample.size else None, "original": None if np.isnan(original) else original})
     return rows
 
@@ -128,12 +128,12 @@ def rq2(case: Case) -> pd.DataFrame:
     UnanswerableError
         If NSGA-II is missing, or there is no other algorithm.
     """
-    require_rq2(case)
+    require_rq2_algorithms(case)
     rows = rq2_rows(case, lambda algorithm, metric: defined_values(case.solutions_of(algorithm), metric))
     return pd.DataFrame(rows, columns=RQ2_COLUMNS, dtype=object)
 
 
-def require_rq2(case: Case) -> None:
+def require_rq2_algorithms(case: Case) -> None:
     """Raise `UnanswerableError` if NSGA-II is missing, or there is no other algorithm."""
     case.solutions_of(NSGA2)  # raises if there are none
     if all(name == NSGA2 for name in case.algorithms):
@@ -141,13 +141,13 @@ def require_rq2(case: Case) -> None:
 
 
 def rq2_rows(case: Case, sample_of: SampleFunction) -> list[dict[str, Any]]:
-    """Rows for each other algorithm: NSGA-II's indicators of runs and samples of metrics against the algorithm's, oriented as in `rq2`."""
-    quality = compute_indicators(case) if case.has_runs and len(case.solutions) else None
+    """For every other algorithm, a row for each indicator and metric: NSGA-II's values against that algorithm's, oriented as in `rq2`."""
+    indicators = compute_indicators(case) if case.has_runs and len(case.solutions) else None
     rows = []
     for baseline in (name for name in case.algorithms if name != NSGA2):
         pair = (NSGA2, baseline)
         tests = [(name, not more_is_better, compare_samples(*(
-            [] if quality is None else quality.loc[quality["algorithm"] == algorithm, name] for algorithm in pair)))
+            [] if indicators is None else indicators.loc[indicators["algorithm"] == algorithm, name] for algorithm in pair)))
             for name, more_is_better in MORE_IS_BETTER.items()]
         tests += [(metric.name, not metric.more_is_unsafe, compare_samples(*(sample_of(algorithm, metric) for algorithm in pair)))
                   for metric in case.scoring.metrics]

@@ -14,8 +14,8 @@ from safevar_sumo.analysis.research_questions.changes import ANY, critical_solut
 from safevar_sumo.analysis.research_questions.indicators import (
     REFERENCE_COORDINATE,
     compute_convergence,
+    defined_minimised_values,
     nondominated_points,
-    objective_values,
 )
 from safevar_sumo.metrics import F_DIFF, F_NUM_DIFF, F_SAFE, Objective
 from safevar_sumo.study import SAFETY_DEGREE
@@ -44,7 +44,7 @@ def draw_change_counts(cases: Sequence[Case]) -> Figure:
     Raises
     ------
     UnanswerableError
-        As `rq31`, for the first case that has no answer.
+        If `rq31` raises it for a case.
     """
     import seaborn as sns
 
@@ -70,7 +70,7 @@ def draw_changed_characteristics(case: Case) -> Figure:
     shares_by_number = shares.pivot(index="characteristic", columns="j", values="percent").astype(float)
     shares_by_number = shares_by_number.loc[order, list(dict.fromkeys(shares["j"]))].rename(index=escape_dollars)
     title = f"{case.name}: characteristics changed in critical solutions"
-    figure, ((axis,),) = new_figure(title, 1, 1, (7.6, 1.4 + 0.3 * len(shares_by_number)))
+    figure, ((axis,),) = new_figure(title, rows=1, columns=1, size=(7.6, 1.4 + 0.3 * len(shares_by_number)))
     sns.heatmap(shares_by_number, ax=axis, cmap="cividis", vmin=0, vmax=100, annot=True, fmt=".0f", annot_kws={"fontsize": 7},
                 linewidths=0.5, cbar_kws={"label": "critical solutions\nin which it is changed [%]"})
     axis.grid(visible=False)
@@ -91,7 +91,7 @@ def draw_change_sizes(case: Case) -> Figure:
     changes = list_changes(case)
     characteristics = case.characteristics.members
     title = f"{case.name}: changes in critical solutions"
-    figure, axes = new_panels(title, len(characteristics), 4, (2.25, 1.85), min_width=9.0, title_height=1.0)
+    figure, axes = new_panels(title, len(characteristics), max_columns=4, panel_size=(2.25, 1.85), min_width=9.0, title_height=1.0)
     for axis, characteristic in zip(axes, characteristics, strict=True):
         change = changes.loc[changes["characteristic"] == characteristic.name, "change"]
         low, high = (float(f"{end - characteristic.original:.9g}") for end in (characteristic.lower, characteristic.upper))
@@ -130,7 +130,7 @@ def draw_pareto_fronts(case: Case) -> Figure:
     signs = [objective.sign for objective in objectives]
     fronts = {}
     for algorithm in case.algorithms:
-        points = objective_values(case, case.solutions_of(algorithm))
+        points = defined_minimised_values(case, case.solutions_of(algorithm))
         if len(points):
             fronts[algorithm] = nondominated_points(points) * signs
     if not fronts:
@@ -169,7 +169,7 @@ def _original_value(case: Case, objective: Objective) -> float:
 def draw_convergence(case: Case) -> Figure:
     """Convergence: the hypervolume of all settings so far over the number of evaluations, as median and range over the runs."""
     growth = compute_convergence(case)
-    figure, ((axis,),) = new_figure(f"{case.name}: convergence", 1, 1, (6.4, 4.0))
+    figure, ((axis,),) = new_figure(f"{case.name}: convergence", rows=1, columns=1, size=(6.4, 4.0))
     for i, (algorithm, group) in enumerate(growth.groupby("algorithm", sort=False)):
         statistics = group.groupby("evaluations")["hypervolume"].agg(["min", "median", "max"])
         colour = COLOURS[i % len(COLOURS)]

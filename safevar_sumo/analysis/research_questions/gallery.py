@@ -46,7 +46,7 @@ def draw_figures(cases: Sequence[Case]) -> tuple[dict[str, Figure], list[str]]:
     figures, all_errors = {}, []
     is_single = len(cases) == 1
     for name, draw_cases in FIGURES_OF_ALL_CASES.items():
-        answerable_cases, errors = _answerable_cases(cases)
+        answerable_cases, errors = _select_answerable(cases)
         all_errors += errors
         if answerable_cases:
             figures[name] = draw_cases(answerable_cases)
@@ -63,7 +63,7 @@ def draw_figures(cases: Sequence[Case]) -> tuple[dict[str, Figure], list[str]]:
     return figures, list(dict.fromkeys(f"{error.source}: {error.problem}" for error in all_errors))
 
 
-def _answerable_cases(cases: Sequence[Case]) -> tuple[list[Case], list[UnanswerableError]]:
+def _select_answerable(cases: Sequence[Case]) -> tuple[list[Case], list[UnanswerableError]]:
     """The cases that have an answer to RQ3.1, and the errors of the others."""
     answerable_cases, errors = [], []
     for case in cases:
@@ -75,7 +75,7 @@ def _answerable_cases(cases: Sequence[Case]) -> tuple[list[Case], list[Unanswera
     return answerable_cases, errors
 
 
-def save_figures(cases: Sequence[Case], directory: Path, kind: str) -> tuple[list[Path], list[str]]:
+def save_figures(cases: Sequence[Case], directory: Path, file_format: str) -> tuple[list[Path], list[str]]:
     """Draw every figure into a file; returns the files, and the reasons for missing figures.
 
     Raises
@@ -86,7 +86,7 @@ def save_figures(cases: Sequence[Case], directory: Path, kind: str) -> tuple[lis
     figures, reasons = draw_figures(cases)
     files = []
     for name, figure in figures.items():
-        path = directory / f"{_file_name(f'{cases[0].name}-{name}' if len(cases) == 1 else name)}.{kind}"
+        path = directory / f"{_file_name(f'{cases[0].name}-{name}' if len(cases) == 1 else name)}.{file_format}"
         directory.mkdir(parents=True, exist_ok=True)
         save(figure, path)
         files.append(path)

@@ -26,7 +26,7 @@ def titles_of(metrics: Iterable[MetricFacts]) -> dict[str, str]:
 
 
 def nondominated_points(points: FloatArray) -> FloatArray:
-    """The distinct non-dominated points for minimisation of m objectives, with shape (M, m)."""
+    """The distinct non-dominated points for minimisation, with shape (points, objectives)."""
     return np.asarray(moocore.filter_dominated(_check_points(points, "the set of points")))
 
 
@@ -62,13 +62,14 @@ class Scale(NamedTuple):
         return np.asarray((points - self.ideal) / self.width)
 
 
-def objective_values(case: Case, frame: pd.DataFrame) -> FloatArray:
-    """The objectives' values, smaller being better, of the rows in which all of them are defined, with shape (M, objectives)."""
-    points = _signed_objective_values(case, frame)
+def defined_minimised_values(case: Case, frame: pd.DataFrame) -> FloatArray:
+    """The objectives' values, smaller being better, of the rows in which all of them are defined; shape (points, objectives)."""
+    points = _minimised_values(case, frame)
     return np.asarray(points[np.isfinite(points).all(axis=1)])
 
 
-def _signed_objective_values(case: Case, frame: pd.DataFrame) -> FloatArray:
+def _minimised_values(case: Case, frame: pd.DataFrame) -> FloatArray:
+    """The objectives' values, smaller being better; NaN where undefined."""
     signs = [objective.sign for objective in case.scoring.objectives]
     return np.asarray(frame[[objective.name for objective in case.scoring.objectives]].to_numpy(dtype=float) * signs)
 
@@ -81,7 +82,7 @@ def reference_front(case: Case) -> FloatArray:
     UnanswerableError
         If there is no solution.
     """
-    points = objective_values(case, case.solutions)
+    points = defined_minimised_values(case, case.solutions)
     if not len(points):
         raise UnanswerableError(case.name, "has no solution", "results with at least one finished run")
     return nondominated_points(points)
@@ -102,7 +103,7 @@ def compute_indicators(case: Case) -> pd.DataFrame:
     scaled_reference = scale.normalised(reference)
     by_run = dict(list(case.solutions.groupby(["algorithm", "run"])))
     for algorithm, run in runs:
-        front = objective_values(case, by_run[algorithm, run]) if (algorithm, run) in by_run else np.zeros((0, 0))
+        front = defined_minimised_values(case, by_run[algorithm, run]) if (algorithm, run) in by_run else np.zeros((0, 0))
         if len(front):
             scaled_front = scale.normalised(front)
             rows.append((algorithm, run, igd(front, reference), igd_plus(scaled_front, scaled_reference), hypervolume(scaled_front)))
@@ -134,7 +135,7 @@ def compute_convergence(case: Case, curve_points: int = 50) -> pd.DataFrame:
 
 def _hypervolumes_after(case: Case, evaluations: pd.DataFrame, scale: Scale, evaluation_counts: np.ndarray) -> list[float]:
     """Hypervolume of the first k evaluations, for each count k."""
-    scaled_points = scale.normalised(_signed_objective_values(case, evaluations))
+    scaled_points = scale.normalised(_minimised_values(case, evaluations))
     is_defined = np.isfinite(scaled_points).all(axis=1)
     scaled_points, evaluation_indices = scaled_points[is_defined], evaluations["evaluation"].to_numpy()[is_defined]
     ends = np.searchsorted(evaluation_indices, evaluation_counts, side="left")
@@ -150,7 +151,7 @@ def _check_points(points: FloatArray, name: str) -> FloatArray:
     """Refuse empty sets and undefined points, for which indicators would return their best value."""
     array = np.asarray(points, dtype=float)
     if array.ndim != 2 or not array.size:
-        raise InputError(name, "is empty", "at least one point, shape (M, m)")
+        raise InputError(name, "is empty or has not two dimensions", "at least one point, shape (points, objectives)")
     if not np.isfinite(array).all():
         raise InputError(name, "holds an undefined value", "points with finite objectives")
     return array

@@ -73,7 +73,7 @@ Layouts = Mapping[str, Callable[[Answer], list[Table]]]
 def lay_out(answer: Answer, layouts: Layouts | None = None) -> list[Table]:
     """The tables of an answer; for an empty answer a table with the reason."""
     if answer.frame.empty:
-        return [Table(TITLES[answer.name], (), [], 0, (), answer.notes)]
+        return [Table(TITLES[answer.name], headings=(), rows=[], label_count=0, notes=answer.notes)]
     tables = (layouts or LAYOUTS)[answer.name](answer)
     return [*tables[:-1], tables[-1]._replace(notes=(*tables[-1].notes, *answer.notes))]
 
@@ -81,10 +81,10 @@ def lay_out(answer: Answer, layouts: Layouts | None = None) -> list[Table]:
 def pivot_table(title: str, frame: pd.DataFrame, labels: Sequence[str], cells: Callable[[Row], Sequence[str]],
                 headings: Sequence[str] = (), *, over: str = "setting", names: Mapping[str, str] | None = None,
                 notes: Sequence[str] = ()) -> Table:
-    """A row for each combination of `labels`, and a block of cells for each value of the column `over`, by default each case.
+    """Make a row for each combination of `labels`, and a block of columns for each value of the column `over`, by default each case.
 
-    Each block has one column per heading, below the value of `over` as a spanning heading; without `headings` a block is one column under
-    that value. `names` are titles for the values of labels.
+    A block has one column per heading, below the value of `over` as a spanning heading. Without `headings` a block is one column, headed
+    by that value. `cells` makes the cells of one row and block; `names` are titles for the values of labels.
     """
     blocks = list(dict.fromkeys(frame[over]))
     keys = list(zip(*(frame[label] for label in labels), strict=True))
@@ -93,7 +93,8 @@ def pivot_table(title: str, frame: pd.DataFrame, labels: Sequence[str], cells: C
     rows = [(*((names or {}).get(label, label) for label in key), *(cell for block in blocks for cell in cells_at.get((key, block), gaps)))
             for key in dict.fromkeys(keys)]
     spans = tuple((block, len(headings)) for block in blocks) if headings else ()
-    return Table(title, (*labels, *(tuple(headings) * len(blocks) or blocks)), rows, len(labels), spans, tuple(notes))
+    return Table(title, (*labels, *(tuple(headings) * len(blocks) or blocks)), rows, label_count=len(labels), spans=spans,
+                 notes=tuple(notes))
 
 
 def layout_by_case(layout: Callable[[str, pd.DataFrame], list[Table]]) -> Callable[[Answer], list[Table]]:
@@ -122,34 +123,34 @@ def _titles(answer: Answer) -> dict[str, str]:
     return {**ALGORITHM_TITLES, **titles_of(answer.metrics)}
 
 
-def _lay_out_tests(answer: Answer, group_column: str, sizes: tuple[str, ...], notes: tuple[str, ...]) -> Table:
+def _lay_out_tests(answer: Answer, group_column: str, size_columns: tuple[str, ...], notes: tuple[str, ...]) -> Table:
     """P-values (also with Holm's correction if the answer is over runs) and effect sizes; one block of columns per case."""
     frame, methods = answer.frame, set(answer.frame["method"])
     has_holm = "p_holm" in frame
     marks = {} if has_holm else {EXACT_TEST: "e"}
     method_notes = [f"p{f' with {marks[method]}' if method in marks else ''}: {method}."
                     for method in (EXACT_SIGNED_TEST, ASYMPTOTIC_SIGNED_TEST, ASYMPTOTIC_TEST, EXACT_TEST) if method in methods]
-    return pivot_table(TITLES[answer.name], frame, (group_column, "metric"), lambda row: _format_test_cells(row, sizes, marks),
-                       ("p", *(("p Holm",) if has_holm else ()), "A12", "magnitude", *sizes), names=_titles(answer),
+    return pivot_table(TITLES[answer.name], frame, (group_column, "metric"), lambda row: _format_test_cells(row, size_columns, marks),
+                       ("p", *(("p Holm",) if has_holm else ()), "A12", "magnitude", *size_columns), names=_titles(answer),
                        notes=(*method_notes, *notes, HOLM_NOTE if has_holm else BOLD_NOTE))
 
 
-def _format_test_cells(row: Row, sizes: Sequence[str] = (), marks: Mapping[str, str] = MappingProxyType({})) -> tuple[str, ...]:
+def _format_test_cells(row: Row, size_columns: Sequence[str] = (), marks: Mapping[str, str] = MappingProxyType({})) -> tuple[str, ...]:
     """P-value with a mark for its method, Holm's p-value if the row has one, effect size, magnitude, sizes of the samples."""
     has_holm = "p_holm" in row
     if pd.isna(row["p_value"]):
-        return (UNDEFINED,) * (3 + has_holm + len(sizes))
+        return (UNDEFINED,) * (3 + has_holm + len(size_columns))
     is_significant = row["p_holm" if has_holm else "p_value"] < ALPHA
     p = format_p_value(row["p_value"]) + marks.get(row["method"], "")
     effect = _bold_if(f"{row['effect_size']:.3f}", is_significant and (has_holm or row["magnitude"] in NOTABLE_MAGNITUDES))
     tests = (p, _bold_if(format_p_value(row["p_holm"]), is_significant)) if has_holm else (_bold_if(p, is_significant),)
-    return (*tests, effect, row["magnitude"], *(str(row[size]) for size in sizes))
+    return (*tests, effect, row["magnitude"], *(str(row[column]) for column in size_columns))
 
 
 def _lay_out_rq1(answer: Answer) -> list[Table]:
     frame, metrics, names = answer.frame, answer.metrics, _titles(answer)
-    sizes = ("n1", "n2") if frame["setting"].nunique() == 1 else ()
-    test = _lay_out_tests(answer, "algorithm", sizes, (
+    size_columns = ("n1", "n2") if frame["setting"].nunique() == 1 else ()
+    test = _lay_out_tests(answer, "algorithm", size_columns, (
         "A12 below 0.5: the algorithm's solutions are more unsafe than the original vehicle,",
         "whose value is repeated to the sample's size.", non_collision_note(metrics)))
     cases, headings = list(dict.fromkeys(frame["setting"])), tuple(metric.title for metric in metrics)
@@ -158,13 +159,13 @@ def _lay_out_rq1(answer: Answer) -> list[Table]:
     rows = [(names.get(name, name), *(_format_number(means.get((case, name, metric.name)), ".2f")
                                       for case in cases for metric in metrics))
             for name in ("original", *dict.fromkeys(frame["algorithm"]))]
-    return [test, Table("RQ1: mean metrics", ("vehicle", *headings * len(cases)), rows, 1,
-                        tuple((case, len(headings)) for case in cases), (units_note(metrics), non_collision_note(metrics)))]
+    return [test, Table("RQ1: mean metrics", ("vehicle", *headings * len(cases)), rows, label_count=1,
+                        spans=tuple((case, len(headings)) for case in cases), notes=(units_note(metrics), non_collision_note(metrics)))]
 
 
 def _lay_out_rq2(answer: Answer) -> list[Table]:
-    sizes = ("n1", "n2") if answer.frame["setting"].nunique() == 1 else ()
-    return [_lay_out_tests(answer, "baseline", sizes, (
+    size_columns = ("n1", "n2") if answer.frame["setting"].nunique() == 1 else ()
+    return [_lay_out_tests(answer, "baseline", size_columns, (
         "A12 above 0.5: NSGA-II is better. IGD, IGD+ and HV compare runs; the other metrics compare pooled solutions.",
         non_collision_note(answer.metrics), "IGD on the objectives as they are, IGD+ and hypervolume (HV) on normalised ones."))]
 
@@ -202,7 +203,7 @@ def _lay_out_ranks(answer: Answer) -> list[Table]:
             rows.append((names.get(str(metric), str(metric)), *(_format_number(rank, ".2f") for rank in metric_rows["mean_rank"]),
                          _format_number(first["critical_difference"], ".2f"), p, _bold_if(holm, is_significant), str(first["runs"])))
         headings = ("metric", *(names.get(name, name) for name in algorithms), "critical difference", "p", "p Holm", "runs")
-        tables.append(Table(f"{TITLES['rq2-ranks']}: {case}", headings, rows, 1, notes=(
+        tables.append(Table(f"{TITLES['rq2-ranks']}: {case}", headings, rows, label_count=1, notes=(
             "p: Friedman's test; runs with the same number form a block. Holm's correction is for all metrics of a case.",
             f"Mean ranks that differ by less than the critical difference are not distinguished (Nemenyi, {ALPHA:g}).",
             non_collision_note(answer.metrics))))
@@ -257,7 +258,7 @@ def _lay_out_safety(case: str, group: pd.DataFrame) -> list[Table]:
         rows.append((SAFETY_UNITS[name], *cells))
         if name != "avgSD_cS":
             rows.append(("  % of the original", *percent))
-    return [Table(f"{TITLES[SAFETY_TABLE]}: {case}", ("mean of", *values.headings[1:]), rows, 1, notes=(
+    return [Table(f"{TITLES[SAFETY_TABLE]}: {case}", ("mean of", *values.headings[1:]), rows, label_count=1, notes=(
         "Without collisions: avgSD_mD is the reduction of the distance, TET and TIT are increases.",
         "avgSD_cS is the speed of the collisions. aveDece is the decrease over all solutions."))]
 
@@ -271,7 +272,7 @@ def _lay_out_collisions(answer: Answer) -> list[Table]:
 def _lay_out_combinations(answer: Answer) -> list[Table]:
     rows: list[tuple[str, ...]] = [(row["setting"], str(row["rank"]), ", ".join(row["characteristics"]), f"{row['percent']:.1f}")
                                    for row in answer.frame.to_dict("records")]
-    return [Table(TITLES["combinations"], ("case", "rank", "characteristics", "%"), rows, 3,
+    return [Table(TITLES["combinations"], ("case", "rank", "characteristics", "%"), rows, label_count=3,
                   notes=("Percent of the critical solutions with exactly four characteristics changed.",))]
 
 
@@ -281,9 +282,9 @@ def _lay_out_weather(answer: Answer) -> list[Table]:
         rows = [(row["characteristic"], *(_format_number(row[name], spec) for name, spec in WEATHER_COLUMNS.items()))
                 for row in group.to_dict("records")]
         tables.append(Table(f"{TITLES['weather']}: {case} against {other_case}",
-                            ("characteristic", str(case), str(other_case), "diff.", *(str(case), str(other_case)) * 3), rows, 1,
-                            (("% changed", 3), ("rank", 2), ("mean increase", 2), ("mean decrease", 2)),
-                            ("Over the critical solutions; increase and decrease in the characteristic's unit.",)))
+                            ("characteristic", str(case), str(other_case), "diff.", *(str(case), str(other_case)) * 3), rows,
+                            label_count=1, spans=(("% changed", 3), ("rank", 2), ("mean increase", 2), ("mean decrease", 2)),
+                            notes=("Over the critical solutions; increase and decrease in the characteristic's unit.",)))
     return tables
 
 
@@ -309,8 +310,8 @@ def _lay_out_paper_combinations(answer: Answer) -> list[Table]:
     rows = [(name, *(CONTAINED_MARK if name in row["characteristics"] else "" for row in records)) for name in names]
     rows.append(("% of solutions", *(f"{row['percent']:.1f}" for row in records)))
     spans = tuple((case, sum(row["setting"] == case for row in records)) for case in dict.fromkeys(answer.frame["setting"]))
-    return [Table(TITLES["combinations"], ("characteristic", *(f"#{row['rank']}" for row in records)), rows, 1, spans,
-                  ("Percent of the critical solutions with exactly four characteristics changed; #: rank.",))]
+    return [Table(TITLES["combinations"], ("characteristic", *(f"#{row['rank']}" for row in records)), rows, label_count=1,
+                  spans=spans, notes=("Percent of the critical solutions with exactly four characteristics changed; #: rank.",))]
 
 
 def _bold_if(cell: str, is_bold: bool) -> str:

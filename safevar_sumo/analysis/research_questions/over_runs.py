@@ -22,7 +22,7 @@ from safevar_sumo.analysis.research_questions.comparisons import (
     ALPHA,
     TwoSampleTest,
     magnitude_of,
-    require_rq2,
+    require_rq2_algorithms,
     rq1,
     rq1_rows,
     rq2,
@@ -33,8 +33,8 @@ from safevar_sumo.analysis.words import number_of
 from safevar_sumo.metrics import MetricFacts
 from safevar_sumo.records import FloatArray
 
-RQ1_COLUMNS = ["setting", "algorithm", "metric", "p_value", "p_holm", "effect_size", "magnitude", "runs", "method", "mean", "original"]
-RQ2_COLUMNS = ["setting", "baseline", "metric", "p_value", "p_holm", "effect_size", "magnitude", "n1", "n2", "method"]
+RQ1_RUNS_COLUMNS = ["setting", "algorithm", "metric", "p_value", "p_holm", "effect_size", "magnitude", "runs", "method", "mean", "original"]
+RQ2_RUNS_COLUMNS = ["setting", "baseline", "metric", "p_value", "p_holm", "effect_size", "magnitude", "n1", "n2", "method"]
 EXACT_SIGNED_TEST = "Wilcoxon signed-rank, two-sided, exact"
 ASYMPTOTIC_SIGNED_TEST = "Wilcoxon signed-rank, two-sided, normal approximation with correction for continuity"
 MAX_EXACT_RUNS = 50
@@ -44,9 +44,9 @@ MAX_EXACT_RUNS = 50
 def rq1_runs(case: Case) -> pd.DataFrame:
     """Every algorithm's run means against the original's value, metric by metric: Wilcoxon's signed-rank test.
 
-    Columns: `RQ1_COLUMNS`. `effect_size` is the share of runs whose mean is safer than the original's value, plus half the share of equal
-    ones (A12 against one value): below 0.5 the runs are less safe. `mean` is the mean of the run means. `p_holm` is `p_value` corrected by
-    Holm's method for all tests of RQ1 and RQ2 of this case. Undefined values are None.
+    Columns: `RQ1_RUNS_COLUMNS`. `effect_size` is the share of runs whose mean is safer than the original's value, plus half the share of
+    equal ones (A12 against one value): below 0.5 the runs are less safe. `mean` is the mean of the run means. `p_holm` is `p_value`
+    corrected by Holm's method for all tests of RQ1 and RQ2 of this case. Undefined values are None.
 
     Raises
     ------
@@ -57,9 +57,9 @@ def rq1_runs(case: Case) -> pd.DataFrame:
 
 
 def rq2_runs(case: Case) -> pd.DataFrame:
-    """NSGA-II's runs against those of every other algorithm: indicators and metrics' run means, Mann-Whitney U.
+    """Compare NSGA-II with every other algorithm by Mann-Whitney U, with one value per run: indicators, and metrics' means over solutions.
 
-    Columns: `RQ2_COLUMNS`. `effect_size` is A12, oriented as in `rq2`; `n1` and `n2` count runs; `p_holm` as in `rq1_runs`.
+    Columns: `RQ2_RUNS_COLUMNS`. `effect_size` is A12, oriented as in `rq2`; `n1` and `n2` count runs; `p_holm` is defined as in `rq1_runs`.
 
     Raises
     ------
@@ -67,7 +67,7 @@ def rq2_runs(case: Case) -> pd.DataFrame:
         If the solutions belong to no run, NSGA-II is missing, or there is no other algorithm.
     """
     frame = _corrected_frames(case)[1]
-    require_rq2(case)
+    require_rq2_algorithms(case)
     assert frame is not None
     return frame
 
@@ -88,17 +88,19 @@ def signed_rank_test(sample: FloatArray, value: float) -> TwoSampleTest:
     The test drops values equal to `value` (as Wilcoxon did); the effect size counts them by half.
     """
     if not sample.size or np.isnan(value):
-        return TwoSampleTest(None, None, None, len(sample), 0, None)
+        return TwoSampleTest(p_value=None, effect_size=None, magnitude=None, n1=len(sample), n2=0, method=None)
     differences = sample - value
     absolute_differences = np.abs(differences[differences != 0])
     effect = float(np.mean(differences > 0) + np.mean(differences == 0) / 2)
     if not absolute_differences.size:
-        return TwoSampleTest(1.0, effect, magnitude_of(effect), len(sample), 1, EXACT_SIGNED_TEST)
+        return TwoSampleTest(p_value=1.0, effect_size=effect, magnitude=magnitude_of(effect), n1=len(sample), n2=1,
+                             method=EXACT_SIGNED_TEST)
     has_ties_or_zeros = np.unique(absolute_differences).size < len(sample)
     is_exact = not has_ties_or_zeros and len(sample) <= MAX_EXACT_RUNS
     test = scipy.stats.wilcoxon(differences, alternative="two-sided", correction=not is_exact, method="exact" if is_exact else "approx")
     method = EXACT_SIGNED_TEST if is_exact else ASYMPTOTIC_SIGNED_TEST
-    return TwoSampleTest(float(test.pvalue), effect, magnitude_of(effect), len(sample), 1, method)
+    return TwoSampleTest(p_value=float(test.pvalue), effect_size=effect, magnitude=magnitude_of(effect), n1=len(sample), n2=1,
+                         method=method)
 
 
 def fewest_runs(question: str) -> int:
@@ -109,7 +111,7 @@ def fewest_runs(question: str) -> int:
     return next(n for n in range(1, 100) if 2 / (2**n if question == "RQ1" else math.comb(2 * n, n)) < ALPHA)
 
 
-def pooling_effect_line(case: Case, questions: Collection[str] = ("RQ1", "RQ2")) -> str:
+def significance_change_line(case: Case, questions: Collection[str] = ("RQ1", "RQ2")) -> str:
     """One line: the tests of these questions that are significant (p < ALPHA) only for the paper's pooled solutions, or only over runs.
 
     Example: "... 2 tests are no longer significant (RQ2 SafeFuzzer: TET, TIT)."
@@ -117,11 +119,12 @@ def pooling_effect_line(case: Case, questions: Collection[str] = ("RQ1", "RQ2"))
     Raises
     ------
     UnanswerableError
-        As `rq1_runs`.
+        If `rq1_runs` raises it.
     """
     titles = titles_of(case.scoring.metrics)
-    rq1_frame, rq2_frame = _corrected_frames(case)
-    comparisons = [("RQ1", "algorithm", rq1(case), rq1_frame), *([] if rq2_frame is None else [("RQ2", "baseline", rq2(case), rq2_frame)])]
+    rq1_runs_frame, rq2_runs_frame = _corrected_frames(case)
+    comparisons = [("RQ1", "algorithm", rq1(case), rq1_runs_frame), *(
+        [] if rq2_runs_frame is None else [("RQ2", "baseline", rq2(case), rq2_runs_frame)])]
     changes: dict[str, dict[str, list[str]]] = {"no longer": {}, "now": {}}
     test_count = 0
     for question, group_column, pooled_frame, runs_frame in comparisons:
@@ -141,13 +144,13 @@ def pooling_effect_line(case: Case, questions: Collection[str] = ("RQ1", "RQ2"))
 
 
 def notes_on_runs(case: Case, question: str) -> list[str]:
-    """Notes on the table of RQ1 or RQ2 over runs: `pooling_effect_line`, and a warning if there are too few runs for a test."""
+    """Notes on the table of RQ1 or RQ2 over runs: `significance_change_line`, and a warning if there are too few runs for a test."""
     frame = _corrected_frames(case)[question != "RQ1"]
     if frame is None:
         return []
     tests = frame[frame["p_value"].notna()]
     is_untestable = tests[["runs"] if question == "RQ1" else ["n1", "n2"]].min(axis=1) < fewest_runs(question)
-    lines = [] if is_untestable.all() else [pooling_effect_line(case, (question,))]
+    lines = [] if is_untestable.all() else [significance_change_line(case, (question,))]
     if is_untestable.any():
         lines.append(f"too few runs for {number_of(int(is_untestable.sum()), 'test')} ({fewest_runs(question)} runs are needed): "
                      "no difference there can be significant.")
@@ -155,9 +158,9 @@ def notes_on_runs(case: Case, question: str) -> list[str]:
 
 
 def summary_lines(case: Case) -> list[str]:
-    """Lines on RQ1 and RQ2 for the end of a study: effect sizes over runs, significant ones with an asterisk, and `pooling_effect_line`.
+    """Lines on RQ1 and RQ2 for the end of a study: effect sizes over runs, significant ones with an asterisk.
 
-    A line says so if there are too few runs for a significant difference.
+    A line says so if there are too few runs for a significant difference. The last line is `significance_change_line`.
     """
     titles = titles_of(case.scoring.metrics)
     lines, any_testable = [], False
@@ -177,25 +180,25 @@ def summary_lines(case: Case) -> list[str]:
             untestable = [titles[row["metric"]] for row in defined_rows
                           if min(row[column] for column in count_columns) < fewest_runs(question)]
             any_testable = any_testable or len(untestable) < len(defined_rows)
-            subject = "" if len(untestable) == len(defined_rows) else f"{', '.join(untestable)}: "
-            note = f"; {subject}too few runs for a test ({fewest_runs(question)} are needed)" if untestable else ""
+            named_metrics = "" if len(untestable) == len(defined_rows) else f"{', '.join(untestable)}: "
+            note = f"; {named_metrics}too few runs for a test ({fewest_runs(question)} are needed)" if untestable else ""
             effects = ", ".join(f"{titles[row['metric']]} " + ("-" if row["effect_size"] is None or row["p_holm"] is None else
                                 f"{row['effect_size']:.2f}{'*' if row['p_holm'] < ALPHA else ''}") for row in rows)
             lines.append(f"{heading.format(ALGORITHM_TITLES.get(str(name), name))}{effects}{note}")
-    return [*lines, pooling_effect_line(case)] if any_testable else lines
+    return [*lines, significance_change_line(case)] if any_testable else lines
 
 
 def _corrected_frames(case: Case) -> tuple[pd.DataFrame, pd.DataFrame | None]:
     """The frames of RQ1 and RQ2 over runs, with p-values corrected as one family; None if RQ2 has no answer."""
     case.require_solutions()
     means = partial(run_means, case)
-    rows_of_rq1 = rq1_rows(case, means, signed_rank_test)
+    rows_of_rq1 = [{**row, "runs": row["n1"]} for row in rq1_rows(case, means, signed_rank_test)]
     has_rq2 = NSGA2 in case.algorithms and len(case.algorithms) > 1
     rows_of_rq2 = rq2_rows(case, means) if has_rq2 else []
     for row, p in zip([*rows_of_rq1, *rows_of_rq2], correct_by_holm([row["p_value"] for row in [*rows_of_rq1, *rows_of_rq2]]), strict=True):
         row["p_holm"] = p
-    return (pd.DataFrame(rows_of_rq1, columns=RQ1_COLUMNS, dtype=object),
-            pd.DataFrame(rows_of_rq2, columns=RQ2_COLUMNS, dtype=object) if has_rq2 else None)
+    return (pd.DataFrame(rows_of_rq1, columns=RQ1_RUNS_COLUMNS, dtype=object),
+            pd.DataFrame(rows_of_rq2, columns=RQ2_RUNS_COLUMNS, dtype=object) if has_rq2 else None)
 
 
 def run_means(case: Case, algorithm: str, metric: MetricFacts) -> FloatArray:
@@ -211,7 +214,8 @@ def run_means(case: Case, algorithm: str, metric: MetricFacts) -> FloatArray:
 
 def run_mean_series(case: Case, algorithm: str, metric: MetricFacts) -> pd.Series[float]:
     """The means of `run_means`, indexed by the run's number."""
-    run_numbers, solutions = case.runs_of(algorithm), solutions_for_metric(case.solutions_of(algorithm), metric)
+    run_numbers = case.runs_of(algorithm)
+    solutions = solutions_for_metric(case.solutions_of(algorithm), metric)  # for TET and TIT without collisions
     runs, column = solutions["run"].to_numpy(), solutions[metric.name].to_numpy(dtype=float)
     defined = ~np.isnan(column)
     samples = {run: column[defined & (runs == run)] for run in run_numbers}

@@ -1,6 +1,6 @@
 """How likely is an unsafe outcome when vehicles vary as a study specifies, and which characteristic decides?
 
-The options and the function of the library are defined here, so that a command's help can be shown without loading the computation.
+The command's options and the Python function `risk` are defined here, so that help can be shown without loading the computation.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ RARE_BELOW = 1e-2
 PILOT_VEHICLES = 1000
 """Number of vehicles first drawn by plain Monte Carlo, whose outcomes decide the method."""
 ENOUGH_FAILURES = 100
-"""Plain Monte Carlo is kept if, at the pilot's rate, all requested vehicles would have at least this many failures."""
+"""Plain Monte Carlo is kept if at least this many failures are to be expected among all requested vehicles, by the pilot's share."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,7 +65,7 @@ def risk(study: StudyLike | Results, *, samples: int = RiskOptions.samples, conf
          width: float | None = RiskOptions.width, unsafe: Criterion | None = None, method: str = RiskOptions.method,
          rare: bool = RiskOptions.rare, pool: Pool | None = None, jobs: int | None = None, progress: bool | Progress = False,
          as_it_is_now: bool = False) -> Risk:
-    """Estimate how likely an unsafe outcome is when vehicles vary as the study says, and which characteristic decides.
+    """Estimate how likely an unsafe outcome is when vehicles vary as the study says, and which characteristic decides whether one occurs.
 
     Parameters
     ----------
@@ -74,4 +74,4 @@ def risk(study: StudyLike | Results, *, samples: int = RiskOptions.samples, conf
     """
     from safevar_sumo.analysis.risk.compute import estimate_risk
 
-    return answer_question(estimate_risk, study_of(study, as_it_is_now=as_it_is_now), RiskOptions, locals())
+    return answer_question(estimate_risk, study_of(study, as_it_is_now=as_it_is_now), RiskOptions, locals())  # the arguments

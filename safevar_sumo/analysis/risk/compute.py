@@ -13,7 +13,7 @@ import scipy
 
 from safevar_sumo.analysis.evaluator import Evaluator, Progress, clopper_pearson, open_evaluator, show_no_progress
 from safevar_sumo.analysis.risk import ENOUGH_FAILURES, PILOT_VEHICLES, RARE_BELOW, RiskOptions
-from safevar_sumo.analysis.risk.rare import Estimate, PlateauError, Response, estimate_rare, is_plateau, load_openturns
+from safevar_sumo.analysis.risk.rare import Estimate, RareMethodError, Response, estimate_rare, is_plateau, load_openturns
 from safevar_sumo.errors import InputError, SimulationError
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import FloatArray, finite_or_none
@@ -167,7 +167,7 @@ class Risk:
     remark: str
 
     @property
-    def of_domain(self) -> bool:
+    def is_share_of_domain(self) -> bool:
         """Whether the probability is a share of the domain, because the study does not say how vehicles vary."""
         return not self.study.variation
 
@@ -221,11 +221,11 @@ def estimate_risk(study: Study, options: RiskOptions, *, pool: Pool | None = Non
         unsafe = evaluator.choose_criterion(options.unsafe)
         simulated_before = evaluator.simulated
         response = Response(evaluator, model.settings_of_normal, unsafe)
-        counts = _draw_vehicles(evaluator, model, unsafe, options, response)
-        if isinstance(counts, Estimate):
-            estimate, method = counts, _rare_method(options)
+        counts_or_estimate = _draw_vehicles(evaluator, model, unsafe, options, response)
+        if isinstance(counts_or_estimate, Estimate):
+            estimate, method = counts_or_estimate, _rare_method(options)
         else:
-            estimate, method = counts.estimate(options.confidence), "monte_carlo"
+            estimate, method = counts_or_estimate.estimate(options.confidence), "monte_carlo"
         lacks_indices = model.is_correlated or bool(evaluator.region) or options.requires_rare_method
         sensitivity, sensitivity_of_unsafe = (
             (None, None) if lacks_indices else compute_sensitivities(evaluator, model, unsafe, options.confidence))
@@ -234,7 +234,7 @@ def estimate_risk(study: Study, options: RiskOptions, *, pool: Pool | None = Non
         study=study, unsafe=unsafe, samples=estimate.simulations - estimate.errors, failures=estimate.failures, errors=estimate.errors,
         confidence=options.confidence, sensitivity=sensitivity, sensitivity_of_unsafe=sensitivity_of_unsafe,
         probability=estimate.probability, interval=estimate.interval, method=method, simulations=simulated_before + estimate.simulations,
-        coefficient_of_variation=estimate.variation, remark=estimate.remark,
+        coefficient_of_variation=estimate.coefficient_of_variation, remark=estimate.remark,
         design_point=None if design_setting is None else dict(zip(evaluator.characteristics.names, design_setting.tolist(), strict=True)))
 
 
@@ -249,10 +249,10 @@ class _VehicleCounts:
 
     def estimate(self, confidence: float) -> Estimate:
         share = self.failures / self.vehicles
-        variation = float(np.sqrt((1 - share) / self.failures)) if self.failures else float("nan")
-        return Estimate(probability=share, variation=variation, interval=clopper_pearson(self.failures, self.vehicles, confidence),
-                        failures=self.failures, errors=self.errors, simulations=self.vehicles + self.errors, design_point=None,
-                        remark=self.remark)
+        coefficient = float(np.sqrt((1 - share) / self.failures)) if self.failures else float("nan")
+        return Estimate(probability=share, coefficient_of_variation=coefficient, failures=self.failures, errors=self.errors,
+                        interval=clopper_pearson(self.failures, self.vehicles, confidence), simulations=self.vehicles + self.errors,
+                        design_point=None, remark=self.remark)
 
 
 def _rare_method(options: RiskOptions) -> str:
@@ -275,7 +275,7 @@ def _draw_vehicles(evaluator: Evaluator, model: VariationModel, unsafe: Unsafe, 
         number = min(largest_number, requested - offset)
         probabilities = rng.random((number, len(evaluator.characteristics))) if is_pilot else None
         settings = _draw_feasible_vehicles(evaluator, model, number, rng) if probabilities is None else model.settings(probabilities)
-        evaluations = evaluator.evaluate(settings, "vehicles as they vary", offset, requested)
+        evaluations = evaluator.evaluate(settings, "vehicles as they vary", done_before=offset, total=requested)
         valid_vehicles = int(np.count_nonzero(evaluations.valid))
         counts.vehicles, counts.errors = counts.vehicles + valid_vehicles, counts.errors + number - valid_vehicles
         counts.failures += int(np.count_nonzero(unsafe.of(evaluations)))
@@ -313,8 +313,8 @@ def _try_rare_method(response: Response, responses: FloatArray, options: RiskOpt
         return None
     try:
         return estimate_rare(response, _rare_method(options), options.confidence, seed)
-    except PlateauError:
-        counts.remark = "the response is a plateau before failures, which methods for rare failures cannot cross; plain Monte Carlo is used"
+    except RareMethodError as error:
+        counts.remark = f"{error}; plain Monte Carlo is used"
         return None
 
 

@@ -42,6 +42,7 @@ MIN_RESPONSE = 1e-9
 """Smallest absolute value of a response, so that its sign always shows whether the vehicle is unsafe."""
 PLATEAU_SHARE = 0.5
 """The response is a plateau if at least this share of the vehicles nearest to failure have the same response."""
+PLATEAU = "the response is a plateau before failures, which methods for rare failures cannot cross"
 PATH_POINTS = 9
 """Number of points evaluated on the straight path between two failures."""
 COMPARED_FAILURES = 14
@@ -53,8 +54,8 @@ SettingsFunction = Callable[[FloatArray], FloatArray]
 """Turns points of standard normal space into settings."""
 
 
-class PlateauError(Exception):
-    """The response does not show which vehicles are nearer to failure."""
+class RareMethodError(Exception):
+    """A method for rare failures does not find its way to a failure; the text says why."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,7 +63,7 @@ class Estimate:
     """A probability, its coefficient of variation and interval, the most probable failure in standard normal space, and a remark."""
 
     probability: float
-    variation: float
+    coefficient_of_variation: float
     interval: tuple[float, float]
     failures: int
     errors: int
@@ -80,13 +81,13 @@ class Response:
         self.simulations = self.errors = self.failure_count = 0
         self.stage = "rare failures"
         self.expected_simulations = 1
-        self._failure_points: list[FloatArray] = []
+        self._failure_batches: list[FloatArray] = []
         """Points of unsafe vehicles in each call, shape (k, n) each."""
 
     @property
-    def failures(self) -> FloatArray:
+    def failure_points(self) -> FloatArray:
         """Distinct points of unsafe vehicles, shape (k, n)."""
-        return np.unique(np.concatenate([np.zeros((0, self.dimensions)), *self._failure_points]), axis=0)
+        return np.unique(np.concatenate([np.zeros((0, self.dimensions)), *self._failure_batches]), axis=0)
 
     def __call__(self, points: Any) -> FloatArray:
         """The response at points, shape (N, n)."""
@@ -103,7 +104,7 @@ class Response:
         self.simulations += len(points)
         self.errors += int(np.count_nonzero(~evaluations.valid))
         self.failure_count += int(np.count_nonzero(is_unsafe))
-        self._failure_points.append(points[is_unsafe])
+        self._failure_batches.append(points[is_unsafe])
         return np.where(is_unsafe, np.minimum(margin, -MIN_RESPONSE), np.maximum(margin, MIN_RESPONSE))
 
 
@@ -142,8 +143,8 @@ def estimate_rare(response: Response, method: str, confidence: float, seed: int)
 
     Raises
     ------
-    PlateauError
-        If the response does not show which vehicles are nearer to failure.
+    RareMethodError
+        If the response does not show which vehicles are nearer to failure, or cross-entropy sampling loses all failures.
     """
     estimate_once = _run_subset_simulation if method == "subset_simulation" else _run_cross_entropy
     probabilities, variations, thresholds = [], [], list[float]()
@@ -161,8 +162,8 @@ def estimate_rare(response: Response, method: str, confidence: float, seed: int)
                 response.expected_simulations = response.simulations * repeats // REPEATS
     mean = float(np.mean(probabilities))
     if mean <= 0:
-        return Estimate(probability=0.0, variation=math.nan, interval=(0.0, MIN_PROBABILITY), failures=response.failure_count,
-                        errors=response.errors, simulations=response.simulations, design_point=None,
+        return Estimate(probability=0.0, coefficient_of_variation=math.nan, interval=(0.0, MIN_PROBABILITY),
+                        failures=response.failure_count, errors=response.errors, simulations=response.simulations, design_point=None,
                         remark="no failure was found: either there is none, or the response does not lead to it")
     spread = float(np.std(probabilities, ddof=1)) / mean / math.sqrt(repeats)
     variation = max(spread, INFLATION * math.sqrt(float(np.mean(np.square(variations))) / repeats))
@@ -170,7 +171,7 @@ def estimate_rare(response: Response, method: str, confidence: float, seed: int)
     factor = math.exp(quantile * math.sqrt(math.log1p(variation**2)))
     rng = np.random.default_rng(seed)
     remark = _remark_on_islands(response, thresholds, rng)
-    return Estimate(probability=mean, variation=variation, interval=(mean / factor, min(mean * factor, 1.0)),
+    return Estimate(probability=mean, coefficient_of_variation=variation, interval=(mean / factor, min(mean * factor, 1.0)),
                     failures=response.failure_count, errors=response.errors, design_point=_find_design_point(response, rng), remark=remark,
                     simulations=response.simulations)
 
@@ -214,9 +215,13 @@ def _run_subset_simulation(response: Response, seed: int) -> tuple[float, float,
         if "variance estimate" not in str(error):
             raise
         return _run_subset_simulation(response, seed + 1)
+    except RuntimeError as error:  # the probability of a level is below MIN_PROBABILITY
+        if "estimate too small" not in str(error):
+            raise
+        return 0.0, 0.0, []
     thresholds = [float(value) for value in algorithm.getThresholdPerStep()]
     if is_stagnant:
-        raise PlateauError
+        raise RareMethodError(PLATEAU)
     if thresholds[-1] > 0:
         return 0.0, 0.0, thresholds
     result = algorithm.getResult()
@@ -224,14 +229,19 @@ def _run_subset_simulation(response: Response, seed: int) -> tuple[float, float,
 
 
 def _run_cross_entropy(response: Response, seed: int) -> tuple[float, float, list[float]]:
-    """As `_run_subset_simulation`, by cross-entropy importance sampling with one normal distribution of independent components."""
+    """Probability and coefficient of variation by cross-entropy importance sampling with independent normal variables; no thresholds."""
     ot = load_openturns()
     algorithm = ot.StandardSpaceCrossEntropyImportanceSampling(_failure_event(ot, response, response.dimensions), 2 * LEVEL_SHARE)
     algorithm.setBlockSize(LEVEL_SIZE)
     algorithm.setMaximumOuterSampling(1)
     algorithm.setMaximumCoefficientOfVariation(-1.0)
     ot.RandomGenerator.SetSeed(seed)
-    algorithm.run()
+    try:
+        algorithm.run()
+    except RuntimeError as error:
+        if "sumPdfCritic is equal to zero" not in str(error):
+            raise
+        raise RareMethodError("cross-entropy sampling lost all failures") from None
     result = algorithm.getResult()
     probability = float(result.getProbabilityEstimate())
     return probability, float(result.getCoefficientOfVariation()) if probability > 0 else 0.0, []
@@ -239,7 +249,7 @@ def _run_cross_entropy(response: Response, seed: int) -> tuple[float, float, lis
 
 def _remark_on_islands(response: Response, thresholds: list[float], rng: np.random.Generator) -> str:
     """A remark if failures lie on islands with safe settings between them: straight paths between islands do not stay near failure."""
-    failures = response.failures
+    failures = response.failure_points
     if len(failures) < 2:
         return ""
     nodes = _select_distant_points(failures[rng.permutation(len(failures))[:2000]])
@@ -271,9 +281,9 @@ def _select_distant_points(points: FloatArray) -> FloatArray:
 
 def _find_design_point(response: Response, rng: np.random.Generator) -> FloatArray | None:
     """The failure nearest to the origin, searched between the nearest known failure and the origin, and around that failure."""
-    if not len(response.failures):
+    if not len(response.failure_points):
         return None
-    nearest, response.stage = _nearest_point(response.failures), "most probable failure"
+    nearest, response.stage = _nearest_point(response.failure_points), "most probable failure"
     for search_round in range(SEARCH_ROUNDS):
         inner_points = nearest * np.linspace(0.5, 1.0, SEARCH_SETTINGS)[:, np.newaxis]
         random_points = (nearest * (1 - 0.05 * rng.random((SEARCH_SETTINGS, 1)))

@@ -27,7 +27,7 @@ def print_risk(console: Console, result: Risk) -> None:
     print_text(console, result.study.title)
     sampling = "" if result.method == "monte_carlo" else f", drawn by {result.method.replace('_', ' ')}"
     print_text(console, f"Unsafe: {result.unsafe.description}. {result.failures} of {result.samples} vehicles{sampling}.")
-    label = "Share of the domain that is unsafe:" if result.of_domain else "Probability"
+    label = "Share of the domain that is unsafe:" if result.is_share_of_domain else "Probability"
     print_text(console, f"{label} {result.probability:.4g}, with {100 * result.confidence:.0f} % confidence from {low:.4g} to {high:.4g}.")
     if result.remark:
         print_text(console, f"note: {result.remark}.")
@@ -35,10 +35,10 @@ def print_risk(console: Console, result: Risk) -> None:
         values = ", ".join(f"{characteristic.name} = {characteristic.text(result.design_point[characteristic.name])}{characteristic.suffix}"
                            for characteristic in CharacteristicSet.of(result.study.vehicle.characteristics))
         print_text(console, f"The most probable failure: {values}.")
-    if not result.of_domain and 0 < result.probability < RARE_BELOW:
+    if not result.is_share_of_domain and 0 < result.probability < RARE_BELOW:
         print_text(console, f"Of {FLEET_VEHICLES:,} vehicles that vary independently at least one is unsafe with probability "
                             f"{result.of_fleet(FLEET_VEHICLES):.2g}.")
-    if result.of_domain:
+    if result.is_share_of_domain:
         print_text(console, "warning: this is not a probability in the field: the study has no [variation] table for how real vehicles "
                             "vary.")
     print_text(console, _how_vehicles_vary(result.study))
@@ -54,7 +54,7 @@ def print_risk(console: Console, result: Risk) -> None:
                                                for name in ("first_order", "total")))
     console.print(table)
     if result.sensitivity_of_unsafe["total"].isna().all():
-        print_text(console, "Too few settings are unsafe, or safe, for indices of being unsafe; see those of the safety degree.")
+        print_text(console, "There are no indices of the unsafe outcome, because too few settings are unsafe or too few are safe.")
     print_meanings(console, CharacteristicSet.of(result.study.vehicle.characteristics))
     print_text(console, f"Sobol indices, first order and total, with half of their {100 * result.confidence:.0f} % intervals: estimates, "
                         "which may exceed 1 or fall below 0 by their error.")
@@ -87,7 +87,7 @@ def sensitivity_figure(result: Risk) -> Figure:
                          "a study without correlations and constraints")
     names = result.sensitivity.sort_values("total", kind="stable")["characteristic"].to_list()
     title = f"{result.study.name}: what decides ({100 * result.confidence:.0f} % intervals)"
-    figure, (axes,) = new_figure(title, 1, 2, (7.2, 1.5 + 0.28 * max(len(names), 4)))
+    figure, (axes,) = new_figure(title, rows=1, columns=2, size=(7.2, 1.5 + 0.28 * max(len(names), 4)))
     frames = {"safety degree": result.sensitivity, f"unsafe ({result.unsafe})": result.sensitivity_of_unsafe}
     for axis, (output, frame) in zip(axes, frames.items(), strict=True):
         rows = frame.set_index("characteristic").loc[names]

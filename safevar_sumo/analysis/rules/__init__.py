@@ -1,6 +1,6 @@
 """In which regions of the domain do failures lie, in physical units?
 
-The options and the function of the library are defined here, so that a command's help can be shown without loading the computation.
+The command's options and the Python function `rules` are defined here, so that help can be shown without loading the computation.
 """
 
 from __future__ import annotations
@@ -41,4 +41,4 @@ def rules(study: StudyLike | Results, *, samples: int = RulesOptions.samples, un
     """
     from safevar_sumo.analysis.rules.compute import find_rules
 
-    return answer_question(find_rules, study_of(study, as_it_is_now=as_it_is_now), RulesOptions, locals())
+    return answer_question(find_rules, study_of(study, as_it_is_now=as_it_is_now), RulesOptions, locals())  # the arguments

@@ -151,16 +151,16 @@ def _evaluate_design(evaluator: Evaluator, number: int, seed: int) -> Evaluation
     return evaluations.take(evaluations.valid)
 
 
-def _find_boxes(settings: FloatArray, unsafe: BoolArray, characteristics: CharacteristicSet) -> list[Limits]:
+def _find_boxes(settings: FloatArray, is_unsafe: BoolArray, characteristics: CharacteristicSet) -> list[Limits]:
     """The distinct boxes that become rules."""
-    tree = _fit_pruned_tree((settings - characteristics.lower) / (characteristics.upper - characteristics.lower), unsafe)
+    tree = _fit_pruned_tree((settings - characteristics.lower) / (characteristics.upper - characteristics.lower), is_unsafe)
     leaves = [(_round_limits(limits, characteristics), density) for limits, density in _boxes_of_leaves(tree, characteristics)]
     dense_boxes = [limits for limits, density in leaves if density > 0.5] or [max(leaves, key=lambda leaf: leaf[1])[0]]
-    simple_boxes = [_drop_useless_conditions(limits, settings, unsafe) for limits in dense_boxes]
-    return _order_by_coverage(simple_boxes, settings, unsafe)
+    simple_boxes = [_drop_useless_conditions(limits, settings, is_unsafe) for limits in dense_boxes]
+    return _order_by_coverage(simple_boxes, settings, is_unsafe)
 
 
-def _fit_pruned_tree(inputs: FloatArray, unsafe: BoolArray) -> Any:
+def _fit_pruned_tree(inputs: FloatArray, is_unsafe: BoolArray) -> Any:
     """The smallest tree whose cross-validated Brier score is within a standard error of the best score."""
     from sklearn.model_selection import StratifiedKFold, cross_val_score  # takes a second to load
     from sklearn.tree import DecisionTreeClassifier
@@ -168,13 +168,13 @@ def _fit_pruned_tree(inputs: FloatArray, unsafe: BoolArray) -> Any:
     def new_tree(pruning: float) -> Any:
         return DecisionTreeClassifier(max_depth=MAX_DEPTH, min_samples_leaf=MIN_SETTINGS // 2, ccp_alpha=pruning, random_state=0)
 
-    path = np.unique(np.maximum(new_tree(0.0).cost_complexity_pruning_path(inputs, unsafe).ccp_alphas, 0.0))[:-1]
+    path = np.unique(np.maximum(new_tree(0.0).cost_complexity_pruning_path(inputs, is_unsafe).ccp_alphas, 0.0))[:-1]
     prunings = path[np.unique(np.linspace(0, len(path) - 1, MAX_PRUNINGS).round().astype(int))] if len(path) else np.zeros(1)
     folds = StratifiedKFold(FOLDS, shuffle=True, random_state=0)
-    scores = np.array([cross_val_score(new_tree(pruning), inputs, unsafe, cv=folds, scoring="neg_brier_score") for pruning in prunings])
+    scores = np.array([cross_val_score(new_tree(pruning), inputs, is_unsafe, cv=folds, scoring="neg_brier_score") for pruning in prunings])
     means, errors = scores.mean(axis=1), scores.std(axis=1, ddof=1) / math.sqrt(FOLDS)
     best = int(np.argmax(means))
-    return new_tree(prunings[np.flatnonzero(means >= means[best] - errors[best])[-1]]).fit(inputs, unsafe)
+    return new_tree(prunings[np.flatnonzero(means >= means[best] - errors[best])[-1]]).fit(inputs, is_unsafe)
 
 
 def _boxes_of_leaves(tree: Any, characteristics: CharacteristicSet) -> list[tuple[Limits, float]]:
@@ -204,12 +204,12 @@ def _round_limits(limits: Limits, characteristics: CharacteristicSet) -> Limits:
     return {column: (rounded(limits[column][0], widths[column]), rounded(limits[column][1], widths[column])) for column in sorted(limits)}
 
 
-def _drop_useless_conditions(limits: Limits, settings: FloatArray, unsafe: BoolArray) -> Limits:
+def _drop_useless_conditions(limits: Limits, settings: FloatArray, is_unsafe: BoolArray) -> Limits:
     """Drop conditions while the lower bound of the density does not fall."""
     def least_density(box: Limits) -> float:
-        inside = is_within(box, settings)
-        count = int(np.count_nonzero(inside))
-        return clopper_pearson(int(np.count_nonzero(unsafe & inside)), count)[0] if count else 0.0
+        is_inside = is_within(box, settings)
+        count = int(np.count_nonzero(is_inside))
+        return clopper_pearson(int(np.count_nonzero(is_unsafe & is_inside)), count)[0] if count else 0.0
 
     while limits:
         candidates = [{column: ends for column, ends in limits.items() if column != dropped} for dropped in limits]
@@ -220,31 +220,33 @@ def _drop_useless_conditions(limits: Limits, settings: FloatArray, unsafe: BoolA
     return limits
 
 
-def _order_by_coverage(boxes: list[Limits], settings: FloatArray, unsafe: BoolArray) -> list[Limits]:
+def _order_by_coverage(boxes: list[Limits], settings: FloatArray, is_unsafe: BoolArray) -> list[Limits]:
     """Order boxes by coverage, and drop boxes that add few unsafe settings to the boxes before them, but not the first box."""
     chosen: list[Limits] = []
-    uncovered = unsafe.copy()
-    for limits in sorted(boxes, key=lambda box: -np.count_nonzero(unsafe & is_within(box, settings))):
-        inside = is_within(limits, settings)
-        if not chosen or np.count_nonzero(uncovered & inside) >= MIN_ADDED_SHARE * np.count_nonzero(unsafe):
+    uncovered = is_unsafe.copy()
+    for limits in sorted(boxes, key=lambda box: -np.count_nonzero(is_unsafe & is_within(box, settings))):
+        is_inside = is_within(limits, settings)
+        if not chosen or np.count_nonzero(uncovered & is_inside) >= MIN_ADDED_SHARE * np.count_nonzero(is_unsafe):
             chosen.append(limits)
-            uncovered &= ~inside
+            uncovered &= ~is_inside
     return chosen
 
 
 def is_within(limits: Limits, settings: FloatArray) -> BoolArray:
     """Whether each of M settings lies within limits; shape (M,)."""
-    inside = np.ones(len(settings), dtype=bool)
+    is_inside = np.ones(len(settings), dtype=bool)
     for column, (low, high) in limits.items():
-        inside &= (settings[:, column] >= (-np.inf if low is None else low)) & (settings[:, column] <= (np.inf if high is None else high))
-    return inside
+        is_inside &= settings[:, column] >= (-np.inf if low is None else low)
+        is_inside &= settings[:, column] <= (np.inf if high is None else high)
+    return is_inside
 
 
-def _validate_rule(limits: Limits, settings: FloatArray, unsafe: BoolArray, characteristics: CharacteristicSet) -> Rule:
+def _validate_rule(limits: Limits, settings: FloatArray, is_unsafe: BoolArray, characteristics: CharacteristicSet) -> Rule:
     """The rule of a box, with the numbers of validation settings."""
-    inside = is_within(limits, settings)
-    return Rule({characteristics.names[column]: ends for column, ends in limits.items()}, int(np.count_nonzero(inside)),
-                int(np.count_nonzero(inside & unsafe)), int(np.count_nonzero(unsafe)), CONFIDENCE)
+    is_inside = is_within(limits, settings)
+    return Rule(limits={characteristics.names[column]: ends for column, ends in limits.items()}, inside=int(np.count_nonzero(is_inside)),
+                unsafe_inside=int(np.count_nonzero(is_inside & is_unsafe)), unsafe_everywhere=int(np.count_nonzero(is_unsafe)),
+                confidence=CONFIDENCE)
 
 
 def print_rules(console: Console, result: Rules) -> None:
