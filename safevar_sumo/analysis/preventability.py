@@ -106,7 +106,7 @@ class Preventability:
         if not self.looked_at:
             return ""
         sample = "" if self.looked_at == self.collisions else f"{self.looked_at}, drawn at random, of "
-        parts = [f"{self.share(category):.0%} {category.replace('by full', 'only by full')}"
+        parts = [f"{100 * (self.share(category) or 0):.0f} % {category.replace('by full', 'only by full')}"
                  for category in PreventableBy if self.counts.get(category)]
         return f"Preventability in the same vehicle ({sample}{number_of(self.collisions, 'collision')}): {', '.join(parts)}."
 

@@ -113,7 +113,7 @@ def study_or_case(source: StudyLike | Results, *, as_it_is_now: bool = False, re
             source = load(source)
         elif not (is_study or os.path.lexists(source)):
             expected = f"a directory that the command `study` has written, {one_of(study_names())}, or the path of a study file (TOML)"
-            problem = f"is no results directory, no study and no file{did_you_mean(source, study_names())}"
+            problem = f"is neither a results directory, a study nor a file{did_you_mean(source, study_names())}"
             raise InputError(source, problem, expected)
     if isinstance(source, Results):
         for change in changes_since(source.directory, source.case, as_it_is_now=as_it_is_now):

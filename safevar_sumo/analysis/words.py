@@ -24,7 +24,7 @@ def list_of_changes(characteristics: CharacteristicSet, values: Mapping[str, flo
         original, value = characteristic.original, values.get(characteristic.name, characteristic.original)
         if value != original:
             changes.append(f"{characteristic.name} {original:g} -> {characteristic.text(value)}{characteristic.suffix} "
-                           f"({(value - original) / abs(original):+.1%})")
+                           f"({100 * (value - original) / abs(original):+.1f} %)")
     return ", ".join(changes) or "no change at all"
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -32,6 +32,8 @@ class Unsafe:
 
     below: float | None = None
     points: float | None = None
+    is_half: bool = field(default=False, compare=False, repr=False)
+    """Whether `below` is half of the original's safety degree, the default if nothing collides."""
 
     def __str__(self) -> str:
         if self.points is not None:
@@ -39,11 +41,25 @@ class Unsafe:
         return "collision" if self.below is None else f"below={self.below!r}"
 
     @property
+    def description(self) -> str:
+        """The criterion in words, rounded: `collision`, `safety degree below 0.85 m (half of the original's)`."""
+        if self.points is not None:
+            return f"at most {self.points:g} points"
+        if self.below is None:
+            return "collision"
+        share = " (half of the original's)" if self.is_half else ""
+        return f"safety degree below {self._limit} {'m' if self.below >= 0 else 'm/s'}{share}"
+
+    @property
+    def _limit(self) -> str:
+        return f"{self.below:.2f}" if self.is_half else f"{self.below:.3g}"
+
+    @property
     def in_words(self) -> str:
         """What an unsafe vehicle does: `collides`, `SD is below 1.4`."""
         if self.points is not None:
             return f"keeps at most {self.points:g} points"
-        return "collides" if self.below is None else f"SD is below {self.below:g}"
+        return "collides" if self.below is None else f"SD is below {self._limit}"
 
     def of(self, evaluations: Evaluations) -> BoolArray:
         """Which evaluations are unsafe; shape (M,). An undefined safety degree is not unsafe."""
@@ -106,7 +122,7 @@ class Unsafe:
             return cls(points=round(points - POINT_LOSS, POINT_DECIMALS))
         if (outcomes == COLLISION).any() or not safety_degree > 0:
             return cls()
-        return cls(float(f"{DEGREE_SHARE * safety_degree:.{LIMIT_DIGITS}g}"))
+        return cls(float(f"{DEGREE_SHARE * safety_degree:.{LIMIT_DIGITS}g}"), is_half=True)
 
     @classmethod
     def default_among(cls, evaluations: Evaluations, original: Evaluations) -> Unsafe:

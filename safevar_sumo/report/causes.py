@@ -107,17 +107,17 @@ def draw_necessity(summary: SummaryEntry, data: ReportInput) -> Markup | None:
     names = sorted((name for name in necessary if changed.get(name)), key=lambda name: (-necessary[name], -changed[name], name))
     if not names:
         return None
-    bars = [[Bar(0, changed[name], "weak", f"{name}: changed in {changed[name]:.0%} of the failures"),
-             Bar(0, necessary[name], "hit", f"{name}: needed in {necessary[name]:.0%} of the failures")] for name in names]
-    end_labels = [("", f"needed {necessary[name]:.0%}{_interval_text(*summary.necessary_interval[name])}, changed {changed[name]:.0%}")
-            for name in names]
+    bars = [[Bar(0, changed[name], "weak", f"{name}: changed in {100 * changed[name]:.0f} % of the failures"),
+             Bar(0, necessary[name], "hit", f"{name}: needed in {100 * necessary[name]:.0f} % of the failures")] for name in names]
+    end_labels = [("", f"needed {100 * necessary[name]:.0f} %{_interval_text(*summary.necessary_interval[name])}, "
+                       f"changed {100 * changed[name]:.0f} %") for name in names]
     description = f"{data.case.name}: how often a characteristic is needed for a failure, beside how often it is changed"
     return draw_bars(description, names, bars, [None] * len(names), end_labels)
 
 
 def _interval_text(low: float, high: float) -> str:
     """The 95 % interval of a share, as text; empty if all failures were analysed."""
-    return f" ({low:.0%} to {high:.0%})" if low < high else ""
+    return f" ({100 * low:.0f} % to {100 * high:.0f} %)" if low < high else ""
 
 
 def make_cause_sections(failures: Sequence[FailureEntry], data: ReportInput) -> list[CauseSection]:

@@ -12,6 +12,7 @@ from safevar_sumo.analysis.risk.compute import FLEET_VEHICLES, estimate_risk, fl
 from safevar_sumo.analysis.rules.compute import find_rules, rule_in_words
 from safevar_sumo.analysis.tolerance.compute import find_tolerances
 from safevar_sumo.analysis.words import number_of
+from safevar_sumo.metrics import Unsafe
 from safevar_sumo.replay.comparison import format_number, quantity_text, superscript_powers
 from safevar_sumo.report.input import ReportInput, load_or_compute
 from safevar_sumo.report.svg import Bar, draw_bars
@@ -26,7 +27,7 @@ def make_tolerance_section(data: ReportInput, jobs: int | None, progress: Progre
         tolerances = find_tolerances(data.case.study, data.options["tolerance"], jobs=jobs, progress=progress)
         return {**tolerances.to_dict(), "verdict": tolerances.verdict}
 
-    result = load_or_compute(data, "tolerance", compute)
+    result = _with_criterion_in_words(load_or_compute(data, "tolerance", compute))
     return {**{name: result[name] for name in ("verdict", "unsafe", "joint")}, "chart": _draw_intervals(data, result["alone"])}
 
 
@@ -35,7 +36,7 @@ def make_risk_section(data: ReportInput, jobs: int | None, progress: Progress) -
     def compute() -> Section:
         return estimate_risk(data.case.study, data.options["risk"], jobs=jobs, progress=progress).to_dict()
 
-    result = load_or_compute(data, "risk", compute)
+    result = _with_criterion_in_words(load_or_compute(data, "risk", compute))
     study = data.case.study
     fleet = {"vehicles": FLEET_VEHICLES, "probability": fleet_probability(result["probability"], FLEET_VEHICLES)}
     fleets = {"fleet": fleet} if study.variation else {}
@@ -54,8 +55,11 @@ def make_rules_section(data: ReportInput, jobs: int | None, progress: Progress) 
             f"Left out: {omitted_rules} that may be due to chance, as few vehicles were simulated; the command rules simulates more.")
         return {"words": words, "samples": found.samples, "share": found.unsafe_share, "remark": remark, "unsafe": str(found.unsafe)}
 
-    result: Section = load_or_compute(data, "rules", compute)
-    return result
+    return _with_criterion_in_words(load_or_compute(data, "rules", compute))
+
+
+def _with_criterion_in_words(section: Section) -> Section:
+    return {**section, "unsafe": Unsafe.parse(section["unsafe"]).description}
 
 
 INDEX_NAMES = {"first_order": "alone", "total": "with others"}

@@ -202,7 +202,7 @@ def _select_failure(data: ReportInput, handle: str, reasons: list[str], failure:
     return SelectedFailure(
         title="; ".join([title, *map(str.lower, titles)]), handle=handle, reasons=reasons, anchor=data.anchor("replay", handle),
         changes=changes, largest_change=largest_change,
-        size=f"{len(changes)} of {len(setting)} characteristics changed, by at most {largest_change:.0%}",
+        size=f"{len(changes)} of {len(setting)} characteristics changed, by at most {100 * largest_change:.0f} %",
         end=_describe_end(data, handle, setting), f_safe=data.solutions[handle]["f_safe"], failing_points=data.failing_points(setting),
         unsafe_share=failure.robustness if failure else None,
         cause=max(failure.minimal_causes, key=lambda cause: cause.robustness or 0.0, default=None) if failure else None)
@@ -253,8 +253,8 @@ def _robustness_figure(robust: SelectedFailure | None, explanations: Explanation
     if robust is None:
         reason = "every failure analysed is borderline" if explanations else "not computed"
         return KeyFigure(REASON_TITLES[ROBUST], NO_VALUE, reason if any(data.unsafe_solutions) else "no solution is unsafe")
-    return KeyFigure(REASON_TITLES[ROBUST], f"{number_of(len(robust.changes), 'change')} of at most {robust.largest_change:.0%}",
-                     f"{robust.unsafe_share:.0%} of its neighbours are unsafe too")
+    return KeyFigure(REASON_TITLES[ROBUST], f"{number_of(len(robust.changes), 'change')} of at most {100 * robust.largest_change:.0f} %",
+                     f"{100 * (robust.unsafe_share or 0):.0f} % of its neighbours are unsafe too")
 
 
 def _severity_figure(most_severe: SelectedFailure | None, data: ReportInput) -> KeyFigure:
@@ -270,8 +270,8 @@ def _preventability_figure(preventable: PreventedShares | None, data: ReportInpu
         any_collision = are_collisions(data.case.solutions).any()
         return KeyFigure(title, NO_VALUE, "not computed" if any_collision else "there is no collision to avoid")
     low, high = preventable.interval_competent_driver
-    sample = "all" if low == high else f"95 % interval {low:.0%} to {high:.0%};"
-    return KeyFigure(title, f"{preventable.competent_driver:.0%} of the collisions",
+    sample = "all" if low == high else f"95 % interval {100 * low:.0f} % to {100 * high:.0f} %;"
+    return KeyFigure(title, f"{100 * preventable.competent_driver:.0f} % of the collisions",
                      f"in the same vehicle ({sample} {preventable.looked_at} collisions analysed)")
 
 
@@ -282,7 +282,7 @@ def _tolerance_figure(tolerance: Mapping[str, Any] | None) -> KeyFigure:
     factor, samples = tolerance["joint"]["factor"], tolerance["joint"]["samples"]
     if not factor:
         return KeyFigure(title, "none", "no box around the original is safe")
-    return KeyFigure(title, f"{factor:.1%} of the way",
+    return KeyFigure(title, f"{100 * factor:.1f} % of the way",
                      f"from the original to the ends of their domains; none of {samples} vehicles sampled there is unsafe")
 
 
@@ -354,7 +354,7 @@ def describe_limits(data: ReportInput, explanations: Explanations | None) -> Tru
     if explanations and explanations.failures:
         borderline_count = sum(is_borderline(failure.robustness) for failure in explanations.failures)
         remarks.append(f"{borderline_count} of {len(explanations.failures)} failures analysed are borderline: "
-                       f"fewer than {MIN_ROBUST_SHARE:.0%} of their neighbours are unsafe too.")
+                       f"fewer than {100 * MIN_ROBUST_SHARE:.0f} % of their neighbours are unsafe too.")
     if not published:
         remarks.append("There are no published values of the original vehicle to compare the study with.")
     return TrustSection(GENERAL_LIMITS, remarks, published, describe_agreement(data).rows, _simulate_spreads(data))

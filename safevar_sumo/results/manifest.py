@@ -131,7 +131,7 @@ def read_manifest(directory: Path) -> dict[str, Any]:
     except FileNotFoundError:
         likely_path = Path("results") / directory.name
         hint = f"; did you mean {likely_path}?" if likely_path != directory and (likely_path / MANIFEST).is_file() else ""
-        raise InputError(directory, f"is no results directory: there is no {MANIFEST}{hint}", expected) from None
+        raise InputError(directory, f"is not a results directory: there is no {MANIFEST}{hint}", expected) from None
     except OSError as error:
         raise InputError(file, f"cannot be read: {error.strerror}") from None
     except json.JSONDecodeError as error:

@@ -168,7 +168,8 @@ def _with_overrides(base: _RawStudy, overrides: Mapping[str, Any], source: objec
         if "vehicle" in changed_keys or "ads" in changed_keys:  # spread and model_error concern their parameters
             tables = {key: value for key, value in tables.items() if key in overrides or key not in ("spread", "model_error")}
         if omitted_keys:
-            remarks = (*remarks, f"{source}: has another {' and another '.join(changed_keys)} than study {base.tables.get('name')!r}, so "
+            differences = " and a different ".join("ADS" if key == "ads" else key for key in changed_keys)
+            remarks = (*remarks, f"{source}: has a different {differences} than study {base.tables.get('name')!r}, so "
                                  f"it does not inherit that study's {' and '.join(f'[{key}]' for key in omitted_keys)}")
     return _RawStudy(source, tables, msgspec.structs.replace(base.origin, remarks=remarks))
 

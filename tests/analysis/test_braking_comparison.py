@@ -90,4 +90,20 @@ def test_a_creeping_deceleration_is_no_late_pedal() -> None:
     assert comparison.parts["delay"] == 0
     assert comparison.parts["deceleration"] == pytest.approx(comparison.lost_margin)
     assert "later" not in sentence(comparison)
-    assert "brakes more weakly" in sentence(comparison)
+    assert "decelerates less with the pedal down" in sentence(comparison)
+
+
+@pytest.mark.parametrize(("original_gain", "changed_gain", "phrase"), [
+    (0.0, 3.0, "because it speeds up while the pedal moves and the gear changes from 0 to 2 (from 10.00 to 10.60 instead of from 10.00 to"),
+    (1.0, 3.0, "because it speeds up more while the pedal moves"), (3.0, 1.0, "because it speeds up less while the pedal moves"),
+    (3.0, 0.0, "because it does not speed up while the pedal moves")])
+def test_a_vehicle_that_speeds_up_while_its_pedal_moves_does_not_slow_less(original_gain: float, changed_gain: float, phrase: str) -> None:
+    """The pedal moves for 0.2 s, in which the vehicles gain speed; then both decelerate alike."""
+    runs = drive_of(SAME, SAME)
+    for column, gain in enumerate((original_gain, changed_gain)):
+        delay = np.clip(runs.trace.time - 0.5, 0.0, 0.2)
+        runs.trace.speed[:, column] = np.maximum(runs.trace.speed[:, column] + gain * delay, 0.0)
+    runs.trace.gear[runs.trace.time > 0.6, 1] = 2
+    text = sentence(compare_braking(*(summarise_run(runs, column, 1.0) for column in (0, 1))))
+    assert phrase in text
+    assert "saved" not in text

@@ -7,7 +7,8 @@ import re
 from io import StringIO
 from itertools import combinations
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from rich.console import Console
 
 from safevar_sumo.analysis.evaluator import Evaluator
 from safevar_sumo.analysis.explain import ExplainOptions
+from safevar_sumo.analysis.explain.braking_comparison import BrakingComparison, RunSummary
 from safevar_sumo.analysis.explain.causes import (
     RESOLUTION,
     BoundaryState,
@@ -36,8 +38,8 @@ from safevar_sumo.analysis.explain.necessity import (
     find_smallest_robust_failure,
     necessity_frame,
 )
-from safevar_sumo.analysis.explain.render import most_robust, print_explained
-from safevar_sumo.analysis.explain.result import Cause, Explained
+from safevar_sumo.analysis.explain.render import _print_explanation, _sample_in_words, most_robust, print_explained
+from safevar_sumo.analysis.explain.result import Cause, Explained, Explanation
 from safevar_sumo.analysis.explain.summary import NUMBER_WORDS, FailureDescription, failures_paragraph, summarise_failures
 from safevar_sumo.analysis.preventability import Preventability
 from safevar_sumo.analysis.research_questions.case import Case, load_cases
@@ -45,7 +47,7 @@ from safevar_sumo.cli.program import commands
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import BoolArray, FloatArray
-from safevar_sumo.results import handles_of
+from safevar_sumo.results import SolutionId, handles_of
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo import assemble, evaluate
 from safevar_sumo.vehicles import CharacteristicSet
@@ -204,7 +206,25 @@ def assert_tells_a_manager(paragraph: str, explained: Explained) -> None:
                   key=lambda member: abs(fewest.setting[member.name] / member.original - 1))
     assert f"{largest.short_name} {100 * (fewest.setting[largest.name] / largest.original - 1):+.0f} %" in paragraph
     share = explained.preventability.shares.competent_driver
-    assert f"a competent driver avoids {100 * share:.0f} %" in paragraph
+    assert f"a competent driver avoids {100 * share:.0f} % (" in paragraph
+
+
+def test_how_many_failures_were_analysed_in_words() -> None:
+    counts = [SimpleNamespace(analysed=number, failures=number) for number in (1, 2, 3)]
+    assert [_sample_in_words(cast("Explained", count)) for count in counts] == ["the only failure", "both failures", "all 3 failures"]
+
+
+def test_the_heading_of_a_failure_is_whole() -> None:
+    """The reasons stand below the heading, which is cut at the width of the terminal."""
+    printed = StringIO()
+    run = RunSummary("stopped", np.nan, None, np.nan, np.nan)
+    failure = Explanation(
+        handle=SolutionId("nsga2", 123, 45), setting={}, outcome="stopped", safety_degree=None, changed=(), causes=(), necessary=(),
+        robustness=Robustness({}), because=BrakingComparison(run, run, {}), reasons=("fewest changes", "smallest robust", "most severe"))
+    characteristics = CharacteristicSet.of(load_study("smoke").vehicle.characteristics)
+    _print_explanation(Console(file=printed, width=60), str, failure, characteristics, cast("Explained", None))
+    assert printed.getvalue().startswith("nsga2:123:45 ")
+    assert "Chosen as: fewest changes, robust with the fewest" in printed.getvalue()
 
 
 @pytest.mark.slow

@@ -235,7 +235,7 @@ def test_a_report_has_a_badge_for_each_cause_or_says_how_to_install(slippery: Pa
 
 @pytest.mark.parametrize(("typed", "told"), [
     (("smoke",), "smoke: is a study and has no solutions\nexpected: a directory"),
-    (("nowhere",), "nowhere: is no results directory: there is no manifest.json\nexpected: a directory written by the command `study`"),
+    (("nowhere",), "nowhere: is not a results directory: there is no manifest.json\nexpected: a directory written by the command `study`"),
     (("{}", "--solutions", "nsga2:0:999"), "--solutions: there is no solution nsga2:0:999"), (("{}", "--solutions", "first"), "'first'")])
 def test_bad_input_is_refused(typed: tuple[str, ...], told: str, slippery: Path) -> None:
     refused("opinion", *(part.format(slippery) for part in typed), message=(told,))

@@ -13,8 +13,14 @@ from safevar_sumo.ads.competent_driver import CompetentDriver
 from safevar_sumo.analysis.evaluator import Evaluator
 from safevar_sumo.analysis.explain.braking_comparison import sentence
 from safevar_sumo.analysis.explain.compute import PointComparison, compare_at_points, points_in_words
-from safevar_sumo.analysis.explain.summary import summarise_failures
-from safevar_sumo.analysis.preventability import PreventableBy, approach_parameters, assess_preventability, classify_collisions
+from safevar_sumo.analysis.explain.summary import _avoided_shares_in_words, summarise_failures
+from safevar_sumo.analysis.preventability import (
+    Preventability,
+    PreventableBy,
+    approach_parameters,
+    assess_preventability,
+    classify_collisions,
+)
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import FloatArray
 from safevar_sumo.results import solutions_frame
@@ -39,6 +45,15 @@ def vehicle(brakes: float = 1.0, max_rpm: float = 1.0) -> FloatArray:
     """The original vehicle with these shares of its brakes (and engine drag) and of its maximum speed of the engine."""
     factors = {"maxBrakeTorque": brakes, "dampRateZeroT_CE": brakes, "max_rpm": max_rpm}
     return ORIGINAL * [factors.get(name, 1.0) for name in NAMES]
+
+
+def test_shares_are_told_with_their_counts() -> None:
+    counts = {PreventableBy.COMPETENT_DRIVER: 5, PreventableBy.NOBODY: 2}
+    sentences = [_avoided_shares_in_words(Preventability(counts=counts, collisions=number))[0] for number in (7, 300)]
+    end = "a competent driver avoids 71 % (5 of 7) and 29 % (2 of 7) are physically unavoidable."
+    assert sentences == [f"In the same vehicle, of the collisions, {end}",
+                         f"In the same vehicle, of 7 collisions, drawn at random from 300, {end}"]
+    assert str(Preventability(counts=counts, collisions=7)).startswith("Preventability in the same vehicle (7 collisions): 71 % ")
 
 
 @pytest.mark.slow

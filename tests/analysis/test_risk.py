@@ -77,7 +77,8 @@ def test_a_share_of_the_domain_is_not_called_a_probability(variation: dict[str, 
     print_risk(console, risk(study, unsafe="collision", samples=200, pool=Plant(study, box)))
     printed = console.file.getvalue()  # type: ignore[attr-defined]
     assert says in printed
-    assert ("no probability in the field" in printed) == warns
+    assert ("this is not a probability in the field" in printed) == warns
+    assert "unsafe in all" in printed
 
 
 def test_the_promised_record_and_the_same_again() -> None:

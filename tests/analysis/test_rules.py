@@ -84,4 +84,4 @@ def test_the_promised_record_the_same_again_and_in_words() -> None:
     assert frame.where(frame.notna(), None)[list(record["conditions"][0])].to_dict("records") == record["conditions"]
     assert frame["rule"].tolist() == [0, 0]
     result = rule_in_words(first.rules[0], CharacteristicSet.of(first.study.vehicle.characteristics), first.unsafe)
-    assert result.startswith("a above 7 N m and b below 3 N m: collides in 100% (")
+    assert result.startswith("a above 7 N m and b below 3 N m: collides in 100 % (")

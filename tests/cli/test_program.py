@@ -67,6 +67,11 @@ def test_the_package_and_the_help_load_nothing_heavy() -> None:
     assert loaded("import safevar_sumo.cli") == set()
 
 
+def test_a_subject_that_is_nothing_is_refused_in_plain_words() -> None:
+    with pytest.raises(InputError, match=r"rian: is neither a results directory, a study nor a file; did you mean 'rain'\?"):
+        commands.main(["rules", "rian"], standalone_mode=False)
+
+
 @pytest.mark.slow
 def test_one_simulation_loads_sumo_and_no_statistics() -> None:
     code = "from click.testing import CliRunner\nfrom safevar_sumo.cli.program import commands\n"

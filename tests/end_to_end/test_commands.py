@@ -145,6 +145,6 @@ def test_a_title_is_no_markup(in_tmp: Path) -> None:
 @SLOW
 def test_a_study_ends_with_a_summary(in_tmp: Path) -> None:
     output = run("study", "smoke").stdout
-    for part in ("original vehicle", "nsga2", "RQ1", "RQ2", "NSGA-II: SD", "too few runs for a test (8 are needed)",
+    for part in ("original vehicle", "nsga2", "RQ1", "RQ2", "against the original vehicle: SD", "too few runs for a test (8 are needed)",
                  "python -m safevar_sumo tables results/smoke"):
         assert part in output

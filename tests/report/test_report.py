@@ -139,7 +139,7 @@ def test_the_sections_stand_in_their_order_and_tell_what_was_found(page: str, sl
     fewest = by_reason["fewest changes"]
     for words in (f"borderline: only {100 * fewest.robustness.share:.0f} % of the neighbours are unsafe",
                   f"Scaling all changes to {100 * fewest.causes[0].fraction:.1f} % is still unsafe",
-                  "Unsafe alone: tireFric.", "within 80 % of the way", "tireFric below 1.5: collides in 100%",
+                  "Unsafe alone: tireFric.", "within 80 % of the way", "tireFric below 1.5: collides in 100 %",
                   "A share of the domain, not a probability in the field", "NSGA-II (1 run)", "wet leaves", "RQ1: solutions", "RQ3.2",
                   "from seed 1"):
         assert words in page
@@ -181,7 +181,7 @@ def test_the_verdict_leads_with_the_robust_failure_and_calls_the_others_borderli
     whole_cause = msgspec.structs.replace(robust, minimal_causes=[all_changes])
     every = reach_verdict(data, Explanations([fewest, whole_cause], summary), None).headline
     assert every.startswith(f"{number} changes suffice for a collision that is robust: the vehicle collides")
-    assert [one.value for one in result.key_figures[2:]] == ["14% of the collisions", "42.0% of the way"]
+    assert [one.value for one in result.key_figures[2:]] == ["14 % of the collisions", "42.0 % of the way"]
     assert result.key_figures[0].value.startswith(f"{number} changes")
 
 

@@ -147,6 +147,7 @@ def test_another_system_inherits_neither_title_nor_published_values(text: str, i
     assert (study.title == sun.title) == inherits
     assert (study.published == sun.published) == inherits
     assert bool(study.origin.remarks) != inherits
+    assert all(": has a different " in remark for remark in study.origin.remarks)
     changed = load_study("sun", weather="fog")
     assert (changed.title, changed.published) == ("sun", {})
     own = load_study("rain")

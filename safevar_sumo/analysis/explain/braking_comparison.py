@@ -47,6 +47,8 @@ class Braking(NamedTuple):
         Speed at the command minus the speed at the end of the delay [m/s].
     deceleration
         Mean deceleration after the delay [m/s^2], averaged over the distance, as in UN R13-H.
+    gears
+        Gear at the command and at the end of the delay.
     """
 
     time: float
@@ -56,6 +58,7 @@ class Braking(NamedTuple):
     speed_deficit: float
     speed_lost: float
     deceleration: float
+    gears: tuple[float, float] = (0, 0)
 
     @property
     def stopping_distance(self) -> float:
@@ -86,14 +89,13 @@ class BrakingComparison(NamedTuple):
     """Runs of the original and of the changed vehicle, and the parts of the margin that the changed vehicle lost [m].
 
     One of the `parts` is the remainder, which no difference explains; `parts` is empty if one of the vehicles never braked. `point` is the
-    name of a test point. `saved_distances` are those that the original and the changed vehicle save by slowing while the pedal moves [m].
+    name of a test point.
     """
 
     original: RunSummary
     changed: RunSummary
     parts: dict[str, float]
     point: str = ""
-    saved_distances: tuple[float, float] = (0.0, 0.0)
 
     @property
     def lost_margin(self) -> float:
@@ -155,7 +157,8 @@ def _measure_braking(runs: SimulationRuns, column: int, first: int, last: int) -
     return Braking(
         time=float(trace.time[first]), gap=float(trace.gap[first, column]), speed=initial_speed, delay=delay,
         speed_deficit=initial_speed - float(position[end_of_delay] - position[first]) / delay if end_of_delay > first else 0.0,
-        speed_lost=initial_speed - float(speed[end_of_delay]), deceleration=specific_energy / distance)
+        speed_lost=initial_speed - float(speed[end_of_delay]), deceleration=specific_energy / distance,
+        gears=(float(trace.gear[first, column]), float(trace.gear[end_of_delay, column])))
 
 
 def compare_braking(original: RunSummary, changed: RunSummary, point: str = "") -> BrakingComparison:
@@ -163,10 +166,10 @@ def compare_braking(original: RunSummary, changed: RunSummary, point: str = "") 
     original_braking, changed_braking = original.braking, _braking_to_compare(changed, original)
     if original_braking is None or changed_braking is None:
         return BrakingComparison(original, changed, {}, point)
-    parts, saved_distances = _split_lost_margin(original_braking, changed_braking)
+    parts = _split_lost_margin(original_braking, changed_braking)
     gap_errors = original.least_gap - original_braking.margin, changed.least_gap - changed_braking.margin
     remainders = [0.0 if np.isnan(error) else error for error in gap_errors]
-    return BrakingComparison(original, changed, {**parts, "remainder": remainders[0] - remainders[1]}, point, saved_distances)
+    return BrakingComparison(original, changed, {**parts, "remainder": remainders[0] - remainders[1]}, point)
 
 
 def _braking_to_compare(changed: RunSummary, original: RunSummary) -> Braking | None:
@@ -177,8 +180,8 @@ def _braking_to_compare(changed: RunSummary, original: RunSummary) -> Braking | 
     return original.braking._replace(time=np.nan, gap=0.0, speed=speed)
 
 
-def _split_lost_margin(original: Braking, changed: Braking) -> tuple[dict[str, float], tuple[float, float]]:
-    """Parts of the lost margin by cause [m], and the distances that the two vehicles save by slowing while the pedal moves [m].
+def _split_lost_margin(original: Braking, changed: Braking) -> dict[str, float]:
+    """Parts of the lost margin by cause [m].
 
     With the two runs' means of t, of v - d and of 1 / a, a vehicle saves e t + d (v - d) / a.
     """
@@ -194,8 +197,7 @@ def _split_lost_margin(original: Braking, changed: Braking) -> tuple[dict[str, f
         "delay": (changed.delay - original.delay) * sum(mean_delay_speeds) / 2,
         "slowing": savings[0] - savings[1],
         "deceleration": ((1 / changed.deceleration - 1 / original.deceleration)
-                         * (speeds_after_delay[0]**2 + speeds_after_delay[1]**2) / 4)
-    }, (savings[0], savings[1])
+                         * (speeds_after_delay[0]**2 + speeds_after_delay[1]**2) / 4)}
 
 
 MIN_PART = 0.005
@@ -204,7 +206,7 @@ PART_PHRASES = {
     "gap": ("it begins to brake at a smaller gap", "it begins to brake at a larger gap"), "speed": ("it is faster", "it is slower"),
     "delay": ("its brake pedal follows later", "its brake pedal follows sooner"),
     "slowing": ("it slows less while the pedal moves", "it slows more while the pedal moves"),
-    "deceleration": ("it brakes more weakly", "it brakes harder")}
+    "deceleration": ("it decelerates less with the pedal down", "it decelerates more with the pedal down")}
 """Phrases for each part: if it costs distance, and if it gains distance."""
 
 
@@ -228,7 +230,7 @@ def sentence(comparison: BrakingComparison, *, full: bool = False) -> str:
     no_effect = "" if changed_braking is not None else " Its brake has no effect."
     parts, is_lost = comparison.parts, comparison.lost_margin >= 0
     loss_prefix, gain_prefix = ("", "gained ") if is_lost else ("lost ", "")
-    phrases = [f"{abs(parts[name]):.2f} m {loss_prefix if parts[name] > 0 else gain_prefix}because {PART_PHRASES[name][parts[name] < 0]}"
+    phrases = [f"{abs(parts[name]):.2f} m {loss_prefix if parts[name] > 0 else gain_prefix}because {_phrase_of(comparison, name)}"
                f"{_quantities_in_words(comparison, name)}"
                for name in sorted(PART_PHRASES, key=lambda name: -parts[name]) if abs(parts[name]) >= MIN_PART]
     if abs(parts["remainder"]) > MAX_OMITTED_REMAINDER:
@@ -241,15 +243,29 @@ def sentence(comparison: BrakingComparison, *, full: bool = False) -> str:
     return f"{endings}{no_effect} {introduction}: {join_phrases(phrases)}."
 
 
+def _phrase_of(comparison: BrakingComparison, part: str) -> str:
+    """The phrase for a part; a vehicle that speeds up while its pedal moves does not slow less."""
+    gains, changed, original = comparison.parts[part] < 0, comparison.changed.braking, comparison.original.braking
+    if part == "slowing" and changed is not None and original is not None and min(changed.speed_lost, original.speed_lost) < 0:
+        if changed.speed_lost >= 0:
+            return "it does not speed up while the pedal moves"
+        before, after = changed.gears
+        gear = "" if before == after else f" and the gear changes from {before:g} to {after:g}"
+        return f"it speeds up {'' if original.speed_lost >= 0 else 'less ' if gains else 'more '}while the pedal moves{gear}"
+    return PART_PHRASES[part][gains]
+
+
 def _quantities_in_words(comparison: BrakingComparison, part: str) -> str:
     """The quantity that explains a part, for the changed vehicle and for the original vehicle."""
     original_braking, changed_braking = comparison.original.braking, comparison.changed.braking
     if original_braking is None or changed_braking is None:
         return ""
+    if part == "slowing":
+        changes = [f"from {one.speed:.2f} to {one.speed - one.speed_lost:.2f}" for one in (changed_braking, original_braking)]
+        return f" ({' instead of '.join(changes)} m/s)"
     quantities = {"gap": (changed_braking.gap, original_braking.gap, "m"),
                   "speed": (changed_braking.speed, original_braking.speed, "m/s at the command"),
                   "delay": (changed_braking.delay, original_braking.delay, "s after the command"),
-                  "slowing": (comparison.saved_distances[1], comparison.saved_distances[0], "m saved"),
                   "deceleration": (changed_braking.deceleration, original_braking.deceleration, "m/s^2")}
     changed, original, unit = quantities[part]
     decimals = next((digits for digits in range(2, 9) if f"{changed:.{digits}f}" != f"{original:.{digits}f}"), 2)

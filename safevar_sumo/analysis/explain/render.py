@@ -38,7 +38,8 @@ def print_explained(console: Console, subject: str, result: Explained, point: st
     """Print the answer in about ten lines; `full` explains every chosen failure. Printed commands name `subject` and the test `point`."""
     characteristics = CharacteristicSet.of(result.study.vehicle.characteristics)
     print_text(console, result.study.title)
-    print_text(console, f"Unsafe: {result.unsafe}. {number_of(result.failures, 'failure')} among {result.looked_at} different settings.")
+    print_text(console, f"Unsafe: {result.unsafe.description}. {number_of(result.failures, 'failure')} among {result.looked_at} different "
+                        "settings.")
     print_constraints(console, result.study)
     if result.otherwise:
         print_text(console, f"note: {number_of(result.otherwise, 'setting')} with another outcome than recorded. "
@@ -104,8 +105,9 @@ def _most_necessary_in_words(result: Explained, characteristics: CharacteristicS
 
 def _necessary_share(row: Mapping[Any, Any]) -> str:
     """The share of failures that need a characteristic; with an interval if the failures are a sample."""
-    interval = f" ({row['necessary_lower']:.0%} to {row['necessary_upper']:.0%})" if row["necessary_lower"] < row["necessary_upper"] else ""
-    return f"{row['necessary']:.0%}{interval}"
+    low, high = row["necessary_lower"], row["necessary_upper"]
+    interval = f" ({100 * low:.0f} % to {100 * high:.0f} %)" if low < high else ""
+    return f"{100 * row['necessary']:.0f} %{interval}"
 
 
 def _full_name(characteristic: Characteristic) -> str:
@@ -122,13 +124,13 @@ def _accuracy_in_words(result: Explained) -> str:
         return ""
     return (f"How exact: decisions fall into frames of {step:g} s, in which the vehicle covers {braking.speed * step:.2f} m at "
             f"{braking.speed:.1f} m/s. Along a characteristic the safety degree is a sawtooth of about that height: more digits of "
-            "a value mean nothing.")
+            "a value mean nothing, and only let a command repeat a simulation exactly.")
 
 
 def _print_explanation(console: Console, command_for: CommandFor, failure: Explanation, characteristics: CharacteristicSet,
                        result: Explained) -> None:
-    title = f"{', '.join(LABELS.get(reason, reason) for reason in failure.reasons)}: {failure.handle or 'a sampled setting'}"
-    console.rule(escape(title), align="left")
+    console.rule(escape(str(failure.handle or "a sampled setting")), align="left")
+    print_text(console, f"Chosen as: {', '.join(LABELS.get(reason, reason) for reason in failure.reasons)}")
     ending = f"{failure.outcome}, SD {two_decimals(failure.safety_degree)} with {number_of(len(failure.changed), 'change')}"
     print_text(console, f"{ending}: {list_of_changes(characteristics, failure.setting)}")
     if not failure.causes:
@@ -151,9 +153,9 @@ def _print_explanation(console: Console, command_for: CommandFor, failure: Expla
         print_text(console, f"In the same vehicle: {failure.preventable}.")
     console.print(_braking_table(failure.because))
     if failure.causes:
-        shares = ", ".join(f"{share:.0%} at {step:g} s a step" for step, share in failure.robustness.shares_by_step.items())
+        shares = ", ".join(f"{100 * share:.0f} % at {step:g} s a step" for step, share in failure.robustness.shares_by_step.items())
         word = "borderline" if failure.robustness.borderline else "robust"
-        print_text(console, f"Unsafe neighbours within the filter's thresholds: {shares}; {word} ({failure.robustness.share:.0%}).")
+        print_text(console, f"Unsafe neighbours within the filter's thresholds: {shares}; {word} ({100 * failure.robustness.share:.0f} %).")
 
 
 def _print_cause(console: Console, command_for: CommandFor, cause: Cause, characteristics: CharacteristicSet) -> None:
@@ -195,20 +197,20 @@ def _print_statistics(console: Console, result: Explained) -> None:
     table = WholeTable("characteristic", right=("changed", "necessary", "in some cause"),
                        title=f"Changed vs. necessary ({_sample_in_words(result)})")
     for row in result.necessity.to_dict("records"):
-        table.add_row(row["characteristic"], f"{row['changed']:.0%}", _necessary_share(row), f"{row['involved']:.0%}")
+        table.add_row(row["characteristic"], f"{100 * row['changed']:.0f} %", _necessary_share(row), f"{100 * row['involved']:.0f} %")
     console.print(table)
     intervals = "" if result.analysed == result.failures else (
-        f" In brackets: {CONFIDENCE:.0%} intervals for all {result.failures} (Clopper and Pearson's, slightly too wide).")
+        f" In brackets: {100 * CONFIDENCE:.0f} % intervals for all {result.failures} (Clopper and Pearson's, slightly too wide).")
     print_text(console, f"necessary: in every minimal cause of a failure; shares of the failures.{intervals}")
     causes = WholeTable("minimal cause", right=("failures", "share"), title=f"Distinct minimal causes: {len(result.distinct)}")
     for row in result.distinct.head(MAX_DISTINCT_CAUSES).to_dict("records"):
-        causes.add_row(", ".join(row["cause"]) or "none: the original vehicle", str(row["failures"]), f"{row['share']:.0%}")
+        causes.add_row(", ".join(row["cause"]) or "none: the original vehicle", str(row["failures"]), f"{100 * row['share']:.0f} %")
     console.print(causes)
 
 
 def _sample_in_words(result: Explained) -> str:
     if result.analysed == result.failures:
-        return f"all {result.failures} failures"
+        return {1: "the only failure", 2: "both failures"}.get(result.failures, f"all {result.failures} failures")
     return f"random sample: {result.analysed} of {result.failures} failures"
 
 

@@ -120,7 +120,7 @@ class Cause:
                  BoundaryState.FILTER: f"with less, the change of {self.at_threshold} falls below the filter's threshold "
                                        "and counts as none",
                  BoundaryState.NOT_SIMULATED: "slightly less could not be simulated"}[self.end]
-        return f"Scaling all changes to {self.fraction:.1%} is still unsafe; {below}."
+        return f"Scaling all changes to {100 * self.fraction:.1f} % is still unsafe; {below}."
 
 
 @dataclass(frozen=True, kw_only=True)

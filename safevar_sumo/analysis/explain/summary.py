@@ -73,7 +73,7 @@ def summarise_failures(study: Study, solutions: pd.DataFrame, original: Evaluati
              f"{unsafe_in_words} collide." if criterion.below is None else
              f"No collision. {unsafe_in_words} keep less than half of the original's {degree:.2f} m."]
     for (reason, handle), row, causes, fails_at in zip(handle_of.items(), rows.to_dict("records"), all_causes, failing_points, strict=True):
-        size = f"{number_of(int(row['f_num_diff']), 'change')} of up to {row['f_diff']:.0%}"
+        size = f"{number_of(int(row['f_num_diff']), 'change')} of up to {100 * row['f_diff']:.0f} %"
         ending, cause = f"{row['outcome']}, SD {row['f_safe']:.2f}", _cause_in_words(evaluator, causes)
         lines.append(f"{LABELS.get(reason, reason).capitalize()}: {handle}, {ending}, {size}. {cause}{fails_at}")
     at_worst = f"at the worst point of the first (without --point: at all {len(assemble(study).points)}, which takes long)"
@@ -276,6 +276,8 @@ def _avoided_shares_in_words(preventable: Preventability) -> list[str]:
         return []
     words = {PreventableBy.COMPETENT_DRIVER: "a competent driver avoids {}", PreventableBy.FULL_BRAKING:
              "only full braking at the first possible moment avoids another {}", PreventableBy.NOBODY: "{} are physically unavoidable"}
-    parts = [text.format(f"{100 * (preventable.share(by) or 0.0):.0f} %") for by, text in words.items() if preventable.counts.get(by)]
-    sample = "" if preventable.looked_at == preventable.collisions else f"{preventable.looked_at} drawn at random from "
-    return [f"In the same vehicle, of {sample}{preventable.collisions} collisions, {join_phrases(parts)}."]
+    parts = [text.format(f"{100 * count / preventable.looked_at:.0f} % ({count} of {preventable.looked_at})")
+             for by, text in words.items() if (count := preventable.counts.get(by))]
+    sample = "the collisions" if preventable.looked_at == preventable.collisions else (
+        f"{preventable.looked_at} collisions, drawn at random from {preventable.collisions}")
+    return [f"In the same vehicle, of {sample}, {join_phrases(parts)}."]

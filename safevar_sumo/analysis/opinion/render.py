@@ -17,7 +17,7 @@ def print_opinions(console: Console, result: Opinions) -> None:
     """Print how many causes are confirmed, then every cause with the reason."""
     characteristics = CharacteristicSet.of(result.study.vehicle.characteristics)
     print_text(console, result.study.title)
-    print_text(console, f"Unsafe: {result.unsafe}. {MODEL_IN_WORDS}: {opinion_in_words(result)}")
+    print_text(console, f"Unsafe: {result.unsafe.description}. {MODEL_IN_WORDS}: {opinion_in_words(result)}")
     print_text(console, f"The original vehicle with our model: {result.original_here}; with the second: {result.original_there}.")
     for handle in result.without_cause:
         print_text(console, f"note: {handle} is not unsafe: it has no cause")

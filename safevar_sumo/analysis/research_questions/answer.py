@@ -132,6 +132,9 @@ def _notes(question: str, case: Case, *, alone: bool) -> list[str]:
     if question.startswith("rq3") or question in ("combinations", WEATHER):
         notes.append(f"{case.name}: {len(critical_solutions(case))} of {ALGORITHM_TITLES[NSGA2]}'s {len(case.solutions_of(NSGA2))} "
                      "solutions are critical.")
+    if question == "rq3.3":
+        units = [f"{characteristic.name} {characteristic.unit}" for characteristic in case.characteristics if characteristic.unit != "-"]
+        notes.append(f"Units of delta: {', '.join(units)}.")
     if question == "combinations" and frequent_combinations(case).empty:
         notes.append(f"{case.name}: no critical solution has exactly four characteristics changed.")
     return notes

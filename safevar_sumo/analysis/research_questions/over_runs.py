@@ -168,9 +168,10 @@ def summary_lines(case: Case) -> list[str]:
     """
     titles = titles_of(case.scoring.metrics)
     lines, any_testable = [], False
-    questions = (("RQ1", rq1_runs, "algorithm", "A12 below 0.5: the runs are more unsafe than the original vehicle"),
-                 ("RQ2", rq2_runs, "baseline", "A12 above 0.5: NSGA-II is better"))
-    for question, frame_of, group_column, meaning in questions:
+    questions = (("RQ1", rq1_runs, "algorithm", "A12 below 0.5: the runs are more unsafe than the original vehicle",
+                  "A12 of {} against the original vehicle"),
+                 ("RQ2", rq2_runs, "baseline", "A12 above 0.5: NSGA-II is better", "A12 of NSGA-II against {}"))
+    for question, frame_of, group_column, meaning, heading in questions:
         try:
             frame = frame_of(case)
         except UnanswerableError as error:
@@ -187,7 +188,7 @@ def summary_lines(case: Case) -> list[str]:
             note = f"; {named_metrics}too few runs for a test ({fewest_runs(question)} are needed)" if untestable else ""
             effects = ", ".join(f"{titles[row['metric']]} " + ("-" if row["effect_size"] is None or row["p_holm"] is None else
                                 f"{row['effect_size']:.2f}{'*' if row['p_holm'] < ALPHA else ''}") for row in rows)
-            lines.append(f"  {ALGORITHM_TITLES.get(str(name), name)}: {effects}{note}")
+            lines.append(f"  {heading.format(ALGORITHM_TITLES.get(str(name), name))}: {effects}{note}")
     return [*lines, significance_change_line(case)] if any_testable else lines
 
 

@@ -288,7 +288,7 @@ def _draw_vehicles(evaluator: Evaluator, model: VariationModel, unsafe: Unsafe, 
                 if estimate is not None:
                     return estimate
             elif options.requires_rare_method:
-                counts.remark = f"more than {RARE_BELOW:g} of {valid_vehicles} vehicles are unsafe: plain Monte Carlo is used"
+                counts.remark = f"more than {100 * RARE_BELOW:g} % of {valid_vehicles} vehicles are unsafe: plain Monte Carlo is used"
         low, high = clopper_pearson(counts.failures, counts.vehicles, options.confidence) if counts.vehicles else (0.0, 1.0)
         if options.width is not None and high - low <= options.width:
             break
@@ -308,7 +308,7 @@ def _try_rare_method(response: Response, responses: FloatArray, options: RiskOpt
                         "rare failures cannot approach failures; plain Monte Carlo is used")
         return None
     if not options.requires_rare_method and find_spec("openturns") is None:
-        counts.remark = ("fewer than 0.01 of the first vehicles are unsafe; pip install 'safevar_sumo[rare]' for a method that needs fewer "
+        counts.remark = ("fewer than 1 % of the first vehicles are unsafe; pip install 'safevar_sumo[rare]' for a method that needs fewer "
                         "vehicles for rare failures")
         return None
     try:

@@ -26,9 +26,9 @@ def print_risk(console: Console, result: Risk) -> None:
     low, high = result.interval
     print_text(console, result.study.title)
     sampling = "" if result.method == "monte_carlo" else f", drawn by {result.method.replace('_', ' ')}"
-    print_text(console, f"Unsafe: {result.unsafe}. {result.failures} of {result.samples} vehicles{sampling}.")
+    print_text(console, f"Unsafe: {result.unsafe.description}. {result.failures} of {result.samples} vehicles{sampling}.")
     label = "Share of the domain that is unsafe:" if result.is_share_of_domain else "Probability"
-    print_text(console, f"{label} {result.probability:.4g}, with {result.confidence:.0%} confidence from {low:.4g} to {high:.4g}.")
+    print_text(console, f"{label} {result.probability:.4g}, with {100 * result.confidence:.0f} % confidence from {low:.4g} to {high:.4g}.")
     if result.remark:
         print_text(console, f"note: {result.remark}.")
     if result.design_point is not None:
@@ -39,12 +39,13 @@ def print_risk(console: Console, result: Risk) -> None:
         print_text(console, f"Of {FLEET_VEHICLES:,} vehicles that vary independently at least one is unsafe with probability "
                             f"{result.of_fleet(FLEET_VEHICLES):.2g}.")
     if result.is_share_of_domain:
-        print_text(console, "warning: this is no probability in the field: the study has no [variation] table for how real vehicles vary.")
+        print_text(console, "warning: this is not a probability in the field: the study has no [variation] table for how real vehicles "
+                            "vary.")
     print_text(console, _how_vehicles_vary(result.study))
     print_constraints(console, result.study)
     if result.sensitivity is None or result.sensitivity_of_unsafe is None:
         return
-    table = WholeTable("characteristic", right=("SD: alone", "in all", "unsafe: alone", "in all"),
+    table = WholeTable("characteristic", right=("SD alone", "SD in all", "unsafe alone", "unsafe in all"),
                        title="What decides: share of the variance")
     unsafe_indices = result.sensitivity_of_unsafe.set_index("characteristic")
     for row in result.sensitivity.sort_values("total", ascending=False, kind="stable").to_dict("records"):
@@ -55,8 +56,8 @@ def print_risk(console: Console, result: Risk) -> None:
     if result.sensitivity_of_unsafe["total"].isna().all():
         print_text(console, "There are no indices of the unsafe outcome, because too few settings are unsafe or too few are safe.")
     print_meanings(console, CharacteristicSet.of(result.study.vehicle.characteristics))
-    print_text(console, f"Sobol indices, first order and total, with half of their {result.confidence:.0%} intervals: estimates, which may "
-                        "exceed 1 or fall below 0 by their error.")
+    print_text(console, f"Sobol indices, first order and total, with half of their {100 * result.confidence:.0f} % intervals: estimates, "
+                        "which may exceed 1 or fall below 0 by their error.")
 
 
 def _how_vehicles_vary(study: Study) -> str:
@@ -85,7 +86,7 @@ def sensitivity_figure(result: Risk) -> Figure:
         raise InputError("correlations", "there are no sensitivity indices of characteristics that are correlated or bound by constraints",
                          "a study without correlations and constraints")
     names = result.sensitivity.sort_values("total", kind="stable")["characteristic"].to_list()
-    title = f"{result.study.name}: what decides ({result.confidence:.0%} intervals)"
+    title = f"{result.study.name}: what decides ({100 * result.confidence:.0f} % intervals)"
     figure, (axes,) = new_figure(title, rows=1, columns=2, size=(7.2, 1.5 + 0.28 * max(len(names), 4)))
     frames = {"safety degree": result.sensitivity, f"unsafe ({result.unsafe})": result.sensitivity_of_unsafe}
     for axis, (output, frame) in zip(axes, frames.items(), strict=True):

@@ -253,7 +253,8 @@ def print_rules(console: Console, result: Rules) -> None:
     """Print every rule with its density and coverage."""
     characteristics = CharacteristicSet.of(result.study.vehicle.characteristics)
     print_text(console, result.study.title)
-    print_text(console, f"Unsafe: {result.unsafe}; {result.unsafe_share:.2%} of {result.samples} settings all over the domain.")
+    print_text(console, f"Unsafe: {result.unsafe.description}; {100 * result.unsafe_share:.2f} % of {result.samples} settings "
+                        "all over the domain.")
     print_constraints(console, result.study)
     if result.remark:
         print_text(console, f"No rule: {result.remark}.")
@@ -264,14 +265,16 @@ def print_rules(console: Console, result: Rules) -> None:
     if result.rules:
         named = {name for rule in result.rules for name in rule.limits}
         print_meanings(console, [characteristic for characteristic in characteristics if characteristic.name in named])
-        print_text(console, f"Tested on settings that did not form the rules; in brackets {result.rules[0].confidence:.0%} intervals.")
+        print_text(console, f"Tested on settings that did not form the rules; in brackets "
+                            f"{100 * result.rules[0].confidence:.0f} % intervals.")
 
 
 def rule_in_words(rule: Rule, characteristics: CharacteristicSet, unsafe: Unsafe) -> str:
-    """A rule with its density and coverage: `tireFric below 1.35 and gearSwitchTime above 0.55 s: collides in 92% (..), covers 61%`."""
+    """A rule with its density and coverage: `tireFric below 1.35 and gearSwitchTime above 0.55 s: collides in 92 % (..), covers 61 %`."""
     conditions = [_condition_in_words(characteristic, *rule.limits[characteristic.name])
                   for characteristic in characteristics if characteristic.name in rule.limits]
-    shares = [f"{word} {share:.0%} ({interval[0]:.0%} to {interval[1]:.0%})" if share is not None and interval is not None else f"{word} -"
+    shares = [f"{word} -" if share is None or interval is None else
+              f"{word} {100 * share:.0f} % ({100 * interval[0]:.0f} % to {100 * interval[1]:.0f} %)"
               for word, share, interval in ((f"{unsafe.in_words} in", rule.density, rule.density_interval),
                                             ("covers", rule.coverage, rule.coverage_interval))]
     return f"{join_phrases(conditions) if conditions else 'everywhere'}: {', '.join(shares)}"

@@ -30,7 +30,8 @@ def print_tolerance(console: Console, result: Tolerance) -> None:
     """Print the verdict, the limits of each characteristic by itself, the worst pairs, and the safe box."""
     print_text(console, result.study.title)
     original = result.original
-    print_text(console, f"Unsafe: {result.unsafe}. The original vehicle: {original.outcome[0]}, SD {two_decimals(original.f_safe[0])}.")
+    print_text(console, f"Unsafe: {result.unsafe.description}. The original vehicle: {original.outcome[0]}, "
+                        f"SD {two_decimals(original.f_safe[0])}.")
     print_text(console, result.verdict)
     print_constraints(console, result.study)
     console.print(_scan_table(result))
@@ -65,9 +66,9 @@ def _box_in_words(result: Tolerance) -> str:
     failed = f"; {box.failed} of them could not be simulated and count as unsafe in what follows" if box.failed else ""
     box_settings = "all settings in the box that satisfy the constraints" if result.study.constraints else "all settings in the box"
     predicate = "are unsafe or cannot be simulated" if box.failed else "are unsafe"
-    return (f"{subject}: each may go {box.factor:.1%} of the way from its original value to either end of its domain. None of "
-            f"{box.samples} settings drawn at random in this box is unsafe{failed}. With {box.confidence:.0%} confidence at most "
-            f"{box.unsafe_at_most:.2%} of {box_settings} {predicate}.")
+    return (f"{subject}: each may go {100 * box.factor:.1f} % of the way from its original value to either end of its domain. None of "
+            f"{box.samples} settings drawn at random in this box is unsafe{failed}. With {100 * box.confidence:.0f} % confidence at most "
+            f"{100 * box.unsafe_at_most:.2f} % of {box_settings} {predicate}.")
 
 
 def _scan_table(result: Tolerance) -> WholeTable:
@@ -106,8 +107,8 @@ def _print_pairs(console: Console, result: Tolerance) -> None:
     for pair in unsafe_pairs[:MAX_PAIRS]:
         names = [characteristic.name for characteristic in pair.characteristics]
         nearest = ", ".join(f"{name} {value:.5g}" for name, value in zip(names, pair.nearest or (), strict=True))
-        failed = f" ({pair.not_simulated_share:.1%} could not be simulated)" if pair.not_simulated_share else ""
-        table.add_row(" with ".join(names), f"{pair.unsafe_share:.1%}{failed}", nearest)
+        failed = f" ({100 * pair.not_simulated_share:.1f} % could not be simulated)" if pair.not_simulated_share else ""
+        table.add_row(" with ".join(names), f"{100 * pair.unsafe_share:.1f} %{failed}", nearest)
     console.print(table)
     if len(unsafe_pairs) > MAX_PAIRS:
         print_text(console, f"... and {len(unsafe_pairs) - MAX_PAIRS} more (--json has all).")
