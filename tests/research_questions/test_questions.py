@@ -208,8 +208,9 @@ def test_several_cases_stand_in_one_frame_and_the_refused_in_the_notes() -> None
 def test_the_brief_lines_say_what_the_data_allows() -> None:
     five = made_up(*(row(name, run=run, sd=sd + run / 10) for name, sd in (("nsga2", 1.0), ("rs", 2.5)) for run in range(5)))
     lines = summary_lines(five)
-    assert any("NSGA-II: SD 0.00, " in line and line.endswith("too few runs for a test (8 are needed)") for line in lines)
-    assert any("RS: IGD " in line and "too few" not in line for line in lines), "five runs against five can differ significantly"
+    assert any("A12 of NSGA-II against the original vehicle: SD 0.00, " in line
+               and line.endswith("too few runs for a test (8 are needed)") for line in lines)
+    assert any("A12 of NSGA-II against RS: IGD " in line and "too few" not in line for line in lines), "five runs can differ significantly"
     assert any("RQ2 over runs: only nsga2 has finished runs" in line for line in summary_lines(made_up(row())))
     (rq1_answer,), (rq2_answer,) = (answer_questions([five], name) for name in ("rq1-runs", "rq2-runs"))
     assert any("too few runs for all 8 tests of RQ1 (8 are needed)" in note for note in rq1_answer.notes)

@@ -81,7 +81,7 @@ def answer_questions(cases: Sequence[Case], question: str | None = None) -> list
             frame = pd.concat(frames, ignore_index=True)
             answered_names = {*frame["setting"], *frame["other"]} if name == WEATHER else case_names - {error.source for error in errors}
             case_notes = [note for case in cases if case.name in answered_names
-                          for note in _notes(name, case, alone=question is not None)]
+                          for note in _notes(table, case, alone=question is not None)]
             answers.append(Answer(table, frame, tuple(dict.fromkeys([*notes, *case_notes])), metrics))
     if all_errors and all(answer.frame.empty for answer in answers):
         raise all_errors[0]
