@@ -79,7 +79,7 @@ def _print_answer(console: Console, command_for: CommandFor, result: Explained, 
         print_text(console, f"Necessary most often ({_sample_in_words(result)}): {_most_necessary_in_words(result, characteristics)}.")
         common = result.distinct.iloc[0]
         print_text(console, f"{number_of(len(result.distinct), 'distinct minimal cause')}; the most frequent: "
-                      f"{', '.join(common['cause']) or 'none'} ({common['share']:.0%} of the failures).")
+                      f"{', '.join(common['cause']) or 'none'} ({100 * common['share']:.0f} % of the failures).")
 
 
 def _describe(failure: Explanation | None) -> FailureDescription | None:

@@ -138,7 +138,7 @@ NUMBER_WORDS = ("no", "one", "two", "three", "four", "five", "six", "seven", "ei
 MAX_CHANGES_LISTED = 4
 """Maximum number of changes that are listed, the largest first."""
 WEATHER_PHRASES = {"clear": "In clear weather", "wet": "On a wet road", "fog": "In fog", "night": "At night",
-                   "soft_rain": "In soft rain", "hard_rain": "In hard rain"}
+                   "soft_rain": "In soft rain", "hard_rain": "In hard rain", "carla_hard_rain": "In hard rain"}
 """Weathers as the beginning of a sentence; any other weather is named."""
 
 
@@ -213,8 +213,8 @@ def _conditions_in_words(system: System) -> str:
 
 def _weather_in_words(point: Point) -> str:
     name = point.weather.name
-    no_effect = " (no effect on road and sensors)" if equals_clear(point.weather) else ""
-    return WEATHER_PHRASES.get(name, f"With the weather '{name}'{no_effect}")
+    no_effect = " (which changes neither road nor sensors)" if name != "clear" and equals_clear(point.weather) else ""
+    return WEATHER_PHRASES.get(name, f"With the weather '{name}'") + no_effect
 
 
 def _original_ending_in_words(system: System, original: Evaluations) -> str:
