@@ -213,7 +213,7 @@ def _conditions_in_words(system: System) -> str:
 
 def _weather_in_words(point: Point) -> str:
     name = point.weather.name
-    no_effect = " (which changes neither road nor sensors)" if name != "clear" and equals_clear(point.weather) else ""
+    no_effect = " (which changes neither road nor sensors)" if equals_clear(point.weather) else ""
     return WEATHER_PHRASES.get(name, f"With the weather '{name}'") + no_effect
 
 
