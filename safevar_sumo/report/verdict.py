@@ -302,7 +302,7 @@ def _agreement_sentence(totals: Totals) -> str:
     if totals.precision is not None:
         collisions += f", and {totals.both} of the {totals.here} collisions here are published ones (precision {totals.precision:.2f})"
     rho = totals.spearman.get(SAFETY_DEGREE)
-    order = "" if rho is None else f" safety degrees are in the same order with a rank correlation of {rho:.2f} (1 is perfect);"
+    order = "" if rho is None else f" the rank correlation of the safety degrees is {rho:.2f} (1: the same order, 0: none);"
     return f"{totals.file}, {totals.rows} vehicles simulated again:{order} {collisions}."
 
 
