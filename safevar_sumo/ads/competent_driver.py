@@ -14,8 +14,8 @@ from safevar_sumo.records import TIME_ROUNDING, BoolArray, Command, FloatArray, 
 
 
 class _Memory(NamedTuple):
-    """Reaction; the obstacle's first lateral position [m], infinite before the first; whether the obstacle was in the way there; time
-    since the obstacle strayed from there [s], negative before.
+    """The reaction; the lateral position of the obstacle when it was first sensed [m], infinite until then; whether it was in the way
+    there; the time since it strayed from there [s], negative until it does.
     """
 
     reaction: Reaction
@@ -65,18 +65,18 @@ class CompetentDriver(Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
 
     def drive(self, seen: Observation, memory: _Memory) -> tuple[Command, _Memory]:
         is_perceived, memory = self._perceive(seen, memory)
-        has_leader = is_perceived & is_in_the_way(seen, self.corridor)
+        is_in_way = is_perceived & is_in_the_way(seen, self.corridor)
         command, reaction = react(
-            seen, memory.reaction, has_leader & (time_to_reach(seen) < self.critical_ttc), np.full_like(seen.speed, HARDEST_BRAKING),
+            seen, memory.reaction, is_in_way & (time_to_reach(seen) < self.critical_ttc), np.full_like(seen.speed, HARDEST_BRAKING),
             reaction_time=self.reaction_time, corridor=self.corridor, coasting_deceleration=self.lets_go, cruise_speed=self.cruise_speed,
-            start=self.start_throttle, following=self._following(seen, has_leader))
+            start=self.start_throttle, following=self._following(seen, is_in_way))
         return command, memory._replace(reaction=reaction)
 
-    def _following(self, seen: Observation, has_leader: BoolArray) -> FloatArray:
-        """Acceleration that keeps the headway to a moving leader [m/s^2]; infinite without a leader."""
-        gap = np.where(has_leader, seen.gap, 0.0)
+    def _following(self, seen: Observation, is_in_way: BoolArray) -> FloatArray:
+        """Acceleration that keeps the headway to a moving leader [m/s^2]; infinite if no leader is in the way."""
+        gap = np.where(is_in_way, seen.gap, 0.0)
         gap_control = KEEPING_GAINS[0] * (seen.obstacle_speed - seen.speed) + KEEPING_GAINS[1] * (gap - self.headway * seen.speed)
-        return np.where(has_leader & (seen.obstacle_speed > 0), np.maximum(gap_control, -self.lets_go), np.inf)
+        return np.where(is_in_way & (seen.obstacle_speed > 0), np.maximum(gap_control, -self.lets_go), np.inf)
 
     def _perceive(self, seen: Observation, memory: _Memory) -> tuple[BoolArray, _Memory]:
         """Whether the obstacle is perceived: it was in the way at first, or strayed from its first position `perception_time` ago."""

@@ -35,7 +35,7 @@ REFERENCE_DRIVERS = ("competent_driver", "full_braking")
 
 
 class PreventableBy(StrEnum):
-    """The weakest reference driver that avoids a collision in the same vehicle; by NOBODY, a collision is not preventable."""
+    """The weakest reference driver that avoids a collision in the same vehicle; NOBODY if none avoids it."""
 
     COMPETENT_DRIVER = "preventable by a competent driver"
     FULL_BRAKING = "preventable by full braking at the first possible moment"

@@ -186,7 +186,7 @@ def assert_tells_a_manager(paragraph: str, explained: Explained) -> None:
     by_reason = {reason: one for one in explained.explanations for reason in one.reasons}
     fewest, robust = by_reason["fewest changes"], by_reason["smallest robust"]
     degree = float(explained.original.f_safe[0])
-    assert paragraph.startswith(f"In wet leaves, the original vehicle stops {degree:.2f} m short of the pedestrian. ")
+    assert paragraph.startswith(f"With the weather 'wet leaves', the original vehicle stops {degree:.2f} m short of the pedestrian. ")
     as_few = len(robust.changed) == len(fewest.changed)
     for one in (robust,) if as_few else (fewest, robust):
         word = "borderline: only" if one.robustness.borderline else "robust:"

@@ -78,7 +78,7 @@ def test_the_same_bytes_twice(kind: str, crash: Comparison, tmp_path: Path) -> N
             for frame in range(image.n_frames):
                 image.seek(frame)
                 durations.append(image.info["duration"])
-        seconds = lay_out_scene(crash).length * crash.film.runs.trace.step
+        seconds = lay_out_scene(crash).sample_count * crash.film.runs.trace.step
         assert sum(durations[:-1]) / 1000 == pytest.approx(seconds, abs=0.3), "it lasts as long as the drive"
     if kind == "mp4":
         assert (tmp_path / "a.mp4").read_bytes()[4:8] == b"ftyp"

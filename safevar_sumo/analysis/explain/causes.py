@@ -66,7 +66,7 @@ def find_minimal_causes(evaluator: Evaluator, settings: FloatArray, unsafe: Unsa
 
 
 def estimate_subset_count(changes: int) -> int:
-    """Estimated number of subsets of so many changes that are simulated until the smallest unsafe subsets appear.
+    """Estimated number of subsets to simulate, for a setting with this number of changes, until the smallest unsafe subsets appear.
 
     The estimate assumes causes with half of the changes, about as in the shipped studies.
     """
@@ -94,7 +94,7 @@ def involved_columns(causes: Sequence[MinimalCause]) -> frozenset[int]:
 
 
 LINE_SETTINGS = 32
-"""Number of settings first simulated on a line. The search finds every unsafe stretch of the line that is as long as their spacing."""
+"""Number of settings first simulated on each `Line`. The search finds every unsafe stretch of the line that is as long as their spacing."""
 PARTS_PER_ROUND = 8
 """Number of parts into which each of `ROUNDS` rounds divides the interval with the boundary."""
 ROUNDS = 3
@@ -175,7 +175,7 @@ class Line(NamedTuple):
 
 
 def find_first_unsafe_shares(evaluator: Evaluator, lines: list[Line], unsafe: Unsafe, stage: str = "boundaries") -> FloatArray:
-    """The first unsafe share of every line, whose end is unsafe; exact to `RESOLUTION` of the line above `lowest`."""
+    """The first unsafe share of every line; its end must be unsafe. The error is at most `RESOLUTION` times the line above `lowest`."""
     return find_boundary_shares(evaluator, lines, unsafe, stage)[0]
 
 

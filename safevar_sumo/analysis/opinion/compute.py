@@ -1,4 +1,4 @@
-"""Simulates the minimal causes of failures, and the nearest safe setting below each, again with the second vehicle model."""
+"""Simulates minimal causes of failures again with the second vehicle model, and for each the largest share of its changes that is safe."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def assemble_both_systems(study: Study) -> tuple[System, System, VehicleMapping]
     InputError
         If commonroad-vehicle-models is not installed, or the second model cannot represent the vehicle at all.
     """
-    load_bmw_parameters()
+    load_bmw_parameters()  # raises the error if the package is not installed
     system = assemble(study)
     mapping = map_vehicle(study, system.vehicle)
     return system, replace(system, vehicle=SecondVehicle(system.vehicle, mapping, study)), mapping

@@ -61,7 +61,7 @@ def rq31(case: Case) -> pd.DataFrame:
 
 
 def rq32(case: Case) -> pd.DataFrame:
-    """Share of the critical solutions with j characteristics changed in which each characteristic is changed.
+    """For each characteristic and j: the share of the critical solutions with j changes that change this characteristic.
 
     Columns setting, characteristic, j ("1".."n", "any"), percent (None without such a solution), rank (only for
     j = "any"; ties share the better rank and the next one is skipped).

@@ -152,5 +152,5 @@ def rq2_rows(case: Case, sample_of: SampleFunction) -> list[dict[str, Any]]:
         tests += [(metric.name, not metric.more_is_unsafe, compare_samples(*(sample_of(algorithm, metric) for algorithm in pair)))
                   for metric in case.scoring.metrics]
         rows += [{"setting": case.name, "baseline": baseline, "metric": name,
-                  **(reverse_effect(test) if smaller_is_better else test)._asdict()} for name, smaller_is_better, test in tests]
+                  **(reverse_effect(test) if is_reversed else test)._asdict()} for name, is_reversed, test in tests]
     return rows

@@ -35,7 +35,7 @@ from safevar_sumo.records import FloatArray
 RQ1_RUNS_COLUMNS = ["setting", "algorithm", "metric", "p_value", "p_holm", "effect_size", "magnitude", "runs", "method", "mean", "original"]
 RQ2_RUNS_COLUMNS = ["setting", "baseline", "metric", "p_value", "p_holm", "effect_size", "magnitude", "n1", "n2", "method"]
 COUNT_COLUMNS = {"RQ1": ["runs"], "RQ2": ["n1", "n2"]}
-"""Columns of the numbers of runs that a test of each question compares."""
+"""For each question, the columns with the number of runs in each sample of a test."""
 EXACT_SIGNED_TEST = "Wilcoxon signed-rank, two-sided, exact"
 ASYMPTOTIC_SIGNED_TEST = "Wilcoxon signed-rank, two-sided, normal approximation with correction for continuity"
 MAX_EXACT_RUNS = 50
@@ -146,7 +146,10 @@ def significance_change_line(case: Case) -> str:
 
 
 def notes_over_runs(case: Case, question: str, *, pooling: bool) -> list[str]:
-    """Notes on RQ1 or RQ2 over runs: how many tests have too few runs; with `pooling` the `significance_change_line`, if any has enough."""
+    """Notes on RQ1 or RQ2 over runs: how many tests have too few runs.
+
+    With `pooling`, also the `significance_change_line`, if at least one test of RQ1 or RQ2 has enough runs.
+    """
     enough_by_question = {name: _has_enough_runs(frame, name) for name, frame in zip(COUNT_COLUMNS, _corrected_frames(case), strict=True)
                           if frame is not None}
     enough = enough_by_question[question]

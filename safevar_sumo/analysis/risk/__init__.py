@@ -26,7 +26,7 @@ RARE_BELOW = 1e-2
 PILOT_VEHICLES = 1000
 """Number of vehicles first drawn by plain Monte Carlo, whose outcomes decide the method."""
 ENOUGH_FAILURES = 100
-"""Plain Monte Carlo is kept if at least this many failures are to be expected among all requested vehicles, by the pilot's share."""
+"""Plain Monte Carlo is kept if the share of failures in the pilot, times the number of requested vehicles, is at least this."""
 
 
 @dataclass(frozen=True, kw_only=True)
