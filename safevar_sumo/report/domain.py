@@ -47,13 +47,13 @@ def make_risk_section(data: ReportInput, jobs: int | None, progress: Progress) -
 def make_rules_section(data: ReportInput, jobs: int | None, progress: Progress) -> Section:
     """Rules in words, with their density and coverage among vehicles held back while the rules were found."""
     def compute() -> Section:
-        found = find_rules(data.case.study, data.options["rules"], jobs=jobs, progress=progress)
-        significant = [rule for rule in found.rules if rule.is_denser_than(found.unsafe_share)]
-        words = [superscript_powers(rule_in_words(rule, data.case.characteristics, found.unsafe)) for rule in significant]
-        omitted_rules = number_of(len(found.rules) - len(significant), "rule")
-        remark = (found.remark and f"{found.remark}.") if len(significant) == len(found.rules) else (
+        result = find_rules(data.case.study, data.options["rules"], jobs=jobs, progress=progress)
+        significant = [rule for rule in result.rules if rule.is_denser_than(result.unsafe_share)]
+        words = [superscript_powers(rule_in_words(rule, data.case.characteristics, result.unsafe)) for rule in significant]
+        omitted_rules = number_of(len(result.rules) - len(significant), "rule")
+        remark = (result.remark and f"{result.remark}.") if len(significant) == len(result.rules) else (
             f"Left out: {omitted_rules} that may be due to chance, as few vehicles were simulated; the command rules simulates more.")
-        return {"words": words, "samples": found.samples, "share": found.unsafe_share, "remark": remark, "unsafe": str(found.unsafe)}
+        return {"words": words, "samples": result.samples, "share": result.unsafe_share, "remark": remark, "unsafe": str(result.unsafe)}
 
     return _with_criterion_in_words(load_or_compute(data, "rules", compute))
 
