@@ -151,7 +151,8 @@ def totals(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def test_the_page_says_how_well_the_study_agrees() -> None:
     searched_otherwise = load_study("rain", title="Mine", search={"seed": 5, "evaluations": 100})
     page = page_of(searched_otherwise)
-    for words in ("80 vehicles", "rank correlation of 0.61", "10 of the 40 published collisions", "recall 0.25", "precision 0.50"):
+    for words in ("80 vehicles", "rank correlation of the safety degrees is 0.61 (1: the same order, 0: none)",
+                  "10 of the 40 published collisions", "recall 0.25", "precision 0.50"):
         assert words in page.sentence
     assert page.rows == [["made_up.csv", "80", "0.61", "0.25", "40", "20", "10", "0.25", "0.50"]]
 
@@ -160,7 +161,7 @@ def test_the_page_quotes_every_file_and_not_only_the_best(totals: Path) -> None:
     worse = Agreement(**{**MADE_UP.to_dict(), "rows": 90, "spearman": {"safety_degree": 0.1}})
     write_totals(totals, load_study("rain"), "worse.csv", worse)
     sentence = page_of(load_study("rain")).sentence
-    for words in ("made_up.csv, 80 vehicles simulated again", "correlation of 0.61", "worse.csv, 90 vehicles", "correlation of 0.10"):
+    for words in ("made_up.csv, 80 vehicles simulated again", "safety degrees is 0.61", "worse.csv, 90 vehicles", "safety degrees is 0.10"):
         assert words in sentence
 
 
