@@ -17,7 +17,7 @@ from safevar_sumo.errors import InputError, SafevarError, one_of, warn
 from safevar_sumo.progress import CampaignProgress
 from safevar_sumo.records import Evaluations
 from safevar_sumo.results import MANIFEST, ResultsDirectory, read_manifest
-from safevar_sumo.results.files import RUNS
+from safevar_sumo.results.files import stored_runs
 from safevar_sumo.study import Study, StudyLike
 from safevar_sumo.sumo import Engine, reason_for_sumo, settings_per_batch
 from safevar_sumo.sumo.system import System
@@ -125,7 +125,7 @@ def _extent_remarks(results: ResultsDirectory, study: Study) -> list[str]:
     if earlier != now:
         remarks.append(f"{results.path}: each run had {earlier} evaluations before and has {now} now: an id such as nsga2:0:0 may "
                        "name another solution than in earlier output and reports")
-    names = {path.stem for path in (results.path / RUNS).glob("*-*.journal")} - set(map(str, all_runs(study)))
+    names = stored_runs(results.path) - set(map(str, all_runs(study)))
     if names:
         remarks.append(f"{results.path}: {number_of(len(names), 'earlier run')} left out of the results: {', '.join(sorted(names))}")
     return remarks

@@ -42,24 +42,20 @@ class Unsafe:
 
     @property
     def description(self) -> str:
-        """The criterion in words, rounded: `collision`, `safety degree below 0.85 m (half of the original's)`."""
+        """The criterion in words, rounded: `collision`, `safety degree below 0.847 m (half of the original's)`."""
         if self.points is not None:
             return f"at most {self.points:g} points"
         if self.below is None:
             return "collision"
         share = " (half of the original's)" if self.is_half else ""
-        return f"safety degree below {self._limit} {'m' if self.below >= 0 else 'm/s'}{share}"
-
-    @property
-    def _limit(self) -> str:
-        return f"{self.below:.2f}" if self.is_half else f"{self.below:.3g}"
+        return f"safety degree below {self.below:.3g} {'m' if self.below >= 0 else 'm/s'}{share}"
 
     @property
     def in_words(self) -> str:
         """What an unsafe vehicle does: `collides`, `SD is below 1.4`."""
         if self.points is not None:
             return f"keeps at most {self.points:g} points"
-        return "collides" if self.below is None else f"SD is below {self._limit}"
+        return "collides" if self.below is None else f"SD is below {self.below:.3g}"
 
     def of(self, evaluations: Evaluations) -> BoolArray:
         """Which evaluations are unsafe; shape (M,). An undefined safety degree is not unsafe."""

@@ -12,7 +12,7 @@ import numpy as np
 
 from safevar_sumo.ads import ADS
 from safevar_sumo.analysis.explain.necessity import MIN_ROBUST_SHARE, is_borderline, robustness_in_words
-from safevar_sumo.analysis.explain.result import REASONS, ROBUST, CauseEntry, FailureEntry
+from safevar_sumo.analysis.explain.result import REASONS, ROBUST, CauseEntry, FailureEntry, most_robust
 from safevar_sumo.analysis.model_spread import ModelSpread, compute_model_spreads
 from safevar_sumo.analysis.preventability import PreventedShares
 from safevar_sumo.analysis.research_questions.case import ALGORITHM_TITLES, are_collisions
@@ -205,7 +205,7 @@ def _select_failure(data: ReportInput, handle: str, reasons: list[str], failure:
         size=f"{len(changes)} of {len(setting)} characteristics changed, by at most {100 * largest_change:.0f} %",
         end=_describe_end(data, handle, setting), f_safe=data.solutions[handle]["f_safe"], failing_points=data.failing_points(setting),
         unsafe_share=failure.robustness if failure else None,
-        cause=max(failure.minimal_causes, key=lambda cause: cause.robustness or 0.0, default=None) if failure else None)
+        cause=most_robust(failure.minimal_causes) if failure else None)
 
 
 def _describe_end(data: ReportInput, handle: str, setting: FloatArray) -> str:

@@ -38,8 +38,8 @@ from safevar_sumo.analysis.explain.necessity import (
     find_smallest_robust_failure,
     necessity_frame,
 )
-from safevar_sumo.analysis.explain.render import _print_explanation, _sample_in_words, most_robust, print_explained
-from safevar_sumo.analysis.explain.result import Cause, Explained, Explanation
+from safevar_sumo.analysis.explain.render import _print_explanation, _sample_in_words, print_explained
+from safevar_sumo.analysis.explain.result import Cause, Explained, Explanation, most_robust
 from safevar_sumo.analysis.explain.summary import NUMBER_WORDS, FailureDescription, failures_paragraph, summarise_failures
 from safevar_sumo.analysis.preventability import Preventability
 from safevar_sumo.analysis.research_questions.case import Case, load_cases

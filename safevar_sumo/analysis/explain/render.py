@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -12,7 +12,7 @@ from rich.markup import escape
 from safevar_sumo.analysis.evaluator import CONFIDENCE
 from safevar_sumo.analysis.explain.braking_comparison import BrakingComparison, sentence
 from safevar_sumo.analysis.explain.compute import points_in_words
-from safevar_sumo.analysis.explain.result import REASONS, ROBUST, Cause, Explained, Explanation
+from safevar_sumo.analysis.explain.result import REASONS, ROBUST, Cause, Explained, Explanation, most_robust
 from safevar_sumo.analysis.explain.summary import LABELS, FailureDescription, failures_paragraph
 from safevar_sumo.analysis.figures import BLUE, FONT, GREY, SKY_BLUE, escape_dollars, new_figure
 from safevar_sumo.analysis.words import list_of_changes, number_of, question_command, simulate_command, two_decimals
@@ -90,11 +90,6 @@ def _describe(failure: Explanation | None) -> FailureDescription | None:
     return FailureDescription(
         str(failure.handle or "a sampled setting"), changes, failure.outcome, failure.safety_degree, failure.robustness,
         len(failure.causes[0].changes), None if cause is None else cause.neighbours)
-
-
-def most_robust(causes: Iterable[Cause]) -> Cause | None:
-    """The cause with the largest share of unsafe neighbours; the first of several, or in a rated study, whose causes have no shares."""
-    return max(causes, key=lambda cause: 0.0 if cause.neighbours is None else cause.neighbours.share, default=None)
 
 
 def _most_necessary_in_words(result: Explained, characteristics: CharacteristicSet) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import msgspec
 import pandas as pd
@@ -121,6 +121,14 @@ class Cause:
                                        "and counts as none",
                  BoundaryState.NOT_SIMULATED: "slightly less could not be simulated"}[self.end]
         return f"Scaling all changes to {100 * self.fraction:.1f} % is still unsafe; {below}."
+
+
+SomeCause = TypeVar("SomeCause", Cause, CauseEntry)
+
+
+def most_robust(causes: Iterable[SomeCause]) -> SomeCause | None:
+    """The cause with the largest share of unsafe neighbours; the first of several, or in a rated study, whose causes have no shares."""
+    return max(causes, key=lambda cause: cause.robustness or 0.0, default=None)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -31,7 +31,7 @@ LABELS = {ROBUST: "robust with the fewest changes", REASONS["smallest"]: "smalle
 """Titles of failures by the reason for their choice; any other reason is itself the title."""
 MAX_SIMULATIONS = 4000
 """Approximate maximum number of simulations that search for a robust failure at the end of a study; `explain` has a higher limit."""
-MAX_CAUSES = 8
+MAX_ESTIMATED_CAUSES = 8
 """Maximum number of minimal causes of a failure whose robustness is estimated at the end of a study."""
 
 
@@ -100,7 +100,7 @@ def _write_paragraph(evaluator: Evaluator, solutions: pd.DataFrame, is_unsafe: p
     fewest_row = int(np.lexsort([getattr(failures, name) for name in reversed(CHOICES["fewest"])])[0])
     rows = [fewest_row] if robust_row is None else [fewest_row, robust_row]
     descriptions, chosen = [], failures.take(rows)
-    causes = [group[:MAX_CAUSES] for group in find_minimal_causes(evaluator, chosen.settings, unsafe)]
+    causes = [group[:MAX_ESTIMATED_CAUSES] for group in find_minimal_causes(evaluator, chosen.settings, unsafe)]
     cause_settings = [cause.setting for group in causes for cause in group]
     robustnesses = iter(estimate_robustness(evaluator, np.array([*chosen.settings, *cause_settings]), step, unsafe))
     failure_robustnesses = [next(robustnesses) for _ in rows]
