@@ -20,6 +20,8 @@ BAND_SHARE = 0.9
 """Share of the predictions that lie in the band."""
 HALF_WIDTH = 1.645
 """Half width [standard deviations] of the interval around the mean that holds `BAND_SHARE` of a normal distribution."""
+LEAST_DISTANCE = 0.3
+"""Distance [domain widths] that the model's error assumes of nearer vehicles: near the original too, a decision may fall a frame off."""
 ROUNDING_TOLERANCE = 1e-5
 """Relative tolerance within which a parameter's value in the study equals its (rounded) value in the first set of [spread]."""
 
@@ -76,14 +78,18 @@ def compute_model_spreads(study: Study, settings: FloatArray, point: str = "") -
 
 def band_of(study: Study, evaluations: Sequence[Evaluations]) -> tuple[FloatArray, FloatArray]:
     """Lower and upper ends, shape (M,) each, of the sets' predictions for M settings, widened by repeats and the model's error."""
-    error = study.model_error.get(SAFETY_DEGREE, 0.0) * distance_from_original(study, evaluations[0].settings)
+    error = study.model_error.get(SAFETY_DEGREE, 0.0) * error_distance(study, evaluations[0].settings)
     return prediction_band(np.stack([prediction.f_safe for prediction in evaluations]), study.repeatability.get(SAFETY_DEGREE, 0.0), error)
 
 
-def distance_from_original(study: Study, settings: FloatArray) -> FloatArray:
-    """Euclidean distance of settings from the original vehicle, each characteristic in widths of its domain; shape (M,)."""
+def error_distance(study: Study, settings: FloatArray) -> FloatArray:
+    """Distance of settings from the original vehicle to which the model's error is proportional [domain widths]; shape (M,).
+
+    It is the Euclidean distance, each characteristic in widths of its domain, but at least `LEAST_DISTANCE`.
+    """
     characteristics = CharacteristicSet.of(study.vehicle.characteristics)
-    return np.asarray(np.linalg.norm((settings - characteristics.original) / (characteristics.upper - characteristics.lower), axis=1))
+    changes = (settings - characteristics.original) / (characteristics.upper - characteristics.lower)
+    return np.asarray(np.maximum(np.linalg.norm(changes, axis=1), LEAST_DISTANCE))
 
 
 def prediction_band(safety_degrees: FloatArray, repeatability: float, error: FloatArray | float = 0.0) -> tuple[FloatArray, FloatArray]:

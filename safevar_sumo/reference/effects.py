@@ -8,7 +8,7 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 
-from safevar_sumo.analysis.model_spread import BAND_SHARE, band_of, distance_from_original, evaluate_sets
+from safevar_sumo.analysis.model_spread import BAND_SHARE, band_of, error_distance, evaluate_sets
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray, finite_or_none
 from safevar_sumo.reference.rows import ReferenceData
 from safevar_sumo.study import SAFETY_DEGREE, Study
@@ -129,14 +129,14 @@ def _distance_from_band(values: FloatArray, lower: FloatArray, upper: FloatArray
 def error_beyond_spread(study: Study, references: Mapping[str, ReferenceData]) -> float:
     """Margin on each side with which the band holds the share `BAND_SHARE` of new rows [m per domain width of distance from the original].
 
-    The method is split conformal prediction (Lei et al. 2018). The score of a row is its distance from the band, divided by its distance
-    from the original setting. All files have the same weight.
+    The method is split conformal prediction (Lei et al. 2018). The score of a row is its distance from the band, divided by its
+    `error_distance` from the original setting. All files have the same weight.
     """
     study_without_error = msgspec.structs.replace(study, model_error={})
     scores, weights = [], []
     for data in references.values():
-        distances, published = distance_from_original(study, data.settings), data.metrics[SAFETY_DEGREE]
-        is_usable = (distances > 0) & np.isfinite(published)
+        distances, published = error_distance(study, data.settings), data.metrics[SAFETY_DEGREE]
+        is_usable = np.isfinite(published)
         if is_usable.any():
             lower, upper = band_of(study_without_error, evaluate_sets(study_without_error, data.settings[is_usable]))
             scores.append(_distance_from_band(published[is_usable], lower, upper) / distances[is_usable])

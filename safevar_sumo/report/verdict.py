@@ -225,7 +225,9 @@ def _headline(data: ReportInput, failures: Sequence[SelectedFailure], explanatio
         return "No change is needed: the original vehicle itself is unsafe."
     outcome = "a collision" if are_collisions(data.case.solutions).any() else "an unsafe outcome"
     phrase = f"{outcome} that is robust" if ROBUST in first.reasons else outcome
-    borderline = "Every failure analysed is borderline. The one with the fewest changes: " if explanations and phrase == outcome else ""
+    borderline = ""
+    if explanations and phrase == outcome:
+        borderline = f"{_borderline_failures(explanations)} borderline. The one with the fewest changes: "
     versions = "simulated with the present files and versions, " if data.later_changes else ""
     return f"{borderline}{_changes_lead_to(first, phrase)}: {versions}the vehicle {first.end}."
 
@@ -249,9 +251,15 @@ def _key_figures(data: ReportInput, failures: Sequence[SelectedFailure], explana
             _preventability_figure(explanations.summary.preventable if explanations else None, data), _tolerance_figure(tolerance)]
 
 
+def _borderline_failures(explanations: Explanations) -> str:
+    """The failures that are borderline, and a verb, if no robust failure was found among those with the fewest changes."""
+    all_borderline = all(is_borderline(failure.robustness) for failure in explanations.failures)
+    return "Every failure analysed is" if all_borderline else "The failures with the fewest changes are"
+
+
 def _robustness_figure(robust: SelectedFailure | None, explanations: Explanations | None, data: ReportInput) -> KeyFigure:
     if robust is None:
-        reason = "every failure analysed is borderline" if explanations else "not computed"
+        reason = f"{_borderline_failures(explanations)} borderline" if explanations else "not computed"
         return KeyFigure(REASON_TITLES[ROBUST], NO_VALUE, reason if any(data.unsafe_solutions) else "no solution is unsafe")
     return KeyFigure(REASON_TITLES[ROBUST], f"{number_of(len(robust.changes), 'change')} of at most {100 * robust.largest_change:.0f} %",
                      f"{100 * (robust.unsafe_share or 0):.0f} % of its neighbours are unsafe too")

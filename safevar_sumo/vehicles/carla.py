@@ -148,7 +148,7 @@ class Carla(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         "gearSwitchTime": "s", "clutchStrength": "kg m^2/s", "mass": "kg", "dragCoeff": "-", "tireFric": "-",
         "dampRate": "kg m^2/s", "radius": "cm", "maxBrakeTorque": "N m",
     }
-    FITTED_UP_TO: ClassVar[float] = 6.2  # m/s; highest speed in simulations of the published settings of sun and rain
+    FITTED_UP_TO: ClassVar[float] = 6.5  # m/s; highest speed in simulations of the published settings of sun and rain
 
     tyre_friction: Positive
     longitudinal_stiffness: Positive

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Sequence
 from io import StringIO
 from itertools import combinations
 from pathlib import Path
@@ -32,6 +33,7 @@ from safevar_sumo.analysis.explain.causes import (
 )
 from safevar_sumo.analysis.explain.compute import explain_failures
 from safevar_sumo.analysis.explain.necessity import (
+    STEP_FACTORS,
     Robustness,
     count_distinct_causes,
     estimate_robustness,
@@ -311,6 +313,26 @@ def test_the_smallest_robust_failure_is_the_first_whose_neighbours_are_unsafe_to
     failures = evaluator.evaluate(np.array([[9.0, 1.0], [7.01, 2.99], [8.5, 2.0]]), "failures")
     assert find_smallest_robust_failure(evaluator, failures, 0.1, COLLISION, max_evaluations=1) == 2
     assert find_smallest_robust_failure(evaluator, failures.take([1]), 0.1, COLLISION, max_evaluations=1) is None
+
+
+@pytest.mark.parametrize(("shares", "row"), [
+    ([(0.5, 1.0, 1.0), (0.9, 0.9, 0.9)], 0), ([(0.39, 1.0, 1.0), (0.9, 0.9, 0.9)], 1), ([(0.9, 0.6, 0.8), (0.41, 1.0, 1.0)], 1),
+    ([(0.79, 0.79, 0.79), (1.0, 1.0, 0.3)], None)])
+def test_a_failure_is_robust_by_the_mean_of_all_time_steps(shares: list[tuple[float, ...]], row: int | None,
+                                                           monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever the study's own time step says, if the other steps can make up for it."""
+    evaluator, factors_of_calls = made_up_evaluator(2, box), []
+
+    def estimates(_: Evaluator, settings: FloatArray, step: float, unsafe: Unsafe, factors: Sequence[float]) -> list[Robustness]:
+        factors_of_calls.append((len(settings), tuple(factors)))
+        return [Robustness({step * factor: shares[int(setting[0]) - 8][STEP_FACTORS.index(factor)] for factor in factors})
+                for setting in settings]
+
+    monkeypatch.setattr("safevar_sumo.analysis.explain.necessity.estimate_robustness", estimates)
+    failures = evaluator.evaluate(np.array([[8.0, 1.0], [9.0, 1.0]]), "failures")
+    assert find_smallest_robust_failure(evaluator, failures, 0.1, COLLISION, max_evaluations=1) == row
+    candidates = sum(first > 0.39 for first, *_ in shares)
+    assert factors_of_calls == [(2, STEP_FACTORS[:1]), (candidates, STEP_FACTORS[1:])]
 
 
 def test_necessary_and_changed_over_failures() -> None:

@@ -177,6 +177,10 @@ def test_the_verdict_leads_with_the_robust_failure_and_calls_the_others_borderli
     number, needed = len(first.changes), len(robust.minimal_causes[0].changes)
     assert 0 < needed < number, "or the next line tells nothing"
     assert result.headline.startswith(f"{number} changes lead to a collision that is robust ({needed} of them suffice")
+    severe = msgspec.structs.replace(robust, reasons=["most severe"])
+    assert reach_verdict(data, Explanations([fewest, severe], summary), None).headline.startswith(
+        "The failures with the fewest changes are borderline. The one with the fewest changes: "), "the most severe one is not"
+    assert reach_verdict(data, Explanations([fewest], summary), None).headline.startswith("Every failure analysed is borderline.")
     all_changes = msgspec.structs.replace(robust.minimal_causes[0], changes={one.text: 1.0 for one in first.changes})
     whole_cause = msgspec.structs.replace(robust, minimal_causes=[all_changes])
     every = reach_verdict(data, Explanations([fewest, whole_cause], summary), None).headline

@@ -142,13 +142,22 @@ def find_smallest_robust_failure(evaluator: Evaluator, failures: Evaluations, st
     """The row of the robust failure with the fewest changes; of several, the one whose largest change is smallest.
 
     Failures are tried in this order until one is robust, or about `max_evaluations` settings are evaluated; None if no tried failure is
-    robust.
+    robust. Other time steps than the study's are left out where they could not make a failure robust.
     """
     order = np.lexsort([failures.f_safe, failures.f_diff, failures.f_num_diff])
-    max_failures = max(FAILURES_PER_BATCH, max_evaluations // (NEIGHBOUR_COUNT * len(STEP_FACTORS)))
-    for start in range(0, min(len(order), max_failures), FAILURES_PER_BATCH):
+    least_share = len(STEP_FACTORS) * MIN_ROBUST_SHARE - len(STEP_FACTORS[1:])  # the mean is robust if all other steps' shares are 1
+    neighbour_sets = 0
+    for start in range(0, len(order), FAILURES_PER_BATCH):
         rows = order[start:start + FAILURES_PER_BATCH]
-        for row, robustness in zip(rows.tolist(), estimate_robustness(evaluator, failures.settings[rows], step, unsafe), strict=True):
-            if not robustness.borderline:
-                return int(row)
+        candidates = [(row, estimate) for row, estimate in zip(
+            rows.tolist(), estimate_robustness(evaluator, failures.settings[rows], step, unsafe, STEP_FACTORS[:1]), strict=True)
+            if estimate.share >= least_share]
+        if candidates:
+            other_steps = estimate_robustness(evaluator, failures.settings[[row for row, _ in candidates]], step, unsafe, STEP_FACTORS[1:])
+            for (row, estimate), others in zip(candidates, other_steps, strict=True):
+                if not Robustness(estimate.shares_by_step | others.shares_by_step).borderline:
+                    return int(row)
+        neighbour_sets += len(rows) + len(STEP_FACTORS[1:]) * len(candidates)
+        if neighbour_sets * NEIGHBOUR_COUNT >= max_evaluations:
+            break
     return None
