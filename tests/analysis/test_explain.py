@@ -194,13 +194,12 @@ def assert_tells_a_manager(paragraph: str, explained: Explained) -> None:
         word = "borderline: only" if one.robustness.borderline else "robust:"
         share = f"{word} {100 * one.robustness.share:.0f} % of the neighbours are unsafe too"
         needed, number = len(one.causes[0].changes), len(one.changed)
-        collision = f"a collision at {-3.6 * (one.safety_degree or 0):.0f} km/h ({share})"
+        collision = rf"a collision at {-3.6 * (one.safety_degree or 0):.0f} km/h \({share}(, but only \d+ % with a step of [\d.]+ s)?\)"
         if needed < number:
             counts = rf"{NUMBER_WORDS[number]} changes: [^;]*; {NUMBER_WORDS[needed]} of them suffice"
-            assert re.search(rf"{re.escape(collision)} was found with {counts}",
-                             paragraph, re.IGNORECASE)
+            assert re.search(rf"{collision} was found with {counts}", paragraph, re.IGNORECASE)
         else:
-            assert f"for {collision}: " in paragraph
+            assert re.search(f"for {collision}: ", paragraph)
     assert (f"The robust failure with the fewest changes, {robust.handle}: " in paragraph) is not as_few
     members = CharacteristicSet.of(explained.study.vehicle.characteristics)
     fewest = robust if as_few else fewest

@@ -137,7 +137,7 @@ def test_the_sections_stand_in_their_order_and_tell_what_was_found(page: str, sl
                      rf"{100 * alone.share:.0f} % of the neighbours are unsafe too\): the vehicle collides at", page)
     assert "^2" not in re.sub("<(style|script).*?</(style|script)>", "", page, flags=re.DOTALL)
     fewest = by_reason["fewest changes"]
-    for words in (f"borderline: only {100 * fewest.robustness.share:.0f} % of the neighbours are unsafe",
+    for words in (f"{'borderline: only' if fewest.robustness.borderline else 'robust:'} {100 * fewest.robustness.share:.0f} % of the",
                   f"Scaling all changes to {100 * fewest.causes[0].fraction:.1f} % is still unsafe",
                   "Unsafe alone: tireFric.", "within 80 % of the way", "tireFric below 1.5: collides in 100 %",
                   "A share of the domain, not a probability in the field", "NSGA-II (1 run)", "wet leaves", "RQ1: solutions", "RQ3.2",
