@@ -64,7 +64,8 @@ def test_a_notebook_shows_its_tables_and_pictures(name: str, place: Path, monkey
 
 def _executed(name: str, place: Path, timeout: int) -> nbformat.NotebookNode:
     notebook = nbformat.read(NOTEBOOKS / f"{name}.ipynb", as_version=4)
-    NotebookClient(notebook, timeout=timeout, kernel_name="python3", resources={"metadata": {"path": str(place)}}).execute()
+    NotebookClient(notebook, timeout=timeout, kernel_name="python3", record_timing=False,
+                   resources={"metadata": {"path": str(place)}}).execute()
     return notebook
 
 
