@@ -48,6 +48,12 @@ def test_stored_outputs_are_of_todays_vehicle() -> None:
     results = [text for name in SHOWN for text in texts[name] if text.startswith("<Results of sun")]
     assert len(results) == len(SHOWN)
     assert len(set(results)) == 1
+    traces = {value: sv.simulate("sun", {"tireFric": value}).trace for value in (3.5, 1.5)}
+    begins = {value: trace[trace["brake [-]"] > 0].iloc[0] for value, trace in traces.items()}
+    ways = {value: trace["position [m]"].iloc[-1] - begins[value]["position [m]"] for value, trace in traces.items()}
+    sentence = (f"that gains {begins[1.5]['gap [m]'] - begins[3.5]['gap [m]']:.2f} m, and the longer way to a stop takes "
+                f"{ways[1.5] - ways[3.5]:.2f} m of it")
+    assert sentence in (NOTEBOOKS / "quickstart.ipynb").read_text()
     assert "SD is below 1.1 in" in "".join(texts["answers"])
     assert all(path.stat().st_size < 500_000 for path in NOTEBOOKS.glob("*.ipynb"))
 
