@@ -145,7 +145,7 @@ def find_smallest_robust_failure(evaluator: Evaluator, failures: Evaluations, st
     robust. Other time steps than the study's are left out where they could not make a failure robust.
     """
     order = np.lexsort([failures.f_safe, failures.f_diff, failures.f_num_diff])
-    least_share = len(STEP_FACTORS) * MIN_ROBUST_SHARE - len(STEP_FACTORS[1:])  # the mean is robust if all other steps' shares are 1
+    least_share = len(STEP_FACTORS) * MIN_ROBUST_SHARE - len(STEP_FACTORS[1:])  # with it, the mean is just robust if all others are 1
     neighbour_sets = 0
     for start in range(0, len(order), FAILURES_PER_BATCH):
         rows = order[start:start + FAILURES_PER_BATCH]
