@@ -82,7 +82,7 @@ def tabulate_failing_points(matrix: Sequence[Point], failing: Collection[str]) -
 SAMPLED_VEHICLES = 4000
 """Number of vehicles sampled for the section on risk, and for the one on rules."""
 EXPLAIN_SIMULATIONS = 30_000
-"""Approximate number of simulations for the minimal causes of all failures."""
+"""Approximate number of simulations for the minimal causes of all failures, and for the search for a robust failure."""
 
 
 class Resimulation(NamedTuple):

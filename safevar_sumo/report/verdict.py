@@ -279,9 +279,9 @@ def _preventability_figure(preventable: PreventedShares | None, data: ReportInpu
         return KeyFigure(title, NO_VALUE, "not computed" if any_collision else "there is no collision to avoid")
     low, high = preventable.interval_competent_driver
     sample = "all" if low == high else f"95 % interval {100 * low:.0f} % to {100 * high:.0f} %;"
-    share = preventable.competent_driver
-    decimals = 0 if share in (0, 1) or 0.005 <= share < 0.995 else 1  # nearly all is not all
-    return KeyFigure(title, f"{100 * share:.{decimals}f} % of the collisions",
+    percent, is_whole = 100 * preventable.competent_driver, preventable.competent_driver in (0, 1)
+    words = f"{percent:.0f}" if is_whole or 0.5 <= percent < 99.5 else f"{min(max(percent, 0.1), 99.9):.1f}"  # nearly all is not all
+    return KeyFigure(title, f"{words} % of the collisions",
                      f"in the same vehicle ({sample} {preventable.looked_at} collisions analysed)")
 
 

@@ -186,6 +186,9 @@ def test_the_verdict_leads_with_the_robust_failure_and_calls_the_others_borderli
     every = reach_verdict(data, Explanations([fewest, whole_cause], summary), None).headline
     assert every.startswith(f"{number} changes suffice for a collision that is robust: the vehicle collides")
     assert [one.value for one in result.key_figures[2:]] == ["14 % of the collisions", "42.0 % of the way"]
+    for share, words in ((0.9996, "99.9 %"), (0.9954, "99.5 %"), (1.0, "100 %"), (0.0002, "0.1 %"), (0.0, "0 %")):
+        nearly = msgspec.structs.replace(summary, preventable=msgspec.structs.replace(summary.preventable, competent_driver=share))
+        assert reach_verdict(data, Explanations([fewest], nearly), None).key_figures[2].value == f"{words} of the collisions"
     assert result.key_figures[0].value.startswith(f"{number} changes")
 
 
