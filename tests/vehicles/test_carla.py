@@ -10,6 +10,9 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from safevar_sumo.records import GRAVITY, Command, Observation
+from safevar_sumo.study import load_study
+from safevar_sumo.sumo.matrix import simulate
+from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles.carla import AIR_DENSITY, ENGINE_INERTIA, FINAL_RATIO, FRONTAL_AREA, GEAR_RATIOS, RPM, WHEELS, Carla
 from tests.vehicles.runs import STEP, SYSTEMS, braking_after, drawn, drive, ends, original
 
@@ -25,6 +28,12 @@ def tyre_force(vehicle: Carla, friction: float, load: float, speed: float, rim: 
     slip = (rim - speed) / (max(rim, speed) + vehicle.slip_offset)
     k = min(4 * GRAVITY * vehicle.longitudinal_stiffness * abs(slip) / (friction * load), 3.0)
     return float(np.sign(slip) * friction * load * (k - k * k / 3 + k**3 / 27))
+
+
+@pytest.mark.parametrize("study", ["sun", "rain"])
+def test_vehicles_of_the_domain_reach_the_speed_up_to_which_the_vehicle_was_fitted_and_no_more(study: str) -> None:
+    runs = simulate(assemble(load_study(study)), drawn("carla", 1000, 3))
+    assert 0.9 * Carla.FITTED_UP_TO < runs.trace.speed.max() <= Carla.FITTED_UP_TO
 
 
 def test_driving_and_braking_follow_the_differential_equations() -> None:
