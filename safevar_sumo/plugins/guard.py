@@ -162,14 +162,14 @@ class Guard(NamedTuple):
         Raises
         ------
         UserCodeError
-            If the function raises anything, `SystemExit` included.
+            If the function raises anything but `KeyboardInterrupt`.
         """
         audit_hook.call_depth += 1
         try:
             return function(*arguments)
-        except UserCodeError:
+        except (UserCodeError, KeyboardInterrupt):
             raise
-        except (Exception, SystemExit) as error:
+        except BaseException as error:
             raise self.failure(method, error) from error
         finally:
             audit_hook.call_depth -= 1

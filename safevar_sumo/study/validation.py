@@ -100,7 +100,7 @@ def _missing_keys(raw: object, kind: Any) -> list[str]:
 
 def _unknown_key(source: object, key_path: str, key: str, fields: Iterable[str]) -> InputError:
     """The error for an unknown key: it suggests tables of a study that have this key, else the nearest known key."""
-    tables = {name: _record_types(field.type) for name, field in _fields(Study).items()}
+    tables = {name: _record_types(field.type) for name, field in _fields(Study).items() if get_origin(field.type) not in (dict, list)}
     known_paths = [f"{name}.{key}" for name, kinds in tables.items() if any(key in _fields(kind) for kind in kinds)]
     if known_paths:
         return InputError(source, f"{key_path}: there is no such key; did you mean {' or '.join(known_paths)}?", one_of(fields))

@@ -30,6 +30,7 @@ def failing(system: object) -> str:
 
 @pytest.mark.parametrize(("body", "expected"), [
     ("1 / 0", "raised in drive: ZeroDivisionError: division by zero"), ("raise SystemExit(0)", "raised in drive: SystemExit: 0"),
+    ("raise GeneratorExit", "raised in drive: GeneratorExit ("),
     (r"raise RuntimeError('my\n message')", "raised in drive: RuntimeError: my message ("), ("pass", "returned None from drive"),
     ("return 0.5", "returned 0.5 from drive"), ("return 0.5, 0, 0", "returned (0.5, 0, 0) from drive"),
     ("return '0.5', 0", "returned throttle = '0.5' from drive"), ("return 0, 2", "returned brake = 2.0 from drive"),
