@@ -11,6 +11,7 @@ import msgspec
 import numpy as np
 from rich.console import Console
 
+from safevar_sumo.analysis.parameters import FITTED_TABLES
 from safevar_sumo.analysis.research_questions.case import Case, load_cases
 from safevar_sumo.cli.arguments import PICTURE_ENDINGS, check_output, complete_study, refuse_overwriting
 from safevar_sumo.cli.program import StrictCommand, commands, print_remarks
@@ -44,7 +45,7 @@ from safevar_sumo.reference.replication import Nearness, compare_with_nearest_ro
 from safevar_sumo.results import MANIFEST, write_imported, write_whole
 from safevar_sumo.study import SAFETY_DEGREE, Study, check_writable, load_study, study_names, write_study
 from safevar_sumo.sumo.system import assemble
-from safevar_sumo.terminal import WholeTable, show_stages
+from safevar_sumo.terminal import WholeTable, print_text, show_stages
 from safevar_sumo.vehicles import CharacteristicSet
 from safevar_sumo.workers.batches import evaluate_all
 from safevar_sumo.workers.local import available_cores, local_pool
@@ -348,13 +349,21 @@ def _two_decimals(value: float | None) -> str:
 
 def print_calibration(console: Console, study: Study, result: Calibration) -> None:
     """Print the fitted values, and their agreement with the rows used and with the rows held back."""
-    table = WholeTable("parameter", "unit", right=("fitted", "equal fit from", "equal fit to", "lower", "upper"), title=study.title)
-    for name, value in result.values.items():
-        bound = result.bounds[name]
-        shared = f" (shared with {', '.join(result.together)})" if name in result.shared else ""
-        numbers = (value, *result.intervals[name], bound.lower, bound.upper)
-        table.add_row(name + shared, bound.unit, *(f"{number:.5g}" for number in numbers))
+    table = WholeTable("parameter", "unit", right=("fitted", "equal fit", "bounds"), title=study.title)
+    group = ""
+    for key, value in result.values.items():
+        prefix = next(prefix for prefix in FITTED_TABLES if key.startswith(prefix))
+        if prefix != group:
+            table.add_section()
+            table.add_row(f"[{prefix.removesuffix('.')}]", "", "", "", "")
+            group = prefix
+        bound = result.bounds[key]
+        mark = " *" if key in result.shared else ""
+        ranges = (f"{lower:.5g} to {upper:.5g}" for lower, upper in (result.intervals[key], (bound.lower, bound.upper)))
+        table.add_row(f"{key.removeprefix(prefix)}{mark}", bound.unit, f"{value:.5g}", *ranges)
     console.print(table)
+    if result.shared:
+        print_text(console, f"* shared with {', '.join(result.together)}")
     for name in result.used:
         comparison = WholeTable("", right=("Spearman's rho", "mean abs. error", "bias"), title=f"{name}: rows used / held back")
         agreements = (result.used[name], result.held_back[name])

@@ -144,7 +144,10 @@ def test_several_studies_are_fitted_together(data: Path, in_tmp: Path) -> None:
     words = ("calibrate", "mine.toml", "late.toml", f"mine={data}", "late_rows.csv", "--trials", "15")
     refused(*words, "--out", "nowhere", message=("--out", "nowhere"))
     Path("fitted").mkdir()
-    run(*words, "--out", "fitted")
+    lines = run(*words, "--out", "fitted").stdout.splitlines()
+    row = next(line for line in lines if "brake_gap *" in line)
+    assert "7 to 12" in row, "a table of the usual width breaks no number"
+    assert "* shared with late" in lines
     fitted = [tomllib.loads(Path(f"fitted/{name}-calibrated.toml").read_text()) for name in ("mine", "late")]
     assert fitted[0]["ads"]["parameters"]["brake_gap"] == fitted[1]["ads"]["parameters"]["brake_gap"]
     assert "hesitation" not in fitted[0]["ads"]["parameters"]
