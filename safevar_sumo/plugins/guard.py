@@ -162,14 +162,14 @@ class Guard(NamedTuple):
         Raises
         ------
         UserCodeError
-            If the function raises anything but `KeyboardInterrupt`.
+            If the function raises anything, `SystemExit` and `GeneratorExit` included.
         """
         audit_hook.call_depth += 1
         try:
             return function(*arguments)
-        except (UserCodeError, KeyboardInterrupt):
+        except UserCodeError:
             raise
-        except BaseException as error:
+        except (Exception, SystemExit, GeneratorExit) as error:  # no `BaseException`: interrupts and time limits pass
             raise self.failure(method, error) from error
         finally:
             audit_hook.call_depth -= 1
