@@ -5,15 +5,16 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Future
+from itertools import pairwise
 
 import numpy as np
 
 from safevar_sumo.analysis.parameters import value_of, with_values
 from safevar_sumo.records import Evaluations, FloatArray
-from safevar_sumo.reference.loss import MAX_LOSS, ReferenceLoss, original_loss
+from safevar_sumo.reference.loss import MAX_LOSS, ReferenceLoss, original_loss, original_residuals
 from safevar_sumo.reference.parameters import FittedParameter
 from safevar_sumo.reference.rows import ReferenceData
-from safevar_sumo.reference.search import StudyGroup
+from safevar_sumo.reference.search import Misfit, StudyGroup
 from safevar_sumo.study import Study
 from safevar_sumo.sumo import Engine, settings_per_batch
 from safevar_sumo.sumo.system import assemble
@@ -54,11 +55,13 @@ class FitSpace:
         values = np.array([value_of(studies[parameter.study_indices[0]], parameter.key) for parameter in self._parameters])
         return np.asarray(np.clip((self._scaled(values) - self._start) / self._width, 0, 1))
 
-    def losses(self, groups: Sequence[StudyGroup]) -> list[float]:
-        """The mean loss of the studies of each group."""
+    def misfits(self, groups: Sequence[StudyGroup]) -> list[Misfit]:
+        """The mean loss of the studies of each group, and the residuals of all of them."""
         futures_of_groups = [[fit.submit(study) for fit, study in zip(self._fits, group, strict=True)] for group in groups]
-        return [float(np.mean([fit.loss(futures) for fit, futures in zip(self._fits, futures_of_studies, strict=True)]))
-                for futures_of_studies in futures_of_groups]
+        misfits_of_groups = ([fit.misfit(futures) for fit, futures in zip(self._fits, futures_of_studies, strict=True)]
+                             for futures_of_studies in futures_of_groups)
+        return [Misfit(float(np.mean([misfit.loss for misfit in misfits])), np.concatenate([misfit.residuals for misfit in misfits]))
+                for misfits in misfits_of_groups]
 
 
 class StudyFit:
@@ -66,7 +69,8 @@ class StudyFit:
 
     def __init__(self, study: Study, references: Mapping[str, ReferenceData], pool: Pool) -> None:
         self.study = study
-        self._references = [(len(data.settings), ReferenceLoss(data, study)) for data in references.values()]
+        self._losses = [ReferenceLoss(data, study) for data in references.values()]
+        self._limits = [0, *np.cumsum([1, *(len(data.settings) for data in references.values())])]
         self._characteristics = CharacteristicSet.of(study.vehicle.characteristics)
         self._inputs, self._pool = inputs_of(study, pool), RetryingPool(pool, study)
         settings = [self._characteristics.original[np.newaxis], *(data.settings for data in references.values())]
@@ -79,15 +83,15 @@ class StudyFit:
         work, size = pack_study(study, self._inputs), self._batch_size
         return [self._pool.submit(work, self._settings[start:start + size]) for start in range(0, len(self._settings), size)]
 
-    def loss(self, futures: Sequence[Future[Evaluations]]) -> float:
-        """The loss, from the futures of all batches."""
+    def misfit(self, futures: Sequence[Future[Evaluations]]) -> Misfit:
+        """The loss and the residuals, from the futures of all batches."""
         distinct_evaluations = Evaluations.concatenate([wait_for_result(future) for future in futures])
-        if not distinct_evaluations.valid.all():
-            return MAX_LOSS
         evaluations = distinct_evaluations.take(self._row_of.ravel())
-        loss = original_loss(evaluations.take([0]), self.study.published, self.study.fit)
-        first_row = 1
-        for row_count, reference_loss in self._references:
-            loss += reference_loss.of(evaluations.take(np.arange(first_row, first_row + row_count))) / len(self._references)
-            first_row += row_count
-        return loss
+        original, *files = [evaluations.take(np.arange(start, end)) for start, end in pairwise(self._limits)]
+        published, fit = self.study.published, self.study.fit
+        residuals = np.concatenate([original_residuals(original, published, fit),
+                                    *(loss.residuals(file) for loss, file in zip(self._losses, files, strict=True))])
+        if not evaluations.valid.all():
+            return Misfit(MAX_LOSS, residuals)
+        reference_losses = [loss.of(file) for loss, file in zip(self._losses, files, strict=True)]
+        return Misfit(original_loss(original, published, fit) + sum(reference_losses) / max(len(files), 1), residuals)

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from safevar_sumo.metrics import METRICS
-from safevar_sumo.records import Evaluations
+from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.reference.agreement import measure_agreement
 from safevar_sumo.reference.effects import Regression
 from safevar_sumo.reference.rows import ReferenceData
@@ -18,6 +18,8 @@ MAX_LOSS = 1e5
 """Largest loss of a study in one reference. A study that cannot be simulated has this loss too."""
 MAX_DEVIATION = 10.0
 """Largest deviation of a value of the original vehicle, as a multiple of the tolerance. An undefined value has this deviation too."""
+ROW_NOISE = 0.4
+"""Standard deviation of the noise of a row in `residuals`, as a share of the standard deviation of the reference's metric."""
 
 
 def original_loss(original: Evaluations, published: Mapping[str, float], fit: FitTable) -> float:
@@ -37,6 +39,16 @@ def _excess(deviation: float, tolerance: float) -> float:
     return 2 * max(multiple - 1, 0.0)
 
 
+def original_residuals(original: Evaluations, published: Mapping[str, float], fit: FitTable) -> FloatArray:
+    """Deviations of the original vehicle's metrics from the published values, in tolerances; their squares are weighted by metric."""
+    if not fit.original:
+        return np.empty(0)
+    names = [name for name in published if name in METRICS]
+    deviations = np.array([original.metrics[name][0] / published[name] - 1 for name in names]) / fit.tolerance
+    deviations = np.nan_to_num(np.clip(deviations, -MAX_DEVIATION, MAX_DEVIATION), nan=MAX_DEVIATION)
+    return np.asarray(deviations * np.sqrt([fit.weights.get(name, 0.0) for name in names]))
+
+
 class ReferenceLoss:
     """The loss of a study in comparison with one reference, the sum of:
 
@@ -49,11 +61,13 @@ class ReferenceLoss:
     """
 
     def __init__(self, data: ReferenceData, study: Study) -> None:
-        self._data, self._study, self._units = data, study, dict[str, float]()
+        self._data, self._study = data, study
+        self._units, self._noise = dict[str, float](), dict[str, float]()
         for name in study.fit.weights:
             values = data.metrics[name][~np.isnan(data.metrics[name])]
             if values.size and np.ptp(values) > 0:
                 self._units[name] = study.repeatability.get(name) or float(np.std(values))
+                self._noise[name] = ROW_NOISE * float(np.std(values))
         self._regression = Regression.over(data.settings, CharacteristicSet.of(study.vehicle.characteristics))
         self._effects = self._regression.effects(data.metrics[SAFETY_DEGREE])
 
@@ -70,3 +84,13 @@ class ReferenceLoss:
         collisions = result.collisions
         one_sided = collisions["reference"] + collisions["here"] - 2 * collisions["both"]
         return min(loss, MAX_LOSS) + fit.collisions * one_sided / max(result.rows, 1)
+
+    def residuals(self, evaluations: Evaluations) -> FloatArray:
+        """Differences from the reference in standard deviations of their noise; their squares are weighted by metric.
+
+        An undefined difference is 0; a row that cannot be simulated has differences of `MAX_DEVIATION`.
+        """
+        differences = [np.sqrt(self._study.fit.weights[name]) * np.where(
+            evaluations.valid, np.nan_to_num((evaluations.metrics[name] - self._data.metrics[name]) / noise), MAX_DEVIATION)
+            for name, noise in self._noise.items()]
+        return np.concatenate([np.empty(0), *differences])

@@ -14,18 +14,23 @@ StudyGroup = tuple[Study, ...]
 """Studies that are fitted together."""
 
 
+class Misfit(NamedTuple):
+    """The loss of studies, and their residuals in standard deviations of the residuals' noise."""
+
+    loss: float
+    residuals: FloatArray
+
+
 class Space(Protocol):
-    """Maps places in the unit cube of the parameters' bounds to studies, and studies to their losses."""
+    """Maps places in the unit cube of the parameters' bounds to studies, and studies to their misfits."""
 
     def studies_at(self, place: FloatArray) -> StudyGroup: ...
 
-    def losses(self, groups: Sequence[StudyGroup]) -> list[float]: ...
+    def misfits(self, groups: Sequence[StudyGroup]) -> list[Misfit]: ...
 
 
 MAX_KEPT_RATIO = 1.25
 """A trial is kept, for profiles and the spread, if its loss is at most this multiple of the lowest loss."""
-SCREENING_DIVISOR = 4
-"""Screening takes at most the trials divided by this number."""
 
 
 class Trial(NamedTuple):
@@ -54,37 +59,26 @@ class SearchRace:
         self.lowest_loss, self.trials_left = np.inf, trials
         self.kept: list[Trial] = []
         """Trials of searches with a loss of at most `MAX_KEPT_RATIO` times the lowest loss at the time of the trial."""
-        self.space, self.population, self._done = space, population, done
+        self._space, self.population, self._done = space, population, done
 
-    def try_studies(self, groups: Sequence[StudyGroup]) -> list[float]:
-        """The losses of groups of studies; each group is one trial."""
-        losses = self.space.losses(groups)
-        self.trials_left -= len(losses)
-        for group, loss in zip(groups, losses, strict=True):
-            if self.best is None or loss < self.lowest_loss:
-                self.best, self.lowest_loss = group, loss
+    def try_studies(self, groups: Sequence[StudyGroup]) -> list[Misfit]:
+        """The misfits of groups of studies; each group is one trial."""
+        misfits = self._space.misfits(groups)
+        self.trials_left -= len(misfits)
+        for group, misfit in zip(groups, misfits, strict=True):
+            if self.best is None or misfit.loss < self.lowest_loss:
+                self.best, self.lowest_loss = group, misfit.loss
             self._done(self.lowest_loss, self.best)
-        return losses
+        return misfits
 
-    def begin(self, place: FloatArray, deviation: float, seed: int, population: int | None = None) -> CmaSearch:
-        """Begin a search at a place, with `deviation` as initial standard deviation; the race's population is the default."""
-        return CmaSearch(self, place, deviation, seed, population or self.population)
+    def try_places(self, places: Sequence[FloatArray] | FloatArray) -> list[Misfit]:
+        """The misfits of the studies at places; each place is one trial."""
+        return self.try_studies([self._space.studies_at(place) for place in places])
 
-    def begin_at_random_places(self, first_indices: Sequence[int], starts: int, screened: int, deviation: float,
-                               rng: np.random.Generator) -> list[CmaSearch]:
-        """Begin `starts` searches at random places, or at the best of `screened` random places.
-
-        Screening takes at most 1 / `SCREENING_DIVISOR` of the trials left. Parameter i starts at the same share of its bounds as parameter
-        `first_indices[i]`.
-        """
-        size = len(first_indices)
-        screened = min(screened, self.trials_left // SCREENING_DIVISOR) if starts else 0
-        if screened < max(starts, 1):
-            return [self.begin(rng.random(size)[first_indices], deviation, int(rng.integers(1, 2**31))) for _ in range(starts)]
-        places = rng.random((screened, size))[:, first_indices]
-        losses = [loss for k in range(0, screened, self.population)
-                 for loss in self.try_studies([self.space.studies_at(place) for place in places[k:k + self.population]])]
-        return [self.begin(places[k], deviation, int(rng.integers(1, 2**31))) for k in np.argsort(losses, kind="stable")[:starts]]
+    def begin(self, place: FloatArray, deviation: float, seed: int, population: int | None = None,
+              axes: FloatArray | None = None) -> CmaSearch:
+        """Begin a search at a place, with `deviation` as initial standard deviation along `axes`; the race's population is the default."""
+        return CmaSearch(self, place, deviation, seed, population or self.population, np.eye(len(place)) if axes is None else axes)
 
     def run(self, searches: Sequence[CmaSearch]) -> None:
         """Spend all trials left by successive halving (Jamieson and Talwalkar 2016).
@@ -103,23 +97,28 @@ class SearchRace:
 
 
 class CmaSearch:
-    """One search by CMA-ES (Hansen 2016); `lowest_loss` is that of its trials so far."""
+    """One search by CMA-ES (Hansen 2016); `lowest_loss` is that of its trials so far.
 
-    def __init__(self, race: SearchRace, place: FloatArray, deviation: float, seed: int, population: int) -> None:
+    Its first generation has the covariance `deviation`**2 * `axes` @ `axes`.T, where `axes` has the shape (n, n).
+    """
+
+    def __init__(self, race: SearchRace, place: FloatArray, deviation: float, seed: int, population: int, axes: FloatArray) -> None:
         import cma  # slow to import
 
         self._race, self.lowest_loss, self.population = race, np.inf, population
-        self._strategy: Any = cma.CMAEvolutionStrategy(place, deviation, {
-            "bounds": [0, 1], "seed": seed, "verbose": -9, "popsize": population, "maxstd": np.inf})
+        self._axes, self._bounds = axes, cma.BoundTransform([0, 1])
+        self._strategy: Any = cma.CMAEvolutionStrategy(np.linalg.solve(axes, self._bounds.inverse(place)), deviation, {
+            "seed": seed, "verbose": -9, "popsize": population, "maxstd": np.inf})
 
     def advance(self, trials: int) -> None:
         """Run generations for a number of trials; CMA-ES does not learn from an incomplete last generation."""
         race = self._race
         for trials_left in range(trials, 0, -self.population):
-            places = self._strategy.ask()
-            losses = race.try_studies([race.space.studies_at(place) for place in places[:trials_left]])
+            coordinates = self._strategy.ask()
+            places = [np.asarray(self._bounds.repair(self._axes @ point)) for point in coordinates]
+            losses = [misfit.loss for misfit in race.try_places(places[:trials_left])]
             max_loss = MAX_KEPT_RATIO * race.lowest_loss
             race.kept += [Trial(loss, place) for loss, place in zip(losses, places, strict=False) if loss <= max_loss]
             self.lowest_loss = min(self.lowest_loss, min(losses))
             if len(losses) == len(places):
-                self._strategy.tell(places, losses)
+                self._strategy.tell(coordinates, losses)

@@ -215,20 +215,15 @@ class FitTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     Sets of parameters whose loss is within the share `alike` of the lowest loss fit equally well: they become the study's `spread`.
 
     `trials` sets of parameters are tried, in generations of `population`: in a race of searches from the study's own values and from
-    `starts` random places in the bounds; the worse half gives up after every round. With `screened`, the random places are the best of
-    `screened` places, but at most a quarter of the trials is spent on them. A search from a random place begins with a standard deviation
-    of `width` of the bounds; a search around known values has a third of the `population`. `seed` is the seed of all random numbers.
-
-    A fit from scratch of several studies has three stages: the first study alone; the other studies' own parameters; all parameters,
-    beginning at the values of the first two stages. All stages but the last use one row in `thinning`.
+    `starts` random places in the bounds; the worse half gives up after every round. With `ensemble`, each random start is an ensemble
+    Kalman inversion of so many places, and the search begins at its best place and in its covariance; all inversions have half the trials
+    at most. A search around known values has a third of the `population`. `seed` is the seed of all random numbers.
     """
 
     trials: PositiveInt = 1200
     seed: Annotated[int, Meta(ge=0, le=2**31)] = 1
     starts: Annotated[int, Meta(ge=0, le=1000)] = 0
-    screened: Annotated[int, Meta(ge=0, le=100_000)] = 0
-    width: Annotated[float, Meta(gt=0, le=1)] = 0.3
-    thinning: Annotated[int, Meta(ge=1, le=100)] = 1
+    ensemble: Annotated[int, Meta(ge=0, le=100_000)] = 0
     population: Annotated[int, Meta(ge=4, le=1000)] = 14
     hold_out: Annotated[int, Meta(ge=2, le=1000)] = 2
     tolerance: Annotated[float, Meta(gt=0, le=1)] = 0.05
