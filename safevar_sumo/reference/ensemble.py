@@ -17,6 +17,8 @@ SPREAD = 0.08
 """The axes are those of the step with the mean standard deviation of places next to this share of the bounds' width."""
 LEAST_VARIANCE = 1e-5
 """Added to the variance of every parameter, so that the axes span the space."""
+STEP_SHARE = 0.5
+"""Share that a step uses of the weight that Iglesias and Yang (2021) allow: residuals are not linear in the parameters."""
 
 
 class Inversion(NamedTuple):
@@ -33,9 +35,8 @@ def invert(race: SearchRace, dimension: int, size: int, max_trials: int, rng: np
     """Move an ensemble of `size` (2 to `max_trials`) random places until the residuals are as small as their noise.
 
     Every step replaces the places by a sample from the posterior of a linear model of the residuals, with perturbed observations
-    (Iglesias, Law and Stuart 2013). A step uses as much of the data's weight as the linear model allows (Iglesias and Yang 2021); the
-    inversion ends when it has used the whole weight, or before it exceeds `max_trials`. It moves the logits of the places, so that no
-    place leaves the bounds.
+    (Iglesias, Law and Stuart 2013). A step uses a part of the data's weight (Iglesias and Yang 2021); the inversion ends when it has used
+    the whole weight, or before it exceeds `max_trials`. It moves the logits of the places, so that no place leaves the bounds.
     """
     places = rng.uniform(MARGIN, 1 - MARGIN, (size, dimension))
     weight_used, trials_left, lowest_loss, best_place = 0.0, max_trials, np.inf, places[0]
@@ -66,7 +67,7 @@ def _step_weight(residuals: FloatArray) -> float:
     """Share of the data's weight for a step, from residuals in standard deviations of their noise, shape (places, residuals)."""
     misfits, count = (residuals**2).sum(axis=1) / 2, residuals.shape[1]
     mean, variance = float(misfits.mean()), float(misfits.var())
-    return max(count / (2 * mean) if mean else 1.0, float(np.sqrt(count / (2 * variance))) if variance else 1.0)
+    return STEP_SHARE * max(count / (2 * mean) if mean else 1.0, float(np.sqrt(count / (2 * variance))) if variance else 1.0)
 
 
 def _posterior_sample(places: FloatArray, residuals: FloatArray, weight: float, rng: np.random.Generator) -> FloatArray:

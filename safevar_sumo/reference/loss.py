@@ -18,7 +18,7 @@ MAX_LOSS = 1e5
 """Largest loss of a study in one reference. A study that cannot be simulated has this loss too."""
 MAX_DEVIATION = 10.0
 """Largest deviation of a value of the original vehicle, as a multiple of the tolerance. An undefined value has this deviation too."""
-ROW_NOISE = 0.4
+ROW_NOISE = 0.25
 """Standard deviation of the noise of a row in `residuals`, as a share of the standard deviation of the reference's metric."""
 
 
