@@ -24,6 +24,9 @@ from safevar_sumo.workers.evaluation import Pool, pack_study
 from safevar_sumo.workers.interrupts import wait_for_result
 from safevar_sumo.workers.retrying import RetryingPool
 
+SIGNIFICANT_DIGITS = 6
+"""Significant digits of the values that are tried."""
+
 
 class FitSpace:
     """The unit cube of the parameters' bounds: a place in it determines the parameters' values, hence the studies and their loss."""
@@ -38,9 +41,13 @@ class FitSpace:
         return np.log(values, out=values.copy(), where=self._log)
 
     def values(self, places: FloatArray) -> FloatArray:
-        """The parameters' values at places, both of shape (..., parameters)."""
+        """The parameters' values at places, both of shape (..., parameters), with `SIGNIFICANT_DIGITS`.
+
+        A study file then holds what was tried, and a search tries the same values where linear algebra differs in its last digits.
+        """
         scaled = self._start + np.asarray(places) * self._width
-        return np.asarray(np.clip(np.exp(scaled, out=scaled.copy(), where=self._log), self._lower, self._upper))
+        values = np.clip(np.exp(scaled, out=scaled.copy(), where=self._log), self._lower, self._upper)
+        return np.array([float(f"{value:.{SIGNIFICANT_DIGITS}g}") for value in values.flat]).reshape(values.shape)
 
     def studies_at(self, place: FloatArray) -> StudyGroup:
         """The studies with the parameters' values at a place."""

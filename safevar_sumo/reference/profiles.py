@@ -16,8 +16,6 @@ from safevar_sumo.study import Study
 
 MAX_SETS = 20
 """Maximum number of parameter sets in a table [spread], including the best set."""
-SIGNIFICANT_DIGITS = 6
-"""Significant digits of values in a table [spread]."""
 
 
 class ParameterSpace(Protocol):
@@ -58,7 +56,7 @@ class Profiles(NamedTuple):
 
     def spread(self, study: int) -> dict[str, list[float]]:
         """Values of each parameter of the study with this index, one for each of the `sets`: the table [spread]."""
-        return {parameter.key: [float(f"{value:.{SIGNIFICANT_DIGITS}g}") for value in self.values[self.sets, k]]
+        return {parameter.key: self.values[self.sets, k].tolist()
                 for k, parameter in enumerate(self.parameters) if study in parameter.study_indices}
 
     def interval(self, k: int) -> tuple[float, float]:

@@ -116,6 +116,7 @@ def test_a_search_by_logarithm_has_the_geometric_mean_in_the_middle_and_stays_in
     trial = FitSpace([FittedParameter(GAP, (0,), bounds), FittedParameter(HESITATION, (0,), linear)], [])
     assert trial.values(np.array([[0.5, 0.5], [0.75, 0.0]])) == pytest.approx(np.array([[3.0, 15.15], [3 * 10**0.5, 0.3]]))
     assert trial.values(np.ones(2)).max() <= 30.0
+    assert trial.values(np.full(2, 1 / 7)).tolist() == [0.579209, 4.54286], "six digits, as in the study file"
     study = msgspec.structs.replace(mine(1.0), calibration={GAP: msgspec.structs.replace(bounds, lower=0.0)})
     with pytest.raises(InputError, match="log = true and lower = 0"):
         free_parameters([study])
