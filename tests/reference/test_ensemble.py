@@ -41,22 +41,22 @@ def inversion_of(model: LinearModel, size: int, max_trials: int, seed: int = 1) 
 def test_a_linear_model_is_inverted_and_the_last_places_scatter_as_the_posterior(seed: int) -> None:
     """With weak prior knowledge the posterior of a linear model is the least-squares estimate with covariance (A.T A)^-1 noise^2."""
     model = LinearModel(noise=0.5)
-    found, race = inversion_of(model, 400, 10_000, seed)
-    assert found.place == pytest.approx(TRUTH, abs=0.03)
+    inversion, race = inversion_of(model, 400, 10_000, seed)
+    assert inversion.place == pytest.approx(TRUTH, abs=0.03)
     last = logit(np.array(model.places[-400:]))
     covariance = np.linalg.inv(model.matrix.T @ model.matrix) * model.noise**2
     assert last.mean(axis=0) == pytest.approx(logit(TRUTH), abs=0.05)
     assert np.cov(last.T) == pytest.approx(covariance, abs=0.3 * covariance.max())
     assert race.trials_left == 10_000 - len(model.places)
-    assert race.lowest_loss == min(misfit.loss for misfit in model.misfits([found.place]))
+    assert race.lowest_loss == min(misfit.loss for misfit in model.misfits([inversion.place]))
 
 
 def test_the_axes_are_those_of_the_places_on_the_way_with_a_mean_deviation_of_one() -> None:
     """Parameters that the data ties together stay tied together: here the first two count by their sum alone."""
     model = LinearModel(noise=0.05)
     model.matrix[:, 1] = model.matrix[:, 0]
-    found, _ = inversion_of(model, 200, 10_000)
-    covariance = found.axes @ found.axes.T
+    inversion, _ = inversion_of(model, 200, 10_000)
+    covariance = inversion.axes @ inversion.axes.T
     assert np.sqrt(np.diag(covariance)).mean() == pytest.approx(1.0)
     assert covariance[0, 1] / np.sqrt(covariance[0, 0] * covariance[1, 1]) < -0.8
 
@@ -64,11 +64,11 @@ def test_the_axes_are_those_of_the_places_on_the_way_with_a_mean_deviation_of_on
 @pytest.mark.parametrize(("size", "max_trials"), [(2, 2), (2, 7), (10, 10), (10, 39), (30, 95)])
 def test_an_inversion_ends_before_it_exceeds_its_trials(size: int, max_trials: int) -> None:
     model = LinearModel(noise=1e-6)
-    found, race = inversion_of(model, size, max_trials)
+    inversion, race = inversion_of(model, size, max_trials)
     used = 10_000 - race.trials_left
     assert max_trials - size < used == len(model.places) <= max_trials
-    assert any((found.place == place).all() for place in model.places)
-    assert np.isfinite(found.axes).all()
+    assert any((inversion.place == place).all() for place in model.places)
+    assert np.isfinite(inversion.axes).all()
 
 
 def test_places_stay_in_the_bounds_where_the_data_pulls_beyond_them() -> None:
@@ -78,10 +78,10 @@ def test_places_stay_in_the_bounds_where_the_data_pulls_beyond_them() -> None:
             return [Misfit(float(((place - 2) ** 2).sum()), (place - 2) / 1e-3) for place in groups]
 
     model = Beyond(noise=1.0)
-    found, _ = inversion_of(model, 50, 2_000)
+    inversion, _ = inversion_of(model, 50, 2_000)
     assert (np.array(model.places) > 0).all()
     assert (np.array(model.places) < 1).all()
-    assert (found.place > 0.99).all()
+    assert (inversion.place > 0.99).all()
 
 
 def test_data_without_weight_move_nothing() -> None:
