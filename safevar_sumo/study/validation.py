@@ -207,6 +207,8 @@ def contradictions(source: object, study: Study) -> Iterator[InputError]:
     for name, bounds in study.calibration.items():
         if bounds.lower >= bounds.upper:
             yield InputError(source, f"calibration.{name!r}: lower = {bounds.lower} and upper = {bounds.upper}", "numbers, lower < upper")
+    if study.fit.ensemble == 1:
+        yield InputError(source, "fit.ensemble = 1", "0 for starts without an ensemble, or at least 2 places")
     if study.matrix is not None and bool(study.matrix.tests) == bool(study.matrix.protocol):
         yield InputError(source, f"matrix: {len(study.matrix.tests)} tests and protocol = {study.matrix.protocol!r}",
                          "tests, or a protocol")

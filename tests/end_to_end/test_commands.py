@@ -116,6 +116,7 @@ def test_bad_input_ends_with_code_2_and_says_what_is_legal(arguments: list[str],
     ("[vehicle]", "parameters = { duration = 0 }\n[vehicle]", ("scenario.parameters.duration = 0",)),
     ("[vehicle]", 'parameters = { network = "x" }\n[vehicle]', ("network 'x'", "lead_vehicle_stopped")),
     ('unit = "kg", ', 'unit = "t", ', ("vehicle.characteristics.mass.unit", "'t'", "kg")),
+    ("ensemble = 200", "ensemble = 1", ("fit.ensemble = 1", "at least 2")),
     ("lower = 2040, upper = 2700", "lower = 2700, upper = 2040", ("vehicle.characteristics.mass", "lower < upper")),
 ])
 def test_a_bad_study_file_ends_with_code_2(old: str, new: str, expected: tuple[str, ...], in_tmp: Path) -> None:

@@ -22,7 +22,7 @@ def test_the_published_settings_are_searched_as_published() -> None:
         assert len(study.vehicle.characteristics) == 12
 
 
-REACTS = {"recognition_delay", "hesitation", "brake_gap", "brake_gap_per_speed", "brake_place", "brake_gap_before", "brake_gap_past"}
+REACTS = {"hesitation", "brake_place"}
 
 
 def test_rain_differs_from_sun_only_in_weather_and_reaction_of_its_driver() -> None:
