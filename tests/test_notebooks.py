@@ -51,8 +51,8 @@ def test_stored_outputs_are_of_todays_vehicle() -> None:
     traces = {value: sv.simulate("sun", {"tireFric": value}).trace for value in (3.5, 1.5)}
     begins = {value: trace[trace["brake [-]"] > 0].iloc[0] for value, trace in traces.items()}
     ways = {value: trace["position [m]"].iloc[-1] - begins[value]["position [m]"] for value, trace in traces.items()}
-    sentence = (f"that gains {begins[1.5]['gap [m]'] - begins[3.5]['gap [m]']:.2f} m, and the longer way to a stop takes "
-                f"{ways[1.5] - ways[3.5]:.2f} m of it")
+    delay, advance = (begins[1.5][name] - begins[3.5][name] for name in ("time [s]", "position [m]"))
+    sentence = f"brakes {delay:.2f} s later, {advance:.2f} m farther on, and the way to a stop is {ways[1.5] - ways[3.5]:.2f} m longer"
     assert sentence in (NOTEBOOKS / "quickstart.ipynb").read_text()
     assert "SD is below 1.1 in" in "".join(texts["answers"])
     assert all(path.stat().st_size < 500_000 for path in NOTEBOOKS.glob("*.ipynb"))
