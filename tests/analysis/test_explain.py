@@ -233,13 +233,15 @@ def test_the_summary_of_a_study_leads_with_the_answer(case: Case, explained: Exp
     paragraph, first, *others, more = summarise_failures(case.study, case.solutions, original, InlinePool(), "my results")
     crashes = int((case.solutions["outcome"] == "collision").sum())
     assert_tells_a_manager(paragraph, explained)
-    assert first == f"{crashes} of {len(case.solutions)} solutions collide."
+    distinct = len(np.unique(case.solutions[list(case.study.vehicle.characteristics)].to_numpy(dtype=float), axis=0))
+    settings = "" if distinct == len(case.solutions) else f" ({distinct} different settings)"
+    assert first == f"{crashes} of {len(case.solutions)} solutions{settings} collide."
     assert [line.partition(":")[0] for line in others] == ["Fewest changes", "Smallest largest change", "Most severe"]
     assert all(" These changes alone cause it: " in line for line in others)
     safe = case.solutions[case.solutions["f_safe"] > 2]
     assert more == "Why, and how far: python -m safevar_sumo explain 'my results'"
     nothing, more = summarise_failures(case.study, safe, original, InlinePool(), "out")
-    assert nothing.startswith(f"Nothing unsafe found in {len(safe)} solutions")
+    assert nothing.startswith(f"Nothing unsafe found in {len(safe)} solution{'s' * (len(safe) > 1)}:")
     assert more == "How far each characteristic may go: python -m safevar_sumo tolerance out"
 
 
