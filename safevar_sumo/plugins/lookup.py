@@ -25,8 +25,8 @@ from safevar_sumo.plugins.files import audit_hook, file_beside, is_user_file
 from safevar_sumo.plugins.guard import Contract, Guard
 from safevar_sumo.study import convert_table
 
-_KNOWN_MODULES = {__name__.partition(".")[0], *sys.stdlib_module_names}
-"""Names of top modules that are no user code: this package and Python's standard library."""
+_KNOWN_MODULES = {__name__.partition(".")[0], "__main__", "__mp_main__", *sys.stdlib_module_names}
+"""Names of top modules that are no user code: this package, the script that runs, and Python's standard library."""
 
 
 class Member(NamedTuple):

@@ -101,3 +101,13 @@ def test_a_numpy_py_in_the_working_directory_is_not_numpy(tmp_path: Path) -> Non
     command = [sys.executable, "-m", "safevar_sumo", "study", "smoke", "--runs", "1", "--evaluations", "10", "--jobs", "1", "--quiet"]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
+
+
+def test_a_script_in_the_folder_of_the_study_stays_the_main_module(tmp_path: Path) -> None:
+    """Each vehicle with a TraCI controller has copies of the user's modules; the script that runs is none of them."""
+    (tmp_path / "mine.toml").write_text('extends = "native"\nname = "mine"\n[ads]\nkind = "traci"\nmodel = "mine:step"\n')
+    (tmp_path / "mine.py").write_text("def step(traci, vehicle_id):\n    traci.vehicle.setSpeed(vehicle_id, 5)\n")
+    (tmp_path / "script.py").write_text(
+        "import safevar_sumo as sv\nsv.simulate('mine.toml')\nprint(len(sv.evaluate('mine.toml', [{'mass': 1600}])))\n")
+    output = subprocess.run([sys.executable, "script.py"], cwd=tmp_path, capture_output=True, text=True, timeout=300)
+    assert output.stdout.split() == ["1"], output.stderr
