@@ -28,7 +28,7 @@ from safevar_sumo.analysis.research_questions.changes import (
 from safevar_sumo.analysis.research_questions.comparisons import ALPHA, rq1, rq2
 from safevar_sumo.analysis.research_questions.over_runs import correct_by_holm, rq1_runs, rq2_runs, significance_change_line, summary_lines
 from safevar_sumo.errors import InputError
-from safevar_sumo.study import CharacteristicTable
+from safevar_sumo.study import CharacteristicTable, load_study
 from tests.research_questions.made_up import CHARACTERISTICS, ORIGINAL, made_up, made_up_study, row
 
 HEAVY, GRIPLESS, BOTH = (1100.0, 2.0, 0.1), (1000.0, 1.0, 0.1), (1200.0, 1.5, 0.1)
@@ -181,8 +181,16 @@ def test_weather_compares_cases_that_differ_in_it_alone() -> None:
     assert (result["percent"], result["percent_other"], result["difference"]) == (50, 100, 50)
     assert (result["increase"], result["increase_other"], result["decrease"]) == (100, 200, None)
     assert (result["rank"], result["rank_other"]) == (1, 1)
-    with pytest.raises(InputError, match="differ in the weather alone"):
+    with pytest.raises(InputError, match="differ in the weather alone; these two also differ in metrics.ttc_threshold"):
         answer_questions([clear, other], "weather")
+    with pytest.raises(InputError, match="these two have equally clear weather"):
+        find_weather_pairs([clear, clear])
+
+
+def test_the_reaction_in_rain_that_was_fitted_apart_belongs_to_the_weather() -> None:
+    sun, rain = (made_up(row(values=HEAVY), study=load_study(name)) for name in ("sun", "rain"))
+    assert sun.study.ads.parameters["brake_place"] != rain.study.ads.parameters["brake_place"]
+    assert [(clearer.name, other.name) for clearer, other in find_weather_pairs([rain, sun])] == [("sun", "rain")]
 
 
 def test_every_question_at_once_tells_what_is_lacking() -> None:

@@ -10,9 +10,9 @@ from collections import Counter
 from collections.abc import Sequence
 from itertools import permutations
 
+import msgspec
 import numpy as np
 import pandas as pd
-from msgspec.structs import replace
 
 from safevar_sumo.ads import REACTION_PARAMETERS
 from safevar_sumo.analysis.research_questions.case import NSGA2, Case, UnanswerableError, are_collisions
@@ -165,16 +165,21 @@ def frequent_combinations(case: Case) -> pd.DataFrame:
 def find_weather_pairs(cases: Sequence[Case]) -> list[tuple[Case, Case]]:
     """Pairs of cases that differ only in the weather and the ADS's reaction to it, clearer weather first (by friction, visibility, delays).
 
+    Parameters of the reaction are the ADS's delays, and those that the calibration of either study marks as its own.
+
     Raises
     ------
     UnanswerableError
         If there is no such pair.
     """
     pairs = [(clearer, other) for clearer, other in permutations(cases, 2)
-             if _without_weather(clearer) == _without_weather(other) and _clearness(clearer) > _clearness(other)]
+             if not _differences(clearer, other) and _clearness(clearer) > _clearness(other)]
     if not pairs:
-        raise UnanswerableError(", ".join(case.name for case in cases), "two cases are needed that differ in the weather alone",
-                                "results such as those of sun and rain")
+        problem = "two cases are needed that differ in the weather alone"
+        if len(cases) == 2:
+            differences = ", ".join(_differences(*cases))
+            problem += f"; these two also differ in {differences}" if differences else "; these two have equally clear weather"
+        raise UnanswerableError(", ".join(case.name for case in cases), problem, "results such as those of sun and rain")
     return pairs
 
 
@@ -217,7 +222,12 @@ def _clearness(case: Case) -> tuple[float, float, float]:
     return weather.road_friction, weather.visibility, -weather.recognition_delay - sum(reaction_delays)
 
 
-def _without_weather(case: Case) -> tuple[object, ...]:
-    study = case.study
-    parameters = {name: value for name, value in study.ads.parameters.items() if name not in REACTION_PARAMETERS}
-    return study.scenario, study.vehicle, replace(study.ads, parameters=parameters), study.metrics
+def _differences(one: Case, other: Case) -> list[str]:
+    """Keys, of what a simulation depends on, in which two studies differ other than by the weather and the ADS's reaction to it."""
+    studies = [msgspec.to_builtins(case.study) for case in (one, other)]
+    own_keys = [key for case in (one, other) for key, parameter in case.study.calibration.items() if parameter.own]
+    for study in studies:
+        for name in (*REACTION_PARAMETERS, *(key.removeprefix("ads.parameters.") for key in own_keys)):
+            study["ads"]["parameters"].pop(name, None)
+    return [f"{table}.{key}" for table in ("scenario", "vehicle", "ads", "metrics") for key in studies[0][table] | studies[1][table]
+            if studies[0][table].get(key) != studies[1][table].get(key)]
