@@ -181,7 +181,7 @@ def test_weather_compares_cases_that_differ_in_it_alone() -> None:
     assert (result["percent"], result["percent_other"], result["difference"]) == (50, 100, 50)
     assert (result["increase"], result["increase_other"], result["decrease"]) == (100, 200, None)
     assert (result["rank"], result["rank_other"]) == (1, 1)
-    with pytest.raises(InputError, match="differ in the weather alone; these two also differ in metrics.ttc_threshold"):
+    with pytest.raises(InputError, match=r"differ in the weather alone; these two also differ in metrics\.ttc_threshold"):
         answer_questions([clear, other], "weather")
     with pytest.raises(InputError, match="these two have equally clear weather"):
         find_weather_pairs([clear, clear])
