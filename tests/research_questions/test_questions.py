@@ -256,6 +256,14 @@ def test_solutions_of_one_run_are_not_taken_for_independent() -> None:
     assert original["p_holm"] >= original["p_value"] * 2
 
 
+def test_a_question_with_too_few_runs_for_significance_loses_none() -> None:
+    rows = [row(name, run=run, sd=sd + run / 100, values=(1100.0 + run, 2.0, 0.1)) for name, sd in (("nsga2", 1.0), ("rs", 2.0))
+            for run in range(5) for _ in range(40)]
+    line = significance_change_line(made_up(*rows))
+    assert "RQ1" not in line, "5 runs are too few for its tests, not for RQ2's"
+    assert "of 7 tests" in line
+
+
 HEAVIER = (1200.0, 2.0, 0.1)
 
 

@@ -113,7 +113,7 @@ def fewest_runs(question: str) -> int:
 
 
 def significance_change_line(case: Case) -> str:
-    """One line: the tests that are significant (p < ALPHA) only for the paper's pooled solutions, or only over runs.
+    """One line: the tests with enough runs that are significant (p < ALPHA) only for the paper's pooled solutions, or only over runs.
 
     Example: "..., 3 of 28 tests are no longer significant: RQ1 NSGA-II SD, TET; RQ2 SafeFuzzer TET."
 
@@ -129,6 +129,8 @@ def significance_change_line(case: Case) -> str:
     changes, test_count = {"no longer": dict[str, list[str]](), "now": dict[str, list[str]]()}, 0
     for question, group_column, pooled_frame, runs_frame in comparisons:
         for pooled_row, runs_row in zip(pooled_frame.to_dict("records"), runs_frame.to_dict("records"), strict=True):
+            if min(runs_row[column] for column in COUNT_COLUMNS[question]) < fewest_runs(question):
+                continue
             pooled_p, runs_p = pooled_row["p_value"], runs_row["p_holm"]
             test_count += runs_p is not None
             if pooled_p is None or runs_p is None or (pooled_p < ALPHA) == (runs_p < ALPHA):
