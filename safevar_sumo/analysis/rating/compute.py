@@ -20,7 +20,7 @@ from safevar_sumo.records import CellResults, FloatArray, finite_or_none
 from safevar_sumo.results import SolutionId, row_of_handle
 from safevar_sumo.scenarios import weather_of
 from safevar_sumo.study import Study
-from safevar_sumo.vehicles import CharacteristicSet
+from safevar_sumo.vehicles import CharacteristicSet, region_of
 from safevar_sumo.workers.evaluation import Pool
 
 POINT_KINDS = ("standard", "extended", "robustness")
@@ -185,7 +185,8 @@ def rate_variant(subject: Study | Case, options: RatingOptions, *, pool: Pool | 
     Raises
     ------
     InputError
-        If the results have no such solution, a value is outside its domain, or the study cannot be assembled.
+        If the results have no such solution, a value is outside its domain, the changed variant violates a constraint, or the study
+        cannot be assembled.
     SimulationError
         If a vehicle cannot be simulated.
     """
@@ -201,6 +202,8 @@ def rate_variant(subject: Study | Case, options: RatingOptions, *, pool: Pool | 
         characteristics.setting(options.changes, "changes", switch="")  # refuses unknown names
         setting_values, name = {**setting_values, **options.changes}, f"{name} changed" if setting_values else name
     variants = {name: characteristics.setting(setting_values, "changes")} if setting_values else {}
+    if options.changes:
+        region_of(study).check(variants[name][np.newaxis], "changes")
     return rate(study, variants, pool=pool, jobs=jobs, progress=progress)
 
 
