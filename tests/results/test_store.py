@@ -26,6 +26,7 @@ from safevar_sumo.results import (
     choose_handle,
     handles_of,
     load_runs,
+    read_late_files,
     record,
     row_of_handle,
     solutions_frame,
@@ -298,6 +299,29 @@ def test_an_edited_manifest_is_refused_until_it_is_removed(tmp_path: Path, study
     file.unlink()
     ResultsDirectory(tmp_path, study).begin(evaluations(2.5))
     assert json.loads(file.read_text())["original"]["safety_degree"] == 2.5
+
+
+@pytest.mark.parametrize("content", [b"", b'{"my_table.csv": "ab', b"{}", b"[]", b"3", b'["\xff"]', b'{"other.csv": "ab"}'])
+def test_a_damaged_record_of_an_input_is_an_error_not_a_forgotten_input(tmp_path: Path, study: Study, content: bytes) -> None:
+    written(tmp_path, study).record_late_files({"my_table.csv": "ab"})
+    assert read_late_files(tmp_path) == {"my_table.csv": "ab"}
+    (file,) = (tmp_path / "runs").glob("read-*.json")
+    file.write_bytes(content)
+    before = contents(tmp_path)
+    with pytest.raises(InputError, match=rf"{file.name}: (is torn or )?was edited"):
+        ResultsDirectory(tmp_path, study)
+    assert contents(tmp_path) == before
+
+
+@pytest.mark.parametrize("content", [b"", b'["..', b"{}", b"3", b"[3]", b'["\xff"]'])
+def test_a_damaged_record_of_folders_is_an_error_until_it_is_removed(slippery: Path, tmp_path: Path, content: bytes) -> None:
+    shutil.copytree(slippery, tmp_path / "it")
+    file = tmp_path / "it/runs/places.json"
+    file.write_bytes(content)
+    with pytest.raises(InputError, match=r"places\.json: is torn or was edited"):
+        load_cases([tmp_path / "it"])
+    file.unlink()
+    load_cases([tmp_path / "it"])
 
 
 def contents(place: Path) -> dict[str, tuple[bytes, int]]:
