@@ -340,8 +340,9 @@ def test_the_paragraph_says_how_robust_the_changes_that_suffice_are_by_themselve
 @pytest.mark.parametrize(("weather", "words"), [
     ("hard_rain", "In hard rain, the original"),
     ("carla_hard_rain", "In hard rain (which changes neither road nor sensors), the original"),
-    ({"name": "black ice", "road_friction": 0.2, "visibility": 1.0}, "With the weather 'black ice', the original")])
-def test_a_weather_without_a_phrase_is_named(weather: str | dict[str, Any], words: str) -> None:
+    ({"name": "black ice", "road_friction": 0.2, "visibility": 1.0}, "With the weather 'black ice', the original"),
+    ({"name": "wet", "road_friction": 0.9, "visibility": 1.0}, "With the weather 'wet', the original")])
+def test_a_weather_that_is_not_shipped_is_named(weather: str | dict[str, Any], words: str) -> None:
     system = assemble(load_study("smoke", weather=weather))
     original = evaluate(system, system.characteristics.original[np.newaxis])
     assert failures_paragraph(system, original, None, None, Preventability(counts={}, collisions=0)).startswith(words)

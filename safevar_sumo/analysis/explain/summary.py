@@ -19,7 +19,7 @@ from safevar_sumo.analysis.words import OUTCOME_VERBS, join_phrases, list_of_cha
 from safevar_sumo.metrics import RATING_POINTS, Unsafe
 from safevar_sumo.records import KMH_PER_MS, Evaluations, FloatArray, Outcome, finite_or_none
 from safevar_sumo.results import CHOICES, choose_handle, handles_of, record, row_of_handle
-from safevar_sumo.scenarios import Point, equals_clear
+from safevar_sumo.scenarios import equals_clear, weather_in_words
 from safevar_sumo.scenarios.base import pre_crash_of
 from safevar_sumo.study import Study
 from safevar_sumo.sumo.matrix import simulate_all_points, study_at, worst_points
@@ -137,9 +137,6 @@ def _cause_in_words(evaluator: Evaluator, causes: list[MinimalCause]) -> str:
 NUMBER_WORDS = ("no", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten", "eleven", "twelve")
 MAX_CHANGES_LISTED = 4
 """Maximum number of changes that are listed, the largest first."""
-WEATHER_PHRASES = {"clear": "In clear weather", "wet": "On a wet road", "fog": "In fog", "night": "At night",
-                   "soft_rain": "In soft rain", "hard_rain": "In hard rain", "carla_hard_rain": "In hard rain"}
-"""Weathers as the beginning of a sentence; any other weather is named."""
 
 
 class FailureDescription(NamedTuple):
@@ -208,13 +205,10 @@ def _conditions_in_words(system: System) -> str:
     points = system.points
     if len(points) > 1:
         return f"At the worst of {len(points)} test points"
-    return f"At {points[0].name}," if system.matrix else f"{_weather_in_words(points[0])},"
-
-
-def _weather_in_words(point: Point) -> str:
-    name = point.weather.name
-    no_effect = " (which changes neither road nor sensors)" if equals_clear(point.weather) else ""
-    return WEATHER_PHRASES.get(name, f"With the weather '{name}'") + no_effect
+    if system.matrix:
+        return f"At {points[0].name},"
+    weather = points[0].weather
+    return f"{weather_in_words(weather)}{' (which changes neither road nor sensors)' if equals_clear(weather) else ''},"
 
 
 def _original_ending_in_words(system: System, original: Evaluations) -> str:
