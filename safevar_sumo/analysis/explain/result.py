@@ -180,7 +180,7 @@ class Explained:
     otherwise
         Number of solutions that ended otherwise than in the results: with another outcome than the recorded one.
     preventability
-        Shares of the collisions that reference drivers avoid.
+        Shares of the collisions among the evaluated settings that reference drivers avoid.
     """
 
     study: Study

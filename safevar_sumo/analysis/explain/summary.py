@@ -183,7 +183,7 @@ def failures_paragraph(system: System, original: Evaluations, smallest: FailureD
         The robust failure with the fewest changes, and among these the smallest largest change; None if no tried failure is robust. It
         leads the paragraph if it has as few changes as `smallest`.
     preventable
-        Shares of the collisions that reference drivers avoid.
+        Shares of the collisions among the solutions that reference drivers avoid.
     """
     parts = [f"{_conditions_in_words(system)} the original vehicle {_original_ending_in_words(system, original)}."]
     if smallest is None:
