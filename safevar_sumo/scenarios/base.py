@@ -7,7 +7,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from enum import StrEnum
 from typing import Annotated, Any, NamedTuple, Protocol
 
-import msgspec
 import numpy as np
 from msgspec import Meta
 

@@ -39,7 +39,13 @@ from safevar_sumo.analysis.explain.necessity import (
 )
 from safevar_sumo.analysis.explain.render import _print_explanation, _sample_in_words, print_explained
 from safevar_sumo.analysis.explain.result import Cause, Explained, Explanation, most_robust
-from safevar_sumo.analysis.explain.summary import NUMBER_WORDS, FailureDescription, failures_paragraph, summarise_failures
+from safevar_sumo.analysis.explain.summary import (
+    NUMBER_WORDS,
+    FailureDescription,
+    _estimate_robustnesses,
+    failures_paragraph,
+    summarise_failures,
+)
 from safevar_sumo.analysis.preventability import Preventability
 from safevar_sumo.analysis.research_questions.case import Case, load_cases
 from safevar_sumo.cli.program import commands
@@ -358,6 +364,18 @@ def test_the_paragraph_leads_with_the_robust_failure_if_it_has_as_few_changes() 
     nobody = Preventability(counts={}, collisions=0)
     assert failures_paragraph(system, original, severe, robust, nobody) == failures_paragraph(system, original, robust, robust, nobody)
     assert failures_paragraph(system, original, severe, larger, nobody) == failures_paragraph(system, original, severe, None, nobody)
+
+
+def test_the_summary_names_the_most_robust_of_all_causes_or_none() -> None:
+    """Any two changes suffice; only the last pair is not at the edge of the unsafe region."""
+    evaluator = made_up_evaluator(5, lambda settings: np.asarray((settings > 7).sum(axis=1) >= 2))
+    settings = np.array([[7.001, 7.001, 7.001, 9.0, 9.0]])
+    causes = find_minimal_causes(evaluator, settings, COLLISION)
+    assert [cause.columns for cause in causes[0]] == list(combinations(range(5), 2))
+    ((failure, cause),) = _estimate_robustnesses(evaluator, settings, causes, 0.1, COLLISION)
+    assert (failure.share, cause and cause.share) == (1.0, 1.0)
+    ((failure, cause),) = _estimate_robustnesses(evaluator, settings, [causes[0] * 3], 0.1, COLLISION)
+    assert (failure.share, cause) == (1.0, None)
 
 
 def test_of_several_causes_the_most_robust_is_named() -> None:
