@@ -161,7 +161,8 @@ def test_the_numbers_of_a_reports_questions_are_those_that_the_page_about_it_giv
 
 
 def test_the_page_on_results_lists_every_key_that_may_change() -> None:
-    (listed,) = re.findall(r"You may change these keys at any time[^:]*: (.*?)\. ", (ROOT / "docs" / "results.md").read_text(), flags=re.DOTALL)
+    page = (ROOT / "docs" / "results.md").read_text()
+    (listed,) = re.findall(r"You may change these keys at any time[^:]*: (.*?)\. ", page, flags=re.DOTALL)
     keys = re.findall(r"`\[*(\w+)\]*`", listed)
     assert sorted(keys) == sorted([*KEYS_WITHOUT_EFFECT_ON_RESULTS, *DESCRIPTION_KEYS, *KEYS_WITHOUT_EFFECT_ON_EVALUATIONS])
 
