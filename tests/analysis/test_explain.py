@@ -20,6 +20,7 @@ from rich.console import Console
 
 from safevar_sumo.analysis.evaluator import Evaluator
 from safevar_sumo.analysis.explain import ExplainOptions
+from safevar_sumo.analysis.explain import causes as causes_module
 from safevar_sumo.analysis.explain.braking_comparison import BrakingComparison, RunSummary
 from safevar_sumo.analysis.explain.causes import (
     RESOLUTION,
@@ -272,6 +273,29 @@ def test_all_smallest_unsafe_subsets_and_no_other_whatever_the_outcomes(table: l
         assert not any(set(subset) < set(cause.columns) for subset in unsafe)
     assert necessary_columns(result) == (set.intersection(*smallest) if smallest else set())
     assert involved_columns(result) == set().union(*smallest)
+
+
+def test_subsets_are_made_a_limited_number_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of 8 rows of 8 changes, all pairs are 224 subsets."""
+    alive = most = 0
+
+    class Counted(causes_module._Subset):
+        def __init__(self, *_: object) -> None:
+            nonlocal alive, most
+            alive += 1
+            most = max(most, alive)
+
+        def __del__(self) -> None:
+            nonlocal alive
+            alive -= 1
+
+    evaluator, settings = made_up_evaluator(8, lambda rows: (rows != ORIGINAL).sum(axis=1) >= 2), np.full((8, 8), 9.0)
+    expected = find_minimal_causes(evaluator, settings, COLLISION)
+    monkeypatch.setattr(causes_module, "_Subset", Counted)
+    monkeypatch.setattr(causes_module, "MAX_SUBSETS", 10)
+    result = find_minimal_causes(evaluator, settings, COLLISION)
+    assert [[cause.columns for cause in row] for row in result] == [[cause.columns for cause in row] for row in expected]
+    assert most <= 2 * 10 + 2, "a batch, and the next one while it is made"
 
 
 def test_a_boundary_is_the_first_unsafe_place_and_no_island_is_skipped() -> None:
