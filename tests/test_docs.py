@@ -21,7 +21,8 @@ from safevar_sumo.analysis.risk import RiskOptions
 from safevar_sumo.analysis.rules import RulesOptions
 from safevar_sumo.cli.program import commands
 from safevar_sumo.report import input as report_input
-from safevar_sumo.study import load_study, study_names
+from safevar_sumo.results.manifest import KEYS_WITHOUT_EFFECT_ON_EVALUATIONS, KEYS_WITHOUT_EFFECT_ON_RESULTS
+from safevar_sumo.study import DESCRIPTION_KEYS, load_study, study_names
 from safevar_sumo.vehicles import VEHICLES
 
 ROOT = Path(__file__).parents[1]
@@ -157,6 +158,13 @@ def test_the_numbers_of_a_reports_questions_are_those_that_the_page_about_it_giv
     numbers = (report_input.SAMPLED_VEHICLES, RiskOptions.samples, RulesOptions.samples, report_input.EXPLAIN_SIMULATIONS,
                ExplainOptions.limit)
     assert re.findall(r"\d+,\d+", paragraph[0]) == [f"{number:,}" for number in numbers]
+
+
+def test_the_page_on_results_lists_every_key_that_may_change() -> None:
+    page = (ROOT / "docs" / "results.md").read_text()
+    (listed,) = re.findall(r"You may change these keys at any time[^:]*: (.*?)\. ", page, flags=re.DOTALL)
+    keys = re.findall(r"`\[*(\w+)\]*`", listed)
+    assert sorted(keys) == sorted([*KEYS_WITHOUT_EFFECT_ON_RESULTS, *DESCRIPTION_KEYS, *KEYS_WITHOUT_EFFECT_ON_EVALUATIONS])
 
 
 def test_every_generated_table_of_a_page_is_made_from_the_code() -> None:

@@ -25,7 +25,7 @@ from safevar_sumo.sumo.matrix import simulate, simulate_all_points, study_at, wo
 from safevar_sumo.sumo.system import System, assemble
 
 MAX_SIMULATIONS = 20_000
-"""Approximate maximum number of simulations for a study's preventability; if all collisions need more, a random sample is simulated."""
+"""Approximate maximum number of simulations; if all given collisions need more, a random sample of them is simulated."""
 
 SETTINGS_PER_CALL = 20
 """Number of settings simulated in one call at all points of a test matrix: enough to fill the batches of simulations."""
@@ -43,7 +43,7 @@ class PreventableBy(StrEnum):
 
 
 class PreventedShares(msgspec.Struct, frozen=True, kw_only=True):
-    """Shares of the simulated collisions by category in the JSON of `explain`, None without a collision.
+    """Shares of the simulated collisions (see `Preventability`) by category in the JSON of `explain`, None without a collision.
 
     `looked_at` is the number of simulated collisions; `interval_competent_driver` the 95 % interval of the share `competent_driver`.
     """
@@ -57,14 +57,16 @@ class PreventedShares(msgspec.Struct, frozen=True, kw_only=True):
 
 @dataclass(frozen=True, kw_only=True)
 class Preventability:
-    """Counts of a study's collisions, or of a random sample of them, by category: the weakest driver that avoids each collision.
+    """Counts of collisions, or of a random sample of them, by category: the weakest driver that avoids each collision.
+
+    The collisions are the distinct solutions that collide, or of a study without results the drawn settings that collide.
 
     Attributes
     ----------
     counts
         Number of simulated collisions in each category; the categories are disjoint.
     collisions
-        Number of distinct settings of the study that collide, simulated with the reference drivers or not.
+        Number of all these collisions, simulated with the reference drivers or not.
     """
 
     counts: Mapping[PreventableBy, int]
@@ -80,7 +82,7 @@ class Preventability:
         return self.counts.get(category, 0) / self.looked_at if self.looked_at else None
 
     def interval(self, category: PreventableBy) -> tuple[float, float] | None:
-        """95 % confidence interval of a category's share in all collisions of the study; None if no collision was simulated.
+        """95 % confidence interval of a category's share in all `collisions`; None if no collision was simulated.
 
         If all collisions were simulated, the share has no sampling error and the interval is the share itself. For a sample the
         interval is Clopper and Pearson's. It is slightly too wide, as it has no correction for a finite population.

@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.text import Text
 
 from safevar_sumo.analysis.model_spread import ModelSpread, compute_model_spreads, studies_of_sets
-from safevar_sumo.analysis.words import question_command
+from safevar_sumo.analysis.rating import RatingOptions
 from safevar_sumo.api.simulation import Simulation, evaluate_settings, simulate_with_original
 from safevar_sumo.cli.arguments import (
     PICTURE_ENDINGS,
@@ -131,7 +131,7 @@ def _print_results(target: CommandTarget, system: System, simulation: Simulation
         if system.rater is None:
             print_matrix(Console(), results_at_points)
         else:
-            print_text(Console(), f"{len(system.matrix)} cells and variations: run `{question_command('rating', target.source)} --matrix`")
+            print_text(Console(), f"{len(system.matrix)} cells and variations: run `{_rating_command(target, system, simulation)}`")
         if types := pre_crash_sentence(system.points):
             print_text(Console(), types)
     remarks = [remark for point in system.points for remark in remarks_of(point.scenario)]
@@ -140,6 +140,15 @@ def _print_results(target: CommandTarget, system: System, simulation: Simulation
     for name, value in simulation.put_back.items():
         click.echo(f"note: {name} = {value:g} is so near the original that the filter reset it to {simulation.setting[name]:g}; "
                    "--no-filter keeps it", err=True)
+
+
+def _rating_command(target: CommandTarget, system: System, simulation: Simulation) -> str:
+    """The command that rates the simulated vehicle: a solution, and the values that differ from it or from the original."""
+    base = system.characteristics.original if target.setting is None else target.setting
+    changes = {name: simulation.setting[name] for name, value in zip(system.characteristics.names, base.tolist(), strict=True)
+               if simulation.setting[name] != value}
+    solution = None if target.handle is None else str(target.handle)
+    return f"{RatingOptions(changes=changes or None, solution=solution).command_line(target.source)} --matrix"
 
 
 def _warn_of_differences(target: CommandTarget, simulation: Simulation) -> None:

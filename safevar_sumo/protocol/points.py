@@ -28,11 +28,26 @@ DECIMALS = 2
 """Decimals to which the calculator rounds measured values, half up."""
 SHARE_DECIMALS = 6
 """Decimals to which the calculator rounds shares before a comparison."""
-REQUIRED_TEST, REQUIRED_SPEED = "CCRs", 20.0
-"""The standard-range cells of this test up to this speed [km/h] must be green, otherwise all frontal collisions score nothing.
 
-The calculator also intends to require CPNA at 10 km/h and 75 %, but version 5.4.9 does not find those cells.
-"""
+
+class RequiredCells(NamedTuple):
+    """Standard-range cells that must be green: of a test up to a speed [km/h], at one impact location [%] or, if it is None, at all."""
+
+    test_name: str
+    max_speed: float
+    impact_location: float | None = None
+
+    def numbers(self, protocol: Protocol) -> list[int]:
+        """Numbers of these cells."""
+        return [number for number, cell in enumerate(protocol.cells)
+                if cell.matrix.test_name == self.test_name and cell.range_or_layer == STANDARD and cell.vut_speed <= self.max_speed
+                and self.impact_location in (None, cell.impact_location)]
+
+
+REQUIRED_CELLS = RequiredCells("CCRs", 20.0)
+"""If one of these cells is not green, all frontal collisions score nothing."""
+UNCHECKED_CELLS = RequiredCells("CPNA", 10.0, 75.0)
+"""Cells that the calculator also intends to require; version 5.4.9 does not find them."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -101,9 +116,7 @@ def _columns_of(protocol: Protocol) -> _Columns:
         cell.matrix.test_name, cell.range_or_layer, cell.condition) == key))
               for layer in protocol.layers for condition in layer.simulated_conditions]
     nominal_cells = np.array([protocol.matrix_cell_numbers[cell.matrix.name, cell.row, cell.column] for cell in cells])
-    required_cells = cells_where(
-        lambda cell: cell.matrix.test_name == REQUIRED_TEST and cell.range_or_layer == STANDARD and cell.vut_speed <= REQUIRED_SPEED)
-    return _Columns(bands, nominal_cells, ranges, variations, required_cells)
+    return _Columns(bands, nominal_cells, ranges, variations, np.array(REQUIRED_CELLS.numbers(protocol), dtype=np.intp))
 
 
 def colours_of(protocol: Protocol, results: CellResults) -> npt.NDArray[np.int8]:

@@ -8,7 +8,7 @@ from typing import Any
 from markupsafe import Markup
 
 from safevar_sumo.analysis.evaluator import Progress
-from safevar_sumo.analysis.risk.compute import FLEET_VEHICLES, estimate_risk, fleet_probability
+from safevar_sumo.analysis.risk.compute import FLEET_VEHICLES, estimate_risk
 from safevar_sumo.analysis.rules.compute import find_rules, rule_in_words
 from safevar_sumo.analysis.tolerance.compute import find_tolerances
 from safevar_sumo.analysis.words import number_of
@@ -34,13 +34,13 @@ def make_tolerance_section(data: ReportInput, jobs: int | None, progress: Progre
 def make_risk_section(data: ReportInput, jobs: int | None, progress: Progress) -> Section:
     """The probability of a failure with its interval, and bars of the characteristics that decide whether a vehicle fails."""
     def compute() -> Section:
-        return estimate_risk(data.case.study, data.options["risk"], jobs=jobs, progress=progress).to_dict()
+        estimate = estimate_risk(data.case.study, data.options["risk"], jobs=jobs, progress=progress)
+        fleet = {"vehicles": FLEET_VEHICLES, "probability": estimate.of_fleet(FLEET_VEHICLES)}
+        return {**estimate.to_dict(), **({} if estimate.is_share_of_domain else {"fleet": fleet})}
 
     result = _with_criterion_in_words(load_or_compute(data, "risk", compute))
     study = data.case.study
-    fleet = {"vehicles": FLEET_VEHICLES, "probability": fleet_probability(result["probability"], FLEET_VEHICLES)}
-    fleets = {"fleet": fleet} if study.variation else {}
-    return {**result, **fleets, "of_domain": not study.variation, "correlated": bool(study.correlations),
+    return {**result, "of_domain": not study.variation, "correlated": bool(study.correlations),
             "chart": _draw_sensitivities(data, result["sensitivity"])}
 
 

@@ -106,7 +106,8 @@ NO_VALUE = "–"  # noqa: RUF001
 class SelectedFailure(NamedTuple):
     """A failure that the verdict shows; all values are those of the solution, not scaled back.
 
-    `unsafe_share` is the share of the failure's neighbours that are unsafe, `cause` its first minimal cause; None if it was not explained.
+    `unsafe_share` is the share of the failure's neighbours that are unsafe, `cause` its most robust minimal cause; None if the failure
+    was not explained.
     """
 
     title: str

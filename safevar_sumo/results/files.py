@@ -9,7 +9,9 @@ import secrets
 import tempfile
 from hashlib import sha256
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple, TypeVar
+
+import msgspec
 
 from safevar_sumo.errors import InputError, SafevarError
 from safevar_sumo.plugins import DIGEST_LENGTH, Files
@@ -126,21 +128,46 @@ def write_folders(directory: Path, study: Study) -> None:
 
 
 def folders_of(directory: Path) -> tuple[str, ...]:
-    """Folders of the user code and files of a directory's study: the recorded folders that exist, then the directory's two parents."""
-    folders = [os.path.abspath(directory.resolve() / folder) for folder in _read_json(directory / RUNS / FOLDERS_FILE, [])]
+    """Folders of the user code and files of a directory's study: the recorded folders that exist, then the directory's two parents.
+
+    Raises
+    ------
+    InputError
+        If the record is damaged.
+    """
+    file = directory / RUNS / FOLDERS_FILE
+    recorded_folders = _read_record(file, list[str], "the file as it was, or no file: the command `study` then writes it again")
+    folders = [os.path.abspath(directory.resolve() / folder) for folder in recorded_folders or ()]
     return tuple(dict.fromkeys([*filter(os.path.isdir, folders), *map(str, directory.resolve().parents[:2])]))
 
 
 def record_late_file(directory: Path, name: str, digest: str) -> None:
     """Record a file that was read after the study began, in a separate JSON file, because several processes may record files."""
     make_synced_directory(directory / RUNS)
-    file_name = LATE_FILE_PATTERN.replace("*", sha256(name.encode()).hexdigest()[:DIGEST_LENGTH])
-    write_whole(directory / RUNS / file_name, json.dumps({name: digest}) + "\n")
+    write_whole(_late_record(directory, name), json.dumps({name: digest}) + "\n")
 
 
 def read_late_files(directory: Path) -> Files:
-    """Digests, by file name, of the files that were read after the study began."""
-    return {name: digest for path in sorted((directory / RUNS).glob(LATE_FILE_PATTERN)) for name, digest in _read_json(path, {}).items()}
+    """Digests, by file name, of the files that were read after the study began.
+
+    Raises
+    ------
+    InputError
+        If a record is damaged: an input of the results would be forgotten.
+    """
+    files: dict[str, str] = {}
+    remedy = "the file as it was, or no file if every file that your own code reads is as it was when it was first read"
+    for path in sorted((directory / RUNS).glob(LATE_FILE_PATTERN)):
+        record = _read_record(path, dict[str, str], remedy) or {}
+        if [_late_record(directory, name) for name in record] != [path]:
+            raise InputError(path, "was edited: it does not hold the file that its name stands for", remedy)
+        files |= record
+    return files
+
+
+def _late_record(directory: Path, name: str) -> Path:
+    """The record of a file that was read after the study began; its name depends on the file's name."""
+    return directory / RUNS / LATE_FILE_PATTERN.replace("*", sha256(name.encode()).hexdigest()[:DIGEST_LENGTH])
 
 
 def _relative_path(folder: str, directory: Path) -> str:
@@ -150,9 +177,23 @@ def _relative_path(folder: str, directory: Path) -> str:
         return folder
 
 
-def _read_json(path: Path, default: Any) -> Any:
-    """The content of a JSON file beside the journals; the default if the file is missing or damaged."""
+Record = TypeVar("Record")
+
+
+def _read_record(path: Path, kind: type[Record], remedy: str) -> Record | None:
+    """The content of a JSON file beside the journals; None if there is no file.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read or is damaged; `remedy` names what the user can do.
+    """
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return default
+        refuse_other_than_file(path)
+        return msgspec.json.decode(path.read_bytes(), type=kind)
+    except FileNotFoundError:
+        return None
+    except OSError as error:
+        raise InputError(path, f"cannot be read: {error.strerror}") from None
+    except ValueError as error:
+        raise InputError(path, f"is torn or was edited: {error}", remedy) from None

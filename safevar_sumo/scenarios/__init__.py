@@ -7,7 +7,6 @@ from safevar_sumo.scenarios.along import Along
 from safevar_sumo.scenarios.base import (
     SCENARIO_CONTRACT,
     VUT,
-    WEATHERS,
     GuardedScenario,
     Lane,
     Point,
@@ -15,14 +14,13 @@ from safevar_sumo.scenarios.base import (
     Scenario,
     Scene,
     World,
-    equals_clear,
     pre_crash_sentence,
-    weather_of,
 )
 from safevar_sumo.scenarios.car_to_car import CarToCar
 from safevar_sumo.scenarios.crossing import Crossing
 from safevar_sumo.scenarios.lead_vehicle_stopped import LeadVehicleStopped
 from safevar_sumo.scenarios.pedestrian_crossing import PedestrianCrossing
+from safevar_sumo.scenarios.weather import WEATHERS, equals_clear, weather_in_words, weather_of
 
 SCENARIOS: Mapping[str, type[Any]] = {
     "pedestrian_crossing": PedestrianCrossing,
@@ -34,4 +32,4 @@ SCENARIOS: Mapping[str, type[Any]] = {
 
 __all__ = [
     "SCENARIOS", "SCENARIO_CONTRACT", "VUT", "WEATHERS", "GuardedScenario", "Lane", "Point", "PreCrash", "Scenario", "Scene", "World",
-    "equals_clear", "pre_crash_sentence", "weather_of"]
+    "equals_clear", "pre_crash_sentence", "weather_in_words", "weather_of"]

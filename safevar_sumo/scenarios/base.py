@@ -3,17 +3,13 @@
 from __future__ import annotations
 
 import math
-import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from enum import StrEnum
-from pathlib import Path
 from typing import Annotated, Any, NamedTuple, Protocol
 
-import msgspec
 import numpy as np
 from msgspec import Meta
 
-from safevar_sumo.errors import unknown_name
 from safevar_sumo.plugins import Contract, Guard, read_only_copy
 from safevar_sumo.records import ALL_TRUE, ZERO, BoolArray, Encounter, FloatArray, Trace
 from safevar_sumo.study import Weather
@@ -151,33 +147,6 @@ class Point(NamedTuple):
     weather: Weather
     name: str = ""
     parameters: tuple[tuple[str, Any], ...] = ()
-
-
-_WEATHER_TABLES = tomllib.loads(Path(__file__).with_name("weather.toml").read_text(encoding="utf-8"))
-WEATHERS = {name: msgspec.convert({"name": name, **table}, Weather) for name, table in _WEATHER_TABLES.items()}
-"""Weathers by name, from weather.toml beside this module."""
-
-
-def weather_of(choice: str | Weather, source: object) -> Weather:
-    """The weather that a study names or defines.
-
-    Raises
-    ------
-    InputError
-        If there is no weather of that name.
-    """
-    if isinstance(choice, Weather):
-        return choice
-    if choice not in WEATHERS:
-        fields = ", ".join(Weather.__struct_fields__)
-        raise unknown_name(source, f"weather = {choice!r}", choice, WEATHERS, f", or a table with {fields}")
-    return WEATHERS[choice]
-
-
-def equals_clear(weather: Weather) -> bool:
-    """Whether a weather has the effects of clear weather under another name."""
-    clear = WEATHERS["clear"]
-    return weather.name != clear.name and weather.light == clear.light and msgspec.structs.replace(weather, name=clear.name) == clear
 
 
 class PreCrash(StrEnum):

@@ -164,7 +164,8 @@ class RatingTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
 class MatrixTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The test points at which every setting is simulated: those of `tests`, or all cells of a `protocol`, which then rates every setting.
 
-    `aggregate` combines the points' safety degrees: `worst` takes the lowest one. (`mean` would average distances with negative speeds.)
+    `aggregate` combines the points' safety degrees: `worst` takes the lowest one. Only results of version 0.2.0 may have `mean`; in a study
+    it is an error, as it would average distances with negative speeds.
     """
 
     tests: list[MatrixTest] = []

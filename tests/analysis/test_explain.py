@@ -20,6 +20,7 @@ from rich.console import Console
 
 from safevar_sumo.analysis.evaluator import Evaluator
 from safevar_sumo.analysis.explain import ExplainOptions
+from safevar_sumo.analysis.explain import causes as causes_module
 from safevar_sumo.analysis.explain.braking_comparison import BrakingComparison, RunSummary
 from safevar_sumo.analysis.explain.causes import (
     RESOLUTION,
@@ -39,7 +40,13 @@ from safevar_sumo.analysis.explain.necessity import (
 )
 from safevar_sumo.analysis.explain.render import _print_explanation, _sample_in_words, print_explained
 from safevar_sumo.analysis.explain.result import Cause, Explained, Explanation, most_robust
-from safevar_sumo.analysis.explain.summary import NUMBER_WORDS, FailureDescription, failures_paragraph, summarise_failures
+from safevar_sumo.analysis.explain.summary import (
+    NUMBER_WORDS,
+    FailureDescription,
+    _estimate_robustnesses,
+    failures_paragraph,
+    summarise_failures,
+)
 from safevar_sumo.analysis.preventability import Preventability
 from safevar_sumo.analysis.research_questions.case import Case, load_cases
 from safevar_sumo.cli.program import commands
@@ -268,6 +275,29 @@ def test_all_smallest_unsafe_subsets_and_no_other_whatever_the_outcomes(table: l
     assert involved_columns(result) == set().union(*smallest)
 
 
+def test_subsets_are_made_a_limited_number_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of 8 rows of 8 changes, all pairs are 224 subsets."""
+    alive = most = 0
+
+    class Counted(causes_module._Subset):
+        def __init__(self, *_: object) -> None:
+            nonlocal alive, most
+            alive += 1
+            most = max(most, alive)
+
+        def __del__(self) -> None:
+            nonlocal alive
+            alive -= 1
+
+    evaluator, settings = made_up_evaluator(8, lambda rows: (rows != ORIGINAL).sum(axis=1) >= 2), np.full((8, 8), 9.0)
+    expected = find_minimal_causes(evaluator, settings, COLLISION)
+    monkeypatch.setattr(causes_module, "_Subset", Counted)
+    monkeypatch.setattr(causes_module, "MAX_SUBSETS", 10)
+    result = find_minimal_causes(evaluator, settings, COLLISION)
+    assert [[cause.columns for cause in row] for row in result] == [[cause.columns for cause in row] for row in expected]
+    assert most <= 2 * 10 + 2, "a batch, and the next one while it is made"
+
+
 def test_a_boundary_is_the_first_unsafe_place_and_no_island_is_skipped() -> None:
     evaluator = made_up_evaluator(3, two_islands)
     (causes,) = find_minimal_causes(evaluator, np.array([[9.5, 1.0, 8.0]]), COLLISION)
@@ -340,8 +370,9 @@ def test_the_paragraph_says_how_robust_the_changes_that_suffice_are_by_themselve
 @pytest.mark.parametrize(("weather", "words"), [
     ("hard_rain", "In hard rain, the original"),
     ("carla_hard_rain", "In hard rain (which changes neither road nor sensors), the original"),
-    ({"name": "black ice", "road_friction": 0.2, "visibility": 1.0}, "With the weather 'black ice', the original")])
-def test_a_weather_without_a_phrase_is_named(weather: str | dict[str, Any], words: str) -> None:
+    ({"name": "black ice", "road_friction": 0.2, "visibility": 1.0}, "With the weather 'black ice', the original"),
+    ({"name": "wet", "road_friction": 0.9, "visibility": 1.0}, "With the weather 'wet', the original")])
+def test_a_weather_that_is_not_shipped_is_named(weather: str | dict[str, Any], words: str) -> None:
     system = assemble(load_study("smoke", weather=weather))
     original = evaluate(system, system.characteristics.original[np.newaxis])
     assert failures_paragraph(system, original, None, None, Preventability(counts={}, collisions=0)).startswith(words)
@@ -357,6 +388,18 @@ def test_the_paragraph_leads_with_the_robust_failure_if_it_has_as_few_changes() 
     nobody = Preventability(counts={}, collisions=0)
     assert failures_paragraph(system, original, severe, robust, nobody) == failures_paragraph(system, original, robust, robust, nobody)
     assert failures_paragraph(system, original, severe, larger, nobody) == failures_paragraph(system, original, severe, None, nobody)
+
+
+def test_the_summary_names_the_most_robust_of_all_causes_or_none() -> None:
+    """Any two changes suffice; only the last pair is not at the edge of the unsafe region."""
+    evaluator = made_up_evaluator(5, lambda settings: np.asarray((settings > 7).sum(axis=1) >= 2))
+    settings = np.array([[7.001, 7.001, 7.001, 9.0, 9.0]])
+    causes = find_minimal_causes(evaluator, settings, COLLISION)
+    assert [cause.columns for cause in causes[0]] == list(combinations(range(5), 2))
+    ((failure, cause),) = _estimate_robustnesses(evaluator, settings, causes, 0.1, COLLISION)
+    assert (failure.share, cause and cause.share) == (1.0, 1.0)
+    ((failure, cause),) = _estimate_robustnesses(evaluator, settings, [causes[0] * 3], 0.1, COLLISION)
+    assert (failure.share, cause) == (1.0, None)
 
 
 def test_of_several_causes_the_most_robust_is_named() -> None:

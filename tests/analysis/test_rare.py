@@ -12,10 +12,11 @@ import pytest
 import scipy
 
 from safevar_sumo import risk
+from safevar_sumo.analysis.risk import compute
 from safevar_sumo.analysis.risk.compute import Risk
 from safevar_sumo.errors import InputError
-from safevar_sumo.records import FloatArray
-from tests.analysis.known_regions import Plant, made_up_study
+from safevar_sumo.records import BoolArray, FloatArray
+from tests.analysis.known_regions import Plant, box, made_up_study
 
 Limit = Callable[[FloatArray], FloatArray]
 
@@ -107,6 +108,27 @@ def test_a_plateau_and_a_frequent_failure_are_left_to_monte_carlo() -> None:
     assert frequent.method == "monte_carlo"
     assert frequent.samples == 10_000
     assert "plain Monte Carlo" in frequent.remark
+
+
+def test_a_pilot_that_cannot_be_simulated_is_not_called_unsafe() -> None:
+    study, calls = made_up_study(2), 0
+
+    def first_call(settings: FloatArray) -> BoolArray:
+        nonlocal calls
+        calls += 1
+        return np.full(len(settings), calls * len(settings) <= 1000)
+
+    study = msgspec.structs.replace(study, search=msgspec.structs.replace(study.search, seed=1))
+    plant = Plant(study, box, failing=first_call)
+    estimate = risk(study, unsafe="collision", pool=plant, rare=True, samples=2000)
+    assert (estimate.method, estimate.samples, estimate.errors) == ("monte_carlo", 1000, 1000)
+    assert estimate.remark == "none of the first 1000 vehicles could be simulated: plain Monte Carlo is used"
+
+
+def test_the_limit_of_rare_failures_has_one_owner(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(compute, "RARE_BELOW", 0.02)
+    monkeypatch.setattr(compute, "find_spec", lambda name: None)
+    assert rare(linear(beta_of(1e-3)), 2, rare=False).remark.startswith("fewer than 2 % of the first vehicles are unsafe; ")
 
 
 @pytest.mark.slow

@@ -14,7 +14,7 @@ from click.testing import CliRunner
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from safevar_sumo.analysis.rating.compute import RatedVehicle, Rating
+from safevar_sumo.analysis.rating.compute import RatedVehicle, Rating, remarks
 from safevar_sumo.analysis.rating.render import rating_in_words
 from safevar_sumo.analysis.rating.workbook import PreprocessedFile, Template
 from safevar_sumo.cli.program import commands
@@ -110,6 +110,22 @@ def test_a_required_cell_that_is_not_green_costs_everything() -> None:
     impact[numbers("CCRs", "standard")[0]] = 1.0
     assert points_of(PROTOCOL, results(impact)).total.tolist() == [0.0]
     assert points_of(PROTOCOL, results(impact)).fails.tolist() == [True]
+
+
+def test_remarks_name_the_required_cells_that_are_not_green() -> None:
+    def remarks_on(cell_number: int) -> list[str]:
+        impact = np.full(N, np.nan)
+        impact[cell_number] = 1.0
+        return remarks(Rating(study=load_study("euro_ncap_rating", weather="clear"), protocol=PROTOCOL, vehicles=[rated(results(impact))]))
+
+    assert remarks_on(numbers("CCRs", "standard")[0]) == [
+        "original: it earns nothing, because CCRs at 10 and 20 km/h is not green in the whole standard range."]
+    cpna = [number for number in numbers("CPNA") if CELLS[number].vut_speed == 10]
+    unchecked = [number for number in cpna if remarks_on(number)]
+    assert {(CELLS[number].impact_location, CELLS[number].range_or_layer) for number in unchecked} == {(75, "standard")}
+    assert remarks_on(unchecked[0]) == [
+        "original: CPNA at 10 km/h and 75 % is not green, which Euro NCAP requires; Euro NCAP's calculator 5.4.9 does not check this, "
+        "nor do these points."]
 
 
 @settings(max_examples=40, deadline=None)

@@ -5,12 +5,13 @@ from __future__ import annotations
 import re
 from io import StringIO
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import msgspec
 import numpy as np
 import pandas as pd
 import pytest
+from click.testing import CliRunner
 from rich.console import Console
 
 from safevar_sumo.analysis.evaluator import Evaluator
@@ -25,11 +26,15 @@ from safevar_sumo.analysis.risk.rare import Response
 from safevar_sumo.analysis.tolerance import ToleranceOptions
 from safevar_sumo.analysis.tolerance.compute import find_tolerances
 from safevar_sumo.analysis.tolerance.render import print_tolerance, profiles_figure
+from safevar_sumo.api.simulation import Simulation
+from safevar_sumo.cli.program import commands
+from safevar_sumo.cli.simulate import _rating_command
+from safevar_sumo.cli.target import CommandTarget
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.protocol import EURO_NCAP_2026, protocol_of, rater
 from safevar_sumo.report.input import _at_point as at_point
 from safevar_sumo.report.rated import draw_matrices
-from safevar_sumo.results import record, solutions_frame
+from safevar_sumo.results import SolutionId, record, solutions_frame
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.system import assemble
 from tests.in_process import InlinePool
@@ -101,6 +106,19 @@ def test_explain_names_the_cells_of_a_worse_colour_and_the_summary_the_points_th
     lines = summarise_failures(STUDY, case.solutions, original, TwoWorkers(), "it")
     assert f"{points:.2f}" in lines[0]
     assert isinstance(case.solutions, pd.DataFrame)
+
+
+def test_simulate_prints_the_command_that_rates_the_simulated_vehicle() -> None:
+    done = CliRunner(env={"COLUMNS": "300"}).invoke(commands, ["simulate", STUDY.name, "--set", "payload=200", "--set", "brakeTorque=0.6"])
+    (words,) = re.findall(r"run `python -m safevar_sumo (rating .*)`", done.stdout)
+    assert sorted(words.split()) == sorted(["rating", "euro_ncap_rating", "--set", "payload=200.0", "--set", "brakeTorque=0.6", "--matrix"])
+    system = assemble(STUDY)
+    solution = system.characteristics.setting({"payload": 200.0, "brakeTorque": 0.6}, "it")
+    target = CommandTarget(STUDY, "my results", SolutionId("nsga2", 3, 0), solution)
+    for changes, flags in (({}, ""), ({"payload": 100.0}, " --set payload=100.0")):
+        setting = dict(zip(system.characteristics.names, solution.tolist(), strict=True)) | changes
+        command = _rating_command(target, system, cast("Simulation", SimpleNamespace(setting=setting)))
+        assert command == f"python -m safevar_sumo rating 'my results'{flags} --solution nsga2:3:0 --matrix"
 
 
 def test_only_cells_of_a_worse_colour_explain_a_failure(monkeypatch: pytest.MonkeyPatch) -> None:

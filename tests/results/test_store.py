@@ -26,6 +26,7 @@ from safevar_sumo.results import (
     choose_handle,
     handles_of,
     load_runs,
+    read_late_files,
     record,
     row_of_handle,
     solutions_frame,
@@ -257,6 +258,17 @@ def test_stored_results_are_read_as_they_were_written(stored: str) -> None:
         pd.testing.assert_frame_equal(result.evaluations, load_runs(STORED / "format-1").evaluations)
 
 
+def test_results_with_the_mean_of_a_matrix_are_read_though_a_study_may_no_longer_ask_for_it(tmp_path: Path) -> None:
+    shutil.copytree(STORED / "format-2", tmp_path / "out")
+    file = tmp_path / "out" / "manifest.json"
+    manifest = json.loads(file.read_text())
+    manifest["study"]["matrix"] = {"tests": [{"name": "crossing", "over": {"speed": [20]}}], "aggregate": "mean"}
+    file.write_text(json.dumps(manifest))
+    (case,) = load_cases([tmp_path / "out"])
+    assert case.study.matrix is not None
+    assert case.study.matrix.aggregate == "mean"
+
+
 def test_the_format_that_is_written_now_is_stored_here() -> None:
     assert (STORED / f"format-{FORMAT}").is_dir()
 
@@ -298,6 +310,29 @@ def test_an_edited_manifest_is_refused_until_it_is_removed(tmp_path: Path, study
     file.unlink()
     ResultsDirectory(tmp_path, study).begin(evaluations(2.5))
     assert json.loads(file.read_text())["original"]["safety_degree"] == 2.5
+
+
+@pytest.mark.parametrize("content", [b"", b'{"my_table.csv": "ab', b"{}", b"[]", b"3", b'["\xff"]', b'{"other.csv": "ab"}'])
+def test_a_damaged_record_of_an_input_is_an_error_not_a_forgotten_input(tmp_path: Path, study: Study, content: bytes) -> None:
+    written(tmp_path, study).record_late_files({"my_table.csv": "ab"})
+    assert read_late_files(tmp_path) == {"my_table.csv": "ab"}
+    (file,) = (tmp_path / "runs").glob("read-*.json")
+    file.write_bytes(content)
+    before = contents(tmp_path)
+    with pytest.raises(InputError, match=rf"{file.name}: (is torn or )?was edited"):
+        ResultsDirectory(tmp_path, study)
+    assert contents(tmp_path) == before
+
+
+@pytest.mark.parametrize("content", [b"", b'["..', b"{}", b"3", b"[3]", b'["\xff"]'])
+def test_a_damaged_record_of_folders_is_an_error_until_it_is_removed(slippery: Path, tmp_path: Path, content: bytes) -> None:
+    shutil.copytree(slippery, tmp_path / "it")
+    file = tmp_path / "it/runs/places.json"
+    file.write_bytes(content)
+    with pytest.raises(InputError, match=r"places\.json: is torn or was edited"):
+        load_cases([tmp_path / "it"])
+    file.unlink()
+    load_cases([tmp_path / "it"])
 
 
 def contents(place: Path) -> dict[str, tuple[bytes, int]]:

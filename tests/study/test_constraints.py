@@ -186,6 +186,16 @@ def test_an_unfeasible_setting_is_simulated_only_where_that_is_asked_for(bound: 
     assert "or any with --beyond" in run("simulate", "bound.toml", "--set", "mass=2040", expect=2).stderr
 
 
+def test_a_rating_refuses_a_variant_that_violates_a_constraint(in_tmp: Path) -> None:
+    Path("light.toml").write_text(
+        'extends = "euro_ncap_rating"\n[[constraints]]\nsum = { payload = 1.0 }\nunit = "kg"\nat_most = 100\n')
+    problem = "violates a constraint: payload = 400 kg (payload = 400 kg)\nexpected: at most 100 kg"
+    assert run("rating", "light.toml", "--set", "payload=400", expect=2).stderr == f"safevar-sumo: --set: {problem}\n"
+    with pytest.raises(InputError) as refused:
+        sv.rating("light.toml", {"payload": 400})
+    assert str(refused.value) == f"changes: {problem}"
+
+
 @pytest.mark.parametrize("name", ["rain_realistic", "wear_realistic"])
 def test_shipped_constraints_say_why_and_leave_a_good_part_of_the_domain(name: str) -> None:
     study = load_study(name)

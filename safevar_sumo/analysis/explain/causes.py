@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from enum import StrEnum
-from itertools import combinations
+from itertools import combinations, islice
 from math import comb
 from typing import NamedTuple
 
@@ -19,7 +19,7 @@ from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import FloatArray, finite_or_none
 
 MAX_SUBSETS = 20_000
-"""Maximum number of subsets that are in memory at the same time."""
+"""Maximum number of subsets simulated in one call; further subsets are made only after it, which bounds the memory."""
 
 
 class MinimalCause(NamedTuple):
@@ -50,10 +50,9 @@ def find_minimal_causes(evaluator: Evaluator, settings: FloatArray, unsafe: Unsa
     columns_by_row = [tuple(np.flatnonzero(flags).tolist()) for flags in evaluator.characteristics.changed(settings)]
     causes: list[list[MinimalCause]] = [[] for _ in settings]
     for size in range(max(map(len, columns_by_row), default=0) + 1):
-        subsets = [_Subset(row, columns) for row, changed_columns in enumerate(columns_by_row) if not causes[row]
-                   for columns in combinations(changed_columns, size)]
-        for start in range(0, len(subsets), MAX_SUBSETS):
-            chunk = subsets[start:start + MAX_SUBSETS]
+        open_rows = [row for row in range(len(settings)) if not causes[row]]
+        subsets = (_Subset(row, columns) for row in open_rows for columns in combinations(columns_by_row[row], size))
+        while chunk := list(islice(subsets, MAX_SUBSETS)):
             partial_settings = np.tile(original, (len(chunk), 1))
             for index, (row, columns) in enumerate(chunk):
                 partial_settings[index, list(columns)] = settings[row, list(columns)]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any, Protocol, TypeVar
 
 import msgspec
 import pandas as pd
@@ -123,11 +123,21 @@ class Cause:
         return f"Scaling all changes to {100 * self.fraction:.1f} % is still unsafe; {below}."
 
 
-SomeCause = TypeVar("SomeCause", Cause, CauseEntry)
+class EstimatedCause(Protocol):
+    """A cause with the share of its neighbours that are unsafe too; None if unknown."""
+
+    @property
+    def robustness(self) -> float | None: ...
+
+
+SomeCause = TypeVar("SomeCause", bound=EstimatedCause)
 
 
 def most_robust(causes: Iterable[SomeCause]) -> SomeCause | None:
-    """The cause with the largest share of unsafe neighbours; the first of several, or in a rated study, whose causes have no shares."""
+    """The cause of a failure that is named: the one with the largest share of unsafe neighbours, among all of the failure's causes.
+
+    The first of several, or in a rated study, whose causes have no shares; None without a cause.
+    """
     return max(causes, key=lambda cause: cause.robustness or 0.0, default=None)
 
 
@@ -180,7 +190,7 @@ class Explained:
     otherwise
         Number of solutions that ended otherwise than in the results: with another outcome than the recorded one.
     preventability
-        Shares of the collisions that reference drivers avoid.
+        Shares of the collisions among the evaluated settings that reference drivers avoid.
     """
 
     study: Study

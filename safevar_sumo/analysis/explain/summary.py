@@ -12,14 +12,14 @@ from safevar_sumo.analysis.evaluator import Evaluator
 from safevar_sumo.analysis.explain.causes import MinimalCause, find_minimal_causes
 from safevar_sumo.analysis.explain.compute import compare_at_points, points_in_words, unsafe_points_of
 from safevar_sumo.analysis.explain.necessity import Robustness, estimate_robustness, find_smallest_robust_failure
-from safevar_sumo.analysis.explain.result import DISTINCT_CAUSE, REASONS, ROBUST
+from safevar_sumo.analysis.explain.result import DISTINCT_CAUSE, REASONS, ROBUST, most_robust
 from safevar_sumo.analysis.preventability import Preventability, PreventableBy, assess_preventability
 from safevar_sumo.analysis.rating.summary import summarise_rated_solutions
 from safevar_sumo.analysis.words import OUTCOME_VERBS, join_phrases, list_of_changes, number_of, question_command
 from safevar_sumo.metrics import RATING_POINTS, Unsafe
 from safevar_sumo.records import KMH_PER_MS, Evaluations, FloatArray, Outcome, finite_or_none
 from safevar_sumo.results import CHOICES, choose_handle, handles_of, record, row_of_handle
-from safevar_sumo.scenarios import Point, equals_clear
+from safevar_sumo.scenarios import equals_clear, weather_in_words
 from safevar_sumo.scenarios.base import pre_crash_of
 from safevar_sumo.study import Study
 from safevar_sumo.sumo.matrix import simulate_all_points, study_at, worst_points
@@ -31,8 +31,8 @@ LABELS = {ROBUST: "robust with the fewest changes", REASONS["smallest"]: "smalle
 """Titles of failures by the reason for their choice; any other reason is itself the title."""
 MAX_SIMULATIONS = 4000
 """Approximate maximum number of simulations that search for a robust failure at the end of a study; `explain` has a higher limit."""
-MAX_ESTIMATED_CAUSES = 8
-"""Maximum number of minimal causes of a failure whose robustness is estimated at the end of a study."""
+MAX_ESTIMATED_CAUSES = 20
+"""Number of minimal causes of a failure up to which their robustness is estimated at the end of a study; `explain` estimates all."""
 
 
 def summarise_failures(study: Study, solutions: pd.DataFrame, original: Evaluations, pool: Pool, directory: str) -> list[str]:
@@ -100,18 +100,35 @@ def _write_paragraph(evaluator: Evaluator, solutions: pd.DataFrame, is_unsafe: p
     fewest_row = int(np.lexsort([getattr(failures, name) for name in reversed(CHOICES["fewest"])])[0])
     rows = [fewest_row] if robust_row is None else [fewest_row, robust_row]
     descriptions, chosen = [], failures.take(rows)
-    causes = [group[:MAX_ESTIMATED_CAUSES] for group in find_minimal_causes(evaluator, chosen.settings, unsafe)]
-    cause_settings = [cause.setting for group in causes for cause in group]
-    robustnesses = iter(estimate_robustness(evaluator, np.array([*chosen.settings, *cause_settings]), step, unsafe))
-    failure_robustnesses = [next(robustnesses) for _ in rows]
-    for index, row in enumerate(rows):
+    causes = find_minimal_causes(evaluator, chosen.settings, unsafe)
+    for index, (robustness, cause_robustness) in enumerate(_estimate_robustnesses(evaluator, chosen.settings, causes, step, unsafe)):
         changed = np.flatnonzero(evaluator.characteristics.changed(chosen.settings[index]))
         changes = {names[column]: float(chosen.settings[index, column]) for column in changed}
-        name, degree = str(all_handles[candidates[failing_rows[row]]]), finite_or_none(chosen.f_safe[index])
-        cause_robustness = max((next(robustnesses) for _ in causes[index]), key=lambda robustness: robustness.share)
-        descriptions.append(FailureDescription(name, changes, str(chosen.outcome[index]), degree, failure_robustnesses[index],
+        name, degree = str(all_handles[candidates[failing_rows[rows[index]]]]), finite_or_none(chosen.f_safe[index])
+        descriptions.append(FailureDescription(name, changes, str(chosen.outcome[index]), degree, robustness,
                                                len(causes[index][0].columns), cause_robustness))
     return failures_paragraph(system, original, descriptions[0], descriptions[1] if len(descriptions) > 1 else None, preventable)
+
+
+class _Estimate(NamedTuple):
+    """The robustness of a minimal cause by itself."""
+
+    neighbours: Robustness
+
+    @property
+    def robustness(self) -> float:
+        return self.neighbours.share
+
+
+def _estimate_robustnesses(evaluator: Evaluator, settings: FloatArray, causes: list[list[MinimalCause]], step: float,
+                           unsafe: Unsafe) -> list[tuple[Robustness, Robustness | None]]:
+    """The robustness of each failure, and of its most robust cause by itself: None if it has more than `MAX_ESTIMATED_CAUSES`."""
+    estimated = [group if len(group) <= MAX_ESTIMATED_CAUSES else [] for group in causes]
+    cause_settings = [cause.setting for group in estimated for cause in group]
+    estimates = map(_Estimate, estimate_robustness(evaluator, np.array([*settings, *cause_settings]), step, unsafe))
+    failures = [next(estimates).neighbours for _ in settings]
+    named = [most_robust([next(estimates) for _ in group]) for group in estimated]
+    return [(failure, None if cause is None else cause.neighbours) for failure, cause in zip(failures, named, strict=True)]
 
 
 def _find_failing_points(study: Study, settings: FloatArray, unsafe: Unsafe) -> tuple[list[str], str]:
@@ -137,9 +154,6 @@ def _cause_in_words(evaluator: Evaluator, causes: list[MinimalCause]) -> str:
 NUMBER_WORDS = ("no", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten", "eleven", "twelve")
 MAX_CHANGES_LISTED = 4
 """Maximum number of changes that are listed, the largest first."""
-WEATHER_PHRASES = {"clear": "In clear weather", "wet": "On a wet road", "fog": "In fog", "night": "At night",
-                   "soft_rain": "In soft rain", "hard_rain": "In hard rain", "carla_hard_rain": "In hard rain"}
-"""Weathers as the beginning of a sentence; any other weather is named."""
 
 
 class FailureDescription(NamedTuple):
@@ -158,7 +172,7 @@ class FailureDescription(NamedTuple):
     sufficient_count
         Number of changes that are enough: the size of the failure's minimal causes.
     cause_robustness
-        Robustness of the first minimal cause by itself; None if it was not simulated.
+        Robustness of the failure's most robust minimal cause by itself; None if not all of its causes were simulated.
     """
 
     name: str
@@ -186,7 +200,7 @@ def failures_paragraph(system: System, original: Evaluations, smallest: FailureD
         The robust failure with the fewest changes, and among these the smallest largest change; None if no tried failure is robust. It
         leads the paragraph if it has as few changes as `smallest`.
     preventable
-        Shares of the collisions that reference drivers avoid.
+        Shares of the collisions among the solutions that reference drivers avoid.
     """
     parts = [f"{_conditions_in_words(system)} the original vehicle {_original_ending_in_words(system, original)}."]
     if smallest is None:
@@ -208,13 +222,10 @@ def _conditions_in_words(system: System) -> str:
     points = system.points
     if len(points) > 1:
         return f"At the worst of {len(points)} test points"
-    return f"At {points[0].name}," if system.matrix else f"{_weather_in_words(points[0])},"
-
-
-def _weather_in_words(point: Point) -> str:
-    name = point.weather.name
-    no_effect = " (which changes neither road nor sensors)" if equals_clear(point.weather) else ""
-    return WEATHER_PHRASES.get(name, f"With the weather '{name}'") + no_effect
+    if system.matrix:
+        return f"At {points[0].name},"
+    weather = points[0].weather
+    return f"{weather_in_words(weather)}{' (which changes neither road nor sensors)' if equals_clear(weather) else ''},"
 
 
 def _original_ending_in_words(system: System, original: Evaluations) -> str:

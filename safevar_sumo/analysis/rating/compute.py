@@ -13,14 +13,28 @@ import pandas as pd
 from safevar_sumo.analysis.evaluator import Evaluator, Progress, open_evaluator, show_no_progress
 from safevar_sumo.analysis.rating import RatingOptions
 from safevar_sumo.analysis.research_questions.case import Case
+from safevar_sumo.analysis.words import join_phrases
 from safevar_sumo.errors import InputError
-from safevar_sumo.protocol import COLOURS, EURO_NCAP_2026, NOT_RED, RED, Cell, CellMatrix, Points, Protocol, points_of
+from safevar_sumo.protocol import (
+    COLOURS,
+    EURO_NCAP_2026,
+    NOT_RED,
+    RED,
+    REQUIRED_CELLS,
+    UNCHECKED_CELLS,
+    Cell,
+    CellMatrix,
+    Points,
+    Protocol,
+    RequiredCells,
+    points_of,
+)
 from safevar_sumo.protocol.rater import darken, rater_of, with_protocol
 from safevar_sumo.records import CellResults, FloatArray, finite_or_none
 from safevar_sumo.results import SolutionId, row_of_handle
 from safevar_sumo.scenarios import weather_of
 from safevar_sumo.study import Study
-from safevar_sumo.vehicles import CharacteristicSet
+from safevar_sumo.vehicles import CharacteristicSet, region_of
 from safevar_sumo.workers.evaluation import Pool
 
 POINT_KINDS = ("standard", "extended", "robustness")
@@ -185,7 +199,8 @@ def rate_variant(subject: Study | Case, options: RatingOptions, *, pool: Pool | 
     Raises
     ------
     InputError
-        If the results have no such solution, a value is outside its domain, or the study cannot be assembled.
+        If the results have no such solution, a value is outside its domain, the changed variant violates a constraint, or the study
+        cannot be assembled.
     SimulationError
         If a vehicle cannot be simulated.
     """
@@ -201,6 +216,8 @@ def rate_variant(subject: Study | Case, options: RatingOptions, *, pool: Pool | 
         characteristics.setting(options.changes, "changes", switch="")  # refuses unknown names
         setting_values, name = {**setting_values, **options.changes}, f"{name} changed" if setting_values else name
     variants = {name: characteristics.setting(setting_values, "changes")} if setting_values else {}
+    if options.changes:
+        region_of(study).check(variants[name][np.newaxis], "changes")
     return rate(study, variants, pool=pool, jobs=jobs, progress=progress)
 
 
@@ -241,12 +258,11 @@ def remarks(rating: Rating) -> list[str]:
         lines.append(f"Euro NCAP tests on a dry road; this rating has the weather {weather.name!r}, by night {darken(weather).name!r}.")
     for vehicle in rating.vehicles:
         if vehicle.fails:
-            lines.append(f"{vehicle.name}: it earns nothing, because CCRs at 10 and 20 km/h is not green in the whole standard range.")
-        cpna_cells = [cell_number for cell_number, cell in enumerate(vehicle.protocol.cells)
-                      if (cell.matrix.test_name, cell.vut_speed, cell.impact_location) == ("CPNA", 10, 75) and not cell.is_robustness_cell]
-        if not vehicle.fails and any(vehicle.colour(cell_number) != "green" for cell_number in cpna_cells):
-            lines.append(f"{vehicle.name}: CPNA at 10 km/h and 75 % is not green, which Euro NCAP requires; Euro NCAP's calculator "
-                         f"{vehicle.protocol.calculator_version} does not check this, nor do these points.")
+            lines.append(f"{vehicle.name}: it earns nothing, because {_describe_cells(REQUIRED_CELLS, vehicle.protocol)} is not green in "
+                         "the whole standard range.")
+        elif any(vehicle.colour(cell_number) != "green" for cell_number in UNCHECKED_CELLS.numbers(vehicle.protocol)):
+            lines.append(f"{vehicle.name}: {_describe_cells(UNCHECKED_CELLS, vehicle.protocol)} is not green, which Euro NCAP requires; "
+                         f"Euro NCAP's calculator {vehicle.protocol.calculator_version} does not check this, nor do these points.")
         invalid_cells = int(np.count_nonzero(~vehicle.cells.valid))
         if invalid_cells:
             lines.append(f"{vehicle.name}: {invalid_cells} cells are no valid tests and earn nothing: the vehicle cannot hold the speed.")
@@ -254,3 +270,9 @@ def remarks(rating: Rating) -> list[str]:
         lines.append("The driving system never warns: rows with FCW are red.")
     return lines
 
+
+def _describe_cells(required: RequiredCells, protocol: Protocol) -> str:
+    """Required cells in words, such as `CPNA at 10 km/h and 75 %`."""
+    speeds = sorted({protocol.cells[cell_number].vut_speed for cell_number in required.numbers(protocol)})
+    location = "" if required.impact_location is None else f" and {required.impact_location:g} %"
+    return f"{required.test_name} at {join_phrases(f'{speed:g}' for speed in speeds)} km/h{location}"

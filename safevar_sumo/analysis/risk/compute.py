@@ -114,13 +114,6 @@ def _or_default(value: float | None, default: float) -> float:
 
 FLEET_VEHICLES = 1000
 """Number of vehicles of the fleet in examples."""
-
-
-def fleet_probability(probability: float, vehicles: int) -> float:
-    """Probability that at least one of N independent vehicles is unsafe, 1 - (1 - p)^N."""
-    return float(-np.expm1(vehicles * np.log1p(-probability))) if probability < 1 else 1.0
-
-
 VEHICLES_PER_CHECK = 1000
 """Number of vehicles drawn between two checks of the interval's width."""
 MAX_VEHICLES_PER_CALL = 50_000
@@ -172,8 +165,8 @@ class Risk:
         return not self.study.variation
 
     def of_fleet(self, vehicles: int) -> float:
-        """Probability that at least one of `vehicles` vehicles is unsafe, if they vary independently of each other."""
-        return fleet_probability(self.probability, vehicles)
+        """Probability that at least one of N = `vehicles` vehicles is unsafe if they vary independently of each other, 1 - (1 - p)^N."""
+        return float(-np.expm1(vehicles * np.log1p(-self.probability))) if self.probability < 1 else 1.0
 
     def to_dict(self) -> dict[str, Any]:
         """The JSON of `risk`."""
@@ -288,7 +281,9 @@ def _draw_vehicles(evaluator: Evaluator, model: VariationModel, unsafe: Unsafe, 
                 if estimate is not None:
                     return estimate
             elif options.requires_rare_method:
-                counts.remark = f"more than {100 * RARE_BELOW:g} % of {valid_vehicles} vehicles are unsafe: plain Monte Carlo is used"
+                pilot = f"at least {100 * RARE_BELOW:g} % of {valid_vehicles} vehicles are unsafe" if valid_vehicles else (
+                    f"none of the first {number} vehicles could be simulated")
+                counts.remark = f"{pilot}: plain Monte Carlo is used"
         low, high = clopper_pearson(counts.failures, counts.vehicles, options.confidence) if counts.vehicles else (0.0, 1.0)
         if options.width is not None and high - low <= options.width:
             break
@@ -308,8 +303,8 @@ def _try_rare_method(response: Response, responses: FloatArray, options: RiskOpt
                         "rare failures cannot approach failures; plain Monte Carlo is used")
         return None
     if not options.requires_rare_method and find_spec("openturns") is None:
-        counts.remark = ("fewer than 1 % of the first vehicles are unsafe; pip install 'safevar_sumo[rare]' for a method that needs fewer "
-                        "vehicles for rare failures")
+        counts.remark = (f"fewer than {100 * RARE_BELOW:g} % of the first vehicles are unsafe; pip install 'safevar_sumo[rare]' for a "
+                        "method that needs fewer vehicles for rare failures")
         return None
     try:
         return estimate_rare(response, _rare_method(options), options.confidence, seed)

@@ -1,0 +1,43 @@
+"""The weathers that a study can name: weather.toml beside this module, and their words."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+
+import msgspec
+
+from safevar_sumo.errors import unknown_name
+from safevar_sumo.study import Weather
+
+_TABLES = tomllib.loads(Path(__file__).with_name("weather.toml").read_text(encoding="utf-8"))
+_PHRASES: dict[str, str] = {name: table.pop("phrase") for name, table in _TABLES.items()}
+WEATHERS = {name: msgspec.convert({"name": name, **table}, Weather) for name, table in _TABLES.items()}
+"""Weathers by name."""
+
+
+def weather_of(choice: str | Weather, source: object) -> Weather:
+    """The weather that a study names or defines.
+
+    Raises
+    ------
+    InputError
+        If there is no weather of that name.
+    """
+    if isinstance(choice, Weather):
+        return choice
+    if choice not in WEATHERS:
+        fields = ", ".join(Weather.__struct_fields__)
+        raise unknown_name(source, f"weather = {choice!r}", choice, WEATHERS, f", or a table with {fields}")
+    return WEATHERS[choice]
+
+
+def equals_clear(weather: Weather) -> bool:
+    """Whether a weather has the effects of clear weather under another name."""
+    clear = WEATHERS["clear"]
+    return weather.name != clear.name and weather.light == clear.light and msgspec.structs.replace(weather, name=clear.name) == clear
+
+
+def weather_in_words(weather: Weather) -> str:
+    """The beginning of a sentence: the phrase of a weather of weather.toml; any other weather, of the same name too, is named."""
+    return _PHRASES[weather.name] if WEATHERS.get(weather.name) == weather else f"With the weather '{weather.name}'"
