@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 
 from safevar_sumo.analysis.evaluator import Evaluator
+from safevar_sumo.analysis.explain import ExplainOptions
 from safevar_sumo.analysis.explain.causes import MinimalCause, find_minimal_causes
 from safevar_sumo.analysis.explain.compute import compare_at_points, points_in_words, unsafe_points_of
 from safevar_sumo.analysis.explain.necessity import Robustness, estimate_robustness, find_smallest_robust_failure
@@ -29,8 +30,6 @@ from safevar_sumo.workers.evaluation import Pool
 
 LABELS = {ROBUST: "robust with the fewest changes", REASONS["smallest"]: "smallest largest change", DISTINCT_CAUSE: "distinct cause"}
 """Titles of failures by the reason for their choice; any other reason is itself the title."""
-MAX_SIMULATIONS = 4000
-"""Approximate maximum number of simulations that search for a robust failure at the end of a study; `explain` has a higher limit."""
 MAX_ESTIMATED_CAUSES = 20
 """Number of minimal causes of a failure up to which their robustness is estimated at the end of a study; `explain` estimates all."""
 
@@ -96,7 +95,7 @@ def _write_paragraph(evaluator: Evaluator, solutions: pd.DataFrame, is_unsafe: p
     if not len(failures):
         return failures_paragraph(system, original, None, None, preventable)
     step = compare_at_points(system, original.settings, original.settings[:0], unsafe)[1]
-    robust_row = find_smallest_robust_failure(evaluator, failures, step, unsafe, MAX_SIMULATIONS // len(system.points))
+    robust_row = find_smallest_robust_failure(evaluator, failures, step, unsafe, _max_robustness_evaluations(evaluator.study, system))
     fewest_row = int(np.lexsort([getattr(failures, name) for name in reversed(CHOICES["fewest"])])[0])
     rows = [fewest_row] if robust_row is None else [fewest_row, robust_row]
     descriptions, chosen = [], failures.take(rows)
@@ -108,6 +107,12 @@ def _write_paragraph(evaluator: Evaluator, solutions: pd.DataFrame, is_unsafe: p
         descriptions.append(FailureDescription(name, changes, str(chosen.outcome[index]), degree, robustness,
                                                len(causes[index][0].columns), cause_robustness))
     return failures_paragraph(system, original, descriptions[0], descriptions[1] if len(descriptions) > 1 else None, preventable)
+
+
+def _max_robustness_evaluations(study: Study, system: System) -> int:
+    """Limit on the search for a robust failure at the end of a study: that of `explain`, but no more than the study's own evaluations."""
+    search = study.search
+    return min(ExplainOptions.limit // len(system.points), len(search.algorithms) * search.runs * search.evaluations)
 
 
 class _Estimate(NamedTuple):
