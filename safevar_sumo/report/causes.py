@@ -12,7 +12,7 @@ from markupsafe import Markup
 from safevar_sumo.analysis.evaluator import Progress
 from safevar_sumo.analysis.explain.compute import explain_failures
 from safevar_sumo.analysis.explain.necessity import robustness_in_words
-from safevar_sumo.analysis.explain.result import CauseEntry, FailureEntry, SummaryEntry
+from safevar_sumo.analysis.explain.result import CauseEntry, FailureEntry, SummaryEntry, most_robust
 from safevar_sumo.analysis.opinion.compute import CauseToJudge, assemble_both_systems, judge_causes
 from safevar_sumo.analysis.research_questions.indicators import nondominated_points
 from safevar_sumo.errors import InputError
@@ -121,16 +121,23 @@ def _interval_text(low: float, high: float) -> str:
 
 
 def make_cause_sections(failures: Sequence[FailureEntry], data: ReportInput) -> list[CauseSection]:
-    """Make a section for the smallest minimal cause of each set of characteristics, in order of the number and size of changes."""
+    """Make a section for the smallest minimal cause of each set of characteristics.
+
+    The first is the cause that the verdict names; the others follow in order of their robustness, then of the number and size of changes.
+    """
     smallest: dict[tuple[str, ...], tuple[CauseEntry, FailureEntry]] = {}
     for failure in failures:
         for cause in failure.minimal_causes:
             key = tuple(cause.changes)
             if key and (key not in smallest or _size_of_changes(data, cause) < _size_of_changes(data, smallest[key][0])):
                 smallest[key] = cause, failure
-    selection = sorted(smallest.values(), key=lambda entry: _size_of_changes(data, entry[0]))[:MAX_CAUSES]
-    if not selection:
+    if not smallest:
         return []
+    named = most_robust(failures[0].minimal_causes)
+    if named is not None and named.changes:
+        smallest[tuple(named.changes)] = named, failures[0]
+    selection = sorted(smallest.values(), key=lambda entry: (entry[0] is not named, -(entry[0].robustness or 0.0),
+                                                             _size_of_changes(data, entry[0])))[:MAX_CAUSES]
     data.simulate_again([data.setting_with(cause.changes) for cause, _ in selection])
     opinions = [None] * len(selection) if reason_without_opinion(data) else _ask_opinions(data, selection)
     return [_make_cause_section(data, rank, cause, failure, opinion)
