@@ -55,7 +55,7 @@ def reason_for_sumo(system: System) -> str:
     return next((reason for reason in scenes_or_reasons if isinstance(reason, str)), "")
 
 
-def drive_all(system: System, settings: FloatArray, engine: Engine = Engine.RECORDED, options: tuple[str, ...] = (),
+def drive_all(system: System, settings: FloatArray, engine: Engine = Engine.RECORDED,
               watch: Watcher | None = None) -> SimulationRuns:
     """Simulate N settings of n characteristics, shape (N, n), at every point; `watch` is called with SUMO's world at every sample.
 
@@ -69,15 +69,15 @@ def drive_all(system: System, settings: FloatArray, engine: Engine = Engine.RECO
     InputError
         If a user's ADS fails.
     """
-    scenarios, sumo_options = [point.scenario for point in system.points], (*step_options(system), *options)
+    scenarios, options = [point.scenario for point in system.points], step_options(system)
     if engine is Engine.RECORDED:
         if watch is None and not reason_for_sumo(system):
-            scenes = record_scenes(scenarios, sumo_options)
+            scenes = record_scenes(scenarios, options)
             world = RecordedWorld([scene for scene in scenes if isinstance(scene, Recording)], len(settings))
             return drive(system, np.tile(settings, (len(system.points), 1)), world)
         engine = Engine.LIBSUMO
     (scenario,) = scenarios
-    with open_world(copied_network(stage_network(scenario).folder, len(settings)), len(settings), engine, sumo_options) as sumo_world:
+    with open_world(copied_network(stage_network(scenario).folder, len(settings)), len(settings), engine, options) as sumo_world:
         return drive(system, settings, sumo_world, watch)
 
 

@@ -163,7 +163,7 @@ def evaluations_at_worst_points(at_points: Sequence[PointResult | PointEvaluatio
     return evaluations.take(point_numbers * len(settings) + setting_numbers)
 
 
-def simulate(system: System, settings: FloatArray, engine: Engine = Engine.RECORDED, options: tuple[str, ...] = (),
+def simulate(system: System, settings: FloatArray, engine: Engine = Engine.RECORDED,
              watch: Watcher | None = None) -> SimulationRuns:
     """Run the scenario once for every setting, shape (N, n); `watch` is called with the world at every sample.
 
@@ -171,28 +171,27 @@ def simulate(system: System, settings: FloatArray, engine: Engine = Engine.RECOR
     the last setting. Raises the errors of `drive_all`.
     """
     if not system.matrix:
-        return drive_all(system, settings, engine, options, watch)
+        return drive_all(system, settings, engine, watch)
     if watch is not None or engine is Engine.GUI:
-        return drive_all(system_at_worst_point(system, settings), settings, engine, options, watch)
-    at_points = simulate_all_points(system, settings, engine, options)
+        return drive_all(system_at_worst_point(system, settings), settings, engine, watch)
+    at_points = simulate_all_points(system, settings, engine)
     return _select_runs([result.runs for result in at_points], worst_points(at_points))
 
 
-def simulate_all_points(system: System, settings: FloatArray, engine: Engine = Engine.RECORDED,
-                        options: tuple[str, ...] = ()) -> list[PointResult]:
+def simulate_all_points(system: System, settings: FloatArray, engine: Engine = Engine.RECORDED) -> list[PointResult]:
     """Simulate settings, shape (N, n), at every point; results are in the points' order. Raises the errors of `drive_all`."""
-    by_name = {result.point.name: result for group in _simulate_groups(system, settings, engine, options) for result in group}
+    by_name = {result.point.name: result for group in _simulate_groups(system, settings, engine) for result in group}
     return [by_name[point.name] for point in system.points]
 
 
-def _simulate_groups(system: System, settings: FloatArray, engine: Engine, options: tuple[str, ...] = ()) -> Iterator[list[PointResult]]:
+def _simulate_groups(system: System, settings: FloatArray, engine: Engine) -> Iterator[list[PointResult]]:
     """Yield the results of settings at every point, in groups of points that share a simulation."""
     n = len(settings)
     groups: Iterable[tuple[Point, ...]] = ((point,) for point in system.points)
     if _is_recorded(system, engine):
-        groups = _group_points(system.points, largest_batch(system) // max(n, 1), (*step_options(system), *options))
+        groups = _group_points(system.points, largest_batch(system) // max(n, 1), step_options(system))
     for points in groups:
-        runs = drive_all(replace(system, matrix=points), settings, engine, options)
+        runs = drive_all(replace(system, matrix=points), settings, engine)
         evaluations = score(system, np.tile(settings, (len(points), 1)), runs)
         yield [PointResult(point, evaluations.take(np.arange(start, start + n)), runs.of(slice(start, start + n)))
                for point, start in zip(points, range(0, len(points) * n, n), strict=True)]
