@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from safevar_sumo.errors import InputError
-from safevar_sumo.plugins import guard_process_state
+from safevar_sumo.plugins import check_open_runs, guard_process_state, open_rows
 from safevar_sumo.protocol.driving_robot import DrivingRobot
 from safevar_sumo.records import STANDSTILL, TIME_DECIMALS, BoolArray, Evaluations, FloatArray, Observation, Outcome, SimulationRuns, Trace
 from safevar_sumo.scenarios import VUT, Lane, Point
@@ -98,11 +98,13 @@ def drive(system: System, settings: FloatArray, world: SumoWorld | RecordedWorld
     With K points, `settings` holds K groups of equal size, and group k drives at point k.
     """
     guards = [member.guard for member in system.members if member.guard is not None]
-    with guard_process_state(guards[0].source if guards else "", [guard.name for guard in guards]):
-        return _simulate(system, settings, world, watch, listen)
+    outcomes = _Outcomes(len(settings))
+    with guard_process_state(guards[0].source if guards else "", [guard.name for guard in guards]), check_open_runs(outcomes.is_checked):
+        return _simulate(system, settings, world, outcomes, watch, listen)
 
 
-def _simulate(system: System, settings: FloatArray, world: Any, watch: Watcher | None, listen: Listener | None) -> SimulationRuns:
+def _simulate(system: System, settings: FloatArray, world: Any, outcomes: _Outcomes, watch: Watcher | None,
+              listen: Listener | None) -> SimulationRuns:
     vehicle, step, n = system.vehicle, world.step_length, len(settings)
     characteristics = dict(zip(system.characteristics.names, np.ascontiguousarray(settings.T), strict=True))
     prepared = vehicle.prepare(characteristics, _road_friction(system.points, n), step, *_road_arguments(system.points, n))
@@ -118,7 +120,7 @@ def _simulate(system: System, settings: FloatArray, world: Any, watch: Watcher |
     ads_memory = system.ads.start(n, system.nominal, step)
     batch = PointBatch(system.points, world, n)
     log = _Log(n, int(batch.last_step.max()) + 1, frame)
-    outcomes, robot = _Outcomes(n), DrivingRobot(system.points, vehicle, prepared, state, step)
+    robot = DrivingRobot(system.points, vehicle, prepared, state, step)
     contacts, warnings = Contacts(n, robot.has_test_speed), _FirstWarnings(system.ads, n)
     for sample in range(log.length):
         if watch is not None:
@@ -141,6 +143,7 @@ def _simulate(system: System, settings: FloatArray, world: Any, watch: Watcher |
             break
         if watch is None:
             world.end_runs(outcomes.ended_copies)
+        np.copyto(outcomes.is_checked, outcomes.is_open)
         state = vehicle.advance(prepared, state, command)
         _check_finite(state.speed, settings, system.characteristics)
         world.advance(np.where(outcomes.is_open, state.speed, 0.0))
@@ -157,11 +160,11 @@ def _check_finite(speed: FloatArray, settings: FloatArray, characteristics: Char
     The error replaces numpy's overflow warnings, which name neither a characteristic nor a value.
     """
     if np.count_nonzero(np.isfinite(speed)) < len(speed):
-        copy = np.flatnonzero(~np.isfinite(speed))[0]
-        changes = [f"{characteristic.name} = {value:g}" for characteristic, value in zip(characteristics, settings[copy], strict=True)
-                   if value != characteristic.original]
-        values = ", ".join(changes) or "the original's values"
-        raise InputError("vehicle", f"its speed is {speed[copy]} with {values}", "values that the model can compute with")
+        for copy in open_rows(~np.isfinite(speed))[:1]:
+            changes = [f"{characteristic.name} = {value:g}" for characteristic, value in zip(characteristics, settings[copy], strict=True)
+                       if value != characteristic.original]
+            values = ", ".join(changes) or "the original's values"
+            raise InputError("vehicle", f"its speed is {speed[copy]} with {values}", "values that the model can compute with")
 
 
 def _road_friction(points: Sequence[Point], n: int) -> Any:
@@ -229,10 +232,13 @@ class _Log:
 
 
 class _Outcomes:
-    """Outcomes of N runs (docs/method.md, section 4): `is_open` is true where an outcome can change; `ended_copies` ended in this step."""
+    """Outcomes of N runs (docs/method.md, section 4): `is_open` is true where an outcome can change; `ended_copies` ended in this step.
+
+    `is_checked` is true where user code is checked: in runs that were open when their vehicles last advanced.
+    """
 
     def __init__(self, n: int) -> None:
-        self.is_open = np.ones(n, dtype=bool)
+        self.is_open, self.is_checked = np.ones(n, dtype=bool), np.ones(n, dtype=bool)
         self.ended_copies: list[int] = []
         self.collision_speed = np.full(n, np.nan)
         self._has_moved = np.zeros(n, dtype=bool)
