@@ -8,6 +8,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
+from dataclasses import replace
 
 import msgspec
 import numpy as np
@@ -21,6 +22,7 @@ from safevar_sumo.study import ModelTable, Origin, load_study
 from safevar_sumo.vehicles import CharacteristicSet
 from safevar_sumo.workers.evaluation import PoolLostError, WorkerLostError, pack_study
 from safevar_sumo.workers.interrupts import defer_interrupts, wait_for_first, wait_for_result
+from safevar_sumo.workers.isolation import find_difference
 from safevar_sumo.workers.local import LocalPool, local_pool
 from safevar_sumo.workers.retrying import ATTEMPTS, RetryingPool
 
@@ -153,6 +155,16 @@ class ToldPool:
         else:
             future.set_exception(error)
         return future
+
+
+def test_metrics_that_only_one_side_has_are_a_difference() -> None:
+    one = evaluated(settings(1))
+    assert find_difference(one, one) is None
+    fewer = replace(one, metrics={name: values for name, values in one.metrics.items() if name != "safety_degree"})
+    for both in ((one, fewer), (fewer, one)):
+        name, *lists = find_difference(*both) or ("no difference",)
+        assert name == "the list of metrics"
+        assert sum("safety_degree" in str(names) for names in lists) == 1
 
 
 def died() -> WorkerLostError:
