@@ -237,13 +237,15 @@ def study_at(study: Study, name: str, source: object) -> Study:
     system = assemble(study)
     parameters = dict(_find_point(system, name, source).parameters)
     assert study.matrix is not None
+    origin = replace_in(study.origin, point=name)
     if system.rater is not None:
-        return reduce_to_cells(study, system.weather, [[point.name for point in system.matrix].index(name)])
+        reduced_study = reduce_to_cells(study, system.weather, [[point.name for point in system.matrix].index(name)])
+        return replace_in(reduced_study, origin=origin)
     test_name, weather = parameters.pop("test"), parameters.pop("weather")
     test = next(test for test in study.matrix.tests if test.name == test_name and test.over.keys() == parameters.keys()
                 and all(value in test.over[key] for key, value in parameters.items()))
     reduced_test = replace_in(test, over={key: [value] for key, value in parameters.items()}, weathers=[weather] if test.weathers else [])
-    return replace_in(study, matrix=replace_in(study.matrix, tests=[reduced_test]))
+    return replace_in(study, matrix=replace_in(study.matrix, tests=[reduced_test]), origin=origin)
 
 
 def _group_points(points: Sequence[Point], size: int, options: Sequence[str]) -> Iterator[tuple[Point, ...]]:
