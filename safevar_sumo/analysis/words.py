@@ -17,15 +17,20 @@ OUTCOME_VERBS = {
 """How a run ended, as the verb of a sentence; a collision is described with its speed instead."""
 
 
-def list_of_changes(characteristics: CharacteristicSet, values: Mapping[str, float]) -> str:
+def change_texts(characteristics: CharacteristicSet, values: Mapping[str, float]) -> list[str]:
     """The values that differ from the original values, in the order of the study, such as `mass 2404 -> 2600 kg (+8.2 %)`."""
-    changes = []
+    texts = []
     for characteristic in characteristics:
         original, value = characteristic.original, values.get(characteristic.name, characteristic.original)
         if value != original:
-            changes.append(f"{characteristic.name} {original:g} -> {characteristic.text(value)}{characteristic.suffix} "
-                           f"({100 * (value - original) / abs(original):+.1f} %)")
-    return ", ".join(changes) or "no change at all"
+            texts.append(f"{characteristic.name} {original:g} -> {characteristic.text(value)}{characteristic.suffix} "
+                         f"({100 * (value - original) / abs(original):+.1f} %)")
+    return texts
+
+
+def list_of_changes(characteristics: CharacteristicSet, values: Mapping[str, float]) -> str:
+    """The values that differ from the original values in one line, as in `change_texts`."""
+    return ", ".join(change_texts(characteristics, values)) or "no change at all"
 
 
 def direction_in_words(characteristic: Characteristic, value: float) -> str:

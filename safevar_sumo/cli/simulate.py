@@ -32,7 +32,7 @@ from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import KMH_PER_MS, Evaluations, FloatArray, Outcome
 from safevar_sumo.results import record
 from safevar_sumo.scenarios import pre_crash_sentence
-from safevar_sumo.study import SAFETY_DEGREE, Study, check_writable
+from safevar_sumo.study import SAFETY_DEGREE, Study, check_writable, unit_text
 from safevar_sumo.sumo.matrix import PointResult, point_record, remarks_of, simulate_all_points, system_at_point, vehicle_remarks
 from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.terminal import WholeTable, print_meanings, print_text
@@ -248,7 +248,7 @@ def print_sweep(console: Console, study: Study, names: Sequence[str], original: 
     characteristics = CharacteristicSet.of(study.vehicle.characteristics)
     columns = [characteristics.names.index(name) for name in names]
     units = [characteristics.members[column].unit for column in columns]
-    table = WholeTable(right=(f"{name}{'' if unit == '-' else f', {unit}'}" for name, unit in zip(names, units, strict=True)),
+    table = WholeTable(right=(name + unit_text(unit, ", {}") for name, unit in zip(names, units, strict=True)),
                        title=study.title)
     table.add_column("outcome")
     for name in variants.metrics:

@@ -24,7 +24,7 @@ from safevar_sumo.replay.comparison import format_number, superscript_powers
 from safevar_sumo.report.causes import FIRST_CHOICES, Explanations
 from safevar_sumo.report.input import ChangeRow, FailingPointsTable, ReportInput, load_or_compute
 from safevar_sumo.scenarios import SCENARIOS, Point, equals_clear, pre_crash_sentence
-from safevar_sumo.study import SAFETY_DEGREE
+from safevar_sumo.study import SAFETY_DEGREE, unit_text
 from safevar_sumo.sumo.matrix import vehicle_remarks
 from safevar_sumo.vehicles import VEHICLES
 
@@ -49,7 +49,7 @@ def describe_tested_system(data: ReportInput) -> TestedSystem:
                 f"Scenario: {_name_and_sentence(SCENARIOS, study.scenario.model)}; {_describe_conditions(data)}.",
         tags="" if data.system is None else pre_crash_sentence(data.system.points), search=_describe_search(data),
         characteristics=[
-            (characteristic.name, "" if characteristic.unit == "-" else superscript_powers(characteristic.unit),
+            (characteristic.name, superscript_powers(unit_text(characteristic.unit, "{}")),
              *map(format_number, (characteristic.original, characteristic.lower, characteristic.upper, characteristic.threshold)),
              characteristic.words)
             for characteristic in case.characteristics],
