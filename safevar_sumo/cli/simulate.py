@@ -26,7 +26,7 @@ from safevar_sumo.cli.arguments import (
     refuse_overwriting,
 )
 from safevar_sumo.cli.program import commands
-from safevar_sumo.cli.target import CommandTarget, as_it_is_now_option, load_target, replay_options
+from safevar_sumo.cli.target import CommandTarget, as_it_is_now_option, json_option, load_target, point_option, replay_options
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import KMH_PER_MS, Evaluations, FloatArray, Outcome
@@ -55,9 +55,9 @@ FILE = click.Path(path_type=Path)
 @click.option("--slower", type=NumberRange(0.01, 1000), default=1.0, show_default=True, metavar="TIMES",
               help="How many times slower than real time --gui plays.")
 @as_it_is_now_option
-@click.option("--point", metavar="NAME", help="Only this point of the study's matrix.")
+@point_option
 @click.option("--spread", is_flag=True, help="Add the vehicle model's own uncertainty: other parameters that fit published data as well.")
-@click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+@json_option
 def simulate_command(study: str, solution: str | None, choice: str | None, changes: tuple[str, ...], no_filter: bool, beyond: bool,
                      trace: Path | None, point: str | None, spread: bool, as_json: bool, **replay_outputs: Any) -> None:
     """Simulate STUDY once, or a solution of the results directory DIR with the study as recorded there."""
