@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from shlex import quote
 
 from safevar_sumo.records import Outcome
@@ -58,6 +58,17 @@ def join_phrases(phrases: Iterable[str]) -> str:
 def number_of(count: int, noun: str) -> str:
     """A number with its noun: `1 change`, `2 changes`."""
     return f"{count} {noun}{'' if count == 1 else 's'}"
+
+
+MAX_POINTS_NAMED = 6
+"""Maximum number of failing test points that a sentence names."""
+
+
+def points_in_words(failing_points: Sequence[str], point_count: int, limit: int = MAX_POINTS_NAMED) -> str:
+    """A sentence such as `Fails at 2 of 72 points: CPNA, speed 40, impact_location 25, night; CPLA, speed 60, clear.`"""
+    names, rest = "; ".join(failing_points[:limit]), len(failing_points) - limit
+    others = f" and {rest} more" if rest > 0 else ""
+    return f"Fails at {len(failing_points)} of {point_count} points{': ' + names if failing_points else ''}{others}."
 
 
 def two_decimals(value: float | None) -> str:

@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.text import Text
 
 from safevar_sumo.analysis.model_spread import ModelSpread, compute_model_spreads, studies_of_sets
-from safevar_sumo.analysis.words import question_command
+from safevar_sumo.analysis.words import points_in_words, question_command
 from safevar_sumo.api.simulation import Simulation, evaluate_settings, simulate_with_original
 from safevar_sumo.cli.arguments import (
     PICTURE_ENDINGS,
@@ -31,7 +31,7 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import KMH_PER_MS, Evaluations, FloatArray, Outcome
 from safevar_sumo.results import record
-from safevar_sumo.scenarios import pre_crash_sentence
+from safevar_sumo.scenarios import LOCATION_DIMENSION, SPEED_DIMENSION, pre_crash_sentence
 from safevar_sumo.study import SAFETY_DEGREE, Study, check_writable, unit_text
 from safevar_sumo.sumo.matrix import PointResult, point_record, remarks_of, simulate_all_points, system_at_point, vehicle_remarks
 from safevar_sumo.sumo.system import System, assemble
@@ -264,14 +264,11 @@ def print_sweep(console: Console, study: Study, names: Sequence[str], original: 
 
 COLOUR_BANDS = ((5.0, "green"), (15.0, "yellow"), (25.0, "dark_orange"), (35.0, "orange4"))
 """Upper limits of the relative impact speed [km/h] and their colours, from Euro NCAP's car-to-car AEB tests; above them: red."""
-MAX_POINTS_NAMED = 6
-"""Maximum number of failing points that the summary names."""
-ROW_DIMENSION, COLUMN_DIMENSION = "speed", "impact_location"
 
 
-def print_matrix(console: Console, results: Sequence[PointResult], row: int = 0) -> None:
+def print_matrix(console: Console, results: Sequence[PointResult]) -> None:
     """Print a table for each test and weather: rows are speeds and other dimensions, columns are impact locations."""
-    records = [point_record(result, row) for result in results]
+    records = [point_record(result) for result in results]
     tables: dict[tuple[str, str], list[tuple[dict[str, Any], dict[str, Any]]]] = {}
     for result, result_record in zip(results, records, strict=True):
         coordinates = dict(result.point.parameters)
@@ -280,9 +277,7 @@ def print_matrix(console: Console, results: Sequence[PointResult], row: int = 0)
         _print_test_table(console, f"{test}, {weather}", cells)
     if records:
         collision_points = [entry["point"] for entry in records if entry["impact_speed"] is not None]
-        rest = f" and {len(collision_points) - MAX_POINTS_NAMED} more" if len(collision_points) > MAX_POINTS_NAMED else ""
-        names = "; ".join(collision_points[:MAX_POINTS_NAMED]) + rest
-        summary = f"{len(collision_points)} of {len(records)} points fail{': ' + names if collision_points else ''}."
+        summary = points_in_words(collision_points, len(records))
         invalid = sum(entry["outcome"] == Outcome.INVALID_TEST for entry in records)
         if invalid:
             summary += f" {invalid} are invalid tests: the vehicle leaves the tolerance of the test's speed before the ADS acts."
@@ -290,19 +285,20 @@ def print_matrix(console: Console, results: Sequence[PointResult], row: int = 0)
 
 
 def _print_test_table(console: Console, title: str, cells: Sequence[tuple[dict[str, Any], dict[str, Any]]]) -> None:
-    columns = list(dict.fromkeys(coordinates.get(COLUMN_DIMENSION) for coordinates, _ in cells))
+    columns = list(dict.fromkeys(coordinates.get(LOCATION_DIMENSION) for coordinates, _ in cells))
     table = WholeTable("speed", right=("" if column is None else f"{column:g} %" for column in columns), title=title)
     texts_by_row: dict[str, dict[Any, Text]] = {}
     for coordinates, result in cells:
-        texts_by_row.setdefault(_row_name(coordinates), {})[coordinates.get(COLUMN_DIMENSION)] = _cell_text(result)
+        texts_by_row.setdefault(_row_name(coordinates), {})[coordinates.get(LOCATION_DIMENSION)] = _cell_text(result)
     for name, texts in texts_by_row.items():
         table.add_row(name, *(texts.get(column, Text("")) for column in columns))
     console.print(table)
 
 
 def _row_name(coordinates: dict[str, Any]) -> str:
-    speed = [f"{coordinates[ROW_DIMENSION]:g} km/h"] if ROW_DIMENSION in coordinates else []
-    return ", ".join([*speed, *(f"{name} {value}" for name, value in coordinates.items() if name not in (ROW_DIMENSION, COLUMN_DIMENSION))])
+    speed = [f"{coordinates[SPEED_DIMENSION]:g} km/h"] if SPEED_DIMENSION in coordinates else []
+    others = (f"{name} {value}" for name, value in coordinates.items() if name not in (SPEED_DIMENSION, LOCATION_DIMENSION))
+    return ", ".join([*speed, *others])
 
 
 def _cell_text(result: dict[str, Any]) -> Text:

@@ -17,7 +17,7 @@ from safevar_sumo.analysis.model_spread import ModelSpread, compute_model_spread
 from safevar_sumo.analysis.preventability import PreventedShares
 from safevar_sumo.analysis.research_questions.case import ALGORITHM_TITLES, are_collisions
 from safevar_sumo.analysis.words import number_of
-from safevar_sumo.metrics import METRICS, Unsafe
+from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import KMH_PER_MS, FloatArray, Outcome
 from safevar_sumo.reference import Totals, shipped_totals_of
 from safevar_sumo.replay.comparison import format_number, superscript_powers
@@ -167,14 +167,8 @@ def reach_verdict(data: ReportInput, explanations: Explanations | None, toleranc
     return Verdict(
         headline="No solution was found." if solutions.empty else _headline(data, failures, explanations),
         unsafe_count=sum(data.unsafe_solutions), solution_count=len(solutions),
-        criterion=_describe_criterion(data.case.unsafe), original=_describe_original(data), agreement=describe_agreement(data),
+        criterion=data.case.unsafe.description, original=_describe_original(data), agreement=describe_agreement(data),
         failures=failures, key_figures=[] if solutions.empty else _key_figures(data, failures, explanations, tolerance))
-
-
-def _describe_criterion(unsafe: Unsafe) -> str:
-    if unsafe.below is None:
-        return "a collision"
-    return f"a safety degree below {unsafe.below:.2f} m, half of the original's (no solution collides)"
 
 
 def _describe_original(data: ReportInput) -> str:

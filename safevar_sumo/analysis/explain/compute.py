@@ -115,10 +115,6 @@ def _distinct_rows(settings: np.ndarray) -> list[int]:
     return sorted(np.unique(settings, axis=0, return_index=True)[1].tolist())
 
 
-MAX_POINTS_NAMED = 6
-"""Maximum number of failing test points that a sentence names."""
-
-
 class PointComparison(NamedTuple):
     """One failure at the test points of a study.
 
@@ -179,13 +175,6 @@ def unsafe_points_of(system: System, point_results: list[PointResult], unsafe: U
     unsafe_by_point = np.stack([unsafe.of(result.evaluations) for result in point_results])
     return [tuple(result.point.name for result, is_unsafe in zip(point_results, flags, strict=True) if is_unsafe)
             for flags in unsafe_by_point.T]
-
-
-def points_in_words(failing_points: tuple[str, ...], point_count: int, limit: int = MAX_POINTS_NAMED) -> str:
-    """A sentence such as `Fails at 2 of 72 points: CPNA, speed 40, impact_location 25, night; CPLA, speed 60, clear.`"""
-    names, rest = "; ".join(failing_points[:limit]), len(failing_points) - limit
-    others = f" and {rest} more" if rest > 0 else ""
-    return f"Fails at {len(failing_points)} of {point_count} points{': ' + names if failing_points else ''}{others}."
 
 
 class FailureSelection(NamedTuple):

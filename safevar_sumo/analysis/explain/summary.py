@@ -10,12 +10,12 @@ import pandas as pd
 
 from safevar_sumo.analysis.evaluator import Evaluator
 from safevar_sumo.analysis.explain.causes import MinimalCause, find_minimal_causes
-from safevar_sumo.analysis.explain.compute import compare_at_points, points_in_words, unsafe_points_of
+from safevar_sumo.analysis.explain.compute import compare_at_points, unsafe_points_of
 from safevar_sumo.analysis.explain.necessity import Robustness, estimate_robustness, find_smallest_robust_failure
 from safevar_sumo.analysis.explain.result import DISTINCT_CAUSE, REASONS, ROBUST
 from safevar_sumo.analysis.preventability import Preventability, PreventableBy, assess_preventability
 from safevar_sumo.analysis.rating.summary import summarise_rated_solutions
-from safevar_sumo.analysis.words import OUTCOME_VERBS, join_phrases, list_of_changes, number_of, question_command
+from safevar_sumo.analysis.words import OUTCOME_VERBS, join_phrases, list_of_changes, number_of, points_in_words, question_command
 from safevar_sumo.metrics import RATING_POINTS, Unsafe
 from safevar_sumo.records import KMH_PER_MS, Evaluations, FloatArray, Outcome, finite_or_none
 from safevar_sumo.results import CHOICES, choose_handle, handles_of, record, row_of_handle
