@@ -46,16 +46,16 @@ def find_moments(runs: SimulationRuns, row: int) -> Moments:
                    end=int(np.flatnonzero(runs.trace.active[:, row])[-1]))
 
 
-def find_divergence(runs: SimulationRuns, first: int = 0, second: int = 1) -> int | None:
-    """Find the first sample at which the speeds of two of N runs have diverged; None if they never do."""
-    trace = runs.trace
-    is_active = trace.active[:, first] & trace.active[:, second]
-    samples = np.flatnonzero(is_active & (np.abs(trace.speed[:, first] - trace.speed[:, second]) > MIN_DIVERGENCE))
-    return int(samples[0]) if samples.size else None
-
-
 ORIGINAL, CHANGED = 0, 1
 """Rows of a comparison."""
+
+
+def find_divergence(runs: SimulationRuns) -> int | None:
+    """Find the first sample at which the speeds of the original and the changed vehicle have diverged; None if they never do."""
+    trace = runs.trace
+    is_active = trace.active[:, ORIGINAL] & trace.active[:, CHANGED]
+    samples = np.flatnonzero(is_active & (np.abs(trace.speed[:, ORIGINAL] - trace.speed[:, CHANGED]) > MIN_DIVERGENCE))
+    return int(samples[0]) if samples.size else None
 
 
 @dataclass(frozen=True, kw_only=True)
