@@ -13,7 +13,7 @@ from safevar_sumo.vehicles import Characteristic, CharacteristicSet
 OUTCOME_VERBS = {
     Outcome.STOPPED: "stops", Outcome.PASSED: "passes", Outcome.TIMEOUT: "is still under way at the end",
     Outcome.NEVER_MOVED: "never moves", Outcome.SIMULATOR_ERROR: "could not be simulated",
-    Outcome.INVALID_TEST: "leaves the tolerance of the test's speed", Outcome.INFEASIBLE: "violates a constraint"}
+    Outcome.INVALID_TEST: "violates the test's speed tolerance", Outcome.INFEASIBLE: "violates a constraint"}
 """How a run ended, as the verb of a sentence; a collision is described with its speed instead."""
 
 

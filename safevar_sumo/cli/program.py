@@ -29,7 +29,7 @@ COMMANDS = {
     "check": ("check", "Check your own driving system, vehicle, scenario, metric, objective, algorithm or TraCI controller."),
     "list": ("catalogue", "List studies, vehicles, ADSs, scenarios, weathers, algorithms, metrics and objectives."),
     "explain": ("questions", "Explain failures: which changes cause them, how small a change is enough, and why."),
-    "opinion": ("questions", "Have another vehicle model confirm or contradict the causes of failures."),
+    "opinion": ("questions", "Check the minimal causes of failures with a second vehicle model."),
     "tolerance": ("questions", "Find how far each characteristic may go: alone, in pairs, and all together."),
     "risk": ("questions", "Estimate the probability of an unsafe outcome, and which characteristics decide it."),
     "rules": ("questions", "Find rules, in physical units, that describe the unsafe settings."),

@@ -137,9 +137,9 @@ def _print_results(target: CommandTarget, system: System, simulation: Simulation
     remarks = [remark for point in system.points for remark in remarks_of(point.scenario)]
     for remark in dict.fromkeys([*remarks, *system.remarks, *vehicle_remarks(system)]):
         click.echo(f"note: {remark}", err=True)
-    for name, value in simulation.put_back.items():
-        click.echo(f"note: {name} = {value:g} is so near the original that the filter reset it to {simulation.setting[name]:g}; "
-                   "--no-filter keeps it", err=True)
+    for name, value in simulation.reset_values.items():
+        click.echo(f"note: {name} = {value:g} differs from the original by less than the filter threshold and was reset to "
+                   f"{simulation.setting[name]:g}; --no-filter keeps it", err=True)
 
 
 def _warn_of_differences(target: CommandTarget, simulation: Simulation) -> None:
@@ -148,7 +148,7 @@ def _warn_of_differences(target: CommandTarget, simulation: Simulation) -> None:
 
     assert target.row is not None
     for difference in list_differences(simulation.evaluation, target.row):
-        click.echo(f"warning: {target.handle} of {target.source}: {difference}; other versions or code than in the study?", err=True)
+        click.echo(f"warning: {target.handle} of {target.source}: {difference}; have versions or code changed since the study?", err=True)
 
 
 def _write_trace(path: Path, simulation: Simulation) -> None:
@@ -280,7 +280,7 @@ def print_matrix(console: Console, results: Sequence[PointResult]) -> None:
         summary = points_in_words(collision_points, len(records))
         invalid = sum(entry["outcome"] == Outcome.INVALID_TEST for entry in records)
         if invalid:
-            summary += f" {invalid} are invalid tests: the vehicle leaves the tolerance of the test's speed before the ADS acts."
+            summary += f" {invalid} are invalid tests: the vehicle violates the test's speed tolerance before the ADS acts."
         print_text(console, summary)
 
 

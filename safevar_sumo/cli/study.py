@@ -186,7 +186,7 @@ def print_summary(console: Console, study: Study, campaign: Campaign, directory:
             print_text(console, f"  {line}")
     invalid = sum(campaign.invalid_tests.values())
     if invalid:
-        print_text(console, f"{invalid} settings leave the tolerance of a test's speed before the ADS acts (invalid-test): "
+        print_text(console, f"{invalid} settings violate a test's speed tolerance before the ADS acts (invalid-test): "
                             "they are neither failures nor successes, and no result contains them.")
     _print_most_critical(console, study, campaign)
     case = build_case(study, record(campaign.original, row=0), solutions, solutions_frame(names, []), tuple(campaign.solutions),

@@ -239,7 +239,7 @@ def test_without_a_display_it_is_refused(slippery: Path, monkeypatch: pytest.Mon
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     (case,) = load_cases([slippery])
     comparison = compare_setting(case.study, assemble(case.study), case.characteristics.original)
-    with pytest.raises(InputError, match="no display"):
+    with pytest.raises(InputError, match="needs a display"):
         show_in_gui(comparison)
 
 

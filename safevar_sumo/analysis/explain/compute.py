@@ -213,7 +213,7 @@ def choose_failures(source: Study | Case, options: ExplainOptions, evaluator: Ev
     settings, rows = evaluated.evaluations.settings, evaluated.rows_to_explain
     sample = rows if named_solutions else [rows[i] for i in select_affordable_rows(settings[rows], evaluator, max_evaluations)]
     robust_row = None if named_solutions or is_rated(evaluator.study) else _find_robust_row(evaluated, evaluator, original, max_evaluations)
-    choice_reasons = dict.fromkeys(rows, ("asked for",)) if named_solutions else _choose_rows(evaluated, robust_row)
+    choice_reasons = dict.fromkeys(rows, ("requested",)) if named_solutions else _choose_rows(evaluated, robust_row)
     analysed_rows = sorted({*sample, *choice_reasons})
     causes = dict(zip(analysed_rows, find_minimal_causes(evaluator, settings[analysed_rows], evaluated.unsafe), strict=True))
     if not named_solutions:

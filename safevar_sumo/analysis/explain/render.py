@@ -94,7 +94,8 @@ def _describe(failure: Explanation | None) -> FailureDescription | None:
 def _most_necessary_in_words(result: Explained, characteristics: CharacteristicSet) -> str:
     full_names = {characteristic.name: _full_name(characteristic) for characteristic in characteristics}
     rows = result.necessity[result.necessity["necessary"] > 0].head(MAX_NECESSARY).to_dict("records")
-    return ", ".join(f"{full_names[row['characteristic']]} {_necessary_share(row)}" for row in rows) or "none, causes differ"
+    shares = (f"{full_names[row['characteristic']]} {_necessary_share(row)}" for row in rows)
+    return ", ".join(shares) or "none; no change is common to all causes"
 
 
 def _necessary_share(row: Mapping[Any, Any]) -> str:
@@ -116,7 +117,7 @@ def _accuracy_in_words(result: Explained) -> str:
     braking = result.explanations[0].because.original.braking
     if step is None or braking is None:
         return ""
-    return (f"How exact: decisions fall into frames of {step:g} s, in which the vehicle covers {braking.speed * step:.2f} m at "
+    return (f"Accuracy: the driving system decides every {step:g} s, in which the vehicle covers {braking.speed * step:.2f} m at "
             f"{braking.speed:.1f} m/s. Along a characteristic the safety degree is a sawtooth of about that height: more digits of "
             "a value mean nothing, and only let a command repeat a simulation exactly.")
 

@@ -77,7 +77,7 @@ def summarise_failures(study: Study, solutions: pd.DataFrame, original: Evaluati
         ending, cause = f"{row['outcome']}, SD {row['f_safe']:.2f}", _cause_in_words(evaluator, causes)
         lines.append(f"{LABELS.get(reason, reason).capitalize()}: {handle}, {ending}, {size}. {cause}{fails_at}")
     at_worst = f"at the worst point of the first (without --point: at all {len(assemble(study).points)}, which takes long)"
-    return [*lines, f"Why, and how far{f', {at_worst}' if worst else ''}: {question_command('explain', directory, worst)}"]
+    return [*lines, f"Causes and limits{f', {at_worst}' if worst else ''}: {question_command('explain', directory, worst)}"]
 
 
 def _write_paragraph(evaluator: Evaluator, solutions: pd.DataFrame, is_unsafe: pd.Series[bool], original: Evaluations, unsafe: Unsafe,
@@ -199,7 +199,7 @@ def failures_paragraph(system: System, original: Evaluations, smallest: FailureD
     sentence = _failure_in_words(characteristics, smallest)
     parts.append(f"{sentence[0].upper()}{sentence[1:]}")
     if smallest.robustness.borderline:
-        parts.append("None of the failures that were tried is robust." if robust is None else
+        parts.append("No failure tested is robust." if robust is None else
                      f"The robust failure with the fewest changes, {robust.name}: {_failure_in_words(characteristics, robust)}")
     return " ".join([*parts, *_avoided_shares_in_words(preventable)])
 

@@ -54,7 +54,8 @@ def first_losses_in_words(scan: OneAtATimeScan) -> str:
     least = min(kept for _, kept in scan.points or [])
     first = ("; it never costs a whole point" if whole_point is None else
              f"; the first point is lost at {whole_point:.5g}{characteristic.suffix}")
-    return f"{characteristic.name}: points are lost from {any_loss:.5g}{characteristic.suffix} on{first}; the fewest are {least:.2f}."
+    start = f"{characteristic.name}: points are lost from {any_loss:.5g}{characteristic.suffix} on"
+    return f"{start}{first}; the minimum is {least:.2f} points."
 
 
 def _box_in_words(result: Tolerance) -> str:
