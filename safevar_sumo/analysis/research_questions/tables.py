@@ -33,9 +33,9 @@ def as_text(answers: Sequence[Answer], layouts: Layouts = LAYOUTS) -> str:
     return "\n".join(_render_text(table) for answer in answers for table in lay_out(answer, layouts))
 
 
-def as_markdown(answers: Sequence[Answer]) -> str:
+def as_markdown(answers: Sequence[Answer], layouts: Layouts = LAYOUTS) -> str:
     """Markdown tables; a heading that spans several columns is repeated in each column's heading."""
-    return "\n".join(_render_markdown(table) for answer in answers for table in lay_out(answer, LAYOUTS))
+    return "\n".join(_render_markdown(table) for answer in answers for table in lay_out(answer, layouts))
 
 
 def as_latex(answers: Sequence[Answer], layouts: Layouts = LAYOUTS) -> str:
