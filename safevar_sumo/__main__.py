@@ -26,7 +26,9 @@ def main() -> None:
 
 
 def _exit_with_error(message: str, code: int) -> None:
-    print(f"safevar-sumo: {message}", file=sys.stderr)
+    from safevar_sumo.shipped import PROGRAM
+
+    print(f"{PROGRAM}: {message}", file=sys.stderr)
     sys.exit(code)
 
 

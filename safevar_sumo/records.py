@@ -240,7 +240,7 @@ class SimulationRuns:
         """Speed of a collision relative to the obstacle along the vehicle's path [m/s], shape (N,); NaN without a collision.
 
         A gap d that closes within a time step, from the relative speed v at the relative acceleration a, closes at sqrt(v^2 + 2 a d);
-        Where no gap closes, the speed at the end of the step counts: `collision_speed` minus the obstacle's speed.
+        where no gap closes, the speed at the end of the step counts: `collision_speed` minus the obstacle's speed.
         """
         trace, vehicles = self.trace, np.arange(len(self.collision_speed))
         last_sample = len(trace.time) - 1 - np.argmax(trace.active[::-1], axis=0)

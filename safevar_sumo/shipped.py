@@ -1,10 +1,12 @@
-"""Folders of the shipped studies and SUMO networks, and the command that starts the program."""
+"""Folders of the shipped studies and SUMO networks, the program's name, and the command that starts it."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 PACKAGE = Path(__file__).resolve().parent
+PROGRAM = "safevar-sumo"
+"""Name of the installed program, at the start of its errors."""
 PROGRAM_COMMAND = "python -m safevar_sumo"
 """Start of every command line of this package."""
 

@@ -39,7 +39,7 @@ class PreventableBy(StrEnum):
 
     COMPETENT_DRIVER = "preventable by a competent driver"
     FULL_BRAKING = "preventable by full braking at the first possible moment"
-    NOBODY = "preventable by nobody"
+    NOBODY = "physically unavoidable"
 
 
 class PreventedShares(msgspec.Struct, frozen=True, kw_only=True):

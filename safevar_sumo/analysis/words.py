@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from shlex import quote
 
 from safevar_sumo.records import Outcome
@@ -13,19 +13,24 @@ from safevar_sumo.vehicles import Characteristic, CharacteristicSet
 OUTCOME_VERBS = {
     Outcome.STOPPED: "stops", Outcome.PASSED: "passes", Outcome.TIMEOUT: "is still under way at the end",
     Outcome.NEVER_MOVED: "never moves", Outcome.SIMULATOR_ERROR: "could not be simulated",
-    Outcome.INVALID_TEST: "leaves the tolerance of the test's speed", Outcome.INFEASIBLE: "violates a constraint"}
+    Outcome.INVALID_TEST: "violates the test's speed tolerance", Outcome.INFEASIBLE: "violates a constraint"}
 """How a run ended, as the verb of a sentence; a collision is described with its speed instead."""
 
 
-def list_of_changes(characteristics: CharacteristicSet, values: Mapping[str, float]) -> str:
+def change_texts(characteristics: CharacteristicSet, values: Mapping[str, float]) -> list[str]:
     """The values that differ from the original values, in the order of the study, such as `mass 2404 -> 2600 kg (+8.2 %)`."""
-    changes = []
+    texts = []
     for characteristic in characteristics:
         original, value = characteristic.original, values.get(characteristic.name, characteristic.original)
         if value != original:
-            changes.append(f"{characteristic.name} {original:g} -> {characteristic.text(value)}{characteristic.suffix} "
-                           f"({100 * (value - original) / abs(original):+.1f} %)")
-    return ", ".join(changes) or "no change at all"
+            texts.append(f"{characteristic.name} {original:g} -> {characteristic.text(value)}{characteristic.suffix} "
+                         f"({100 * (value - original) / abs(original):+.1f} %)")
+    return texts
+
+
+def list_of_changes(characteristics: CharacteristicSet, values: Mapping[str, float]) -> str:
+    """The values that differ from the original values in one line, as in `change_texts`."""
+    return ", ".join(change_texts(characteristics, values)) or "no change at all"
 
 
 def direction_in_words(characteristic: Characteristic, value: float) -> str:
@@ -53,6 +58,17 @@ def join_phrases(phrases: Iterable[str]) -> str:
 def number_of(count: int, noun: str) -> str:
     """A number with its noun: `1 change`, `2 changes`."""
     return f"{count} {noun}{'' if count == 1 else 's'}"
+
+
+MAX_POINTS_NAMED = 6
+"""Maximum number of failing test points that a sentence names."""
+
+
+def points_in_words(failing_points: Sequence[str], point_count: int, limit: int = MAX_POINTS_NAMED) -> str:
+    """A sentence such as `Fails at 2 of 72 points: CPNA, speed 40, impact_location 25, night; CPLA, speed 60, clear.`"""
+    names, rest = "; ".join(failing_points[:limit]), len(failing_points) - limit
+    others = f" and {rest} more" if rest > 0 else ""
+    return f"Fails at {len(failing_points)} of {point_count} points{': ' + names if failing_points else ''}{others}."
 
 
 def two_decimals(value: float | None) -> str:

@@ -136,7 +136,7 @@ def choose_engine(system: System, name: str) -> tuple[Engine, str]:
     if name not in ENGINE_NAMES.values():
         raise InputError("--engine", repr(name), one_of(ENGINE_NAMES.values()))
     if name == ENGINE_NAMES[Engine.LIBSUMO]:
-        return Engine.LIBSUMO, "asked for"
+        return Engine.LIBSUMO, "requested"
     reason = reason_for_sumo(system)
     return (Engine.LIBSUMO, reason) if reason else (Engine.RECORDED, "nobody reacts to the vehicle under test")
 

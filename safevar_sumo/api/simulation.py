@@ -69,8 +69,8 @@ class Simulation:
         The study that the setting was simulated in.
     setting
         The simulated value of every characteristic in its table unit, after the filter.
-    put_back
-        Requested values that the filter put back to the original, by name.
+    reset_values
+        Requested values that the filter reset to the original, by name.
     evaluation
         Outcome, metrics and objectives as arrays of one row.
     runs
@@ -83,7 +83,7 @@ class Simulation:
 
     study: Study
     setting: Mapping[str, float]
-    put_back: Mapping[str, float]
+    reset_values: Mapping[str, float]
     evaluation: Evaluations
     runs: SimulationRuns
     scoring: Scoring
@@ -186,7 +186,7 @@ def simulate_with_original(study: Study, system: System, requested: FloatArray, 
     setting = characteristics.filter(requested) if filtered else requested
     original = _simulate_one(study, system, requested=characteristics.original, setting=characteristics.original)
     if np.array_equal(setting, characteristics.original) and not gui:
-        return replace(original, put_back=_values_put_back(system, requested, setting))
+        return replace(original, reset_values=_reset_values(system, requested, setting))
     return replace(_simulate_one(study, system, requested, setting, Engine.GUI if gui else Engine.LIBSUMO), _original=original)
 
 
@@ -205,11 +205,11 @@ def _simulate_one(study: Study, system: System, requested: FloatArray, setting: 
     runs = drive_all(system_at_worst_point(system, settings), settings, engine, listen=record_observation)
     return Simulation(
         study=study, setting=dict(zip(system.characteristics.names, setting.tolist(), strict=True)),
-        put_back=_values_put_back(system, requested, setting), evaluation=score(system, settings, runs), runs=runs,
+        reset_values=_reset_values(system, requested, setting), evaluation=score(system, settings, runs), runs=runs,
         scoring=system.measuring.scoring, _observations=observations)
 
 
-def _values_put_back(system: System, requested: FloatArray, setting: FloatArray) -> dict[str, float]:
+def _reset_values(system: System, requested: FloatArray, setting: FloatArray) -> dict[str, float]:
     values = zip(system.characteristics.names, requested, setting, strict=True)
     return {name: float(requested_value) for name, requested_value, filtered_value in values if requested_value != filtered_value}
 

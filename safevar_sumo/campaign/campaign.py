@@ -77,8 +77,8 @@ def run_campaign(study: Study, keys: Iterable[RunKey], results: ResultsDirectory
     retrying_pool, work = RetryingPool(pool, study, results.record_late_files), pack_study(study, results.inputs, engine=engine)
     original = _evaluate_original(study, work, characteristics, results, retrying_pool, observer)
     if not original.valid[0]:
-        raise InputError(study.source, "the original vehicle leaves the tolerance of a test's speed before the ADS acts "
-                         "(invalid-test): nothing can be compared with it", "tests whose speed the vehicle can hold")
+        raise InputError(study.source, "the original vehicle violates a test's speed tolerance before the ADS acts (invalid-test), "
+                         "so there is no baseline", "tests whose speed the vehicle can hold")
     if original.collided[0] and not is_rated(study):
         observer.warned(f"study {study.name!r}: the original vehicle itself collides: no change is needed")
     results.begin(original)

@@ -10,6 +10,7 @@ import numpy as np
 
 from safevar_sumo.errors import InputError, unknown_name
 from safevar_sumo.plugins import Files, Lookup, Member, digests, guard_process_state, instance_of, note_inputs, unload_user_modules
+from safevar_sumo.results.files import run_name
 from safevar_sumo.search import ALGORITHM_CONTRACT, ALGORITHMS, Algorithm, GuardedAlgorithm, MapElites, MoCell, Problem, Search
 from safevar_sumo.study import SearchTable, Study
 
@@ -21,7 +22,7 @@ class RunKey(NamedTuple):
     run: int
 
     def __str__(self) -> str:
-        return f"{self.algorithm}-{self.run:02d}"
+        return run_name(self.algorithm, self.run)
 
 
 def all_runs(study: Study) -> list[RunKey]:

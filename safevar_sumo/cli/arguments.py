@@ -14,7 +14,7 @@ from click.shell_completion import CompletionItem
 
 from safevar_sumo.errors import InputError, SafevarError, unknown_name
 from safevar_sumo.records import FloatArray
-from safevar_sumo.study import check_writable, load_study, study_names
+from safevar_sumo.study import check_writable, load_study, study_names, unit_text
 from safevar_sumo.vehicles import CharacteristicSet
 
 PICTURE_ENDINGS = (".png", ".pdf", ".svg")
@@ -142,5 +142,5 @@ def complete_changes(ctx: click.Context, param: click.Parameter, incomplete: str
         characteristics = load_study(study).vehicle.characteristics
     except SafevarError:
         return []
-    return [CompletionItem(f"{name}=", help=f"{item.lower:g} to {item.upper:g}" + (f" {item.unit}" if item.unit != "-" else ""))
+    return [CompletionItem(f"{name}=", help=f"{item.lower:g} to {item.upper:g}{unit_text(item.unit)}")
             for name, item in characteristics.items() if name.startswith(incomplete)]

@@ -12,6 +12,7 @@ from rich.console import Console
 
 from safevar_sumo.ads import ADS
 from safevar_sumo.cli.program import commands
+from safevar_sumo.cli.target import json_option
 from safevar_sumo.metrics import METRIC_OF_OBJECTIVE, METRICS, OPTIONAL_METRICS, RATING_POINTS
 from safevar_sumo.scenarios import SCENARIOS, WEATHERS, equals_clear
 from safevar_sumo.search import ALGORITHMS
@@ -24,7 +25,7 @@ SECTIONS = ("studies", "vehicles", "ads", "scenarios", "weathers", "algorithms",
 
 @commands.command(name="list")
 @click.argument("section", required=False, type=click.Choice(SECTIONS), metavar="[SECTION]")
-@click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+@json_option
 def list_command(section: str | None, as_json: bool) -> None:
     """List studies, vehicles, ADSs, scenarios, weathers, algorithms, metrics and objectives; with SECTION, such as weathers, only these."""
     studies = [load_study(name) for name in study_names()]

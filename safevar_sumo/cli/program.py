@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, NoReturn, TextIO
 import click
 
 from safevar_sumo.errors import INTERRUPT_EXIT_CODE, InputError, SafevarError, did_you_mean
+from safevar_sumo.shipped import PROGRAM, PROGRAM_COMMAND
 
 if TYPE_CHECKING:
     from safevar_sumo.study import Study
@@ -28,7 +29,7 @@ COMMANDS = {
     "check": ("check", "Check your own driving system, vehicle, scenario, metric, objective, algorithm or TraCI controller."),
     "list": ("catalogue", "List studies, vehicles, ADSs, scenarios, weathers, algorithms, metrics and objectives."),
     "explain": ("questions", "Explain failures: which changes cause them, how small a change is enough, and why."),
-    "opinion": ("questions", "Have another vehicle model confirm or contradict the causes of failures."),
+    "opinion": ("questions", "Check the minimal causes of failures with a second vehicle model."),
     "tolerance": ("questions", "Find how far each characteristic may go: alone, in pairs, and all together."),
     "risk": ("questions", "Estimate the probability of an unsafe outcome, and which characteristics decide it."),
     "rules": ("questions", "Find rules, in physical units, that describe the unsafe settings."),
@@ -124,7 +125,7 @@ def main() -> None:
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")
     try:
-        code = commands.main(standalone_mode=False, prog_name="safevar-sumo")
+        code = commands.main(standalone_mode=False, prog_name=PROGRAM)
         sys.stdout.flush()
     except click.exceptions.Abort:
         _exit_with_error("interrupted", INTERRUPT_EXIT_CODE)
@@ -149,7 +150,7 @@ def main() -> None:
 def _error_in_two_lines(error: click.ClickException) -> str:
     """Put an error of click into the form of this program's errors."""
     context = error.ctx if isinstance(error, click.UsageError) else None
-    command = context.command_path if context is not None else "safevar-sumo"
+    command = PROGRAM_COMMAND + (context.command_path.removeprefix(PROGRAM) if context is not None else "")
     return f"{' '.join(error.format_message().split())}\nexpected: see {command} --help"
 
 
@@ -163,7 +164,7 @@ def _show_warning(message: Warning | str, category: type[Warning], filename: str
 def _exit_on_interrupt() -> Iterator[None]:
     """End the program on Ctrl-C while modules load: compiled modules would swallow the exception."""
     def exit_at_once(*_: object) -> None:
-        os.write(2, b"safevar-sumo: interrupted\n")
+        os.write(2, f"{PROGRAM}: interrupted\n".encode())
         os._exit(INTERRUPT_EXIT_CODE)
 
     in_main_thread = threading.current_thread() is threading.main_thread()
@@ -191,7 +192,7 @@ def _discard_output() -> None:
 
 def _exit_with_error(message: str, code: int) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # another Ctrl-C must change neither exit code nor message
-    click.echo(f"safevar-sumo: {message}", err=True)
+    click.echo(f"{PROGRAM}: {message}", err=True)
     _exit_program(code)
 
 

@@ -88,7 +88,7 @@ def explain(source: str, full: bool, point: str | None, jobs: int | None, as_jso
 
 @add_question(OpinionOptions, "DIR", click.argument("handles", nargs=-1, metavar=""))
 def opinion(source: str, handles: tuple[str, ...], point: str | None, jobs: int | None, as_json: bool, **values: Any) -> None:
-    """Have another vehicle model confirm or contradict the minimal causes of failures of results in DIR."""
+    """Check the minimal causes of failures of results in DIR with a second vehicle model."""
     from safevar_sumo.analysis.opinion.compute import ask_for_opinions
     from safevar_sumo.analysis.opinion.render import print_opinions
 
@@ -128,7 +128,7 @@ def tolerance(source: str, point: str | None, jobs: int | None, as_json: bool, p
 
 @add_question(RiskOptions, "STUDY|DIR", _plot_option("Draw the sensitivity indices to this file: png, pdf or svg."))
 def risk(source: str, point: str | None, jobs: int | None, as_json: bool, plot: Path | None, **values: Any) -> None:
-    """Estimate how likely an unsafe outcome is if vehicles vary as [variation] of STUDY says, and which characteristics decide it."""
+    """Estimate how likely an unsafe outcome is if vehicles vary as defined in STUDY's [variation], and which characteristics decide it."""
     from safevar_sumo.analysis.figures import save
     from safevar_sumo.analysis.risk.compute import estimate_risk
     from safevar_sumo.analysis.risk.render import print_risk, sensitivity_figure

@@ -13,9 +13,10 @@ from rich.console import Console
 
 from safevar_sumo.analysis.parameters import FITTED_TABLES
 from safevar_sumo.analysis.research_questions.case import Case, load_cases
+from safevar_sumo.analysis.words import two_decimals
 from safevar_sumo.cli.arguments import PICTURE_ENDINGS, check_output, complete_study, refuse_overwriting
 from safevar_sumo.cli.program import StrictCommand, commands, print_remarks
-from safevar_sumo.cli.target import jobs_option
+from safevar_sumo.cli.target import jobs_option, json_option
 from safevar_sumo.errors import InputError, SimulationError
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.progress import show_counting_bar
@@ -56,7 +57,7 @@ from safevar_sumo.workers.local import available_cores, local_pool
 @click.argument("reference", type=click.Path(path_type=Path), metavar="REFERENCE.csv")
 @jobs_option
 @click.option("--plot", type=click.Path(path_type=Path), metavar="FILE.png", help="Plot simulated against reference values.")
-@click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+@json_option
 @click.option("--totals", type=click.Path(path_type=Path), metavar="FILE.toml",
               help="Also save rank correlations, errors and counts of collisions to this file, without any row of the data.")
 @click.option("--effects", "with_effects", is_flag=True, help="Compare the characteristics' linear effects here and in the reference.")
@@ -323,9 +324,9 @@ def print_agreement(console: Console, study: Study, result: Agreement) -> None:
     console.print(table)
     collisions = result.collisions
     console.print(f"Collisions: {collisions['reference']} in the reference, {collisions['here']} here, {collisions['both']} in both: "
-                  f"precision {_two_decimals(result.precision)}, recall {_two_decimals(result.recall)}; their mean speed is "
-                  f"{_two_decimals(result.collision_speed['reference'])} m/s in the reference, "
-                  f"{_two_decimals(result.collision_speed['here'])} m/s here.")
+                  f"precision {two_decimals(result.precision)}, recall {two_decimals(result.recall)}; their mean speed is "
+                  f"{two_decimals(result.collision_speed['reference'])} m/s in the reference, "
+                  f"{two_decimals(result.collision_speed['here'])} m/s here.")
     if result.undecided["within_repeats"] is not None:
         console.print(f"Of {result.undecided['differ']} settings that collide only in the reference or only here, "
                       f"{result.undecided['within_repeats']} may collide or not within the scatter of repeats.")
@@ -341,10 +342,6 @@ def print_effects(console: Console, effects: Sequence[Effect]) -> None:
         agrees = "-" if effect.agrees is None else "yes" if effect.agrees else "no"
         table.add_row(effect.name, *("-" if value is None else f"{value:+.2f}" for value in (effect.reference, effect.here)), agrees)
     console.print(table)
-
-
-def _two_decimals(value: float | None) -> str:
-    return "-" if value is None else f"{value:.2f}"
 
 
 def print_calibration(console: Console, study: Study, result: Calibration) -> None:

@@ -14,6 +14,7 @@ from rich.text import Text
 
 from safevar_sumo.analysis.model_spread import ModelSpread, compute_model_spreads, studies_of_sets
 from safevar_sumo.analysis.rating import RatingOptions
+from safevar_sumo.analysis.words import points_in_words
 from safevar_sumo.api.simulation import Simulation, evaluate_settings, simulate_with_original
 from safevar_sumo.cli.arguments import (
     PICTURE_ENDINGS,
@@ -26,13 +27,13 @@ from safevar_sumo.cli.arguments import (
     refuse_overwriting,
 )
 from safevar_sumo.cli.program import commands
-from safevar_sumo.cli.target import CommandTarget, as_it_is_now_option, load_target, replay_options
+from safevar_sumo.cli.target import CommandTarget, as_it_is_now_option, json_option, load_target, point_option, replay_options
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import KMH_PER_MS, Evaluations, FloatArray, Outcome
 from safevar_sumo.results import record
-from safevar_sumo.scenarios import pre_crash_sentence
-from safevar_sumo.study import SAFETY_DEGREE, Study, check_writable
+from safevar_sumo.scenarios import LOCATION_DIMENSION, SPEED_DIMENSION, pre_crash_sentence
+from safevar_sumo.study import SAFETY_DEGREE, Study, check_writable, unit_text
 from safevar_sumo.sumo.matrix import PointResult, point_record, remarks_of, simulate_all_points, system_at_point, vehicle_remarks
 from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.terminal import WholeTable, print_meanings, print_text
@@ -55,9 +56,9 @@ FILE = click.Path(path_type=Path)
 @click.option("--slower", type=NumberRange(0.01, 1000), default=1.0, show_default=True, metavar="TIMES",
               help="How many times slower than real time --gui plays.")
 @as_it_is_now_option
-@click.option("--point", metavar="NAME", help="Only this point of the study's matrix.")
+@point_option
 @click.option("--spread", is_flag=True, help="Add the vehicle model's own uncertainty: other parameters that fit published data as well.")
-@click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+@json_option
 def simulate_command(study: str, solution: str | None, choice: str | None, changes: tuple[str, ...], no_filter: bool, beyond: bool,
                      trace: Path | None, point: str | None, spread: bool, as_json: bool, **replay_outputs: Any) -> None:
     """Simulate STUDY once, or a solution of the results directory DIR with the study as recorded there."""
@@ -137,9 +138,9 @@ def _print_results(target: CommandTarget, system: System, simulation: Simulation
     remarks = [remark for point in system.points for remark in remarks_of(point.scenario)]
     for remark in dict.fromkeys([*remarks, *system.remarks, *vehicle_remarks(system)]):
         click.echo(f"note: {remark}", err=True)
-    for name, value in simulation.put_back.items():
-        click.echo(f"note: {name} = {value:g} is so near the original that the filter reset it to {simulation.setting[name]:g}; "
-                   "--no-filter keeps it", err=True)
+    for name, value in simulation.reset_values.items():
+        click.echo(f"note: {name} = {value:g} differs from the original by less than the filter threshold and was reset to "
+                   f"{simulation.setting[name]:g}; --no-filter keeps it", err=True)
 
 
 def _rating_command(target: CommandTarget, system: System, simulation: Simulation) -> str:
@@ -157,7 +158,7 @@ def _warn_of_differences(target: CommandTarget, simulation: Simulation) -> None:
 
     assert target.row is not None
     for difference in list_differences(simulation.evaluation, target.row):
-        click.echo(f"warning: {target.handle} of {target.source}: {difference}; other versions or code than in the study?", err=True)
+        click.echo(f"warning: {target.handle} of {target.source}: {difference}; have versions or code changed since the study?", err=True)
 
 
 def _write_trace(path: Path, simulation: Simulation) -> None:
@@ -257,7 +258,7 @@ def print_sweep(console: Console, study: Study, names: Sequence[str], original: 
     characteristics = CharacteristicSet.of(study.vehicle.characteristics)
     columns = [characteristics.names.index(name) for name in names]
     units = [characteristics.members[column].unit for column in columns]
-    table = WholeTable(right=(f"{name}{'' if unit == '-' else f', {unit}'}" for name, unit in zip(names, units, strict=True)),
+    table = WholeTable(right=(name + unit_text(unit, ", {}") for name, unit in zip(names, units, strict=True)),
                        title=study.title)
     table.add_column("outcome")
     for name in variants.metrics:
@@ -273,14 +274,11 @@ def print_sweep(console: Console, study: Study, names: Sequence[str], original: 
 
 COLOUR_BANDS = ((5.0, "green"), (15.0, "yellow"), (25.0, "dark_orange"), (35.0, "orange4"))
 """Upper limits of the relative impact speed [km/h] and their colours, from Euro NCAP's car-to-car AEB tests; above them: red."""
-MAX_POINTS_NAMED = 6
-"""Maximum number of failing points that the summary names."""
-ROW_DIMENSION, COLUMN_DIMENSION = "speed", "impact_location"
 
 
-def print_matrix(console: Console, results: Sequence[PointResult], row: int = 0) -> None:
+def print_matrix(console: Console, results: Sequence[PointResult]) -> None:
     """Print a table for each test and weather: rows are speeds and other dimensions, columns are impact locations."""
-    records = [point_record(result, row) for result in results]
+    records = [point_record(result) for result in results]
     tables: dict[tuple[str, str], list[tuple[dict[str, Any], dict[str, Any]]]] = {}
     for result, result_record in zip(results, records, strict=True):
         coordinates = dict(result.point.parameters)
@@ -289,29 +287,28 @@ def print_matrix(console: Console, results: Sequence[PointResult], row: int = 0)
         _print_test_table(console, f"{test}, {weather}", cells)
     if records:
         collision_points = [entry["point"] for entry in records if entry["impact_speed"] is not None]
-        rest = f" and {len(collision_points) - MAX_POINTS_NAMED} more" if len(collision_points) > MAX_POINTS_NAMED else ""
-        names = "; ".join(collision_points[:MAX_POINTS_NAMED]) + rest
-        summary = f"{len(collision_points)} of {len(records)} points fail{': ' + names if collision_points else ''}."
+        summary = points_in_words(collision_points, len(records))
         invalid = sum(entry["outcome"] == Outcome.INVALID_TEST for entry in records)
         if invalid:
-            summary += f" {invalid} are invalid tests: the vehicle leaves the tolerance of the test's speed before the ADS acts."
+            summary += f" {invalid} are invalid tests: the vehicle violates the test's speed tolerance before the ADS acts."
         print_text(console, summary)
 
 
 def _print_test_table(console: Console, title: str, cells: Sequence[tuple[dict[str, Any], dict[str, Any]]]) -> None:
-    columns = list(dict.fromkeys(coordinates.get(COLUMN_DIMENSION) for coordinates, _ in cells))
+    columns = list(dict.fromkeys(coordinates.get(LOCATION_DIMENSION) for coordinates, _ in cells))
     table = WholeTable("speed", right=("" if column is None else f"{column:g} %" for column in columns), title=title)
     texts_by_row: dict[str, dict[Any, Text]] = {}
     for coordinates, result in cells:
-        texts_by_row.setdefault(_row_name(coordinates), {})[coordinates.get(COLUMN_DIMENSION)] = _cell_text(result)
+        texts_by_row.setdefault(_row_name(coordinates), {})[coordinates.get(LOCATION_DIMENSION)] = _cell_text(result)
     for name, texts in texts_by_row.items():
         table.add_row(name, *(texts.get(column, Text("")) for column in columns))
     console.print(table)
 
 
 def _row_name(coordinates: dict[str, Any]) -> str:
-    speed = [f"{coordinates[ROW_DIMENSION]:g} km/h"] if ROW_DIMENSION in coordinates else []
-    return ", ".join([*speed, *(f"{name} {value}" for name, value in coordinates.items() if name not in (ROW_DIMENSION, COLUMN_DIMENSION))])
+    speed = [f"{coordinates[SPEED_DIMENSION]:g} km/h"] if SPEED_DIMENSION in coordinates else []
+    others = (f"{name} {value}" for name, value in coordinates.items() if name not in (SPEED_DIMENSION, LOCATION_DIMENSION))
+    return ", ".join([*speed, *others])
 
 
 def _cell_text(result: dict[str, Any]) -> Text:

@@ -17,6 +17,7 @@ from rich.live import Live
 from rich.text import Text
 
 from safevar_sumo.analysis.research_questions.indicators import nondominated_points
+from safevar_sumo.analysis.words import change_texts
 from safevar_sumo.api.running import ENGINE_NAMES, carry_out_runs, choose_engine, load_for_search, open_pool
 from safevar_sumo.campaign import Campaign, Forecast, RunKey, all_runs, forecast
 from safevar_sumo.cli.arguments import NumberRange, complete_study
@@ -185,7 +186,7 @@ def print_summary(console: Console, study: Study, campaign: Campaign, directory:
             print_text(console, f"  {line}")
     invalid = sum(campaign.invalid_tests.values())
     if invalid:
-        print_text(console, f"{invalid} settings leave the tolerance of a test's speed before the ADS acts (invalid-test): "
+        print_text(console, f"{invalid} settings violate a test's speed tolerance before the ADS acts (invalid-test): "
                             "they are neither failures nor successes, and no result contains them.")
     _print_most_critical(console, study, campaign)
     case = build_case(study, record(campaign.original, row=0), solutions, solutions_frame(names, []), tuple(campaign.solutions),
@@ -207,13 +208,11 @@ def _print_most_critical(console: Console, study: Study, campaign: Campaign) -> 
     solutions = Evaluations.concatenate(list(campaign.solutions.values()))
     characteristics = CharacteristicSet.of(study.vehicle.characteristics)
     most_critical = solutions.take([int(np.lexsort((solutions.f_diff, solutions.f_num_diff, solutions.f_safe))[0])])
-    changes = [
-        f"{item.name} {item.original:g} -> {value:.6g} {'' if item.unit == '-' else item.unit}".rstrip()
-        for item, value in zip(characteristics, most_critical.settings[0].tolist(), strict=True) if value != item.original]
+    changes = change_texts(characteristics, dict(zip(characteristics.names, most_critical.settings[0].tolist(), strict=True)))
     console.print(f"Most critical setting: SD {most_critical.f_safe[0]:.2f} ({most_critical.outcome[0]}), "
                   f"the original's {campaign.original.f_safe[0]:.2f} ({campaign.original.outcome[0]}). Its changes:")
     for change in changes or ["no change"]:
-        console.print(f"  {change}")
+        print_text(console, f"  {change}")
 
 
 MAX_FRONT_ROWS = 5

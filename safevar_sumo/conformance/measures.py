@@ -13,11 +13,11 @@ from safevar_sumo.ads import Ads
 from safevar_sumo.conformance.models import AdsProbe, StudyProbe, VehicleProbe
 from safevar_sumo.conformance.probe import Indices, MissingReaction, Outputs, Probe, corners_of, cost_of, guard_of, measure_time, target_of
 from safevar_sumo.conformance.subject import Subject
-from safevar_sumo.metrics import METRICS, guard_metric
+from safevar_sumo.metrics import F_DIFF, METRICS, guard_metric
 from safevar_sumo.plugins import Lookup, instance_of, unload_user_modules
 from safevar_sumo.records import Command, Evaluations, FloatArray, Nominal, Observation, SimulationRuns
 from safevar_sumo.search import ALGORITHMS, GuardedAlgorithm, Problem
-from safevar_sumo.study import Study
+from safevar_sumo.study import SAFETY_DEGREE, Study
 from safevar_sumo.sumo.batch import drive_all
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet, guard_change
@@ -60,7 +60,7 @@ class MetricProbe(Probe):
 def _simulate_runs(study: Study) -> SimulationRuns:
     """Simulate 24 vehicles in a study; every fourth vehicle gives full throttle all the time."""
     plain_study = msgspec.structs.replace(study, metrics=msgspec.structs.replace(study.metrics, also=[]),
-                                          search=msgspec.structs.replace(study.search, objectives=["safety_degree", "f_diff"]))
+                                          search=msgspec.structs.replace(study.search, objectives=[SAFETY_DEGREE, F_DIFF.name]))
     system = assemble(plain_study)
     lower, upper = system.characteristics.lower, system.characteristics.upper
     settings = lower + np.random.default_rng(0).random((MetricProbe.vehicle_count, len(lower))) * (upper - lower)

@@ -20,6 +20,7 @@ from safevar_sumo.conformance.source import Source
 from safevar_sumo.conformance.subject import Subject, contract_violation, find_subject, subjects_of
 from safevar_sumo.errors import InputError, UserCodeError
 from safevar_sumo.plugins import guard_process_state
+from safevar_sumo.shipped import PROGRAM_COMMAND
 from safevar_sumo.study import Study, load_study, study_names
 
 RUN_LIMIT = 6.0
@@ -84,7 +85,7 @@ def refuse_defects(study: Study) -> list[str]:
             location = f"{finding.file}:{finding.line}"
             problem = f"{report.key} {finding.got}{'' if location in finding.got else f' ({location})'}"
             if finding.check in BLOCKING_CHECKS:
-                command = f"python -m safevar_sumo check {shlex.quote(study.origin.called or study.name)}"
+                command = f"{PROGRAM_COMMAND} check {shlex.quote(study.origin.called or study.name)}"
                 raise UserCodeError(study.source, f"{problem}; to reproduce it: {command}", f"{finding.expected}; {finding.advice}")
             remarks.append(f"{problem}; expected: {finding.expected}")
     return remarks

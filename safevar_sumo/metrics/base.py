@@ -12,7 +12,7 @@ from msgspec import Meta, Struct
 from safevar_sumo.errors import InputError
 from safevar_sumo.plugins import Guard, read_only_copy
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray, SimulationRuns
-from safevar_sumo.study import SAFETY_DEGREE, MetricsTable
+from safevar_sumo.study import SAFETY_DEGREE, MetricsTable, unit_text
 
 TIME_TOLERANCE = 1e-6
 """Largest difference between two times that count as equal [s]."""
@@ -74,7 +74,7 @@ class MetricFacts(Struct, frozen=True, kw_only=True):
     @property
     def heading(self) -> str:
         """`head`, by default title and unit."""
-        return self.head or (self.title if self.unit == "-" else f"{self.title}, {self.unit}")
+        return self.head or self.title + unit_text(self.unit, ", {}")
 
 
 class Metric(MetricFacts, frozen=True, kw_only=True):

@@ -19,7 +19,7 @@ from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray, finite_or_none
 from safevar_sumo.reference.rows import ReferenceData
 from safevar_sumo.results import evaluation_keys, write_whole
-from safevar_sumo.study import SAFETY_DEGREE, Study, load_study, refuse_other_than_file, study_names
+from safevar_sumo.study import SAFETY_DEGREE, Study, load_study, refuse_other_than_file, study_names, unit_text
 from safevar_sumo.vehicles import CharacteristicSet
 
 if TYPE_CHECKING:
@@ -183,7 +183,7 @@ def plot_agreement(path: Path, title: str, characteristics: CharacteristicSet, r
         lowest.append(lowest_on_axis)
         highest.append(highest_on_axis)
         characteristic = characteristics.members[i]
-        axis.set_xlabel(characteristic.name + ("" if characteristic.unit == "-" else f" [{as_formula(characteristic.unit)}]"))
+        axis.set_xlabel(characteristic.name + as_formula(unit_text(characteristic.unit, " [{}]")))
     margin = 0.1 * (max(highest) - min(lowest)) + 1e-6
     for i, axis in enumerate(axes[2:].flat):
         axis.set_ylim(min(lowest) - margin, max(highest) + margin)

@@ -12,7 +12,7 @@ from safevar_sumo.analysis.figures import save
 from safevar_sumo.records import FloatArray
 from safevar_sumo.reference.parameters import FittedParameter
 from safevar_sumo.reference.search import SearchRace
-from safevar_sumo.study import Study
+from safevar_sumo.study import Study, unit_text
 
 MAX_SETS = 20
 """Maximum number of parameter sets in a table [spread], including the best set."""
@@ -104,7 +104,7 @@ def plot_profiles(path: Path, profiles: Profiles, studies: Sequence[Study]) -> N
             axis.scatter(values[is_as_good], profiles.losses[is_as_good], s=5, alpha=0.6, color="#0072b2", linewidths=0)
             axis.axvline(values[0], color="black", linewidth=0.8, linestyle="--")
             key = parameter.label(studies).replace("vehicle.parameters.", "").replace("ads.parameters.", "")
-            axis.set_xlabel(key + ("" if parameter.bounds.unit == "-" else f" [{parameter.bounds.unit}]"))
+            axis.set_xlabel(key + unit_text(parameter.bounds.unit, " [{}]"))
             if k % columns == 0:
                 axis.set_ylabel("loss")
         figure.suptitle(f"Loss of {' and '.join(study.name for study in studies)} over each parameter; band: fits as well as the best")

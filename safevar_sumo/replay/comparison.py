@@ -16,7 +16,7 @@ from safevar_sumo.metrics import METRICS, RATING_POINTS, MetricFacts
 from safevar_sumo.records import Evaluations, FloatArray, Outcome, SimulationRuns
 from safevar_sumo.replay.film import Film, record_film
 from safevar_sumo.results import UNKNOWN
-from safevar_sumo.study import Study, StudyLike
+from safevar_sumo.study import Study, StudyLike, unit_text
 from safevar_sumo.sumo.batch import score
 from safevar_sumo.sumo.matrix import system_at_worst_point
 from safevar_sumo.sumo.staging import stage_network
@@ -46,16 +46,16 @@ def find_moments(runs: SimulationRuns, row: int) -> Moments:
                    end=int(np.flatnonzero(runs.trace.active[:, row])[-1]))
 
 
-def find_divergence(runs: SimulationRuns, first: int = 0, second: int = 1) -> int | None:
-    """Find the first sample at which the speeds of two of N runs have diverged; None if they never do."""
-    trace = runs.trace
-    is_active = trace.active[:, first] & trace.active[:, second]
-    samples = np.flatnonzero(is_active & (np.abs(trace.speed[:, first] - trace.speed[:, second]) > MIN_DIVERGENCE))
-    return int(samples[0]) if samples.size else None
-
-
 ORIGINAL, CHANGED = 0, 1
 """Rows of a comparison."""
+
+
+def find_divergence(runs: SimulationRuns) -> int | None:
+    """Find the first sample at which the speeds of the original and the changed vehicle have diverged; None if they never do."""
+    trace = runs.trace
+    is_active = trace.active[:, ORIGINAL] & trace.active[:, CHANGED]
+    samples = np.flatnonzero(is_active & (np.abs(trace.speed[:, ORIGINAL] - trace.speed[:, CHANGED]) > MIN_DIVERGENCE))
+    return int(samples[0]) if samples.size else None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,7 +98,8 @@ class Comparison:
         if nearest is not None and runs.outcome[row] == Outcome.STOPPED:
             ending = f"{ending} with {runs.trace.gap[nearest, row]:.2f} m to spare"
         values = [(metric, self.evaluations.metrics[metric.name][row]) for metric in self.objectives]
-        return ", ".join([ending, *(f"{metric.title} {value:.1f} {metric.unit}" for metric, value in values if np.isfinite(value))])
+        texts = (f"{metric.title} {value:.1f}{unit_text(metric.unit)}" for metric, value in values if np.isfinite(value))
+        return ", ".join([ending, *texts])
 
 
 def changes_in_words(characteristics: CharacteristicSet, setting: FloatArray) -> list[str]:
@@ -115,7 +116,7 @@ def format_number(value: float) -> str:
 
 def quantity_text(value: float, unit: str) -> str:
     """A number with its unit, whose powers are raised; a pure number has no unit."""
-    return format_number(value) + ("" if unit == "-" else " " + superscript_powers(unit))
+    return format_number(value) + superscript_powers(unit_text(unit))
 
 
 def superscript_powers(text: str) -> str:

@@ -25,14 +25,11 @@ LEGEND_HEIGHT = 1.8
 """Height of the legend above the lower edge of the view [m]."""
 
 
-def show_in_gui(comparison: Comparison, network: str | None = None, *, slower: float = 1.0, rest: float = PAUSE,
-                pictures: Path | None = None) -> None:
+def show_in_gui(comparison: Comparison, *, slower: float = 1.0, rest: float = PAUSE, pictures: Path | None = None) -> None:
     """Play a comparison in SUMO's own window, with pauses at the nearest moments and at the end.
 
     Parameters
     ----------
-    network
-        The network of the window, by default the comparison's network.
     slower
         Factor by which to play slower than real time.
     rest
@@ -47,7 +44,7 @@ def show_in_gui(comparison: Comparison, network: str | None = None, *, slower: f
     """
     scene = lay_out_scene(comparison)
     layout = _Layout(scene)
-    with open_window(network or comparison.network, scene.step) as window:
+    with open_window(comparison.network, scene.step) as window:
         for row in comparison.rows:
             _add_road_and_actors(window, scene, row, layout)
         pauses = {moments.nearest for moments in scene.moments if moments.nearest is not None} | {scene.sample_count - 1}

@@ -17,6 +17,8 @@ BRAKE_LIGHT = 8
 ANY_POSITION = 2
 """Value of keepRoute that allows positions beside every road (TraCI, "move to XY")."""
 VIEW_NAME = "View #0"
+WINDOW_SIZE = "1200,700"
+"""Width and height of the window [pixels]."""
 TEXT_SIZE = 85
 VIEW_SETTINGS = """<viewsettings>
     <scheme name="safevar">
@@ -99,8 +101,8 @@ class Window:
 
 
 @contextmanager
-def open_window(network: str, step: float, width: int = 1200, height: int = 700) -> Iterator[Window]:
-    """Open a window on one copy of a network without traffic, `width` times `height` pixels.
+def open_window(network: str, step: float) -> Iterator[Window]:
+    """Open a window on one copy of a network without traffic.
 
     Raises
     ------
@@ -115,7 +117,7 @@ def open_window(network: str, step: float, width: int = 1200, height: int = 700)
         api = engine_api(Engine.GUI)
         command = ["-n", str(copied_network(network, 1).network), "--step-length", repr(step), "--collision.action", "none",
                    "--gui-settings-file", str(settings_file), "--start", "true", "--quit-on-end", "true", "--no-step-log", "true",
-                   "--no-warnings", "true", "--window-size", f"{width},{height}", "--time-to-teleport", "-1",
+                   "--no-warnings", "true", "--window-size", WINDOW_SIZE, "--time-to-teleport", "-1",
                    "--xml-validation", "never", "--xml-validation.net", "never"]
         try:
             start_engine(api, Engine.GUI, [program_path(Engine.GUI), *command])

@@ -16,6 +16,7 @@ from safevar_sumo.analysis.explain.result import CauseEntry, FailureEntry, Summa
 from safevar_sumo.analysis.opinion.compute import CauseToJudge, assemble_both_systems, judge_causes
 from safevar_sumo.analysis.research_questions.indicators import nondominated_points
 from safevar_sumo.errors import InputError
+from safevar_sumo.metrics import PUBLISHED_SCORING
 from safevar_sumo.replay.comparison import list_differences, quantity_text, superscript_powers
 from safevar_sumo.report.input import ChangeRow, FailingPointsTable, ReportInput, load_or_compute
 from safevar_sumo.report.svg import Bar, draw_bars
@@ -26,7 +27,7 @@ MAX_REPLAYS = 10
 """Maximum number of solutions with a replay in a report, unless there are more explained failures."""
 FIRST_CHOICES = ("fewest", "smallest", "most_severe")
 """Choices that select the first solutions on the page, as the flags of `simulate` do."""
-OBJECTIVES = ["f_safe", "f_diff", "f_num_diff"]
+OBJECTIVES = [objective.name for objective in PUBLISHED_SCORING.objectives]
 
 
 class Explanations(NamedTuple):

@@ -28,7 +28,7 @@ from safevar_sumo.replay.comparison import Comparison, changes_in_words, compare
 from safevar_sumo.replay.page import player_data
 from safevar_sumo.replay.scene import lay_out_scene
 from safevar_sumo.results import ANSWERS, MANIFEST, RESULTS, SOLUTIONS, choose_handle, handles_of, read_manifest, write_whole
-from safevar_sumo.scenarios import Point
+from safevar_sumo.scenarios import LOCATION_DIMENSION, SPEED_DIMENSION, Point
 from safevar_sumo.shipped import PACKAGE
 from safevar_sumo.study import SAFETY_DEGREE, refuse_other_than_file, user_code_names
 from safevar_sumo.sumo.matrix import evaluate, evaluations_at_worst_points, simulate_all_points, study_at
@@ -51,7 +51,6 @@ class ChangeRow(NamedTuple):
     description: str
 
 
-SPEED_DIMENSION, LOCATION_DIMENSION = "speed", "impact_location"
 AVOIDED_TEXT, FAILURE_TEXT = "–", "fails"  # noqa: RUF001
 
 

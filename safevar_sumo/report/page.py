@@ -157,7 +157,7 @@ SECTIONS = {
     "risk": "Share of unsafe vehicles",
     "rules": "Failure regions",
     "questions": "Research questions",
-    "trust": "What was not tested, and how far to trust it",
+    "trust": "Limits and trust",
     "reproduce": "How to reproduce every number",
 }
 """Headings of the sections in order, by the names that `--only` accepts."""
@@ -226,7 +226,7 @@ def _study_data(data: ReportInput, sections: Sequence[str], jobs: int | None, sh
     different_handles = [solution.handle for solution in solutions if solution.differences]
     if different_handles:
         warn(f"{data.directory}: simulated again with different results: {', '.join(different_handles)}; "
-             "other versions or code than in the study?")
+             "have versions or code changed since the study?")
     return {"name": data.case.name, "title": data.case.study.title, "anchor": data.anchor(), "replays": solutions,
             "different": different_handles,
             "problem": data.problem, "later_changes": data.later_changes, "original_fails": data.original_fails,

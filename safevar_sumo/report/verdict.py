@@ -17,14 +17,14 @@ from safevar_sumo.analysis.model_spread import ModelSpread, compute_model_spread
 from safevar_sumo.analysis.preventability import PreventedShares
 from safevar_sumo.analysis.research_questions.case import ALGORITHM_TITLES, are_collisions
 from safevar_sumo.analysis.words import number_of
-from safevar_sumo.metrics import METRICS, Unsafe
+from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import KMH_PER_MS, FloatArray, Outcome
 from safevar_sumo.reference import Totals, shipped_totals_of
 from safevar_sumo.replay.comparison import format_number, superscript_powers
 from safevar_sumo.report.causes import FIRST_CHOICES, Explanations
 from safevar_sumo.report.input import ChangeRow, FailingPointsTable, ReportInput, load_or_compute
 from safevar_sumo.scenarios import SCENARIOS, Point, equals_clear, pre_crash_sentence
-from safevar_sumo.study import SAFETY_DEGREE
+from safevar_sumo.study import SAFETY_DEGREE, unit_text
 from safevar_sumo.sumo.matrix import vehicle_remarks
 from safevar_sumo.vehicles import VEHICLES
 
@@ -49,7 +49,7 @@ def describe_tested_system(data: ReportInput) -> TestedSystem:
                 f"Scenario: {_name_and_sentence(SCENARIOS, study.scenario.model)}; {_describe_conditions(data)}.",
         tags="" if data.system is None else pre_crash_sentence(data.system.points), search=_describe_search(data),
         characteristics=[
-            (characteristic.name, "" if characteristic.unit == "-" else superscript_powers(characteristic.unit),
+            (characteristic.name, superscript_powers(unit_text(characteristic.unit, "{}")),
              *map(format_number, (characteristic.original, characteristic.lower, characteristic.upper, characteristic.threshold)),
              characteristic.words)
             for characteristic in case.characteristics],
@@ -168,14 +168,8 @@ def reach_verdict(data: ReportInput, explanations: Explanations | None, toleranc
     return Verdict(
         headline="No solution was found." if solutions.empty else _headline(data, failures, explanations),
         unsafe_count=sum(data.unsafe_solutions), solution_count=len(solutions),
-        criterion=_describe_criterion(data.case.unsafe), original=_describe_original(data), agreement=describe_agreement(data),
+        criterion=data.case.unsafe.description, original=_describe_original(data), agreement=describe_agreement(data),
         failures=failures, key_figures=[] if solutions.empty else _key_figures(data, failures, explanations, tolerance))
-
-
-def _describe_criterion(unsafe: Unsafe) -> str:
-    if unsafe.below is None:
-        return "a collision"
-    return f"a safety degree below {unsafe.below:.2f} m, half of the original's (no solution collides)"
 
 
 def _describe_original(data: ReportInput) -> str:

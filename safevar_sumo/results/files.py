@@ -46,8 +46,13 @@ FILES = (
 """Every file of a results directory; the manual lists them."""
 
 
+def run_name(algorithm: str, run: int) -> str:
+    """The name of an algorithm's run in its journal and in messages, such as nsga2-03."""
+    return f"{algorithm}-{run:02d}"
+
+
 def journal_file(directory: Path, run: str) -> Path:
-    """The journal of a run, such as nsga2-03, or of the `ORIGINAL`."""
+    """The journal of a run, by the run's name, or of the `ORIGINAL`."""
     return directory / RUNS / f"{run}.journal"
 
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from safevar_sumo.errors import InputError, warn
-from safevar_sumo.results.files import MANIFEST, SOLUTIONS, journal_file
+from safevar_sumo.results.files import MANIFEST, SOLUTIONS, journal_file, run_name
 from safevar_sumo.results.imported import read_imported
 from safevar_sumo.results.journal import JournalContent, read_journal
 from safevar_sumo.results.manifest import is_edited, owner_digest, read_manifest, refuse_edited_table
@@ -137,7 +137,7 @@ def _read_journals(folder: Path, manifest: Mapping[str, Any],
     """Algorithm, number and journal's content of every run; None for a run without a journal."""
     owner = owner_digest(manifest)
     for algorithm, run in runs:
-        path = journal_file(folder, f"{algorithm}-{run:02d}")
+        path = journal_file(folder, run_name(algorithm, run))
         yield algorithm, run, read_journal(path, owner, path.stem) if path.exists() else None
 
 
@@ -160,7 +160,7 @@ def load_runs(directory: str | Path) -> StoredResults:
     evaluations_of_runs, solutions_of_runs, positions, failures = [], [], [], []
     for algorithm, run, content in _read_journals(folder, manifest, search.runs):
         if content is not None and content.tail_size and content.result(search.budget) is None:
-            warn(f"{journal_file(folder, f'{algorithm}-{run:02d}')}: the last {content.tail_size} bytes are torn, "
+            warn(f"{journal_file(folder, run_name(algorithm, run))}: the last {content.tail_size} bytes are torn, "
                  "so the run counts as unfinished; running the same study again simulates the lost evaluations")
         if content is None or content.evaluations is None:
             continue

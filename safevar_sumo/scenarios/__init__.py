@@ -5,7 +5,9 @@ from typing import Any
 
 from safevar_sumo.scenarios.along import Along
 from safevar_sumo.scenarios.base import (
+    LOCATION_DIMENSION,
     SCENARIO_CONTRACT,
+    SPEED_DIMENSION,
     VUT,
     GuardedScenario,
     Lane,
@@ -31,5 +33,5 @@ SCENARIOS: Mapping[str, type[Any]] = {
 }
 
 __all__ = [
-    "SCENARIOS", "SCENARIO_CONTRACT", "VUT", "WEATHERS", "GuardedScenario", "Lane", "Point", "PreCrash", "Scenario", "Scene", "World",
-    "equals_clear", "pre_crash_sentence", "weather_in_words", "weather_of"]
+    "LOCATION_DIMENSION", "SCENARIOS", "SCENARIO_CONTRACT", "SPEED_DIMENSION", "VUT", "WEATHERS", "GuardedScenario", "Lane", "Point",
+    "PreCrash", "Scenario", "Scene", "World", "equals_clear", "pre_crash_sentence", "weather_in_words", "weather_of"]

@@ -140,6 +140,10 @@ class Scenario(Protocol):
         """The geometry that the metrics are computed from."""
 
 
+SPEED_DIMENSION, LOCATION_DIMENSION = "speed", "impact_location"
+"""Dimensions of a test matrix that are the rows or columns of its tables."""
+
+
 class Point(NamedTuple):
     """A scenario in a weather; `name` is its name in the study, `parameters` distinguish it from the study's other points."""
 

@@ -74,12 +74,17 @@ ENTRY_LANE, JUNCTION_LANE, EXIT_LANE = "across_0", ":junction_0_0", "across_on_0
 """The target's lanes: before the junction, on it, and beyond."""
 
 
-def change_target_lanes(frame: Frame, entry: Coordinates, exit_: Coordinates, direction: Direction, length: float = 300.0) -> XmlChanges:
-    """Changes for straight lanes of the target in a direction: `entry` to `exit_` on the junction, and `length` metres before and after.
+TARGET_LANE_LENGTH = 300.0
+"""Length of the target's lanes before the junction and beyond it [m]."""
+
+
+def change_target_lanes(frame: Frame, entry: Coordinates, exit_: Coordinates, direction: Direction) -> XmlChanges:
+    """Changes for straight lanes of the target in a direction: `entry` to `exit_` on the junction, and the lanes before and after it.
 
     Points are given along the vehicle's lane and to its left [m].
     """
-    begin, end = ((x + sign * length * direction.along, y + sign * length * direction.left) for (x, y), sign in ((entry, -1), (exit_, 1)))
+    begin, end = ((x + sign * TARGET_LANE_LENGTH * direction.along, y + sign * TARGET_LANE_LENGTH * direction.left)
+                  for (x, y), sign in ((entry, -1), (exit_, 1)))
     return {f"edge/lane[@id='{lane}']": {"shape": " ".join(",".join(map(repr, frame.point(*end))) for end in ends),
                                          "length": repr(math.dist(*ends))}
             for lane, ends in ((ENTRY_LANE, (begin, entry)), (JUNCTION_LANE, (entry, exit_)), (EXIT_LANE, (exit_, end)))}

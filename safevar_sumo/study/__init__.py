@@ -29,10 +29,11 @@ from safevar_sumo.study.schema import (
     user_code_names,
     user_code_packages,
 )
+from safevar_sumo.study.units import unit_text
 from safevar_sumo.study.validation import convert_table, error_with_key
 
 __all__ = [
     "DESCRIPTION_KEYS", "OBJECTIVES", "SAFETY_DEGREE", "CharacteristicTable", "Constraint", "FitTable", "FreeParameter", "MatrixTable",
     "MatrixTest", "MetricsTable", "ModelTable", "Origin", "RatingTable", "SearchTable", "Study", "StudyLike", "VehicleTable",
     "Weather", "check_writable", "convert_table", "error_with_key", "fmus_of", "label_of", "load_study", "refuse_other_than_file",
-    "study_names", "study_path", "tables_of", "upgrade_tables", "user_code_names", "user_code_packages", "write_study"]
+    "study_names", "study_path", "tables_of", "unit_text", "upgrade_tables", "user_code_names", "user_code_packages", "write_study"]

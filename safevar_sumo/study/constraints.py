@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 from msgspec import Meta, Struct
 
 from safevar_sumo.errors import InputError, one_of, unknown_name
+from safevar_sumo.study.units import unit_text
 
 if TYPE_CHECKING:
     from safevar_sumo.study.schema import CharacteristicTable
@@ -49,7 +50,7 @@ class Constraint(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
     def bounds_in_words(self, table: Mapping[str, CharacteristicTable]) -> str:
         """The bounds in words."""
-        unit = "" if self.unit_of(table) == "-" else f" {self.unit_of(table)}"
+        unit = unit_text(self.unit_of(table))
         bounds = {"at least": self.at_least, "at most": self.at_most}
         return " and ".join(f"{word} {value:g}{unit}" for word, value in bounds.items() if value is not None)
 

@@ -10,6 +10,7 @@ import msgspec
 from msgspec import Meta, Struct
 
 from safevar_sumo.errors import InputError, unknown_name
+from safevar_sumo.study.units import unit_text
 
 if TYPE_CHECKING:
     from safevar_sumo.study.schema import CharacteristicTable
@@ -79,7 +80,7 @@ def variation_mistakes(source: object, rows: Mapping[str, CharacteristicTable], 
 
 
 def _distribution_mistakes(source: object, key: str, row: CharacteristicTable, distribution: Distribution) -> Iterator[InputError]:
-    domain_lower, domain_upper, unit = row.lower, row.upper, "" if row.unit == "-" else f" {row.unit}"
+    domain_lower, domain_upper, unit = row.lower, row.upper, unit_text(row.unit)
     for field, value in msgspec.structs.asdict(distribution).items():
         if field not in ("deviation", "sigma") and value is not None and not domain_lower <= value <= domain_upper:
             yield InputError(source, f"{key}.{field} = {value:g}", f"a number in [{domain_lower:g}, {domain_upper:g}]{unit}")

@@ -68,10 +68,10 @@ def _check_surface(lanes: list[ElementTree.Element], file: Path) -> None:
         heights = [float((*point.split(","), "0")[2]) for point in lane.get("shape", "").split()]
         climb = max(heights, default=0.0) - min(heights, default=0.0)
         if climb > MAX_SLOPE * float(lane.get("length", 0)):
-            raise InputError(file, f"vehicle {VUT!r} is to drive on lane {lane.get('id')!r}, which climbs {climb:.2f} m",
+            raise InputError(file, f"vehicle {VUT!r} drives on lane {lane.get('id')!r}, which rises {climb:.2f} m",
                              "a level road, as netconvert's option `flatten` makes it; the scenario's `grade` sets a slope")
         if float(lane.get("friction", 1)) != 1:
-            raise InputError(file, f"vehicle {VUT!r} is to drive on lane {lane.get('id')!r} of friction {lane.get('friction')}",
+            raise InputError(file, f"vehicle {VUT!r} drives on lane {lane.get('id')!r} of friction {lane.get('friction')}",
                              "friction 1; `road_friction` of the study's [weather] sets another one")
 
 

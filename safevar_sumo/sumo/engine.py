@@ -80,7 +80,7 @@ def start_engine(api: Any, engine: Engine, command: list[str]) -> None:
             raise EnvironmentFault(f"SUMO does not start: {str(error).strip()}") from None
         return
     if engine is Engine.GUI and sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
-        raise InputError("gui", "sumo-gui has no display to open its window on", "a desktop session, or DISPLAY in the environment")
+        raise InputError("gui", "sumo-gui needs a display", "a desktop session, or DISPLAY in the environment")
     with redirect_stdout(StringIO()), warnings.catch_warnings():  # traci prints that it waits for SUMO
         warnings.simplefilter("ignore")
         api.start(command, numRetries=CONNECTION_ATTEMPTS)

@@ -113,7 +113,7 @@ class SumoWorld:
         departed = set(self._api.vehicle.getIDList())
         for id_ in self.ids(VUT):
             if id_ not in departed:
-                raise SimulationError(f"SUMO found no place for vehicle {id_!r}: look at the network's traffic file")
+                raise SimulationError(f"SUMO could not insert vehicle {id_!r}; check the network's traffic file")
             self._api.vehicle.setSpeedMode(id_, SPEED_MODE)
             self._api.vehicle.setLaneChangeMode(id_, LANE_CHANGE_MODE)
 

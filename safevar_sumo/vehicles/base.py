@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple, Protocol
+from typing import Annotated, Any, NamedTuple, Protocol
 
 import numpy as np
+from msgspec import Meta
 
 from safevar_sumo.errors import UserCodeError
 from safevar_sumo.plugins import Contract, Guard, accepts, open_rows, read_only_copy
 from safevar_sumo.records import GRAVITY, BoolArray, Command, FloatArray, Observation
 from safevar_sumo.vehicles.sensors import Sensors
+
+Positive = Annotated[float, Meta(gt=0, le=1e5)]
+"""A model's parameter above 0."""
 
 
 class Slope(NamedTuple):

@@ -14,10 +14,9 @@ import numpy as np
 from msgspec import Meta, Struct
 
 from safevar_sumo.records import GRAVITY, TIME_ROUNDING, BoolArray, Command, FloatArray, Observation
-from safevar_sumo.vehicles.base import LEVEL, Characteristics, Slope, SumoType
+from safevar_sumo.vehicles.base import LEVEL, Characteristics, Positive, Slope, SumoType
 from safevar_sumo.vehicles.sensors import Sensors
 
-Positive = Annotated[float, Meta(gt=0, le=1e5)]
 Share = Annotated[float, Meta(gt=0, le=1)]
 # Constants used with arrays in every step are arrays themselves: numpy would convert a float each time, which doubles the cost.
 ZERO, ONE = map(np.array, (0.0, 1.0))

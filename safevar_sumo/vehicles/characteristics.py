@@ -17,7 +17,7 @@ from msgspec import Struct
 from safevar_sumo.errors import InputError, unknown_name
 from safevar_sumo.plugins import Guard, read_only_copy
 from safevar_sumo.records import BoolArray, FloatArray
-from safevar_sumo.study import CharacteristicTable
+from safevar_sumo.study import CharacteristicTable, unit_text
 
 PLAUSIBLE_MULTIPLE = 1000.0
 """Values beyond this multiple of the domain's largest magnitude count as typos."""
@@ -70,7 +70,7 @@ class Characteristic:
     @property
     def suffix(self) -> str:
         """The unit as text after a number; empty without a unit."""
-        return "" if self.unit == "-" else f" {self.unit}"
+        return unit_text(self.unit)
 
     def check(self, value: float, source: object, *, beyond: bool = False, otherwise: str = "",
               switch: str = "beyond=True") -> None:

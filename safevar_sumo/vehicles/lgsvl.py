@@ -18,7 +18,7 @@ from safevar_sumo.vehicles.base import LEVEL, Characteristics, Slope, SumoType
 
 # Constants used with arrays in every step are arrays themselves: numpy would convert a float each time, which doubles the cost.
 ZERO, ONE, TWO, HALF = map(np.array, (0.0, 1.0, 2.0, 0.5))
-RPM = np.array(30 / math.pi)  # r/min per rad/s
+RPM_PER_RAD_S = np.array(30 / math.pi)  # r/min per rad/s
 RADIANS = math.pi / 180  # rad per degree
 WHEELS = 4
 GEAR_RATIOS = np.array([4.17, 3.14, 2.11, 1.67, 1.28, 1.0, 0.84, 0.67])  # VehicleSMI
@@ -151,7 +151,7 @@ class Lgsvl(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
             mass=p.mass,
             accel=np.minimum(drive, grip) / p.mass,
             decel=np.minimum(p.brake_torque / p.radius, grip) / p.mass,
-            max_speed=p.largest_rpm / RPM / (GEAR_RATIOS[-1] * FINAL_RATIO) * p.radius,
+            max_speed=p.largest_rpm / RPM_PER_RAD_S / (GEAR_RATIOS[-1] * FINAL_RATIO) * p.radius,
             tau=np.full_like(p.mass, p.step + self.pedal_lag))
 
     def at_rest(self, prepared: _Prepared) -> LgsvlState:
@@ -173,10 +173,10 @@ class Lgsvl(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         wheel_speed = rim / p.radius
         gear = zeros + 1
         for lower_ratio in GEAR_RATIOS[:-1]:
-            gear += p.least_rpm + wheel_speed * (lower_ratio * FINAL_RATIO * RPM) > SHIFT_UP * p.largest_rpm
+            gear += p.least_rpm + wheel_speed * (lower_ratio * FINAL_RATIO * RPM_PER_RAD_S) > SHIFT_UP * p.largest_rpm
         ratio = GEAR_RATIOS[gear.astype(np.intp) - 1]
         gearing = ratio * FINAL_RATIO
-        engine_rpm = p.least_rpm + wheel_speed * gearing * RPM
+        engine_rpm = p.least_rpm + wheel_speed * gearing * RPM_PER_RAD_S
         full_torque = _torque_share(engine_rpm / p.largest_rpm) * gearing * p.motor_torque
         needed_torque = p.damping * wheel_speed + p.radius * force
         throttle = np.minimum(np.maximum(needed_torque, 0.0) / np.maximum(full_torque, 1.0), 1.0)
@@ -241,7 +241,7 @@ def _roll(p: _Prepared, s: LgsvlState, gearing: FloatArray, cornering_drag: Floa
     m dv/dt = K (r w - v) - (D_air v + D_tyre + D_corner) v - m g sin
     """
     h = p.substep
-    steady_rpm = p.least_rpm + s.wheel_speed * gearing * RPM
+    steady_rpm = p.least_rpm + s.wheel_speed * gearing * RPM_PER_RAD_S
     engine_rpm = s.engine_rpm + (steady_rpm - s.engine_rpm) * p.engine_share
     drive = _torque_share(engine_rpm / p.largest_rpm) * gearing * s.traction_torque * s.throttle
 

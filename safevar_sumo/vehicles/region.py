@@ -12,7 +12,7 @@ import numpy as np
 from safevar_sumo.errors import InputError
 from safevar_sumo.plugins import Guard, Lookup, Member
 from safevar_sumo.records import BoolArray, FloatArray
-from safevar_sumo.study import Constraint, Study
+from safevar_sumo.study import Constraint, Study, unit_text
 from safevar_sumo.vehicles.characteristics import CharacteristicSet
 
 SLACK = 1e-9
@@ -172,7 +172,7 @@ def _bounds_of(constraint: Constraint, study: Study, characteristics: Characteri
     minimum = -np.inf if constraint.at_least is None else constraint.at_least
     maximum = np.inf if constraint.at_most is None else constraint.at_most
     condition, unit = constraint.bounds_in_words(study.vehicle.characteristics), constraint.unit_of(study.vehicle.characteristics)
-    suffix = "" if unit == "-" else f" {unit}"
+    suffix = unit_text(unit)
     if constraint.sum:
         weights = [(characteristics.names.index(name), weight) for name, weight in constraint.sum.items()]
         width = sum(abs(weight) * (characteristics.upper - characteristics.lower)[column] for column, weight in weights)

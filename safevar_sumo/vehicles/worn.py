@@ -8,7 +8,7 @@ import numpy as np
 from msgspec import Meta, Struct
 
 from safevar_sumo.records import BoolArray, Command, FloatArray, Observation
-from safevar_sumo.vehicles.base import LEVEL, Characteristics, Slope, SumoType
+from safevar_sumo.vehicles.base import LEVEL, Characteristics, Positive, Slope, SumoType
 from safevar_sumo.vehicles.sensors import Sensors, delay_signal, extend_history, sensed_observation, start_history
 
 DEEP_TREAD, HALF_WORN_TREAD, LEGAL_TREAD = 6.7, 3.0, 1.6
@@ -19,7 +19,6 @@ HALF_WORN_RATIO = 39.9 / 31.7
 """Stopping distance at 1.6 mm over the distance at 3 mm, from 50 mph on a wet road (MIRA for Continental; both in m) [-]."""
 HALF_WORN_LOSS = (1 - HALF_WORN_RATIO / DEEP_TREAD_RATIO) / (1 - 1 / DEEP_TREAD_RATIO)
 """Loss of friction at 3 mm over the loss at 1.6 mm [-], as friction is proportional to 1 / stopping distance."""
-Positive = Annotated[float, Meta(gt=0, le=1e5)]
 
 
 class _Prepared(NamedTuple):

@@ -61,7 +61,7 @@ def cluster_pool(address: str, time_limit: float) -> Iterator[ClusterPool]:
     try:
         client = Client(address, timeout=CONNECT_TIMEOUT, set_as_default=False)
     except (OSError, TimeoutError, ValueError) as error:
-        raise InputError("cluster", f"nobody answers at {address!r}: {error}", legal) from None
+        raise InputError("cluster", f"no scheduler answers at {address!r}: {error}", legal) from None
     except (TypeError, RuntimeError) as error:
         raise InputError("cluster", f"{address!r}: {describe_error(error)}", CERTIFICATES) from None
     with defer_interrupts():

@@ -147,7 +147,7 @@ def test_a_named_solution_is_explained_whatever_it_is(case: Case) -> None:
     safe = case.solutions["f_safe"].idxmax()
     handle = str(handles_of(case.solutions)[safe])
     (one,) = explain_failures(case, ExplainOptions(solutions=(handle,), unsafe="collision"), pool=InlinePool()).explanations
-    assert (str(one.handle), one.causes, one.reasons) == (handle, (), ("asked for",))
+    assert (str(one.handle), one.causes, one.reasons) == (handle, (), ("requested",))
     with pytest.raises(InputError, match="nsga2:7:0"):
         explain_failures(case, ExplainOptions(solutions=("nsga2:7:0",)), pool=InlinePool())
 
@@ -246,7 +246,7 @@ def test_the_summary_of_a_study_leads_with_the_answer(case: Case, explained: Exp
     assert [line.partition(":")[0] for line in others] == ["Fewest changes", "Smallest largest change", "Most severe"]
     assert all(" These changes alone cause it: " in line for line in others)
     safe = case.solutions[case.solutions["f_safe"] > 2]
-    assert more == "Why, and how far: python -m safevar_sumo explain 'my results'"
+    assert more == "Causes and limits: python -m safevar_sumo explain 'my results'"
     nothing, more = summarise_failures(case.study, safe, original, InlinePool(), "out")
     assert nothing.startswith(f"Nothing unsafe found in {len(safe)} solution{'s' * (len(safe) > 1)}:")
     assert more == "How far each characteristic may go: python -m safevar_sumo tolerance out"

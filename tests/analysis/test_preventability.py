@@ -12,7 +12,7 @@ import scipy
 from safevar_sumo.ads.competent_driver import CompetentDriver
 from safevar_sumo.analysis.evaluator import Evaluator
 from safevar_sumo.analysis.explain.braking_comparison import sentence
-from safevar_sumo.analysis.explain.compute import PointComparison, compare_at_points, points_in_words
+from safevar_sumo.analysis.explain.compute import PointComparison, compare_at_points
 from safevar_sumo.analysis.explain.summary import _avoided_shares_in_words, summarise_failures
 from safevar_sumo.analysis.preventability import (
     Preventability,
@@ -21,6 +21,7 @@ from safevar_sumo.analysis.preventability import (
     assess_preventability,
     classify_collisions,
 )
+from safevar_sumo.analysis.words import points_in_words
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import FloatArray
 from safevar_sumo.results import solutions_frame

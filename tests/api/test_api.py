@@ -58,7 +58,7 @@ def test_a_study_needs_no_file() -> None:
 def test_simulate_returns_the_setting_and_the_original_beside_it() -> None:
     result = sv.simulate("rain", {"tireFric": 1.5, "mass": 2410.0})
     assert result.setting["tireFric"] == 1.5
-    assert result.put_back == {"mass": 2410.0}
+    assert result.reset_values == {"mass": 2410.0}
     assert result.objectives["f_num_diff"] == 1
     assert result.objectives["f_diff"] == pytest.approx(2 / 3.5)
     assert result.metrics["safety_degree"] == result.objectives["f_safe"]

@@ -133,7 +133,7 @@ def test_where_it_cannot_run_it_says_so_in_one_line(start: str, says: str) -> No
     done = subprocess.run([sys.executable, "-S", *arguments], capture_output=True, text=True, cwd=ROOT)  # -S: nothing is installed
     assert done.returncode == 1
     assert re.fullmatch(f"safevar-sumo: {re.escape(says)}.*\n", done.stderr)
-    for file in ("__init__.py", "__main__.py"):
+    for file in ("__init__.py", "__main__.py", "shipped.py"):
         ast.parse((ROOT / "safevar_sumo" / file).read_text(), feature_version=(3, 10))
 
 

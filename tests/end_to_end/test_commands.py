@@ -97,8 +97,8 @@ def test_a_users_scalar_ads_is_named_in_a_study(in_tmp: Path) -> None:
     (["simulate", "/"], ("/",)),
     (["simulate", ""], ("STUDY|DIR: '' is empty",)), (["tables", "out", ""], ("DIR...: '' is empty",)),
     (["simulate", "sun", "--as-it-is-now"], ("--as-it-is-now: a study is simulated as it is now anyway",)),
-    (["validate", "sun", "none.csv", "--jobs", "1025"], ("--jobs", "1025", "see safevar-sumo validate --help")),
-    (["study", "sun", "--seed"], ("--seed", "see safevar-sumo study --help")), (["study"], ("Missing argument 'STUDY'",)),
+    (["validate", "sun", "none.csv", "--jobs", "1025"], ("--jobs", "1025", "see python -m safevar_sumo validate --help")),
+    (["study", "sun", "--seed"], ("--seed", "see python -m safevar_sumo study --help")), (["study"], ("Missing argument 'STUDY'",)),
     (["simulate", "sun", "--nothing"], ("No such option '--nothing'",)),
 ])
 def test_bad_input_ends_with_code_2_and_says_what_is_legal(arguments: list[str], expected: tuple[str, ...], in_tmp: Path) -> None:

@@ -255,7 +255,7 @@ def test_a_simulation_that_hangs_is_stopped_on_a_cluster_too(scheduler: tuple[su
 @pytest.mark.slow
 def test_an_address_that_nobody_answers_is_told_in_time(in_tmp: Path) -> None:
     began = time.monotonic()
-    refused("study", "smoke", "--cluster", "tcp://127.0.0.1:9", "--out", "out", message=("--cluster: nobody answers at 'tcp://127.0.0.1:9'",))
+    refused("study", "smoke", "--cluster", "tcp://127.0.0.1:9", "--out", "out", message=("--cluster: no scheduler answers at 'tcp://127.0.0.1:9'",))
     assert time.monotonic() - began < 15
     assert not Path("out").exists()
 

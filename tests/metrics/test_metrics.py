@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from safevar_sumo.errors import InputError
-from safevar_sumo.metrics import F_DIFF, F_SAFE, METRICS, Objective, Scoring, Unsafe, time_to_collision
+from safevar_sumo.metrics import F_DIFF, F_NUM_DIFF, F_SAFE, METRICS, Objective, Scoring, Unsafe, time_to_collision
 from safevar_sumo.records import Encounter, Evaluations, Outcome, SimulationRuns, Trace
-from safevar_sumo.study import MetricsTable
+from safevar_sumo.study import OBJECTIVES, MetricsTable
+from safevar_sumo.vehicles import CHANGES
 
 STEP = 0.01
 THRESHOLDS = MetricsTable(ttc_threshold=2.0)
@@ -156,6 +157,12 @@ def test_a_batch_that_failed_as_a_whole_has_no_valid_objective() -> None:
     scoring = Scoring(metrics=(), objectives=(F_SAFE, F_DIFF, Objective(name="jerk", title="jerk", unit="m/s^3")))
     assert scoring.valid(failed).tolist() == [False, False]
     assert np.isnan(scoring.values(failed)[:, 2]).all()
+
+
+def test_measures_of_change_are_the_published_objectives() -> None:
+    changes = [Objective(name=change.name, title=change.title, unit=change.unit) for change in CHANGES.values()]
+    assert changes == [F_DIFF, F_NUM_DIFF]
+    assert tuple(change.name for change in changes) == OBJECTIVES[1:]
 
 
 def test_average_deceleration_is_that_of_the_braking_cycle() -> None:

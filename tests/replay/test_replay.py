@@ -220,9 +220,8 @@ def of_colour(picture: np.ndarray, red: int, green: int, blue: int) -> np.ndarra
 @pytest.mark.usefixtures("screen")
 def test_both_vehicles_are_in_the_window_at_the_nearest_moment(slippery: Path, tmp_path: Path) -> None:
     (case,) = load_cases([slippery])
-    system = assemble(case.study)
-    comparison = compare_setting(case.study, system, case.solutions[list(case.characteristics.names)].to_numpy()[0])
-    show_in_gui(comparison, system.scenario.network, slower=0.01, rest=0.0, pictures=tmp_path)
+    comparison = compare_setting(case.study, assemble(case.study), case.solutions[list(case.characteristics.names)].to_numpy()[0])
+    show_in_gui(comparison, slower=0.01, rest=0.0, pictures=tmp_path)
     first, second = (find_moments(comparison.film.runs, row) for row in comparison.rows)
     assert {path.stem for path in tmp_path.iterdir()} == {f"{sample:04d}" for sample in (first.nearest, second.nearest, first.end)}
     with Image.open(tmp_path / f"{second.nearest:04d}.png") as image:
@@ -239,10 +238,9 @@ def test_without_a_display_it_is_refused(slippery: Path, monkeypatch: pytest.Mon
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     (case,) = load_cases([slippery])
-    system = assemble(case.study)
-    comparison = compare_setting(case.study, system, case.characteristics.original)
-    with pytest.raises(InputError, match="no display"):
-        show_in_gui(comparison, system.scenario.network)
+    comparison = compare_setting(case.study, assemble(case.study), case.characteristics.original)
+    with pytest.raises(InputError, match="needs a display"):
+        show_in_gui(comparison)
 
 
 def test_a_verdict_names_the_comfort_that_the_study_optimises() -> None:

@@ -110,11 +110,11 @@ def load_original(study: str) -> np.ndarray:
 
 
 @pytest.mark.parametrize(("file", "old", "new", "message"), [
-    ("network.nod.xml", 'x="80" y="0"', 'x="80" y="0" z="4"', "lane 'departure_0', which climbs"),
+    ("network.nod.xml", 'x="80" y="0"', 'x="80" y="0" z="4"', "lane 'departure_0', which rises"),
     ("network.edg.xml", 'id="approach"', 'id="approach" friction="0.3"', "lane 'approach_0' of friction 0.3")])
 def test_a_slope_or_friction_that_has_no_effect_is_refused(mine: Path, file: str, old: str, new: str, message: str) -> None:
     rewritten(mine / file, old, new)
-    with pytest.raises(InputError, match=r"traffic\.rou\.xml: vehicle 'vut' is to drive on ") as caught:
+    with pytest.raises(InputError, match=r"traffic\.rou\.xml: vehicle 'vut' drives on ") as caught:
         check_network(str(mine))
     assert message in str(caught.value)
 

@@ -115,10 +115,6 @@ def _distinct_rows(settings: np.ndarray) -> list[int]:
     return sorted(np.unique(settings, axis=0, return_index=True)[1].tolist())
 
 
-MAX_POINTS_NAMED = 6
-"""Maximum number of failing test points that a sentence names."""
-
-
 class PointComparison(NamedTuple):
     """One failure at the test points of a study.
 
@@ -181,13 +177,6 @@ def unsafe_points_of(system: System, point_results: list[PointResult], unsafe: U
             for flags in unsafe_by_point.T]
 
 
-def points_in_words(failing_points: tuple[str, ...], point_count: int, limit: int = MAX_POINTS_NAMED) -> str:
-    """A sentence such as `Fails at 2 of 72 points: CPNA, speed 40, impact_location 25, night; CPLA, speed 60, clear.`"""
-    names, rest = "; ".join(failing_points[:limit]), len(failing_points) - limit
-    others = f" and {rest} more" if rest > 0 else ""
-    return f"Fails at {len(failing_points)} of {point_count} points{': ' + names if failing_points else ''}{others}."
-
-
 class FailureSelection(NamedTuple):
     """The failures to explain, of a study or of results, with their minimal causes.
 
@@ -224,7 +213,7 @@ def choose_failures(source: Study | Case, options: ExplainOptions, evaluator: Ev
     settings, rows = evaluated.evaluations.settings, evaluated.rows_to_explain
     sample = rows if named_solutions else [rows[i] for i in select_affordable_rows(settings[rows], evaluator, max_evaluations)]
     robust_row = None if named_solutions or is_rated(evaluator.study) else _find_robust_row(evaluated, evaluator, original, max_evaluations)
-    choice_reasons = dict.fromkeys(rows, ("asked for",)) if named_solutions else _choose_rows(evaluated, robust_row)
+    choice_reasons = dict.fromkeys(rows, ("requested",)) if named_solutions else _choose_rows(evaluated, robust_row)
     analysed_rows = sorted({*sample, *choice_reasons})
     causes = dict(zip(analysed_rows, find_minimal_causes(evaluator, settings[analysed_rows], evaluated.unsafe), strict=True))
     if not named_solutions:

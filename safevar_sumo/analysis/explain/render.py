@@ -11,11 +11,10 @@ from rich.markup import escape
 
 from safevar_sumo.analysis.evaluator import CONFIDENCE
 from safevar_sumo.analysis.explain.braking_comparison import BrakingComparison, sentence
-from safevar_sumo.analysis.explain.compute import points_in_words
 from safevar_sumo.analysis.explain.result import REASONS, ROBUST, Cause, Explained, Explanation, most_robust
 from safevar_sumo.analysis.explain.summary import LABELS, FailureDescription, failures_paragraph
 from safevar_sumo.analysis.figures import BLUE, FONT, GREY, SKY_BLUE, escape_dollars, new_figure
-from safevar_sumo.analysis.words import list_of_changes, number_of, question_command, simulate_command, two_decimals
+from safevar_sumo.analysis.words import list_of_changes, number_of, points_in_words, question_command, simulate_command, two_decimals
 from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.terminal import WholeTable, print_constraints, print_meanings, print_text
@@ -95,7 +94,8 @@ def _describe(failure: Explanation | None) -> FailureDescription | None:
 def _most_necessary_in_words(result: Explained, characteristics: CharacteristicSet) -> str:
     full_names = {characteristic.name: _full_name(characteristic) for characteristic in characteristics}
     rows = result.necessity[result.necessity["necessary"] > 0].head(MAX_NECESSARY).to_dict("records")
-    return ", ".join(f"{full_names[row['characteristic']]} {_necessary_share(row)}" for row in rows) or "none, causes differ"
+    shares = (f"{full_names[row['characteristic']]} {_necessary_share(row)}" for row in rows)
+    return ", ".join(shares) or "none; no change is common to all causes"
 
 
 def _necessary_share(row: Mapping[Any, Any]) -> str:
@@ -117,7 +117,7 @@ def _accuracy_in_words(result: Explained) -> str:
     braking = result.explanations[0].because.original.braking
     if step is None or braking is None:
         return ""
-    return (f"How exact: decisions fall into frames of {step:g} s, in which the vehicle covers {braking.speed * step:.2f} m at "
+    return (f"Accuracy: the driving system decides every {step:g} s, in which the vehicle covers {braking.speed * step:.2f} m at "
             f"{braking.speed:.1f} m/s. Along a characteristic the safety degree is a sawtooth of about that height: more digits of "
             "a value mean nothing, and only let a command repeat a simulation exactly.")
 

@@ -11,12 +11,12 @@ import pandas as pd
 from safevar_sumo.analysis.evaluator import Evaluator
 from safevar_sumo.analysis.explain import ExplainOptions
 from safevar_sumo.analysis.explain.causes import MinimalCause, find_minimal_causes
-from safevar_sumo.analysis.explain.compute import compare_at_points, points_in_words, unsafe_points_of
+from safevar_sumo.analysis.explain.compute import compare_at_points, unsafe_points_of
 from safevar_sumo.analysis.explain.necessity import Robustness, estimate_robustness, find_smallest_robust_failure
 from safevar_sumo.analysis.explain.result import DISTINCT_CAUSE, REASONS, ROBUST, most_robust
 from safevar_sumo.analysis.preventability import Preventability, PreventableBy, assess_preventability
 from safevar_sumo.analysis.rating.summary import summarise_rated_solutions
-from safevar_sumo.analysis.words import OUTCOME_VERBS, join_phrases, list_of_changes, number_of, question_command
+from safevar_sumo.analysis.words import OUTCOME_VERBS, join_phrases, list_of_changes, number_of, points_in_words, question_command
 from safevar_sumo.metrics import RATING_POINTS, Unsafe
 from safevar_sumo.records import KMH_PER_MS, Evaluations, FloatArray, Outcome, finite_or_none
 from safevar_sumo.results import CHOICES, choose_handle, handles_of, record, row_of_handle
@@ -76,7 +76,7 @@ def summarise_failures(study: Study, solutions: pd.DataFrame, original: Evaluati
         ending, cause = f"{row['outcome']}, SD {row['f_safe']:.2f}", _cause_in_words(evaluator, causes)
         lines.append(f"{LABELS.get(reason, reason).capitalize()}: {handle}, {ending}, {size}. {cause}{fails_at}")
     at_worst = f"at the worst point of the first (without --point: at all {len(assemble(study).points)}, which takes long)"
-    return [*lines, f"Why, and how far{f', {at_worst}' if worst else ''}: {question_command('explain', directory, worst)}"]
+    return [*lines, f"Causes and limits{f', {at_worst}' if worst else ''}: {question_command('explain', directory, worst)}"]
 
 
 def _write_paragraph(evaluator: Evaluator, solutions: pd.DataFrame, is_unsafe: pd.Series[bool], original: Evaluations, unsafe: Unsafe,
@@ -218,7 +218,7 @@ def failures_paragraph(system: System, original: Evaluations, smallest: FailureD
     sentence = _failure_in_words(characteristics, smallest)
     parts.append(f"{sentence[0].upper()}{sentence[1:]}")
     if smallest.robustness.borderline:
-        parts.append("None of the failures that were tried is robust." if robust is None else
+        parts.append("No failure tested is robust." if robust is None else
                      f"The robust failure with the fewest changes, {robust.name}: {_failure_in_words(characteristics, robust)}")
     return " ".join([*parts, *_avoided_shares_in_words(preventable)])
 

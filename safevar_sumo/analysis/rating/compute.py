@@ -163,9 +163,9 @@ class Rating:
             open_points += sum(matrix.points[2] for matrix in matrices) * len(open_layers) / len(layers)
         return round(open_points, DECIMALS)
 
-    def colour_changes(self, variant: RatedVehicle | None = None) -> list[tuple[Cell, str | None, str | None]]:
-        """Cells whose colour in a variant (default: `self.variant`) differs from the original's, with the original's and its colour."""
-        variant = variant or self.variant
+    def colour_changes(self) -> list[tuple[Cell, str | None, str | None]]:
+        """Cells whose colour in the variant differs from the original's, with the original's and the variant's colour."""
+        variant = self.variant
         if variant is None:
             return []
         cell_numbers = np.flatnonzero(self.original.scores.colours[0] != variant.scores.colours[0]).tolist()

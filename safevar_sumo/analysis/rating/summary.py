@@ -31,7 +31,7 @@ def summarise_rated_solutions(study: Study, solutions: pd.DataFrame, original: E
                 f"Points against each characteristic: {question_command('tolerance', directory)}"]
     characteristics = CharacteristicSet.of(study.vehicle.characteristics)
     lines = [f"The original vehicle earns {original_points:.2f} points. {int(has_loss.sum())} of "
-             f"{number_of(len(solutions), 'vehicle')} found lose at least one of them."]
+             f"{number_of(len(solutions), 'solution')} lose at least one point."]
     handle = None
     for choice, title in TITLES.items():
         handle = choose_handle(solutions, unsafe, choice, study.name)

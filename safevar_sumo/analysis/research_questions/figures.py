@@ -28,8 +28,8 @@ COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
 """Okabe and Ito's colours, which colour-blind readers can distinguish; each also has its own marker and line style."""
 MARKERS, DASHES = ("o", "X", "^", "s", "D", "v"), ("-", "--", "-.", ":", (0, (5, 1)), (0, (1, 1)))
 INCREASE_COLOUR, DECREASE_COLOUR = COLOURS[1], COLOURS[0]
-OBJECTIVE_TITLES = {"f_safe": "f_safe: safety degree [m, -m/s]", "f_diff": "f_diff: largest change [fraction of the original]",
-                    "f_num_diff": "f_numDiff: characteristics changed"}
+OBJECTIVE_TITLES = {F_SAFE.name: "f_safe: safety degree [m, -m/s]", F_DIFF.name: "f_diff: largest change [fraction of the original]",
+                    F_NUM_DIFF.name: "f_numDiff: characteristics changed"}
 LONGEST_NAME = 28
 """Number of letters of a name that fit above a small axis."""
 PANELS_PER_ROW = 3

@@ -40,10 +40,10 @@ def igd_plus(front: FloatArray, reference: FloatArray) -> float:
     return float(moocore.igd_plus(_check_points(front, "the front"), ref=_check_points(reference, "the reference front")))
 
 
-def hypervolume(front: FloatArray, worst: float = REFERENCE_COORDINATE) -> float:
-    """The volume between `front` and the point (worst, ..., worst)."""
+def hypervolume(front: FloatArray) -> float:
+    """The volume between `front` and the reference point."""
     points = _check_points(front, "the front")
-    return float(moocore.hypervolume(points, ref=np.full(points.shape[1], worst)))
+    return float(moocore.hypervolume(points, ref=np.full(points.shape[1], REFERENCE_COORDINATE)))
 
 
 class Scale(NamedTuple):
@@ -110,7 +110,11 @@ def compute_indicators(case: Case) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=["algorithm", "run", *MORE_IS_BETTER])
 
 
-def compute_convergence(case: Case, curve_points: int = 50) -> pd.DataFrame:
+CURVE_POINTS = 50
+"""Maximum number of points of a run's curve."""
+
+
+def compute_convergence(case: Case) -> pd.DataFrame:
     """The hypervolume of each run's settings after a number of evaluations; columns algorithm, run, evaluations, hypervolume.
 
     A run that ended early keeps its last hypervolume. The hypervolume is 0 as long as no setting dominates the reference point.
@@ -123,7 +127,7 @@ def compute_convergence(case: Case, curve_points: int = 50) -> pd.DataFrame:
     runs = [(algorithm, run) for algorithm in case.algorithms for run in case.runs_of(algorithm)]
     scale = Scale.of(reference_front(case))
     budget = case.study.search.evaluations
-    evaluation_counts = np.unique(np.linspace(min(case.study.search.population, budget), budget, curve_points).astype(int))
+    evaluation_counts = np.unique(np.linspace(min(case.study.search.population, budget), budget, CURVE_POINTS).astype(int))
     by_run = dict(list(case.evaluations.groupby(["algorithm", "run"])))
     frames = [pd.DataFrame({"algorithm": algorithm, "run": run, "evaluations": evaluation_counts,
                             "hypervolume": _hypervolumes_after(case, by_run[algorithm, run], scale, evaluation_counts)})

@@ -268,7 +268,7 @@ def _draw_vehicles(evaluator: Evaluator, model: VariationModel, unsafe: Unsafe, 
         number = min(largest_number, requested - offset)
         probabilities = rng.random((number, len(evaluator.characteristics))) if is_pilot else None
         settings = _draw_feasible_vehicles(evaluator, model, number, rng) if probabilities is None else model.settings(probabilities)
-        evaluations = evaluator.evaluate(settings, "vehicles as they vary", done_before=offset, total=requested)
+        evaluations = evaluator.evaluate(settings, "sampling vehicles", done_before=offset, total=requested)
         valid_vehicles = int(np.count_nonzero(evaluations.valid))
         counts.vehicles, counts.errors = counts.vehicles + valid_vehicles, counts.errors + number - valid_vehicles
         counts.failures += int(np.count_nonzero(unsafe.of(evaluations)))
@@ -346,7 +346,7 @@ def compute_sensitivities(evaluator: Evaluator, model: VariationModel, unsafe: U
     seed, names = evaluator.study.search.seed % 2**32, evaluator.characteristics.names
     problem = {"num_vars": len(names), "names": list(names), "bounds": [[0.0, 1.0]] * len(names)}
     points = sobol.sample(problem, BASE_POINTS, calc_second_order=False, seed=seed)
-    evaluations = evaluator.evaluate(model.settings(np.asarray(points)), "what decides")
+    evaluations = evaluator.evaluate(model.settings(np.asarray(points)), "sensitivity analysis")
     degree = np.where(evaluations.valid, evaluations.f_safe, np.nan)
     is_unsafe = np.where(evaluations.valid, unsafe.of(evaluations).astype(float), np.nan)
     if min(np.count_nonzero(is_unsafe == outcome) for outcome in (0, 1)) < MIN_OUTCOMES:

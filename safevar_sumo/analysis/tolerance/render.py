@@ -54,7 +54,8 @@ def first_losses_in_words(scan: OneAtATimeScan) -> str:
     least = min(kept for _, kept in scan.points or [])
     first = ("; it never costs a whole point" if whole_point is None else
              f"; the first point is lost at {whole_point:.5g}{characteristic.suffix}")
-    return f"{characteristic.name}: points are lost from {any_loss:.5g}{characteristic.suffix} on{first}; the fewest are {least:.2f}."
+    start = f"{characteristic.name}: points are lost from {any_loss:.5g}{characteristic.suffix} on"
+    return f"{start}{first}; the minimum is {least:.2f} points."
 
 
 def _box_in_words(result: Tolerance) -> str:
@@ -151,7 +152,11 @@ def _draw_profile(axis: Axes, scan: OneAtATimeScan, column: str) -> None:
     axis.locator_params(axis="x", nbins=4)
 
 
-def pairs_figure(result: Tolerance, most: int = 6) -> Figure:
+MAX_PAIRS_DRAWN = 6
+"""Maximum number of pairs in the figure."""
+
+
+def pairs_figure(result: Tolerance) -> Figure:
     """The planes of the worst pairs: with the largest unsafe share, or the lowest safety degree where nothing is unsafe.
 
     Raises
@@ -161,7 +166,7 @@ def pairs_figure(result: Tolerance, most: int = 6) -> Figure:
     """
     if not result.pairs:
         raise InputError("pairs", "there is no pair to draw", "at least two characteristics, evaluated in pairs")
-    worst = sorted(result.pairs, key=lambda pair: (-pair.unsafe_share, np.nanmin(pair.safety_degree)))[:most]
+    worst = sorted(result.pairs, key=lambda pair: (-pair.unsafe_share, np.nanmin(pair.safety_degree)))[:MAX_PAIRS_DRAWN]
     degrees = np.concatenate([pair.safety_degree.ravel() for pair in worst])
     title = f"{result.study.name}: the worst pairs (unsafe: {result.unsafe})"
     figure, axes = new_panels(title, len(worst), 3, (3.0, 2.4), min_width=4.6, title_height=1.1)
