@@ -182,7 +182,7 @@ def test_the_answer_takes_ten_lines_and_the_rest_is_asked_for(explained: Explain
     assert_tells_a_manager(short[2], explained)
     braking = explained.explanations[0].because.original.braking
     assert braking is not None
-    assert f"frames of 0.05 s, in which the vehicle covers {braking.speed * 0.05:.2f} m at {braking.speed:.1f} m/s" in full
+    assert f"decides every 0.05 s, in which the vehicle covers {braking.speed * 0.05:.2f} m at {braking.speed:.1f} m/s" in full
     assert re.search(r"max_rpm 5800 -> \d+ r/min", full), "28 r/min are no change at all: no decimals"
     assert not re.search(r"max_rpm 5800 -> \d+\.", full)
 
