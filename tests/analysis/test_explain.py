@@ -363,7 +363,7 @@ def test_the_paragraph_says_how_robust_the_changes_that_suffice_are_by_themselve
     finding = FailureDescription("rs:0:0", changes, "collision", -1.5, Robustness({0.05: 0.98}), 2, Robustness({0.05: 0.44}))
     original = evaluate(system, system.characteristics.original[None])
     paragraph = failures_paragraph(system, original, finding, finding, Preventability(counts={}, collisions=0))
-    assert "a collision at 5 km/h (robust: 98 % of" in paragraph.lower()
+    assert "a collision at 1.5 m/s, 5 km/h (robust: 98 % of" in paragraph.lower()
     assert "; two of them suffice (borderline: only 44 % of the neighbours are unsafe too)." in paragraph
 
 

@@ -245,7 +245,7 @@ def _original_ending_in_words(system: System, original: Evaluations) -> str:
 
 
 def _failure_in_words(characteristics: CharacteristicSet, failure: FailureDescription) -> str:
-    """A sentence such as `a collision at 5 km/h (robust: ...) was found with ten changes: ...; three of them suffice`."""
+    """A sentence such as `a collision at 1.5 m/s, 5 km/h (robust: ...) was found with ten changes: ...; three of them suffice`."""
     number, sufficient, effect = len(failure.changes), failure.sufficient_count, f"{_outcome_in_words(failure)} ({failure.robustness})"
     listed = _changes_in_words(characteristics, failure.changes)
     if sufficient < number:
@@ -272,9 +272,9 @@ def _outcome_in_words(failure: FailureDescription) -> str:
 
 
 def _speed_in_words(degree: float) -> str:
-    """The collision speed of a safety degree, in whole km/h or, below 3 km/h, with a decimal."""
+    """The collision speed of a safety degree in m/s, and in whole km/h or, below 3 km/h, with a decimal."""
     speed = -degree * KMH_PER_MS
-    return f"{speed:.{int(speed < 3)}f} km/h"
+    return f"{-degree:.1f} m/s, {speed:.{int(speed < 3)}f} km/h"
 
 
 def _changes_in_words(characteristics: CharacteristicSet, values: Mapping[str, float]) -> str:
