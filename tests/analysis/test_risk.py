@@ -14,8 +14,9 @@ import pytest
 from rich.console import Console
 
 from safevar_sumo import risk
-from safevar_sumo.analysis.risk.compute import Risk, VariationModel
+from safevar_sumo.analysis.risk.compute import Risk
 from safevar_sumo.analysis.risk.render import print_risk
+from safevar_sumo.analysis.risk.variation import VariationModel
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import FloatArray
 from safevar_sumo.study import load_study
