@@ -2,7 +2,7 @@
 
 from safevar_sumo.errors import refuse_other_than_file
 from safevar_sumo.study.constraints import Constraint
-from safevar_sumo.study.file import check_writable, load_study, upgrade_tables, write_study
+from safevar_sumo.study.file import load_study, upgrade_tables, write_study
 from safevar_sumo.study.schema import (
     DESCRIPTION_KEYS,
     OBJECTIVES,
@@ -34,5 +34,5 @@ from safevar_sumo.study.validation import convert_table, error_with_key
 __all__ = [
     "DESCRIPTION_KEYS", "OBJECTIVES", "SAFETY_DEGREE", "CharacteristicTable", "Constraint", "FitTable", "FreeParameter", "MatrixTable",
     "MatrixTest", "MetricsTable", "ModelTable", "Origin", "RatingTable", "SearchTable", "Study", "StudyLike", "VehicleTable",
-    "Weather", "check_writable", "convert_table", "error_with_key", "fmus_of", "label_of", "load_study", "refuse_other_than_file",
+    "Weather", "convert_table", "error_with_key", "fmus_of", "label_of", "load_study", "refuse_other_than_file",
     "study_names", "study_path", "tables_of", "upgrade_tables", "user_code_names", "user_code_packages", "write_study"]

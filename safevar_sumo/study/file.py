@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import tomllib
 from collections.abc import Mapping
@@ -11,7 +12,8 @@ from typing import Any, NamedTuple
 import msgspec
 import tomli_w
 
-from safevar_sumo.errors import InputError, refuse_other_than_file
+from safevar_sumo.errors import InputError
+from safevar_sumo.output import unwritable, whole_file
 from safevar_sumo.shipped import STUDIES
 from safevar_sumo.study.schema import NAME_PATTERN, Origin, SearchTable, Study, StudyLike, is_file, study_path, tables_of
 from safevar_sumo.study.validation import contradictions, convert_table, raise_mistakes, unusable_values
@@ -128,7 +130,8 @@ def _read_file(path: Path, visited_paths: tuple[Path, ...]) -> _RawStudy:
     except OSError as error:
         raise InputError(path, f"cannot be read: {error.strerror}") from None
     folders = () if path.parent == STUDIES else (str(path.resolve().parent),)
-    return _with_base(_RawStudy(path, tables, Origin(called=str(path) if folders else "", places=folders)), path, visited_paths)
+    origin = Origin(called=str(path) if folders else "", places=folders, files=(os.path.abspath(path),) if folders else ())
+    return _with_base(_RawStudy(path, tables, origin), path, visited_paths)
 
 
 def _with_base(raw: _RawStudy, path: Path, visited_paths: tuple[Path, ...]) -> _RawStudy:
@@ -151,7 +154,8 @@ def _with_base(raw: _RawStudy, path: Path, visited_paths: tuple[Path, ...]) -> _
     merged_study = _with_overrides(base_study, tables, raw.source)
     folders = tuple(dict.fromkeys((*raw.origin.places, *base_study.origin.places)))
     remarks = () if path.parent == STUDIES else merged_study.origin.remarks  # shipped studies leave keys out on purpose
-    origin = msgspec.structs.replace(merged_study.origin, called=raw.origin.called, places=folders, remarks=remarks)
+    origin = msgspec.structs.replace(merged_study.origin, called=raw.origin.called, places=folders, remarks=remarks,
+                                     files=(*raw.origin.files, *base_study.origin.files))
     return merged_study._replace(origin=origin)
 
 
@@ -216,25 +220,7 @@ def write_study(path: Path, study: Study, comment: str) -> None:
     lines = ("".join(character if character.isprintable() else "?" for character in line) for line in comment.splitlines())
     text = "".join(f"# {line}".rstrip() + "\n" for line in lines) + "\n" + tomli_w.dumps(tables)
     try:
-        path.write_text(text, encoding="utf-8")
+        with whole_file(path) as file:
+            file.write_text(text, encoding="utf-8")
     except OSError as error:
-        raise InputError("out", f"cannot write {path}: {error.strerror}", "a file in a directory that exists") from None
-
-
-def check_writable(path: Path, source: str = "out") -> None:
-    """Refuse an output file that cannot be written, before the work begins.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be written.
-    """
-    try:
-        refuse_other_than_file(path, source, streams=True)
-        is_new = not path.exists()
-        with path.open("a"):
-            pass
-        if is_new:
-            path.unlink()
-    except OSError as error:
-        raise InputError(source, f"cannot write {path}: {error.strerror}", "a file in a directory that exists") from None
+        raise unwritable(path, "out", error) from None
