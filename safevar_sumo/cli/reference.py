@@ -112,8 +112,10 @@ def import_command(study: str, out: Path, original: str | None, **paths: Path | 
     solutions = {}
     for algorithm, path in files.items():
         solutions[algorithm] = evaluations_of(read_rows(path, characteristics), characteristics)
-    write_imported(out, loaded_study, solutions, metrics, {algorithm: path.name for algorithm, path in files.items()})
+    replaced_counts = write_imported(out, loaded_study, solutions, metrics, {algorithm: path.name for algorithm, path in files.items()})
     click.echo(f"Results: {out}, {', '.join(f'{len(rows)} solutions of {name}' for name, rows in solutions.items())}")
+    for name, count in replaced_counts.items():
+        click.echo(f"note: they replace {count} solutions of {name} of an earlier import", err=True)
 
 
 def read_rows(path: Path, characteristics: CharacteristicSet) -> ReferenceData:
