@@ -11,7 +11,6 @@ import msgspec
 import numpy as np
 from rich.console import Console
 
-from safevar_sumo.analysis.parameters import FITTED_TABLES
 from safevar_sumo.cli.arguments import PICTURE_ENDINGS, check_output, complete_study, refuse_overwriting
 from safevar_sumo.cli.program import commands
 from safevar_sumo.cli.reference import read_rows
@@ -22,7 +21,7 @@ from safevar_sumo.output import check_writable
 from safevar_sumo.reference import Calibration, FitSubject, calibrate, calibrate_together
 from safevar_sumo.reference.fit_result import rename_fitted
 from safevar_sumo.reference.profiles import plot_profiles
-from safevar_sumo.study import Study, load_study, study_names, write_study
+from safevar_sumo.study import FITTED_TABLES, Study, load_study, study_names, write_study
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.terminal import WholeTable, print_text, show_stages
 from safevar_sumo.workers.identity import input_files

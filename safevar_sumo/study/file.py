@@ -15,6 +15,7 @@ import tomli_w
 from safevar_sumo.errors import InputError
 from safevar_sumo.output import unwritable, whole_file
 from safevar_sumo.shipped import STUDIES
+from safevar_sumo.study.fitted import contradictions_of_file
 from safevar_sumo.study.schema import NAME_PATTERN, Origin, SearchTable, Study, StudyLike, is_file, study_path, tables_of
 from safevar_sumo.study.validation import contradictions, convert_table, raise_mistakes, unusable_values
 
@@ -140,6 +141,7 @@ def _with_base(raw: _RawStudy, path: Path, visited_paths: tuple[Path, ...]) -> _
     tables = dict(raw.tables)
     base = tables.pop("extends", None)
     if base is None:
+        raise_mistakes(contradictions_of_file(raw.source, tables, tables))
         return raw
     if not isinstance(base, str):
         raise InputError(raw.source, f"extends = {base!r}", "the name or path of a study")
@@ -175,6 +177,7 @@ def _with_overrides(base: _RawStudy, overrides: Mapping[str, Any], source: objec
             differences = " and a different ".join("ADS" if key == "ads" else key for key in changed_keys)
             remarks = (*remarks, f"{source}: has a different {differences} than study {base.tables.get('name')!r}, so "
                                  f"it does not inherit that study's {' and '.join(f'[{key}]' for key in omitted_keys)}")
+    raise_mistakes(contradictions_of_file(source, overrides, tables))
     return _RawStudy(source, tables, msgspec.structs.replace(base.origin, remarks=remarks))
 
 

@@ -192,8 +192,8 @@ class Origin(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The files of a study; results do not depend on them.
 
     `called` is the study's path as given on the command line, empty if the study was given by its name; `places` are the folders of its
-    file and of the files that it extends, where user code is looked up first; `files` are those
-    that are not shipped; `remarks` are for the user.
+    file and of the files that it extends, where user code is looked up first; `files` are those of these files that are not shipped;
+    `remarks` are for the user.
     """
 
     called: str = ""

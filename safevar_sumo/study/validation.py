@@ -16,7 +16,7 @@ from msgspec import Struct
 
 from safevar_sumo.errors import InputError, did_you_mean, one_of, unknown_name
 from safevar_sumo.study.constraints import constraint_mistakes
-from safevar_sumo.study.schema import CharacteristicTable, Origin, Study
+from safevar_sumo.study.schema import FMU_KEYS, CharacteristicTable, Origin, Study
 from safevar_sumo.study.variation import variation_mistakes
 
 T = TypeVar("T")
@@ -120,7 +120,7 @@ def _record_types(kind: Any) -> list[Any]:
 
 def _unknown_choice(source: object, key_path: str, value: object, names: Iterable[str]) -> InputError:
     """The error for a value that is none of `names`; "" among the names means that the key may be omitted."""
-    problem = f"{key_path} is missing" if value is None else f"{key_path} = {_short_text(value)}"
+    problem = f"{key_path} is missing" if value is None else f"{key_path} = {short_text(value)}"
     return unknown_name(source, problem, value, filter(None, names), ", or no such key" * ("" in names))
 
 
@@ -139,7 +139,7 @@ def error_with_key(source: object, raw: object, error: msgspec.ValidationError, 
         value = value[key] if exists and isinstance(value, dict) else None
     key_path = ".".join([*([prefix] if prefix else []), *keys])
     if exists and key_path:
-        text = f"{key_path} is a table" if isinstance(value, dict) else f"{key_path} = {_short_text(value)}"
+        text = f"{key_path} is a table" if isinstance(value, dict) else f"{key_path} = {short_text(value)}"
         return InputError(source, text, _expectation(problem))
     return InputError(source, f"{key_path}: {problem}" if key_path else problem)
 
@@ -155,7 +155,8 @@ def _expectation(problem: str) -> str:
                   expected)
 
 
-def _short_text(value: object) -> str:
+def short_text(value: object) -> str:
+    """A value as an error quotes it."""
     try:
         text = repr(value)
     except ValueError:  # an integer of more digits than Python prints
@@ -202,6 +203,7 @@ def contradictions(source: object, study: Study) -> Iterator[InputError]:
         yield InputError(source, "vehicle.characteristics: none", "at least one")
     for name, row in characteristics.items():
         yield from _characteristic_mistakes(source, f"vehicle.characteristics.{name}", row)
+    yield from _keys_of_fmus(source, study)
     yield from variation_mistakes(source, characteristics, study.variation, study.correlations)
     yield from constraint_mistakes(source, characteristics, study.constraints)
     for name, bounds in study.calibration.items():
@@ -223,6 +225,15 @@ def contradictions(source: object, study: Study) -> Iterator[InputError]:
     for name, value in study.published.items():
         if value == 0:
             yield InputError(source, f"published.{name} = 0", "a number other than 0")
+
+
+def _keys_of_fmus(source: object, study: Study) -> Iterator[InputError]:
+    """Errors for keys of FMUs in tables of models that are none."""
+    for name, table in (("vehicle", study.vehicle), ("ads", study.ads), ("scenario", study.scenario)):
+        for key in FMU_KEYS if name == "scenario" else FMU_KEYS[1:] if table.kind != "fmu" else ():
+            if getattr(table, key, None):
+                yield InputError(source, f"{name}.{key}: {table.model!r} is no FMU",
+                                 "no such key" if name == "scenario" else f'no such key, or {name}.kind = "fmu"')
 
 
 def _characteristic_mistakes(source: object, key: str, row: CharacteristicTable) -> Iterator[InputError]:

@@ -93,6 +93,9 @@ def measuring_of(study: Study, lookup: Lookup) -> Measuring:
         return record
 
     for name in study.metrics.also:
+        if name in METRICS:
+            raise InputError(lookup.source, f"metrics.also = {study.metrics.also}: every study has {name!r}",
+                             f"{one_of(OPTIONAL_METRICS)}, or package.module:Name")
         look_up(name, "metrics.also")
     names = [METRIC_OF_OBJECTIVE[name].name if name in METRIC_OF_OBJECTIVE else name for name in study.search.objectives]
     objectives = [_objective_of(look_up(name, OBJECTIVES_KEY)) for name in names]
@@ -206,9 +209,12 @@ def _assemble(study: Study, source: str) -> System:
     is_shipped_vehicle = models.members[0].guard is None
     _check_units(study, models.vehicle, is_shipped_vehicle, source)
     measuring = measuring_of(study, Lookup(source, study.origin.places))
-    for name in study.published:
-        if name not in measuring.metrics:
-            raise unknown_name(source, f"published.{name} is no metric", name, measuring.metrics)
+    tables_by_metric = {"published": study.published, "repeatability": study.repeatability, "model_error": study.model_error,
+                        "fit.weights": study.fit.weights}
+    for key, table in tables_by_metric.items():
+        for name in table:
+            if name not in measuring.metrics:
+                raise unknown_name(source, f"{key}.{name} is no metric", name, measuring.metrics)
     rater = rater_of(study, source)
     matrix = _matrix_points(study if rater is None else expand_protocol(study, models.weather), source)
     for network in dict.fromkeys(scenario.network for scenario in (models.scenario, *(point.scenario for point in matrix))):
