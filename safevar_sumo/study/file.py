@@ -116,8 +116,6 @@ def _with_algorithms(tables: dict[str, Any]) -> dict[str, Any]:
 
 def _read_file(path: Path, visited_paths: tuple[Path, ...]) -> _RawStudy:
     """Read a TOML file and the study that it `extends`; keys of the file override that study, table by table."""
-    if path in visited_paths:
-        raise InputError(path, f"extends = {path.stem!r} leads back to this file", "a study that does not extend this one")
     try:
         tables = tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except tomllib.TOMLDecodeError as error:
@@ -152,6 +150,9 @@ def _with_base(raw: _RawStudy, path: Path, visited_paths: tuple[Path, ...]) -> _
         base_path = sibling if is_file(sibling) else study_path(base)
     except InputError as error:
         raise InputError(raw.source, f"extends = {base!r}: {error.problem}", error.legal) from None
+    if base_path in (*visited_paths, path):
+        raise InputError(raw.source, f"extends = {base!r} leads back to {'this file' if base_path == path else base_path}",
+                         "a study that does not extend this one")
     base_study = _read_file(base_path, (*visited_paths, path))
     merged_study = _with_overrides(base_study, tables, raw.source)
     folders = tuple(dict.fromkeys((*raw.origin.places, *base_study.origin.places)))

@@ -62,7 +62,8 @@ def mistakes(source: object, raw: Any, kind: Any, key_path: str = "") -> Iterato
             if name in raw:
                 yield from mistakes(source, raw[name], field.type, _path_within(key_path, name))
             elif field.required:
-                yield InputError(source, f"{_path_within(key_path, name)} is missing")
+                model = f", for model = {short_text(raw['model'])}" if "model" in raw else ""
+                yield InputError(source, f"{_path_within(key_path, name)} is missing{model}")
     elif get_origin(kind) is dict and isinstance(raw, Mapping):
         for key, value in raw.items():
             inner_path, missing_keys = _path_within(key_path, str(key)), _missing_keys(value, get_args(kind)[1])
@@ -102,7 +103,7 @@ def _unknown_key(source: object, key_path: str, key: str, fields: Iterable[str])
     """The error for an unknown key: it suggests tables of a study that have this key, else the nearest known key."""
     tables = {name: _record_types(field.type) for name, field in _fields(Study).items() if get_origin(field.type) not in (dict, list)}
     known_paths = [f"{name}.{key}" for name, kinds in tables.items() if any(key in _fields(kind) for kind in kinds)]
-    if known_paths:
+    if known_paths and "[" not in key_path:
         return InputError(source, f"{key_path}: there is no such key; did you mean {' or '.join(known_paths)}?", one_of(fields))
     return unknown_name(source, f"{key_path}: there is no such key", key, fields)
 
@@ -132,12 +133,13 @@ def _path_within(key_path: str, key: str) -> str:
 def error_with_key(source: object, raw: object, error: msgspec.ValidationError, prefix: str = "") -> InputError:
     """Turn msgspec's error on `raw` into an error that names the key and its value."""
     problem, _, location = str(error).partition(" - at `$")
-    keys = [key for key in location.rstrip("`").replace("[...]", "").split(".") if key]
-    value, exists = raw, True
-    for key in keys:
-        exists = exists and isinstance(value, dict) and key in value
-        value = value[key] if exists and isinstance(value, dict) else None
-    key_path = ".".join([*([prefix] if prefix else []), *keys])
+    key_path, value, exists = prefix, raw, True
+    for index, key in re.findall(r"\[(\d+)\]|([^.\[\]]+)", location.rstrip("`").replace("[...]", "")):
+        key_path = f"{key_path}[{index}]" if index else ".".join(filter(None, (key_path, key)))
+        try:
+            value = value[int(index) if index else key]  # type: ignore[index]
+        except (KeyError, IndexError, TypeError):
+            exists = False
     if exists and key_path:
         text = f"{key_path} is a table" if isinstance(value, dict) else f"{key_path} = {short_text(value)}"
         return InputError(source, text, _expectation(problem))

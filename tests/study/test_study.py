@@ -113,6 +113,8 @@ def test_a_bad_study_is_refused_with_file_key_and_value(tmp_path: Path, old: str
     ('extends = "euro_ncap_rating"\n[rating.claims]\nCCRs = [3]', "rating.claims.CCRs[0] = 3\nexpected: a text"),
     ('[rating.claims]\nCCRs = ["glare"]', "rating.claims: the study is not rated\nexpected: matrix.protocol"),
     ("search = 3", "search = 3"),
+    ('[vehicle]\nmodel = "tesla"', "vehicle.characteristics is missing, for model = 'tesla'"),
+    ('extends = "mine.toml"\n', "extends = 'mine.toml' leads back to this file\nexpected: a study that does not extend"),
     ('[weather]\nname = "x"\nroad_friction = 1\nvisibility = 1\nhesitation = 0.3\n[ads.parameters]\nhesitation = 0.1',
      "weather.hesitation = 0.3 and ads.parameters.hesitation = 0.1\nexpected: ads.parameters.hesitation alone"),
     ('weather = { name = "x", road_friction = 1, visibility = 1, hesitation = [] }', "weather.hesitation = []\nexpected: a number"),
@@ -141,9 +143,11 @@ def test_an_unusable_value_is_refused_by_its_key(text: str, expected: str, tmp_p
     ("[model_error]\nsafety_degre = 1", "model_error.safety_degre is no metric; did you mean 'safety_degree'?"),
     ("[repeatability]\nfoo = 1", "repeatability.foo is no metric\nexpected: one of ave_dece"),
     ("[fit.weights]\ntett = 1", "fit.weights.tett is no metric; did you mean 'tet'?"),
+    ("[ads.parameters]\nthrottle = [true, 0.2, 0.3]", "ads.parameters.throttle[0] = True\nexpected: a number"),
+    ('[scenario.parameters]\nnetwork = "nope"', "mine.toml: scenario.parameters.network: there is no network 'nope'"),
     ('[metrics]\nalso = ["tet"]', "metrics.also = ['tet']: every study has 'tet'\nexpected: one of brake_harshness"),
 ])
-def test_a_metric_that_the_study_does_not_have_is_refused(text: str, expected: str, tmp_path: Path) -> None:
+def test_a_value_that_a_model_refuses_is_named(text: str, expected: str, tmp_path: Path) -> None:
     (tmp_path / "mine.toml").write_text(f'extends = "smoke"\n{text}\n')
     with pytest.raises(InputError) as caught:
         assemble(load_study(str(tmp_path / "mine.toml")))
