@@ -74,7 +74,8 @@ def calibrate_command(study: str, words: tuple[str, ...], trials: int | None, se
 
     def save_best(ending: str) -> list[InputError | None]:
         comment = f"Best of {trials_done} of {max_trials} trials, {ending} (seed {studies[0].fit.seed}). Loss {least_loss:.4f}."
-        return _write_studies(targets, studies, best_studies, [comment] * len(studies))
+        fitted = [msgspec.structs.replace(item, spread={}, model_error={}) for item in best_studies]  # those of the values before the fit
+        return _write_studies(targets, studies, fitted, [comment] * len(studies))
 
     def after_trial(loss: float, best: Study | tuple[Study, ...]) -> None:
         nonlocal trials_done, least_loss, best_studies, last_save

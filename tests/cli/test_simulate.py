@@ -74,13 +74,13 @@ def test_an_output_that_fails_leaves_the_old_file_and_no_new_one(in_tmp: Path, m
 
 
 def test_an_output_replaces_no_file_that_the_study_is_made_of(in_tmp: Path) -> None:
-    Path("my_ads.py").write_text("from safevar_sumo.ads import ScalarAds\nfrom my_numbers import BRAKE\n\n\n"
+    Path("my_braking.py").write_text("from safevar_sumo.ads import ScalarAds\nfrom my_numbers import BRAKE\n\n\n"
                                  "class Mine(ScalarAds):\n    def drive(self, seen):\n        return (0.0, BRAKE)\n")
     Path("my_numbers.py").write_text("BRAKE = 1.0\n")
     shutil.copytree(NETWORKS / "pedestrian_crossing", "my_net")
-    Path("base.toml").write_text('extends = "sun"\n[ads]\nmodel = "my_ads:Mine"\n[scenario.parameters]\nnetwork = "my_net"\n')
+    Path("base.toml").write_text('extends = "sun"\n[ads]\nmodel = "my_braking:Mine"\n[scenario.parameters]\nnetwork = "my_net"\n')
     Path("child.toml").write_text('extends = "base.toml"\n')
-    files = ["child.toml", "base.toml", "my_ads.py", "my_numbers.py", "my_net/traffic.rou.xml", "my_net/network.edg.xml"]
+    files = ["child.toml", "base.toml", "my_braking.py", "my_numbers.py", "my_net/traffic.rou.xml", "my_net/network.edg.xml"]
     contents = {file: Path(file).read_bytes() for file in files}
     for file in files:
         refused("simulate", "child.toml", "--trace", file, message=("--trace", file, "an input of the command"))
