@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from safevar_sumo.errors import InputError
+from safevar_sumo.output import WRITABLE, whole_file
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -59,11 +60,11 @@ def save(figure: Figure, path: Path, source: str = "out") -> None:
     import matplotlib
 
     try:
-        with matplotlib.rc_context({"svg.hashsalt": "safevar_sumo"}):
-            figure.savefig(path, dpi=DPI, metadata=PICTURE_METADATA.get(path.suffix.lower()))
+        with matplotlib.rc_context({"svg.hashsalt": "safevar_sumo"}), whole_file(path) as file:
+            figure.savefig(file, dpi=DPI, metadata=PICTURE_METADATA.get(path.suffix.lower()))
     except (OSError, ValueError) as error:
         raise InputError(source, f"cannot write {path}: {getattr(error, 'strerror', None) or error}",
-                         "a file that ends in .png, .pdf or .svg, in a directory that can be written") from None
+                         f"{WRITABLE}; its name ends in .png, .pdf or .svg") from None
 
 
 def escape_dollars(name: str) -> str:

@@ -11,7 +11,7 @@ import numpy as np
 from safevar_sumo.analysis.parameters import value_of, with_values
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import Evaluations, FloatArray, finite_or_none
-from safevar_sumo.study import SAFETY_DEGREE, Study
+from safevar_sumo.study import ROUNDING_TOLERANCE, SAFETY_DEGREE, Study
 from safevar_sumo.sumo.matrix import evaluate, system_at_point
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet
@@ -22,8 +22,6 @@ HALF_WIDTH = 1.645
 """Half width [standard deviations] of the interval around the mean that holds `BAND_SHARE` of a normal distribution."""
 LEAST_DISTANCE = 0.3
 """Distance [domain widths] that the model's error assumes of nearer vehicles: near the original too, a decision may fall a frame off."""
-ROUNDING_TOLERANCE = 1e-5
-"""Relative tolerance within which a parameter's value in the study equals its (rounded) value in the first set of [spread]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -102,7 +100,8 @@ def prediction_band(safety_degrees: FloatArray, repeatability: float, error: Flo
 
 def evaluate_sets(study: Study, settings: FloatArray, point: str = "") -> list[Evaluations]:
     """Evaluate settings, shape (M, n), in this process with each parameter set, first with the study's values."""
-    systems = [assemble(variant) for variant in studies_of_sets(study)]
+    systems = [assemble(variant, study.source if k == 0 else f"{study.source}: spread: set {k}")
+               for k, variant in enumerate(studies_of_sets(study))]
     return [evaluate(system_at_point(system, point, source="point") if point else system, settings) for system in systems]
 
 
@@ -117,6 +116,6 @@ def studies_of_sets(study: Study) -> list[Study]:
     if not study.spread:
         raise InputError(study.source, "has no table [spread]", "a study that `calibrate` has fitted, such as sun or rain")
     values_of_sets = {key: values for key, values in study.spread.items()
-                      if np.isclose(value_of(study, key), values[0], rtol=ROUNDING_TOLERANCE, atol=0)}
+                      if np.isclose(value_of(study, key, "spread"), values[0], rtol=ROUNDING_TOLERANCE, atol=0)}
     set_count = len(next(iter(study.spread.values())))
-    return [study, *(with_values(study, {key: values[k] for key, values in values_of_sets.items()}) for k in range(1, set_count))]
+    return [study, *(with_values(study, {key: values[k] for key, values in values_of_sets.items()}, "spread") for k in range(1, set_count))]

@@ -44,7 +44,7 @@ def algorithm_of(label: str, study: Study) -> Algorithm:
         raise InputError(source, f"search.algorithms = {search.algorithms}: two have the same name", "algorithms with different names")
     for table in search.parameters:
         if table not in ALGORITHMS and table not in search.labels:
-            legal = [*SearchTable.__struct_fields__, *ALGORITHMS, *search.labels]
+            legal = dict.fromkeys((*SearchTable.__struct_fields__, *ALGORITHMS, *search.labels))
             raise unknown_name(source, f"search.{table}: there is no such key and no such algorithm", table, legal)
     member = algorithm_class(name, study)
     with guard_process_state(source, [name] if member.guard else []):

@@ -13,8 +13,9 @@ import numpy as np
 from click.shell_completion import CompletionItem
 
 from safevar_sumo.errors import InputError, SafevarError, unknown_name
+from safevar_sumo.output import check_writable
 from safevar_sumo.records import FloatArray
-from safevar_sumo.study import check_writable, load_study, study_names, unit_text
+from safevar_sumo.study import load_study, study_names, unit_text
 from safevar_sumo.vehicles import CharacteristicSet
 
 PICTURE_ENDINGS = (".png", ".pdf", ".svg")

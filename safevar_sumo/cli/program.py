@@ -40,7 +40,7 @@ COMMANDS = {
     "import": ("reference", "Import published CSV solutions as a results directory."),
     "validate": ("reference", "Compare a study with reference data, row by row."),
     "replicate": ("reference", "Compare whole studies with published ones: tables, and which conclusions hold."),
-    "calibrate": ("reference", "Fit a study's free parameters to reference data."),
+    "calibrate": ("calibrate", "Fit a study's free parameters to reference data."),
 }
 """Each command's module in this folder and its sentence in the help, in the order of the help."""
 
@@ -142,8 +142,9 @@ def main() -> None:
         _discard_output()
         _exit_program(1)
     except OSError as error:
+        place = error.filename or ("standard output" if _output_fails() else "")
         _discard_output()
-        _exit_with_error(f"{error.strerror or error}{f': {error.filename}' if error.filename else ''}", 1)
+        _exit_with_error(f"{error.strerror or error}{f': {place}' if place else ''}", 1)
     _exit_program(code if isinstance(code, int) else 0)
 
 
@@ -188,6 +189,15 @@ def _ensure_standard_streams() -> None:
 def _discard_output() -> None:
     """Discard output after the reader of a pipe has closed it, so that the interpreter does not flush it again."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def _output_fails() -> bool:
+    """Whether standard output does not even take an end of line."""
+    try:
+        os.write(sys.stdout.fileno(), b"\n")
+    except OSError:
+        return True
+    return False
 
 
 def _exit_with_error(message: str, code: int) -> None:

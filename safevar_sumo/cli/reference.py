@@ -1,4 +1,4 @@
-"""Commands that compare studies with published data (validate, calibrate, import, replicate), and the text that they print."""
+"""Commands that compare studies with published data (validate, import, replicate), and the text that they print."""
 
 from __future__ import annotations
 
@@ -7,11 +7,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import click
-import msgspec
 import numpy as np
 from rich.console import Console
 
-from safevar_sumo.analysis.parameters import FITTED_TABLES
 from safevar_sumo.analysis.research_questions.case import Case, load_cases
 from safevar_sumo.analysis.words import two_decimals
 from safevar_sumo.cli.arguments import PICTURE_ENDINGS, check_output, complete_study, refuse_overwriting
@@ -19,16 +17,13 @@ from safevar_sumo.cli.program import StrictCommand, commands, print_remarks
 from safevar_sumo.cli.target import jobs_option, json_option
 from safevar_sumo.errors import InputError, SimulationError
 from safevar_sumo.metrics import METRICS
+from safevar_sumo.output import check_writable
 from safevar_sumo.progress import show_counting_bar
 from safevar_sumo.records import Evaluations
 from safevar_sumo.reference import (
     Agreement,
-    Calibration,
     Effect,
-    FitSubject,
     ReferenceData,
-    calibrate,
-    calibrate_together,
     effects_of,
     evaluations_of,
     measure_agreement,
@@ -40,13 +35,11 @@ from safevar_sumo.reference import (
 )
 from safevar_sumo.reference.conclusions import pair_cases
 from safevar_sumo.reference.effects import ABSOLUTE_TOLERANCE, RELATIVE_TOLERANCE
-from safevar_sumo.reference.fit_result import rename_fitted
-from safevar_sumo.reference.profiles import plot_profiles
 from safevar_sumo.reference.replication import Nearness, compare_with_nearest_rows, render_replication
 from safevar_sumo.results import MANIFEST, write_imported, write_whole
-from safevar_sumo.study import SAFETY_DEGREE, Study, check_writable, load_study, study_names, write_study
+from safevar_sumo.study import SAFETY_DEGREE, Study, load_study
 from safevar_sumo.sumo.system import assemble
-from safevar_sumo.terminal import WholeTable, print_text, show_stages
+from safevar_sumo.terminal import WholeTable
 from safevar_sumo.vehicles import CharacteristicSet
 from safevar_sumo.workers.batches import evaluate_all
 from safevar_sumo.workers.local import available_cores, local_pool
@@ -72,7 +65,7 @@ def validate(study: str, reference: Path, jobs: int | None, plot: Path | None, a
         check_output(plot, "--plot", PICTURE_ENDINGS)
     if totals is not None:
         check_output(totals, "--totals", (".toml",))
-    data = _read_rows(reference, system.characteristics)
+    data = read_rows(reference, system.characteristics)
     settings = np.concatenate([system.characteristics.original[np.newaxis], data.settings])
     with (local_pool(jobs or available_cores(), loaded_study.search.time_limit) as pool,
           show_counting_bar(Console(stderr=True), "settings", len(np.unique(settings, axis=0))) as count_settings):
@@ -100,107 +93,6 @@ def validate(study: str, reference: Path, jobs: int | None, plot: Path | None, a
             Console().print(str(coverage))
 
 
-@commands.command(name="calibrate")
-@click.argument("study", shell_complete=complete_study)
-@click.argument("words", nargs=-1, metavar="[STUDY]... [[STUDY=]REFERENCE.csv]...")
-@click.option("--trials", type=click.IntRange(min=1), help="Number of parameter sets to try.  [default: the first study's]")
-@click.option("--seed", type=click.IntRange(min=0, max=2**31), help="Seed of the search.  [default: the first study's]")
-@click.option("--starts", type=click.IntRange(min=0, max=1000), help="Number of additional random starts.  [default: the first study's]")
-@click.option("--from-scratch", is_flag=True, help="Start only from random points, not from the values in the studies.")
-@jobs_option
-@click.option("--plot", type=click.Path(path_type=Path), metavar="FILE.png", help="Draw the loss over every parameter.")
-@click.option("--out", type=click.Path(path_type=Path), metavar="FILE.toml",
-              help="Study file to write; for several studies, the directory for their files.  [default: STUDY-calibrated.toml]")
-def calibrate_command(study: str, words: tuple[str, ...], trials: int | None, seed: int | None, starts: int | None,
-                      from_scratch: bool, jobs: int | None, plot: Path | None, out: Path | None) -> None:
-    """Fit the parameters under [calibration] of STUDY to published values and to rows of reference files, as [fit] says.
-
-    Several studies are fitted together: they share each parameter to which they give the same value, unless [calibration] marks it as
-    a study's own. STUDY=FILE.csv assigns a reference file to a study; otherwise the file's name must begin with the study's name.
-    """
-    names = [study, *(word for word in words if _is_study(word))]
-    files = [word for word in words if not _is_study(word)]
-    fit_options = {name: value for name, value in (("trials", trials), ("seed", seed), ("starts", starts)) if value is not None}
-    studies = [msgspec.structs.replace(item, fit=msgspec.structs.replace(item.fit, **fit_options)) for item in map(load_study, names)]
-    systems = [assemble(item, name) for item, name in zip(studies, names, strict=True)]
-    if len({item.name for item in studies}) < len(studies):
-        raise InputError("STUDY", f"two studies are called {studies[0].name!r}", "studies of different names")
-    targets = _choose_targets(studies, out)
-    if plot is not None:
-        check_output(plot, "--plot", PICTURE_ENDINGS)
-    owners = [_find_owner(file, studies) for file in files]
-    for source in (*map(Path, names), *(path for _, path in owners)):
-        for target in targets:
-            if target.exists() and source.exists() and target.samefile(source):
-                raise InputError("--out", f"{target} is an input of the calibration", "another file")
-    for target in targets:
-        check_writable(target)
-    if len({path.name for _, path in owners}) < len(owners):
-        raise InputError("REFERENCE.csv", "two files have the same name", "files of different names")
-    data = [{path.name: _read_rows(path, system.characteristics) for owner, path in owners if owner == index}
-            for index, system in enumerate(systems)]
-    trials_done, least_loss, best_studies = 0, np.inf, tuple(studies)
-    max_trials = studies[0].fit.trials
-    try:
-        with (local_pool(jobs or available_cores(), max(item.search.time_limit for item in studies)) as pool,
-              show_stages(Console(stderr=True)) as show_progress):
-            show_progress("trials", 0, max_trials)
-
-            def after_trial(loss: float, best: Study | tuple[Study, ...]) -> None:
-                nonlocal trials_done, least_loss, best_studies
-                trials_done, least_loss, best_studies = trials_done + 1, loss, best if isinstance(best, tuple) else (best,)
-                show_progress(f"trials, lowest loss {loss:.4f}", trials_done, max_trials)
-
-            if len(studies) == 1:
-                calibrations = [calibrate(studies[0], data[0], pool, after_trial, from_scratch=from_scratch)]
-            else:
-                subjects = [FitSubject(item, references) for item, references in zip(studies, data, strict=True)]
-                calibrations = calibrate_together(subjects, pool, after_trial, from_scratch=from_scratch)
-    except KeyboardInterrupt:
-        if trials_done:
-            comment = f"Best of {trials_done} of {max_trials} trials, then interrupted (seed {studies[0].fit.seed}). Loss {least_loss:.4f}."
-            for item, best_study, target in zip(studies, best_studies, targets, strict=True):
-                write_study(target, rename_fitted(item, best_study), comment)
-            click.echo(f"interrupted: the best of {trials_done} trials is in {', '.join(map(str, targets))}", err=True)
-        raise
-    if plot is not None and calibrations[0].profiles is not None:
-        plot_profiles(plot, calibrations[0].profiles, studies)
-    for item, calibration, references, target in zip(studies, calibrations, data, targets, strict=True):
-        print_calibration(Console(), item, calibration)
-        write_study(target, rename_fitted(item, calibration.study), calibration.comment(item, references, from_scratch=from_scratch))
-        Console().print(f"Study file: {target}", soft_wrap=True)
-
-
-def _is_study(word: str) -> bool:
-    """Whether a word names a study rather than a reference file."""
-    return word in study_names() or word.endswith(".toml")
-
-
-def _choose_targets(studies: Sequence[Study], out: Path | None) -> list[Path]:
-    """Choose the study files to write, one for each study."""
-    if len(studies) == 1:
-        return [out or Path(f"{studies[0].name}-calibrated.toml")]
-    if out is not None and not out.is_dir():
-        raise InputError("--out", f"{out} is not a directory", "an existing directory, for the files of several studies")
-    return [(out or Path()) / f"{study.name}-calibrated.toml" for study in studies]
-
-
-def _find_owner(word: str, studies: Sequence[Study]) -> tuple[int, Path]:
-    """Find the index of the study that a reference file belongs to, and the file's path."""
-    names = [study.name for study in studies]
-    name, _, file = word.partition("=")
-    if file and name in names and not Path(word).exists():
-        return names.index(name), Path(file)
-    path = Path(word)
-    if len(names) == 1:
-        return 0, path
-    candidates = [name for name in names if path.name.startswith(name)]
-    if not candidates:
-        expected = "STUDY=FILE.csv, or a file name that begins with the study's name"
-        raise InputError("REFERENCE.csv", f"{word} may belong to any of {', '.join(names)}", expected)
-    return names.index(max(candidates, key=len)), path
-
-
 @commands.command(name="import")
 @click.argument("study", shell_complete=complete_study)
 @click.option("--out", type=click.Path(path_type=Path), required=True, metavar="DIR", help="Directory for the results.")
@@ -220,12 +112,15 @@ def import_command(study: str, out: Path, original: str | None, **paths: Path | 
     characteristics = CharacteristicSet.of(loaded_study.vehicle.characteristics)
     solutions = {}
     for algorithm, path in files.items():
-        solutions[algorithm] = evaluations_of(_read_rows(path, characteristics), characteristics)
-    write_imported(out, loaded_study, solutions, metrics, {algorithm: path.name for algorithm, path in files.items()})
+        solutions[algorithm] = evaluations_of(read_rows(path, characteristics), characteristics)
+    replaced_counts = write_imported(out, loaded_study, solutions, metrics, {algorithm: path.name for algorithm, path in files.items()})
     click.echo(f"Results: {out}, {', '.join(f'{len(rows)} solutions of {name}' for name, rows in solutions.items())}")
+    for name, count in replaced_counts.items():
+        click.echo(f"note: they replace {count} solutions of {name} of an earlier import", err=True)
 
 
-def _read_rows(path: Path, characteristics: CharacteristicSet) -> ReferenceData:
+def read_rows(path: Path, characteristics: CharacteristicSet) -> ReferenceData:
+    """Read a reference file, and warn of rows outside the domains."""
     data = read_reference(path, characteristics)
     if data.skipped:
         click.echo(f"warning: {path}: {data.skipped} rows with values outside the domains are left out", err=True)
@@ -344,32 +239,3 @@ def print_effects(console: Console, effects: Sequence[Effect]) -> None:
     console.print(table)
 
 
-def print_calibration(console: Console, study: Study, result: Calibration) -> None:
-    """Print the fitted values, and their agreement with the rows used and with the rows held back."""
-    table = WholeTable("parameter", "unit", right=("fitted", "equal fit", "bounds"), title=study.title)
-    group = ""
-    for key, value in result.values.items():
-        prefix = next(prefix for prefix in FITTED_TABLES if key.startswith(prefix))
-        if prefix != group:
-            table.add_section()
-            table.add_row(f"[{prefix.removesuffix('.')}]", "", "", "", "")
-            group = prefix
-        bound = result.bounds[key]
-        mark = " *" if key in result.shared else ""
-        ranges = (f"{lower:.5g} to {upper:.5g}" for lower, upper in (result.intervals[key], (bound.lower, bound.upper)))
-        table.add_row(f"{key.removeprefix(prefix)}{mark}", bound.unit, f"{value:.5g}", *ranges)
-    console.print(table)
-    if result.shared:
-        print_text(console, f"* shared with {', '.join(result.together)}")
-    for name in result.used:
-        comparison = WholeTable("", right=("Spearman's rho", "mean abs. error", "bias"), title=f"{name}: rows used / held back")
-        agreements = (result.used[name], result.held_back[name])
-        for metric in agreements[0].spearman:
-            heading = METRICS[metric].heading
-            comparison.add_row(heading, *(
-                " / ".join("-" if number is None else f"{number:.3f}" for number in (getattr(fit, quantity)[metric] for fit in agreements))
-                for quantity in ("spearman", "mean_absolute_error", "bias")))
-        console.print(comparison)
-    for name in result.on_a_bound:
-        console.print(f"{name} lies on its bound: a wider bound may fit better.", markup=False)
-    console.print(result.loss_line)

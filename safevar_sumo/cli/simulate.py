@@ -30,14 +30,16 @@ from safevar_sumo.cli.program import commands
 from safevar_sumo.cli.target import CommandTarget, as_it_is_now_option, json_option, load_target, point_option, replay_options
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import METRICS
+from safevar_sumo.output import check_writable, unwritable, whole_file
 from safevar_sumo.records import KMH_PER_MS, Evaluations, FloatArray, Outcome
 from safevar_sumo.results import record
 from safevar_sumo.scenarios import LOCATION_DIMENSION, SPEED_DIMENSION, pre_crash_sentence
-from safevar_sumo.study import SAFETY_DEGREE, Study, check_writable, unit_text
+from safevar_sumo.study import SAFETY_DEGREE, Study, unit_text
 from safevar_sumo.sumo.matrix import PointResult, point_record, remarks_of, simulate_all_points, system_at_point, vehicle_remarks
 from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.terminal import WholeTable, print_meanings, print_text
 from safevar_sumo.vehicles import CharacteristicSet
+from safevar_sumo.workers.identity import input_files
 
 FILE = click.Path(path_type=Path)
 
@@ -71,7 +73,7 @@ def simulate_command(study: str, solution: str | None, choice: str | None, chang
     requested_settings = combine_values(values_by_name, base, system.characteristics)
     if not beyond and changes:
         system.check_feasible(requested_settings, "--set", filtered=not no_filter, switch="--beyond")
-    _check_outputs(study, trace, outputs)
+    _check_outputs([study, *input_files(target.study, system)], trace, outputs)
     if any(len(values) > 1 for values in values_by_name.values()):
         if trace is not None or outputs.are_requested or spread:
             expected = "one value for each characteristic with --trace, --plot, --animate, --gui or --spread"
@@ -91,11 +93,11 @@ def simulate_command(study: str, solution: str | None, choice: str | None, chang
     _print_results(target, system, simulation, spreads, as_json)
 
 
-def _check_outputs(study: str, trace: Path | None, outputs: ReplayOutputs) -> None:
+def _check_outputs(inputs: Sequence[str | Path], trace: Path | None, outputs: ReplayOutputs) -> None:
     if trace is not None:
-        refuse_overwriting(trace, "--trace", study)
+        refuse_overwriting(trace, "--trace", *inputs)
         check_writable(trace, "--trace")
-    outputs.check(study)
+    outputs.check(inputs)
     if trace is not None and trace.resolve() in outputs.files:
         raise InputError("--trace", f"{trace} is what --plot or --animate writes", "another file")
 
@@ -164,10 +166,10 @@ def _warn_of_differences(target: CommandTarget, simulation: Simulation) -> None:
 def _write_trace(path: Path, simulation: Simulation) -> None:
     """Write one row per time step; the header gives the units."""
     try:
-        with path.open("w", encoding="utf-8", newline="") as file:
-            simulation.trace.to_csv(file, index=False, lineterminator="\n")
+        with whole_file(path) as file, file.open("w", encoding="utf-8", newline="") as stream:
+            simulation.trace.to_csv(stream, index=False, lineterminator="\n")
     except OSError as error:
-        raise InputError("--trace", f"cannot write {path}: {error.strerror or error}", "a file in a directory that exists") from None
+        raise unwritable(path, "--trace", error) from None
 
 
 class ReplayOutputs(NamedTuple):
@@ -187,17 +189,17 @@ class ReplayOutputs(NamedTuple):
         """Absolute paths of the files to write."""
         return [path.resolve() for path in (self.plot, self.animate) if path is not None]
 
-    def check(self, study: str) -> None:
-        """Before any simulation, refuse a file that cannot be written or is an input of `study`; raises InputError."""
+    def check(self, inputs: Sequence[str | Path]) -> None:
+        """Before any simulation, refuse a file that cannot be written or is one of the `inputs`; raises InputError."""
         if self.slower != 1 and not self.gui:
             raise InputError("--slower", f"{self.slower:g} without --gui", "together with --gui")
         if self.plot is not None:
-            refuse_overwriting(self.plot, "--plot", study)
+            refuse_overwriting(self.plot, "--plot", *inputs)
             check_output(self.plot, "--plot", PICTURE_ENDINGS)
         if self.animate is not None:
             from safevar_sumo.replay.animation import ANIMATION_WRITERS, require_ffmpeg
 
-            refuse_overwriting(self.animate, "--animate", study)
+            refuse_overwriting(self.animate, "--animate", *inputs)
             check_output(self.animate, "--animate", tuple(ANIMATION_WRITERS))
             require_ffmpeg(self.animate)
 

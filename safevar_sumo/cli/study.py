@@ -60,6 +60,8 @@ def study(study: str, batch: int | None, engine: str, out: Path | None, jobs: in
     loaded_study, system = load_for_search(_apply_options(load_study(study), **options), study)
     print_remarks(loaded_study, [*system.remarks, *vehicle_remarks(system)])
     keys = _select_runs(all_runs(loaded_study), only, shard)
+    if not keys:
+        click.echo(f"warning: --shard {shard} selects none of the runs", err=True)
     directory = out or Path("results") / loaded_study.name
     with open_pool(loaded_study, jobs, cluster) as pool:
         if dry_run:
@@ -114,6 +116,8 @@ def status(directory: str, watch: bool, every: float, as_json: bool) -> None:
     """Show the progress of the study in DIR, without disturbing it: runs, front, collisions, time left."""
     from safevar_sumo.results import status as read_status
 
+    if not watch and click.get_current_context().get_parameter_source("every") is not click.core.ParameterSource.DEFAULT:
+        raise InputError("--every", f"{every:g} without --watch", "together with --watch")
     progress, start_time = read_status(directory), time.monotonic()
     start_share = progress.share
     for remark in progress.remarks:

@@ -18,6 +18,10 @@ TIME_TOLERANCE = 1e-6
 """Largest difference between two times that count as equal [s]."""
 
 
+STUDY_SOURCE = "study"
+"""Source of errors about a study's table [metrics], in functions that do not know the study's file."""
+
+
 def sampling_stride(step: float, interval: float | None) -> int:
     """Number of simulation steps between two samples that are `interval` seconds apart; 1 without an interval.
 
@@ -30,7 +34,7 @@ def sampling_stride(step: float, interval: float | None) -> int:
         return 1
     steps = round(interval / step)
     if steps < 1 or abs(steps * step - interval) > TIME_TOLERANCE:
-        raise InputError("study", f"metrics.sampling_interval = {interval}", f"a whole multiple of the simulation's step, {step:g} s")
+        raise InputError(STUDY_SOURCE, f"metrics.sampling_interval = {interval}", f"a whole multiple of the simulation's step, {step:g} s")
     return steps
 
 

@@ -189,8 +189,12 @@ def original_metrics(text: str | None, published: Mapping[str, float]) -> dict[s
         If `text` has another form, or there is no safety degree.
     """
     original: dict[str, float | None] = {name: published.get(name) for name in METRICS}
+    names = set()
     for assignment in text.split(",") if text is not None else ():
         name, _, number = (word.strip() for word in assignment.partition("="))
+        if name in names:
+            raise InputError("original", f"{text!r} has {name!r} twice", "each metric once")
+        names.add(name)
         try:
             value = float(number)
         except ValueError:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from safevar_sumo.errors import InputError, SafevarError
+from safevar_sumo.output import unwritable, whole_file
 from safevar_sumo.records import FloatArray
 from safevar_sumo.replay.comparison import CHANGED, ORIGINAL, Comparison
 from safevar_sumo.replay.film import LaneLine
@@ -191,9 +192,10 @@ def animate(comparison: Comparison, path: Path) -> None:
     if ending not in ANIMATION_WRITERS:
         raise InputError("animate", str(path), f"a file that ends in {', '.join(ANIMATION_WRITERS)}")
     try:
-        ANIMATION_WRITERS[ending](lay_out_scene(comparison), path)
+        with whole_file(path) as file:
+            ANIMATION_WRITERS[ending](lay_out_scene(comparison), file)
     except OSError as error:
-        raise InputError("animate", f"cannot write {path}: {error.strerror or error}", "a file in a directory that exists") from None
+        raise unwritable(path, "animate", error) from None
 
 
 def require_ffmpeg(path: Path) -> None:
@@ -231,7 +233,8 @@ def _write_mp4(scene: FlatScene, path: Path) -> None:
                "-movflags", "+faststart", "-fflags", "+bitexact", "-flags:v", "+bitexact", "-map_metadata", "-1", str(path)]
     process = subprocess.run(command, input=b"".join(frame.tobytes() for frame in frames), capture_output=True, check=False)
     if process.returncode != 0:
-        raise SafevarError(f"{path}: ffmpeg failed: {(process.stderr.decode(errors='replace').strip() or 'no message').splitlines()[-1]}")
+        last_line = (process.stderr.decode(errors="replace").strip() or "no message").splitlines()[-1]
+        raise SafevarError(f"--animate: ffmpeg failed: {last_line}")
 
 
 def _find_ffmpeg() -> str:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import errno
 import json
 import os
-import secrets
 import tempfile
 from hashlib import sha256
 from pathlib import Path
@@ -14,6 +13,7 @@ from typing import NamedTuple, TypeVar
 import msgspec
 
 from safevar_sumo.errors import InputError, SafevarError
+from safevar_sumo.output import whole_file
 from safevar_sumo.plugins import DIGEST_LENGTH, Files
 from safevar_sumo.study import Study, refuse_other_than_file
 
@@ -93,18 +93,10 @@ def write_whole(path: Path, text: str) -> None:
     SafevarError
         If the file cannot be written.
     """
-    temporary_file = path.parent / f".{path.name}.{secrets.token_hex(4)}.tmp"
     try:
         refuse_other_than_file(path)
-        try:
-            with open(temporary_file, "x", encoding="utf-8", newline="") as file:
-                file.write(text)
-                file.flush()
-                os.fsync(file.fileno())
-            os.replace(temporary_file, path)
-        except BaseException:
-            temporary_file.unlink(missing_ok=True)
-            raise
+        with whole_file(path) as temporary_file, open(temporary_file, "x", encoding="utf-8", newline="") as file:
+            file.write(text)
         sync_directory(path.parent)
     except OSError as error:
         raise SafevarError(f"{path}: cannot be written: {error.strerror}; earlier data stays valid") from None

@@ -25,8 +25,8 @@ UNKNOWN = "unknown"
 
 
 def write_imported(path: Path, study: Study, solutions: Mapping[str, Evaluations],
-                   original: Mapping[str, float | None] | None, files: Mapping[str, str]) -> None:
-    """Write a results directory of imported solutions.
+                   original: Mapping[str, float | None] | None, files: Mapping[str, str]) -> dict[str, int]:
+    """Write a results directory of imported solutions; returns the numbers of earlier solutions that they replace, by algorithm.
 
     Parameters
     ----------
@@ -51,10 +51,13 @@ def write_imported(path: Path, study: Study, solutions: Mapping[str, Evaluations
     earlier_manifest = _earlier_manifest(path, tables)
     frame = solutions_frame(characteristics, [((algorithm, 0), evaluations) for algorithm, evaluations in solutions.items()])
     frame = frame.drop(columns="run")
+    replaced_counts: dict[str, int] = {}
     if earlier_manifest:
         refuse_edited_table(path / SOLUTIONS, earlier_manifest, "the file as it was, or another directory")
         stored = read_imported(path, characteristics)
-        frame = pd.concat([stored[~stored["algorithm"].isin(list(solutions))], frame], ignore_index=True)
+        is_replaced = stored["algorithm"].isin(list(solutions))
+        replaced_counts = {str(name): int(count) for name, count in stored["algorithm"][is_replaced].value_counts().items()}
+        frame = pd.concat([stored[~is_replaced], frame], ignore_index=True)
         frame = frame.sort_values(["algorithm", "f_safe", "f_diff", "f_num_diff", *characteristics], kind="stable", ignore_index=True)
     text = frame.to_csv(index=False, lineterminator="\n")
     manifest: dict[str, Any] = {
@@ -64,6 +67,7 @@ def write_imported(path: Path, study: Study, solutions: Mapping[str, Evaluations
         DIGESTS_KEY: {SOLUTIONS: digest_of_table(text)}}
     write_whole(path / SOLUTIONS, text)
     write_manifest(path, manifest)
+    return replaced_counts
 
 
 def _earlier_manifest(path: Path, study: dict[str, Any]) -> dict[str, Any]:

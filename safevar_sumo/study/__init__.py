@@ -2,7 +2,8 @@
 
 from safevar_sumo.errors import refuse_other_than_file
 from safevar_sumo.study.constraints import Constraint
-from safevar_sumo.study.file import check_writable, load_study, upgrade_tables, write_study
+from safevar_sumo.study.file import load_study, upgrade_tables, write_study
+from safevar_sumo.study.fitted import FITTED_TABLES, ROUNDING_TOLERANCE, locate_parameter, missing_parameter
 from safevar_sumo.study.schema import (
     DESCRIPTION_KEYS,
     OBJECTIVES,
@@ -33,7 +34,8 @@ from safevar_sumo.study.units import unit_text
 from safevar_sumo.study.validation import convert_table, error_with_key
 
 __all__ = [
-    "DESCRIPTION_KEYS", "OBJECTIVES", "SAFETY_DEGREE", "CharacteristicTable", "Constraint", "FitTable", "FreeParameter", "MatrixTable",
-    "MatrixTest", "MetricsTable", "ModelTable", "Origin", "RatingTable", "SearchTable", "Study", "StudyLike", "VehicleTable",
-    "Weather", "check_writable", "convert_table", "error_with_key", "fmus_of", "label_of", "load_study", "refuse_other_than_file",
-    "study_names", "study_path", "tables_of", "unit_text", "upgrade_tables", "user_code_names", "user_code_packages", "write_study"]
+    "DESCRIPTION_KEYS", "FITTED_TABLES", "OBJECTIVES", "ROUNDING_TOLERANCE", "SAFETY_DEGREE", "CharacteristicTable", "Constraint",
+    "FitTable", "FreeParameter", "MatrixTable", "MatrixTest", "MetricsTable", "ModelTable", "Origin", "RatingTable", "SearchTable",
+    "Study", "StudyLike", "VehicleTable", "Weather", "convert_table", "error_with_key", "fmus_of", "label_of", "load_study",
+    "locate_parameter", "missing_parameter", "refuse_other_than_file", "study_names", "study_path", "tables_of", "unit_text",
+    "upgrade_tables", "user_code_names", "user_code_packages", "write_study"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import tomllib
 from collections.abc import Mapping
@@ -11,8 +12,10 @@ from typing import Any, NamedTuple
 import msgspec
 import tomli_w
 
-from safevar_sumo.errors import InputError, refuse_other_than_file
+from safevar_sumo.errors import InputError
+from safevar_sumo.output import unwritable, whole_file
 from safevar_sumo.shipped import STUDIES
+from safevar_sumo.study.fitted import contradictions_of_file
 from safevar_sumo.study.schema import NAME_PATTERN, Origin, SearchTable, Study, StudyLike, is_file, study_path, tables_of
 from safevar_sumo.study.validation import contradictions, convert_table, raise_mistakes, unusable_values
 
@@ -113,8 +116,6 @@ def _with_algorithms(tables: dict[str, Any]) -> dict[str, Any]:
 
 def _read_file(path: Path, visited_paths: tuple[Path, ...]) -> _RawStudy:
     """Read a TOML file and the study that it `extends`; keys of the file override that study, table by table."""
-    if path in visited_paths:
-        raise InputError(path, f"extends = {path.stem!r} leads back to this file", "a study that does not extend this one")
     try:
         tables = tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except tomllib.TOMLDecodeError as error:
@@ -128,7 +129,8 @@ def _read_file(path: Path, visited_paths: tuple[Path, ...]) -> _RawStudy:
     except OSError as error:
         raise InputError(path, f"cannot be read: {error.strerror}") from None
     folders = () if path.parent == STUDIES else (str(path.resolve().parent),)
-    return _with_base(_RawStudy(path, tables, Origin(called=str(path) if folders else "", places=folders)), path, visited_paths)
+    origin = Origin(called=str(path) if folders else "", places=folders, files=(os.path.abspath(path),) if folders else ())
+    return _with_base(_RawStudy(path, tables, origin), path, visited_paths)
 
 
 def _with_base(raw: _RawStudy, path: Path, visited_paths: tuple[Path, ...]) -> _RawStudy:
@@ -137,6 +139,7 @@ def _with_base(raw: _RawStudy, path: Path, visited_paths: tuple[Path, ...]) -> _
     tables = dict(raw.tables)
     base = tables.pop("extends", None)
     if base is None:
+        raise_mistakes(contradictions_of_file(raw.source, tables, tables))
         return raw
     if not isinstance(base, str):
         raise InputError(raw.source, f"extends = {base!r}", "the name or path of a study")
@@ -147,11 +150,15 @@ def _with_base(raw: _RawStudy, path: Path, visited_paths: tuple[Path, ...]) -> _
         base_path = sibling if is_file(sibling) else study_path(base)
     except InputError as error:
         raise InputError(raw.source, f"extends = {base!r}: {error.problem}", error.legal) from None
+    if base_path in (*visited_paths, path):
+        raise InputError(raw.source, f"extends = {base!r} leads back to {'this file' if base_path == path else base_path}",
+                         "a study that does not extend this one")
     base_study = _read_file(base_path, (*visited_paths, path))
     merged_study = _with_overrides(base_study, tables, raw.source)
     folders = tuple(dict.fromkeys((*raw.origin.places, *base_study.origin.places)))
     remarks = () if path.parent == STUDIES else merged_study.origin.remarks  # shipped studies leave keys out on purpose
-    origin = msgspec.structs.replace(merged_study.origin, called=raw.origin.called, places=folders, remarks=remarks)
+    origin = msgspec.structs.replace(merged_study.origin, called=raw.origin.called, places=folders, remarks=remarks,
+                                     files=(*raw.origin.files, *base_study.origin.files))
     return merged_study._replace(origin=origin)
 
 
@@ -171,6 +178,7 @@ def _with_overrides(base: _RawStudy, overrides: Mapping[str, Any], source: objec
             differences = " and a different ".join("ADS" if key == "ads" else key for key in changed_keys)
             remarks = (*remarks, f"{source}: has a different {differences} than study {base.tables.get('name')!r}, so "
                                  f"it does not inherit that study's {' and '.join(f'[{key}]' for key in omitted_keys)}")
+    raise_mistakes(contradictions_of_file(source, overrides, tables))
     return _RawStudy(source, tables, msgspec.structs.replace(base.origin, remarks=remarks))
 
 
@@ -216,25 +224,7 @@ def write_study(path: Path, study: Study, comment: str) -> None:
     lines = ("".join(character if character.isprintable() else "?" for character in line) for line in comment.splitlines())
     text = "".join(f"# {line}".rstrip() + "\n" for line in lines) + "\n" + tomli_w.dumps(tables)
     try:
-        path.write_text(text, encoding="utf-8")
+        with whole_file(path) as file:
+            file.write_text(text, encoding="utf-8")
     except OSError as error:
-        raise InputError("out", f"cannot write {path}: {error.strerror}", "a file in a directory that exists") from None
-
-
-def check_writable(path: Path, source: str = "out") -> None:
-    """Refuse an output file that cannot be written, before the work begins.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be written.
-    """
-    try:
-        refuse_other_than_file(path, source, streams=True)
-        is_new = not path.exists()
-        with path.open("a"):
-            pass
-        if is_new:
-            path.unlink()
-    except OSError as error:
-        raise InputError(source, f"cannot write {path}: {error.strerror}", "a file in a directory that exists") from None
+        raise unwritable(path, "out", error) from None

@@ -16,7 +16,7 @@ from msgspec import Struct
 
 from safevar_sumo.errors import InputError, did_you_mean, one_of, unknown_name
 from safevar_sumo.study.constraints import constraint_mistakes
-from safevar_sumo.study.schema import CharacteristicTable, Origin, Study
+from safevar_sumo.study.schema import FMU_KEYS, CharacteristicTable, Origin, Study
 from safevar_sumo.study.variation import variation_mistakes
 
 T = TypeVar("T")
@@ -62,7 +62,8 @@ def mistakes(source: object, raw: Any, kind: Any, key_path: str = "") -> Iterato
             if name in raw:
                 yield from mistakes(source, raw[name], field.type, _path_within(key_path, name))
             elif field.required:
-                yield InputError(source, f"{_path_within(key_path, name)} is missing")
+                model = f", for model = {short_text(raw['model'])}" if "model" in raw else ""
+                yield InputError(source, f"{_path_within(key_path, name)} is missing{model}")
     elif get_origin(kind) is dict and isinstance(raw, Mapping):
         for key, value in raw.items():
             inner_path, missing_keys = _path_within(key_path, str(key)), _missing_keys(value, get_args(kind)[1])
@@ -102,7 +103,7 @@ def _unknown_key(source: object, key_path: str, key: str, fields: Iterable[str])
     """The error for an unknown key: it suggests tables of a study that have this key, else the nearest known key."""
     tables = {name: _record_types(field.type) for name, field in _fields(Study).items() if get_origin(field.type) not in (dict, list)}
     known_paths = [f"{name}.{key}" for name, kinds in tables.items() if any(key in _fields(kind) for kind in kinds)]
-    if known_paths:
+    if known_paths and "[" not in key_path:
         return InputError(source, f"{key_path}: there is no such key; did you mean {' or '.join(known_paths)}?", one_of(fields))
     return unknown_name(source, f"{key_path}: there is no such key", key, fields)
 
@@ -120,7 +121,7 @@ def _record_types(kind: Any) -> list[Any]:
 
 def _unknown_choice(source: object, key_path: str, value: object, names: Iterable[str]) -> InputError:
     """The error for a value that is none of `names`; "" among the names means that the key may be omitted."""
-    problem = f"{key_path} is missing" if value is None else f"{key_path} = {_short_text(value)}"
+    problem = f"{key_path} is missing" if value is None else f"{key_path} = {short_text(value)}"
     return unknown_name(source, problem, value, filter(None, names), ", or no such key" * ("" in names))
 
 
@@ -132,14 +133,15 @@ def _path_within(key_path: str, key: str) -> str:
 def error_with_key(source: object, raw: object, error: msgspec.ValidationError, prefix: str = "") -> InputError:
     """Turn msgspec's error on `raw` into an error that names the key and its value."""
     problem, _, location = str(error).partition(" - at `$")
-    keys = [key for key in location.rstrip("`").replace("[...]", "").split(".") if key]
-    value, exists = raw, True
-    for key in keys:
-        exists = exists and isinstance(value, dict) and key in value
-        value = value[key] if exists and isinstance(value, dict) else None
-    key_path = ".".join([*([prefix] if prefix else []), *keys])
+    key_path, value, exists = prefix, raw, True
+    for index, key in re.findall(r"\[(\d+)\]|([^.\[\]]+)", location.rstrip("`").replace("[...]", "")):
+        key_path = f"{key_path}[{index}]" if index else ".".join(filter(None, (key_path, key)))
+        try:
+            value = value[int(index) if index else key]  # type: ignore[index]
+        except (KeyError, IndexError, TypeError):
+            exists = False
     if exists and key_path:
-        text = f"{key_path} is a table" if isinstance(value, dict) else f"{key_path} = {_short_text(value)}"
+        text = f"{key_path} is a table" if isinstance(value, dict) else f"{key_path} = {short_text(value)}"
         return InputError(source, text, _expectation(problem))
     return InputError(source, f"{key_path}: {problem}" if key_path else problem)
 
@@ -155,7 +157,8 @@ def _expectation(problem: str) -> str:
                   expected)
 
 
-def _short_text(value: object) -> str:
+def short_text(value: object) -> str:
+    """A value as an error quotes it."""
     try:
         text = repr(value)
     except ValueError:  # an integer of more digits than Python prints
@@ -202,6 +205,7 @@ def contradictions(source: object, study: Study) -> Iterator[InputError]:
         yield InputError(source, "vehicle.characteristics: none", "at least one")
     for name, row in characteristics.items():
         yield from _characteristic_mistakes(source, f"vehicle.characteristics.{name}", row)
+    yield from _keys_of_fmus(source, study)
     yield from variation_mistakes(source, characteristics, study.variation, study.correlations)
     yield from constraint_mistakes(source, characteristics, study.constraints)
     for name, bounds in study.calibration.items():
@@ -223,6 +227,15 @@ def contradictions(source: object, study: Study) -> Iterator[InputError]:
     for name, value in study.published.items():
         if value == 0:
             yield InputError(source, f"published.{name} = 0", "a number other than 0")
+
+
+def _keys_of_fmus(source: object, study: Study) -> Iterator[InputError]:
+    """Errors for keys of FMUs in tables of models that are none."""
+    for name, table in (("vehicle", study.vehicle), ("ads", study.ads), ("scenario", study.scenario)):
+        for key in FMU_KEYS if name == "scenario" else FMU_KEYS[1:] if table.kind != "fmu" else ():
+            if getattr(table, key, None):
+                yield InputError(source, f"{name}.{key}: {table.model!r} is no FMU",
+                                 "no such key" if name == "scenario" else f'no such key, or {name}.kind = "fmu"')
 
 
 def _characteristic_mistakes(source: object, key: str, row: CharacteristicTable) -> Iterator[InputError]:

@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from safevar_sumo.errors import InputError
+from safevar_sumo.metrics.base import STUDY_SOURCE
 from safevar_sumo.plugins import check_open_runs, guard_process_state, open_rows
 from safevar_sumo.protocol.driving_robot import DrivingRobot
 from safevar_sumo.records import STANDSTILL, TIME_DECIMALS, BoolArray, Evaluations, FloatArray, Observation, Outcome, SimulationRuns, Trace
@@ -36,7 +37,12 @@ Listener = Callable[[Observation], None]
 @np.errstate(all="ignore")
 def score(system: System, settings: FloatArray, runs: SimulationRuns) -> Evaluations:
     """The metrics and objectives of settings that have been simulated in `runs`."""
-    metrics = {name: metric(runs, system.metrics_table) for name, metric in system.measuring.metrics.items()}
+    try:
+        metrics = {name: metric(runs, system.metrics_table) for name, metric in system.measuring.metrics.items()}
+    except InputError as error:
+        if error.source == STUDY_SOURCE:
+            raise InputError(system.source, error.problem, error.legal) from None
+        raise
     invalid = runs.outcome == Outcome.INVALID_TEST
     if invalid.any():
         metrics = {name: np.where(invalid, np.nan, values) for name, values in metrics.items()}

@@ -157,6 +157,10 @@ class Sources(NamedTuple):
         return tuple((self.folder / name).read_bytes() for name in names)
 
 
+NETWORK_KEY = "scenario.parameters.network"
+"""Key of a study that names the network, the source of errors about a network that does not exist."""
+
+
 def sources_of(network: str) -> Sources:
     """The sources of a network, given by its name in `sumo_nets/`, by its folder, or by a `.net.xml` file beside its traffic.
 
@@ -175,7 +179,7 @@ def sources_of(network: str) -> Sources:
                 raise InputError(sources.folder, f"{name} is missing", LEGAL_FOLDERS)
         return sources
     names = sorted(path.name for path in NETWORKS.iterdir() if path.is_dir())
-    raise InputError("scenario.parameters.network", f"there is no network {network!r}{did_you_mean(network, names)}",
+    raise InputError(NETWORK_KEY, f"there is no network {network!r}{did_you_mean(network, names)}",
                      f"one of {', '.join(names)}, a folder, or a {NETWORK_ENDING} beside {TRAFFIC_FILE} and {OPTIONS_FILE}")
 
 

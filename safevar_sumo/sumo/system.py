@@ -25,7 +25,7 @@ from safevar_sumo.records import FloatArray, Nominal
 from safevar_sumo.scenarios import SCENARIO_CONTRACT, SCENARIOS, GuardedScenario, Point, Scenario, equals_clear, weather_of
 from safevar_sumo.study import MatrixTest, MetricsTable, ModelTable, Study, VehicleTable, Weather, user_code_names
 from safevar_sumo.sumo.network import check_network, network_remarks
-from safevar_sumo.sumo.sources import is_network, is_shipped
+from safevar_sumo.sumo.sources import NETWORK_KEY, is_network, is_shipped
 from safevar_sumo.sumo.traci_controller import TraciController
 from safevar_sumo.sumo.traci_module import substitute_traci
 from safevar_sumo.vehicles import (
@@ -93,6 +93,9 @@ def measuring_of(study: Study, lookup: Lookup) -> Measuring:
         return record
 
     for name in study.metrics.also:
+        if name in METRICS:
+            raise InputError(lookup.source, f"metrics.also = {study.metrics.also}: every study has {name!r}",
+                             f"{one_of(OPTIONAL_METRICS)}, or package.module:Name")
         look_up(name, "metrics.also")
     names = [METRIC_OF_OBJECTIVE[name].name if name in METRIC_OF_OBJECTIVE else name for name in study.search.objectives]
     objectives = [_objective_of(look_up(name, OBJECTIVES_KEY)) for name in names]
@@ -132,8 +135,9 @@ class Models(NamedTuple):
 class System:
     """A study's models, points, metrics and constraints, ready to simulate.
 
-    `step_length` [s] is None if the network determines the time step; `rater` rates results in the matrix of a protocol; `metrics_table`
-    has the thresholds of the metrics in `measuring`; `members` define all models, metrics and constraints.
+    `source` is the study, as errors name it; `step_length` [s] is None if the network determines the time step; `rater` rates results in
+    the matrix of a protocol; `metrics_table` has the thresholds of the metrics in `measuring`; `members` define all models, metrics and
+    constraints.
     """
 
     characteristics: CharacteristicSet
@@ -146,6 +150,7 @@ class System:
     members: tuple[Member, ...]
     measuring: Measuring
     region: FeasibleRegion
+    source: str = "study"
     step_length: float | None = None
     matrix: tuple[Point, ...] = ()
     rater: Rater | None = None
@@ -206,13 +211,21 @@ def _assemble(study: Study, source: str) -> System:
     is_shipped_vehicle = models.members[0].guard is None
     _check_units(study, models.vehicle, is_shipped_vehicle, source)
     measuring = measuring_of(study, Lookup(source, study.origin.places))
-    for name in study.published:
-        if name not in measuring.metrics:
-            raise unknown_name(source, f"published.{name} is no metric", name, measuring.metrics)
+    tables_by_metric = {"published": study.published, "repeatability": study.repeatability, "model_error": study.model_error,
+                        "fit.weights": study.fit.weights}
+    for key, table in tables_by_metric.items():
+        for name in table:
+            if name not in measuring.metrics:
+                raise unknown_name(source, f"{key}.{name} is no metric", name, measuring.metrics)
     rater = rater_of(study, source)
     matrix = _matrix_points(study if rater is None else expand_protocol(study, models.weather), source)
     for network in dict.fromkeys(scenario.network for scenario in (models.scenario, *(point.scenario for point in matrix))):
-        check_network(network)
+        try:
+            check_network(network)
+        except InputError as error:
+            if error.source == NETWORK_KEY:
+                raise InputError(source, f"{NETWORK_KEY}: {error.problem}", error.legal) from None
+            raise
     region = region_of(study, source)
     characteristics = region.characteristics
     nominal = calibration_drive(models.vehicle, characteristics)
@@ -224,7 +237,7 @@ def _assemble(study: Study, source: str) -> System:
     return System(
         characteristics=characteristics, vehicle=models.vehicle, ads=models.ads, scenario=models.scenario, weather=models.weather,
         metrics_table=study.metrics, nominal=nominal, members=(*models.members, *measuring.members, *region.members),
-        measuring=measuring, region=region, step_length=study.step_length, matrix=matrix, rater=rater)
+        measuring=measuring, region=region, source=source, step_length=study.step_length, matrix=matrix, rater=rater)
 
 
 def models_of(study: Study, source: str) -> Models:

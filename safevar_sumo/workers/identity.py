@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import platform
+import sys
 from collections.abc import Mapping
 from functools import cache
 from hashlib import sha256
@@ -14,8 +15,9 @@ import msgspec
 
 from safevar_sumo.plugins import DIGEST_LENGTH, files_named_in
 from safevar_sumo.results import RESULTS, evaluation_keys
-from safevar_sumo.study import Study
+from safevar_sumo.study import Study, tables_of
 from safevar_sumo.sumo.network import network_files
+from safevar_sumo.sumo.sources import sources_of
 from safevar_sumo.sumo.system import System
 
 Inputs = dict[str, dict[str, str]]
@@ -47,6 +49,14 @@ def identity_of(study: Study, system: System, sources: Mapping[str, str] = Mappi
     if system.matrix and system.rater is None:
         resolved["weathers"] = [msgspec.to_builtins(point.weather) for point in system.matrix]
     return {"resolved": resolved, "network": network_digests(system), "sources": dict(sources), "results": RESULTS, "platform": _platform()}
+
+
+def input_files(study: Study, system: System) -> list[Path]:
+    """The files that a study is made of: its own file and those that it extends, networks, loaded modules, and files that it names."""
+    networks = [sources_of(folder) for folder in dict.fromkeys(point.scenario.network for point in system.points)]
+    return [*(Path(file) for file in study.origin.files), *(sources.folder / name for sources in networks for name in sources.files),
+            *(Path(file) for module in list(sys.modules.values()) if (file := getattr(module, "__file__", None))),
+            *map(Path, files_named_in(tables_of(study), study.origin.places))]
 
 
 def network_digests(system: System) -> dict[str, str]:

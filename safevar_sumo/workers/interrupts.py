@@ -35,6 +35,19 @@ def defer_interrupts() -> Iterator[None]:
     _raise_pending_interrupt()
 
 
+@contextmanager
+def terminate_as_interrupt() -> Iterator[None]:
+    """Within `defer_interrupts`, treat the signal SIGTERM like Ctrl-C."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    previous_handler = signal.signal(signal.SIGTERM, lambda *_: signal.raise_signal(signal.SIGINT))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, previous_handler or signal.SIG_DFL)
+
+
 def wait_for_first(futures: Iterable[Future[Evaluations]]) -> set[Future[Evaluations]]:
     """Wait until a future is done, and return all futures that are done; an empty set if there are no futures."""
     while True:

@@ -52,7 +52,8 @@ def test_the_sets_are_simulated_one_by_one() -> None:
 
 
 def test_a_study_keeps_what_it_gives_another_value() -> None:
-    study = load_study("sun", spread={GAP: [OWN, 5.0], "ads.parameters.corridor": [2.5, 2.0]}, ads={"parameters": {"brake_gap": 8.0}})
+    base = load_study("sun", spread={GAP: [OWN, 5.0], "ads.parameters.corridor": [2.5, 2.0]})
+    study = load_study(base, ads={"parameters": {"brake_gap": 8.0}})
     assert [one.ads.parameters["brake_gap"] for one in studies_of_sets(study)] == [8.0, 8.0]
     assert [one.ads.parameters["corridor"] for one in studies_of_sets(study)] == [2.5, 2.0]
 
@@ -63,6 +64,13 @@ def test_another_vehicle_or_driver_has_no_spread_and_lists_are_of_one_length() -
     assert not other.model_error
     with pytest.raises(InputError, match="spread"):
         load_study("sun", spread={GAP: [OWN], "ads.parameters.corridor": [2.5, 2.0]})
+    with pytest.raises(InputError, match=r"spread\.'ads.parameters.brake_gap' begins with 5\nexpected: 7.17059 first"):
+        load_study("sun", spread={GAP: [5.0, OWN]})
+    with pytest.raises(InputError, match=r"spread\.'vehicle.parameters.tyre' is no parameter of the study"):
+        load_study("sun", spread={"vehicle.parameters.tyre": [5.0, 6.0]})
+    with pytest.raises(InputError, match=r"study 'sun': spread: set 1: vehicle.parameters.tyre_friction = -1.0"):
+        compute_model_spreads(study := load_study("sun", spread={"vehicle.parameters.tyre_friction": [0.53897, -1.0]}),
+                              assemble(study).characteristics.original[np.newaxis])
     with pytest.raises(InputError, match="spread"):
         studies_of_sets(load_study("native"))
 

@@ -11,6 +11,7 @@ from typing import Any
 import msgspec
 import pytest
 
+from safevar_sumo import output
 from safevar_sumo.campaign import all_runs, run_campaign
 from safevar_sumo.errors import SafevarError
 from safevar_sumo.results import ResultsDirectory, files, journal, load_runs
@@ -89,7 +90,7 @@ def carried_out(study: Study, path: Path) -> bytes:
 def broken(study: Study, path: Path, disk: Disk) -> bool:
     """Carry the study out on a disk that fails; whether it ended with an error."""
     with pytest.MonkeyPatch.context() as patch:
-        for module in (files, journal):
+        for module in (files, journal, output):
             patch.setattr(module, "open", disk.open, raising=False)
         for name in ("fsync", "replace", "mkdir", "open", "unlink"):
             patch.setattr(os, name, disk.failing(getattr(os, name)))
@@ -115,7 +116,7 @@ def test_every_step_on_the_disk_may_fail(kinds: tuple[int, ...], stays: bool, ti
         if not failed:
             assert (out / "solutions.csv").read_bytes() == expected
         assert carried_out(tiny, out) == expected
-        assert not [path for path in out.rglob("*.tmp") if not failed]
+        assert not [path for path in out.rglob("*.tmp*") if not failed]
         if disk.steps < number:
             break
     assert number < MOST_STEPS - 1, "no step is left that has not failed"

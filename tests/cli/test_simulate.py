@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
+import shutil
 from pathlib import Path
 
 import pytest
@@ -11,6 +14,7 @@ from click.testing import CliRunner, Result
 from safevar_sumo.cli.arguments import read_changes
 from safevar_sumo.cli.program import commands
 from safevar_sumo.errors import InputError
+from safevar_sumo.shipped import NETWORKS
 from safevar_sumo.study import load_study
 from safevar_sumo.vehicles import CharacteristicSet
 from tests.in_process import refused
@@ -49,6 +53,38 @@ def test_the_original_stands_beside_the_changed_vehicle_and_a_verdict_under_them
     assert "less safe than the original" in result.stdout
     assert "note: dragCoeff = 0.301 differs from the original by less than the filter threshold and was reset to 0.3" in result.stderr
     assert "changed vehicle" not in simulate("rain").stdout
+
+
+def test_an_output_that_fails_leaves_the_old_file_and_no_new_one(in_tmp: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    replace = os.replace
+
+    def full(source: Path, target: Path) -> None:
+        if target.parent == in_tmp:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        replace(source, target)
+
+    monkeypatch.setattr(os, "replace", full)
+    for flag, name in (("--trace", "trace.csv"), ("--plot", "plot.png"), ("--animate", "film.html")):
+        refused("simulate", "sun", flag, name, message=(flag, name, "No space left on device", "with space for it"))
+        assert list(in_tmp.iterdir()) == []
+        Path(name).write_text("old")
+        refused("simulate", "sun", flag, name, message=(flag, name))
+        assert Path(name).read_text() == "old"
+        Path(name).unlink()
+
+
+def test_an_output_replaces_no_file_that_the_study_is_made_of(in_tmp: Path) -> None:
+    Path("my_braking.py").write_text("from safevar_sumo.ads import ScalarAds\nfrom my_numbers import BRAKE\n\n\n"
+                                 "class Mine(ScalarAds):\n    def drive(self, seen):\n        return (0.0, BRAKE)\n")
+    Path("my_numbers.py").write_text("BRAKE = 1.0\n")
+    shutil.copytree(NETWORKS / "pedestrian_crossing", "my_net")
+    Path("base.toml").write_text('extends = "sun"\n[ads]\nmodel = "my_braking:Mine"\n[scenario.parameters]\nnetwork = "my_net"\n')
+    Path("child.toml").write_text('extends = "base.toml"\n')
+    files = ["child.toml", "base.toml", "my_braking.py", "my_numbers.py", "my_net/traffic.rou.xml", "my_net/network.edg.xml"]
+    contents = {file: Path(file).read_bytes() for file in files}
+    for file in files:
+        refused("simulate", "child.toml", "--trace", file, message=("--trace", file, "an input of the command"))
+    assert {file: Path(file).read_bytes() for file in files} == contents
 
 
 @pytest.mark.slow

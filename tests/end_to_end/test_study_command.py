@@ -117,6 +117,15 @@ def test_bad_options_are_refused(arguments: list[str], expected: tuple[str, ...]
     assert not Path("out/runs").exists()
 
 
+def test_a_shard_without_runs_is_told() -> None:
+    output = run("study", "small.toml", "--out", "out", "--only", "rs:1", "--shard", "2/2", "--quiet")
+    assert output.stderr == "warning: --shard 2/2 selects none of the runs\n"
+
+
+def test_an_interval_is_refused_without_watching(copied: Path) -> None:
+    refused("status", "out", "--every", "1", message=("--every", "1 without --watch", "together with --watch"))
+
+
 def test_a_dry_run_tells_what_it_would_take_and_writes_nothing() -> None:
     output = run("study", "small.toml", "--dry-run").stdout
     for word in ("nsga2, rs, safe_fuzzer", "900", "evaluations/s", "min", "MB"):

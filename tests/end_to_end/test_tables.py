@@ -50,6 +50,15 @@ def imported(in_tmp: Path) -> Path:
     return in_tmp / "imported"
 
 
+def test_a_second_import_says_what_it_replaces(imported: Path) -> None:
+    package_csv(Path("new.csv"), 20, 3)
+    done = run("import", "sun", "--out", "imported", "--nsga2", "new.csv")
+    assert "20 solutions of nsga2" in done.stdout
+    assert done.stderr == "note: they replace 40 solutions of nsga2 of an earlier import\n"
+    refused("import", "sun", "--out", "imported", "--rs", "rs.csv", "--original", "sd=1,sd=2",
+            message=("--original", "'sd=1,sd=2' has 'sd' twice", "each metric once"))
+
+
 @pytest.mark.slow
 def test_every_question_in_every_format(results: Path) -> None:
     for rq in QUESTIONS:

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
+import sys
 import tomllib
 from collections.abc import Callable
 from pathlib import Path
@@ -12,12 +15,14 @@ import pandas as pd
 import pytest
 from click.testing import CliRunner
 
-from safevar_sumo.cli import reference
+from safevar_sumo.cli import calibrate
 from safevar_sumo.cli.program import commands
+from safevar_sumo.errors import InputError
 from safevar_sumo.reference import with_values
 from safevar_sumo.study import Study, load_study
 from safevar_sumo.sumo.matrix import evaluate
 from safevar_sumo.sumo.system import assemble
+from tests.end_to_end.processes import ended, started, until
 from tests.in_process import refused, run
 
 COLUMNS = {"safety_degree": "SaftyDegree", "tet": "TET", "tit": "TIT", "ave_dece": "Dece"}
@@ -116,6 +121,72 @@ def test_calibrate_does_not_write_over_what_it_starts_from(data: Path, in_tmp: P
     assert data.read_text().startswith("max_rpm")
 
 
+def test_calibrate_does_not_write_over_a_study_that_its_study_extends(in_tmp: Path) -> None:
+    Path("base.toml").write_text('extends = "sun"\n')
+    Path("child.toml").write_text('extends = "base.toml"\nname = "child"\n')
+    refused("calibrate", "child.toml", "--trials", "1", "--out", "base.toml", message=("--out", "base.toml", "an input of the command"))
+    assert Path("base.toml").read_text() == 'extends = "sun"\n'
+
+
+def small_fit() -> tuple[str, ...]:
+    """Write a study with a free parameter, and return the command that fits it in few trials."""
+    Path("mine.toml").write_text(
+        'extends = "sun"\nname = "mine"\n[ads.parameters]\nbrake_gap = 8.0\n'
+        '[calibration]\n"ads.parameters.brake_gap" = { lower = 7, upper = 12, unit = "m", meaning = "gap" }\n')
+    return "calibrate", "mine.toml", "--trials", "5", "--out", "found.toml"
+
+
+def test_a_picture_that_fails_does_not_lose_the_fit(in_tmp: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def failing(*_: object) -> None:
+        raise InputError("plot", "no space is left")
+
+    monkeypatch.setattr(calibrate, "plot_profiles", failing)
+    refused(*small_fit(), "--plot", "plot.png", message=("--plot", "no space is left"))
+    assert 7 <= load_study("found.toml").ads.parameters["brake_gap"] <= 12
+
+
+def test_a_full_disk_loses_neither_the_old_file_nor_the_fit(in_tmp: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    replace = os.replace
+
+    def full(source: Path, target: Path) -> None:
+        if target.name == "found.toml":
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        replace(source, target)
+
+    Path("found.toml").write_text("old")
+    monkeypatch.setattr(os, "replace", full)
+    errors = run(*small_fit(), expect=2).stderr
+    for part in ("--out: cannot write found.toml: No space left on device", "fitted, but not written: ads.parameters.brake_gap = "):
+        assert part in errors
+    assert Path("found.toml").read_text() == "old"
+    assert sorted(path.name for path in in_tmp.iterdir()) == ["found.toml", "mine.toml"]
+
+
+def test_the_best_so_far_is_saved_now_and_then(in_tmp: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def killed(study: Study, references: object, pool: object, done: Callable[[float, Study], None], *, from_scratch: bool) -> None:
+        done(1.0, with_values(study, {"ads.parameters.brake_gap": 5.5}))
+        raise SystemExit
+
+    monkeypatch.setattr(calibrate, "calibrate", killed)
+    monkeypatch.setattr(calibrate, "SECONDS_BETWEEN_SAVES", 0.0)
+    CliRunner().invoke(commands, ["calibrate", "sun", "--trials", "9", "--out", "best.toml"])
+    assert "Best of 1 of 9 trials, while more are tried" in Path("best.toml").read_text()
+    assert load_study("best.toml").ads.parameters["brake_gap"] == 5.5
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no SIGTERM to catch")
+def test_a_terminated_calibration_leaves_the_best_so_far(in_tmp: Path, data: Path) -> None:
+    small_fit()
+    process = started("calibrate", "mine.toml", str(data), "--trials", "100000", "--jobs", "1", "--out", "found.toml")
+    stderr = process.stderr
+    assert stderr is not None
+    until(lambda: "lowest loss" in stderr.readline(), process)
+    process.terminate()
+    assert "is in found.toml" in ended(process, 130)
+    assert "then interrupted" in Path("found.toml").read_text()
+
+
 @pytest.mark.slow
 def test_settings_that_cannot_be_simulated_are_told(data: Path, in_tmp: Path, worker_processes: None) -> None:
     Path("hasty.toml").write_text('extends = "sun"\nname = "hasty"\n[search]\ntime_limit = 0.001\n')
@@ -129,7 +200,7 @@ def test_an_interrupted_calibration_leaves_the_best_so_far(in_tmp: Path, monkeyp
         done(1.0, with_values(study, {"ads.parameters.brake_gap": 5.5}))
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(reference, "calibrate", interrupted)
+    monkeypatch.setattr(calibrate, "calibrate", interrupted)
     CliRunner().invoke(commands, ["calibrate", "sun", "--trials", "9", "--out", "best.toml"])
     assert "Best of 2 of 9 trials" in Path("best.toml").read_text()
     assert load_study("best.toml").ads.parameters["brake_gap"] == 5.5

@@ -144,6 +144,7 @@ MASS = {"sum": {"mass": 1.0}}
     ([{"sum": {name: 1.0}, "at_least": float(value), "at_most": float(value)} for name, value in zip(SUN.names, SUN.original, strict=True)],
      "leave only the original vehicle"),
     ([{"sum": {"mass": 1.0}, "upper": 1.0}], "constraints[0].upper: there is no such key\nexpected: one of at_least"),
+    ([{"sum": {"mass": 1.0}, "name": "x"}], "constraints[0].name: there is no such key\nexpected: one of at_least"),
     ([{"sum": {"mas": 1.0}, "at_least": 1.0}], "constraints[0].sum.mas: there is no such characteristic; did you mean 'mass'?"),
     ([{**MASS, "at_least": 1.0, "unit": "t"}], "constraints[0].unit = 't'\nexpected: 'kg', the unit of mass, or '-'"),
     ([{"sum": {"mass": 1.0, "radius": 1.0}, "at_least": 1.0}], "constraints[0].sum adds mass [kg], radius [cm]"),

@@ -110,8 +110,22 @@ def test_a_bad_study_is_refused_with_file_key_and_value(tmp_path: Path, old: str
     ('[variation.mass]\ndistribution = "norml"', "mass.distribution = 'norml'; did you mean 'normal'?\nexpected: one of fixed, lognormal"),
     ('[metrics]\nalso = ["max_jerk", "max_jerk"]', "'max_jerk' is listed 2 times\nexpected: each metric once"),
     ("[[constraints]]\nsum = { mass = 'a' }", "constraints[0].sum.mass = 'a'\nexpected: a number"),
-    ("[rating.claims]\nCCRs = [3]", "rating.claims.CCRs[0] = 3\nexpected: a text"),
+    ('extends = "euro_ncap_rating"\n[rating.claims]\nCCRs = [3]', "rating.claims.CCRs[0] = 3\nexpected: a text"),
+    ('[rating.claims]\nCCRs = ["glare"]', "rating.claims: the study is not rated\nexpected: matrix.protocol"),
     ("search = 3", "search = 3"),
+    ('[vehicle]\nmodel = "tesla"', "vehicle.characteristics is missing, for model = 'tesla'"),
+    ('extends = "mine.toml"\n', "extends = 'mine.toml' leads back to this file\nexpected: a study that does not extend"),
+    ('[weather]\nname = "x"\nroad_friction = 1\nvisibility = 1\nhesitation = 0.3\n[ads.parameters]\nhesitation = 0.1',
+     "weather.hesitation = 0.3 and ads.parameters.hesitation = 0.1\nexpected: ads.parameters.hesitation alone"),
+    ('weather = { name = "x", road_friction = 1, visibility = 1, hesitation = [] }', "weather.hesitation = []\nexpected: a number"),
+    ("[vehicle]\nstep = 0.001", "vehicle.step: 'carla' is no FMU\nexpected: no such key, or vehicle.kind = \"fmu\""),
+    ('[vehicle.inputs]\nfoo = "bar"', "vehicle.inputs: 'carla' is no FMU"),
+    ("[vehicle.sensors]\nmount = 1", "vehicle.sensors: 'carla' is no FMU"),
+    ("[ads]\nstep = 0.2", "ads.step: 'world_on_rails' is no FMU"),
+    ('[ads.outputs]\nfoo = "bar"', "ads.outputs: 'world_on_rails' is no FMU"),
+    ('[scenario]\nkind = "fmu"', "scenario.kind: 'pedestrian_crossing' is no FMU\nexpected: no such key"),
+    ('[calibration."ads.parameters.brake_gapp"]\nlower = 1\nupper = 2\nunit = "m"\nmeaning = "x"',
+     "calibration.'ads.parameters.brake_gapp' is no parameter of the study"),
     ("extends = 3\n", "extends"),
     (f"[ads.parameters.{'.'.join(['deep'] * 1500)}]\nx = 1", "ads is nested too deeply\nexpected: at most 32 tables"),
 ])
@@ -123,6 +137,22 @@ def test_an_unusable_value_is_refused_by_its_key(text: str, expected: str, tmp_p
     assert expected in str(caught.value)
     assert str(path) in str(caught.value)
     assert len(str(caught.value)) < 1000
+
+
+@pytest.mark.parametrize(("text", "expected"), [
+    ("[model_error]\nsafety_degre = 1", "model_error.safety_degre is no metric; did you mean 'safety_degree'?"),
+    ("[repeatability]\nfoo = 1", "repeatability.foo is no metric\nexpected: one of ave_dece"),
+    ("[fit.weights]\ntett = 1", "fit.weights.tett is no metric; did you mean 'tet'?"),
+    ("[ads.parameters]\nthrottle = [true, 0.2, 0.3]", "ads.parameters.throttle[0] = True\nexpected: a number"),
+    ('[scenario.parameters]\nnetwork = "nope"', "mine.toml: scenario.parameters.network: there is no network 'nope'"),
+    ('[metrics]\nalso = ["tet"]', "metrics.also = ['tet']: every study has 'tet'\nexpected: one of brake_harshness"),
+])
+def test_a_value_that_a_model_refuses_is_named(text: str, expected: str, tmp_path: Path) -> None:
+    (tmp_path / "mine.toml").write_text(f'extends = "smoke"\n{text}\n')
+    with pytest.raises(InputError) as caught:
+        assemble(load_study(str(tmp_path / "mine.toml")))
+    assert expected in str(caught.value)
+    assert "mine.toml" in str(caught.value)
 
 
 def test_all_mistakes_of_a_file_are_reported_at_once(tmp_path: Path) -> None:

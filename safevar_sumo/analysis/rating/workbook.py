@@ -18,6 +18,7 @@ from openpyxl.utils.exceptions import InvalidFileException
 
 from safevar_sumo.analysis.rating.compute import RatedVehicle
 from safevar_sumo.errors import InputError
+from safevar_sumo.output import unwritable, whole_file
 from safevar_sumo.protocol import EURO_NCAP_2026, CellMatrix, protocol_of
 from safevar_sumo.protocol.points import DECIMALS, round_half_up
 
@@ -62,10 +63,10 @@ class _Spreadsheet:
 
     def _save(self) -> None:
         try:
-            self._workbook.save(self.output)
+            with whole_file(self.output) as file:
+                self._workbook.save(file)
         except OSError as error:
-            raise InputError("--xlsx", f"cannot write {self.output}: {error.strerror or error}",
-                             "a file in a directory that exists") from None
+            raise unwritable(self.output, "--xlsx", error) from None
 
 
 class Template(_Spreadsheet):

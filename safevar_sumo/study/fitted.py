@@ -1,0 +1,74 @@
+"""Parameters that tables of a study file name by their keys, and checks of the tables that a file states itself."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from safevar_sumo.errors import InputError
+from safevar_sumo.study.validation import short_text
+
+FITTED_TABLES = ("vehicle.parameters.", "ads.parameters.", "weather.")
+"""Prefixes of the parameters that may be fitted."""
+ROUNDING_TOLERANCE = 1e-5
+"""Relative tolerance within which a parameter's value in the study equals its (rounded) value in the first set of [spread]."""
+
+
+def locate_parameter(tables: Any, name: str) -> tuple[Any, int | str] | None:
+    """The table or list that holds a parameter that may be fitted, and the parameter's key or index in it; None if there is none."""
+    if not name.startswith(FITTED_TABLES):
+        return None
+    *path, last = name.split(".")
+    table = tables
+    try:
+        for key in path:
+            table = table[_key_or_index(table, key)]
+        key_or_index = _key_or_index(table, last)
+        is_number = isinstance(table[key_or_index], int | float)
+    except (KeyError, IndexError, ValueError, TypeError):
+        return None
+    return (table, key_or_index) if is_number else None
+
+
+def _key_or_index(table: Any, name: str) -> int | str:
+    """The key in a table, or the index in a list; an index has one spelling, so that each parameter has one name."""
+    return int(name) if isinstance(table, list) and name == str(int(name)) else name
+
+
+def missing_parameter(source: object, table: str, name: str) -> InputError:
+    """The error for a parameter that a table such as `spread` names and the study does not have."""
+    return InputError(source, f"{table}.{name!r} is no parameter of the study",
+                      f"a number that is given under {', '.join(prefix.rstrip('.') for prefix in FITTED_TABLES)}")
+
+
+def contradictions_of_file(source: object, stated: Mapping[str, Any], tables: Mapping[str, Any]) -> Iterator[InputError]:
+    """Errors for tables that a file states itself, not inherits, and that do not fit the complete `tables` of its study."""
+    for table in ("calibration", "spread"):
+        values = stated.get(table)
+        for name, value in values.items() if isinstance(values, Mapping) else ():
+            if name.startswith("weather.") and isinstance(tables.get("weather"), str):
+                continue  # a shipped weather: its values are looked up later
+            place = locate_parameter(tables, name)
+            if place is None:
+                yield missing_parameter(source, table, name)
+            elif table == "spread" and isinstance(value, list) and value and isinstance(value[0], int | float):
+                own_value = float(place[0][place[1]])
+                if not math.isclose(value[0], own_value, rel_tol=ROUNDING_TOLERANCE):
+                    yield InputError(source, f"spread.{name!r} begins with {value[0]:g}", f"{own_value:g} first, the study's own value")
+    rating, matrix = stated.get("rating"), tables.get("matrix")
+    if isinstance(rating, Mapping) and rating.get("claims") and not (isinstance(matrix, Mapping) and matrix.get("protocol")):
+        yield InputError(source, "rating.claims: the study is not rated", "matrix.protocol, or no claims")
+    yield from _hesitation_mistakes(source, tables.get("weather"), tables.get("ads"))
+
+
+def _hesitation_mistakes(source: object, weather: object, ads: object) -> Iterator[InputError]:
+    """Errors for the key weather.hesitation of earlier versions, which is read as a parameter of the driving system."""
+    if isinstance(weather, Mapping) and "hesitation" in weather:
+        parameters = ads.get("parameters") if isinstance(ads, Mapping) else None
+        value, other = weather["hesitation"], parameters.get("hesitation") if isinstance(parameters, Mapping) else None
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            yield InputError(source, f"weather.hesitation = {short_text(value)}", "a number")
+        elif other not in (None, value):
+            yield InputError(source, f"weather.hesitation = {value:g} and ads.parameters.hesitation = {short_text(other)}",
+                             "ads.parameters.hesitation alone")
