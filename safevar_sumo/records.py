@@ -336,10 +336,10 @@ class Evaluations:
 
     def take(self, rows: Sequence[int] | npt.NDArray[np.intp] | BoolArray) -> Evaluations:
         """The evaluations of `rows`, in that order."""
-        return Evaluations(
-            settings=self.settings[rows], outcome=self.outcome[rows], collision_speed=self.collision_speed[rows],
-            metrics={name: values[rows] for name, values in self.metrics.items()},
-            f_diff=self.f_diff[rows], f_num_diff=self.f_num_diff[rows], reasons=self.reasons)
+        return replace(
+            self, settings=self.settings[rows], outcome=self.outcome[rows], collision_speed=self.collision_speed[rows],
+            metrics={name: values[rows] for name, values in self.metrics.items()}, f_diff=self.f_diff[rows],
+            f_num_diff=self.f_num_diff[rows], cells=None if self.cells is None else self.cells.of(rows))
 
     @classmethod
     def none(cls, n: int, metrics: Iterable[str]) -> Evaluations:
@@ -350,13 +350,19 @@ class Evaluations:
 
     @classmethod
     def concatenate(cls, batches: Sequence[Evaluations]) -> Evaluations:
-        """Join batches of evaluations in order; a metric that a batch lacks is undefined in its rows."""
+        """Join batches of evaluations in order; a metric that a batch lacks is undefined in its rows.
+
+        There are `cells` only if all batches have them.
+        """
         def join(name: str) -> np.ndarray:
             return np.concatenate([getattr(batch, name) for batch in batches])
 
+        cells = [batch.cells for batch in batches if batch.cells is not None]
         return cls(
             settings=join("settings"), outcome=join("outcome"), collision_speed=join("collision_speed"),
             metrics={name: np.concatenate([batch.metrics.get(name, np.full(len(batch), np.nan)) for batch in batches])
                      for name in dict.fromkeys(name for batch in batches for name in batch.metrics)},
             f_diff=join("f_diff"), f_num_diff=join("f_num_diff"),
-            reasons={setting: reason for batch in batches for setting, reason in batch.reasons.items()})
+            reasons={setting: reason for batch in batches for setting, reason in batch.reasons.items()},
+            files={name: digest for batch in batches for name, digest in batch.files.items()},
+            cells=CellResults._make(map(np.concatenate, zip(*cells, strict=True))) if len(cells) == len(batches) else None)

@@ -10,7 +10,7 @@ from typing import Annotated, Any, Protocol
 import numpy as np
 from msgspec import Meta
 
-from safevar_sumo.plugins import Contract, Guard, read_only_copy
+from safevar_sumo.plugins import Contract, Guard, open_rows, read_only_copy
 from safevar_sumo.records import BoolArray, Command, FloatArray, Nominal, Observation
 
 PositiveParameter = Annotated[float, Meta(gt=0, le=1e3)]
@@ -100,8 +100,9 @@ class PerVehicleAds:
         return drivers
 
     def drive(self, seen: Observation, memory: list[ScalarAds]) -> tuple[Command, list[ScalarAds]]:
-        pedals = [self._checked_pedals(self._guard.call("drive", driver.drive, observation))
-                  for driver, observation in zip(memory, _scalar_observations(seen), strict=True)]
+        observations, pedals = list(_scalar_observations(seen)), [(0.0, 0.0)] * len(memory)
+        for i in open_rows(np.ones(len(memory), dtype=bool)).tolist():
+            pedals[i] = self._checked_pedals(self._guard.call("drive", memory[i].drive, observations[i]))
         return Command(*np.array(pedals, dtype=float).reshape(len(memory), 2).T.copy()), memory
 
     def warns(self, memory: list[ScalarAds]) -> BoolArray:

@@ -125,7 +125,8 @@ class Evaluator:
             for future in wait_for_first([future for future, part in futures.items() if part not in results_by_part]):
                 evaluations = future.result()
                 if evaluations.cells is None:
-                    raise SimulationError(f"study {self.study.name!r}: a vehicle cannot be simulated: {evaluations.reason(0)}")
+                    reason = evaluations.reason(int(np.argmax(evaluations.failed)))
+                    raise SimulationError(f"study {self.study.name!r}: a vehicle cannot be simulated: {reason}")
                 results_by_part[futures[future]] = evaluations.cells
                 done += evaluations.cells.impact.shape[1]
                 self.progress(stage, done, cell_count)

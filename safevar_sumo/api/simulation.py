@@ -11,16 +11,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from safevar_sumo.ads import Ads
 from safevar_sumo.analysis.words import OUTCOME_VERBS
 from safevar_sumo.errors import InputError, unknown_name
 from safevar_sumo.metrics import Scoring, time_to_collision
-from safevar_sumo.records import STANDSTILL, TIME_DECIMALS, Command, Evaluations, FloatArray, Nominal, Observation, Outcome, SimulationRuns
+from safevar_sumo.records import STANDSTILL, TIME_DECIMALS, Evaluations, FloatArray, Observation, Outcome, SimulationRuns
 from safevar_sumo.results import evaluations_frame, record
 from safevar_sumo.study import SAFETY_DEGREE, Study, StudyLike, load_study
-from safevar_sumo.sumo.batch import score
+from safevar_sumo.sumo.batch import drive_all, score
 from safevar_sumo.sumo.engine import Engine
-from safevar_sumo.sumo.matrix import simulate as simulate_settings
 from safevar_sumo.sumo.matrix import system_at_worst_point
 from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.terminal import open_progress
@@ -37,23 +35,7 @@ OBSERVATION_HEADS = {"speed": "seen speed [m/s]", "gap": "seen gap [m]", "closin
                      "lateral": "seen lateral [m]", "lateral_speed": "seen lateral speed [m/s]"}
 
 
-class RecordingAds:
-    """Wraps an ADS and records its observations of its only vehicle."""
-
-    def __init__(self, ads: Ads) -> None:
-        self._ads = ads
-        self.observations: list[Observation] = []
-
-    def start(self, n: int, nominal: Nominal, step: float) -> Any:
-        self.observations.clear()
-        return self._ads.start(n, nominal, step)
-
-    def drive(self, seen: Observation, memory: Any) -> tuple[Command, Any]:
-        self.observations.append(Observation(*(np.copy(value) for value in seen)))  # type: ignore[arg-type]
-        return self._ads.drive(seen, memory)
-
-
-def trace_frame(runs: SimulationRuns, recording: RecordingAds) -> pd.DataFrame:
+def trace_frame(runs: SimulationRuns, observations: Sequence[Observation]) -> pd.DataFrame:
     """One row per step of the only vehicle while its simulation counts.
 
     The columns `gap` (along the vehicle's path) and `lateral` (from the middle of its lane) hold the obstacle's true position; the columns
@@ -73,7 +55,7 @@ def trace_frame(runs: SimulationRuns, recording: RecordingAds) -> pd.DataFrame:
     frame = pd.DataFrame({name: values[active] for name, values in columns.items()})
     observed = pd.DataFrame([{"time [s]": round(float(observation.time), TIME_DECIMALS),
                               **{head: float(getattr(observation, name)[0]) for name, head in OBSERVATION_HEADS.items()}}
-                             for observation in recording.observations])
+                             for observation in observations])
     return frame.merge(observed, how="left", on="time [s]").replace([np.inf, -np.inf], np.nan)
 
 
@@ -105,7 +87,7 @@ class Simulation:
     evaluation: Evaluations
     runs: SimulationRuns
     scoring: Scoring
-    _recording: RecordingAds
+    _observations: Sequence[Observation]
     _original: Simulation | None = None
 
     @property
@@ -143,7 +125,7 @@ class Simulation:
     @cached_property
     def trace(self) -> pd.DataFrame:
         """One row per step, units in the columns' names; NaN where a value does not exist."""
-        return trace_frame(self.runs, self._recording)
+        return trace_frame(self.runs, self._observations)
 
     @property
     def verdict(self) -> str:
@@ -215,13 +197,16 @@ def load_and_assemble(study: StudyLike, source: str = "") -> tuple[Study, System
 
 
 def _simulate_one(study: Study, system: System, requested: FloatArray, setting: FloatArray, engine: Engine = Engine.LIBSUMO) -> Simulation:
-    recording = RecordingAds(system.ads)
-    settings = setting[np.newaxis]
-    runs = simulate_settings(replace(system_at_worst_point(system, settings), ads=recording), settings, engine)  # in SUMO itself
+    settings, observations = setting[np.newaxis], list[Observation]()
+
+    def record_observation(seen: Observation) -> None:
+        observations.append(Observation._make(map(np.copy, seen)))
+
+    runs = drive_all(system_at_worst_point(system, settings), settings, engine, listen=record_observation)
     return Simulation(
         study=study, setting=dict(zip(system.characteristics.names, setting.tolist(), strict=True)),
         put_back=_values_put_back(system, requested, setting), evaluation=score(system, settings, runs), runs=runs,
-        scoring=system.measuring.scoring, _recording=recording)
+        scoring=system.measuring.scoring, _observations=observations)
 
 
 def _values_put_back(system: System, requested: FloatArray, setting: FloatArray) -> dict[str, float]:

@@ -1,7 +1,7 @@
 """User code: looked up by name, checked against a contract, called through a guard."""
 
 from safevar_sumo.plugins.files import DIGEST_LENGTH, Files, changed_files, digest_of, digests, file_by_name, files_named_in, note_inputs
-from safevar_sumo.plugins.guard import Contract, Guard, accepts, guard_process_state, read_only_copy
+from safevar_sumo.plugins.guard import Contract, Guard, accepts, check_open_runs, guard_process_state, open_rows, read_only_copy
 from safevar_sumo.plugins.lookup import (
     Lookup,
     Member,
@@ -16,5 +16,6 @@ from safevar_sumo.plugins.lookup import (
 
 __all__ = [
     "DIGEST_LENGTH", "Contract", "Files", "Guard", "Lookup", "Member", "ModuleCopies", "accepts", "add_import_folders",
-    "added_import_folders", "changed_files", "check_parameters", "digest_of", "digests", "file_by_name", "files_named_in",
-    "guard_process_state", "inherit_import_folders", "instance_of", "note_inputs", "read_only_copy", "unload_user_modules"]
+    "added_import_folders", "changed_files", "check_open_runs", "check_parameters", "digest_of", "digests", "file_by_name",
+    "files_named_in", "guard_process_state", "inherit_import_folders", "instance_of", "note_inputs", "open_rows", "read_only_copy",
+    "unload_user_modules"]

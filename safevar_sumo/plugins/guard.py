@@ -8,6 +8,7 @@ import os
 import traceback
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
@@ -17,12 +18,14 @@ import numpy as np
 
 from safevar_sumo.errors import InputError, UserCodeError, describe_error
 from safevar_sumo.plugins.files import audit_hook
-from safevar_sumo.records import BoolArray, FloatArray
+from safevar_sumo.records import BoolArray, FloatArray, IntArray
 
 _PACKAGE_FOLDER = str(Path(__file__).resolve().parents[1])
 _IMPORTLIB_FOLDER = str(Path(importlib.__file__).parent)
 LIBRARY_FOLDER = "site-packages"
 INFINITY = float("inf")
+_open_runs: ContextVar[BoolArray | None] = ContextVar("open_runs", default=None)
+"""Which of N runs have not ended yet, shape (N,); None outside a simulation."""
 
 
 class Contract(NamedTuple):
@@ -136,6 +139,25 @@ def guard_process_state(source: str, names: Sequence[str]) -> Iterator[None]:
             os.environ.update(environment)
 
 
+@contextmanager
+def check_open_runs(are_open: BoolArray) -> Iterator[None]:
+    """Within the block, ignore wrong values of runs that have ended: a vehicle still moves while others in its batch drive.
+
+    `are_open`, shape (N,), may change during the block.
+    """
+    token = _open_runs.set(are_open)
+    try:
+        yield
+    finally:
+        _open_runs.reset(token)
+
+
+def open_rows(holds: BoolArray) -> IntArray:
+    """The indices at which `holds` is true, shape (N,), without those of runs that have ended."""
+    are_open = _open_runs.get()
+    return np.flatnonzero(holds if are_open is None or are_open.shape != holds.shape else holds & are_open)
+
+
 class Guard(NamedTuple):
     """Calls user code and checks the results.
 
@@ -205,7 +227,7 @@ class Guard(NamedTuple):
 
     def numbers(self, method: str, quantity: str, value: Any, shape: tuple[int, ...], lowest: float = -INFINITY, highest: float = INFINITY,
                 *, above: bool = False, infinite: bool = False, undefined: bool = False) -> FloatArray:
-        """A result as a new array of float64.
+        """A result as a new array of float64; wrong values of runs that have ended become 0.
 
         Parameters
         ----------
@@ -227,7 +249,9 @@ class Guard(NamedTuple):
         if undefined:
             is_valid |= np.isnan(numbers)
         if not is_valid.all():
-            raise self.wrong_value(method, quantity, float(numbers[~is_valid][0]), expected)
+            for row in open_rows(~is_valid)[:1]:
+                raise self.wrong_value(method, quantity, float(numbers.flat[row]), expected)
+            numbers[~is_valid] = 0.0
         return numbers
 
     def booleans(self, method: str, quantity: str, value: Any, shape: tuple[int, ...]) -> BoolArray:

@@ -189,13 +189,15 @@ class FreeParameter(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
 
 
 class Origin(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The files of a study; results do not depend on them.
+    """Where a study comes from; results do not depend on it.
 
-    `called` is the study's path as given on the command line, empty if the study was given by its name; `places` are the folders of its
+    `called` is the study's path as given on the command line, empty if the study was given by its name; `point` is the point of the matrix
+    to which the study was reduced, empty for a whole study; `places` are the folders of its
     file and of the files that it extends, where user code is looked up first; `remarks` are for the user.
     """
 
     called: str = ""
+    point: str = ""
     places: tuple[str, ...] = ()
     remarks: tuple[str, ...] = ()
 

@@ -9,9 +9,9 @@ import numpy as np
 import numpy.typing as npt
 
 from safevar_sumo.errors import InputError
-from safevar_sumo.plugins import guard_process_state
+from safevar_sumo.plugins import check_open_runs, guard_process_state, open_rows
 from safevar_sumo.protocol.driving_robot import DrivingRobot
-from safevar_sumo.records import STANDSTILL, TIME_DECIMALS, BoolArray, Evaluations, FloatArray, Outcome, SimulationRuns, Trace
+from safevar_sumo.records import STANDSTILL, TIME_DECIMALS, BoolArray, Evaluations, FloatArray, Observation, Outcome, SimulationRuns, Trace
 from safevar_sumo.scenarios import VUT, Lane, Point
 from safevar_sumo.scenarios.base import Scene
 from safevar_sumo.scenarios.frame import Frame
@@ -28,6 +28,9 @@ from safevar_sumo.sumo.world import INSERTION_DECELERATION, SumoWorld
 from safevar_sumo.vehicles import LEVEL, CharacteristicSet, Sensors, at_start, slope_of
 
 Watcher = Callable[[SumoWorld], None]
+"""A function that is called with SUMO's world at every sample."""
+Listener = Callable[[Observation], None]
+"""A function that is called with what the ADS observes at every sample."""
 
 
 @np.errstate(all="ignore")
@@ -55,10 +58,11 @@ def reason_for_sumo(system: System) -> str:
     return next((reason for reason in scenes_or_reasons if isinstance(reason, str)), "")
 
 
-def drive_all(system: System, settings: FloatArray, engine: Engine = Engine.RECORDED, options: tuple[str, ...] = (),
-              watch: Watcher | None = None) -> SimulationRuns:
-    """Simulate N settings of n characteristics, shape (N, n), at every point; `watch` is called with SUMO's world at every sample.
+def drive_all(system: System, settings: FloatArray, engine: Engine = Engine.RECORDED, watch: Watcher | None = None,
+              listen: Listener | None = None) -> SimulationRuns:
+    """Simulate N settings of n characteristics, shape (N, n), at every point.
 
+    `watch` is called with SUMO's world at every sample, `listen` with what the ADS observes.
     Several points must share a network and have recorded scenes; SUMO simulates only one point at once. The result holds the
     runs at the first point, then the runs at the second point, and so on.
 
@@ -69,16 +73,16 @@ def drive_all(system: System, settings: FloatArray, engine: Engine = Engine.RECO
     InputError
         If a user's ADS fails.
     """
-    scenarios, sumo_options = [point.scenario for point in system.points], (*step_options(system), *options)
+    scenarios, options = [point.scenario for point in system.points], step_options(system)
     if engine is Engine.RECORDED:
         if watch is None and not reason_for_sumo(system):
-            scenes = record_scenes(scenarios, sumo_options)
+            scenes = record_scenes(scenarios, options)
             world = RecordedWorld([scene for scene in scenes if isinstance(scene, Recording)], len(settings))
-            return drive(system, np.tile(settings, (len(system.points), 1)), world)
+            return drive(system, np.tile(settings, (len(system.points), 1)), world, listen=listen)
         engine = Engine.LIBSUMO
     (scenario,) = scenarios
-    with open_world(copied_network(stage_network(scenario).folder, len(settings)), len(settings), engine, sumo_options) as sumo_world:
-        return drive(system, settings, sumo_world, watch)
+    with open_world(copied_network(stage_network(scenario).folder, len(settings)), len(settings), engine, options) as sumo_world:
+        return drive(system, settings, sumo_world, watch, listen)
 
 
 def step_options(system: System) -> tuple[str, ...]:
@@ -87,17 +91,20 @@ def step_options(system: System) -> tuple[str, ...]:
 
 
 @np.errstate(all="ignore")
-def drive(system: System, settings: FloatArray, world: SumoWorld | RecordedWorld, watch: Watcher | None = None) -> SimulationRuns:
+def drive(system: System, settings: FloatArray, world: SumoWorld | RecordedWorld, watch: Watcher | None = None,
+          listen: Listener | None = None) -> SimulationRuns:
     """Simulate vehicles in an open world that has not taken its first step; see `drive_all`.
 
     With K points, `settings` holds K groups of equal size, and group k drives at point k.
     """
     guards = [member.guard for member in system.members if member.guard is not None]
-    with guard_process_state(guards[0].source if guards else "", [guard.name for guard in guards]):
-        return _simulate(system, settings, world, watch)
+    outcomes = _Outcomes(len(settings))
+    with guard_process_state(guards[0].source if guards else "", [guard.name for guard in guards]), check_open_runs(outcomes.is_checked):
+        return _simulate(system, settings, world, outcomes, watch, listen)
 
 
-def _simulate(system: System, settings: FloatArray, world: Any, watch: Watcher | None) -> SimulationRuns:
+def _simulate(system: System, settings: FloatArray, world: Any, outcomes: _Outcomes, watch: Watcher | None,
+              listen: Listener | None) -> SimulationRuns:
     vehicle, step, n = system.vehicle, world.step_length, len(settings)
     characteristics = dict(zip(system.characteristics.names, np.ascontiguousarray(settings.T), strict=True))
     prepared = vehicle.prepare(characteristics, _road_friction(system.points, n), step, *_road_arguments(system.points, n))
@@ -113,7 +120,7 @@ def _simulate(system: System, settings: FloatArray, world: Any, watch: Watcher |
     ads_memory = system.ads.start(n, system.nominal, step)
     batch = PointBatch(system.points, world, n)
     log = _Log(n, int(batch.last_step.max()) + 1, frame)
-    outcomes, robot = _Outcomes(n), DrivingRobot(system.points, vehicle, prepared, state, step)
+    robot = DrivingRobot(system.points, vehicle, prepared, state, step)
     contacts, warnings = Contacts(n, robot.has_test_speed), _FirstWarnings(system.ads, n)
     for sample in range(log.length):
         if watch is not None:
@@ -124,6 +131,8 @@ def _simulate(system: System, settings: FloatArray, world: Any, watch: Watcher |
         active = outcomes.judge(speed, scene.over, collisions, last=sample >= batch.last_step)
         observation = batch.observe(sample * step, speed, scene)._replace(throttle=state.throttle, brake=state.brake)
         observation, state = vehicle.sense(prepared, state, observation)
+        if listen is not None:
+            listen(observation)
         command, ads_memory = system.ads.drive(observation, ads_memory)
         warnings.update(ads_memory, speed, scene, outcomes.is_open)
         command, state = robot.drive(command, state, outcomes.is_open)
@@ -134,6 +143,7 @@ def _simulate(system: System, settings: FloatArray, world: Any, watch: Watcher |
             break
         if watch is None:
             world.end_runs(outcomes.ended_copies)
+        np.copyto(outcomes.is_checked, outcomes.is_open)
         state = vehicle.advance(prepared, state, command)
         _check_finite(state.speed, settings, system.characteristics)
         world.advance(np.where(outcomes.is_open, state.speed, 0.0))
@@ -150,11 +160,11 @@ def _check_finite(speed: FloatArray, settings: FloatArray, characteristics: Char
     The error replaces numpy's overflow warnings, which name neither a characteristic nor a value.
     """
     if np.count_nonzero(np.isfinite(speed)) < len(speed):
-        copy = np.flatnonzero(~np.isfinite(speed))[0]
-        changes = [f"{characteristic.name} = {value:g}" for characteristic, value in zip(characteristics, settings[copy], strict=True)
-                   if value != characteristic.original]
-        values = ", ".join(changes) or "the original's values"
-        raise InputError("vehicle", f"its speed is {speed[copy]} with {values}", "values that the model can compute with")
+        for copy in open_rows(~np.isfinite(speed))[:1]:
+            changes = [f"{characteristic.name} = {value:g}" for characteristic, value in zip(characteristics, settings[copy], strict=True)
+                       if value != characteristic.original]
+            values = ", ".join(changes) or "the original's values"
+            raise InputError("vehicle", f"its speed is {speed[copy]} with {values}", "values that the model can compute with")
 
 
 def _road_friction(points: Sequence[Point], n: int) -> Any:
@@ -222,10 +232,13 @@ class _Log:
 
 
 class _Outcomes:
-    """Outcomes of N runs (docs/method.md, section 4): `is_open` is true where an outcome can change; `ended_copies` ended in this step."""
+    """Outcomes of N runs (docs/method.md, section 4): `is_open` is true where an outcome can change; `ended_copies` ended in this step.
+
+    `is_checked` is true where user code is checked: in runs that were open when their vehicles last advanced.
+    """
 
     def __init__(self, n: int) -> None:
-        self.is_open = np.ones(n, dtype=bool)
+        self.is_open, self.is_checked = np.ones(n, dtype=bool), np.ones(n, dtype=bool)
         self.ended_copies: list[int] = []
         self.collision_speed = np.full(n, np.nan)
         self._has_moved = np.zeros(n, dtype=bool)

@@ -163,7 +163,7 @@ def evaluations_at_worst_points(at_points: Sequence[PointResult | PointEvaluatio
     return evaluations.take(point_numbers * len(settings) + setting_numbers)
 
 
-def simulate(system: System, settings: FloatArray, engine: Engine = Engine.RECORDED, options: tuple[str, ...] = (),
+def simulate(system: System, settings: FloatArray, engine: Engine = Engine.RECORDED,
              watch: Watcher | None = None) -> SimulationRuns:
     """Run the scenario once for every setting, shape (N, n); `watch` is called with the world at every sample.
 
@@ -171,28 +171,27 @@ def simulate(system: System, settings: FloatArray, engine: Engine = Engine.RECOR
     the last setting. Raises the errors of `drive_all`.
     """
     if not system.matrix:
-        return drive_all(system, settings, engine, options, watch)
+        return drive_all(system, settings, engine, watch)
     if watch is not None or engine is Engine.GUI:
-        return drive_all(system_at_worst_point(system, settings), settings, engine, options, watch)
-    at_points = simulate_all_points(system, settings, engine, options)
+        return drive_all(system_at_worst_point(system, settings), settings, engine, watch)
+    at_points = simulate_all_points(system, settings, engine)
     return _select_runs([result.runs for result in at_points], worst_points(at_points))
 
 
-def simulate_all_points(system: System, settings: FloatArray, engine: Engine = Engine.RECORDED,
-                        options: tuple[str, ...] = ()) -> list[PointResult]:
+def simulate_all_points(system: System, settings: FloatArray, engine: Engine = Engine.RECORDED) -> list[PointResult]:
     """Simulate settings, shape (N, n), at every point; results are in the points' order. Raises the errors of `drive_all`."""
-    by_name = {result.point.name: result for group in _simulate_groups(system, settings, engine, options) for result in group}
+    by_name = {result.point.name: result for group in _simulate_groups(system, settings, engine) for result in group}
     return [by_name[point.name] for point in system.points]
 
 
-def _simulate_groups(system: System, settings: FloatArray, engine: Engine, options: tuple[str, ...] = ()) -> Iterator[list[PointResult]]:
+def _simulate_groups(system: System, settings: FloatArray, engine: Engine) -> Iterator[list[PointResult]]:
     """Yield the results of settings at every point, in groups of points that share a simulation."""
     n = len(settings)
     groups: Iterable[tuple[Point, ...]] = ((point,) for point in system.points)
     if _is_recorded(system, engine):
-        groups = _group_points(system.points, largest_batch(system) // max(n, 1), (*step_options(system), *options))
+        groups = _group_points(system.points, largest_batch(system) // max(n, 1), step_options(system))
     for points in groups:
-        runs = drive_all(replace(system, matrix=points), settings, engine, options)
+        runs = drive_all(replace(system, matrix=points), settings, engine)
         evaluations = score(system, np.tile(settings, (len(points), 1)), runs)
         yield [PointResult(point, evaluations.take(np.arange(start, start + n)), runs.of(slice(start, start + n)))
                for point, start in zip(points, range(0, len(points) * n, n), strict=True)]
@@ -238,13 +237,15 @@ def study_at(study: Study, name: str, source: object) -> Study:
     system = assemble(study)
     parameters = dict(_find_point(system, name, source).parameters)
     assert study.matrix is not None
+    origin = replace_in(study.origin, point=name)
     if system.rater is not None:
-        return reduce_to_cells(study, system.weather, [[point.name for point in system.matrix].index(name)])
+        reduced_study = reduce_to_cells(study, system.weather, [[point.name for point in system.matrix].index(name)])
+        return replace_in(reduced_study, origin=origin)
     test_name, weather = parameters.pop("test"), parameters.pop("weather")
     test = next(test for test in study.matrix.tests if test.name == test_name and test.over.keys() == parameters.keys()
                 and all(value in test.over[key] for key, value in parameters.items()))
     reduced_test = replace_in(test, over={key: [value] for key, value in parameters.items()}, weathers=[weather] if test.weathers else [])
-    return replace_in(study, matrix=replace_in(study.matrix, tests=[reduced_test]))
+    return replace_in(study, matrix=replace_in(study.matrix, tests=[reduced_test]), origin=origin)
 
 
 def _group_points(points: Sequence[Point], size: int, options: Sequence[str]) -> Iterator[tuple[Point, ...]]:

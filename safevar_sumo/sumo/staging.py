@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 import hashlib
-import os
-import tempfile
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Sequence
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import platformdirs
-
-from safevar_sumo.errors import InputError, SimulationError
+from safevar_sumo.errors import InputError
 from safevar_sumo.scenarios import GuardedScenario, Lane, Scenario
 from safevar_sumo.scenarios.base import XmlChanges, lane_through
+from safevar_sumo.sumo.cache import ensure_all_cached
 from safevar_sumo.sumo.copies import parse_xml
 from safevar_sumo.sumo.network import NETWORK_FILE, built_network, network_fingerprint
 from safevar_sumo.sumo.sources import OPTIONS_FILE, TRAFFIC_FILE, Sources, options_of, sources_of
@@ -35,6 +32,8 @@ def stage_network(scenario: Scenario) -> StagedNetwork:
     ------
     InputError
         If the parameters are impossible, or change an element that the network or the traffic file lacks.
+    EnvironmentFault
+        If the cache cannot be written.
     """
     return stage_networks([scenario])[0]
 
@@ -121,18 +120,10 @@ def _change_xml(file: Path, changes: XmlChanges) -> ElementTree.Element:
 
 @lru_cache(maxsize=1000)
 def _store_network(name: str, files: tuple[tuple[str, bytes], ...]) -> Path:
-    digest = hashlib.sha256(repr(files).encode()).hexdigest()
-    target = platformdirs.user_cache_path("safevar_sumo") / "staged" / digest[:16] / (name or "network")
-    if not target.is_dir():
-        try:
-            target.parent.mkdir(parents=True, exist_ok=True)
-            with tempfile.TemporaryDirectory(dir=target.parent) as folder:
-                copy = Path(folder) / target.name
-                copy.mkdir()
-                for file, content in files:
-                    (copy / file).write_bytes(content)
-                os.replace(copy, target)
-        except OSError as error:
-            if not target.is_dir():
-                raise SimulationError(f"{target}: cannot write the cache of networks: {error.strerror}") from None
-    return target
+    folder = f"staged-{hashlib.sha256(repr(files).encode()).hexdigest()[:16]}/{name or 'network'}"
+    return ensure_all_cached(folder, [file for file, _ in files], partial(_write_files, files))
+
+
+def _write_files(files: tuple[tuple[str, bytes], ...], into: Path) -> None:
+    for name, content in files:
+        (into / name).write_bytes(content)

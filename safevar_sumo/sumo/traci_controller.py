@@ -39,7 +39,8 @@ class TraciController:
 
     def start(self, n: int, nominal: Nominal, step: float) -> _Memory:
         world = current_world()
-        world.set_types(SumoType(*(np.full(n, getattr(nominal, name)) for name in SumoType._fields)))
+        values = nominal.mass, nominal.accel, nominal.decel, nominal.max_speed, nominal.actuator_lag
+        world.set_types(SumoType(*(np.full(n, value) for value in values)))
         names, traffic = world.names(), SensedTraffic(world, step)
         views = [TraciView(world, copy, names, traffic, nominal, step) for copy in range(n)]
         traffic.record_step()

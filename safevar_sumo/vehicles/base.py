@@ -8,7 +8,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from safevar_sumo.errors import UserCodeError
-from safevar_sumo.plugins import Contract, Guard, accepts, read_only_copy
+from safevar_sumo.plugins import Contract, Guard, accepts, open_rows, read_only_copy
 from safevar_sumo.records import GRAVITY, BoolArray, Command, FloatArray, Observation
 from safevar_sumo.vehicles.sensors import Sensors
 
@@ -237,7 +237,7 @@ class GuardedVehicle:
     def advance(self, prepared: _Prepared, state: _State, command: Command) -> _State:
         result = self._guard.call("advance", self.model.advance, prepared.constants, state.model_state, read_only_copy(command))
         state, max_speed = self._checked_state("advance", prepared.n, result), prepared.types.max_speed
-        for i in np.flatnonzero(state.speed > max_speed * (1 + SPEED_ROUNDING))[:1]:  # SUMO itself accepts any speed
+        for i in open_rows(state.speed > max_speed * (1 + SPEED_ROUNDING))[:1]:  # SUMO itself accepts any speed
             raise self._guard.wrong_value("advance", "speed", float(state.speed[i]), f"up to max_speed = {max_speed[i]:g} of its sumo_type")
         return state
 

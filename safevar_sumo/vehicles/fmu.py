@@ -9,7 +9,7 @@ import numpy as np
 
 from safevar_sumo.errors import InputError, UserCodeError, unknown_name
 from safevar_sumo.fmu import COMMON_UNITS, REAL_TYPES, SI, Description, Fault, Fleet, History, Instances, Port, Unit, constants_of, ports_of
-from safevar_sumo.plugins import Guard
+from safevar_sumo.plugins import Guard, open_rows
 from safevar_sumo.records import BoolArray, Command, FloatArray, Observation
 from safevar_sumo.study import CharacteristicTable
 from safevar_sumo.vehicles.base import HIGHEST_SPEED, LEVEL, SPEED_ROUNDING, Characteristics, Slope, SumoType
@@ -213,7 +213,7 @@ class FmuVehicle:
         outputs = dict(zip(self._outputs, point_outputs, strict=True))
         outputs["speed"] = dict(zip(self._outputs, step_outputs, strict=True))["speed"]
         next_state, max_speed = self._state(outputs, command, state.seen, history), prepared.types.max_speed
-        for i in np.flatnonzero(next_state.speed > np.maximum(max_speed, state.speed) * (1 + SPEED_ROUNDING))[:1]:
+        for i in open_rows(next_state.speed > np.maximum(max_speed, state.speed) * (1 + SPEED_ROUNDING))[:1]:
             raise self._guard.wrong_value("doStep", "speed", float(next_state.speed[i]),
                                           f"up to vehicle.sumo_type.max_speed = {max_speed[i]:g}")
         return next_state

@@ -76,8 +76,11 @@ def find_difference(evaluations: Evaluations, other_evaluations: Evaluations,
         return None
     if evaluations.outcome[0] != other_evaluations.outcome[0]:
         return "outcome", str(evaluations.outcome[0]), str(other_evaluations.outcome[0])
+    if evaluations.metrics.keys() != other_evaluations.metrics.keys():
+        return "the list of metrics", ", ".join(evaluations.metrics), ", ".join(other_evaluations.metrics)
     for name in ("collision_speed", *evaluations.metrics):
-        values, other_values = (batch.metrics.get(name, batch.collision_speed) for batch in (evaluations, other_evaluations))
+        values, other_values = (batch.collision_speed if name == "collision_speed" else batch.metrics[name]
+                                for batch in (evaluations, other_evaluations))
         if not np.allclose(values, other_values, rtol=0, atol=tolerance, equal_nan=True):
             return name, float(values[0]), float(other_values[0])
     return None

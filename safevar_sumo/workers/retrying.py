@@ -191,8 +191,12 @@ class RetryingPool:
 
 
 def reproduction_command(study: Study, setting: FloatArray) -> str:
-    """The command that simulates a setting of n characteristics, shape (n,)."""
+    """The command that simulates a setting of n characteristics, shape (n,), in a study or at the point to which it was reduced."""
+    characteristics = CharacteristicSet.of(study.vehicle.characteristics)
+    point = ["--point", shlex.quote(study.origin.point)] if study.origin.point else []
     changes = [f"--set {characteristic.name}={value!r}"
-               for characteristic, value in zip(CharacteristicSet.of(study.vehicle.characteristics), setting.tolist(), strict=True)
-               if value != characteristic.original]
-    return " ".join([f"{PROGRAM_COMMAND} simulate", shlex.quote(study.origin.called or study.name), *changes])
+               for characteristic, value in zip(characteristics, setting.tolist(), strict=True) if value != characteristic.original]
+    is_beyond = ((setting < characteristics.lower) | (setting > characteristics.upper)).any()
+    switches = {"--no-filter": (characteristics.filter(setting) != setting).any(), "--beyond": is_beyond}
+    switches_on = [switch for switch, is_on in switches.items() if is_on]
+    return " ".join([f"{PROGRAM_COMMAND} simulate", shlex.quote(study.origin.called or study.name), *point, *changes, *switches_on])

@@ -7,11 +7,14 @@ from typing import Any
 import numpy as np
 import pytest
 
+import safevar_sumo as sv
 from safevar_sumo.ads import GuardedAds, PerVehicleAds, ScalarAds
 from safevar_sumo.ads.aeb import Aeb
 from safevar_sumo.plugins import Guard
 from safevar_sumo.records import Command, SimulationRuns
 from safevar_sumo.scenarios import Along, CarToCar
+from safevar_sumo.sumo.matrix import simulate
+from safevar_sumo.sumo.system import assemble
 from tests.scenarios.holding import CARLA, Hold, driven
 from tests.scenarios.test_crossing import WORN
 
@@ -70,3 +73,12 @@ def test_an_ads_of_ones_own_warns() -> None:
     for ads in (PerVehicleAds(Near, guard), GuardedAds(NearForMany(), guard)):
         run = driven(CarToCar(test="CCRs", speed=36), ads, np.stack([original, original]))
         assert run.warning_ttc == pytest.approx([2.0, 2.0], abs=STEP + 1e-6)
+
+
+def test_one_simulation_has_the_warning_of_a_batch() -> None:
+    scenario = {"model": "car_to_car", "parameters": {"test": "CCRs", "speed": 36.0}}
+    study = sv.load_study("native", ads={"model": "aeb", "parameters": {}}, scenario=scenario)
+    alone, system = sv.simulate(study), assemble(study)
+    batch = simulate(system, system.characteristics.original[np.newaxis])
+    assert alone.runs.warning_ttc.tolist() == batch.warning_ttc.tolist()
+    assert not np.isnan(batch.warning_ttc).any()

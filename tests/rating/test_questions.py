@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from concurrent.futures import Future
 from io import StringIO
 from types import SimpleNamespace
 from typing import Any, cast
@@ -30,13 +31,16 @@ from safevar_sumo.api.simulation import Simulation
 from safevar_sumo.cli.program import commands
 from safevar_sumo.cli.simulate import _rating_command
 from safevar_sumo.cli.target import CommandTarget
+from safevar_sumo.errors import SimulationError
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.protocol import EURO_NCAP_2026, protocol_of, rater
+from safevar_sumo.records import Evaluations
 from safevar_sumo.report.input import _at_point as at_point
 from safevar_sumo.report.rated import draw_matrices
 from safevar_sumo.results import SolutionId, record, solutions_frame
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.system import assemble
+from safevar_sumo.workers.evaluation import WorkerLostError
 from tests.in_process import InlinePool
 
 STUDY = load_study("euro_ncap_rating")
@@ -180,3 +184,27 @@ def test_rare_failures_are_approached_by_points_where_points_are_the_criterion()
     points = float(evaluations.column("rating_points")[0])
     response = Response(evaluator, lambda where: where, Unsafe(points=points - 2))
     assert response.record(evaluations.settings, evaluations) == pytest.approx([2.0])
+
+
+class LosingPool(InlinePool):
+    """A pool whose workers die with every batch of several settings, and with these masses."""
+
+    def __init__(self, *masses: float) -> None:
+        super().__init__()
+        self._masses = masses
+
+    def submit(self, work: bytes, settings: np.ndarray) -> Future[Evaluations]:
+        if len(settings) == 1 and settings[0, 0] not in self._masses:
+            return super().submit(work, settings)
+        future: Future[Evaluations] = Future()
+        future.set_exception(WorkerLostError(f"lost with {settings[-1, 0]:g}"))
+        return future
+
+
+def test_parts_of_a_divided_batch_have_the_cells_of_the_whole() -> None:
+    original = Evaluator(STUDY, InlinePool()).characteristics.original
+    settings = np.stack([original, np.where(np.arange(len(original)) == 0, original + 100, original)])
+    whole, parts = (Evaluator(STUDY, pool).simulate_cells(settings, "") for pool in (InlinePool(), LosingPool()))
+    assert all(np.array_equal(one, other, equal_nan=True) for one, other in zip(whole, parts, strict=True))
+    with pytest.raises(SimulationError, match=f"a vehicle cannot be simulated: lost with {settings[1, 0]:g}"):
+        Evaluator(STUDY, LosingPool(settings[1, 0])).simulate_cells(settings, "")

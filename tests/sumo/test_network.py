@@ -17,6 +17,7 @@ from safevar_sumo.errors import EnvironmentFault, InputError
 from safevar_sumo.shipped import NETWORKS
 from safevar_sumo.sumo.engine import open_world
 from safevar_sumo.sumo.network import check_network, copied_network
+from safevar_sumo.sumo.staging import _store_network
 
 FOLDERS = sorted(path.name for path in NETWORKS.iterdir() if path.is_dir())
 BINARIES = Path(sumo.SUMO_HOME) / "bin"
@@ -56,6 +57,20 @@ def test_a_damaged_file_in_the_cache_is_built_again(spoil: Callable[[Path], None
     assert file.read_bytes() == built
     kept = {path.name for path in file.parent.iterdir()} - {"nobody.rou.xml", "nobody.rou.xml.sha256"}  # the same without its actors
     assert kept == {file.name, f"{file.name}.sha256"}
+
+
+def test_a_variant_of_a_network_is_checked_before_use_as_well(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    files, build = (("traffic.rou.xml", b"<routes/>"), ("scenario.sumocfg", b"<configuration/>")), _store_network.__wrapped__
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    folder = build("road", files)
+    (folder / files[0][0]).write_bytes(b"<rou")
+    (folder / files[1][0]).unlink()
+    assert build("road", files) == folder
+    assert {name: (folder / name).read_bytes() for name, _ in files} == dict(files)
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
+    with pytest.raises(EnvironmentFault, match="cannot write the cache of networks"):
+        build("road", files)
 
 
 @pytest.mark.parametrize(("loss", "n"), [("half", 12), ("nothing", 25), ("error", 60)])

@@ -8,6 +8,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
+from dataclasses import replace
 
 import msgspec
 import numpy as np
@@ -17,12 +18,15 @@ import pytest
 from safevar_sumo.errors import EnvironmentFault, InputError, SimulationError, UserCodeError
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import Evaluations, Outcome
-from safevar_sumo.study import ModelTable, Origin, load_study
+from safevar_sumo.study import ModelTable, Origin, Study, load_study
+from safevar_sumo.sumo.matrix import study_at
+from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet
 from safevar_sumo.workers.evaluation import PoolLostError, WorkerLostError, pack_study
 from safevar_sumo.workers.interrupts import defer_interrupts, wait_for_first, wait_for_result
+from safevar_sumo.workers.isolation import find_difference
 from safevar_sumo.workers.local import LocalPool, local_pool
-from safevar_sumo.workers.retrying import ATTEMPTS, RetryingPool
+from safevar_sumo.workers.retrying import ATTEMPTS, RetryingPool, reproduction_command
 
 pytestmark = pytest.mark.usefixtures("worker_processes")
 SMOKE = pack_study(load_study("smoke"))
@@ -155,6 +159,16 @@ class ToldPool:
         return future
 
 
+def test_metrics_that_only_one_side_has_are_a_difference() -> None:
+    one = evaluated(settings(1))
+    assert find_difference(one, one) is None
+    fewer = replace(one, metrics={name: values for name, values in one.metrics.items() if name != "safety_degree"})
+    for both in ((one, fewer), (fewer, one)):
+        name, *lists = find_difference(*both) or ("no difference",)
+        assert name == "the list of metrics"
+        assert sum("safety_degree" in str(names) for names in lists) == 1
+
+
 def died() -> WorkerLostError:
     return WorkerLostError("the worker process died (exit code -9)")
 
@@ -213,6 +227,24 @@ def test_what_a_users_code_does_on_one_setting_is_an_error_that_names_it() -> No
     assert f"--set {SUN.names[0]}=4313.0" in str(caught.value)
     assert str(caught.value).count("--set") == 1, "what is not changed need not be set"
     assert len(pool.tried) < 15
+
+
+def reproduced(study: Study, **values: float) -> str:
+    """What follows the study's name in the command that reproduces these values."""
+    setting = CharacteristicSet.of(study.vehicle.characteristics).setting(values, "test", beyond=True)
+    return reproduction_command(study, setting).partition(f"simulate {study.name}")[2]
+
+
+def test_the_command_that_reproduces_a_setting_keeps_small_changes_and_the_point() -> None:
+    study, original = load_study("euro_ncap_car_to_car"), SUN.original[SUN.names.index("mass")]
+    assert reproduced(study, mass=original + 200) == f" --set mass={original + 200}"
+    assert reproduced(study, mass=original + 5) == f" --set mass={original + 5} --no-filter"
+    assert reproduced(study, mass=original * 9) == f" --set mass={original * 9} --beyond"
+    point = assemble(study).matrix[3].name
+    assert reproduced(study_at(study, point, "test"), mass=original + 200) == f" --point '{point}' --set mass={original + 200}"
+    rated = load_study("euro_ncap_rating")
+    cell = assemble(rated).matrix[3].name
+    assert f"--point '{cell}'" in reproduced(study_at(rated, cell, "test"))
 
 
 def test_settings_that_fail_one_after_the_other_without_end_are_a_fault_of_the_study() -> None:
