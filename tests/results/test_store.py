@@ -358,6 +358,7 @@ def test_a_study_under_way(slippery: Path, tmp_path: Path) -> None:
     shutil.copytree(slippery, tmp_path / "it")
     nsga2, rs = tmp_path / "it/runs/nsga2-00.journal", tmp_path / "it/runs/rs-00.journal"
     rs.unlink()
+    (tmp_path / "it/solutions.csv").unlink()  # written after the last run
     nsga2.write_bytes(nsga2.read_bytes()[:len(nsga2.read_bytes()) * 2 // 3])  # torn, as while somebody writes
     result = status(tmp_path / "it")
     assert [run.state for run in result.runs] == ["begun", "waiting"]
@@ -381,6 +382,29 @@ def test_reading_a_torn_run_warns(slippery: Path, tmp_path: Path) -> None:
     with pytest.warns(UserWarning, match=r"nsga2-00\.journal: the last \d+ bytes are torn, so the run counts as unfinished"):
         (case,) = load_cases([tmp_path / "it"])
     assert ("nsga2", 0) not in case.finished_runs
+
+
+def test_a_lost_journal_of_a_finished_study_is_named_with_its_remedy(slippery: Path, tmp_path: Path) -> None:
+    shutil.copytree(slippery, tmp_path / "it")
+    lost = tmp_path / "it/runs/rs-00.journal"
+    lost.unlink()
+    with pytest.raises(InputError, match=r"rs-00\.journal: is missing, although solutions\.csv holds.*\nexpected: .*the same study again"):
+        load_runs(tmp_path / "it")
+    assert f"{lost} is missing" in status(tmp_path / "it").remarks[0]
+    (tmp_path / "it/runs/nsga2-00.journal").unlink()
+    with pytest.raises(InputError, match=r"nsga2-00\.journal: is missing \(and 1 more\)"):
+        load_runs(tmp_path / "it")
+
+
+def test_every_command_about_solutions_says_which_runs_are_unfinished(slippery: Path, tmp_path: Path) -> None:
+    shutil.copytree(slippery, tmp_path / "it")
+    (tmp_path / "it/runs/rs-00.journal").unlink()
+    (tmp_path / "it/solutions.csv").unlink()
+    for command in (["explain", str(tmp_path / "it"), "--top", "1"], ["simulate", str(tmp_path / "it"), "--most-severe"]):
+        done = CliRunner().invoke(commands, command)
+        assert done.exit_code == 0, done.output
+        assert "unfinished, rs 0 of 1 runs" in done.stderr
+    assert "unfinished" not in CliRunner().invoke(commands, ["simulate", str(tmp_path / "it")]).output
 
 
 def test_watching_ends_with_the_study_and_json_is_json(slippery: Path) -> None:
