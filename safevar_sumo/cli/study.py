@@ -64,6 +64,8 @@ def study(study: str, batch: int | None, engine: str, out: Path | None, jobs: in
         if dry_run:
             used_engine, reason = choose_engine(system, engine)
             size = batch or settings_per_batch(system, used_engine)
+            if system.matrix:
+                click.echo(f"note: measuring the time of a few vehicles at {len(system.matrix)} points", err=True)
             cost = forecast(loaded_study, len(keys), pool, size, used_engine)
             print_forecast(Console(), loaded_study, len(keys), cost, f"{ENGINE_NAMES[used_engine]}: {reason}")
             return
@@ -145,7 +147,7 @@ def print_forecast(console: Console, study: Study, runs: int, cost: Forecast, en
     table.add_row("runs", str(runs))
     table.add_row("engine", engine)
     table.add_row("evaluations, at most", str(cost.evaluations))
-    table.add_row("evaluations/s, measured by a short probe", f"{cost.rate:.0f}")
+    table.add_row("evaluations/s, measured by a short probe", f"{cost.rate:.{0 if cost.rate >= 10 else 1}f}")
     table.add_row("time, at most", f"{cost.seconds / 60:.1f} min")
     table.add_row("disk, at most", f"{cost.size / 1e6:.0f} MB")
     console.print(table)
