@@ -129,11 +129,13 @@ def status(directory: str, watch: bool, every: float, as_json: bool) -> None:
     if not watch:
         Console().print(status_view(progress, rate=None))
         return
-    with Live(status_view(progress, rate=None), console=Console(), auto_refresh=False) as live:
+    with Live(status_view(progress, rate=None), console=(console := Console()), auto_refresh=False) as live:
         while not progress.finished:
             time.sleep(every)
             progress = read_status(directory)
             live.update(status_view(progress, (progress.share - start_share) / (time.monotonic() - start_time)), refresh=True)
+    if not console.is_terminal:
+        console.line()  # on a terminal, `Live` ends its last line itself
 
 
 SAFETY_NOTE = "SD: least distance in m, or minus the collision's speed in m/s.\nTET, TIT: over solutions without collision."

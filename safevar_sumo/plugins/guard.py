@@ -161,11 +161,11 @@ def open_rows(holds: BoolArray) -> IntArray:
     return np.flatnonzero(holds if are_open is None or are_open.shape != holds.shape else holds & are_open)
 
 
-def _refuse_exit(code: int) -> NoReturn:
+def _refuse_exit(status: int) -> NoReturn:
     """Raise an exception in place of `os._exit`, which would end this process without a message; threads and children of it may end."""
     if os.getpid() == _process and threading.current_thread() is threading.main_thread():
-        raise SystemExit(f"os._exit({code})")
-    _end_process(code)
+        raise SystemExit(f"os._exit({status})")
+    _end_process(status)
 
 
 def _is_from_signal(error: BaseException) -> bool:
