@@ -21,7 +21,7 @@ lint: .venv/installed-test
 	.venv/bin/lint-imports --no-logo
 
 docs: .venv/installed-docs
-	$(RUN) -m mkdocs build --quiet --strict
+	NO_MKDOCS_2_WARNING=1 $(RUN) -m mkdocs build --quiet --strict
 
 benchmark: .venv/installed-test
 	$(RUN) benchmarks/evaluation.py

@@ -163,7 +163,7 @@ def _show_warning(message: Warning | str, category: type[Warning], filename: str
 
 @contextmanager
 def _exit_on_interrupt() -> Iterator[None]:
-    """End the program on Ctrl-C while modules load: compiled modules would swallow the exception."""
+    """End the program on Ctrl-C while modules load: compiled modules would swallow the exception. Later, Ctrl-C raises it."""
     def exit_at_once(*_: object) -> None:
         os.write(2, f"{PROGRAM}: interrupted\n".encode())
         os._exit(INTERRUPT_EXIT_CODE)
@@ -174,7 +174,12 @@ def _exit_on_interrupt() -> Iterator[None]:
         yield
     finally:
         if in_main_thread:
-            signal.signal(signal.SIGINT, signal.default_int_handler if previous_handler is None else previous_handler)
+            signal.signal(signal.SIGINT, _raise_interrupt if previous_handler in (None, signal.default_int_handler) else previous_handler)
+
+
+def _raise_interrupt(*_: object) -> NoReturn:
+    """Raise what Python's own handler of Ctrl-C raises, with a frame that tells it from an interrupt that user code raises."""
+    raise KeyboardInterrupt
 
 
 def _ensure_standard_streams() -> None:

@@ -101,5 +101,5 @@ def _open_spreadsheet(xlsx: Path | None, template: Path | None, preprocessed: Pa
     try:
         from safevar_sumo.analysis.rating.workbook import PreprocessedFile, Template
     except ModuleNotFoundError:
-        raise InputError(flag, "openpyxl is not installed", "pip install 'safevar_sumo[rating]'") from None
+        raise InputError(flag, "openpyxl is not installed", "in the checkout: pip install '.[rating]'") from None
     return (PreprocessedFile if template is None else Template)(source_file, output)

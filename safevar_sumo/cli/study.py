@@ -67,6 +67,8 @@ def study(study: str, batch: int | None, engine: str, out: Path | None, jobs: in
         if dry_run:
             used_engine, reason = choose_engine(system, engine)
             size = batch or settings_per_batch(system, used_engine)
+            if system.matrix:
+                click.echo(f"note: measuring the time of a few vehicles at {len(system.matrix)} points", err=True)
             cost = forecast(loaded_study, len(keys), pool, size, used_engine)
             print_forecast(Console(), loaded_study, len(keys), cost, f"{ENGINE_NAMES[used_engine]}: {reason}")
             return
@@ -132,11 +134,13 @@ def status(directory: str, watch: bool, every: float, as_json: bool) -> None:
     if not watch:
         Console().print(status_view(progress, rate=None))
         return
-    with Live(status_view(progress, rate=None), console=Console(), auto_refresh=False) as live:
+    with Live(status_view(progress, rate=None), console=(console := Console()), auto_refresh=False) as live:
         while not progress.finished:
             time.sleep(every)
             progress = read_status(directory)
             live.update(status_view(progress, (progress.share - start_share) / (time.monotonic() - start_time)), refresh=True)
+    if not console.is_terminal:
+        console.line()  # on a terminal, `Live` ends its last line itself
 
 
 SAFETY_NOTE = "SD: least distance in m, or minus the collision's speed in m/s.\nTET, TIT: over solutions without collision."
@@ -150,7 +154,7 @@ def print_forecast(console: Console, study: Study, runs: int, cost: Forecast, en
     table.add_row("runs", str(runs))
     table.add_row("engine", engine)
     table.add_row("evaluations, at most", str(cost.evaluations))
-    table.add_row("evaluations/s, measured by a short probe", f"{cost.rate:.0f}")
+    table.add_row("evaluations/s, measured by a short probe", f"{cost.rate:.{0 if cost.rate >= 10 else 1}f}")
     table.add_row("time, at most", f"{cost.seconds / 60:.1f} min")
     table.add_row("disk, at most", f"{cost.size / 1e6:.0f} MB")
     console.print(table)

@@ -120,11 +120,20 @@ def _split_names(text: str | None) -> tuple[str, ...] | None:
 def load_results_or_study(source: str, point: str | None = None, *, results_only: bool = False) -> Study | Case:
     """Load a results directory or, unless `results_only`, a study by name or path; `point` restricts it to a point of its matrix.
 
+    A note says which runs of a results directory are unfinished.
+
     Raises
     ------
     InputError
         If there is no such study or results directory, or it has no such point.
     """
+    subject = _load_subject(source, point, results_only=results_only)
+    if not isinstance(subject, Study) and subject.shortfall:
+        click.echo(f"note: {subject.shortfall}", err=True)
+    return subject
+
+
+def _load_subject(source: str, point: str | None, *, results_only: bool = False) -> Study | Case:
     from safevar_sumo.analysis.subject import study_or_case
 
     with warnings.catch_warnings(record=True) as caught:
@@ -147,5 +156,5 @@ def _restrict_to_point(study: Study, point: str) -> Study:
 
 def load_study_at_point(source: str, point: str | None = None) -> Study:
     """Load a study, or the study recorded in a results directory, at one point or at all; raises what `load_results_or_study` raises."""
-    subject = load_results_or_study(source, point)
+    subject = _load_subject(source, point)
     return subject if isinstance(subject, Study) else subject.study

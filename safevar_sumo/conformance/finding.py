@@ -11,6 +11,10 @@ from dataclasses import asdict, dataclass, field
 from types import FrameType
 from typing import Any
 
+from safevar_sumo.errors import UserCodeError
+from safevar_sumo.plugins import Guard
+from safevar_sumo.study import Study, user_code_names
+
 ADVICE: Mapping[str, str] = {
     "contract": "return what the base class documents: see `safevar_sumo/{base}` and the tutorials",
     "units": "give the study's table and UNITS the same names and units",
@@ -108,3 +112,24 @@ def time_limit(seconds: float) -> Iterator[None]:
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0)
         signal.signal(signal.SIGALRM, previous_handler)
+
+
+@contextmanager
+def limit_user_code(study: Study) -> Iterator[None]:
+    """Give the user code of a study, if any, as much time in a block as a batch of a search has, where `time_limit` has an effect.
+
+    Raises
+    ------
+    UserCodeError
+        With the line at which the user code was interrupted.
+    """
+    if not (names := user_code_names(study)):
+        yield
+        return
+    try:
+        with time_limit(study.search.time_limit):
+            yield
+    except UserCodeTimeout as error:
+        source, code = study.source, " and ".join(names)
+        problem = f"{code}: the simulation took longer than {study.search.time_limit:g} s ({Guard(source, code).location(error)})"
+        raise UserCodeError(source, problem, "code that returns, or a longer search.time_limit") from None

@@ -160,7 +160,7 @@ def _read_description(path: str, *_: int) -> Description:  # also cached by the 
         from fmpy import platform, platform_tuple, sharedLibraryExtension
         from fmpy.model_description import read_model_description
     except ImportError:
-        raise InputError("fmu", "needs FMPy, which is not installed", "pip install 'safevar_sumo[fmu]'") from None
+        raise InputError("fmu", "needs FMPy, which is not installed", "in the checkout: pip install '.[fmu]'") from None
     try:
         with zipfile.ZipFile(path) as archive:
             files = set(archive.namelist())

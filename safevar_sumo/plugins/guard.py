@@ -5,6 +5,8 @@ from __future__ import annotations
 import importlib
 import inspect
 import os
+import signal
+import threading
 import traceback
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -12,7 +14,7 @@ from contextvars import ContextVar
 from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple, NoReturn, Self
 
 import numpy as np
 
@@ -24,6 +26,7 @@ _PACKAGE_FOLDER = str(Path(__file__).resolve().parents[1])
 _IMPORTLIB_FOLDER = str(Path(importlib.__file__).parent)
 LIBRARY_FOLDER = "site-packages"
 INFINITY = float("inf")
+_process, _end_process = os.getpid(), os._exit
 _open_runs: ContextVar[BoolArray | None] = ContextVar("open_runs", default=None)
 """Which of N runs have not ended yet, shape (N,); None outside a simulation."""
 
@@ -158,6 +161,25 @@ def open_rows(holds: BoolArray) -> IntArray:
     return np.flatnonzero(holds if are_open is None or are_open.shape != holds.shape else holds & are_open)
 
 
+def _refuse_exit(status: int) -> NoReturn:
+    """Raise an exception in place of `os._exit`, which would end this process without a message; threads and children of it may end."""
+    if os.getpid() == _process and threading.current_thread() is threading.main_thread():
+        raise SystemExit(f"os._exit({status})")
+    _end_process(status)
+
+
+def _is_from_signal(error: BaseException) -> bool:
+    """Whether a signal raised an exception, and not the code that the signal interrupted: Ctrl-C, or a time limit of this package."""
+    if isinstance(error, Exception | SystemExit | GeneratorExit):
+        return False
+    if isinstance(error, KeyboardInterrupt) and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        return True  # that handler is compiled and leaves no frame
+    innermost_frame = error.__traceback__
+    while innermost_frame is not None and innermost_frame.tb_next is not None:
+        innermost_frame = innermost_frame.tb_next
+    return innermost_frame is not None and innermost_frame.tb_frame.f_code.co_filename.startswith(_PACKAGE_FOLDER + os.sep)
+
+
 class Guard(NamedTuple):
     """Calls user code and checks the results.
 
@@ -184,21 +206,26 @@ class Guard(NamedTuple):
         Raises
         ------
         UserCodeError
-            If the function raises anything, `SystemExit` and `GeneratorExit` included.
+            If the function raises anything, or ends the process by `os._exit`.
         """
         audit_hook.call_depth += 1
+        os._exit = _refuse_exit
         try:
             return function(*arguments)
         except UserCodeError:
             raise
-        except (Exception, SystemExit, GeneratorExit) as error:  # no `BaseException`: interrupts and time limits pass
+        except BaseException as error:
+            if _is_from_signal(error):
+                raise
             raise self.failure(method, error) from error
         finally:
             audit_hook.call_depth -= 1
+            if not audit_hook.call_depth:
+                os._exit = _end_process
 
     def failure(self, method: str, error: BaseException) -> UserCodeError:
         """The error for an exception that user code raised."""
-        location = self._location(error)
+        location = self.location(error)
         problem = f"{self.name} raised in {method}: {describe_error(error)}{f' ({location})' if location else ''}"
         return UserCodeError(self.source, problem, error.legal if isinstance(error, InputError) else "")
 
@@ -269,7 +296,7 @@ class Guard(NamedTuple):
             raise self._wrong_result(f"{quantity} of shape {array.shape}", method, expected)
         return np.broadcast_to(array, shape)
 
-    def _location(self, error: BaseException) -> str:
+    def location(self, error: BaseException) -> str:
         """File and line of the innermost frame in the user code's folder, else of the innermost frame outside this package."""
         frames = [(frame.filename, frame.lineno) for frame in traceback.extract_tb(error.__traceback__)]
         if isinstance(error, SyntaxError) and error.filename:

@@ -248,7 +248,7 @@ def _find_ffmpeg() -> str:
         return str(imageio_ffmpeg.get_ffmpeg_exe())
     except (ImportError, RuntimeError):
         raise InputError("animate", "an mp4 needs ffmpeg, which is not installed",
-                         "ffmpeg on the PATH, or pip install 'safevar_sumo[film]'; a .gif or .html needs neither") from None
+                         "ffmpeg on the PATH, or in the checkout: pip install '.[film]'; a .gif or .html needs neither") from None
 
 
 def _write_page(scene: FlatScene, path: Path) -> None:

@@ -57,8 +57,9 @@ def draw_comparison(comparison: Comparison) -> Figure:
     ttc_axis.axhline(comparison.ttc_threshold, color="0.4", linewidth=0.9, linestyle=":")
     for axis in (pedal_axis, ttc_axis):
         axis.set_xlabel("time [s]")
-    if len(comparison.rows) > 1:
-        _mark_divergence(axes, comparison)
+    if (divergence_time := _divergence_time(comparison)) is not None:
+        for axis in axes:
+            axis.axvline(divergence_time, color="0.35", linewidth=0.9, linestyle="-.", zorder=1)
     _draw_heading(figure, comparison)
     _draw_legend(figure, comparison)
     return figure
@@ -86,7 +87,8 @@ def _draw_legend(figure: Figure, comparison: Comparison) -> None:
     entries = [Line2D([], [], color=COLOURS[row], linestyle=DASHES[row], label=f"{comparison.name(row)} vehicle: {comparison.verdict(row)}")
                for row in comparison.rows]
     entries += [Line2D([], [], color="0.35", marker=mark, linestyle="", markersize=7, label=label) for label, mark in marks.items()]
-    entries.append(Line2D([], [], color="0.35", linestyle="-.", linewidth=0.9, label="speeds diverge (by 0.1 m/s)"))
+    if _divergence_time(comparison) is not None:
+        entries.append(Line2D([], [], color="0.35", linestyle="-.", linewidth=0.9, label="speeds diverge (by 0.1 m/s)"))
     entries.append(Line2D([], [], color="0.4", linestyle=":", linewidth=0.9,
                           label=f"TTC* = {comparison.ttc_threshold:g} s: critical below"))
     figure.legend(entries, [str(entry.get_label()) for entry in entries], loc="outside lower center", ncols=3, frameon=False)
@@ -105,7 +107,8 @@ def _draw_mark(axis: Axes, row: int, point: tuple[float, float], mark: str, text
     axis.plot(*point, marker=mark, color=COLOURS[row], markersize=12 - 4 * row + 2 * (mark == IMPACT_MARK), linestyle="", zorder=6 + row,
               markeredgecolor="white")
     offset, alignment = ((3, 7), "left") if is_speed else ((0, 9 if is_above else -17), "center")
-    axis.annotate(text, point, xytext=offset, textcoords="offset points", color=COLOURS[row], fontweight="bold", ha=alignment)
+    axis.annotate(text, point, xytext=offset, textcoords="offset points", color=COLOURS[row], fontweight="bold", ha=alignment,
+                  bbox={"facecolor": "white", "edgecolor": "none", "pad": 0.8}, zorder=5)
 
 
 def _draw_speed(axis: Axes, comparison: Comparison, row: int) -> None:
@@ -135,11 +138,10 @@ def _draw_pedals(axis: Axes, comparison: Comparison, row: int) -> None:
     _draw_line(axis, comparison, row, trace.throttle[:, row] - trace.brake[:, row])
 
 
-def _mark_divergence(axes: np.ndarray, comparison: Comparison) -> None:
-    sample = find_divergence(comparison.film.runs)
-    if sample is not None:
-        for axis in axes:
-            axis.axvline(comparison.film.runs.trace.time[sample], color="0.35", linewidth=0.9, linestyle="-.", zorder=1)
+def _divergence_time(comparison: Comparison) -> float | None:
+    """The time at which the speeds of two vehicles diverge [s]; None for a single vehicle or speeds that stay together."""
+    sample = find_divergence(comparison.film.runs) if len(comparison.rows) > 1 else None
+    return None if sample is None else float(comparison.film.runs.trace.time[sample])
 
 
 def _draw_heading(figure: Figure, comparison: Comparison) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -15,6 +16,8 @@ ROW_PITCH = ROW_HEIGHT * 1.6
 NAME_WIDTH = 170
 """Width of the column of names at the left [pixels]."""
 RIGHT_MARGIN = 24
+DOT_RADIUS, CHARACTER_WIDTH, TEXT_HEIGHT = 4.5, 6.5, 10.0
+"""Sizes of a dot and of a text [pixels]."""
 
 
 class Dot(NamedTuple):
@@ -79,13 +82,29 @@ def draw_scatter(description: str, dots: Sequence[Dot], x_title: str, y_title: s
     elements += [_text((WIDTH + left_margin) / 2, height - 8, x_title, "anchor-middle title"),
               f'<g transform="translate(14 {(height - bottom_margin) / 2}) rotate(-90)">{_text(0, 0, y_title, "anchor-middle title")}</g>']
     if line is not None:
-        elements += [f'<path class="level" d="M{left_margin} {pixel_y(line):.1f}H{WIDTH - RIGHT_MARGIN}"/>',
-                  _text(WIDTH - RIGHT_MARGIN, pixel_y(line) - 5, line_title, "anchor-end")]
+        elements.append(f'<path class="level" d="M{left_margin} {pixel_y(line):.1f}H{WIDTH - RIGHT_MARGIN}"/>')
     for dot in dots:
         centre = f'cx="{pixel_x(dot.x):.1f}" cy="{pixel_y(dot.y):.1f}"'
-        circle = f'<circle class="{dot.css_class}" {centre} r="4.5"><title>{escape(dot.tooltip)}</title></circle>'
+        circle = f'<circle class="{dot.css_class}" {centre} r="{DOT_RADIUS}"><title>{escape(dot.tooltip)}</title></circle>'
         elements.append(f'<a href="#{escape(dot.link)}" aria-label="{escape(dot.tooltip)}">{circle}</a>' if dot.link else circle)
+    if line is not None:
+        centres = [(pixel_x(dot.x), pixel_y(dot.y)) for dot in dots]
+        x, y = _free_place(centres, line_title, left_margin, pixel_y(line), height - bottom_margin)
+        elements.append(_text(x, y, line_title, "anchor-end on-paper"))
     return _svg(description, height, elements, role="group" if any(dot.link for dot in dots) else "img")
+
+
+def _free_place(dots: Sequence[tuple[float, float]], text: str, left: float, line: float, bottom: float) -> tuple[float, float]:
+    """The right end, as far right as possible, of a text above or below a horizontal line, where it covers the fewest dots [pixels]."""
+    width = CHARACTER_WIDTH * len(text)
+
+    def count_covered(place: tuple[float, float]) -> int:
+        right, base = place[0] + DOT_RADIUS, place[1] + DOT_RADIUS
+        return sum(right - width - 2 * DOT_RADIUS < x < right and base - TEXT_HEIGHT - 2 * DOT_RADIUS < y < base for x, y in dots)
+
+    heights = [line - DOT_RADIUS, *([line + TEXT_HEIGHT + DOT_RADIUS] if line + TEXT_HEIGHT + DOT_RADIUS < bottom else [])]
+    right_ends = range(WIDTH - RIGHT_MARGIN, math.ceil(left + width), -10)
+    return min(((float(x), y) for x in right_ends for y in heights), key=count_covered)
 
 
 def _svg(description: str, height: float, elements: Sequence[str], role: str = "img") -> Markup:

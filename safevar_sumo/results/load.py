@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -12,7 +13,7 @@ from safevar_sumo.errors import InputError, warn
 from safevar_sumo.results.files import MANIFEST, SOLUTIONS, journal_file, run_name
 from safevar_sumo.results.imported import read_imported
 from safevar_sumo.results.journal import JournalContent, read_journal
-from safevar_sumo.results.manifest import is_edited, owner_digest, read_manifest, refuse_edited_table
+from safevar_sumo.results.manifest import DIGESTS_KEY, is_edited, owner_digest, read_manifest, refuse_edited_table
 from safevar_sumo.results.store import evaluations_frame, solutions_frame
 from safevar_sumo.study import label_of
 
@@ -141,13 +142,25 @@ def _read_journals(folder: Path, manifest: Mapping[str, Any],
         yield algorithm, run, read_journal(path, owner, path.stem) if path.exists() else None
 
 
+def _lost_journals(folder: Path, manifest: Mapping[str, Any], runs: Sequence[tuple[str, int]]) -> list[Path]:
+    """Missing journals of runs that the table of solutions holds: `study` writes it, and its digest, after the last run."""
+    table = folder / SOLUTIONS
+    if SOLUTIONS not in manifest.get(DIGESTS_KEY, {}) or not table.exists():
+        return []
+    with table.open(encoding="utf-8", errors="replace", newline="") as file:
+        finished_runs = {(row["algorithm"], row["run"]) for row in csv.DictReader(file)}
+    journals = [journal_file(folder, f"{algorithm}-{run:02d}") for algorithm, run in runs if (algorithm, str(run)) in finished_runs]
+    return [journal for journal in journals if not journal.exists()]
+
+
 def load_runs(directory: str | Path) -> StoredResults:
     """Read the runs and evaluations of a results directory's study, which may be unfinished; warns of torn journals.
 
     Raises
     ------
     InputError
-        If the directory holds no results, or a file in it is damaged, was edited or belongs to another study.
+        If the directory holds no results, a file in it is damaged, was edited or belongs to another study, or the journal of a finished run
+        is missing.
     """
     folder = Path(directory)
     manifest = read_manifest(folder)
@@ -157,6 +170,10 @@ def load_runs(directory: str | Path) -> StoredResults:
     if "imported" in manifest:
         no_evaluations = evaluations_frame(search.characteristics, []).assign(evaluation=0)
         return StoredResults(manifest, no_evaluations, read_imported(folder, search.characteristics))
+    for journal in (lost_journals := _lost_journals(folder, manifest, search.runs))[:1]:
+        others = f" (and {len(lost_journals) - 1} more)" if len(lost_journals) > 1 else ""
+        raise InputError(journal, f"is missing{others}, although {SOLUTIONS} holds solutions of this run",
+                         "the file as it was, or the same study again, which computes the run anew")
     evaluations_of_runs, solutions_of_runs, positions, failures = [], [], [], []
     for algorithm, run, content in _read_journals(folder, manifest, search.runs):
         if content is not None and content.tail_size and content.result(search.budget) is None:
@@ -192,8 +209,11 @@ def status(directory: str | Path) -> Status:
         raise InputError(folder, "holds imported solutions, which have no runs", "results of the command `study`")
     search = _read_search(folder, manifest)
     runs = [_summarise_run(*journal, search.budget) for journal in _read_journals(folder, manifest, search.runs)]
-    table = folder / SOLUTIONS
-    remarks = [f"{table} was edited: it no longer holds the computed solutions"] if is_edited(table, manifest) else []
+    if is_edited(folder / SOLUTIONS, manifest):
+        remarks = [f"{folder / SOLUTIONS} was edited: it no longer holds the computed solutions"]
+    else:
+        remarks = [f"{journal} is missing: the same study again computes the run anew"
+                   for journal in _lost_journals(folder, manifest, search.runs)]
     return Status(study=str(manifest["study"].get("name")), title=str(manifest["study"].get("title")), budget=search.budget,
                   runs=tuple(run for run, _ in runs), points=np.concatenate([objectives for _, objectives in runs]), remarks=tuple(remarks))
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import shlex
 import time
 from collections.abc import Iterable, Mapping
+from itertools import count
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
@@ -94,7 +96,7 @@ class ResultsDirectory:
             stored_digest = self._source_digests.get(name) or read_late_files(self.path).get(name, digest)
             if stored_digest != digest:
                 raise InputError(name, "is not the file that this study began with: it was changed meanwhile",
-                                 "the file as it was, and the same command; or another --out")
+                                 f"the file as it was, and the same command; or {another_directory(self.path)}")
             if name not in self._source_digests:
                 record_late_file(self.path, name, digest)
                 self._source_digests[name] = digest
@@ -141,7 +143,7 @@ class ResultsDirectory:
         problem, remedy = ("they are imported", "") if "imported" in stored_manifest else first_difference(stored_manifest, self.manifest)
         self._source_digests = {**self.manifest.get("sources", {}), **late_files}
         if problem:
-            expected = f"another --out, or {remedy}" if remedy else "another --out"
+            expected = f"{another_directory(self.path)}, or {remedy}" if remedy else another_directory(self.path)
             raise InputError(self.path, f"holds results of another study: {problem}", expected)
 
     def _refuse_another_owner(self, path: Path) -> None:
@@ -150,7 +152,7 @@ class ResultsDirectory:
         while (owner := owner_of(path)) is None and time.monotonic() < deadline:
             time.sleep(SECONDS_TO_CLAIM / 1000)
         if owner != owner_digest(self.manifest):
-            raise InputError(self.path, "is in use by another study that is running now", "another --out")
+            raise InputError(self.path, "is in use by another study that is running now", another_directory(self.path))
 
     def _remove(self, path: Path) -> None:
         try:
@@ -158,6 +160,13 @@ class ResultsDirectory:
             sync_directory(self.path)
         except OSError as error:
             raise SafevarError(f"{path}: cannot be removed: {error.strerror}; it is outdated") from None
+
+
+def another_directory(path: Path) -> str:
+    """A remedy that can be typed for results that a study cannot continue: the next free directory, such as results/two-2."""
+    stem = path if path.name else path.resolve()
+    free_path = next(candidate for number in count(2) if not (candidate := Path(f"{stem}-{number}")).exists())
+    return f"another --out, such as --out {shlex.quote(str(free_path))}"
 
 
 def solutions_frame(characteristics: tuple[str, ...], solutions: Iterable[tuple[tuple[str, int], Evaluations]]) -> pd.DataFrame:

@@ -64,7 +64,7 @@ class MapElites(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
             import ribs  # noqa: F401
         except ImportError:
             raise InputError(source, "search.algorithms = 'map_elites' needs pyribs, which is not installed",
-                             "pip install 'safevar_sumo[qd]'") from None
+                             "in the checkout: pip install '.[qd]'") from None
         return cell_count
 
     def search(self, problem: Problem, rng: np.random.Generator) -> Search:

@@ -52,7 +52,7 @@ def cluster_pool(address: str, time_limit: float) -> Iterator[ClusterPool]:
     try:
         from distributed import Client
     except ImportError:
-        raise InputError("cluster", "Dask is not installed", "pip install 'safevar_sumo[cluster]'") from None
+        raise InputError("cluster", "Dask is not installed", "in the checkout: pip install '.[cluster]'") from None
     legal = "the address of a Dask scheduler, such as tcp://host:8786"
     if not ADDRESS.fullmatch(address):
         raise InputError("cluster", repr(address), legal)

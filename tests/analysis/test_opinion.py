@@ -230,7 +230,7 @@ def test_a_report_has_a_badge_for_each_cause_or_says_how_to_install(slippery: Pa
     monkeypatch.setitem(sys.modules, "vehiclemodels.parameters_vehicle2", None)
     without = make_report([slippery], only=["causes"], jobs=1)
     assert "second vehicle model:" not in without
-    assert "pip install &#39;safevar_sumo[opinion]&#39;" in without
+    assert "pip install &#39;.[opinion]&#39;" in without
 
 
 @pytest.mark.parametrize(("typed", "told"), [
@@ -243,4 +243,4 @@ def test_bad_input_is_refused(typed: tuple[str, ...], told: str, slippery: Path)
 
 def test_without_the_extra_it_says_how_to_install_it(slippery: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "vehiclemodels.parameters_vehicle2", None)
-    refused("opinion", str(slippery), message=("is not installed", "pip install 'safevar_sumo[opinion]'"))
+    refused("opinion", str(slippery), message=("is not installed", "pip install '.[opinion]'"))

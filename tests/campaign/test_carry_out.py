@@ -7,6 +7,7 @@ from dataclasses import replace
 from io import StringIO
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pandas as pd
 import pytest
@@ -22,7 +23,7 @@ from safevar_sumo.records import Evaluations
 from safevar_sumo.results import Journal, ResultsDirectory, load_runs, status
 from safevar_sumo.results.journal import read_journal
 from safevar_sumo.search import Search
-from safevar_sumo.study import Study, tables_of
+from safevar_sumo.study import MatrixTable, Study, tables_of
 from safevar_sumo.workers.evaluation import PoolLostError, WorkerLostError
 from tests.campaign.formulas import SUN, EventLog, FormulaPool, carried_out, evaluated, solutions, with_search
 
@@ -192,7 +193,13 @@ def test_a_forecast_tells_what_all_workers_do_together(workers: int, study: Stud
     monkeypatch.setattr("time.perf_counter", lambda: float(next(seconds)))
     pool = FormulaPool(workers)
     rate = forecast(study, 6, pool).rate
-    assert rate == 4 / 5 * (len(pool.simulated) - 1), "settings of the second probe, in a second; the first one warms up"
+    assert rate == 4 / 5 * (len(pool.simulated) - workers), "settings of the second probe, in a second; the first one warms up"
+
+
+def test_a_forecast_of_many_points_measures_few_vehicles(study: Study) -> None:
+    rated, pool = msgspec.structs.replace(study, matrix=MatrixTable(protocol="euro_ncap_2026")), FormulaPool()
+    forecast(rated, 6, pool)
+    assert (1 + 4) * 1 <= len(pool.simulated) <= 1 + (1 + 4) * 8000 // 1859
 
 
 def test_a_torn_tail_is_told_and_simulated_again(study: Study, tmp_path: Path) -> None:

@@ -137,6 +137,13 @@ def test_an_ads_that_exits_is_a_fault_and_no_success(where: str, in_tmp: Path) -
     refused("simulate", "mine.toml", message=("my_ads:Careful", "SystemExit", "my_ads.py:10"))
 
 
+def test_an_ads_that_hangs_is_stopped_at_its_line(in_tmp: Path) -> None:
+    Path("my_ads.py").write_text("import time\nfrom safevar_sumo.ads import ScalarAds\n\n\nclass Careful(ScalarAds):\n"
+                                 "    def drive(self, seen):\n        time.sleep(1000)\n")
+    Path("mine.toml").write_text('extends = "smoke"\nname = "mine"\n[ads]\nmodel = "my_ads:Careful"\n[search]\ntime_limit = 1.0\n')
+    refused("simulate", "mine.toml", message=("my_ads:Careful", "longer than 1 s", "my_ads.py:7", "search.time_limit"))
+
+
 def test_a_title_is_no_markup(in_tmp: Path) -> None:
     Path("mine.toml").write_text('extends = "smoke"\nname = "mine"\ntitle = "[red]x[/blue] {$"\n')
     assert "[red]x[/blue]" in run("simulate", "mine.toml").stdout

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import os
+import signal
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from safevar_sumo.cli.program import _raise_interrupt
 from safevar_sumo.errors import InputError, UserCodeError
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.matrix import evaluate
@@ -30,7 +32,8 @@ def failing(system: object) -> str:
 
 @pytest.mark.parametrize(("body", "expected"), [
     ("1 / 0", "raised in drive: ZeroDivisionError: division by zero"), ("raise SystemExit(0)", "raised in drive: SystemExit: 0"),
-    ("raise GeneratorExit", "raised in drive: GeneratorExit ("),
+    ("raise GeneratorExit", "raised in drive: GeneratorExit ("), ("raise BaseException(1, 2)", "raised in drive: BaseException: (1, 2) ("),
+    ("import os; os._exit(3)", "raised in drive: SystemExit: os._exit(3) ("),
     (r"raise RuntimeError('my\n message')", "raised in drive: RuntimeError: my message ("), ("pass", "returned None from drive"),
     ("return 0.5", "returned 0.5 from drive"), ("return 0.5, 0, 0", "returned (0.5, 0, 0) from drive"),
     ("return '0.5', 0", "returned throttle = '0.5' from drive"), ("return 0, 2", "returned brake = 2.0 from drive"),
@@ -40,6 +43,22 @@ def test_a_scalar_ads_that_is_wrong(body: str, expected: str, mine: Mine, folder
     message = failing(mine(SCALAR + f"    def drive(self, seen):\n        {body}\n"))
     assert f"ads.model = 'mine:Mine' {expected}" in message
     assert f"({folder / 'mine.py'}:{6 if 'raised' in expected else 5})" in message, "the line that raises, or the method's own"
+
+
+def test_only_ctrl_c_itself_passes_as_an_interrupt(mine: Mine) -> None:
+    end_process, python_handler = os._exit, signal.getsignal(signal.SIGINT)
+    ctrl_c = mine(SCALAR + "    def drive(self, seen):\n        import signal\n        signal.raise_signal(signal.SIGINT)\n")
+    with pytest.raises(KeyboardInterrupt):
+        evaluate(ctrl_c, ctrl_c.characteristics.original[None])
+    try:
+        signal.signal(signal.SIGINT, _raise_interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            evaluate(ctrl_c, ctrl_c.characteristics.original[None])
+        message = failing(mine(SCALAR + "    def drive(self, seen):\n        raise KeyboardInterrupt\n"))
+    finally:
+        signal.signal(signal.SIGINT, python_handler)
+    assert "raised in drive: KeyboardInterrupt (" in message
+    assert os._exit is end_process
 
 
 def test_a_wrong_parameter_is_named_with_the_study_s_file(mine: Mine, folder: Path) -> None:

@@ -159,6 +159,16 @@ def test_the_words_of_the_figure_lie_within_their_axes_and_overlap_nothing(compa
     assert impact.y1 < figure.axes[1].transData.transform((0, 0))[1], "below the ground, where no line is"
 
 
+def test_the_figure_of_one_vehicle_has_no_line_or_entry_of_another() -> None:
+    study = load_study("smoke")
+    system = assemble(study)
+    figure = draw_comparison(compare_setting(study, system, system.characteristics.original))
+    assert not any("diverge" in text.get_text() for text in figure.legends[0].get_texts())
+    figure.canvas.draw()
+    for text in figure.axes[1].texts:
+        assert text.get_bbox_patch().get_facecolor() == (1.0, 1.0, 1.0, 1.0), "the ground's line does not strike the number through"
+
+
 @pytest.mark.parametrize("friction", [1.1, 1.9])
 def test_the_larger_gap_has_its_number_above(friction: float) -> None:
     study = load_study("smoke")

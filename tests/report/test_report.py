@@ -295,6 +295,16 @@ def test_the_command_writes_the_page_and_refuses_what_it_cannot(slippery: Path, 
         assert isinstance(report(*arguments), InputError)
 
 
+def test_the_words_beside_the_line_of_a_chart_cover_no_point() -> None:
+    dots = [Dot(x, y, "a", "hit") for x in range(40, 101, 2) for y in (0.1, 0.2, -0.1, -0.2, -3)]
+    chart = str(draw_scatter("chart", dots, "x", "y", 0.0, "collision below"))
+    right, base = map(float, re.search(r'on-paper" x="([\d.]+)" y="([\d.]+)"', chart).groups())  # type: ignore[union-attr]
+    points = [tuple(map(float, result)) for result in re.findall(r'cx="([\d.]+)" cy="([\d.]+)"', chart)]
+    assert right - 90 > 62
+    assert not any(right - 90 < x < right and base - 10 < y < base for x, y in points)
+    assert chart.index("<circle") < chart.index("collision below"), "drawn over what it cannot avoid"
+
+
 def test_a_chart_puts_its_points_where_they_belong_and_escapes_their_words() -> None:
     chart = str(draw_scatter("chart", [Dot(0, 0, "a", "hit"), Dot(100, 2, "<b>", "miss", "x")], "x", "y", 0.0, "line"))
     dots = [tuple(map(float, result)) for result in re.findall(r'cx="([\d.]+)" cy="([\d.]+)"', chart)]

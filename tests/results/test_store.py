@@ -114,7 +114,10 @@ def test_the_error_names_the_changed_file_and_both_remedies(tmp_path: Path, stud
     with pytest.raises(InputError) as caught:
         ResultsDirectory(tmp_path, study, {"sources": {"my_ads.py": "abc", "my_map.py": "012"}})
     assert "my_map.py has changed since" in str(caught.value)
-    assert caught.value.legal == "another --out, or the file as it was"
+    assert caught.value.legal == f"another --out, such as --out {tmp_path}-2, or the file as it was"
+    Path(f"{tmp_path}-2").mkdir()
+    with pytest.raises(InputError, match=rf"such as --out {tmp_path}-3, or"):
+        ResultsDirectory(tmp_path, study, {"sources": {"my_ads.py": "abc", "my_map.py": "012"}})
     with pytest.raises(InputError, match=r"my_map\.py no longer exists"):
         ResultsDirectory(tmp_path, study, {"sources": {"my_ads.py": "abc"}})
 
@@ -358,6 +361,7 @@ def test_a_study_under_way(slippery: Path, tmp_path: Path) -> None:
     shutil.copytree(slippery, tmp_path / "it")
     nsga2, rs = tmp_path / "it/runs/nsga2-00.journal", tmp_path / "it/runs/rs-00.journal"
     rs.unlink()
+    (tmp_path / "it/solutions.csv").unlink()  # written after the last run
     nsga2.write_bytes(nsga2.read_bytes()[:len(nsga2.read_bytes()) * 2 // 3])  # torn, as while somebody writes
     result = status(tmp_path / "it")
     assert [run.state for run in result.runs] == ["begun", "waiting"]
@@ -383,10 +387,34 @@ def test_reading_a_torn_run_warns(slippery: Path, tmp_path: Path) -> None:
     assert ("nsga2", 0) not in case.finished_runs
 
 
+def test_a_lost_journal_of_a_finished_study_is_named_with_its_remedy(slippery: Path, tmp_path: Path) -> None:
+    shutil.copytree(slippery, tmp_path / "it")
+    lost = tmp_path / "it/runs/rs-00.journal"
+    lost.unlink()
+    with pytest.raises(InputError, match=r"rs-00\.journal: is missing, although solutions\.csv holds.*\nexpected: .*the same study again"):
+        load_runs(tmp_path / "it")
+    assert f"{lost} is missing" in status(tmp_path / "it").remarks[0]
+    (tmp_path / "it/runs/nsga2-00.journal").unlink()
+    with pytest.raises(InputError, match=r"nsga2-00\.journal: is missing \(and 1 more\)"):
+        load_runs(tmp_path / "it")
+
+
+def test_every_command_about_solutions_says_which_runs_are_unfinished(slippery: Path, tmp_path: Path) -> None:
+    shutil.copytree(slippery, tmp_path / "it")
+    (tmp_path / "it/runs/rs-00.journal").unlink()
+    (tmp_path / "it/solutions.csv").unlink()
+    for command in (["explain", str(tmp_path / "it"), "--top", "1"], ["simulate", str(tmp_path / "it"), "--most-severe"]):
+        done = CliRunner().invoke(commands, command)
+        assert done.exit_code == 0, done.output
+        assert "unfinished, rs 0 of 1 runs" in done.stderr
+    assert "unfinished" not in CliRunner().invoke(commands, ["simulate", str(tmp_path / "it")]).output
+
+
 def test_watching_ends_with_the_study_and_json_is_json(slippery: Path) -> None:
     done = CliRunner().invoke(commands, ["status", str(slippery), "--watch"])
     assert done.exit_code == 0
     assert "Finished." in done.output
+    assert done.output.endswith("\n")
     output = json.loads(CliRunner().invoke(commands, ["status", str(slippery), "--json"]).output)
     assert output["finished"] is True
     assert np.isfinite(output["runs"][0]["best"])

@@ -46,7 +46,7 @@ def load_bmw_parameters() -> Any:
         from vehiclemodels.parameters_vehicle2 import parameters_vehicle2
     except ImportError:
         raise InputError("opinion", "commonroad-vehicle-models, the second vehicle model, is not installed",
-                         "pip install 'safevar_sumo[opinion]'") from None
+                         "in the checkout: pip install '.[opinion]'") from None
     return _parameters(parameters_vehicle2)
 
 

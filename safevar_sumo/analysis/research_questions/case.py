@@ -118,17 +118,20 @@ class Case:
         return sorted(run for name, run in self.finished_runs if name == algorithm)
 
     @property
+    def shortfall(self) -> str:
+        """Note on unfinished runs, for the readers of every answer about the solutions; empty if there are none."""
+        done, planned = Counter(algorithm for algorithm, _ in self.finished_runs), self.study.search.runs
+        shortfalls = [f"{name} {done[name]} of {planned} runs" for name in self.study.search.labels if done[name] < planned]
+        if not self.has_runs or not shortfalls:
+            return ""
+        return f"{self.name}: unfinished, {', '.join(shortfalls)}; only solutions of finished runs count."
+
+    @property
     def remarks(self) -> list[str]:
         """Notes for the readers of every table of this case."""
-        lines = []
+        lines = [self.shortfall] if self.shortfall else []
         if not self.has_runs:
             lines.append(f"{self.name}: imported solutions, without runs; the original vehicle's metrics are published or supplied.")
-        else:
-            done = Counter(algorithm for algorithm, _ in self.finished_runs)
-            planned = self.study.search.runs
-            shortfalls = [f"{name} {done[name]} of {planned} runs" for name in self.study.search.labels if done[name] < planned]
-            if shortfalls:
-                lines.append(f"{self.name}: unfinished, {', '.join(shortfalls)}; tables use the finished runs.")
         if self.failures:
             lines.append(f"{self.name}: {len(self.failures)} settings could not be simulated (simulator-error) and are in no result: "
                         f"{'; '.join(failure_lines(self.failures))}. `study --retry-failed` simulates them again.")

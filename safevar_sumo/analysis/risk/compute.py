@@ -213,8 +213,8 @@ def _try_rare_method(response: Response, responses: FloatArray, options: RiskOpt
                         "rare failures cannot approach failures; plain Monte Carlo is used")
         return None
     if not options.requires_rare_method and find_spec("openturns") is None:
-        counts.remark = (f"fewer than {100 * RARE_BELOW:g} % of the first vehicles are unsafe; pip install 'safevar_sumo[rare]' for a "
-                        "method that needs fewer vehicles for rare failures")
+        counts.remark = (f"fewer than {100 * RARE_BELOW:g} % of the first vehicles are unsafe; for a method that needs fewer vehicles "
+                          "for rare failures, in the checkout: pip install '.[rare]'")
         return None
     try:
         return estimate_rare(response, _rare_method(options), options.confidence, seed)

@@ -119,7 +119,7 @@ def load_openturns() -> Any:
     try:
         import openturns
     except ImportError:
-        remedy = "pip install 'safevar_sumo[rare]'; or --method monte_carlo"
+        remedy = "in the checkout: pip install '.[rare]'; or --method monte_carlo"
         raise InputError("--rare or --method", "OpenTURNS is not installed", remedy) from None
     openturns.Log.Show(openturns.Log.NONE)
     return openturns
