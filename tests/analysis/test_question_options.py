@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import inspect
-import json
 import re
 import shlex
-import shutil
 import subprocess
 import sys
 from dataclasses import fields
@@ -26,7 +24,6 @@ from safevar_sumo.analysis.rules import RulesOptions
 from safevar_sumo.analysis.tolerance import ToleranceOptions
 from safevar_sumo.cli.program import commands
 from safevar_sumo.errors import InputError
-from safevar_sumo.results.manifest import write_manifest
 
 OTHER_DEFAULT = """
 import inspect, pathlib, sys, types
@@ -95,14 +92,11 @@ def test_python_and_the_command_refuse_the_same_values(typed: dict[str, Any], le
 
 
 @pytest.mark.parametrize("question", ["explain", "opinion", "tolerance", "risk", "rules", "rating"])
-def test_a_warning_of_what_has_changed_names_the_callers_line(question: str, slippery: Path, tmp_path: Path,
-                                                              monkeypatch: pytest.MonkeyPatch) -> None:
-    shutil.copytree(slippery, tmp_path / "copy", ignore=shutil.ignore_patterns("runs"))
-    manifest = json.loads((slippery / "manifest.json").read_text())
-    write_manifest(tmp_path / "copy", {**manifest, "results": 0})
+def test_a_warning_of_what_has_changed_names_the_callers_line(question: str, slippery: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("safevar_sumo.workers.identity.RESULTS", 0)
     monkeypatch.setattr(f"safevar_sumo.analysis.{question}.answer_question", lambda *_: None)
     with pytest.warns(UserWarning, match="simulated as it is now") as caught:
-        getattr(sv, question)(tmp_path / "copy", as_it_is_now=True)
+        getattr(sv, question)(slippery, as_it_is_now=True)
     assert {one.filename for one in caught} == {__file__}
 
 

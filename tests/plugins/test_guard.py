@@ -48,9 +48,10 @@ def test_a_scalar_ads_that_is_wrong(body: str, expected: str, mine: Mine, folder
 def test_only_ctrl_c_itself_passes_as_an_interrupt(mine: Mine) -> None:
     end_process, python_handler = os._exit, signal.getsignal(signal.SIGINT)
     ctrl_c = mine(SCALAR + "    def drive(self, seen):\n        import signal\n        signal.raise_signal(signal.SIGINT)\n")
-    with pytest.raises(KeyboardInterrupt):
-        evaluate(ctrl_c, ctrl_c.characteristics.original[None])
     try:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        with pytest.raises(KeyboardInterrupt):
+            evaluate(ctrl_c, ctrl_c.characteristics.original[None])
         signal.signal(signal.SIGINT, _raise_interrupt)
         with pytest.raises(KeyboardInterrupt):
             evaluate(ctrl_c, ctrl_c.characteristics.original[None])
