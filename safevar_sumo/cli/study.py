@@ -12,6 +12,7 @@ from typing import Any
 import click
 import msgspec
 import numpy as np
+from rich import filesize
 from rich.console import Console, Group, RenderableType
 from rich.live import Live
 from rich.text import Text
@@ -155,8 +156,8 @@ def print_forecast(console: Console, study: Study, runs: int, cost: Forecast, en
     table.add_row("engine", engine)
     table.add_row("evaluations, at most", str(cost.evaluations))
     table.add_row("evaluations/s, measured by a short probe", f"{cost.rate:.{0 if cost.rate >= 10 else 1}f}")
-    table.add_row("time, at most", f"{cost.seconds / 60:.1f} min")
-    table.add_row("disk, at most", f"{cost.size / 1e6:.0f} MB")
+    table.add_row("search time, at most", f"{cost.seconds / 60:.1f} min" if cost.seconds >= 60 else f"{cost.seconds:.0f} s")
+    table.add_row("disk, at most", filesize.decimal(cost.size))
     console.print(table)
 
 
