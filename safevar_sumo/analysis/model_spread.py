@@ -106,7 +106,7 @@ def evaluate_sets(study: Study, settings: FloatArray, point: str = "") -> list[E
 
 
 def studies_of_sets(study: Study) -> list[Study]:
-    """One study for each parameter set. A parameter keeps its value in `study` if this value differs from the value in the first set.
+    """One study for each parameter set; the `parameters_outside_sets` keep their values.
 
     Raises
     ------
@@ -115,7 +115,13 @@ def studies_of_sets(study: Study) -> list[Study]:
     """
     if not study.spread:
         raise InputError(study.source, "has no table [spread]", "a study that `calibrate` has fitted, such as sun or rain")
-    values_of_sets = {key: values for key, values in study.spread.items()
-                      if np.isclose(value_of(study, key, "spread"), values[0], rtol=ROUNDING_TOLERANCE, atol=0)}
+    outside_names = parameters_outside_sets(study)
+    values_of_sets = {key: values for key, values in study.spread.items() if key not in outside_names}
     set_count = len(next(iter(study.spread.values())))
     return [study, *(with_values(study, {key: values[k] for key, values in values_of_sets.items()}, "spread") for k in range(1, set_count))]
+
+
+def parameters_outside_sets(study: Study) -> list[str]:
+    """The parameters under [spread] whose value in `study` is not that of the first set: the sets say nothing on other values."""
+    return [key for key, values in study.spread.items()
+            if not np.isclose(value_of(study, key, "spread"), values[0], rtol=ROUNDING_TOLERANCE, atol=0)]

@@ -12,7 +12,7 @@ import numpy as np
 from rich.console import Console
 from rich.text import Text
 
-from safevar_sumo.analysis.model_spread import ModelSpread, compute_model_spreads, studies_of_sets
+from safevar_sumo.analysis.model_spread import ModelSpread, compute_model_spreads, parameters_outside_sets, studies_of_sets
 from safevar_sumo.analysis.rating import RatingOptions
 from safevar_sumo.analysis.words import points_in_words
 from safevar_sumo.api.simulation import Simulation, evaluate_settings, simulate_with_original
@@ -82,6 +82,8 @@ def simulate_command(study: str, solution: str | None, choice: str | None, chang
         _simulate_sweep(target, system, requested_settings, tuple(values_by_name), not no_filter, as_json)
         return
     parameter_sets = studies_of_sets(target.study) if spread else []
+    for name in parameters_outside_sets(target.study) if spread else ():
+        click.echo(f"note: [spread] does not vary {name}: the study's value is not the first of its list", err=True)
     with limit_user_code(target.study):
         simulation = simulate_with_original(target.study, system, requested_settings[0], filtered=not no_filter)
     if target.row is not None and not changes:

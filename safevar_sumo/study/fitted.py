@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -46,16 +45,11 @@ def contradictions_of_file(source: object, stated: Mapping[str, Any], tables: Ma
     """Errors for tables that a file states itself, not inherits, and that do not fit the complete `tables` of its study."""
     for table in ("calibration", "spread"):
         values = stated.get(table)
-        for name, value in values.items() if isinstance(values, Mapping) else ():
+        for name in values if isinstance(values, Mapping) else ():
             if name.startswith("weather.") and isinstance(tables.get("weather"), str):
                 continue  # a shipped weather: its values are looked up later
-            place = locate_parameter(tables, name)
-            if place is None:
+            if locate_parameter(tables, name) is None:
                 yield missing_parameter(source, table, name)
-            elif table == "spread" and isinstance(value, list) and value and isinstance(value[0], int | float):
-                own_value = float(place[0][place[1]])
-                if not math.isclose(value[0], own_value, rel_tol=ROUNDING_TOLERANCE):
-                    yield InputError(source, f"spread.{name!r} begins with {value[0]:g}", f"{own_value:g} first, the study's own value")
     rating, matrix = stated.get("rating"), tables.get("matrix")
     if isinstance(rating, Mapping) and rating.get("claims") and not (isinstance(matrix, Mapping) and matrix.get("protocol")):
         yield InputError(source, "rating.claims: the study is not rated", "matrix.protocol, or no claims")
