@@ -21,6 +21,8 @@ def refuse_unlike_sumo(study: Study, recorded: Evaluations, in_sumo: Evaluations
     InputError
         With the first such setting and both values.
     """
+    if in_sumo.failed.all():
+        return  # such evaluations lack the user's metrics
     for row in np.flatnonzero(~_are_alike(recorded, in_sumo, ROUNDING) & ~in_sumo.failed).tolist():
         setting = recorded.settings[row]
         difference = find_difference(recorded.take([row]), in_sumo.take([row]), ROUNDING)
