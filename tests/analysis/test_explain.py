@@ -200,7 +200,8 @@ def assert_tells_a_manager(paragraph: str, explained: Explained) -> None:
         needed, number = len(one.causes[0].changes), len(one.changed)
         step, least = min(one.robustness.shares_by_step.items(), key=lambda item: item[1])
         exception = f", but only {100 * least:.0f} % with a step of {step:g} s" if least < 0.8 <= one.robustness.share else ""
-        collision = re.escape(f"a collision at {-(one.safety_degree or 0):.1f} m/s, {-3.6 * (one.safety_degree or 0):.0f} km/h ({share}{exception})")
+        speed = -(one.safety_degree or 0)
+        collision = re.escape(f"a collision at {speed:.1f} m/s, {3.6 * speed:.0f} km/h ({share}{exception})")
         if needed < number:
             counts = rf"{NUMBER_WORDS[number]} changes: [^;]*; {NUMBER_WORDS[needed]} of them suffice"
             assert re.search(rf"{collision} was found with {counts}", paragraph, re.IGNORECASE)
