@@ -11,7 +11,7 @@ import numpy as np
 from safevar_sumo.analysis.parameters import value_of, with_values
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import Evaluations, FloatArray, finite_or_none
-from safevar_sumo.study import ROUNDING_TOLERANCE, SAFETY_DEGREE, Study
+from safevar_sumo.study import SAFETY_DEGREE, Study
 from safevar_sumo.sumo.matrix import evaluate, system_at_point
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet
@@ -20,6 +20,8 @@ BAND_SHARE = 0.9
 """Share of the predictions that lie in the band."""
 HALF_WIDTH = 1.645
 """Half width [standard deviations] of the interval around the mean that holds `BAND_SHARE` of a normal distribution."""
+ROUNDING_TOLERANCE = 1e-5
+"""Relative tolerance within which a parameter's value in the study equals its (rounded) value in the first set of [spread]."""
 LEAST_DISTANCE = 0.3
 """Distance [domain widths] that the model's error assumes of nearer vehicles: near the original too, a decision may fall a frame off."""
 

@@ -149,7 +149,7 @@ def _lost_journals(folder: Path, manifest: Mapping[str, Any], runs: Sequence[tup
         return []
     with table.open(encoding="utf-8", errors="replace", newline="") as file:
         finished_runs = {(row["algorithm"], row["run"]) for row in csv.DictReader(file)}
-    journals = [journal_file(folder, f"{algorithm}-{run:02d}") for algorithm, run in runs if (algorithm, str(run)) in finished_runs]
+    journals = [journal_file(folder, run_name(algorithm, run)) for algorithm, run in runs if (algorithm, str(run)) in finished_runs]
     return [journal for journal in journals if not journal.exists()]
 
 

@@ -10,8 +10,6 @@ from safevar_sumo.study.validation import short_text
 
 FITTED_TABLES = ("vehicle.parameters.", "ads.parameters.", "weather.")
 """Prefixes of the parameters that may be fitted."""
-ROUNDING_TOLERANCE = 1e-5
-"""Relative tolerance within which a parameter's value in the study equals its (rounded) value in the first set of [spread]."""
 
 
 def locate_parameter(tables: Any, name: str) -> tuple[Any, int | str] | None:
