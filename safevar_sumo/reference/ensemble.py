@@ -13,6 +13,8 @@ from safevar_sumo.reference.search import SearchRace
 
 MARGIN = 1e-4
 """Distance that the places of an ensemble keep from the ends of the bounds, as a share of the bounds' width."""
+PLACE_DECIMALS = 4
+"""Decimals of the places: last digits that depend on how residuals were computed do not reach the search that follows."""
 SPREAD = 0.08
 """The axes are those of the step with the mean standard deviation of places next to this share of the bounds' width."""
 LEAST_VARIANCE = 1e-5
@@ -38,7 +40,7 @@ def invert(race: SearchRace, dimension: int, size: int, max_trials: int, rng: np
     (Iglesias, Law and Stuart 2013). A step uses a part of the data's weight (Iglesias and Yang 2021); the inversion ends when it has used
     the whole weight, or before it exceeds `max_trials`. It moves the logits of the places, so that no place leaves the bounds.
     """
-    places = rng.uniform(MARGIN, 1 - MARGIN, (size, dimension))
+    places = rng.uniform(MARGIN, 1 - MARGIN, (size, dimension)).round(PLACE_DECIMALS)
     weight_used, trials_left, lowest_loss, best_place = 0.0, max_trials, np.inf, places[0]
     covariance, distance_from_spread = np.eye(dimension), np.inf
     while True:
@@ -79,4 +81,4 @@ def _posterior_sample(places: FloatArray, residuals: FloatArray, weight: float, 
     with threadpool_limits(limits=1):  # with several threads the last digits depend on their number
         gain = np.linalg.solve(deviations @ deviations.T + np.eye(size) / weight, (logits - logits.mean(axis=0)) / np.sqrt(size - 1))
         moved_logits = logits - (perturbed @ deviations.T) @ gain
-    return np.asarray(np.clip(expit(moved_logits), MARGIN, 1 - MARGIN))
+    return np.asarray(np.clip(expit(moved_logits), MARGIN, 1 - MARGIN).round(PLACE_DECIMALS))
