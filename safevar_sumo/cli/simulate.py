@@ -28,10 +28,10 @@ from safevar_sumo.cli.arguments import (
 )
 from safevar_sumo.cli.program import commands
 from safevar_sumo.cli.target import CommandTarget, as_it_is_now_option, json_option, load_target, point_option, replay_options
-from safevar_sumo.conformance.finding import limit_user_code
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.output import check_writable, unwritable, whole_file
+from safevar_sumo.plugins import limit_user_code
 from safevar_sumo.records import KMH_PER_MS, Evaluations, FloatArray, Outcome
 from safevar_sumo.results import record
 from safevar_sumo.scenarios import LOCATION_DIMENSION, SPEED_DIMENSION, pre_crash_sentence

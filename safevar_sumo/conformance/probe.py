@@ -11,9 +11,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from safevar_sumo.conformance.finding import load_factor
 from safevar_sumo.conformance.subject import Subject
-from safevar_sumo.plugins import Guard, Lookup, unload_user_modules
+from safevar_sumo.plugins import Guard, Lookup, load_factor, unload_user_modules
 from safevar_sumo.records import FloatArray
 from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.sumo.traci_module import substitute_traci

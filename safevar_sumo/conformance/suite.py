@@ -12,14 +12,14 @@ from typing import Any
 import numpy as np
 
 from safevar_sumo.ads import ScalarAds
-from safevar_sumo.conformance.finding import ADVICE, BLOCKING_CHECKS, Finding, Report, UserCodeTimeout, time_limit
+from safevar_sumo.conformance.finding import ADVICE, BLOCKING_CHECKS, Finding, Report
 from safevar_sumo.conformance.measures import PROBES
 from safevar_sumo.conformance.models import StudyProbe
 from safevar_sumo.conformance.probe import Indices, Outputs, Probe, measure_time, target_of
 from safevar_sumo.conformance.source import Source
 from safevar_sumo.conformance.subject import Subject, contract_violation, find_subject, subjects_of
 from safevar_sumo.errors import InputError, UserCodeError
-from safevar_sumo.plugins import guard_process_state
+from safevar_sumo.plugins import UserCodeTimeout, guard_process_state, time_limit
 from safevar_sumo.shipped import PROGRAM_COMMAND
 from safevar_sumo.study import Study, load_study, study_names
 

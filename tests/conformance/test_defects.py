@@ -10,7 +10,8 @@ from typing import NamedTuple
 import pytest
 
 from safevar_sumo import testing
-from safevar_sumo.conformance import KINDS, check, check_subject, find_subject, finding, subjects_of, suite
+from safevar_sumo.conformance import KINDS, check, check_subject, find_subject, subjects_of, suite
+from safevar_sumo.plugins import timeout
 from safevar_sumo.study import load_study, study_names
 from safevar_sumo.workers.isolation import check_code
 from safevar_sumo.workers.retrying import RetryingPool
@@ -173,7 +174,7 @@ def test_a_planted_defect_is_named_with_file_and_line(name: str, in_tmp: Path, m
 @pytest.mark.slow
 def test_the_time_limit_begins_after_a_module_and_its_library_are_imported(in_tmp: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(suite, "RUN_LIMIT", limit := 1.0)
-    monkeypatch.setattr(finding, "load_factor", lambda: 1.0)
+    monkeypatch.setattr(timeout, "load_factor", lambda: 1.0)
     slow = f"import time\ntime.sleep({1.2 * limit})\n"
     (in_tmp / "library.py").write_text(slow)
     (in_tmp / "mine.py").write_text(slow + ALGORITHM.replace("    def search(self, problem, rng):\n", """    def search(self, problem, rng):
