@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import Any, Protocol, TypeVar
+from operator import attrgetter
+from typing import Any, TypeVar
 
 import msgspec
 import pandas as pd
@@ -123,22 +124,15 @@ class Cause:
         return f"Scaling all changes to {100 * self.fraction:.1f} % is still unsafe; {below}."
 
 
-class EstimatedCause(Protocol):
-    """A cause with the share of its neighbours that are unsafe too; None if unknown."""
-
-    @property
-    def robustness(self) -> float | None: ...
+SomeCause = TypeVar("SomeCause")
 
 
-SomeCause = TypeVar("SomeCause", bound=EstimatedCause)
-
-
-def most_robust(causes: Iterable[SomeCause]) -> SomeCause | None:
-    """The cause of a failure that is named: the one with the largest share of unsafe neighbours, among all of the failure's causes.
+def most_robust(causes: Iterable[SomeCause], share: Callable[[SomeCause], float | None] = attrgetter("robustness")) -> SomeCause | None:
+    """The cause of a failure that is named: the one with the largest `share` of unsafe neighbours, among all of the failure's causes.
 
     The first of several, or in a rated study, whose causes have no shares; None without a cause.
     """
-    return max(causes, key=lambda cause: cause.robustness or 0.0, default=None)
+    return max(causes, key=lambda cause: share(cause) or 0.0, default=None)
 
 
 @dataclass(frozen=True, kw_only=True)

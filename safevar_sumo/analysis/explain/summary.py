@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from operator import attrgetter
 from typing import NamedTuple
 
 import numpy as np
@@ -115,25 +116,15 @@ def _max_robustness_evaluations(study: Study, system: System) -> int:
     return min(ExplainOptions.limit // len(system.points), len(search.algorithms) * search.runs * search.evaluations)
 
 
-class _Estimate(NamedTuple):
-    """The robustness of a minimal cause by itself."""
-
-    neighbours: Robustness
-
-    @property
-    def robustness(self) -> float:
-        return self.neighbours.share
-
-
 def _estimate_robustnesses(evaluator: Evaluator, settings: FloatArray, causes: list[list[MinimalCause]], step: float,
                            unsafe: Unsafe) -> list[tuple[Robustness, Robustness | None]]:
     """The robustness of each failure, and of its most robust cause by itself: None if it has more than `MAX_ESTIMATED_CAUSES`."""
     estimated = [group if len(group) <= MAX_ESTIMATED_CAUSES else [] for group in causes]
     cause_settings = [cause.setting for group in estimated for cause in group]
-    estimates = map(_Estimate, estimate_robustness(evaluator, np.array([*settings, *cause_settings]), step, unsafe))
-    failures = [next(estimates).neighbours for _ in settings]
-    named = [most_robust([next(estimates) for _ in group]) for group in estimated]
-    return [(failure, None if cause is None else cause.neighbours) for failure, cause in zip(failures, named, strict=True)]
+    estimates = iter(estimate_robustness(evaluator, np.array([*settings, *cause_settings]), step, unsafe))
+    failures = [next(estimates) for _ in settings]
+    named = [most_robust([next(estimates) for _ in group], share=attrgetter("share")) for group in estimated]
+    return list(zip(failures, named, strict=True))
 
 
 def _find_failing_points(study: Study, settings: FloatArray, unsafe: Unsafe) -> tuple[list[str], str]:
