@@ -210,7 +210,7 @@ def failures_paragraph(system: System, original: Evaluations, smallest: FailureD
     parts.append(f"{sentence[0].upper()}{sentence[1:]}")
     if smallest.robustness.borderline:
         parts.append("No failure tested is robust." if robust is None else
-                     f"The robust failure with the fewest changes, {robust.name}: {_failure_in_words(characteristics, robust)}")
+                     f"The robust failure with the fewest changes: {_failure_in_words(characteristics, robust)}")
     return " ".join([*parts, *_avoided_shares_in_words(preventable)])
 
 
@@ -236,8 +236,9 @@ def _original_ending_in_words(system: System, original: Evaluations) -> str:
 
 
 def _failure_in_words(characteristics: CharacteristicSet, failure: FailureDescription) -> str:
-    """A sentence such as `a collision at 1.5 m/s, 5 km/h (robust: ...) was found with ten changes: ...; three of them suffice`."""
-    number, sufficient, effect = len(failure.changes), failure.sufficient_count, f"{_outcome_in_words(failure)} ({failure.robustness})"
+    """A sentence such as `a collision at 1.5 m/s, 5 km/h (rs:0:4, robust: ...) was found with ten changes: ...; three of them suffice`."""
+    number, sufficient = len(failure.changes), failure.sufficient_count
+    effect = f"{_outcome_in_words(failure)} ({failure.name}, {failure.robustness})"
     listed = _changes_in_words(characteristics, failure.changes)
     if sufficient < number:
         cause = "" if failure.cause_robustness is None else f" ({failure.cause_robustness})"
