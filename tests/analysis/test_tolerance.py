@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from safevar_sumo import tolerance
 from safevar_sumo.analysis.evaluator import Evaluator
-from safevar_sumo.analysis.tolerance import joint as safe_box
+from safevar_sumo.analysis.tolerance import safe_box
 from safevar_sumo.analysis.tolerance.compute import Tolerance
 from safevar_sumo.analysis.tolerance.render import profiles_figure
 from safevar_sumo.metrics import Unsafe

@@ -14,7 +14,8 @@ import pandas as pd
 
 from safevar_sumo.analysis.evaluator import Evaluator, Progress, open_evaluator, show_no_progress
 from safevar_sumo.analysis.tolerance import ToleranceOptions
-from safevar_sumo.analysis.tolerance.joint import Pair, SafeBox, find_safe_box, no_safe_box, scan_pairs
+from safevar_sumo.analysis.tolerance.pairs import Pair, scan_pairs
+from safevar_sumo.analysis.tolerance.safe_box import SafeBox, find_safe_box, no_safe_box
 from safevar_sumo.errors import InputError, unknown_name
 from safevar_sumo.metrics import RATING_POINTS, Unsafe
 from safevar_sumo.protocol.rater import is_rated

@@ -9,7 +9,7 @@ from rich.console import Console
 
 from safevar_sumo.analysis.figures import BLUE, DEGREE_LABEL, FONT, VERMILION, as_formula, escape_dollars, new_panels
 from safevar_sumo.analysis.tolerance.compute import WHOLE_POINT_LOSS, OneAtATimeScan, Tolerance
-from safevar_sumo.analysis.tolerance.joint import Pair
+from safevar_sumo.analysis.tolerance.pairs import Pair
 from safevar_sumo.analysis.words import two_decimals
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import RATING_POINTS
