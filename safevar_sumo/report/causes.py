@@ -11,8 +11,8 @@ from markupsafe import Markup
 
 from safevar_sumo.analysis.evaluator import Progress
 from safevar_sumo.analysis.explain.compute import explain_failures
-from safevar_sumo.analysis.explain.necessity import robustness_in_words
 from safevar_sumo.analysis.explain.result import CauseEntry, FailureEntry, SummaryEntry, most_robust
+from safevar_sumo.analysis.explain.robustness import robustness_in_words
 from safevar_sumo.analysis.opinion.compute import CauseToJudge, assemble_both_systems, judge_causes
 from safevar_sumo.analysis.research_questions.indicators import nondominated_points
 from safevar_sumo.errors import InputError

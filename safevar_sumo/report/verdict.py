@@ -11,8 +11,8 @@ import msgspec
 import numpy as np
 
 from safevar_sumo.ads import ADS
-from safevar_sumo.analysis.explain.necessity import MIN_ROBUST_SHARE, is_borderline, robustness_in_words
 from safevar_sumo.analysis.explain.result import REASONS, ROBUST, CauseEntry, FailureEntry, most_robust
+from safevar_sumo.analysis.explain.robustness import MIN_ROBUST_SHARE, is_borderline, robustness_in_words
 from safevar_sumo.analysis.model_spread import ModelSpread, compute_model_spreads
 from safevar_sumo.analysis.preventability import PreventedShares
 from safevar_sumo.analysis.research_questions.case import ALGORITHM_TITLES, are_collisions

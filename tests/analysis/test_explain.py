@@ -32,21 +32,12 @@ from safevar_sumo.analysis.explain.causes import (
     select_affordable_rows,
 )
 from safevar_sumo.analysis.explain.compute import explain_failures
-from safevar_sumo.analysis.explain.necessity import (
-    Robustness,
-    count_distinct_causes,
-    estimate_robustness,
-    necessity_frame,
-)
+from safevar_sumo.analysis.explain.necessity import count_distinct_causes, necessity_frame
+from safevar_sumo.analysis.explain.paragraph import NUMBER_WORDS, FailureDescription, failures_paragraph
 from safevar_sumo.analysis.explain.render import _print_explanation, _sample_in_words, print_explained
 from safevar_sumo.analysis.explain.result import Cause, Explained, Explanation, most_robust
-from safevar_sumo.analysis.explain.summary import (
-    NUMBER_WORDS,
-    FailureDescription,
-    _estimate_robustnesses,
-    failures_paragraph,
-    summarise_failures,
-)
+from safevar_sumo.analysis.explain.robustness import Robustness, estimate_robustness
+from safevar_sumo.analysis.explain.summary import _estimate_robustnesses, summarise_failures
 from safevar_sumo.analysis.preventability import Preventability
 from safevar_sumo.analysis.research_questions.case import Case, load_cases
 from safevar_sumo.cli.program import commands

@@ -13,7 +13,8 @@ from safevar_sumo.ads.competent_driver import CompetentDriver
 from safevar_sumo.analysis.evaluator import Evaluator
 from safevar_sumo.analysis.explain.braking_comparison import sentence
 from safevar_sumo.analysis.explain.compute import PointComparison, compare_at_points
-from safevar_sumo.analysis.explain.summary import _avoided_shares_in_words, summarise_failures
+from safevar_sumo.analysis.explain.paragraph import _avoided_shares_in_words
+from safevar_sumo.analysis.explain.summary import summarise_failures
 from safevar_sumo.analysis.preventability import (
     Preventability,
     PreventableBy,

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from safevar_sumo.analysis.evaluator import Evaluator
-from safevar_sumo.analysis.explain.necessity import STEP_FACTORS, Robustness, estimate_robustness, find_smallest_robust_failure
+from safevar_sumo.analysis.explain.robustness import STEP_FACTORS, Robustness, estimate_robustness, find_smallest_robust_failure
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import FloatArray
 from tests.analysis.known_regions import box, made_up_evaluator
@@ -48,7 +48,7 @@ def test_a_failure_is_robust_by_the_mean_of_all_time_steps(shares: list[tuple[fl
         return [Robustness({step * factor: shares[int(setting[0]) - 8][STEP_FACTORS.index(factor)] for factor in factors})
                 for setting in settings]
 
-    monkeypatch.setattr("safevar_sumo.analysis.explain.necessity.estimate_robustness", estimates)
+    monkeypatch.setattr("safevar_sumo.analysis.explain.robustness.estimate_robustness", estimates)
     failures = evaluator.evaluate(np.array([[8.0, 1.0], [9.0, 1.0]]), "failures")
     assert find_smallest_robust_failure(evaluator, failures, 0.1, COLLISION, max_evaluations=1) == row
     candidates = sum(first > 0.39 for first, *_ in shares)

@@ -17,15 +17,9 @@ from safevar_sumo.analysis.explain.causes import (
     necessary_columns,
     select_affordable_rows,
 )
-from safevar_sumo.analysis.explain.necessity import (
-    STEP_FACTORS,
-    cause_key,
-    count_distinct_causes,
-    estimate_robustness,
-    find_smallest_robust_failure,
-    necessity_frame,
-)
+from safevar_sumo.analysis.explain.necessity import cause_key, count_distinct_causes, necessity_frame
 from safevar_sumo.analysis.explain.result import DISTINCT_CAUSE, REASONS, ROBUST, Cause, Explained, Explanation
+from safevar_sumo.analysis.explain.robustness import STEP_FACTORS, estimate_robustness, find_smallest_robust_failure
 from safevar_sumo.analysis.preventability import assess_preventability, classify_collisions
 from safevar_sumo.analysis.research_questions.case import Case
 from safevar_sumo.errors import InputError

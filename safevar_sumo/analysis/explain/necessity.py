@@ -1,19 +1,17 @@
-"""Statistics of many failures: how often each characteristic is changed and needed, distinct minimal causes, and robustness."""
+"""Statistics of many failures: how often each characteristic is changed and needed, and distinct minimal causes."""
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
 
-from safevar_sumo.analysis.evaluator import Evaluator, clopper_pearson
+from safevar_sumo.analysis.evaluator import clopper_pearson
 from safevar_sumo.analysis.explain.causes import MinimalCause, involved_columns, necessary_columns
 from safevar_sumo.analysis.words import direction_in_words
-from safevar_sumo.metrics import Unsafe
-from safevar_sumo.records import BoolArray, Evaluations, FloatArray
+from safevar_sumo.records import BoolArray
 from safevar_sumo.vehicles import CharacteristicSet
 
 CauseKey = tuple[str, ...]
@@ -75,89 +73,3 @@ def count_distinct_causes(characteristics: CharacteristicSet, causes: Sequence[S
     return pd.DataFrame({
         "cause": pd.Series(order, dtype=object), "failures": pd.Series([counts[key] for key in order], dtype=int),
         "share": pd.Series([counts[key] / len(causes) for key in order], dtype=float)})
-
-
-NEIGHBOUR_COUNT = 64
-"""Number of neighbours of a setting that are simulated with each time step."""
-STEP_FACTORS = (1.0, 0.5, 2.0)
-"""Factors by which the study's time step is multiplied."""
-MIN_ROBUST_SHARE = 0.8
-"""Share of unsafe neighbours from which on a failure is called robust; below, it is borderline."""
-FAILURES_PER_BATCH = 8
-"""Number of failures whose robustness is estimated at a time, the smallest failures first."""
-
-
-class Robustness(NamedTuple):
-    """Shares of unsafe outcomes among the neighbours of a setting, by time step [s]."""
-
-    shares_by_step: dict[float, float]
-
-    @property
-    def share(self) -> float:
-        return sum(self.shares_by_step.values()) / len(self.shares_by_step)
-
-    @property
-    def borderline(self) -> bool:
-        return is_borderline(self.share)
-
-    def __str__(self) -> str:
-        """A phrase such as `robust: 84 % of the neighbours are unsafe too, but only 53 % with a step of 0.1 s`."""
-        step, least_share = min(self.shares_by_step.items(), key=lambda item: item[1])
-        disagrees = is_borderline(least_share) and not self.borderline
-        return robustness_in_words(self.share) + (f", but only {100 * least_share:.0f} % with a step of {step:g} s" if disagrees else "")
-
-
-def is_borderline(share: float) -> bool:
-    """Whether small perturbations remove a failure, because too few of its neighbours are unsafe."""
-    return share < MIN_ROBUST_SHARE
-
-
-def robustness_in_words(share: float) -> str:
-    """A phrase such as `borderline: only 44 % of the neighbours are unsafe too`."""
-    return f"{'borderline: only' if is_borderline(share) else 'robust:'} {100 * share:.0f} % of the neighbours are unsafe too"
-
-
-def estimate_robustness(evaluator: Evaluator, settings: FloatArray, step: float, unsafe: Unsafe,
-                        factors: Sequence[float] = STEP_FACTORS) -> list[Robustness]:
-    """The robustness of each of M settings, shape (M, n).
-
-    A setting's neighbours differ from it in each characteristic by at most the filter's threshold. They are simulated without the filter,
-    with each of `factors` times the study's time step (`step` seconds). Neighbours that cannot be simulated do not count.
-    """
-    characteristics = evaluator.characteristics
-    rng = np.random.default_rng(evaluator.study.search.seed)
-    offsets = rng.uniform(-1, 1, (NEIGHBOUR_COUNT, len(characteristics))) * characteristics.threshold
-    neighbours = np.clip(settings[:, np.newaxis] + offsets, characteristics.lower, characteristics.upper).reshape(-1, len(characteristics))
-    shares = {}
-    for factor in factors:
-        step_evaluator = evaluator if factor == 1 else evaluator.with_step(step * factor)
-        evaluations = step_evaluator.evaluate(neighbours, f"neighbours at {step * factor:g} s a step")
-        is_unsafe, is_valid = (flags.reshape(len(settings), NEIGHBOUR_COUNT) for flags in (unsafe.of(evaluations), evaluations.valid))
-        shares[step * factor] = (is_unsafe & is_valid).sum(axis=1) / np.maximum(is_valid.sum(axis=1), 1)
-    return [Robustness({step: float(step_shares[row]) for step, step_shares in shares.items()}) for row in range(len(settings))]
-
-
-def find_smallest_robust_failure(evaluator: Evaluator, failures: Evaluations, step: float, unsafe: Unsafe,
-                                 max_evaluations: int) -> int | None:
-    """The row of the robust failure with the fewest changes; of several, the one whose largest change is smallest.
-
-    Failures are tried in this order until one is robust, or about `max_evaluations` settings are evaluated; None if no tried failure is
-    robust. Other time steps than the study's are left out where they could not make a failure robust.
-    """
-    order = np.lexsort([failures.f_safe, failures.f_diff, failures.f_num_diff])
-    least_share = len(STEP_FACTORS) * MIN_ROBUST_SHARE - len(STEP_FACTORS[1:])  # with it, the mean is just robust if all others are 1
-    neighbour_sets = 0
-    for start in range(0, len(order), FAILURES_PER_BATCH):
-        rows = order[start:start + FAILURES_PER_BATCH]
-        candidates = [(row, estimate) for row, estimate in zip(
-            rows.tolist(), estimate_robustness(evaluator, failures.settings[rows], step, unsafe, STEP_FACTORS[:1]), strict=True)
-            if estimate.share >= least_share]
-        if candidates:
-            other_steps = estimate_robustness(evaluator, failures.settings[[row for row, _ in candidates]], step, unsafe, STEP_FACTORS[1:])
-            for (row, estimate), others in zip(candidates, other_steps, strict=True):
-                if not Robustness(estimate.shares_by_step | others.shares_by_step).borderline:
-                    return int(row)
-        neighbour_sets += len(rows) + len(STEP_FACTORS[1:]) * len(candidates)
-        if neighbour_sets * NEIGHBOUR_COUNT >= max_evaluations:
-            break
-    return None

@@ -11,8 +11,8 @@ from rich.markup import escape
 
 from safevar_sumo.analysis.evaluator import CONFIDENCE
 from safevar_sumo.analysis.explain.braking_comparison import BrakingComparison, sentence
-from safevar_sumo.analysis.explain.result import REASONS, ROBUST, Cause, Explained, Explanation, most_robust
-from safevar_sumo.analysis.explain.summary import LABELS, FailureDescription, failures_paragraph
+from safevar_sumo.analysis.explain.paragraph import FailureDescription, failures_paragraph
+from safevar_sumo.analysis.explain.result import LABELS, REASONS, ROBUST, Cause, Explained, Explanation, most_robust
 from safevar_sumo.analysis.figures import BLUE, FONT, GREY, SKY_BLUE, escape_dollars, new_figure
 from safevar_sumo.analysis.words import list_of_changes, number_of, points_in_words, question_command, simulate_command, two_decimals
 from safevar_sumo.protocol.rater import is_rated

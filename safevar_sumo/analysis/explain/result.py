@@ -12,7 +12,7 @@ import pandas as pd
 
 from safevar_sumo.analysis.explain.braking_comparison import BrakingComparison, sentence
 from safevar_sumo.analysis.explain.causes import BoundaryState
-from safevar_sumo.analysis.explain.necessity import Robustness
+from safevar_sumo.analysis.explain.robustness import Robustness
 from safevar_sumo.analysis.preventability import Preventability, PreventedShares
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import Evaluations
@@ -26,6 +26,8 @@ REASONS = {"fewest": "fewest changes", "smallest": "smallest changes", "most_sev
 """The other reasons for choosing a failure, by the name of the choice in `CHOICES`; the JSON contains these texts."""
 DISTINCT_CAUSE = "a cause of its own"
 """The reason for choosing the simplest failure with a cause that no other chosen failure has."""
+LABELS = {ROBUST: "robust with the fewest changes", REASONS["smallest"]: "smallest largest change", DISTINCT_CAUSE: "distinct cause"}
+"""Titles of failures by the reason for their choice; any other reason is itself the title."""
 
 
 class CauseEntry(msgspec.Struct, frozen=True, kw_only=True):

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from operator import attrgetter
-from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -13,24 +11,20 @@ from safevar_sumo.analysis.evaluator import Evaluator
 from safevar_sumo.analysis.explain import ExplainOptions
 from safevar_sumo.analysis.explain.causes import MinimalCause, find_minimal_causes
 from safevar_sumo.analysis.explain.compute import compare_at_points, unsafe_points_of
-from safevar_sumo.analysis.explain.necessity import Robustness, estimate_robustness, find_smallest_robust_failure
-from safevar_sumo.analysis.explain.result import DISTINCT_CAUSE, REASONS, ROBUST, most_robust
-from safevar_sumo.analysis.preventability import Preventability, PreventableBy, assess_preventability
+from safevar_sumo.analysis.explain.paragraph import FailureDescription, failures_paragraph
+from safevar_sumo.analysis.explain.result import LABELS, REASONS, most_robust
+from safevar_sumo.analysis.explain.robustness import Robustness, estimate_robustness, find_smallest_robust_failure
+from safevar_sumo.analysis.preventability import assess_preventability
 from safevar_sumo.analysis.rating.summary import summarise_rated_solutions
-from safevar_sumo.analysis.words import OUTCOME_VERBS, join_phrases, list_of_changes, number_of, points_in_words, question_command
+from safevar_sumo.analysis.words import list_of_changes, number_of, points_in_words, question_command
 from safevar_sumo.metrics import RATING_POINTS, Unsafe
-from safevar_sumo.records import KMH_PER_MS, Evaluations, FloatArray, Outcome, finite_or_none
+from safevar_sumo.records import Evaluations, FloatArray, finite_or_none
 from safevar_sumo.results import CHOICES, choose_handle, handles_of, record, row_of_handle
-from safevar_sumo.scenarios import equals_clear, weather_in_words
-from safevar_sumo.scenarios.base import pre_crash_of
 from safevar_sumo.study import Study
 from safevar_sumo.sumo.matrix import simulate_all_points, study_at, worst_points
 from safevar_sumo.sumo.system import System, assemble
-from safevar_sumo.vehicles import CharacteristicSet
 from safevar_sumo.workers.evaluation import Pool
 
-LABELS = {ROBUST: "robust with the fewest changes", REASONS["smallest"]: "smallest largest change", DISTINCT_CAUSE: "distinct cause"}
-"""Titles of failures by the reason for their choice; any other reason is itself the title."""
 MAX_ESTIMATED_CAUSES = 20
 """Number of minimal causes of a failure up to which their robustness is estimated at the end of a study; `explain` estimates all."""
 
@@ -145,147 +139,3 @@ def _cause_in_words(evaluator: Evaluator, causes: list[MinimalCause]) -> str:
     rest = len(causes) - 1
     others = f" ({number_of(rest, 'alternative set')} of the same size; see explain)" if rest else ""
     return f"These changes alone cause it: {list_of_changes(evaluator.characteristics, values)}{others}."
-
-
-NUMBER_WORDS = ("no", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten", "eleven", "twelve")
-MAX_CHANGES_LISTED = 4
-"""Maximum number of changes that are listed, the largest first."""
-
-
-class FailureDescription(NamedTuple):
-    """A failure as the paragraph describes it.
-
-    Attributes
-    ----------
-    name
-        Name of the failure, such as a solution's handle.
-    changes
-        All of the failure's changes, values by name in their units.
-    outcome, safety_degree
-        Outcome and safety degree [m, or -m/s] of the failure.
-    robustness
-        Robustness of the failure.
-    sufficient_count
-        Number of changes that are enough: the size of the failure's minimal causes.
-    cause_robustness
-        Robustness of the failure's most robust minimal cause by itself; None if not all of its causes were simulated.
-    """
-
-    name: str
-    changes: Mapping[str, float]
-    outcome: str
-    safety_degree: float | None
-    robustness: Robustness
-    sufficient_count: int
-    cause_robustness: Robustness | None = None
-
-
-def failures_paragraph(system: System, original: Evaluations, smallest: FailureDescription | None, robust: FailureDescription | None,
-                       preventable: Preventability) -> str:
-    """The paragraph about a study's failures.
-
-    Parameters
-    ----------
-    system
-        The study's system; in a test matrix, with the points of the evaluations only.
-    original
-        The original vehicle's evaluation.
-    smallest
-        The most severe of the failures with the fewest changes; None if nothing is unsafe.
-    robust
-        The robust failure with the fewest changes, and among these the smallest largest change; None if no tried failure is robust. It
-        leads the paragraph if it has as few changes as `smallest`.
-    preventable
-        Shares of the collisions among the solutions that reference drivers avoid.
-    """
-    parts = [f"{_conditions_in_words(system)} the original vehicle {_original_ending_in_words(system, original)}."]
-    if smallest is None:
-        return " ".join([*parts, "Nothing unsafe was found."])
-    characteristics = CharacteristicSet(system.characteristics.members)
-    if not smallest.sufficient_count:
-        return " ".join([*parts, "No change is needed for it to be unsafe."])
-    if robust is not None and len(robust.changes) == len(smallest.changes):
-        smallest = robust
-    sentence = _failure_in_words(characteristics, smallest)
-    parts.append(f"{sentence[0].upper()}{sentence[1:]}")
-    if smallest.robustness.borderline:
-        parts.append("No failure tested is robust." if robust is None else
-                     f"The robust failure with the fewest changes: {_failure_in_words(characteristics, robust)}")
-    return " ".join([*parts, *_avoided_shares_in_words(preventable)])
-
-
-def _conditions_in_words(system: System) -> str:
-    points = system.points
-    if len(points) > 1:
-        return f"At the worst of {len(points)} test points"
-    if system.matrix:
-        return f"At {points[0].name},"
-    weather = points[0].weather
-    return f"{weather_in_words(weather)}{' (which changes neither road nor sensors)' if equals_clear(weather) else ''},"
-
-
-def _original_ending_in_words(system: System, original: Evaluations) -> str:
-    """How the original vehicle's run ends."""
-    degree, outcome = float(original.f_safe[0]), Outcome(str(original.outcome[0]))
-    if outcome == Outcome.COLLISION:
-        return f"itself collides, at {_speed_in_words(degree)}"
-    is_pedestrian = all(pre_crash_of(point.scenario).startswith("pedestrian") for point in system.points)
-    if outcome == Outcome.STOPPED and is_pedestrian:
-        return f"stops {degree:.2f} m short of the pedestrian"
-    return f"{OUTCOME_VERBS.get(outcome, outcome)}" + ("" if np.isnan(degree) else f" with a safety degree of {degree:.2f} m")
-
-
-def _failure_in_words(characteristics: CharacteristicSet, failure: FailureDescription) -> str:
-    """A sentence such as `a collision at 1.5 m/s, 5 km/h (rs:0:4, robust: ...) was found with ten changes: ...; three of them suffice`."""
-    number, sufficient = len(failure.changes), failure.sufficient_count
-    effect = f"{_outcome_in_words(failure)} ({failure.name}, {failure.robustness})"
-    listed = _changes_in_words(characteristics, failure.changes)
-    if sufficient < number:
-        cause = "" if failure.cause_robustness is None else f" ({failure.cause_robustness})"
-        subset = f"{_count_in_words(sufficient)} of them {_verb_suffice(sufficient)}{cause}"
-        return f"{effect} was found with {_count_in_words(number)} changes: {listed}; {subset}."
-    return f"{_count_in_words(number)} {'change' if number == 1 else 'changes'} {_verb_suffice(number)} for {effect}: {listed}."
-
-
-def _verb_suffice(number: int) -> str:
-    return "suffices" if number == 1 else "suffice"
-
-
-def _count_in_words(number: int) -> str:
-    return NUMBER_WORDS[number] if number < len(NUMBER_WORDS) else str(number)
-
-
-def _outcome_in_words(failure: FailureDescription) -> str:
-    if failure.safety_degree is None:
-        return failure.outcome
-    if failure.outcome == Outcome.COLLISION:
-        return f"a collision at {_speed_in_words(failure.safety_degree)}"
-    return f"a safety degree of only {failure.safety_degree:.2f} m"
-
-
-def _speed_in_words(degree: float) -> str:
-    """The collision speed of a safety degree in m/s, and in whole km/h or, below 3 km/h, with a decimal."""
-    speed = -degree * KMH_PER_MS
-    return f"{-degree:.1f} m/s, {speed:.{int(speed < 3)}f} km/h"
-
-
-def _changes_in_words(characteristics: CharacteristicSet, values: Mapping[str, float]) -> str:
-    """Short names with changes relative to the original values, the largest change first."""
-    shares = {characteristic.short_name: (values[characteristic.name] - characteristic.original) / abs(characteristic.original)
-              for characteristic in characteristics if characteristic.name in values}
-    largest = sorted(shares, key=lambda name: -abs(shares[name]))
-    parts = [f"{name} {100 * shares[name]:+.0f} %" for name in largest[:MAX_CHANGES_LISTED]]
-    return ", ".join(parts) + (f" and {len(shares) - MAX_CHANGES_LISTED} more" if len(shares) > MAX_CHANGES_LISTED else "")
-
-
-def _avoided_shares_in_words(preventable: Preventability) -> list[str]:
-    """A sentence on the shares of the collisions that each reference driver avoids; no sentence without a collision."""
-    if not preventable.looked_at:
-        return []
-    words = {PreventableBy.COMPETENT_DRIVER: "a competent driver avoids {}", PreventableBy.FULL_BRAKING:
-             "only full braking at the first possible moment avoids another {}", PreventableBy.NOBODY: "{} are physically unavoidable"}
-    parts = [text.format(f"{100 * count / preventable.looked_at:.0f} % ({count} of {preventable.looked_at})")
-             for by, text in words.items() if (count := preventable.counts.get(by))]
-    sample = "the collisions" if preventable.looked_at == preventable.collisions else (
-        f"{preventable.looked_at} collisions, drawn at random from {preventable.collisions}")
-    return [f"In the same vehicle, of {sample}, {join_phrases(parts)}."]
