@@ -24,7 +24,7 @@ from safevar_sumo.protocol.rater import Rater, expand_protocol, is_rated, rater_
 from safevar_sumo.records import FloatArray, Nominal
 from safevar_sumo.scenarios import SCENARIO_CONTRACT, SCENARIOS, GuardedScenario, Point, Scenario, equals_clear, weather_of
 from safevar_sumo.study import MatrixTest, MetricsTable, ModelTable, Study, VehicleTable, Weather, user_code_names
-from safevar_sumo.sumo.network import check_network, network_remarks
+from safevar_sumo.sumo.network_check import check_network, network_remarks
 from safevar_sumo.sumo.sources import NETWORK_KEY, is_network, is_shipped
 from safevar_sumo.sumo.traci_controller import TraciController
 from safevar_sumo.sumo.traci_module import substitute_traci

@@ -16,7 +16,8 @@ import sumo
 from safevar_sumo.errors import EnvironmentFault, InputError
 from safevar_sumo.shipped import NETWORKS
 from safevar_sumo.sumo.engine import open_world
-from safevar_sumo.sumo.network import check_network, copied_network
+from safevar_sumo.sumo.network import copied_network
+from safevar_sumo.sumo.network_check import check_network
 from safevar_sumo.sumo.staging import _store_network
 
 FOLDERS = sorted(path.name for path in NETWORKS.iterdir() if path.is_dir())

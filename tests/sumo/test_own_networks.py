@@ -15,7 +15,8 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.shipped import NETWORKS
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.matrix import simulate
-from safevar_sumo.sumo.network import built_network, check_network, copied_network, network_fingerprint
+from safevar_sumo.sumo.network import built_network, copied_network, network_fingerprint
+from safevar_sumo.sumo.network_check import check_network
 from safevar_sumo.sumo.system import System, assemble
 
 NETCONVERT = str(Path(sumo.SUMO_HOME) / "bin" / "netconvert")
