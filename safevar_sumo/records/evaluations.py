@@ -1,0 +1,126 @@
+"""Evaluated settings: what a batch returns to the search."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from safevar_sumo.records.base import BoolArray, FloatArray
+from safevar_sumo.records.runs import Outcome
+from safevar_sumo.study import SAFETY_DEGREE
+
+
+class CellResults(NamedTuple):
+    """Results of M vehicles in every cell of a rating, shape (M, number of cells).
+
+    `impact` is the relative speed of the collision [km/h], NaN without one; `warning` the true time to collision at the warning [s],
+    NaN without one; `valid` is false where the test could not be driven.
+    """
+
+    impact: FloatArray
+    warning: FloatArray
+    valid: BoolArray
+
+    def of(self, vehicles: Sequence[int] | npt.NDArray[np.intp] | BoolArray) -> CellResults:
+        return CellResults._make(values[vehicles] for values in self)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Evaluations:
+    """M evaluated settings with their outcomes, metrics and objectives.
+
+    `settings` has shape (M, n) and holds the filtered values in their table units; all other arrays have shape (M,).
+    `metrics` holds `safevar_sumo.metrics.METRICS` and the study's further metrics; an undefined value is NaN.
+    `collision_speed` is in m/s, `f_diff` a fraction, `f_num_diff` a count. `reasons` says, by the bytes of a
+    setting, why the setting could not be simulated. `files` are digests, by name, of files that user code
+    read for the first time in a batch; they belong to the batch, not to its rows. `cells` are a rating's results, None without a rating.
+    """
+
+    settings: FloatArray
+    outcome: npt.NDArray[np.str_]
+    collision_speed: FloatArray
+    metrics: Mapping[str, FloatArray]
+    f_diff: FloatArray
+    f_num_diff: FloatArray
+    reasons: Mapping[bytes, str] = field(default_factory=dict)
+    files: Mapping[str, str] = field(default_factory=dict)
+    cells: CellResults | None = None
+
+    def __len__(self) -> int:
+        return len(self.settings)
+
+    @property
+    def f_safe(self) -> FloatArray:
+        """First objective: the safety degree (method section 3) [m, or -m/s on a collision]."""
+        return self.metrics[SAFETY_DEGREE]
+
+    def column(self, name: str) -> FloatArray:
+        """A metric, f_safe, f_diff or f_num_diff by name; shape (M,). A metric without values is NaN everywhere."""
+        if name in ("f_safe", "f_diff", "f_num_diff"):
+            return np.asarray(getattr(self, name))
+        return np.asarray(self.metrics.get(name, np.full(len(self), np.nan)))
+
+    @property
+    def objectives(self) -> FloatArray:
+        """The published study's three objectives, all minimised, shape (M, 3)."""
+        return np.stack([self.f_safe, self.f_diff, self.f_num_diff], axis=1)
+
+    @property
+    def collided(self) -> BoolArray:
+        return np.asarray(self.outcome == Outcome.COLLISION)
+
+    @property
+    def valid(self) -> BoolArray:
+        """Where the setting can be scored: it is feasible, the test was valid, and the simulator reported no error."""
+        return np.asarray(~self.failed & (self.outcome != Outcome.INVALID_TEST) & ~self.infeasible)
+
+    @property
+    def infeasible(self) -> BoolArray:
+        """Where a constraint of the study is violated, so that nothing was simulated."""
+        return np.asarray(self.outcome == Outcome.INFEASIBLE)
+
+    @property
+    def failed(self) -> BoolArray:
+        """Where the simulation failed."""
+        return np.asarray(self.outcome == Outcome.SIMULATOR_ERROR)
+
+    def reason(self, row: int) -> str:
+        """Why a setting that is not valid could not be scored."""
+        return self.reasons.get(self.settings[row].tobytes(), "no reason was recorded")
+
+    def take(self, rows: Sequence[int] | npt.NDArray[np.intp] | BoolArray) -> Evaluations:
+        """The evaluations of `rows`, in that order."""
+        return replace(
+            self, settings=self.settings[rows], outcome=self.outcome[rows], collision_speed=self.collision_speed[rows],
+            metrics={name: values[rows] for name, values in self.metrics.items()}, f_diff=self.f_diff[rows],
+            f_num_diff=self.f_num_diff[rows], cells=None if self.cells is None else self.cells.of(rows))
+
+    @classmethod
+    def none(cls, n: int, metrics: Iterable[str]) -> Evaluations:
+        """Empty evaluations, for settings of `n` characteristics."""
+        empty_array = np.zeros(0)
+        return cls(settings=np.zeros((0, n)), outcome=np.zeros(0, dtype="U16"), collision_speed=empty_array,
+                   metrics=dict.fromkeys(metrics, empty_array), f_diff=empty_array, f_num_diff=empty_array)
+
+    @classmethod
+    def concatenate(cls, batches: Sequence[Evaluations]) -> Evaluations:
+        """Join batches of evaluations in order; a metric that a batch lacks is undefined in its rows.
+
+        There are `cells` only if all batches have them.
+        """
+        def join(name: str) -> np.ndarray:
+            return np.concatenate([getattr(batch, name) for batch in batches])
+
+        cells = [batch.cells for batch in batches if batch.cells is not None]
+        return cls(
+            settings=join("settings"), outcome=join("outcome"), collision_speed=join("collision_speed"),
+            metrics={name: np.concatenate([batch.metrics.get(name, np.full(len(batch), np.nan)) for batch in batches])
+                     for name in dict.fromkeys(name for batch in batches for name in batch.metrics)},
+            f_diff=join("f_diff"), f_num_diff=join("f_num_diff"),
+            reasons={setting: reason for batch in batches for setting, reason in batch.reasons.items()},
+            files={name: digest for batch in batches for name, digest in batch.files.items()},
+            cells=CellResults._make(map(np.concatenate, zip(*cells, strict=True))) if len(cells) == len(batches) else None)
