@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import faulthandler
 import os
 import sys
 
@@ -11,6 +12,8 @@ def main() -> None:
     if sys.version_info < (3, 11):  # noqa: UP036
         _exit_with_error(f"needs Python 3.11 or newer; this is {'.'.join(map(str, sys.version_info[:3]))}", 1)
     _put_installed_modules_first()
+    if sys.stderr is not None:
+        faulthandler.enable(all_threads=False)  # if compiled user code crashes, its line is printed
     try:
         from safevar_sumo import cli
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -14,6 +15,7 @@ import numpy.typing as npt
 from safevar_sumo.analysis.words import OUTCOME_VERBS
 from safevar_sumo.errors import InputError, unknown_name
 from safevar_sumo.metrics import Scoring, time_to_collision
+from safevar_sumo.plugins import limit_user_code
 from safevar_sumo.records import STANDSTILL, TIME_DECIMALS, Evaluations, FloatArray, Observation, Outcome, SimulationRuns
 from safevar_sumo.results import evaluations_frame, record
 from safevar_sumo.study import SAFETY_DEGREE, Study, StudyLike, load_study
@@ -148,6 +150,8 @@ def simulate(study: StudyLike, changes: Mapping[str, float] | None = None, *, fi
              gui: bool = False) -> Simulation:
     """Simulate one setting in this process, and the original vehicle for comparison.
 
+    User code that hangs is stopped after the study's `search.time_limit` in the main thread (not on Windows, not with `gui`).
+
     Parameters
     ----------
     study
@@ -165,6 +169,8 @@ def simulate(study: StudyLike, changes: Mapping[str, float] | None = None, *, fi
     ------
     InputError
         If the study or a change cannot be used.
+    UserCodeError
+        If user code fails or hangs.
     SimulationError
         If SUMO fails.
     """
@@ -181,13 +187,14 @@ def changed_setting(system: System, changes: Mapping[str, float] | None, filtere
 
 
 def simulate_with_original(study: Study, system: System, requested: FloatArray, *, filtered: bool = True, gui: bool = False) -> Simulation:
-    """Simulate a setting, shape (n,), that is yet to be filtered, and the original vehicle."""
+    """Simulate a setting, shape (n,), that is yet to be filtered, and the original vehicle; user code that hangs is stopped."""
     characteristics = system.characteristics
     setting = characteristics.filter(requested) if filtered else requested
-    original = _simulate_one(study, system, requested=characteristics.original, setting=characteristics.original)
-    if np.array_equal(setting, characteristics.original) and not gui:
-        return replace(original, reset_values=_reset_values(system, requested, setting))
-    return replace(_simulate_one(study, system, requested, setting, Engine.GUI if gui else Engine.LIBSUMO), _original=original)
+    with nullcontext() if gui else limit_user_code(study):
+        original = _simulate_one(study, system, requested=characteristics.original, setting=characteristics.original)
+        if np.array_equal(setting, characteristics.original) and not gui:
+            return replace(original, reset_values=_reset_values(system, requested, setting))
+        return replace(_simulate_one(study, system, requested, setting, Engine.GUI if gui else Engine.LIBSUMO), _original=original)
 
 
 def load_and_assemble(study: StudyLike, source: str = "") -> tuple[Study, System]:

@@ -31,7 +31,6 @@ from safevar_sumo.cli.target import CommandTarget, as_it_is_now_option, json_opt
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.output import check_writable, unwritable, whole_file
-from safevar_sumo.plugins import limit_user_code
 from safevar_sumo.records import KMH_PER_MS, Evaluations, FloatArray, Outcome
 from safevar_sumo.results import record
 from safevar_sumo.scenarios import LOCATION_DIMENSION, SPEED_DIMENSION, pre_crash_sentence
@@ -84,8 +83,7 @@ def simulate_command(study: str, solution: str | None, choice: str | None, chang
     parameter_sets = studies_of_sets(target.study) if spread else []
     for name in parameters_outside_sets(target.study) if spread else ():
         click.echo(f"note: [spread] does not vary {name}: the study's value is not the first of its list", err=True)
-    with limit_user_code(target.study):
-        simulation = simulate_with_original(target.study, system, requested_settings[0], filtered=not no_filter)
+    simulation = simulate_with_original(target.study, system, requested_settings[0], filtered=not no_filter)
     if target.row is not None and not changes:
         _warn_of_differences(target, simulation)
     if trace is not None:

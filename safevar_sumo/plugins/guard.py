@@ -26,7 +26,7 @@ _PACKAGE_FOLDER = str(Path(__file__).resolve().parents[1])
 _IMPORTLIB_FOLDER = str(Path(importlib.__file__).parent)
 LIBRARY_FOLDER = "site-packages"
 INFINITY = float("inf")
-_process, _end_process = os.getpid(), os._exit
+_process, _end_process, _abort_process = os.getpid(), os._exit, os.abort
 _open_runs: ContextVar[BoolArray | None] = ContextVar("open_runs", default=None)
 """Which of N runs have not ended yet, shape (N,); None outside a simulation."""
 
@@ -163,9 +163,20 @@ def open_rows(holds: BoolArray) -> IntArray:
 
 def _refuse_exit(status: int) -> NoReturn:
     """Raise an exception in place of `os._exit`, which would end this process without a message; threads and children of it may end."""
-    if os.getpid() == _process and threading.current_thread() is threading.main_thread():
+    if _is_main_thread():
         raise SystemExit(f"os._exit({status})")
     _end_process(status)
+
+
+def _refuse_abort() -> NoReturn:
+    """Raise an exception in place of `os.abort`, as `_refuse_exit` does."""
+    if _is_main_thread():
+        raise SystemExit("os.abort()")
+    _abort_process()
+
+
+def _is_main_thread() -> bool:
+    return os.getpid() == _process and threading.current_thread() is threading.main_thread()
 
 
 def _is_from_signal(error: BaseException) -> bool:
@@ -206,10 +217,10 @@ class Guard(NamedTuple):
         Raises
         ------
         UserCodeError
-            If the function raises anything, or ends the process by `os._exit`.
+            If the function raises anything, or ends the process by `os._exit` or `os.abort`.
         """
         audit_hook.call_depth += 1
-        os._exit = _refuse_exit
+        os._exit, os.abort = _refuse_exit, _refuse_abort
         try:
             return function(*arguments)
         except UserCodeError:
@@ -221,7 +232,7 @@ class Guard(NamedTuple):
         finally:
             audit_hook.call_depth -= 1
             if not audit_hook.call_depth:
-                os._exit = _end_process
+                os._exit, os.abort = _end_process, _abort_process
 
     def failure(self, method: str, error: BaseException) -> UserCodeError:
         """The error for an exception that user code raised."""

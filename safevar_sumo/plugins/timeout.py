@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -32,9 +33,11 @@ TICKS = 10
 def time_limit(seconds: float) -> Iterator[None]:
     """Raise `UserCodeTimeout` in a block that would take longer than `seconds` on an idle machine.
 
-    The import of modules does not count. The limit has no effect outside the main thread and on Windows.
+    The import of modules does not count, nor time in a debugger. The limit has no effect outside the main thread, on Windows, and where the
+    caller has set an alarm of its own.
     """
-    if threading.current_thread() is not threading.main_thread() or not hasattr(signal, "setitimer"):
+    in_main_thread = threading.current_thread() is threading.main_thread()
+    if not in_main_thread or not hasattr(signal, "setitimer") or signal.getitimer(signal.ITIMER_REAL)[0]:
         yield
         return
     ticks_left = TICKS
@@ -43,7 +46,7 @@ def time_limit(seconds: float) -> Iterator[None]:
         nonlocal ticks_left
         while frame is not None and frame.f_code.co_filename != "<frozen importlib._bootstrap>":
             frame = frame.f_back
-        ticks_left -= frame is None
+        ticks_left -= frame is None and sys.gettrace() is None
         if not ticks_left:
             raise UserCodeTimeout
 

@@ -87,6 +87,7 @@ def network_files(folder: str) -> dict[str, str]:
     return {name: hashlib.sha256(content).hexdigest()[:16] for name, content in zip(sources.files, contents, strict=True)}
 
 
+@cache
 def netconvert_version() -> str:
     """Version of SUMO, and thus of netconvert."""
     from importlib.metadata import version

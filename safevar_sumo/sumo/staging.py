@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Sequence
-from functools import cached_property, lru_cache, partial
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -53,34 +53,32 @@ def _stage(scenario: Any, fingerprint: str) -> StagedNetwork:
     """The staged network; `fingerprint` makes the contents of the network's files part of the cache key."""
     folder = scenario.network
     lanes, actors = (getattr(scenario, name, None) for name in ("lanes", "actors"))
-    if lanes is not None and (changes := lanes(_BuiltRoads(folder))):
+    if lanes is not None and (changes := lanes(_BuiltRoads(folder, fingerprint))):
         folder = str(_change_lanes(sources_of(folder), built_network(folder), changes))
-    if actors is not None and (changes := actors(_BuiltRoads(folder))):
+        fingerprint = network_fingerprint(folder)
+    if actors is not None and (changes := actors(_BuiltRoads(folder, fingerprint))):
         folder = str(_change_traffic(sources_of(folder), changes))
-    return StagedNetwork(folder, fingerprint if folder == scenario.network else network_fingerprint(folder))
+        fingerprint = network_fingerprint(folder)
+    return StagedNetwork(folder, fingerprint)
 
 
 class _BuiltRoads:
     """The lanes of a built network."""
 
-    def __init__(self, network: str) -> None:
-        self._network = network
+    def __init__(self, network: str, fingerprint: str) -> None:
+        self._network, self._fingerprint = network, fingerprint
 
     def lane(self, lane: str) -> Lane:
-        if lane not in self._lanes:
+        lanes = _read_lanes(self._network, self._fingerprint)
+        if lane not in lanes:
             raise InputError(sources_of(self._network).folder, f"there is no lane {lane!r}")
-        return self._lanes[lane]
-
-    @cached_property
-    def _lanes(self) -> dict[str, Lane]:
-        network = built_network(self._network)
-        return _read_lanes(network, network.read_bytes())
+        return lanes[lane]
 
 
 @lru_cache(maxsize=100)
-def _read_lanes(network: Path, content: bytes) -> dict[str, Lane]:
+def _read_lanes(network: str, fingerprint: str) -> dict[str, Lane]:
     lanes = {}
-    for lane in ElementTree.fromstring(content).iter("lane"):
+    for lane in ElementTree.fromstring(built_network(network).read_bytes()).iter("lane"):
         coordinates = [(float(x), float(y)) for x, y in (point.split(",")[:2] for point in lane.attrib["shape"].split())]
         lanes[lane.attrib["id"]] = lane_through(lane.attrib["id"], coordinates)
     return lanes

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import inspect
 import re
+import signal
 import subprocess
 import sys
+import time
 import warnings
 from importlib.metadata import version
 from pathlib import Path
@@ -16,6 +18,8 @@ import pytest
 
 import safevar_sumo as sv
 from safevar_sumo import report
+from safevar_sumo.conformance.finding import time_limit
+from safevar_sumo.errors import UserCodeError
 from safevar_sumo.study import load_study, tables_of
 from safevar_sumo.sumo.matrix import simulate, simulate_all_points, study_at, worst_points
 from safevar_sumo.sumo.system import assemble
@@ -53,6 +57,32 @@ def test_a_study_needs_no_file() -> None:
     assert mine.weather == sv.Weather(name="ice", road_friction=0.2, visibility=0.9)
     assert tables["name"] == "mine", "what was given is left as it was"
     assert sv.simulate(mine).study.name == "other"
+
+
+@pytest.mark.skipif(not hasattr(signal, "setitimer"), reason="Windows has no such signals")
+def test_simulate_stops_user_code_that_hangs_but_neither_a_debugger_nor_an_alarm_of_the_caller(in_tmp: Path) -> None:
+    Path("hanging_ads.py").write_text("import time\nfrom safevar_sumo.ads import ScalarAds\n\n\nclass Mine(ScalarAds):\n"
+                                      "    def drive(self, seen):\n        time.sleep(1000)\n")
+    Path("mine.toml").write_text('extends = "smoke"\n[ads]\nmodel = "hanging_ads:Mine"\n[search]\ntime_limit = 0.3\n')
+    with pytest.raises(UserCodeError, match=re.escape("longer than 0.3 s") + r".*hanging_ads\.py:7"):
+        sv.simulate("mine.toml")
+    alarms = list[int]()
+    previous_handler = signal.signal(signal.SIGALRM, lambda number, _: alarms.append(number))
+    try:
+        signal.setitimer(signal.ITIMER_REAL, 0.2)
+        with time_limit(0.1):
+            time.sleep(1)
+        assert alarms
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, previous_handler)
+    tracer = sys.gettrace()
+    try:
+        sys.settrace(lambda *_: None)
+        with time_limit(0.1):
+            time.sleep(1)
+    finally:
+        sys.settrace(tracer)
 
 
 def test_simulate_returns_the_setting_and_the_original_beside_it() -> None:

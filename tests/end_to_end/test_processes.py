@@ -114,6 +114,18 @@ def test_a_worker_that_hangs_does_not_outlive_a_killed_study() -> None:
     until(lambda: not left_of_group(process))
 
 
+@SLOW
+def test_a_crash_of_compiled_code_names_the_line_that_called_it() -> None:
+    Path("my_ads.py").write_text("import ctypes\nfrom safevar_sumo.ads import ScalarAds\n\n\nclass Crashing(ScalarAds):\n"
+                                 "    def drive(self, seen):\n        ctypes.string_at(0)\n")
+    Path("crashing.toml").write_text('extends = "small.toml"\nname = "crashing"\n[ads]\nmodel = "my_ads:Crashing"\n')
+    process = started("simulate", "crashing.toml")
+    _, errors = process.communicate(timeout=120)
+    assert process.returncode == -signal.SIGSEGV
+    assert "Segmentation fault" in errors
+    assert f'{Path("my_ads.py").resolve()}", line 7 in drive' in errors
+
+
 SUMO_GOES_WRONG = """
 import os
 import signal

@@ -34,6 +34,7 @@ def failing(system: object) -> str:
     ("1 / 0", "raised in drive: ZeroDivisionError: division by zero"), ("raise SystemExit(0)", "raised in drive: SystemExit: 0"),
     ("raise GeneratorExit", "raised in drive: GeneratorExit ("), ("raise BaseException(1, 2)", "raised in drive: BaseException: (1, 2) ("),
     ("import os; os._exit(3)", "raised in drive: SystemExit: os._exit(3) ("),
+    ("import os; os.abort()", "raised in drive: SystemExit: os.abort() ("),
     (r"raise RuntimeError('my\n message')", "raised in drive: RuntimeError: my message ("), ("pass", "returned None from drive"),
     ("return 0.5", "returned 0.5 from drive"), ("return 0.5, 0, 0", "returned (0.5, 0, 0) from drive"),
     ("return '0.5', 0", "returned throttle = '0.5' from drive"), ("return 0, 2", "returned brake = 2.0 from drive"),
@@ -46,7 +47,7 @@ def test_a_scalar_ads_that_is_wrong(body: str, expected: str, mine: Mine, folder
 
 
 def test_only_ctrl_c_itself_passes_as_an_interrupt(mine: Mine) -> None:
-    end_process, python_handler = os._exit, signal.getsignal(signal.SIGINT)
+    end_functions, python_handler = (os._exit, os.abort), signal.getsignal(signal.SIGINT)
     ctrl_c = mine(SCALAR + "    def drive(self, seen):\n        import signal\n        signal.raise_signal(signal.SIGINT)\n")
     try:
         signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -59,7 +60,7 @@ def test_only_ctrl_c_itself_passes_as_an_interrupt(mine: Mine) -> None:
     finally:
         signal.signal(signal.SIGINT, python_handler)
     assert "raised in drive: KeyboardInterrupt (" in message
-    assert os._exit is end_process
+    assert (os._exit, os.abort) == end_functions
 
 
 def test_a_wrong_parameter_is_named_with_the_study_s_file(mine: Mine, folder: Path) -> None:
