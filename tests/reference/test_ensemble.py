@@ -93,3 +93,19 @@ def test_data_without_weight_move_nothing() -> None:
     model = Silent(noise=1.0)
     inversion_of(model, 20, 2_000)
     assert np.array(model.places[-20:]) == pytest.approx(np.array(model.places[:20]))
+
+
+def test_last_digits_of_residuals_do_not_reach_the_search_that_follows() -> None:
+    """Two computations of one fit, such as on two computers, try the same places, although their residuals differ in the last digits."""
+
+    class OtherComputer(LinearModel):
+        def misfits(self, groups: Sequence[Any]) -> list[Misfit]:
+            return [Misfit(loss * (1 + 1e-12), residuals * (1 + 1e-12)) for loss, residuals in super().misfits(groups)]
+
+    tried = []
+    for model in (LinearModel(noise=0.5), OtherComputer(noise=0.5)):
+        inversion, race = inversion_of(model, 40, 1000)
+        race.begin(inversion.place, 0.05, seed=3, axes=inversion.axes).advance(160)
+        tried.append(np.array(model.places))
+    assert len(tried[0]) > 200
+    assert (tried[0] == tried[1]).all()
