@@ -18,8 +18,8 @@ import pytest
 
 import safevar_sumo as sv
 from safevar_sumo import report
-from safevar_sumo.conformance.finding import time_limit
 from safevar_sumo.errors import UserCodeError
+from safevar_sumo.plugins import time_limit
 from safevar_sumo.study import load_study, tables_of
 from safevar_sumo.sumo.matrix import simulate, simulate_all_points, study_at, worst_points
 from safevar_sumo.sumo.system import assemble

@@ -195,7 +195,6 @@ def test_what_ships_is_what_the_trust_page_says() -> None:
 PUBLISHED_EFFECTS = {"tireFric": 1.2, "mass": -0.8, "maxBrakeTorque": 0.6, "dampRateZeroT_CE": 0.4, "radius": 0.4, "max_rpm": 0.2,
                      "dampRateZeroT_CD": 0.2}
 """Linear effect on the safety degree over a whole domain in the published random search in sun [m]."""
-NEAR = 0.05
 
 
 @pytest.mark.parametrize(("study", "within"), [
@@ -213,8 +212,8 @@ def test_the_original_vehicle_is_as_near_to_the_published_one_as_is_said(study: 
         assert here[name][0] == pytest.approx(read.published[name], rel=share), name
 
 
-@pytest.mark.parametrize(("study", "expected"), [("sun", 0.60), ("rain", 0.59)])
-def test_vehicles_come_in_the_order_of_the_published_effects(study: str, expected: float) -> None:
+@pytest.mark.parametrize("study", ["sun", "rain"])
+def test_vehicles_come_in_the_order_of_the_published_effects(study: str) -> None:
     """Spearman's rho over 150 vehicles with the published linear effects, which know nothing of what saturates or comes together."""
     system = assemble(load_study(study))
     characteristics = system.characteristics
@@ -222,4 +221,4 @@ def test_vehicles_come_in_the_order_of_the_published_effects(study: str, expecte
     settings = np.random.default_rng(14).uniform(characteristics.lower, characteristics.upper, (150, len(width)))
     effects = np.array([PUBLISHED_EFFECTS.get(name, 0.0) for name in characteristics.names])
     here = score(system, settings, simulate(system, settings)).f_safe
-    assert rank_correlation(((settings - characteristics.original) / width) @ effects, here) == pytest.approx(expected, abs=NEAR)
+    assert rank_correlation(((settings - characteristics.original) / width) @ effects, here) > 0.55

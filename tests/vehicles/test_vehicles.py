@@ -137,7 +137,7 @@ def lateral_error(model: str, population: np.ndarray) -> np.ndarray:
 ACTS = {
     "carla": {
         "max_rpm": (speed_at(30), +1), "dampRateFullT": (speed_at(1), -1), "dampRateZeroT_CE": (coasting_loss(3, 2), +1),
-        "dampRateZeroT_CD": (speed_at(0.8, half_throttle), -1), "gearSwitchTime": (speed_at(1), -1),
+        "dampRateZeroT_CD": (speed_at(0.8, half_throttle), -1), "gearSwitchTime": (speed_at(0.8), -1),
         "clutchStrength": (speed_at(0.65), +1), "mass": (speed_at(3), -1), "dragCoeff": (speed_at(1.5), -1),
         "tireFric": (stopping_distance(1.0), -1), "dampRate": (coasting_loss(3, 2), +1), "radius": (stopping_distance(1.0), +1),
         "maxBrakeTorque": (stopping_distance(1.0), -1),
