@@ -75,7 +75,7 @@ def test_calibrate_finds_back_what_was_changed(data: Path, in_tmp: Path) -> None
     """A study that starts from another brake gap comes nearer to the one that the data was made with."""
     Path("mine.toml").write_text(
         'extends = "sun"\nname = "mine"\n[ads.parameters]\nbrake_gap = 8.0\n'
-        '[calibration]\n"ads.parameters.brake_gap" = { lower = 7, upper = 12, unit = "m", meaning = "gap" }\n')
+        '[calibration]\n"ads.parameters.brake_gap" = { lower = 6, upper = 12, unit = "m", meaning = "gap" }\n')
     truth = load_study("sun").ads.parameters["brake_gap"]
     done = run("calibrate", "mine.toml", str(data), "--trials", "37", "--seed", "3", "--out", "found.toml")
     result = tomllib.loads(Path("found.toml").read_text())
@@ -132,7 +132,7 @@ def small_fit() -> tuple[str, ...]:
     """Write a study with a free parameter, and return the command that fits it in few trials."""
     Path("mine.toml").write_text(
         'extends = "sun"\nname = "mine"\n[ads.parameters]\nbrake_gap = 8.0\n'
-        '[calibration]\n"ads.parameters.brake_gap" = { lower = 7, upper = 12, unit = "m", meaning = "gap" }\n')
+        '[calibration]\n"ads.parameters.brake_gap" = { lower = 6, upper = 12, unit = "m", meaning = "gap" }\n')
     return "calibrate", "mine.toml", "--trials", "5", "--out", "found.toml"
 
 
@@ -142,7 +142,7 @@ def test_a_picture_that_fails_does_not_lose_the_fit(in_tmp: Path, monkeypatch: p
 
     monkeypatch.setattr(calibrate, "plot_profiles", failing)
     refused(*small_fit(), "--plot", "plot.png", message=("--plot", "no space is left"))
-    assert 7 <= load_study("found.toml").ads.parameters["brake_gap"] <= 12
+    assert 6 <= load_study("found.toml").ads.parameters["brake_gap"] <= 12
 
 
 def test_a_full_disk_loses_neither_the_old_file_nor_the_fit(in_tmp: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -208,7 +208,7 @@ def test_an_interrupted_calibration_leaves_the_best_so_far(in_tmp: Path, monkeyp
 
 @pytest.mark.slow
 def test_several_studies_are_fitted_together(data: Path, in_tmp: Path) -> None:
-    free = '[calibration]\n"ads.parameters.brake_gap" = { lower = 7, upper = 12, unit = "m", meaning = "gap" }\n'
+    free = '[calibration]\n"ads.parameters.brake_gap" = { lower = 6, upper = 12, unit = "m", meaning = "gap" }\n'
     Path("mine.toml").write_text(f'extends = "sun"\nname = "mine"\n{free}')
     Path("late.toml").write_text(f'extends = "sun"\nname = "late"\n[ads.parameters]\nhesitation = 0.1\n{free}')
     Path("late_rows.csv").write_bytes(data.read_bytes())
@@ -217,7 +217,7 @@ def test_several_studies_are_fitted_together(data: Path, in_tmp: Path) -> None:
     Path("fitted").mkdir()
     lines = run(*words, "--out", "fitted").stdout.splitlines()
     row = next(line for line in lines if "brake_gap *" in line)
-    assert "7 to 12" in row, "a table of the usual width breaks no number"
+    assert "6 to 12" in row, "a table of the usual width breaks no number"
     assert "* shared with late" in lines
     fitted = [tomllib.loads(Path(f"fitted/{name}-calibrated.toml").read_text()) for name in ("mine", "late")]
     assert fitted[0]["ads"]["parameters"]["brake_gap"] == fitted[1]["ads"]["parameters"]["brake_gap"]

@@ -130,15 +130,18 @@ def test_the_sections_stand_in_their_order_and_tell_what_was_found(page: str, sl
     assert f"{-3.6 * worst:.0f} km/h" in page
     assert f"stops with {case.original['safety_degree']:.2f} m to spare" in page
     by_reason = {reason: one for one in explained.explanations for reason in one.reasons}
-    alone = cause.neighbours if (cause := most_robust(by_reason["smallest robust"].causes)) else None
+    robust, fewest = (by_reason[reason] for reason in ("smallest robust", "fewest changes"))
+    cause = most_robust(robust.causes)
+    assert cause is not None
+    alone = cause.neighbours
     assert alone is not None
-    assert alone.borderline, "or the next line tells nothing"
-    assert re.search(r"\d+ changes lead to a collision that is robust \(\d of them suffices? to be unsafe, but borderline: only "
-                     rf"{100 * alone.share:.0f} % of the neighbours are unsafe too\): the vehicle collides at", page)
+    borderline = f", but borderline: only {100 * alone.share:.0f} % of the neighbours are unsafe too" if alone.borderline else ""
+    assert re.search(rf"\d+ changes lead to a collision that is robust \(\d of them suffices? to be unsafe{borderline}\): "
+                     r"the vehicle collides at", page)
     assert "^2" not in re.sub("<(style|script).*?</(style|script)>", "", page, flags=re.DOTALL)
-    fewest = by_reason["fewest changes"]
-    for words in (f"{'borderline: only' if fewest.robustness.borderline else 'robust:'} {100 * fewest.robustness.share:.0f} % of the",
-                  f"Scaling all changes to {100 * fewest.causes[0].fraction:.1f} % is still unsafe",
+    badge = f"{'borderline' if fewest.robustness.borderline else 'robust'}: {100 * fewest.robustness.share:.0f} % of its neighbours are"
+    for words in (badge, f"robust: {100 * robust.robustness.share:.0f} % of the",
+                  f"Scaling all changes to {100 * cause.fraction:.1f} % is still unsafe",
                   "Unsafe alone: tireFric.", "within 80 % of the way", "tireFric below 1.5: collides in 100 %",
                   "A share of the domain, not a probability in the field", "NSGA-II (1 run)", "wet leaves", "RQ1: solutions", "RQ3.2",
                   "from seed 1"):
@@ -177,6 +180,10 @@ def test_the_verdict_leads_with_the_robust_failure_and_calls_the_others_borderli
     number, needed = len(first.changes), len(robust.minimal_causes[0].changes)
     assert 0 < needed < number, "or the next line tells nothing"
     assert result.headline.startswith(f"{number} changes lead to a collision that is robust ({needed} of them suffice")
+    for share, but in ((0.79, ", but borderline: only 79 % of the neighbours are unsafe too"), (0.81, ""), (None, "")):
+        alone = msgspec.structs.replace(robust.minimal_causes[0], robustness=share)
+        with_share = msgspec.structs.replace(robust, minimal_causes=[alone])
+        assert f" to be unsafe{but}): " in reach_verdict(data, Explanations([fewest, with_share], summary), None).headline
     severe = msgspec.structs.replace(robust, reasons=["most severe"])
     assert reach_verdict(data, Explanations([fewest, severe], summary), None).headline.startswith(
         "The failures with the fewest changes are borderline. The one with the fewest changes: "), "the most severe one is not"
