@@ -207,6 +207,11 @@ def test_cases_stand_side_by_side_in_one_figure(case: Case) -> None:
     assert not lacking
 
 
+def test_numbers_of_changes_stand_in_the_order_of_numbers() -> None:
+    (axis,) = (axis for axis in draw_change_counts([random_setting("sun")]).axes if axis.axison)
+    assert [label.get_text() for label in axis.get_xticklabels()] == [str(j) for j in range(1, 13)]
+
+
 def test_the_original_vehicle_and_the_line_of_collisions_are_in_the_fronts(case: Case) -> None:
     for axis, marked in zip(draw_pareto_fronts(case).axes, (True, True, False), strict=True):
         output = {str(line.get_label()): line for line in axis.lines}

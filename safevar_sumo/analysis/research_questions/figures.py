@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from safevar_sumo.analysis.figures import FONT, as_formula, escape_dollars, new_figure, new_panels
+from safevar_sumo.analysis.figures import FONT, SKY_BLUE, as_formula, escape_dollars, new_figure, new_panels
 from safevar_sumo.analysis.research_questions.case import ALGORITHM_TITLES, Case, UnanswerableError
 from safevar_sumo.analysis.research_questions.changes import ANY, critical_solutions, list_changes, rq31, rq32
 from safevar_sumo.analysis.research_questions.indicators import (
@@ -46,13 +46,14 @@ def draw_change_counts(cases: Sequence[Case]) -> Figure:
     UnanswerableError
         If `rq31` raises it for a case.
     """
-    import seaborn as sns
-
     counts = [rq31(case) for case in cases]
     title = f"{cases[0].name}: number of changed characteristics" if len(cases) == 1 else "number of changed characteristics"
     figure, axes = new_panels(title, len(cases), PANELS_PER_ROW, (3.9, 3.3), min_width=6.4, title_height=0.5)
     for axis, case, group in zip(axes, cases, counts, strict=True):
-        sns.boxplot(group, x="j", y="count", ax=axis, color="#56b4e9", linecolor="black", linewidth=0.8, fliersize=3)
+        counts_by_number = {str(j): rows["count"].to_numpy() for j, rows in group.groupby("j", sort=False)}
+        axis.boxplot(list(counts_by_number.values()), tick_labels=list(counts_by_number), widths=0.8, patch_artist=True,
+                     boxprops={"facecolor": SKY_BLUE, "linewidth": 0.8}, medianprops={"color": "black"}, flierprops={"markersize": 3})
+        axis.grid(visible=False, axis="x")
         axis.set_xlabel("characteristics changed")
         axis.set_ylabel(f"critical solutions per run\n({group['run'].nunique()} runs)")
         axis.set_title(escape_dollars(case.name) if len(cases) > 1 else "", fontsize=FONT)
