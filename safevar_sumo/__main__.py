@@ -5,6 +5,7 @@ from __future__ import annotations
 import faulthandler
 import os
 import sys
+from contextlib import suppress
 
 
 def main() -> None:
@@ -12,7 +13,7 @@ def main() -> None:
     if sys.version_info < (3, 11):  # noqa: UP036
         _exit_with_error(f"needs Python 3.11 or newer; this is {'.'.join(map(str, sys.version_info[:3]))}", 1)
     _put_installed_modules_first()
-    if sys.stderr is not None:
+    with suppress(AttributeError, OSError, RuntimeError, ValueError):  # a console without a file, or none
         faulthandler.enable(all_threads=False)  # if compiled user code crashes, its line is printed
     try:
         from safevar_sumo import cli

@@ -24,6 +24,7 @@ from safevar_sumo.records import BoolArray, FloatArray, IntArray
 
 _PACKAGE_FOLDER = str(Path(__file__).resolve().parents[1])
 _IMPORTLIB_FOLDER = str(Path(importlib.__file__).parent)
+_STANDARD_LIBRARY_FOLDER = str(Path(os.__file__).parent)
 LIBRARY_FOLDER = "site-packages"
 INFINITY = float("inf")
 _process, _end_process, _abort_process = os.getpid(), os._exit, os.abort
@@ -308,13 +309,15 @@ class Guard(NamedTuple):
         return np.broadcast_to(array, shape)
 
     def location(self, error: BaseException) -> str:
-        """File and line of the innermost frame in the user code's folder, else of the innermost frame outside this package."""
+        """File and line of the innermost frame in the user code's folder, else outside libraries, else outside this package."""
         frames = [(frame.filename, frame.lineno) for frame in traceback.extract_tb(error.__traceback__)]
         if isinstance(error, SyntaxError) and error.filename:
             frames.append((error.filename, error.lineno))
         frames_beyond_package = [frame for frame in frames if not frame[0].startswith((_PACKAGE_FOLDER, _IMPORTLIB_FOLDER, "<frozen"))]
         user_frames = [frame for frame in frames_beyond_package if self.folder and frame[0].startswith(self.folder)
                        and (LIBRARY_FOLDER in self.folder or LIBRARY_FOLDER not in frame[0])]
+        user_frames = user_frames or [frame for frame in frames_beyond_package if LIBRARY_FOLDER not in frame[0]
+                                      and not frame[0].startswith(_STANDARD_LIBRARY_FOLDER)]
         return "{}:{}".format(*(user_frames or frames_beyond_package)[-1]) if frames_beyond_package else ""
 
 

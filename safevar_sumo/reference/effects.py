@@ -81,25 +81,26 @@ class Coverage(NamedTuple):
     """Share of the published rows that lie within the band of the model's predictions.
 
     `sets` and `rows` are numbers of parameter sets and rows; `all_rows` and `held_back` are shares of all rows, and of those that the fit
-    did not use; `width` is the median width of the band [m]; `needed` is the margin on each side with which the band would cover 90 % of
-    the rows held back [m].
+    did not use (None without such rows); `width` is the median width of the band [m]; `needed` is the margin on each side with which the
+    band would cover 90 % of the rows held back, or of all rows [m].
     """
 
     sets: int
     rows: int
     all_rows: float
-    held_back: float
+    held_back: float | None
     width: float
     needed: float
 
-    def to_dict(self) -> dict[str, float]:
+    def to_dict(self) -> dict[str, float | None]:
         """The fields by name."""
         return self._asdict()
 
     def __str__(self) -> str:
+        held_back = "none of them held back" if self.held_back is None else f"{self.held_back:.0%} of the rows held back"
         return (f"The {BAND_SHARE:.0%} band of {self.sets} parameter sets, of repeats and of the model's error is {self.width:.2f} m wide "
-                f"(median) and covers {self.all_rows:.0%} of {self.rows} rows, {self.held_back:.0%} of the rows held back; "
-                f"{self.needed:.2f} m more on each side would cover {BAND_SHARE:.0%} of the rows held back.")
+                f"(median) and covers {self.all_rows:.0%} of {self.rows} rows, {held_back}; {self.needed:.2f} m more on each side would "
+                f"cover {BAND_SHARE:.0%} of {'these rows' if self.held_back is None else 'the rows held back'}.")
 
 
 def measure_coverage(data: ReferenceData, study: Study) -> Coverage:
@@ -117,7 +118,7 @@ def measure_coverage(data: ReferenceData, study: Study) -> Coverage:
     held_back = np.arange(len(published)) % study.fit.hold_out == study.fit.hold_out - 1
     new_rows = held_back if held_back.any() else np.ones(len(published), dtype=bool)
     return Coverage(sets=len(evaluations), rows=len(published), all_rows=float(np.mean(distances == 0)),
-                    held_back=float(np.mean(distances[new_rows] == 0)), width=float(np.median(upper - lower)),
+                    held_back=float(np.mean(distances[held_back] == 0)) if held_back.any() else None, width=float(np.median(upper - lower)),
                     needed=float(np.quantile(distances[new_rows], BAND_SHARE)))
 
 

@@ -189,10 +189,10 @@ def _with_pedals_before_impacts(runs: SimulationRuns) -> SimulationRuns:
 
 
 def list_differences(replayed: Evaluations, recorded: Mapping[str, Any]) -> list[str]:
-    """List where the replay of a solution differs from its row of solutions.csv, with both values."""
+    """List where the replay of a solution differs from its row of solutions.csv, with both values; one cell has no rating points."""
     differing_metrics = [
         f"{name} was {recorded[name]:.6g} and is {values[0]:.6g} now" for name, values in replayed.metrics.items()
-        if name in recorded and not np.array_equal(float(recorded[name]), float(values[0]), equal_nan=True)]
+        if name in recorded and name != RATING_POINTS.name and not np.array_equal(float(recorded[name]), float(values[0]), equal_nan=True)]
     if recorded["outcome"] not in (replayed.outcome[0], UNKNOWN):
         return [f"the outcome was {recorded['outcome']} and is {replayed.outcome[0]} now", *differing_metrics]
     return differing_metrics

@@ -19,7 +19,7 @@ from safevar_sumo.ads import ADS, ADS_CONTRACT, REACTION_PARAMETERS, SCALAR_ADS_
 from safevar_sumo.errors import InputError, one_of, unknown_name
 from safevar_sumo.fmu import STEP_LIMIT, description_of
 from safevar_sumo.metrics import METRIC_OF_OBJECTIVE, METRICS, OPTIONAL_METRICS, RATING_POINTS, Metric, Objective, Scoring, guard_metric
-from safevar_sumo.plugins import Guard, Lookup, Member, ModuleCopies, check_parameters, guard_process_state, instance_of
+from safevar_sumo.plugins import Guard, Lookup, Member, ModuleCopies, check_parameters, guard_process_state, instance_of, limit_user_code
 from safevar_sumo.protocol.rater import Rater, expand_protocol, is_rated, rater_of
 from safevar_sumo.records import FloatArray, Nominal
 from safevar_sumo.scenarios import SCENARIO_CONTRACT, SCENARIOS, GuardedScenario, Point, Scenario, equals_clear, weather_of
@@ -202,7 +202,7 @@ def assemble(study: Study, source: str = "") -> System:
         Naming the study, the key, the value and the legal values.
     """
     source = source or study.source
-    with guard_process_state(source, user_code_names(study)):
+    with guard_process_state(source, user_code_names(study)), limit_user_code(study):
         return _assemble(study, source)
 
 

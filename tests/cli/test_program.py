@@ -207,3 +207,10 @@ def test_a_pipe_is_refused_by_its_name(arguments: str, tmp_path: Path, monkeypat
     error = CliRunner().invoke(commands, arguments.split()).exception
     assert isinstance(error, InputError)
     assert "is no regular file" in str(error)
+
+
+def test_the_program_runs_where_stderr_is_no_file() -> None:
+    code = ("import contextlib, io, sys; from safevar_sumo.__main__ import main; sys.argv = ['safevar-sumo', '--version']\n"
+            "with contextlib.redirect_stderr(io.StringIO()): main()")
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert (done.returncode, "version" in done.stdout) == (0, True), done.stderr

@@ -278,6 +278,16 @@ def test_the_models_error_covers_nine_tenths_of_rows_each_file_counted_alike(dat
     assert measure_coverage(far, msgspec.structs.replace(study, model_error={"safety_degree": 21.000001})).all_rows == 21 / 24
 
 
+def test_a_file_too_short_to_hold_rows_back_says_so(data: ReferenceData) -> None:
+    study = msgspec.structs.replace(mine(1.0), spread={GAP: [value_of(mine(1.0), GAP)] * 2}, repeatability={"safety_degree": 1e-3})
+    short = data.take(np.arange(len(data.settings)) < study.fit.hold_out - 1)
+    coverage = measure_coverage(short, study)
+    assert coverage.held_back is None
+    assert "none of them held back" in str(coverage)
+    assert "the rows held back" not in str(coverage)
+    assert "of the rows held back" in str(measure_coverage(data, study))
+
+
 @pytest.mark.parametrize(("starts", "trials", "ensemble"), [(1, 1, 5), (3, 2, 5), (2, 9, 2), (2, 33, 4), (1, 25, 50)])
 def test_a_fit_from_scratch_has_as_many_trials_as_it_may(data: ReferenceData, starts: int, trials: int, ensemble: int) -> None:
     losses = list[float]()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 import shutil
@@ -63,6 +64,8 @@ def test_the_most_severe_the_smallest_and_the_fewest(flag: str, column: str, sli
 def test_a_replay_that_differs_from_its_row_is_reported(slippery: Path, case: Case) -> None:
     comparison = compare_setting(case.study, assemble(case.study), case.characteristics.original)
     result = list_differences(comparison.evaluations, {"safety_degree": 1.0, "tet": np.nan, "outcome": "collision"})
+    rated = dataclasses.replace(comparison.evaluations, metrics={**comparison.evaluations.metrics, "rating_points": np.array([np.nan])})
+    assert list_differences(rated, {"rating_points": 3.0, "outcome": "stopped"}) == [], "a single cell has no points"
     assert [one.split(" was ")[0] for one in result] == ["the outcome", "safety_degree", "tet"]
 
 
