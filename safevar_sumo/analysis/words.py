@@ -71,6 +71,12 @@ def points_in_words(failing_points: Sequence[str], point_count: int, limit: int 
     return f"Fails at {len(failing_points)} of {point_count} points{': ' + names if failing_points else ''}{others}."
 
 
+def percentage(share: float) -> str:
+    """A share in percent, such as `14 %`; `0 %` and `100 %` only if it is exactly none or all."""
+    percent = 100 * share
+    return f"{percent:.0f} %" if share in (0, 1) or 0.5 <= percent < 99.5 else f"{min(max(percent, 0.1), 99.9):.1f} %"
+
+
 def two_decimals(value: float | None) -> str:
     """Two decimals, never `-0.00`; `-` if undefined."""
     return "-" if value is None or math.isnan(value) else f"{round(value, 2) + 0.0:.2f}"

@@ -16,7 +16,7 @@ from safevar_sumo.analysis.explain.robustness import MIN_ROBUST_SHARE, is_border
 from safevar_sumo.analysis.model_spread import ModelSpread, compute_model_spreads
 from safevar_sumo.analysis.preventability import PreventedShares
 from safevar_sumo.analysis.research_questions.case import ALGORITHM_TITLES, are_collisions
-from safevar_sumo.analysis.words import number_of
+from safevar_sumo.analysis.words import number_of, percentage
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import KMH_PER_MS, FloatArray, Outcome
 from safevar_sumo.reference import Totals, shipped_totals_of
@@ -274,9 +274,7 @@ def _preventability_figure(preventable: PreventedShares | None, data: ReportInpu
         return KeyFigure(title, NO_VALUE, "not computed" if any_collision else "there is no collision to avoid")
     low, high = preventable.interval_competent_driver
     sample = "all" if low == high else f"95 % interval {100 * low:.0f} % to {100 * high:.0f} %;"
-    percent, is_whole = 100 * preventable.competent_driver, preventable.competent_driver in (0, 1)
-    words = f"{percent:.0f}" if is_whole or 0.5 <= percent < 99.5 else f"{min(max(percent, 0.1), 99.9):.1f}"  # nearly all is not all
-    return KeyFigure(title, f"{words} % of the collisions",
+    return KeyFigure(title, f"{percentage(preventable.competent_driver)} of the collisions",
                      f"in the same vehicle ({sample} {preventable.looked_at} collisions analysed)")
 
 

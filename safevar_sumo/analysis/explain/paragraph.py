@@ -9,7 +9,7 @@ import numpy as np
 
 from safevar_sumo.analysis.explain.robustness import Robustness
 from safevar_sumo.analysis.preventability import Preventability, PreventableBy
-from safevar_sumo.analysis.words import OUTCOME_VERBS, join_phrases
+from safevar_sumo.analysis.words import OUTCOME_VERBS, join_phrases, percentage
 from safevar_sumo.records import KMH_PER_MS, Evaluations, Outcome
 from safevar_sumo.scenarios import equals_clear, weather_in_words
 from safevar_sumo.scenarios.base import pre_crash_of
@@ -153,7 +153,7 @@ def _avoided_shares_in_words(preventable: Preventability) -> list[str]:
         return []
     words = {PreventableBy.COMPETENT_DRIVER: "a competent driver avoids {}", PreventableBy.FULL_BRAKING:
              "only full braking at the first possible moment avoids another {}", PreventableBy.NOBODY: "{} are physically unavoidable"}
-    parts = [text.format(f"{100 * count / preventable.looked_at:.0f} % ({count} of {preventable.looked_at})")
+    parts = [text.format(f"{percentage(count / preventable.looked_at)} ({count} of {preventable.looked_at})")
              for by, text in words.items() if (count := preventable.counts.get(by))]
     sample = "the collisions" if preventable.looked_at == preventable.collisions else (
         f"{preventable.looked_at} collisions, drawn at random from {preventable.collisions}")
