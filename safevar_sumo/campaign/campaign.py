@@ -16,7 +16,7 @@ from safevar_sumo.campaign.verification import Verification
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import PUBLISHED_SCORING, Scoring
 from safevar_sumo.protocol.rater import is_rated
-from safevar_sumo.records import Evaluations
+from safevar_sumo.records import Evaluations, Outcome
 from safevar_sumo.results import ORIGINAL, Failure, JournalBusyError, ResultsDirectory
 from safevar_sumo.search import Problem, Search
 from safevar_sumo.study import Study
@@ -81,6 +81,8 @@ def run_campaign(study: Study, keys: Iterable[RunKey], results: ResultsDirectory
                          "so there is no baseline", "tests whose speed the vehicle can hold")
     if original.collided[0] and not is_rated(study):
         observer.warned(f"study {study.name!r}: the original vehicle itself collides: no change is needed")
+    if original.outcome[0] == Outcome.NEVER_MOVED:
+        observer.warned(f"study {study.name!r}: the original vehicle never moves, so the search tells nothing of the ADS's safety")
     results.begin(original)
     problem = Problem(characteristics=characteristics, original=original, evaluations=study.search.evaluations,
                       population=study.search.population, scoring=results.scoring, region=region_of(study))
