@@ -75,6 +75,8 @@ def run_campaign(study: Study, keys: Iterable[RunKey], results: ResultsDirectory
     """
     characteristics = CharacteristicSet.of(study.vehicle.characteristics)
     retrying_pool, work = RetryingPool(pool, study, results.record_late_files), pack_study(study, results.inputs, engine=engine)
+    for remark in check_code(study, results.inputs, retrying_pool):
+        observer.warned(remark)
     original = _evaluate_original(study, work, characteristics, results, retrying_pool, observer)
     if not original.valid[0]:
         raise InputError(study.source, "the original vehicle violates a test's speed tolerance before the ADS acts (invalid-test), "
@@ -143,7 +145,7 @@ def run_campaign(study: Study, keys: Iterable[RunKey], results: ResultsDirectory
 
 def _evaluate_original(study: Study, work: bytes, characteristics: CharacteristicSet, results: ResultsDirectory, pool: RetryingPool,
                        observer: Observer) -> Evaluations:
-    """Evaluate the original vehicle, or read its journal; raises an error if the simulation fails, or if user code mixes settings up."""
+    """Evaluate the original vehicle, or read its journal; raises an error if the simulation fails."""
     def simulate() -> Evaluations:
         return wait_for_result(pool.submit(work, characteristics.original[np.newaxis], must_succeed=True))
 
@@ -157,8 +159,6 @@ def _evaluate_original(study: Study, work: bytes, characteristics: Characteristi
         if journal.content.evaluations is not None:
             return journal.content.evaluations
         evaluations = simulate()
-        for remark in check_code(study, results.inputs, pool):
-            observer.warned(remark)
         journal.append(positions=[0], evaluations=evaluations)
         return evaluations
     finally:

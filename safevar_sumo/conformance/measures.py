@@ -20,7 +20,7 @@ from safevar_sumo.search import ALGORITHMS, GuardedAlgorithm, Problem
 from safevar_sumo.study import SAFETY_DEGREE, Study
 from safevar_sumo.sumo.batch import drive_all
 from safevar_sumo.sumo.system import assemble
-from safevar_sumo.vehicles import CharacteristicSet, guard_change
+from safevar_sumo.vehicles import CharacteristicSet, guard_change, region_of
 
 
 class MetricProbe(Probe):
@@ -107,6 +107,29 @@ class ObjectiveProbe(Probe):
             yield MissingReaction((), "other values at the corners of the domains than at the original", f"{values[0]:g} everywhere")
 
 
+class ConstraintProbe(Probe):
+    """Applies a constraint's function to the original setting, to the corners of the domains and to random settings."""
+
+    methods = ("function",)
+    RANDOM_SETTINGS = 200
+
+    def __init__(self, subject: Subject) -> None:
+        super().__init__(subject)
+        characteristics = CharacteristicSet.of(subject.study.vehicle.characteristics)
+        shares = np.random.default_rng(0).random((self.RANDOM_SETTINGS, len(characteristics)))
+        inner = characteristics.lower + shares * (characteristics.upper - characteristics.lower)
+        self._settings = np.concatenate([corners_of(characteristics), inner])
+        self.vehicle_count = len(self._settings)
+
+    def load(self) -> Any:
+        unload_user_modules()
+        bounds = region_of(self.subject.study).bounds
+        return next(bound.quantity for bound in bounds if bound.constraint.function == self.subject.name)
+
+    def run(self, model: Any, vehicles: Indices) -> Outputs:
+        return {"the value": model(self._settings[vehicles])}
+
+
 class AlgorithmProbe(Probe):
     """Lets an algorithm minimise a smooth function in place of simulations."""
 
@@ -180,4 +203,5 @@ class AlgorithmProbe(Probe):
 
 PROBES: Mapping[str, tuple[type[Probe], ...]] = {
     "ads": (AdsProbe, StudyProbe), "vehicle": (VehicleProbe, StudyProbe), "scenario": (StudyProbe,), "metric": (MetricProbe,),
-    "objective": (ObjectiveProbe,), "algorithm": (AlgorithmProbe,), "traci": (StudyProbe,)}
+    "objective": (ObjectiveProbe,), "algorithm": (AlgorithmProbe,), "traci": (StudyProbe,),
+    "constraint": (ConstraintProbe,)}

@@ -237,10 +237,13 @@ class StudyProbe(Probe):
         """Actors that react, since SUMO gives other results than the recorded scene, although the scenario does not declare it."""
         in_sumo = evaluate(model, self.settings, Engine.LIBSUMO)
         for name, values in {"outcome": in_sumo.outcome, **in_sumo.metrics}.items():
-            if not (np.array_equal(outputs[name], values) if values.dtype.kind == "U" else
-                    np.allclose(outputs[name], values, rtol=0, atol=1e-9, equal_nan=True)):
+            recorded = outputs[name]
+            is_same = recorded == values if values.dtype.kind == "U" else np.isclose(recorded, values, rtol=0, atol=1e-9, equal_nan=True)
+            for i in np.flatnonzero(~is_same)[:1]:
+                pairs = zip(model.characteristics.names, self.settings[i], strict=True)
+                setting = ", ".join(f"{characteristic} = {value:g}" for characteristic, value in pairs)
                 yield MissingReaction(("observe",), "reactive_actors = True where somebody reacts to the vehicle under test",
-                                      f"{name} is {outputs[name][0]} in the recorded scene and {values[0]} in SUMO")
+                                      f"{name} is {recorded[i]} in the recorded scene and {values[i]} in SUMO with {setting}", "contract")
                 return
 
     def cost(self, model: System, seconds: float) -> tuple[float, str]:

@@ -27,11 +27,12 @@ MATRIX_POINTS = 2
 
 
 class MissingReaction(NamedTuple):
-    """A missing reaction of a subject; `methods` names the methods that should react."""
+    """A missing reaction of a subject; `methods` names the methods that should react, `check` the check that fails."""
 
     methods: tuple[str, ...]
     expected: str
     got: str
+    check: str = "reaction"
 
 
 class Probe(ABC):

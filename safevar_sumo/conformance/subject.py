@@ -25,13 +25,14 @@ from safevar_sumo.vehicles import CHANGES, VEHICLE_CONTRACT, VEHICLES, Change, F
 
 KINDS: Mapping[str, Mapping[str, Any]] = {
     "ads": ADS, "vehicle": VEHICLES, "scenario": SCENARIOS, "metric": {**METRICS, **OPTIONAL_METRICS}, "objective": CHANGES,
-    "algorithm": ALGORITHMS, "traci": {}}
+    "algorithm": ALGORITHMS, "traci": {}, "constraint": {}}
 """Kinds of subjects, each with its shipped subjects by name."""
 METHODS: Mapping[str, tuple[str, ...]] = {
     "ads": ("start", "drive"), "vehicle": ("prepare", "sumo_type", "at_rest", "sense", "advance"),
     "scenario": ("begin", "observe", "encounter"), "algorithm": ("search",), "traci": ("step",)}
 """Methods by which `kind_of` recognises a class, by kind."""
-KEYS = {"metric": "metrics.also", "objective": "search.objectives", "algorithm": "search.algorithms", "traci": "ads.model"}
+KEYS = {"metric": "metrics.also", "objective": "search.objectives", "algorithm": "search.algorithms", "traci": "ads.model",
+        "constraint": "constraints.function"}
 """Key of a study that names subjects of a kind; `KIND.model` for all other kinds."""
 DEFAULT_STUDIES = {"traci": "native"}
 """Study to try a subject of a kind in if no study names the subject; `smoke` for all other kinds."""
@@ -121,7 +122,8 @@ def subjects_of(study: Study) -> Iterator[Subject]:
     tests = study.matrix.tests if study.matrix else []
     names_by_kind = {"vehicle": [study.vehicle.model], "traci" if study.ads.kind == "traci" else "ads": [study.ads.model],
                      "scenario": [study.scenario.model, *(test.model for test in tests if test.model)],
-                     "metric": study.metrics.also, "objective": study.search.objectives, "algorithm": study.search.algorithms}
+                     "metric": study.metrics.also, "objective": study.search.objectives, "algorithm": study.search.algorithms,
+                     "constraint": [constraint.function for constraint in study.constraints if constraint.function]}
     names_done = set[str]()
     for kind, names in names_by_kind.items():
         for name in dict.fromkeys(names):
@@ -166,6 +168,8 @@ def kind_of(target: Any) -> str:
 def contract_violation(subject: Subject) -> tuple[str, str]:
     """A subject's violation of its contract, found by inspection only ("" without one), and what the contract expects."""
     target, kind = subject.member.target, subject.kind
+    if kind == "constraint":
+        return "", ""  # `region_of` refuses what is no function
     if kind in ("metric", "objective"):
         record = Metric if kind == "metric" else Change
         fields = "name=..., title=..., unit=..., " + ("more_is_unsafe=..., " if kind == "metric" else "") + "function=..."
@@ -267,7 +271,8 @@ def _is_named(study: Study, kind: str, name: str) -> bool:
     return name in {
         "ads": [study.ads.model] if study.ads.kind != "traci" else [], "traci": [study.ads.model] if study.ads.kind == "traci" else [],
         "vehicle": [study.vehicle.model], "scenario": [study.scenario.model], "metric": study.metrics.also,
-        "objective": [] if name in study.metrics.also else study.search.objectives, "algorithm": study.search.algorithms}[kind]
+        "objective": [] if name in study.metrics.also else study.search.objectives, "algorithm": study.search.algorithms,
+        "constraint": [constraint.function for constraint in study.constraints]}[kind]
 
 
 def _stated_parameters(study: Study, kind: str, name: str) -> Mapping[str, Any]:

@@ -30,7 +30,8 @@ COST_LIMIT = 1e-3
 VEHICLES_ALONE = 2
 """Number of vehicles that also run alone."""
 CONTRACT_FILES = {"ads": "ads/base.py", "vehicle": "vehicles/base.py", "scenario": "scenarios/base.py", "metric": "metrics/base.py",
-         "objective": "vehicles/characteristics.py", "algorithm": "search/base.py", "traci": "sumo/traci_controller.py"}
+         "objective": "vehicles/characteristics.py", "algorithm": "search/base.py", "traci": "sumo/traci_controller.py",
+         "constraint": "vehicles/region.py"}
 """File of the contract by kind of subject."""
 
 
@@ -145,7 +146,7 @@ class _Suite:
                 findings = list(self._compare_runs(probe, model, outputs))
                 if not findings:
                     with self._source.watch_returns(), time_limit(RUN_LIMIT):
-                        findings = [self._finding("reaction", missing.got, missing.expected,
+                        findings = [self._finding(missing.check, missing.got, missing.expected,
                                                   self._source.location_of_definition(*missing.methods))
                                     for missing in probe.missing_reactions(model, outputs)]
                     findings += self._cost_findings(probe, model)

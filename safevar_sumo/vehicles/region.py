@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from safevar_sumo.errors import InputError
-from safevar_sumo.plugins import Guard, Lookup, Member
+from safevar_sumo.plugins import Guard, Lookup, Member, read_only_copy
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.study import Constraint, Study, unit_text
 from safevar_sumo.vehicles.characteristics import CharacteristicSet
@@ -184,7 +184,7 @@ def _bounds_of(constraint: Constraint, study: Study, characteristics: Characteri
     members.append(member)
 
     def quantity(settings: FloatArray) -> FloatArray:
-        columns = {name: column.copy() for name, column in zip(characteristics.names, settings.T, strict=True)}
+        columns = read_only_copy(dict(zip(characteristics.names, settings.T, strict=True)))
         return guard.numbers("its call", "values", guard.call("its call", member.target, columns), (len(settings),))
 
     samples = quantity(np.stack([characteristics.original, characteristics.lower, characteristics.upper]))

@@ -11,6 +11,7 @@ import numpy as np
 import platformdirs
 
 from safevar_sumo.errors import UserCodeError
+from safevar_sumo.output import whole_file
 from safevar_sumo.records import Evaluations
 from safevar_sumo.results import RESULTS
 from safevar_sumo.study import Study, tables_of, user_code_names
@@ -23,14 +24,12 @@ from safevar_sumo.workers.retrying import RetryingPool
 EXPECTED_RESULTS = (
     "results of a vehicle that depend on this vehicle alone: nothing kept in a class, a module or the model itself from one call or "
     "setting to another, no mean or sum over the batch, nothing random")
-_passed_checks: set[str] = set()
-"""Identities of studies whose code has passed in this process, in case the cache folder is not writable."""
+_passed_checks: dict[str, list[str]] = {}
+"""Warnings by identity of the studies whose code has passed in this process, in case the cache folder is not writable."""
 
 
 def check_code(study: Study, inputs: Inputs, pool: RetryingPool) -> list[str]:
-    """Check the user code of a study in a worker, unless it has passed before with the same files.
-
-    Returns warnings.
+    """Check the user code of a study in a worker, unless it has passed before with the same files; returns the warnings, kept or new.
 
     Raises
     ------
@@ -42,14 +41,17 @@ def check_code(study: Study, inputs: Inputs, pool: RetryingPool) -> list[str]:
     identity = json.dumps([tables_of(study), inputs, RESULTS, version("safevar_sumo")], sort_keys=True, default=str)
     name = hashlib.sha256(identity.encode()).hexdigest()
     marker = platformdirs.user_cache_path("safevar_sumo") / "checks" / name
-    if name in _passed_checks or marker.exists():
-        return []
+    with suppress(OSError, ValueError):
+        _passed_checks.setdefault(name, json.loads(marker.read_text(encoding="utf-8")))
+    if name in _passed_checks:
+        return _passed_checks[name]
     original = CharacteristicSet.of(study.vehicle.characteristics).original[np.newaxis]
     remarks = list(wait_for_result(pool.submit(pack_study(study, inputs, check=True), original, must_succeed=True)).reasons.values())
-    _passed_checks.add(name)
+    _passed_checks[name] = remarks
     with suppress(OSError):  # without the marker, the next process checks again
         marker.parent.mkdir(parents=True, exist_ok=True)
-        marker.touch()
+        with whole_file(marker) as file:
+            file.write_text(json.dumps(remarks), encoding="utf-8")
     return remarks
 
 

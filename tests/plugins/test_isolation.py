@@ -17,7 +17,10 @@ from safevar_sumo.results import load_runs
 from safevar_sumo.shipped import NETWORKS
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.system import assemble
-from tests.in_process import InlinePool, run
+from safevar_sumo.workers import isolation
+from safevar_sumo.workers.retrying import RetryingPool
+from tests.in_process import InlinePool, refused, run
+from tests.plugins.beside import ADS as USES_ADS
 from tests.plugins.beside import SCALAR, Mine
 
 ADS = ("import numpy as np\n\n\nclass Mine:\n    def start(self, n, nominal, step):\n        return 0\n\n"
@@ -30,8 +33,8 @@ PLACE = ADS + "        return (np.linspace(0.2, 0.8, len(seen.speed)), 0), memor
 HONEST = SCALAR + "    def drive(self, seen):\n        return 0.5, 0.0\n"
 
 
-def checked(mine: Mine, module: str, folder: Path) -> None:
-    mine(module)
+def checked(mine: Mine, module: str, folder: Path, table: str = USES_ADS) -> None:
+    mine(module, table)
     refuse_defects(load_study(str(folder / "mine.toml")))
 
 
@@ -60,6 +63,71 @@ def test_a_folder_whose_configuration_writes_files_or_opens_sockets_is_refused(o
     file.write_text(file.read_text().replace("</configuration>", f"{option}</configuration>"))
     with pytest.raises(InputError, match=r"sets SUMO's option '[a-z.-]+'"):
         assemble(load_study(str(folder / "mine.toml")))
+
+
+CONSTRAINT = """import numpy as np
+
+calls = []
+
+
+def mine(values):
+    calls.append(1)
+    mass = values["mass"]
+    {line}
+
+
+def step(traci, vehicle_id):
+    pass
+"""
+CONSTRAINED = '[[constraints]]\nfunction = "mine:mine"\nunit = "kg"\nat_most = 1e9\n'
+
+
+@pytest.mark.parametrize(("line", "message"), [
+    ("return mass + np.random.random(len(mass))", "the value of vehicle .* when the run is repeated"),
+    ("return mass + len(calls)", "the value of vehicle .* in a second run"),
+    ("return mass - np.mean(mass)", "the value of vehicle .* in two halves"),
+    ("return mass + np.arange(len(mass))", "the value of vehicle .* in another order"),
+    ("mass[:] = 0; return mass", "read-only")], ids=["random", "counts", "mean", "place", "changes arguments"])
+def test_a_constraint_whose_function_is_none_of_the_setting_alone_is_refused(line: str, message: str, mine: Mine, folder: Path) -> None:
+    with pytest.raises(UserCodeError, match=rf"'mine:mine' .*{message}"):
+        checked(mine, CONSTRAINT.format(line=line), folder, CONSTRAINED)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("command", ["study", "tolerance"])
+def test_a_random_constraint_is_refused_before_the_first_batch(command: str, mine: Mine, folder: Path) -> None:
+    mine(CONSTRAINT.format(line="return mass + np.random.random(len(mass))"), CONSTRAINED)
+    for _ in range(2):
+        refused(command, str(folder / "mine.toml"), message=("constraints.function = 'mine:mine'", "when the run is repeated", "mine.py:"))
+
+
+REACTS = """from safevar_sumo.scenarios import PedestrianCrossing
+
+
+class Mine(PedestrianCrossing, frozen=True, kw_only=True):
+    reactive_actors = False
+
+    def observe(self, world, step, memory):
+        if (world.speeds() > 6.0).any():
+            world.walk("pedestrian", 0.5)
+        return super().observe(world, step, memory)
+"""
+
+
+def test_actors_that_react_undeclared_are_an_error_each_time_that_names_the_vehicle(mine: Mine, folder: Path) -> None:
+    """The original reaches 5.7 m/s, the fastest vehicle 6.1 m/s."""
+    mine(REACTS, '[scenario]\nmodel = "mine:Mine"\n')
+    for _ in range(2):
+        with pytest.raises(UserCodeError, match=r"(?s)is (\S+) in the recorded scene and (?!\1)\S+ in SUMO with .*reactive_actors = True"):
+            refuse_defects(load_study(str(folder / "mine.toml")))
+
+
+def test_warnings_about_user_code_are_kept_and_repeated(mine: Mine, folder: Path) -> None:
+    mine(HONEST)
+    study, inputs = load_study(str(folder / "mine.toml")), {"sources": {"mine.py": str(folder)}}
+    for _ in range(2):
+        assert "never brakes" in "".join(isolation.check_code(study, inputs, RetryingPool(InlinePool(), study)))
+        isolation._passed_checks.clear()  # as in another process
 
 
 LATCH = """
