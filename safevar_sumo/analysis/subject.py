@@ -156,7 +156,7 @@ def changes_since(directory: Path, case: Case, *, as_it_is_now: bool = False) ->
         rest = f" (and {len(changes) - MAX_CHANGES_NAMED} more)" if len(changes) > MAX_CHANGES_NAMED else ""
         named = f"{'; '.join(changes[:MAX_CHANGES_NAMED])}{rest}"
         raise InputError(directory / MANIFEST, f"{named}: new simulations would not match these results",
-                         "the inputs of that time; or --as-it-is-now (as_it_is_now=True) to simulate with the present inputs and a warning")
+                         "the inputs of that time; or `as_it_is_now=True` to simulate with the present inputs and a warning")
     return [f"{difference}; simulated as it is now" for difference in changes]
 
 

@@ -134,7 +134,7 @@ def _extent_remarks(results: ResultsDirectory, study: Study) -> list[str]:
 def choose_engine(system: System, name: str) -> tuple[Engine, str]:
     """Choose the engine that moves a system's vehicles, and say why; raises InputError for an unknown engine."""
     if name not in ENGINE_NAMES.values():
-        raise InputError("--engine", repr(name), one_of(ENGINE_NAMES.values()))
+        raise InputError("engine", repr(name), one_of(ENGINE_NAMES.values()))
     if name == ENGINE_NAMES[Engine.LIBSUMO]:
         return Engine.LIBSUMO, "requested"
     reason = reason_for_sumo(system)

@@ -203,7 +203,7 @@ class Run:
         """Journal and remember evaluations of the present request."""
         positions = [self._positions[setting.tobytes()] for setting in evaluations.settings]
         if not self._evaluated_positions.isdisjoint(positions):
-            raise InputError(self._journal.path, "holds other settings than this search requests", "another --out")
+            raise InputError(self._journal.path, "holds other settings than this search requests", "another `out`")
         self._journal.append(positions, evaluations)
         self._remember(positions, evaluations)
 

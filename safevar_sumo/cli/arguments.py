@@ -15,6 +15,7 @@ from click.shell_completion import CompletionItem
 from safevar_sumo.errors import InputError, SafevarError, unknown_name
 from safevar_sumo.output import check_writable
 from safevar_sumo.records import FloatArray
+from safevar_sumo.results import FILES, MANIFEST
 from safevar_sumo.study import load_study, study_names, unit_text
 from safevar_sumo.vehicles import CharacteristicSet
 
@@ -35,7 +36,7 @@ def check_output(path: Path, flag: str, endings: tuple[str, ...]) -> None:
 
 
 def refuse_overwriting(path: Path, flag: str, *inputs: str | Path) -> None:
-    """Refuse to overwrite an input of the command: a file, or a file of a results directory.
+    """Refuse to overwrite an input of the command (a file, or a file of a directory), or a file of any results directory.
 
     Raises
     ------
@@ -48,6 +49,9 @@ def refuse_overwriting(path: Path, flag: str, *inputs: str | Path) -> None:
         files = [source, *source.glob("*.*"), *source.glob("runs/*")] if source.is_dir() else [source]
         if any(file.exists() and path.samefile(file) for file in files if file.suffix not in PICTURE_ENDINGS):
             raise InputError(flag, f"{path} is an input of the command", "another file")
+    for folder in path.resolve().parents[:2]:
+        if (folder / MANIFEST).is_file() and any(path.samefile(file) for item in FILES for file in folder.glob(item.name)):
+            raise InputError(flag, f"{path} is a file of a results directory", "another file")
 
 
 class NumberRange(click.FloatRange):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import io
 import os
+import re
 import signal
 import sys
 import threading
@@ -12,6 +13,7 @@ import warnings
 from collections.abc import Iterable, Iterator
 from concurrent.futures.thread import _threads_queues
 from contextlib import contextmanager
+from functools import partial
 from typing import TYPE_CHECKING, Any, NoReturn, TextIO
 
 import click
@@ -43,6 +45,10 @@ COMMANDS = {
     "calibrate": ("calibrate", "Fit a study's free parameters to reference data."),
 }
 """Each command's module in this folder and its sentence in the help, in the order of the help."""
+
+
+ARGUMENT = re.compile(r"`(\w+)(?:=([^`]+))?`")
+"""An argument of a function of the library in an error, such as `method=monte_carlo`."""
 
 
 class StrictCommand(click.Command):
@@ -94,18 +100,24 @@ class LazyCommands(click.Group):
         return super().resolve_command(ctx, args)
 
     def invoke(self, ctx: click.Context) -> Any:
-        """Call a command; errors about one of its parameters name the flag that sets it."""
+        """Call a command; an error of the library, which names its arguments, then names the flags that set them."""
         try:
             return super().invoke(ctx)
         except InputError as error:
             command = super().get_command(ctx, str(ctx.invoked_subcommand))
             flags = {option.name: option.opts[-1] for option in command.params if isinstance(option, click.Option)} if command else {}
-            error.source = flags.get(str(error.source), error.source)
+            error.source = flags.get(error.source, error.source) if isinstance(error.source, str) else error.source  # a path is no argument
+            error.problem, error.legal = (ARGUMENT.sub(partial(_to_flag, flags), text) for text in (error.problem, error.legal))
             raise
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         with formatter.section("Commands"):
             formatter.write_dl([(name, sentence) for name, (_, sentence) in COMMANDS.items()])
+
+
+def _to_flag(flags: dict[str, str], argument: re.Match[str]) -> str:
+    name, value = argument.groups()
+    return argument[0] if name not in flags else flags[name] if value in (None, "True") else f"{flags[name]} {value}"
 
 
 @click.group(cls=LazyCommands, context_settings={"help_option_names": ["-h", "--help"]})

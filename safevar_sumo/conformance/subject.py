@@ -113,7 +113,7 @@ def _find_fmu(name: str, given_study: Study | None) -> Subject:
                 remarks = () if given_study else (f"tried in {study.origin.called}, which names it",)
                 return _subject_of_fmu(study, key.partition(".")[0], model)._replace(remarks=remarks)
     problem = f"no study says what the variables of {name!r} stand for" if Path(name).exists() else f"there is no file {name!r}"
-    raise InputError("check", problem, '--study STUDY, whose [ads] or [vehicle] has kind = "fmu" and that model')
+    raise InputError("check", problem, '`study=STUDY`, whose [ads] or [vehicle] has kind = "fmu" and that model')
 
 
 def subjects_of(study: Study) -> Iterator[Subject]:

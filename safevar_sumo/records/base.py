@@ -32,5 +32,5 @@ for _constant in (ZERO, ALL_TRUE, UNDEFINED):
 
 
 def finite_or_none(value: float) -> float | None:
-    """Make a number fit for JSON, which has no NaN: an undefined number becomes None."""
-    return None if np.isnan(value) else float(value)
+    """Make a number fit for JSON, which has neither NaN nor infinities: such a number becomes None."""
+    return float(value) if np.isfinite(value) else None

@@ -234,7 +234,7 @@ def _write_mp4(scene: FlatScene, path: Path) -> None:
     process = subprocess.run(command, input=b"".join(frame.tobytes() for frame in frames), capture_output=True, check=False)
     if process.returncode != 0:
         last_line = (process.stderr.decode(errors="replace").strip() or "no message").splitlines()[-1]
-        raise SafevarError(f"--animate: ffmpeg failed: {last_line}")
+        raise SafevarError(f"{path}: ffmpeg failed: {last_line}")
 
 
 def _find_ffmpeg() -> str:

@@ -224,7 +224,7 @@ def read_inputs(directories: Iterable[str | Path], point: str | None = None, *, 
 
 def _at_point(case: Case, point: str) -> Case:
     """The case with its solutions and original vehicle simulated again at one point of the study's matrix."""
-    study = study_at(case.study, point, source="--point")
+    study = study_at(case.study, point, source="point")
     system = assemble(study)
     settings = np.concatenate([case.characteristics.original[np.newaxis], case.solutions[list(case.characteristics.names)].to_numpy(float)])
     evaluations = evaluate(system, settings)

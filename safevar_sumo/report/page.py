@@ -177,7 +177,7 @@ def make_report(directories: Iterable[str | Path], only: Sequence[str] = (), job
     sections = [name for name in SECTIONS if not only or name in only]
     if point is not None:
         if "questions" in only:
-            raise InputError("only", "the research questions are about whole studies", "sections other than questions with --point")
+            raise InputError("only", "the research questions are about whole studies", "sections other than questions with `point`")
         sections = [name for name in sections if name != "questions"]
     inputs = read_inputs(directories, point, as_it_is_now=as_it_is_now)
     for data in inputs:

@@ -74,7 +74,8 @@ def make_directory(path: Path) -> None:
         with tempfile.TemporaryFile(dir=path):
             pass
     except OSError as error:
-        raise InputError("out", f"cannot write to {path}: {error.strerror}", "a directory that can be written") from None
+        problem = "it is a link whose target does not exist" if path.is_symlink() and not path.exists() else error.strerror
+        raise InputError("out", f"cannot write to {path}: {problem}", "a directory that can be written") from None
 
 
 def make_synced_directory(path: Path) -> None:

@@ -255,10 +255,10 @@ class Journal:
         size = len(data)
         frames, end = decode_frames(data, self.path)
         if not frames and data.strip(b"\0") and not data.startswith(MAGIC[:len(data)]):
-            raise InputError(self.path, "is no journal", "another --out")
+            raise InputError(self.path, "is no journal", "another `out`")
         if frames and frames[0] != owner:
             if any(isinstance(frame, Batch) for frame in frames):
-                raise _owner_error(self.path, frames[0], owner, "another --out")
+                raise _owner_error(self.path, frames[0], owner, "another `out`")
             frames, end, size = [], 0, 0
             self._truncate(0)
         if end < size:

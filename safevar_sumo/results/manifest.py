@@ -27,7 +27,7 @@ KEYS_WITHOUT_EFFECT_ON_EVALUATIONS = ("runs", "algorithms", "evaluations", "time
 LAYERS = {
     "resolved": "the same study and options", "network": "the network's file as it was", "sources": "the file as it was",
     "results": "that version", "versions": "those versions", "platform": "such a machine"}
-"""Inputs that results depend on, each with the remedy if it has changed; an error says "expected: another --out ..., or REMEDY"."""
+"""Inputs that results depend on, each with the remedy if it has changed; an error says "expected: another `out` ..., or REMEDY"."""
 LAYERS_OF_FILES = ("network", "sources")
 """Layers that hold a digest for each file."""
 LAYERS_OF_FORMAT_2 = ("resolved", "network", "sources", "code", "versions", "platform")

@@ -166,7 +166,7 @@ def another_directory(path: Path) -> str:
     """A remedy that can be typed for results that a study cannot continue: the next free directory, such as results/two-2."""
     stem = path if path.name else path.resolve()
     free_path = next(candidate for number in count(2) if not (candidate := Path(f"{stem}-{number}")).exists())
-    return f"another --out, such as --out {shlex.quote(str(free_path))}"
+    return f"another `out`, such as `out={shlex.quote(str(free_path))}`"
 
 
 def solutions_frame(characteristics: tuple[str, ...], solutions: Iterable[tuple[tuple[str, int], Evaluations]]) -> pd.DataFrame:

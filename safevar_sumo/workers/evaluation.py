@@ -145,4 +145,4 @@ def _find_unknown_files(task: _Work, files: Files) -> Files:
 def _refuse_changed_files(files: list[str]) -> None:
     if files:
         raise InputError(files[0], "is not the file that this study began with: it was changed meanwhile, or a worker has another one",
-                         "the file as it was, and the same command; or another --out")
+                         "the file as it was, and the same command; or another `out`")

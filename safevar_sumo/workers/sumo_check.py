@@ -30,7 +30,7 @@ def refuse_unlike_sumo(study: Study, recorded: Evaluations, in_sumo: Evaluations
             name, value, sumo_value = difference
             values = ", ".join(f"{key} = {value:.17g}" for key, value in zip(study.vehicle.characteristics, setting, strict=True))
             raise InputError(f"study {study.name!r}", f"{name} is {value} in the recorded scene and {sumo_value} in SUMO with {values}",
-                             "scenario: reactive_actors = True, if anybody reacts to the vehicle under test; or --engine sumo")
+                             "scenario: reactive_actors = True, if anybody reacts to the vehicle under test; or `engine=sumo`")
 
 
 def _are_alike(batch: Evaluations, other_batch: Evaluations, tolerance: float) -> BoolArray:

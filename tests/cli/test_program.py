@@ -97,6 +97,14 @@ def test_what_the_library_says_of_a_parameter_is_said_of_its_flag(in_tmp: Path) 
         assert result.source == arguments[-2]
 
 
+def test_errors_of_the_library_speak_of_arguments_and_not_of_flags() -> None:
+    for file in (ROOT / "safevar_sumo").rglob("*.py"):
+        if "cli" not in file.parts:
+            for node in ast.walk(ast.parse(file.read_text())):
+                if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id.endswith("Error"):
+                    assert not re.search(r"--[a-z]", re.sub(r"`[^`]*`", "", ast.unparse(node))), f"{file}:{node.lineno}"
+
+
 @pytest.mark.parametrize(("typed", "says"), [
     ("simulate rian", "did you mean 'rain'?"), ("explain rian", "did you mean 'rain'?"), ("simlate rain", "did you mean 'simulate'?"),
     ("simulate rain --set tirefric=1", "did you mean 'tireFric'?"), ("tolerance rain --characteristics mas", "did you mean 'mass'?"),

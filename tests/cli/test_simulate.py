@@ -109,6 +109,15 @@ def test_nothing_that_is_read_is_written_over(in_tmp: Path) -> None:
     assert not Path("x.csv").exists()
 
 
+def test_no_output_replaces_a_file_of_a_results_directory(in_tmp: Path, slippery: Path) -> None:
+    shutil.copytree(slippery, "results")
+    for file in ("solutions.csv", "manifest.json", "runs/original.journal"):
+        before = Path("results", file).read_bytes()
+        refused("simulate", "smoke", "--trace", f"results/{file}", message=("--trace", file, "a file of a results directory"))
+        assert Path("results", file).read_bytes() == before
+    assert simulate("smoke", "--trace", "results/trace.csv").exit_code == 0
+
+
 @pytest.mark.parametrize(("arguments", "message"), [
     (("simulate", "sun", "--set", "tireFric=1..2:1"), ("tireFric=1..2:1", "at least 2")),
     (("simulate", "sun", "--set", "mass=2_404"), ("mass=2_404",)),

@@ -94,6 +94,8 @@ def test_a_users_scalar_ads_is_named_in_a_study(in_tmp: Path) -> None:
     (["simulate", "sun", "--set", "mass=5000"], ("mass = 5000", "[2040, 2700] kg")),
     (["simulate", "sun", "--set", "weight=1"], ("weight", "mass")),
     (["simulate", "sun", "--trace", "/proc/nowhere/trace.csv"], ("--trace", "/proc/nowhere/trace.csv")),
+    (["study", "smoke", "--out", "link"], ("--out: cannot write to link: it is a link whose target does not exist",)),
+    (["tables", "out"], ("out: is not a results directory",)),
     (["simulate", "/"], ("/",)),
     (["simulate", ""], ("STUDY|DIR: '' is empty",)), (["tables", "out", ""], ("DIR...: '' is empty",)),
     (["simulate", "sun", "--as-it-is-now"], ("--as-it-is-now: a study is simulated as it is now anyway",)),
@@ -102,6 +104,7 @@ def test_a_users_scalar_ads_is_named_in_a_study(in_tmp: Path) -> None:
     (["simulate", "sun", "--nothing"], ("No such option '--nothing'",)),
 ])
 def test_bad_input_ends_with_code_2_and_says_what_is_legal(arguments: list[str], expected: tuple[str, ...], in_tmp: Path) -> None:
+    Path("link").symlink_to("nowhere")
     refused(*arguments, message=expected)
     assert not list(in_tmp.rglob("*.csv"))
 

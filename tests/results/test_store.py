@@ -114,9 +114,9 @@ def test_the_error_names_the_changed_file_and_both_remedies(tmp_path: Path, stud
     with pytest.raises(InputError) as caught:
         ResultsDirectory(tmp_path, study, {"sources": {"my_ads.py": "abc", "my_map.py": "012"}})
     assert "my_map.py has changed since" in str(caught.value)
-    assert caught.value.legal == f"another --out, such as --out {tmp_path}-2, or the file as it was"
+    assert caught.value.legal == f"another `out`, such as `out={tmp_path}-2`, or the file as it was"
     Path(f"{tmp_path}-2").mkdir()
-    with pytest.raises(InputError, match=rf"such as --out {tmp_path}-3, or"):
+    with pytest.raises(InputError, match=rf"such as `out={tmp_path}-3`, or"):
         ResultsDirectory(tmp_path, study, {"sources": {"my_ads.py": "abc", "my_map.py": "012"}})
     with pytest.raises(InputError, match=r"my_map\.py no longer exists"):
         ResultsDirectory(tmp_path, study, {"sources": {"my_ads.py": "abc"}})

@@ -66,7 +66,7 @@ class _Spreadsheet:
             with whole_file(self.output) as file:
                 self._workbook.save(file)
         except OSError as error:
-            raise unwritable(self.output, "--xlsx", error) from None
+            raise unwritable(self.output, "xlsx", error) from None
 
 
 class Template(_Spreadsheet):

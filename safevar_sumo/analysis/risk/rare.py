@@ -119,8 +119,8 @@ def load_openturns() -> Any:
     try:
         import openturns
     except ImportError:
-        remedy = "in the checkout: pip install '.[rare]'; or --method monte_carlo"
-        raise InputError("--rare or --method", "OpenTURNS is not installed", remedy) from None
+        remedy = "in the checkout: pip install '.[rare]'; or `method=monte_carlo`"
+        raise InputError("method", "OpenTURNS is not installed", remedy) from None
     openturns.Log.Show(openturns.Log.NONE)
     return openturns
 
@@ -266,7 +266,7 @@ def _remark_on_islands(response: Response, thresholds: list[float], rng: np.rand
     if island_count < 2:
         return ""
     return (f"failures lie on {island_count} islands with safe settings between them, and this method may have missed others; "
-            "--method monte_carlo misses none, with many samples")
+            "plain Monte Carlo misses none, with many samples")
 
 
 def _select_distant_points(points: FloatArray) -> FloatArray:
