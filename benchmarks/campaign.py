@@ -137,7 +137,7 @@ def floor(study: Study) -> float:
     """Processor seconds that bare libsumo takes to load and step the network for one setting of a population."""
     system, n = assemble(study), study.search.population
     steps = len(simulate(system, drawn(study, n)).trace.time)
-    network = stage_network(system.points[0].scenario).folder
+    network = stage_network(system.points[0].scenario)
     return float(np.median([bare(network, n, steps)[0] for _ in range(9)])) / n
 
 

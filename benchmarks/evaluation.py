@@ -121,7 +121,7 @@ def through_socket(system: System, settings: FloatArray, command: list[str]) -> 
 def records_of(study: str, populations: tuple[int, ...] = POPULATIONS) -> Iterator[Record]:
     """Measure a study's evaluations."""
     system = assemble(load_study(study))
-    network = stage_network(system.points[0].scenario).folder
+    network = stage_network(system.points[0].scenario)
     for n in populations:
         settings = settings_of(system, n)
         steps = len(simulate(system, settings).trace.time)
@@ -147,7 +147,7 @@ def beside_others(study: str, system: System, settings: FloatArray) -> Iterator[
     n, few = len(settings), settings[:SOCKET_SETTINGS]
     scalar = replace(system, ads=PerVehicleAds(Coasting, Guard("benchmark", "ads")))
     evaluate(system, settings)
-    command = sumo_command(Engine.TRACI, copied_network(stage_network(system.points[0].scenario).folder, 1))
+    command = sumo_command(Engine.TRACI, copied_network(stage_network(system.points[0].scenario), 1))
     with socket_to(command):
         through_socket(system, few[:1], command)
         together, alone, coasting, socket = medians_in_turn(

@@ -19,6 +19,7 @@ from safevar_sumo.results import UNKNOWN
 from safevar_sumo.study import Study, StudyLike, unit_text
 from safevar_sumo.sumo.batch import score
 from safevar_sumo.sumo.matrix import system_at_worst_point
+from safevar_sumo.sumo.network import Network
 from safevar_sumo.sumo.staging import stage_network
 from safevar_sumo.sumo.system import Measuring, System
 from safevar_sumo.vehicles import CharacteristicSet
@@ -69,7 +70,7 @@ class Comparison:
     title: str
     characteristics: CharacteristicSet
     ttc_threshold: float
-    network: str
+    network: Network
     evaluations: Evaluations
     film: Film
     objectives: tuple[MetricFacts, ...] = ()
@@ -165,7 +166,7 @@ def compare_setting(study: Study, system: System, setting: FloatArray) -> Compar
                    if (point.scenario, point.weather) == (worst_system.scenario, worst_system.weather)]
     recording = record_film(worst_system, settings)
     return Comparison(title=study.title + "".join(point_names[:1]), characteristics=system.characteristics,
-                      ttc_threshold=system.metrics_table.ttc_threshold, network=stage_network(worst_system.scenario).folder,
+                      ttc_threshold=system.metrics_table.ttc_threshold, network=stage_network(worst_system.scenario),
                       evaluations=score(worst_system, settings, recording.runs),
                       film=replace(recording, runs=_with_pedals_before_impacts(recording.runs)),
                       objectives=_further_objectives(worst_system.measuring))

@@ -12,7 +12,7 @@ import numpy as np
 from safevar_sumo.records import FloatArray, SimulationRuns
 from safevar_sumo.sumo.copies import copy_and_name
 from safevar_sumo.sumo.matrix import simulate, system_at_worst_point
-from safevar_sumo.sumo.network import built_network
+from safevar_sumo.sumo.network import Network, built_network
 from safevar_sumo.sumo.staging import stage_network
 from safevar_sumo.sumo.system import System
 from safevar_sumo.sumo.world import SumoWorld
@@ -73,7 +73,7 @@ def record_film(system: System, settings: FloatArray) -> Film:
     """
     camera, system = _Camera(len(settings)), system_at_worst_point(system, settings)
     runs = simulate(system, settings, watch=camera.record)
-    return Film(runs=runs, tracks=camera.tracks(), road=read_road(stage_network(system.scenario).folder))
+    return Film(runs=runs, tracks=camera.tracks(), road=read_road(stage_network(system.scenario)))
 
 
 class _Camera:
@@ -104,7 +104,7 @@ class _Camera:
         return by_name
 
 
-def read_road(network: str) -> tuple[LaneLine, ...]:
+def read_road(network: Network) -> tuple[LaneLine, ...]:
     """Read the lanes of one copy of a network, as netconvert built it."""
     root = ElementTree.parse(built_network(network)).getroot()
     return tuple(_lane(edge.get("function", ""), lane) for edge in root.iter("edge") for lane in edge.iter("lane"))

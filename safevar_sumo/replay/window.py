@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 from safevar_sumo.errors import SimulationError
 from safevar_sumo.sumo.engine import Engine, engine_api, program_path, start_engine, stop_engine
-from safevar_sumo.sumo.network import copied_network
+from safevar_sumo.sumo.network import Network, copied_network
 
 BRAKE_LIGHT = 8
 """Signal of a vehicle (TraCI, "change vehicle state": bit 3)."""
@@ -101,7 +101,7 @@ class Window:
 
 
 @contextmanager
-def open_window(network: str, step: float) -> Iterator[Window]:
+def open_window(network: Network, step: float) -> Iterator[Window]:
     """Open a window on one copy of a network without traffic.
 
     Raises

@@ -17,10 +17,9 @@ from safevar_sumo.sumo.matrix import (
     vehicle_remarks,
     worst_points,
 )
-from safevar_sumo.sumo.network import network_files, network_fingerprint
 from safevar_sumo.sumo.system import System, assemble, models_of
 
 __all__ = [
-    "Engine", "PointResult", "System", "assemble", "evaluate", "evaluations_at_worst_points", "models_of", "network_files",
-    "network_fingerprint", "point_record", "reason_for_sumo", "remarks_of", "score", "settings_per_batch", "simulate",
+    "Engine", "PointResult", "System", "assemble", "evaluate", "evaluations_at_worst_points", "models_of",
+    "point_record", "reason_for_sumo", "remarks_of", "score", "settings_per_batch", "simulate",
     "simulate_all_points", "study_at", "system_at_point", "system_at_worst_point", "vehicle_remarks", "worst_points"]

@@ -87,7 +87,7 @@ def drive_all(system: System, settings: FloatArray, engine: Engine = Engine.RECO
             return drive(system, np.tile(settings, (len(system.points), 1)), world, listen=listen)
         engine = Engine.LIBSUMO
     (scenario,) = scenarios
-    with open_world(copied_network(stage_network(scenario).folder, len(settings)), len(settings), engine, options) as sumo_world:
+    with open_world(copied_network(stage_network(scenario), len(settings)), len(settings), engine, options) as sumo_world:
         return drive(system, settings, sumo_world, watch, listen)
 
 

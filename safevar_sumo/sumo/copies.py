@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import groupby
@@ -30,10 +29,6 @@ DEMAND_IDS: IdAttributes = {
     "stop": ("lane", "edge", "expected", "permitted", "join", "split"), "param": (),
 }
 """Elements of a traffic file, with their attributes that contain ids."""
-SIGNAL_PARAMETERS = re.compile(
-    r"(max|min|detector)-gap|passing-time|show-detectors|freq|(jam|inactive)-threshold|coordinated|cycleTime|cycleOffset|link(Max|Min)Dur:\d+"
-    r"|minTimeLoss|detectorRange|ring[12]|barrier2?Phases|coordinate-mode|whetherOutputState|fixForceOff|controllerType|total-cycle-length")
-"""Parameters of a traffic light that refer to no detectors or files."""
 _COPY_PLACEHOLDER = "\x01"
 """Placeholder for the number of a copy; XML cannot contain this character."""
 
@@ -56,56 +51,43 @@ def parse_xml(source: Path) -> ElementTree.Element:
     Raises
     ------
     InputError
-        If the file is not XML.
+        If the file cannot be read, or is not XML.
     """
     try:
         return ElementTree.parse(source).getroot()
-    except (ElementTree.ParseError, LookupError, ValueError) as error:
+    except (OSError, ElementTree.ParseError, LookupError, ValueError) as error:
         raise InputError(source, f"is not XML: {error}") from None
 
 
-def write_roads(root: ElementTree.Element, n: int, file: Path) -> None:
-    """Write N copies of a built network, tag by tag: SUMO requires edges before junctions, and junctions before connections."""
-    blocks = []
-    for tag, children in groupby(root, key=lambda child: child.tag):
-        elements = "".join(_marked_xml(child, {} if tag in SHARED_ELEMENTS else ROAD_IDS) for child in children)
-        blocks += [elements] if tag in SHARED_ELEMENTS else [elements.replace(_COPY_PLACEHOLDER, str(copy)) for copy in range(n)]
-    _write(root, blocks, file)
-
-
-def write_demand(original: ElementTree.Element, n: int, file: Path) -> None:
-    """Write N copies of traffic in the order of departure: SUMO drops actors that come too late in the file."""
-    texts = [(time, _marked_xml(child, DEMAND_IDS)) for child, time in _departures(original)]
-    copies = sorted(((time, copy, text) for copy in range(n) for time, text in texts), key=lambda entry: entry[0])
-    _write(original, [text.replace(_COPY_PLACEHOLDER, str(copy)) for _, copy, text in copies], file)
-
-
-def check_roads(root: ElementTree.Element, file: Path) -> None:
-    """Refuse elements of a built network that cannot be copied.
+def write_roads(root: ElementTree.Element, n: int, file: Path, source: Path) -> None:
+    """Write N copies of a built network, tag by tag: SUMO requires edges before junctions, and junctions before connections.
 
     Raises
     ------
     InputError
-        Naming the file and the element.
+        If an element of the `source` cannot be copied.
     """
-    if root.tag != "net":
-        raise InputError(file, f"is a {root.tag!r}", "a network of SUMO, <net>")
-    for child in root:
-        for element in [child] if child.tag in SHARED_ELEMENTS else child.iter():
-            if element.tag not in ROAD_IDS and child.tag not in SHARED_ELEMENTS:
-                raise InputError(file, f"has a {element.tag!r}", f"{', '.join([*ROAD_IDS, *SHARED_ELEMENTS])}")
-        if child.tag == "tlLogic":
-            _check_signals(child, file)
+    blocks = []
+    for tag, children in groupby(root, key=lambda child: child.tag):
+        if tag in SHARED_ELEMENTS:
+            blocks += [ElementTree.tostring(child, encoding="unicode") for child in children]
+        else:
+            elements = "".join(_marked_xml(child, ROAD_IDS, source) for child in children)
+            blocks += [elements.replace(_COPY_PLACEHOLDER, str(copy)) for copy in range(n)]
+    _write(root, blocks, file)
 
 
-def _check_signals(light: ElementTree.Element, file: Path) -> None:
-    name = light.get("id")
-    for element in light:
-        if element.tag == "param" and not SIGNAL_PARAMETERS.fullmatch(element.get("key", "")):
-            raise InputError(file, f"traffic light {name!r} has the parameter {element.get('key')!r}",
-                             "parameters that name no file, detector or lane")
-        if element.tag == "phase" and (element.get("earlyTarget") or element.get("finalTarget")):
-            raise InputError(file, f"traffic light {name!r} has phases with conditions", "phases without earlyTarget and finalTarget")
+def write_demand(original: ElementTree.Element, n: int, file: Path, source: Path) -> None:
+    """Write N copies of traffic in the order of departure: SUMO drops actors that come too late in the file.
+
+    Raises
+    ------
+    InputError
+        If an element of the `source` cannot be copied.
+    """
+    texts = [(time, _marked_xml(child, DEMAND_IDS, source)) for child, time in _departures(original)]
+    copies = sorted(((time, copy, text) for copy in range(n) for time, text in texts), key=lambda entry: entry[0])
+    _write(original, [text.replace(_COPY_PLACEHOLDER, str(copy)) for _, copy, text in copies], file)
 
 
 def _departures(root: ElementTree.Element) -> Iterable[tuple[ElementTree.Element, float]]:
@@ -130,16 +112,18 @@ def parse_seconds(text: str) -> float | None:
     return total if math.isfinite(total) else None
 
 
-def _marked_xml(element: ElementTree.Element, ids: IdAttributes) -> str:
-    return ElementTree.tostring(_mark_ids(element, ids), encoding="unicode")
+def _marked_xml(element: ElementTree.Element, ids: IdAttributes, source: Path) -> str:
+    return ElementTree.tostring(_mark_ids(element, ids, source), encoding="unicode")
 
 
-def _mark_ids(element: ElementTree.Element, ids: IdAttributes) -> ElementTree.Element:
+def _mark_ids(element: ElementTree.Element, ids: IdAttributes, source: Path) -> ElementTree.Element:
+    if element.tag not in ids:
+        raise InputError(source, f"has a {element.tag!r}, which cannot be copied for every vehicle", ", ".join(ids))
     attributes = {name: " ".join(copied_id(_COPY_PLACEHOLDER, id_) for id_ in value.split()) if name in ids.get(element.tag, ()) else value
                   for name, value in element.attrib.items()}
     result = ElementTree.Element(element.tag, attributes)
     result.text, result.tail = element.text, element.tail
-    result.extend(_mark_ids(child, ids) for child in element)
+    result.extend([_mark_ids(child, ids, source) for child in element])
     return result
 
 

@@ -21,7 +21,7 @@ from safevar_sumo.scenarios.euro_ncap import KMH
 from safevar_sumo.study import SAFETY_DEGREE, Study
 from safevar_sumo.sumo.batch import Watcher, drive_all, reason_for_sumo, score, step_options
 from safevar_sumo.sumo.engine import Engine
-from safevar_sumo.sumo.network import lanes_of
+from safevar_sumo.sumo.network import number_of_lanes, open_network
 from safevar_sumo.sumo.recording import Recording, record_scenes
 from safevar_sumo.sumo.system import System, assemble
 
@@ -151,7 +151,7 @@ def _batch_size(system: System, engine: Engine) -> int:
     """Largest number of vehicles in one simulation, in recorded scenes or in copies of the largest network."""
     if _is_recorded(system, engine):
         return largest_batch(system)
-    lanes = max(lanes_of(network) for network in {point.scenario.network for point in system.points})
+    lanes = max(number_of_lanes(open_network(network)) for network in {point.scenario.network for point in system.points})
     return min(max(MAX_LANES // max(lanes, 1), 1), MAX_COPIES, largest_batch(system))
 
 

@@ -1,7 +1,8 @@
-"""N copies of a SUMO network and its traffic, at the same coordinates and without connections between copies.
+"""SUMO networks: their folders, and N copies of a network and its traffic at the same coordinates, without connections between copies.
 
-Netconvert builds the network once, by the recipe in its folder; then its elements are copied. The user's cache folder keeps the built
-network and the copies, in folders named by the content of the sources.
+A folder has a recipe (`.netccfg`), by which netconvert builds the network, or a built network (`.net.xml`); its traffic,
+and SUMO's options. The user's cache folder keeps the built network and the copies, in folders named by the content of
+the sources.
 """
 
 from __future__ import annotations
@@ -13,19 +14,105 @@ import subprocess
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Sequence
 from functools import cache, partial
+from importlib.metadata import version
 from pathlib import Path
 from typing import NamedTuple
 
-from safevar_sumo.errors import EnvironmentFault, InputError
+from safevar_sumo.errors import EnvironmentFault, InputError, did_you_mean
+from safevar_sumo.shipped import NETWORKS
 from safevar_sumo.sumo import copies
 from safevar_sumo.sumo.cache import ensure_cached
-from safevar_sumo.sumo.copies import check_roads, parse_xml, write_demand, write_roads
-from safevar_sumo.sumo.sources import OPTIONS_FILE, TRAFFIC_FILE, Sources, sources_of
+from safevar_sumo.sumo.copies import parse_xml, write_demand, write_roads
 
-NETWORK_FILE = "network.net.xml"
-LOAD_MARK_FILE = "tried.txt"
-RECIPE_OPTIONS = ("--xml-validation", "never")
-"""Options of netconvert and SUMO for every network."""
+TRAFFIC_FILE, OPTIONS_FILE, NETWORK_FILE = "traffic.rou.xml", "scenario.sumocfg", "network.net.xml"
+NETWORK_ENDING, RECIPE_ENDING = ".net.xml", ".netccfg"
+LEGAL_FOLDERS = (f"a folder with a recipe of netconvert (*{RECIPE_ENDING}) or a *{NETWORK_ENDING}, "
+                 f"beside {TRAFFIC_FILE} and {OPTIONS_FILE}")
+NETWORK_KEY = "scenario.parameters.network"
+"""Key of a study that names the network, the source of errors about a network that does not exist."""
+SOURCE_OPTION = re.compile(r"sumo-net-file|(osm|opendrive|node|edge|connection|type|tllogic|polygon)-files")
+"""Options of netconvert that name source files."""
+DIGEST_LENGTH = 16
+
+
+class Network(NamedTuple):
+    """A network as its files are now.
+
+    `roads` is the recipe or the built network; `digests` are those of `roads`, the recipe's sources, traffic and options,
+    by file name.
+    """
+
+    folder: Path
+    roads: str
+    digests: tuple[tuple[str, str], ...]
+
+    def path(self, name: str) -> Path:
+        return self.folder / name
+
+    @property
+    def is_built(self) -> bool:
+        """Whether the user built the network; otherwise netconvert builds it."""
+        return self.roads.endswith(NETWORK_ENDING)
+
+
+def open_network(network: str, source: str = NETWORK_KEY) -> Network:
+    """A network, given by its name in `sumo_nets/`, by its folder, or by a `.net.xml` file beside its traffic.
+
+    Raises
+    ------
+    InputError
+        If the network does not exist, a file is missing, or it is unclear which files to use; `source` names the key.
+    """
+    path = NETWORKS / network if is_shipped(network) else Path(network)
+    if not is_network(path):
+        names = sorted(path.name for path in NETWORKS.iterdir() if path.is_dir())
+        raise InputError(source, f"there is no network {network!r}{did_you_mean(network, names)}",
+                         f"one of {', '.join(names)}, or {LEGAL_FOLDERS}")
+    folder, roads = (path, _roads_in(path)) if path.is_dir() else (path.parent, path.name)
+    names = [roads, *_sources_of(folder / roads), TRAFFIC_FILE, OPTIONS_FILE]
+    for name in names:
+        if not (folder / name).is_file():
+            raise InputError(folder, f"{name} is missing", LEGAL_FOLDERS)
+    return Network(folder, roads, tuple((name, _digest((folder / name).read_bytes())) for name in names))
+
+
+def is_shipped(network: str) -> bool:
+    """Whether a network is given by its name in `sumo_nets/`."""
+    return network not in ("", ".", "..") and Path(network).name == network and is_network(NETWORKS / network)
+
+
+def is_network(path: Path) -> bool:
+    """Whether a path is a folder or a built network."""
+    try:
+        return path.is_dir() or (path.name.endswith(NETWORK_ENDING) and path.is_file())
+    except OSError:  # for example, a name is too long
+        return False
+
+
+def options_of(file: Path) -> dict[str, str]:
+    """The options that a configuration of SUMO or netconvert sets."""
+    return {element.tag: element.attrib["value"].strip() for element in parse_xml(file).iter() if "value" in element.attrib}
+
+
+def _roads_in(folder: Path) -> str:
+    """The recipe in a folder or, without a recipe, its built network."""
+    for ending in (RECIPE_ENDING, NETWORK_ENDING):
+        names = sorted(file.name for file in folder.glob(f"*{ending}"))
+        if len(names) > 1 and (folder / OPTIONS_FILE).is_file():
+            names = [name for name in names if name == options_of(folder / OPTIONS_FILE).get("net-file")] or names
+        if len(names) > 1:
+            raise InputError(folder, f"has {' and '.join(names)}", f"one of them, or net-file in {OPTIONS_FILE} that names one network")
+        if names:
+            return names[0]
+    raise InputError(folder, "has no network", LEGAL_FOLDERS)
+
+
+def _sources_of(roads: Path) -> list[str]:
+    """The files that a recipe names; none for a built network."""
+    if not roads.name.endswith(RECIPE_ENDING):
+        return []
+    values = [value for option, value in options_of(roads).items() if SOURCE_OPTION.fullmatch(option)]
+    return [name.strip() for value in values for name in value.split(",")]
 
 
 class CopiedNetwork(NamedTuple):
@@ -36,62 +123,38 @@ class CopiedNetwork(NamedTuple):
     options: Path
 
 
-def copied_network(folder: str, n: int) -> CopiedNetwork:
-    """At least `n` copies of a network, of which `n` have traffic; `folder` is a network as in `sources_of`.
+def copied_network(network: Network, n: int) -> CopiedNetwork:
+    """At least `n` copies of a network, of which `n` have traffic.
 
     Raises
     ------
     InputError
-        If the folder or a source is missing, a source is not XML, or netconvert refuses the sources.
+        If a source is not XML, netconvert refuses the sources, or an element cannot be copied.
     EnvironmentFault
         If netconvert fails for another reason, or the cache cannot be written.
     """
-    sources = sources_of(folder)
     size = round_up(n)
-    roads = ensure_cached(_cache_folder(sources, size, sources.road_files), NETWORK_FILE, partial(_copy_roads, sources, size))
-    traffic = ensure_cached(_cache_folder(sources, n, (TRAFFIC_FILE,)), TRAFFIC_FILE, partial(_copy_demand, sources, n))
-    return CopiedNetwork(roads, traffic, sources.folder / OPTIONS_FILE)
+    roads = cache_folder(network, size, _road_digests(network))
+    traffic = cache_folder(network, n, [dict(network.digests)[TRAFFIC_FILE]])
+    return CopiedNetwork(ensure_cached(roads, NETWORK_FILE, partial(_copy_roads, network, size)),
+                         ensure_cached(traffic, TRAFFIC_FILE, partial(_copy_demand, network, n)), network.path(OPTIONS_FILE))
 
 
-def built_network(folder: str) -> Path:
+def built_network(network: Network) -> Path:
     """The file of the original network, which netconvert or the user built; raises the errors of `copied_network`."""
-    return _build_if_needed(sources_of(folder))
+    if network.is_built:
+        return network.path(network.roads)
+    return ensure_cached(cache_folder(network, 0, _road_digests(network)), NETWORK_FILE, partial(_build, network))
 
 
-def try_network(folder: str) -> None:
-    """Load a network with its options and traffic in SUMO, unless SUMO has loaded it before; raises the errors of `copied_network`."""
-    sources = sources_of(folder)
-    ensure_cached(_cache_folder(sources, 0, sources.files), LOAD_MARK_FILE, partial(_try_traffic, sources, _build_if_needed(sources)))
-
-
-def lanes_of(folder: str) -> int:
+@cache
+def number_of_lanes(network: Network) -> int:
     """Number of lanes of a network, junctions included; raises the errors of `copied_network`."""
-    file = built_network(folder)
-    return _count_lanes(file, file.stat().st_mtime_ns)
+    return built_network(network).read_bytes().count(b"<lane ")
 
 
 @cache
-def _count_lanes(file: Path, modification_time: int) -> int:
-    return file.read_bytes().count(b"<lane ")
-
-
-def network_fingerprint(folder: str) -> str:
-    """A fingerprint of the content of a network: sources, traffic and options."""
-    return ":".join(network_files(folder).values())
-
-
-def network_files(folder: str) -> dict[str, str]:
-    """A digest of each source file of a network, by file name."""
-    sources = sources_of(folder)
-    contents = sources.contents(*sources.files)
-    return {name: hashlib.sha256(content).hexdigest()[:16] for name, content in zip(sources.files, contents, strict=True)}
-
-
-@cache
-def netconvert_version() -> str:
-    """Version of SUMO, and thus of netconvert."""
-    from importlib.metadata import version
-
+def sumo_version() -> str:
     return version("eclipse-sumo")
 
 
@@ -105,84 +168,54 @@ def round_up(n: int) -> int:
         size *= 10
 
 
-def _cache_folder(sources: Sources, n: int, files: Sequence[str]) -> str:
-    """Name of the folder in the cache for `n` copies that are made from these files."""
-    digest = _digest(sources.contents(*files), f"{n} {sources.plain_files} {sources.options}")
-    return f"{re.sub(r'[^a-zA-Z0-9_.-]', '_', sources.folder.name)}-{n}-{digest}"  # SUMO splits file names at commas
+def cache_folder(network: Network, n: int, digests: Sequence[str]) -> str:
+    """Name of the folder in the cache for `n` copies that are made from files with these digests."""
+    name = re.sub(r"[^a-zA-Z0-9_.-]", "_", network.folder.name)  # SUMO splits file names at commas
+    return f"{name}-{n}-{_digest(' '.join([*digests, sumo_version(), _code_digest()]).encode())}"
 
 
-@cache
-def _digest(contents: tuple[bytes, ...], build_options: str) -> str:
-    """A digest of all that determines copies: sources, options of the build, netconvert's version and recipe, and this package's code."""
-    code = b"".join(Path(str(module)).read_bytes() for module in (__file__, copies.__file__))
-    digest = hashlib.sha256(f"{build_options} {netconvert_version()} {RECIPE_OPTIONS}".encode() + code)
-    for content in contents:
-        digest.update(len(content).to_bytes(8, "big") + content)
-    return digest.hexdigest()[:16]
-
-
-def _copy_roads(sources: Sources, n: int, into: Path) -> None:
-    write_roads(_read_roads(_build_if_needed(sources)), n, into / NETWORK_FILE)
-
-
-def _copy_demand(sources: Sources, n: int, into: Path) -> None:
-    write_demand(parse_xml(sources.folder / TRAFFIC_FILE), n, into / TRAFFIC_FILE)
-
-
-def _build_if_needed(sources: Sources) -> Path:
-    if sources.network_file:
-        ensure_cached(_cache_folder(sources, 0, sources.road_files), LOAD_MARK_FILE, partial(_try_roads, sources))
-        return sources.folder / sources.network_file
-    return ensure_cached(_cache_folder(sources, 0, sources.road_files), NETWORK_FILE, partial(_build, sources))
-
-
-def _read_roads(file: Path) -> ElementTree.Element:
-    root = parse_xml(file)
-    check_roads(root, file)
-    return root
-
-
-def _run_program(sources: Sources, program: str, *arguments: str) -> tuple[int, str]:
-    """Run a program of SUMO in a network's folder; return its exit code and error messages."""
+def run_program(folder: Path, program: str, *arguments: str) -> tuple[int, str]:
+    """Run a program of SUMO in a folder; return its exit code, and its errors and warnings."""
     import sumo
 
-    process = subprocess.run([str(Path(sumo.SUMO_HOME) / "bin" / program), *arguments, *RECIPE_OPTIONS], capture_output=True, text=True,
-                          errors="replace", check=False, cwd=sources.folder, env={**os.environ, "SUMO_HOME": sumo.SUMO_HOME})
-    lines = [line.strip() for line in process.stderr.splitlines() if line.strip() and not line.startswith(("Warning:", "Quitting"))]
+    process = subprocess.run(
+        [str(Path(sumo.SUMO_HOME) / "bin" / program), *arguments, "--xml-validation", "never"], capture_output=True,
+        text=True, errors="replace", check=False, cwd=folder, env={**os.environ, "SUMO_HOME": sumo.SUMO_HOME})
+    lines = [line.strip() for line in process.stderr.splitlines() if line.strip() and not line.startswith("Quitting")]
     return process.returncode, " ".join(lines).removeprefix("Error: ")[:500]
 
 
-def _try_roads(sources: Sources, into: Path) -> None:
-    """Load a network built by the user, in a separate SUMO process because some broken networks crash SUMO."""
-    _read_roads(sources.folder / sources.network_file)
-    exit_code, errors = _run_program(sources, "sumo", "-n", sources.network_file, "--no-step-log", "true", "--end", "0")
+def _digest(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()[:DIGEST_LENGTH]
+
+
+@cache
+def _code_digest() -> str:
+    return _digest(b"".join(Path(str(module)).read_bytes() for module in (__file__, copies.__file__)))
+
+
+def _road_digests(network: Network) -> list[str]:
+    return [digest for name, digest in network.digests if name not in (TRAFFIC_FILE, OPTIONS_FILE)]
+
+
+def _copy_roads(network: Network, n: int, into: Path) -> None:
+    file = built_network(network)
+    write_roads(parse_xml(file), n, into / NETWORK_FILE, source=file if network.is_built else network.folder)
+
+
+def _copy_demand(network: Network, n: int, into: Path) -> None:
+    write_demand(parse_xml(network.path(TRAFFIC_FILE)), n, into / TRAFFIC_FILE, source=network.path(TRAFFIC_FILE))
+
+
+def _build(network: Network, into: Path) -> None:
+    file = into / NETWORK_FILE
+    exit_code, errors = run_program(network.folder, "netconvert", "-c", network.roads, "-o", str(file), "--no-warnings",
+                                    "true")
+    if exit_code < 0 or "bad_alloc" in errors or ("Could not" in errors and "output" in errors):
+        raise EnvironmentFault(f"{network.folder}: netconvert fails: {errors or f'exit code {exit_code}'}")
     if exit_code != 0:
-        raise InputError(sources.folder / sources.network_file, f"SUMO cannot load it: {errors or f'exit code {exit_code}'}",
-                         "a network of SUMO")
-    (into / LOAD_MARK_FILE).write_text("SUMO loads it.\n", encoding="ascii")
-
-
-def _try_traffic(sources: Sources, network_file: Path, into: Path) -> None:
-    exit_code, errors = _run_program(sources, "sumo", "-c", OPTIONS_FILE, "-n", str(network_file.absolute()), "-r", TRAFFIC_FILE, "--begin",
-                             "0", "--end", "0", "--no-step-log", "true")
-    if exit_code != 0 or errors:
-        raise InputError(sources.folder, f"SUMO refuses {OPTIONS_FILE} or {TRAFFIC_FILE}: {errors or f'exit code {exit_code}'}",
-                         "options and traffic that SUMO loads without an error")
-    (into / LOAD_MARK_FILE).write_text("SUMO loads it.\n", encoding="ascii")
-
-
-def _build(sources: Sources, into: Path) -> None:
-    command = list[str]()
-    for option, names in sources.plain_files:
-        command += [f"--{option}", ",".join(names)]
-    for option, value in sources.options:
-        command += [f"--{option}", value]
-    exit_code, errors = _run_program(sources, "netconvert", *command, "-o", str(into / NETWORK_FILE))
-    if exit_code != 0:
-        if exit_code < 0 or not errors or ("Could not" in errors and "output" in errors) or "bad_alloc" in errors:
-            raise EnvironmentFault(f"{sources.folder}: netconvert fails: {errors or f'exit code {exit_code}'}")
-        raise InputError(sources.folder, f"netconvert refuses the network: {errors}", "sources that netconvert builds a network from")
-    _drop_header(into / NETWORK_FILE)
+        raise InputError(network.folder, f"netconvert refuses the network: {errors}", "sources that netconvert builds a network from")
+    _drop_header(file)
 
 
 def _drop_header(file: Path) -> None:

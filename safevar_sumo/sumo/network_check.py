@@ -1,33 +1,54 @@
-"""Whether a network can be simulated correctly: checks of its files before the first simulation, and remarks on what is not used."""
+"""Checks of a user's network: SUMO judges it, and own checks refuse what SUMO accepts but a study would measure wrongly."""
 
 from __future__ import annotations
 
-import math
+import re
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 
-from safevar_sumo.errors import InputError
-from safevar_sumo.sumo.copies import check_roads, parse_xml
-from safevar_sumo.sumo.demand import check_demand, unused_attribute_remarks
-from safevar_sumo.sumo.network import NETWORK_FILE, built_network, network_fingerprint, try_network
-from safevar_sumo.sumo.sources import OPTIONS_FILE, TRAFFIC_FILE, Sources, check_options, is_shipped, options_of, sources_of
+import numpy as np
+
+from safevar_sumo.errors import EnvironmentFault, InputError, SimulationError
+from safevar_sumo.scenarios import VUT
+from safevar_sumo.sumo.cache import ensure_cached
+from safevar_sumo.sumo.copies import parse_seconds, parse_xml
+from safevar_sumo.sumo.engine import open_world
+from safevar_sumo.sumo.network import (
+    NETWORK_FILE,
+    OPTIONS_FILE,
+    TRAFFIC_FILE,
+    Network,
+    built_network,
+    cache_folder,
+    copied_network,
+    is_shipped,
+    open_network,
+    options_of,
+    run_program,
+)
 
 SHORTEST_STEP, LONGEST_STEP = 0.001, 1.0
 """SUMO's shortest time step, and the longest step in which a vehicle can still react in time [s]."""
-POSITIVE_NUMBERS: Mapping[str, tuple[str, ...]] = {
-    "vType": ("length", "width", "height", "maxSpeed", "accel", "decel", "mass"),
-    "edge": ("length", "width", "speed"), "lane": ("length", "width", "speed"),
-}
-NON_NEGATIVE_NUMBERS: Mapping[str, tuple[str, ...]] = {"vType": ("minGap", "tau", "actionStepLength"), "walk": ("speed",)}
-"""Attributes, by element, that must be positive, and attributes that must not be negative."""
-UNSET_VALUE = "-1"
-"""Value that marks an attribute in netconvert's sources as not set."""
+MAX_SLOPE = 0.005
+"""Largest difference in height on a road that counts as level, per length [-]."""
+N_STEPS = 600
+"""Number of steps in which the traffic of two copies is compared."""
+WARNINGS_FILE = "warnings.txt"
+DRIVER_ATTRIBUTES = re.compile("carFollowModel|speedFactor|speedDev|sigma.*|desiredMaxSpeed|impatience|laneChangeModel|lc[A-Z].*|jm[A-Z].*"
+                               "|actionStepLength|startupDelay|delta|stepping|minGapLat|maxSpeedLat|latAlignment")
+"""Attributes of SUMO's own driver."""
+SETTING_ATTRIBUTES = ("mass", "accel", "decel", "emergencyDecel", "apparentDecel", "maxSpeed", "tau")
+"""Attributes of the type of the vehicle under test that the vehicle model replaces by values of the setting."""
+SIGMA_MODELS, DETERMINISTIC_MODELS = ("Krauss", "KraussOrig1", "KraussPS"), ("IDM", "IDMM", "ACC", "CACC")
+"""Car-following models that are random unless sigma is 0, and models that are never random."""
+NO_EFFECT = {"sigma": "0", "speedDev": "0", "speedFactor": "1"}
+"""Values of attributes of SUMO's own driver that no remark mentions."""
 
 
-def check_network(network: str) -> None:
-    """Refuse a network that cannot be simulated correctly.
+def check_network(name: str, source: str) -> None:
+    """Refuse a network that cannot be simulated correctly; `source` is the study.
 
     Raises
     ------
@@ -36,73 +57,161 @@ def check_network(network: str) -> None:
     EnvironmentFault
         If netconvert fails for reasons outside the network.
     """
-    _check_files(network, network_fingerprint(network))
+    network = open_network(name, source)
+    if not is_shipped(name):
+        _check_files(network)
 
 
-def network_remarks(network: str, max_speed: float, *, sumo_drives: bool) -> list[str]:
-    """Remarks on parts of a user's network that the simulation does not use; no remarks on shipped networks."""
-    if is_shipped(network):
+def network_remarks(name: str, max_speed: float, *, sumo_drives: bool) -> list[str]:
+    """Remarks on parts of a user's network that the simulation does not use, and SUMO's warnings; none on shipped networks.
+
+    Parameters
+    ----------
+    max_speed
+        Top speed of the original vehicle; higher speed limits have no effect [m/s].
+    sumo_drives
+        Whether SUMO's own driver influences the vehicle, as with a controller written for TraCI.
+    """
+    if is_shipped(name):
         return []
-    file = sources_of(network).folder / TRAFFIC_FILE
-    roots = parse_xml(file), parse_xml(built_network(network))
-    return [f"{file}: {remark}" for remark in unused_attribute_remarks(*roots, max_speed, sumo_drives=sumo_drives)]
+    network = open_network(name)
+    file = network.path(TRAFFIC_FILE)
+    traffic = parse_xml(file)
+    attributes = [f"{name} = {value}" for element in traffic.findall(f"*[@id='{VUT}']") for name, value in element.items()
+                  if name in SETTING_ATTRIBUTES
+                  or (DRIVER_ATTRIBUTES.fullmatch(name) and not sumo_drives and value != NO_EFFECT.get(name))]
+    lanes = [] if sumo_drives else _lanes_of_vut(traffic, parse_xml(built_network(network)))
+    slow_lanes = [lane for lane in lanes if float(lane.get("speed", "inf")) < max_speed]
+    if slow_lanes:
+        attributes.append(f"the speed limit of lane {slow_lanes[0].get('id')!r} ({float(slow_lanes[0].get('speed', 'nan')):g} m/s)"
+                          f"{f' and of {len(slow_lanes) - 1} more' if len(slow_lanes) > 1 else ''}")
+    unused = [f"{file}: no effect on vehicle {VUT!r}: {', '.join(dict.fromkeys(attributes))}; the study's vehicle and ADS "
+              "determine how it drives"] if attributes else []
+    warnings = _warnings_file(network).read_text(encoding="utf-8")
+    return [*unused, *([f"{network.folder}: {warnings}"] if warnings else [])]
 
 
-@lru_cache(maxsize=1000)
-def _check_files(network: str, fingerprint: str) -> None:
-    sources = sources_of(network)
-    check_options(sources.folder / OPTIONS_FILE)
-    _check_step(sources.folder / OPTIONS_FILE)
-    for name in (*(name for option, names in sources.plain_files if option == "edge-files" for name in names), TRAFFIC_FILE):
-        _check_numbers(parse_xml(sources.folder / name), sources.folder / name, UNSET_VALUE if name != TRAFFIC_FILE else "")
-    for name in (*sources.road_files, TRAFFIC_FILE):
-        if b"<include" in (sources.folder / name).read_bytes():
-            raise InputError(sources.folder / name, "includes another file", "one file that contains everything")
-    network_file = built_network(network)
-    roads = parse_xml(network_file)
-    error_source = network_file if sources.network_file else sources.folder
-    check_roads(roads, error_source)
-    _check_numbers(roads, error_source)
-    _check_edits(sources, network_file.read_text(encoding="utf-8"))
-    check_demand(parse_xml(sources.folder / TRAFFIC_FILE), sources.folder / TRAFFIC_FILE, roads, options_of(sources.folder / OPTIONS_FILE))
-    if not is_shipped(network):
-        try_network(network)
+@lru_cache(maxsize=100)
+def _check_files(network: Network) -> None:
+    options = options_of(network.path(OPTIONS_FILE))
+    step = options.get("step-length", "1")
+    if not SHORTEST_STEP <= (parse_seconds(step) or 0.0) <= LONGEST_STEP:
+        raise InputError(network.path(OPTIONS_FILE), f"step-length = {step!r}",
+                         f"a number from {SHORTEST_STEP:g} to {LONGEST_STEP:g} [s]")
+    if options.get("route-files", TRAFFIC_FILE) != TRAFFIC_FILE:
+        raise InputError(network.path(OPTIONS_FILE), f"route-files = {options['route-files']!r}",
+                         f"{TRAFFIC_FILE}, all traffic in one file")
+    traffic = parse_xml(network.path(TRAFFIC_FILE))
+    _check_vut(network, traffic)
+    _check_types(network, traffic, options)
+    _warnings_file(network)
+    if not network.is_built:
+        _check_sources(network)
 
 
-def _check_edits(sources: Sources, built_text: str) -> None:
-    """Refuse a network that was edited in netedit while its sources were not."""
-    file = sources.folder / (sources.output_file or NETWORK_FILE)
-    names = sources.road_files
-    if sources.network_file or not file.is_file() or any((sources.folder / name).stat().st_mtime >= file.stat().st_mtime for name in names):
+def _check_sources(network: Network) -> None:
+    """Refuse sources that the recipe does not name, and a network that was edited in netedit while its sources were not."""
+    names = [name for name, _ in network.digests]
+    for file in sorted(network.folder.glob("*.???.xml")):
+        if file.name not in names and re.search(r"\.(nod|edg|con|typ|tll)\.xml$", file.name):
+            raise InputError(file, f"is not used: {network.roads} does not name it", f"sources that {network.roads} names")
+    file = network.path(options_of(network.path(network.roads)).get("output-file", NETWORK_FILE))
+    sources = [network.path(name) for name in names[:-2]]
+    if not file.is_file() or max(source.stat().st_mtime for source in sources) >= file.stat().st_mtime:
         return
-    header, _, network = file.read_text(encoding="utf-8", errors="replace").partition("<net ")
-    if "netedit" in header and f"<net {network}".strip() != built_text.strip():
-        raise InputError(file, f"has edits by netedit that {', '.join(names)} do not have",
+    header, _, roads = file.read_text(encoding="utf-8", errors="replace").partition("<net ")
+    if "netedit" in header and f"<net {roads}".strip() != built_network(network).read_text(encoding="utf-8").strip():
+        raise InputError(file, f"has edits by netedit that {', '.join(names[:-2])} do not have",
                          "those files saved from netedit as plain XML, too; or a folder without those files, so that this network is used")
 
 
-def _check_step(file: Path) -> None:
-    step = options_of(file).get("step-length", "1")
-    if not SHORTEST_STEP <= _parse_number(step) <= LONGEST_STEP:
-        raise InputError(file, f"step-length = {step!r}", f"a number from {SHORTEST_STEP:g} to {LONGEST_STEP:g} [s]")
+def _check_types(network: Network, traffic: ElementTree.Element, options: Mapping[str, str]) -> None:
+    """Refuse types whose drivers are random: they differ between copies, so that a result would depend on its batch."""
+    persons = [actor.get("type") for actor in traffic if actor.tag in ("person", "personFlow")]
+    vehicles = [actor.get("type") for actor in traffic if actor.tag in ("vehicle", "trip", "flow")]
+    for kind in traffic.findall("vType"):
+        name, model = kind.get("id"), kind.get("carFollowModel", options.get("default.carfollowmodel", "Krauss"))
+        if name == VUT or name not in (*persons, *vehicles):
+            continue
+        values = {"speedDev": kind.get("speedDev", options.get("default.speeddev", "0.1"))}
+        if name in vehicles and model not in DETERMINISTIC_MODELS:
+            values["sigma" if model in SIGMA_MODELS else "carFollowModel"] = kind.get("sigma", "0.5") if model in SIGMA_MODELS else model
+        for attribute, value in values.items():
+            if not re.fullmatch(r"0*\.?0*", value):
+                raise InputError(network.path(TRAFFIC_FILE), f"vType {name!r} drives at random: {attribute} = {value}",
+                                 f'speedDev="0"; for vehicles sigma="0" or carFollowModel {", ".join(DETERMINISTIC_MODELS)}')
 
 
-def _check_numbers(root: ElementTree.Element, file: Path, unset_value: str = "") -> None:
-    """Refuse impossible lengths, speeds and accelerations."""
-    for element in root.iter():
-        for names, positive, legal in ((POSITIVE_NUMBERS, True, "a number above 0"), (NON_NEGATIVE_NUMBERS, False, "a number from 0 on")):
-            for name in names.get(element.tag, ()):
-                text = element.get(name, unset_value)
-                if text == unset_value or (number := _parse_number(text)) > 0 or (number == 0 and not positive):
-                    continue
-                label = f"{element.tag} {element.get('id')!r}" if "id" in element.attrib else element.tag
-                raise InputError(file, f"{label}: {name} = {text!r}", legal)
+def _check_vut(network: Network, traffic: ElementTree.Element) -> None:
+    """Refuse a vehicle under test with stops or a shared type, and a sloping or slippery road of this vehicle."""
+    file = network.path(TRAFFIC_FILE)
+    vut = next((actor for actor in traffic if actor.tag in ("vehicle", "trip") and actor.get("id") == VUT), None)
+    if vut is None:
+        raise InputError(file, f"has no vehicle {VUT!r}", f'<vehicle id="{VUT}" type="{VUT}" depart="0" ...>, the vehicle under test')
+    if vut.get("type") != VUT or len(traffic.findall(f"*[@type='{VUT}']")) > 1:
+        raise InputError(file, f"vehicle {VUT!r}: type = {vut.get('type')!r}", f"{VUT!r}, a vType of its own, which each setting changes")
+    if parse_seconds(vut.get("depart", "")) != 0:
+        raise InputError(file, f"vehicle {VUT!r}: depart = {vut.get('depart')!r}", "0")
+    if any(element.find("stop") is not None for element in (vut, *vut, *traffic.findall(f"route[@id='{vut.get('route')}']"))):
+        raise InputError(file, f"vehicle {VUT!r} has a stop", "none: its ADS drives it")
+    for lane in _lanes_of_vut(traffic, parse_xml(built_network(network))):
+        heights = [float((*point.split(","), "0")[2]) for point in lane.get("shape", "").split()]
+        climb = max(heights, default=0.0) - min(heights, default=0.0)
+        if climb > MAX_SLOPE * float(lane.get("length", 0)):
+            raise InputError(file, f"vehicle {VUT!r} drives on lane {lane.get('id')!r}, which rises {climb:.2f} m",
+                             "a level road, as netconvert's option `flatten` makes it; the scenario's `grade` sets a slope")
+        if float(lane.get("friction", 1)) != 1:
+            raise InputError(file, f"vehicle {VUT!r} drives on lane {lane.get('id')!r} of friction {lane.get('friction')}",
+                             "friction 1; `road_friction` of the study's [weather] sets another one")
 
 
-def _parse_number(text: str) -> float:
-    """The number in a text, or -infinity if the text is no finite number."""
+def _lanes_of_vut(traffic: ElementTree.Element, roads: ElementTree.Element) -> list[ElementTree.Element]:
+    """The lanes of the edges that the traffic names for the vehicle under test."""
+    edges = {edge.get("id"): edge for edge in roads.iter("edge")}
+    routes = [route for vut in traffic.findall(f"*[@id='{VUT}']")
+              for route in (vut, *vut.findall("route"), *traffic.findall(f"route[@id='{vut.get('route')}']"))]
+    names = " ".join(route.get(name, "") for route in routes for name in ("edges", "from", "via", "to")).split()
+    return [lane for name in dict.fromkeys(names) if name in edges for lane in edges[name].iter("lane")]
+
+
+def _warnings_file(network: Network) -> Path:
+    """A file with SUMO's warnings about a network that SUMO has loaded; raises the errors of `check_network`."""
+    folder = cache_folder(network, 0, [digest for _, digest in network.digests])
+    return ensure_cached(f"tried-{folder}", WARNINGS_FILE, partial(_try_network, network))
+
+
+def _try_network(network: Network, into: Path) -> None:
+    """Load a network in a separate SUMO process, because some broken networks crash SUMO; then compare the traffic of two copies."""
+    legal = "options and traffic that SUMO loads without an error"
+    exit_code, messages = run_program(
+        network.folder, "sumo", "-c", OPTIONS_FILE, "-n", str(built_network(network).absolute()), "-r", TRAFFIC_FILE,
+        "--begin", "0", "--end", "1", "--no-step-log", "true")
+    if exit_code != 0:
+        raise InputError(network.folder, f"SUMO refuses the network, {OPTIONS_FILE} or {TRAFFIC_FILE}: "
+                         f"{messages or f'exit code {exit_code}'}", legal)
     try:
-        number = float(text)
-    except ValueError:
-        return -math.inf
-    return number if math.isfinite(number) else -math.inf
+        actor, time = _first_difference(network)
+    except (SimulationError, EnvironmentFault) as error:
+        raise InputError(network.folder, f"SUMO refuses copies of the network: {error}", legal) from None
+    if actor:
+        raise InputError(network.path(TRAFFIC_FILE), f"{actor!r} moves at random: two copies of it differ at {time:g} s",
+                         'traffic without random numbers: vTypes with speedDev="0" and sigma="0", no probabilities and '
+                         f"distributions, and pedestrian.striping.dawdling 0 in {OPTIONS_FILE}")
+    (into / WARNINGS_FILE).write_text(messages, encoding="utf-8")
+
+
+def _first_difference(network: Network) -> tuple[str, float]:
+    """The first actor that moves differently in two copies, and the time [s]; "" and 0 if there is none.
+
+    The vehicle under test stays at its start.
+    """
+    with open_world(copied_network(network, 2), 2) as world:
+        world.allow_departure()
+        world.depart()
+        for step in range(1, N_STEPS + 1):
+            world.advance(np.zeros(2))
+            poses = world.actor_poses()
+            for name in sorted({id_.partition(".")[2] for id_ in poses}):
+                if poses.get(f"0.{name}") != poses.get(f"1.{name}"):
+                    return name, step * world.step_length
+    return "", 0.0

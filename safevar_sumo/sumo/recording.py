@@ -5,7 +5,7 @@ While SUMO plays a scene, the vehicle under test stays at its start; `recorded_w
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Hashable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
 from hashlib import sha256
@@ -21,8 +21,7 @@ from safevar_sumo.scenarios.target import TargetTest
 from safevar_sumo.sumo.cache import ensure_cached
 from safevar_sumo.sumo.copies import copied_id, copy_and_name
 from safevar_sumo.sumo.engine import Engine, open_world
-from safevar_sumo.sumo.network import copied_network, netconvert_version
-from safevar_sumo.sumo.sources import is_shipped
+from safevar_sumo.sumo.network import Network, copied_network, is_shipped, sumo_version
 from safevar_sumo.sumo.staging import stage_networks
 from safevar_sumo.sumo.world import SumoWorld, begin, direction_of
 
@@ -113,14 +112,13 @@ def record_scenes(scenarios: Sequence[Scenario], options: Sequence[str]) -> list
     """
     reasons = [_reason_for_sumo(scenario) for scenario in scenarios]
     recordable = [scenario for scenario, reason in zip(scenarios, reasons, strict=True) if not reason]
-    folders = {_Key(scenario, network.fingerprint, tuple(options)): network.folder
-               for scenario, network in zip(recordable, stage_networks(recordable), strict=True)}
-    new_folders = {key: folder for key, folder in folders.items() if key not in _recordings}
-    if new_folders:
-        for old_key in [key for key in _recordings if key not in folders][:max(len(_recordings) + len(new_folders) - MAX_RECORDINGS, 0)]:
+    keys = [_Key(scenario, network, tuple(options)) for scenario, network in zip(recordable, stage_networks(recordable), strict=True)]
+    new_keys = [key for key in dict.fromkeys(keys) if key not in _recordings]
+    if new_keys:
+        for old_key in [key for key in _recordings if key not in keys][:max(len(_recordings) + len(new_keys) - MAX_RECORDINGS, 0)]:
             del _recordings[old_key]
-        _recordings.update(zip(new_folders, _recordings_of(new_folders), strict=True))
-    scenes = {key.scenario: _recordings[key] for key in folders}
+        _recordings.update(zip(new_keys, _recordings_of(new_keys), strict=True))
+    scenes = {key.scenario: _recordings[key] for key in keys}
     return [reason or scenes[scenario] for scenario, reason in zip(scenarios, reasons, strict=True)]
 
 
@@ -133,10 +131,10 @@ def _reason_for_sumo(scenario: Scenario) -> str:
 
 
 class _Key(NamedTuple):
-    """A scenario, the fingerprint of its network and traffic, and additional options of SUMO."""
+    """A scenario, its network, and additional options of SUMO."""
 
     scenario: Any
-    fingerprint: str
+    network: Network
     options: tuple[str, ...]
 
 
@@ -144,14 +142,15 @@ _recordings: dict[_Key, Recording | str] = {}
 """The scenes that this process keeps, or the reasons why scenes cannot be recorded."""
 
 
-def _recordings_of(folders: Mapping[_Key, str]) -> list[Recording | str]:
-    """The scenes of keys with network folders, read from the cache or played by SUMO."""
+def _recordings_of(keys: Sequence[_Key]) -> list[Recording | str]:
+    """The scenes, read from the cache or played by SUMO."""
     def play() -> list[Recording | str]:
-        return [_play(key.scenario, folder, key.options) for key, folder in folders.items()]
+        return [_play(*key) for key in keys]
 
-    if any(isinstance(key.scenario, GuardedScenario) for key in folders):
+    if any(isinstance(key.scenario, GuardedScenario) for key in keys):
         return play()
-    digest = sha256(_code_bytes() + repr([(type(scenario).__name__, to_builtins(scenario), *rest) for scenario, *rest in folders]).encode())
+    inputs = [(type(key.scenario).__name__, to_builtins(key.scenario), key.network.digests, key.options) for key in keys]
+    digest = sha256(_code_bytes() + repr(inputs).encode())
     def build(folder: Path) -> None:
         (folder / SCENES_FILE).write_bytes(msgpack.encode(play(), enc_hook=_packed_array))
 
@@ -163,7 +162,7 @@ def _recordings_of(folders: Mapping[_Key, str]) -> list[Recording | str]:
 def _code_bytes() -> bytes:
     """SUMO's version and the code that plays scenes: a scene depends on them and on its scenario."""
     files = sorted(file for folder in ("sumo", "scenarios") for file in (Path(__file__).parents[1] / folder).glob("*.py"))
-    return b"".join([netconvert_version().encode(), *(file.read_bytes() for file in files)])
+    return b"".join([sumo_version().encode(), *(file.read_bytes() for file in files)])
 
 
 def _packed_array(array: Any) -> tuple[tuple[int, ...], bytes]:
@@ -175,9 +174,9 @@ def _unpacked_array(_: Any, packed: Any) -> FloatArray:
     return np.frombuffer(content).reshape(shape)
 
 
-def _play(scenario: Any, folder: str, options: tuple[str, ...]) -> Recording | str:
+def _play(scenario: Any, network: Network, options: tuple[str, ...]) -> Recording | str:
     """The scene, or the reason why it cannot be recorded."""
-    with open_world(copied_network(folder, 1), 1, Engine.LIBSUMO, options) as world:
+    with open_world(copied_network(network, 1), 1, Engine.LIBSUMO, options) as world:
         world.allow_departure()
         world.depart()
         try:

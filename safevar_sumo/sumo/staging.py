@@ -4,28 +4,20 @@ from __future__ import annotations
 
 import hashlib
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.scenarios import GuardedScenario, Lane, Scenario
 from safevar_sumo.scenarios.base import XmlChanges, lane_through
 from safevar_sumo.sumo.cache import ensure_all_cached
 from safevar_sumo.sumo.copies import parse_xml
-from safevar_sumo.sumo.network import NETWORK_FILE, built_network, network_fingerprint
-from safevar_sumo.sumo.sources import OPTIONS_FILE, TRAFFIC_FILE, Sources, options_of, sources_of
+from safevar_sumo.sumo.network import NETWORK_FILE, OPTIONS_FILE, TRAFFIC_FILE, Network, built_network, open_network, options_of
 
 
-class StagedNetwork(NamedTuple):
-    """A network with a scenario's lanes and traffic: its folder (or `.net.xml` file), and a digest of its content."""
-
-    folder: str
-    fingerprint: str
-
-
-def stage_network(scenario: Scenario) -> StagedNetwork:
+def stage_network(scenario: Scenario) -> Network:
     """The scenario's network, with lanes and traffic changed by the scenario's parameters.
 
     Raises
@@ -38,45 +30,42 @@ def stage_network(scenario: Scenario) -> StagedNetwork:
     return stage_networks([scenario])[0]
 
 
-def stage_networks(scenarios: Sequence[Scenario]) -> list[StagedNetwork]:
+def stage_networks(scenarios: Sequence[Scenario]) -> list[Network]:
     """The networks of several scenarios, whose files are read once per network; raises the errors of `stage_network`."""
-    fingerprints = {name: network_fingerprint(name) for name in {scenario.network for scenario in scenarios}}
-    def stage(scenario: Any) -> StagedNetwork:
+    networks = {name: open_network(name) for name in {scenario.network for scenario in scenarios}}
+
+    def stage(scenario: Any) -> Network:
         may_vary = isinstance(scenario, GuardedScenario)  # a user's scenario may return different changes in each call
-        return (_stage.__wrapped__ if may_vary else _stage)(scenario, fingerprints[scenario.network])
+        return (_stage.__wrapped__ if may_vary else _stage)(scenario, networks[scenario.network])
 
     return [stage(scenario) for scenario in scenarios]
 
 
 @lru_cache(maxsize=10_000)
-def _stage(scenario: Any, fingerprint: str) -> StagedNetwork:
-    """The staged network; `fingerprint` makes the contents of the network's files part of the cache key."""
-    folder = scenario.network
+def _stage(scenario: Any, network: Network) -> Network:
     lanes, actors = (getattr(scenario, name, None) for name in ("lanes", "actors"))
-    if lanes is not None and (changes := lanes(_BuiltRoads(folder, fingerprint))):
-        folder = str(_change_lanes(sources_of(folder), built_network(folder), changes))
-        fingerprint = network_fingerprint(folder)
-    if actors is not None and (changes := actors(_BuiltRoads(folder, fingerprint))):
-        folder = str(_change_traffic(sources_of(folder), changes))
-        fingerprint = network_fingerprint(folder)
-    return StagedNetwork(folder, fingerprint)
+    if lanes is not None and (changes := lanes(_BuiltRoads(network))):
+        network = _variant(network, {NETWORK_FILE: _change_xml(built_network(network), changes)})
+    if actors is not None and (changes := actors(_BuiltRoads(network))):
+        network = _variant(network, {TRAFFIC_FILE: _change_xml(network.path(TRAFFIC_FILE), changes)})
+    return network
 
 
 class _BuiltRoads:
     """The lanes of a built network."""
 
-    def __init__(self, network: str, fingerprint: str) -> None:
-        self._network, self._fingerprint = network, fingerprint
+    def __init__(self, network: Network) -> None:
+        self._network = network
 
     def lane(self, lane: str) -> Lane:
-        lanes = _read_lanes(self._network, self._fingerprint)
+        lanes = _read_lanes(self._network)
         if lane not in lanes:
-            raise InputError(sources_of(self._network).folder, f"there is no lane {lane!r}")
+            raise InputError(self._network.folder, f"there is no lane {lane!r}")
         return lanes[lane]
 
 
 @lru_cache(maxsize=100)
-def _read_lanes(network: str, fingerprint: str) -> dict[str, Lane]:
+def _read_lanes(network: Network) -> dict[str, Lane]:
     lanes = {}
     for lane in ElementTree.fromstring(built_network(network).read_bytes()).iter("lane"):
         coordinates = [(float(x), float(y)) for x, y in (point.split(",")[:2] for point in lane.attrib["shape"].split())]
@@ -84,25 +73,21 @@ def _read_lanes(network: str, fingerprint: str) -> dict[str, Lane]:
     return lanes
 
 
-def _change_lanes(sources: Sources, network_file: Path, changes: XmlChanges) -> Path:
-    """A copy of a built network with changes to its lanes."""
-    files = {NETWORK_FILE: ElementTree.tostring(_change_xml(network_file, changes)), **_read_files(sources, TRAFFIC_FILE, OPTIONS_FILE)}
-    return _store_network(sources.folder.name, tuple(files.items()))
+def _variant(network: Network, changed_files: Mapping[str, bytes]) -> Network:
+    """A built network with changed files, in the cache."""
+    gui_settings = options_of(network.path(OPTIONS_FILE)).get("gui-settings-file", "")
+    sources = {NETWORK_FILE: built_network(network), **{name: network.path(name) for name in (TRAFFIC_FILE, OPTIONS_FILE, gui_settings)}}
+    contents = {name: changed_files.get(name) or file.read_bytes() for name, file in sources.items() if file.is_file()}
+    return _store_network(network.folder.name, tuple(contents.items()))
 
 
-def _change_traffic(sources: Sources, changes: XmlChanges) -> Path:
-    """A copy of a network, or of its sources, with changes to its traffic."""
-    files = _read_files(sources, *sources.files) | {TRAFFIC_FILE: ElementTree.tostring(_change_xml(sources.folder / TRAFFIC_FILE, changes))}
-    return _store_network(sources.folder.name, tuple(files.items())) / sources.network_file
+@lru_cache(maxsize=1000)
+def _store_network(name: str, files: tuple[tuple[str, bytes], ...]) -> Network:
+    folder = f"staged-{hashlib.sha256(repr(files).encode()).hexdigest()[:16]}/{name or 'network'}"
+    return open_network(str(ensure_all_cached(folder, [file for file, _ in files], partial(_write_files, files))))
 
 
-def _read_files(sources: Sources, *names: str) -> dict[str, bytes]:
-    """Contents of the named files of a network, and of its settings of sumo-gui."""
-    gui_settings = options_of(sources.folder / OPTIONS_FILE).get("gui-settings-file", "")
-    return {name: (sources.folder / name).read_bytes() for name in (*names, gui_settings) if (sources.folder / name).is_file()}
-
-
-def _change_xml(file: Path, changes: XmlChanges) -> ElementTree.Element:
+def _change_xml(file: Path, changes: XmlChanges) -> bytes:
     root = parse_xml(file)
     for path, attributes in changes.items():
         elements = root.findall(path)
@@ -113,13 +98,7 @@ def _change_xml(file: Path, changes: XmlChanges) -> ElementTree.Element:
                 root.remove(element)
             else:
                 element.attrib.update(attributes)
-    return root
-
-
-@lru_cache(maxsize=1000)
-def _store_network(name: str, files: tuple[tuple[str, bytes], ...]) -> Path:
-    folder = f"staged-{hashlib.sha256(repr(files).encode()).hexdigest()[:16]}/{name or 'network'}"
-    return ensure_all_cached(folder, [file for file, _ in files], partial(_write_files, files))
+    return ElementTree.tostring(root)
 
 
 def _write_files(files: tuple[tuple[str, bytes], ...], into: Path) -> None:

@@ -24,8 +24,8 @@ from safevar_sumo.protocol.rater import Rater, expand_protocol, is_rated, rater_
 from safevar_sumo.records import FloatArray, Nominal
 from safevar_sumo.scenarios import SCENARIO_CONTRACT, SCENARIOS, GuardedScenario, Point, Scenario, equals_clear, weather_of
 from safevar_sumo.study import MatrixTest, MetricsTable, ModelTable, Study, VehicleTable, Weather, user_code_names
+from safevar_sumo.sumo.network import NETWORK_KEY, is_network, is_shipped
 from safevar_sumo.sumo.network_check import check_network, network_remarks
-from safevar_sumo.sumo.sources import NETWORK_KEY, is_network, is_shipped
 from safevar_sumo.sumo.traci_controller import TraciController
 from safevar_sumo.sumo.traci_module import substitute_traci
 from safevar_sumo.vehicles import (
@@ -220,12 +220,7 @@ def _assemble(study: Study, source: str) -> System:
     rater = rater_of(study, source)
     matrix = _matrix_points(study if rater is None else expand_protocol(study, models.weather), source)
     for network in dict.fromkeys(scenario.network for scenario in (models.scenario, *(point.scenario for point in matrix))):
-        try:
-            check_network(network)
-        except InputError as error:
-            if error.source == NETWORK_KEY:
-                raise InputError(source, f"{NETWORK_KEY}: {error.problem}", error.legal) from None
-            raise
+        check_network(network, f"{source}: {NETWORK_KEY}")
     region = region_of(study, source)
     characteristics = region.characteristics
     nominal = calibration_drive(models.vehicle, characteristics)

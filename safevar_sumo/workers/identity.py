@@ -16,8 +16,7 @@ import msgspec
 from safevar_sumo.plugins import DIGEST_LENGTH, files_named_in
 from safevar_sumo.results import RESULTS, evaluation_keys
 from safevar_sumo.study import Study, tables_of
-from safevar_sumo.sumo.network import network_files
-from safevar_sumo.sumo.sources import sources_of
+from safevar_sumo.sumo.network import open_network
 from safevar_sumo.sumo.system import System
 
 Inputs = dict[str, dict[str, str]]
@@ -53,8 +52,8 @@ def identity_of(study: Study, system: System, sources: Mapping[str, str] = Mappi
 
 def input_files(study: Study, system: System) -> list[Path]:
     """The files that a study is made of: its own file and those that it extends, networks, loaded modules, and files that it names."""
-    networks = [sources_of(folder) for folder in dict.fromkeys(point.scenario.network for point in system.points)]
-    return [*(Path(file) for file in study.origin.files), *(sources.folder / name for sources in networks for name in sources.files),
+    networks = [open_network(folder) for folder in dict.fromkeys(point.scenario.network for point in system.points)]
+    return [*(Path(file) for file in study.origin.files), *(network.path(name) for network in networks for name, _ in network.digests),
             *(Path(file) for module in list(sys.modules.values()) if (file := getattr(module, "__file__", None))),
             *map(Path, files_named_in(tables_of(study), study.origin.places))]
 
@@ -63,8 +62,8 @@ def network_digests(system: System) -> dict[str, str]:
     """Digests of the files of all networks in the simulations."""
     folders = list(dict.fromkeys(point.scenario.network for point in system.points))
     if len(folders) == 1:
-        return network_files(folders[0])
-    return {f"{Path(folder).name}/{name}": digest for folder in folders for name, digest in network_files(folder).items()}
+        return dict(open_network(folders[0]).digests)
+    return {f"{Path(folder).name}/{name}": digest for folder in folders for name, digest in open_network(folder).digests}
 
 
 @cache

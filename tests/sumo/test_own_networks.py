@@ -15,7 +15,7 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.shipped import NETWORKS
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.matrix import simulate
-from safevar_sumo.sumo.network import built_network, copied_network, network_fingerprint
+from safevar_sumo.sumo.network import built_network, copied_network, open_network
 from safevar_sumo.sumo.network_check import check_network
 from safevar_sumo.sumo.system import System, assemble
 
@@ -40,25 +40,25 @@ def on(study: str, network: Path) -> System:
 
 
 def roads(network: Path, n: int = 1) -> ElementTree.Element:
-    return ElementTree.parse(copied_network(str(network), n).network).getroot()
+    return ElementTree.parse(copied_network(open_network(str(network)), n).network).getroot()
 
 
 def test_edge_types_in_a_separate_file_change_the_network(mine: Path) -> None:
-    before = network_fingerprint(str(mine))
+    before = open_network(str(mine)).digests
     (mine / "network.typ.xml").write_text('<types><type id="slow" speed="7" numLanes="1" width="3" disallow="pedestrian"/></types>')
     with pytest.raises(InputError, match=r"network\.typ\.xml: is not used: network\.netccfg does not name it"):
-        check_network(str(mine))
+        check_network(str(mine), "study")
     rewritten(mine / "network.netccfg", "</input>", '<type-files value="network.typ.xml"/></input>')
     rewritten(mine / "network.edg.xml", 'id="departure" from="crossing" to="east" numLanes="1" width="4" speed="70" disallow="pedestrian"',
               'id="departure" from="crossing" to="east" type="slow"')
-    check_network(str(mine))
+    check_network(str(mine), "study")
     lane = roads(mine).find(".//lane[@id='0.departure_0']")
     assert lane is not None
     assert [float(lane.attrib[name]) for name in ("speed", "width")] == [7, 3]
-    assert network_fingerprint(str(mine)) != before
-    first = copied_network(str(mine), 1).network
+    assert open_network(str(mine)).digests != before
+    first = copied_network(open_network(str(mine)), 1).network
     rewritten(mine / "network.typ.xml", 'speed="7"', 'speed="8"')
-    assert copied_network(str(mine), 1).network != first
+    assert copied_network(open_network(str(mine)), 1).network != first
 
 
 def test_traffic_lights_are_copied_with_their_programmes(mine: Path) -> None:
@@ -66,7 +66,7 @@ def test_traffic_lights_are_copied_with_their_programmes(mine: Path) -> None:
     subprocess.run([NETCONVERT, "-n", "network.nod.xml", "-e", "network.edg.xml", "-x", "network.con.xml", "--tls.cycle.time", "77",
                     "--plain-output-prefix", "network"], cwd=mine, check=True, capture_output=True)
     rewritten(mine / "network.tll.xml", "duration=", 'name="my own" duration=')
-    check_network(str(mine))
+    check_network(str(mine), "study")
     copies = roads(mine, 2)
     lights = copies.findall("tlLogic")
     assert [light.attrib["id"] for light in lights] == ["0.crossing", "1.crossing"]
@@ -77,15 +77,12 @@ def test_traffic_lights_are_copied_with_their_programmes(mine: Path) -> None:
 
 
 @pytest.mark.parametrize(("line", "message"), [
-    ('<plain-output-prefix value="/tmp/x"/>', "sets netconvert's option 'plain-output-prefix'"), ('<log value="x"/>', "option 'log'"),
-    ('<junctions.join-output value="x"/>', "option 'junctions.join-output'"), ('<save-configuration value="x"/>', "save-configuration"),
-    ('<keep-edges.input-file value="x"/>', "keep-edges.input-file"), ('<unheard-of value="1"/>', "option 'unheard-of'"),
-    ('<type-files value="../types.xml"/>', "type-files = '../types.xml' is in another folder"), ('<no-turnarounds/>', "without value="),
-    ('<type-files value="none.typ.xml"/>', "type-files: none.typ.xml is missing"), ('<precision value="2"/>', "sets 'precision' twice")])
-def test_a_recipe_that_uses_files_of_other_folders_is_refused(mine: Path, line: str, message: str) -> None:
+    ('<unheard-of value="1"/>', "netconvert refuses the network: No option with the name 'unheard-of' exists"),
+    ('<type-files value="none.typ.xml"/>', "none.typ.xml is missing")])
+def test_a_recipe_that_netconvert_refuses_is_an_error(mine: Path, line: str, message: str) -> None:
     rewritten(mine / "network.netccfg", "</configuration>", f"{line}</configuration>")
-    with pytest.raises(InputError, match=r"network\.netccfg: ") as caught:
-        check_network(str(mine))
+    with pytest.raises(InputError) as caught:
+        check_network(str(mine), "study")
     assert message in str(caught.value)
 
 
@@ -101,9 +98,9 @@ def test_a_built_network_without_sources_gives_the_same_results(mine: Path) -> N
     shutil.copy(mine / "town.net.xml", mine / "village.net.xml")
     with pytest.raises(InputError, match=r"has town\.net\.xml and village\.net\.xml"):
         on("smoke", mine)
-    before = network_fingerprint(str(mine / "town.net.xml"))
+    before = open_network(str(mine / "town.net.xml")).digests
     rewritten(mine / "town.net.xml", "<location", "<!-- --><location")
-    assert network_fingerprint(str(mine / "town.net.xml")) != before
+    assert open_network(str(mine / "town.net.xml")).digests != before
 
 
 def load_original(study: str) -> np.ndarray:
@@ -116,7 +113,7 @@ def load_original(study: str) -> np.ndarray:
 def test_a_slope_or_friction_that_has_no_effect_is_refused(mine: Path, file: str, old: str, new: str, message: str) -> None:
     rewritten(mine / file, old, new)
     with pytest.raises(InputError, match=r"traffic\.rou\.xml: vehicle 'vut' drives on ") as caught:
-        check_network(str(mine))
+        check_network(str(mine), "study")
     assert message in str(caught.value)
 
 
@@ -139,7 +136,7 @@ def test_no_id_of_a_built_network_belongs_to_two_copies(tmp_path: Path) -> None:
     for name in ("traffic.rou.xml", "scenario.sumocfg"):
         shutil.copy(NETWORKS / "along" / name, tmp_path / name)
     root = roads(tmp_path / "town.net.xml", 2)
-    plain = ElementTree.parse(built_network(str(tmp_path / "town.net.xml"))).getroot()
+    plain = ElementTree.parse(built_network(open_network(str(tmp_path / "town.net.xml")))).getroot()
     originals = {one.attrib["id"] for one in plain.iter() if one.tag in ("edge", "lane", "junction", "tlLogic")}
     numbers = ("index", "fromLane", "toLane", "linkIndex", "linkIndex2", "name", "type")
     kept = {value for child in root if child.tag not in ("location", "type") for element in child.iter() if element.tag != "param"
