@@ -48,6 +48,8 @@ def _range(kind: Any) -> str:
 def _words(kind: Any) -> str:
     """A type in words."""
     name = type(kind).__name__
+    if name == "Metadata":
+        return _words(kind.type)
     if name == "StructType":
         return f"[{kind.cls.__name__}](#{kind.cls.__name__.lower()})"
     if name == "UnionType":

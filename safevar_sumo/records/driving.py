@@ -66,11 +66,6 @@ class Nominal(NamedTuple):
     tables: Callable[[], PedalTables]
 
     @property
-    def tau(self) -> float:
-        """`actuator_lag` by its former name, for ADSs that were written with it."""
-        return self.actuator_lag
-
-    @property
     def speeds(self) -> FloatArray:
         return self.tables().speeds
 

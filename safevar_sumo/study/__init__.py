@@ -1,14 +1,14 @@
 """A study: data only, read strictly from a TOML file."""
 
 from safevar_sumo.errors import refuse_other_than_file
+from safevar_sumo.study.characteristics import CharacteristicTable, unit_text
 from safevar_sumo.study.constraints import Constraint
-from safevar_sumo.study.file import load_study, upgrade_tables, write_study
+from safevar_sumo.study.file import load_study, write_study
 from safevar_sumo.study.fitted import FITTED_TABLES, locate_parameter, missing_parameter
 from safevar_sumo.study.schema import (
     DESCRIPTION_KEYS,
     OBJECTIVES,
     SAFETY_DEGREE,
-    CharacteristicTable,
     FitTable,
     FreeParameter,
     MatrixTable,
@@ -30,7 +30,6 @@ from safevar_sumo.study.schema import (
     user_code_names,
     user_code_packages,
 )
-from safevar_sumo.study.units import unit_text
 from safevar_sumo.study.validation import convert_table, error_with_key
 
 __all__ = [
@@ -38,4 +37,4 @@ __all__ = [
     "FitTable", "FreeParameter", "MatrixTable", "MatrixTest", "MetricsTable", "ModelTable", "Origin", "RatingTable", "SearchTable",
     "Study", "StudyLike", "VehicleTable", "Weather", "convert_table", "error_with_key", "fmus_of", "label_of", "load_study",
     "locate_parameter", "missing_parameter", "refuse_other_than_file", "study_names", "study_path", "tables_of", "unit_text",
-    "upgrade_tables", "user_code_names", "user_code_packages", "write_study"]
+    "user_code_names", "user_code_packages", "write_study"]

@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 from msgspec import Meta, Struct
 
 from safevar_sumo.errors import InputError, one_of, unknown_name
-from safevar_sumo.study.units import unit_text
-
-if TYPE_CHECKING:
-    from safevar_sumo.study.schema import CharacteristicTable
+from safevar_sumo.study.characteristics import CharacteristicTable, unit_text
 
 MAX_MEANING_LENGTH = 400
 """Largest number of characters of a constraint's meaning."""

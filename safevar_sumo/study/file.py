@@ -17,7 +17,7 @@ from safevar_sumo.output import unwritable, whole_file
 from safevar_sumo.shipped import STUDIES
 from safevar_sumo.study.fitted import contradictions_of_file
 from safevar_sumo.study.schema import NAME_PATTERN, Origin, SearchTable, Study, StudyLike, is_file, study_path, tables_of
-from safevar_sumo.study.validation import contradictions, convert_table, raise_mistakes, unusable_values
+from safevar_sumo.study.validation import contradictions, convert_table, infinite_numbers, raise_mistakes
 
 WHOLE_TABLES = ("calibration", "published", "repeatability", "spread", "model_error")
 """Tables that a study inherits as a whole or not at all."""
@@ -62,30 +62,17 @@ def _raw_study(study: StudyLike) -> _RawStudy:
 
 
 def _checked_study(raw: _RawStudy) -> Study:
-    raise_mistakes(unusable_values(raw.source, raw.tables))
-    tables = _with_fmu(raw, upgrade_tables(raw.tables))
-    remarks = raw.origin.remarks
-    if tables.get("ads") != raw.tables.get("ads"):
-        remarks = (*remarks, f"{raw.source}: weather.hesitation is read as ads.parameters.hesitation")
-    study = convert_table(raw.source, _with_algorithms(tables), Study)
+    raise_mistakes(infinite_numbers(raw.source, raw.tables))
+    if "origin" in raw.tables:
+        raise InputError(raw.source, "origin: there is no such key")
+    study = convert_table(raw.source, _with_algorithms(_with_fmu(raw)), Study)
     raise_mistakes(contradictions(raw.source, study))
-    return msgspec.structs.replace(study, origin=msgspec.structs.replace(raw.origin, remarks=remarks))
+    return msgspec.structs.replace(study, origin=raw.origin)
 
 
-def upgrade_tables(tables: dict[str, Any]) -> dict[str, Any]:
-    """Bring tables of any earlier version into the present form: `weather.hesitation` becomes a parameter of the driving system."""
-    weather, ads = tables.get("weather"), tables.get("ads")
-    if not (isinstance(weather, dict) and "hesitation" in weather and isinstance(ads, dict)):
-        return tables
-    tables = {**tables, "weather": {key: value for key, value in weather.items() if key != "hesitation"}}
-    parameters = ads.get("parameters", {})
-    if weather["hesitation"] and isinstance(parameters, dict):
-        tables["ads"] = {**ads, "parameters": {**parameters, "hesitation": weather["hesitation"]}}
-    return tables
-
-
-def _with_fmu(raw: _RawStudy, tables: dict[str, Any]) -> dict[str, Any]:
+def _with_fmu(raw: _RawStudy) -> dict[str, Any]:
     """A study's tables, with rows of characteristics completed from the parameters that the vehicle's FMU declares."""
+    tables = raw.tables
     vehicle = tables.get("vehicle")
     if not isinstance(vehicle, dict) or vehicle.get("kind") != "fmu" or not isinstance(model := vehicle.get("model"), str):
         return tables
@@ -120,12 +107,8 @@ def _read_file(path: Path, visited_paths: tuple[Path, ...]) -> _RawStudy:
         tables = tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except tomllib.TOMLDecodeError as error:
         raise InputError(path, f"is not TOML: {error}") from None
-    except (RecursionError, OverflowError):
-        raise InputError(path, "is nested too deeply", "a study such as those in studies/") from None
     except UnicodeDecodeError as error:
         raise InputError(path, f"is not UTF-8 text: {error}") from None
-    except ValueError as error:  # an integer of too many digits
-        raise InputError(path, f"cannot be read: {error}") from None
     except OSError as error:
         raise InputError(path, f"cannot be read: {error.strerror}") from None
     folders = () if path.parent == STUDIES else (str(path.resolve().parent),)
@@ -135,7 +118,6 @@ def _read_file(path: Path, visited_paths: tuple[Path, ...]) -> _RawStudy:
 
 def _with_base(raw: _RawStudy, path: Path, visited_paths: tuple[Path, ...]) -> _RawStudy:
     """The tables of the study that `raw` extends, overridden by the tables of `raw`, with the folders of both studies."""
-    raise_mistakes(unusable_values(raw.source, raw.tables))
     tables = dict(raw.tables)
     base = tables.pop("extends", None)
     if base is None:

@@ -6,7 +6,6 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from safevar_sumo.errors import InputError
-from safevar_sumo.study.validation import short_text
 
 FITTED_TABLES = ("vehicle.parameters.", "ads.parameters.", "weather.")
 """Prefixes of the parameters that may be fitted."""
@@ -51,16 +50,3 @@ def contradictions_of_file(source: object, stated: Mapping[str, Any], tables: Ma
     rating, matrix = stated.get("rating"), tables.get("matrix")
     if isinstance(rating, Mapping) and rating.get("claims") and not (isinstance(matrix, Mapping) and matrix.get("protocol")):
         yield InputError(source, "rating.claims: the study is not rated", "matrix.protocol, or no claims")
-    yield from _hesitation_mistakes(source, tables.get("weather"), tables.get("ads"))
-
-
-def _hesitation_mistakes(source: object, weather: object, ads: object) -> Iterator[InputError]:
-    """Errors for the key weather.hesitation of earlier versions, which is read as a parameter of the driving system."""
-    if isinstance(weather, Mapping) and "hesitation" in weather:
-        parameters = ads.get("parameters") if isinstance(ads, Mapping) else None
-        value, other = weather["hesitation"], parameters.get("hesitation") if isinstance(parameters, Mapping) else None
-        if isinstance(value, bool) or not isinstance(value, int | float):
-            yield InputError(source, f"weather.hesitation = {short_text(value)}", "a number")
-        elif other not in (None, value):
-            yield InputError(source, f"weather.hesitation = {value:g} and ads.parameters.hesitation = {short_text(other)}",
-                             "ads.parameters.hesitation alone")

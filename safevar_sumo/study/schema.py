@@ -12,42 +12,25 @@ from msgspec import Meta, Struct
 
 from safevar_sumo.errors import InputError, refuse_other_than_file, unknown_name
 from safevar_sumo.shipped import STUDIES
+from safevar_sumo.study.characteristics import CharacteristicTable, PositiveNumber
 from safevar_sumo.study.constraints import Constraint
 from safevar_sumo.study.variation import Correlation, Distribution
 
-PositiveNumber = Annotated[float, Meta(gt=0, le=1e6)]
 PositiveInt = Annotated[int, Meta(ge=1, le=10_000_000)]
 FmuStep = Annotated[float, Meta(ge=1e-6, le=10)]
 Weight = Annotated[float, Meta(ge=0, le=1e6)]
 Seed = Annotated[int, Meta(ge=0, le=2**63 - 1)]
 Parameters = dict[str, Any]
 NAME_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9_.-]*\Z"
+Name = Annotated[str, Meta(pattern=NAME_PATTERN, description="letters, digits, _, . and -, the first a letter or digit")]
 SAFETY_DEGREE: Final = "safety_degree"
 """Column and key of the metric."""
 OBJECTIVES = (SAFETY_DEGREE, "f_diff", "f_num_diff")
 """Objectives of the published study."""
-MAX_DESCRIPTION_LENGTH = 200
-"""Largest number of characters of a characteristic's description."""
 FMU_KEYS = ("kind", "inputs", "outputs", "sensors", "sumo_type", "step")
 """Keys of a model's table that only FMUs use; an ADS that is no FMU has only `kind`."""
 DESCRIPTION_KEYS = ("meaning", "counterpart")
 """Keys that describe a characteristic to people; no result depends on them."""
-
-
-class CharacteristicTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """One row of the characteristics table; its values are in `unit`, and f_diff multiplies its change by `weight`.
-
-    `meaning` describes the characteristic and begins with a short name (up to the first comma or bracket); `counterpart` is the part
-    of a real vehicle that sets it.
-    """
-
-    unit: str
-    original: float
-    lower: float
-    upper: float
-    weight: PositiveNumber = 1.0
-    meaning: Annotated[str, Meta(max_length=MAX_DESCRIPTION_LENGTH)] = ""
-    counterpart: Annotated[str, Meta(max_length=MAX_DESCRIPTION_LENGTH)] = ""
 
 
 class ModelTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -164,13 +147,12 @@ class RatingTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
 class MatrixTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The test points at which every setting is simulated: those of `tests`, or all cells of a `protocol`, which then rates every setting.
 
-    `aggregate` combines the points' safety degrees: `worst` takes the lowest one. Only results of version 0.2.0 may have `mean`; in a study
-    it is an error, as it would average distances with negative speeds.
+    `aggregate` combines the points' safety degrees: `worst` takes the lowest one.
     """
 
     tests: list[MatrixTest] = []
     protocol: Literal["", "euro_ncap_2026"] = ""
-    aggregate: Literal["worst", "mean"] = "worst"
+    aggregate: Literal["worst"] = "worst"
 
 
 class FreeParameter(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -257,7 +239,7 @@ class Study(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
     # A new key that changes no result of a campaign also belongs in KEYS_WITHOUT_EFFECT_ON_RESULTS of results/manifest.py. Any other new
     # key becomes part of the identity of results: let `evaluation_keys` there omit its default, so that older results keep their identity.
-    name: Annotated[str, Meta(pattern=NAME_PATTERN)]
+    name: Name
     title: str
     scenario: ModelTable
     weather: str | Weather

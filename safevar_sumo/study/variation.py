@@ -4,16 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import msgspec
 from msgspec import Meta, Struct
 
 from safevar_sumo.errors import InputError, unknown_name
-from safevar_sumo.study.units import unit_text
-
-if TYPE_CHECKING:
-    from safevar_sumo.study.schema import CharacteristicTable
+from safevar_sumo.study.characteristics import CharacteristicTable, unit_text
 
 MAX_WIDTHS = 100
 """Largest standard deviation of a normal distribution truncated to the domain [widths of the domain]. A wider distribution differs from the

@@ -261,17 +261,6 @@ def test_stored_results_are_read_as_they_were_written(stored: str) -> None:
         pd.testing.assert_frame_equal(result.evaluations, load_runs(STORED / "format-1").evaluations)
 
 
-def test_results_with_the_mean_of_a_matrix_are_read_though_a_study_may_no_longer_ask_for_it(tmp_path: Path) -> None:
-    shutil.copytree(STORED / "format-2", tmp_path / "out")
-    file = tmp_path / "out" / "manifest.json"
-    manifest = json.loads(file.read_text())
-    manifest["study"]["matrix"] = {"tests": [{"name": "crossing", "over": {"speed": [20]}}], "aggregate": "mean"}
-    file.write_text(json.dumps(manifest))
-    (case,) = load_cases([tmp_path / "out"])
-    assert case.study.matrix is not None
-    assert case.study.matrix.aggregate == "mean"
-
-
 def test_the_format_that_is_written_now_is_stored_here() -> None:
     assert (STORED / f"format-{FORMAT}").is_dir()
 

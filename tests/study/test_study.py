@@ -38,16 +38,6 @@ def test_rain_differs_from_sun_only_in_weather_and_reaction_of_its_driver() -> N
     assert all(row.own for row in rain.calibration.values())
 
 
-def test_a_weathers_hesitation_of_former_files_is_the_drivers() -> None:
-    weather = {"name": "drizzle", "road_friction": 1.0, "visibility": 1.0, "hesitation": 0.1}
-    moved, still = load_study("sun", weather=weather), load_study("sun", weather={**weather, "hesitation": 0})
-    assert moved.ads.parameters["hesitation"] == 0.1
-    assert any("ads.parameters.hesitation" in remark for remark in moved.origin.remarks)
-    assert still.ads == load_study("sun").ads
-    with pytest.raises(InputError, match="hesitation"):
-        assemble(load_study("sun", weather=weather, ads={"model": "full_braking"}))
-
-
 def variant(tmp_path: Path, old: str, new: str) -> str:
     text = (STUDIES / "sun.toml").read_text()
     assert old in text
@@ -73,7 +63,7 @@ def variant(tmp_path: Path, old: str, new: str) -> str:
     ("original = 5800", "original = 'many'", "vehicle.characteristics.max_rpm.original = 'many'"),
     ("original = 0.15, lower = 0.1", "original = 0, lower = -1", "vehicle.characteristics.dampRateFullT.original = 0"),
     ("[ads]", "[ads", "is not TOML"),
-    ('name = "sun"', 'name = "../sun"', "name = '../sun'"),
+    ('name = "sun"', 'name = "../sun"', "name = '../sun'\nexpected: letters, digits, _, . and -"),
     ('name = "sun"', 'name = "sun"\nextends = "nothing"', "nothing"),
 ])
 def test_a_bad_study_is_refused_with_file_key_and_value(tmp_path: Path, old: str, new: str, expected: str) -> None:
@@ -87,22 +77,19 @@ def test_a_bad_study_is_refused_with_file_key_and_value(tmp_path: Path, old: str
 
 
 @pytest.mark.parametrize(("text", "expected"), [
-    ("[ads.parameters]\nlatency = 2024-05-01", "ads.parameters.latency = 2024-05-01, a date or time"),
-    ("[ads.parameters]\nmodel = { when = [07:30:00] }", "ads.parameters.model.when.0 = 07:30:00"),
-    ("[ads.parameters]\nseed = 18446744073709551616", "ads.parameters.seed = 18446744073709551616, beyond 64 bits"),
-    (f"[ads.parameters]\nseed = 1{'0' * 5000}", "digits"),
     ("[search]\nruns = 1_000_000", "search.runs = 1000000"),
     ("[search]\nevaluations = 9223372036854775807", "search.evaluations"),
-    ("[ads.parameters]\n\"a\\u0007\" = 1", "is no name"),
     ("[variation.mass]\ndistribution = 'normal'\ndeviation = 1e300", "variation.mass.deviation = 1e+300\nexpected: at most 66000"),
     ("[variation.mass]\ndistribution = 'uniform'\nlower = 9999", "variation.mass.lower = 9999"),
     ('[calibration."ads.parameters.brake_gap"]\nlower = "a"', "calibration.'ads.parameters.brake_gap'.lower = 'a'"),
     ('[calibration."ads.parameters.brake_gap"]\nlow = 1', "calibration.'ads.parameters.brake_gap'.low: there is no such key"),
     ('[published]\ntet = "much"', "published.tet = 'much'"),
-    ('title = "a\\u001b[31mred"', "title = "),
     ("seed = 3", "seed: there is no such key; did you mean search.seed or fit.seed?"),
     ("[search]\nttc_threshold = 3", "search.ttc_threshold: there is no such key; did you mean metrics.ttc_threshold?"),
     ("[vehicle.characteristics.masss]\noriginal = 9", "vehicle.characteristics.masss lacks unit, lower, upper; did you mean 'mass'?"),
+    ("evaluatons = 5", "evaluatons: there is no such key; did you mean search.evaluations?"),
+    ("\n".join(f"x{i} = 1" for i in range(20_000)), "more than 8 mistakes: x0: there is no such key"),
+    ('[weather]\nname = "x"\nroad_friction = 0\nvisibility = 1', "weather.road_friction = 0\nexpected: a number above 0 to 1.5"),
     ("zzz = 1", "zzz: there is no such key\nexpected: one of ads, calibration"),
     ("[origin]\nplaces = []", "origin"),
     ("[vehicle]\ncharacteristics = 3", "vehicle.characteristics = 3\nexpected: a table"),
@@ -115,9 +102,6 @@ def test_a_bad_study_is_refused_with_file_key_and_value(tmp_path: Path, old: str
     ("search = 3", "search = 3"),
     ('[vehicle]\nmodel = "tesla"', "vehicle.characteristics is missing, for model = 'tesla'"),
     ('extends = "mine.toml"\n', "extends = 'mine.toml' leads back to this file\nexpected: a study that does not extend"),
-    ('[weather]\nname = "x"\nroad_friction = 1\nvisibility = 1\nhesitation = 0.3\n[ads.parameters]\nhesitation = 0.1',
-     "weather.hesitation = 0.3 and ads.parameters.hesitation = 0.1\nexpected: ads.parameters.hesitation alone"),
-    ('weather = { name = "x", road_friction = 1, visibility = 1, hesitation = [] }', "weather.hesitation = []\nexpected: a number"),
     ("[vehicle]\nstep = 0.001", "vehicle.step: 'carla' is no FMU\nexpected: no such key, or vehicle.kind = \"fmu\""),
     ('[vehicle.inputs]\nfoo = "bar"', "vehicle.inputs: 'carla' is no FMU"),
     ("[vehicle.sensors]\nmount = 1", "vehicle.sensors: 'carla' is no FMU"),
@@ -127,7 +111,6 @@ def test_a_bad_study_is_refused_with_file_key_and_value(tmp_path: Path, old: str
     ('[calibration."ads.parameters.brake_gapp"]\nlower = 1\nupper = 2\nunit = "m"\nmeaning = "x"',
      "calibration.'ads.parameters.brake_gapp' is no parameter of the study"),
     ("extends = 3\n", "extends"),
-    (f"[ads.parameters.{'.'.join(['deep'] * 1500)}]\nx = 1", "ads is nested too deeply\nexpected: at most 32 tables"),
 ])
 def test_an_unusable_value_is_refused_by_its_key(text: str, expected: str, tmp_path: Path) -> None:
     path = tmp_path / "mine.toml"

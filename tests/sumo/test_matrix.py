@@ -76,11 +76,6 @@ def test_results_do_not_depend_on_the_batch_the_order_of_points_or_the_size_of_s
     assert same(evaluate(SYSTEM, population), whole)
 
 
-def test_a_mean_of_distances_and_speeds_is_refused() -> None:
-    with pytest.raises(InputError, match=r"(?s)wear.toml: matrix\.aggregate = 'mean'.*'worst'"):
-        load_study("wear", matrix={"aggregate": "mean", "tests": [{"name": "CPNA", "parameters": {"test": "CPNA"}}]})
-
-
 def test_named_point_finds_a_point_and_suggests_similar_names() -> None:
     assert system_at_point(SYSTEM, "CPLA, speed 30, clear", "--point").scenario.speed == 30  # type: ignore[attr-defined]
     with pytest.raises(InputError, match="CPNCO, speed 40, clear"):

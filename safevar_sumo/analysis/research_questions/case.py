@@ -17,7 +17,7 @@ from safevar_sumo.metrics import PUBLISHED_SCORING, MetricFacts, Scoring, Unsafe
 from safevar_sumo.records import FloatArray, Outcome
 from safevar_sumo.results import MANIFEST, Failure, failure_lines, folders_of, load_runs
 from safevar_sumo.scenarios import weather_of
-from safevar_sumo.study import Origin, Study, Weather, error_with_key, upgrade_tables
+from safevar_sumo.study import Origin, Study, Weather, error_with_key
 from safevar_sumo.vehicles import CharacteristicSet
 
 NSGA2 = "nsga2"
@@ -182,7 +182,7 @@ def load_case(directory: Path) -> Case:
     """Read one results directory."""
     manifest, evaluations, solutions, finished, failures = load_runs(directory)
     try:
-        study = msgspec.convert(upgrade_tables(manifest["study"]), Study)
+        study = msgspec.convert(manifest["study"], Study)
         study = msgspec.structs.replace(study, origin=Origin(places=folders_of(directory)))
     except msgspec.ValidationError as error:
         raise error_with_key(directory / MANIFEST, manifest["study"], error, "study") from None
