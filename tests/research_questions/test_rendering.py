@@ -28,7 +28,7 @@ from safevar_sumo.analysis.research_questions.figures import (
     draw_pareto_fronts,
 )
 from safevar_sumo.analysis.research_questions.gallery import FIGURES_OF_ALL_CASES, FIGURES_OF_ONE_CASE, draw_figures, save_figures
-from safevar_sumo.analysis.research_questions.layout import PAPER_LAYOUTS
+from safevar_sumo.analysis.research_questions.layout import PAPER_LAYOUTS, Layouts
 from safevar_sumo.analysis.research_questions.tables import FORMATS, as_json, as_latex, as_markdown, as_text, escaped_for_latex
 from safevar_sumo.errors import InputError
 from safevar_sumo.study import CharacteristicTable, load_study
@@ -122,13 +122,27 @@ def test_json_records_have_the_promised_keys(question: str, keys: set[str]) -> N
 
 
 def test_significant_and_notable_cells_stand_out() -> None:
-    cases = [made_up(*(row(sd=1 - i / 100) for i in range(30)))]
+    cases = [made_up(*(row(run=i % 8, sd=1 - i / 100) for i in range(30)))]
     result = answer_questions(cases, "rq1")
     assert "<0.001*  0.000*" in as_text(result)
     assert r"\textbf{\textless{}0.001} & \textbf{0.000}" in as_latex(result)
     assert r"**\<0.001** | **0.000**" in as_markdown(result)
     even = as_text(answer_questions([made_up(row(sd=1), row(sd=3))], "rq1")).splitlines()
     assert next(line for line in even if " SD " in line).count("*") == 0
+
+
+@pytest.mark.parametrize("layouts", [None, PAPER_LAYOUTS])
+def test_pooled_solutions_of_too_few_runs_do_not_stand_out_either(layouts: Layouts | None) -> None:
+    """As at the end of a study: seven runs are too few for RQ1, five are enough for RQ2, whatever the number of solutions."""
+    case = made_up(*(row(name, run=i % 7, sd=sd - i / 100) for name, sd in (("nsga2", 0.5), ("rs", 1.5)) for i in range(30)))
+    for question, stands_out in (("rq1", False), ("rq2", True)):
+        (answer,) = answer_questions([case], question)
+        lines = [line for line in as_text([answer], layouts).splitlines() if "<0.001" in line]
+        assert lines
+        assert any("*" in line for line in lines) is stands_out
+        assert any("too few runs of NSGA-II, RS for a test (8 are needed)" in note for note in answer.notes) is not stands_out
+    (imported,) = answer_questions([dataclasses.replace(case, has_runs=False)], "rq1")
+    assert "*" in as_text([imported], layouts).replace("(or *)", ""), "the runs of imported solutions are unknown"
 
 
 @pytest.mark.parametrize("question", ["rq1-runs", "rq2-runs"])
@@ -146,7 +160,7 @@ def test_what_cannot_be_told_is_never_a_nan(kind: str) -> None:
 
 
 def test_the_papers_layout_has_cases_by_metrics_and_cells_of_p_and_a12() -> None:
-    cases = [made_up(*(row(sd=1 - i / 100) for i in range(30))), rich_setting(name="wet", weather="hard_rain")]
+    cases = [made_up(*(row(run=i % 8, sd=1 - i / 100) for i in range(30))), rich_setting(name="wet", weather="hard_rain")]
     output = as_text(answer_questions(cases, "rq1"), PAPER_LAYOUTS)
     head = next(line for line in output.splitlines() if line.startswith("case"))
     assert head.split() == ["case", "algorithm", "SD", "TET", "TIT", "aveDece"]

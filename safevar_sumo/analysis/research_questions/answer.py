@@ -24,7 +24,7 @@ from safevar_sumo.analysis.research_questions.changes import (
     rq33_safety,
 )
 from safevar_sumo.analysis.research_questions.comparisons import rq1, rq2
-from safevar_sumo.analysis.research_questions.over_runs import notes_over_runs, rq1_runs, rq2_runs
+from safevar_sumo.analysis.research_questions.over_runs import algorithms_with_few_runs, fewest_runs, notes_over_runs, rq1_runs, rq2_runs
 from safevar_sumo.errors import unknown_name
 from safevar_sumo.metrics import PUBLISHED_SCORING, MetricFacts
 
@@ -46,16 +46,22 @@ FRAMES_OF_ONE_CASE: Mapping[str, Callable[[Case], Frames]] = {
     "combinations": lambda case: {"combinations": frequent_combinations(case)},
 }
 WEATHER = "weather"
+POOLED_QUESTIONS = ("rq1", "rq2")
+"""The questions whose tests pool the solutions of all runs."""
 QUESTIONS = (*FRAMES_OF_ONE_CASE, SAFETY_TABLE, WEATHER)
 
 
 class Answer(NamedTuple):
-    """The answer to a question: a tidy frame over all cases (empty if no case has an answer), notes on the frame, and the metrics."""
+    """The answer to a question: a tidy frame over all cases (empty if no case has an answer), notes on the frame, and the metrics.
+
+    `untested` are the pairs of case and algorithm whose runs are too few for a test: none of their p-values counts as significant.
+    """
 
     name: str
     frame: pd.DataFrame
     notes: tuple[str, ...]
     metrics: tuple[MetricFacts, ...] = PUBLISHED_SCORING.metrics
+    untested: frozenset[tuple[str, str]] = frozenset()
 
 
 def answer_questions(cases: Sequence[Case], question: str | None = None) -> list[Answer]:
@@ -82,7 +88,9 @@ def answer_questions(cases: Sequence[Case], question: str | None = None) -> list
             answered_names = {*frame["setting"], *frame["other"]} if name == WEATHER else case_names - {error.source for error in errors}
             case_notes = [note for case in cases if case.name in answered_names
                           for note in _notes(table, case, alone=question is not None)]
-            answers.append(Answer(table, frame, tuple(dict.fromkeys([*notes, *case_notes])), metrics))
+            untested = frozenset((case.name, algorithm) for case in cases for algorithm in algorithms_with_few_runs(case, table.upper())
+                                 ) if table in POOLED_QUESTIONS else frozenset()
+            answers.append(Answer(table, frame, tuple(dict.fromkeys([*notes, *case_notes])), metrics, untested))
     if all_errors and all(answer.frame.empty for answer in answers):
         raise all_errors[0]
     return [answer for answer in answers if answer.name == SAFETY_TABLE] if question == SAFETY_TABLE else answers
@@ -109,7 +117,10 @@ def _collect_frames(name: str, cases: Sequence[Case]) -> tuple[dict[str, list[pd
 def _notes(question: str, case: Case, *, alone: bool) -> list[str]:
     """Notes on a case for the readers of a table; `alone` if it is the only question asked."""
     notes = list(case.remarks)
-    if question in ("rq1", "rq2"):
+    if question in POOLED_QUESTIONS:
+        if few := [ALGORITHM_TITLES.get(name, name) for name in algorithms_with_few_runs(case, question.upper())]:
+            notes.append(f"{case.name}: too few runs of {', '.join(few)} for a test ({fewest_runs(question.upper())} are needed): "
+                         "no p-value of pooled solutions stands out.")
         for metric in case.scoring.metrics:
             rows = solutions_for_metric(case.solutions, metric)
             undefined_values = int(rows[metric.name].isna().sum())

@@ -6,6 +6,7 @@ In the frames, the columns `setting` and `other` hold the names of cases.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
@@ -130,21 +131,28 @@ def _lay_out_tests(answer: Answer, group_column: str, size_columns: tuple[str, .
     marks = {} if has_holm else {EXACT_TEST: "e"}
     method_notes = [f"p{f' with {marks[method]}' if method in marks else ''}: {method}."
                     for method in (EXACT_SIGNED_TEST, ASYMPTOTIC_SIGNED_TEST, ASYMPTOTIC_TEST, EXACT_TEST) if method in methods]
-    return pivot_table(TITLES[answer.name], frame, (group_column, "metric"), lambda row: _format_test_cells(row, size_columns, marks),
+    return pivot_table(TITLES[answer.name], frame, (group_column, "metric"),
+                       lambda row: _format_test_cells(answer, row, size_columns, marks),
                        ("p", *(("p Holm",) if has_holm else ()), "A12", "magnitude", *size_columns), names=_titles(answer),
                        notes=(*method_notes, *notes, HOLM_NOTE if has_holm else BOLD_NOTE))
 
 
-def _format_test_cells(row: Row, size_columns: Sequence[str] = (), marks: Mapping[str, str] = MappingProxyType({})) -> tuple[str, ...]:
+def _format_test_cells(answer: Answer, row: Row, size_columns: Sequence[str] = (),
+                       marks: Mapping[str, str] = MappingProxyType({})) -> tuple[str, ...]:
     """P-value with a mark for its method, Holm's p-value if the row has one, effect size, magnitude, sizes of the samples."""
     has_holm = "p_holm" in row
     if pd.isna(row["p_value"]):
         return (UNDEFINED,) * (3 + has_holm + len(size_columns))
-    is_significant = row["p_holm" if has_holm else "p_value"] < ALPHA
+    is_significant = row["p_holm"] < ALPHA if has_holm else _is_significant(answer, row)
     p = format_p_value(row["p_value"]) + marks.get(row["method"], "")
     effect = _bold_if(f"{row['effect_size']:.3f}", is_significant and (has_holm or row["magnitude"] in NOTABLE_MAGNITUDES))
     tests = (p, _bold_if(format_p_value(row["p_holm"]), is_significant)) if has_holm else (_bold_if(p, is_significant),)
     return (*tests, effect, row["magnitude"], *(str(row[column]) for column in size_columns))
+
+
+def _is_significant(answer: Answer, row: Row) -> bool:
+    """Whether a test of pooled solutions counts as significant: enough runs stand behind it."""
+    return bool(row["p_value"] < ALPHA) and (row["setting"], row.get("algorithm", row.get("baseline"))) not in answer.untested
 
 
 def _lay_out_rq1(answer: Answer) -> list[Table]:
@@ -186,7 +194,7 @@ def _lay_out_pairs(answer: Answer) -> list[Table]:
     """A table for each pair: its metrics, cases side by side."""
     notes = ("One value for each run; A12 above 0.5: the first is better (a better front, more unsafe solutions).",
              non_collision_note(answer.metrics), "Holm's correction is for all pairs and metrics of a case.")
-    return [pivot_table(TITLES["rq2-pairs"], answer.frame, ("algorithm", "other", "metric"), _format_test_cells,
+    return [pivot_table(TITLES["rq2-pairs"], answer.frame, ("algorithm", "other", "metric"), partial(_format_test_cells, answer),
                         ("p", "p Holm", "A12", "magnitude"), names=_titles(answer), notes=notes)]
 
 
@@ -296,7 +304,7 @@ def _lay_out_paper_tests(answer: Answer, group_column: str, note: str) -> list[T
         if pd.isna(row["p_value"]):
             return (UNDEFINED,)
         cell = f"{format_p_value(row['p_value'])} / {row['effect_size']:.3f}"
-        return (_bold_if(cell, row["p_value"] < ALPHA and row["magnitude"] in NOTABLE_MAGNITUDES),)
+        return (_bold_if(cell, _is_significant(answer, row) and row["magnitude"] in NOTABLE_MAGNITUDES),)
 
     table = pivot_table(TITLES[answer.name], answer.frame, ("setting", group_column), cells, over="metric", names=ALGORITHM_TITLES,
                         notes=(CELL_NOTE, note))

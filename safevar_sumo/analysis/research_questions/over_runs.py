@@ -112,6 +112,15 @@ def fewest_runs(question: str) -> int:
     return next(n for n in range(1, 100) if 2 / (2**n if question == "RQ1" else math.comb(2 * n, n)) < ALPHA)
 
 
+def algorithms_with_few_runs(case: Case, question: str) -> list[str]:
+    """RQ1's algorithms or RQ2's baselines with too few runs for a significant test; none if the runs are unknown (imported)."""
+    if not case.has_runs or (question == "RQ2" and NSGA2 not in case.algorithms):
+        return []
+    runs = {name: len(case.runs_of(name)) for name in case.algorithms}
+    most = runs.pop(NSGA2) if question == "RQ2" else math.inf
+    return [name for name, number in runs.items() if min(number, most) < fewest_runs(question)]
+
+
 def significance_change_line(case: Case) -> str:
     """One line: the tests with enough runs that are significant (p < ALPHA) only for the paper's pooled solutions, or only over runs.
 
