@@ -238,7 +238,8 @@ class Guard(NamedTuple):
     def failure(self, method: str, error: BaseException) -> UserCodeError:
         """The error for an exception that user code raised."""
         location = self.location(error)
-        problem = f"{self.name} raised in {method}: {describe_error(error)}{f' ({location})' if location else ''}"
+        reason = f"{error.source}: {error.problem}" if isinstance(error, InputError) else describe_error(error)
+        problem = f"{self.name} raised in {method}: {reason}{f' ({location})' if location else ''}"
         return UserCodeError(self.source, problem, error.legal if isinstance(error, InputError) else "")
 
     def wrong_value(self, method: str, quantity: str, value: object, expected: str) -> UserCodeError:

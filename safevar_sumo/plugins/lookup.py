@@ -143,7 +143,7 @@ class Lookup(NamedTuple):
             module = guard._replace(folder=folder).call("import", importlib.import_module, name)
         except UserCodeError as error:
             problem = error.problem.replace("raised in import", "cannot be imported", 1)
-            expected = f"a module in {' or '.join(dict.fromkeys(folders))}, or an installed one"
+            expected = error.legal or f"a module in {' or '.join(dict.fromkeys(folders))}, or an installed one"
             raise UserCodeError(self.source, problem, expected) from error
         finally:
             sys.dont_write_bytecode = dont_write_bytecode

@@ -19,7 +19,17 @@ from safevar_sumo.ads import ADS, ADS_CONTRACT, REACTION_PARAMETERS, SCALAR_ADS_
 from safevar_sumo.errors import InputError, one_of, unknown_name
 from safevar_sumo.fmu import STEP_LIMIT, description_of
 from safevar_sumo.metrics import METRIC_OF_OBJECTIVE, METRICS, OPTIONAL_METRICS, RATING_POINTS, Metric, Objective, Scoring, guard_metric
-from safevar_sumo.plugins import Guard, Lookup, Member, ModuleCopies, check_parameters, guard_process_state, instance_of, limit_user_code
+from safevar_sumo.plugins import (
+    Guard,
+    Lookup,
+    Member,
+    ModuleCopies,
+    accepts,
+    check_parameters,
+    guard_process_state,
+    instance_of,
+    limit_user_code,
+)
 from safevar_sumo.protocol.rater import Rater, expand_protocol, is_rated, rater_of
 from safevar_sumo.records import FloatArray, Nominal
 from safevar_sumo.scenarios import SCENARIO_CONTRACT, SCENARIOS, GuardedScenario, Point, Scenario, equals_clear, weather_of
@@ -117,7 +127,7 @@ def _check_duplicates(objectives: Iterable[Objective], source: str) -> None:
         raise InputError(source, f"search.objectives: one of {', '.join(names)} is named twice", choices)
 
 
-CONTROLLER_FORMS = "a function step(traci, vehicle_id), or a class with that method"
+CONTROLLER_FORMS = "a function step(traci, vehicle_id) with the body of a script's loop, or a class with that method"
 """The legal forms of a controller written for TraCI."""
 
 
@@ -251,9 +261,11 @@ def _create_traci_controller(table: ModelTable, lookup: Lookup) -> tuple[Ads, Me
     with substitute_traci():
         member = lookup.find({}, table.model, "ads.model")
         controller, parameters = member.target, lookup.with_paths(member, table.parameters, "ads.parameters")
-        if not callable(getattr(controller, "step", None) if inspect.isclass(controller) else controller):
-            raise InputError(lookup.source, f"{name} has no step", CONTROLLER_FORMS)
-        if not inspect.isclass(controller):
+        is_class = inspect.isclass(controller)
+        step = getattr(controller, "step", None) if is_class else controller
+        if not callable(step) or not (is_class or parameters or accepts(step, 2)):
+            raise InputError(lookup.source, f"{name} cannot be called as step(traci, vehicle_id)", CONTROLLER_FORMS)
+        if not is_class:
             check_parameters(controller, (None, None), parameters, name, "ads.parameters", lookup.source)
 
         def controller_of(target: Any) -> Any:

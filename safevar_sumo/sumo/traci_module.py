@@ -11,7 +11,7 @@ from typing import Any
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.sumo.engine import Engine, engine_api
-from safevar_sumo.sumo.traci_view import TraciView, positional_arguments, real_traci, traci_exception
+from safevar_sumo.sumo.traci_view import TraciView, positional_arguments, real_traci, refuse_own_loop, traci_exception
 
 VARIABLES: Mapping[str, str] = {
     "TRACI_ID_LIST": "getIDList", "ID_COUNT": "getIDCount", "VAR_POSITION": "getPosition", "VAR_POSITION3D": "getPosition3D",
@@ -180,7 +180,9 @@ class _Domain:
 def _make_function(domain: str, name: str) -> Callable[..., Any]:
     def function(*arguments: Any, **named: Any) -> Any:
         if not _driven_vehicles:
-            raise InputError(f"traci.{domain}.{name}".replace("..", "."), "is called while no vehicle is driven",
+            full_name = f"traci.{domain}.{name}".replace("..", ".")
+            refuse_own_loop(domain, name, full_name)
+            raise InputError(full_name, "is called while no vehicle is driven",
                              "calls within start and step, not where a module is imported")
         view, subscriptions = _driven_vehicles[-1]
         if domain and "subscri" in name.lower():

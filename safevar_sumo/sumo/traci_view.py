@@ -25,14 +25,13 @@ COMMANDS: Mapping[str, tuple[str, ...]] = {
     "setSpeed": ("speed",), "slowDown": ("speed", "duration"), "setAcceleration": ("acceleration", "duration"), "setAccel": ("accel",),
     "setDecel": ("decel",), "setMaxSpeed": ("speed",), "setSpeedMode": ("mode",)}
 """The commands that a controller may give, each with its numeric arguments."""
-EXPECTED_CALLS = "only queries and commands in a controller's step"
 SUMO_CONTROL = -1.0
 """Value of a speed or speed mode with which a command returns control to SUMO's own driver."""
 QUERY_FUNCTIONS = re.compile("(get|is|has|find|convert|couldChangeLane).*")
 DISPLAY_FUNCTIONS = ("setColor", "highlight")
-STEP_FUNCTIONS = ("simulationStep", "simulationStepLegacy", "executeMove", "step")
-SESSION_FUNCTIONS = ("start", "init", "connect", "load", "close", "switch", "switchConnection", "setOrder", "loadState", "saveState")
-"""Functions that advance simulations, and functions that begin or end them."""
+LOOP_FUNCTIONS = ("start", "init", "connect", "load", "close", "switch", "switchConnection", "setOrder", "loadState", "saveState",
+                  "simulationStep", "simulationStepLegacy", "executeMove", "step")
+"""Functions that begin, advance or end simulations."""
 VISIBLE_PROPERTIES = re.compile("get(Length|Width|Height|MinGap|VehicleClass|ShapeClass|TypeID|Color|(Emergency|Apparent)?Decel|Accel"
                                 "|MaxSpeed|Tau|Mass)")
 """Functions that return properties of other actors that are visible at once or follow from the actor's type."""
@@ -159,10 +158,7 @@ class TraciView:
 
     def _dispatch(self, domain: str, name: str, arguments: tuple[Any, ...]) -> Any:
         full_name = f"traci.{domain}.{name}" if domain else f"traci.{name}"
-        if name in STEP_FUNCTIONS and domain in ("", "simulation"):
-            raise InputError(full_name, "safevar advances the simulation; remove this call", EXPECTED_CALLS)
-        if name in SESSION_FUNCTIONS and domain in ("", "simulation"):
-            raise InputError(full_name, "safevar starts and ends the simulation; remove this call", EXPECTED_CALLS)
+        refuse_own_loop(domain, name, full_name)
         if not QUERY_FUNCTIONS.fullmatch(name):
             return self._command(domain, name, full_name, arguments)
         if not domain:
@@ -263,6 +259,13 @@ class TraciView:
             return False
         copy, dot, name = value.removeprefix(":").removeprefix("!").partition(".")
         return bool(dot and copy.isdecimal() and name in self._names and int(copy) != self._copy)
+
+
+def refuse_own_loop(domain: str, name: str, full_name: str) -> None:
+    """Refuse a function that begins, advances or ends the simulation; raises InputError."""
+    if name in LOOP_FUNCTIONS and domain in ("", "simulation"):
+        raise InputError(full_name, "safevar_sumo itself starts, advances and ends the simulation",
+                         "the body of your script's loop, without this call, as a function step(traci, vehicle_id)")
 
 
 def _invalid_value(value: Any) -> Any:

@@ -15,6 +15,7 @@ from safevar_sumo.records import Outcome
 from safevar_sumo.study import ModelTable, load_study
 from safevar_sumo.sumo.matrix import evaluate, simulate
 from safevar_sumo.sumo.system import System, assemble
+from tests.in_process import run
 
 SCRIPT = '''
 def step(traci, vehicle_id):
@@ -177,11 +178,11 @@ def test_no_function_returns_ids_or_actors_of_other_copies(tmp_path: Path, monke
 
 
 REFUSED = [
-    ("traci.simulationStep()", "traci.simulationStep: safevar advances the simulation; remove this call"),
-    ("traci.simulation.step()", "safevar advances the simulation; remove this call"),
-    ("traci.simulation.executeMove()", "safevar advances the simulation; remove this call"),
-    ("traci.executeMove()", "safevar advances the simulation; remove this call"),
-    ("traci.close()", "traci.close: safevar starts and ends the simulation; remove this call"),
+    ("traci.simulationStep()", "traci.simulationStep: safevar_sumo itself starts, advances and ends the simulation"),
+    ("traci.simulation.step()", "safevar_sumo itself starts, advances and ends the simulation"),
+    ("traci.simulation.executeMove()", "safevar_sumo itself starts, advances and ends the simulation"),
+    ("traci.executeMove()", "safevar_sumo itself starts, advances and ends the simulation"),
+    ("traci.close()", "traci.close: safevar_sumo itself starts, advances and ends the simulation"),
     ("traci.vehicle.setSpeed('parked_ahead', 3)", "traci.vehicle.setSpeed: vehID = 'parked_ahead' is not the vehicle under test"),
     ("traci.vehicle.setSpeed(v, speed=float('nan'))", "traci.vehicle.setSpeed: speed = nan"),
     ("traci.vehicle.setSpeed(v, -0.5)", "traci.vehicle.setSpeed: speed = -0.5"),
@@ -205,6 +206,42 @@ def test_illegal_calls_are_refused_even_if_the_controller_catches_the_error(line
         simulate(runs, changed(runs))
     assert problem in str(caught.value)
     assert "my_controller.py:3" in str(caught.value)
+
+
+OWN_LOOP = """
+import traci
+
+
+def step(traci, v):
+    traci.simulationStep()
+
+
+def run():
+    while traci.simulation.getMinExpectedNumber() > 0:
+        traci.simulationStep()
+
+
+def main(traci, v):
+    traci.start(["sumo", "-c", "scenario.sumocfg"])
+    run()
+"""
+
+
+@pytest.mark.parametrize(("model", "problem"), [
+    ("my_script:step", "raised in step: traci.simulationStep: safevar_sumo itself starts, advances and ends the simulation"),
+    ("my_script:main", "raised in step: traci.start: safevar_sumo itself starts"),
+    ("my_script:run", "cannot be called as step(traci, vehicle_id)"),
+    ("my_loop:run", "cannot be imported: traci.start: safevar_sumo itself starts"),
+])
+def test_a_script_with_a_loop_of_its_own_is_told_once_what_to_change(model: str, problem: str, in_tmp: Path) -> None:
+    Path("my_script.py").write_text(OWN_LOOP)
+    Path("my_loop.py").write_text(f"{OWN_LOOP}\n\nmain(traci, 'vut')\n")
+    Path("mine.toml").write_text(f'extends = "native"\nname = "mine"\n[ads]\nkind = "traci"\nmodel = "{model}"\n')
+    (error,) = run("simulate", "mine.toml", expect=2).stderr.split("safevar-sumo: ")[1:]
+    assert problem in error
+    assert len(error.splitlines()) == 2
+    assert error.count("expected: ") == 1
+    assert "as a function step(traci, vehicle_id)" in error or "a function step(traci, vehicle_id) with the body" in error
 
 
 def test_a_script_stops_the_original_but_not_a_vehicle_with_weak_brakes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
