@@ -88,8 +88,9 @@ def _open_spreadsheet(xlsx: Path | None, template: Path | None, preprocessed: Pa
     source_file = template if template is not None else preprocessed
     if source_file is None:
         if xlsx is not None:
-            raise InputError("--xlsx", f"{xlsx} needs the official template; to make it, run `pip install euroncap-rating-2026` and "
-                                       "`euroncap_rating_2026 crash_avoidance generate-template`",
+            raise InputError("--xlsx", f"{xlsx} needs the official template; to make it, run `python -m venv calculator`, "
+                                       "`calculator/bin/pip install euroncap-rating-2026` and "
+                                       "`calculator/bin/euroncap_rating_2026 crash_avoidance generate-template`",
                              "--template FILE, or --preprocessed FILE")
         return None
     if template is not None and xlsx is None:

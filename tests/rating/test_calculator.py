@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -107,3 +110,15 @@ def test_other_cells_and_sheets_are_refused_by_name(template: Path, tmp_path: Pa
         Template(tmp_path / "other.xlsx", tmp_path / "out.xlsx")
     with pytest.raises(InputError, match=r"has no sheet 'FC - Car & PTW verif.'"):
         PreprocessedFile(template, tmp_path / "out.xlsx")
+
+
+def test_the_pages_commands_run_as_typed(calculator: Calculator, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """All but the two that make the calculator's environment, which is there."""
+    page = (Path(__file__).parents[2] / "docs/rating.md").read_text(encoding="utf-8")
+    (block,) = (block for block in page.split("```text\n") if block.startswith("python -m venv calculator\ncalculator/bin/pip install "))
+    (tmp_path / "calculator").symlink_to(calculator.python.parents[1])
+    monkeypatch.setenv("PATH", f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}")
+    for line in block.split("\n```")[0].splitlines()[2:]:
+        done = subprocess.run(line, shell=True, cwd=tmp_path, capture_output=True, text=True, check=False)
+        assert done.returncode == 0, f"{line}\n{done.stdout}\n{done.stderr}"
+    assert list(tmp_path.glob("scored/*_report.xlsx"))
