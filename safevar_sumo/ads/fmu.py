@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from safevar_sumo.ads.driver import Trim, pedals_for, trim_at
-from safevar_sumo.errors import InputError, UserCodeError
-from safevar_sumo.fmu import Description, Fault, Fleet, History, Instances, constants_of, ports_of
+from safevar_sumo.errors import InputError
+from safevar_sumo.fmu import Description, Fleet, History, Instances, constants_of, ports_of
 from safevar_sumo.plugins import Guard
 from safevar_sumo.records import BoolArray, Command, FloatArray, Nominal, Observation
 
@@ -47,9 +47,7 @@ class FmuAds:
     inputs, outputs, parameters, step
         Values of these keys in the study.
     guard
-        Checks the results of the FMU.
-    limit
-        Longest time that an instance may take for one step [s].
+        Calls the FMU and checks its results.
 
     Raises
     ------
@@ -58,9 +56,9 @@ class FmuAds:
     """
 
     def __init__(self, description: Description, inputs: Mapping[str, str], outputs: Mapping[str, str], parameters: Mapping[str, Any],
-                 step: float | None, guard: Guard, limit: float) -> None:
+                 step: float | None, guard: Guard) -> None:
         source = guard.source
-        self._guard, self._communication_step = guard, step or description.step
+        self._guard, self._communication_step = guard, description.communication_step(step, source, "ads")
         input_ports = ports_of(description, inputs, {**OBSERVATION_UNITS, **CONSTANT_UNITS}, ("input",), source, "ads.inputs",
                                constants=CONSTANT_UNITS)
         output_ports = ports_of(description, outputs, OUTPUT_UNITS, ("output",), source, "ads.outputs")
@@ -69,9 +67,8 @@ class FmuAds:
         if not input_ports.keys() & OBSERVATION_UNITS.keys():
             raise InputError(source, "ads.inputs: no observed quantity", f"some of {', '.join(OBSERVATION_UNITS)}")
         self._inputs, self._outputs = tuple(input_ports), tuple(output_ports)
-        mapped_names = [port.variable.name for port in input_ports.values()]
-        self._instances = Instances(description, [*input_ports.values()], [*output_ports.values()],
-                                    list(constants_of(description, parameters, mapped_names, source, "ads.parameters")), limit)
+        constants = constants_of(description, parameters, [*input_ports.values()], source, "ads.parameters")
+        self._instances = Instances(description, [*input_ports.values()], [*output_ports.values()], constants)
         self.max_vehicles = self._instances.max_vehicles
         if "warns" in output_ports:
             self.warns = self._warns
@@ -83,11 +80,8 @@ class FmuAds:
 
     def drive(self, seen: Observation, memory: _Memory) -> tuple[Command, _Memory]:
         inputs = self._input_values(seen, memory.constants)
-        try:
-            history = memory.history or memory.fleet.start(inputs)[1]
-            (values, _), history = memory.fleet.advance(history, inputs)
-        except Fault as fault:
-            raise UserCodeError(self._guard.source, f"{self._guard.name} {fault}") from None
+        history = memory.history or self._guard.call("initialisation", memory.fleet.start, inputs)[1]
+        (values, _), history = self._guard.call("doStep", memory.fleet.advance, history, inputs)
         outputs = dict(zip(self._outputs, values, strict=True))
         warns = None if "warns" not in outputs else outputs["warns"] > 0.5
         memory = memory._replace(history=history, warns=warns)

@@ -1,20 +1,22 @@
-"""An FMU's `modelDescription.xml`: version, variables, units, and how the FMU may be simulated."""
+"""An FMU's model description, as FMPy reads it: which variables, units and steps a study may use."""
 
 from __future__ import annotations
 
 import os
-import xml.etree.ElementTree as ElementTree
-import zipfile
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from hashlib import sha256
 from math import isfinite
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING
+from zipfile import ZipFile
 
 from safevar_sumo.errors import InputError, describe_error, did_you_mean
 from safevar_sumo.fmu.units import BASE_UNITS, COMMON_UNITS, Unit
+
+if TYPE_CHECKING:
+    from fmpy.model_description import ModelDescription, ModelVariable
 
 REAL_TYPES = ("Real", "Float64", "Float32")
 """Types of variables that have units."""
@@ -25,49 +27,40 @@ MAX_MEANING = 200
 """Longest description of a variable that becomes a characteristic's meaning [characters]."""
 MAX_LISTED = 12
 """Largest number of variables that an error lists."""
-
-
-class Variable(NamedTuple):
-    """A variable; `unit` is None if the FMU does not define it; `start`, `lower` and `upper` are None if the FMU declares none."""
-
-    name: str
-    reference: int
-    type: str
-    causality: str
-    variability: str
-    unit_name: str
-    unit: Unit | None
-    start: Any
-    lower: float | None
-    upper: float | None
-    meaning: str
-
-    @property
-    def can_be_characteristic(self) -> bool:
-        """Whether this is a real parameter with the original value and the domain that a characteristic needs."""
-        return self.causality == "parameter" and self.variability != "constant" and self.type in REAL_TYPES and None not in (
-            self.start, self.lower, self.upper) and self.lower < self.upper and self.start != 0  # type: ignore[operator]
+MIN_STEP, MAX_STEP = 1e-6, 10.0
+"""Shortest and longest communication step [s]."""
 
 
 @dataclass(frozen=True)
 class Description:
-    """An FMU: its file, the digest of the file, and the declarations in it.
-
-    `identifier` is the name of its library, `token` its GUID (FMI 2.0) or instantiation token (FMI 3.0).
-    `step` is the step that the FMU requires [s], None if any step will do; with `single_instance` a process may hold only one instance.
-    """
+    """An FMU: its file, the digest of the file, FMPy's model description, the units that it defines, and its scalar variables by name."""
 
     path: str
     digest: str
-    version: str
-    identifier: str
-    token: str
-    step: float | None
-    single_instance: bool
+    model: ModelDescription = field(compare=False, repr=False)
     units: Mapping[str, Unit] = field(compare=False, repr=False)
-    variables: Mapping[str, Variable] = field(compare=False, repr=False)
+    variables: Mapping[str, ModelVariable] = field(compare=False, repr=False)
 
-    def variable(self, name: str, causalities: Collection[str], source: str, key: str, types: Collection[str] = NUMBER_TYPES) -> Variable:
+    @property
+    def is_single(self) -> bool:
+        """Whether a process may hold only one instance."""
+        return bool(self.model.coSimulation.canBeInstantiatedOnlyOncePerProcess)
+
+    def communication_step(self, stated: float | None, source: str, key: str) -> float | None:
+        """The time between two calls [s]: as stated, else the step that the FMU requires; None if any step will do.
+
+        An FMU requires its internal step, or its default step if its step cannot change.
+        """
+        simulation, default = self.model.coSimulation, getattr(self.model.defaultExperiment, "stepSize", None)
+        required = simulation.fixedInternalStepSize or (None if simulation.canHandleVariableCommunicationStepSize else default)
+        step = stated or float(required or 0.0)
+        if step and not MIN_STEP <= step <= MAX_STEP:
+            raise InputError(source, f"{Path(self.path).name} requires a step of {step:g} s",
+                             f"a step from {MIN_STEP:g} to {MAX_STEP:g} s; {key}.step sets another")
+        return step or None
+
+    def variable(self, name: str, causalities: Collection[str], source: str, key: str,
+                 types: Collection[str] = NUMBER_TYPES) -> ModelVariable:
         """A variable by name.
 
         Raises
@@ -75,39 +68,25 @@ class Description:
         InputError
             If the variable does not exist, or has another causality or type.
         """
-        candidates = [variable.name for variable in self.variables.values() if variable.causality in causalities and variable.type in types]
-        listing = ", ".join(candidates[:MAX_LISTED]) + ", ..." * (len(candidates) > MAX_LISTED)
-        expected = f"{_with_article(' or '.join(causalities))} of the FMU: {listing or 'it has none'}"
-        if name not in self.variables:
-            problem = f"{Path(self.path).name} has no such variable{did_you_mean(name, candidates)}"
-            raise InputError(source, f"{key} = {name!r}: {problem}", expected)
-        variable = self.variables[name]
-        if variable.causality not in causalities:
-            raise InputError(source, f"{key} = {name!r}: that variable is {_with_article(variable.causality)}", expected)
-        if variable.type not in types:
-            raise InputError(source, f"{key} = {name!r}: that variable is of type {variable.type}", f"a type among {', '.join(types)}")
-        return variable
-
-    def table_rows(self, fixed_names: Collection[str]) -> dict[str, dict[str, Any]]:
-        """Rows of the characteristics' table for all parameters that can be characteristics, except those of `fixed_names`."""
-        return {name: self.table_row(name) for name, variable in self.variables.items()
-                if variable.can_be_characteristic and name not in fixed_names}
-
-    def table_row(self, name: str, unit: str = "") -> dict[str, Any]:
-        """The table row that a parameter declares, converted to `unit` if a unit is given; empty if the variable is no parameter."""
+        names = [other.name for other in self.variables.values() if causality_of(other) in causalities and other.type in types]
+        listing = ", ".join(names[:MAX_LISTED]) + ", ..." * (len(names) > MAX_LISTED)
         variable = self.variables.get(name)
-        if variable is None or variable.causality != "parameter":
-            return {}
-        row = {"unit": variable.unit_name or "-", "original": variable.start, "lower": variable.lower, "upper": variable.upper,
-               "meaning": variable.meaning if len(variable.meaning) <= MAX_MEANING else ""}
-        declared_unit, row_unit = variable.unit, self.units.get(unit) or COMMON_UNITS.get(unit)
-        if unit and unit != row["unit"] and variable.unit_name:
-            if declared_unit is None or row_unit is None or not declared_unit.fits(row_unit):
-                return {}  # the vehicle model refuses the unit later
-            row |= {key: declared_unit.to(row_unit, row[key]) for key in ("original", "lower", "upper") if row[key] is not None}
-        return {key: value for key, value in row.items() if value not in (None, "")}
+        if variable is None:
+            problem = f"{Path(self.path).name} has no such variable{did_you_mean(name, names)}"
+        elif name not in names:
+            problem = f"that variable is {_with_article(causality_of(variable))} of type {variable.type}"
+        else:
+            return variable
+        raise InputError(source, f"{key} = {name!r}: {problem}", f"{_with_article(' or '.join(causalities))} of the FMU with a number: "
+                         f"{listing or 'it has none'}")
 
-    def unit_for(self, variable: Variable, unit: Unit, unit_name: str, source: str, key: str) -> Unit:
+    def unit_of(self, variable: ModelVariable) -> Unit | None:
+        """The unit of a variable; None if it declares none, or one that is not defined."""
+        name = declared(variable, "unit")
+        unit = self.units.get(name) or COMMON_UNITS.get(name)
+        return unit._replace(offset=0.0) if unit is not None and declared(variable, "relativeQuantity") else unit
+
+    def unit_for(self, variable: ModelVariable, unit: Unit, unit_name: str, source: str, key: str) -> Unit:
         """The unit of a variable that is to hold a quantity given in `unit`; `unit` itself if the variable declares no unit.
 
         Raises
@@ -115,14 +94,56 @@ class Description:
         InputError
             If the unit of the variable measures another kind of quantity or is not defined.
         """
-        if variable.type not in REAL_TYPES or not variable.unit_name:
+        name, variable_unit = declared(variable, "unit"), self.unit_of(variable)
+        if variable.type not in REAL_TYPES or not name:
             return unit
-        if variable.unit is None:
-            raise InputError(source, f"{key} = {variable.name!r}: its unit {variable.unit_name!r} has no BaseUnit in the UnitDefinitions",
+        if variable_unit is None:
+            raise InputError(source, f"{key} = {variable.name!r}: its unit {name!r} has no BaseUnit in the UnitDefinitions",
                              f"a unit with a BaseUnit of the same kind as {unit_name}")
-        if not variable.unit.fits(unit):
-            raise InputError(source, f"{key} = {variable.name!r}: its unit is {variable.unit_name!r}", f"a unit of {unit_name}")
-        return variable.unit
+        if not variable_unit.fits(unit):
+            raise InputError(source, f"{key} = {variable.name!r}: its unit is {name!r}", f"a unit of {unit_name}")
+        return variable_unit
+
+    def table_rows(self, fixed_names: Collection[str]) -> dict[str, dict[str, str | float]]:
+        """Rows of the characteristics' table for all real parameters with start, min and max, except those of `fixed_names`."""
+        rows = {name: self.table_row(name) for name, variable in self.variables.items()
+                if name not in fixed_names and variable.type in REAL_TYPES and variable.variability != "constant"}
+        return {name: row for name, row in rows.items()
+                if {"original", "lower", "upper"} <= row.keys() and row["lower"] != row["upper"] and row["original"] != 0}
+
+    def table_row(self, name: str, unit: str = "") -> dict[str, str | float]:
+        """The table row that a parameter declares, converted to `unit` if a unit is given; empty if the variable is no parameter."""
+        variable = self.variables.get(name)
+        if variable is None or causality_of(variable) != "parameter":
+            return {}
+        declared_name, meaning = declared(variable, "unit"), " ".join((variable.description or "").split())
+        numbers = {key: number for key, attribute in (("original", "start"), ("lower", "min"), ("upper", "max"))
+                   if (number := number_of(variable, attribute)) is not None}
+        row_unit, declared_unit = self.units.get(unit) or COMMON_UNITS.get(unit), self.unit_of(variable)
+        if unit and declared_name not in ("", unit):
+            if declared_unit is None or row_unit is None or not declared_unit.fits(row_unit):
+                return {}  # the vehicle model refuses the unit later
+            numbers = {key: declared_unit.to(row_unit, number) for key, number in numbers.items()}
+        return {"unit": declared_name or "-", **numbers, **({"meaning": meaning} if 0 < len(meaning) <= MAX_MEANING else {})}
+
+
+def causality_of(variable: ModelVariable) -> str:
+    return variable.causality or "local"
+
+
+def declared(variable: ModelVariable, name: str) -> str:
+    """An attribute of a variable or of its declared type; "" if neither has it."""
+    value = getattr(variable, name, None)
+    return (getattr(variable.declaredType, name, None) if value is None else value) or ""
+
+
+def number_of(variable: ModelVariable, name: str) -> float | None:
+    """A finite number that a variable or its declared type declares."""
+    try:
+        number = float(declared(variable, name))
+    except (TypeError, ValueError):
+        return None
+    return number if isfinite(number) else None
 
 
 def file_of(model: str, folders: Sequence[str]) -> str:
@@ -147,78 +168,34 @@ def description_of(model: str, folders: Sequence[str], source: str, key: str) ->
         folder = folders[0] if folders else os.getcwd()
         problem = "is a directory" if os.path.isdir(os.path.join(folder, model)) else f"there is no such file in {folder}"
         raise InputError(source, f"{key} = {model!r}: {problem}", SUPPORTED_FMU)
-    status = os.stat(path)
-    try:
-        return _read_description(path, status.st_mtime_ns, status.st_size, status.st_ino)
-    except InputError as error:
-        raise InputError(source, f"{key} = {model!r} {error.problem}", error.legal) from None
+    return _read_description(path, sha256(Path(path).read_bytes()).hexdigest(), source, f"{key} = {model!r}")
 
 
 @lru_cache(maxsize=32)
-def _read_description(path: str, *_: int) -> Description:  # also cached by the file's time, size and inode
+def _read_description(path: str, digest: str, source: str, name: str) -> Description:
     try:
-        from fmpy import platform, platform_tuple, sharedLibraryExtension
+        from fmpy import platform, platform_tuple
         from fmpy.model_description import read_model_description
     except ImportError:
-        raise InputError("fmu", "needs FMPy, which is not installed", "in the checkout: pip install '.[fmu]'") from None
-    try:
-        with zipfile.ZipFile(path) as archive:
-            files = set(archive.namelist())
-            version = ElementTree.fromstring(archive.read("modelDescription.xml")).get("fmiVersion", "")
-    except Exception as error:  # any error in a user's file
-        raise InputError("fmu", f"cannot be read as an FMU: {describe_error(error)}", SUPPORTED_FMU) from None
-    if not version.startswith(("2.", "3.")):
-        raise InputError("fmu", f"is of FMI {version}", SUPPORTED_FMU)
+        raise InputError(source, f"{name} needs FMPy, which is not installed", "in the checkout: pip install '.[fmu]'") from None
     try:
         model = read_model_description(path, validate=False)
+        with ZipFile(path) as archive:
+            platforms = sorted({name.split("/")[1] for name in archive.namelist() if name.startswith("binaries/")} - {""})
     except Exception as error:  # any error of FMPy about a user's file
-        raise InputError("fmu", f"cannot be read as an FMU: {describe_error(error)}", SUPPORTED_FMU) from None
-    simulation = model.coSimulation
-    if simulation is None:
+        raise InputError(source, f"{name} cannot be read as an FMU: {describe_error(error)}", SUPPORTED_FMU) from None
+    if not model.fmiVersion.startswith(("2.", "3.")):
+        raise InputError(source, f"{name} is of FMI {model.fmiVersion}", SUPPORTED_FMU)
+    if model.coSimulation is None:
         kind = "model exchange" if model.modelExchange is not None else "scheduled execution"
-        raise InputError("fmu", f"is for {kind} only, without a solver of its own", SUPPORTED_FMU)
-    folder = platform_tuple if model.fmiVersion.startswith("3") else platform
-    if f"binaries/{folder}/{simulation.modelIdentifier}{sharedLibraryExtension}" not in files:
-        platforms = sorted({name.split("/")[1] for name in files
-                            if name.startswith("binaries/") and name.count("/") > 1 and name[-1] != "/"})
+        raise InputError(source, f"{name} is for {kind} only, without a solver of its own", SUPPORTED_FMU)
+    if not {platform, platform_tuple} & set(platforms):
         others = f"only for {', '.join(platforms)}" if platforms else "nor for any other"
-        raise InputError("fmu", f"has no binary for this machine ({folder}), {others}", f"binaries/{folder}")
+        raise InputError(source, f"{name} has no binary for this machine ({platform}), {others}", f"binaries/{platform}")
     units = {unit.name: Unit(tuple(int(getattr(unit.baseUnit, base)) for base in BASE_UNITS), float(unit.baseUnit.factor),
                              float(unit.baseUnit.offset)) for unit in model.unitDefinitions if unit.baseUnit is not None}
-    return Description(
-        path, sha256(Path(path).read_bytes()).hexdigest(), model.fmiVersion, identifier=simulation.modelIdentifier, token=model.guid or "",
-        step=_required_step(model), single_instance=simulation.canBeInstantiatedOnlyOncePerProcess, units=units,
-        variables={variable.name: _variable_of(variable, units) for variable in model.modelVariables if not variable.dimensions})
-
-
-def _required_step(model: Any) -> float | None:
-    """The step that an FMU requires [s]: its internal step, or its default step if its step cannot change; None if any step will do."""
-    simulation, default_step = model.coSimulation, getattr(model.defaultExperiment, "stepSize", None)
-    step = simulation.fixedInternalStepSize or (None if simulation.canHandleVariableCommunicationStepSize else default_step)
-    return float(step) if step and float(step) > 0 else None
-
-
-def _variable_of(variable: Any, units: Mapping[str, Unit]) -> Variable:
-    def attribute(name: str) -> Any:
-        value = getattr(variable, name, None)
-        return getattr(variable.declaredType, name, None) if value is None else value
-
-    unit_name, start = attribute("unit") or "", variable.start
-    unit = units.get(unit_name) or COMMON_UNITS.get(unit_name)
-    if unit is not None and attribute("relativeQuantity"):
-        unit = unit._replace(offset=0.0)
-    variability = variable.variability or ("continuous" if variable.type in REAL_TYPES else "discrete")
-    return Variable(variable.name, variable.valueReference, variable.type, variable.causality or "local", variability, unit_name, unit,
-                    start=_to_float(start) if variable.type in REAL_TYPES else start, lower=_to_float(attribute("min")),
-                    upper=_to_float(attribute("max")), meaning=" ".join((variable.description or "").split()))
-
-
-def _to_float(text: Any) -> float | None:
-    try:
-        number = float(text)
-    except (TypeError, ValueError):
-        return None
-    return number if isfinite(number) else None
+    variables = {variable.name: variable for variable in model.modelVariables if not variable.dimensions}
+    return Description(path, digest, model, units, variables)
 
 
 def _with_article(word: str) -> str:

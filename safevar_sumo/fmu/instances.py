@@ -1,36 +1,36 @@
-"""Instances of an FMU for N vehicles, in separate processes, and vehicles that can continue from any earlier step."""
+"""Instances of an FMU for N vehicles, and vehicles that can continue from any earlier step."""
 
 from __future__ import annotations
 
-import heapq
 import math
-import pickle
-import shutil
-import signal
-import subprocess
+import os
 import sys
+import tempfile
 import weakref
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from hashlib import sha256
+from io import BytesIO
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
+from zipfile import ZipFile
 
 import numpy as np
+import platformdirs
 
-from safevar_sumo.errors import EnvironmentFault, SafevarError
-from safevar_sumo.fmu.description import Description, Variable
-from safevar_sumo.fmu.host import HostSetup
-from safevar_sumo.fmu.ports import FloatArray, Port
+from safevar_sumo.fmu.description import REAL_TYPES, Description
+from safevar_sumo.fmu.ports import Constant, FloatArray, Port
 
-STEP_LIMIT = 10.0
-"""Longest time that an instance may take for one simulation step; beyond it the instance counts as hung [s]."""
-MAX_INSTANCES, MAX_PROCESSES = 200, 4
-"""Largest number of vehicles of a simulation: with all instances in one process, and with one process for each."""
+if TYPE_CHECKING:
+    from fmpy.fmi2 import FMU2Slave
+    from fmpy.model_description import ModelVariable
+
+MAX_INSTANCES = 200
+"""Largest number of vehicles of a simulation; 1 for an FMU that allows only one instance in a process."""
 POINT_TOLERANCE = 1e-9
 """Tolerance for times of communication points, as a share of a step [-]."""
-
-
-class Fault(SafevarError):
-    """An FMU crashed, hung or failed; the message continues a sentence that begins with the FMU's name."""
+class FmuError(Exception):
+    """An FMU failed; the message says what it did and logged, and when."""
 
 
 class History(NamedTuple):
@@ -39,64 +39,6 @@ class History(NamedTuple):
     previous: History | None
     inputs: FloatArray
     step_number: int
-
-
-class _Host:
-    """A process with instances of an FMU."""
-
-    def __init__(self, setup: HostSetup) -> None:
-        try:
-            self._process = subprocess.Popen(
-                [sys.executable, "-P", str(Path(__file__).with_name("host.py"))], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
-                stderr=subprocess.DEVNULL, start_new_session=True)
-        except OSError as error:
-            raise EnvironmentFault(f"no process for an FMU can be started: {error.strerror}") from None
-        self._folder = list[str]()
-        self.end = weakref.finalize(self, _end_process, self._process, self._folder)
-        self.activity = "is loaded"
-        self.send(("open", *setup))
-        self._folder.append(self.receive())
-        self.receive()
-
-    def send(self, request: tuple[Any, ...]) -> None:
-        try:
-            pickle.dump(request, self._process.stdin, protocol=pickle.HIGHEST_PROTOCOL)  # type: ignore[arg-type]
-            self._process.stdin.flush()  # type: ignore[union-attr]
-        except OSError:  # the process has ended, which `receive` reports
-            return
-
-    def receive(self) -> Any:
-        try:
-            status, answer = pickle.load(self._process.stdout)  # type: ignore[arg-type]
-        except (EOFError, OSError, pickle.UnpicklingError):
-            self._process.wait()
-            raise Fault(f"crashed {_describe_end(self._process.returncode)} while it {self.activity}") from None
-        if status == "hangs":
-            self.end()
-            raise Fault(answer)
-        if status == "failed":
-            raise Fault(f"failed: {answer}")
-        return answer
-
-
-def _end_process(process: subprocess.Popen[bytes], folders: list[str]) -> None:
-    process.kill()
-    for folder in folders:
-        shutil.rmtree(folder, ignore_errors=True)
-    for stream in (process.stdin, process.stdout):
-        if stream is not None:
-            try:
-                stream.close()
-            except OSError:  # nobody needs the data that is still to be written
-                continue
-    process.wait()
-
-
-def _describe_end(exit_code: int) -> str:
-    try:
-        return f"(signal {signal.Signals(-exit_code).name})" if exit_code < 0 else f"(exit code {exit_code})"
-    except ValueError:
-        return f"(signal {-exit_code})"
 
 
 class Instances:
@@ -108,92 +50,130 @@ class Instances:
         The FMU's ports, in the order of the values. Ports for parameters are set once, at the start.
     constants
         Further parameters and their values.
-    time_limit
-        Longest time that an instance may take for one request [s].
     """
 
     def __init__(self, description: Description, inputs: Sequence[Port], outputs: Sequence[Port],
-                 constants: Sequence[tuple[Variable, Any]], time_limit: float) -> None:
-        self.description, self.inputs, self.outputs = description, tuple(inputs), tuple(outputs)
-        self._constants = [value for _, value in constants]
-        self._parameter_indices = [k for k, port in enumerate(inputs) if not port.is_input]
-        self._input_indices = [k for k, port in enumerate(inputs) if port.is_input]
-        constant_references = ((variable.type, variable.reference) for variable, _ in constants)
-        self._setup = HostSetup(
-            description.path, description.digest, description.version, description.identifier, description.token,
-            inputs=tuple(inputs[k].typed_reference for k in self._input_indices),
-            parameters=(*(inputs[k].typed_reference for k in self._parameter_indices), *constant_references),
-            outputs=tuple(port.typed_reference for port in outputs), time_limit=time_limit)
-        self._hosts = dict[int, _Host]()
-        self._free_numbers, self._next_number = list[int](), 0
+                 constants: Sequence[tuple[ModelVariable, Constant]]) -> None:
+        self._description, self._inputs, self._outputs, self._constants = description, inputs, outputs, constants
+        self._is_3 = description.model.fmiVersion.startswith("3")
+        self._free, self._messages = list["FMU2Slave"](), list[str]()
+        self.max_vehicles = 1 if description.is_single else MAX_INSTANCES
         self.generation = 0
-        """Number of times that all instances were lost."""
+        """Number of times that vehicles have lost their instances."""
 
-    @property
-    def max_vehicles(self) -> int:
-        return MAX_PROCESSES if self.description.single_instance else MAX_INSTANCES
+    def lease(self, n: int) -> list[FMU2Slave]:
+        """N instances; the only instance that an FMU allows is taken from the vehicle that had it."""
+        if self._description.is_single:
+            self.generation += 1
+            self._free = self._free or [self._new_slave()]
+            return list(self._free)
+        return [self._free.pop() if self._free else self._new_slave() for _ in range(n)]
 
-    def lease(self, n: int) -> list[int]:
-        """Numbers of n instances."""
-        reused_numbers = [heapq.heappop(self._free_numbers) for _ in range(min(n, len(self._free_numbers)))]
-        new_numbers = range(self._next_number, self._next_number + n - len(reused_numbers))
-        self._next_number = new_numbers.stop
-        return [*reused_numbers, *new_numbers]
+    def give_back(self, slaves: list[FMU2Slave], generation: int) -> None:
+        if generation == self.generation and not self._description.is_single:
+            self._free += slaves
 
-    def give_back(self, numbers: Sequence[int]) -> None:
-        for number in numbers:
-            heapq.heappush(self._free_numbers, number)
+    def start(self, slaves: Sequence[FMU2Slave], values: FloatArray) -> FloatArray:
+        """Initialise N instances, new or used, with values of the k inputs, shape (k, N); returns the m outputs, shape (m, N)."""
+        return self._on_each("is initialised", slaves, values, self._start)
 
-    def start(self, numbers: Sequence[int], values: FloatArray) -> FloatArray:
-        """Initialise N instances with values of the k inputs, shape (k, N); returns the m outputs, shape (m, N)."""
-        fmu_values = [port.to_fmu(values[k]) for k, port in enumerate(self.inputs)]
-        parameters = [[*(float(fmu_values[k][i]) for k in self._parameter_indices), *self._constants] for i in range(len(numbers))]
-        inputs = [[float(fmu_values[k][i]) for k in self._input_indices] for i in range(len(numbers))]
-        answers = self._request("start", numbers, "is initialised",
-                                lambda positions: ([parameters[i] for i in positions], [inputs[i] for i in positions]))
-        return np.asarray(self._outputs_of(answers[:, np.newaxis])[-1])
+    def step(self, slaves: Sequence[FMU2Slave], time: float, length: float, values: FloatArray) -> FloatArray:
+        """Advance N instances by a step from `time` [s]; returns the m outputs after it, shape (m, N)."""
+        def step(slave: FMU2Slave, column: Sequence[float]) -> None:
+            self._write_inputs(slave, column, are_inputs=True)
+            result = slave.doStep(time, length)
+            if self._is_3 and (result[1] or result[2]):
+                raise FmuError("it requests the end of the simulation" if result[1] else f"it returned early, at {result[3]:g} s")
 
-    def step(self, numbers: Sequence[int], steps: Sequence[tuple[float, float]], values: FloatArray) -> FloatArray:
-        """Advance N instances by one or more steps, each given by its start and length [s].
+        return self._on_each(f"is at {time:g} s", slaves, values, step)
 
-        Returns the m outputs after the last two steps, shape (2, m, N), or after a single step, shape (1, m, N).
-        """
-        fmu_values = [self.inputs[k].to_fmu(values[k]).tolist() for k in self._input_indices]
-        inputs = list(map(list, zip(*fmu_values, strict=True))) or [[] for _ in numbers]
-        kept_steps = min(len(steps), 2)
-        return self._outputs_of(self._request("step", numbers, f"is at {steps[0][0]:g} s",
-                                             lambda positions: (steps, [inputs[i] for i in positions], kept_steps)))
+    def _start(self, slave: FMU2Slave, column: Sequence[float]) -> None:
+        if slave.has_started:
+            slave.terminate()
+            slave.reset()
+        slave.has_started = True
+        self._write_inputs(slave, column, are_inputs=False)
+        for variable, value in self._constants:
+            self._write(slave, variable, value)
+        if not self._is_3:
+            slave.setupExperiment(startTime=0.0)
+        slave.enterInitializationMode()
+        self._write_inputs(slave, column, are_inputs=True)
+        slave.exitInitializationMode()
 
-    def _outputs_of(self, answers: FloatArray) -> FloatArray:
-        """Answers, shape (N, steps, m), as outputs in the outer units of the ports, shape (steps, m, N)."""
-        outputs = np.ascontiguousarray(answers.transpose(1, 2, 0))
-        return np.stack([port.from_fmu(outputs[:, k]) for k, port in enumerate(self.outputs)], axis=1)
-
-    def _request(self, name: str, numbers: Sequence[int], activity: str, arguments: Any) -> FloatArray:
-        """Answers of N instances, shape (N, ...). All instances run in one process, or each runs in its own process."""
-        groups = {number: [i] for i, number in enumerate(numbers)} if self.description.single_instance else {0: [*range(len(numbers))]}
-        hosts = {}
+    def _on_each(self, activity: str, slaves: Sequence[FMU2Slave], values: FloatArray,
+                 work: Callable[[FMU2Slave, Sequence[float]], None]) -> FloatArray:
+        columns = np.array([port.to_fmu(row) for port, row in zip(self._inputs, values, strict=True)]).T.tolist()
+        outputs = np.zeros((len(self._outputs), len(slaves)))
         try:
-            for host_number, positions in groups.items():
-                hosts[host_number] = host = self._host(host_number)
-                host.activity = activity
-                host.send((name, [numbers[i] for i in positions], *arguments(positions)))
-            return np.concatenate([host.receive() for host in hosts.values()])
-        except Fault:
-            self.close()  # answers of other processes may be pending
-            raise
+            for i, slave in enumerate(slaves):
+                work(slave, columns[i])
+                outputs[:, i] = [getattr(slave, f"get{self._function(port.variable)}")([port.variable.valueReference])[0]
+                                 for port in self._outputs]
+        except Exception as error:  # any error of FMPy about an FMU
+            self._free, self.generation = [], self.generation + 1  # any further call of an instance that failed is undefined
+            messages, self._messages[:] = self._messages[-1:], []
+            reason = (str(error).strip() or type(error).__name__).splitlines()[0].rstrip(".")
+            raise FmuError(f"{': '.join([reason, *messages])} while it {activity}") from error
+        return np.stack([port.from_fmu(row) for port, row in zip(self._outputs, outputs, strict=True)])
 
-    def _host(self, number: int) -> _Host:
-        if number not in self._hosts:
-            self._hosts[number] = _Host(self._setup)
-        return self._hosts[number]
+    def _write_inputs(self, slave: FMU2Slave, column: Sequence[float], *, are_inputs: bool) -> None:
+        """Set the inputs of an instance or its parameters among the ports."""
+        for port, value in zip(self._inputs, column, strict=True):
+            if port.is_input == are_inputs:
+                self._write(slave, port.variable, value)
 
-    def close(self) -> None:
-        """End the processes. A vehicle that continues is simulated again from its start."""
-        for host in self._hosts.values():
-            host.end()
-        self._hosts = {}
-        self.generation += 1
+    def _write(self, slave: FMU2Slave, variable: ModelVariable, value: Constant) -> None:
+        is_kept = variable.type in (*REAL_TYPES, "String")
+        typed_value = value if is_kept else bool(value) if variable.type == "Boolean" else round(float(value))
+        getattr(slave, f"set{self._function(variable)}")([variable.valueReference], [typed_value])
+
+    def _function(self, variable: ModelVariable) -> str:
+        """End of the names of the functions that set and get a variable."""
+        integer = "Int64" if self._is_3 else "Integer"
+        return integer if variable.type == "Enumeration" else str(variable.type)
+
+    def _new_slave(self) -> FMU2Slave:
+        from fmpy.simulation import instantiate_fmu
+
+        def note(*arguments: bytes | int | None) -> None:
+            *_, status, _, message = arguments
+            if isinstance(message, bytes) and status not in (0, 1):  # worse than a warning
+                self._messages.append(" ".join(message.decode(errors="replace").split()))
+
+        folder = _unpacked(self._description)
+        _forget_other_modules(folder)
+        slave = instantiate_fmu(folder, self._description.model, "CoSimulation", debug_logging=True, logger=note)
+        slave.has_started = False
+        return slave
+
+
+def _unpacked(description: Description) -> str:
+    """The folder with an FMU's files, in the user's cache folder by the digest of its file.
+
+    Raises
+    ------
+    FmuError
+        If the file has changed.
+    """
+    folder = platformdirs.user_cache_path("safevar_sumo") / "fmus" / description.digest
+    if not folder.is_dir():
+        content = Path(description.path).read_bytes()
+        if sha256(content).hexdigest() != description.digest:
+            raise FmuError("its file has changed since the study was read")
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=folder.parent, ignore_cleanup_errors=True) as new, ZipFile(BytesIO(content)) as archive:
+            archive.extractall(new)
+            with suppress(OSError):  # another process was faster
+                os.rename(new, folder)
+    return str(folder)
+
+
+def _forget_other_modules(folder: str) -> None:
+    """Let an FMU that is written in Python import its own modules, not others of the same names."""
+    for file in Path(folder, "resources").glob("*.py"):
+        if not str(getattr(sys.modules.get(file.stem), "__file__", folder)).startswith(folder):
+            del sys.modules[file.stem]
 
 
 class Fleet:
@@ -208,18 +188,19 @@ class Fleet:
     """
 
     def __init__(self, instances: Instances, n: int, step: float, communication_step: float | None) -> None:
-        self._instances, self._step, self._communication_step = instances, step, communication_step
-        self._numbers = instances.lease(n)
-        weakref.finalize(self, instances.give_back, self._numbers)
+        self._instances, self._n, self._step, self._interval = instances, n, step, communication_step or step
+        self._slaves, self._generation = list['FMU2Slave'](), -1
         self._history: History | None = None
-        self._generation = instances.generation
         self._last_outputs: FloatArray
         """Outputs at the last two communication points, shape (2, m, N)."""
 
     def start(self, inputs: FloatArray) -> tuple[FloatArray, History]:
         """Initialise the vehicles with k inputs, shape (k, N); returns the m outputs, shape (m, N), and the history."""
-        outputs = self._instances.start(self._numbers, inputs)
-        self._generation = self._instances.generation
+        if self._generation != self._instances.generation:
+            self._slaves = self._instances.lease(self._n)
+            self._generation = self._instances.generation
+            weakref.finalize(self, self._instances.give_back, self._slaves, self._generation)
+        outputs = self._instances.start(self._slaves, inputs)
         self._last_outputs, self._history = np.stack([outputs, outputs]), History(previous=None, inputs=inputs, step_number=-1)
         return outputs, self._history
 
@@ -246,20 +227,17 @@ class Fleet:
 
     def _drive(self, step_number: int, inputs: FloatArray) -> None:
         """Advance to the last communication point in a step, if the step contains any."""
-        interval = self._communication_step or self._step
-        points = range(self._first_point_in(step_number), self._first_point_in(step_number + 1))
-        if points:
-            outputs = self._instances.step(self._numbers, [(point * interval, interval) for point in points], inputs)
-            self._last_outputs = outputs if len(outputs) == 2 else np.stack([self._last_outputs[1], outputs[0]])
+        for point in range(self._first_point_in(step_number), self._first_point_in(step_number + 1)):
+            outputs = self._instances.step(self._slaves, point * self._interval, self._interval, inputs)
+            self._last_outputs = np.stack([self._last_outputs[1], outputs])
 
     def _first_point_in(self, step_number: int) -> int:
         """Number of the first communication point at or after the start of a step."""
-        return math.ceil(step_number * self._step / (self._communication_step or self._step) - POINT_TOLERANCE)
+        return math.ceil(step_number * self._step / self._interval - POINT_TOLERANCE)
 
     def _end_outputs(self, step_number: int) -> FloatArray:
-        interval = self._communication_step or self._step
         # how far the last communication point lies beyond the end of the step [intervals]
-        overshoot = self._first_point_in(step_number + 1) - (step_number + 1) * self._step / interval
+        overshoot = self._first_point_in(step_number + 1) - (step_number + 1) * self._step / self._interval
         if abs(overshoot) <= POINT_TOLERANCE:
             return np.asarray(self._last_outputs[1])
         return np.asarray(self._last_outputs[1] - (self._last_outputs[1] - self._last_outputs[0]) * overshoot)

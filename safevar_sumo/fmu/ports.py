@@ -2,42 +2,43 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping
-from typing import Any, NamedTuple
+from collections.abc import Collection, Mapping
+from itertools import combinations
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from safevar_sumo.errors import InputError, unknown_name
-from safevar_sumo.fmu.description import NUMBER_TYPES, REAL_TYPES, Description, Variable
+from safevar_sumo.fmu.description import NUMBER_TYPES, REAL_TYPES, Description, causality_of, number_of
 from safevar_sumo.fmu.units import SI, Unit
 
+if TYPE_CHECKING:
+    from fmpy.model_description import ModelVariable
+
 FloatArray = npt.NDArray[np.float64]
-PYTHON_TYPES = {"String": (str,), "Boolean": (bool,), **dict.fromkeys(REAL_TYPES, (int, float))}
+Constant = str | bool | float
+"""A value of a parameter."""
+PYTHON_TYPES: Mapping[str, tuple[type, ...]] = {"String": (str,), "Boolean": (bool,), **dict.fromkeys(REAL_TYPES, (int, float))}
 """Python types that a study may give parameters of an FMI type; other FMI types take whole numbers."""
 
 
 class Port(NamedTuple):
-    """A variable of an FMU, its unit, and the unit of its values outside the FMU."""
+    """A variable of an FMU, its unit, the unit of its values outside the FMU, and the bounds to which these are clipped (FMU's unit)."""
 
-    variable: Variable
+    variable: ModelVariable
     fmu_unit: Unit
     outer_unit: Unit
+    lower: float = -np.inf
+    upper: float = np.inf
 
     @property
     def is_input(self) -> bool:
-        return self.variable.causality == "input"
-
-    @property
-    def typed_reference(self) -> tuple[str, int]:
-        """Type and value reference of the variable."""
-        return self.variable.type, self.variable.reference
+        return causality_of(self.variable) == "input"
 
     def to_fmu(self, values: FloatArray) -> FloatArray:
         """Values in the FMU's unit; those of an input, such as an infinite gap, are clipped to its declared bounds."""
-        converted = np.asarray(self.outer_unit.to(self.fmu_unit, values))
-        lower, upper = (self.variable.lower, self.variable.upper) if self.is_input else (None, None)
-        return np.asarray(np.clip(converted, -np.inf if lower is None else lower, np.inf if upper is None else upper))
+        return np.asarray(np.clip(self.outer_unit.to(self.fmu_unit, values), self.lower, self.upper))
 
     def from_fmu(self, values: FloatArray) -> FloatArray:
         """Values of the FMU in the outer unit."""
@@ -70,22 +71,30 @@ def ports_of(description: Description, variable_names: Mapping[str, str], units:
             raise unknown_name(source, f"{key}.{quantity}: there is no such quantity", quantity, units)
         legal_causalities = (*causalities, "parameter") if quantity in constants else causalities
         variable = description.variable(name, legal_causalities, source, f"{key}.{quantity}")
-        first_quantity = next((mapped_quantity for mapped_quantity, port in ports.items() if port.variable.name == name), None)
-        if first_quantity and "parameter" not in causalities:  # variables of sumo_type may hold several quantities
-            raise InputError(source, f"{key}.{quantity} = {name!r}: that variable is {key}.{first_quantity} already", "each variable once")
         outer_unit = SI[units[quantity]]
-        ports[quantity] = Port(variable, description.unit_for(variable, outer_unit, units[quantity], source, f"{key}.{quantity}"),
-                               outer_unit)
+        port = Port(variable, description.unit_for(variable, outer_unit, units[quantity], source, f"{key}.{quantity}"), outer_unit)
+        lower, upper = (number_of(variable, end) if port.is_input else None for end in ("min", "max"))
+        ports[quantity] = port._replace(lower=-np.inf if lower is None else lower, upper=np.inf if upper is None else upper)
     return ports
 
 
-def constants_of(description: Description, values: Mapping[str, Any], mapped_names: Collection[str], source: str,
-                 key: str) -> Iterator[tuple[Variable, Any]]:
-    """Parameters of an FMU that a study sets, with their values in the FMU's units; raises the same errors as `ports_of`."""
+def constants_of(description: Description, values: Mapping[str, Constant], ports: Collection[Port], source: str,
+                 key: str) -> list[tuple[ModelVariable, Constant]]:
+    """Parameters of an FMU that a study sets besides the `ports` that it writes, with their values in the FMU's units.
+
+    Raises
+    ------
+    InputError
+        As `ports_of`; also if two parameters or ports have the same value reference, hence the same value.
+    """
+    constants = []
     for name, value in values.items():
         variable = description.variable(name, ("parameter", "structuralParameter"), source, key, (*NUMBER_TYPES, "String"))
         if type(value) not in PYTHON_TYPES.get(variable.type, (int,)):
             raise InputError(source, f"{key}.{name} = {value!r}", f"a value of type {variable.type}")
-        if name in mapped_names:
-            raise InputError(source, f"{key}.{name}: another key of the study sets the same parameter", "each parameter once")
-        yield variable, value
+        constants.append((variable, value))
+    for one, other in combinations([*(port.variable for port in ports), *(variable for variable, _ in constants)], 2):
+        if (one.type, one.valueReference) == (other.type, other.valueReference):
+            raise InputError(source, f"{key.partition('.')[0]}: {one.name!r} and {other.name!r} have one value, and two keys set it",
+                             "one key for each value reference of the FMU")
+    return constants

@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple, TypeVar
 
+import numpy as np
+import numpy.typing as npt
+
+Values = TypeVar("Values", float, npt.NDArray[np.float64])
 BASE_UNITS = ("kg", "m", "s", "A", "K", "mol", "cd", "rad")
 """FMI's base units (FMI 2.0.4, section 2.2.2)."""
 
@@ -21,7 +25,7 @@ class Unit(NamedTuple):
         """Whether both measure the same kind of quantity; radians count as plain numbers."""
         return self.exponents[:-1] == other.exponents[:-1]
 
-    def to(self, other: Unit, value: Any) -> Any:
+    def to(self, other: Unit, value: Values) -> Values:
         """A value or an array converted to another unit of the same kind; unchanged where both units are equal."""
         if (self.factor, self.offset) == (other.factor, other.offset):
             return value

@@ -17,7 +17,7 @@ import numpy as np
 
 from safevar_sumo.ads import ADS, ADS_CONTRACT, REACTION_PARAMETERS, SCALAR_ADS_CONTRACT, Ads, FmuAds, GuardedAds, PerVehicleAds, ScalarAds
 from safevar_sumo.errors import InputError, one_of, unknown_name
-from safevar_sumo.fmu import STEP_LIMIT, description_of
+from safevar_sumo.fmu import description_of
 from safevar_sumo.metrics import METRIC_OF_OBJECTIVE, METRICS, OPTIONAL_METRICS, RATING_POINTS, Metric, Objective, Scoring, guard_metric
 from safevar_sumo.plugins import (
     Guard,
@@ -248,9 +248,8 @@ def _assemble(study: Study, source: str) -> System:
 def models_of(study: Study, source: str) -> Models:
     """The study's models with their parameters; raises the errors of `assemble`."""
     lookup = Lookup(source, study.origin.places)
-    time_limit = min(study.search.time_limit / 2, STEP_LIMIT)  # less than the time limit of a batch
-    vehicle, vehicle_member = _create_vehicle(study.vehicle, lookup, time_limit)
-    ads, ads_member = _create_ads(study.ads, lookup, time_limit)
+    vehicle, vehicle_member = _create_vehicle(study.vehicle, lookup)
+    ads, ads_member = _create_ads(study.ads, lookup)
     scenario, scenario_member = _create_scenario(study.scenario, lookup)
     return Models(vehicle, ads, scenario, weather_of(study.weather, source), (vehicle_member, ads_member, scenario_member))
 
@@ -338,14 +337,14 @@ def _check_units(study: Study, vehicle: Vehicle, is_shipped_vehicle: bool, sourc
             raise InputError(source, f"vehicle.characteristics.{name} is missing", f"all of {', '.join(units)}")
 
 
-def _create_vehicle(table: VehicleTable, lookup: Lookup, time_limit: float) -> tuple[Vehicle, Member]:
+def _create_vehicle(table: VehicleTable, lookup: Lookup) -> tuple[Vehicle, Member]:
     if table.kind == "fmu":
         guard = Guard(lookup.source, f"vehicle.model = {table.model!r}")
         fmu_table = {**msgspec.structs.asdict(table),
                      "parameters": lookup.with_paths(Member(FmuVehicle, guard), table.parameters, "vehicle.parameters")}
         units = {name: row.unit for name, row in table.characteristics.items()}
         description = description_of(table.model, lookup.folders, lookup.source, "vehicle.model")
-        return FmuVehicle(description, units, fmu_table, guard, time_limit), Member(FmuVehicle, guard, file=description.path)
+        return FmuVehicle(description, units, fmu_table, guard), Member(FmuVehicle, guard, file=description.path)
     member = lookup.class_of(VEHICLES, table.model, "vehicle.model", VEHICLE_CONTRACT)
     parameters = lookup.with_paths(member, table.parameters, "vehicle.parameters")
     vehicle = instance_of(member, parameters, f"vehicle.model = {table.model!r}", "vehicle.parameters", lookup.source)
@@ -359,14 +358,14 @@ def _create_scenario(table: ModelTable, lookup: Lookup) -> tuple[Scenario, Membe
     return _locate_network(scenario if member.guard is None else GuardedScenario(scenario, member.guard), lookup.folders), member
 
 
-def _create_ads(table: ModelTable, lookup: Lookup, time_limit: float) -> tuple[Ads, Member]:
+def _create_ads(table: ModelTable, lookup: Lookup) -> tuple[Ads, Member]:
     if table.kind == "traci":
         return _create_traci_controller(table, lookup)
     if table.kind == "fmu":
         guard = Guard(lookup.source, f"ads.model = {table.model!r}")
         parameters = lookup.with_paths(Member(FmuAds, guard), table.parameters, "ads.parameters")
         description = description_of(table.model, lookup.folders, lookup.source, "ads.model")
-        ads = FmuAds(description, table.inputs, table.outputs, parameters, table.step, guard, time_limit)
+        ads = FmuAds(description, table.inputs, table.outputs, parameters, table.step, guard)
         return ads, Member(FmuAds, guard, file=description.path)
     member = lookup.class_of(ADS, table.model, "ads.model", SCALAR_ADS_CONTRACT, ADS_CONTRACT,
                              otherwise=f'with ads.kind = "traci" {CONTROLLER_FORMS}')

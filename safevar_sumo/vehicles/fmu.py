@@ -8,7 +8,20 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from safevar_sumo.errors import InputError, UserCodeError, unknown_name
-from safevar_sumo.fmu import COMMON_UNITS, REAL_TYPES, SI, Description, Fault, Fleet, History, Instances, Port, Unit, constants_of, ports_of
+from safevar_sumo.fmu import (
+    COMMON_UNITS,
+    REAL_TYPES,
+    SI,
+    Description,
+    Fleet,
+    History,
+    Instances,
+    Port,
+    Unit,
+    constants_of,
+    declared,
+    ports_of,
+)
 from safevar_sumo.plugins import Guard, open_rows
 from safevar_sumo.records import BoolArray, Command, FloatArray, Observation
 from safevar_sumo.study import CharacteristicTable
@@ -64,9 +77,7 @@ class FmuVehicle:
     table
         The study's table `vehicle`.
     guard
-        Checks the results of the FMU.
-    limit
-        Longest time that an FMU instance may take for one step [s].
+        Calls the FMU and checks its results.
 
     Raises
     ------
@@ -76,8 +87,9 @@ class FmuVehicle:
 
     UNITS: Mapping[str, str]
 
-    def __init__(self, description: Description, units: Mapping[str, str], table: Mapping[str, Any], guard: Guard, limit: float) -> None:
-        source, self._guard, self._communication_step = guard.source, guard, table["step"] or description.step
+    def __init__(self, description: Description, units: Mapping[str, str], table: Mapping[str, Any], guard: Guard) -> None:
+        source, self._guard = guard.source, guard
+        self._communication_step = description.communication_step(table["step"], source, "vehicle")
         self.UNITS = dict(units)
         self._sensor_entries, self._type_entries = dict(table["sensors"]), {"tau": DEFAULT_LAG, **table["sumo_type"]}
         for key, entries, quantities in (("sensors", self._sensor_entries, SENSOR_UNITS), ("sumo_type", self._type_entries, TYPE_UNITS)):
@@ -102,18 +114,13 @@ class FmuVehicle:
             for name, unit in quantities.items() if isinstance(entry := entries.get(name), str) and entry in units}
         characteristic_ports = {name: self._characteristic_port(description, name, unit) for name, unit in units.items()
                                 if name in description.variables or name not in self._sensor_entries.values()}
-        for quantity, port in input_ports.items():
-            if port.variable.name in characteristic_ports:
-                raise InputError(source, f"vehicle.inputs.{quantity} = {port.variable.name!r}: that variable is also a characteristic",
-                                 "a separate variable for each")
         type_variables = {name: entry for name, entry in self._type_entries.items() if isinstance(entry, str) and entry not in units}
         type_ports = ports_of(description, type_variables, TYPE_UNITS, READABLE_CAUSALITIES, source, "vehicle.sumo_type")
         self._inputs, self._characteristics, self._outputs = tuple(input_ports), tuple(characteristic_ports), (*output_ports, *type_ports)
         self._reads_type = bool(type_ports)
         ports = [*input_ports.values(), *characteristic_ports.values()]
-        mapped_names = [port.variable.name for port in ports]
-        constants = list(constants_of(description, table["parameters"], mapped_names, source, "vehicle.parameters"))
-        self._instances = Instances(description, ports, [*output_ports.values(), *type_ports.values()], constants, limit)
+        constants = constants_of(description, table["parameters"], ports, source, "vehicle.parameters")
+        self._instances = Instances(description, ports, [*output_ports.values(), *type_ports.values()], constants)
         self.max_vehicles = self._instances.max_vehicles
         self.takes_slope, self.can_start_moving = "grade" in input_ports, "initial_speed" in input_ports
         self._takes_friction = "road_friction" in input_ports
@@ -128,11 +135,12 @@ class FmuVehicle:
     def _characteristic_port(self, description: Description, name: str, unit: str) -> Port:
         key = f"vehicle.characteristics.{name}"
         variable = description.variable(name, ("parameter",), self._guard.source, key, REAL_TYPES)
-        if unit == (variable.unit_name or unit) or (unit == "-" and variable.unit_name in ("", "1")):
+        variable_unit = declared(variable, "unit")
+        if unit == (variable_unit or unit) or (unit == "-" and variable_unit in ("", "1")):
             return Port(variable, SI["-"], SI["-"])
         defined_unit = description.units.get(unit) or COMMON_UNITS.get(unit)
         if defined_unit is None:
-            raise InputError(self._guard.source, f"{key}.unit = {unit!r}: the unit is not defined", repr(variable.unit_name))
+            raise InputError(self._guard.source, f"{key}.unit = {unit!r}: the unit is not defined", repr(variable_unit))
         return Port(variable, description.unit_for(variable, defined_unit, unit, self._guard.source, f"{key}.unit"), defined_unit)
 
     def _unit_pair(self, description: Description, name: str, unit: str, quantity_unit: str, key: str) -> tuple[Unit, Unit]:
@@ -155,7 +163,7 @@ class FmuVehicle:
         fleet = Fleet(self._instances, n, step, self._communication_step)
         outputs = {}
         if self._reads_type:
-            outputs = dict(zip(self._outputs, self._start_fleet(fleet, self._input_array(inputs, characteristics))[0], strict=True))
+            outputs = dict(zip(self._outputs, self._start(fleet, self._input_array(inputs, characteristics))[0], strict=True))
 
         def quantity_values(entry: str | float, name: str) -> FloatArray:
             """Values of the quantity `name`, shape (n,): its entry is a number, a characteristic, or an output of the FMU."""
@@ -187,7 +195,7 @@ class FmuVehicle:
             problem = f"{self._guard.name} has no vehicle.inputs.initial_speed, and the traffic puts it onto the road in motion"
             raise UserCodeError(self._guard.source, problem, "a variable for the initial speed, or traffic that departs with speed 0")
         inputs = self._input_array({**prepared.inputs, "initial_speed": speed}, prepared.characteristics)
-        outputs, history = self._start_fleet(prepared.fleet, inputs)
+        outputs, history = self._start(prepared.fleet, inputs)
         released = Command(np.zeros_like(speed), np.zeros_like(speed))
         state = self._state(dict(zip(self._outputs, outputs, strict=True)), released, None, history)
         for i in np.flatnonzero(np.abs(state.speed - speed) > 1e-6)[:1]:
@@ -206,10 +214,7 @@ class FmuVehicle:
 
     def advance(self, prepared: _Prepared, state: _State, command: Command) -> _State:
         inputs = self._input_array({**prepared.inputs, **command._asdict()}, prepared.characteristics)
-        try:
-            (point_outputs, step_outputs), history = prepared.fleet.advance(state.history, inputs)
-        except Fault as fault:
-            raise self._user_code_error(fault) from None
+        (point_outputs, step_outputs), history = self._guard.call("doStep", prepared.fleet.advance, state.history, inputs)
         outputs = dict(zip(self._outputs, point_outputs, strict=True))
         outputs["speed"] = dict(zip(self._outputs, step_outputs, strict=True))["speed"]
         next_state, max_speed = self._state(outputs, command, state.seen, history), prepared.types.max_speed
@@ -224,14 +229,9 @@ class FmuVehicle:
         return [] if self._takes_friction else [
             f"{self._guard.name} has no vehicle.inputs.road_friction: weather has no effect on how it accelerates and brakes"]
 
-    def _start_fleet(self, fleet: Fleet, inputs: FloatArray) -> tuple[FloatArray, History]:
-        try:
-            return fleet.start(inputs)
-        except Fault as fault:
-            raise self._user_code_error(fault) from None
-
-    def _user_code_error(self, fault: Fault) -> UserCodeError:
-        return UserCodeError(self._guard.source, f"{self._guard.name} {fault}")
+    def _start(self, fleet: Fleet, inputs: FloatArray) -> tuple[FloatArray, History]:
+        outputs, history = self._guard.call("initialisation", fleet.start, inputs)
+        return outputs, history
 
     def _input_array(self, inputs: Mapping[str, FloatArray], characteristics: Characteristics) -> FloatArray:
         return np.stack([*(inputs[name] for name in self._inputs), *(characteristics[name] for name in self._characteristics)])

@@ -179,10 +179,11 @@ def aeb(nominal: Nominal) -> str:
     return AEB.format(facts=tuple(nominal[:5]), tables=[table.tolist() for table in tables[:3]], braking=tables.braking, seen=SEEN)
 
 
-def changed(fmu: Path, into: Path, edit: Callable[[str], str], keep: Callable[[str], bool] = lambda name: True) -> Path:
-    """Write an FMU with an edited model description and only the files to `keep`."""
+def changed(fmu: Path, into: Path, edit: Callable[[str], str], keep: Callable[[str], bool] = lambda name: True,
+            other: Callable[[str, bytes], bytes] = lambda name, content: content) -> Path:
+    """Write an FMU with an edited model description, only the files to `keep`, and `other` contents of these files."""
     with zipfile.ZipFile(fmu) as old, zipfile.ZipFile(into, "w") as new:
         for name in filter(keep, old.namelist()):
             content = old.read(name)
-            new.writestr(name, edit(content.decode()) if name == "modelDescription.xml" else content)
+            new.writestr(name, edit(content.decode()) if name == "modelDescription.xml" else other(name, content))
     return into
