@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import faulthandler
 import importlib
-import io
 import os
 import re
 import signal
@@ -11,8 +11,7 @@ import sys
 import threading
 import warnings
 from collections.abc import Iterable, Iterator
-from concurrent.futures.thread import _threads_queues
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import partial
 from typing import TYPE_CHECKING, Any, NoReturn, TextIO
 
@@ -51,37 +50,8 @@ ARGUMENT = re.compile(r"`(\w+)(?:=([^`]+))?`")
 """An argument of a function of the library in an error, such as `method=monte_carlo`."""
 
 
-class StrictCommand(click.Command):
-    """A command that refuses an empty value, a repeated option, and options that exclude each other; click would use the last."""
-
-    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        if not ctx.resilient_parsing:
-            try:
-                values, _, options = self.make_parser(ctx).parse_args(list(args))
-            except click.UsageError as error:
-                error.ctx = ctx
-                raise
-            flags: dict[str, str] = {}
-            for option in options:
-                value = values[str(option.name)]
-                if value == "" or (isinstance(value, list | tuple) and "" in value):
-                    raise InputError(option.opts[-1] if isinstance(option, click.Option) else option.human_readable_name,
-                                     "'' is empty", "a value")
-                if not isinstance(option, click.Option) or option.multiple or option.name is None:
-                    continue
-                flag, earlier_flag = option.opts[-1], flags.get(option.name)
-                if earlier_flag not in (None, flag):
-                    raise InputError(flag, f"{earlier_flag} is given too", "one of them")
-                if earlier_flag == flag and not option.is_flag:
-                    raise InputError(flag, f"is given twice, the last time as {value!r}", "one value")
-                flags[option.name] = flag
-        return super().parse_args(ctx, args)
-
-
 class LazyCommands(click.Group):
     """The group of all commands; it loads a command's module, which takes long, only when the command is called."""
-
-    command_class = StrictCommand
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         return list(COMMANDS)
@@ -131,39 +101,29 @@ def commands() -> None:
 
 def main() -> None:
     """Run the program; its exit code is 0, 1 (failed, or `check` has findings), 2 (bad input) or 130 (interrupted)."""
-    _ensure_standard_streams()
     warnings.showwarning = _show_warning
-    for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="replace")
+    with suppress(AttributeError, OSError, ValueError):  # standard error is no file
+        faulthandler.enable()  # if compiled code crashes, its line is printed
     try:
         code = commands.main(standalone_mode=False, prog_name=PROGRAM)
         sys.stdout.flush()
-    except click.exceptions.Abort:
-        _exit_with_error("interrupted", INTERRUPT_EXIT_CODE)
     except click.exceptions.NoArgsIsHelpError as error:
         error.show()
-        _exit_program(error.exit_code)
+        sys.exit(error.exit_code)
     except click.ClickException as error:
         _exit_with_error(_error_in_two_lines(error), error.exit_code)
     except SafevarError as error:
         _exit_with_error(str(error), error.exit_code)
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, click.exceptions.Abort):
         _exit_with_error("interrupted", INTERRUPT_EXIT_CODE)
-    except BrokenPipeError:
-        _discard_output()
-        _exit_program(1)
     except OSError as error:
-        place = error.filename or ("standard output" if _output_fails() else "")
-        _discard_output()
-        _exit_with_error(f"{error.strerror or error}{f': {place}' if place else ''}", 1)
-    _exit_program(code if isinstance(code, int) else 0)
+        _exit_with_error(f"{error.strerror or error}{f': {error.filename}' if error.filename else ''}", 1)
+    sys.exit(code if isinstance(code, int) else 0)
 
 
 def _error_in_two_lines(error: click.ClickException) -> str:
     """Put an error of click into the form of this program's errors."""
-    context = error.ctx if isinstance(error, click.UsageError) else None
-    command = PROGRAM_COMMAND + (context.command_path.removeprefix(PROGRAM) if context is not None else "")
+    command = " ".join([PROGRAM_COMMAND, *(word for word in sys.argv[1:2] if word in COMMANDS)])
     return f"{' '.join(error.format_message().split())}\nexpected: see {command} --help"
 
 
@@ -194,44 +154,9 @@ def _raise_interrupt(*_: object) -> NoReturn:
     raise KeyboardInterrupt
 
 
-def _ensure_standard_streams() -> None:
-    """Open standard streams that the caller has closed, so that no file takes their descriptors."""
-    while (descriptor := os.open(os.devnull, os.O_RDWR)) <= 2:
-        os.set_inheritable(descriptor, True)
-    os.close(descriptor)
-    sys.stdout = sys.stdout or open(os.devnull, "w")  # noqa: SIM115
-    sys.stderr = sys.stderr or open(os.devnull, "w")  # noqa: SIM115
-
-
-def _discard_output() -> None:
-    """Discard output after the reader of a pipe has closed it, so that the interpreter does not flush it again."""
-    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-
-
-def _output_fails() -> bool:
-    """Whether standard output does not even take an end of line."""
-    try:
-        os.write(sys.stdout.fileno(), b"\n")
-    except OSError:
-        return True
-    return False
-
-
-def _exit_with_error(message: str, code: int) -> None:
+def _exit_with_error(message: str, code: int) -> NoReturn:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # another Ctrl-C must change neither exit code nor message
     click.echo(f"{PROGRAM}: {message}", err=True)
-    _exit_program(code)
-
-
-def _exit_program(code: int) -> NoReturn:
-    """End the program even while threads of user code run; only Python's own executors may finish their tasks."""
-    thread_names = [thread.name for thread in threading.enumerate()
-                    if thread is not threading.current_thread() and not thread.daemon and thread not in _threads_queues]
-    if thread_names:
-        click.echo(f"note: threads still running, ended now: {', '.join(thread_names)}", err=True)
-        sys.stdout.flush()
-        sys.stderr.flush()
-        os._exit(code)
     sys.exit(code)
 
 

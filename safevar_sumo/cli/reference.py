@@ -13,7 +13,7 @@ from rich.console import Console
 from safevar_sumo.analysis.research_questions.case import Case, load_cases
 from safevar_sumo.analysis.words import two_decimals
 from safevar_sumo.cli.arguments import PICTURE_ENDINGS, check_output, complete_study, refuse_overwriting
-from safevar_sumo.cli.program import StrictCommand, commands, print_remarks
+from safevar_sumo.cli.program import commands, print_remarks
 from safevar_sumo.cli.target import jobs_option, json_option
 from safevar_sumo.errors import InputError, SimulationError
 from safevar_sumo.metrics import METRICS
@@ -141,7 +141,7 @@ MULTIVALUE_FLAGS = ("--published", "--reference")
 """Flags that take all words up to the next flag as values."""
 
 
-class _MultivalueCommand(StrictCommand):
+class _MultivalueCommand(click.Command):
     """Reads `--published A B` as `--published A --published B`."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:

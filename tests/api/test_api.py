@@ -18,9 +18,9 @@ import pandas as pd
 import pytest
 
 import safevar_sumo as sv
-from safevar_sumo import report
 from safevar_sumo.errors import UserCodeError
 from safevar_sumo.plugins import UserCodeTimeout, limit_user_code, time_limit
+from safevar_sumo.report import report
 from safevar_sumo.study import load_study, tables_of
 from safevar_sumo.sumo.matrix import simulate, simulate_all_points, study_at, worst_points
 from safevar_sumo.sumo.system import assemble
@@ -184,7 +184,7 @@ def test_a_value_that_is_missing_is_the_originals() -> None:
 
 def test_the_functions_share_one_convention_and_its_types_are_public() -> None:
     """Every argument is documented in its function, every class of a signature is a name of the package."""
-    several = [sv.run, sv.evaluate, sv.explain, sv.tolerance, sv.risk, sv.rules, report.report]
+    several = [sv.run, sv.evaluate, sv.explain, sv.tolerance, sv.risk, sv.rules, report]
     others = ["None", "str", "int", "float", "bool", "Path", "Sequence", "Mapping", "tuple", "list", "pd", "DataFrame", "npt", "ArrayLike"]
     for function in (*several, sv.simulate, sv.compare, sv.load, sv.tables, sv.figures):
         signature = inspect.signature(function)

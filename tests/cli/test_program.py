@@ -31,7 +31,6 @@ from safevar_sumo.study import load_study, study_names
 from safevar_sumo.terminal import WholeTable
 
 ROOT = Path(__file__).parents[2]
-OLD_PYTHON = "import runpy, sys; sys.version_info = (3, 10, 9); runpy.run_module('safevar_sumo', run_name='__main__')"
 HEAVY = {"libsumo", "traci", "matplotlib", "pandas", "scipy", "seaborn", "cma"}
 
 
@@ -79,15 +78,6 @@ def test_one_simulation_loads_sumo_and_no_statistics() -> None:
     assert loaded(code + "print(CliRunner().invoke(commands, ['simulate', 'sun', '--json']).exit_code)") <= {"libsumo", "traci"}
 
 
-@pytest.mark.slow
-@pytest.mark.skipif(os.name != "posix", reason="a shell that closes streams")
-@pytest.mark.parametrize(("streams", "code"), [(">&-", 0), (">&- 2>&- <&-", 0), ("> /dev/full", 1)])
-def test_closed_and_full_streams_are_no_traceback(streams: str, code: int) -> None:
-    done = subprocess.run(f"{sys.executable} -m safevar_sumo list {streams}", shell=True, capture_output=True, text=True, check=False)
-    assert done.returncode == code
-    assert done.stderr in ("", "safevar-sumo: No space left on device: standard output\n")
-
-
 def test_what_the_library_says_of_a_parameter_is_said_of_its_flag(in_tmp: Path) -> None:
     Path("file").write_text("")
     for arguments in (["import", "native", "--rs", "x.csv", "--out", "o", "--original", "sd"], ["study", "smoke", "--cluster", "nowhere"],
@@ -131,18 +121,6 @@ def test_an_error_names_what_was_probably_meant(typed: str, says: str, in_tmp: P
     result = capsys.readouterr().err
     assert ended.value.code == 2
     assert says in result
-
-
-@pytest.mark.parametrize(("start", "says"), [
-    ("-m safevar_sumo list", "click is not installed"), (f"-c {OLD_PYTHON}", "needs Python 3.11 or newer; this is 3.10.9")])
-def test_where_it_cannot_run_it_says_so_in_one_line(start: str, says: str) -> None:
-    command, code = start.split(" ", 1)
-    arguments = [command, code] if command == "-c" else start.split()
-    done = subprocess.run([sys.executable, "-S", *arguments], capture_output=True, text=True, cwd=ROOT)  # -S: nothing is installed
-    assert done.returncode == 1
-    assert re.fullmatch(f"safevar-sumo: {re.escape(says)}.*\n", done.stderr)
-    for file in ("__init__.py", "__main__.py", "shipped.py"):
-        ast.parse((ROOT / "safevar_sumo" / file).read_text(), feature_version=(3, 10))
 
 
 @pytest.mark.parametrize(("words", "incomplete", "expected"), [

@@ -97,7 +97,6 @@ def test_a_users_scalar_ads_is_named_in_a_study(in_tmp: Path) -> None:
     (["study", "smoke", "--out", "link"], ("--out: cannot write to link: it is a link whose target does not exist",)),
     (["tables", "out"], ("out: is not a results directory",)),
     (["simulate", "/"], ("/",)),
-    (["simulate", ""], ("STUDY|DIR: '' is empty",)), (["tables", "out", ""], ("DIR...: '' is empty",)),
     (["simulate", "sun", "--as-it-is-now"], ("--as-it-is-now: a study is simulated as it is now anyway",)),
     (["validate", "sun", "none.csv", "--jobs", "1025"], ("--jobs", "1025", "see python -m safevar_sumo validate --help")),
     (["study", "sun", "--seed"], ("--seed", "see python -m safevar_sumo study --help")), (["study"], ("Missing argument 'STUDY'",)),
