@@ -9,6 +9,7 @@ from contextlib import contextmanager
 import msgspec
 import numpy as np
 
+from safevar_sumo.analysis.research_questions.case import Case
 from safevar_sumo.errors import InputError, SimulationError
 from safevar_sumo.metrics import METRICS, RATING_POINTS, Unsafe
 from safevar_sumo.protocol import cells_of_part
@@ -105,6 +106,15 @@ class Evaluator:
 
         return self.region.draw_feasible(draw_next, number, rng, filtered=feasible_after_filter, rejections=MAX_REJECTIONS)
 
+    def random_settings(self, number: int) -> FloatArray:
+        """The first `number` random vehicles of the study, uniform over the domain's feasible part: those that `risk` draws, too."""
+        rng, bounds = np.random.default_rng(self.study.search.seed), self.characteristics
+
+        def draw_next(count: int) -> FloatArray:
+            return np.asarray(bounds.lower + rng.random((count, len(bounds))) * (bounds.upper - bounds.lower))
+
+        return self.region.draw_feasible(draw_next, number, np.random.default_rng(self.study.search.seed), rejections=MAX_REJECTIONS)
+
     def simulate_cells(self, settings: FloatArray, stage: str) -> CellResults:
         """Simulate M settings, shape (M, n), in every cell of a rated study; the workers share the cells.
 
@@ -148,10 +158,15 @@ class Evaluator:
             raise SimulationError(f"study {self.study.name!r} cannot be simulated with the original vehicle: {evaluations.outcome[0]}")
         return evaluations
 
-    def choose_criterion(self, text: str | None, original: Evaluations | None = None) -> Unsafe:
-        """The criterion that an option states, or the default criterion; raises what `parse_criterion` and `Unsafe.default_among` raise."""
+    def choose_criterion(self, text: str | None, source: Study | Case, original: Evaluations | None = None) -> Unsafe:
+        """The criterion that an option states, or the default: that of the solutions, or of a study without results, of its whole domain.
+
+        Raises what `parse_criterion` and `Unsafe.default_among` raise.
+        """
         if text is not None:
             return self.parse_criterion(text)
+        if not isinstance(source, Study) and len(source.solutions):
+            return source.unsafe
         original = self.evaluate_original() if original is None else original
         if RATING_POINTS.name in original.metrics:
             return Unsafe.default_among(original, original)  # a lost point: it depends on the original vehicle alone

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -124,10 +124,34 @@ def study_or_case(source: StudyLike | Results, *, as_it_is_now: bool = False, re
     return load_study(source)
 
 
-def study_of(source: StudyLike | Results, *, as_it_is_now: bool = False) -> Study:
-    """The study itself, or the study of the results; raises what `study_or_case` raises."""
-    subject = study_or_case(source, as_it_is_now=as_it_is_now)
+def study_in(subject: Study | Case) -> Study:
+    """The study itself, or the study of the results."""
     return subject if isinstance(subject, Study) else subject.study
+
+
+def at_point(case: Case, point: str) -> Case:
+    """Results at one point of the study's matrix: their solutions and the original vehicle, simulated again there.
+
+    Raises
+    ------
+    InputError
+        If the study has no such point.
+    """
+    import numpy as np
+
+    from safevar_sumo.sumo.matrix import evaluate, study_at
+    from safevar_sumo.sumo.system import assemble
+
+    study, names = study_at(case.study, point, source="--point"), list(case.characteristics.names)
+    system = assemble(study)
+    scoring = system.measuring.scoring
+    settings = np.concatenate([case.characteristics.original[np.newaxis], case.solutions[names].to_numpy(float)])
+    evaluations = evaluate(system, settings)
+    columns = {"f_safe": evaluations.f_safe, **evaluations.metrics, "outcome": evaluations.outcome}
+    solutions = case.solutions.drop(columns=[name for name in case.original if name not in evaluations.metrics])
+    original = {metric.name: float(evaluations.metrics[metric.name][0]) for metric in scoring.metrics}
+    return replace(case, study=study, scoring=scoring, original=original,
+                   solutions=solutions.assign(**{name: values[1:] for name, values in columns.items()}))
 
 
 def changes_since(directory: Path, case: Case, *, as_it_is_now: bool = False) -> list[str]:

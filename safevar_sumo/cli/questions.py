@@ -15,6 +15,7 @@ from safevar_sumo.analysis.opinion import OpinionOptions
 from safevar_sumo.analysis.options import Options
 from safevar_sumo.analysis.risk import RiskOptions
 from safevar_sumo.analysis.rules import RulesOptions
+from safevar_sumo.analysis.subject import study_in
 from safevar_sumo.analysis.tolerance import ToleranceOptions
 from safevar_sumo.cli.arguments import PICTURE_ENDINGS, check_output
 from safevar_sumo.cli.program import commands
@@ -25,7 +26,6 @@ from safevar_sumo.cli.target import (
     jobs_option,
     json_option,
     load_results_or_study,
-    load_study_at_point,
     point_option,
 )
 from safevar_sumo.errors import InputError
@@ -110,12 +110,12 @@ def tolerance(source: str, point: str | None, jobs: int | None, as_json: bool, p
     from safevar_sumo.analysis.tolerance.compute import find_tolerances
     from safevar_sumo.analysis.tolerance.render import pairs_figure, print_tolerance, profiles_figure
 
-    options, study = ToleranceOptions(**values), load_study_at_point(source, point)
+    options, subject = ToleranceOptions(**values), load_results_or_study(source, point)
     pairs_plot = None if plot is None else plot.with_stem(f"{plot.stem}-pairs")
     for path in (plot, pairs_plot if options.pairs else None):
         if path is not None:
             check_output(path, "--plot", PICTURE_ENDINGS)
-    result = _compute_with_bar(find_tolerances, study, options, jobs)
+    result = _compute_with_bar(find_tolerances, subject, options, jobs)
     if as_json:
         click.echo(_to_json(result))
     else:
@@ -133,14 +133,15 @@ def risk(source: str, point: str | None, jobs: int | None, as_json: bool, plot: 
     from safevar_sumo.analysis.risk.compute import estimate_risk
     from safevar_sumo.analysis.risk.render import print_risk, sensitivity_figure
 
-    options, study = RiskOptions(**values), load_study_at_point(source, point)
+    options, subject = RiskOptions(**values), load_results_or_study(source, point)
+    study = study_in(subject)
     if plot is not None:
         check_output(plot, "--plot", PICTURE_ENDINGS)
         if study.correlations:
             raise InputError("--plot", "sensitivity indices of correlated characteristics are not defined", "a study without correlations")
         if options.requires_rare_method:
             raise InputError("--plot", "a method for rare failures computes no sensitivity indices to draw", "--method auto")
-    result = _compute_with_bar(estimate_risk, study, options, jobs)
+    result = _compute_with_bar(estimate_risk, subject, options, jobs)
     if study.correlations:
         click.echo("note: no sensitivity indices: they are not defined for correlated characteristics", err=True)
     if result.errors:
@@ -158,7 +159,7 @@ def rules(source: str, point: str | None, jobs: int | None, as_json: bool, **val
     """Find rules, in physical units, that describe the unsafe settings of STUDY, from evenly spread settings instead of a search."""
     from safevar_sumo.analysis.rules.compute import find_rules, print_rules
 
-    result = _compute_with_bar(find_rules, load_study_at_point(source, point), RulesOptions(**values), jobs)
+    result = _compute_with_bar(find_rules, load_results_or_study(source, point), RulesOptions(**values), jobs)
     if not as_json:
         print_rules(Console(), result)
         return

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
-from dataclasses import fields, replace
+from dataclasses import fields
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 
 from safevar_sumo.analysis.options import Option, Options
+from safevar_sumo.analysis.subject import study_in
 from safevar_sumo.cli.arguments import NumberRange
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import FloatArray
-from safevar_sumo.results import UNKNOWN, SolutionId, choose_handle, row_of_handle
+from safevar_sumo.results import SolutionId, choose_handle, row_of_handle
 from safevar_sumo.study import Study
 
 if TYPE_CHECKING:
@@ -55,7 +56,7 @@ def load_target(source: str, solution: str | None, choice: str | None) -> Comman
     if solution is not None and choice is not None:
         raise InputError("--solution", f"{solution!r} and --{choice.replace('_', '-')} both choose a solution", "one of them")
     if solution is None and choice is None:
-        return CommandTarget(load_study_at_point(source), source)
+        return CommandTarget(study_in(_load_subject(source)), source)
     case = load_results_or_study(source, results_only=True)
     assert not isinstance(case, Study)
     requested_handle = None if solution is None else SolutionId.parse(solution)
@@ -133,8 +134,9 @@ def load_results_or_study(source: str, point: str | None = None, *, results_only
     return subject
 
 
-def _load_subject(source: str, point: str | None, *, results_only: bool = False) -> Study | Case:
-    from safevar_sumo.analysis.subject import study_or_case
+def _load_subject(source: str, point: str | None = None, *, results_only: bool = False) -> Study | Case:
+    from safevar_sumo.analysis.subject import at_point, study_or_case
+    from safevar_sumo.sumo.matrix import study_at
 
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", UserWarning)
@@ -144,17 +146,5 @@ def _load_subject(source: str, point: str | None, *, results_only: bool = False)
     if point is None:
         return subject
     if isinstance(subject, Study):
-        return _restrict_to_point(subject, point)
-    return replace(subject, study=_restrict_to_point(subject.study, point), solutions=subject.solutions.assign(outcome=UNKNOWN))
-
-
-def _restrict_to_point(study: Study, point: str) -> Study:
-    from safevar_sumo.sumo.matrix import study_at
-
-    return study_at(study, point, source="--point")
-
-
-def load_study_at_point(source: str, point: str | None = None) -> Study:
-    """Load a study, or the study recorded in a results directory, at one point or at all; raises what `load_results_or_study` raises."""
-    subject = _load_subject(source, point)
-    return subject if isinstance(subject, Study) else subject.study
+        return study_at(subject, point, source="--point")
+    return at_point(subject, point)

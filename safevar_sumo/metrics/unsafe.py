@@ -42,12 +42,12 @@ class Unsafe:
 
     @property
     def description(self) -> str:
-        """The criterion in words, rounded: `collision`, `safety degree below 0.847 m (half of the original's)`."""
+        """The criterion in words, rounded: `collision`, `safety degree below 0.847 m (half of the original's, a screening limit)`."""
         if self.points is not None:
             return f"at most {self.points:g} points"
         if self.below is None:
             return "collision"
-        share = " (half of the original's)" if self.is_half else ""
+        share = " (half of the original's, a screening limit)" if self.is_half else ""
         return f"safety degree below {self.below:.3g} {'m' if self.below >= 0 else 'm/s'}{share}"
 
     @property

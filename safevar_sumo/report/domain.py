@@ -9,7 +9,7 @@ from markupsafe import Markup
 
 from safevar_sumo.analysis.evaluator import Progress
 from safevar_sumo.analysis.risk.compute import FLEET_VEHICLES, estimate_risk
-from safevar_sumo.analysis.rules.compute import find_rules, rule_in_words
+from safevar_sumo.analysis.rules.compute import RULES_NOTE, find_rules, rule_in_words
 from safevar_sumo.analysis.tolerance.compute import find_tolerances
 from safevar_sumo.analysis.words import number_of
 from safevar_sumo.metrics import Unsafe
@@ -24,7 +24,7 @@ Section = dict[str, Any]
 def make_tolerance_section(data: ReportInput, jobs: int | None, progress: Progress) -> Section:
     """Bars of the values at which each characteristic alone is safe, and the safe factor of all characteristics together."""
     def compute() -> Section:
-        tolerances = find_tolerances(data.case.study, data.options["tolerance"], jobs=jobs, progress=progress)
+        tolerances = find_tolerances(data.case, data.options["tolerance"], jobs=jobs, progress=progress)
         return {**tolerances.to_dict(), "verdict": tolerances.verdict}
 
     result = _with_criterion_in_words(load_or_compute(data, "tolerance", compute))
@@ -34,7 +34,7 @@ def make_tolerance_section(data: ReportInput, jobs: int | None, progress: Progre
 def make_risk_section(data: ReportInput, jobs: int | None, progress: Progress) -> Section:
     """The probability of a failure with its interval, and bars of the characteristics that decide whether a vehicle fails."""
     def compute() -> Section:
-        estimate = estimate_risk(data.case.study, data.options["risk"], jobs=jobs, progress=progress)
+        estimate = estimate_risk(data.case, data.options["risk"], jobs=jobs, progress=progress)
         fleet = {"vehicles": FLEET_VEHICLES, "probability": estimate.of_fleet(FLEET_VEHICLES)}
         return {**estimate.to_dict(), **({} if estimate.is_share_of_domain else {"fleet": fleet})}
 
@@ -47,13 +47,14 @@ def make_risk_section(data: ReportInput, jobs: int | None, progress: Progress) -
 def make_rules_section(data: ReportInput, jobs: int | None, progress: Progress) -> Section:
     """Rules in words, with their density and coverage among vehicles held back while the rules were found."""
     def compute() -> Section:
-        result = find_rules(data.case.study, data.options["rules"], jobs=jobs, progress=progress)
+        result = find_rules(data.case, data.options["rules"], jobs=jobs, progress=progress)
         significant = [rule for rule in result.rules if rule.is_denser_than(result.unsafe_share)]
         words = [superscript_powers(rule_in_words(rule, data.case.characteristics, result.unsafe)) for rule in significant]
         omitted_rules = number_of(len(result.rules) - len(significant), "rule")
         remark = (result.remark and f"{result.remark}.") if len(significant) == len(result.rules) else (
             f"Left out: {omitted_rules} that may be due to chance, as few vehicles were simulated; the command rules simulates more.")
-        return {"words": words, "samples": result.samples, "share": result.unsafe_share, "remark": remark, "unsafe": str(result.unsafe)}
+        return {"words": words, "note": RULES_NOTE, "samples": result.samples, "share": result.unsafe_share, "remark": remark,
+                "unsafe": str(result.unsafe)}
 
     return _with_criterion_in_words(load_or_compute(data, "rules", compute))
 

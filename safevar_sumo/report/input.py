@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cache, cached_property
 from hashlib import sha256
 from importlib.metadata import version
@@ -20,7 +20,7 @@ from safevar_sumo.analysis.options import Options
 from safevar_sumo.analysis.research_questions.case import Case, load_cases
 from safevar_sumo.analysis.risk import RiskOptions
 from safevar_sumo.analysis.rules import RulesOptions
-from safevar_sumo.analysis.subject import changes_since
+from safevar_sumo.analysis.subject import at_point, changes_since
 from safevar_sumo.analysis.tolerance import ToleranceOptions
 from safevar_sumo.errors import InputError, SafevarError, warn
 from safevar_sumo.records import Evaluations, FloatArray
@@ -31,7 +31,7 @@ from safevar_sumo.results import ANSWERS, MANIFEST, RESULTS, SOLUTIONS, choose_h
 from safevar_sumo.scenarios import LOCATION_DIMENSION, SPEED_DIMENSION, Point
 from safevar_sumo.shipped import PACKAGE
 from safevar_sumo.study import SAFETY_DEGREE, refuse_other_than_file, user_code_names
-from safevar_sumo.sumo.matrix import evaluate, evaluations_at_worst_points, simulate_all_points, study_at
+from safevar_sumo.sumo.matrix import evaluations_at_worst_points, simulate_all_points
 from safevar_sumo.sumo.system import System, assemble
 
 
@@ -215,25 +215,11 @@ def read_inputs(directories: Iterable[str | Path], point: str | None = None, *, 
         else:
             later_changes = changes_since(path, case, as_it_is_now=as_it_is_now)
         if point is not None:
-            case = _at_point(case, point)
+            case = at_point(case, point)
             system = assemble(case.study, str(path))
         inputs.append(ReportInput(study_number=study_number, directory=path, case=case, manifest=read_manifest(path), system=system,
                                   problem=problem, point=point or "", later_changes=later_changes))
     return inputs
-
-
-def _at_point(case: Case, point: str) -> Case:
-    """The case with its solutions and original vehicle simulated again at one point of the study's matrix."""
-    study = study_at(case.study, point, source="point")
-    system = assemble(study)
-    settings = np.concatenate([case.characteristics.original[np.newaxis], case.solutions[list(case.characteristics.names)].to_numpy(float)])
-    evaluations = evaluate(system, settings)
-    columns = {"f_safe": evaluations.f_safe, **evaluations.metrics, "outcome": evaluations.outcome}
-    scoring = system.measuring.scoring
-    solutions = case.solutions.drop(columns=[metric.name for metric in case.scoring.metrics if metric.name not in evaluations.metrics])
-    original = {metric.name: float(evaluations.metrics[metric.name][0]) for metric in scoring.metrics}
-    return replace(case, study=study, scoring=scoring, original=original,
-                   solutions=solutions.assign(**{name: values[1:] for name, values in columns.items()}))
 
 
 def load_or_compute(data: ReportInput, name: str, compute: Callable[[], Any]) -> Any:

@@ -16,6 +16,7 @@ from safevar_sumo.analysis.risk import compute
 from safevar_sumo.analysis.risk.compute import Risk
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import BoolArray, FloatArray
+from safevar_sumo.study.variation import Uniform
 from tests.analysis.known_regions import Plant, box, made_up_study
 
 Limit = Callable[[FloatArray], FloatArray]
@@ -41,7 +42,7 @@ def islands(beta: float) -> Limit:
 
 def rare(limit: Limit, n: int, seed: int = 1, **options: object) -> Risk:
     study = made_up_study(n)
-    study = msgspec.structs.replace(study, search=msgspec.structs.replace(study.search, seed=seed))
+    study = msgspec.structs.replace(study, search=msgspec.structs.replace(study.search, seed=seed), variation={"a": Uniform()})
     plant = Plant(study, lambda settings: limit(of_normal(settings)) < 0, lambda settings: limit(of_normal(settings)))
     return risk(study, unsafe="collision", pool=plant, **{"rare": True, **options})  # type: ignore[arg-type]
 
@@ -129,6 +130,12 @@ def test_the_limit_of_rare_failures_has_one_owner(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(compute, "RARE_BELOW", 0.02)
     monkeypatch.setattr(compute, "find_spec", lambda name: None)
     assert rare(linear(beta_of(1e-3)), 2, rare=False).remark.startswith("fewer than 2 % of the first vehicles are unsafe; ")
+
+
+def test_a_share_of_the_domain_is_counted_whatever_is_installed() -> None:
+    """Without [variation] it is no probability, and the shares of `risk`, `rules` and a report are counted on the same vehicles."""
+    study = made_up_study(2)
+    assert risk(study, unsafe="collision", pool=Plant(study, lambda rows: rows[:, 0] > 9.99), samples=3000).method == "monte_carlo"
 
 
 @pytest.mark.slow

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import json
+from io import StringIO
 from typing import Any
 
 import numpy as np
 import pytest
+from rich.console import Console
 
-from safevar_sumo import rules
-from safevar_sumo.analysis.rules.compute import Rule, Rules, rule_in_words
+from safevar_sumo import risk, rules
+from safevar_sumo.analysis.rules.compute import Rule, Rules, print_rules, rule_in_words
+from safevar_sumo.study import load_study
 from safevar_sumo.vehicles import CharacteristicSet
 from tests.analysis.known_regions import Plant, Region, box, diagonal_band, everywhere, made_up_study, nowhere, two_islands
 
@@ -84,4 +87,29 @@ def test_the_promised_record_the_same_again_and_in_words() -> None:
     assert frame.where(frame.notna(), None)[list(record["conditions"][0])].to_dict("records") == record["conditions"]
     assert frame["rule"].tolist() == [0, 0]
     result = rule_in_words(first.rules[0], CharacteristicSet.of(first.study.vehicle.characteristics), first.unsafe)
-    assert result.startswith("a above 7 N m and b below 3 N m: collides in 100 % (")
+    assert result.startswith("a above 7 N m and b below 3 N m, the others anywhere: collides in 100 % (")
+
+
+@pytest.mark.parametrize("constraint", [None, {"sum": {"a": 1.0, "b": 1.0}, "at_most": 12.0}])
+def test_the_share_of_unsafe_vehicles_is_that_of_risk(constraint: dict[str, Any] | None) -> None:
+    """The same vehicles in both, the first ones of a longer sequence in a shorter one: each estimate lies in the other's interval."""
+    study = made_up_study(2)
+    study = load_study(study, constraints=[constraint]) if constraint else study
+    asked = {number: Plant(study, box) for number in (400, 1000)}
+    shares = {number: rules(study, unsafe="collision", pool=pool, samples=number) for number, pool in asked.items()}
+    estimate = risk(study, unsafe="collision", pool=(plant := Plant(study, box)), samples=1000, method="monte_carlo")
+    assert asked[400].seen < asked[1000].seen <= plant.seen
+    assert (shares[1000].unsafe_share, shares[1000].unsafe_interval) == (estimate.probability, pytest.approx(estimate.interval))
+    for one, other in ((400, 1000), (1000, 400)):
+        low, high = shares[one].unsafe_interval
+        assert low < shares[other].unsafe_share < high
+
+
+def test_rules_say_over_what_they_hold() -> None:
+    """In a rule all characteristics vary, in a tolerance one alone: otherwise their limits contradict each other."""
+    console = Console(file=StringIO(), width=300)
+    print_rules(console, of(box))
+    printed = console.file.getvalue()  # type: ignore[attr-defined]
+    assert "a above 7 N m and b below 3 N m, the others anywhere: collides in" in printed
+    assert "all characteristics vary together over the whole domain; how far one may go while all others stay as in the original" in printed
+    assert "% of 16384 vehicles drawn evenly over the whole domain (" in printed

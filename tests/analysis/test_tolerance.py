@@ -14,10 +14,13 @@ from hypothesis import strategies as st
 
 from safevar_sumo import tolerance
 from safevar_sumo.analysis.evaluator import Evaluator
-from safevar_sumo.analysis.tolerance import safe_box
-from safevar_sumo.analysis.tolerance.compute import Tolerance
+from safevar_sumo.analysis.research_questions.case import build_case
+from safevar_sumo.analysis.tolerance import ToleranceOptions, safe_box
+from safevar_sumo.analysis.tolerance.compute import Tolerance, find_tolerances
 from safevar_sumo.analysis.tolerance.render import profiles_figure
 from safevar_sumo.metrics import Unsafe
+from safevar_sumo.records import BoolArray, FloatArray
+from safevar_sumo.results import record, solutions_frame
 from tests.analysis.known_regions import Plant, Region, box, everywhere, made_up_study, nowhere, two_islands
 
 
@@ -101,6 +104,25 @@ def test_the_box_varies_the_characteristics_that_are_asked_for() -> None:
     result = of(3, region, characteristics=["a", "b"]).joint
     assert result.factor == pytest.approx(0.8, rel=0.02)
     assert result.characteristics == ("a", "b")
+
+
+def test_the_box_holds_no_unsafe_solution_of_a_search() -> None:
+    """A sliver that begins half of the way to the domain's end; no scan, no random setting and no corner of the domain hits it."""
+    def sliver(rows: FloatArray) -> BoolArray:
+        return np.asarray((np.abs(rows[:, 0] - rows[:, 1]) < 0.001) & (rows[:, 0] > 7) & (np.abs(rows[:, 2:] - 2).max(axis=1) < 0.5))
+
+    study = made_up_study(4)
+    found = [[8.5, 8.5, 2.0, 2.2], [5.0, 5.0, 5.0, 5.0]]
+    evaluations = Plant(study, sliver).submit(b"", np.array(found)).result()
+    case = build_case(study, record(Plant(study, sliver).submit(b"", np.full((1, 4), 5.0)).result(), 0),
+                      solutions_frame(tuple("abcd"), [(("rs", 0), evaluations)]), solutions_frame(tuple("abcd"), []), [("rs", 0)])
+    pool = Plant(study, sliver)
+    assert find_tolerances(study, ToleranceOptions(unsafe="collision"), pool=pool).joint.factor == pytest.approx(1, abs=0.01)
+    result = find_tolerances(case, ToleranceOptions(), pool=pool)
+    assert str(result.unsafe) == "collision", "as the solutions do, and as `explain` takes it"
+    assert 0.49 < result.joint.factor < 0.5
+    two = find_tolerances(case, ToleranceOptions(characteristics=("a", "b")), pool=pool)
+    assert two.joint.factor == 1, "the solution changes others as well"
 
 
 @pytest.mark.slow

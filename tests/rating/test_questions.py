@@ -24,6 +24,7 @@ from safevar_sumo.analysis.rating import RatingOptions, compute
 from safevar_sumo.analysis.rating.render import colour_changes_in_words, matrices_figure, print_matrices, print_rating
 from safevar_sumo.analysis.research_questions.case import build_case
 from safevar_sumo.analysis.risk.rare import Response
+from safevar_sumo.analysis.subject import at_point
 from safevar_sumo.analysis.tolerance import ToleranceOptions
 from safevar_sumo.analysis.tolerance.compute import find_tolerances
 from safevar_sumo.analysis.tolerance.render import print_tolerance, profiles_figure
@@ -35,7 +36,6 @@ from safevar_sumo.errors import SimulationError
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.protocol import EURO_NCAP_2026, protocol_of, rater
 from safevar_sumo.records import Evaluations
-from safevar_sumo.report.input import _at_point as at_point
 from safevar_sumo.report.rated import draw_matrices
 from safevar_sumo.results import SolutionId, record, solutions_frame
 from safevar_sumo.study import load_study

@@ -410,8 +410,9 @@ def test_a_weather_without_effect_is_called_so(weather: str, has_effect: bool) -
 def test_a_section_without_rules_promises_none() -> None:
     def section(**rules: object) -> str:
         template = template_environment(TEMPLATE_FOLDER).get_template("rules.html.j2")
-        return template.render(studies=[{"name": "x", "rules": {"samples": 4000, "share": 0.003, "unsafe": "collision", **rules}}])
+        return template.render(studies=[{"name": "x", "rules": {"samples": 4000, "share": 0.003, "unsafe": "collision",
+                                                           "note": "Shares of others.", **rules}}])
 
-    assert "the shares below" not in section(words=[], remark="").lower()
+    assert "Shares of others." not in section(words=[], remark="")
     assert "<p>Too few.</p>" in section(words=[], remark="Too few.")
-    assert "the shares below" in section(words=["a rule"], remark="").lower()
+    assert "Shares of others." in section(words=["a rule"], remark="")

@@ -240,7 +240,7 @@ def test_a_point_is_lost_to_six_decimals() -> None:
 def test_a_criterion_in_words_is_rounded_but_its_text_is_exact() -> None:
     half = Unsafe.default({"safety_degree": 1.694206}, FRAME["outcome"].head(0))
     assert (str(half), half.description, half.in_words) == (
-        "below=0.847103", "safety degree below 0.847 m (half of the original's)", "SD is below 0.847")
+        "below=0.847103", "safety degree below 0.847 m (half of the original's, a screening limit)", "SD is below 0.847")
     assert half == Unsafe(0.847103)
     assert [Unsafe.parse(text).description for text in ("collision", "below=0.847103", "below=-2", "points=3.5")] == [
         "collision", "safety degree below 0.847 m", "safety degree below -2 m/s", "at most 3.5 points"]

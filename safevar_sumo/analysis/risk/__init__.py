@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
 from safevar_sumo.analysis.options import Options, document_options, option, unsafe_option
-from safevar_sumo.analysis.subject import Results, answer_question, study_of
+from safevar_sumo.analysis.subject import Results, answer_question, study_or_case
 from safevar_sumo.errors import InputError, unknown_name
 from safevar_sumo.study import StudyLike
 
@@ -41,9 +41,9 @@ class RiskOptions(Options):
         None, "Stop as soon as the confidence interval of the probability is at most this wide.", kind=float, low=0, high=1,
         is_open=(True, False))
     unsafe: str | None = unsafe_option()
-    method: str = option("auto", f"Method: monte_carlo, subset_simulation, cross_entropy, or auto, which draws {PILOT_VEHICLES:,} vehicles "
-                                 "and takes subset_simulation if OpenTURNS is installed, the probability is below "
-                                 f"{RARE_BELOW:g} and --samples vehicles would have fewer than {ENOUGH_FAILURES} failures.",
+    method: str = option("auto", "Method: monte_carlo, subset_simulation, cross_entropy, or auto, which for a study with [variation] draws "
+                                 f"{PILOT_VEHICLES:,} vehicles and takes subset_simulation if OpenTURNS is installed, the probability is "
+                                 f"below {RARE_BELOW:g} and --samples vehicles would have fewer than {ENOUGH_FAILURES} failures.",
                          metavar="METHOD", kind=str)
     rare: bool = option(False, "For rare failures, 1e-3 to 1e-8: as auto, but requires OpenTURNS and computes no sensitivities.", kind=bool)
 
@@ -74,4 +74,4 @@ def risk(study: StudyLike | Results, *, samples: int = RiskOptions.samples, conf
     """
     from safevar_sumo.analysis.risk.compute import estimate_risk
 
-    return answer_question(estimate_risk, study_of(study, as_it_is_now=as_it_is_now), RiskOptions, locals())  # the arguments
+    return answer_question(estimate_risk, study_or_case(study, as_it_is_now=as_it_is_now), RiskOptions, locals())  # the arguments

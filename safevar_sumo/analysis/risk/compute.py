@@ -11,10 +11,12 @@ import pandas as pd
 import scipy
 
 from safevar_sumo.analysis.evaluator import Evaluator, Progress, clopper_pearson, open_evaluator, show_no_progress
+from safevar_sumo.analysis.research_questions.case import Case
 from safevar_sumo.analysis.risk import ENOUGH_FAILURES, PILOT_VEHICLES, RARE_BELOW, RiskOptions
 from safevar_sumo.analysis.risk.rare import Estimate, RareMethodError, Response, estimate_rare, is_plateau, load_openturns
 from safevar_sumo.analysis.risk.sensitivity import compute_sensitivities
 from safevar_sumo.analysis.risk.variation import VariationModel
+from safevar_sumo.analysis.subject import study_in
 from safevar_sumo.errors import InputError, SimulationError
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import FloatArray, finite_or_none
@@ -108,7 +110,7 @@ class Risk:
         return f"<Risk of {self.study.name}, unsafe {self.unsafe}: {self.probability:.4g} ({low:.4g} to {high:.4g})>"
 
 
-def estimate_risk(study: Study, options: RiskOptions, *, pool: Pool | None = None, jobs: int | None = None,
+def estimate_risk(source: Study | Case, options: RiskOptions, *, pool: Pool | None = None, jobs: int | None = None,
                   progress: Progress = show_no_progress) -> Risk:
     """Estimate the probability of an unsafe outcome. The filter of small changes is not applied, as no search changes vehicles.
 
@@ -119,9 +121,10 @@ def estimate_risk(study: Study, options: RiskOptions, *, pool: Pool | None = Non
     SimulationError
         If no vehicle can be simulated.
     """
+    study = study_in(source)
     model = VariationModel(study)
     with open_evaluator(study, pool, jobs, progress) as evaluator:
-        unsafe = evaluator.choose_criterion(options.unsafe)
+        unsafe = evaluator.choose_criterion(options.unsafe, source)
         simulated_before = evaluator.simulated
         response = Response(evaluator, model.settings_of_normal, unsafe)
         counts_or_estimate = _draw_vehicles(evaluator, model, unsafe, options, response)
@@ -166,7 +169,7 @@ def _draw_vehicles(evaluator: Evaluator, model: VariationModel, unsafe: Unsafe, 
                    response: Response) -> Estimate | _VehicleCounts:
     """Draw vehicles by plain Monte Carlo; if few of the first `PILOT_VEHICLES` are unsafe, switch to a method for rare failures."""
     counts, rng = _VehicleCounts(), np.random.default_rng(evaluator.study.search.seed)
-    is_pilot = _needs_pilot(options) and not evaluator.region
+    is_pilot = _needs_pilot(options, evaluator.study) and not evaluator.region
     if options.requires_rare_method and evaluator.region:
         counts.remark = "the study has constraints, which only plain Monte Carlo supports"
     if options.requires_rare_method:
@@ -202,8 +205,10 @@ def _draw_vehicles(evaluator: Evaluator, model: VariationModel, unsafe: Unsafe, 
     return counts
 
 
-def _needs_pilot(options: RiskOptions) -> bool:
-    return options.requires_rare_method or (options.method == "auto" and options.width is None and options.samples >= 2 * PILOT_VEHICLES)
+def _needs_pilot(options: RiskOptions, study: Study) -> bool:
+    """Whether a method for rare failures may follow; unless required, not for a share of the domain, which `rules` counts likewise."""
+    may_be_rare = options.method == "auto" and bool(study.variation) and options.width is None
+    return options.requires_rare_method or (may_be_rare and options.samples >= 2 * PILOT_VEHICLES)
 
 
 def _try_rare_method(response: Response, responses: FloatArray, options: RiskOptions, counts: _VehicleCounts, seed: int) -> Estimate | None:

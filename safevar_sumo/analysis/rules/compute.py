@@ -1,4 +1,4 @@
-"""Finds rules in physical units that say where a study is unsafe, from an unbiased design, and validates them on a second design.
+"""Finds rules in physical units that say where a study is unsafe, from random vehicles, and validates them on others.
 
 A classification tree (CART, by scikit-learn) cuts the domain into boxes. The tree is pruned to the smallest tree whose score in
 cross-validation is within a standard error of the best score. Its boxes with more unsafe than safe settings become rules. A rule
@@ -16,11 +16,13 @@ import numpy as np
 import pandas as pd
 from rich.console import Console
 
-from safevar_sumo.analysis.evaluator import CONFIDENCE, Evaluator, Progress, clopper_pearson, open_evaluator, show_no_progress
+from safevar_sumo.analysis.evaluator import CONFIDENCE, Progress, clopper_pearson, open_evaluator, show_no_progress
+from safevar_sumo.analysis.research_questions.case import Case
 from safevar_sumo.analysis.rules import RulesOptions
+from safevar_sumo.analysis.subject import study_in
 from safevar_sumo.analysis.words import join_phrases
 from safevar_sumo.metrics import Unsafe
-from safevar_sumo.records import BoolArray, Evaluations, FloatArray
+from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.study import Study
 from safevar_sumo.terminal import print_constraints, print_meanings, print_text
 from safevar_sumo.vehicles import Characteristic, CharacteristicSet
@@ -32,6 +34,9 @@ FOLDS, MAX_DEPTH, MAX_PRUNINGS = 5, 6, 24
 """Number of folds of the cross-validation; maximum depth of the tree; maximum number of prunings compared."""
 MIN_ADDED_SHARE = 0.01
 """Share of the unsafe settings that a rule must cover in addition to the rules before it."""
+RULES_NOTE = ("Shares of vehicles that did not form the rules. In a rule all characteristics vary together over the whole domain; how far "
+              "one may go while all others stay as in the original says `tolerance`.")
+"""What the shares of rules are shares of."""
 LIMIT_DIGITS = 3
 """Limits are rounded to this many digits of the domain's width."""
 Limits = dict[int, tuple[float | None, float | None]]
@@ -89,13 +94,14 @@ class Rule:
 
 @dataclass(frozen=True, kw_only=True)
 class Rules:
-    """Rules of a study, ordered by coverage; of `samples` settings, `unsafe_share` were unsafe."""
+    """Rules of a study, ordered by coverage; of `samples` settings, `unsafe_share` were unsafe, with its 95 % interval."""
 
     study: Study
     unsafe: Unsafe
     rules: list[Rule]
     samples: int
     unsafe_share: float
+    unsafe_interval: tuple[float, float]
     remark: str = ""
 
     def to_dict(self) -> list[dict[str, Any]]:
@@ -117,21 +123,25 @@ class Rules:
         return f"<Rules of {self.study.name}, unsafe {self.unsafe}: {share} settings, {len(self.rules)} rules>"
 
 
-def find_rules(study: Study, options: RulesOptions, *, pool: Pool | None = None, jobs: int | None = None,
+def find_rules(source: Study | Case, options: RulesOptions, *, pool: Pool | None = None, jobs: int | None = None,
                progress: Progress = show_no_progress) -> Rules:
-    """Find rules that say where a study is unsafe, from settings spread evenly over the whole domain.
+    """Find rules that say where a study is unsafe, from random settings of the whole domain.
 
     Raises
     ------
     InputError
         If `unsafe` cannot be used, or the study cannot be assembled.
     """
+    study = study_in(source)
     characteristics = CharacteristicSet.of(study.vehicle.characteristics)
     with open_evaluator(study, pool, jobs, progress) as evaluator:
-        unsafe = evaluator.choose_criterion(options.unsafe)
-        training, validation = (_evaluate_design(evaluator, options.samples // 2, study.search.seed + half) for half in (1, 2))
+        unsafe = evaluator.choose_criterion(options.unsafe, source)
+        evaluations = evaluator.evaluate(evaluator.random_settings(options.samples), "settings over the whole domain")
+    in_training = np.arange(len(evaluations)) < len(evaluations) // 2
+    training, validation = (evaluations.take(evaluations.valid & half) for half in (in_training, ~in_training))
     is_unsafe, is_unsafe_validation = unsafe.of(training), unsafe.of(validation)
-    unsafe_count = int(np.count_nonzero(is_unsafe))
+    unsafe_count, samples = int(np.count_nonzero(is_unsafe)), len(training) + len(validation)
+    all_unsafe = unsafe_count + int(np.count_nonzero(is_unsafe_validation))
     remark, boxes = "", list[Limits]()
     if unsafe_count == len(is_unsafe) > 0:
         boxes = [{}]
@@ -142,13 +152,7 @@ def find_rules(study: Study, options: RulesOptions, *, pool: Pool | None = None,
         boxes = _find_boxes(training.settings, is_unsafe, characteristics)
     rules = [_validate_rule(limits, validation.settings, is_unsafe_validation, characteristics) for limits in boxes]
     return Rules(study=study, unsafe=unsafe, rules=sorted(rules, key=lambda rule: -rule.unsafe_inside), remark=remark,
-                 samples=len(training) + len(validation), unsafe_share=float(np.mean(np.concatenate([is_unsafe, is_unsafe_validation]))))
-
-
-def _evaluate_design(evaluator: Evaluator, number: int, seed: int) -> Evaluations:
-    """Evaluations of settings over the whole domain, without the settings that could not be simulated."""
-    evaluations = evaluator.evaluate(evaluator.feasible_settings(number, seed), "settings over the whole domain")
-    return evaluations.take(evaluations.valid)
+                 samples=samples, unsafe_share=all_unsafe / samples, unsafe_interval=clopper_pearson(all_unsafe, samples))
 
 
 def _find_boxes(settings: FloatArray, is_unsafe: BoolArray, characteristics: CharacteristicSet) -> list[Limits]:
@@ -253,8 +257,9 @@ def print_rules(console: Console, result: Rules) -> None:
     """Print every rule with its density and coverage."""
     characteristics = CharacteristicSet.of(result.study.vehicle.characteristics)
     print_text(console, result.study.title)
-    print_text(console, f"Unsafe: {result.unsafe.description}; {100 * result.unsafe_share:.2f} % of {result.samples} settings "
-                        "all over the domain.")
+    low, high = result.unsafe_interval
+    print_text(console, f"Unsafe: {result.unsafe.description}; {100 * result.unsafe_share:.2f} % of {result.samples} vehicles "
+                        f"drawn evenly over the whole domain ({100 * low:.2f} % to {100 * high:.2f} %).")
     print_constraints(console, result.study)
     if result.remark:
         print_text(console, f"No rule: {result.remark}.")
@@ -265,19 +270,19 @@ def print_rules(console: Console, result: Rules) -> None:
     if result.rules:
         named = {name for rule in result.rules for name in rule.limits}
         print_meanings(console, [characteristic for characteristic in characteristics if characteristic.name in named])
-        print_text(console, f"Tested on settings that did not form the rules; in brackets "
-                            f"{100 * result.rules[0].confidence:.0f} % intervals.")
+        print_text(console, f"{RULES_NOTE} In brackets: {100 * result.rules[0].confidence:.0f} % intervals.")
 
 
 def rule_in_words(rule: Rule, characteristics: CharacteristicSet, unsafe: Unsafe) -> str:
-    """A rule with its density and coverage: `tireFric below 1.35 and gearSwitchTime above 0.55 s: collides in 92 % (..), covers 61 %`."""
+    """A rule with its density and coverage: `mass above 2500 kg, the others anywhere: collides in 92 % (..), covers 61 % (..)`."""
+    others = ", the others anywhere" if 0 < len(rule.limits) < len(characteristics) else ""
     conditions = [_condition_in_words(characteristic, *rule.limits[characteristic.name])
                   for characteristic in characteristics if characteristic.name in rule.limits]
     shares = [f"{word} -" if share is None or interval is None else
               f"{word} {100 * share:.0f} % ({100 * interval[0]:.0f} % to {100 * interval[1]:.0f} %)"
               for word, share, interval in ((f"{unsafe.in_words} in", rule.density, rule.density_interval),
                                             ("covers", rule.coverage, rule.coverage_interval))]
-    return f"{join_phrases(conditions) if conditions else 'everywhere'}: {', '.join(shares)}"
+    return f"{join_phrases(conditions) if conditions else 'everywhere'}{others}: {', '.join(shares)}"
 
 
 def _condition_in_words(characteristic: Characteristic, low: float | None, high: float | None) -> str:

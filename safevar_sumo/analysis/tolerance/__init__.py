@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
 from safevar_sumo.analysis.options import Options, document_options, option, unsafe_option
-from safevar_sumo.analysis.subject import Results, answer_question, study_of
+from safevar_sumo.analysis.subject import Results, answer_question, study_or_case
 from safevar_sumo.study import StudyLike
 
 if TYPE_CHECKING:
@@ -41,8 +41,8 @@ def tolerance(study: StudyLike | Results, *, unsafe: Criterion | None = None, ch
     Parameters
     ----------
     study
-        A study; or results or their directory, whose study is examined.
+        A study; or results or their directory: their study is examined, and the joint box holds none of their unsafe solutions.
     """
     from safevar_sumo.analysis.tolerance.compute import find_tolerances
 
-    return answer_question(find_tolerances, study_of(study, as_it_is_now=as_it_is_now), ToleranceOptions, locals())
+    return answer_question(find_tolerances, study_or_case(study, as_it_is_now=as_it_is_now), ToleranceOptions, locals())

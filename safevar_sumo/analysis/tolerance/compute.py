@@ -13,6 +13,8 @@ import numpy.typing as npt
 import pandas as pd
 
 from safevar_sumo.analysis.evaluator import Evaluator, Progress, open_evaluator, show_no_progress
+from safevar_sumo.analysis.research_questions.case import Case
+from safevar_sumo.analysis.subject import study_in
 from safevar_sumo.analysis.tolerance import ToleranceOptions
 from safevar_sumo.analysis.tolerance.pairs import Pair, scan_pairs
 from safevar_sumo.analysis.tolerance.safe_box import SafeBox, find_safe_box, no_safe_box
@@ -184,7 +186,7 @@ class Tolerance:
         if self.unsafe.of(self.original)[0]:
             return "The original vehicle itself is unsafe."
         if single_names:
-            return f"Unsafe alone: {', '.join(single_names)}."
+            return f"Unsafe alone, all others as in the original: {', '.join(single_names)}."
         if self.pairs is None:
             return "No single characteristic makes it unsafe."
         if unsafe_pairs:
@@ -214,25 +216,29 @@ class Tolerance:
         return f"<Tolerance of {self.study.name}, unsafe {self.unsafe}: {self.verdict}>"
 
 
-def find_tolerances(study: Study, options: ToleranceOptions, *, pool: Pool | None = None, jobs: int | None = None,
+def find_tolerances(source: Study | Case, options: ToleranceOptions, *, pool: Pool | None = None, jobs: int | None = None,
                     progress: Progress = show_no_progress) -> Tolerance:
     """Find how far the characteristics of a study may go. The filter is not applied, as the question is about the vehicle.
+
+    The joint box holds none of the unsafe solutions of results.
 
     Raises
     ------
     InputError
         If `unsafe` or a name cannot be used, or the study cannot be assembled.
     """
+    study = study_in(source)
     columns = _columns_of(study, options.characteristics)
     if options.pairs and len(columns) < 2:
         raise InputError("pairs", "one characteristic makes no pair", "at least two characteristics")
     with open_evaluator(study, pool, jobs, progress) as evaluator:
         original = evaluator.evaluate_original()
-        unsafe = evaluator.choose_criterion(options.unsafe, original)
+        unsafe = evaluator.choose_criterion(options.unsafe, source, original)
         scans = scan(evaluator, columns, unsafe)
         pairs = scan_pairs(evaluator, columns, unsafe) if options.pairs else None
         needs_box = not unsafe.of(original)[0] and not is_rated(study)  # a box of a rated study would take thousands of whole test matrices
-        box = (find_safe_box(evaluator, columns, unsafe, _unsafe_settings(evaluator, scans, pairs or [])) if needs_box
+        solutions = None if isinstance(source, Study) else source.solutions[unsafe.rows(source.solutions)]
+        box = (find_safe_box(evaluator, columns, unsafe, _unsafe_settings(evaluator, scans, pairs or []), solutions) if needs_box
                else no_safe_box(evaluator, columns))
     return Tolerance(study=study, unsafe=unsafe, original=original, alone=scans, pairs=pairs, joint=box)
 

@@ -77,7 +77,7 @@ def _scan_table(result: Tolerance) -> WholeTable:
                            "violates a constraint": [scan.infeasible for scan in result.alone]}
     intervals_by_header = {header: intervals for header, intervals in intervals_by_header.items() if any(intervals)}
     headers = ("original", "safe from", "to", "SD at the ends", "unsafe", *intervals_by_header)
-    table = WholeTable("characteristic", right=headers, title="Each alone")
+    table = WholeTable("characteristic", right=headers, title="Each alone, all others as in the original")
     for index, scan in enumerate(result.alone):
         characteristic = scan.characteristic
         table.add_row(f"{characteristic.name} [{characteristic.unit}]", f"{characteristic.original:g}", *_limits_in_words(scan),

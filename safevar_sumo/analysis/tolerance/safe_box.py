@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+import pandas as pd
 import scipy
 
 from safevar_sumo.analysis.evaluator import CONFIDENCE, Evaluator, sobol_points
@@ -52,7 +53,8 @@ def no_safe_box(evaluator: Evaluator, columns: Sequence[int], attempts: int = 0)
     return SafeBox(0.0, CONFIDENCE, 0, 0, attempts, 1.0, tuple(evaluator.characteristics.names[column] for column in columns))
 
 
-def find_safe_box(evaluator: Evaluator, columns: Sequence[int], unsafe: Unsafe, unsafe_settings: FloatArray) -> SafeBox:
+def find_safe_box(evaluator: Evaluator, columns: Sequence[int], unsafe: Unsafe, unsafe_settings: FloatArray,
+                  solutions: pd.DataFrame | None = None) -> SafeBox:
     """The largest safe box around an original vehicle that is safe itself.
 
     Parameters
@@ -60,7 +62,9 @@ def find_safe_box(evaluator: Evaluator, columns: Sequence[int], unsafe: Unsafe, 
     columns
         The characteristics that vary.
     unsafe_settings
-        Unsafe settings, shape (K, n); the box ends before all of them.
+        Unsafe settings, shape (K, n), each the nearest of its line; the box ends before all of them.
+    solutions
+        Unsafe solutions of a search; the box shrinks from them as from unsafe settings that it finds itself.
 
     Notes
     -----
@@ -75,7 +79,18 @@ def find_safe_box(evaluator: Evaluator, columns: Sequence[int], unsafe: Unsafe, 
     at most alpha_k; all tests together fail with probability sum alpha_k <= alpha, whichever of them accepts. Later tests draw more
     settings, so that the bound stays `MAX_UNSAFE_SHARE` if all of them can be simulated.
     """
+    def shrunk(factor: float, unsafe_found: FloatArray) -> float:
+        """The factor of a box that ends before all unsafe settings found on the straight ways from the original to some of these."""
+        nearest = unsafe_found[np.argsort(_box_factors(evaluator, unsafe_found), kind="stable")[:MAX_LINES]]
+        lines = [Line(evaluator.characteristics.original, end, 0.0) for end in nearest]
+        shares = find_first_unsafe_shares(evaluator, lines, unsafe, "nearest unsafe settings")
+        edge_settings = [line.settings_at(np.array([share]))[0] for line, share in zip(lines, shares, strict=True)]
+        return min(factor, float(np.min(_box_factors(evaluator, np.stack(edge_settings))))) * STEP_BACK
+
     factor = min(1.0, STEP_BACK * float(np.min(_box_factors(evaluator, unsafe_settings), initial=np.inf)))
+    known = _solutions_of_columns(evaluator, columns, solutions)
+    if len(known):
+        factor = shrunk(factor, known)
     attempt = 0
     for search in range(10**6):
         if factor < MIN_FACTOR:
@@ -99,12 +114,18 @@ def find_safe_box(evaluator: Evaluator, columns: Sequence[int], unsafe: Unsafe, 
                     unsafe_at_most = float(scipy.stats.beta.ppf(1 - error_probability, failed + 1, samples - failed))
                 return SafeBox(factor, CONFIDENCE, samples, failed, attempt, unsafe_at_most,
                                tuple(evaluator.characteristics.names[column] for column in columns))
-        nearest = unsafe_found[np.argsort(_box_factors(evaluator, unsafe_found), kind="stable")[:MAX_LINES]]
-        lines = [Line(evaluator.characteristics.original, end, 0.0) for end in nearest]
-        shares = find_first_unsafe_shares(evaluator, lines, unsafe, "nearest unsafe settings")
-        edge_settings = np.stack([line.settings_at(np.array([share]))[0] for line, share in zip(lines, shares, strict=True)])
-        factor = min(factor, float(np.min(_box_factors(evaluator, edge_settings)))) * STEP_BACK
+        factor = shrunk(factor, unsafe_found)
     return no_safe_box(evaluator, columns, attempt)
+
+
+def _solutions_of_columns(evaluator: Evaluator, columns: Sequence[int], solutions: pd.DataFrame | None) -> FloatArray:
+    """The distinct solutions that change no other characteristics than these, shape (K, n)."""
+    names, original = list(evaluator.characteristics.names), evaluator.characteristics.original
+    if solutions is None:
+        return np.zeros((0, len(names)))
+    settings = np.unique(solutions[names].to_numpy(dtype=float), axis=0)
+    others = np.setdiff1d(np.arange(len(names)), columns)
+    return np.asarray(settings[(settings == original)[:, others].all(axis=1)])
 
 
 def _settings_in_box(evaluator: Evaluator, columns: Sequence[int], factor: float, points: FloatArray) -> FloatArray:
