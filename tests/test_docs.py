@@ -212,7 +212,7 @@ def test_marked_numbers_stand_in_the_paragraph_below_them() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("numbers", MARKED, ids=lambda one: one.page)
 def test_marked_numbers_are_those_that_their_commands_print(numbers: Numbers, in_tmp: Path) -> None:
-    """Shares are given in whole per cent."""
+    """Shares are given in whole per cent, other numbers with two decimals and their unit."""
     for command in numbers.commands:
         done = CliRunner().invoke(commands, shlex.split(command.removeprefix(PROGRAM)), catch_exceptions=False)
         assert done.exit_code == 0, f"{command}\n{done.output}"
@@ -221,4 +221,5 @@ def test_marked_numbers_are_those_that_their_commands_print(numbers: Numbers, in
         result = records
         for key in path.split("."):
             result = result[int(key) if isinstance(result, list) else key]
-        assert f"{100 * result:.0f} %" == value, f"{numbers.page}: {path}"
+        unit = value.partition(" ")[2]
+        assert value == (f"{100 * result:.0f} %" if unit == "%" else f"{result:.2f} {unit}"), f"{numbers.page}: {path}"

@@ -86,19 +86,23 @@ def explain(source: str, full: bool, point: str | None, jobs: int | None, as_jso
         click.echo(f"Causes: {out}", err=as_json)
 
 
-@add_question(OpinionOptions, "DIR", click.argument("handles", nargs=-1, metavar=""))
-def opinion(source: str, handles: tuple[str, ...], point: str | None, jobs: int | None, as_json: bool, **values: Any) -> None:
+@add_question(OpinionOptions, "DIR", click.option("--solutions", "lists", multiple=True, hidden=True),
+              click.argument("handles", nargs=-1, metavar=""))
+def opinion(source: str, lists: tuple[str, ...], handles: tuple[str, ...], point: str | None, jobs: int | None, as_json: bool,
+            **values: Any) -> None:
     """Check the minimal causes of failures of results in DIR with a second vehicle model."""
     from safevar_sumo.analysis.opinion.compute import ask_for_opinions
-    from safevar_sumo.analysis.opinion.render import print_opinions
+    from safevar_sumo.analysis.opinion.render import opinion_in_words, print_opinions
 
-    options = OpinionOptions(**{**values, "solutions": (*values["solutions"], *handles)})
+    values["solutions"] = [handle.strip() for text in (*values["solutions"], *lists, *handles) for handle in text.split(",")]
+    options = OpinionOptions(**values)
     result = _compute_with_bar(ask_for_opinions, load_results_or_study(source, point, results_only=True), options, jobs)
     if not as_json:
         print_opinions(Console(), result)
         return
     for handle in result.without_cause:
         click.echo(f"note: {handle} is not unsafe: it has no cause", err=True)
+    click.echo(f"note: {opinion_in_words(result)}", err=True)
     click.echo(_to_json(result))
 
 

@@ -156,7 +156,7 @@ def reason_without_opinion(data: ReportInput) -> str:
 
 def _ask_opinions(data: ReportInput, selection: Sequence[tuple[CauseEntry, FailureEntry]]) -> list[SecondOpinion]:
     """Ask the second vehicle model for its opinion on each cause, once for these results."""
-    judged_causes = [CauseToJudge(failure.handle or None, cause.changes, cause.fraction) for cause, failure in selection]
+    judged_causes = [CauseToJudge(failure.handle or None, cause.changes, cause.fraction, cause.robustness) for cause, failure in selection]
     opinions = load_or_compute(data, "opinion", lambda: judge_causes(data.case.study, judged_causes, data.case.unsafe).to_dict())
     return msgspec.convert(opinions, list[SecondOpinion])
 

@@ -5,7 +5,9 @@ from __future__ import annotations
 import json
 import re
 import sys
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,18 +15,18 @@ from click.testing import CliRunner
 from vehiclemodels.parameters_vehicle2 import parameters_vehicle2
 from vehiclemodels.vehicle_dynamics_mb import vehicle_dynamics_mb
 
-from safevar_sumo.analysis.opinion import OpinionOptions
 from safevar_sumo.analysis.opinion.compute import CauseToJudge, assemble_both_systems, judge_causes
 from safevar_sumo.analysis.opinion.mapping import MAPPING_TABLES
 from safevar_sumo.analysis.opinion.multi_body import MultiBodyState, Plant, advance, at_speed, body_derivatives, build_plant, tyre_forces
 from safevar_sumo.analysis.opinion.result import OpinionVerdict
+from safevar_sumo.analysis.opinion.second_vehicle import SecondState, SecondVehicle
 from safevar_sumo.cli.program import commands
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
-from safevar_sumo.records import GRAVITY
+from safevar_sumo.records import GRAVITY, Command
 from safevar_sumo.report import make_report
 from safevar_sumo.study import load_study
-from safevar_sumo.sumo.matrix import simulate
+from safevar_sumo.sumo.matrix import evaluate, simulate
 from safevar_sumo.vehicles import LEVEL, VEHICLES
 from tests.in_process import refused
 
@@ -93,7 +95,8 @@ def test_at_the_limit_the_anti_lock_controller_uses_the_friction(friction: float
 @pytest.mark.parametrize("name", VEHICLES)
 def test_every_characteristic_is_in_the_table_or_outside_and_acts_as_the_table_says(name: str) -> None:
     study = load_study(MAPPING_TABLES[name].study)
-    system, second, mapping = assemble_both_systems(study)
+    system, second, vehicle = assemble_both_systems(study)
+    mapping = vehicle.mapping
     assert mapping.name == name
     assert mapping.table.represented_names | set(mapping.table.omission_reasons) == set(VEHICLES[name].UNITS)
     original = {one.name: one.original * ONE for one in system.characteristics}
@@ -182,7 +185,7 @@ def test_a_failure_that_our_model_alone_has_is_contradicted(made: str, tmp_path:
             for name, row in load_study("wear").vehicle.characteristics.items()}
     study = load_study({"extends": "wear", "name": "glitch", "matrix": ONE_TEST,
                         "vehicle": {"model": f"glitch_{made.lower()}:{made}", "characteristics": rows}})
-    causes = [CauseToJudge("nsga2:0:0", {"payload": 300.0}, 0.9), CauseToJudge("nsga2:0:1", {"brakeResponse": 0.4}, 0.9)]
+    causes = [CauseToJudge("nsga2:0:0", {"payload": 300.0}, 0.9, 1.0), CauseToJudge("nsga2:0:1", {"brakeResponse": 0.4}, 0.9, 1.0)]
     planted, true = judge_causes(study, causes, Unsafe()).opinions
     assert planted.to_dict() | {"because": ""} == {
         "solution": "nsga2:0:0", "changes": {"payload": 300.0},
@@ -190,6 +193,63 @@ def test_a_failure_that_our_model_alone_has_is_contradicted(made: str, tmp_path:
         "there": {"outcome": "passed", "safety_degree": planted.there.safety_degree}, "opinion": "contradicted", "because": ""}
     assert true.opinion == OpinionVerdict.CONFIRMED
     assert judge_causes(study, causes, Unsafe()).opinions == (planted, true)
+
+
+WORN_TYRES = {"mass": 2686.0, "tireFric": 1.0, "radius": 31.85, "maxBrakeTorque": 1216.0}
+
+
+class RimSpy(SecondVehicle):
+    """Records the largest speed of a rim above the car's [m/s]."""
+
+    largest = -np.inf
+
+    def advance(self, prepared: Any, state: SecondState, command: Command) -> SecondState:
+        after = super().advance(prepared, state, command)
+        self.largest = max(self.largest, float(np.max(after.body.wheel_speeds * prepared.parameters.plant.radius - after.speed)))
+        return after
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("study", ["rain", "smoke", "wear", "native", "lgsvl"])
+def test_no_rim_is_much_faster_than_the_car(study: str) -> None:
+    """Full throttle with the least friction of each domain: the torque is limited to what the tyres carry."""
+    system, second, vehicle = assemble_both_systems(load_study(study))
+    extremes = [system.characteristics.original, system.characteristics.lower, system.characteristics.upper]
+    if study in ("rain", "smoke"):
+        extremes.append(system.characteristics.setting(WORN_TYRES, "cause"))
+    spy = RimSpy(system.vehicle, vehicle.mapping, load_study(study))
+    point = max(second.points, key=lambda one: getattr(one.scenario, "test_speed", None) or 0.0)
+    simulate(replace(second.at(point), vehicle=spy), np.stack(extremes))
+    assert -0.5 < spy.largest < 1.0
+    assert not spy.spinning
+
+
+@pytest.mark.slow
+def test_a_car_whose_wheels_spin_confirms_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without the limit of its torque, worn tyres' rims are 300 m/s faster than the car and push it into a collision at 8 m/s."""
+    cause = CauseToJudge("nsga2:24:1", WORN_TYRES, 0.99, 1.0)
+    (calm,) = judge_causes(load_study("rain"), [cause], Unsafe()).opinions
+    monkeypatch.setattr("safevar_sumo.analysis.opinion.multi_body.TRACTION_SHARE", np.inf)
+    (spinning,) = judge_causes(load_study("rain"), [cause], Unsafe()).opinions
+    assert (spinning.opinion, spinning.there.outcome) == (OpinionVerdict.OUTSIDE, "collision")
+    assert "spin" in spinning.because
+    assert (calm.there.safety_degree or 0.0) > -4 > -7 > (spinning.there.safety_degree or 0.0)
+
+
+@pytest.mark.slow
+def test_a_cause_that_is_borderline_in_either_model_is_called_borderline() -> None:
+    """In ours by its robustness; in the second by the neighbours, here of the smallest change at which it collides."""
+    study = load_study("rain")
+    (here,) = judge_causes(study, [CauseToJudge(None, WORN_TYRES, 0.99, 0.79)], Unsafe()).opinions
+    assert (here.opinion, here.because.split(";")[0]) == (
+        OpinionVerdict.BORDERLINE, "with our model borderline: only 79 % of the neighbours are unsafe too")
+    _, second, _ = assemble_both_systems(study)
+    frictions = np.linspace(1.0, 3.5, 60)
+    runs = evaluate(second, np.stack([second.characteristics.setting({**WORN_TYRES, "tireFric": one}, "cause") for one in frictions]))
+    least = float(frictions[runs.collided].max())
+    (there,) = judge_causes(study, [CauseToJudge(None, {**WORN_TYRES, "tireFric": least}, 0.99, 1.0)], Unsafe()).opinions
+    assert (there.opinion, there.there.outcome) == (OpinionVerdict.BORDERLINE, "collision")
+    assert re.match(r"with the second model only \d\d% of the neighbours are unsafe, too; also unsafe", there.because)
 
 
 def test_what_cannot_be_represented_at_all_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -215,9 +275,12 @@ def test_the_command_asks_about_the_failures_or_about_those_named(slippery: Path
         assert (one["there"]["outcome"] is None) == (one["opinion"] == "outside")
         assert all(name in one["because"] for name in outside & set(one["changes"]))
     first, *others = dict.fromkeys(one["solution"] for one in every)
-    assert OpinionOptions(solutions=(f"{first},{others[0]}",)) == OpinionOptions(solutions=(first, others[0]))
-    some = CliRunner().invoke(commands, ["opinion", str(slippery), "--json", "--solutions", first, others[0]]).stdout
-    assert json.loads(some) == [one for one in every if one["solution"] in (first, others[0])]
+    some = CliRunner().invoke(commands, ["opinion", str(slippery), "--json", "--solution", first, "--solution", others[0]])
+    assert json.loads(some.stdout) == [one for one in every if one["solution"] in (first, others[0])]
+    for alias in (["--solutions", f"{first},{others[0]}"], ["--solutions", first, others[0]]):
+        assert CliRunner().invoke(commands, ["opinion", str(slippery), "--json", *alias]).stdout == some.stdout
+    outside_count = sum(one["opinion"] == "outside" for one in every)
+    assert f"of {len(every)} minimal causes {outside_count} outside" in done.stderr
 
 
 @pytest.mark.slow
@@ -236,7 +299,7 @@ def test_a_report_has_a_badge_for_each_cause_or_says_how_to_install(slippery: Pa
 @pytest.mark.parametrize(("typed", "told"), [
     (("smoke",), "smoke: is a study and has no solutions\nexpected: a directory"),
     (("nowhere",), "nowhere: is not a results directory: there is no manifest.json\nexpected: a directory written by the command `study`"),
-    (("{}", "--solutions", "nsga2:0:999"), "--solutions: there is no solution nsga2:0:999"), (("{}", "--solutions", "first"), "'first'")])
+    (("{}", "--solution", "nsga2:0:999"), "solution nsga2:0:999"), (("{}", "--solutions", "first"), "'first'")])
 def test_bad_input_is_refused(typed: tuple[str, ...], told: str, slippery: Path) -> None:
     refused("opinion", *(part.format(slippery) for part in typed), message=(told,))
 

@@ -10,6 +10,7 @@ import numpy as np
 from safevar_sumo.analysis.evaluator import Evaluator
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import Evaluations, FloatArray
+from safevar_sumo.vehicles import CharacteristicSet
 
 NEIGHBOUR_COUNT = 64
 """Number of neighbours of a setting that are simulated with each time step."""
@@ -51,6 +52,12 @@ def robustness_in_words(share: float) -> str:
     return f"{'borderline: only' if is_borderline(share) else 'robust:'} {100 * share:.0f} % of the neighbours are unsafe too"
 
 
+def draw_neighbours(characteristics: CharacteristicSet, settings: FloatArray, seed: int) -> FloatArray:
+    """The neighbours of M settings, shape (M, n), one setting after the other; they differ from it by at most the filter's threshold."""
+    offsets = np.random.default_rng(seed).uniform(-1, 1, (NEIGHBOUR_COUNT, len(characteristics))) * characteristics.threshold
+    return np.clip(settings[:, np.newaxis] + offsets, characteristics.lower, characteristics.upper).reshape(-1, len(characteristics))
+
+
 def estimate_robustness(evaluator: Evaluator, settings: FloatArray, step: float, unsafe: Unsafe,
                         factors: Sequence[float] = STEP_FACTORS) -> list[Robustness]:
     """The robustness of each of M settings, shape (M, n).
@@ -58,11 +65,7 @@ def estimate_robustness(evaluator: Evaluator, settings: FloatArray, step: float,
     A setting's neighbours differ from it in each characteristic by at most the filter's threshold. They are simulated without the filter,
     with each of `factors` times the study's time step (`step` seconds). Neighbours that cannot be simulated do not count.
     """
-    characteristics = evaluator.characteristics
-    rng = np.random.default_rng(evaluator.study.search.seed)
-    offsets = rng.uniform(-1, 1, (NEIGHBOUR_COUNT, len(characteristics))) * characteristics.threshold
-    neighbours = np.clip(settings[:, np.newaxis] + offsets, characteristics.lower, characteristics.upper).reshape(-1, len(characteristics))
-    shares = {}
+    neighbours, shares = draw_neighbours(evaluator.characteristics, settings, evaluator.study.search.seed), {}
     for factor in factors:
         step_evaluator = evaluator if factor == 1 else evaluator.with_step(step * factor)
         evaluations = step_evaluator.evaluate(neighbours, f"neighbours at {step * factor:g} s a step")

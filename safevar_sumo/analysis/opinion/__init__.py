@@ -26,15 +26,10 @@ class OpinionOptions(Options):
 
     question: ClassVar[str] = "opinion"
     solutions: tuple[str, ...] = option(
-        (), "Drive the N-th solution of a run, from 0; may be repeated, or list several, separated by commas.  [default: the failures that "
-            "a report explains]", metavar="ALG:RUN:N", form="repeated",
+        (), "Drive the N-th solution of a run, from 0; may be repeated.  [default: the failures that a report explains]",
+        flag="--solution", metavar="ALG:RUN:N", form="repeated",
         python='Handles of solutions, such as "nsga2:3:0". By default the failures that a report explains.')
     unsafe: str | None = unsafe_option()
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        handles = (name.strip() for text in self.solutions for name in text.split(","))
-        object.__setattr__(self, "solutions", tuple(dict.fromkeys(handles)))
 
 
 @document_options(OpinionOptions)

@@ -26,6 +26,7 @@ SLIP_LIMIT, LEAST_CONTROL_SPEED = 0.1, 2.0
 
 Real controllers work between 0.1 and 0.2 from about 7 km/h on (Bosch, Automotive Handbook, "Antilock braking system").
 """
+TRACTION_SHARE = 0.9
 RELEASE_RATE, BUILD_UP_RATE = 25.0, 8.0
 """Rates at which the controller releases and restores pressure [1/s], as shares of full pressure; valves release faster than they restore.
 
@@ -141,11 +142,12 @@ def at_speed(plant: Plant, speed: FloatArray) -> MultiBodyState:
 
 
 class TyreForces(NamedTuple):
-    """One tyre of each axle, shape (2, N): the force along the road [N], its derivative `gradient` by the wheel's speed
-    [N s/rad], and the slip [-], positive when braking.
+    """One tyre of each axle, shape (2, N): the force along the road and its largest value `peak` [N], the force's derivative
+    `gradient` by the wheel's speed [N s/rad], and the slip [-], positive when braking.
     """
 
     force: FloatArray
+    peak: FloatArray
     gradient: FloatArray
     slip: FloatArray
 
@@ -160,7 +162,7 @@ def tyre_forces(plant: Plant, body: MultiBodyState) -> TyreForces:
     curve = (1 - tyre.p_ex1) * scaled_slip + tyre.p_ex1 * np.arctan(scaled_slip)
     angle = tyre.p_cx1 * np.arctan(curve) + load * tyre.p_vx1
     slope = peak * np.cos(angle) * (tyre.p_cx1 / (1 + curve * curve)) * (1 - tyre.p_ex1 + tyre.p_ex1 / (1 + scaled_slip * scaled_slip))
-    return TyreForces(peak * np.sin(angle), slope * (stiffness * plant.radius / slip_speed), slip)
+    return TyreForces(peak * np.sin(angle), peak, slope * (stiffness * plant.radius / slip_speed), slip)
 
 
 class BodyDerivatives(NamedTuple):
@@ -197,7 +199,8 @@ def advance(plant: Plant, body: MultiBodyState, pedal: FloatArray, drive_torque:
     forces = tyre_forces(plant, body)
     pressure_shares = _limit_pressure(body, forces.slip, pedal, step)
     brake_torques = np.minimum(pedal, pressure_shares) * (plant.brake_torque * plant.brake_shares)
-    derivatives = body_derivatives(plant, body, drive_torque * plant.drive_shares - brake_torques, forces)
+    drive_torques = np.minimum(drive_torque * plant.drive_shares, 2 * TRACTION_SHARE * plant.radius * forces.peak)
+    derivatives = body_derivatives(plant, body, drive_torques - brake_torques, forces)
     gradients = np.maximum(forces.gradient, 0.0)
     damping = 1 + step * gradients * plant.radius / plant.wheel_inertia
     wheel_speeds = np.maximum(body.wheel_speeds + step * derivatives.wheel_speeds / damping, 0.0)

@@ -19,6 +19,7 @@ class OpinionVerdict(StrEnum):
 
     CONFIRMED = "confirmed"
     CONTRADICTED = "contradicted"
+    BORDERLINE = "borderline"
     OUTSIDE = "outside"
 
 

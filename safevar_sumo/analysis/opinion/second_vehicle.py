@@ -19,6 +19,8 @@ from safevar_sumo.vehicles import LEVEL, CharacteristicSet, Sensors, Slope, Sumo
 from safevar_sumo.vehicles.base import Characteristics
 from safevar_sumo.vehicles.sensors import delay_signal, extend_history, start_history
 
+SPIN_LIMIT = 1.0
+"""Speed of a rim above the car's from which the wheels of a driven car spin [m/s]: its simulation confirms nothing."""
 CREEP_SPEED = 0.01
 """Speed above which the original vehicle's wheel speed is scaled with its speed [m/s]."""
 
@@ -37,6 +39,7 @@ class _Prepared(NamedTuple):
     engine_radius: FloatArray
     slope: Slope
     step: float
+    settings: FloatArray
 
 
 class SecondState(NamedTuple):
@@ -63,10 +66,15 @@ class SecondVehicle:
         The vehicle's mapping to the second model.
     study
         The study.
+
+    Attributes
+    ----------
+    spinning
+        The settings, as bytes, of the vehicles whose wheels spun in a simulation.
     """
 
     def __init__(self, vehicle: Vehicle, mapping: VehicleMapping, study: Study) -> None:
-        self._vehicle, self._mapping = vehicle, mapping
+        self._vehicle, self.mapping, self.spinning = vehicle, mapping, set[bytes]()
         self.UNITS = vehicle.UNITS
         shipped_tables = load_study(mapping.table.study).vehicle.characteristics
         tables = {**shipped_tables, **{name: table for name, table in study.vehicle.characteristics.items()
@@ -80,7 +88,7 @@ class SecondVehicle:
         original = {name: value * ones for name, value in self._original.items()}
         surface = Surface(road_friction, slope, wet)
         road_arguments = (slope, wet) if np.any(wet) else () if slope is LEVEL else (slope,)  # a user's vehicle may lack slope and wet
-        original_vehicle, represent = self._mapping.vehicle, self._mapping.table.represent
+        original_vehicle, represent = self.mapping.vehicle, self.mapping.table.represent
         original_plant = represent(original_vehicle, original, self._original, surface).plant
         return _Prepared(
             vehicle=self._vehicle.prepare(characteristics, road_friction, step, *road_arguments),
@@ -89,7 +97,7 @@ class SecondVehicle:
                 original_vehicle, {**original, **{name: characteristics[name] for name in original if name in characteristics}},
                 self._original, surface),
             engine_mass=original_plant.mass + WHEEL_COUNT * original_plant.wheel_inertia / original_plant.radius**2,
-            engine_radius=original_plant.radius, slope=slope, step=step)
+            engine_radius=original_plant.radius, slope=slope, step=step, settings=np.stack([*characteristics.values()], axis=1))
 
     def sumo_type(self, prepared: _Prepared) -> SumoType:
         return self._vehicle.sumo_type(prepared.vehicle)
@@ -97,12 +105,12 @@ class SecondVehicle:
     def at_rest(self, prepared: _Prepared) -> SecondState:
         zeros = np.zeros_like(prepared.engine_mass)
         return self._initial_state(prepared, zeros, self._vehicle.at_rest(prepared.vehicle),
-                                   self._mapping.vehicle.at_rest(prepared.original))
+                                   self.mapping.vehicle.at_rest(prepared.original))
 
     def at_speed(self, prepared: _Prepared, speed: FloatArray) -> SecondState:
         """The state in which the pedals hold the original vehicle's speed."""
         return self._initial_state(prepared, speed, self._vehicle.at_speed(prepared.vehicle, speed),
-                                   self._mapping.vehicle.at_speed(prepared.original, speed))
+                                   self.mapping.vehicle.at_speed(prepared.original, speed))
 
     def _initial_state(self, prepared: _Prepared, speed: FloatArray, vehicle: Any, original: Any) -> SecondState:
         commands = start_history(float(np.max(prepared.parameters.brake_delay)), prepared.step, original.brake)
@@ -119,7 +127,7 @@ class SecondVehicle:
         return observation, state._replace(vehicle=vehicle)
 
     def hold_gear(self, prepared: _Prepared, state: SecondState, holds: BoolArray) -> SecondState:
-        hold = getattr(self._mapping.vehicle, "hold_gear", None)
+        hold = getattr(self.mapping.vehicle, "hold_gear", None)
         return state if hold is None else state._replace(original=hold(prepared.original, state.original, holds))
 
     def advance(self, prepared: _Prepared, state: SecondState, command: Command) -> SecondState:
@@ -134,6 +142,8 @@ class SecondVehicle:
             change = np.maximum((demand - brake) * lag_share, -parameters.brake_fall * step)
             brake = brake + np.minimum(change, parameters.brake_rise * step)
             body = advance(parameters.plant, body, brake, drive_torque, step)
+        spins = np.max(body.wheel_speeds * parameters.plant.radius, axis=0) > body.speed + SPIN_LIMIT
+        self.spinning.update(setting.tobytes() for setting in prepared.settings[spins])
         return SecondState(body.speed, original.throttle, brake, original.gear, state.vehicle, original, body, commands)
 
     def _advance_engine(self, prepared: _Prepared, state: SecondState, throttle: FloatArray) -> tuple[Any, FloatArray]:
@@ -143,7 +153,7 @@ class SecondVehicle:
         original = original._replace(speed=speed) if not hasattr(original, "wheel_speed") else original._replace(
             speed=speed, wheel_speed=np.where(
                 original.speed > CREEP_SPEED, original.wheel_speed * speed / np.maximum(original.speed, CREEP_SPEED), original.wheel_speed))
-        next_original = self._mapping.vehicle.advance(prepared.original, original, Command(throttle, brake=np.zeros_like(throttle)))
+        next_original = self.mapping.vehicle.advance(prepared.original, original, Command(throttle, brake=np.zeros_like(throttle)))
         torque = prepared.engine_mass * ((next_original.speed - speed) / prepared.step + prepared.slope.back) * prepared.engine_radius
         torque = np.where(torque > 0, torque * parameters.drive_ratio, torque)
         resistance = (radius * (parameters.drag + parameters.air_drag * state.speed) * state.speed
