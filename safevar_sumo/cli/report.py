@@ -13,7 +13,8 @@ from safevar_sumo.analysis.research_questions.answer import QUESTIONS, answer_qu
 from safevar_sumo.analysis.research_questions.case import load_cases
 from safevar_sumo.analysis.research_questions.gallery import FORMATS as PICTURE_FORMATS
 from safevar_sumo.analysis.research_questions.gallery import save_figures
-from safevar_sumo.analysis.research_questions.tables import ENDINGS, FORMATS, FORMATS_WITH_LAYOUT, LAYOUTS_BY_NAME
+from safevar_sumo.analysis.research_questions.layout import LAYOUTS_BY_NAME
+from safevar_sumo.analysis.research_questions.tables import ENDINGS, FORMATS, FORMATS_WITH_LAYOUT
 from safevar_sumo.cli.arguments import check_output
 from safevar_sumo.cli.program import commands
 from safevar_sumo.cli.target import as_it_is_now, as_it_is_now_option, jobs_option, point_option

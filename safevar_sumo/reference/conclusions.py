@@ -12,7 +12,7 @@ import pandas as pd
 from safevar_sumo.analysis.research_questions.answer import Answer, answer_questions
 from safevar_sumo.analysis.research_questions.case import ALGORITHM_TITLES, Case, UnanswerableError
 from safevar_sumo.analysis.research_questions.changes import changes_of, critical_solutions, masks_by_change_count
-from safevar_sumo.analysis.research_questions.comparisons import ALPHA, magnitude_of
+from safevar_sumo.analysis.research_questions.statistics import ALPHA, magnitude_of
 from safevar_sumo.errors import InputError
 from safevar_sumo.reference.agreement import rank_correlation
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import shlex
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from io import BytesIO
@@ -62,11 +63,14 @@ def list_tables(cases: Sequence[Case]) -> list[dict[str, Any]]:
 
 
 def _table_data(table: Table) -> dict[str, Any]:
-    rows = [[{"text": superscript_powers(str(cell)), "bold": isinstance(cell, BoldText)} for cell in row] for row in table.rows]
-    spans = [("", table.label_count), *((superscript_powers(name), width) for name, width in table.spans)] if table.spans else []
-    heads, notes = ([superscript_powers(text) for text in texts] for texts in (table.headings, table.notes))
-    title = superscript_powers(table.title)
-    return {"title": title, "heads": heads, "spans": spans, "rows": rows, "labels": table.label_count, "notes": notes}
+    columns, labels = table.frame.columns, table.frame.index.nlevels
+    blocks = Counter(columns.get_level_values(0)) if columns.nlevels > 1 else {}
+    heads = [] if table.frame.empty else [*table.frame.index.names, *columns.get_level_values(-1)]
+    rows = [[{"text": superscript_powers(cell), "bold": isinstance(cell, BoldText)} for cell in row]
+            for row in table.frame.reset_index().to_numpy().tolist()]
+    return {"title": superscript_powers(table.title), "heads": list(map(superscript_powers, heads)), "rows": rows, "labels": labels,
+            "spans": [("", labels), *((superscript_powers(name), width) for name, width in blocks.items())] if blocks else [],
+            "notes": list(map(superscript_powers, table.notes))}
 
 
 def embed_figures(cases: Sequence[Case]) -> list[dict[str, str]]:

@@ -19,14 +19,24 @@ CHARACTERISTICS = {
 UNCHANGED = (1000.0, 2.0, 0.1)
 
 
-def made_up_study(**changes: Any) -> Study:
+def made_up_study(algorithms: Sequence[str] = ("nsga2", "rs"), runs: int = 2,
+                  characteristics: Mapping[str, CharacteristicTable]
+                  = CHARACTERISTICS, **changes: Any) -> Study:
     smoke = load_study("smoke")
-    vehicle = msgspec.structs.replace(smoke.vehicle, characteristics=dict(CHARACTERISTICS))
-    search = msgspec.structs.replace(smoke.search, algorithms=["nsga2", "rs"], runs=2, evaluations=100)
+    vehicle = msgspec.structs.replace(smoke.vehicle, characteristics=dict(characteristics))
+    search = msgspec.structs.replace(smoke.search, algorithms=list(algorithms), runs=runs, evaluations=100)
     return msgspec.structs.replace(smoke, **{"name": "made-up", "vehicle": vehicle, "search": search, **changes})
 
 
-def row(algorithm: str = "nsga2", run: int = 0, values: Sequence[float] = UNCHANGED, sd: float = 1.0, tet: float | None = 1.5,
+def only(frame: pd.DataFrame, **wanted: Any) -> dict[str, Any]:
+    """The one row with these values."""
+    result = frame[(frame[list(wanted)] == pd.Series(wanted)).all(axis=1)]
+    assert len(result) == 1
+    return dict(result.iloc[0])
+
+
+def row(algorithm: str = "nsga2", run: int = 0, values: Sequence[float] = UNCHANGED, sd: float = 1.0, tet: float
+        | None = 1.5,
         tit: float | None = 0.75, ave_dece: float | None = 5.0, f_diff: float | None = None) -> dict[str, Any]:
     """A solution; a safety degree of 0 or less is a collision, without TET and TIT."""
     crash = sd <= 0

@@ -1,50 +1,111 @@
-"""Any set of algorithms compared: pairs, ranks over runs, and what runs attain."""
+"""RQ1 and RQ2 on made-up solutions: against the original vehicle, pairs, ranks, over runs, and what the lines and notes
+say.
+"""
 
 from __future__ import annotations
 
 import itertools
+import re
 
-import msgspec
 import numpy as np
+import pandas as pd
 import pytest
 import scipy
 
-from safevar_sumo.analysis.research_questions.algorithm_figures import draw_attainment_surfaces, draw_critical_differences, find_cliques
-from safevar_sumo.analysis.research_questions.algorithms import compare_pairs, compute_attainment, critical_difference, rank_algorithms
+from safevar_sumo.analysis.research_questions.algorithm_figures import draw_critical_differences, find_cliques
 from safevar_sumo.analysis.research_questions.answer import answer_questions
 from safevar_sumo.analysis.research_questions.case import Case, UnanswerableError
-from safevar_sumo.analysis.research_questions.comparisons import compare_samples, reverse_effect
-from safevar_sumo.analysis.research_questions.over_runs import correct_by_holm
-from safevar_sumo.analysis.research_questions.tables import FORMATS_WITH_LAYOUT
-from tests.research_questions.made_up import made_up, made_up_study, row
+from safevar_sumo.analysis.research_questions.comparisons import (
+    compare_pairs,
+    rank_algorithms,
+    rq1,
+    rq1_runs,
+    rq2,
+    rq2_runs,
+    significance_change_line,
+    summary_lines,
+)
+from safevar_sumo.analysis.research_questions.statistics import ALPHA, compare_samples, correct_by_holm
+from safevar_sumo.errors import InputError
+from tests.research_questions.made_up import ORIGINAL, made_up, made_up_study, only, row
 
 RUNS = 12
 
 
 def three_algorithms() -> Case:
     """The second finds more severe solutions than the first, the third as the first; run 3 of the third finds none."""
-    study = made_up_study()
-    study = msgspec.structs.replace(study, search=msgspec.structs.replace(study.search, algorithms=["nsga2", "spea2", "mocell"], runs=RUNS))
+    study = made_up_study(algorithms=["nsga2", "spea2", "mocell"], runs=RUNS)
     rng, rows = np.random.default_rng(1), []
     for (name, worse), run in itertools.product((("nsga2", 0.0), ("spea2", 1.0), ("mocell", 0.0)), range(RUNS)):
         if (name, run) != ("mocell", 3):
-            rows += [row(name, run, (900.0, 1.5, 0.1), sd=2 - worse - share - 0.2 * rng.random(), f_diff=0.3 * share + 0.05 * rng.random())
-                     for share in (0.2, 0.5, 0.8)]
-    finished = [(name, run) for name in ("nsga2", "spea2", "mocell") for run in range(RUNS)]
-    return made_up(*rows, study=study, finished=finished)
+            rows += [row(name, run, (900.0, 1.5, 0.1), sd=2 - worse - share - 0.2 * rng.random(),
+                         f_diff=0.3 * share + 0.05 * rng.random()) for share in (0.2, 0.5, 0.8)]
+    return made_up(*rows, study=study, finished=list(itertools.product(("nsga2", "spea2", "mocell"), range(RUNS))))
+
+
+def test_rq1_is_small_where_solutions_are_more_unsafe() -> None:
+    frame = rq1(made_up(*(row(sd=1 + i / 10, tet=2, tit=1, ave_dece=3) for i in range(5))))
+    assert frame["metric"].tolist() == ["safety_degree", "tet", "tit", "ave_dece"]
+    assert frame[["effect_size", "magnitude", "n1", "n2"]].drop_duplicates().values.tolist() == [[0, "large", 5, 5]]
+    safer = rq1(made_up(*(row(sd=3, tet=0.5, tit=0.1, ave_dece=7) for _ in range(5))))
+    assert safer["effect_size"].tolist() == [1, 1, 1, 1]
+
+
+def test_a_tet_that_stands_at_a_collision_is_not_counted() -> None:
+    case = made_up({**row(sd=-3), "tet": 0.0}, row(sd=1, tet=1.4), {**row("rs", sd=-3), "tet": 9.0},
+                   row("rs", sd=1, tet=1.3))
+    assert only(rq1(case), algorithm="nsga2", metric="tet")["mean"] == 1.4
+    assert only(rq2(case), metric="tet")["effect_size"] == 1
+
+
+def test_rq1_says_which_values_are_undefined() -> None:
+    result = answer_questions([made_up(row(tet=None), row(sd=-1), row(), original={**ORIGINAL, "tit": None})], "rq1")[0]
+    assert only(result.frame, metric="tet")["n1"] == 1
+    assert only(result.frame, metric="tit")["p_value"] is None
+    notes = "".join(result.notes)
+    assert "tet is undefined in 1 of 2 solutions" in notes
+    assert "the original vehicle's tit is undefined" in notes
+
+
+def test_rq2_is_high_where_nsga2_is_better() -> None:
+    rows = [*(row(run=run, sd=0.5 - run / 10, tet=2, tit=1, ave_dece=3, f_diff=0.1) for run in (0, 1, 2)),
+            *(row("rs", run=run, sd=1.5 + run / 10, f_diff=0.6) for run in (0, 1, 2))]
+    frame = rq2(made_up(*rows))
+    assert frame["metric"].tolist() == ["igd", "igd_plus", "hypervolume", "safety_degree", "tet", "tit", "ave_dece"]
+    assert frame["effect_size"].tolist() == [1] * 7
+    exchanged = [{**one, "algorithm": {"rs": "nsga2", "nsga2": "rs"}[one["algorithm"]]} for one in rows]
+    assert rq2(made_up(*exchanged))["effect_size"].tolist() == [0] * 7
+
+
+def test_rq2_compares_runs_by_front_and_pooled_solutions_by_metric() -> None:
+    rows = (row(), row(), row(run=1), row("rs"), row("rs", run=1), row("rs", run=1), row("rs", run=1))
+    sizes = {metric: (n1, n2) for metric, n1, n2 in rq2(made_up(*rows))[["metric", "n1", "n2"]].to_numpy()}
+    assert (sizes["igd"], sizes["tet"]) == ((2, 2), (3, 4))
+    (imported,) = answer_questions([made_up(*rows, has_runs=False)], "rq2")
+    assert only(imported.frame, metric="igd")["p_value"] is None
+    assert only(imported.frame, metric="tet")["n1"] == 3
+    assert any("need runs" in note for note in imported.notes)
+
+
+@pytest.mark.parametrize(("case", "expected"), [
+    (made_up(row("rs")), "no finished run of nsga2"), (made_up(row()), "only nsga2"), (made_up(), "no finished run")])
+def test_rq2_without_an_algorithm_is_refused(case: Case, expected: str) -> None:
+    with pytest.raises(InputError, match=expected):
+        answer_questions([case], "rq2")
 
 
 def test_every_pair_is_tested_once_and_corrected_for_all() -> None:
     case = three_algorithms()
     frame = compare_pairs(case)
+    pairs = {("nsga2", "spea2"), ("nsga2", "mocell"), ("spea2", "mocell")}
+    assert set(zip(frame["algorithm"], frame["other"], strict=True)) == pairs
     assert len(frame) == 3 * 7
-    assert set(zip(frame["algorithm"], frame["other"], strict=True)) == {("nsga2", "spea2"), ("nsga2", "mocell"), ("spea2", "mocell")}
-    means = {name: [group["safety_degree"].mean() for _, group in case.solutions_of(name).groupby("run")] for name in case.algorithms}
-    chosen = frame[(frame["metric"] == "safety_degree") & (frame["algorithm"] == "spea2")].iloc[0]
-    expected = reverse_effect(compare_samples(means["spea2"], means["mocell"]))
-    assert (chosen["p_value"], chosen["effect_size"]) == (expected.p_value, expected.effect_size)
+    means = case.solutions.groupby(["algorithm", "run"])["safety_degree"].mean()
+    expected = compare_samples(means["mocell"], means["spea2"])
+    chosen = only(frame, metric="safety_degree", algorithm="spea2")
+    assert (chosen["p_value"], chosen["effect_size"]) == (expected.p_value, expected.effect_size) == (expected.p_value,
+                                                                                                      1)
     assert (chosen["n1"], chosen["n2"]) == (RUNS, RUNS - 1)
-    assert chosen["effect_size"] == 1, "every run of SPEA2 is more unsafe"
     assert frame["p_holm"].tolist() == correct_by_holm(frame["p_value"].tolist())
 
 
@@ -52,22 +113,13 @@ def test_ranks_are_friedmans_over_the_runs_that_all_have() -> None:
     case = three_algorithms()
     frame = rank_algorithms(case)
     part = frame[frame["metric"] == "safety_degree"].set_index("algorithm")
-    runs = [run for run in range(RUNS) if run != 3]
-    means = case.solutions.groupby(["run", "algorithm"])["safety_degree"].mean()
-    values = np.array([[means[run, name] for name in case.algorithms] for run in runs])
-    expected = scipy.stats.friedmanchisquare(*values.T)
+    means = case.solutions.groupby(["run", "algorithm"])["safety_degree"].mean().unstack().dropna()
     assert part["runs"].tolist() == [RUNS - 1] * 3
-    assert part.loc["nsga2", "p_value"] == pytest.approx(expected.pvalue)
+    assert part.loc["nsga2", "p_value"] == pytest.approx(scipy.stats.friedmanchisquare(*means.to_numpy().T).pvalue)
     assert part.loc["spea2", "mean_rank"] == 1
     assert part["mean_rank"].sum() == pytest.approx(6)
     by_metric = frame.drop_duplicates("metric")
     assert by_metric["p_holm"].tolist() == correct_by_holm(by_metric["p_value"].tolist())
-
-
-@pytest.mark.parametrize(("algorithms", "runs", "published"), [(4, 14, 1.25), (5, 30, 1.11)])
-def test_critical_differences_are_published_ones(algorithms: int, runs: int, published: float) -> None:
-    """Demsar 2006: 2.569 sqrt(20 / 84) = 1.25; his q of five algorithms at 0.05 is 2.728."""
-    assert critical_difference(algorithms, runs, 0.05) == pytest.approx(published, abs=0.006)
 
 
 def test_a_bar_joins_the_largest_groups_that_are_not_told_apart() -> None:
@@ -76,45 +128,76 @@ def test_a_bar_joins_the_largest_groups_that_are_not_told_apart() -> None:
     assert find_cliques(np.array([1.0, 3.0]), 1.0) == []
 
 
-def test_attainment_is_what_so_many_runs_reach() -> None:
-    """Two runs by hand: one has (1, 0.4), the other (2, 0.2): both reach (2, 0.4)."""
-    case = made_up(row("nsga2", 0, (900.0, 2.0, 0.1), sd=1.0, f_diff=0.4), row("nsga2", 1, (900.0, 2.0, 0.1), sd=2.0, f_diff=0.2))
-    surface = compute_attainment(case)["nsga2"]
-    assert surface[50.0].tolist() == [[1.0, 0.4], [2.0, 0.2]]
-    assert surface[100.0].tolist() == [[2.0, 0.4]]
-
-
-def test_attainment_panels_have_the_same_axes() -> None:
-    axes = [axis for axis in draw_attainment_surfaces(three_algorithms()).axes if axis.axison]
-    assert len(axes) == 3
-    assert len({(axis.get_xlim(), axis.get_ylim()) for axis in axes}) == 1
-
-
-def test_two_runs_have_no_figure_of_critical_differences() -> None:
+def test_what_cannot_be_asked_says_why() -> None:
     """The largest difference of three mean ranks is 2; with two runs the critical difference is 2.9."""
     degrees = {"nsga2": 1.0, "rs": 1.5, "mocell": 2.0}
-    case = made_up(*(row(name, run, (900.0, 2.0, 0.1), sd=sd) for name, sd in degrees.items() for run in (0, 1)))
-    with pytest.raises(UnanswerableError, match="2 runs are too few for a figure of critical differences"):
-        draw_critical_differences(case)
+    two_runs = made_up(*(row(name, run, sd=sd) for name, sd in degrees.items() for run in (0, 1)))
+    for question, case, problem in ((rank_algorithms, made_up(row("nsga2"), row("rs")), "of 2 algorithms"),
+                                    (compare_pairs, made_up(row("nsga2")), "of 1 algorithm"),
+                                    (compare_pairs, made_up(row("nsga2"), row("rs"), has_runs=False), "imported"),
+                                    (draw_critical_differences, two_runs,
+                                     "2 runs are too few for a figure of critical diff")):
+        with pytest.raises(UnanswerableError, match=problem):
+            question(case)
 
 
-def test_what_cannot_be_asked_says_why() -> None:
-    two = made_up(row("nsga2"), row("rs"))
-    for question in (rank_algorithms, draw_critical_differences):
-        with pytest.raises(UnanswerableError, match="of 2 algorithms"):
-            question(two)
-    with pytest.raises(UnanswerableError, match="of 1 algorithm"):
-        compare_pairs(made_up(row("nsga2")))
-    with pytest.raises(UnanswerableError, match="imported"):
-        compare_pairs(made_up(row("nsga2"), row("rs"), has_runs=False))
+def test_the_brief_lines_and_notes_say_what_the_data_allows() -> None:
+    five = made_up(*(row(name, run=run, sd=sd + run / 10) for name, sd in (("nsga2", 1.0), ("rs", 2.5))
+                     for run in range(5)))
+    lines = "\n".join(summary_lines(five))
+    assert re.search(r"A12 of NSGA-II against the original vehicle: SD 0\.00, .*too few runs for a test \(8 are needed\)", lines)
+    assert re.search(r"A12 of NSGA-II against RS: IGD (?!.*too few)", lines), "five runs can differ significantly"
+    assert "RQ2 over runs: only nsga2 has finished runs" in "\n".join(summary_lines(made_up(row())))
+    (rq1_answer,), (rq2_answer,) = (answer_questions([five], name) for name in ("rq1-runs", "rq2-runs"))
+    assert any("too few runs for all 8 tests of RQ1 (8 are needed)" in note for note in rq1_answer.notes)
+    assert not any("too few runs" in note for note in rq2_answer.notes)
+    two = made_up(*(row(name, run=run) for name in ("nsga2", "rs") for run in range(2)))
+    notes = "".join(answer_questions([two], "rq2-runs")[0].notes)
+    assert "too few runs for all 7 tests of RQ2 (5 are needed)" in notes
+    assert "pooled" not in notes, "no test can be significant"
 
 
-@pytest.mark.slow
-def test_tables_and_figures_of_three_algorithms_can_be_made() -> None:
-    case = three_algorithms()
-    for name in ("rq2-pairs", "rq2-ranks"):
-        for rendered in (make(answer_questions([case], name)) for make in FORMATS_WITH_LAYOUT.values()):
-            assert "SPEA2" in rendered
-            assert "MOCell" in rendered
-    assert len(draw_critical_differences(case).axes) == 3
-    assert [axis.get_title() for axis in draw_attainment_surfaces(case).axes] == ["NSGA-II", "SPEA2", "MOCell"]
+def test_solutions_of_one_run_are_not_taken_for_independent() -> None:
+    """Runs of 40 copies each: pooled, rank tests see 320 against 320 values; over runs they see the 8 against 8 that
+    there are.
+    """
+    ours, theirs = [1.0, 1.1, 1.2, 1.3, 1.4, 1.6, 1.7, 2.2], [1.5, 1.8, 1.9, 2.3, 2.4, 2.5, 2.6, 2.7]
+    case = made_up(*(row(name, run=run, sd=sd, values=(1100.0 + run, 2.0, 0.1))
+                     for name, degrees in (("nsga2", ours), ("rs", theirs)) for run, sd in enumerate(degrees)
+                     for _ in range(40)))
+    paper, runs = (only(frame, metric="safety_degree") for frame in (rq2(case), rq2_runs(case)))
+    assert paper["p_value"] < 1e-30
+    assert (runs["n1"], runs["n2"], runs["effect_size"]) == (8, 8, 1 - (0 + 0 + 0 + 0 + 0 + 1 + 1 + 3) / 64)
+    assert runs["p_value"] == scipy.stats.mannwhitneyu(ours, theirs, method="exact").pvalue > ALPHA / 10
+    line = significance_change_line(case)
+    assert re.search(r"\d+ of \d+ tests are no longer significant: .*; RQ2 RS .*SD", line)
+    notes = {answer.name: "".join(answer.notes) for answer in answer_questions([case]) if answer.name.endswith("-runs")}
+    assert (line in notes["rq1-runs"], line in notes["rq2-runs"]) == (True, False), "once, not below both tables"
+    assert line in "".join(answer_questions([case], "rq2-runs")[0].notes)
+    original = only(rq1_runs(case), algorithm="nsga2", metric="safety_degree")
+    assert original["p_value"] == 2 * 2 / 2**8, "signed ranks of which all but the smallest are negative: the second of 2^8 orders"
+    assert (original["effect_size"], original["p_holm"] >= original["p_value"] * 2) == (1 / 8, True)
+
+
+def test_a_question_with_too_few_runs_for_significance_loses_none() -> None:
+    line = significance_change_line(made_up(*(
+        row(name, run=run, sd=sd + run / 100, values=(1100.0 + run, 2.0, 0.1))
+        for name, sd in (("nsga2", 1.0), ("rs", 2.0)) for run in range(5) for _ in range(40))))
+    assert "RQ1" not in line, "5 runs are too few for its tests, not for RQ2's"
+    assert "of 7 tests" in line
+
+
+def test_tables_have_a_row_for_each_case_that_can_answer_and_a_note_for_the_others() -> None:
+    good, alone = made_up(row(), row("rs")), made_up(row(), study=made_up_study(name="alone"))
+    result = answer_questions([good, alone], "rq2")[0]
+    assert set(result.frame["setting"]) == {"made-up"}
+    assert any(note.startswith("alone: ") for note in result.notes)
+    by_name = {one.name: one for one in answer_questions([alone])}
+    assert isinstance(by_name["rq1"].frame, pd.DataFrame)
+    assert not by_name["rq1"].frame.empty
+    assert by_name["rq2"].frame.empty
+    assert "only nsga2" in by_name["rq2"].notes[0]
+    with pytest.raises(InputError, match="no finished run"):
+        answer_questions([made_up()])
+    with pytest.raises(InputError, match="rq9"):
+        answer_questions([good], "rq9")

@@ -1,4 +1,6 @@
-"""The results of one study for the research questions: solutions by algorithm and run, and the original vehicle's metrics."""
+"""The results of one study for the research questions: solutions by algorithm and run, and the original vehicle's
+metrics.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +16,7 @@ import pandas as pd
 
 from safevar_sumo.errors import InputError, describe_error
 from safevar_sumo.metrics import PUBLISHED_SCORING, MetricFacts, Scoring, Unsafe
-from safevar_sumo.records import FloatArray, Outcome
+from safevar_sumo.records import Outcome
 from safevar_sumo.results import MANIFEST, Failure, failure_lines, folders_of, load_runs
 from safevar_sumo.scenarios import weather_of
 from safevar_sumo.study import Origin, Study, Weather, error_with_key
@@ -23,7 +25,8 @@ from safevar_sumo.vehicles import CharacteristicSet
 NSGA2 = "nsga2"
 """The algorithm that RQ2 compares with the others, and whose solutions RQ3 analyses."""
 ALGORITHM_TITLES = {
-    "nsga2": "NSGA-II", "spea2": "SPEA2", "mocell": "MOCell", "map_elites": "MAP-Elites", "rs": "RS", "safe_fuzzer": "SafeFuzzer"}
+    "nsga2": "NSGA-II", "spea2": "SPEA2", "mocell": "MOCell", "map_elites": "MAP-Elites", "rs": "RS",
+    "safe_fuzzer": "SafeFuzzer"}
 
 
 class UnanswerableError(InputError):
@@ -88,11 +91,6 @@ class Case:
         if not self.algorithms:
             raise UnanswerableError(self.name, "has no finished run", "results with at least one finished run")
 
-    def require_runs(self) -> None:
-        """Raise `UnanswerableError` if the solutions are imported and belong to no run."""
-        if not self.has_runs:
-            raise UnanswerableError(self.name, "is imported: the runs of its solutions are unknown", "results of the command `study`")
-
     def solutions_of(self, algorithm: str) -> pd.DataFrame:
         """Pooled solutions of all finished runs of an algorithm.
 
@@ -103,7 +101,8 @@ class Case:
         """
         if algorithm not in self.algorithms:
             names = ", ".join(self.algorithms) or "no algorithm"
-            raise UnanswerableError(self.name, f"has no finished run of {algorithm}", f"results of {algorithm} (it has results of {names})")
+            raise UnanswerableError(self.name, f"has no finished run of {algorithm}",
+                                    f"results of {algorithm} (it has results of {names})")
         return self.solutions[self.solutions["algorithm"] == algorithm]
 
     def runs_of(self, algorithm: str) -> list[int]:
@@ -114,14 +113,17 @@ class Case:
         UnanswerableError
             If the solutions are imported and belong to no run.
         """
-        self.require_runs()
+        if not self.has_runs:
+            raise UnanswerableError(self.name, "is imported: the runs of its solutions are unknown",
+                                    "results of the command `study`")
         return sorted(run for name, run in self.finished_runs if name == algorithm)
 
     @property
     def shortfall(self) -> str:
         """Note on unfinished runs, for the readers of every answer about the solutions; empty if there are none."""
         done, planned = Counter(algorithm for algorithm, _ in self.finished_runs), self.study.search.runs
-        shortfalls = [f"{name} {done[name]} of {planned} runs" for name in self.study.search.labels if done[name] < planned]
+        shortfalls = [f"{name} {done[name]} of {planned} runs" for name in self.study.search.labels if done[name]
+                      < planned]
         if not self.has_runs or not shortfalls:
             return ""
         return f"{self.name}: unfinished, {', '.join(shortfalls)}; only solutions of finished runs count."
@@ -131,22 +133,25 @@ class Case:
         """Notes for the readers of every table of this case."""
         lines = [self.shortfall] if self.shortfall else []
         if not self.has_runs:
-            lines.append(f"{self.name}: imported solutions, without runs; the original vehicle's metrics are published or supplied.")
+            lines.append(f"{self.name}: imported solutions, without runs; "
+                         "the original vehicle's metrics are published or supplied.")
         if self.failures:
-            lines.append(f"{self.name}: {len(self.failures)} settings could not be simulated (simulator-error) and are in no result: "
+            lines.append(f"{self.name}: {len(self.failures)} settings could not be simulated (simulator-error) "
+                         "and are in no result: "
                         f"{'; '.join(failure_lines(self.failures))}. `study --retry-failed` simulates them again.")
         return lines
 
 
 def solutions_for_metric(solutions: pd.DataFrame, metric: MetricFacts) -> pd.DataFrame:
-    """The solutions that count for a metric: for TET and TIT only those without collision (docs/method.md, section 4)."""
+    """The solutions that count for a metric: for TET and TIT only those without collision (docs/method.md, section
+    4).
+    """
     return solutions if metric.over_collisions else solutions[~are_collisions(solutions)]
 
 
-def defined_values(solutions: pd.DataFrame, metric: MetricFacts) -> FloatArray:
-    """A metric's defined values over the solutions that count for it."""
-    column = solutions_for_metric(solutions, metric)[metric.name].to_numpy(dtype=float)
-    return np.asarray(column[~np.isnan(column)])
+def defined_solutions(solutions: pd.DataFrame, metric: MetricFacts) -> pd.DataFrame:
+    """The solutions that count for a metric and have a value of it."""
+    return solutions_for_metric(solutions, metric).dropna(subset=[metric.name])
 
 
 def are_collisions(solutions: pd.DataFrame) -> pd.Series[bool]:
@@ -166,35 +171,28 @@ def load_cases(directories: Iterable[str | Path]) -> list[Case]:
     duplicates = [path for path, count in Counter(path.resolve() for path in paths).items() if count > 1]
     if duplicates:
         raise InputError("directories", f"{duplicates[0]} is given twice", "each results directory once")
-    cases = [_load_or_refuse(path) for path in paths]
+    cases = []
+    for path in paths:
+        try:
+            cases.append(_load_case(path))
+        except (TypeError, ValueError, KeyError, ArithmeticError) as error:
+            raise InputError(path, f"is damaged: {describe_error(error)}",
+                             "an unchanged directory of the command `study`") from error
     names = Counter(case.name for case in cases)
-    return [replace(case, name=f"{case.name} ({path})") if names[case.name] > 1 else case for case, path in zip(cases, paths, strict=True)]
+    return [replace(case, name=f"{case.name} ({path})") if names[case.name] > 1 else case for case,
+            path in zip(cases, paths, strict=True)]
 
 
-def _load_or_refuse(path: Path) -> Case:
-    try:
-        return load_case(path)
-    except (TypeError, ValueError, KeyError, ArithmeticError) as error:
-        raise InputError(path, f"is damaged: {describe_error(error)}", "an unchanged directory of the command `study`") from error
-
-
-def load_case(directory: Path) -> Case:
-    """Read one results directory."""
+def _load_case(directory: Path) -> Case:
     manifest, evaluations, solutions, finished, failures = load_runs(directory)
     try:
         study = msgspec.convert(manifest["study"], Study)
-        study = msgspec.structs.replace(study, origin=Origin(places=folders_of(directory)))
     except msgspec.ValidationError as error:
         raise error_with_key(directory / MANIFEST, manifest["study"], error, "study") from None
-    original = manifest.get("original")
-    if not isinstance(original, dict):
-        raise InputError(directory / MANIFEST, "does not describe the original vehicle", "a manifest of the command `study`")
-    try:
-        scoring = msgspec.convert(manifest["scoring"], Scoring) if "scoring" in manifest else PUBLISHED_SCORING
-    except msgspec.ValidationError as error:
-        raise error_with_key(directory / MANIFEST, manifest["scoring"], error, "scoring") from None
-    return build_case(study, original, solutions, evaluations, finished, has_runs="imported" not in manifest, failures=failures,
-                      scoring=scoring)
+    scoring = msgspec.convert(manifest["scoring"], Scoring) if "scoring" in manifest else PUBLISHED_SCORING
+    return build_case(msgspec.structs.replace(study, origin=Origin(places=folders_of(directory))), manifest["original"],
+                      solutions,
+                      evaluations, finished, has_runs="imported" not in manifest, failures=failures, scoring=scoring)
 
 
 def build_case(study: Study, original: Mapping[str, Any], solutions: pd.DataFrame, evaluations: pd.DataFrame,
@@ -204,6 +202,7 @@ def build_case(study: Study, original: Mapping[str, Any], solutions: pd.DataFram
     names = [metric.name for metric in scoring.metrics]
     columns = [*names, *(objective.name for objective in scoring.objectives)]
     metrics = {name: np.nan if original.get(name) is None else float(original[name]) for name in names}
-    solutions, evaluations = (frame.assign(**{name: np.nan for name in columns if name not in frame}) for frame in (solutions, evaluations))
+    solutions, evaluations = (frame.assign(**{name: np.nan for name in columns if name not in frame})
+                              for frame in (solutions, evaluations))
     return Case(name=study.name, study=study, original=metrics, solutions=solutions, evaluations=evaluations,
                 finished_runs=tuple(finished), has_runs=has_runs, failures=tuple(failures), scoring=scoring)

@@ -1,156 +1,367 @@
-"""Comparison of two samples: Mann-Whitney U, and the size of the difference (docs/method.md, section 7).
+"""RQ1 and RQ2: algorithms against the original vehicle and against each other, over pooled solutions and over runs.
 
-In the frames, the column `setting` holds the case's name, and `method` the name of the test.
+The paper pools the solutions of all runs and compares them with a second sample: the original's single value, repeated
+once for each solution. Solutions of one run resemble each other, and a repeated value is no sample: p-values become too
+small. Over runs, each run contributes one value, and Holm's method corrects for the number of tests.
+
+In the frames, the column `setting` holds the case's name, and `method` the name of the test; undefined values are None.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, NamedTuple
+import math
+from collections.abc import Callable, Iterable, Mapping
+from itertools import combinations
+from typing import Any
 
 import numpy as np
 import pandas as pd
 import scipy
-from numpy.typing import ArrayLike
 
-from safevar_sumo.analysis.research_questions.case import NSGA2, Case, UnanswerableError, defined_values
-from safevar_sumo.analysis.research_questions.indicators import MORE_IS_BETTER, compute_indicators
-from safevar_sumo.errors import InputError
+from safevar_sumo.analysis.research_questions.case import (
+    ALGORITHM_TITLES,
+    NSGA2,
+    Case,
+    UnanswerableError,
+    defined_solutions,
+)
+from safevar_sumo.analysis.research_questions.indicators import INDICATOR_TITLES, MORE_IS_BETTER, compute_indicators
+from safevar_sumo.analysis.research_questions.statistics import (
+    ALPHA,
+    TwoSampleTest,
+    compare_samples,
+    correct_by_holm,
+    critical_difference,
+    fewest_runs,
+    friedman_test,
+    signed_rank_test,
+)
+from safevar_sumo.analysis.words import number_of
 from safevar_sumo.metrics import MetricFacts
-from safevar_sumo.records import FloatArray
 
-ALPHA = 0.01
-"""A p-value below this level is significant."""
-EXACT_SAMPLE_SIZE = 8
-"""Without ties, the p-value is exact if one sample has at most this many values; otherwise it is a normal approximation."""
-EXACT_TEST = "Mann-Whitney U, two-sided, exact"
-ASYMPTOTIC_TEST = "Mann-Whitney U, two-sided, normal approximation with corrections for ties and continuity"
-MAGNITUDES = ((0.714, "large"), (0.638, "medium"), (0.556, "small"))
-"""Kitchenham's magnitudes; each holds from this value of max(A12, 1 - A12) on."""
-NOTABLE_MAGNITUDES = ("medium", "large")
+RQ1_COLUMNS = ["setting", "algorithm", "metric", "p_value", "effect_size", "magnitude", "n1", "n2", "method", "mean",
+               "original"]
+RQ2_COLUMNS = ["setting", "baseline", "metric", "p_value", "effect_size", "magnitude", "n1", "n2", "method"]
+RQ1_RUNS_COLUMNS = ["setting", "algorithm", "metric", "p_value", "p_holm", "effect_size", "magnitude", "runs", "method",
+                    "mean", "original"]
+RQ2_RUNS_COLUMNS = ["setting", "baseline", "metric", "p_value", "p_holm", "effect_size", "magnitude", "n1", "n2",
+                    "method"]
+PAIR_COLUMNS = ["setting", "algorithm", "other", "metric", "p_value", "p_holm", "effect_size", "magnitude", "n1", "n2",
+                "method"]
+RANK_COLUMNS = ["setting", "metric", "algorithm", "mean_rank", "median", "runs", "statistic", "p_value", "p_holm",
+                "critical_difference"]
 
-
-class TwoSampleTest(NamedTuple):
-    """Comparison of two samples X and Y; None where a sample is empty.
-
-    `effect_size` is Vargha-Delaney's A12 = P(X > Y) + 0.5 P(X = Y), `n1` and `n2` the samples' sizes.
-    """
-
-    p_value: float | None
-    effect_size: float | None
-    magnitude: str | None
-    n1: int
-    n2: int
-    method: str | None
+SampleFunction = Callable[[Case, str, MetricFacts], "pd.Series[float]"]
+"""Returns an algorithm's values of a metric."""
+Samples = Mapping[str, tuple[bool, Mapping[str, "pd.Series[float]"]]]
+"""For each indicator and metric: whether more is better (of a metric: more unsafe), and each algorithm's values."""
 
 
-def compare_samples(x: ArrayLike, y: ArrayLike) -> TwoSampleTest:
-    """Compare two samples by U test and effect size.
-
-    Raises
-    ------
-    InputError
-        If a value is NaN.
-    """
-    first, second = np.asarray(x, dtype=float), np.asarray(y, dtype=float)
-    if np.isnan(first).any() or np.isnan(second).any():
-        raise InputError("Mann-Whitney U", "a value is NaN", "samples without undefined values")
-    if not first.size or not second.size:
-        return TwoSampleTest(p_value=None, effect_size=None, magnitude=None, n1=first.size, n2=second.size, method=None)
-    pooled = np.concatenate([first, second])
-    is_exact = min(first.size, second.size) <= EXACT_SAMPLE_SIZE and np.unique(pooled).size == pooled.size
-    test = scipy.stats.mannwhitneyu(first, second, alternative="two-sided", method="exact" if is_exact else "asymptotic")
-    a12 = float(test.statistic) / (first.size * second.size)
-    return TwoSampleTest(float(test.pvalue), a12, magnitude_of(a12), first.size, second.size, EXACT_TEST if is_exact else ASYMPTOTIC_TEST)
+def pooled_values(case: Case, algorithm: str, metric: MetricFacts) -> pd.Series[float]:
+    """A metric's defined values over the solutions that count for it."""
+    return defined_solutions(case.solutions_of(algorithm), metric)[metric.name].astype(float)
 
 
-def magnitude_of(effect_size: float) -> str:
-    """The magnitude of an effect size, by Kitchenham's intervals."""
-    folded_effect = round(max(effect_size, 1 - effect_size), 12)
-    return next((name for limit, name in MAGNITUDES if folded_effect >= limit), "negligible")
-
-
-RQ1_COLUMNS = ["setting", "algorithm", "metric", "p_value", "effect_size", "magnitude", "n1", "n2", "method", "mean", "original"]
+def run_means(case: Case, algorithm: str, metric: MetricFacts) -> pd.Series[float]:
+    """The mean of a metric's defined values in each finished run that has some, by the run's number."""
+    solutions = defined_solutions(case.solutions_of(algorithm), metric)
+    samples = {run: solutions.loc[solutions["run"] == run, metric.name].to_numpy(dtype=float)
+               for run in case.runs_of(algorithm)}
+    return pd.Series({run: float(np.mean(sample)) for run, sample in samples.items() if sample.size}, dtype=float)
 
 
 def rq1(case: Case) -> pd.DataFrame:
     """Every algorithm's solutions against the original's value, repeated once for each solution, metric by metric.
 
-    Columns: `RQ1_COLUMNS`. `effect_size` is A12, oriented so that smaller values mean that the algorithm's solutions are
-    more unsafe; `mean` is the mean over the algorithm's solutions, `original` the original vehicle's value. Undefined values are None.
+    Columns: `RQ1_COLUMNS`. `effect_size` is A12, oriented so that smaller values mean that the algorithm's solutions
+    are more unsafe; `mean` is the mean over the algorithm's solutions, `original` the original vehicle's value.
 
     Raises
     ------
     UnanswerableError
         If no run is finished.
     """
-    case.require_solutions()
-    rows = rq1_rows(case, lambda algorithm, metric: defined_values(case.solutions_of(algorithm), metric),
-                    lambda sample, original: compare_samples(sample, np.full(0 if np.isnan(original) else len(sample), original)))
+    rows = _rows_against_original(case, pooled_values, lambda sample, original: compare_samples(
+        sample, np.full(0 if np.isnan(original) else len(sample), original)))
     return pd.DataFrame(rows, columns=RQ1_COLUMNS, dtype=object)
 
 
-SampleFunction = Callable[[str, MetricFacts], FloatArray]
-"""Returns an algorithm's N values of a metric, shape (N,)."""
-
-
-def rq1_rows(case: Case, sample_of: SampleFunction, test: Callable[[FloatArray, float], TwoSampleTest]) -> list[dict[str, Any]]:
-    """A row for each algorithm and metric: the test of its sample against the original's value, oriented as in `rq1`."""
+def _rows_against_original(case: Case, sample_of: SampleFunction,
+                           test: Callable[[pd.Series[float], float], TwoSampleTest]
+                           ) -> list[dict[str, Any]]:
+    case.require_solutions()
     rows = []
     for algorithm in case.algorithms:
         for metric in case.scoring.metrics:
-            sample, original = sample_of(algorithm, metric), case.original[metric.name]
-            comparison = test(sample, original)
-            rows.append({"setting": case.name, "algorithm": algorithm, "metric": metric.name,
-                         **(reverse_effect(comparison) if metric.more_is_unsafe else comparison)._asdict(),
-                         "mean": float(np.mean(sample)) if sample.size else None, "original": None if np.isnan(original) else original})
+            sample, original = sample_of(case, algorithm, metric), case.original[metric.name]
+            result = test(sample, original).reversed_if(metric.more_is_unsafe)
+            rows.append({"setting": case.name, "algorithm": algorithm, "metric": metric.name, **result._asdict(),
+                         "runs": result.n1,
+                         "mean": float(np.mean(sample.to_numpy())) if sample.size else None,
+                         "original": None if np.isnan(original) else original})
     return rows
-
-
-def reverse_effect(test: TwoSampleTest) -> TwoSampleTest:
-    """The same test with the effect size of the second sample against the first, 1 - A12."""
-    effect = None if test.effect_size is None else 1 - test.effect_size
-    return test if effect is None else test._replace(effect_size=effect, magnitude=magnitude_of(effect))
-
-
-RQ2_COLUMNS = ["setting", "baseline", "metric", "p_value", "effect_size", "magnitude", "n1", "n2", "method"]
 
 
 def rq2(case: Case) -> pd.DataFrame:
     """NSGA-II against every other algorithm: its runs' indicators, then its pooled solutions' metrics.
 
-    Columns: `RQ2_COLUMNS`. `effect_size` is A12, oriented so that higher values mean that NSGA-II is better: a better front,
-    more unsafe solutions. `n1` counts NSGA-II's values, `n2` the baseline's. Undefined values are None, as are the
-    indicators of imported solutions, which belong to no run.
+    Columns: `RQ2_COLUMNS`. `effect_size` is A12, oriented so that higher values mean that NSGA-II is better: a better
+    front, more unsafe solutions. `n1` counts NSGA-II's values, `n2` the baseline's. Indicators of imported solutions,
+    which belong to no run, are None.
 
     Raises
     ------
     UnanswerableError
         If NSGA-II is missing, or there is no other algorithm.
     """
-    require_rq2_algorithms(case)
-    rows = rq2_rows(case, lambda algorithm, metric: defined_values(case.solutions_of(algorithm), metric))
-    return pd.DataFrame(rows, columns=RQ2_COLUMNS, dtype=object)
+    return pd.DataFrame(_rows_of_pairs(case, _nsga2_pairs(case), _samples(case, pooled_values)), columns=RQ2_COLUMNS,
+                        dtype=object)
 
 
-def require_rq2_algorithms(case: Case) -> None:
-    """Raise `UnanswerableError` if NSGA-II is missing, or there is no other algorithm."""
+def _nsga2_pairs(case: Case) -> list[tuple[str, str]]:
+    """NSGA-II with every other algorithm; raises `UnanswerableError` if NSGA-II is missing, or there is no other
+    algorithm.
+    """
     case.solutions_of(NSGA2)  # raises if there are none
-    if all(name == NSGA2 for name in case.algorithms):
-        raise UnanswerableError(case.name, f"only {NSGA2} has finished runs", "results of another algorithm to compare with, such as rs")
+    pairs = [(NSGA2, name) for name in case.algorithms if name != NSGA2]
+    if not pairs:
+        raise UnanswerableError(case.name, f"only {NSGA2} has finished runs",
+                                "results of another algorithm to compare with, such as rs")
+    return pairs
 
 
-def rq2_rows(case: Case, sample_of: SampleFunction) -> list[dict[str, Any]]:
-    """For every other algorithm, a row for each indicator and metric: NSGA-II's values against that algorithm's, oriented as in `rq2`."""
+def _samples(case: Case, sample_of: SampleFunction) -> Samples:
+    samples: dict[str, tuple[bool, dict[str, pd.Series[float]]]] = {}
     indicators = compute_indicators(case) if case.has_runs and len(case.solutions) else None
-    rows = []
-    for baseline in (name for name in case.algorithms if name != NSGA2):
-        pair = (NSGA2, baseline)
-        tests = [(name, not more_is_better, compare_samples(*(
-            [] if indicators is None else indicators.loc[indicators["algorithm"] == algorithm, name] for algorithm in pair)))
-            for name, more_is_better in MORE_IS_BETTER.items()]
-        tests += [(metric.name, not metric.more_is_unsafe, compare_samples(*(sample_of(algorithm, metric) for algorithm in pair)))
-                  for metric in case.scoring.metrics]
-        rows += [{"setting": case.name, "baseline": baseline, "metric": name,
-                  **(reverse_effect(test) if is_reversed else test)._asdict()} for name, is_reversed, test in tests]
+    for name, more_is_better in MORE_IS_BETTER.items():
+        samples[name] = more_is_better, {
+            algorithm: pd.Series(dtype=float) if indicators is None else
+            indicators.loc[indicators.index.get_level_values("algorithm") == algorithm, name].droplevel("algorithm")
+            for algorithm in case.algorithms}
+    for metric in case.scoring.metrics:
+        samples[metric.name] = metric.more_is_unsafe, {algorithm: sample_of(case, algorithm, metric)
+                                                       for algorithm in case.algorithms}
+    return samples
+
+
+def _rows_of_pairs(case: Case, pairs: Iterable[tuple[str, str]], samples: Samples) -> list[dict[str, Any]]:
+    """A row for each pair and metric; the second algorithm is both its `other` and its `baseline`."""
+    return [{"setting": case.name, "algorithm": first, "other": second, "baseline": second, "metric": metric,
+             **compare_samples(values[first], values[second]).reversed_if(not more_is_better)._asdict()}
+            for first, second in pairs for metric, (more_is_better, values) in samples.items()]
+
+
+def compare_over_runs(case: Case) -> dict[str, pd.DataFrame]:
+    """The frames of `rq1_runs` and `rq2_runs` by question, RQ1 and RQ2; RQ2 is missing if it has no answer.
+
+    Raises
+    ------
+    UnanswerableError
+        If the solutions belong to no run, or no run is finished.
+    """
+    rows = {"RQ1": _rows_against_original(case, run_means, signed_rank_test)}
+    if NSGA2 in case.algorithms and len(case.algorithms) > 1:
+        rows["RQ2"] = _rows_of_pairs(case, _nsga2_pairs(case), _samples(case, run_means))
+    _add_holm([row for rows_of_question in rows.values() for row in rows_of_question])
+    return {question: pd.DataFrame(rows[question], columns=columns, dtype=object)
+            for question, columns in (("RQ1", RQ1_RUNS_COLUMNS), ("RQ2", RQ2_RUNS_COLUMNS)) if question in rows}
+
+
+def _add_holm(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Add `p_holm` to the rows, corrected as one family."""
+    for row, p in zip(rows, correct_by_holm([row["p_value"] for row in rows]), strict=True):
+        row["p_holm"] = p
     return rows
+
+
+def rq1_runs(case: Case) -> pd.DataFrame:
+    """Every algorithm's run means against the original's value, metric by metric: Wilcoxon's signed-rank test.
+
+    Columns: `RQ1_RUNS_COLUMNS`. `effect_size` is the share of runs whose mean is safer than the original's value, plus
+    half the share of equal ones (A12 against one value): below 0.5 the runs are less safe. `mean` is the mean of the
+    run means. `p_holm` is `p_value` corrected by Holm's method for all tests of RQ1 and RQ2 of this case.
+
+    Raises
+    ------
+    UnanswerableError
+        If the solutions belong to no run, or no run is finished.
+    """
+    return compare_over_runs(case)["RQ1"]
+
+
+def rq2_runs(case: Case) -> pd.DataFrame:
+    """Compare NSGA-II with every other algorithm by Mann-Whitney U, with one value per run: indicators, and metrics'
+    means over solutions.
+
+    Columns: `RQ2_RUNS_COLUMNS`. `effect_size` is A12, oriented as in `rq2`; `n1` and `n2` count runs; `p_holm` is
+    defined as in `rq1_runs`.
+
+    Raises
+    ------
+    UnanswerableError
+        If the solutions belong to no run, NSGA-II is missing, or there is no other algorithm.
+    """
+    frames = compare_over_runs(case)
+    _nsga2_pairs(case)
+    return frames["RQ2"]
+
+
+def compare_pairs(case: Case) -> pd.DataFrame:
+    """Compare every pair of algorithms by Mann-Whitney U, with one value per run: each indicator, and each metric's
+    mean over solutions.
+
+    Columns: `PAIR_COLUMNS`, where `other` is the other algorithm. `effect_size` is A12, oriented so that higher values
+    mean that `algorithm` is better than `other`: a better front, more unsafe solutions. `p_holm` is `p_value` corrected
+    by Holm's method for all pairs and metrics of this case.
+
+    Raises
+    ------
+    UnanswerableError
+        If there are no runs, or runs of only one algorithm.
+    """
+    samples = _samples_of_several(case, 2)
+    return pd.DataFrame(_add_holm(_rows_of_pairs(case, combinations(case.algorithms, 2), samples)),
+                        columns=PAIR_COLUMNS, dtype=object)
+
+
+def rank_algorithms(case: Case) -> pd.DataFrame:
+    """Mean ranks of the algorithms over runs, metric by metric, with Friedman's test.
+
+    Runs with the same number form a block; a block in which an algorithm has no value is left out. Columns:
+    `RANK_COLUMNS`. Rank 1 is the best, `runs` counts blocks, `statistic` and `p_value` are Friedman's, `p_holm` is
+    corrected for all metrics of this case. Mean ranks that differ by less than `critical_difference` are not
+    distinguished (Nemenyi's test at 0.01; Demsar 2006).
+
+    Raises
+    ------
+    UnanswerableError
+        If there are no runs, or fewer than three algorithms.
+    """
+    tests, rows = list[dict[str, Any]](), list[dict[str, Any]]()
+    for metric, (more_is_better, by_algorithm) in _samples_of_several(case, 3).items():
+        blocks = pd.DataFrame(by_algorithm).dropna()
+        values = blocks.to_numpy(dtype=float)
+        ranks = scipy.stats.rankdata(-values if more_is_better else values, axis=1)
+        statistic, p = friedman_test(values)
+        tests.append({"metric": metric, "statistic": statistic, "p_value": p})
+        rows += [{"setting": case.name, "metric": metric, "algorithm": name, "runs": len(blocks),
+                  "mean_rank": float(ranks[:, i].mean()) if len(blocks) else None,
+                  "median": float(np.median(values[:, i])) if len(blocks) else None,
+                  "critical_difference": critical_difference(len(blocks.columns), len(blocks)) if len(blocks) else None}
+                 for i, name in enumerate(blocks.columns)]
+    tests_by_metric = {test["metric"]: test for test in _add_holm(tests)}
+    return pd.DataFrame([{**row, **tests_by_metric[row["metric"]]} for row in rows], columns=RANK_COLUMNS, dtype=object)
+
+
+def _samples_of_several(case: Case, min_algorithms: int) -> Samples:
+    """The samples over runs of at least so many algorithms."""
+    if case.has_runs and len(case.algorithms) < min_algorithms:
+        names = ", ".join(case.algorithms) or "none"
+        raise UnanswerableError(case.name,
+                                f"has finished runs of {number_of(len(case.algorithms), 'algorithm')} ({names})",
+                                f"results of {min_algorithms} algorithms or more")
+    return _samples(case, run_means)
+
+
+def algorithms_with_few_runs(case: Case, question: str) -> list[str]:
+    """RQ1's algorithms or RQ2's baselines with too few runs for a significant test; none if the runs are unknown
+    (imported).
+    """
+    if not case.has_runs or (question == "RQ2" and NSGA2 not in case.algorithms):
+        return []
+    runs = {name: len(case.runs_of(name)) for name in case.algorithms}
+    most = runs.pop(NSGA2) if question == "RQ2" else math.inf
+    return [name for name, number in runs.items() if min(number, most) < fewest_runs(question)]
+
+
+def titles_of(metrics: Iterable[MetricFacts]) -> dict[str, str]:
+    """Titles of metrics and quality indicators in tables, by name."""
+    return {**INDICATOR_TITLES, **{metric.name: metric.title for metric in metrics}}
+
+
+def _tests_over_runs(case: Case) -> pd.DataFrame:
+    """Each test of RQ1 and RQ2 over runs with an effect size, in words; columns question, algorithm, metric,
+    effect_size, p_holm, ...
+
+    `pooled_p` is the p-value over the paper's pooled solutions; `enough` is whether there are enough runs for the test
+    to be significant.
+
+    Raises
+    ------
+    UnanswerableError
+        If `rq1_runs` raises it.
+    """
+    frames, titles = [], titles_of(case.scoring.metrics)
+    for question, frame in compare_over_runs(case).items():
+        pooled_frame, group, counts = ((rq1(case), "algorithm", ["runs"]) if question == "RQ1"
+                                       else (rq2(case), "baseline", ["n1", "n2"]))
+        frames.append(frame.assign(
+            question=question, algorithm=frame[group].map(lambda name: ALGORITHM_TITLES.get(name, name)),
+            metric=frame["metric"].map(titles), pooled_p=pooled_frame["p_value"],
+            enough=frame[counts].min(axis=1) >= fewest_runs(question)))
+    return pd.concat(frames, ignore_index=True)
+
+
+def notes_over_runs(case: Case, question: str, *, pooling: bool) -> list[str]:
+    """Notes on RQ1 or RQ2 over runs: how many tests have too few runs.
+
+    With `pooling`, also the `significance_change_line`, if at least one test of RQ1 or RQ2 has enough runs.
+    """
+    tests = _tests_over_runs(case).dropna(subset="effect_size")
+    enough = tests.loc[tests["question"] == question, "enough"]
+    share = f"{(~enough).sum()} of the" if enough.any() else "all"
+    too_few = f"too few runs for {share} {len(enough)} tests of {question} ({fewest_runs(question)} are needed)."
+    return [*([] if enough.all() else [too_few]),
+            *([significance_change_line(case)] if pooling and tests["enough"].any() else [])]
+
+
+def significance_change_line(case: Case) -> str:
+    """One line: the tests with enough runs that are significant (p < ALPHA) only for the paper's pooled solutions, or
+    only over runs.
+
+    Example: "..., 3 of 28 tests are no longer significant: RQ1 NSGA-II SD, TET; RQ2 SafeFuzzer TET."
+    """
+    tests, texts = _tests_over_runs(case), []
+    tests = tests[tests["enough"]].dropna(subset="p_holm")
+    was_significant, is_significant = (tests[column].astype(float) < ALPHA for column in ("pooled_p", "p_holm"))
+    for word, changes in (("no longer", tests[was_significant & ~is_significant]),
+                          ("now", tests[~was_significant & is_significant])):
+        groups = changes.dropna(subset="pooled_p").groupby(["question", "algorithm"], sort=False)["metric"]
+        named = "; ".join(f"{question} {name} {', '.join(metrics)}" for (question, name), metrics in groups)
+        count = groups.size().sum()
+        if count:
+            texts.append(f"{count} of {len(tests)} tests {'is' if count == 1 else 'are'} {word} significant: {named}")
+    return ("With one value for each run and Holm's correction for the number of tests, instead of the paper's pooled "
+            f"solutions, {'. '.join(texts) or 'the same tests are significant'}.")
+
+
+def summary_lines(case: Case) -> list[str]:
+    """Lines on RQ1 and RQ2 for the end of a study: effect sizes over runs, significant ones with an asterisk.
+
+    A line says so if there are too few runs for a significant difference. The last line is `significance_change_line`.
+    """
+    lines, any_testable = list[str](), False
+    questions = (("RQ1", compare_over_runs, "A12 below 0.5: the runs are more unsafe than the original vehicle",
+                  "A12 of {} against the original vehicle"),
+                 ("RQ2", _nsga2_pairs, "A12 above 0.5: NSGA-II is better", "A12 of NSGA-II against {}"))
+    for question, check, meaning, heading in questions:
+        try:
+            check(case)
+            tests = _tests_over_runs(case)
+        except UnanswerableError as error:
+            lines.append(f"{question} over runs: {error.problem}.")
+            continue
+        lines.append(f"{question} over runs: {meaning}; * p < {ALPHA:g} after Holm's correction")
+        for name, group in tests[tests["question"] == question].groupby("algorithm", sort=False):
+            defined_tests = group.dropna(subset="effect_size")
+            untestable = defined_tests.loc[~defined_tests["enough"], "metric"]
+            is_any_testable = bool(defined_tests["enough"].any())
+            named_metrics = f"{', '.join(untestable)}: " if is_any_testable else ""
+            too_few = f"; {named_metrics}too few runs for a test ({fewest_runs(question)} are needed)"
+            effects = ", ".join(f"{test['metric']} " + ("-" if test["effect_size"] is None or test["p_holm"] is None
+                                                        else
+                                f"{test['effect_size']:.2f}{'*' if test['p_holm'] < ALPHA else ''}")
+                                for test in group.to_dict("records"))
+            lines.append(f"  {heading.format(name)}: {effects}{too_few if len(untestable) else ''}")
+            any_testable = any_testable or is_any_testable
+    return [*lines, significance_change_line(case)] if any_testable else lines

@@ -1,9 +1,8 @@
-"""Quality of a run's front (docs/method.md, section 7): IGD on the objectives in their units, IGD+ and hypervolume on normalised ones."""
+"""Quality of a run's front (docs/method.md, section 7): IGD on the objectives in their units, IGD+ and hypervolume on
+normalised ones.
+"""
 
 from __future__ import annotations
-
-from collections.abc import Iterable
-from typing import NamedTuple
 
 import moocore
 import numpy as np
@@ -11,67 +10,68 @@ import pandas as pd
 
 from safevar_sumo.analysis.research_questions.case import Case, UnanswerableError
 from safevar_sumo.errors import InputError
-from safevar_sumo.metrics import MetricFacts
 from safevar_sumo.records import FloatArray
 
 MORE_IS_BETTER = {"igd": False, "igd_plus": False, "hypervolume": True}
 INDICATOR_TITLES = {"igd": "IGD", "igd_plus": "IGD+", "hypervolume": "HV"}
 REFERENCE_COORDINATE = 1.1
 """Each coordinate of the hypervolume's reference point for objectives normalised to 0..1: a tenth beyond the nadir."""
+SURFACE_PERCENTAGES = (50.0, 100.0)
+"""An attainment surface is computed for each of these percentages of the runs, and for the percentage that one run is
+(the best of all)."""
+CURVE_POINTS = 50
+"""Maximum number of points of a run's curve."""
 
 
-def titles_of(metrics: Iterable[MetricFacts]) -> dict[str, str]:
-    """Titles of metrics and quality indicators in tables, by name."""
-    return {**INDICATOR_TITLES, **{metric.name: metric.title for metric in metrics}}
+def _check_points(points: FloatArray) -> FloatArray:
+    """Refuse empty sets and undefined points, for which indicators would return their best value."""
+    array = np.asarray(points, dtype=float)
+    if array.ndim != 2 or not array.size or not np.isfinite(array).all():
+        raise InputError("a set of points", "is empty or holds an undefined value",
+                         "at least one point, shape (points, objectives)")
+    return array
 
 
 def nondominated_points(points: FloatArray) -> FloatArray:
     """The distinct non-dominated points for minimisation, with shape (points, objectives)."""
-    return np.asarray(moocore.filter_dominated(_check_points(points, "the set of points")))
+    return np.asarray(moocore.filter_dominated(_check_points(points)))
 
 
 def igd(front: FloatArray, reference: FloatArray) -> float:
     """Mean Euclidean distance from each point of the reference front to the nearest point of `front`."""
-    return float(moocore.igd(_check_points(front, "the front"), ref=_check_points(reference, "the reference front")))
+    return float(moocore.igd(_check_points(front), ref=_check_points(reference)))
 
 
 def igd_plus(front: FloatArray, reference: FloatArray) -> float:
     """IGD with distances that count only the objectives in which `front` is worse."""
-    return float(moocore.igd_plus(_check_points(front, "the front"), ref=_check_points(reference, "the reference front")))
+    return float(moocore.igd_plus(_check_points(front), ref=_check_points(reference)))
 
 
 def hypervolume(front: FloatArray) -> float:
     """The volume between `front` and the reference point."""
-    points = _check_points(front, "the front")
+    points = _check_points(front)
     return float(moocore.hypervolume(points, ref=np.full(points.shape[1], REFERENCE_COORDINATE)))
 
 
-class Scale(NamedTuple):
-    """Normalises objectives: `ideal` becomes 0, `ideal + width`, the nadir, becomes 1."""
+def normalised(points: FloatArray, reference: FloatArray) -> FloatArray:
+    """Points on the scale from the best (0) to the worst value (1) of each objective in a reference front.
 
-    ideal: FloatArray
-    width: FloatArray
+    The scale's width is 1 if both are equal.
+    """
+    ideal, nadir = reference.min(axis=0), reference.max(axis=0)
+    return np.asarray((points - ideal) / np.where(nadir > ideal, nadir - ideal, 1.0))
 
-    @classmethod
-    def of(cls, reference: FloatArray) -> Scale:
-        """The scale from the best to the worst value of each objective in a reference front; the width is 1 if both are equal."""
-        ideal, nadir = reference.min(axis=0), reference.max(axis=0)
-        return cls(ideal, np.where(nadir > ideal, nadir - ideal, 1.0))
 
-    def normalised(self, points: FloatArray) -> FloatArray:
-        return np.asarray((points - self.ideal) / self.width)
+def minimised_values(case: Case, frame: pd.DataFrame) -> FloatArray:
+    """The objectives' values, smaller being better, shape (rows, objectives); NaN where undefined."""
+    signs = [objective.sign for objective in case.scoring.objectives]
+    return np.asarray(frame[[objective.name for objective in case.scoring.objectives]].to_numpy(dtype=float) * signs)
 
 
 def defined_minimised_values(case: Case, frame: pd.DataFrame) -> FloatArray:
-    """The objectives' values, smaller being better, of the rows in which all of them are defined; shape (points, objectives)."""
-    points = _minimised_values(case, frame)
+    """The `minimised_values` of the rows in which all objectives are defined."""
+    points = minimised_values(case, frame)
     return np.asarray(points[np.isfinite(points).all(axis=1)])
-
-
-def _minimised_values(case: Case, frame: pd.DataFrame) -> FloatArray:
-    """The objectives' values, smaller being better; NaN where undefined."""
-    signs = [objective.sign for objective in case.scoring.objectives]
-    return np.asarray(frame[[objective.name for objective in case.scoring.objectives]].to_numpy(dtype=float) * signs)
 
 
 def reference_front(case: Case) -> FloatArray:
@@ -89,35 +89,30 @@ def reference_front(case: Case) -> FloatArray:
 
 
 def compute_indicators(case: Case) -> pd.DataFrame:
-    """IGD, IGD+ and hypervolume of every finished run that has solutions; columns algorithm, run, igd, igd_plus and hypervolume.
+    """IGD, IGD+ and hypervolume of every finished run that has solutions; index algorithm and run, a column for each
+    indicator.
 
     Raises
     ------
     UnanswerableError
         If there are no runs or no solutions.
     """
-    rows = []
     runs = [(algorithm, run) for algorithm in case.algorithms for run in case.runs_of(algorithm)]
     reference = reference_front(case)
-    scale = Scale.of(reference)
-    scaled_reference = scale.normalised(reference)
-    by_run = dict(list(case.solutions.groupby(["algorithm", "run"])))
-    for algorithm, run in runs:
-        front = defined_minimised_values(case, by_run[algorithm, run]) if (algorithm, run) in by_run else np.zeros((0, 0))
-        if len(front):
-            scaled_front = scale.normalised(front)
-            rows.append((algorithm, run, igd(front, reference), igd_plus(scaled_front, scaled_reference), hypervolume(scaled_front)))
-    return pd.DataFrame(rows, columns=["algorithm", "run", *MORE_IS_BETTER])
-
-
-CURVE_POINTS = 50
-"""Maximum number of points of a run's curve."""
+    fronts = {key: defined_minimised_values(case, group) for key, group in case.solutions.groupby(["algorithm", "run"])}
+    rows = {run: (igd(front, reference), igd_plus(scaled := normalised(front, reference),
+                                                  normalised(reference, reference)),
+                  hypervolume(scaled)) for run in runs if len(front := fronts.get(run, reference[:0]))}
+    return pd.DataFrame(rows.values(), pd.MultiIndex.from_tuples(rows, names=["algorithm", "run"]),
+                        list(MORE_IS_BETTER))
 
 
 def compute_convergence(case: Case) -> pd.DataFrame:
-    """The hypervolume of each run's settings after a number of evaluations; columns algorithm, run, evaluations, hypervolume.
+    """The hypervolume of each run's settings after a number of evaluations; columns algorithm, run, evaluations,
+    hypervolume.
 
-    A run that ended early keeps its last hypervolume. The hypervolume is 0 as long as no setting dominates the reference point.
+    A run that ended early keeps its last hypervolume. The hypervolume is 0 as long as no setting dominates the
+    reference point.
 
     Raises
     ------
@@ -125,37 +120,56 @@ def compute_convergence(case: Case) -> pd.DataFrame:
         If there are no runs or no solutions.
     """
     runs = [(algorithm, run) for algorithm in case.algorithms for run in case.runs_of(algorithm)]
-    scale = Scale.of(reference_front(case))
-    budget = case.study.search.evaluations
-    evaluation_counts = np.unique(np.linspace(min(case.study.search.population, budget), budget, CURVE_POINTS).astype(int))
+    reference, budget = reference_front(case), case.study.search.evaluations
+    evaluation_counts = np.unique(np.linspace(min(case.study.search.population, budget), budget,
+                                              CURVE_POINTS).astype(int))
     by_run = dict(list(case.evaluations.groupby(["algorithm", "run"])))
-    frames = [pd.DataFrame({"algorithm": algorithm, "run": run, "evaluations": evaluation_counts,
-                            "hypervolume": _hypervolumes_after(case, by_run[algorithm, run], scale, evaluation_counts)})
-              for algorithm, run in runs if (algorithm, run) in by_run]
+    frames = []
+    for algorithm, run in (run for run in runs if run in by_run):
+        points = normalised(minimised_values(case, by_run[algorithm, run]), reference)
+        is_defined = np.isfinite(points).all(axis=1)
+        points = points[is_defined]
+        ends = np.searchsorted(by_run[algorithm, run]["evaluation"].to_numpy()[is_defined], evaluation_counts,
+                               side="left")
+        front, volumes = points[:0], []
+        for new_points in np.split(points, ends)[:-1]:
+            front = np.concatenate([front, new_points])
+            front = nondominated_points(front) if len(front) else front
+            volumes.append(hypervolume(front) if len(front) else 0.0)
+        frames.append(pd.DataFrame({"algorithm": algorithm, "run": run, "evaluations": evaluation_counts,
+                                    "hypervolume": volumes}))
     if not frames:
         raise UnanswerableError(case.name, "has no evaluations", "results with the journals of their runs")
     return pd.concat(frames, ignore_index=True)
 
 
-def _hypervolumes_after(case: Case, evaluations: pd.DataFrame, scale: Scale, evaluation_counts: np.ndarray) -> list[float]:
-    """Hypervolume of the first k evaluations, for each count k."""
-    scaled_points = scale.normalised(_minimised_values(case, evaluations))
-    is_defined = np.isfinite(scaled_points).all(axis=1)
-    scaled_points, evaluation_indices = scaled_points[is_defined], evaluations["evaluation"].to_numpy()[is_defined]
-    ends = np.searchsorted(evaluation_indices, evaluation_counts, side="left")
-    front, volumes = np.zeros((0, scaled_points.shape[1])), []
-    for start, end in zip([0, *ends[:-1]], ends, strict=True):
-        front = np.concatenate([front, scaled_points[start:end]])
-        front = nondominated_points(front) if len(front) else front
-        volumes.append(hypervolume(front) if len(front) else 0.0)
-    return volumes
+def compute_attainment(case: Case) -> dict[str, dict[float, FloatArray]]:
+    """Empirical attainment surfaces of the first two objectives, by algorithm and percentage of its runs.
 
+    A surface is K points, shape (K, 2), in the objectives' units, sorted by the first objective. For each of its
+    points, that percentage of the runs found a setting at least as good (Fonseca, Guerreiro, Lopez-Ibanez, Paquete
+    2011).
 
-def _check_points(points: FloatArray, name: str) -> FloatArray:
-    """Refuse empty sets and undefined points, for which indicators would return their best value."""
-    array = np.asarray(points, dtype=float)
-    if array.ndim != 2 or not array.size:
-        raise InputError(name, "is empty or has not two dimensions", "at least one point, shape (points, objectives)")
-    if not np.isfinite(array).all():
-        raise InputError(name, "holds an undefined value", "points with finite objectives")
-    return array
+    Raises
+    ------
+    UnanswerableError
+        If there are no runs with solutions.
+    """
+    surfaces: dict[str, dict[float, FloatArray]] = {}
+    signs = np.array([objective.sign for objective in case.scoring.objectives[:2]])
+    for algorithm in case.algorithms:
+        solutions = case.solutions_of(algorithm)
+        fronts = [defined_minimised_values(case, solutions[solutions["run"] == run])[:, :2]
+                  for run in case.runs_of(algorithm)]
+        fronts = [front for front in fronts if len(front)]
+        if fronts:
+            run_indices = np.repeat(np.arange(len(fronts)), [len(front) for front in fronts])
+            percentages = sorted({100 / len(fronts), *SURFACE_PERCENTAGES})
+            points = moocore.eaf(np.concatenate(fronts), run_indices, percentiles=percentages)
+            surfaces[algorithm] = {
+                percentage: (minimised := points[points[:, 2] == percentage, :2])[np.argsort(minimised[:, 0],
+                                                                                             kind="stable")] * signs
+                for percentage in np.unique(points[:, 2]).tolist()}
+    if not surfaces:
+        raise UnanswerableError(case.name, "has no solution", "results with at least one finished run")
+    return surfaces
