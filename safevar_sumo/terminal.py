@@ -67,6 +67,13 @@ def print_meanings(console: Console, characteristics: Iterable[Characteristic]) 
         console.print(table)
 
 
+def print_heading(console: Console, title: str, no_verdict: str) -> None:
+    """Print a study's title, below the reason, if any, why no verdict on its ADS is possible."""
+    if no_verdict:
+        print_text(console, no_verdict)
+    print_text(console, title)
+
+
 def print_constraints(console: Console, study: Study) -> None:
     """Print the constraints that all settings satisfy, if the study has any."""
     characteristics = study.vehicle.characteristics

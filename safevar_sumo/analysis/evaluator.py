@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import cached_property
 
 import msgspec
 import numpy as np
@@ -18,7 +19,7 @@ from safevar_sumo.records import CellResults, Evaluations, FloatArray, Outcome
 from safevar_sumo.study import Study
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet, region_of
-from safevar_sumo.workers.batches import evaluate_all, inputs_of
+from safevar_sumo.workers.batches import ask_why_no_verdict, evaluate_all, inputs_of
 from safevar_sumo.workers.evaluation import Pool, pack_study
 from safevar_sumo.workers.interrupts import wait_for_first
 from safevar_sumo.workers.local import available_cores, local_pool
@@ -157,6 +158,11 @@ class Evaluator:
         if not evaluations.valid[0]:
             raise SimulationError(f"study {self.study.name!r} cannot be simulated with the original vehicle: {evaluations.outcome[0]}")
         return evaluations
+
+    @cached_property
+    def no_verdict(self) -> str:
+        """Why simulations tell nothing about the ADS, in a sentence with which every answer begins; "" if they do."""
+        return ask_why_no_verdict(self.study, self._pool)
 
     def choose_criterion(self, text: str | None, source: Study | Case, original: Evaluations | None = None) -> Unsafe:
         """The criterion that an option states, or the default: that of the solutions, or of a study without results, of its whole domain.

@@ -21,7 +21,7 @@ from safevar_sumo.results.files import stored_runs
 from safevar_sumo.study import Study, StudyLike
 from safevar_sumo.sumo import Engine, reason_for_sumo, settings_per_batch
 from safevar_sumo.sumo.system import System
-from safevar_sumo.workers.batches import source_digests
+from safevar_sumo.workers.batches import ask_why_no_verdict, source_digests
 from safevar_sumo.workers.cluster import cluster_pool
 from safevar_sumo.workers.evaluation import Pool
 from safevar_sumo.workers.identity import identity_of
@@ -108,13 +108,16 @@ def carry_out_runs(study: Study, system: System, keys: list[RunKey], directory: 
     for remark in _extent_remarks(results, study):
         observer.warned(remark)
     results.manifest["engine"] = {"name": ENGINE_NAMES[engine_used], "reason": reason}
+    no_verdict = ask_why_no_verdict(study, pool)
+    if no_verdict:
+        observer.warned(f"study {study.name!r}: {no_verdict}")
     campaign = run_campaign(study, keys, results, pool, observer, batch or settings_per_batch(system, engine_used), engine=engine_used,
                             retry_failed=retry_failed)
     if campaign.busy:
         raise SafevarError(f"another process works on {', '.join(map(str, campaign.busy))}: run the study again later to finish it")
     if keys == all_runs(study):
         results.finish(campaign.solutions)
-    return campaign
+    return campaign._replace(no_verdict=no_verdict)
 
 
 def _extent_remarks(results: ResultsDirectory, study: Study) -> list[str]:

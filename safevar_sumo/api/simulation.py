@@ -20,6 +20,7 @@ from safevar_sumo.records import STANDSTILL, TIME_DECIMALS, Evaluations, FloatAr
 from safevar_sumo.results import evaluations_frame, record
 from safevar_sumo.study import SAFETY_DEGREE, Study, StudyLike, load_study
 from safevar_sumo.sumo.batch import drive_all, score
+from safevar_sumo.sumo.empty_road import driven_entry, why_no_verdict
 from safevar_sumo.sumo.engine import Engine
 from safevar_sumo.sumo.matrix import system_at_worst_point
 from safevar_sumo.sumo.system import System, assemble
@@ -79,6 +80,8 @@ class Simulation:
         The trajectory and outcome of the only vehicle.
     scoring
         The metrics, and the objectives that a search of the study minimises.
+    no_verdict
+        Why simulations of the study tell nothing about its ADS, in a sentence; empty if they do.
     original
         The simulation of the original vehicle in the same study; for the original vehicle, the simulation itself.
     """
@@ -90,6 +93,7 @@ class Simulation:
     runs: SimulationRuns
     scoring: Scoring
     _observations: Sequence[Observation]
+    no_verdict: str = ""
     _original: Simulation | None = None
 
     @property
@@ -139,7 +143,8 @@ class Simulation:
 
     def to_dict(self) -> dict[str, Any]:
         """The JSON of `simulate`: plain values, None where undefined."""
-        return {"study": self.study.name, "vcs": dict(self.setting), **record(self.evaluation, row=0)}
+        return {"study": self.study.name, **driven_entry(self.no_verdict), "vcs": dict(self.setting),
+                **record(self.evaluation, row=0)}
 
     def __repr__(self) -> str:
         metrics = ", ".join(f"{name}={value:.4g}" for name, value in self.metrics.items())
@@ -192,9 +197,11 @@ def simulate_with_original(study: Study, system: System, requested: FloatArray, 
     setting = characteristics.filter(requested) if filtered else requested
     with nullcontext() if gui else limit_user_code(study):
         original = _simulate_one(study, system, requested=characteristics.original, setting=characteristics.original)
+        original = replace(original, no_verdict=why_no_verdict(system))
         if np.array_equal(setting, characteristics.original) and not gui:
             return replace(original, reset_values=_reset_values(system, requested, setting))
-        return replace(_simulate_one(study, system, requested, setting, Engine.GUI if gui else Engine.LIBSUMO), _original=original)
+        simulation = _simulate_one(study, system, requested, setting, Engine.GUI if gui else Engine.LIBSUMO)
+        return replace(simulation, _original=original, no_verdict=original.no_verdict)
 
 
 def load_and_assemble(study: StudyLike, source: str = "") -> tuple[Study, System]:

@@ -16,7 +16,7 @@ from safevar_sumo.campaign.verification import Verification
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import PUBLISHED_SCORING, Scoring
 from safevar_sumo.protocol.rater import is_rated
-from safevar_sumo.records import Evaluations, Outcome
+from safevar_sumo.records import Evaluations
 from safevar_sumo.results import ORIGINAL, Failure, JournalBusyError, ResultsDirectory
 from safevar_sumo.search import Problem, Search
 from safevar_sumo.study import Study
@@ -37,7 +37,7 @@ class Campaign(NamedTuple):
 
     `failures` are settings that could not be simulated. `busy` are runs that another process carries out. `collisions` and
     `invalid_tests` are numbers of distinct settings of each finished run: those that collided, and those that left the speed tolerance
-    of a test. `scoring` holds the metrics and objectives.
+    of a test. `scoring` holds the metrics and objectives. `no_verdict` says why the runs tell nothing about the ADS.
     """
 
     original: Evaluations
@@ -47,6 +47,7 @@ class Campaign(NamedTuple):
     collisions: dict[RunKey, int]
     invalid_tests: dict[RunKey, int]
     scoring: Scoring = PUBLISHED_SCORING
+    no_verdict: str = ""
 
 
 def run_campaign(study: Study, keys: Iterable[RunKey], results: ResultsDirectory, pool: Pool, observer: Observer,
@@ -83,8 +84,6 @@ def run_campaign(study: Study, keys: Iterable[RunKey], results: ResultsDirectory
                          "so there is no baseline", "tests whose speed the vehicle can hold")
     if original.collided[0] and not is_rated(study):
         observer.warned(f"study {study.name!r}: the original vehicle itself collides: no change is needed")
-    if original.outcome[0] == Outcome.NEVER_MOVED:
-        observer.warned(f"study {study.name!r}: the original vehicle never moves, so the search tells nothing of the ADS's safety")
     results.begin(original)
     problem = Problem(characteristics=characteristics, original=original, evaluations=study.search.evaluations,
                       population=study.search.population, scoring=results.scoring, region=region_of(study))

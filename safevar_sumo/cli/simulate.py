@@ -31,10 +31,12 @@ from safevar_sumo.cli.target import CommandTarget, as_it_is_now_option, json_opt
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.output import check_writable, unwritable, whole_file
+from safevar_sumo.plugins import limit_user_code
 from safevar_sumo.records import KMH_PER_MS, Evaluations, FloatArray, Outcome
 from safevar_sumo.results import record
 from safevar_sumo.scenarios import LOCATION_DIMENSION, SPEED_DIMENSION, pre_crash_sentence
 from safevar_sumo.study import SAFETY_DEGREE, Study, unit_text
+from safevar_sumo.sumo.empty_road import summary_entry, why_no_verdict
 from safevar_sumo.sumo.matrix import PointResult, point_record, remarks_of, simulate_all_points, system_at_point, vehicle_remarks
 from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.terminal import WholeTable, print_meanings, print_text
@@ -109,11 +111,15 @@ def _simulate_sweep(target: CommandTarget, system: System, requested_settings: F
     settings = system.characteristics.filter(requested_settings) if filtered else requested_settings
     evaluations = evaluate_settings(target.study, np.concatenate([system.characteristics.original[np.newaxis], settings]))
     original, variants = evaluations.take([0]), evaluations.take(np.arange(1, len(evaluations)))
+    with limit_user_code(target.study):
+        no_verdict = why_no_verdict(system)
     if as_json:
         values = [dict(zip(system.characteristics.names, setting, strict=True)) for setting in variants.settings.tolist()]
         records = [{"study": target.study.name, "vcs": values[row], **record(variants, row)} for row in range(len(variants))]
-        click.echo(json.dumps(records, indent=2, allow_nan=False))
+        click.echo(json.dumps([*records, *summary_entry(no_verdict)], indent=2, allow_nan=False))
     else:
+        if no_verdict:
+            click.echo(no_verdict)
         print_sweep(Console(), target.study, names, original, variants)
     reset_count = int(np.count_nonzero((settings != requested_settings).any(axis=1)))
     if reset_count:
@@ -224,6 +230,8 @@ class ReplayOutputs(NamedTuple):
 
 def print_simulation(console: Console, simulation: Simulation) -> None:
     """Print a setting beside the original vehicle: its values, outcome, metrics and objectives, and a verdict."""
+    if simulation.no_verdict:
+        print_text(console, simulation.no_verdict)
     _print_setting(console, simulation)
     characteristics = CharacteristicSet.of(simulation.study.vehicle.characteristics)
     print_meanings(console, [item for item in characteristics if simulation.setting[item.name] != item.original])

@@ -169,6 +169,8 @@ def print_summary(console: Console, study: Study, campaign: Campaign, directory:
 
     names = tuple(study.vehicle.characteristics)
     solutions = solutions_frame(names, campaign.solutions.items())
+    if campaign.no_verdict:
+        print_text(console, campaign.no_verdict)
     if len(solutions):
         for line in summarise_failures(study, solutions, campaign.original, pool, str(directory)):
             print_text(console, line)

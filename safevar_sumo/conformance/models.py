@@ -15,6 +15,7 @@ from safevar_sumo.conformance.subject import Subject
 from safevar_sumo.records import Command, FloatArray, Nominal, Observation
 from safevar_sumo.sumo import Engine, reason_for_sumo
 from safevar_sumo.sumo.batch import drive_all
+from safevar_sumo.sumo.empty_road import why_no_verdict
 from safevar_sumo.sumo.matrix import evaluate
 from safevar_sumo.sumo.system import System
 from safevar_sumo.vehicles import LEVEL, CharacteristicSet, GuardedVehicle, slope_of
@@ -210,15 +211,17 @@ class StudyProbe(Probe):
         return {"outcome": evaluations.outcome, "collision_speed": evaluations.collision_speed, **evaluations.metrics}
 
     def missing_reactions(self, model: System, outputs: Outputs) -> Iterator[MissingReaction]:
+        is_driver = self.subject.kind in ("ads", "traci") and not self.subject.in_any_study
+        if is_driver and (reason := why_no_verdict(model)):
+            yield MissingReaction(("drive", "step"), "a drive to the encounter, with no braking while nobody is in sight", reason)
+            return
         if self.subject.kind not in ("scenario", "traci"):
             return
         runs = drive_all(replace(model, matrix=()), self.settings[:1])
         gap, speed = runs.trace.gap[:, 0], runs.trace.speed[:, 0]
         is_detected = np.isfinite(gap)
         if self.subject.kind == "traci":
-            if outputs["outcome"][0] == "never-moved":
-                yield MissingReaction(("step",), "a command to move: setSpeed, slowDown or setAcceleration", "the vehicle never moves")
-            elif outputs["outcome"][0] == "collision" and not runs.trace.brake.any():
+            if outputs["outcome"][0] == "collision" and not runs.trace.brake.any():
                 yield MissingReaction(("step",), "a brake pedal above 0 at some time before somebody in its way",
                                       "never brakes, and collides")
             return

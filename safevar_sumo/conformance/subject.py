@@ -45,7 +45,10 @@ DOMAINS_BY_UNIT = {
 
 
 class Subject(NamedTuple):
-    """A class, function or record to check. `name` is its name on the command line or in `study`; `remarks` state assumptions."""
+    """A class, function or record to check. `name` is its name on the command line or in `study`; `remarks` state assumptions.
+
+    `in_any_study` is true if no study names an ADS: `study` may then start it from rest although it holds its initial speed.
+    """
 
     name: str
     kind: str
@@ -53,6 +56,7 @@ class Subject(NamedTuple):
     study: Study
     parameters: Mapping[str, Any] = {}
     remarks: tuple[str, ...] = ()
+    in_any_study: bool = False
 
     @property
     def key(self) -> str:
@@ -84,8 +88,9 @@ def find_subject(name: str, study: str | None = None) -> Subject:
     kinds = [kind for kind, members in KINDS.items() if name in members]
     if kinds:
         shipped_studies = (shipped for shipped in map(load_study, study_names()) if _is_named(shipped, kinds[0], name))
-        trial_study = given_study or next(shipped_studies, load_study("smoke"))
-        return _put_in_study(Subject(name, kinds[0], Member(KINDS[kinds[0]][name]), trial_study))
+        trial_study = given_study or next(shipped_studies, None)
+        member = Member(KINDS[kinds[0]][name])
+        return _put_in_study(Subject(name, kinds[0], member, trial_study or load_study("smoke"), in_any_study=not trial_study))
     if name.endswith(".fmu"):
         return _find_fmu(name, given_study)
     if ":" not in name:
@@ -101,7 +106,9 @@ def find_subject(name: str, study: str | None = None) -> Subject:
         legal = "a class with the methods of an ADS, a vehicle, a scenario, an algorithm or a TraCI controller; a Metric; a Change"
         raise InputError("check", f"{name!r} is {_type_name(member.target)}, which is nothing that a study can name", legal)
     remarks = (f"tried in {nearby_study.origin.called}, which names it",) if nearby_study else ()
-    return _put_in_study(Subject(name, kind, member, naming_study or load_study(DEFAULT_STUDIES.get(kind, "smoke")), {}, remarks))
+    trial_study = naming_study or load_study(DEFAULT_STUDIES.get(kind, "smoke"))
+    in_any_study = kind == "ads" and naming_study is None
+    return _put_in_study(Subject(name, kind, member, trial_study, {}, remarks, in_any_study))
 
 
 def _find_fmu(name: str, given_study: Study | None) -> Subject:

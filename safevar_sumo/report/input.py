@@ -31,6 +31,7 @@ from safevar_sumo.results import ANSWERS, MANIFEST, RESULTS, SOLUTIONS, choose_h
 from safevar_sumo.scenarios import LOCATION_DIMENSION, SPEED_DIMENSION, Point
 from safevar_sumo.shipped import PACKAGE
 from safevar_sumo.study import SAFETY_DEGREE, refuse_other_than_file, user_code_names
+from safevar_sumo.sumo.empty_road import why_no_verdict
 from safevar_sumo.sumo.matrix import evaluations_at_worst_points, simulate_all_points
 from safevar_sumo.sumo.system import System, assemble
 
@@ -172,6 +173,11 @@ class ReportInput:
             ExplainOptions(unsafe=unsafe, limit=EXPLAIN_SIMULATIONS), OpinionOptions(unsafe=unsafe), ToleranceOptions(unsafe=unsafe),
             RiskOptions(unsafe=unsafe, samples=SAMPLED_VEHICLES), RulesOptions(unsafe=unsafe, samples=SAMPLED_VEHICLES))
         return {options.question: options for options in all_options}
+
+    @cached_property
+    def no_verdict(self) -> str:
+        """Why simulations tell nothing about the ADS, in a sentence; "" if they do, or if the study cannot be simulated."""
+        return "" if self.system is None else why_no_verdict(self.system)
 
     @property
     def original_fails(self) -> bool:

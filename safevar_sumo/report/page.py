@@ -233,7 +233,8 @@ def _study_data(data: ReportInput, sections: Sequence[str], jobs: int | None, sh
              "have versions or code changed since the study?")
     return {"name": data.case.name, "title": data.case.study.title, "anchor": data.anchor(), "replays": solutions,
             "different": different_handles,
-            "problem": data.problem, "later_changes": data.later_changes, "original_fails": data.original_fails,
+            "problem": data.problem, "no_verdict": data.no_verdict,
+            "later_changes": data.later_changes, "original_fails": data.original_fails,
             "front": draw_front(data, [solution.handle for solution in solutions]) if solutions else None,
             **domain_sections, **{name: make() for name, make in makers.items()
                          if name in sections or (name in ("necessity", "opinion_problem") and "causes" in sections)}}

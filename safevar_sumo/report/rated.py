@@ -39,7 +39,8 @@ def rated_study_data(data: ReportInput, jobs: int | None, progress: Progress) ->
         variants[str(handle)] = row[list(names)].to_numpy(dtype=float)
     rating = rate(case.study, variants, jobs=jobs, progress=progress)
     rating_command = RatingOptions(solution=None if handle is None else str(handle)).command_line(str(data.directory))
-    return {"title": case.study.title, "sentence": rating_in_words(rating), "notes": remarks(rating), "points": _point_rows(rating),
+    return {"title": case.study.title, "sentence": f"{rating.no_verdict} {rating_in_words(rating)}".lstrip(),
+            "notes": remarks(rating), "points": _point_rows(rating),
             "lost": [(test_in_words(test), f"{lost:.2f}") for test, lost in lost_by_test(rating)],
             "turned": colour_changes_in_words(rating), "picture": draw_matrices(rating),
             "names": [vehicle.name for vehicle in rating.vehicles], "not_simulated": not_simulated(rating),

@@ -166,7 +166,7 @@ def reach_verdict(data: ReportInput, explanations: Explanations | None, toleranc
     solutions = data.case.solutions
     failures = [] if solutions.empty else _select_failures(data, explanations)
     return Verdict(
-        headline="No solution was found." if solutions.empty else _headline(data, failures, explanations),
+        headline=data.no_verdict or ("No solution was found." if solutions.empty else _headline(data, failures, explanations)),
         unsafe_count=sum(data.unsafe_solutions), solution_count=len(solutions),
         criterion=data.case.unsafe.description, original=_describe_original(data), agreement=describe_agreement(data),
         failures=failures, key_figures=[] if solutions.empty else _key_figures(data, failures, explanations, tolerance))

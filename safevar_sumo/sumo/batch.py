@@ -133,6 +133,8 @@ def _simulate(system: System, settings: FloatArray, world: Any, outcomes: _Outco
             watch(world)
         speed = world.speeds()
         scene = batch.scene(outcomes.is_open)
+        if system.sees_nobody:
+            scene = scene._replace(visible=np.array(False), over=scene.over | (scene.gap <= 0))
         collisions = contacts.record_collisions(world, outcomes.is_open, scene)
         active = outcomes.judge(speed, scene.over, collisions, last=sample >= batch.last_step)
         observation = batch.observe(sample * step, speed, scene)._replace(throttle=state.throttle, brake=state.brake)
@@ -196,7 +198,8 @@ def _sensors_in_weather(system: System, prepared: Any, n: int) -> Sensors:
     weathers = [point.weather for point in system.points]
     delay = np.repeat([weather.recognition_delay for weather in weathers], n // len(weathers))
     visibility = np.repeat([weather.visibility for weather in weathers], n // len(weathers))
-    return Sensors(sensors.latency + delay, sensors.reach * visibility, sensors.scale)
+    reach = np.full(n, -1.0) if system.sees_nobody else sensors.reach * visibility
+    return Sensors(sensors.latency + delay, reach, sensors.scale)
 
 
 class _FirstWarnings:

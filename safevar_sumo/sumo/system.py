@@ -147,7 +147,7 @@ class System:
 
     `source` is the study, as errors name it; `step_length` [s] is None if the network determines the time step; `rater` rates results in
     the matrix of a protocol; `metrics_table` has the thresholds of the metrics in `measuring`; `members` define all models, metrics and
-    constraints.
+    constraints; with `sees_nobody` the ADS sees no other actor, and a run ends at the place of the encounter.
     """
 
     characteristics: CharacteristicSet
@@ -164,6 +164,7 @@ class System:
     step_length: float | None = None
     matrix: tuple[Point, ...] = ()
     rater: Rater | None = None
+    sees_nobody: bool = False
 
     @property
     def points(self) -> tuple[Point, ...]:

@@ -81,6 +81,13 @@ def evaluate_all(study: Study, settings: FloatArray, pool: Pool, done: Callable[
     return evaluations.take(row_of.ravel())
 
 
+def ask_why_no_verdict(study: Study, pool: Pool) -> str:
+    """Why simulations of a study tell nothing about its ADS, as `why_no_verdict` finds in a worker; "" if they do."""
+    original = CharacteristicSet.of(study.vehicle.characteristics).original[np.newaxis]
+    result = wait_for_result(RetryingPool(pool, study).submit(pack_study(study, inputs_of(study, pool), empty_road=True), original))
+    return "" if len(result) else next(iter(result.reasons.values()), "")  # a failed simulation has a row
+
+
 def inputs_of(study: Study, pool: Pool) -> Inputs:
     """Digests of the files that must be the same on every worker, by layer and name; raises as `source_digests`."""
     return {"network": network_digests(assemble(study)), "sources": source_digests(study, pool)}

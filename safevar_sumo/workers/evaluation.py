@@ -15,6 +15,7 @@ from safevar_sumo.metrics import METRICS
 from safevar_sumo.plugins import Files, changed_files, digests, note_inputs, unload_user_modules
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.study import Study, user_code_packages
+from safevar_sumo.sumo.empty_road import why_no_verdict
 from safevar_sumo.sumo.engine import Engine
 from safevar_sumo.sumo.matrix import evaluate, evaluate_cells
 from safevar_sumo.sumo.system import System, assemble
@@ -55,6 +56,7 @@ class _Work(msgspec.Struct, frozen=True):
     afresh: bool
     check: bool
     cells: tuple[int, int] | None = None
+    empty_road: bool = False
 
 
 class _Mode(msgspec.Struct, frozen=True):
@@ -63,10 +65,11 @@ class _Mode(msgspec.Struct, frozen=True):
     afresh: bool
     check: bool
     cells: tuple[int, int] | None = None
+    empty_road: bool = False
 
 
 def pack_study(study: Study, inputs: Mapping[str, Any] | None = None, *, engine: Engine = Engine.RECORDED, afresh: bool = False,
-           check: bool = False, cells: tuple[int, int] | None = None) -> bytes:
+           check: bool = False, cells: tuple[int, int] | None = None, empty_road: bool = False) -> bytes:
     """Pack a study for a worker as bytes.
 
     Parameters
@@ -82,11 +85,13 @@ def pack_study(study: Study, inputs: Mapping[str, Any] | None = None, *, engine:
         Whether the worker only checks the user code; the `reasons` of the result are then remarks on this code.
     cells
         (k, n): for a rated study, results in part k of n parts of the cells, instead of points for all cells.
+    empty_road
+        Whether the worker only applies `why_no_verdict`; the sentence, if any, is the only one of the result's `reasons`.
     """
     if inputs is None:
         inputs = {"network": network_digests(assemble(study))}
     return msgspec.msgpack.encode(_Work(study, {layer: dict(inputs[layer]) for layer in SHARED_LAYERS if layer in inputs}, engine, afresh,
-                                        check, cells))
+                                        check, cells, empty_road))
 
 
 def evaluate_batch(work: bytes, settings: FloatArray) -> Evaluations:
@@ -110,17 +115,21 @@ def evaluate_batch(work: bytes, settings: FloatArray) -> Evaluations:
         assembler = _task_and_system
     with note_inputs() as reading:
         cells = mode.cells
-        task, system = assembler(work if cells is None else _work_for_all_cells(work))
+        task, system = assembler(_work_for_all_cells(work) if cells is not None or mode.empty_road else work)
         _refuse_changed_networks(task.inputs, system)
-        evaluations = evaluate(system, settings, task.engine) if cells is None else evaluate_cells(system, settings, cells, task.engine)
+        if mode.empty_road:
+            reason = why_no_verdict(system)
+            evaluations = replace(Evaluations.none(settings.shape[1], METRICS), reasons={b"": reason} if reason else {})
+        else:
+            evaluations = evaluate(system, settings, task.engine) if cells is None else evaluate_cells(system, settings, cells, task.engine)
     _refuse_changed_networks(task.inputs, system)
     files_read = digests(reading.files(user_code_packages(task.study)), task.study.origin.places)
     return replace(evaluations, files=_find_unknown_files(task, files_read))
 
 
 def _work_for_all_cells(work: bytes) -> bytes:
-    """The work without `cells`: all parts of the cells then share one cached system."""
-    return msgspec.msgpack.encode(msgspec.structs.replace(msgspec.msgpack.decode(work, type=_Work), cells=None))
+    """The work without `cells` and `empty_road`: all parts of the cells then share one cached system."""
+    return msgspec.msgpack.encode(msgspec.structs.replace(msgspec.msgpack.decode(work, type=_Work), cells=None, empty_road=False))
 
 
 @lru_cache(maxsize=4)

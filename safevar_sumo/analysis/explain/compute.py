@@ -230,13 +230,15 @@ def explain_failures(source: Study | Case, options: ExplainOptions, *, pool: Poo
         settings = evaluated.evaluations.settings
         explanations = _explain_rows(evaluated, evaluator, original, causes, choice_reasons)
         preventable = assess_preventability(evaluator, settings[_collisions_to_classify(study, evaluated.evaluations)])
+        no_verdict = evaluator.no_verdict
     sample_causes, characteristics = [causes[row] for row in sample], evaluator.characteristics
     changed = characteristics.changed(settings[sample])
     return Explained(
         study=study, unsafe=evaluated.unsafe, original=original, explanations=explanations,
         necessity=necessity_frame(characteristics, changed, sample_causes, len(evaluated.rows_to_explain)),
         distinct=count_distinct_causes(characteristics, sample_causes), looked_at=len(evaluated.evaluations),
-        failures=len(evaluated.rows_to_explain), analysed=len(sample), otherwise=evaluated.deviations, preventability=preventable)
+        failures=len(evaluated.rows_to_explain), analysed=len(sample), otherwise=evaluated.deviations, preventability=preventable,
+        no_verdict=no_verdict)
 
 
 def _collisions_to_classify(study: Study, evaluations: Evaluations) -> BoolArray:

@@ -17,7 +17,7 @@ from safevar_sumo.analysis.figures import BLUE, FONT, GREY, SKY_BLUE, escape_dol
 from safevar_sumo.analysis.words import list_of_changes, number_of, points_in_words, question_command, simulate_command, two_decimals
 from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.sumo.system import assemble
-from safevar_sumo.terminal import WholeTable, print_constraints, print_meanings, print_text
+from safevar_sumo.terminal import WholeTable, print_constraints, print_heading, print_meanings, print_text
 from safevar_sumo.vehicles import Characteristic, CharacteristicSet
 
 if TYPE_CHECKING:
@@ -36,7 +36,7 @@ CommandFor = Callable[[Mapping[str, float]], str]
 def print_explained(console: Console, subject: str, result: Explained, point: str = "", *, full: bool = False) -> None:
     """Print the answer in about ten lines; `full` explains every chosen failure. Printed commands name `subject` and the test `point`."""
     characteristics = CharacteristicSet.of(result.study.vehicle.characteristics)
-    print_text(console, result.study.title)
+    print_heading(console, result.study.title, result.no_verdict)
     print_text(console, f"Unsafe: {result.unsafe.description}. {number_of(result.failures, 'failure')} among {result.looked_at} different "
                         "settings.")
     print_constraints(console, result.study)

@@ -67,7 +67,7 @@ class FailureEntry(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True
         return "" if self.algorithm is None else f"{self.algorithm}:{self.run}:{self.index}"
 
 
-class SummaryEntry(msgspec.Struct, frozen=True, kw_only=True):
+class SummaryEntry(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     """The last entry in the JSON of `explain`.
 
     `necessary` and `changed` are shares of the analysed failures by characteristic; `necessary_interval` has 95 % intervals of `necessary`.
@@ -77,6 +77,7 @@ class SummaryEntry(msgspec.Struct, frozen=True, kw_only=True):
     changed: dict[str, float]
     necessary_interval: dict[str, list[float]]
     preventable: PreventedShares
+    driven: bool = True
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -200,6 +201,7 @@ class Explained:
     analysed: int
     otherwise: int
     preventability: Preventability
+    no_verdict: str = ""
 
     def to_dict(self) -> list[dict[str, Any]]:
         """The JSON of `explain`: a list with an entry for each explained failure, and a summary."""
@@ -209,7 +211,7 @@ class Explained:
         summary = SummaryEntry(
             necessary=dict(columns("necessary")), changed=dict(columns("changed")),
             necessary_interval={name: ends for name, *ends in columns("necessary_lower", "necessary_upper")},
-            preventable=self.preventability.shares)
+            preventable=self.preventability.shares, driven=not self.no_verdict)
         return [*(failure.to_dict() for failure in self.explanations), {"summary": msgspec.to_builtins(summary)}]
 
     def __repr__(self) -> str:

@@ -34,6 +34,7 @@ from safevar_sumo.records import CellResults, FloatArray, finite_or_none
 from safevar_sumo.results import SolutionId, row_of_handle
 from safevar_sumo.scenarios import weather_of
 from safevar_sumo.study import Study
+from safevar_sumo.sumo.empty_road import driven_entry
 from safevar_sumo.vehicles import CharacteristicSet, region_of
 from safevar_sumo.workers.evaluation import Pool
 
@@ -138,6 +139,7 @@ class Rating:
     study: Study
     protocol: Protocol
     vehicles: list[RatedVehicle]
+    no_verdict: str = ""
 
     @property
     def original(self) -> RatedVehicle:
@@ -184,7 +186,7 @@ class Rating:
 
     def to_dict(self) -> dict[str, Any]:
         """The JSON of `rating`."""
-        return {"study": self.study.name, "variants": [vehicle.to_dict() for vehicle in self.vehicles],
+        return {"study": self.study.name, **driven_entry(self.no_verdict), "variants": [vehicle.to_dict() for vehicle in self.vehicles],
                 "not_simulated": [{"test": test, "points": points} for test, points in self.protocol.points_not_simulated.items()]}
 
     def __repr__(self) -> str:
@@ -247,7 +249,7 @@ def rate_on(evaluator: Evaluator, settings: Mapping[str, FloatArray]) -> Rating:
                              cells=cells.of([index]), scores=points_of(rater.protocol, cells.of([index]), rater.claims),
                              claims=rater.claims)
                 for index, (name, setting) in enumerate(settings_by_name.items())]
-    return Rating(study=evaluator.study, protocol=rater.protocol, vehicles=vehicles)
+    return Rating(study=evaluator.study, protocol=rater.protocol, vehicles=vehicles, no_verdict=evaluator.no_verdict)
 
 
 def remarks(rating: Rating) -> list[str]:

@@ -13,7 +13,7 @@ from safevar_sumo.analysis.figures import FONT, escape_dollars, new_figure
 from safevar_sumo.analysis.rating.compute import RatedTest, RatedVehicle, Rating, max_points
 from safevar_sumo.analysis.words import join_phrases, number_of
 from safevar_sumo.protocol import COLOURS, CellMatrix
-from safevar_sumo.terminal import WholeTable, print_text
+from safevar_sumo.terminal import WholeTable, print_heading, print_text
 from safevar_sumo.vehicles import CharacteristicSet
 
 if TYPE_CHECKING:
@@ -32,7 +32,7 @@ FIGURE_COLUMNS = 4
 
 def print_rating(console: Console, rating: Rating) -> None:
     """Print the verdict, the points of every test, the robustness layers that hold, and the tests not simulated."""
-    print_text(console, rating.study.title)
+    print_heading(console, rating.study.title, rating.no_verdict)
     print_text(console, rating_in_words(rating))
     console.print(_build_points_table(rating))
     console.print(_build_layers_table(rating))

@@ -21,6 +21,7 @@ from safevar_sumo.errors import InputError, SimulationError
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import FloatArray, finite_or_none
 from safevar_sumo.study import SAFETY_DEGREE, Study
+from safevar_sumo.sumo.empty_road import driven_entry
 from safevar_sumo.vehicles.region import REJECTIONS
 from safevar_sumo.workers.evaluation import Pool
 
@@ -70,6 +71,7 @@ class Risk:
     coefficient_of_variation: float
     design_point: dict[str, float] | None
     remark: str
+    no_verdict: str = ""
 
     @property
     def is_share_of_domain(self) -> bool:
@@ -84,7 +86,8 @@ class Risk:
         """The JSON of `risk`."""
         rows = [] if self.sensitivity is None else self.sensitivity.to_dict("records")
         return {
-            "study": self.study.name, "unsafe": str(self.unsafe), "samples": self.samples, "failures": self.failures,
+            "study": self.study.name, **driven_entry(self.no_verdict), "unsafe": str(self.unsafe),
+            "samples": self.samples, "failures": self.failures,
             "probability": self.probability, "interval": list(self.interval), "confidence": self.confidence,
             "sensitivity": [{
                 "characteristic": row["characteristic"],
@@ -135,12 +138,13 @@ def estimate_risk(source: Study | Case, options: RiskOptions, *, pool: Pool | No
         lacks_indices = model.is_correlated or bool(evaluator.region) or options.requires_rare_method
         sensitivity, sensitivity_of_unsafe = (
             (None, None) if lacks_indices else compute_sensitivities(evaluator, model, unsafe, options.confidence))
+        no_verdict = evaluator.no_verdict
     design_setting = None if estimate.design_point is None else model.settings_of_normal(estimate.design_point[np.newaxis])[0]
     return Risk(
         study=study, unsafe=unsafe, samples=estimate.simulations - estimate.errors, failures=estimate.failures, errors=estimate.errors,
         confidence=options.confidence, sensitivity=sensitivity, sensitivity_of_unsafe=sensitivity_of_unsafe,
         probability=estimate.probability, interval=estimate.interval, method=method, simulations=simulated_before + estimate.simulations,
-        coefficient_of_variation=estimate.coefficient_of_variation, remark=estimate.remark,
+        coefficient_of_variation=estimate.coefficient_of_variation, remark=estimate.remark, no_verdict=no_verdict,
         design_point=None if design_setting is None else dict(zip(evaluator.characteristics.names, design_setting.tolist(), strict=True)))
 
 

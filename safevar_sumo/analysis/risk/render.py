@@ -14,7 +14,7 @@ from safevar_sumo.analysis.risk.compute import FLEET_VEHICLES, Risk
 from safevar_sumo.errors import InputError
 from safevar_sumo.study import Study
 from safevar_sumo.study.variation import Uniform
-from safevar_sumo.terminal import WholeTable, print_constraints, print_meanings, print_text
+from safevar_sumo.terminal import WholeTable, print_constraints, print_heading, print_meanings, print_text
 from safevar_sumo.vehicles import CharacteristicSet
 
 if TYPE_CHECKING:
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 def print_risk(console: Console, result: Risk) -> None:
     """Print the probability with its interval, how vehicles vary, and which characteristics decide."""
     low, high = result.interval
-    print_text(console, result.study.title)
+    print_heading(console, result.study.title, result.no_verdict)
     sampling = "" if result.method == "monte_carlo" else f", drawn by {result.method.replace('_', ' ')}"
     print_text(console, f"Unsafe: {result.unsafe.description}. {result.failures} of {result.samples} vehicles{sampling}.")
     label = "Share of the domain that is unsafe:" if result.is_share_of_domain else "Probability"

@@ -24,7 +24,8 @@ from safevar_sumo.analysis.words import join_phrases
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.study import Study
-from safevar_sumo.terminal import print_constraints, print_meanings, print_text
+from safevar_sumo.sumo.empty_road import summary_entry
+from safevar_sumo.terminal import print_constraints, print_heading, print_meanings, print_text
 from safevar_sumo.vehicles import Characteristic, CharacteristicSet
 from safevar_sumo.workers.evaluation import Pool
 
@@ -103,10 +104,11 @@ class Rules:
     unsafe_share: float
     unsafe_interval: tuple[float, float]
     remark: str = ""
+    no_verdict: str = ""
 
     def to_dict(self) -> list[dict[str, Any]]:
-        """The JSON of `rules`: a list with an entry for each rule."""
-        return [rule.to_dict() for rule in self.rules]
+        """The JSON of `rules`: a list with an entry for each rule, and a summary if no verdict on the ADS is possible."""
+        return [*(rule.to_dict() for rule in self.rules), *summary_entry(self.no_verdict)]
 
     def to_frame(self) -> pd.DataFrame:
         """One row for each condition of each rule; a rule without conditions, which holds everywhere, has one row.
@@ -137,6 +139,7 @@ def find_rules(source: Study | Case, options: RulesOptions, *, pool: Pool | None
     with open_evaluator(study, pool, jobs, progress) as evaluator:
         unsafe = evaluator.choose_criterion(options.unsafe, source)
         evaluations = evaluator.evaluate(evaluator.random_settings(options.samples), "settings over the whole domain")
+        no_verdict = evaluator.no_verdict
     in_training = np.arange(len(evaluations)) < len(evaluations) // 2
     training, validation = (evaluations.take(evaluations.valid & half) for half in (in_training, ~in_training))
     is_unsafe, is_unsafe_validation = unsafe.of(training), unsafe.of(validation)
@@ -152,7 +155,8 @@ def find_rules(source: Study | Case, options: RulesOptions, *, pool: Pool | None
         boxes = _find_boxes(training.settings, is_unsafe, characteristics)
     rules = [_validate_rule(limits, validation.settings, is_unsafe_validation, characteristics) for limits in boxes]
     return Rules(study=study, unsafe=unsafe, rules=sorted(rules, key=lambda rule: -rule.unsafe_inside), remark=remark,
-                 samples=samples, unsafe_share=all_unsafe / samples, unsafe_interval=clopper_pearson(all_unsafe, samples))
+                 no_verdict=no_verdict, samples=samples, unsafe_share=all_unsafe / samples,
+                 unsafe_interval=clopper_pearson(all_unsafe, samples))
 
 
 def _find_boxes(settings: FloatArray, is_unsafe: BoolArray, characteristics: CharacteristicSet) -> list[Limits]:
@@ -256,7 +260,7 @@ def _validate_rule(limits: Limits, settings: FloatArray, is_unsafe: BoolArray, c
 def print_rules(console: Console, result: Rules) -> None:
     """Print every rule with its density and coverage."""
     characteristics = CharacteristicSet.of(result.study.vehicle.characteristics)
-    print_text(console, result.study.title)
+    print_heading(console, result.study.title, result.no_verdict)
     low, high = result.unsafe_interval
     print_text(console, f"Unsafe: {result.unsafe.description}; {100 * result.unsafe_share:.2f} % of {result.samples} vehicles "
                         f"drawn evenly over the whole domain ({100 * low:.2f} % to {100 * high:.2f} %).")

@@ -23,6 +23,7 @@ from safevar_sumo.metrics import RATING_POINTS, Unsafe
 from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.records import Evaluations, FloatArray, Outcome, finite_or_none
 from safevar_sumo.study import SAFETY_DEGREE, Study
+from safevar_sumo.sumo.empty_road import driven_entry
 from safevar_sumo.vehicles import Characteristic
 from safevar_sumo.workers.evaluation import Pool
 
@@ -176,6 +177,7 @@ class Tolerance:
     alone: list[OneAtATimeScan]
     pairs: list[Pair] | None
     joint: SafeBox
+    no_verdict: str = ""
 
     @property
     def verdict(self) -> str:
@@ -183,6 +185,8 @@ class Tolerance:
         single_names = [scan.characteristic.name for scan in self.alone if scan.unsafe]
         unsafe_pairs = [" with ".join(characteristic.name for characteristic in pair.characteristics) for pair in self.pairs or []
                         if pair.nearest is not None]
+        if self.no_verdict:
+            return self.no_verdict
         if self.unsafe.of(self.original)[0]:
             return "The original vehicle itself is unsafe."
         if single_names:
@@ -209,7 +213,8 @@ class Tolerance:
 
     def to_dict(self) -> dict[str, Any]:
         """The JSON of `tolerance`."""
-        return {"study": self.study.name, "unsafe": str(self.unsafe), "alone": [scan.to_dict() for scan in self.alone],
+        return {"study": self.study.name, **driven_entry(self.no_verdict), "unsafe": str(self.unsafe),
+                "alone": [scan.to_dict() for scan in self.alone],
                 "pairs": [pair.to_dict() for pair in self.pairs or []], "joint": self.joint.to_dict()}
 
     def __repr__(self) -> str:
@@ -240,7 +245,8 @@ def find_tolerances(source: Study | Case, options: ToleranceOptions, *, pool: Po
         solutions = None if isinstance(source, Study) else source.solutions[unsafe.rows(source.solutions)]
         box = (find_safe_box(evaluator, columns, unsafe, _unsafe_settings(evaluator, scans, pairs or []), solutions) if needs_box
                else no_safe_box(evaluator, columns))
-    return Tolerance(study=study, unsafe=unsafe, original=original, alone=scans, pairs=pairs, joint=box)
+        return Tolerance(study=study, unsafe=unsafe, original=original, alone=scans, pairs=pairs, joint=box,
+                         no_verdict=evaluator.no_verdict)
 
 
 def _columns_of(study: Study, characteristics: Sequence[str] | None) -> list[int]:

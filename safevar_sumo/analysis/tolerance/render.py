@@ -15,7 +15,7 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import RATING_POINTS
 from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.study import SAFETY_DEGREE
-from safevar_sumo.terminal import WholeTable, print_constraints, print_meanings, print_text
+from safevar_sumo.terminal import WholeTable, print_constraints, print_heading, print_meanings, print_text
 from safevar_sumo.vehicles import Characteristic
 
 if TYPE_CHECKING:
@@ -28,11 +28,12 @@ MAX_PAIRS = 12
 
 def print_tolerance(console: Console, result: Tolerance) -> None:
     """Print the verdict, the limits of each characteristic by itself, the worst pairs, and the safe box."""
-    print_text(console, result.study.title)
+    print_heading(console, result.study.title, result.no_verdict)
     original = result.original
     print_text(console, f"Unsafe: {result.unsafe.description}. The original vehicle: {original.outcome[0]}, "
                         f"SD {two_decimals(original.f_safe[0])}.")
-    print_text(console, result.verdict)
+    if not result.no_verdict:
+        print_text(console, result.verdict)
     print_constraints(console, result.study)
     console.print(_scan_table(result))
     print_text(console, "* the end of the domain: values beyond it were not simulated.")

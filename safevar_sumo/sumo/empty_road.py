@@ -1,0 +1,59 @@
+"""The rule on whether a study can judge its ADS: with nobody in sight, the original vehicle drives to the place of the encounter."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from safevar_sumo.errors import SimulationError
+from safevar_sumo.records import Outcome, SimulationRuns
+from safevar_sumo.sumo.matrix import simulate_all_points
+from safevar_sumo.sumo.system import System
+
+MIN_PEDAL = 0.03
+"""Brake pedal from which on the vehicle brakes [-], as for the robot of Euro NCAP's tests."""
+MIN_SLOWDOWN = 2.0
+"""Speed that braking takes off before it counts [m/s]: cruise controls brake to hold a speed, some by full strokes."""
+
+
+def why_no_verdict(system: System) -> str:
+    """Why simulations tell nothing about the ADS, in a sentence; "" if they do.
+
+    At every point the original vehicle drives once as on an empty road, as the ADS sees nobody. If it does not reach the place of
+    the encounter before the encounter is over, or brakes on its way, the obstacle is not what keeps it from a collision.
+    """
+    try:
+        results = simulate_all_points(replace(system, sees_nobody=True), system.characteristics.original[np.newaxis])
+    except SimulationError:  # the study's own simulations decide, and report their errors
+        return ""
+    problems = {result.point.name: problem for result in results if (problem := _problem(result.runs))}
+    if not problems:
+        return ""
+    point, problem = next(iter(problems.items()))
+    alike = sum(other.split()[0] == problem.split()[0] for other in problems.values())
+    where = f" at {alike} of {len(results)} points, such as {point}" if len(results) > 1 else ""
+    return f"The original vehicle {problem}{where}: no verdict."
+
+
+def driven_entry(no_verdict: str) -> dict[str, bool]:
+    """The entry that an answer's JSON object has if no verdict is possible."""
+    return {"driven": False} if no_verdict else {}
+
+
+def summary_entry(no_verdict: str) -> list[dict[str, dict[str, bool]]]:
+    """The last record of an answer's JSON array if no verdict is possible."""
+    return [{"summary": driven_entry(no_verdict)}] if no_verdict else []
+
+
+def _problem(runs: SimulationRuns) -> str:
+    trace = runs.trace
+    until_end = slice(int(np.count_nonzero(trace.active)) + 1)  # the sample after the last active one ended the run
+    gap, speed, brake, position = (values[until_end, 0] for values in (trace.gap, trace.speed, trace.brake, trace.position))
+    if ((brake > MIN_PEDAL) & (speed < np.maximum.accumulate(speed) - MIN_SLOWDOWN)).any():
+        return "brakes without an obstacle"
+    if gap[-1] <= 0 or runs.outcome[0] == Outcome.COLLISION:
+        return ""
+    distance = position[-1] - position[0]
+    of_distance = f" of {distance + gap[-1]:.1f}" if np.isfinite(gap[-1]) else ""
+    return f"never reaches the encounter (it gets {distance:.1f}{of_distance} m)"
