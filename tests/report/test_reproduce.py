@@ -77,7 +77,7 @@ def test_every_printed_command_gives_the_numbers_of_the_page(
 
     words = " ".join(output_of(printed["rules"]).split())
     rules = json.loads((answers / "rules.json").read_text())["value"]
-    assert f"{100 * rules['share']:.2f} % of {rules['samples']} settings" in words
+    assert f"{100 * rules['share']:.2f} % of {rules['samples']} vehicles" in words
     assert all(rule.replace("²", "^2").replace("³", "^3") in words for rule in rules["words"])
     assert json.loads((answers / "tolerance.json").read_text())["value"]["verdict"] in " ".join(output_of(printed["tolerance"]).split())
 
