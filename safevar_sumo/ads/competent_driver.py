@@ -27,7 +27,10 @@ class _Memory(NamedTuple):
 class CompetentDriver(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Holds its speed or a headway; perceives obstacles that move into its way, reacts to a TTC below 2 s, and brakes with up to 0.774 g.
 
-    After a stop it waits until the way is clear. Behind a moving leader it keeps its headway by the accelerator only:
+    UN R157 means this driver for cars that cut in, cut out or brake on motorways; its use for pedestrians is ours.
+
+    While it reacts it releases the accelerator, and the vehicle coasts. After a stop it waits until the way is clear.
+    Behind a moving leader it keeps its headway by the accelerator only:
     a = 0.07 (u - v) + 0.23 (gap - headway v), the gap control of Milanes and Shladover (2014), but at least `-lets_go`;
     u and v are the speeds of leader and vehicle.
 
@@ -40,7 +43,7 @@ class CompetentDriver(Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     stray, perception_time
         An obstacle that enters the way is perceived `perception_time` after it has moved `stray` from its first lateral position [m, s].
     lets_go
-        Coasting deceleration while it reacts or increases its gap [m/s^2].
+        Largest deceleration while it increases its gap [m/s^2].
     headway
         Time headway at which it follows [s].
     corridor
@@ -68,7 +71,7 @@ class CompetentDriver(Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
         is_in_way = is_perceived & is_in_the_way(seen, self.corridor)
         command, reaction = react(
             seen, memory.reaction, is_in_way & (time_to_reach(seen) < self.critical_ttc), np.full_like(seen.speed, HARDEST_BRAKING),
-            reaction_time=self.reaction_time, corridor=self.corridor, coasting_deceleration=self.lets_go, cruise_speed=self.cruise_speed,
+            reaction_time=self.reaction_time, corridor=self.corridor, cruise_speed=self.cruise_speed,
             start=self.start_throttle, following=self._following(seen, is_in_way))
         return command, memory._replace(reaction=reaction)
 

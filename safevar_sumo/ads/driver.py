@@ -116,28 +116,33 @@ StartThrottle = tuple[Annotated[float, Meta(ge=0, le=1)], ...]
 
 
 class Reaction(NamedTuple):
-    """The original vehicle; time between calls [s]; speed to hold [m/s] and trim, both from the first observation.
+    """The original vehicle; time between calls [s]; speed to hold [m/s], trim and brake pedal [-], as first observed.
 
-    `danger_time` is the time since the driver first saw the danger [s], negative before; `braking` is the commanded deceleration [m/s^2];
-    both have shape (N,).
+    `speed` is that of the last call [m/s], `danger_time` the time since the danger was first seen [s], negative before;
+    `coasting` is the deceleration that the driver felt before braking, `braking` the intended one [m/s^2]. Shape (N,).
     """
 
     nominal: Nominal
     step: float
-    cruise: tuple[FloatArray, Trim] | None
+    cruise: tuple[FloatArray, Trim, FloatArray] | None
+    speed: FloatArray
     danger_time: FloatArray
+    coasting: FloatArray
     braking: FloatArray
 
 
 def initial_reaction(n: int, nominal: Nominal, step: float) -> Reaction:
     """The state before a danger appears."""
-    return Reaction(nominal, step, None, np.full(n, -1.0), np.zeros(n))
+    return Reaction(nominal, step, None, np.zeros(n), np.full(n, -1.0), np.zeros(n), np.zeros(n))
 
 
 def react(seen: Observation, reaction: Reaction, danger: BoolArray, deceleration: FloatArray, *, reaction_time: float, corridor: float,
-          jerk: float = JERK, coasting_deceleration: float = 0.0, cruise_speed: float | None = None, start: StartThrottle = (),
+          jerk: float = JERK, cruise_speed: float | None = None, start: StartThrottle = (),
           following: FloatArray | float = np.inf) -> tuple[Command, Reaction]:
-    """Drive on, or react to a danger; the danger is over when no obstacle ahead approaches or blocks the way.
+    """Drive on, or react to a danger: release the accelerator, and brake when the reaction time is over.
+
+    The danger is over when no obstacle ahead approaches or blocks the way. The original vehicle's tables were written
+    in other gears. So a driver who reacts uses the felt deceleration: the brake adds what coasting lacks.
 
     Parameters
     ----------
@@ -149,8 +154,6 @@ def react(seen: Observation, reaction: Reaction, danger: BoolArray, deceleration
         Time from the first sight of the danger to braking [s].
     corridor
         Half the width of the way [m].
-    coasting_deceleration
-        Deceleration during the reaction time [m/s^2].
     cruise_speed
         Speed to hold [m/s], by default the initial speed.
     start
@@ -158,26 +161,27 @@ def react(seen: Observation, reaction: Reaction, danger: BoolArray, deceleration
     following
         Upper limit of the acceleration when following a leader, shape (N,) [m/s^2].
     """
-    cruise = reaction.cruise
+    nominal, step, cruise, last_speed = reaction[:4]
     if cruise is None:
-        speed = seen.speed if cruise_speed is None else np.full_like(seen.speed, cruise_speed)
-        cruise = speed, trim_at(reaction.nominal, seen)
+        last_speed, speed = seen.speed, seen.speed if cruise_speed is None else np.full_like(seen.speed, cruise_speed)
+        cruise = speed, trim_at(nominal, seen), seen.brake
+    speed_to_hold, initial_trim, initial_brake = cruise
     is_approaching = np.isfinite(seen.gap) & (seen.gap > 0) & (seen.closing_speed > 0)
     danger_lasts = is_approaching | blocks_the_way(seen, corridor)
-    is_aware = reaction.danger_time >= 0
-    danger_time = np.where(is_aware, np.where(danger_lasts, reaction.danger_time + reaction.step, -1.0), np.where(danger, 0.0, -1.0))
+    is_aware, was_braking = reaction.danger_time >= 0, reaction.danger_time >= reaction_time - TIME_ROUNDING
+    is_reacting = np.where(is_aware, danger_lasts, danger)
+    danger_time = np.where(is_reacting, np.where(is_aware, reaction.danger_time + step, 0.0), -1.0)
     is_braking = danger_time >= reaction_time - TIME_ROUNDING
-    braking = np.where(is_braking, np.minimum(reaction.braking + jerk * reaction.step, deceleration), 0.0)
-    speed_to_hold, initial_trim = cruise
-    cruising = np.minimum(CRUISE_GAIN * (speed_to_hold - seen.speed), following)
-    is_coasting = (danger_time >= 0) & (coasting_deceleration > 0)
-    acceleration = np.where(is_braking, -braking, np.where(is_coasting, -coasting_deceleration, cruising))
-    command = pedals_for(reaction.nominal, seen.speed, acceleration, initial_trim)
-    step_index = round(seen.time / reaction.step)
-    if step_index < len(start):
-        is_starting = danger_time < 0
-        command = Command(np.where(is_starting, start[step_index], command.throttle), np.where(is_starting, 0.0, command.brake))
-    return command, reaction._replace(cruise=cruise, danger_time=danger_time, braking=braking)
+    coasting = np.where(was_braking, reaction.coasting, np.maximum((last_speed - seen.speed) / step, 0.0))
+    braking = np.where(is_braking, np.minimum(np.maximum(reaction.braking, coasting) + jerk * step, deceleration), 0.0)
+    brake = np.minimum(initial_brake + np.maximum(braking - coasting, 0.0) / nominal.braking, 1.0)
+    if (step_index := round(seen.time / step)) < len(start):
+        calm = Command(np.full_like(brake, start[step_index]), np.zeros_like(brake))
+    else:
+        acceleration = np.minimum(CRUISE_GAIN * (speed_to_hold - seen.speed), following)
+        calm = pedals_for(nominal, seen.speed, acceleration, initial_trim)
+    command = Command(np.where(is_reacting, 0.0, calm.throttle), np.where(is_reacting, brake, calm.brake))
+    return command, Reaction(nominal, step, cruise, seen.speed, danger_time, coasting, braking)
 
 
 class FollowingMemory(NamedTuple):

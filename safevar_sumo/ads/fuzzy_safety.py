@@ -1,8 +1,9 @@
-"""The fuzzy safety model (Mattas et al. 2020, "Fuzzy Surrogate Safety Metrics"), the performance model of UN R157 as amended."""
+"""The fuzzy safety model (Mattas et al. 2020, "Fuzzy Surrogate Safety Metrics"), in UN R157 as amended.
+
+The regulation means it for cars that cut in, cut out or brake on motorways; its use for pedestrians is ours.
+"""
 
 from __future__ import annotations
-
-from typing import NamedTuple
 
 import numpy as np
 from msgspec import Struct
@@ -13,13 +14,6 @@ from safevar_sumo.records import Command, FloatArray, Nominal, Observation
 
 LEAST_DIVISOR = 1e-9
 """Lower bound of accelerations and widths by which numbers are divided [m/s^2, m]."""
-
-
-class _Memory(NamedTuple):
-    """Reaction, and the vehicle's speed at the last call [m/s], None before the first call."""
-
-    reaction: Reaction
-    speed: FloatArray | None
 
 
 class FuzzySafety(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -47,19 +41,17 @@ class FuzzySafety(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     margin: NonNegativeParameter = 2.0
     corridor: PositiveParameter = 1.4
 
-    def start(self, n: int, nominal: Nominal, step: float) -> _Memory:
-        return _Memory(initial_reaction(n, nominal, step), None)
+    def start(self, n: int, nominal: Nominal, step: float) -> Reaction:
+        return initial_reaction(n, nominal, step)
 
-    def drive(self, seen: Observation, memory: _Memory) -> tuple[Command, _Memory]:
-        last_speed = seen.speed if memory.speed is None else memory.speed
-        acceleration = (seen.speed - last_speed) / memory.reaction.step
+    def drive(self, seen: Observation, memory: Reaction) -> tuple[Command, Reaction]:
+        acceleration = (seen.speed - (seen.speed if memory.cruise is None else memory.speed)) / memory.step
         gap = np.where(is_in_the_way(seen, self.corridor), seen.gap, np.inf)
         pfs = self.proactive_metric(gap, seen.speed, seen.obstacle_speed)
         cfs = self.critical_metric(gap, seen.speed, seen.obstacle_speed, acceleration)
         deceleration = np.where(cfs > 0, cfs * (self.hardest - self.comfortable) + self.comfortable, pfs * self.comfortable)
-        command, reaction = react(seen, memory.reaction, (pfs > 0) | (cfs > 0), np.minimum(deceleration, HARDEST_BRAKING),
-                                  reaction_time=self.reaction_time, corridor=self.corridor, cruise_speed=self.cruise_speed)
-        return command, _Memory(reaction, seen.speed)
+        return react(seen, memory, (pfs > 0) | (cfs > 0), np.minimum(deceleration, HARDEST_BRAKING),
+                     reaction_time=self.reaction_time, corridor=self.corridor, cruise_speed=self.cruise_speed)
 
     def proactive_metric(self, gap: FloatArray, v: FloatArray, u: FloatArray) -> FloatArray:
         """PFS in [0, 1] at a gap [m] and speeds v and u (leader) [m/s], shape (N,): 0 above the safe distance, 1 below the unsafe one."""

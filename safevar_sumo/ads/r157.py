@@ -15,7 +15,8 @@ from safevar_sumo.records import Command, Nominal, Observation
 class R157(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Holds its speed; reacts to a TTC below (v - u) / (2 * 6 m/s^2) + 0.35 s + 0.1 s, and brakes with 6 m/s^2 at once.
 
-    v and u are the speeds of the vehicle and the obstacle.
+    v and u are the speeds of the vehicle and the obstacle. UN R157 means this for cars that cut in, cut out or
+    brake on motorways; its use for pedestrians is ours.
 
     Parameters
     ----------

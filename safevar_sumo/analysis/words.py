@@ -71,10 +71,11 @@ def points_in_words(failing_points: Sequence[str], point_count: int, limit: int 
     return f"Fails at {len(failing_points)} of {point_count} points{': ' + names if failing_points else ''}{others}."
 
 
-def percentage(share: float) -> str:
-    """A share in percent, such as `14 %`; `0 %` and `100 %` only if it is exactly none or all."""
-    percent = 100 * share
-    return f"{percent:.0f} %" if share in (0, 1) or 0.5 <= percent < 99.5 else f"{min(max(percent, 0.1), 99.9):.1f} %"
+def share_in_words(share: float) -> str:
+    """A share with two digits, such as `14 %`; `all` and `none` only if it is exactly that."""
+    if share in (0, 1):
+        return "all" if share else "none"
+    return "nearly all" if share >= 0.995 else "hardly any" if share < 0.005 else f"{100 * share:.0f} %"
 
 
 def two_decimals(value: float | None) -> str:

@@ -38,6 +38,7 @@ class Evaluations:
     `collision_speed` is in m/s, `f_diff` a fraction, `f_num_diff` a count. `reasons` says, by the bytes of a
     setting, why the setting could not be simulated. `files` are digests, by name, of files that user code
     read for the first time in a batch; they belong to the batch, not to its rows. `cells` are a rating's results, None without a rating.
+    `worst_points` are the numbers of the points at which the settings were worst, None without a matrix.
     """
 
     settings: FloatArray
@@ -49,6 +50,7 @@ class Evaluations:
     reasons: Mapping[bytes, str] = field(default_factory=dict)
     files: Mapping[str, str] = field(default_factory=dict)
     cells: CellResults | None = None
+    worst_points: npt.NDArray[np.intp] | None = None
 
     def __len__(self) -> int:
         return len(self.settings)
@@ -97,7 +99,8 @@ class Evaluations:
         return replace(
             self, settings=self.settings[rows], outcome=self.outcome[rows], collision_speed=self.collision_speed[rows],
             metrics={name: values[rows] for name, values in self.metrics.items()}, f_diff=self.f_diff[rows],
-            f_num_diff=self.f_num_diff[rows], cells=None if self.cells is None else self.cells.of(rows))
+            f_num_diff=self.f_num_diff[rows], cells=None if self.cells is None else self.cells.of(rows),
+            worst_points=None if self.worst_points is None else self.worst_points[rows])
 
     @classmethod
     def none(cls, n: int, metrics: Iterable[str]) -> Evaluations:
@@ -110,12 +113,14 @@ class Evaluations:
     def concatenate(cls, batches: Sequence[Evaluations]) -> Evaluations:
         """Join batches of evaluations in order; a metric that a batch lacks is undefined in its rows.
 
-        There are `cells` only if all batches have them.
+        There are `cells` only if all batches have them; the worst point of a batch without `worst_points` is the first.
         """
         def join(name: str) -> np.ndarray:
             return np.concatenate([getattr(batch, name) for batch in batches])
 
         cells = [batch.cells for batch in batches if batch.cells is not None]
+        points = [np.zeros(len(batch), dtype=np.intp) if batch.worst_points is None else batch.worst_points
+                  for batch in batches]
         return cls(
             settings=join("settings"), outcome=join("outcome"), collision_speed=join("collision_speed"),
             metrics={name: np.concatenate([batch.metrics.get(name, np.full(len(batch), np.nan)) for batch in batches])
@@ -123,4 +128,5 @@ class Evaluations:
             f_diff=join("f_diff"), f_num_diff=join("f_num_diff"),
             reasons={setting: reason for batch in batches for setting, reason in batch.reasons.items()},
             files={name: digest for batch in batches for name, digest in batch.files.items()},
+            worst_points=None if all(batch.worst_points is None for batch in batches) else np.concatenate(points),
             cells=CellResults._make(map(np.concatenate, zip(*cells, strict=True))) if len(cells) == len(batches) else None)

@@ -16,7 +16,7 @@ from safevar_sumo.analysis.explain.robustness import MIN_ROBUST_SHARE, is_border
 from safevar_sumo.analysis.model_spread import ModelSpread, compute_model_spreads
 from safevar_sumo.analysis.preventability import PreventedShares
 from safevar_sumo.analysis.research_questions.case import ALGORITHM_TITLES, are_collisions
-from safevar_sumo.analysis.words import number_of, percentage
+from safevar_sumo.analysis.words import number_of, share_in_words
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import KMH_PER_MS, FloatArray, Outcome
 from safevar_sumo.reference import Totals, shipped_totals_of
@@ -274,8 +274,8 @@ def _preventability_figure(preventable: PreventedShares | None, data: ReportInpu
         return KeyFigure(title, NO_VALUE, "not computed" if any_collision else "there is no collision to avoid")
     low, high = preventable.interval_competent_driver
     sample = "all" if low == high else f"95 % interval {100 * low:.0f} % to {100 * high:.0f} %;"
-    return KeyFigure(title, f"{percentage(preventable.competent_driver)} of the collisions",
-                     f"in the same vehicle ({sample} {preventable.looked_at} collisions analysed)")
+    return KeyFigure(title, f"{share_in_words(preventable.competent_driver)} of the collisions",
+                     f"{preventable.later}, in the same vehicle ({sample} {preventable.looked_at} collisions analysed)")
 
 
 def _tolerance_figure(tolerance: Mapping[str, Any] | None) -> KeyFigure:

@@ -16,7 +16,7 @@ from safevar_sumo.study import DESCRIPTION_KEYS, RatingTable, Study, refuse_othe
 
 FORMAT = 3
 READABLE_FORMATS = (2, FORMAT)
-RESULTS = 5
+RESULTS = 6
 """Version number of the package's results, raised whenever they change (enforced by tests/golden)."""
 PACKAGES = ("safevar_sumo", "libsumo", "eclipse-sumo", "deap", "numpy")
 KEYS_WITHOUT_EFFECT_ON_RESULTS = ("title", "published", "repeatability", "fit", "calibration", "spread", "model_error", "variation",

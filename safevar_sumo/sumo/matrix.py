@@ -160,7 +160,7 @@ def evaluations_at_worst_points(at_points: Sequence[PointResult | PointEvaluatio
     settings = at_points[0].evaluations.settings
     point_numbers, setting_numbers = worst_points(at_points), np.arange(len(settings))
     evaluations = Evaluations.concatenate([result.evaluations for result in at_points])
-    return evaluations.take(point_numbers * len(settings) + setting_numbers)
+    return replace(evaluations.take(point_numbers * len(settings) + setting_numbers), worst_points=point_numbers)
 
 
 def simulate(system: System, settings: FloatArray, engine: Engine = Engine.RECORDED,

@@ -104,15 +104,26 @@ def test_the_competent_driver_brakes_three_quarters_of_a_second_after_two_second
     assert decelerations[-1] == pytest.approx(0.774 * 9.81)
 
 
-def test_the_competent_driver_lets_go_of_the_accelerator_while_it_reacts() -> None:
-    """From 30 m on, 2 s before a collision, it slows down by 0.4 m/s^2 for its 0.75 s; before that it holds its speed."""
-    driver, one, decelerations = CompetentDriver(), np.ones(1), []
-    memory = driver.start(1, KNOWN, STEP)
-    for k in range(20):
-        seen = Observation(k * STEP, 15 * one, (33.3 - 15 * k * STEP) * one, 15 * one, 0 * one, 0 * one, 1.0, 0 * one, 0 * one)
+@pytest.mark.parametrize("driver", [CompetentDriver(), Rss(), FuzzySafety(), R157()])
+def test_who_reacts_releases_the_accelerator_and_brakes_by_what_is_missing(driver: Any) -> None:
+    """The vehicle coasts with 1 m/s^2; the tables are those of a gear in which the original coasts with 3 m/s^2."""
+    first_gear = KNOWN.tables()._replace(coasting=np.full(len(TABLE), 3.0))
+    memory = driver.start(1, KNOWN._replace(tables=lambda: first_gear), STEP)
+    one, speed, gap, commands = np.ones(1), 12.0, 40.0, []
+    for k in range(80):
+        seen = Observation(k * STEP, speed * one, gap * one, speed * one, 0 * one, 0 * one, 1.0, 0 * one, 0.25 * one)
         command, memory = driver.drive(seen, memory)
-        decelerations.append(float(command.brake[0]) * 10)
-    assert decelerations == pytest.approx([0.0] * 5 + [0.4] * 15)
+        commands.append((float(command.throttle[0]), float(command.brake[0])))
+        gap, speed = gap - speed * STEP, max(speed - (0.0 if commands[-1][0] else 1 + 10 * commands[-1][1]) * STEP, 0.0)
+        if not speed or gap <= 0:
+            break
+    throttle, brake = np.array(commands).T
+    released, braking = np.argmax(throttle == 0), np.argmax(brake > 0)
+    assert released > 0
+    assert (braking - released) * STEP == pytest.approx(driver.reaction_time, abs=2 * STEP)
+    assert not throttle[released:].any()
+    greatest = {"R157": 6.0, "FuzzySafety": 1 + 10 * brake.max()}.get(type(driver).__name__, 0.774 * 9.81)
+    assert 1 + 10 * brake.max() == pytest.approx(greatest, abs=1e-6), "of the vehicle, not of its brakes"
 
 
 def test_the_competent_driver_keeps_its_headway_with_the_accelerator_alone() -> None:

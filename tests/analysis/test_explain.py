@@ -40,6 +40,7 @@ from safevar_sumo.analysis.explain.robustness import Robustness, estimate_robust
 from safevar_sumo.analysis.explain.summary import _estimate_robustnesses, summarise_failures
 from safevar_sumo.analysis.preventability import Preventability
 from safevar_sumo.analysis.research_questions.case import Case, load_cases
+from safevar_sumo.analysis.words import share_in_words
 from safevar_sumo.cli.program import commands
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
@@ -104,7 +105,9 @@ def test_the_records_are_those_of_the_solutions(case: Case, explained: Explained
     assert list(last) == ["summary"]
     assert list(last["summary"]) == ["necessary", "changed", "necessary_interval", "preventable"]
     preventable = last["summary"]["preventable"]
-    assert list(preventable) == ["competent_driver", "full_braking", "nobody", "looked_at", "interval_competent_driver"]
+    assert list(preventable)[:3] == ["competent_driver", "full_braking", "nobody"]
+    assert list(preventable)[3:] == ["looked_at", "interval_competent_driver", "later"]
+    assert list(preventable["later"]) == ["reaction", "competent_driver"]
     assert sum(list(preventable.values())[:3]) == pytest.approx(1)
     assert preventable["looked_at"] == explained.failures
     assert all(share <= last["summary"]["changed"][name] for name, share in last["summary"]["necessary"].items())
@@ -204,8 +207,8 @@ def assert_tells_a_manager(paragraph: str, explained: Explained) -> None:
     largest = max((member for member in members if member.name in fewest.changed),
                   key=lambda member: abs(fewest.setting[member.name] / member.original - 1))
     assert f"{largest.short_name} {100 * (fewest.setting[largest.name] / largest.original - 1):+.0f} %" in paragraph
-    share = explained.preventability.shares.competent_driver
-    assert f"a competent driver avoids {100 * share:.0f} % (" in paragraph
+    shares = explained.preventability.shares
+    assert f"a competent driver avoids {share_in_words(shares.competent_driver)} ({shares.later})" in paragraph
 
 
 def test_how_many_failures_were_analysed_in_words() -> None:
@@ -354,7 +357,7 @@ def test_the_paragraph_says_how_robust_the_changes_that_suffice_are_by_themselve
     system, changes = assemble(load_study("sun")), {"tireFric": 1.04, "radius": 32.05, "mass": 2500.0}
     finding = FailureDescription("rs:0:0", changes, "collision", -1.5, Robustness({0.05: 0.98}), 2, Robustness({0.05: 0.44}))
     original = evaluate(system, system.characteristics.original[None])
-    paragraph = failures_paragraph(system, original, finding, finding, Preventability(counts={}, collisions=0))
+    paragraph = failures_paragraph(system, original, finding, finding, Preventability(counts={}, collisions=0, later=0))
     assert "a collision at 1.5 m/s, 5 km/h (rs:0:0, robust: 98 % of" in paragraph.lower()
     assert "; two of them suffice (borderline: only 44 % of the neighbours are unsafe too)." in paragraph
 
@@ -367,7 +370,8 @@ def test_the_paragraph_says_how_robust_the_changes_that_suffice_are_by_themselve
 def test_a_weather_that_is_not_shipped_is_named(weather: str | dict[str, Any], words: str) -> None:
     system = assemble(load_study("smoke", weather=weather))
     original = evaluate(system, system.characteristics.original[np.newaxis])
-    assert failures_paragraph(system, original, None, None, Preventability(counts={}, collisions=0)).startswith(words)
+    nobody = Preventability(counts={}, collisions=0, later=0)
+    assert failures_paragraph(system, original, None, None, nobody).startswith(words)
 
 
 def test_the_paragraph_leads_with_the_robust_failure_if_it_has_as_few_changes() -> None:
@@ -377,7 +381,7 @@ def test_the_paragraph_leads_with_the_robust_failure_if_it_has_as_few_changes() 
         FailureDescription(name, changes, "collision", degree, Robustness({0.05: 0.98}), len(changes))
         for name, changes, degree in (("rs:0:1", {"radius": 32.0}, -3.0), ("rs:0:4", {"radius": 33.0}, -1.0),
                                       ("rs:0:7", {"radius": 34.0, "mass": 2600.0}, -1.0)))
-    nobody = Preventability(counts={}, collisions=0)
+    nobody = Preventability(counts={}, collisions=0, later=0)
     assert failures_paragraph(system, original, severe, robust, nobody) == failures_paragraph(system, original, robust, robust, nobody)
     assert failures_paragraph(system, original, severe, larger, nobody) == failures_paragraph(system, original, severe, None, nobody)
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+import sys
 from dataclasses import replace
 
 import msgspec
@@ -13,7 +15,6 @@ from safevar_sumo.ads.competent_driver import CompetentDriver
 from safevar_sumo.analysis.evaluator import Evaluator
 from safevar_sumo.analysis.explain.braking_comparison import sentence
 from safevar_sumo.analysis.explain.compute import PointComparison, compare_at_points
-from safevar_sumo.analysis.explain.paragraph import _avoided_shares_in_words
 from safevar_sumo.analysis.explain.summary import summarise_failures
 from safevar_sumo.analysis.preventability import (
     Preventability,
@@ -24,11 +25,12 @@ from safevar_sumo.analysis.preventability import (
 )
 from safevar_sumo.analysis.words import points_in_words
 from safevar_sumo.metrics import Unsafe
-from safevar_sumo.records import FloatArray
+from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.results import solutions_frame
 from safevar_sumo.study import ModelTable, load_study
 from safevar_sumo.sumo.matrix import evaluate, simulate
 from safevar_sumo.sumo.system import System, assemble
+from safevar_sumo.vehicles import calibration_drive
 from tests.in_process import InlinePool
 
 STUDY = load_study("euro_ncap_pedestrian")
@@ -49,41 +51,91 @@ def vehicle(brakes: float = 1.0, max_rpm: float = 1.0) -> FloatArray:
     return ORIGINAL * [factors.get(name, 1.0) for name in NAMES]
 
 
-def test_shares_are_told_with_their_counts() -> None:
-    counts = {PreventableBy.COMPETENT_DRIVER: 5, PreventableBy.NOBODY: 2}
-    sentences = [_avoided_shares_in_words(Preventability(counts=counts, collisions=number))[0] for number in (7, 300)]
-    end = "a competent driver avoids 71 % (5 of 7) and 29 % (2 of 7) are physically unavoidable."
-    assert sentences == [f"In the same vehicle, of the collisions, {end}",
-                         f"In the same vehicle, of 7 collisions, drawn at random from 300, {end}"]
-    assert str(Preventability(counts=counts, collisions=7)).startswith("Preventability in the same vehicle (7 collisions): 71 % ")
+def collisions(here: Evaluator, *settings: FloatArray) -> Evaluations:
+    """The evaluations of settings that collide."""
+    evaluations = here.evaluate(np.concatenate([np.atleast_2d(one) for one in settings]), "collisions")
+    assert evaluations.collided.all()
+    return evaluations
+
+
+def categories(here: Evaluator, *settings: FloatArray) -> list[PreventableBy | None]:
+    """The weakest driver who avoids each collision."""
+    return [avoidance and avoidance.by for avoidance in classify_collisions(here, collisions(here, *settings))]
+
+
+def test_shares_are_told_as_a_range_over_reaction_times_with_two_digits() -> None:
+    by, full_braking = PreventableBy, "only full braking at the first possible moment avoids"
+    for counts, later, number, words in (
+            ({by.COMPETENT_DRIVER: 5, by.FULL_BRAKING: 1, by.NOBODY: 1}, 3, 7, "of 7 collisions, a competent driver "
+             f"avoids 71 % (43 % if he needs 0.4 s longer), {full_braking} another 14 % and 14 % are physically unavoidable."),
+            ({by.COMPETENT_DRIVER: 999, by.FULL_BRAKING: 1}, 390, 3000, "of 1000 collisions, drawn at random from "
+             f"3000, a competent driver avoids nearly all (39 % if he needs 0.4 s longer) and {full_braking} hardly any."),
+            ({by.FULL_BRAKING: 17}, 0, 17, "of 17 collisions, a competent driver avoids none "
+             f"(none if he needs 0.4 s longer) and {full_braking} all.")):
+        assert str(Preventability(counts=counts, collisions=number, later=later)) == f"In the same vehicle, {words}"
 
 
 @pytest.mark.slow
 def test_a_competent_driver_avoids_what_a_short_sighted_system_does_not_and_nobody_stops_without_brakes() -> None:
-    both = np.stack([vehicle(), vehicle(brakes=0.1)])
-    assert classify_collisions(evaluator(test="CPFA", speed=30), both) == [PreventableBy.COMPETENT_DRIVER, PreventableBy.NOBODY]
+    found = categories(evaluator(test="CPFA", speed=30), vehicle(), vehicle(brakes=0.1))
+    assert found == [PreventableBy.COMPETENT_DRIVER, PreventableBy.NOBODY]
 
 
 @pytest.mark.slow
 def test_a_child_that_comes_out_late_is_avoided_by_full_braking_alone() -> None:
-    assert classify_collisions(evaluator(test="CPNCO", speed=40), vehicle()[np.newaxis]) == [PreventableBy.FULL_BRAKING]
+    assert categories(evaluator(test="CPNCO", speed=40), vehicle()) == [PreventableBy.FULL_BRAKING]
 
 
 @pytest.mark.slow
 def test_shares_are_those_of_all_collisions_and_a_sample_is_random() -> None:
     """Of 60 collisions, the 40 of the lowest engine speeds are the brakeless ones: those that come first when settings are sorted."""
-    collisions = np.stack([vehicle(0.1, 1 - (60 - k) / 1e6) for k in range(40)] + [vehicle(1.0, 1 - k / 1e6) for k in range(20)])
     here = evaluator(test="CPFA", speed=30)
-    whole = msgspec.structs.asdict(assess_preventability(here, np.concatenate([collisions, collisions])).shares)
+    brakeless = (vehicle(0.1, 1 - (60 - k) / 1e6) for k in range(40))
+    every = collisions(here, *brakeless, *(vehicle(1.0, 1 - k / 1e6) for k in range(20)))
+    whole = msgspec.to_builtins(assess_preventability(here, Evaluations.concatenate([every, every])).shares)
+    later = whole.pop("later")
     assert whole == {"competent_driver": pytest.approx(1 / 3), "full_braking": 0, "nobody": pytest.approx(2 / 3), "looked_at": 60,
                      "interval_competent_driver": [pytest.approx(1 / 3)] * 2}
-    sample = msgspec.structs.asdict(assess_preventability(here, collisions, max_simulations=60).shares)
+    assert (later["reaction"], later["competent_driver"]) == (pytest.approx(1.15), pytest.approx(1 / 3))
+    sample = msgspec.to_builtins(assess_preventability(here, every, max_simulations=90).shares)
     assert sample["looked_at"] == 30
-    assert sample == msgspec.structs.asdict(assess_preventability(here, collisions[::-1], max_simulations=60).shares)
+    reverse = every.take(np.arange(60)[::-1])
+    assert sample == msgspec.to_builtins(assess_preventability(here, reverse, max_simulations=90).shares)
     hits = round(sample["competent_driver"] * 30)
     expected = scipy.stats.beta.ppf(0.025, hits, 31 - hits), scipy.stats.beta.ppf(0.975, hits + 1, 30 - hits)
     assert sample["interval_competent_driver"] == pytest.approx(expected)
     assert expected[0] < 1 / 3 < expected[1]
+
+
+@pytest.mark.slow
+def test_the_shares_do_not_change_with_the_gear_of_the_calibration_drive(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In first gear the engine brakes with 2.8 m/s^2 at 20 km/h, in the gear of the shipped tables with 0.8 m/s^2."""
+    rain = load_study("rain")
+    first_gear = load_study(rain, vehicle={"parameters": {"shift_up": 0.65, "shift_down": 0.5, "shift_latency": 2.0}})
+    tables = assemble(first_gear).nominal.tables()
+    here, names = Evaluator(rain, InlinePool()), assemble(rain).characteristics.names
+    settings = np.tile(here.characteristics.original, (27, 1))
+    changed = ("mass", "gearSwitchTime", "max_rpm", "dampRateZeroT_CE", "maxBrakeTorque")
+    settings[:, [names.index(name) for name in changed]] = list(itertools.product(
+        (2690,), (0.41,), (4900, 5030, 5220), (1.0, 1.01, 1.03), (1200, 1203, 1210)))
+    evaluations = here.evaluate(settings, "less engine drag, weaker brakes")
+    colliding = evaluations.take(evaluations.collided)
+    shipped = classify_collisions(here, colliding)
+    assert len(set(shipped)) > 1, "all or none would be no test"
+    monkeypatch.setattr(sys.modules[calibration_drive.__module__], "_simulated_tables", lambda *_: tables)
+    assert classify_collisions(here, colliding) == shipped
+
+
+@pytest.mark.slow
+def test_a_vehicle_with_half_the_engine_drag_slows_down_while_its_driver_reacts() -> None:
+    rain = assemble(load_study("rain"))
+    shares = [0.5 if name.startswith("dampRate") else 1.0 for name in rain.characteristics.names]
+    driver = msgspec.convert({**approach_parameters(rain), "reaction_time": 1.15}, CompetentDriver)
+    trace = simulate(replace(rain, ads=driver), rain.characteristics.original[np.newaxis] * shares).trace
+    released = int(np.argmax((trace.time > 1) & (trace.throttle[:, 0] == 0)))
+    braking = int(np.argmax(trace.brake[:, 0] > 0))
+    assert (braking - released) * trace.step >= 1.0
+    assert np.diff(trace.speed[released:braking, 0])[6:].max() < 0  # 0.3 s later, when the wheels no longer push
 
 
 @pytest.mark.slow
@@ -106,7 +158,7 @@ def test_in_a_matrix_the_worst_point_counts() -> None:
     tests = [msgspec.structs.replace(one, over={}, parameters={**one.parameters, "speed": speeds[one.name]}, weathers=[])
              for one in STUDY.matrix.tests if one.name in speeds]
     study = msgspec.structs.replace(STUDY, ads=BLIND, matrix=msgspec.structs.replace(STUDY.matrix, tests=tests))
-    assert classify_collisions(Evaluator(study, InlinePool()), vehicle()[np.newaxis]) == [PreventableBy.FULL_BRAKING]
+    assert categories(Evaluator(study, InlinePool()), vehicle()) == [PreventableBy.FULL_BRAKING]
 
 
 TESTS = [{"name": "CPLA", "model": "along", "over": {"speed": [20, 40]}, "weathers": ["clear", "night"]},

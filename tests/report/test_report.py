@@ -19,7 +19,7 @@ from click.testing import CliRunner
 
 from safevar_sumo.ads.full_braking import FullBraking
 from safevar_sumo.analysis.explain.result import Explained, FailureEntry, SummaryEntry, most_robust
-from safevar_sumo.analysis.preventability import PreventedShares
+from safevar_sumo.analysis.preventability import LaterReaction, PreventedShares
 from safevar_sumo.analysis.research_questions.case import load_cases
 from safevar_sumo.cli.program import commands
 from safevar_sumo.errors import InputError
@@ -167,7 +167,8 @@ def test_the_verdict_leads_with_the_robust_failure_and_calls_the_others_borderli
     (data,) = read_inputs([shutil.copytree(slippery, tmp_path / "copy", ignore=shutil.ignore_patterns("answers"))])
     *entries, last = explained.to_dict()
     summary = msgspec.structs.replace(msgspec.convert(last["summary"], SummaryEntry), preventable=PreventedShares(
-        competent_driver=0.14, full_braking=0.1, nobody=0.76, looked_at=40, interval_competent_driver=[0.05, 0.29]))
+        competent_driver=0.14, full_braking=0.1, nobody=0.76, looked_at=40, interval_competent_driver=[0.05, 0.29],
+        later=LaterReaction(reaction=1.15, competent_driver=0.05)))
     failing = [row for row in data.solutions.values() if row["outcome"] == "collision"]
     entry = msgspec.convert(entries[0], FailureEntry)
     fewest, robust = (msgspec.structs.replace(
@@ -193,7 +194,9 @@ def test_the_verdict_leads_with_the_robust_failure_and_calls_the_others_borderli
     every = reach_verdict(data, Explanations([fewest, whole_cause], summary), None).headline
     assert every.startswith(f"{number} changes suffice for a collision that is robust: the vehicle collides")
     assert [one.value for one in result.key_figures[2:]] == ["14 % of the collisions", "42.0 % of the way"]
-    for share, words in ((0.9996, "99.9 %"), (0.9954, "99.5 %"), (1.0, "100 %"), (0.0002, "0.1 %"), (0.0, "0 %")):
+    note = "5 % if he needs 0.4 s longer, in the same vehicle (95 % interval 5 % to 29 %; 40 "
+    assert result.key_figures[2].note.startswith(note)
+    for share, words in ((0.9996, "nearly all"), (0.9949, "99 %"), (1.0, "all"), (0.0002, "hardly any"), (0.0, "none")):
         nearly = msgspec.structs.replace(summary, preventable=msgspec.structs.replace(summary.preventable, competent_driver=share))
         assert reach_verdict(data, Explanations([fewest], nearly), None).key_figures[2].value == f"{words} of the collisions"
     assert result.key_figures[0].value.startswith(f"{number} changes")
@@ -324,7 +327,7 @@ def test_a_chart_puts_its_points_where_they_belong_and_escapes_their_words() -> 
 
 
 def test_an_empty_point_is_no_point(slippery: Path) -> None:
-    with pytest.raises(InputError, match="--point: ''"):
+    with pytest.raises(InputError, match="point: ''"):
         make_report([slippery], only=["verdict"], point="")
 
 

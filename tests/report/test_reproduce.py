@@ -123,7 +123,7 @@ def test_all_of_it_is_of_the_point(results: Path) -> None:
 def test_its_commands_ask_about_the_point_and_a_wrong_one_is_refused(results: Path) -> None:
     page = make_report([results], ["reproduce"], jobs=1, point=DAY)
     assert all("simulate" not in command and "tables" not in command for command in re.findall("<code>(.*?)</code>", page))
-    with pytest.raises(InputError, match="--point"):
+    with pytest.raises(InputError, match="point: 'crossing, snow'"):
         make_report([results], ["verdict"], jobs=1, point="crossing, snow")
     with pytest.raises(InputError, match="whole studies"):
         make_report([results], ["questions"], jobs=1, point=DAY)

@@ -229,7 +229,8 @@ def explain_failures(source: Study | Case, options: ExplainOptions, *, pool: Poo
         original, evaluated, sample, causes, choice_reasons = choose_failures(source, options, evaluator)
         settings = evaluated.evaluations.settings
         explanations = _explain_rows(evaluated, evaluator, original, causes, choice_reasons)
-        preventable = assess_preventability(evaluator, settings[_collisions_to_classify(study, evaluated.evaluations)])
+        collisions = evaluated.evaluations.take(_collisions_to_classify(study, evaluated.evaluations))
+        preventable = assess_preventability(evaluator, collisions)
         no_verdict = evaluator.no_verdict
     sample_causes, characteristics = [causes[row] for row in sample], evaluator.characteristics
     changed = characteristics.changed(settings[sample])
@@ -298,7 +299,8 @@ def _explain_rows(evaluated: EvaluatedSettings, evaluator: Evaluator, original: 
         robustnesses = estimate_robustness(evaluator, settings, step, unsafe)
     boundaries, cause_robustnesses = iter(find_boundaries(evaluator, all_causes, unsafe)), iter(robustnesses[len(rows):])
     collision_indices = np.flatnonzero(_collisions_to_classify(evaluator.study, chosen))
-    categories = dict(zip(collision_indices.tolist(), classify_collisions(evaluator, chosen.settings[collision_indices]), strict=True))
+    classified = classify_collisions(evaluator, chosen.take(collision_indices))
+    avoidances = dict(zip(collision_indices.tolist(), classified, strict=True))
     explanations = []
     for i, row in enumerate(rows):
         described_causes = []
@@ -318,5 +320,5 @@ def _explain_rows(evaluated: EvaluatedSettings, evaluator: Evaluator, original: 
             changed=tuple(name for name, is_changed in zip(names, changed, strict=True) if is_changed),
             necessary=tuple(names[column] for column in sorted(necessary_columns(causes[row]))), causes=tuple(described_causes),
             robustness=robustnesses[i], because=comparisons[i].braking, points=comparisons[i].failing_points,
-            preventable=str(categories.get(i) or "")))
+            preventable=str(avoidance.by) if (avoidance := avoidances.get(i)) else ""))
     return tuple(explanations)

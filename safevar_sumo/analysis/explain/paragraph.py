@@ -8,8 +8,8 @@ from typing import NamedTuple
 import numpy as np
 
 from safevar_sumo.analysis.explain.robustness import Robustness
-from safevar_sumo.analysis.preventability import Preventability, PreventableBy
-from safevar_sumo.analysis.words import OUTCOME_VERBS, join_phrases, percentage
+from safevar_sumo.analysis.preventability import Preventability
+from safevar_sumo.analysis.words import OUTCOME_VERBS
 from safevar_sumo.records import KMH_PER_MS, Evaluations, Outcome
 from safevar_sumo.scenarios import equals_clear, weather_in_words
 from safevar_sumo.scenarios.base import pre_crash_of
@@ -80,7 +80,7 @@ def failures_paragraph(system: System, original: Evaluations, smallest: FailureD
     if smallest.robustness.borderline:
         parts.append("No failure tested is robust." if robust is None else
                      f"The robust failure with the fewest changes: {_failure_in_words(characteristics, robust)}")
-    return " ".join([*parts, *_avoided_shares_in_words(preventable)])
+    return " ".join([*parts, str(preventable)]).rstrip()
 
 
 def _conditions_in_words(system: System) -> str:
@@ -145,16 +145,3 @@ def _changes_in_words(characteristics: CharacteristicSet, values: Mapping[str, f
     largest = sorted(shares, key=lambda name: -abs(shares[name]))
     parts = [f"{name} {100 * shares[name]:+.0f} %" for name in largest[:MAX_CHANGES_LISTED]]
     return ", ".join(parts) + (f" and {len(shares) - MAX_CHANGES_LISTED} more" if len(shares) > MAX_CHANGES_LISTED else "")
-
-
-def _avoided_shares_in_words(preventable: Preventability) -> list[str]:
-    """A sentence on the shares of the collisions that each reference driver avoids; no sentence without a collision."""
-    if not preventable.looked_at:
-        return []
-    words = {PreventableBy.COMPETENT_DRIVER: "a competent driver avoids {}", PreventableBy.FULL_BRAKING:
-             "only full braking at the first possible moment avoids another {}", PreventableBy.NOBODY: "{} are physically unavoidable"}
-    parts = [text.format(f"{percentage(count / preventable.looked_at)} ({count} of {preventable.looked_at})")
-             for by, text in words.items() if (count := preventable.counts.get(by))]
-    sample = "the collisions" if preventable.looked_at == preventable.collisions else (
-        f"{preventable.looked_at} collisions, drawn at random from {preventable.collisions}")
-    return [f"In the same vehicle, of {sample}, {join_phrases(parts)}."]

@@ -55,8 +55,6 @@ def print_explained(console: Console, subject: str, result: Explained, point: st
     print_text(console, _accuracy_in_words(result))
     for failure in result.explanations:
         _print_explanation(console, command_for, failure, characteristics, result)
-    if result.preventability.looked_at:
-        print_text(console, str(result.preventability))
     _print_statistics(console, result)
 
 

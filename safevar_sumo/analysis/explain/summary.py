@@ -84,7 +84,7 @@ def _write_paragraph(evaluator: Evaluator, solutions: pd.DataFrame, is_unsafe: p
         original = evaluator.evaluate_original()
     system = assemble(evaluator.study)
     evaluations = evaluator.evaluate(solutions.iloc[candidates][list(names)].to_numpy(dtype=float), "unsafe solutions")
-    preventable = assess_preventability(evaluator, evaluations.settings[evaluations.collided])
+    preventable = assess_preventability(evaluator, evaluations.take(evaluations.collided))
     failing_rows = np.flatnonzero(unsafe.of(evaluations))
     failures = evaluations.take(failing_rows)
     if not len(failures):
