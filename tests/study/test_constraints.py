@@ -127,6 +127,14 @@ def test_searches_and_designs_stay_in_any_linear_region_around_the_original(data
         assert total == 60
 
 
+def test_tolerance_refuses_characteristics_that_an_equality_ties_and_answers_for_the_others() -> None:
+    tied = constrained({"sum": {"mass": 1.0, "maxBrakeTorque": -1.0}, "unit": "-", "at_least": 904.0, "at_most": 904.0})
+    with pytest.raises(InputError, match="fewer than 1 in 1000 random settings satisfy the constraints, which leaves no box to test: mass"):
+        sv.tolerance(tied, characteristics=["mass", "radius"], unsafe="collision", jobs=1)
+    free = sv.tolerance(tied, characteristics=["radius"], unsafe="collision", jobs=1)
+    assert free.joint.samples > 0
+
+
 def constrained(*constraints: Mapping[str, Any]) -> Study:
     return load_study("smoke", constraints=list(constraints))
 

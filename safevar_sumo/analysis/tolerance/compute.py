@@ -17,7 +17,7 @@ from safevar_sumo.analysis.research_questions.case import Case
 from safevar_sumo.analysis.subject import study_in
 from safevar_sumo.analysis.tolerance import ToleranceOptions
 from safevar_sumo.analysis.tolerance.pairs import Pair, scan_pairs
-from safevar_sumo.analysis.tolerance.safe_box import SafeBox, find_safe_box, no_safe_box
+from safevar_sumo.analysis.tolerance.safe_box import SafeBox, find_safe_box, no_safe_box, refuse_tied
 from safevar_sumo.errors import InputError, unknown_name
 from safevar_sumo.metrics import RATING_POINTS, Unsafe
 from safevar_sumo.protocol.rater import is_rated
@@ -230,7 +230,7 @@ def find_tolerances(source: Study | Case, options: ToleranceOptions, *, pool: Po
     Raises
     ------
     InputError
-        If `unsafe` or a name cannot be used, or the study cannot be assembled.
+        If `unsafe` or a name cannot be used, the study cannot be assembled, or hardly any setting of a box satisfies its constraints.
     """
     study = study_in(source)
     columns = _columns_of(study, options.characteristics)
@@ -239,9 +239,11 @@ def find_tolerances(source: Study | Case, options: ToleranceOptions, *, pool: Po
     with open_evaluator(study, pool, jobs, progress) as evaluator:
         original = evaluator.evaluate_original()
         unsafe = evaluator.choose_criterion(options.unsafe, source, original)
+        needs_box = not unsafe.of(original)[0] and not is_rated(study)  # a box of a rated study would take thousands of whole test matrices
+        if needs_box:
+            refuse_tied(evaluator, columns)
         scans = scan(evaluator, columns, unsafe)
         pairs = scan_pairs(evaluator, columns, unsafe) if options.pairs else None
-        needs_box = not unsafe.of(original)[0] and not is_rated(study)  # a box of a rated study would take thousands of whole test matrices
         solutions = None if isinstance(source, Study) else source.solutions[unsafe.rows(source.solutions)]
         box = (find_safe_box(evaluator, columns, unsafe, _unsafe_settings(evaluator, scans, pairs or []), solutions) if needs_box
                else no_safe_box(evaluator, columns))

@@ -12,8 +12,10 @@ import scipy
 
 from safevar_sumo.analysis.evaluator import CONFIDENCE, Evaluator, sobol_points
 from safevar_sumo.analysis.explain.causes import Line, find_first_unsafe_shares
+from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import FloatArray
+from safevar_sumo.vehicles.region import REJECTIONS
 
 MAX_UNSAFE_SHARE = 0.003
 """Upper bound of a box's unsafe share, with 95 % confidence, if every sampled setting is safe."""
@@ -139,9 +141,18 @@ def _settings_in_box(evaluator: Evaluator, columns: Sequence[int], factor: float
 
 
 def _random_settings(evaluator: Evaluator, columns: Sequence[int], factor: float, number: int, rng: np.random.Generator) -> FloatArray:
-    """Feasible settings drawn uniformly in a box; fewer than `number` where hardly any is feasible."""
-    return evaluator.region.draw_feasible(
+    """Feasible settings drawn uniformly in a box; fewer than `number` where few are feasible, an error where none is."""
+    settings = evaluator.region.draw_feasible(
         lambda count: _settings_in_box(evaluator, columns, factor, rng.random((count, len(columns)))), number)
+    if not len(settings):
+        raise InputError(evaluator.study.source, f"fewer than 1 in {REJECTIONS} random settings satisfy the constraints, which leaves "
+                         f"no box to test: {evaluator.region}", "characteristics that the constraints do not tie to each other")
+    return settings
+
+
+def refuse_tied(evaluator: Evaluator, columns: Sequence[int]) -> None:
+    """Refuse characteristics that constraints tie so closely that hardly any setting in a box is feasible; raises `InputError`."""
+    _random_settings(evaluator, columns, 1.0, 1, np.random.default_rng(evaluator.study.search.seed))
 
 
 def _unsafe_in_box(evaluator: Evaluator, factor: float, settings: FloatArray, unsafe: Unsafe) -> tuple[FloatArray, int]:
