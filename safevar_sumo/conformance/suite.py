@@ -52,6 +52,8 @@ def check(name: str, study: str | None = None) -> Report:
     """
     start = time.perf_counter()
     if ":" not in name and (name in study_names() or name.endswith(".toml")):
+        if study is not None:
+            raise InputError("study", f"{study!r}: {name!r} is a study itself", "a study to try a model, metric or algorithm in")
         report = Report(subject=name, kind="study")
         for single in check_study(load_study(name)):
             report.findings += single.findings

@@ -250,6 +250,9 @@ class GuardedScenario:
         for name, array in numbers.items():
             if np.isnan(array[is_counted]).any():
                 raise self._guard.wrong_value("encounter", name, float("nan"), "numbers wherever in_conflict is true")
+        least = np.where(is_counted, numbers["separation"], np.inf).min(axis=0)
+        if (is_counted.any(axis=0) & (least == np.inf)).any():
+            raise self._guard.wrong_value("encounter", "separation", float("inf"), "a finite number at some time that in_conflict is true")
         return Encounter(**numbers, in_conflict=in_conflict)
 
 

@@ -73,7 +73,7 @@ class Weather(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
     `road_friction` and `visibility` are factors relative to the dry, clear case [-]; on a `wet` road worn treads lose further friction.
     `recognition_delay` is the additional time that the sensors need to recognise a road user [s], for every ADS; the reaction time
-    of an ADS is one of its parameters. `light` is a label without effect.
+    of an ADS is one of its parameters. `light` decides only whether a rating darkens the weather for its tests by night.
     """
 
     name: str

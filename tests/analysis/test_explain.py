@@ -360,6 +360,9 @@ def test_the_paragraph_says_how_robust_the_changes_that_suffice_are_by_themselve
     paragraph = failures_paragraph(system, original, finding, finding, Preventability(counts={}, collisions=0, later=0))
     assert "a collision at 1.5 m/s, 5 km/h (rs:0:0, robust: 98 % of" in paragraph.lower()
     assert "; two of them suffice (borderline: only 44 % of the neighbours are unsafe too)." in paragraph
+    alike = load_study("sun", vehicle={"characteristics": {name: {"meaning": "x"} for name in ("radius", "mass")}})
+    paragraph = failures_paragraph(assemble(alike), original, finding, finding, Preventability(counts={}, collisions=0, later=0))
+    assert "x -10 %, x +4 %" in paragraph, "two characteristics with one short name"
 
 
 @pytest.mark.parametrize(("weather", "words"), [

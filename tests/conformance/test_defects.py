@@ -15,7 +15,7 @@ from safevar_sumo.plugins import timeout
 from safevar_sumo.study import load_study, study_names
 from safevar_sumo.workers.isolation import check_code
 from safevar_sumo.workers.retrying import RetryingPool
-from tests.in_process import InlinePool, run
+from tests.in_process import InlinePool, refused, run
 
 SCALAR = """import random
 import time
@@ -212,6 +212,10 @@ def test_what_is_shipped_passes(kind: str, name: str) -> None:
     report = check_subject(find_subject(name))
     assert report.kind == kind
     assert report.passed, "\n".join(map(str, report.findings))
+
+
+def test_a_study_is_not_tried_in_another_study() -> None:
+    refused("check", "smoke", "--study", "nope", message=("--study: 'nope': 'smoke' is a study itself",))
 
 
 @pytest.mark.parametrize("name", study_names())

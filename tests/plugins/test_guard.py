@@ -150,6 +150,7 @@ def scenario(method: str, body: str) -> str:
     ("encounter", "result = result._replace(separation=result.separation[0])", "returned separation of shape (3,)"),
     ("encounter", "result = result._replace(in_conflict=result.in_conflict | True, distance=result.distance * np.nan)",
      "returned distance = nan"),
+    ("encounter", "result = result._replace(separation=result.separation + np.inf)", "returned separation = inf"),
     ("encounter", "trace.speed[:] = 0", "read-only"),
 ])
 def test_a_scenario_that_is_wrong(method: str, body: str, expected: str, mine: Mine) -> None:

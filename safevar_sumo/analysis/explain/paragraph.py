@@ -140,8 +140,8 @@ def _speed_in_words(degree: float) -> str:
 
 def _changes_in_words(characteristics: CharacteristicSet, values: Mapping[str, float]) -> str:
     """Short names with changes relative to the original values, the largest change first."""
-    shares = {characteristic.short_name: (values[characteristic.name] - characteristic.original) / abs(characteristic.original)
-              for characteristic in characteristics if characteristic.name in values}
-    largest = sorted(shares, key=lambda name: -abs(shares[name]))
-    parts = [f"{name} {100 * shares[name]:+.0f} %" for name in largest[:MAX_CHANGES_LISTED]]
+    shares = [((values[characteristic.name] - characteristic.original) / abs(characteristic.original), characteristic.short_name)
+              for characteristic in characteristics if characteristic.name in values]
+    largest = sorted(shares, key=lambda share_and_name: -abs(share_and_name[0]))
+    parts = [f"{name} {100 * share:+.0f} %" for share, name in largest[:MAX_CHANGES_LISTED]]
     return ", ".join(parts) + (f" and {len(shares) - MAX_CHANGES_LISTED} more" if len(shares) > MAX_CHANGES_LISTED else "")
