@@ -1,4 +1,3 @@
-from .analysis.evaluator import Progress as Progress
 from .analysis.explain import explain as explain
 from .analysis.explain.result import Cause as Cause
 from .analysis.explain.result import Explained as Explained
@@ -31,6 +30,7 @@ from .errors import SafevarError as SafevarError
 from .errors import SimulationError as SimulationError
 from .metrics import Criterion as Criterion
 from .metrics import Unsafe as Unsafe
+from .progress import Progress as Progress
 from .records import Outcome as Outcome
 from .replay.animation import animate as animate
 from .replay.comparison import Comparison as Comparison

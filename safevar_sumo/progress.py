@@ -1,145 +1,105 @@
-"""Progress of a study: a bar on a terminal, or else a line every half minute."""
+"""Progress of long work: one bar on a terminal, elsewhere a line every half minute; both with the time left."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from datetime import timedelta
+from threading import Event, Thread
 
-import numpy as np
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn
+from rich.progress import BarColumn, MofNCompleteColumn, ProgressColumn, Task, TextColumn
+from rich.progress import Progress as Bar
+from rich.text import Text
 
-from safevar_sumo.campaign import RunKey
-from safevar_sumo.records import Evaluations
-from safevar_sumo.study import Study
-from safevar_sumo.terminal import SECONDS_BETWEEN_LINES, print_text, show_stages
-
-SETTLING_TIME = 5.0
-"""Work before throughput is shown [s]: batches that end together make earlier values meaningless."""
-BAR_WIDTH = 10
-"""Width of the bar [characters]."""
-MIN_TEXT_WIDTH = 26
-"""Narrowest text beside the bar [characters]; if there is less space, the bar is left out."""
+Progress = Callable[[str, int, int], None]
+"""A function that shows progress. Its arguments: the stage, the amount done in it, and its total. A stage begins with nothing done."""
+SECONDS_BETWEEN_LINES = 30.0
+"""Interval of the lines that show progress without a terminal [s]."""
+SETTLING_TIME = 2.0
+"""Work before the time left is shown [s]: batches that end together make earlier estimates meaningless."""
 
 
-class CampaignProgress:
-    """One bar for the whole study on a terminal, or else a line every half minute: throughput, time left, collisions."""
-
-    def __init__(self, console: Console, study: Study, keys: list[RunKey], quiet: bool) -> None:
-        self._console, self._quiet, self._name = console, quiet, study.name
-        has_bar = console.is_terminal and not quiet
-        self._text_width = console.width - len(study.name) - 1
-        bar = [BarColumn(bar_width=BAR_WIDTH)] if self._text_width - BAR_WIDTH - 1 >= MIN_TEXT_WIDTH else []
-        self._text_width -= len(bar) * (BAR_WIDTH + 1)
-        self._bar = Progress(TextColumn("{task.description}", markup=False), *bar, TextColumn("{task.fields[summary]}", markup=False),
-                             console=console, disable=not has_bar)
-        self._tally = _Tally(run_count=len(keys), run_budget=study.search.evaluations)
-        self._task = self._bar.add_task(study.name, total=self._tally.total, summary="waiting")
-        self._last_line = time.monotonic()
-
-    def __enter__(self) -> CampaignProgress:
-        self._bar.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._bar.stop()
-
-    def evaluated(self, key: RunKey, evaluations: Evaluations, simulated: int) -> None:
-        self._tally.add(key, evaluations, simulated)
-        self._show()
-
-    def finished(self, key: RunKey, asked: int) -> None:
-        self._tally.close_run(key, asked)
-        self._show()
-
-    def warned(self, message: str) -> None:
-        print_text(self._console, f"warning: {message}")
-
-    def _show(self) -> None:
-        if self._quiet:
-            return
-        tally = self._tally
-        self._bar.update(self._task, completed=tally.done, total=tally.total, summary=tally.text(self._text_width))
-        now = time.monotonic()
-        if not self._console.is_terminal and now - self._last_line >= SECONDS_BETWEEN_LINES:
-            self._last_line = now
-            print_text(self._console, f"{self._name}: {tally.text()}")
+def show_no_progress(stage: str, done: int, total: int) -> None:
+    """Show no progress."""
 
 
-class _Tally:
-    """Progress of all runs of a study together."""
+class _TimeLeft(ProgressColumn):
+    """The time left in the stage under way, at its mean speed so far."""
 
-    def __init__(self, run_count: int, run_budget: int) -> None:
-        self.done, self.total = 0, run_count * run_budget
-        self._run_budget, self._run_count = run_budget, run_count
-        self._finished_runs = self._timed_simulations = self._timed_evaluations = self._collisions = 0
-        self._lowest_degree = np.inf
-        self._start_time: float | None = None
-        self._last_time = 0.0
-        self._by_run: dict[RunKey, tuple[int, set[bytes]]] = {}  # number of evaluations, and settings that collide
+    def __init__(self) -> None:
+        super().__init__()
+        self._done, self._total, self._start, self._last = 0, 0, 0.0, 0.0
 
-    def add(self, key: RunKey, evaluations: Evaluations, simulated: int) -> None:
-        """Count evaluations of a run; a setting that collides counts once per run, as in `status`."""
-        self._last_time = time.monotonic()
-        if simulated and self._start_time is None:
-            self._start_time = self._last_time  # the first batch does not count, as it includes the start of the workers
-        elif simulated:
-            self._timed_simulations += simulated
-            self._timed_evaluations += len(evaluations)
-        self.done += len(evaluations)
-        evaluation_count, colliding_settings = self._by_run.get(key, (0, set()))
-        previous_count = len(colliding_settings)
-        colliding_settings.update(setting.tobytes() for setting in evaluations.settings[evaluations.collided])
-        self._by_run[key] = evaluation_count + len(evaluations), colliding_settings
-        self._collisions += len(colliding_settings) - previous_count
-        if evaluations.valid.any():
-            self._lowest_degree = min(self._lowest_degree, float(np.min(evaluations.f_safe[evaluations.valid])))
+    def update(self, done: int, total: int) -> None:
+        self._done, self._total, self._last = done, total, time.monotonic()
+        if done == 0:
+            self._start = self._last
 
-    def close_run(self, key: RunKey, asked: int) -> None:
-        """Count a run as finished after `asked` evaluations, which may be fewer than its budget."""
-        evaluation_count, _ = self._by_run.pop(key, (0, set()))
-        self._finished_runs += 1
-        self.done += asked - evaluation_count
-        self.total -= self._run_budget - asked
-
-    def text(self, width: int | None = None) -> str:
-        """The progress as text of at most `width` characters; what matters most comes first."""
-        collisions = [] if np.isinf(self._lowest_degree) else [f"{self._collisions} collisions"]
-        best = [] if np.isinf(self._lowest_degree) else [f"best SD {self._lowest_degree:.2f}"]
-        rate = [f"{self._timed_simulations / self._seconds:.0f}/s"] if self._timed_simulations and self._seconds >= SETTLING_TIME else []
-        text = ""
-        for item in (*rate, self._time_left(), *collisions, f"runs {self._finished_runs}/{self._run_count}", *best):
-            extended_text = f"{text}, {item}" if text else item
-            if width is not None and len(extended_text) > width:
-                break
-            text = extended_text
-        return text
-
-    @property
-    def _seconds(self) -> float:
-        return 0.0 if self._start_time is None else self._last_time - self._start_time
-
-    def _time_left(self) -> str:
-        """Hours, minutes and seconds at the throughput of all runs together, after `SETTLING_TIME`."""
-        if self.done >= self.total:
-            return "0:00:00 left"
-        if not self._timed_evaluations or self._seconds < SETTLING_TIME:
-            return "time left not known yet"
-        return f"{timedelta(seconds=round((self.total - self.done) * self._seconds / self._timed_evaluations))} left"
+    def render(self, task: Task | None = None) -> Text:
+        worked = self._last - self._start
+        if not self._done or worked < SETTLING_TIME:
+            return Text("-:--:-- left")
+        seconds = (self._total - self._done) * worked / self._done - (time.monotonic() - self._last)
+        return Text(f"{timedelta(seconds=max(round(seconds), 0))} left")
 
 
 @contextmanager
-def show_counting_bar(console: Console, label: str, total: int) -> Iterator[Callable[[int], None]]:
-    """Show a bar that counts up to `total`; yields the function that adds to the count."""
-    done = 0
-    with show_stages(console) as report_progress:
-        report_progress(label, done, total)
+def open_progress(progress: bool | Progress, console: Console | None = None) -> Iterator[Progress]:
+    """Yield the function to call: `progress` itself, for True one that moves a bar or prints lines, for False one that does nothing."""
+    if progress is not True:
+        yield progress or show_no_progress
+        return
+    console = console or Console(stderr=True)
+    time_left, ended, line = _TimeLeft(), Event(), "starting"
 
-        def add(count: int) -> None:
-            nonlocal done
-            done += count
-            report_progress(label, done, total)
+    def show(stage: str, done: int, total: int) -> None:
+        nonlocal line
+        line = f"{stage}: {done} of {total}"
+        time_left.update(done, total)
+        bar.update(task, description=stage, completed=done, total=total)
 
-        yield add
+    def print_lines() -> None:
+        while not ended.wait(SECONDS_BETWEEN_LINES) and not console.is_terminal:
+            console.print(f"{line}, {time_left.render()}", soft_wrap=True, markup=False, highlight=False)
+
+    columns = (TextColumn("{task.description}", markup=False), BarColumn(bar_width=None), MofNCompleteColumn(), time_left)
+    lines = Thread(target=print_lines, name="progress", daemon=True)
+    with Bar(*columns, console=console, disable=not console.is_terminal) as bar:
+        task = bar.add_task(line, total=None)
+        lines.start()
+        try:
+            yield show
+        finally:
+            ended.set()
+            lines.join()
+
+
+class PartsProgress:
+    """The progress of several parts as one, so that the time left is that of all parts.
+
+    Parameters
+    ----------
+    progress
+        Shows the progress of all parts.
+    expected
+        The amount that each part is expected to do at most, by the part's name; a part that does less ends early.
+    """
+
+    def __init__(self, progress: Progress, expected: Mapping[str, int]) -> None:
+        self._progress, self._left, self._done = progress, dict(expected), 0
+        progress("starting", 0, sum(expected.values()))
+
+    def begin(self, part: str) -> Progress:
+        """End the previous part and begin another; yields the function that shows the progress of the part's stages."""
+        expected, done_before, done_in_stage = self._left.pop(part), self._done, 0
+
+        def show(stage: str, done: int, total: int) -> None:
+            nonlocal done_in_stage
+            self._done += max(done - done_in_stage, 0)
+            done_in_stage = done
+            part_total = max(expected, self._done - done_before + total - done)
+            self._progress(f"{part}: {stage}", self._done, done_before + part_total + sum(self._left.values()))
+
+        return show

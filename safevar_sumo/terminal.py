@@ -1,15 +1,12 @@
-"""Text on the terminal: users' text without markup and control characters, tables in which nothing is cut off, progress bars."""
+"""Text on the terminal: users' text without markup and control characters, and tables in which nothing is cut off."""
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterable
 from typing import Any
 
 from rich.console import Console, ConsoleOptions, RenderableType, RenderResult
 from rich.measure import Measurement
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 from rich.text import Text
 
@@ -88,39 +85,3 @@ def print_names(console: Console, title: str, rows: Iterable[tuple[str, ...]], h
     for row in rows:
         table.add_row(*row)
     console.print(table)
-
-
-SECONDS_BETWEEN_LINES = 30.0
-"""Interval of the lines that show progress without a terminal [s]."""
-StageProgress = Callable[[str, int, int], None]
-"""Called with the stage, the amount done, and the total amount."""
-
-
-@contextmanager
-def show_stages(console: Console) -> Iterator[StageProgress]:
-    """Show a bar on a terminal, or else a line every half minute; yields the function that moves it."""
-    columns = (TextColumn("{task.description}", markup=False), BarColumn(bar_width=20), MofNCompleteColumn(), TimeRemainingColumn())
-    last_line = time.monotonic()
-    with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
-        task = bar.add_task("starting", total=None)
-
-        def report_progress(stage: str, done: int, total: int) -> None:
-            nonlocal last_line
-            if done == 0:
-                bar.reset(task, description=stage, total=total)
-            bar.update(task, description=stage, completed=done)
-            if not console.is_terminal and time.monotonic() - last_line >= SECONDS_BETWEEN_LINES:
-                last_line = time.monotonic()
-                print_text(console, f"{stage}: {done} of {total}")
-
-        yield report_progress
-
-
-@contextmanager
-def open_progress(progress: bool | StageProgress) -> Iterator[StageProgress]:
-    """Yield the function to call with progress: for True it moves a bar, for False it does nothing, else it is `progress` itself."""
-    if progress is True:
-        with show_stages(Console(stderr=True)) as report_progress:
-            yield report_progress
-    else:
-        yield progress or (lambda stage, done, total: None)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cached_property
 
@@ -13,6 +13,7 @@ import numpy as np
 from safevar_sumo.analysis.research_questions.case import Case
 from safevar_sumo.errors import InputError, SimulationError
 from safevar_sumo.metrics import METRICS, RATING_POINTS, Unsafe
+from safevar_sumo.progress import Progress, show_no_progress
 from safevar_sumo.protocol import cells_of_part
 from safevar_sumo.protocol.rater import is_rated, rater_of
 from safevar_sumo.records import CellResults, Evaluations, FloatArray, Outcome
@@ -31,16 +32,8 @@ CONFIDENCE = 0.95
 """Confidence level of the intervals of shares, unless an option sets another level."""
 CRITERION_SETTINGS = 1024
 """Number of settings over the whole domain that decide the default criterion: a collision if any setting collides, else a safety degree."""
-Progress = Callable[[str, int, int], None]
-"""A function that shows progress. Its arguments: the stage, the number of settings done in this stage, and the stage's total number."""
-
-
 MAX_REJECTIONS = 64
 """If fewer than 1 in this many Sobol points is feasible, mixtures of the feasible region's vertices replace the points."""
-
-
-def show_no_progress(stage: str, done: int, total: int) -> None:
-    """Show no progress."""
 
 
 class Evaluator:

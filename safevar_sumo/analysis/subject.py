@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from safevar_sumo.analysis.options import Options
 from safevar_sumo.errors import InputError, did_you_mean, one_of, warn
+from safevar_sumo.progress import open_progress
 from safevar_sumo.results import MANIFEST, differences_now, make_inputs_comparable, manifest_of, read_late_files, read_manifest
 from safevar_sumo.study import Study, StudyLike, load_study, study_names
-from safevar_sumo.terminal import open_progress
 
 if TYPE_CHECKING:
     import pandas as pd

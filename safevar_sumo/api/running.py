@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from contextlib import AbstractContextManager, nullcontext
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from rich.console import Console
+import numpy as np
 
 from safevar_sumo.analysis.subject import Results, load
 from safevar_sumo.analysis.words import number_of
 from safevar_sumo.api.simulation import load_and_assemble
 from safevar_sumo.campaign import Campaign, Observer, RunKey, algorithm_of, all_runs, files_read_by_algorithms, run_campaign
 from safevar_sumo.errors import InputError, SafevarError, one_of, warn
-from safevar_sumo.progress import CampaignProgress
+from safevar_sumo.progress import Progress, open_progress
 from safevar_sumo.records import Evaluations
 from safevar_sumo.results import MANIFEST, ResultsDirectory, read_manifest
 from safevar_sumo.results.files import stored_runs
@@ -29,9 +29,6 @@ from safevar_sumo.workers.local import available_cores, local_pool
 
 ENGINE_NAMES = {Engine.RECORDED: "recorded", Engine.LIBSUMO: "sumo"}
 """Names of the engines in commands and manifests."""
-if TYPE_CHECKING:
-    from safevar_sumo.analysis.evaluator import Progress
-
 
 def run(study: StudyLike, out: str | Path | None = None, *, jobs: int | None = None, cluster: str | None = None,
         pool: Pool | None = None, progress: bool | Progress | Observer = False, only: Sequence[tuple[str, int]] | None = None,
@@ -51,8 +48,8 @@ def run(study: StudyLike, out: str | Path | None = None, *, jobs: int | None = N
     pool
         Pool that simulates, in place of new worker processes or a cluster.
     progress
-        True for a bar on the terminal; a function called with the study's name, the number of evaluations done, and their maximum
-        number; or an `Observer`.
+        True for a bar on the terminal; a function called with the study's name and what it has found, the number of evaluations done, and
+        the number to do at most; or an `Observer`.
     only
         The only runs to carry out, as (algorithm, number from 0); the results are complete once every run is finished.
     batch
@@ -74,7 +71,7 @@ def run(study: StudyLike, out: str | Path | None = None, *, jobs: int | None = N
     keys = all_runs(loaded_study) if only is None else [RunKey(*key) for key in only]
     directory = Path(out) if out is not None else Path("results") / loaded_study.name
     pool_context = nullcontext(pool) if pool is not None else open_pool(loaded_study, jobs, cluster)
-    with pool_context as workers, _choose_observer(progress, loaded_study, keys) as observer:
+    with pool_context as workers, open_observer(progress, loaded_study, keys) as observer:
         carry_out_runs(loaded_study, system, keys, directory, workers, observer, batch, engine, retry_failed=retry_failed)
     return load(directory)
 
@@ -150,38 +147,46 @@ def open_pool(study: Study, jobs: int | None = None, cluster: str | None = None)
     return cluster_pool(cluster, limit) if cluster is not None else local_pool(jobs or available_cores(), limit)
 
 
-def _choose_observer(progress: bool | Progress | Observer, study: Study, keys: list[RunKey]) -> AbstractContextManager[Observer]:
-    """Choose the observer for a value of `progress`."""
-    if progress is True:
-        return CampaignProgress(Console(stderr=True), study, keys, quiet=False)
-    if progress is False:
-        return nullcontext(NullObserver())
-    return nullcontext(CallbackObserver(progress, study, keys) if callable(progress) else progress)
+@contextmanager
+def open_observer(progress: bool | Progress | Observer, study: Study, keys: Sequence[RunKey],
+                  show_warning: Callable[[str], None] = warn) -> Iterator[Observer]:
+    """Yield the observer for a value of `progress`."""
+    if not (isinstance(progress, bool) or callable(progress)):
+        yield progress
+        return
+    with open_progress(progress) as show_progress:
+        yield CampaignProgress(show_progress, study, keys, show_warning)
 
 
-class NullObserver:
-    """Shows no progress; passes warnings to Python's `warnings`."""
+class CampaignProgress:
+    """Passes on the progress of a campaign: evaluations, without those of journals, of all that are left; and what runs have found."""
+
+    def __init__(self, progress: Progress, study: Study, keys: Sequence[RunKey], show_warning: Callable[[str], None] = warn) -> None:
+        self.warned, self._progress, self._study, self._run_count = show_warning, progress, study, len(keys)
+        self._done, self._total = 0, len(keys) * study.search.evaluations
+        self._counts, self._colliding_settings = Counter[RunKey](), dict[RunKey, set[bytes]]()
+        self._finished_runs, self._lowest_degree = 0, np.inf
+        self._show()
 
     def evaluated(self, key: RunKey, evaluations: Evaluations, simulated: int) -> None:
-        """Take note that a population was evaluated."""
+        """Take note that a population was evaluated; what a journal holds is not left to be done."""
+        self._counts[key] += len(evaluations)
+        if simulated:
+            self._done += len(evaluations)
+        else:
+            self._total -= len(evaluations)
+        collisions = self._colliding_settings.setdefault(key, set())
+        collisions.update(setting.tobytes() for setting in evaluations.settings[evaluations.collided])
+        self._lowest_degree = min(self._lowest_degree, float(np.min(evaluations.f_safe[evaluations.valid], initial=np.inf)))
+        self._show()
 
     def finished(self, key: RunKey, asked: int) -> None:
-        """Take note that a run is finished."""
+        """Take note that a run is finished, which may have taken fewer evaluations than it was allowed."""
+        self._finished_runs += 1
+        self._total -= self._study.search.evaluations - self._counts[key]
+        self._show()
 
-    def warned(self, message: str) -> None:
-        """Pass on a warning of the campaign."""
-        warn(message)
-
-
-class CallbackObserver(NullObserver):
-    """Calls a function with the study's name, the number of evaluations done, and their maximum number."""
-
-    def __init__(self, progress: Progress, study: Study, keys: list[RunKey]) -> None:
-        self._progress, self._name = progress, study.name
-        self._done, self._total = 0, len(keys) * study.search.evaluations
-        progress(self._name, 0, self._total)
-
-    def evaluated(self, key: RunKey, evaluations: Evaluations, simulated: int) -> None:
-        """Take note that a population was evaluated."""
-        self._done += len(evaluations)
-        self._progress(self._name, self._done, self._total)
+    def _show(self) -> None:
+        collisions = sum(map(len, self._colliding_settings.values()))
+        found = "" if np.isinf(self._lowest_degree) else f", {collisions} collisions, best SD {self._lowest_degree:.2f}"
+        self._progress(f"{self._study.name}: runs {self._finished_runs}/{self._run_count}{found}", self._done, self._total)

@@ -16,6 +16,7 @@ from safevar_sumo.analysis.words import OUTCOME_VERBS
 from safevar_sumo.errors import InputError, unknown_name
 from safevar_sumo.metrics import Scoring, time_to_collision
 from safevar_sumo.plugins import limit_user_code
+from safevar_sumo.progress import Progress, open_progress, show_no_progress
 from safevar_sumo.records import STANDSTILL, TIME_DECIMALS, Evaluations, FloatArray, Observation, Outcome, SimulationRuns
 from safevar_sumo.results import evaluations_frame, record
 from safevar_sumo.study import SAFETY_DEGREE, Study, StudyLike, load_study
@@ -24,13 +25,12 @@ from safevar_sumo.sumo.empty_road import driven_entry, why_no_verdict
 from safevar_sumo.sumo.engine import Engine
 from safevar_sumo.sumo.matrix import system_at_worst_point
 from safevar_sumo.sumo.system import System, assemble
-from safevar_sumo.terminal import open_progress
 from safevar_sumo.vehicles import CharacteristicSet
 
 if TYPE_CHECKING:
     import pandas as pd
 
-    from safevar_sumo.analysis.evaluator import Progress
+    from safevar_sumo.progress import Progress
     from safevar_sumo.workers.evaluation import Pool
 
 
@@ -288,11 +288,11 @@ def evaluate(study: StudyLike, settings: pd.DataFrame | Sequence[Mapping[str, fl
 
 
 def evaluate_settings(study: Study, settings: FloatArray, pool: Pool | None = None, jobs: int | None = None,
-                      progress: Progress | None = None) -> Evaluations:
+                      progress: Progress = show_no_progress) -> Evaluations:
     """Simulate settings, shape (M, n), in worker processes, including settings that violate the study's constraints."""
-    from safevar_sumo.analysis.evaluator import open_evaluator, show_no_progress
+    from safevar_sumo.analysis.evaluator import open_evaluator
 
-    with open_evaluator(study, pool, jobs, progress or show_no_progress) as evaluator:
+    with open_evaluator(study, pool, jobs, progress) as evaluator:
         return evaluator.evaluate(settings, "settings", ignore_constraints=True)
 
 

@@ -18,12 +18,13 @@ from safevar_sumo.cli.target import jobs_option
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.output import check_writable
+from safevar_sumo.progress import open_progress
 from safevar_sumo.reference import Calibration, FitSubject, calibrate, calibrate_together
 from safevar_sumo.reference.fit_result import rename_fitted
 from safevar_sumo.reference.profiles import plot_profiles
 from safevar_sumo.study import FITTED_TABLES, Study, load_study, study_names, write_study
 from safevar_sumo.sumo.system import assemble
-from safevar_sumo.terminal import WholeTable, print_text, show_stages
+from safevar_sumo.terminal import WholeTable, print_text
 from safevar_sumo.workers.identity import input_files
 from safevar_sumo.workers.interrupts import terminate_as_interrupt
 from safevar_sumo.workers.local import available_cores, local_pool
@@ -87,7 +88,7 @@ def calibrate_command(study: str, words: tuple[str, ...], trials: int | None, se
 
     try:
         with (local_pool(jobs or available_cores(), max(item.search.time_limit for item in studies)) as pool, terminate_as_interrupt(),
-              show_stages(Console(stderr=True)) as show_progress):
+              open_progress(True) as show_progress):
             show_progress("trials", 0, max_trials)
             if len(studies) == 1:
                 calibrations = [calibrate(studies[0], data[0], pool, after_trial, from_scratch=from_scratch)]

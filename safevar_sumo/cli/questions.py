@@ -29,8 +29,8 @@ from safevar_sumo.cli.target import (
     point_option,
 )
 from safevar_sumo.errors import InputError
+from safevar_sumo.progress import open_progress
 from safevar_sumo.results import make_directory, write_whole
-from safevar_sumo.terminal import show_stages
 
 
 def add_question(options: type[Options], metavar: str, *further_decorators: Callable[[CommandFunction], CommandFunction]
@@ -49,7 +49,7 @@ def add_question(options: type[Options], metavar: str, *further_decorators: Call
 
 def _compute_with_bar(compute: Callable[..., Any], subject: Any, options: Options, jobs: int | None) -> Any:
     """Compute a result; a bar on the terminal shows the progress."""
-    with show_stages(Console(stderr=True)) as progress:
+    with open_progress(True) as progress:
         return compute(subject, options, jobs=jobs, progress=progress)
 
 

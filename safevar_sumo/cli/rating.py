@@ -14,8 +14,8 @@ from safevar_sumo.cli.arguments import PICTURE_ENDINGS, check_output, read_chang
 from safevar_sumo.cli.program import commands
 from safevar_sumo.cli.target import add_flags, as_it_is_now_option, jobs_option, json_option, load_results_or_study
 from safevar_sumo.errors import InputError
+from safevar_sumo.progress import open_progress
 from safevar_sumo.study import Study
-from safevar_sumo.terminal import show_stages
 from safevar_sumo.vehicles import CharacteristicSet
 
 SPREADSHEET_ENDINGS = (".xlsx",)
@@ -52,7 +52,7 @@ def rating(source: str, changes: tuple[str, ...], solution: str | None, matrix: 
         check_output(plot, "--plot", PICTURE_ENDINGS)
         _refuse_existing(plot, "--plot", force)
     spreadsheet = _open_spreadsheet(xlsx, template, preprocessed, force)
-    with show_stages(Console(stderr=True)) as progress:
+    with open_progress(True) as progress:
         result = rate_variant(subject, options, jobs=jobs, progress=progress)
     for remark in remarks(result):
         click.echo(f"note: {remark}", err=True)

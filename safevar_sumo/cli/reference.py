@@ -12,13 +12,14 @@ from rich.console import Console
 
 from safevar_sumo.analysis.research_questions.case import Case, load_cases
 from safevar_sumo.analysis.words import two_decimals
+from safevar_sumo.api.simulation import evaluate_settings
 from safevar_sumo.cli.arguments import PICTURE_ENDINGS, check_output, complete_study, refuse_overwriting
 from safevar_sumo.cli.program import commands, print_remarks
 from safevar_sumo.cli.target import jobs_option, json_option
 from safevar_sumo.errors import InputError, SimulationError
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.output import check_writable
-from safevar_sumo.progress import show_counting_bar
+from safevar_sumo.progress import open_progress
 from safevar_sumo.records import Evaluations
 from safevar_sumo.reference import (
     Agreement,
@@ -41,8 +42,6 @@ from safevar_sumo.study import SAFETY_DEGREE, Study, load_study
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.terminal import WholeTable
 from safevar_sumo.vehicles import CharacteristicSet
-from safevar_sumo.workers.batches import evaluate_all
-from safevar_sumo.workers.local import available_cores, local_pool
 
 
 @commands.command()
@@ -67,9 +66,8 @@ def validate(study: str, reference: Path, jobs: int | None, plot: Path | None, a
         check_output(totals, "--totals", (".toml",))
     data = read_rows(reference, system.characteristics)
     settings = np.concatenate([system.characteristics.original[np.newaxis], data.settings])
-    with (local_pool(jobs or available_cores(), loaded_study.search.time_limit) as pool,
-          show_counting_bar(Console(stderr=True), "settings", len(np.unique(settings, axis=0))) as count_settings):
-        evaluations = evaluate_all(loaded_study, settings, pool, count_settings)
+    with open_progress(True) as progress:
+        evaluations = evaluate_settings(loaded_study, settings, jobs=jobs, progress=progress)
     data, simulated = _simulated_rows(reference, data, evaluations.take(np.arange(1, len(settings))))
     if not evaluations.valid[0]:
         raise SimulationError(f"study {study!r} cannot be simulated with the original vehicle")

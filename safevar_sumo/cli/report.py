@@ -7,7 +7,6 @@ from functools import partial
 from pathlib import Path
 
 import click
-from rich.console import Console
 
 from safevar_sumo.analysis.research_questions.answer import QUESTIONS, answer_questions
 from safevar_sumo.analysis.research_questions.case import load_cases
@@ -83,12 +82,12 @@ def _print_notes(notes: list[str]) -> None:
 @jobs_option
 def report(directories: tuple[str, ...], out: Path, only: str | None, point: str | None, jobs: int | None) -> None:
     """Write one self-contained page about the results directories DIR...: verdict, causes, replays, tables, figures."""
+    from safevar_sumo.progress import open_progress
     from safevar_sumo.report import make_report
-    from safevar_sumo.terminal import show_stages
 
     check_output(out, "--out", (".html", ".htm"))
     sections = [name.strip() for name in only.split(",")] if only is not None else []
-    with show_stages(Console(stderr=True)) as progress, warnings.catch_warnings(record=True) as caught:
+    with open_progress(True) as progress, warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", UserWarning)
         page = make_report(directories, sections, jobs, progress, point=point, as_it_is_now=as_it_is_now())
     for warning in caught:

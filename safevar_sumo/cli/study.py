@@ -19,13 +19,13 @@ from rich.text import Text
 
 from safevar_sumo.analysis.research_questions.indicators import nondominated_points
 from safevar_sumo.analysis.words import change_texts
-from safevar_sumo.api.running import ENGINE_NAMES, carry_out_runs, choose_engine, load_for_search, open_pool
+from safevar_sumo.api.running import ENGINE_NAMES, carry_out_runs, choose_engine, load_for_search, open_observer, open_pool
 from safevar_sumo.campaign import Campaign, Forecast, RunKey, all_runs, forecast
 from safevar_sumo.cli.arguments import NumberRange, complete_study
 from safevar_sumo.cli.program import commands, print_remarks
 from safevar_sumo.cli.target import jobs_option
 from safevar_sumo.errors import InputError
-from safevar_sumo.progress import CampaignProgress
+from safevar_sumo.progress import open_progress
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.results import RunStatus, Status, failure_lines, record, solutions_frame
 from safevar_sumo.shipped import PROGRAM_COMMAND
@@ -74,8 +74,8 @@ def study(study: str, batch: int | None, engine: str, out: Path | None, jobs: in
             print_forecast(Console(), loaded_study, len(keys), cost, f"{ENGINE_NAMES[used_engine]}: {reason}")
             return
         try:
-            with CampaignProgress(Console(stderr=True), loaded_study, keys, quiet) as progress:
-                campaign = carry_out_runs(loaded_study, system, keys, directory, pool, progress, batch, engine, retry_failed=retry_failed)
+            with open_observer(not quiet, loaded_study, keys, lambda message: click.echo(f"warning: {message}", err=True)) as observer:
+                campaign = carry_out_runs(loaded_study, system, keys, directory, pool, observer, batch, engine, retry_failed=retry_failed)
         except KeyboardInterrupt:
             click.echo(f"finished evaluations are kept in {directory}: run the same command again to continue", err=True)
             raise
@@ -172,7 +172,9 @@ def print_summary(console: Console, study: Study, campaign: Campaign, directory:
     if campaign.no_verdict:
         print_text(console, campaign.no_verdict)
     if len(solutions):
-        for line in summarise_failures(study, solutions, campaign.original, pool, str(directory)):
+        with open_progress(True) as progress:
+            lines = summarise_failures(study, solutions, campaign.original, pool, str(directory), progress)
+        for line in lines:
             print_text(console, line)
     evaluations_by_vehicle = {"original vehicle": campaign.original}
     for algorithm in study.search.labels:

@@ -9,7 +9,6 @@ import msgspec
 import numpy as np
 from markupsafe import Markup
 
-from safevar_sumo.analysis.evaluator import Progress
 from safevar_sumo.analysis.explain.compute import explain_failures
 from safevar_sumo.analysis.explain.result import CauseEntry, FailureEntry, SummaryEntry, most_robust
 from safevar_sumo.analysis.explain.robustness import robustness_in_words
@@ -17,6 +16,7 @@ from safevar_sumo.analysis.opinion.compute import CauseToJudge, assemble_both_sy
 from safevar_sumo.analysis.research_questions.indicators import nondominated_points
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import PUBLISHED_SCORING
+from safevar_sumo.progress import Progress
 from safevar_sumo.replay.comparison import list_differences, quantity_text, superscript_powers
 from safevar_sumo.report.input import ChangeRow, FailingPointsTable, ReportInput, load_or_compute
 from safevar_sumo.report.svg import Bar, draw_bars
@@ -25,6 +25,8 @@ MAX_CAUSES = 6
 """Maximum number of minimal causes in a report."""
 MAX_REPLAYS = 10
 """Maximum number of solutions with a replay in a report, unless there are more explained failures."""
+SIMULATIONS_PER_REPLAY = 500
+"""Number of simulations that take as long as a replay."""
 FIRST_CHOICES = ("fewest", "smallest", "most_severe")
 """Choices that select the first solutions on the page, as the flags of `simulate` do."""
 OBJECTIVES = [objective.name for objective in PUBLISHED_SCORING.objectives]
@@ -187,12 +189,13 @@ def _make_cause_section(data: ReportInput, rank: int, cause: CauseEntry, failure
         cause_robustness="" if cause.robustness is None else robustness_in_words(cause.robustness))
 
 
-def replay_solutions(data: ReportInput, explanations: Explanations | None) -> list[ReplayedSolution]:
+def replay_solutions(data: ReportInput, explanations: Explanations | None, progress: Progress) -> list[ReplayedSolution]:
     """Replay solutions: `FIRST_CHOICES`, explained solutions, and non-dominated unsafe solutions."""
     entries, handles = [], _select_handles(data, explanations.failures if explanations else [])
     if data.system is not None and handles:
         data.simulate_again([data.setting_of(handle) for handle in handles])
     for index, handle in enumerate(handles):
+        progress("replays", index * SIMULATIONS_PER_REPLAY, len(handles) * SIMULATIONS_PER_REPLAY)
         row, setting = data.solutions[handle], data.setting_of(handle)
         entry = ReplayedSolution(handle, data.anchor("replay", handle), row["outcome"], row["f_safe"], row["f_diff"],
                                  row["f_num_diff"], data.list_changes(setting),

@@ -7,12 +7,12 @@ from typing import Any
 
 from markupsafe import Markup
 
-from safevar_sumo.analysis.evaluator import Progress
 from safevar_sumo.analysis.risk.compute import FLEET_VEHICLES, estimate_risk
 from safevar_sumo.analysis.rules.compute import RULES_NOTE, find_rules, rule_in_words
 from safevar_sumo.analysis.tolerance.compute import find_tolerances
 from safevar_sumo.analysis.words import number_of
 from safevar_sumo.metrics import Unsafe
+from safevar_sumo.progress import Progress
 from safevar_sumo.replay.comparison import format_number, quantity_text, superscript_powers
 from safevar_sumo.report.input import ReportInput, load_or_compute
 from safevar_sumo.report.svg import Bar, draw_bars

@@ -19,6 +19,7 @@ from safevar_sumo.analysis.opinion import OpinionOptions
 from safevar_sumo.analysis.options import Options
 from safevar_sumo.analysis.research_questions.case import Case, load_cases
 from safevar_sumo.analysis.risk import RiskOptions
+from safevar_sumo.analysis.risk.sensitivity import BASE_POINTS
 from safevar_sumo.analysis.rules import RulesOptions
 from safevar_sumo.analysis.subject import at_point, changes_since
 from safevar_sumo.analysis.tolerance import ToleranceOptions
@@ -178,6 +179,13 @@ class ReportInput:
     def no_verdict(self) -> str:
         """Why simulations tell nothing about the ADS, in a sentence; "" if they do, or if the study cannot be simulated."""
         return "" if self.system is None else why_no_verdict(self.system)
+
+    @property
+    def simulation_counts(self) -> dict[str, int]:
+        """About how many simulations each section takes, at most."""
+        n = len(self.case.characteristics)
+        return {"causes": EXPLAIN_SIMULATIONS, "tolerance": 200 * n + 6000, "risk": SAMPLED_VEHICLES + (n + 2) * BASE_POINTS,
+                "rules": SAMPLED_VEHICLES}
 
     @property
     def original_fails(self) -> bool:

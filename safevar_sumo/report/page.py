@@ -17,16 +17,17 @@ import msgspec
 import numpy as np
 from markupsafe import Markup
 
-from safevar_sumo.analysis.evaluator import Progress, show_no_progress
 from safevar_sumo.analysis.research_questions.answer import answer_questions
 from safevar_sumo.analysis.research_questions.case import Case, UnanswerableError
 from safevar_sumo.analysis.research_questions.gallery import draw_figures
 from safevar_sumo.analysis.research_questions.layout import BoldText, Table, lay_out
 from safevar_sumo.errors import InputError, did_you_mean, warn
+from safevar_sumo.progress import PartsProgress, Progress, show_no_progress
 from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.replay.comparison import superscript_powers
 from safevar_sumo.replay.page import player_files, template_environment
 from safevar_sumo.report.causes import (
+    ReplayedSolution,
     draw_necessity,
     evenly_spaced_indices,
     explain_main_failures,
@@ -195,9 +196,11 @@ def make_report(directories: Iterable[str | Path], only: Sequence[str] = (), job
             title=f"Euro NCAP rating: {', '.join(data.case.name for data in inputs)}", css=_web_file("report.css"),
             studies=[rated_study_data(data, jobs, progress) for data in inputs]) + "\n"
     cases = [data.case for data in inputs] if "questions" in sections else []
+    parts = PartsProgress(progress, {f"{data.directory}: {name}": number for data in inputs
+                                     for name, number in data.simulation_counts.items() if name in sections})
     with ThreadPoolExecutor(1) as drawing_thread:  # meanwhile this process only waits for workers, and nothing else in it draws
         questions = drawing_thread.submit(lambda: (list_tables(cases), embed_figures(cases)) if cases else ([], []))
-        studies = [_study_data(data, sections, jobs, progress) for data in inputs]
+        studies = [_study_data(data, sections, jobs, parts) for data in inputs]
         progress("tables and figures", 0, 1)
         answers, pictures = questions.result()
     page = template_environment(TEMPLATE_FOLDER).get_template("report.html.j2").render(
@@ -210,16 +213,15 @@ def make_report(directories: Iterable[str | Path], only: Sequence[str] = (), job
     return page + "\n"
 
 
-def _study_data(data: ReportInput, sections: Sequence[str], jobs: int | None, show_progress: Progress) -> Mapping[str, Any]:
+def _study_data(data: ReportInput, sections: Sequence[str], jobs: int | None, parts: PartsProgress) -> Mapping[str, Any]:
     """Make the data of one study that the templates of these sections need."""
-    def progress(stage: str, done: int, total: int) -> None:
-        show_progress(f"{data.case.name}: {stage}", done, total)
-
-    explanations = explain_main_failures(data, jobs, progress) if "causes" in sections and data.system is not None else None
-    domain_sections = {name: make(data, jobs, progress) for name, make in DOMAIN_SECTIONS.items()
+    explanations, solutions = None, list[ReplayedSolution]()
+    if "causes" in sections:
+        progress = parts.begin(f"{data.directory}: causes")
+        explanations = None if data.system is None else explain_main_failures(data, jobs, progress)
+        solutions = replay_solutions(data, explanations, progress)
+    domain_sections = {name: make(data, jobs, parts.begin(f"{data.directory}: {name}")) for name, make in DOMAIN_SECTIONS.items()
                        if name in sections and data.system is not None}
-    progress("replays", 0, 1)
-    solutions = replay_solutions(data, explanations) if "causes" in sections else []
     makers: dict[str, Callable[[], Any]] = {
         "tested": lambda: describe_tested_system(data),
         "verdict": lambda: reach_verdict(data, explanations, domain_sections.get("tolerance")),

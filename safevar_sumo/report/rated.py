@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 
-from safevar_sumo.analysis.evaluator import Progress
 from safevar_sumo.analysis.rating import RatingOptions
 from safevar_sumo.analysis.rating.compute import Rating, rate, remarks
 from safevar_sumo.analysis.rating.render import (
@@ -21,6 +20,7 @@ from safevar_sumo.analysis.rating.render import (
     test_in_words,
 )
 from safevar_sumo.analysis.words import question_command
+from safevar_sumo.progress import Progress
 from safevar_sumo.report.input import ReportInput
 from safevar_sumo.results import choose_handle, row_of_handle
 from safevar_sumo.vehicles import CharacteristicSet

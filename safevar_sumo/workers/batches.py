@@ -25,8 +25,8 @@ from safevar_sumo.workers.sumo_check import refuse_unlike_sumo
 
 BATCHES_PER_CALL_AND_WORKER = 4
 """Number of batches per worker: with several small batches, no worker waits long for another."""
-MIN_BATCH = 100
-"""Minimum number of settings of a batch: a smaller batch takes as long."""
+SMALLEST_BATCH = 1 / 20
+"""Smallest batch, as a share of the most economical one: a smaller batch takes as long."""
 VERIFIED_SETTINGS = 50
 """Number of settings to verify in SUMO: of a study, over all calls of `evaluate_all`; and of each run of a campaign."""
 _batch_sizes: dict[bytes, tuple[int, bool]] = {}
@@ -56,7 +56,7 @@ def evaluate_all(study: Study, settings: FloatArray, pool: Pool, done: Callable[
     if work not in _batch_sizes:
         _batch_sizes[work] = choose_batch_size(study)
     best_size, is_recorded = _batch_sizes[work]
-    size = min(best_size, max(math.ceil(len(distinct_settings) / (BATCHES_PER_CALL_AND_WORKER * pool.workers)), MIN_BATCH))
+    size = min(best_size, math.ceil(max(len(distinct_settings) / (BATCHES_PER_CALL_AND_WORKER * pool.workers), SMALLEST_BATCH * best_size)))
     starts = range(0, len(distinct_settings), size)
     futures = {retrying_pool.submit(work, distinct_settings[start:start + size]): start for start in starts}
     sample_size = min(VERIFIED_SETTINGS - _verified_counts.get(work, 0), len(distinct_settings))

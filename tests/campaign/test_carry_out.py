@@ -4,21 +4,19 @@ from __future__ import annotations
 
 from concurrent.futures import Future
 from dataclasses import replace
-from io import StringIO
 from pathlib import Path
 
 import msgspec
 import numpy as np
 import pandas as pd
 import pytest
-from rich.console import Console
 
+from safevar_sumo.api.running import CampaignProgress
 from safevar_sumo.campaign import RunKey, all_runs, forecast, run_campaign
 from safevar_sumo.campaign.batcher import BATCHES_PER_WORKER
 from safevar_sumo.campaign.run import Run
 from safevar_sumo.errors import SimulationError
 from safevar_sumo.metrics import METRICS
-from safevar_sumo.progress import CampaignProgress
 from safevar_sumo.records import Evaluations
 from safevar_sumo.results import Journal, ResultsDirectory, load_runs, status
 from safevar_sumo.results.journal import read_journal
@@ -40,16 +38,18 @@ def test_results_depend_neither_on_workers_nor_on_order_nor_on_batches(study: St
 
 def test_bar_status_and_campaign_count_the_same_collisions(study: Study, tmp_path: Path) -> None:
     """Different settings of each run; the bar also when it goes on from finished journals."""
-    for _ in range(2):
-        console, results = Console(file=StringIO(), width=200, force_terminal=True, _environ={}), ResultsDirectory(tmp_path, study)
-        with CampaignProgress(console, study, all_runs(study), quiet=False) as progress:
-            campaign = run_campaign(study, all_runs(study), results, FormulaPool(), progress)
+    for again in (False, True):
+        shows, results = list[tuple[str, int, int]](), ResultsDirectory(tmp_path, study)
+        progress = CampaignProgress(lambda *values, shows=shows: shows.append(values), study, all_runs(study))
+        campaign = run_campaign(study, all_runs(study), results, FormulaPool(), progress)
         results.finish(campaign.solutions)
         evaluations = load_runs(tmp_path).evaluations
         expected = len(evaluations[evaluations["outcome"] == "collision"].drop_duplicates(["algorithm", "run", *SUN.names]))
         assert expected > 0
         assert sum(campaign.collisions.values()) == sum(run.collisions for run in status(tmp_path).runs) == expected
-        assert f" {expected} collisions" in console.file.getvalue()  # type: ignore[attr-defined]
+        stage, done, total = shows[-1]
+        assert f" {expected} collisions" in stage
+        assert done == total == (0 if again else study.search.evaluations * len(all_runs(study)))
 
 
 class Sizes(FormulaPool):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import time
 from io import StringIO
 
 import msgspec
@@ -10,11 +11,15 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from safevar_sumo import progress
+from safevar_sumo.analysis.evaluator import Evaluator
+from safevar_sumo.api.running import CampaignProgress
 from safevar_sumo.campaign import RunKey, all_runs
 from safevar_sumo.metrics import METRICS
-from safevar_sumo.progress import CampaignProgress
+from safevar_sumo.progress import PartsProgress, open_progress
 from safevar_sumo.records import Evaluations
 from safevar_sumo.study import Study, load_study
+from tests.in_process import InlinePool
 
 
 @pytest.fixture
@@ -39,48 +44,72 @@ def evaluations_of(number: int, first: int = 0) -> Evaluations:
                        metrics=dict.fromkeys(METRICS, values), f_diff=values, f_num_diff=values)
 
 
-def shown(study: Study, clock: list[float], *, terminal_width: int | None, quiet: bool = False) -> str:
-    """What is printed by 500 evaluations, one hundred every ten seconds, of two algorithms in turn, and then a run that ends."""
+def shown(study: Study, clock: list[float], width: int) -> list[str]:
+    """What a terminal shows of 500 evaluations, one hundred every ten seconds, of two algorithms in turn, and then a run that ends."""
     out = StringIO()
-    console = Console(file=out, force_terminal=terminal_width is not None, width=terminal_width or 80, _environ={})
-    with CampaignProgress(console, study, all_runs(study), quiet) as progress:
+    console = Console(file=out, force_terminal=True, width=width, _environ={})
+    with open_progress(True, console) as show:
+        observer = CampaignProgress(show, study, all_runs(study))
         for i in range(5):
-            progress.evaluated(RunKey(("nsga2", "rs")[i % 2], 0), evaluations_of(100, 100 * i), 100)
             clock[0] += 10
-        progress.finished(RunKey("nsga2", 0), 300)
-    return out.getvalue()
+            observer.evaluated(RunKey(("nsga2", "rs")[i % 2], 0), evaluations_of(100, 100 * i), 100)
+        observer.finished(RunKey("nsga2", 0), 300)
+    return [re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", line).rstrip() for line in out.getvalue().splitlines()]
 
 
-def test_elsewhere_a_line_for_the_whole_study_every_30_seconds(study: Study, clock: list[float]) -> None:
-    """6 runs of 1000 evaluations, 400 done, 10 a second: 5600 more take 560 s, whichever algorithms they belong to."""
-    lines = shown(study, clock, terminal_width=None).splitlines()
-    assert lines == ["rain: 10/s, 0:09:20 left, 400 collisions, runs 0/6, best SD -5.63"]
-
-
-@pytest.mark.parametrize(("width", "ending"), [
-    (120, "10/s, 0:08:00 left, 500 collisions, runs 1/6, best SD -5.63"),
-    (80, "10/s, 0:08:00 left, 500 collisions, runs 1/6, best SD -5.63"),
-    (55, "10/s, 0:08:00 left, 500 collisions"), (35, "10/s, 0:08:00 left"), (20, "10/s"),
-])
-def test_on_a_terminal_what_matters_fits_in_its_line_and_no_word_is_cut(
-        width: int, ending: str, study: Study, clock: list[float]) -> None:
-    """The run that ended early leaves 5300 evaluations in all, 500 of them done."""
-    lines = [re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", line).rstrip() for line in shown(study, clock, terminal_width=width).splitlines()]
-    last = [line for line in lines if "rain" in line][-1]
-    assert last.endswith(ending)
-    assert ("━" in last) == (width >= 50)
-    assert max(map(len, lines)) <= width
-    assert not [line for line in lines if "…" in line]
-
-
-def test_what_comes_from_journals_counts_as_done_and_not_as_fast(study: Study, clock: list[float]) -> None:
-    """A run of 1000 that was finished before, of 600 different settings; 500 settings of the next one; then 100 simulated in 20 s."""
+def test_elsewhere_a_line_shows_the_time_left_even_if_a_batch_takes_longer(clock: list[float], monkeypatch: pytest.MonkeyPatch) -> None:
+    """25 of 100 in 10 s: the others take 30 s, of which 6 have passed."""
+    monkeypatch.setattr(progress, "SECONDS_BETWEEN_LINES", 0.02)
     out = StringIO()
-    with CampaignProgress(Console(file=out, width=80), study, all_runs(study), quiet=False) as progress:
-        progress.evaluated(RunKey("nsga2", 0), evaluations_of(600), 0)
-        progress.finished(RunKey("nsga2", 0), 1000)
-        progress.evaluated(RunKey("nsga2", 1), evaluations_of(500), 0)
-        progress.evaluated(RunKey("nsga2", 1), evaluations_of(100, 500), 100)
-        clock[0] += 40
-        progress.evaluated(RunKey("nsga2", 1), evaluations_of(100, 500), 100)  # the same once more: no other collisions
-    assert out.getvalue() == "rain: 2/s, 0:28:40 left, 1200 collisions, runs 1/6, best SD -5.63\n"
+    with open_progress(True, Console(file=out, width=20)) as show:
+        for done in (0, 25):
+            show("two characteristics at a time", done, 100)
+            clock[0] += 10
+        clock[0] -= 4
+        while "left" not in out.getvalue().partition("25 of 100")[2]:
+            time.sleep(0.01)
+    assert "two characteristics at a time: 25 of 100, 0:00:24 left\n" in out.getvalue()
+
+
+@pytest.mark.parametrize("width", [120, 80])
+def test_on_a_terminal_all_fits_in_its_line(width: int, study: Study, clock: list[float]) -> None:
+    """6 runs of 1000 evaluations, of which one ends after 300: 5300 in all, 500 of them done in 50 s."""
+    lines = shown(study, clock, width)
+    last = [line for line in lines if "rain" in line][-1]
+    assert re.fullmatch(r"rain: runs 1/6, 500 collisions, best SD -5\.63 [━╸╺ ]+ 500/5300 0:08:00 left", last)
+    assert max(map(len, lines)) <= width
+
+
+def test_what_comes_from_journals_is_not_left_to_be_done(study: Study) -> None:
+    """A run of 1000 that was finished before, of 600 different settings; 500 settings of the next one; then 100 simulated, and again."""
+    shows: list[tuple[str, int, int]] = []
+    observer = CampaignProgress(lambda *values: shows.append(values), study, all_runs(study))
+    observer.evaluated(RunKey("nsga2", 0), evaluations_of(600), 0)
+    observer.finished(RunKey("nsga2", 0), 1000)
+    observer.evaluated(RunKey("nsga2", 1), evaluations_of(500), 0)
+    for _ in range(2):
+        observer.evaluated(RunKey("nsga2", 1), evaluations_of(100, 500), 100)
+    assert shows[0] == ("rain: runs 0/6", 0, 6000)
+    assert shows[-1] == ("rain: runs 1/6, 1200 collisions, best SD -5.63", 200, 4500)
+
+
+def test_parts_have_one_counter_that_never_passes_its_end() -> None:
+    shows: list[tuple[str, int, int]] = []
+    parts = PartsProgress(lambda *values: shows.append(values), {"causes": 100, "stored": 50, "rules": 10})
+    for part, stages in {"causes": (("a", 0, 20), ("a", 20, 20), ("b", 0, 20), ("b", 20, 20)), "stored": (),
+                         "rules": (("c", 0, 30), ("c", 15, 30), ("c", 30, 30))}.items():
+        show = parts.begin(part)
+        for stage in stages:
+            show(*stage)
+    assert shows == [("starting", 0, 160), ("causes: a", 0, 160), ("causes: a", 20, 160), ("causes: b", 20, 160), ("causes: b", 40, 160),
+                     ("rules: c", 40, 70), ("rules: c", 55, 70), ("rules: c", 70, 70)]
+
+
+def test_a_few_settings_in_a_long_matrix_are_several_batches(monkeypatch: pytest.MonkeyPatch) -> None:
+    """So that the time left is known before the end."""
+    shows: list[tuple[str, int, int]] = []
+    study = load_study("euro_ncap_pedestrian")
+    evaluator = Evaluator(study, InlinePool(), lambda *values: shows.append(values))
+    evaluator.evaluate(evaluator.feasible_settings(32), "settings")
+    assert len(shows) == 5
+    assert shows[-1][1:] == (32, 32)

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from safevar_sumo.api.running import NullObserver, carry_out_runs
+from safevar_sumo.api.running import carry_out_runs
 from safevar_sumo.campaign import all_runs
 from safevar_sumo.conformance import refuse_defects
 from safevar_sumo.errors import InputError, UserCodeError
@@ -19,7 +19,7 @@ from safevar_sumo.study import load_study
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.workers import isolation
 from safevar_sumo.workers.retrying import RetryingPool
-from tests.in_process import InlinePool, refused, run
+from tests.in_process import InlinePool, SilentObserver, refused, run
 from tests.plugins.beside import ADS as USES_ADS
 from tests.plugins.beside import SCALAR, Mine
 
@@ -153,7 +153,7 @@ def test_a_class_that_remembers_what_only_a_rare_setting_does(mine: Mine, folder
     study = load_study(str(folder / "mine.toml"), search={"algorithms": ["nsga2"], "evaluations": 60, "runs": 1})
     for _ in range(2):  # the same command again does not get by either
         with pytest.raises(UserCodeError, match=r"nsga2-00 and \S+ alone; to reproduce it: python -m safevar_sumo simulate") as caught:
-            carry_out_runs(study, system, all_runs(study), tmp_path / "out", InlinePool(), NullObserver(), 7)
+            carry_out_runs(study, system, all_runs(study), tmp_path / "out", InlinePool(), SilentObserver(), 7)
         assert "ads.model = 'mine:Mine' a result depends on what else is simulated" in str(caught.value)
     assert not (tmp_path / "out/solutions.csv").exists()
 
@@ -179,7 +179,7 @@ def test_an_algorithm_whose_runs_learn_from_each_other(own: str, shared: bool, m
     study = load_study(str(folder / "mine.toml"))
 
     def searched() -> object:
-        return carry_out_runs(study, system, all_runs(study), tmp_path / "out", InlinePool(), NullObserver(), None)
+        return carry_out_runs(study, system, all_runs(study), tmp_path / "out", InlinePool(), SilentObserver(), None)
 
     if shared:
         with pytest.raises(UserCodeError, match=r"'mine:Mine' settings requested .* in a second run .*mine.py:9"):
@@ -214,7 +214,7 @@ def test_a_class_that_makes_every_twelfth_vehicle_safer(mine: Mine, folder: Path
     system = mine(SAFER)
     study = load_study(str(folder / "mine.toml"), search={"algorithms": ["rs"], "evaluations": 100, "runs": 2})
     with pytest.raises(UserCodeError, match=r"ads.model = 'mine:Mine' (a result depends on what else is simulated|.* in another order)"):
-        carry_out_runs(study, system, all_runs(study), tmp_path / "out", InlinePool(), NullObserver(), None)
+        carry_out_runs(study, system, all_runs(study), tmp_path / "out", InlinePool(), SilentObserver(), None)
 
 
 CLOCK = """
@@ -236,7 +236,7 @@ def test_an_algorithm_that_draws_from_the_clock(mine: Mine, folder: Path, tmp_pa
     system = mine(CLOCK, '[search]\nalgorithms = ["mine:Mine"]\nevaluations = 20\nruns = 1\n')
     study = load_study(str(folder / "mine.toml"))
     with pytest.raises(UserCodeError, match=r"'mine:Mine' settings requested .* when the run is repeated .*mine.py:10"):
-        carry_out_runs(study, system, all_runs(study), tmp_path / "out", InlinePool(), NullObserver(), None)
+        carry_out_runs(study, system, all_runs(study), tmp_path / "out", InlinePool(), SilentObserver(), None)
 
 
 GREEDY = """
@@ -263,7 +263,7 @@ def test_an_algorithm_that_changes_its_problem_or_asks_for_nothing(module: str, 
     system = mine(module, '[search]\nalgorithms = ["mine:Mine"]\nevaluations = 10\nruns = 1\n')
     study = load_study(str(folder / "mine.toml"))
     with pytest.raises(UserCodeError, match=problem):
-        carry_out_runs(study, system, all_runs(study), tmp_path / "out", InlinePool(), NullObserver(), None)
+        carry_out_runs(study, system, all_runs(study), tmp_path / "out", InlinePool(), SilentObserver(), None)
 
 
 @pytest.fixture

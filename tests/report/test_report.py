@@ -94,7 +94,13 @@ def page(slippery: Path, explained: Explained) -> str:
         patch.setattr(causes, "explain_failures", lambda *_, **__: explained)
         patch.setattr(report_input, "SAMPLED_VEHICLES", 400)
         patch.setattr(local, "LocalPool", lambda *_: Plant(study, lambda rows: rows[:, friction] < 1.5))
-        return make_report([slippery], jobs=1)
+        shows: list[tuple[str, int, int]] = []
+        page = make_report([slippery], jobs=1, progress=lambda *values: shows.append(values))
+        assert shows[0][1] == 0
+        assert shows[0][2] > 1000, "the page's simulations, not those of its first stage"
+        assert [done for _, done, _ in shows[:-2]] == sorted(done for _, done, _ in shows[:-2])
+        assert all(done <= total for _, done, total in shows)
+        return page
 
 
 @pytest.fixture

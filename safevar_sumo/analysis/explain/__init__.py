@@ -14,9 +14,9 @@ from safevar_sumo.analysis.subject import Results, answer_question, study_or_cas
 from safevar_sumo.study import StudyLike
 
 if TYPE_CHECKING:
-    from safevar_sumo.analysis.evaluator import Progress
     from safevar_sumo.analysis.explain.result import Explained
     from safevar_sumo.metrics import Criterion
+    from safevar_sumo.progress import Progress
     from safevar_sumo.workers.evaluation import Pool
 
 

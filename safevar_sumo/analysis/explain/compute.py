@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from safevar_sumo.analysis.evaluator import Evaluator, Progress, open_evaluator, show_no_progress
+from safevar_sumo.analysis.evaluator import Evaluator, open_evaluator
 from safevar_sumo.analysis.explain import ExplainOptions
 from safevar_sumo.analysis.explain.braking_comparison import BrakingComparison, compare_braking, summarise_run
 from safevar_sumo.analysis.explain.causes import (
@@ -24,6 +24,7 @@ from safevar_sumo.analysis.preventability import assess_preventability, classify
 from safevar_sumo.analysis.research_questions.case import Case
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
+from safevar_sumo.progress import Progress, show_no_progress
 from safevar_sumo.protocol.points import UNKNOWN as UNKNOWN_COLOUR
 from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray, finite_or_none

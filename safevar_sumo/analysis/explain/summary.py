@@ -18,6 +18,7 @@ from safevar_sumo.analysis.preventability import assess_preventability
 from safevar_sumo.analysis.rating.summary import summarise_rated_solutions
 from safevar_sumo.analysis.words import list_of_changes, number_of, points_in_words, question_command
 from safevar_sumo.metrics import RATING_POINTS, Unsafe
+from safevar_sumo.progress import Progress, show_no_progress
 from safevar_sumo.records import Evaluations, FloatArray, finite_or_none
 from safevar_sumo.results import CHOICES, choose_handle, handles_of, record, row_of_handle
 from safevar_sumo.study import Study
@@ -29,7 +30,8 @@ MAX_ESTIMATED_CAUSES = 20
 """Number of minimal causes of a failure up to which their robustness is estimated at the end of a study; `explain` estimates all."""
 
 
-def summarise_failures(study: Study, solutions: pd.DataFrame, original: Evaluations, pool: Pool, directory: str) -> list[str]:
+def summarise_failures(study: Study, solutions: pd.DataFrame, original: Evaluations, pool: Pool, directory: str,
+                       progress: Progress = show_no_progress) -> list[str]:
     """Summarise a study's solutions in lines: first a paragraph for a manager, last the command for the next step.
 
     The criterion is `Unsafe.default`.
@@ -49,7 +51,7 @@ def summarise_failures(study: Study, solutions: pd.DataFrame, original: Evaluati
         return summarise_rated_solutions(study, solutions, original, directory)
     if original.collided[0]:
         return ["The original vehicle itself collides: no change is needed."]
-    evaluator, degree = Evaluator(study, pool), float(original.f_safe[0])
+    evaluator, degree = Evaluator(study, pool, progress), float(original.f_safe[0])
     criterion = Unsafe.default(record(original, 0), solutions["outcome"])
     unsafe = criterion.rows(solutions)
     if not unsafe.any():

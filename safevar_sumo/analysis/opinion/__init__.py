@@ -14,9 +14,9 @@ from safevar_sumo.analysis.options import Options, document_options, option, uns
 from safevar_sumo.analysis.subject import Results, answer_question, study_or_case
 
 if TYPE_CHECKING:
-    from safevar_sumo.analysis.evaluator import Progress
     from safevar_sumo.analysis.opinion.result import Opinions
     from safevar_sumo.metrics import Criterion
+    from safevar_sumo.progress import Progress
     from safevar_sumo.workers.evaluation import Pool
 
 

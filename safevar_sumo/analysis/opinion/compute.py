@@ -8,7 +8,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from safevar_sumo.analysis.evaluator import Progress, show_no_progress
 from safevar_sumo.analysis.explain import ExplainOptions
 from safevar_sumo.analysis.explain.compute import explain_failures
 from safevar_sumo.analysis.explain.robustness import draw_neighbours, is_borderline, robustness_in_words
@@ -20,6 +19,7 @@ from safevar_sumo.analysis.opinion.second_vehicle import SPIN_LIMIT, SecondVehic
 from safevar_sumo.analysis.research_questions.case import Case
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
+from safevar_sumo.progress import Progress, show_no_progress
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray, finite_or_none
 from safevar_sumo.study import Study
 from safevar_sumo.sumo.matrix import evaluate

@@ -14,8 +14,8 @@ from safevar_sumo.analysis.subject import Results, answer_question, study_or_cas
 from safevar_sumo.study import StudyLike
 
 if TYPE_CHECKING:
-    from safevar_sumo.analysis.evaluator import Progress
     from safevar_sumo.analysis.rating.compute import Rating
+    from safevar_sumo.progress import Progress
     from safevar_sumo.workers.evaluation import Pool
 
 

@@ -10,11 +10,12 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from safevar_sumo.analysis.evaluator import Evaluator, Progress, open_evaluator, show_no_progress
+from safevar_sumo.analysis.evaluator import Evaluator, open_evaluator
 from safevar_sumo.analysis.rating import RatingOptions
 from safevar_sumo.analysis.research_questions.case import Case
 from safevar_sumo.analysis.words import join_phrases
 from safevar_sumo.errors import InputError
+from safevar_sumo.progress import Progress, show_no_progress
 from safevar_sumo.protocol import (
     COLOURS,
     EURO_NCAP_2026,

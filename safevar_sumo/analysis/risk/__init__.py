@@ -14,9 +14,9 @@ from safevar_sumo.errors import InputError, unknown_name
 from safevar_sumo.study import StudyLike
 
 if TYPE_CHECKING:
-    from safevar_sumo.analysis.evaluator import Progress
     from safevar_sumo.analysis.risk.compute import Risk
     from safevar_sumo.metrics import Criterion
+    from safevar_sumo.progress import Progress
     from safevar_sumo.workers.evaluation import Pool
 
 METHODS = ("auto", "monte_carlo", "subset_simulation", "cross_entropy")

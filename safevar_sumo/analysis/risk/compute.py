@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 import scipy
 
-from safevar_sumo.analysis.evaluator import Evaluator, Progress, clopper_pearson, open_evaluator, show_no_progress
+from safevar_sumo.analysis.evaluator import Evaluator, clopper_pearson, open_evaluator
 from safevar_sumo.analysis.research_questions.case import Case
 from safevar_sumo.analysis.risk import ENOUGH_FAILURES, PILOT_VEHICLES, RARE_BELOW, RiskOptions
 from safevar_sumo.analysis.risk.rare import Estimate, RareMethodError, Response, estimate_rare, is_plateau, load_openturns
@@ -19,6 +19,7 @@ from safevar_sumo.analysis.risk.variation import VariationModel
 from safevar_sumo.analysis.subject import study_in
 from safevar_sumo.errors import InputError, SimulationError
 from safevar_sumo.metrics import Unsafe
+from safevar_sumo.progress import Progress, show_no_progress
 from safevar_sumo.records import FloatArray, finite_or_none
 from safevar_sumo.study import SAFETY_DEGREE, Study
 from safevar_sumo.sumo.empty_road import driven_entry

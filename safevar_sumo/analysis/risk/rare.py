@@ -92,7 +92,7 @@ class Response:
     def __call__(self, points: Any) -> FloatArray:
         """The response at points, shape (N, n)."""
         array = np.asarray(points, dtype=float).reshape(-1, self.dimensions)
-        total = max(self.expected_simulations, self.simulations)
+        total = max(self.expected_simulations, self.simulations + len(array))
         evaluations = self._evaluator.evaluate(self._settings_of(array), self.stage, self.simulations, total)
         return self.record(array, evaluations)
 

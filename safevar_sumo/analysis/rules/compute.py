@@ -16,12 +16,13 @@ import numpy as np
 import pandas as pd
 from rich.console import Console
 
-from safevar_sumo.analysis.evaluator import CONFIDENCE, Progress, clopper_pearson, open_evaluator, show_no_progress
+from safevar_sumo.analysis.evaluator import CONFIDENCE, clopper_pearson, open_evaluator
 from safevar_sumo.analysis.research_questions.case import Case
 from safevar_sumo.analysis.rules import RulesOptions
 from safevar_sumo.analysis.subject import study_in
 from safevar_sumo.analysis.words import join_phrases
 from safevar_sumo.metrics import Unsafe
+from safevar_sumo.progress import Progress, show_no_progress
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.study import Study
 from safevar_sumo.sumo.empty_road import summary_entry

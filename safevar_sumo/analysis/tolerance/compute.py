@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
-from safevar_sumo.analysis.evaluator import Evaluator, Progress, open_evaluator, show_no_progress
+from safevar_sumo.analysis.evaluator import Evaluator, open_evaluator
 from safevar_sumo.analysis.research_questions.case import Case
 from safevar_sumo.analysis.subject import study_in
 from safevar_sumo.analysis.tolerance import ToleranceOptions
@@ -20,6 +20,7 @@ from safevar_sumo.analysis.tolerance.pairs import Pair, scan_pairs
 from safevar_sumo.analysis.tolerance.safe_box import SafeBox, find_safe_box, no_safe_box, refuse_tied
 from safevar_sumo.errors import InputError, unknown_name
 from safevar_sumo.metrics import RATING_POINTS, Unsafe
+from safevar_sumo.progress import Progress, show_no_progress
 from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.records import Evaluations, FloatArray, Outcome, finite_or_none
 from safevar_sumo.study import SAFETY_DEGREE, Study
