@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import msgspec
 import numpy as np
 import numpy.typing as npt
 import scipy
-import tomli_w
 
-from safevar_sumo.analysis.figures import FONT, as_formula, new_figure, save
+from safevar_sumo.analysis.figures import BLUE, FONT, VERMILION, as_formula, new_panels, save
+from safevar_sumo.analysis.words import two_decimals
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray, finite_or_none
@@ -28,12 +28,17 @@ if TYPE_CHECKING:
 BINS = 8
 """Number of bins of values in the figure; all bins hold about equally many rows."""
 SCATTER_WIDTH = 2.0
-"""An outcome is undecided if its safety degree is at most this number of standard deviations of repeats away from 0, the collision."""
+"""An outcome is undecided if its safety degree is at most this number of standard deviations of repeats from a
+collision."""
+
+Numbers = dict[str, float | None]
+"""Numbers by metric, or by side; None where undefined."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Agreement:
-    """Comparison of values simulated by this package ("here") with reference values; None if there are no values to compare.
+    """Comparison of values simulated by this package ("here") with reference values; None if there are no values to
+    compare.
 
     Attributes
     ----------
@@ -53,87 +58,97 @@ class Agreement:
     in_repeats
         By metric: mean absolute error divided by the standard deviation of repeats of one setting in the reference.
     undecided
-        Number of settings that collide on one side only; and the number of these that may be scatter between repeats, because the safety
-        degree in the reference or here is at most two standard deviations from a collision.
+        Number of settings that collide on one side only; and the number of these that may be scatter between repeats,
+        because the safety degree in the reference or here is at most two standard deviations from a collision.
     by_predicted
-        Bins of settings by their safety degree here: lowest and highest safety degree, number of settings, and mean error [m].
+        Bins of settings by their safety degree here: lowest and highest safety degree, number of settings, and mean
+        error [m].
     """
 
     rows: int
-    spearman: dict[str, float | None]
-    mean_absolute_error: dict[str, float | None]
-    bias: dict[str, float | None]
+    spearman: Numbers
+    mean_absolute_error: Numbers
+    bias: Numbers
     collisions: dict[str, int]
-    original: dict[str, dict[str, float | None]]
+    original: dict[str, Numbers]
     precision: float | None
     recall: float | None
-    collision_speed: dict[str, float | None]
-    in_repeats: dict[str, float | None]
+    collision_speed: Numbers
+    in_repeats: Numbers
     undecided: dict[str, int | None]
-    by_predicted: list[dict[str, float | None]]
+    by_predicted: list[Numbers]
 
     def to_dict(self) -> dict[str, Any]:
         """The attributes by name."""
         return asdict(self)
 
+    def sentences(self) -> list[str]:
+        """Sentences about collisions, and about errors by the safety degree here."""
+        counts, speeds = self.collisions, {side: two_decimals(speed) for side, speed in self.collision_speed.items()}
+        lines = [f"Collisions: {counts['reference']} in the reference, {counts['here']} here, {counts['both']} in "
+                 "both: precision "
+                 f"{two_decimals(self.precision)}, recall {two_decimals(self.recall)}; their mean speed is "
+                 f"{speeds['reference']} m/s in "
+                 f"the reference, {speeds['here']} m/s here."]
+        if self.undecided["within_repeats"] is not None:
+            lines.append(f"Of {self.undecided['differ']} settings that collide only in the reference or only here, "
+                         f"{self.undecided['within_repeats']} may collide or not within the scatter of repeats.")
+        bins = ", ".join(f"{part['lowest']:.2f} to {part['highest']:.2f}: {part['bias']:+.2f}"
+                         for part in self.by_predicted)
+        return [*lines, f"Mean error by the safety degree here: {bins}."]
 
-def measure_agreement(reference: ReferenceData, evaluations: Evaluations, study: Study, original: Evaluations) -> Agreement:
-    """Compare evaluations of the reference's settings with the reference, row by row, and the original vehicle with the study's values."""
-    defined_rows = {name: _is_defined(reference, evaluations, name) for name in reference.metrics}
-    differences = {name: evaluations.metrics[name][rows] - reference.metrics[name][rows] for name, rows in defined_rows.items()}
-    errors = {name: _mean(np.abs(values)) for name, values in differences.items()}
-    both_collide = reference.collided & evaluations.collided
-    counts = {"reference": int(np.count_nonzero(reference.collided)), "here": int(np.count_nonzero(evaluations.collided)),
-              "both": int(np.count_nonzero(both_collide))}
+
+def measure_agreement(reference: ReferenceData, evaluations: Evaluations, study: Study,
+                      original: Evaluations) -> Agreement:
+    """Compare evaluations of the reference's settings with the reference, row by row, and the original vehicle with the
+    study's values.
+    """
+    pairs = {name: _defined_pairs(values, evaluations.metrics[name]) for name, values in reference.metrics.items()}
+    errors = {name: _mean(np.abs(here - there)) for name, (there, here) in pairs.items()}
+    both_collide, differ = reference.collided & evaluations.collided, reference.collided != evaluations.collided
+    counts = {"reference": int(reference.collided.sum()), "here": int(evaluations.collided.sum()),
+              "both": int(both_collide.sum())}
+    degrees, repeatability = reference.metrics[SAFETY_DEGREE], study.repeatability.get(SAFETY_DEGREE)
+    distance = np.minimum(np.abs(degrees), np.abs(evaluations.f_safe))
+    within = None if repeatability is None else int(np.count_nonzero(differ & (distance <= SCATTER_WIDTH
+                                                                               * repeatability)))
+    error = evaluations.f_safe - degrees
     return Agreement(
         rows=len(evaluations),
-        spearman={name: rank_correlation(reference.metrics[name][rows], evaluations.metrics[name][rows])
-                  for name, rows in defined_rows.items()},
+        spearman={name: rank_correlation(*pair) for name, pair in pairs.items()},
         mean_absolute_error=errors,
-        bias={name: _mean(values) for name, values in differences.items()},
+        bias={name: _mean(here - there) for name, (there, here) in pairs.items()},
         collisions=counts,
         original={name: {"reference": study.published.get(name), "here": finite_or_none(values[0])}
                   for name, values in original.metrics.items()},
         precision=counts["both"] / counts["here"] if counts["here"] else None,
         recall=counts["both"] / counts["reference"] if counts["reference"] else None,
-        collision_speed={"reference": _mean(-reference.metrics[SAFETY_DEGREE][both_collide]),
+        collision_speed={"reference": _mean(-degrees[both_collide]),
                          "here": _mean(evaluations.collision_speed[both_collide])},
-        in_repeats={name: _error_in_repeats(error, study.repeatability.get(name)) for name, error in errors.items()},
-        undecided=_count_undecided(reference, evaluations, study.repeatability.get(SAFETY_DEGREE)),
-        by_predicted=_error_by_bin(evaluations.f_safe, evaluations.f_safe - reference.metrics[SAFETY_DEGREE]))
+        in_repeats={name: None if error is None or name not in study.repeatability else error
+                    / study.repeatability[name]
+                    for name, error in errors.items()},
+        undecided={"differ": int(differ.sum()), "within_repeats": within},
+        by_predicted=[{"lowest": float(evaluations.f_safe[rows].min()),
+                       "highest": float(evaluations.f_safe[rows].max()),
+                       "rows": len(rows), "bias": float(error[rows].mean())}
+                      for rows in _bins_of(np.where(np.isnan(error), np.nan, evaluations.f_safe))])
 
 
-def may_be_scatter(reference: ReferenceData, evaluations: Evaluations, repeatability: float) -> BoolArray:
-    """Settings that collide on one side only, although their repeats may end either way; a mask."""
-    distance = np.minimum(np.abs(reference.metrics[SAFETY_DEGREE]), np.abs(evaluations.f_safe))
-    return np.asarray((reference.collided != evaluations.collided) & (distance <= SCATTER_WIDTH * repeatability))
+def _defined_pairs(values: FloatArray, other_values: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """The values of rows that are defined on both sides."""
+    rows = ~np.isnan(values) & ~np.isnan(other_values)
+    return values[rows], other_values[rows]
 
 
-def _count_undecided(reference: ReferenceData, evaluations: Evaluations, repeatability: float | None) -> dict[str, int | None]:
-    number = None if repeatability is None else int(np.count_nonzero(may_be_scatter(reference, evaluations, repeatability)))
-    return {"differ": int(np.count_nonzero(reference.collided != evaluations.collided)), "within_repeats": number}
-
-
-def _error_in_repeats(error: float | None, repeatability: float | None) -> float | None:
-    return None if error is None or repeatability is None else error / repeatability
-
-
-def _error_by_bin(predicted: FloatArray, error: FloatArray) -> list[dict[str, float | None]]:
-    is_defined = ~np.isnan(predicted) & ~np.isnan(error)
-    return [{"lowest": float(predicted[rows].min()), "highest": float(predicted[rows].max()), "rows": len(rows),
-             "bias": float(error[rows].mean())}
-            for rows in _split_into_bins(np.where(is_defined, predicted, np.nan))]
-
-
-def _split_into_bins(values: FloatArray) -> list[npt.NDArray[np.intp]]:
+def _bins_of(values: FloatArray) -> list[npt.NDArray[np.intp]]:
     """Indices of defined values, in bins of about equal size; equal values share a bin."""
     defined = values[~np.isnan(values)]
     if not defined.size:
         return []
     edges = np.unique(np.quantile(defined, np.linspace(0, 1, BINS + 1)))
-    bin_numbers = np.where(np.isnan(values), -1, np.clip(np.searchsorted(edges, values, side="right") - 1, 0, max(len(edges) - 2, 0)))
-    bins = [np.flatnonzero(bin_numbers == i) for i in range(max(len(edges) - 1, 1))]
-    return [rows for rows in bins if rows.size]
+    numbers = np.clip(np.searchsorted(edges, values, side="right") - 1, 0, max(len(edges) - 2, 0))
+    return [np.flatnonzero((numbers == i) & ~np.isnan(values)) for i in np.unique(numbers[~np.isnan(values)])]
 
 
 def rank_correlation(values: FloatArray, other_values: FloatArray) -> float | None:
@@ -143,103 +158,67 @@ def rank_correlation(values: FloatArray, other_values: FloatArray) -> float | No
     return float(np.corrcoef(scipy.stats.rankdata(values), scipy.stats.rankdata(other_values))[0, 1])
 
 
-def _is_defined(reference: ReferenceData, evaluations: Evaluations, metric: str) -> BoolArray:
-    """Whether a metric is defined in the reference and here, by row."""
-    return np.asarray(~np.isnan(reference.metrics[metric]) & ~np.isnan(evaluations.metrics[metric]))
-
-
 def _mean(values: FloatArray) -> float | None:
     return float(np.mean(values)) if values.size else None
 
 
-def plot_agreement(path: Path, title: str, characteristics: CharacteristicSet, reference: ReferenceData, evaluations: Evaluations,
-                   repeatability: float | None = None) -> None:
-    """Draw simulated over reference values, errors over simulated values, and errors of the safety degree over each characteristic.
-
-    A ring marks a setting that collides on one side only, although its repeats may end either way.
+def plot_agreement(path: Path, title: str, characteristics: CharacteristicSet, reference: ReferenceData,
+                   evaluations: Evaluations) -> None:
+    """Draw simulated over reference values, errors over simulated values, and errors of the safety degree over each
+    characteristic.
 
     Raises
     ------
     InputError
         If the file cannot be written or its ending names no picture format.
     """
-    axes_per_row = 4
-    axes_rows = 2 + -(-len(characteristics) // axes_per_row)
-    figure, axes = new_figure(title, axes_rows, axes_per_row, (12, 2.4 * axes_rows + 0.8),
-                              gridspec_kw={"height_ratios": [1.5] + [1] * (axes_rows - 1)})
-    undecided = np.zeros(len(evaluations), dtype=bool) if repeatability is None else may_be_scatter(reference, evaluations, repeatability)
-    for axis, error_axis, metric in zip(axes[0], axes[1], reference.metrics, strict=False):
-        _draw_scatter(axis, metric, reference, evaluations, undecided)
-        _draw_error(error_axis, evaluations.metrics[metric], evaluations.metrics[metric] - reference.metrics[metric])
-        error_axis.set_xlabel(f"here: {_axis_label(metric)}")
-        error_axis.set_ylabel("mean error")
-    error = evaluations.metrics[SAFETY_DEGREE] - reference.metrics[SAFETY_DEGREE]
-    lowest, highest = [], []
-    for i, axis in enumerate(axes[2:].flat):
-        if i >= len(characteristics):
-            axis.set_axis_off()
-            continue
-        lowest_on_axis, highest_on_axis = _draw_error(axis, evaluations.settings[:, i], error)
-        lowest.append(lowest_on_axis)
-        highest.append(highest_on_axis)
-        characteristic = characteristics.members[i]
-        axis.set_xlabel(characteristic.name + as_formula(unit_text(characteristic.unit, " [{}]")))
-    margin = 0.1 * (max(highest) - min(lowest)) + 1e-6
-    for i, axis in enumerate(axes[2:].flat):
-        axis.set_ylim(min(lowest) - margin, max(highest) + margin)
-        if i % axes_per_row == 0:
-            axis.set_ylabel("error of SD")
+    figure, axes = new_panels(title, 2 * len(reference.metrics) + len(characteristics), 4, (3.0, 2.4), 12.0, 0.8)
+    for axis, error_axis, (metric, values) in zip(axes, axes[len(reference.metrics):], reference.metrics.items(),
+                                                  strict=False):
+        here = evaluations.metrics[metric]
+        label = f"{METRICS[metric].title} [{as_formula(METRICS[metric].unit)}]"
+        _draw_scatter(axis, values, here, reference.collided | evaluations.collided, label)
+        _draw_error(error_axis, here, here - values, f"here: {label}", "mean error")
+    error = evaluations.f_safe - reference.metrics[SAFETY_DEGREE]
+    for axis, characteristic, values in zip(axes[2 * len(reference.metrics):], characteristics, evaluations.settings.T,
+                                            strict=True):
+        _draw_error(axis, values, error, characteristic.name + as_formula(unit_text(characteristic.unit, " [{}]")),
+                    "error of SD")
+        axis.sharey(axes[2 * len(reference.metrics)])
+    figure.supxlabel("orange: collides in the reference or here", fontsize=FONT)
     save(figure, path, "plot")
 
 
-def _axis_label(metric: str) -> str:
-    return f"{METRICS[metric].title} [{as_formula(METRICS[metric].unit)}]"
-
-
-def _draw_scatter(axis: Axes, metric: str, reference: ReferenceData, evaluations: Evaluations, undecided: BoolArray) -> None:
-    rows = _is_defined(reference, evaluations, metric)
-    is_collision = (reference.collided | evaluations.collided)[rows]
-    x, y = reference.metrics[metric][rows], evaluations.metrics[metric][rows]
-    axis.scatter(x[~is_collision], y[~is_collision], s=6, alpha=0.35, color="#0072b2", linewidths=0, label="no collision")
-    if is_collision.any():
-        axis.scatter(x[is_collision], y[is_collision], s=14, alpha=0.7, color="#d55e00", marker="x", linewidths=0.8,
-                     label="collision, either side")
-        if undecided[rows].any():
-            axis.scatter(x[undecided[rows]], y[undecided[rows]], s=40, facecolors="none", edgecolors="black", linewidths=0.6,
-                         label="repeats may do either")
-        axis.legend(loc="upper left", fontsize=7, frameon=True)
-    if x.size:
-        ends = [min(x.min(), y.min()), max(x.max(), y.max())]
-        axis.plot(ends, ends, color="black", linewidth=0.8, linestyle="--")
+def _draw_scatter(axis: Axes, reference: FloatArray, here: FloatArray, is_collision: BoolArray, label: str) -> None:
+    """Draw simulated over reference values; those that collide on either side in another colour."""
+    axis.scatter(reference, here, s=6, alpha=0.4, c=np.where(is_collision, VERMILION, BLUE), linewidths=0)
+    x, y = _defined_pairs(reference, here)
+    axis.axline((float(x[0]), float(x[0])) if x.size else (0, 0), slope=1, color="black", linewidth=0.8, linestyle="--")
     rho = rank_correlation(x, y)
     axis.set_title(f"rho = {'-' if rho is None else f'{rho:.3f}'}, {x.size} rows", fontsize=FONT)
-    label = _axis_label(metric)
-    axis.set_xlabel(f"reference: {label}")
-    axis.set_ylabel(f"here: {label}")
+    axis.set(xlabel=f"reference: {label}", ylabel=f"here: {label}")
 
 
-def _draw_error(axis: Axes, values: FloatArray, error: FloatArray) -> tuple[float, float]:
-    """Draw the mean error and the quartiles of the error over bins of `values`; return the lowest and highest value drawn."""
-    bins = _split_into_bins(np.where(np.isnan(error), np.nan, values))
-    if not bins:
-        return 0.0, 0.0
-    centres = np.array([values[rows].mean() for rows in bins])
-    means = np.array([error[rows].mean() for rows in bins])
-    quartiles = np.array([np.quantile(error[rows], [0.25, 0.75]) for rows in bins])
-    axis.fill_between(centres, quartiles[:, 0], quartiles[:, 1], color="#0072b2", alpha=0.2, linewidth=0)
-    axis.plot(centres, means, marker="o", markersize=3, color="#0072b2")
+def _draw_error(axis: Axes, values: FloatArray, error: FloatArray, label: str, error_label: str) -> None:
+    """Draw the mean error and the quartiles of the error over bins of `values`."""
+    bins = _bins_of(np.where(np.isnan(error), np.nan, values))
+    centres = [values[rows].mean() for rows in bins]
+    quartiles = [np.quantile(error[rows], [0.25, 0.75]) for rows in bins]
+    axis.fill_between(centres, [low for low, _ in quartiles], [high for _, high in quartiles], color=BLUE, alpha=0.2,
+                      linewidth=0)
+    axis.plot(centres, [error[rows].mean() for rows in bins], marker="o", markersize=3, color=BLUE)
     axis.axhline(0, color="black", linewidth=0.8, linestyle="--")
-    return float(min(quartiles.min(), means.min())), float(max(quartiles.max(), means.max()))
+    axis.set(xlabel=label, ylabel=error_label)
 
 
 SHIPPED_TOTALS = Path(__file__).with_name("published.toml")
-TOTALS_COMMENT = "Agreement of studies with published data: totals, no row of it. `validate STUDY FILE --totals THIS_FILE` writes an entry."
+TOTALS_COMMENT = ("Agreement of studies with published data: totals, no row of it. "
+                  "`validate STUDY FILE --totals THIS_FILE` writes an entry.")
 SIMULATION_KEYS = ("scenario", "vehicle", "ads", "weather", "metrics", "step_length", "matrix")
 """Study keys that affect the metrics of a setting."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Totals:
+class Totals(msgspec.Struct, frozen=True, kw_only=True):
     """Agreement of one study with one file of published data.
 
     Attributes
@@ -250,35 +229,32 @@ class Totals:
         Rank correlation by metric, where defined.
     mean_absolute_error
         By metric, in its unit.
-    reference, here, both
-        Number of settings that collide in the published data, in this simulation, and in both.
+    collisions
+        Number of settings that collide in the published data ("reference"), in this simulation ("here"), and in both.
     """
 
-    study: str
-    file: str
     rows: int
-    spearman: Mapping[str, float]
-    mean_absolute_error: Mapping[str, float]
-    reference: int
-    here: int
-    both: int
+    spearman: dict[str, float]
+    mean_absolute_error: dict[str, float]
+    collisions: dict[str, int]
 
     @property
     def recall(self) -> float | None:
         """Share of the published collisions that collide here; None if there are none."""
-        return self.both / self.reference if self.reference else None
+        return self.collisions["both"] / self.collisions["reference"] if self.collisions["reference"] else None
 
     @property
     def precision(self) -> float | None:
         """Share of the collisions here that the published data has too; None if there are none."""
-        return self.both / self.here if self.here else None
+        return self.collisions["both"] / self.collisions["here"] if self.collisions["here"] else None
 
 
-def shipped_totals_of(study: Study) -> list[Totals]:
-    """Shipped totals that hold for a study: those of shipped studies with the same `SIMULATION_KEYS`."""
-    tables, shipped_names = _simulation_tables(study), study_names()
-    return [_parse_totals(name, file, entry) for name, files in _read_totals(SHIPPED_TOTALS).items()
-            if name in shipped_names and _simulation_tables(load_study(name)) == tables for file, entry in files.items()]
+def shipped_totals_of(study: Study) -> dict[str, Totals]:
+    """Shipped totals that hold for a study, by file: those of shipped studies with the same `SIMULATION_KEYS`."""
+    tables = _simulation_tables(study)
+    return {file: totals for name, files in _read_totals(SHIPPED_TOTALS).items()
+            if name in study_names() and _simulation_tables(load_study(name)) == tables for file,
+            totals in files.items()}
 
 
 def write_totals(path: Path, study: Study, file: str, result: Agreement) -> None:
@@ -290,10 +266,10 @@ def write_totals(path: Path, study: Study, file: str, result: Agreement) -> None
         If the file holds anything but totals, or cannot be written.
     """
     totals = _read_totals(path) if path.exists() else {}
-    entry = {"rows": result.rows, "spearman": _rounded(result.spearman), "mean_absolute_error": _rounded(result.mean_absolute_error),
-             "collisions": result.collisions}
-    totals = {**totals, study.name: {**totals.get(study.name, {}), file: entry}}
-    write_whole(path, f"# {TOTALS_COMMENT}\n\n{tomli_w.dumps(totals)}")
+    totals.setdefault(study.name, {})[file] = Totals(
+        rows=result.rows, spearman=_rounded(result.spearman), mean_absolute_error=_rounded(result.mean_absolute_error),
+        collisions=result.collisions)
+    write_whole(path, f"# {TOTALS_COMMENT}\n\n{msgspec.toml.encode(totals).decode()}")
 
 
 def _rounded(values: Mapping[str, float | None]) -> dict[str, float]:
@@ -301,21 +277,12 @@ def _rounded(values: Mapping[str, float | None]) -> dict[str, float]:
     return {name: round(value, 4) for name, value in values.items() if value is not None}
 
 
-def _read_totals(path: Path) -> dict[str, dict[str, Any]]:
+def _read_totals(path: Path) -> dict[str, dict[str, Totals]]:
     refuse_other_than_file(path)
     try:
-        totals: dict[str, dict[str, Any]] = tomllib.loads(path.read_text(encoding="utf-8"))
-        for name, files in totals.items():
-            for file, entry in files.items():
-                _parse_totals(name, file, entry)
-    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        return msgspec.toml.decode(path.read_bytes(), type=dict[str, dict[str, Totals]])
+    except (OSError, ValueError):
         raise InputError(path, "holds no totals", "a new file, or one that `validate --totals` has written") from None
-    return totals
-
-
-def _parse_totals(study: str, file: str, entry: Mapping[str, Any]) -> Totals:
-    return Totals(study=study, file=file, rows=entry["rows"], spearman=entry["spearman"], mean_absolute_error=entry["mean_absolute_error"],
-                  **{name: entry["collisions"][name] for name in ("reference", "here", "both")})
 
 
 def _simulation_tables(study: Study) -> dict[str, Any]:

@@ -9,18 +9,15 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 
-from safevar_sumo.analysis.parameters import value_of
 from safevar_sumo.errors import InputError, SimulationError
 from safevar_sumo.reference.agreement import Agreement, measure_agreement
-from safevar_sumo.reference.effects import error_beyond_spread
+from safevar_sumo.reference.effects import error_beyond_spread, is_held_back
 from safevar_sumo.reference.ensemble import invert
-from safevar_sumo.reference.fit_result import Calibration
-from safevar_sumo.reference.fit_space import FitSpace, StudyFit
+from safevar_sumo.reference.fit_space import FitSpace, FittedParameter, StudyFit, StudyGroup, free_parameters
 from safevar_sumo.reference.loss import MAX_LOSS
-from safevar_sumo.reference.parameters import free_parameters
 from safevar_sumo.reference.profiles import Profiles
 from safevar_sumo.reference.rows import COLUMNS, ReferenceData
-from safevar_sumo.reference.search import CmaSearch, SearchRace, StudyGroup
+from safevar_sumo.reference.search import CmaSearch, SearchRace
 from safevar_sumo.study import SAFETY_DEGREE, Study
 from safevar_sumo.vehicles import CharacteristicSet
 from safevar_sumo.workers.batches import evaluate_all
@@ -29,13 +26,17 @@ from safevar_sumo.workers.evaluation import Pool
 START_DEVIATION = 0.02
 """Initial standard deviation of a search that begins at known values, as a share of the bounds' width."""
 POPULATION_DIVISOR = 3
-"""Factor by which the population of a search from known values is smaller: the search adapts once a generation, and need not explore."""
+"""Factor by which the population of a search from known values is smaller: the search adapts once a generation, and
+need not explore."""
 RANDOM_DEVIATION = 0.3
 """Initial standard deviation of a search that begins at a random place."""
 ENSEMBLE_DEVIATION = 0.05
-"""Initial standard deviation of a search that begins at the end of an ensemble Kalman inversion, in the mean over the parameters."""
+"""Initial standard deviation of a search that begins at the end of an ensemble Kalman inversion, in the mean over the
+parameters."""
 ERROR_DECIMALS = 3
 """Decimals of a study's model error [m]."""
+BOUND_MARGIN = 0.01
+"""A value lies on a bound if its distance from the bound is at most this share of the bounds' width."""
 
 
 class FitSubject(NamedTuple):
@@ -45,15 +46,52 @@ class FitSubject(NamedTuple):
     references: Mapping[str, ReferenceData]
 
 
-def calibrate(study: Study, references: Mapping[str, ReferenceData], pool: Pool,
-              done: Callable[[float, Study], None] = lambda loss, best: None, *, from_scratch: bool = False) -> Calibration:
-    """Fit one study; see `calibrate_together`."""
-    return calibrate_together([FitSubject(study, references)], pool, lambda loss, best: done(loss, best[0]), from_scratch=from_scratch)[0]
+class FittedValue(NamedTuple):
+    """The value of a parameter, and the least and greatest value that fit as well as the best."""
+
+    parameter: FittedParameter
+    value: float
+    interval: tuple[float, float]
+
+    @property
+    def is_on_bound(self) -> bool:
+        bounds = self.parameter.bounds
+        return min(self.value - bounds.lower, bounds.upper - self.value) <= BOUND_MARGIN * (bounds.upper - bounds.lower)
+
+    @property
+    def is_shared(self) -> bool:
+        return len(self.parameter.study_indices) > 1
 
 
-def calibrate_together(subjects: Sequence[FitSubject], pool: Pool, done: Callable[[float, StudyGroup], None] = lambda loss, best: None, *,
-                       from_scratch: bool = False) -> list[Calibration]:
-    """Fit studies by CMA-ES (Hansen 2016), as their tables [fit] state; the first study's table sets trials, seed, starts and population.
+class Calibration(NamedTuple):
+    """The fit of one study: the fitted values by key, the study with these values, and its agreement with each
+    reference.
+
+    `loss` is that of all studies fitted together; `reached` holds the lowest loss of each search, of which the last
+    starts at the values in the study files, except in a fit from scratch. `used` is the agreement with the rows that
+    the fit used, `held_back` with the others.
+    """
+
+    values: dict[str, FittedValue]
+    study: Study
+    loss: float
+    reached: list[float]
+    used: dict[str, Agreement]
+    held_back: dict[str, Agreement]
+    profiles: Profiles
+
+    @property
+    def loss_line(self) -> str:
+        """A sentence with the lowest loss of all searches, and of each search."""
+        losses = ", ".join(f"{loss:.4f}" for loss in self.reached)
+        return f"Loss {self.loss:.4f}" + (f"; lowest loss of each search: {losses}" if losses else "")
+
+
+def calibrate(subjects: Sequence[FitSubject], pool: Pool, done: Callable[[float, StudyGroup], None] = lambda loss,
+              best: None, *,
+              from_scratch: bool = False) -> list[Calibration]:
+    """Fit studies by CMA-ES (Hansen 2016), as their tables [fit] state; the first study's table sets trials, seed,
+    starts and population.
 
     Parameters
     ----------
@@ -71,79 +109,103 @@ def calibrate_together(subjects: Sequence[FitSubject], pool: Pool, done: Callabl
     SimulationError
         If the studies cannot be simulated with the values in their files.
     """
-    studies = tuple(subject.study for subject in subjects)
-    if not any(study.calibration for study in studies):
-        raise InputError(studies[0].source, "has no table [calibration]", "the free parameters with bounds, unit and meaning")
-    for subject in subjects:
-        _check_subject(subject)
+    studies = [subject.study for subject in subjects]
+    _check_subjects(subjects, from_scratch)
     fit, parameters = studies[0].fit, free_parameters(studies)
-    if from_scratch and not fit.starts:
-        raise InputError(studies[0].source, "fit.starts = 0", "at least 1 for a fit from scratch")
-    fit_data, test_data = [], []
-    for study, references in subjects:
-        is_test = {name: np.arange(len(data.settings)) % study.fit.hold_out == study.fit.hold_out - 1 for name, data in references.items()}
-        fit_data.append({name: data.take(~is_test[name]) for name, data in references.items()})
-        test_data.append({name: data.take(is_test[name]) for name, data in references.items()})
+    fit_data, test_data = ([{name: data.take(is_held_back(data, study.fit.hold_out) == is_test) for name,
+                             data in references.items()}
+                            for study, references in subjects] for is_test in (False, True))
     space = FitSpace(parameters, [StudyFit(study, data, pool) for study, data in zip(studies, fit_data, strict=True)])
-    race = SearchRace(space, fit.population, fit.trials, done, fit.alike)
-    if not from_scratch and race.try_studies([studies])[0].loss >= MAX_LOSS:
+    race = SearchRace(space.misfits_at, fit.population, fit.trials, lambda loss,
+                      place: done(loss, space.studies_at(place)))
+    if not from_scratch and race.try_places([space.own_place()])[0].loss >= MAX_LOSS:
         names = " and ".join(f"study {study.name!r}" for study in studies)
         raise SimulationError(f"{names} cannot be simulated with {'its' if len(studies) == 1 else 'their'} own values")
     rng = np.random.default_rng(fit.seed)
     max_trials = race.trials_left // (2 * max(fit.starts, 1))
     searches = [_begin_at_random(race, len(parameters), fit.ensemble, max_trials, rng) for _ in range(fit.starts)]
     if not from_scratch:
-        population = _refining_population(fit.population, len(parameters))
-        searches.append(race.begin(space.place_of(studies), START_DEVIATION, seed=fit.seed + 1, population=population))
+        population = refining_population(fit.population, len(parameters))
+        searches.append(race.begin(space.own_place(), START_DEVIATION, seed=fit.seed + 1, population=population))
     race.run(searches)
-    assert race.best is not None, "there is at least one trial"
-    lowest_losses, results = [search.lowest_loss for search in searches if search.lowest_loss < np.inf], []
-    profiles = Profiles.of(parameters, space, race, space.place_of(race.best))
-    for k, best_study in enumerate(race.best):
-        study_parameters = [parameter for parameter in parameters if k in parameter.study_indices]
-        best = msgspec.structs.replace(best_study, spread=profiles.spread(k))
+    profiles = Profiles.of(parameters, space, race, fit.alike)
+    reached, results = [search.lowest_loss for search in searches if search.lowest_loss < np.inf], []
+    for k, best in enumerate(space.studies_at(race.best_place)):
+        best = msgspec.structs.replace(best, spread=profiles.spread(k))
         error = {SAFETY_DEGREE: round(error_beyond_spread(best, fit_data[k]), ERROR_DECIMALS)} if fit_data[k] else {}
         best = msgspec.structs.replace(best, model_error=error)
-        results.append(Calibration(
-            values={parameter.key: value_of(best, parameter.key) for parameter in study_parameters}, study=best, loss=race.lowest_loss,
-            reached=lowest_losses, used=_measure_agreements(best, fit_data[k], pool),
-            held_back=_measure_agreements(best, test_data[k], pool),
-            bounds={parameter.key: parameter.bounds for parameter in study_parameters}, search=fit,
-            together=tuple(study.name for study in studies if study is not studies[k]),
-            shared=frozenset(parameter.key for parameter in study_parameters if len(parameter.study_indices) > 1),
-            intervals={parameter.key: profiles.interval(i) for i, parameter in enumerate(parameters) if k in parameter.study_indices},
-            profiles=profiles))
+        values = {parameter.key: FittedValue(parameter, float(profiles.values[0, i]), profiles.interval(i))
+                  for i, parameter in enumerate(parameters) if k in parameter.study_indices}
+        results.append(Calibration(values, best, race.lowest_loss, reached,
+                                   _measure_agreements(best, fit_data[k], pool),
+                                   _measure_agreements(best, test_data[k], pool), profiles))
     return results
 
 
-def _refining_population(population: int, parameter_count: int) -> int:
+def _check_subjects(subjects: Sequence[FitSubject], from_scratch: bool) -> None:
+    first = subjects[0].study
+    if not any(subject.study.calibration for subject in subjects):
+        raise InputError(first.source, "has no table [calibration]",
+                         "the free parameters with bounds, unit and meaning")
+    for study, references in subjects:
+        if not references and not study.published:
+            raise InputError(study.source, "has no table [published] and there is no reference file",
+                             "something to fit to")
+        for name in study.fit.weights:
+            if name not in COLUMNS:
+                raise InputError(study.source, f"fit.weights.{name} is no metric of the reference",
+                                 f"some of {', '.join(COLUMNS)}")
+    if from_scratch and not first.fit.starts:
+        raise InputError(first.source, "fit.starts = 0", "at least 1 for a fit from scratch")
+
+
+def refining_population(population: int, parameter_count: int) -> int:
     """A population `POPULATION_DIVISOR` times smaller, but at least the default population of CMA-ES (Hansen 2016)."""
     return min(population, max(population // POPULATION_DIVISOR, 4 + int(3 * math.log(parameter_count))))
 
 
-def _begin_at_random(race: SearchRace, dimension: int, ensemble_size: int, max_trials: int, rng: np.random.Generator) -> CmaSearch:
-    """Begin a search at the best place of an ensemble Kalman inversion; without an ensemble, or trials for one, at a random place."""
+def _begin_at_random(race: SearchRace, dimension: int, ensemble_size: int, max_trials: int,
+                     rng: np.random.Generator) -> CmaSearch:
+    """Begin a search at the best place of an ensemble Kalman inversion; without an ensemble, or trials for one, at a
+    random place.
+    """
     ensemble_size = min(ensemble_size, max_trials)
     if ensemble_size < 2:
         return race.begin(rng.random(dimension), RANDOM_DEVIATION, seed=int(rng.integers(1, 2**31)))
-    inversion = invert(race, dimension, ensemble_size, max_trials, rng)
-    return race.begin(inversion.place, ENSEMBLE_DEVIATION, seed=int(rng.integers(1, 2**31)), axes=inversion.axes)
-
-
-def _check_subject(subject: FitSubject) -> None:
-    source = subject.study.source
-    if not subject.references and not subject.study.published:
-        raise InputError(source, "has no table [published] and there is no reference file", "something to fit to")
-    for name in subject.study.fit.weights:
-        if name not in COLUMNS:
-            raise InputError(source, f"fit.weights.{name} is no metric of the reference", f"some of {', '.join(COLUMNS)}")
+    place, axes = invert(race, dimension, ensemble_size, max_trials, rng)
+    return race.begin(place, ENSEMBLE_DEVIATION, seed=int(rng.integers(1, 2**31)), axes=axes)
 
 
 def _measure_agreements(study: Study, references: Mapping[str, ReferenceData], pool: Pool) -> dict[str, Agreement]:
-    characteristics = CharacteristicSet.of(study.vehicle.characteristics)
-    agreements = {}
+    original, agreements = CharacteristicSet.of(study.vehicle.characteristics).original, {}
     for name, data in references.items():
-        evaluations = evaluate_all(study, np.concatenate([characteristics.original[np.newaxis], data.settings]), pool)
-        simulated_rows = evaluations.take(np.arange(1, len(evaluations)))
-        agreements[name] = measure_agreement(data, simulated_rows, study, evaluations.take([0]))
+        evaluations = evaluate_all(study, np.concatenate([original[np.newaxis], data.settings]), pool)
+        agreements[name] = measure_agreement(data, evaluations.take(np.arange(1, len(evaluations))), study,
+                                             evaluations.take([0]))
     return agreements
+
+
+def describe_fit(subject: FitSubject, result: Calibration, studies: Sequence[Study], *, from_scratch: bool) -> str:
+    """The fit of one of `studies` in words: search, data with fingerprints, shared parameters, loss, order, values on a
+    bound.
+    """
+    (study, references), fit, values = subject, studies[0].fit, result.values.items()
+    together = "".join(f", together with {other.name!r}" for other in studies if other is not study)
+    start = "random places only" if from_scratch else f"its own values and {fit.starts} random places"
+    own_names = ", ".join(name for name, value in values if not value.is_shared)
+    lines = [f"Study {study.name!r}, calibrated{together} by CMA-ES: {fit.trials} trials, seed {fit.seed}, from "
+             f"{start}.",
+             "Fitted to the original vehicle's published values, and to rows of these files, of which one in "
+             f"{study.fit.hold_out} is held back.",
+             *(f"  {name}, SHA-256 {data.fingerprint}, without {data.skipped} rows outside the domains; rho of the "
+               "safety degree "
+               f"{_order(result.used[name])}, held back {_order(result.held_back[name])}"
+               for name, data in references.items())]
+    return "\n".join([*lines, *([f"Parameters of its own: {own_names}; it shares the others."] if together else []),
+                      f"{result.loss_line}.",
+                      *(f"{name} lies on its bound." for name, value in values if value.is_on_bound)])
+
+
+def _order(result: Agreement) -> str:
+    rho = result.spearman[SAFETY_DEGREE]
+    return "-" if rho is None else f"{rho:.3f}"

@@ -1,4 +1,6 @@
-"""Effects of characteristics on the safety degree, in a reference and here, and the share of rows within the model's uncertainty."""
+"""Effects of characteristics on the safety degree, in a reference and here, and the share of rows within the model's
+uncertainty.
+"""
 
 from __future__ import annotations
 
@@ -15,31 +17,38 @@ from safevar_sumo.study import SAFETY_DEGREE, Study
 from safevar_sumo.vehicles import CharacteristicSet
 
 RELATIVE_TOLERANCE, ABSOLUTE_TOLERANCE = 0.2, 0.1
-"""Two effects agree if they differ by at most `RELATIVE_TOLERANCE` of the published effect, or by at most `ABSOLUTE_TOLERANCE` metres."""
+"""Two effects agree if they differ by at most `RELATIVE_TOLERANCE` of the published effect, or by at most
+`ABSOLUTE_TOLERANCE` metres."""
 ROWS_PER_COEFFICIENT = 10
 """Minimum number of rows for each coefficient of a regression."""
 
 
 class Effect(NamedTuple):
-    """Change of the safety degree over the whole domain of a characteristic [m], in the reference and here; None if undefined."""
+    """Change of the safety degree over the whole domain of a characteristic [m], in the reference and here; None if
+    undefined.
 
-    name: str
+    `agrees` is whether the two agree; None if one of them is undefined.
+    """
+
     reference: float | None
     here: float | None
+    agrees: bool | None
 
-    @property
-    def agrees(self) -> bool | None:
-        """Whether the effect here agrees with the published effect; None if one of them is undefined."""
-        if self.reference is None or self.here is None:
-            return None
-        return abs(self.here - self.reference) <= max(ABSOLUTE_TOLERANCE, RELATIVE_TOLERANCE * abs(self.reference))
+    @classmethod
+    def of(cls, reference: float | None, here: float | None) -> Effect:
+        """The effect, with `agrees` from both values."""
+        if reference is None or here is None:
+            return cls(reference, here, None)
+        return cls(reference, here, abs(here - reference)
+                   <= max(ABSOLUTE_TOLERANCE, RELATIVE_TOLERANCE * abs(reference)))
 
 
 class Regression(NamedTuple):
     """Linear regression of any values on all n characteristics of fixed settings.
 
-    `shares` are the changes of the settings as shares of the domains, shape (rows, n). `varies` is true for the k characteristics that
-    the settings vary, shape (n,). `slope_matrix`, shape (k, rows), times the values gives the k slopes; None for too few rows.
+    `shares` are the changes of the settings as shares of the domains, shape (rows, n). `varies` is true for the k
+    characteristics that the settings vary, shape (n,). `slope_matrix`, shape (k, rows), times the values gives the k
+    slopes; None for too few rows.
     """
 
     shares: FloatArray
@@ -69,20 +78,21 @@ class Regression(NamedTuple):
         return effects
 
 
-def effects_of(data: ReferenceData, evaluations: Evaluations, characteristics: CharacteristicSet) -> list[Effect]:
-    """The effects of all characteristics on the safety degree, in the order of the study."""
+def effects_of(data: ReferenceData, evaluations: Evaluations, characteristics: CharacteristicSet) -> dict[str, Effect]:
+    """The effect of each characteristic on the safety degree, in the order of the study."""
     regression = Regression.over(data.settings, characteristics)
-    effects_of_sides = (regression.effects(values) for values in (data.metrics[SAFETY_DEGREE], evaluations.f_safe))
-    return [Effect(name, *(finite_or_none(value) for value in pair))
-            for name, *pair in zip(characteristics.names, *effects_of_sides, strict=True)]
+    effects = zip(*(regression.effects(values) for values in (data.metrics[SAFETY_DEGREE], evaluations.f_safe)),
+                  strict=True)
+    return {name: Effect.of(*map(finite_or_none, pair)) for name,
+            pair in zip(characteristics.names, effects, strict=True)}
 
 
 class Coverage(NamedTuple):
     """Share of the published rows that lie within the band of the model's predictions.
 
-    `sets` and `rows` are numbers of parameter sets and rows; `all_rows` and `held_back` are shares of all rows, and of those that the fit
-    did not use (None without such rows); `width` is the median width of the band [m]; `needed` is the margin on each side with which the
-    band would cover 90 % of the rows held back, or of all rows [m].
+    `sets` and `rows` are numbers of parameter sets and rows; `all_rows` and `held_back` are shares of all rows, and of
+    those that the fit did not use (None without such rows); `width` is the median width of the band [m]; `needed` is
+    the margin on each side with which the band would cover 90 % of the rows held back, or of all rows [m].
     """
 
     sets: int
@@ -92,14 +102,12 @@ class Coverage(NamedTuple):
     width: float
     needed: float
 
-    def to_dict(self) -> dict[str, float | None]:
-        """The fields by name."""
-        return self._asdict()
-
     def __str__(self) -> str:
-        held_back = "none of them held back" if self.held_back is None else f"{self.held_back:.0%} of the rows held back"
-        return (f"The {BAND_SHARE:.0%} band of {self.sets} parameter sets, of repeats and of the model's error is {self.width:.2f} m wide "
-                f"(median) and covers {self.all_rows:.0%} of {self.rows} rows, {held_back}; {self.needed:.2f} m more on each side would "
+        held_back = "none of them" if self.held_back is None else f"{self.held_back:.0%} of the rows"
+        return (f"The {BAND_SHARE:.0%} band of {self.sets} parameter sets, of repeats and of the model's error is "
+                f"{self.width:.2f} m wide "
+                f"(median) and covers {self.all_rows:.0%} of {self.rows} rows, {held_back} held back; "
+                f"{self.needed:.2f} m more on each side would "
                 f"cover {BAND_SHARE:.0%} of {'these rows' if self.held_back is None else 'the rows held back'}.")
 
 
@@ -113,13 +121,18 @@ def measure_coverage(data: ReferenceData, study: Study) -> Coverage:
     """
     evaluations = evaluate_sets(study, data.settings)
     lower, upper = band_of(study, evaluations)
-    published = data.metrics[SAFETY_DEGREE]
-    distances = _distance_from_band(published, lower, upper)
-    held_back = np.arange(len(published)) % study.fit.hold_out == study.fit.hold_out - 1
-    new_rows = held_back if held_back.any() else np.ones(len(published), dtype=bool)
-    return Coverage(sets=len(evaluations), rows=len(published), all_rows=float(np.mean(distances == 0)),
-                    held_back=float(np.mean(distances[held_back] == 0)) if held_back.any() else None, width=float(np.median(upper - lower)),
+    distances = _distance_from_band(data.metrics[SAFETY_DEGREE], lower, upper)
+    held_back = is_held_back(data, study.fit.hold_out)
+    new_rows = held_back if held_back.any() else ~held_back
+    return Coverage(sets=len(evaluations), rows=len(distances), all_rows=float(np.mean(distances == 0)),
+                    held_back=float(np.mean(distances[held_back] == 0)) if held_back.any() else None,
+                    width=float(np.median(upper - lower)),
                     needed=float(np.quantile(distances[new_rows], BAND_SHARE)))
+
+
+def is_held_back(data: ReferenceData, hold_out: int) -> BoolArray:
+    """Whether a fit leaves a row to judge on: every `hold_out`-th row; shape (rows,)."""
+    return np.asarray(np.arange(len(data.settings)) % hold_out == hold_out - 1)
 
 
 def _distance_from_band(values: FloatArray, lower: FloatArray, upper: FloatArray) -> FloatArray:
@@ -128,18 +141,19 @@ def _distance_from_band(values: FloatArray, lower: FloatArray, upper: FloatArray
 
 
 def error_beyond_spread(study: Study, references: Mapping[str, ReferenceData]) -> float:
-    """Margin on each side with which the band holds the share `BAND_SHARE` of new rows [m per domain width of distance from the original].
+    """Margin on each side with which the band holds the share `BAND_SHARE` of new rows [m per domain width of distance
+    from the original].
 
-    The method is split conformal prediction (Lei et al. 2018). The score of a row is its distance from the band, divided by its
-    `error_distance` from the original setting. All files have the same weight.
+    The method is split conformal prediction (Lei et al. 2018). The score of a row is
+    its distance from the band, divided by its `error_distance` from the original setting. All files have the same
+    weight.
     """
-    study_without_error = msgspec.structs.replace(study, model_error={})
-    scores, weights = [], []
+    without_error, scores, weights = msgspec.structs.replace(study, model_error={}), [], []
     for data in references.values():
         distances, published = error_distance(study, data.settings), data.metrics[SAFETY_DEGREE]
         is_usable = np.isfinite(published)
         if is_usable.any():
-            lower, upper = band_of(study_without_error, evaluate_sets(study_without_error, data.settings[is_usable]))
+            lower, upper = band_of(without_error, evaluate_sets(without_error, data.settings[is_usable]))
             scores.append(_distance_from_band(published[is_usable], lower, upper) / distances[is_usable])
             weights.append(np.full(len(scores[-1]), 1 / len(scores[-1])))
     if not scores:

@@ -1,4 +1,7 @@
-"""The loss of a study: a number for its disagreement with published data. The table [fit] (`FitTable`) weights the parts."""
+"""The loss of a study: a number for its disagreement with published data.
+
+The table [fit] (`FitTable`) weights the parts.
+"""
 
 from __future__ import annotations
 
@@ -17,36 +20,31 @@ from safevar_sumo.vehicles import CharacteristicSet
 MAX_LOSS = 1e5
 """Largest loss of a study in one reference. A study that cannot be simulated has this loss too."""
 MAX_DEVIATION = 10.0
-"""Largest deviation of a value of the original vehicle, as a multiple of the tolerance. An undefined value has this deviation too."""
+"""Largest deviation of a value of the original vehicle, as a multiple of the tolerance.
+
+An undefined value has this deviation too.
+"""
 ROW_NOISE = 0.25
-"""Standard deviation of the noise of a row in `residuals`, as a share of the standard deviation of the reference's metric."""
+"""Standard deviation of the noise of a row in `residuals`, as a share of the standard deviation of the reference's
+metric."""
 
 
-def original_loss(original: Evaluations, published: Mapping[str, float], fit: FitTable) -> float:
-    """How far the original vehicle's metrics deviate from the published values beyond the tolerance; a mean, weighted by metric.
+def original_misfit(original: Evaluations, published: Mapping[str, float], fit: FitTable) -> tuple[float, FloatArray]:
+    """Loss and residuals of the original vehicle's metrics, which deviate from the published values.
 
-    Deviations within the tolerance cost nothing (Vapnik 1995): the published values come from a single simulation of the original
-    vehicle, and the many rows of similar vehicles are stronger evidence.
+    The loss is a mean, weighted by metric, in halves of a tolerance beyond the tolerance. Deviations within the
+    tolerance cost nothing (Vapnik 1995): the published values come from a single simulation of the original vehicle,
+    and the many rows of similar vehicles are stronger evidence. The residuals are the deviations in tolerances; their
+    squares are weighted by metric.
     """
-    deviations = [fit.weights.get(name, 0.0) * _excess(original.metrics[name][0] / value - 1, fit.tolerance)
-                  for name, value in published.items() if name in METRICS]
-    return fit.original * float(np.mean(deviations)) if deviations else 0.0
-
-
-def _excess(deviation: float, tolerance: float) -> float:
-    """Excess of a relative deviation over the tolerance, in units of half a tolerance; 0 within the tolerance."""
-    multiple = min(abs(deviation) / tolerance, MAX_DEVIATION) if np.isfinite(deviation) else MAX_DEVIATION
-    return 2 * max(multiple - 1, 0.0)
-
-
-def original_residuals(original: Evaluations, published: Mapping[str, float], fit: FitTable) -> FloatArray:
-    """Deviations of the original vehicle's metrics from the published values, in tolerances; their squares are weighted by metric."""
-    if not fit.original:
-        return np.empty(0)
     names = [name for name in published if name in METRICS]
+    if not names or not fit.original:
+        return 0.0, np.empty(0)
     deviations = np.array([original.metrics[name][0] / published[name] - 1 for name in names]) / fit.tolerance
     deviations = np.nan_to_num(np.clip(deviations, -MAX_DEVIATION, MAX_DEVIATION), nan=MAX_DEVIATION)
-    return np.asarray(deviations * np.sqrt([fit.weights.get(name, 0.0) for name in names]))
+    weights = np.array([fit.weights.get(name, 0.0) for name in names])
+    excess = 2 * np.maximum(np.abs(deviations) - 1, 0.0)
+    return fit.original * float(np.mean(weights * excess)), np.asarray(deviations * np.sqrt(weights))
 
 
 class ReferenceLoss:
@@ -56,26 +54,25 @@ class ReferenceLoss:
     - differences between the effects of characteristics;
     - the share of rows that collide only in the reference, or only here.
 
-    The unit of errors is the standard deviation of repeats of one setting in the reference or, if the study does not give it, of all
-    values in the reference.
+    The unit of errors is the standard deviation of repeats of one setting in the reference or, if the study does not
+    give it, of all values in the reference.
     """
 
     def __init__(self, data: ReferenceData, study: Study) -> None:
         self._data, self._study = data, study
-        self._units, self._noise = dict[str, float](), dict[str, float]()
-        for name in study.fit.weights:
-            values = data.metrics[name][~np.isnan(data.metrics[name])]
-            if values.size and np.ptp(values) > 0:
-                self._units[name] = study.repeatability.get(name) or float(np.std(values))
-                self._noise[name] = ROW_NOISE * float(np.std(values))
+        defined_values = {name: data.metrics[name][~np.isnan(data.metrics[name])] for name in study.fit.weights}
+        self._deviations = {name: float(np.std(values)) for name, values in defined_values.items() if values.size
+                            and np.ptp(values) > 0}
         self._regression = Regression.over(data.settings, CharacteristicSet.of(study.vehicle.characteristics))
         self._effects = self._regression.effects(data.metrics[SAFETY_DEGREE])
 
     def of(self, evaluations: Evaluations) -> float:
         """The loss, from evaluations of the settings of the reference."""
         fit, loss = self._study.fit, 0.0
-        result = measure_agreement(self._data, evaluations, self._study, original=evaluations)  # no result of the original is read below
-        for name, unit in self._units.items():
+        # no result of the original is read below
+        result = measure_agreement(self._data, evaluations, self._study, original=evaluations)
+        for name, deviation in self._deviations.items():
+            unit = self._study.repeatability.get(name) or deviation
             rho, error = result.spearman[name], result.mean_absolute_error[name]
             loss += fit.weights[name] * (fit.rank * (1 - (rho or 0.0)) + (np.inf if error is None else error) / unit)
             if name == SAFETY_DEGREE and fit.effects:
@@ -90,7 +87,9 @@ class ReferenceLoss:
 
         An undefined difference is 0; a row that cannot be simulated has differences of `MAX_DEVIATION`.
         """
-        differences = [np.sqrt(self._study.fit.weights[name]) * np.where(
-            evaluations.valid, np.nan_to_num((evaluations.metrics[name] - self._data.metrics[name]) / noise), MAX_DEVIATION)
-            for name, noise in self._noise.items()]
-        return np.concatenate([np.empty(0), *differences])
+        differences = [np.empty(0)]
+        for name, deviation in self._deviations.items():
+            errors = np.nan_to_num((evaluations.metrics[name] - self._data.metrics[name]) / (ROW_NOISE * deviation))
+            differences.append(np.sqrt(self._study.fit.weights[name])
+                               * np.where(evaluations.valid, errors, MAX_DEVIATION))
+        return np.concatenate(differences)

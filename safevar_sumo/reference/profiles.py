@@ -1,27 +1,23 @@
-"""Uncertainty of fitted parameters: the losses of trials by parameter, and sets of values that fit as well as the best."""
+"""Uncertainty of fitted parameters: the losses of trials by parameter, and sets of values that fit as well as the
+best.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 
-from safevar_sumo.analysis.figures import save
+from safevar_sumo.analysis.figures import BLUE, GREY, new_panels, save
 from safevar_sumo.records import FloatArray
-from safevar_sumo.reference.parameters import FittedParameter
+from safevar_sumo.reference.fit_space import FitSpace, FittedParameter
 from safevar_sumo.reference.search import SearchRace
 from safevar_sumo.study import Study, unit_text
 
 MAX_SETS = 20
 """Maximum number of parameter sets in a table [spread], including the best set."""
-
-
-class ParameterSpace(Protocol):
-    """Maps places in the unit cube of the parameters' bounds to values."""
-
-    def values(self, places: FloatArray) -> FloatArray: ...
 
 
 class Profiles(NamedTuple):
@@ -32,9 +28,11 @@ class Profiles(NamedTuple):
     parameters
         The fitted parameters.
     losses, values
-        Losses of the K trials, shape (K,), and their parameter values, shape (K, parameters). The best trial comes first.
+        Losses of the K trials, shape (K,), and their parameter values, shape (K, parameters). The best trial comes
+        first.
     sets
-        Indices of up to `MAX_SETS` trials that fit as well as the best and lie as far apart as possible. The best trial comes first.
+        Indices of up to `MAX_SETS` trials that fit as well as the best and lie as far apart as possible. The best trial
+        comes first.
     limit
         The loss up to which a trial fits as well as the best.
     """
@@ -46,12 +44,14 @@ class Profiles(NamedTuple):
     limit: float
 
     @classmethod
-    def of(cls, parameters: Sequence[FittedParameter], space: ParameterSpace, race: SearchRace, best_place: FloatArray) -> Profiles:
-        """The profiles of a finished race whose best trial was at `best_place`."""
-        limit = race.lowest_loss * (1 + race.alike)
-        trials = sorted((trial for trial in race.kept if race.lowest_loss < trial.loss), key=lambda trial: trial.loss)
-        losses = np.array([race.lowest_loss, *(trial.loss for trial in trials)])
-        places = np.array([best_place, *(trial.place for trial in trials)])
+    def of(cls, parameters: Sequence[FittedParameter], space: FitSpace, race: SearchRace, alike: float) -> Profiles:
+        """The profiles of a finished race; a trial fits as well as the best up to `alike` times the lowest loss above
+        it.
+        """
+        limit = race.lowest_loss * (1 + alike)
+        trials = sorted((trial for trial in race.kept if race.lowest_loss < trial[0]), key=lambda trial: trial[0])
+        losses = np.array([race.lowest_loss, *(loss for loss, _ in trials)])
+        places = np.array([race.best_place, *(place for _, place in trials)])
         return cls(parameters, losses, space.values(places), _distant_trials(places[losses <= limit]), limit)
 
     def spread(self, study: int) -> dict[str, list[float]]:
@@ -76,37 +76,26 @@ def _distant_trials(places: FloatArray) -> list[int]:
 
 
 def plot_profiles(path: Path, profiles: Profiles, studies: Sequence[Study]) -> None:
-    """Draw the loss over each parameter: a dot for each trial, in colour if it fits as well as the best, and a band for the interval.
+    """Draw the loss over each parameter: a dot for each trial, in colour if it fits as well as the best, and a band for
+    the interval.
 
     Raises
     ------
     InputError
         If the file cannot be written or its ending names no picture format.
     """
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-    import seaborn as sns
-
-    columns = 4
-    rows = -(-len(profiles.parameters) // columns)
-    with sns.axes_style("whitegrid"), plt.rc_context({"font.size": 9}):
-        figure, axes = plt.subplots(rows, columns, figsize=(11, 1.7 * rows + 0.6), layout="constrained", squeeze=False, sharey=True)
-        is_as_good = profiles.losses <= profiles.limit
-        for k, axis in enumerate(axes.flat):
-            if k >= len(profiles.parameters):
-                axis.set_axis_off()
-                continue
-            parameter, values = profiles.parameters[k], profiles.values[:, k]
-            axis.axvspan(*profiles.interval(k), color="#0072b2", alpha=0.12, linewidth=0)
-            axis.scatter(values[~is_as_good], profiles.losses[~is_as_good], s=3, alpha=0.25, color="#808080", linewidths=0)
-            axis.scatter(values[is_as_good], profiles.losses[is_as_good], s=5, alpha=0.6, color="#0072b2", linewidths=0)
-            axis.axvline(values[0], color="black", linewidth=0.8, linestyle="--")
-            key = parameter.label(studies).replace("vehicle.parameters.", "").replace("ads.parameters.", "")
-            axis.set_xlabel(key + unit_text(parameter.bounds.unit, " [{}]"))
-            if k % columns == 0:
-                axis.set_ylabel("loss")
-        figure.suptitle(f"Loss of {' and '.join(study.name for study in studies)} over each parameter; band: fits as well as the best")
-        save(figure, path, "plot")
-        plt.close(figure)
+    names = [study.name for study in studies]
+    title = f"Loss of {' and '.join(names)} over each parameter; band: fits as well as the best"
+    figure, axes = new_panels(title, len(profiles.parameters), 4, (2.75, 1.7), 11.0, 0.6)
+    is_as_good = profiles.losses <= profiles.limit
+    for k, (axis, parameter) in enumerate(zip(axes, profiles.parameters, strict=True)):
+        values = profiles.values[:, k]
+        axis.axvspan(*profiles.interval(k), color=BLUE, alpha=0.12, linewidth=0)
+        axis.scatter(values, profiles.losses, s=4, alpha=0.5, c=np.where(is_as_good, BLUE, GREY), linewidths=0)
+        axis.axvline(values[0], color="black", linewidth=0.8, linestyle="--")
+        key = parameter.key.replace("vehicle.parameters.", "").replace("ads.parameters.", "")
+        owners = [] if len(parameter.study_indices) == len(names) else [names[i] for i in parameter.study_indices]
+        axis.set(xlabel=f"{', '.join(owners)}: " * bool(owners) + key + unit_text(parameter.bounds.unit, " [{}]"),
+                 ylabel="loss")
+        axis.sharey(axes[0])
+    save(figure, path, "plot")

@@ -1,89 +1,70 @@
-"""Searches, by CMA-ES, for the lowest loss of studies that are fitted together."""
+"""Searches, by CMA-ES, for the place with the lowest loss in the unit cube of the parameters' bounds."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from safevar_sumo.records import FloatArray
-from safevar_sumo.study import Study
-
-StudyGroup = tuple[Study, ...]
-"""Studies that are fitted together."""
-
-
-class Misfit(NamedTuple):
-    """The loss of studies, and their residuals in standard deviations of the residuals' noise."""
-
-    loss: float
-    residuals: FloatArray
-
-
-class Space(Protocol):
-    """Maps places in the unit cube of the parameters' bounds to studies, and studies to their misfits."""
-
-    def studies_at(self, place: FloatArray) -> StudyGroup: ...
-
-    def misfits(self, groups: Sequence[StudyGroup]) -> list[Misfit]: ...
-
 
 MAX_KEPT_RATIO = 1.25
 """A trial is kept, for profiles and the spread, if its loss is at most this multiple of the lowest loss."""
 
 
-class Trial(NamedTuple):
-    """A tried place in the unit cube of the parameters' bounds, and the loss of its studies."""
+class Misfit(NamedTuple):
+    """The loss at a place, and the residuals in standard deviations of their noise."""
 
     loss: float
-    place: FloatArray
+    residuals: FloatArray
 
 
 class SearchRace:
-    """Searches that compete for a number of trials; keeps the studies of the best trial, and counts the trials left.
+    """Searches that compete for a number of trials; `best_place` has the lowest loss of all trials.
 
     Parameters
     ----------
+    misfits_at
+        Returns the misfits at places.
     population
         Default number of trials in a generation of a search.
+    trials
+        Number of trials in all; `trials_left` counts down from it.
     done
-        Called after every trial with the lowest loss so far, and the studies with this loss.
-    alike
-        A trial fits as well as the best if its loss exceeds the lowest loss by at most this share of the lowest loss.
+        Called after every trial with the lowest loss so far, and the place with this loss.
     """
 
-    def __init__(self, space: Space, population: int, trials: int, done: Callable[[float, StudyGroup], None], alike: float = 0.0) -> None:
-        self.alike = alike
-        self.best: StudyGroup | None = None
-        self.lowest_loss, self.trials_left = np.inf, trials
-        self.kept: list[Trial] = []
-        """Trials of searches with a loss of at most `MAX_KEPT_RATIO` times the lowest loss at the time of the trial."""
-        self._space, self.population, self._done = space, population, done
+    def __init__(self, misfits_at: Callable[[Sequence[FloatArray]], list[Misfit]], population: int, trials: int,
+                 done: Callable[[float, FloatArray], None]) -> None:
+        self._misfits_at, self.population, self.trials_left, self._done = misfits_at, population, trials, done
+        self.best_place, self.lowest_loss = np.empty(0), np.inf
+        self.kept: list[tuple[float, FloatArray]] = []
+        """Loss and place of the searches' trials whose loss was at most `MAX_KEPT_RATIO` times the lowest loss then."""
 
-    def try_studies(self, groups: Sequence[StudyGroup]) -> list[Misfit]:
-        """The misfits of groups of studies; each group is one trial."""
-        misfits = self._space.misfits(groups)
+    def try_places(self, places: Sequence[FloatArray]) -> list[Misfit]:
+        """The misfits at places; each place is one trial."""
+        misfits = self._misfits_at(places)
         self.trials_left -= len(misfits)
-        for group, misfit in zip(groups, misfits, strict=True):
-            if self.best is None or misfit.loss < self.lowest_loss:
-                self.best, self.lowest_loss = group, misfit.loss
-            self._done(self.lowest_loss, self.best)
+        for place, misfit in zip(places, misfits, strict=True):
+            if not self.best_place.size or misfit.loss < self.lowest_loss:
+                self.best_place, self.lowest_loss = np.asarray(place), misfit.loss
+            self._done(self.lowest_loss, self.best_place)
         return misfits
-
-    def try_places(self, places: Sequence[FloatArray] | FloatArray) -> list[Misfit]:
-        """The misfits of the studies at places; each place is one trial."""
-        return self.try_studies([self._space.studies_at(place) for place in places])
 
     def begin(self, place: FloatArray, deviation: float, seed: int, population: int | None = None,
               axes: FloatArray | None = None) -> CmaSearch:
-        """Begin a search at a place, with `deviation` as initial standard deviation along `axes`; the race's population is the default."""
-        return CmaSearch(self, place, deviation, seed, population or self.population, np.eye(len(place)) if axes is None else axes)
+        """Begin a search at a place, with `deviation` as initial standard deviation along `axes`, by default the
+        cube's.
+        """
+        return CmaSearch(self, place, deviation, seed, population or self.population, np.eye(len(place)) if axes is None
+                         else axes)
 
     def run(self, searches: Sequence[CmaSearch]) -> None:
         """Spend all trials left by successive halving (Jamieson and Talwalkar 2016).
 
-        All rounds have the same number of trials. Half of the searches reach the next round; the last search gets the remaining trials.
+        All rounds have the same number of trials. Half of the searches reach the next round; the last search gets the
+        remaining trials.
         """
         competitors = list(searches)
         rounds = 1 + (len(competitors) - 1).bit_length()
@@ -102,7 +83,8 @@ class CmaSearch:
     Its first generation has the covariance `deviation`**2 * `axes` @ `axes`.T, where `axes` has the shape (n, n).
     """
 
-    def __init__(self, race: SearchRace, place: FloatArray, deviation: float, seed: int, population: int, axes: FloatArray) -> None:
+    def __init__(self, race: SearchRace, place: FloatArray, deviation: float, seed: int, population: int,
+                 axes: FloatArray) -> None:
         import cma  # slow to import
 
         self._race, self.lowest_loss, self.population = race, np.inf, population
@@ -118,7 +100,7 @@ class CmaSearch:
             places = [np.asarray(self._bounds.repair(self._axes @ point)) for point in coordinates]
             losses = [misfit.loss for misfit in race.try_places(places[:trials_left])]
             max_loss = MAX_KEPT_RATIO * race.lowest_loss
-            race.kept += [Trial(loss, place) for loss, place in zip(losses, places, strict=False) if loss <= max_loss]
-            self.lowest_loss = min(self.lowest_loss, min(losses))
+            race.kept += [(loss, place) for loss, place in zip(losses, places, strict=False) if loss <= max_loss]
+            self.lowest_loss = min(self.lowest_loss, *losses)
             if len(losses) == len(places):
                 self._strategy.tell(coordinates, losses)

@@ -295,27 +295,32 @@ def describe_agreement(data: ReportInput) -> PublishedAgreement:
     if not totals:
         return PublishedAgreement("This study was not compared with published data: whether another simulator or a real vehicle behaves in "
                                   "the same way is unknown.", [])
-    sentences = map(_agreement_sentence, sorted(totals, key=lambda entry: (-entry.reference, -entry.rows)))
-    return PublishedAgreement(f"Agreement with published data. {' '.join(sentences)}", list(map(_agreement_row, totals)))
+    by_collisions = sorted(totals.items(), key=lambda item: (-item[1].collisions["reference"], -item[1].rows))
+    sentences = (_agreement_sentence(file, entry) for file, entry in by_collisions)
+    return PublishedAgreement(f"Agreement with published data. {' '.join(sentences)}",
+                              [_agreement_row(file, entry) for file, entry in totals.items()])
 
 
-def _agreement_sentence(totals: Totals) -> str:
+def _agreement_sentence(file: str, totals: Totals) -> str:
+    counts = totals.collisions
     collisions = "no published collision is among them" if totals.recall is None else (
-        f"{totals.both} of the {totals.reference} published collisions collide here too (recall {totals.recall:.2f})")
+        f"{counts['both']} of the {counts['reference']} published collisions collide here too (recall {totals.recall:.2f})")
     if totals.precision is not None:
-        collisions += f", and {totals.both} of the {totals.here} collisions here are published ones (precision {totals.precision:.2f})"
+        collisions += (f", and {counts['both']} of the {counts['here']} collisions here are published ones "
+                       f"(precision {totals.precision:.2f})")
     rho = totals.spearman.get(SAFETY_DEGREE)
     order = "" if rho is None else f" the rank correlation of the safety degrees is {rho:.2f} (1: the same order, 0: none);"
-    return f"{totals.file}, {totals.rows} vehicles simulated again:{order} {collisions}."
+    return f"{file}, {totals.rows} vehicles simulated again:{order} {collisions}."
 
 
-def _agreement_row(totals: Totals) -> list[str]:
+def _agreement_row(file: str, totals: Totals) -> list[str]:
     """The texts of a row: file, vehicles, rank correlation, mean error, collisions published, here and in both, recall, precision."""
     def decimal(value: float | None) -> str:
         return NO_VALUE if value is None else f"{value:.2f}"
 
     degree_agreement = totals.spearman.get(SAFETY_DEGREE), totals.mean_absolute_error.get(SAFETY_DEGREE)
-    return [totals.file, str(totals.rows), *map(decimal, degree_agreement), *map(str, (totals.reference, totals.here, totals.both)),
+    return [file, str(totals.rows), *map(decimal, degree_agreement),
+            *(str(totals.collisions[side]) for side in ("reference", "here", "both")),
             *map(decimal, (totals.recall, totals.precision))]
 
 

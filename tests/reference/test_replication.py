@@ -1,4 +1,6 @@
-"""A whole study beside a published one: matched, cell beside cell, concluded by rule, and looked for in published rows."""
+"""A whole study beside a published one: matched, cell beside cell, concluded by rule, and looked for in published
+rows.
+"""
 
 from __future__ import annotations
 
@@ -16,8 +18,8 @@ from click.testing import CliRunner, Result
 from safevar_sumo.analysis.research_questions.case import load_cases
 from safevar_sumo.cli.program import commands
 from safevar_sumo.errors import InputError
-from safevar_sumo.reference import Agreement, agreement, shipped_totals_of, write_totals
-from safevar_sumo.reference.agreement import rank_correlation
+from safevar_sumo.reference import agreement
+from safevar_sumo.reference.agreement import Agreement, rank_correlation, shipped_totals_of, write_totals
 from safevar_sumo.reference.conclusions import (
     DIFFERS,
     HOLDS,
@@ -26,7 +28,6 @@ from safevar_sumo.reference.conclusions import (
     compare_tables,
     draw_conclusions,
     judge_test,
-    pair_cases,
 )
 from safevar_sumo.report.verdict import PublishedAgreement, describe_agreement
 from safevar_sumo.study import load_study
@@ -43,7 +44,9 @@ def typed(*arguments: object) -> Result:
 
 
 def rows(path: Path, changed: tuple[str, ...], safety: float, collisions: int, number: int = 40) -> Path:
-    """Solutions that change the first of these characteristics always, the second in half of the cases, the third in a quarter ..."""
+    """Solutions that change the first of these characteristics always, the second in half of the cases, the third in a
+    quarter ...
+    """
     settings = np.repeat(SUN.original[np.newaxis], number, axis=0)
     for place, name in enumerate(changed):
         i = SUN.names.index(name)
@@ -52,7 +55,8 @@ def rows(path: Path, changed: tuple[str, ...], safety: float, collisions: int, n
     values = safety + 0.001 * np.arange(number)
     values[:collisions] = -1.0
     crash = values <= 0
-    frame.assign(SaftyDegree=values, TET=np.where(crash, 0, 1.5), TIT=np.where(crash, 0, 0.7), Dece=5.0).to_csv(path, index=False)
+    frame.assign(SaftyDegree=values, TET=np.where(crash, 0, 1.5), TIT=np.where(crash, 0, 0.7),
+                 Dece=5.0).to_csv(path, index=False)
     return path
 
 
@@ -63,14 +67,15 @@ def sides(tmp_path_factory: pytest.TempPathFactory) -> Path:
     rs = rows(place / "rs.csv", ("mass", "radius"), 2.0, 0)
     here = rows(place / "here.csv", ("mass", "tireFric", "radius", "max_rpm"), 1.0, 20)
     there = rows(place / "there.csv", ("maxBrakeTorque", "dragCoeff", "dampRate"), 1.5, 0)
-    for name, study, nsga2 in (("one", "sun", here), ("same", "sun", here), ("other", "sun", there), ("rain", "rain", here),
+    for name, study, nsga2 in (("one", "sun", here), ("same", "sun", here), ("other", "sun", there),
+                               ("rain", "rain", here),
                                ("wet", "rain", there)):
         assert typed("import", study, "--out", place / name, "--nsga2", nsga2, "--rs", rs).exit_code == 0
     return place
 
 
 def verdicts_of(sides: Path, here: str, there: str) -> dict[tuple[str, str], str]:
-    tables = compare_tables(pair_cases(load_cases([sides / here]), load_cases([sides / there])))
+    tables = compare_tables(load_cases([sides / here]), load_cases([sides / there]))
     return {(one.question, one.statement.split(":")[0]): one.verdict for one in draw_conclusions(tables)}
 
 
@@ -107,7 +112,8 @@ def test_the_page_has_both_sides_and_says_what_is_missing(sides: Path) -> None:
     page = (sides / "page.md").read_text(encoding="utf-8")
     assert "rain: results here, none published given" in page
     assert "| sun | nsga2 | 0.5 / 0 |" in page.replace("40 / 40 | 20 / 0 | ", "")
-    for heading in ("RQ1", "RQ2", "RQ3.1", "RQ3.2", "RQ3.3", "Collisions", "Four changed together", "One weather against another"):
+    for heading in ("RQ1", "RQ2", "RQ3.1", "RQ3.2", "RQ3.3", "Collisions", "Four changed together",
+                    "One weather against another"):
         assert f"### {heading}" in page
     assert typed("replicate", sides / "one", "--published", sides / "other").output == typed(
         "replicate", "--published", sides / "other", "--reference", "--", sides / "one").output
@@ -115,9 +121,8 @@ def test_the_page_has_both_sides_and_says_what_is_missing(sides: Path) -> None:
 
 @pytest.mark.parametrize(("arguments", "problem"), [
     (("one", "--published", "rain"), "none of sun"),
-    (("one", "same", "--published", "other"), "two results of the study"),
+    (("one", "same", "--published", "other"), "two results of a study"),
     (("one", "rain", "--published", "other", "wet", "--reference", "rs.csv"), "may belong to any of sun, rain"),
-    (("one", "--published", "other", "--reference", "nonsense=rs.csv"), "belongs to none of"),
     (("one", "--published", "other", "--reference", "nowhere.csv"), "cannot be read"),
 ])
 def test_what_cannot_be_held_against_each_other_is_refused(sides: Path, arguments: tuple[str, ...], problem: str,
@@ -129,7 +134,8 @@ def test_what_cannot_be_held_against_each_other_is_refused(sides: Path, argument
 
 MADE_UP = Agreement(
     rows=80, spearman={"safety_degree": 0.61234, "tet": None}, mean_absolute_error={"safety_degree": 0.25}, bias={},
-    collisions={"reference": 40, "here": 20, "both": 10}, original={}, precision=0.5, recall=0.25, collision_speed={}, in_repeats={},
+    collisions={"reference": 40, "here": 20, "both": 10}, original={}, precision=0.5, recall=0.25, collision_speed={},
+    in_repeats={},
     undecided={}, by_predicted=[])
 
 
@@ -147,38 +153,33 @@ def totals(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return path
 
 
-@pytest.mark.usefixtures("totals")
-def test_the_page_says_how_well_the_study_agrees() -> None:
-    searched_otherwise = load_study("rain", title="Mine", search={"seed": 5, "evaluations": 100})
-    page = page_of(searched_otherwise)
-    for words in ("80 vehicles", "rank correlation of the safety degrees is 0.61 (1: the same order, 0: none)",
-                  "10 of the 40 published collisions", "recall 0.25", "precision 0.50"):
-        assert words in page.sentence
-    assert page.rows == [["made_up.csv", "80", "0.61", "0.25", "40", "20", "10", "0.25", "0.50"]]
-
-
-def test_the_page_quotes_every_file_and_not_only_the_best(totals: Path) -> None:
+def test_the_page_says_how_well_the_study_agrees_with_every_file(totals: Path) -> None:
     worse = Agreement(**{**MADE_UP.to_dict(), "rows": 90, "spearman": {"safety_degree": 0.1}})
     write_totals(totals, load_study("rain"), "worse.csv", worse)
-    sentence = page_of(load_study("rain")).sentence
-    for words in ("made_up.csv, 80 vehicles simulated again", "safety degrees is 0.61", "worse.csv, 90 vehicles", "safety degrees is 0.10"):
-        assert words in sentence
+    page = page_of(load_study("rain", title="Mine", search={"seed": 5, "evaluations": 100}))
+    for words in ("made_up.csv, 80 vehicles",
+                  "rank correlation of the safety degrees is 0.61 (1: the same order, 0: none)",
+                  "10 of the 40 published collisions", "recall 0.25", "precision 0.50", "worse.csv, 90 vehicles",
+                  "is 0.10"):
+        assert words in page.sentence
+    assert page.rows[0] == ["made_up.csv", "80", "0.61", "0.25", "40", "20", "10", "0.25", "0.50"]
 
 
 @pytest.mark.usefixtures("totals")
 def test_nobody_elses_agreement_is_claimed() -> None:
     """Another weather, or the same study with another parameter, simulates something else."""
     rain = load_study("rain")
-    other = msgspec.structs.replace(rain, ads=msgspec.structs.replace(rain.ads, parameters={**rain.ads.parameters, "margin": 9.0}))
+    other = msgspec.structs.replace(rain, ads=msgspec.structs.replace(rain.ads, parameters={**rain.ads.parameters,
+                                                                                            "margin": 9.0}))
     for study in (load_study("sun"), other):
-        assert shipped_totals_of(study) == []
+        assert shipped_totals_of(study) == {}
         assert "was not compared with published data" in page_of(study).sentence
 
 
 def test_an_entry_is_replaced_and_others_stay(totals: Path) -> None:
     write_totals(totals, load_study("sun"), "made_up.csv", MADE_UP)
     write_totals(totals, load_study("rain"), "made_up.csv", Agreement(**{**MADE_UP.to_dict(), "rows": 7}))
-    assert [one.rows for one in (*shipped_totals_of(load_study("rain")), *shipped_totals_of(load_study("sun")))] == [7, 80]
+    assert [shipped_totals_of(load_study(name))["made_up.csv"].rows for name in ("rain", "sun")] == [7, 80]
     totals.write_text("[rain]\nrows = 3\n")
     with pytest.raises(InputError, match="holds no totals"):
         shipped_totals_of(load_study("rain"))
@@ -187,12 +188,14 @@ def test_an_entry_is_replaced_and_others_stay(totals: Path) -> None:
 def test_what_ships_is_what_the_trust_page_says() -> None:
     lines = (Path(__file__).parents[2] / "docs/trust.md").read_text()
     shown = re.findall(r"^\| \w+, [\w\- ]+ \| (\d+) \| (\d+) \| (\d+) \| [\d.]+ \| [\d.]+ \|", lines, re.MULTILINE)
-    ships = [one for name in ("sun", "rain") for one in shipped_totals_of(load_study(name))]
+    ships = [one.collisions.values() for name in ("sun", "rain")
+             for one in shipped_totals_of(load_study(name)).values()]
     assert len(shown) == 4
-    assert set(shown) <= {(str(one.reference), str(one.here), str(one.both)) for one in ships}
+    assert set(shown) <= {tuple(map(str, counts)) for counts in ships}
 
 
-PUBLISHED_EFFECTS = {"tireFric": 1.2, "mass": -0.8, "maxBrakeTorque": 0.6, "dampRateZeroT_CE": 0.4, "radius": 0.4, "max_rpm": 0.2,
+PUBLISHED_EFFECTS = {"tireFric": 1.2, "mass": -0.8, "maxBrakeTorque": 0.6, "dampRateZeroT_CE": 0.4, "radius": 0.4,
+                     "max_rpm": 0.2,
                      "dampRateZeroT_CD": 0.2}
 """Linear effect on the safety degree over a whole domain in the published random search in sun [m]."""
 
@@ -214,7 +217,9 @@ def test_the_original_vehicle_is_as_near_to_the_published_one_as_is_said(study: 
 
 @pytest.mark.parametrize("study", ["sun", "rain"])
 def test_vehicles_come_in_the_order_of_the_published_effects(study: str) -> None:
-    """Spearman's rho over 150 vehicles with the published linear effects, which know nothing of what saturates or comes together."""
+    """Spearman's rho over 150 vehicles with the published linear effects, which know nothing of what saturates or comes
+    together.
+    """
     system = assemble(load_study(study))
     characteristics = system.characteristics
     width = characteristics.upper - characteristics.lower
