@@ -11,7 +11,6 @@ import msgspec
 from msgspec.inspect import type_info
 
 from safevar_sumo.ads import ADS
-from safevar_sumo.analysis.opinion.mapping import MAPPING_TABLES as REPRESENTED
 from safevar_sumo.metrics import METRICS, OPTIONAL_METRICS, PUBLISHED_SCORING
 from safevar_sumo.results import FILES
 from safevar_sumo.search import ALGORITHMS
@@ -122,17 +121,6 @@ def results_files() -> str:
     return _table(("file", "content", "written by"), [(f"`{one.name}`", one.content, one.writer) for one in FILES])
 
 
-def second_model() -> str:
-    """Which characteristic is which parameter of the second vehicle model."""
-    parts = []
-    for name, table in REPRESENTED.items():
-        outside = [f"`{key}`: {why}" for key, why in table.omission_reasons.items()]
-        rows = [(f"`{row.characteristic}`", row.unit, row.parameter, row.parameter_unit, f"`{row.equation}`") for row in table.rows]
-        listed = f"\nOutside: {'; '.join(outside)}.\n" if outside else ""
-        parts.append(f"### {name}\n\n{_table(('characteristic', 'unit', 'parameter', 'unit', 'equation'), rows)}{listed}")
-    return "\n".join(parts)
-
-
 TABLES: dict[str, Callable[[], str]] = {
     "study_keys": study_keys, "vehicles": models(VEHICLES), "ads": models(ADS), "algorithms": models(ALGORITHMS),
-    "metric_columns": metric_columns, "results_files": results_files, "second_model": second_model}
+    "metric_columns": metric_columns, "results_files": results_files}

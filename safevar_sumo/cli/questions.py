@@ -31,6 +31,7 @@ from safevar_sumo.cli.target import (
 from safevar_sumo.errors import InputError
 from safevar_sumo.progress import open_progress
 from safevar_sumo.results import make_directory, write_whole
+from safevar_sumo.terminal import print_heading, print_text
 
 
 def add_question(options: type[Options], metavar: str, *further_decorators: Callable[[CommandFunction], CommandFunction]
@@ -88,22 +89,22 @@ def explain(source: str, full: bool, point: str | None, jobs: int | None, as_jso
 
 @add_question(OpinionOptions, "DIR", click.option("--solutions", "lists", multiple=True, hidden=True),
               click.argument("handles", nargs=-1, metavar=""))
-def opinion(source: str, lists: tuple[str, ...], handles: tuple[str, ...], point: str | None, jobs: int | None, as_json: bool,
-            **values: Any) -> None:
+def opinion(source: str, lists: tuple[str, ...], handles: tuple[str, ...], point: str | None, jobs: int | None,
+            as_json: bool, **values: Any) -> None:
     """Check the minimal causes of failures of results in DIR with a second vehicle model."""
     from safevar_sumo.analysis.opinion.compute import ask_for_opinions
-    from safevar_sumo.analysis.opinion.render import opinion_in_words, print_opinions
 
-    values["solutions"] = [handle.strip() for text in (*values["solutions"], *lists, *handles) for handle in text.split(",")]
-    options = OpinionOptions(**values)
+    texts = (*values.pop("solutions"), *lists, *handles)
+    options = OpinionOptions(solutions=tuple(name.strip() for text in texts for name in text.split(",")), **values)
     result = _compute_with_bar(ask_for_opinions, load_results_or_study(source, point, results_only=True), options, jobs)
-    if not as_json:
-        print_opinions(Console(), result)
+    if as_json:
+        for note in result.notes:
+            click.echo(f"note: {note}", err=True)
+        click.echo(_to_json(result))
         return
-    for handle in result.without_cause:
-        click.echo(f"note: {handle} is not unsafe: it has no cause", err=True)
-    click.echo(f"note: {opinion_in_words(result)}", err=True)
-    click.echo(_to_json(result))
+    print_heading(Console(), result.study.title, result.no_verdict)
+    for sentence in result.sentences():
+        print_text(Console(), sentence)
 
 
 @add_question(ToleranceOptions, "STUDY|DIR",

@@ -13,6 +13,7 @@ from safevar_sumo.analysis.explain.compute import explain_failures
 from safevar_sumo.analysis.explain.result import CauseEntry, FailureEntry, SummaryEntry, most_robust
 from safevar_sumo.analysis.explain.robustness import robustness_in_words
 from safevar_sumo.analysis.opinion.compute import CauseToJudge, assemble_both_systems, judge_causes
+from safevar_sumo.analysis.opinion.result import Opinion
 from safevar_sumo.analysis.research_questions.indicators import nondominated_points
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import PUBLISHED_SCORING
@@ -50,13 +51,6 @@ class CauseRow(NamedTuple):
     boundary: str
 
 
-class SecondOpinion(msgspec.Struct, frozen=True):
-    """The second vehicle model's opinion on a cause: a verdict, and its reason in a sentence."""
-
-    opinion: str
-    because: str
-
-
 class CauseSection(NamedTuple):
     """A cause on the page.
 
@@ -78,7 +72,7 @@ class CauseSection(NamedTuple):
     reason: str
     robustness: str
     cause_robustness: str
-    opinion: SecondOpinion | None
+    opinion: Opinion | None
 
 
 class ReplayedSolution(NamedTuple):
@@ -156,11 +150,11 @@ def reason_without_opinion(data: ReportInput) -> str:
     return ""
 
 
-def _ask_opinions(data: ReportInput, selection: Sequence[tuple[CauseEntry, FailureEntry]]) -> list[SecondOpinion]:
+def _ask_opinions(data: ReportInput, selection: Sequence[tuple[CauseEntry, FailureEntry]]) -> list[Opinion]:
     """Ask the second vehicle model for its opinion on each cause, once for these results."""
     judged_causes = [CauseToJudge(failure.handle or None, cause.changes, cause.fraction, cause.robustness) for cause, failure in selection]
     opinions = load_or_compute(data, "opinion", lambda: judge_causes(data.case.study, judged_causes, data.case.unsafe).to_dict())
-    return msgspec.convert(opinions, list[SecondOpinion])
+    return msgspec.convert(opinions, list[Opinion])
 
 
 def _size_of_changes(data: ReportInput, cause: CauseEntry) -> tuple[int, float]:
@@ -169,7 +163,7 @@ def _size_of_changes(data: ReportInput, cause: CauseEntry) -> tuple[int, float]:
     return len(cause.changes), float(data.case.characteristics.largest_change(setting[np.newaxis])[0])
 
 
-def _make_cause_section(data: ReportInput, rank: int, cause: CauseEntry, failure: FailureEntry, opinion: SecondOpinion | None
+def _make_cause_section(data: ReportInput, rank: int, cause: CauseEntry, failure: FailureEntry, opinion: Opinion | None
                         ) -> CauseSection:
     """Make the section of one cause; `rank` counts causes from 1."""
     setting = data.setting_with(cause.changes)

@@ -108,6 +108,7 @@ def test_every_command_begins_with_the_reason(still: str) -> None:
                     ("simulate", still, "--set", "mass=2400..2600")):
         begins_with_the_reason(*command)
     assert run("study", still, "--runs", "1", "--evaluations", "20", "--out", "results").stdout.splitlines()[0] == STANDS
+    begins_with_the_reason("opinion", "results")
     run("check", still, expect=1)
     run("report", "results", "--out", "page.html")
     page = Path("page.html").read_text()

@@ -1,6 +1,6 @@
 """Does another vehicle model confirm the failures: is each minimal cause unsafe with that model too?
 
-The command's options and the Python function `opinion` are defined here, so that help can be shown without loading the computation.
+Options and the Python function `opinion` are defined here, so that help can be shown without loading the computation.
 """
 
 from __future__ import annotations
@@ -26,16 +26,17 @@ class OpinionOptions(Options):
 
     question: ClassVar[str] = "opinion"
     solutions: tuple[str, ...] = option(
-        (), "Drive the N-th solution of a run, from 0; may be repeated.  [default: the failures that a report explains]",
+        (), "Drive the N-th solution of a run, from 0; may be repeated.  [default: the failures a report explains]",
         flag="--solution", metavar="ALG:RUN:N", form="repeated",
         python='Handles of solutions, such as "nsga2:3:0". By default the failures that a report explains.')
     unsafe: str | None = unsafe_option()
 
 
 @document_options(OpinionOptions)
-def opinion(source: str | Path | Results, *, solutions: Sequence[str] = OpinionOptions.solutions, unsafe: Criterion | None = None,
-            pool: Pool | None = None, jobs: int | None = None, progress: bool | Progress = False, as_it_is_now: bool = False) -> Opinions:
-    """Drive minimal causes of failures again with another vehicle model: CommonRoad's multi-body vehicle with Pacejka's tyres.
+def opinion(source: str | Path | Results, *, solutions: Sequence[str] = OpinionOptions.solutions,
+            unsafe: Criterion | None = None, pool: Pool | None = None, jobs: int | None = None,
+            progress: bool | Progress = False, as_it_is_now: bool = False) -> Opinions:
+    """Drive minimal causes of failures again with CommonRoad's multi-body vehicle with Pacejka's tyres.
 
     Parameters
     ----------
@@ -44,4 +45,5 @@ def opinion(source: str | Path | Results, *, solutions: Sequence[str] = OpinionO
     """
     from safevar_sumo.analysis.opinion.compute import ask_for_opinions
 
-    return answer_question(ask_for_opinions, study_or_case(source, as_it_is_now=as_it_is_now, results_only=True), OpinionOptions, locals())
+    case = study_or_case(source, as_it_is_now=as_it_is_now, results_only=True)
+    return answer_question(ask_for_opinions, case, OpinionOptions, locals())

@@ -1,8 +1,9 @@
-"""CommonRoad's multi-body vehicle with Pacejka's tyres, driving straight, with an anti-lock controller.
+"""CommonRoad's multi-body vehicle with Pacejka's tyres, driving straight, with anti-lock and traction control.
 
-The equations are those of `vehicle_dynamics_mb` of commonroad-vehicle-models (Althoff and Würsching, "CommonRoad: Vehicle Models", 2020)
-for a vehicle that neither steers nor rolls: body, pitch and heave, two axles on springs, and the wheels of each axle. The package computes
-one vehicle at a time with all 29 states; this module computes the 11 states that change, for N vehicles at once.
+The equations are those of `vehicle_dynamics_mb` of commonroad-vehicle-models (Althoff and Würsching, "CommonRoad:
+Vehicle Models", 2020) for a vehicle that neither steers nor rolls: body, pitch and heave, two axles on springs, and the
+wheels of each axle. The package computes one vehicle at a time with all 29 states; this module computes the 11 states
+that change, for N vehicles at once.
 """
 
 from __future__ import annotations
@@ -18,23 +19,25 @@ from safevar_sumo.vehicles import Slope
 
 WHEEL_COUNT = 4
 LONGEST_STEP = 1e-3
-"""Longest step of the integration [s]; in it the fastest motion, an axle between springs and tyres (75 rad/s), turns by 0.08 rad."""
+"""Longest step of the integration [s]; the fastest motion, an axle on its springs (75 rad/s), turns by 0.08 rad."""
 LEAST_SPEED = 0.1
 """Smallest denominator of a slip [m/s]: half of `v_s` in the package's `vehicle_dynamics_std`."""
 SLIP_LIMIT, LEAST_CONTROL_SPEED = 0.1, 2.0
-"""Slip above which the anti-lock controller releases brake pressure [-], and speed above which the controller acts [m/s].
+"""Slip above which the anti-lock controller releases brake pressure [-], and speed above which it acts [m/s].
 
 Real controllers work between 0.1 and 0.2 from about 7 km/h on (Bosch, Automotive Handbook, "Antilock braking system").
 """
-TRACTION_SHARE = 0.9
 RELEASE_RATE, BUILD_UP_RATE = 25.0, 8.0
-"""Rates at which the controller releases and restores pressure [1/s], as shares of full pressure; valves release faster than they restore.
+"""Rates at which it releases and restores pressure [1/s], as shares of full pressure; valves release faster.
 
-Chosen values: braking uses at least 0.78 of the friction, for coefficients from 0.2 to 1 (tests). UN Regulation 13-H, annex 6, requires
-0.75.
+Chosen values: braking uses at least 0.78 of the friction, for coefficients from 0.2 to 1 (tests). UN Regulation 13-H,
+annex 6, requires 0.75.
 """
+TRACTION_SHARE = 0.9
+"""Share of the greatest tyre force that the traction control lets the engine use [-]: half of the slip at the peak."""
 
 
+@cache
 def load_bmw_parameters() -> Any:
     """Parameters of the package's vehicle 2, a BMW 320i, and of its tyres.
 
@@ -48,175 +51,173 @@ def load_bmw_parameters() -> Any:
     except ImportError:
         raise InputError("opinion", "commonroad-vehicle-models, the second vehicle model, is not installed",
                          "in the checkout: pip install '.[opinion]'") from None
-    return _parameters(parameters_vehicle2)
+    return parameters_vehicle2()
 
 
-@cache
-def _parameters(load_parameters: Any) -> Any:
-    return load_parameters()
-
-
-@cache
-def _tyre() -> Any:
-    return load_bmw_parameters().tire
+ZERO, ONE, UNLIMITED = map(np.array, (0.0, 1.0, np.inf))
 
 
 class Plant(NamedTuple):
-    """Constants of N vehicles, SI, after the package's m, m_s, m_uf, m_ur, a, b, h_s, I_y_s, K_sf, K_sdf, K_zt, R_w, I_y_w.
+    """Constants of N vehicles, SI, after the package's m, m_s, m_uf, a, b, h_s, I_y_s, K_sf, K_sdf, K_zt, R_w, I_y_w.
 
-    Shape (N,), or (2, N) for values per axle, front before rear: `arms`, a and -b; `static_shares` of the sprung mass; `springs` and
-    `dampers` of each wheel; `brake_shares`, T_sb and 1 - T_sb; `drive_shares`, T_se and 1 - T_se. `unsprung_mass` is one axle's,
-    `friction` Pacejka's p_dx1, `brake_torque` the torque of all wheels at full pedal; `back` and `down` are the road slope's accelerations.
+    Shape (N,) or (), or (2, N) or (2, 1) for values per axle, front before rear: `arms`, a and -b; `static_shares` of
+    the sprung mass; `springs` and `dampers` of each wheel; `brake_shares`, T_sb and 1 - T_sb; `drive_shares`, T_se and
+    1 - T_se.
+    `unsprung_mass` is one axle's, `friction` Pacejka's p_dx1, `brake_torque` the torque of all wheels at full pedal;
+    `back` and `down` are the road slope's accelerations.
+
+    The brake pedal follows its command after the dead time `brake_delay`, as a first-order lag with the time constant
+    `brake_lag`, at most at the rates `brake_rise` and `brake_fall` [1/s]. `drag` [N s/m], `air_drag` [N s^2/m^2] and
+    `wheel_damping` of all wheels [N m s] are resistances in addition to those of the original vehicle. `drive_ratio`
+    multiplies the original engine's driving torque.
     """
 
     mass: FloatArray
     sprung_mass: FloatArray
-    unsprung_mass: FloatArray
+    unsprung_mass: float | FloatArray
     arms: FloatArray
     static_shares: FloatArray
-    height: FloatArray
-    pitch_inertia: FloatArray
+    height: float | FloatArray
+    pitch_inertia: float | FloatArray
     springs: FloatArray
     dampers: FloatArray
-    tyre_spring: FloatArray
+    tyre_spring: float | FloatArray
+    brake_shares: FloatArray
+    drive_shares: FloatArray
+    back: float | FloatArray
+    down: float | FloatArray
     radius: FloatArray
     wheel_inertia: FloatArray
     friction: FloatArray
     brake_torque: FloatArray
-    brake_shares: FloatArray
-    drive_shares: FloatArray
-    back: FloatArray
-    down: FloatArray
+    brake_delay: FloatArray = ZERO
+    brake_rise: FloatArray = UNLIMITED
+    brake_fall: FloatArray = UNLIMITED
+    brake_lag: FloatArray = ZERO
+    drag: FloatArray = ZERO
+    air_drag: FloatArray = ZERO
+    wheel_damping: FloatArray = ZERO
+    drive_ratio: FloatArray = ONE
 
 
-def build_plant(mass: FloatArray, unladen_mass: float, slope: Slope, *, front_brake_share: float, front_drive_share: float,
-                centre: FloatArray | None = None, wheelbase: float | None = None, height: float | None = None, **constants: Any) -> Plant:
+def build_plant(mass: FloatArray, unladen_mass: float, slope: Slope, *, front_brake_share: float = 0.5,
+                front_drive_share: float = 0.5, centre: FloatArray | None = None, wheelbase: float | None = None,
+                height: float | None = None, **constants: Any) -> Plant:
     """Vehicles with masses [kg] that differ from the package's vehicle.
 
-    Unsprung masses, springs, dampers, tyres and inertia grow with `unladen_mass` [kg], so that all frequencies stay the package's;
-    a load rests on the springs. `centre` is the distance from the front axle to the whole vehicle's centre of mass [m], `height` the
-    height of that centre above the road [m]; the package's values replace None.
+    Unsprung masses, springs, dampers, tyres and inertia grow with `unladen_mass` [kg], so that all frequencies stay the
+    package's; a load rests on the springs. `centre` is the distance from the front axle to the whole vehicle's centre
+    of mass [m], `height` its height above the road [m]; the package's values replace None. `constants` are
+    other fields of `Plant`.
     """
     bmw = load_bmw_parameters()
-    ones, scale = np.ones_like(mass), unladen_mass / bmw.m
-    unsprung_mass = scale * bmw.m_uf * ones
-    sprung_mass, length = mass - 2 * unsprung_mass, bmw.a + bmw.b if wheelbase is None else wheelbase
-    front_arm = (bmw.a / (bmw.a + bmw.b)) * length * ones if centre is None else (mass * centre - unsprung_mass * length) / sprung_mass
-    values = {name: np.asarray(value, dtype=float) * ones for name, value in constants.items()}
+    scale, package_length = unladen_mass / bmw.m, bmw.a + bmw.b
+    unsprung_mass, length = scale * bmw.m_uf, wheelbase or package_length
+    sprung_mass, front_arm = mass - 2 * unsprung_mass, (bmw.a / package_length) * length * np.ones_like(mass)
+    if centre is not None:
+        front_arm = (mass * centre - unsprung_mass * length) / sprung_mass
+
+    def axles(front: float, rear: float) -> FloatArray:
+        return np.array([[front], [rear]])
+
     plant = Plant(
         mass=mass, sprung_mass=sprung_mass, unsprung_mass=unsprung_mass, arms=np.stack([front_arm, front_arm - length]),
-        static_shares=np.stack([length - front_arm, front_arm]) / length, height=(bmw.h_s if height is None else height) * ones,
-        pitch_inertia=scale * bmw.I_y_s * ones * (length / (bmw.a + bmw.b)) ** 2, tyre_spring=scale * bmw.K_zt * ones,
-        springs=scale * np.stack([bmw.K_sf * ones, bmw.K_sr * ones]), dampers=scale * np.stack([bmw.K_sdf * ones, bmw.K_sdr * ones]),
-        brake_shares=np.stack([front_brake_share * ones, (1 - front_brake_share) * ones]),
-        drive_shares=np.stack([front_drive_share * ones, (1 - front_drive_share) * ones]),
-        back=slope.back * ones, down=slope.down * ones, **values)
-    return plant._replace(height=plant.height + at_speed(plant, ones).heave)  # the body's heights count from unloaded tyres
+        static_shares=np.stack([length - front_arm, front_arm]) / length, height=height or bmw.h_s,
+        pitch_inertia=scale * bmw.I_y_s * (length / package_length) ** 2, tyre_spring=scale * bmw.K_zt,
+        springs=scale * axles(bmw.K_sf, bmw.K_sr), dampers=scale * axles(bmw.K_sdf, bmw.K_sdr),
+        brake_shares=axles(front_brake_share, 1 - front_brake_share), back=slope.back, down=slope.down,
+        drive_shares=axles(front_drive_share, 1 - front_drive_share), **constants)
+    # Heights of the state count from unloaded tyres.
+    return plant._replace(height=plant.height + balanced_state(plant, mass).heights[0])
 
 
 class MultiBodyState(NamedTuple):
-    """State of N vehicles, SI: speed, pitch and heave of the body, and the rates of pitch and heave, shape (N,).
+    """State of N vehicles, SI.
 
-    The other fields hold a value for each axle, front before rear, shape (2, N): its height and the height's rate, its wheels' speed
-    [rad/s], and the share of full pressure that the anti-lock controller allows. Heights count downwards, as in the package.
+    `speed` has the shape (N,). `heights`, shape (4, N), are the body's heave and pitch, and the heights of front and
+    rear axle; `rates` are their derivatives. Heights count downwards, as in the package. For each axle, shape (2, N):
+    the speed of its wheels [rad/s], and the share of full pressure that the anti-lock controller allows.
     """
 
     speed: FloatArray
-    pitch: FloatArray
-    pitch_rate: FloatArray
-    heave: FloatArray
-    heave_rate: FloatArray
-    axle_heights: FloatArray
-    axle_rates: FloatArray
+    heights: FloatArray
+    rates: FloatArray
     wheel_speeds: FloatArray
     pressure_shares: FloatArray
 
 
-def at_speed(plant: Plant, speed: FloatArray) -> MultiBodyState:
+def balanced_state(plant: Plant, speed: FloatArray) -> MultiBodyState:
     """The body in static balance on its springs, with rolling wheels."""
-    zeros, axle_zeros = np.zeros_like(plant.mass), np.zeros_like(plant.arms)
-    heights = (plant.sprung_mass * plant.static_shares + plant.unsprung_mass) * plant.down / (2 * plant.tyre_spring)
+    axles = (plant.sprung_mass * plant.static_shares + plant.unsprung_mass) * plant.down / (2 * plant.tyre_spring)
     # The springs carry the static load without deflection if, above each axle, the body is as high as the axle.
-    heave, pitch = (heights * plant.static_shares).sum(axis=0), (heights[1] - heights[0]) / (plant.arms[0] - plant.arms[1])
-    return MultiBodyState(speed, pitch, zeros, heave, zeros, heights, axle_zeros, axle_zeros + speed / plant.radius, axle_zeros + 1)
+    heave, pitch = (axles * plant.static_shares).sum(axis=0), (axles[1] - axles[0]) / (plant.arms[0] - plant.arms[1])
+    heights, ones = np.stack([heave, pitch, *axles]), np.ones_like(axles)
+    return MultiBodyState(speed, heights, np.zeros_like(heights), ones * speed / plant.radius, ones)
 
 
 class TyreForces(NamedTuple):
-    """One tyre of each axle, shape (2, N): the force along the road and its largest value `peak` [N], the force's derivative
-    `gradient` by the wheel's speed [N s/rad], and the slip [-], positive when braking.
+    """One tyre of each axle, shape (2, N): force along the road and its greatest value [N], slip [-].
+
+    A slip is positive when braking. `gradient` is the derivative of the force by the wheel's speed [N s/rad].
     """
 
     force: FloatArray
     peak: FloatArray
-    gradient: FloatArray
     slip: FloatArray
+    gradient: FloatArray
 
 
 def tyre_forces(plant: Plant, body: MultiBodyState) -> TyreForces:
     """Pacejka's formula for pure longitudinal slip, as in the package's `formula_longitudinal`, and its derivative."""
-    tyre, slip_speed = _tyre(), np.maximum(body.speed, LEAST_SPEED)
-    load = np.maximum(body.axle_heights * plant.tyre_spring, 1.0)
+    tyre, slip_speed = load_bmw_parameters().tire, np.maximum(body.speed, LEAST_SPEED)
+    load = np.maximum(body.heights[2:] * plant.tyre_spring, 1.0)
     slip = (body.speed - plant.radius * body.wheel_speeds) / slip_speed
     peak, stiffness = plant.friction * load, tyre.p_kx1 / (tyre.p_cx1 * plant.friction)
     scaled_slip = stiffness * (tyre.p_hx1 - slip)
     curve = (1 - tyre.p_ex1) * scaled_slip + tyre.p_ex1 * np.arctan(scaled_slip)
     angle = tyre.p_cx1 * np.arctan(curve) + load * tyre.p_vx1
-    slope = peak * np.cos(angle) * (tyre.p_cx1 / (1 + curve * curve)) * (1 - tyre.p_ex1 + tyre.p_ex1 / (1 + scaled_slip * scaled_slip))
-    return TyreForces(peak * np.sin(angle), peak, slope * (stiffness * plant.radius / slip_speed), slip)
+    bend = 1 - tyre.p_ex1 + tyre.p_ex1 / (1 + scaled_slip * scaled_slip)
+    slope = peak * np.cos(angle) * (tyre.p_cx1 / (1 + curve * curve)) * bend
+    return TyreForces(peak * np.sin(angle), peak, slip, slope * (stiffness * plant.radius / slip_speed))
 
 
-class BodyDerivatives(NamedTuple):
-    """Time derivatives of the fields of `MultiBodyState` with the same names, SI."""
+def derivatives(plant: Plant, body: MultiBodyState, torques: FloatArray, force: FloatArray
+                ) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """The right-hand side of the package's equations: the derivatives of speed, rates and wheel speeds.
 
-    speed: FloatArray
-    pitch_rate: FloatArray
-    heave_rate: FloatArray
-    axle_rates: FloatArray
-    wheel_speeds: FloatArray
-
-
-def body_derivatives(plant: Plant, body: MultiBodyState, torques: FloatArray, forces: TyreForces) -> BodyDerivatives:
-    """The right-hand side of the package's equations; `torques`, shape (2, N), turn both wheels of an axle forward [N m]."""
-    traction = 2 * (forces.force[0] + forces.force[1])
-    deflection = body.axle_heights - body.heave + plant.arms * body.pitch
-    deflection_rate = body.axle_rates - body.heave_rate + plant.arms * body.pitch_rate
+    `torques`, shape (2, N), turn both wheels of an axle forward [N m]; `force` is that of one tyre of each axle [N].
+    """
+    traction = 2 * (force[0] + force[1])
+    deflection, deflection_rate = (one[2:] - one[0] + plant.arms * one[1] for one in (body.heights, body.rates))
     static_loads = plant.sprung_mass * plant.down * plant.static_shares / 2
-    spring_forces = static_loads - deflection * plant.springs - deflection_rate * plant.dampers
-    moments = plant.arms * spring_forces
-    return BodyDerivatives(
-        speed=traction / plant.mass - plant.back,
-        pitch_rate=(2 * (moments[0] + moments[1]) + traction * (plant.height - body.heave)) / plant.pitch_inertia,
-        heave_rate=plant.down - 2 * (spring_forces[0] + spring_forces[1]) / plant.sprung_mass,
-        axle_rates=plant.down - 2 * (body.axle_heights * plant.tyre_spring - spring_forces) / plant.unsprung_mass,
-        wheel_speeds=(torques / 2 - plant.radius * forces.force) / plant.wheel_inertia)
+    springs = static_loads - deflection * plant.springs - deflection_rate * plant.dampers
+    moments = plant.arms * springs
+    heave = plant.down - 2 * (springs[0] + springs[1]) / plant.sprung_mass
+    pitch = (2 * (moments[0] + moments[1]) + traction * (plant.height - body.heights[0])) / plant.pitch_inertia
+    axles = plant.down - 2 * (body.heights[2:] * plant.tyre_spring - springs) / plant.unsprung_mass
+    return (traction / plant.mass - plant.back, np.stack([heave, pitch, *axles]),
+            (torques / 2 - plant.radius * force) / plant.wheel_inertia)
 
 
-def advance(plant: Plant, body: MultiBodyState, pedal: FloatArray, drive_torque: FloatArray, step: float) -> MultiBodyState:
+def advance(plant: Plant, body: MultiBodyState, pedal: FloatArray, drive_torque: FloatArray, step: float
+            ) -> MultiBodyState:
     """One integration step under a brake pedal (0 to 1) and a torque of engine and drags on all wheels [N m].
 
-    Wheel speeds, which are stiff, are integrated implicitly (linearised), all other states explicitly, rates before heights.
+    Wheel speeds, which are stiff, are integrated implicitly (linearised), others explicitly, rates before heights.
     """
-    forces = tyre_forces(plant, body)
-    pressure_shares = _limit_pressure(body, forces.slip, pedal, step)
-    brake_torques = np.minimum(pedal, pressure_shares) * (plant.brake_torque * plant.brake_shares)
-    drive_torques = np.minimum(drive_torque * plant.drive_shares, 2 * TRACTION_SHARE * plant.radius * forces.peak)
-    derivatives = body_derivatives(plant, body, drive_torques - brake_torques, forces)
-    gradients = np.maximum(forces.gradient, 0.0)
-    damping = 1 + step * gradients * plant.radius / plant.wheel_inertia
-    wheel_speeds = np.maximum(body.wheel_speeds + step * derivatives.wheel_speeds / damping, 0.0)
-    added_force = gradients * (wheel_speeds - body.wheel_speeds)
-    speed = np.maximum(body.speed + step * (derivatives.speed + 2 * (added_force[0] + added_force[1]) / plant.mass), 0.0)
-    is_standing = (body.speed <= 0) & (drive_torque <= 0) & (plant.back >= 0)  # Pacejka's tyres push slightly even without slip
-    pitch_rate, heave_rate = body.pitch_rate + step * derivatives.pitch_rate, body.heave_rate + step * derivatives.heave_rate
-    axle_rates = body.axle_rates + step * derivatives.axle_rates
-    return MultiBodyState(
-        speed=np.where(is_standing, 0.0, speed), pitch=body.pitch + step * pitch_rate, pitch_rate=pitch_rate,
-        heave=body.heave + step * heave_rate, heave_rate=heave_rate, axle_heights=body.axle_heights + step * axle_rates,
-        axle_rates=axle_rates, wheel_speeds=wheel_speeds, pressure_shares=pressure_shares)
-
-
-def _limit_pressure(body: MultiBodyState, slip: FloatArray, pedal: FloatArray, step: float) -> FloatArray:
-    """The share of full pressure that each axle may have: it falls while the axle's slip is too large, then rises to 1."""
-    is_locking = (slip > SLIP_LIMIT) & (body.speed > LEAST_CONTROL_SPEED)
+    tyres = tyre_forces(plant, body)
+    is_locking = (tyres.slip > SLIP_LIMIT) & (body.speed > LEAST_CONTROL_SPEED)
     lower_shares = np.maximum(np.minimum(body.pressure_shares, pedal) - RELEASE_RATE * step, 0.0)
-    return np.where(is_locking, lower_shares, np.minimum(body.pressure_shares + BUILD_UP_RATE * step, 1.0))
+    pressure_shares = np.where(is_locking, lower_shares, np.minimum(body.pressure_shares + BUILD_UP_RATE * step, 1.0))
+    drive = np.minimum(drive_torque * plant.drive_shares, 2 * TRACTION_SHARE * plant.radius * tyres.peak)
+    brakes = np.minimum(pedal, pressure_shares) * (plant.brake_torque * plant.brake_shares)
+    acceleration, height_gains, wheel_gains = derivatives(plant, body, drive - brakes, tyres.force)
+    gradients = np.maximum(tyres.gradient, 0.0)
+    damping = 1 + step * gradients * plant.radius / plant.wheel_inertia
+    wheel_speeds = np.maximum(body.wheel_speeds + step * wheel_gains / damping, 0.0)
+    added_force = gradients * (wheel_speeds - body.wheel_speeds)
+    speed = np.maximum(body.speed + step * (acceleration + 2 * (added_force[0] + added_force[1]) / plant.mass), 0.0)
+    # Pacejka's tyres push slightly even without slip.
+    is_standing = (body.speed <= 0) & (drive_torque <= 0) & (plant.back >= 0)
+    speed, rates = np.where(is_standing, 0.0, speed), body.rates + step * height_gains
+    return MultiBodyState(speed, body.heights + step * rates, rates, wheel_speeds, pressure_shares)

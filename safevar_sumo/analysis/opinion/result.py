@@ -1,30 +1,30 @@
-"""Result records of `opinion`, with their JSON and a frame."""
+"""Result records of `opinion`, with their JSON, a frame and sentences."""
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass
-from enum import StrEnum
-from typing import Any, NamedTuple
+from typing import Any, Literal, get_args
 
+import msgspec
 import pandas as pd
 
-from safevar_sumo.analysis.words import OUTCOME_VERBS
+from safevar_sumo.analysis.words import OUTCOME_VERBS, join_phrases, list_of_changes, number_of
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import Outcome
-from safevar_sumo.study import SAFETY_DEGREE, Study
+from safevar_sumo.study import Study
+from safevar_sumo.sumo.empty_road import summary_entry
+from safevar_sumo.vehicles import CharacteristicSet
+
+MODEL_IN_WORDS = "Driven again with CommonRoad's multi-body vehicle, Pacejka's tyres and anti-lock brakes"
 
 
-class OpinionVerdict(StrEnum):
-    """The second model's verdict on a cause."""
-
-    CONFIRMED = "confirmed"
-    CONTRADICTED = "contradicted"
-    BORDERLINE = "borderline"
-    OUTSIDE = "outside"
+Verdict = Literal["outside", "confirmed", "contradicted", "borderline"]
+"""The second model's verdict on a cause."""
 
 
-class RunEnd(NamedTuple):
-    """How a run ends: outcome and safety degree [m, or -m/s]; None if the run was not driven or has no safety degree."""
+class RunEnd(msgspec.Struct, frozen=True):
+    """How a run ends: outcome, and safety degree [m, or -m/s]; None if there is none, or the run was not simulated."""
 
     outcome: str | None = None
     safety_degree: float | None = None
@@ -34,15 +34,11 @@ class RunEnd(NamedTuple):
         if self.outcome == Outcome.COLLISION:
             return "a collision" if self.safety_degree is None else f"a collision at {-self.safety_degree:.2f} m/s"
         degree = "" if self.safety_degree is None else f", safety degree {self.safety_degree:.2f} m"
-        return "not driven" if self.outcome is None else f"{OUTCOME_VERBS.get(Outcome(self.outcome), self.outcome)}{degree}"
-
-    def to_dict(self) -> dict[str, Any]:
-        return {"outcome": self.outcome, SAFETY_DEGREE: self.safety_degree}
+        return f"{OUTCOME_VERBS.get(Outcome(self.outcome), self.outcome)}{degree}" if self.outcome else "not driven"
 
 
-@dataclass(frozen=True, kw_only=True)
-class Opinion:
-    """The second model's opinion on one minimal cause.
+class Opinion(msgspec.Struct, frozen=True, kw_only=True):
+    """The second model's opinion on one minimal cause, an entry of `opinion --json`.
 
     Attributes
     ----------
@@ -60,13 +56,8 @@ class Opinion:
     changes: dict[str, float]
     here: RunEnd
     there: RunEnd
-    opinion: OpinionVerdict
+    opinion: Verdict
     because: str
-
-    def to_dict(self) -> dict[str, Any]:
-        """An entry of `opinion --json`."""
-        return {"solution": self.solution, "changes": self.changes, "here": self.here.to_dict(), "there": self.there.to_dict(),
-                "opinion": str(self.opinion), "because": self.because}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,6 +72,8 @@ class Opinions:
         How the original vehicle's run ends: `original_here` with our model, `original_there` with the second model.
     without_cause
         Requested solutions that have no cause, because they are not unsafe.
+    no_verdict
+        Why the original vehicle gives no verdict; empty if it does.
     """
 
     study: Study
@@ -89,22 +82,40 @@ class Opinions:
     original_here: RunEnd
     original_there: RunEnd
     without_cause: tuple[str, ...] = ()
-
-    def count(self, verdict: OpinionVerdict) -> int:
-        """Number of causes with this verdict."""
-        return sum(opinion.opinion == verdict for opinion in self.opinions)
+    no_verdict: str = ""
 
     def to_dict(self) -> list[dict[str, Any]]:
         """The JSON of `opinion`."""
-        return [opinion.to_dict() for opinion in self.opinions]
+        return [*map(msgspec.to_builtins, self.opinions), *summary_entry(self.no_verdict)]
 
     def to_frame(self) -> pd.DataFrame:
-        """One row for each cause: `solution`, `changes`, outcome and safety degree `here` and `there`, `opinion`, `because`."""
-        rows = [(opinion.solution, opinion.changes, *opinion.here, *opinion.there, str(opinion.opinion), opinion.because)
-                for opinion in self.opinions]
+        """One row for each cause: the keys of `to_dict`, with outcome and safety degree of `here` and `there`."""
+        rows = [(one.solution, one.changes, one.here.outcome, one.here.safety_degree, one.there.outcome,
+                 one.there.safety_degree, one.opinion, one.because) for one in self.opinions]
         return pd.DataFrame(rows, columns=["solution", "changes", "outcome_here", "safety_degree_here", "outcome_there",
                                            "safety_degree_there", "opinion", "because"])
 
+    @property
+    def notes(self) -> list[str]:
+        """The solutions that are not unsafe, and the number of causes with each verdict."""
+        words, numbers = {"outside": "outside (no answer)"}, Counter(one.opinion for one in self.opinions)
+        counts = [f"{numbers[one]} {words.get(one, one)}" for one in get_args(Verdict) if one in numbers]
+        total = number_of(len(self.opinions), "minimal cause")
+        return [*(f"{handle} is not unsafe: it has no cause" for handle in self.without_cause),
+                f"of {total} {join_phrases(counts)}" if counts else "there is no cause to judge"]
+
+    def sentences(self) -> list[str]:
+        """The answer as lines: how many causes are confirmed, then every cause with the reason."""
+        characteristics = CharacteristicSet.of(self.study.vehicle.characteristics)
+        *notes, counts = self.notes
+        lines = [f"Unsafe: {self.unsafe.description}. {MODEL_IN_WORDS}: {counts}.",
+                 f"The original vehicle with our model: {self.original_here}; with the second: {self.original_there}.",
+                 *(f"note: {note}" for note in notes)]
+        for one in self.opinions:
+            handle = f"{one.solution}: " if one.solution else ""
+            lines += [f"{handle}{one.opinion}: {list_of_changes(characteristics, one.changes)}",
+                      f"  with our model {one.here}; {one.because}"]
+        return lines
+
     def __repr__(self) -> str:
-        counts = ", ".join(f"{self.count(verdict)} {verdict}" for verdict in OpinionVerdict)
-        return f"<Opinions on {self.study.name}, unsafe {self.unsafe}: {counts}>"
+        return f"<Opinions on {self.study.name}, unsafe {self.unsafe}: {self.notes[-1]}>"
