@@ -43,7 +43,11 @@ class InputError(SafevarError):
 
 
 class UserCodeError(InputError):
-    """User code that a study names failed or returned an illegal value."""
+    """User code that a study names failed or returned an illegal value; `place` is its file and line, "" if they are unknown."""
+
+    def __init__(self, source: object, problem: str, legal: str = "", place: str = "") -> None:
+        super().__init__(source, problem, legal)
+        self.place = place
 
 
 class SimulationError(SafevarError):

@@ -18,11 +18,10 @@ from typing import Any, ClassVar
 
 import pytest
 
-from safevar_sumo.conformance import Report, check
-from safevar_sumo.conformance.finding import ADVICE
+from safevar_sumo.plugins.check import CHECKS, Report, check
 
 _REPORTS: dict[tuple[str, str | None], Report] = {}
-CHECK_NAMES = tuple(ADVICE)
+CHECK_NAMES = tuple(CHECKS)
 """Names of all checks."""
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -15,7 +14,6 @@ import numpy.typing as npt
 from safevar_sumo.analysis.words import OUTCOME_VERBS
 from safevar_sumo.errors import InputError, unknown_name
 from safevar_sumo.metrics import Scoring, time_to_collision
-from safevar_sumo.plugins import limit_user_code
 from safevar_sumo.progress import Progress, open_progress, show_no_progress
 from safevar_sumo.records import STANDSTILL, TIME_DECIMALS, Evaluations, FloatArray, Observation, Outcome, SimulationRuns
 from safevar_sumo.results import evaluations_frame, record
@@ -192,16 +190,15 @@ def changed_setting(system: System, changes: Mapping[str, float] | None, filtere
 
 
 def simulate_with_original(study: Study, system: System, requested: FloatArray, *, filtered: bool = True, gui: bool = False) -> Simulation:
-    """Simulate a setting, shape (n,), that is yet to be filtered, and the original vehicle; user code that hangs is stopped."""
+    """Simulate a setting, shape (n,), that is yet to be filtered, and the original vehicle."""
     characteristics = system.characteristics
     setting = characteristics.filter(requested) if filtered else requested
-    with nullcontext() if gui else limit_user_code(study):
-        original = _simulate_one(study, system, requested=characteristics.original, setting=characteristics.original)
-        original = replace(original, no_verdict=why_no_verdict(system))
-        if np.array_equal(setting, characteristics.original) and not gui:
-            return replace(original, reset_values=_reset_values(system, requested, setting))
-        simulation = _simulate_one(study, system, requested, setting, Engine.GUI if gui else Engine.LIBSUMO)
-        return replace(simulation, _original=original, no_verdict=original.no_verdict)
+    original = _simulate_one(study, system, requested=characteristics.original, setting=characteristics.original)
+    original = replace(original, no_verdict=why_no_verdict(system))
+    if np.array_equal(setting, characteristics.original) and not gui:
+        return replace(original, reset_values=_reset_values(system, requested, setting))
+    simulation = _simulate_one(study, system, requested, setting, Engine.GUI if gui else Engine.LIBSUMO)
+    return replace(simulation, _original=original, no_verdict=original.no_verdict)
 
 
 def load_and_assemble(study: StudyLike, source: str = "") -> tuple[Study, System]:

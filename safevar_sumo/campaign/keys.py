@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from safevar_sumo.errors import InputError, unknown_name
-from safevar_sumo.plugins import Files, Lookup, Member, digests, guard_process_state, instance_of, note_inputs, unload_user_modules
+from safevar_sumo.plugins import Files, Lookup, Member, digests, instance_of, note_inputs, unload_user_modules
 from safevar_sumo.results.files import run_name
 from safevar_sumo.search import ALGORITHM_CONTRACT, ALGORITHMS, Algorithm, GuardedAlgorithm, MapElites, MoCell, Problem, Search
 from safevar_sumo.study import SearchTable, Study
@@ -47,9 +47,8 @@ def algorithm_of(label: str, study: Study) -> Algorithm:
             legal = dict.fromkeys((*SearchTable.__struct_fields__, *ALGORITHMS, *search.labels))
             raise unknown_name(source, f"search.{table}: there is no such key and no such algorithm", table, legal)
     member = algorithm_class(name, study)
-    with guard_process_state(source, [name] if member.guard else []):
-        parameters = Lookup(source, study.origin.places).with_paths(member, search.parameters.get(label, {}), key)
-        algorithm = instance_of(member, parameters, f"search.algorithms: {name!r}", key, source)
+    parameters = Lookup(source, study.origin.places).with_paths(member, search.parameters.get(label, {}), key)
+    algorithm = instance_of(member, parameters, f"search.algorithms: {name!r}", key, source)
     if isinstance(algorithm, MoCell):
         algorithm.grid_sides(search.population, source)  # raises for a grid of another size
     if isinstance(algorithm, MapElites):

@@ -22,7 +22,7 @@ def check_command(subject: str, study: str | None, as_json: bool) -> int:
     SUBJECT is package.module:Name, the name of a shipped model, or the name or path of a study to check everything that it names.
     The exit code is 0 if SUBJECT passes, 1 with findings, 2 if it cannot be loaded.
     """
-    from safevar_sumo.conformance import check
+    from safevar_sumo.plugins.check import check
 
     report = check(subject, study)
     if as_json:
@@ -33,9 +33,8 @@ def check_command(subject: str, study: str | None, as_json: bool) -> int:
         print_text(console, str(finding))
         print_text(console, f"  expected: {finding.expected}")
         print_text(console, f"  advice: {finding.advice}")
-    for remark in (*report.remarks, report.speed):
-        if remark:
-            print_text(console, f"note: {remark}")
+    if report.remark:
+        print_text(console, f"note: {report.remark}")
     verdict = "passed" if report.passed else f"{len(report.findings)} finding{'s' * (len(report.findings) > 1)}"
     print_text(console, f"{subject} ({report.kind}): {verdict}, {report.seconds:.1f} s")
     return 0 if report.passed else 1

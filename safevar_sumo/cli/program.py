@@ -146,12 +146,7 @@ def _exit_on_interrupt() -> Iterator[None]:
         yield
     finally:
         if in_main_thread:
-            signal.signal(signal.SIGINT, _raise_interrupt if previous_handler in (None, signal.default_int_handler) else previous_handler)
-
-
-def _raise_interrupt(*_: object) -> NoReturn:
-    """Raise what Python's own handler of Ctrl-C raises, with a frame that tells it from an interrupt that user code raises."""
-    raise KeyboardInterrupt
+            signal.signal(signal.SIGINT, previous_handler or signal.default_int_handler)
 
 
 def _exit_with_error(message: str, code: int) -> NoReturn:

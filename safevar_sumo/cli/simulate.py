@@ -31,7 +31,6 @@ from safevar_sumo.cli.target import CommandTarget, as_it_is_now_option, json_opt
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.output import check_writable, unwritable, whole_file
-from safevar_sumo.plugins import limit_user_code
 from safevar_sumo.records import KMH_PER_MS, Evaluations, FloatArray, Outcome
 from safevar_sumo.results import record
 from safevar_sumo.scenarios import LOCATION_DIMENSION, SPEED_DIMENSION, pre_crash_sentence
@@ -111,8 +110,7 @@ def _simulate_sweep(target: CommandTarget, system: System, requested_settings: F
     settings = system.characteristics.filter(requested_settings) if filtered else requested_settings
     evaluations = evaluate_settings(target.study, np.concatenate([system.characteristics.original[np.newaxis], settings]))
     original, variants = evaluations.take([0]), evaluations.take(np.arange(1, len(evaluations)))
-    with limit_user_code(target.study):
-        no_verdict = why_no_verdict(system)
+    no_verdict = why_no_verdict(system)
     if as_json:
         values = [dict(zip(system.characteristics.names, setting, strict=True)) for setting in variants.settings.tolist()]
         records = [{"study": target.study.name, "vcs": values[row], **record(variants, row)} for row in range(len(variants))]

@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 from msgspec import Meta, Struct
 
-from safevar_sumo.errors import InputError
+from safevar_sumo.errors import InputError, UserCodeError
 from safevar_sumo.plugins import Guard, read_only_copy
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray, SimulationRuns
 from safevar_sumo.study import SAFETY_DEGREE, MetricsTable, unit_text
@@ -113,7 +113,7 @@ def guard_metric(metric: Any, guard: Guard) -> Metric:
     """
     expected = "a safevar_sumo.metrics.Metric(name=..., title=..., unit=..., more_is_unsafe=..., function=...)"
     if not isinstance(metric, Metric):
-        raise InputError(guard.source, f"{guard.name} is of type {type(metric).__name__}, not Metric", expected)
+        raise UserCodeError(guard.source, f"{guard.name} is of type {type(metric).__name__}, not Metric", expected, guard.definition(""))
     if not callable(metric.function):
         raise InputError(guard.source, f"{guard.name}: function = {metric.function!r}", "a function of simulation runs and thresholds")
     try:

@@ -6,17 +6,14 @@ raises no event, so all files that a study's parameters name count as read.
 
 from __future__ import annotations
 
-import ast
 import os
 import sys
 import sysconfig
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
-from functools import lru_cache
-from hashlib import sha256
+from contextlib import contextmanager
+from hashlib import file_digest
 from pathlib import Path
 from typing import Any
-from urllib.parse import unquote, urlsplit
 
 from safevar_sumo.shipped import NETWORKS, PACKAGE, STUDIES
 
@@ -40,61 +37,39 @@ WRITE_FLAGS = os.O_WRONLY | os.O_CREAT | os.O_TRUNC
 
 
 class InputFiles:
-    """The files that user code reads: absolute `paths` of opened files, and names of loaded `modules`."""
+    """The absolute `paths` of files that user code opens."""
 
     def __init__(self) -> None:
         self.paths: set[str] = set()
-        self.modules: set[str] = set()
 
     def files(self, packages: Sequence[str] = ()) -> set[str]:
         """Every input file: sources in place of Python's caches, and of installed packages only the files of `packages`."""
-        installed = {file for name in list(sys.modules) if name.partition(".")[0] in packages and not is_user_file(file := _file_of(name))}
-        files = {*self.paths, *map(_file_of, self.modules), *installed} - {""}
-        return {path for path in map(_source_of, files) if _is_input(path, packages)}
-
-
-def _file_of(module: str) -> str:
-    return str(getattr(sys.modules.get(module), "__file__", None) or "")
+        modules = {file_of_module(name) for name in list(sys.modules) if name.partition(".")[0] in packages}
+        return {path for path in map(_source_of, self.paths | modules) if _is_input(path, packages)}
 
 
 class _AuditHook:
     """The process's only audit hook, which cannot be removed.
 
-    `call_depth` is the number of calls of user code under way; `recordings` are those of `note_inputs` that are not over.
-    `written_files` are files that user code wrote, hence no inputs; `imported_modules` are the names of all modules that it has loaded.
+    `call_depth` is the number of calls of user code under way, `modules` the names of all modules that it has loaded, `written` the files
+    that it wrote, which are no inputs; `recordings` are those of `note_inputs` that are not over.
     """
 
     def __init__(self) -> None:
-        self.call_depth, self._is_installed = 0, False
-        self.recordings: list[InputFiles] = []
-        self.written_files: set[str] = set()
-        self.imported_modules: set[str] = set()
-
-    def install(self) -> None:
-        if not self._is_installed:
-            sys.addaudithook(self._note)
-            self._is_installed = True
+        self.call_depth, self.modules, self.written, self.recordings = 0, set[str](), set[str](), list[InputFiles]()
+        sys.addaudithook(self._note)
 
     def _note(self, event: str, arguments: tuple[Any, ...]) -> None:
-        if not self.call_depth or event not in ("open", "import", "ctypes.dlopen", "sqlite3.connect"):
+        if not self.call_depth or event not in ("open", "import"):
             return
-        target = arguments[0]
         if event == "import":
-            self.imported_modules.add(target)
-            for recording in self.recordings:
-                recording.modules.add(target)
-            target = arguments[1]
-        if not isinstance(target, str | bytes | os.PathLike):
-            return
-        path = os.fsdecode(target)
-        if event == "sqlite3.connect" and path.startswith("file:"):
-            path = unquote(urlsplit(path).path)
-        path = os.path.abspath(path)
-        if event == "open" and isinstance(arguments[2], int) and arguments[2] & WRITE_FLAGS:
-            self.written_files.add(path)
-            return
-        for recording in self.recordings:
-            recording.paths.add(path)
+            self.modules.add(arguments[0])
+        path = arguments[event == "import"]
+        if isinstance(path, str | bytes | os.PathLike):
+            path = os.path.abspath(os.fsdecode(path))
+            writes = event == "open" and isinstance(arguments[2], int) and arguments[2] & WRITE_FLAGS
+            for paths in [self.written] if writes else [recording.paths for recording in self.recordings]:
+                paths.add(path)
 
 
 audit_hook = _AuditHook()
@@ -102,14 +77,27 @@ audit_hook = _AuditHook()
 
 @contextmanager
 def note_inputs() -> Iterator[InputFiles]:
-    """Record the files and modules that user code opens and loads while a guard calls it."""
-    audit_hook.install()
+    """Record the files that user code opens while a guard calls it."""
     recording = InputFiles()
     audit_hook.recordings.append(recording)
     try:
         yield recording
     finally:
-        audit_hook.recordings[:] = [other for other in audit_hook.recordings if other is not recording]
+        audit_hook.recordings.remove(recording)
+
+
+def unload_user_modules() -> None:
+    """Unload all modules that user code is made of, so that the next lookup loads them again."""
+    for name in sorted(audit_hook.modules):
+        if (file := file_of_module(name)) and is_user_file(file) and name.partition(".")[0] not in ("safevar_sumo", "__main__"):
+            sys.modules.pop(name)
+    audit_hook.modules.clear()
+
+
+def file_of_module(name: str) -> str:
+    """The file of a loaded module, or the folder of a package without __init__.py; "" for a module of the interpreter."""
+    module = sys.modules.get(name)
+    return str(getattr(module, "__file__", None) or next(iter(getattr(module, "__path__", ())), ""))
 
 
 def is_user_file(path: str) -> bool:
@@ -127,59 +115,19 @@ def _source_of(path: str) -> str:
 
 def _is_input(path: str, packages: Sequence[str]) -> bool:
     parts = Path(path).parts
-    if path in audit_hook.written_files or any(name in parts for name in CACHE_FOLDERS) or not os.path.isfile(path):
+    if path in audit_hook.written or any(name in parts for name in CACHE_FOLDERS) or not os.path.isfile(path):
         return False
     library_members = [parts[parts.index(folder) + 1] for folder in LIBRARY_FOLDERS if folder in parts]
     return is_user_file(path) or any(member.partition(".")[0] in packages for member in library_members)
 
 
 def digest_of(path: Path | str) -> str:
-    """Digest of a file's content; "" for a missing file.
-
-    The digest of a Python file covers its syntax tree without docstrings; digests of other files do not depend on the kind of line ends.
-    """
+    """Digest of a file's bytes; "" for a missing file."""
     try:
-        status = os.stat(path)
-        return _digest(str(path), status.st_mtime_ns, status.st_size, status.st_ino)
+        with open(path, "rb") as file:
+            return file_digest(file, "sha256").hexdigest()[:DIGEST_LENGTH]
     except OSError:
         return ""
-
-
-@lru_cache(maxsize=4096)
-def _digest(path: str, *_: int) -> str:
-    """Digest of a file, cached by its time, size and inode."""
-    content = Path(path).read_bytes()
-    if path.endswith(".py"):
-        with suppress(SyntaxError, ValueError, RecursionError):  # the digest of invalid Python covers the file's content
-            content = "".join(_syntax_text(ast.parse(content))).encode()
-    return sha256(content.replace(b"\r\n", b"\n")).hexdigest()[:DIGEST_LENGTH]
-
-
-def _syntax_text(node: Any) -> Iterator[str]:
-    """Pieces of text that describe a syntax tree without positions and docstrings, equal in all versions of Python."""
-    if isinstance(node, list):
-        yield "["
-        for child in node:
-            yield from _syntax_text(child)
-            yield ","
-        yield "]"
-    elif isinstance(node, ast.Constant):
-        yield f"{type(node.value).__name__} {node.value!r}"
-    elif isinstance(node, ast.AST):
-        yield f"{type(node).__name__}("
-        for name, value in ast.iter_fields(node):
-            if name == "body" and isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
-                value = value[1:] if _is_docstring(value) else value
-            if value is not None and value != [] and name not in ("type_comment", "type_ignores"):
-                yield f"{name}="
-                yield from _syntax_text(value)
-        yield ")"
-    else:
-        yield repr(node)
-
-
-def _is_docstring(body: Sequence[ast.stmt]) -> bool:
-    return bool(body) and isinstance(body[0], ast.Expr) and isinstance(body[0].value, ast.Constant) and isinstance(body[0].value.value, str)
 
 
 def digests(paths: Iterable[str], folders: Sequence[str]) -> Files:
@@ -208,7 +156,7 @@ def _name_of(path: str, folders: Sequence[str], extra_parts: int = 0) -> str:
 
 def file_by_name(name: str, folders: Sequence[str]) -> str:
     """The path of the file that `digests` calls `name`; "" if there is no such file."""
-    return next((str(path) for folder in (*folders, *_import_folders()) if (path := Path(folder, name)).is_file()), "")
+    return file_beside(name, (*folders, *_import_folders()))
 
 
 def changed_files(before: Mapping[str, str], now: Mapping[str, str]) -> list[str]:
@@ -218,15 +166,11 @@ def changed_files(before: Mapping[str, str], now: Mapping[str, str]) -> list[str
 
 def files_named_in(value: Any, folders: Sequence[str]) -> Iterator[str]:
     """Files in `folders` whose names occur as texts anywhere in a value."""
-    if isinstance(value, dict):
-        value = list(value.values())
-    if isinstance(value, list | tuple):
-        for item in value:
+    if isinstance(value, dict | list | tuple):
+        for item in value.values() if isinstance(value, dict) else value:
             yield from files_named_in(item, folders)
-    elif isinstance(value, str):
-        path = file_beside(value, folders or (os.getcwd(),))
-        if path:
-            yield path
+    elif isinstance(value, str) and (path := file_beside(value, folders or (os.getcwd(),))):
+        yield path
 
 
 def file_beside(text: str, folders: Sequence[str]) -> str:

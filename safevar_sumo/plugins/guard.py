@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-import importlib
 import inspect
 import os
-import signal
-import threading
 import traceback
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, NamedTuple, NoReturn, Self
+from typing import Any, NamedTuple, ParamSpec, Self, TypeVar
 
 import numpy as np
 
@@ -22,12 +19,12 @@ from safevar_sumo.errors import InputError, UserCodeError, describe_error
 from safevar_sumo.plugins.files import audit_hook
 from safevar_sumo.records import BoolArray, FloatArray, IntArray
 
+Parameters = ParamSpec("Parameters")
+Result = TypeVar("Result")
 _PACKAGE_FOLDER = str(Path(__file__).resolve().parents[1])
-_IMPORTLIB_FOLDER = str(Path(importlib.__file__).parent)
 _STANDARD_LIBRARY_FOLDER = str(Path(os.__file__).parent)
 LIBRARY_FOLDER = "site-packages"
 INFINITY = float("inf")
-_process, _end_process, _abort_process = os.getpid(), os._exit, os.abort
 _open_runs: ContextVar[BoolArray | None] = ContextVar("open_runs", default=None)
 """Which of N runs have not ended yet, shape (N,); None outside a simulation."""
 
@@ -127,23 +124,6 @@ def read_only_copy(value: Any) -> Any:
 
 
 @contextmanager
-def guard_process_state(source: str, names: Sequence[str]) -> Iterator[None]:
-    """Restore the working directory, environment variables and numpy's error state after a block with user code of these names, if any."""
-    if not names:
-        yield
-        return
-    folder, environment = os.getcwd(), dict(os.environ)
-    try:
-        with np.errstate():
-            yield
-    finally:
-        os.chdir(folder)
-        if dict(os.environ) != environment:
-            os.environ.clear()
-            os.environ.update(environment)
-
-
-@contextmanager
 def check_open_runs(are_open: BoolArray) -> Iterator[None]:
     """Within the block, ignore wrong values of runs that have ended: a vehicle still moves while others in its batch drive.
 
@@ -160,36 +140,6 @@ def open_rows(holds: BoolArray) -> IntArray:
     """The indices at which `holds` is true, shape (N,), without those of runs that have ended."""
     are_open = _open_runs.get()
     return np.flatnonzero(holds if are_open is None or are_open.shape != holds.shape else holds & are_open)
-
-
-def _refuse_exit(status: int) -> NoReturn:
-    """Raise an exception in place of `os._exit`, which would end this process without a message; threads and children of it may end."""
-    if _is_main_thread():
-        raise SystemExit(f"os._exit({status})")
-    _end_process(status)
-
-
-def _refuse_abort() -> NoReturn:
-    """Raise an exception in place of `os.abort`, as `_refuse_exit` does."""
-    if _is_main_thread():
-        raise SystemExit("os.abort()")
-    _abort_process()
-
-
-def _is_main_thread() -> bool:
-    return os.getpid() == _process and threading.current_thread() is threading.main_thread()
-
-
-def _is_from_signal(error: BaseException) -> bool:
-    """Whether a signal raised an exception, and not the code that the signal interrupted: Ctrl-C, or a time limit of this package."""
-    if isinstance(error, Exception | SystemExit | GeneratorExit):
-        return False
-    if isinstance(error, KeyboardInterrupt) and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-        return True  # that handler is compiled and leaves no frame
-    innermost_frame = error.__traceback__
-    while innermost_frame is not None and innermost_frame.tb_next is not None:
-        innermost_frame = innermost_frame.tb_next
-    return innermost_frame is not None and innermost_frame.tb_frame.f_code.co_filename.startswith(_PACKAGE_FOLDER + os.sep)
 
 
 class Guard(NamedTuple):
@@ -212,45 +162,49 @@ class Guard(NamedTuple):
     folder: str = ""
     target: Any = None
 
-    def call(self, method: str, function: Callable[..., Any], *arguments: Any) -> Any:
+    def call(self, method: str, function: Callable[Parameters, Result], *arguments: Parameters.args,
+             **keywords: Parameters.kwargs) -> Result:
         """Call a function and return its result.
 
         Raises
         ------
         UserCodeError
-            If the function raises anything, or ends the process by `os._exit` or `os.abort`.
+            If the function raises anything but Ctrl-C.
         """
         audit_hook.call_depth += 1
-        os._exit, os.abort = _refuse_exit, _refuse_abort
         try:
-            return function(*arguments)
-        except UserCodeError:
+            return function(*arguments, **keywords)
+        except (UserCodeError, KeyboardInterrupt):
             raise
         except BaseException as error:
-            if _is_from_signal(error):
-                raise
             raise self.failure(method, error) from error
         finally:
             audit_hook.call_depth -= 1
-            if not audit_hook.call_depth:
-                os._exit, os.abort = _end_process, _abort_process
 
     def failure(self, method: str, error: BaseException) -> UserCodeError:
         """The error for an exception that user code raised."""
-        location = self.location(error)
+        place = self._place(error) or self.definition(method)
         reason = f"{error.source}: {error.problem}" if isinstance(error, InputError) else describe_error(error)
-        problem = f"{self.name} raised in {method}: {reason}{f' ({location})' if location else ''}"
-        return UserCodeError(self.source, problem, error.legal if isinstance(error, InputError) else "")
+        problem = f"{self.name} raised in {method}: {reason}{f' ({place})' if place else ''}"
+        return UserCodeError(self.source, problem, error.legal if isinstance(error, InputError) else "", place)
 
     def wrong_value(self, method: str, quantity: str, value: object, expected: str) -> UserCodeError:
         """The error for a result with a wrong value of `quantity`."""
         return self._wrong_result(f"{quantity} = {_short_text(value)}", method, expected)
 
     def _wrong_result(self, result: str, method: str, expected: str) -> UserCodeError:
-        function = inspect.unwrap(getattr(self.target, method, getattr(self.target, "function", self.target)))
-        code = getattr(function, "__code__", None)  # FMUs and compiled code have none
-        location = f" ({code.co_filename}:{code.co_firstlineno})" if code is not None else ""
-        return UserCodeError(self.source, f"{self.name} returned {result} from {method}{location}", expected)
+        place = self.definition(method)
+        return UserCodeError(self.source, f"{self.name} returned {result} from {method}{f' ({place})' if place else ''}", expected, place)
+
+    def definition(self, method: str) -> str:
+        """File and line at which a method begins, else the class or function; "" for FMUs and compiled code."""
+        target = getattr(self.target, "function", self.target)
+        function = inspect.unwrap(getattr(target, method, target))
+        code = getattr(function, "__code__", None)
+        try:
+            return f"{code.co_filename}:{code.co_firstlineno}" if code else f"{inspect.getfile(target)}:{inspect.getsourcelines(target)[1]}"
+        except (OSError, TypeError):
+            return ""
 
     def elements(self, method: str, value: Any, expected: str, count: int = 2) -> tuple[Any, ...]:
         """The elements of a result that must be a tuple or list of `count` elements."""
@@ -309,17 +263,15 @@ class Guard(NamedTuple):
             raise self._wrong_result(f"{quantity} of shape {array.shape}", method, expected)
         return np.broadcast_to(array, shape)
 
-    def location(self, error: BaseException) -> str:
-        """File and line of the innermost frame in the user code's folder, else outside libraries, else outside this package."""
+    def _place(self, error: BaseException) -> str:
+        """File and line of the innermost frame in the user code's folder, else outside libraries and this package; "" if there is none."""
         frames = [(frame.filename, frame.lineno) for frame in traceback.extract_tb(error.__traceback__)]
         if isinstance(error, SyntaxError) and error.filename:
             frames.append((error.filename, error.lineno))
-        frames_beyond_package = [frame for frame in frames if not frame[0].startswith((_PACKAGE_FOLDER, _IMPORTLIB_FOLDER, "<frozen"))]
-        user_frames = [frame for frame in frames_beyond_package if self.folder and frame[0].startswith(self.folder)
-                       and (LIBRARY_FOLDER in self.folder or LIBRARY_FOLDER not in frame[0])]
-        user_frames = user_frames or [frame for frame in frames_beyond_package if LIBRARY_FOLDER not in frame[0]
-                                      and not frame[0].startswith(_STANDARD_LIBRARY_FOLDER)]
-        return "{}:{}".format(*(user_frames or frames_beyond_package)[-1]) if frames_beyond_package else ""
+        frames = [frame for frame in frames if not frame[0].startswith((_PACKAGE_FOLDER, _STANDARD_LIBRARY_FOLDER, "<frozen"))]
+        user_frames = [frame for frame in frames if self.folder and frame[0].startswith(self.folder)]
+        frames_outside = [frame for frame in user_frames or frames if LIBRARY_FOLDER in self.folder or LIBRARY_FOLDER not in frame[0]]
+        return "{}:{}".format(*frames_outside[-1]) if frames_outside else ""
 
 
 def _type_name(value: object) -> str:

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics.base import STUDY_SOURCE
-from safevar_sumo.plugins import check_open_runs, guard_process_state, open_rows
+from safevar_sumo.plugins import check_open_runs, open_rows
 from safevar_sumo.protocol.driving_robot import DrivingRobot
 from safevar_sumo.records import STANDSTILL, TIME_DECIMALS, BoolArray, Evaluations, FloatArray, Observation, Outcome, SimulationRuns, Trace
 from safevar_sumo.scenarios import VUT, Lane, Point
@@ -103,9 +103,8 @@ def drive(system: System, settings: FloatArray, world: SumoWorld | RecordedWorld
 
     With K points, `settings` holds K groups of equal size, and group k drives at point k.
     """
-    guards = [member.guard for member in system.members if member.guard is not None]
     outcomes = _Outcomes(len(settings))
-    with guard_process_state(guards[0].source if guards else "", [guard.name for guard in guards]), check_open_runs(outcomes.is_checked):
+    with check_open_runs(outcomes.is_checked):
         return _simulate(system, settings, world, outcomes, watch, listen)
 
 

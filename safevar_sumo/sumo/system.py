@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import inspect
-import os
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -23,17 +22,15 @@ from safevar_sumo.plugins import (
     Guard,
     Lookup,
     Member,
-    ModuleCopies,
     accepts,
     check_parameters,
-    guard_process_state,
     instance_of,
-    limit_user_code,
+    unload_user_modules,
 )
 from safevar_sumo.protocol.rater import Rater, expand_protocol, is_rated, rater_of
 from safevar_sumo.records import FloatArray, Nominal
 from safevar_sumo.scenarios import SCENARIO_CONTRACT, SCENARIOS, GuardedScenario, Point, Scenario, equals_clear, weather_of
-from safevar_sumo.study import MatrixTest, MetricsTable, ModelTable, Study, VehicleTable, Weather, user_code_names
+from safevar_sumo.study import MatrixTest, MetricsTable, ModelTable, Study, VehicleTable, Weather
 from safevar_sumo.sumo.network import NETWORK_KEY, is_network, is_shipped
 from safevar_sumo.sumo.network_check import check_network, network_remarks
 from safevar_sumo.sumo.traci_controller import TraciController
@@ -60,12 +57,11 @@ OBJECTIVES_KEY = "search.objectives"
 
 
 class Measuring(NamedTuple):
-    """Metrics and additional measures of change by column; the objectives; and the members that contain user code."""
+    """Metrics and additional measures of change by column, and the objectives."""
 
     metrics: Mapping[str, Metric]
     changes: Mapping[str, Change]
     scoring: Scoring
-    members: tuple[Member, ...]
 
 
 def measuring_of(study: Study, lookup: Lookup) -> Measuring:
@@ -76,7 +72,7 @@ def measuring_of(study: Study, lookup: Lookup) -> Measuring:
     InputError
         If a metric or measure of change does not exist, is invalid, or has a name that is taken.
     """
-    metrics, members = {**METRICS, **({RATING_POINTS.name: RATING_POINTS} if is_rated(study) else {})}, list[Member]()
+    metrics = {**METRICS, **({RATING_POINTS.name: RATING_POINTS} if is_rated(study) else {})}
     default_metrics = dict(metrics)
     changes = {name: change for name, change in CHANGES.items() if name not in RESULT_COLUMNS}
     by_name: dict[str, Metric | Change] = {}
@@ -90,7 +86,6 @@ def measuring_of(study: Study, lookup: Lookup) -> Measuring:
             if name in OPTIONAL_METRICS:
                 metrics[name] = member.target
             return member.target  # type: ignore[no-any-return]
-        members.append(member)
         is_change = isinstance(member.target, Change) and key == OBJECTIVES_KEY
         record = guard_change(member.target, member.guard) if is_change else guard_metric(member.target, member.guard)
         if record.name in (*RESULT_COLUMNS, *metrics, *OPTIONAL_METRICS, *changes, *study.vehicle.characteristics):
@@ -111,7 +106,7 @@ def measuring_of(study: Study, lookup: Lookup) -> Measuring:
     objectives = [_objective_of(look_up(name, OBJECTIVES_KEY)) for name in names]
     _check_duplicates(objectives, lookup.source)
     scoring = Scoring(metrics=tuple(metric.facts for metric in metrics.values()), objectives=tuple(objectives))
-    return Measuring(metrics, changes, scoring, tuple(members))
+    return Measuring(metrics, changes, scoring)
 
 
 def _objective_of(record: Metric | Change) -> Objective:
@@ -132,13 +127,12 @@ CONTROLLER_FORMS = "a function step(traci, vehicle_id) with the body of a script
 
 
 class Models(NamedTuple):
-    """A study's models with their parameters, and the members that define the models."""
+    """A study's models with their parameters."""
 
     vehicle: Vehicle
     ads: Ads
     scenario: Scenario
     weather: Weather
-    members: tuple[Member, ...]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -146,8 +140,8 @@ class System:
     """A study's models, points, metrics and constraints, ready to simulate.
 
     `source` is the study, as errors name it; `step_length` [s] is None if the network determines the time step; `rater` rates results in
-    the matrix of a protocol; `metrics_table` has the thresholds of the metrics in `measuring`; `members` define all models, metrics and
-    constraints; with `sees_nobody` the ADS sees no other actor, and a run ends at the place of the encounter.
+    the matrix of a protocol; `metrics_table` has the thresholds of the metrics in `measuring`; with `sees_nobody` the ADS sees no other
+    actor, and a run ends at the place of the encounter.
     """
 
     characteristics: CharacteristicSet
@@ -157,7 +151,6 @@ class System:
     weather: Weather
     metrics_table: MetricsTable
     nominal: Nominal
-    members: tuple[Member, ...]
     measuring: Measuring
     region: FeasibleRegion
     source: str = "study"
@@ -205,7 +198,7 @@ class System:
 
 
 def assemble(study: Study, source: str = "") -> System:
-    """Look up the study's models and create them with their parameters; errors name the study by `source`.
+    """Load the study's models and create them with their parameters; errors name the study by `source`.
 
     Raises
     ------
@@ -213,13 +206,9 @@ def assemble(study: Study, source: str = "") -> System:
         Naming the study, the key, the value and the legal values.
     """
     source = source or study.source
-    with guard_process_state(source, user_code_names(study)), limit_user_code(study):
-        return _assemble(study, source)
-
-
-def _assemble(study: Study, source: str) -> System:
+    unload_user_modules()  # so that each system has the code as it is now, and no state of another one
     models = models_of(study, source)
-    is_shipped_vehicle = models.members[0].guard is None
+    is_shipped_vehicle = study.vehicle.model in VEHICLES
     _check_units(study, models.vehicle, is_shipped_vehicle, source)
     measuring = measuring_of(study, Lookup(source, study.origin.places))
     tables_by_metric = {"published": study.published, "repeatability": study.repeatability, "model_error": study.model_error,
@@ -242,20 +231,18 @@ def _assemble(study: Study, source: str) -> System:
         nominal.tables()  # so that errors of a user's vehicle do not depend on the ADS
     return System(
         characteristics=characteristics, vehicle=models.vehicle, ads=models.ads, scenario=models.scenario, weather=models.weather,
-        metrics_table=study.metrics, nominal=nominal, members=(*models.members, *measuring.members, *region.members),
-        measuring=measuring, region=region, source=source, step_length=study.step_length, matrix=matrix, rater=rater)
+        metrics_table=study.metrics, nominal=nominal, measuring=measuring, region=region, source=source,
+        step_length=study.step_length, matrix=matrix, rater=rater)
 
 
 def models_of(study: Study, source: str) -> Models:
     """The study's models with their parameters; raises the errors of `assemble`."""
     lookup = Lookup(source, study.origin.places)
-    vehicle, vehicle_member = _create_vehicle(study.vehicle, lookup)
-    ads, ads_member = _create_ads(study.ads, lookup)
-    scenario, scenario_member = _create_scenario(study.scenario, lookup)
-    return Models(vehicle, ads, scenario, weather_of(study.weather, source), (vehicle_member, ads_member, scenario_member))
+    return Models(_create_vehicle(study.vehicle, lookup), _create_ads(study.ads, lookup), _create_scenario(study.scenario, lookup),
+                  weather_of(study.weather, source))
 
 
-def _create_traci_controller(table: ModelTable, lookup: Lookup) -> tuple[Ads, Member]:
+def _create_traci_controller(table: ModelTable, lookup: Lookup) -> Ads:
     """The ADS of a controller written for TraCI: a function `step(traci, vehicle_id)` or a class with that method."""
     name = f"ads.model = {table.model!r}"
     with substitute_traci():
@@ -267,17 +254,10 @@ def _create_traci_controller(table: ModelTable, lookup: Lookup) -> tuple[Ads, Me
             raise InputError(lookup.source, f"{name} cannot be called as step(traci, vehicle_id)", CONTROLLER_FORMS)
         if not is_class:
             check_parameters(controller, (None, None), parameters, name, "ads.parameters", lookup.source)
-
-        def controller_of(target: Any) -> Any:
-            """A controller for one vehicle, from the vehicle's own instance of the module."""
-            if not inspect.isclass(target):
-                return partial(target, **parameters)
-            return instance_of(member._replace(target=target), parameters, name, "ads.parameters", lookup.source)
-
-        controller_of(controller)  # so that wrong parameters raise errors here
-    folders, attribute = [*lookup.folders, os.getcwd()], table.model.partition(":")[2]
-    modules = partial(ModuleCopies, member, attribute, folders, other_names=set())
-    return TraciController(modules, controller_of, member.guard or Guard(lookup.source, name)), member
+        create = partial(instance_of, member, parameters, name, "ads.parameters", lookup.source) if is_class else partial(
+            partial, controller, **parameters)
+        create()  # so that wrong parameters raise errors here
+    return TraciController(create, member.guard or Guard(lookup.source, name))
 
 
 def _matrix_points(study: Study, source: str) -> tuple[Point, ...]:
@@ -297,7 +277,7 @@ def _points_of(test: MatrixTest, study: Study, source: str) -> Iterator[Point]:
     weathers: list[str | Weather] = list(test.weathers) or [study.weather]
     for values in product(*test.over.values()):
         over = dict(zip(test.over, values, strict=True))
-        scenario, _ = _create_scenario(ModelTable(model=test.model or study.scenario.model, parameters={**base, **over}), lookup)
+        scenario = _create_scenario(ModelTable(model=test.model or study.scenario.model, parameters={**base, **over}), lookup)
         for choice in weathers:
             weather = weather_of(choice, lookup.source)
             parameters = {"test": test.name, **over, "weather": weather.name}
@@ -338,36 +318,36 @@ def _check_units(study: Study, vehicle: Vehicle, is_shipped_vehicle: bool, sourc
             raise InputError(source, f"vehicle.characteristics.{name} is missing", f"all of {', '.join(units)}")
 
 
-def _create_vehicle(table: VehicleTable, lookup: Lookup) -> tuple[Vehicle, Member]:
+def _create_vehicle(table: VehicleTable, lookup: Lookup) -> Vehicle:
     if table.kind == "fmu":
         guard = Guard(lookup.source, f"vehicle.model = {table.model!r}")
         fmu_table = {**msgspec.structs.asdict(table),
                      "parameters": lookup.with_paths(Member(FmuVehicle, guard), table.parameters, "vehicle.parameters")}
         units = {name: row.unit for name, row in table.characteristics.items()}
         description = description_of(table.model, lookup.folders, lookup.source, "vehicle.model")
-        return FmuVehicle(description, units, fmu_table, guard), Member(FmuVehicle, guard, file=description.path)
+        return FmuVehicle(description, units, fmu_table, guard)
     member = lookup.class_of(VEHICLES, table.model, "vehicle.model", VEHICLE_CONTRACT)
     parameters = lookup.with_paths(member, table.parameters, "vehicle.parameters")
     vehicle = instance_of(member, parameters, f"vehicle.model = {table.model!r}", "vehicle.parameters", lookup.source)
-    return (vehicle if member.guard is None else GuardedVehicle(vehicle, member.guard)), member
+    return vehicle if member.guard is None else GuardedVehicle(vehicle, member.guard)
 
 
-def _create_scenario(table: ModelTable, lookup: Lookup) -> tuple[Scenario, Member]:
+def _create_scenario(table: ModelTable, lookup: Lookup) -> Scenario:
     member = lookup.class_of(SCENARIOS, table.model, "scenario.model", SCENARIO_CONTRACT)
     parameters = lookup.with_paths(member, table.parameters, "scenario.parameters")
     scenario = instance_of(member, parameters, f"scenario.model = {table.model!r}", "scenario.parameters", lookup.source)
-    return _locate_network(scenario if member.guard is None else GuardedScenario(scenario, member.guard), lookup.folders), member
+    located: Scenario = _locate_network(scenario if member.guard is None else GuardedScenario(scenario, member.guard), lookup.folders)
+    return located
 
 
-def _create_ads(table: ModelTable, lookup: Lookup) -> tuple[Ads, Member]:
+def _create_ads(table: ModelTable, lookup: Lookup) -> Ads:
     if table.kind == "traci":
         return _create_traci_controller(table, lookup)
     if table.kind == "fmu":
         guard = Guard(lookup.source, f"ads.model = {table.model!r}")
         parameters = lookup.with_paths(Member(FmuAds, guard), table.parameters, "ads.parameters")
         description = description_of(table.model, lookup.folders, lookup.source, "ads.model")
-        ads = FmuAds(description, table.inputs, table.outputs, parameters, table.step, guard)
-        return ads, Member(FmuAds, guard, file=description.path)
+        return FmuAds(description, table.inputs, table.outputs, parameters, table.step, guard)
     member = lookup.class_of(ADS, table.model, "ads.model", SCALAR_ADS_CONTRACT, ADS_CONTRACT,
                              otherwise=f'with ads.kind = "traci" {CONTROLLER_FORMS}')
     name = f"ads.model = {table.model!r}"
@@ -375,5 +355,5 @@ def _create_ads(table: ModelTable, lookup: Lookup) -> tuple[Ads, Member]:
     create_ads = partial(instance_of, member, parameters, name, "ads.parameters", lookup.source)
     ads = create_ads()  # also for a ScalarAds, so that wrong parameters raise errors here
     if issubclass(member.target, ScalarAds):
-        return PerVehicleAds(create_ads, member.guard or Guard(lookup.source, name)), member
-    return (ads if member.guard is None else GuardedAds(ads, member.guard)), member
+        return PerVehicleAds(create_ads, member.guard or Guard(lookup.source, name))
+    return ads if member.guard is None else GuardedAds(ads, member.guard)

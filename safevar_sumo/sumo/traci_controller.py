@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from safevar_sumo.ads.driver import Trim, pedals_for, trim_at
-from safevar_sumo.plugins import Guard, ModuleCopies
+from safevar_sumo.plugins import Guard
 from safevar_sumo.records import Command, Nominal, Observation
 from safevar_sumo.scenarios import VUT
 from safevar_sumo.sumo.sensing import SensedTraffic
@@ -28,14 +28,12 @@ class TraciController:
 
     Parameters
     ----------
-    modules
-        Creates separate instances of the user's modules for each vehicle, so that vehicles share no module state.
-    controller_of
-        Creates a controller from the object that the study names in these modules.
+    create
+        Creates a vehicle's controller.
     """
 
-    def __init__(self, modules: Callable[[], ModuleCopies], controller_of: Callable[[Any], Any], guard: Guard) -> None:
-        self._modules, self._controller_of, self._guard = modules, controller_of, guard
+    def __init__(self, create: Callable[[], Any], guard: Guard) -> None:
+        self._create, self._guard = create, guard
 
     def start(self, n: int, nominal: Nominal, step: float) -> _Memory:
         world = current_world()
@@ -45,7 +43,7 @@ class TraciController:
         views = [TraciView(world, copy, names, traffic, nominal, step) for copy in range(n)]
         traffic.record_step()
         with substitute_traci():
-            drivers = [_Driver(view, self._modules(), self._controller_of, self._guard) for view in views]
+            drivers = [_Driver(view, self._create(), self._guard) for view in views]
         return _Memory(nominal, traffic, drivers, initial_trim=None)
 
     def drive(self, seen: Observation, memory: _Memory) -> tuple[Command, _Memory]:
@@ -70,16 +68,13 @@ class _Memory(NamedTuple):
 
 
 class _Driver:
-    """The controller of one vehicle, with separate instances of the user's modules."""
+    """The controller of one vehicle."""
 
-    def __init__(self, view: TraciView, modules: ModuleCopies, controller_of: Callable[[Any], Any], guard: Guard) -> None:
-        self.view, self._modules, self._guard = view, modules, guard
-        self._subscriptions = Subscriptions(view)
-        with modules.inside():
-            self._controller = controller_of(guard.call("import", modules.load))
-        self._step = getattr(self._controller, "step", self._controller)
-        if hasattr(self._controller, "start"):
-            self._call("start", self._controller.start)
+    def __init__(self, view: TraciView, controller: Any, guard: Guard) -> None:
+        self.view, self._guard = view, guard
+        self._subscriptions, self._step = Subscriptions(view), getattr(controller, "step", controller)
+        if hasattr(controller, "start"):
+            self._call("start", controller.start)
 
     def step(self, time: float, speed: float) -> float:
         """The commanded acceleration [m/s^2]."""
@@ -88,7 +83,7 @@ class _Driver:
         return self.view.commanded_speed.acceleration(speed, time, self.view.speed_of_sumo(speed))
 
     def _call(self, method: str, function: Callable[..., Any]) -> None:
-        with self._modules.inside(), bind_traci(self.view, self._subscriptions):
+        with bind_traci(self.view, self._subscriptions):
             self._guard.call(method, function, traci_module(), VUT)
         if self.view.last_error is not None:  # the controller caught the error and continued
             raise self._guard.failure(method, self.view.last_error)

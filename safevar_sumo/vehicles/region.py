@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from safevar_sumo.errors import InputError
-from safevar_sumo.plugins import Guard, Lookup, Member, read_only_copy
+from safevar_sumo.plugins import Guard, Lookup, read_only_copy
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.study import Constraint, Study, unit_text
 from safevar_sumo.vehicles.characteristics import CharacteristicSet
@@ -51,14 +51,12 @@ class _Bounds(NamedTuple):
 class FeasibleRegion:
     """Settings that satisfy all constraints of a study; without constraints, all settings.
 
-    `vertices` are vertices of the polytope of the linear constraints, shape (V, n), empty without such constraints; `members` are the
-    constraints' functions, which are user code.
+    `vertices` are vertices of the polytope of the linear constraints, shape (V, n), empty without such constraints.
     """
 
     characteristics: CharacteristicSet
     bounds: tuple[_Bounds, ...]
     vertices: FloatArray
-    members: tuple[Member, ...] = ()
 
     def __bool__(self) -> bool:
         return bool(self.bounds)
@@ -145,8 +143,8 @@ def region_of(study: Study, source: str = "") -> FeasibleRegion:
     characteristics = CharacteristicSet.of(study.vehicle.characteristics)
     if not study.constraints:
         return FeasibleRegion(characteristics, (), np.zeros((0, len(characteristics))))
-    lookup, members = Lookup(source, study.origin.places), list[Member]()
-    bounds = tuple(_bounds_of(constraint, study, characteristics, lookup, f"constraints[{number}]", members)
+    lookup = Lookup(source, study.origin.places)
+    bounds = tuple(_bounds_of(constraint, study, characteristics, lookup, f"constraints[{number}]")
                    for number, constraint in enumerate(study.constraints))
     linear = [(tuple(bound.constraint.sum.get(name, 0.0) for name in characteristics.names), bound.minimum, bound.maximum)
               for bound in bounds if bound.constraint.sum]
@@ -158,7 +156,7 @@ def region_of(study: Study, source: str = "") -> FeasibleRegion:
     if vertices is None:
         raise InputError(source, f"constraints: no setting in the domains satisfies all of them: {'; '.join(map(str, bounds))}",
                          "constraints that leave a region, with the original in it")
-    region = FeasibleRegion(characteristics, bounds, vertices, tuple(members))
+    region = FeasibleRegion(characteristics, bounds, vertices)
     region.check(characteristics.original[np.newaxis], f"{source}: the original vehicle",
                  otherwise="; the original vehicle must satisfy every constraint")
     if not _has_feasible_change(region):
@@ -167,8 +165,8 @@ def region_of(study: Study, source: str = "") -> FeasibleRegion:
     return region
 
 
-def _bounds_of(constraint: Constraint, study: Study, characteristics: CharacteristicSet, lookup: Lookup, key: str,
-            members: list[Member]) -> _Bounds:
+def _bounds_of(constraint: Constraint, study: Study, characteristics: CharacteristicSet, lookup: Lookup,
+               key: str) -> _Bounds:
     minimum = -np.inf if constraint.at_least is None else constraint.at_least
     maximum = np.inf if constraint.at_most is None else constraint.at_most
     condition, unit = constraint.bounds_in_words(study.vehicle.characteristics), constraint.unit_of(study.vehicle.characteristics)
@@ -181,7 +179,6 @@ def _bounds_of(constraint: Constraint, study: Study, characteristics: Characteri
     guard = member.guard or Guard(lookup.source, f"{key}.function = {constraint.function!r}")
     if not callable(member.target):
         raise InputError(lookup.source, f"{guard.name} is of type {type(member.target).__name__}", "a function of a mapping of arrays")
-    members.append(member)
 
     def quantity(settings: FloatArray) -> FloatArray:
         columns = read_only_copy(dict(zip(characteristics.names, settings.T, strict=True)))

@@ -104,7 +104,7 @@ def evaluate_batch(work: bytes, settings: FloatArray) -> Evaluations:
     """
     mode = msgspec.msgpack.decode(work, type=_Mode)
     if mode.check:
-        from safevar_sumo.conformance import refuse_defects  # slow to import, and rarely needed
+        from safevar_sumo.plugins.check import refuse_defects  # slow to import, and rarely needed
 
         remarks = refuse_defects(msgspec.msgpack.decode(work, type=_Work).study)
         return replace(Evaluations.none(settings.shape[1], METRICS), reasons={remark.encode(): remark for remark in remarks})

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import bdb
 import inspect
 import re
-import signal
 import subprocess
 import sys
-import time
 import warnings
 from importlib.metadata import version
 from pathlib import Path
@@ -18,8 +15,6 @@ import pandas as pd
 import pytest
 
 import safevar_sumo as sv
-from safevar_sumo.errors import UserCodeError
-from safevar_sumo.plugins import UserCodeTimeout, limit_user_code, time_limit
 from safevar_sumo.report import report
 from safevar_sumo.study import load_study, tables_of
 from safevar_sumo.sumo.matrix import simulate, simulate_all_points, study_at, worst_points
@@ -58,67 +53,6 @@ def test_a_study_needs_no_file() -> None:
     assert mine.weather == sv.Weather(name="ice", road_friction=0.2, visibility=0.9)
     assert tables["name"] == "mine", "what was given is left as it was"
     assert sv.simulate(mine).study.name == "other"
-
-
-@pytest.mark.skipif(not hasattr(signal, "setitimer"), reason="Windows has no such signals")
-def test_simulate_stops_user_code_that_hangs_but_neither_a_debugger_nor_an_alarm_of_the_caller(in_tmp: Path) -> None:
-    Path("hanging_ads.py").write_text("import time\nfrom safevar_sumo.ads import ScalarAds\n\n\nclass Mine(ScalarAds):\n"
-                                      "    def drive(self, seen):\n        time.sleep(1000)\n")
-    Path("mine.toml").write_text('extends = "smoke"\n[ads]\nmodel = "hanging_ads:Mine"\n[search]\ntime_limit = 0.3\n')
-    with pytest.raises(UserCodeError, match=re.escape("longer than 0.3 s") + r".*hanging_ads\.py:7"):
-        sv.simulate("mine.toml")
-    alarms = list[int]()
-    previous_handler = signal.signal(signal.SIGALRM, lambda number, _: alarms.append(number))
-    try:
-        signal.setitimer(signal.ITIMER_REAL, 0.2)
-        with time_limit(0.1):
-            time.sleep(1)
-        assert alarms
-    finally:
-        signal.setitimer(signal.ITIMER_REAL, 0)
-        signal.signal(signal.SIGALRM, previous_handler)
-    tracer = sys.gettrace()
-    try:
-        debugger = bdb.Bdb()
-        debugger.reset()
-        sys.settrace(debugger.trace_dispatch)
-        with time_limit(0.1):
-            time.sleep(1)
-        sys.settrace(lambda *_: None)
-        with pytest.raises(UserCodeTimeout), time_limit(0.1):
-            time.sleep(100)
-    finally:
-        sys.settrace(tracer)
-
-
-HANGS = {
-    "as it is made": ("    def __init__(self):\n        while True:\n            pass\n", 7),
-    "and catches what stops it": ("    def drive(self, seen):\n        while True:\n            try:\n                time.sleep(9)\n"
-                                  "            except BaseException:\n                if seen.time > 1 or self.caught:\n"
-                                  "                    raise\n                self.caught = True\n    caught = False\n", 9),
-    "in a library": ("    def drive(self, seen):\n        threading.Event().wait()\n", 7),
-}
-
-
-@pytest.mark.skipif(not hasattr(signal, "setitimer"), reason="Windows has no such signals")
-@pytest.mark.parametrize("how", HANGS)
-def test_the_line_of_user_code_that_hangs_is_named(how: str, in_tmp: Path) -> None:
-    code, line = HANGS[how]
-    module = f"hangs_{len(code)}"
-    Path(f"{module}.py").write_text("import threading, time\nfrom safevar_sumo.ads import ScalarAds\n\n\nclass Mine(ScalarAds):\n" + code
-                                    + ("    def drive(self, seen):\n        pass\n" if "__init__" in code else ""))
-    Path("mine.toml").write_text(f'extends = "smoke"\n[ads]\nmodel = "{module}:Mine"\n[search]\ntime_limit = 0.3\n')
-    with pytest.raises(UserCodeError, match=re.escape("longer than 0.3 s") + rf".*{module}\.py:{line}\b"):
-        sv.simulate("mine.toml")
-
-
-@pytest.mark.skipif(not hasattr(signal, "setitimer"), reason="Windows has no such signals")
-def test_time_that_the_package_spends_is_not_the_user_codes(in_tmp: Path) -> None:
-    Path("quick_ads.py").write_text("from safevar_sumo.ads import FullBraking\n\n\nclass Mine(FullBraking):\n    pass\n")
-    Path("mine.toml").write_text('extends = "smoke"\n[ads]\nmodel = "quick_ads:Mine"\n[search]\ntime_limit = 0.05\n')
-    study = load_study("mine.toml")
-    with limit_user_code(study):
-        time.sleep(1)
 
 
 def test_simulate_returns_the_setting_and_the_original_beside_it() -> None:

@@ -23,9 +23,7 @@ from rich.console import Console
 from safevar_sumo import cli
 from safevar_sumo.cli import catalogue
 from safevar_sumo.cli.program import COMMANDS, commands, main
-from safevar_sumo.conformance.subject import find_subject
 from safevar_sumo.errors import InputError
-from safevar_sumo.metrics import OPTIONAL_METRICS
 from safevar_sumo.shipped import STUDIES
 from safevar_sumo.study import load_study, study_names
 from safevar_sumo.terminal import WholeTable
@@ -159,7 +157,6 @@ def test_every_name_of_the_list_can_be_read_and_typed(monkeypatch: pytest.Monkey
     assert "…" not in output
     for name in ("f_safe", "f_comfort", "f_diff", "rating_points"):
         assert f"│ {name} " in output.partition("Objectives")[2]
-    assert find_subject("f_comfort").member.target is OPTIONAL_METRICS["max_jerk"]
     for name in study_names():
         study = load_study(name)
         for text in (name, study.vehicle.model, study.ads.model, study.scenario.model, *study.vehicle.characteristics):

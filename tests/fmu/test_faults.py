@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from safevar_sumo.conformance import check
 from safevar_sumo.errors import InputError, UserCodeError
+from safevar_sumo.plugins.check import check
 from safevar_sumo.records import Nominal, Observation
 from safevar_sumo.sumo.system import System
 from tests.fmu.exported import changed
@@ -78,8 +78,8 @@ def test_what_cannot_be_used_is_refused_in_one_line(small: Make, edit: Callable[
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("then", "finding"), [
-    ("self.pedal = 1.0", None), ("self.pedal = 0.0", "reaction"), ("self.pedal = time.time() % 1", "determinism"),
-    ("Small.all = getattr(Small, 'all', 0) + 1; self.pedal = 1 / Small.all", "determinism")])
+    ("self.pedal = 1.0", None), ("self.pedal = time.time() % 1", "repetition"),
+    ("Small.all = getattr(Small, 'all', 0) + 1; self.pedal = 1 / Small.all", "repetition")])
 def test_check_names_the_fmu_and_what_it_should_not_do(small: Make, then: str, finding: str | None) -> None:
     small(then)
     report = check("Small.fmu")

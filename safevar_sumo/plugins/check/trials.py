@@ -1,0 +1,164 @@
+"""Trials of user code: simulations, constraints and searches, repeated, in another order and alone."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from safevar_sumo.plugins import Lookup, instance_of, unload_user_modules
+from safevar_sumo.records import Evaluations, FloatArray
+from safevar_sumo.search import ALGORITHMS, GuardedAlgorithm, Problem
+from safevar_sumo.study import Study
+from safevar_sumo.sumo import Engine, reason_for_sumo
+from safevar_sumo.sumo.matrix import evaluate
+from safevar_sumo.sumo.system import System, assemble
+from safevar_sumo.vehicles import CharacteristicSet, region_of
+
+SIMULATED, SIMULATED_BY_TRACI, COMPUTED = 100, 20, 200
+"""Numbers of settings that are simulated, with a controller that reads SUMO, and to which a constraint's function is applied."""
+SMALLER_BATCHES = 4
+"""Number of batches into which the settings are divided."""
+MATRIX_POINTS = 2
+"""Approximate number of a study's test points that are simulated."""
+MAX_EVALUATIONS, MAX_POPULATION = 57, 20
+"""Largest budget of an algorithm's runs."""
+ROUNDING = 1e-9
+"""Largest accepted difference between a result in a recorded scene and in SUMO."""
+Rows = npt.NDArray[np.intp]
+Outputs = Mapping[str, npt.NDArray[np.generic]]
+"""Results by name, one element for each row of the settings."""
+
+
+class Failure(NamedTuple):
+    """A failed check, the expected result, and the actual one with the input that shows it."""
+
+    check: str
+    expected: str
+    got: str
+
+
+def try_simulations(study: Study) -> Iterator[Failure]:
+    """Simulate a study with the original vehicle, the corners of the domains and random settings."""
+    region = region_of(study)
+    settings = region.repaired(region.characteristics.filter(_settings(
+        region.characteristics, SIMULATED_BY_TRACI if study.ads.kind == "traci" else SIMULATED)))
+
+    def load() -> Callable[[Rows], Outputs]:
+        system = _system(study)
+        return lambda rows: _results(evaluate(system, settings[rows]))
+
+    yield from _try(load, region.characteristics, settings)
+    system = _system(study)
+    if ":" in study.scenario.model and not reason_for_sumo(system):
+        recorded, in_sumo = (_results(evaluate(system, settings, engine)) for engine in (Engine.RECORDED, Engine.LIBSUMO))
+        for row, difference in _differences(recorded, in_sumo, ROUNDING):
+            yield Failure("contract", "reactive_actors = True where somebody reacts to the vehicle under test",
+                          f"{difference} in SUMO and in the recorded scene{_inputs(region.characteristics, settings[row])}")
+
+
+def try_constraint(study: Study, function: str) -> Iterator[Failure]:
+    """Apply a constraint's function to the original vehicle, the corners of the domains and random settings."""
+    characteristics = CharacteristicSet.of(study.vehicle.characteristics)
+    settings = _settings(characteristics, COMPUTED)
+
+    def load() -> Callable[[Rows], Outputs]:
+        unload_user_modules()
+        bounds = next(bounds for bounds in region_of(study).bounds if bounds.constraint.function == function)
+        return lambda rows: {"the value": bounds.quantity(settings[rows])}
+
+    yield from _try(load, characteristics, settings)
+
+
+def try_algorithm(study: Study, name: str) -> Iterator[Failure]:
+    """Let an algorithm minimise a smooth function in place of simulations, twice, the second time after another run."""
+    outputs, others = _search(study, name, seeds=(1,)), _search(study, name, seeds=(2, 1))
+    if len(outputs) != len(others):
+        yield Failure("repetition", "the same in every run", f"{len(others)} settings instead of {len(outputs)} in another run")
+    for row in np.flatnonzero((outputs != others).any(axis=1))[:1] if len(outputs) == len(others) else ():
+        yield Failure("repetition", "the same in every run with the same random numbers, to the bit",
+                      f"setting {row} is {others[row].tolist()} instead of {outputs[row].tolist()} in another run")
+
+
+def _try(load: Callable[[], Callable[[Rows], Outputs]], characteristics: CharacteristicSet, settings: FloatArray) -> Iterator[Failure]:
+    """Compare a run of all settings with other runs; `load` loads all user code again."""
+    run, everything = load(), np.arange(len(settings))
+    outputs, run_anew = run(everything), load()
+    others = [("repetition", "in a second run", everything), ("order", "in another order", everything[::-1]),
+              *(("alone", "in a smaller batch", rows) for rows in np.array_split(everything, SMALLER_BATCHES)),
+              *(("alone", "alone", everything[i:i + 1]) for i in (0, len(settings) - 1))]
+    for check, circumstance, rows in others:
+        other_outputs = (run if check == "repetition" else run_anew)(rows)
+        for row, difference in _differences({name: values[rows] for name, values in outputs.items()}, other_outputs):
+            yield Failure(check, "the same, to the bit", f"{difference} {circumstance}{_inputs(characteristics, settings[rows[row]])}")
+
+
+def _differences(outputs: Outputs, others: Outputs, tolerance: float = 0.0) -> Iterator[tuple[int, str]]:
+    """For each result that differs, the first row that does, and both values."""
+    for name, values in outputs.items():
+        is_same = values == others[name]
+        if values.dtype.kind == "f":
+            is_same |= np.isclose(values, others[name], rtol=0, atol=tolerance, equal_nan=True)
+        for row in np.flatnonzero(~is_same)[:1].tolist():
+            yield row, f"{name} is {others[name][row]} instead of {values[row]}"
+
+
+def _inputs(characteristics: CharacteristicSet, setting: FloatArray) -> str:
+    changes = [f"{characteristic.name} = {value:g}" for characteristic, value in zip(characteristics, setting, strict=True)
+               if value != characteristic.original]
+    return f", with {', '.join(changes) or 'the original vehicle'}"
+
+
+def _settings(characteristics: CharacteristicSet, count: int) -> FloatArray:
+    """The original, four corners of the domains, and random settings; shape (count, n)."""
+    lower, upper, is_odd = characteristics.lower, characteristics.upper, np.arange(len(characteristics)) % 2 == 1
+    corners = [characteristics.original, lower, upper, np.where(is_odd, lower, upper), np.where(is_odd, upper, lower)]
+    return np.concatenate([corners, np.random.default_rng(0).uniform(lower, upper, (count - len(corners), len(lower)))])
+
+
+def _system(study: Study) -> System:
+    """The system of a study, with only a few points of its matrix; `assemble` loads all user code again."""
+    system = assemble(study)
+    return replace(system, matrix=system.matrix[::max(len(system.matrix) // MATRIX_POINTS, 1)], rater=None)
+
+
+def _results(evaluations: Evaluations) -> Outputs:
+    return {"outcome": evaluations.outcome, "collision_speed": evaluations.collision_speed, **evaluations.metrics}
+
+
+def _search(study: Study, name: str, seeds: tuple[int, ...]) -> FloatArray:
+    """All settings that a run with the last seed, after runs with the others, requests, and then those that it returns; shape (k, n)."""
+    system, lookup, label = assemble(study), Lookup(study.source, study.origin.places), name.rpartition(":")[2]
+    member = lookup.find(ALGORITHMS, name, "search.algorithms")
+    parameters = lookup.with_paths(member, study.search.parameters.get(label, {}), f"search.{label}")
+    original = _smooth_evaluations(system, system.characteristics.original[np.newaxis])
+    problem = Problem(characteristics=system.characteristics, original=original, population=min(study.search.population, MAX_POPULATION),
+                      evaluations=min(study.search.evaluations, MAX_EVALUATIONS), scoring=system.measuring.scoring, region=system.region)
+    for seed in seeds:
+        algorithm = instance_of(member, parameters, f"search.algorithms = {name!r}", f"search.{label}", study.source)
+        search = (GuardedAlgorithm(algorithm, member.guard) if member.guard else algorithm).search(problem, np.random.default_rng(seed))
+        settings = [next(search)]
+        try:
+            while True:
+                settings.append(search.send(_smooth_evaluations(system, settings[-1])))
+        except StopIteration as end:
+            settings.append(end.value.settings)
+    return np.concatenate(settings)
+
+
+def _smooth_evaluations(system: System, settings: FloatArray) -> Evaluations:
+    """Evaluations in which the safety degree falls from 1 at the lower ends of the domains to -0.5 at the upper ends."""
+    characteristics, scoring = system.characteristics, system.measuring.scoring
+    share = (settings - characteristics.lower) / (characteristics.upper - characteristics.lower)
+    safety_degree = 1.0 - np.add.accumulate(share, axis=1)[:, -1] / len(characteristics) * 1.5
+    names = {name for name in (*(metric.name for metric in scoring.metrics), *(objective.name for objective in scoring.objectives))
+             if not name.startswith("f_")}
+    metrics = {name: np.abs(safety_degree) for name in sorted(names)} | {"safety_degree": safety_degree}
+    collided = safety_degree < 0
+    return Evaluations(
+        settings=settings, outcome=np.where(collided, "collision", "stopped").astype("U16"), metrics=metrics,
+        collision_speed=np.where(collided, -safety_degree, np.nan), f_diff=characteristics.largest_change(settings),
+        f_num_diff=characteristics.number_changed(settings))
