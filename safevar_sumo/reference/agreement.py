@@ -179,12 +179,13 @@ def plot_agreement(path: Path, title: str, characteristics: CharacteristicSet, r
         label = f"{METRICS[metric].title} [{as_formula(METRICS[metric].unit)}]"
         _draw_scatter(axis, values, here, reference.collided | evaluations.collided, label)
         _draw_error(error_axis, here, here - values, f"here: {label}", "mean error")
-    error = evaluations.f_safe - reference.metrics[SAFETY_DEGREE]
-    for axis, characteristic, values in zip(axes[2 * len(reference.metrics):], characteristics, evaluations.settings.T,
+    error, panels = evaluations.f_safe - reference.metrics[SAFETY_DEGREE], axes[2 * len(reference.metrics):]
+    for axis in panels[1:]:
+        axis.sharey(panels[0])
+    for axis, characteristic, values in zip(panels, characteristics, evaluations.settings.T,
                                             strict=True):
         _draw_error(axis, values, error, characteristic.name + as_formula(unit_text(characteristic.unit, " [{}]")),
                     "error of SD")
-        axis.sharey(axes[2 * len(reference.metrics)])
     figure.supxlabel("orange: collides in the reference or here", fontsize=FONT)
     save(figure, path, "plot")
 

@@ -87,6 +87,8 @@ def plot_profiles(path: Path, profiles: Profiles, studies: Sequence[Study]) -> N
     names = [study.name for study in studies]
     title = f"Loss of {' and '.join(names)} over each parameter; band: fits as well as the best"
     figure, axes = new_panels(title, len(profiles.parameters), 4, (2.75, 1.7), 11.0, 0.6)
+    for axis in axes[1:]:
+        axis.sharey(axes[0])
     is_as_good = profiles.losses <= profiles.limit
     for k, (axis, parameter) in enumerate(zip(axes, profiles.parameters, strict=True)):
         values = profiles.values[:, k]
@@ -97,5 +99,4 @@ def plot_profiles(path: Path, profiles: Profiles, studies: Sequence[Study]) -> N
         owners = [] if len(parameter.study_indices) == len(names) else [names[i] for i in parameter.study_indices]
         axis.set(xlabel=f"{', '.join(owners)}: " * bool(owners) + key + unit_text(parameter.bounds.unit, " [{}]"),
                  ylabel="loss")
-        axis.sharey(axes[0])
     save(figure, path, "plot")

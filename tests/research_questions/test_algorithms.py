@@ -12,7 +12,7 @@ import pandas as pd
 import pytest
 import scipy
 
-from safevar_sumo.analysis.research_questions.algorithm_figures import draw_critical_differences, find_cliques
+from safevar_sumo.analysis.research_questions.algorithm_figures import draw_critical_differences
 from safevar_sumo.analysis.research_questions.answer import answer_questions
 from safevar_sumo.analysis.research_questions.case import Case, UnanswerableError
 from safevar_sumo.analysis.research_questions.comparisons import (
@@ -120,12 +120,6 @@ def test_ranks_are_friedmans_over_the_runs_that_all_have() -> None:
     assert part["mean_rank"].sum() == pytest.approx(6)
     by_metric = frame.drop_duplicates("metric")
     assert by_metric["p_holm"].tolist() == correct_by_holm(by_metric["p_value"].tolist())
-
-
-def test_a_bar_joins_the_largest_groups_that_are_not_told_apart() -> None:
-    assert find_cliques(np.array([1.2, 1.9, 2.1, 3.5]), 1.0) == [(0, 2)]
-    assert find_cliques(np.array([1.0, 1.8, 2.6]), 1.0) == [(0, 1), (1, 2)]
-    assert find_cliques(np.array([1.0, 3.0]), 1.0) == []
 
 
 def test_what_cannot_be_asked_says_why() -> None:

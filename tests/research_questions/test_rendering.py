@@ -230,10 +230,10 @@ def test_numbers_of_changes_stand_in_the_order_of_numbers() -> None:
 def test_the_original_vehicle_and_the_line_of_collisions_are_in_the_fronts() -> None:
     case = rich_case()
     for axis, marked in zip(draw_pareto_fronts(case).axes, (True, True, False), strict=True):
-        output = {str(line.get_label()): line for line in axis.lines}
-        # type: ignore[index,call-overload]
-        assert output["original vehicle"].get_xydata()[0, 0] == (case.original["safety_degree"] if marked else 0.0)
-        assert ("collision: 0 or less" in output) == marked
+        (original,) = (marks for marks in axis.collections if marks.get_label() == "original vehicle")
+        expected = case.original["safety_degree"] if marked else 0.0
+        assert np.asarray(original.get_offsets())[0, 0] == expected
+        assert any(line.get_label() == "collision: 0 or less" for line in axis.lines) == marked
 
 
 def test_attainment_panels_have_the_same_axes() -> None:

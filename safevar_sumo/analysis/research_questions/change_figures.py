@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-import numpy as np
 from matplotlib.ticker import MaxNLocator
 
 from safevar_sumo.analysis.figures import (
@@ -93,15 +92,11 @@ def draw_change_sizes(case: Case) -> Figure:
                                              strict=True):
         low, high = (float(f"{end - characteristic.original:.9g}")
                      for end in (characteristic.lower, characteristic.upper))
-        values_by_side = {"+": (VERMILION, high, changes[changes > 0]), "-": (BLUE, low, changes[changes < 0])}
-        for colour, end, values in values_by_side.values():
-            if values.size:
-                edges = np.sort(np.linspace(0, end, 1 + max(1, round(BIN_COUNT * abs(end) / (high - low)))))
-                axis.hist(values, bins=edges.tolist(), color=colour, edgecolor="white", linewidth=0.3)
+        increases, decreases = changes[changes > 0], changes[changes < 0]
+        axis.hist([increases, decreases], bins=BIN_COUNT, range=(low, high), color=[VERMILION, BLUE], stacked=True)
         axis.axvline(0, color="black", linewidth=0.8)
         axis.set_xlim(low, high)
-        counts = ", ".join(f"{sign}{values.size}" for sign, (_, _, values) in values_by_side.items())
-        axis.set_title(f"{escape_dollars(characteristic.name)}\n{counts}",
+        axis.set_title(f"{escape_dollars(characteristic.name)}\n+{len(increases)}, -{len(decreases)}",
                        fontsize=min(FONT, FONT * LONGEST_NAME / len(characteristic.name)))
         axis.set_xlabel(f"change [{as_formula(characteristic.unit)}]", fontsize=FONT)
         axis.locator_params(axis="x", nbins=3, steps=[1, 2, 5, 10])
