@@ -6,7 +6,6 @@ import errno
 import json
 import os
 import re
-import sys
 import tomllib
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -24,7 +23,6 @@ from safevar_sumo.reference.calibration import FitSubject
 from safevar_sumo.study import Study, load_study
 from safevar_sumo.sumo.matrix import evaluate
 from safevar_sumo.sumo.system import assemble
-from tests.end_to_end.processes import ended, started, until
 from tests.in_process import refused, run
 
 COLUMNS = {"safety_degree": "SaftyDegree", "tet": "TET", "tit": "TIT", "ave_dece": "Dece"}
@@ -175,19 +173,6 @@ def test_the_best_so_far_is_saved_now_and_then(in_tmp: Path, monkeypatch: pytest
     CliRunner().invoke(commands, ["calibrate", "sun", "--trials", "9", "--out", "best.toml"])
     assert "Best of 1 of 9 trials, while more are tried" in Path("best.toml").read_text()
     assert load_study("best.toml").ads.parameters["brake_gap"] == 5.5
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no SIGTERM to catch")
-def test_a_terminated_calibration_leaves_the_best_so_far(in_tmp: Path, data: Path) -> None:
-    small_fit()
-    process = started("calibrate", "mine.toml", str(data), "--trials", "100000", "--jobs", "1", "--out", "found.toml")
-    stderr = process.stderr
-    assert stderr is not None
-    until(lambda: "lowest loss" in stderr.readline(), process)
-    process.terminate()
-    assert "is in found.toml" in ended(process, 130)
-    assert "then interrupted" in Path("found.toml").read_text()
 
 
 @pytest.mark.slow

@@ -13,8 +13,8 @@ from safevar_sumo.analysis.research_questions.layout import LAYOUTS, BoldText, L
 LATEX_NEEDS = "% In the preamble: " + " ".join(
     rf"\usepackage{name}" for name in ("[T1]{fontenc}", "{textcomp}", "{booktabs}", "{graphicx}"))
 _LATEX_CODES = str.maketrans({
-    **{character: "\\" + character for character in "{}$&#%_"}, "[": "{[}", "]": "{]}", "\\": r"\textbackslash{}",
-    "^": r"\textasciicircum{}", "~": r"\textasciitilde{}"})
+    **{character: "\\" + character for character in "{}$&#%_"}, **{character: f"{{{character}}}" for character in "[]*"},
+    "\\": r"\textbackslash{}", "^": r"\textasciicircum{}", "~": r"\textasciitilde{}"})
 
 
 def as_text(answers: Sequence[Answer], layouts: Layouts = LAYOUTS) -> str:
