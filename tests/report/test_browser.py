@@ -33,6 +33,12 @@ from safevar_sumo.sumo.system import assemble
 
 ORDER = "return [...arguments[0].tBodies[0].rows].map((row) => parseFloat(row.cells[2].textContent))"
 
+A4 = {"width": round(190 / 25.4 * 96), "height": round(279 / 25.4 * 96)}
+"""The part of a page within its margins [px]."""
+TOO_WIDE = """return [...document.querySelectorAll(".wide")].filter((one) => one.scrollWidth > one.clientWidth + 1
+    || one.getBoundingClientRect().right > innerWidth).map((one) => one.getAttribute("aria-label"))"""
+"""The tables that reach into what is beside them, or beyond the page."""
+
 
 @pytest.fixture(scope="module")
 def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Chrome]:
@@ -160,7 +166,9 @@ def test_it_prints_on_few_pages_with_all_values_and_nothing_to_press(browser: Ch
     assert printed.startswith(b"%PDF")
     assert 3 <= printed.count(b"/Type /Page\n") <= 8
     browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": "print"})
+    browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", A4 | {"deviceScaleFactor": 1, "mobile": False})
     try:
+        assert browser.execute_script(TOO_WIDE) == []
         every = "return document.querySelectorAll(arguments[0]).length"
         seen = "return [...document.querySelectorAll(arguments[0])].filter((one) => one.checkVisibility()).length"
         assert browser.execute_script(seen, ".controls, nav, .play") == 0
@@ -169,6 +177,7 @@ def test_it_prints_on_few_pages_with_all_values_and_nothing_to_press(browser: Ch
         values = "details li, details td"
         assert browser.execute_script(seen, values) == browser.execute_script(every, values) > 0, "closed details are printed too"
     finally:
+        browser.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
         browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": ""})
 
 
