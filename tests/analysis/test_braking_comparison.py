@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -53,6 +55,18 @@ def test_one_difference_is_one_part(other: tuple[float, float, float, float], pa
     comparison = compared(SAME, other)
     assert comparison.parts[part] == pytest.approx(lost, abs=0.05)
     assert all(abs(value) < 0.05 for name, value in comparison.parts.items() if name != part)
+
+
+def test_an_obstacle_that_walks_on_leaves_nothing_unexplained() -> None:
+    """The same drives seen from a frame in which the obstacle moves: the same parts."""
+    runs, walking = drive_of(SAME, (11.0, 15.0, 0.2, 6.0)), 1.4
+    trace = runs.trace
+    moved = replace(runs, trace=replace(trace, speed=trace.speed + walking, position=trace.position + walking * trace.time[:, np.newaxis]))
+    stands, walks = (compare_braking(*(summarise_run(one, column, 1.0) for column in (0, 1))) for one in (runs, moved))
+    assert walks.parts == pytest.approx(stands.parts, abs=1e-4)
+    assert abs(walks.parts["remainder"]) < 0.01
+    assert walks.changed.braking is not None
+    assert walks.changed.braking.speed == pytest.approx(11.0 + walking)
 
 
 def test_an_overshooting_cruise_control_does_not_brake_for_the_obstacle() -> None:

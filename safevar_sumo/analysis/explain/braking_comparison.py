@@ -8,7 +8,8 @@ is v - e, and the speed falls by d. After t the mean deceleration is a. The stop
 and the margin is G - D. A difference of products is split exactly between the two factors,
 x2 y2 - x1 y1 = (x2 - x1) (y1 + y2) / 2 + (y2 - y1) (x1 + x2) / 2. So the lost margin, the original's margin minus the
 changed vehicle's, is a sum of parts, each with the sign of one difference: gap (G smaller), speed (v larger), delay (t
-larger), slowing (e and d: less speed lost while the pedal moves) and deceleration (a smaller).
+larger), slowing (e and d: less speed lost while the pedal moves) and deceleration (a smaller). If the obstacle moves on, v is the speed
+and a the deceleration relative to it, at its mean speed while the vehicle brakes.
 """
 
 from __future__ import annotations
@@ -26,6 +27,8 @@ COAST_DECELERATION = 0.1
 """Deceleration of a vehicle that rolls without a brake [m/s^2]: a rolling resistance of 1 % of its weight."""
 MAX_OMITTED_REMAINDER = 0.05
 """A sentence leaves out the unexplained part of the lost margin if it is at most this long [m]."""
+OBSTACLE_DECIMALS = 6
+"""Decimals of an obstacle's speed, so that one that stands still has none."""
 CRUISE_SHARE = 0.9
 """A vehicle cruises at this share of its highest speed or more [-]."""
 REGULATION_SHARE = 0.05
@@ -49,6 +52,8 @@ class Braking(NamedTuple):
         Mean deceleration after the delay [m/s^2], averaged over the distance, as in UN R13-H.
     gears
         Gear at the command and at the end of the delay.
+    obstacle_speed
+        Mean speed of the obstacle along the vehicle's path from the command on [m/s]; `deceleration` is relative to it.
     """
 
     time: float
@@ -59,11 +64,17 @@ class Braking(NamedTuple):
     speed_lost: float
     deceleration: float
     gears: tuple[float, float] = (0, 0)
+    obstacle_speed: float = 0.0
+
+    @property
+    def closing_speed(self) -> float:
+        """Speed towards the obstacle when the brake was commanded [m/s]."""
+        return self.speed - self.obstacle_speed
 
     @property
     def stopping_distance(self) -> float:
-        """Distance from the command to standstill [m]; the mean deceleration is assumed to continue after the run."""
-        return (self.speed - self.speed_deficit) * self.delay + (self.speed - self.speed_lost)**2 / (2 * self.deceleration)
+        """Distance by which the gap shrinks from the command on [m]; the mean deceleration is assumed to continue after the run."""
+        return (self.closing_speed - self.speed_deficit) * self.delay + (self.closing_speed - self.speed_lost)**2 / (2 * self.deceleration)
 
     @property
     def margin(self) -> float:
@@ -147,6 +158,10 @@ def _measure_braking(runs: SimulationRuns, column: int, first: int, last: int) -
     """The braking from sample `first` to `last`; None if the vehicle only coasts after the pedal has followed."""
     trace = runs.trace
     speed, position = trace.speed[:last + 1, column], trace.position[:last + 1, column]
+    elapsed = trace.time[last] - trace.time[first]
+    shift = position[last] + trace.gap[last, column] - position[first] - trace.gap[first, column]  # of the obstacle
+    obstacle_speed = round(float(shift / elapsed), OBSTACLE_DECIMALS) if last > first and np.isfinite(shift) else 0.0
+    speed, position = speed - obstacle_speed, position - obstacle_speed * trace.time[:last + 1]  # relative to the obstacle
     has_followed = trace.pedal[first:last + 1, column] >= PEDAL_SHARE * trace.brake[first:last + 1, column]
     end_of_delay = first + int(np.argmax(has_followed))
     distance = float(position[last] - position[end_of_delay])
@@ -155,10 +170,10 @@ def _measure_braking(runs: SimulationRuns, column: int, first: int, last: int) -
         return None
     initial_speed, delay = float(speed[first]), (end_of_delay - first) * trace.step
     return Braking(
-        time=float(trace.time[first]), gap=float(trace.gap[first, column]), speed=initial_speed, delay=delay,
+        time=float(trace.time[first]), gap=float(trace.gap[first, column]), speed=initial_speed + obstacle_speed, delay=delay,
         speed_deficit=initial_speed - float(position[end_of_delay] - position[first]) / delay if end_of_delay > first else 0.0,
         speed_lost=initial_speed - float(speed[end_of_delay]), deceleration=specific_energy / distance,
-        gears=(float(trace.gear[first, column]), float(trace.gear[end_of_delay, column])))
+        gears=(float(trace.gear[first, column]), float(trace.gear[end_of_delay, column])), obstacle_speed=obstacle_speed)
 
 
 def compare_braking(original: RunSummary, changed: RunSummary, point: str = "") -> BrakingComparison:
@@ -176,7 +191,7 @@ def _braking_to_compare(changed: RunSummary, original: RunSummary) -> Braking | 
     """The braking of a changed vehicle; if it collides without braking, the original vehicle's braking at the changed vehicle's speed."""
     if changed.braking is not None or original.braking is None or not np.isfinite(changed.collision_speed):
         return changed.braking
-    speed = max(changed.collision_speed, original.braking.speed_lost)  # so that no speed after the delay is negative
+    speed = max(changed.collision_speed, original.braking.speed_lost + original.braking.obstacle_speed)  # so that no speed after the delay is negative
     return original.braking._replace(time=np.nan, gap=0.0, speed=speed)
 
 
@@ -186,14 +201,14 @@ def _split_lost_margin(original: Braking, changed: Braking) -> dict[str, float]:
     With the two runs' means of t, of v - d and of 1 / a, a vehicle saves e t + d (v - d) / a.
     """
     mean_delay, mean_inverse_deceleration = (original.delay + changed.delay) / 2, (1 / original.deceleration + 1 / changed.deceleration) / 2
-    speeds_after_delay = [braking.speed - braking.speed_lost for braking in (original, changed)]
+    speeds_after_delay = [braking.closing_speed - braking.speed_lost for braking in (original, changed)]
     mean_speed_after_delay = sum(speeds_after_delay) / 2
-    mean_delay_speeds = [braking.speed - braking.speed_deficit for braking in (original, changed)]
+    mean_delay_speeds = [braking.closing_speed - braking.speed_deficit for braking in (original, changed)]
     savings = [braking.speed_deficit * mean_delay + braking.speed_lost * mean_speed_after_delay * mean_inverse_deceleration
                for braking in (original, changed)]
     return {
         "gap": original.gap - changed.gap,
-        "speed": (changed.speed - original.speed) * (mean_delay + mean_speed_after_delay * mean_inverse_deceleration),
+        "speed": (changed.closing_speed - original.closing_speed) * (mean_delay + mean_speed_after_delay * mean_inverse_deceleration),
         "delay": (changed.delay - original.delay) * sum(mean_delay_speeds) / 2,
         "slowing": savings[0] - savings[1],
         "deceleration": ((1 / changed.deceleration - 1 / original.deceleration)
