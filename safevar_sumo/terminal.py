@@ -15,13 +15,14 @@ from safevar_sumo.vehicles import Characteristic
 
 
 class WholeTable(Table):
-    """A table of plain text that cuts nothing off: the names in its first column break only between words, other cells anywhere.
+    """A table of plain text that cuts nothing off. It breaks lines between words, without padding if need be, and words if they do not fit.
 
     Columns under `text_heads` hold text, those under `right` numbers. Text is shown as it is, without markup.
     """
 
     def __init__(self, *text_heads: str, right: Iterable[str] = (), title: str = "", **options: Any) -> None:
-        super().__init__(title=printable_text(title) if title else None, title_justify="left", **options)
+        super().__init__(**options)
+        self._title_line = printable_text(title, "italic")
         for head in text_heads:
             self.add_column(Text(head))
         for head in right:
@@ -32,15 +33,22 @@ class WholeTable(Table):
         super().add_row(*(printable_text(cell) if isinstance(cell, str) else cell for cell in cells), **options)
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        if self._title_line:
+            yield self._title_line  # rich breaks a title where its table ends
+        wide_options, sizes = options.update(width=1_000_000), list[tuple[int, int]]()
         for column in self.columns:
-            column.overflow = "fold"
-        wide_options = options.update(width=1_000_000)
+            cells = [Measurement.get(console, wide_options, cell) for cell in (column.header, *column.cells)]
+            sizes.append((max(cell.minimum for cell in cells), max(cell.maximum for cell in cells)))
+        least_width = sum(longest_word + 1 for longest_word, _ in sizes) + 1
+        words_fit = least_width <= options.max_width
+        if words_fit and least_width + 2 * len(sizes) > options.max_width:
+            self.padding = 0
+        for column, (longest_word, full_width) in zip(self.columns, sizes, strict=True):
+            column.overflow, column.no_wrap = "fold", words_fit and longest_word == full_width
         excess = Measurement.get(console, wide_options, self).maximum - options.max_width
         if excess > 0:
-            name_column = self.columns[0]
-            cells = [Measurement.get(console, wide_options, cell) for cell in (name_column.header, *name_column.cells)]
-            longest_word, full_width = (max(sizes) for sizes in zip(*cells, strict=True))
-            name_column.width = max(longest_word, full_width - excess)
+            longest_word, full_width = sizes[0]
+            self.columns[0].width = max(longest_word, full_width - excess)
         yield from super().__rich_console__(console, options)
 
 

@@ -17,6 +17,7 @@ from safevar_sumo.metrics import Scoring, time_to_collision
 from safevar_sumo.progress import Progress, open_progress, show_no_progress
 from safevar_sumo.records import STANDSTILL, TIME_DECIMALS, Evaluations, FloatArray, Observation, Outcome, SimulationRuns
 from safevar_sumo.results import evaluations_frame, record
+from safevar_sumo.scenarios import SCENARIOS, distance_in_words
 from safevar_sumo.study import SAFETY_DEGREE, Study, StudyLike, load_study
 from safevar_sumo.sumo.batch import drive_all, score
 from safevar_sumo.sumo.empty_road import driven_entry, why_no_verdict
@@ -137,7 +138,8 @@ class Simulation:
         if self.outcome is Outcome.COLLISION:
             return f"collides at {self.collision_speed:.2f} m/s"
         safety_degree = self.metrics[SAFETY_DEGREE]
-        return OUTCOME_VERBS[self.outcome] + ("" if np.isnan(safety_degree) else f", with a safety degree of {safety_degree:.2f} m")
+        distance = distance_in_words(SCENARIOS.get(self.study.scenario.model), safety_degree)
+        return OUTCOME_VERBS[self.outcome] + ("" if np.isnan(safety_degree) else f", with a safety degree of {distance}")
 
     def to_dict(self) -> dict[str, Any]:
         """The JSON of `simulate`: plain values, None where undefined."""

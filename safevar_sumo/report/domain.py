@@ -35,7 +35,7 @@ def make_risk_section(data: ReportInput, jobs: int | None, progress: Progress) -
     """The probability of a failure with its interval, and bars of the characteristics that decide whether a vehicle fails."""
     def compute() -> Section:
         estimate = estimate_risk(data.case, data.options["risk"], jobs=jobs, progress=progress)
-        fleet = {"vehicles": FLEET_VEHICLES, "probability": estimate.of_fleet(FLEET_VEHICLES)}
+        fleet = {"vehicles": FLEET_VEHICLES, "probability": estimate.of_fleet_in_words(FLEET_VEHICLES)}
         return {**estimate.to_dict(), **({} if estimate.is_share_of_domain else {"fleet": fleet})}
 
     result = _with_criterion_in_words(load_or_compute(data, "risk", compute))

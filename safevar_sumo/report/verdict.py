@@ -23,7 +23,7 @@ from safevar_sumo.reference import Totals, shipped_totals_of
 from safevar_sumo.replay.comparison import format_number, superscript_powers
 from safevar_sumo.report.causes import FIRST_CHOICES, Explanations
 from safevar_sumo.report.input import ChangeRow, FailingPointsTable, ReportInput, load_or_compute
-from safevar_sumo.scenarios import SCENARIOS, Point, equals_clear, pre_crash_sentence
+from safevar_sumo.scenarios import SCENARIOS, Point, distance_in_words, equals_clear, pre_crash_sentence
 from safevar_sumo.study import SAFETY_DEGREE, unit_text
 from safevar_sumo.sumo.matrix import vehicle_remarks
 from safevar_sumo.vehicles import VEHICLES
@@ -264,7 +264,8 @@ def _severity_figure(most_severe: SelectedFailure | None, data: ReportInput) -> 
     degree = float(data.case.solutions["f_safe"].min()) if most_severe is None else most_severe.f_safe
     if degree < 0:
         return KeyFigure("Most severe", f"collision at {-degree:.1f} m/s", f"{-KMH_PER_MS * degree:.0f} km/h")
-    return KeyFigure("Most severe", f"{degree:.2f} m to spare", "no collision among the solutions")
+    distance = distance_in_words(SCENARIOS.get(data.case.study.scenario.model), degree)
+    return KeyFigure("Most severe", f"safety degree {distance}", "no collision among the solutions")
 
 
 def _preventability_figure(preventable: PreventedShares | None, data: ReportInput) -> KeyFigure:

@@ -16,6 +16,7 @@ from safevar_sumo.scenarios.base import (
     Scenario,
     Scene,
     World,
+    distance_in_words,
     pre_crash_sentence,
 )
 from safevar_sumo.scenarios.car_to_car import CarToCar
@@ -34,4 +35,4 @@ SCENARIOS: Mapping[str, type[Any]] = {
 
 __all__ = [
     "LOCATION_DIMENSION", "SCENARIOS", "SCENARIO_CONTRACT", "SPEED_DIMENSION", "VUT", "WEATHERS", "GuardedScenario", "Lane", "Point",
-    "PreCrash", "Scenario", "Scene", "World", "equals_clear", "pre_crash_sentence", "weather_in_words", "weather_of"]
+    "PreCrash", "Scenario", "Scene", "World", "distance_in_words", "equals_clear", "pre_crash_sentence", "weather_in_words", "weather_of"]

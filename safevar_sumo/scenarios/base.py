@@ -121,6 +121,7 @@ class Scenario(Protocol):
     - `reactive_actors = False` declares that no actor reacts to the vehicle under test: SUMO can play the scene once for all vehicles.
     - `grade` is the rise of the road [%]. SUMO's plane then stands for the inclined road; the vehicle models add the force of gravity.
     - `pre_crash` is the scenario's type in NHTSA's typology.
+    - `centre_to_centre = True` says that the safety degree is the distance between the centres of two vehicles.
     - `lanes(roads)` and `actors(roads)` return `XmlChanges` to the built network and to the traffic on it.
     - `remarks() -> list[str]` returns remarks for the user on the scenario's parameters.
     - `test_speed` [m/s] is held by a robot until the ADS brakes. A run that leaves the tolerance before that is an invalid test. Only
@@ -168,6 +169,11 @@ class PreCrash(StrEnum):
 def pre_crash_of(scenario: Any) -> str:
     """A scenario's pre-crash type; "" if it has none."""
     return str(getattr(scenario, "pre_crash", ""))
+
+
+def distance_in_words(scenario: Any, safety_degree: float) -> str:
+    """A safety degree above 0 in metres, and between which points it is if these are not the bumper and what it may hit."""
+    return f"{safety_degree:.2f} m{' from centre to centre' if getattr(scenario, 'centre_to_centre', False) else ''}"
 
 
 def pre_crash_sentence(points: Iterable[Point]) -> str:

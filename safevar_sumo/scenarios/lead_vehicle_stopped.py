@@ -42,6 +42,7 @@ class LeadVehicleStopped(Struct, frozen=True, kw_only=True, forbid_unknown_field
     grade: Grade = 0.0
     reactive_actors = False
     pre_crash = PreCrash.LEAD_STOPPED
+    centre_to_centre = True
 
     def begin(self, world: World) -> _Memory:
         frame = Frame.through_origin(world.lane_of(VUT))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import re
+from dataclasses import replace
 from io import StringIO
 from typing import Any
 
@@ -80,6 +81,19 @@ def test_a_share_of_the_domain_is_not_called_a_probability(variation: dict[str, 
     assert says in printed
     assert ("this is not a probability in the field" in printed) == warns
     assert "unsafe in all" in printed
+
+
+def test_words_of_a_risk_claim_nothing_that_is_not_there() -> None:
+    """Everything varies as specified, so there are no others; no fleet is certain to fail; 99.9 % is not 100 %."""
+    normal = {"distribution": "normal", "deviation": 1.0}
+    study = msgspec.structs.replace(made_up_study(2), variation=msgspec.convert({"a": normal, "b": normal}, dict[str, Distribution]))
+    result = replace(risk(study, unsafe="collision", samples=200, confidence=0.999, pool=Plant(study, box)), probability=0.009)
+    console = Console(file=StringIO(), width=200)
+    print_risk(console, result)
+    printed = console.file.getvalue()  # type: ignore[attr-defined]
+    assert "They vary as the study specifies: a normal; b normal." in printed
+    assert "at least one is unsafe with probability above 0.99." in printed
+    assert "with 99.9 % confidence" in printed
 
 
 def test_the_promised_record_and_the_same_again() -> None:

@@ -137,6 +137,19 @@ def printed(table: WholeTable, width: int) -> list[str]:
     return console.file.getvalue().splitlines()  # type: ignore[attr-defined, no-any-return]
 
 
+def test_80_columns_break_no_word_of_a_heading() -> None:
+    algorithms = ["nsga2", "rs", "safe_fuzzer", "map_elites", "mocell", "spea2"]
+    title = "Euro NCAP pedestrian, day and night: CARLA's LincolnMkz2017 with an AEB"
+    table = WholeTable("", right=["original vehicle", *algorithms], title=title)
+    table.add_row("solutions that collide", *["12.34"] * 7)
+    console = Console(file=StringIO(), width=80)
+    console.print(table)
+    heading, _, head, *_ = console.file.getvalue().splitlines()  # type: ignore[attr-defined]
+    assert heading == title
+    assert [name.strip() for name in head.split("┃")[3:-1]] == algorithms
+    assert len(head) <= 80
+
+
 @pytest.mark.parametrize("width", [40, 60, 200])
 def test_names_stay_whole_and_the_rest_goes_on_in_the_next_line(width: int) -> None:
     table = WholeTable("characteristic", "here", "what [red]it[/red] is")

@@ -53,6 +53,7 @@ def test_the_original_stands_beside_the_changed_vehicle_and_a_verdict_under_them
     assert "less safe than the original" in result.stdout
     assert "note: dragCoeff = 0.301 differs from the original by less than the filter threshold and was reset to 0.3" in result.stderr
     assert "changed vehicle" not in simulate("rain").stdout
+    assert " m from centre to centre." in simulate("native").stdout
 
 
 def test_an_output_that_fails_leaves_the_old_file_and_no_new_one(in_tmp: Path, monkeypatch: pytest.MonkeyPatch) -> None:

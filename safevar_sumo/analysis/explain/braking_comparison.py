@@ -191,7 +191,8 @@ def _braking_to_compare(changed: RunSummary, original: RunSummary) -> Braking | 
     """The braking of a changed vehicle; if it collides without braking, the original vehicle's braking at the changed vehicle's speed."""
     if changed.braking is not None or original.braking is None or not np.isfinite(changed.collision_speed):
         return changed.braking
-    speed = max(changed.collision_speed, original.braking.speed_lost + original.braking.obstacle_speed)  # so that no speed after the delay is negative
+    least = original.braking.speed_lost + original.braking.obstacle_speed  # so that no speed after the delay is negative
+    speed = max(changed.collision_speed, least)
     return original.braking._replace(time=np.nan, gap=0.0, speed=speed)
 
 

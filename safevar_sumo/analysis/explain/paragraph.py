@@ -11,7 +11,7 @@ from safevar_sumo.analysis.explain.robustness import Robustness
 from safevar_sumo.analysis.preventability import Preventability
 from safevar_sumo.analysis.words import OUTCOME_VERBS
 from safevar_sumo.records import KMH_PER_MS, Evaluations, Outcome
-from safevar_sumo.scenarios import equals_clear, weather_in_words
+from safevar_sumo.scenarios import distance_in_words, equals_clear, weather_in_words
 from safevar_sumo.scenarios.base import pre_crash_of
 from safevar_sumo.sumo.system import System
 from safevar_sumo.vehicles import CharacteristicSet
@@ -101,7 +101,8 @@ def _original_ending_in_words(system: System, original: Evaluations) -> str:
     is_pedestrian = all(pre_crash_of(point.scenario).startswith("pedestrian") for point in system.points)
     if outcome == Outcome.STOPPED and is_pedestrian:
         return f"stops {degree:.2f} m short of the pedestrian"
-    return f"{OUTCOME_VERBS.get(outcome, outcome)}" + ("" if np.isnan(degree) else f" with a safety degree of {degree:.2f} m")
+    return f"{OUTCOME_VERBS.get(outcome, outcome)}" + (
+        "" if np.isnan(degree) else f" with a safety degree of {distance_in_words(system.points[0].scenario, degree)}")
 
 
 def _failure_in_words(characteristics: CharacteristicSet, failure: FailureDescription) -> str:

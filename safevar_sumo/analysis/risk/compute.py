@@ -83,6 +83,11 @@ class Risk:
         """Probability that at least one of N = `vehicles` vehicles is unsafe if they vary independently of each other, 1 - (1 - p)^N."""
         return float(-np.expm1(vehicles * np.log1p(-self.probability))) if self.probability < 1 else 1.0
 
+    def of_fleet_in_words(self, vehicles: int) -> str:
+        """The probability `of_fleet`, which is never called certain."""
+        probability = self.of_fleet(vehicles)
+        return "above 0.99" if probability > 0.99 else f"{probability:.2g}"
+
     def to_dict(self) -> dict[str, Any]:
         """The JSON of `risk`."""
         rows = [] if self.sensitivity is None else self.sensitivity.to_dict("records")

@@ -28,7 +28,7 @@ def print_risk(console: Console, result: Risk) -> None:
     sampling = "" if result.method == "monte_carlo" else f", drawn by {result.method.replace('_', ' ')}"
     print_text(console, f"Unsafe: {result.unsafe.description}. {result.failures} of {result.samples} vehicles{sampling}.")
     label = "Share of the domain that is unsafe:" if result.is_share_of_domain else "Probability"
-    print_text(console, f"{label} {result.probability:.4g}, with {100 * result.confidence:.0f} % confidence from {low:.4g} to {high:.4g}.")
+    print_text(console, f"{label} {result.probability:.4g}, with {100 * result.confidence:g} % confidence from {low:.4g} to {high:.4g}.")
     if result.remark:
         print_text(console, f"note: {result.remark}.")
     if result.design_point is not None:
@@ -37,7 +37,7 @@ def print_risk(console: Console, result: Risk) -> None:
         print_text(console, f"The most probable failure: {values}.")
     if not result.is_share_of_domain and 0 < result.probability < RARE_BELOW:
         print_text(console, f"Of {FLEET_VEHICLES:,} vehicles that vary independently at least one is unsafe with probability "
-                            f"{result.of_fleet(FLEET_VEHICLES):.2g}.")
+                            f"{result.of_fleet_in_words(FLEET_VEHICLES)}.")
     if result.is_share_of_domain:
         print_text(console, "warning: this is not a probability in the field: the study has no [variation] table for how real vehicles "
                             "vary.")
@@ -56,7 +56,7 @@ def print_risk(console: Console, result: Risk) -> None:
     if result.sensitivity_of_unsafe["total"].isna().all():
         print_text(console, "There are no indices of the unsafe outcome, because too few settings are unsafe or too few are safe.")
     print_meanings(console, CharacteristicSet.of(result.study.vehicle.characteristics))
-    print_text(console, f"Sobol indices, first order and total, with half of their {100 * result.confidence:.0f} % intervals: estimates, "
+    print_text(console, f"Sobol indices, first order and total, with half of their {100 * result.confidence:g} % intervals: estimates, "
                         "which may exceed 1 or fall below 0 by their error.")
 
 
@@ -65,7 +65,8 @@ def _how_vehicles_vary(study: Study) -> str:
     not_uniform = [f"{name} {distribution.__struct_config__.tag}"
                    for name, distribution in study.variation.items() if distribution != Uniform()]
     pairs = ", ".join(f"{' with '.join(correlation.between)} {correlation.value:g}" for correlation in study.correlations)
-    manner = f"as the study specifies: {'; '.join(not_uniform)}; the others uniformly" if not_uniform else "uniformly over the whole domain"
+    others = "" if len(not_uniform) == len(study.vehicle.characteristics) else "; the others uniformly"
+    manner = f"as the study specifies: {'; '.join(not_uniform)}{others}" if not_uniform else "uniformly over the whole domain"
     return f"They vary {manner}{f', correlated: {pairs}' if pairs else ''}."
 
 
@@ -86,7 +87,7 @@ def sensitivity_figure(result: Risk) -> Figure:
         raise InputError("correlations", "there are no sensitivity indices of characteristics that are correlated or bound by constraints",
                          "a study without correlations and constraints")
     names = result.sensitivity.sort_values("total", kind="stable")["characteristic"].to_list()
-    title = f"{result.study.name}: what decides ({100 * result.confidence:.0f} % intervals)"
+    title = f"{result.study.name}: what decides ({100 * result.confidence:g} % intervals)"
     figure, (axes,) = new_figure(title, rows=1, columns=2, size=(7.2, 1.5 + 0.28 * max(len(names), 4)))
     frames = {"safety degree": result.sensitivity, f"unsafe ({result.unsafe})": result.sensitivity_of_unsafe}
     for axis, (output, frame) in zip(axes, frames.items(), strict=True):
