@@ -15,7 +15,9 @@ from safevar_sumo.vehicles import Characteristic
 
 
 class WholeTable(Table):
-    """A table of plain text that cuts nothing off. It breaks lines between words, without padding if need be, and words if they do not fit.
+    """A table of plain text that cuts nothing off.
+
+    It breaks lines between words, without padding if need be, and words only if they do not fit.
 
     Columns under `text_heads` hold text, those under `right` numbers. Text is shown as it is, without markup.
     """

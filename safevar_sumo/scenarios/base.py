@@ -172,7 +172,7 @@ def pre_crash_of(scenario: Any) -> str:
 
 
 def distance_in_words(scenario: Any, safety_degree: float) -> str:
-    """A safety degree above 0 in metres, and between which points it is if these are not the bumper and what it may hit."""
+    """A safety degree above 0 in metres, and between which points it is, if not from the bumper on."""
     return f"{safety_degree:.2f} m{' from centre to centre' if getattr(scenario, 'centre_to_centre', False) else ''}"
 
 

@@ -61,7 +61,8 @@ def test_an_obstacle_that_walks_on_leaves_nothing_unexplained() -> None:
     """The same drives seen from a frame in which the obstacle moves: the same parts."""
     runs, walking = drive_of(SAME, (11.0, 15.0, 0.2, 6.0)), 1.4
     trace = runs.trace
-    moved = replace(runs, trace=replace(trace, speed=trace.speed + walking, position=trace.position + walking * trace.time[:, np.newaxis]))
+    position = trace.position + walking * trace.time[:, np.newaxis]
+    moved = replace(runs, trace=replace(trace, speed=trace.speed + walking, position=position))
     stands, walks = (compare_braking(*(summarise_run(one, column, 1.0) for column in (0, 1))) for one in (runs, moved))
     assert walks.parts == pytest.approx(stands.parts, abs=1e-4)
     assert abs(walks.parts["remainder"]) < 0.01

@@ -76,6 +76,20 @@ def test_every_minimal_cause_is_unsafe_and_no_proper_subset_of_it_is(case: Case,
 
 
 @pytest.mark.slow
+def test_a_command_has_as_many_digits_as_it_needs(case: Case, explained: Explained) -> None:
+    causes = [cause for one in explained.explanations for cause in one.causes]
+    settings = [case.characteristics.setting(values, "test") for cause in causes
+                for values in (cause.changes, cause.short_changes, cause.short_boundary)]
+    evaluations = evaluate(assemble(case.study), np.array(settings))
+    exact, short, boundary = (evaluations.f_safe[start::3] for start in range(3))
+    assert np.abs(exact - short).max() < 0.01
+    assert (boundary < 0).all()
+    digits = [len(f"{value!r}".replace(".", "").strip("0")) for cause in causes for value in cause.short_changes.values()]
+    assert max(digits) <= 8
+    assert np.median(digits) <= 5
+
+
+@pytest.mark.slow
 def test_every_boundary_is_unsafe_and_just_below_it_is_safe(case: Case, explained: Explained) -> None:
     causes = [cause for one in explained.explanations for cause in one.causes]
     assert all(collides(case, [cause.boundary for cause in causes]))

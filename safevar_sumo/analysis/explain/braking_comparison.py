@@ -8,8 +8,8 @@ is v - e, and the speed falls by d. After t the mean deceleration is a. The stop
 and the margin is G - D. A difference of products is split exactly between the two factors,
 x2 y2 - x1 y1 = (x2 - x1) (y1 + y2) / 2 + (y2 - y1) (x1 + x2) / 2. So the lost margin, the original's margin minus the
 changed vehicle's, is a sum of parts, each with the sign of one difference: gap (G smaller), speed (v larger), delay (t
-larger), slowing (e and d: less speed lost while the pedal moves) and deceleration (a smaller). If the obstacle moves on, v is the speed
-and a the deceleration relative to it, at its mean speed while the vehicle brakes.
+larger), slowing (e and d: less speed lost while the pedal moves) and deceleration (a smaller). If the obstacle moves
+on, v is the speed and a the deceleration relative to it, at its mean speed while the vehicle brakes.
 """
 
 from __future__ import annotations
@@ -73,8 +73,9 @@ class Braking(NamedTuple):
 
     @property
     def stopping_distance(self) -> float:
-        """Distance by which the gap shrinks from the command on [m]; the mean deceleration is assumed to continue after the run."""
-        return (self.closing_speed - self.speed_deficit) * self.delay + (self.closing_speed - self.speed_lost)**2 / (2 * self.deceleration)
+        """Distance by which the gap shrinks from the command on [m], if the mean deceleration continues after the run."""
+        speed_after_delay = self.closing_speed - self.speed_lost
+        return (self.closing_speed - self.speed_deficit) * self.delay + speed_after_delay**2 / (2 * self.deceleration)
 
     @property
     def margin(self) -> float:
@@ -161,7 +162,7 @@ def _measure_braking(runs: SimulationRuns, column: int, first: int, last: int) -
     elapsed = trace.time[last] - trace.time[first]
     shift = position[last] + trace.gap[last, column] - position[first] - trace.gap[first, column]  # of the obstacle
     obstacle_speed = round(float(shift / elapsed), OBSTACLE_DECIMALS) if last > first and np.isfinite(shift) else 0.0
-    speed, position = speed - obstacle_speed, position - obstacle_speed * trace.time[:last + 1]  # relative to the obstacle
+    speed, position = speed - obstacle_speed, position - obstacle_speed * trace.time[:last + 1]  # relative to it
     has_followed = trace.pedal[first:last + 1, column] >= PEDAL_SHARE * trace.brake[first:last + 1, column]
     end_of_delay = first + int(np.argmax(has_followed))
     distance = float(position[last] - position[end_of_delay])
@@ -170,10 +171,12 @@ def _measure_braking(runs: SimulationRuns, column: int, first: int, last: int) -
         return None
     initial_speed, delay = float(speed[first]), (end_of_delay - first) * trace.step
     return Braking(
-        time=float(trace.time[first]), gap=float(trace.gap[first, column]), speed=initial_speed + obstacle_speed, delay=delay,
+        time=float(trace.time[first]), gap=float(trace.gap[first, column]), speed=initial_speed + obstacle_speed,
+        delay=delay,
         speed_deficit=initial_speed - float(position[end_of_delay] - position[first]) / delay if end_of_delay > first else 0.0,
         speed_lost=initial_speed - float(speed[end_of_delay]), deceleration=specific_energy / distance,
-        gears=(float(trace.gear[first, column]), float(trace.gear[end_of_delay, column])), obstacle_speed=obstacle_speed)
+        gears=(float(trace.gear[first, column]), float(trace.gear[end_of_delay, column])),
+        obstacle_speed=obstacle_speed)
 
 
 def compare_braking(original: RunSummary, changed: RunSummary, point: str = "") -> BrakingComparison:
@@ -191,7 +194,7 @@ def _braking_to_compare(changed: RunSummary, original: RunSummary) -> Braking | 
     """The braking of a changed vehicle; if it collides without braking, the original vehicle's braking at the changed vehicle's speed."""
     if changed.braking is not None or original.braking is None or not np.isfinite(changed.collision_speed):
         return changed.braking
-    least = original.braking.speed_lost + original.braking.obstacle_speed  # so that no speed after the delay is negative
+    least = original.braking.speed_lost + original.braking.obstacle_speed  # so that no speed is negative
     speed = max(changed.collision_speed, least)
     return original.braking._replace(time=np.nan, gap=0.0, speed=speed)
 
@@ -209,7 +212,8 @@ def _split_lost_margin(original: Braking, changed: Braking) -> dict[str, float]:
                for braking in (original, changed)]
     return {
         "gap": original.gap - changed.gap,
-        "speed": (changed.closing_speed - original.closing_speed) * (mean_delay + mean_speed_after_delay * mean_inverse_deceleration),
+        "speed": ((changed.closing_speed - original.closing_speed)
+                  * (mean_delay + mean_speed_after_delay * mean_inverse_deceleration)),
         "delay": (changed.delay - original.delay) * sum(mean_delay_speeds) / 2,
         "slowing": savings[0] - savings[1],
         "deceleration": ((1 / changed.deceleration - 1 / original.deceleration)

@@ -97,6 +97,10 @@ LINE_SETTINGS = 32
 PARTS_PER_ROUND = 8
 """Number of parts into which each of `ROUNDS` rounds divides the interval with the boundary."""
 ROUNDS = 3
+SHORT_DIGITS = (3, 4, 5, 6, 8)
+"""Numbers of significant digits that commands may print."""
+SHORT_DEGREE = 0.01
+"""Difference of safety degrees that a rounded setting may make [m, or m/s]."""
 RESOLUTION = 1 / (LINE_SETTINGS * PARTS_PER_ROUND**ROUNDS)
 """Accuracy of a boundary, as a share of the line."""
 
@@ -143,6 +147,22 @@ def find_boundaries(evaluator: Evaluator, causes: list[MinimalCause], unsafe: Un
         filtered_column = line.first_filtered(evaluator.characteristics.threshold) if state == BoundaryState.FILTER else None
         boundaries.append(Boundary(float(fraction), setting, single_limits, state, filtered_column))
     return boundaries
+
+
+def shorten(evaluator: Evaluator, settings: FloatArray, unsafe: Unsafe) -> FloatArray:
+    """K unsafe settings, shape (K, n), in as few digits as they need to stay unsafe with the same safety degree to 1 cm."""
+    characteristics = evaluator.characteristics
+    rounded = [np.array([[float(f"{value:.{digits}g}") for value in setting] for setting in settings.tolist()])
+               for digits in SHORT_DIGITS]
+    candidates = np.array([*(np.where(settings == characteristics.original, settings, characteristics.filter(
+        np.clip(values, characteristics.lower, characteristics.upper))) for values in rounded), settings])
+    evaluations = evaluator.evaluate(candidates.reshape(-1, settings.shape[1]), "digits of commands")
+    outcome, degree, is_unsafe = (values.reshape(len(candidates), -1) for values in (
+        evaluations.outcome, evaluations.f_safe, unsafe.of(evaluations)))
+    changes_alike = (characteristics.changed(candidates) == characteristics.changed(settings)).all(axis=2)
+    ends_alike = changes_alike & is_unsafe & (outcome == outcome[-1]) & (np.abs(degree - degree[-1]) < SHORT_DEGREE)
+    ends_alike[-1] = True
+    return np.asarray(candidates[np.argmax(ends_alike, axis=0), np.arange(len(settings))])
 
 
 class Line(NamedTuple):

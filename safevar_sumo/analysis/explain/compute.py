@@ -16,6 +16,7 @@ from safevar_sumo.analysis.explain.causes import (
     find_minimal_causes,
     necessary_columns,
     select_affordable_rows,
+    shorten,
 )
 from safevar_sumo.analysis.explain.necessity import cause_key, count_distinct_causes, necessity_frame
 from safevar_sumo.analysis.explain.result import DISTINCT_CAUSE, REASONS, ROBUST, Cause, Explained, Explanation
@@ -298,7 +299,10 @@ def _explain_rows(evaluated: EvaluatedSettings, evaluator: Evaluator, original: 
         comparisons, step = compare_at_points(assemble(evaluator.study), original.settings, chosen.settings, unsafe)
         settings = np.array([*chosen.settings, *(cause.setting for cause in all_causes)])
         robustnesses = estimate_robustness(evaluator, settings, step, unsafe)
-    boundaries, cause_robustnesses = iter(find_boundaries(evaluator, all_causes, unsafe)), iter(robustnesses[len(rows):])
+    boundaries = find_boundaries(evaluator, all_causes, unsafe)
+    exact = [one.setting for both in zip(all_causes, boundaries, strict=True) for one in both]
+    short = iter(shorten(evaluator, np.array(exact), unsafe) if exact and not is_rated(evaluator.study) else exact)
+    boundary_of_next, cause_robustnesses = iter(boundaries), iter(robustnesses[len(rows):])
     collision_indices = np.flatnonzero(_collisions_to_classify(evaluator.study, chosen))
     classified = classify_collisions(evaluator, chosen.take(collision_indices))
     avoidances = dict(zip(collision_indices.tolist(), classified, strict=True))
@@ -306,14 +310,16 @@ def _explain_rows(evaluated: EvaluatedSettings, evaluator: Evaluator, original: 
     for i, row in enumerate(rows):
         described_causes = []
         for cause in causes[row]:
-            boundary = next(boundaries)
+            boundary, columns = next(boundary_of_next), cause.columns
+            short_changes, short_boundary = ({names[column]: float(next_short[column]) for column in columns}
+                                             for next_short in (next(short), next(short)))
             described_causes.append(Cause(
                 changes={names[column]: float(cause.setting[column]) for column in cause.columns},
                 boundary={names[column]: float(boundary.setting[column]) for column in cause.columns}, fraction=boundary.fraction,
                 alone={names[column]: value for column, value in boundary.single_limits.items()}, outcome=cause.outcome,
                 safety_degree=cause.safety_degree, end=boundary.state_below,
                 at_threshold=None if boundary.at_threshold is None else names[boundary.at_threshold],
-                neighbours=next(cause_robustnesses, None)))
+                neighbours=next(cause_robustnesses, None), short_changes=short_changes, short_boundary=short_boundary))
         changed = evaluator.characteristics.changed(chosen.settings[i])
         explanations.append(Explanation(
             handle=evaluated.handles[row], reasons=choice_reasons[row], setting=dict(zip(names, chosen.settings[i].tolist(), strict=True)),

@@ -71,7 +71,7 @@ def _print_answer(console: Console, command_for: CommandFor, result: Explained, 
         limits = [f"{_full_name(characteristic)} {characteristic.original:g} -> "
                   f"{characteristic.text(cause.boundary[characteristic.name])}{characteristic.suffix}"
                   for characteristic in characteristics if characteristic.name in cause.boundary]
-        print_text(console, f"How little is enough: {', '.join(limits)}. {command_for(cause.boundary)}")
+        print_text(console, f"How little is enough: {', '.join(limits)}. {command_for(cause.short_boundary)}")
     if result.analysed and len(result.distinct):
         print_text(console, f"Necessary most often ({_sample_in_words(result)}): {_most_necessary_in_words(result, characteristics)}.")
         common = result.distinct.iloc[0]
@@ -117,7 +117,7 @@ def _accuracy_in_words(result: Explained) -> str:
         return ""
     return (f"Accuracy: the driving system decides every {step:g} s, in which the vehicle covers {braking.speed * step:.2f} m at "
             f"{braking.speed:.1f} m/s. Along a characteristic the safety degree is a sawtooth of about that height: more digits of "
-            "a value mean nothing, and only let a command repeat a simulation exactly.")
+            "a value than a command has mean nothing.")
 
 
 def _print_explanation(console: Console, command_for: CommandFor, failure: Explanation, characteristics: CharacteristicSet,
@@ -165,7 +165,7 @@ def _print_cause(console: Console, command_for: CommandFor, cause: Cause, charac
     console.print(table)
     print_meanings(console, [characteristic for characteristic in characteristics if characteristic.name in cause.changes])
     robustness = "" if cause.neighbours is None else f"By themselves, these changes are {cause.neighbours}. "
-    print_text(console, f"{cause.limit} {robustness}{command_for(cause.changes)}")
+    print_text(console, f"{cause.limit} {robustness}{command_for(cause.short_changes)}")
 
 
 def _braking_table(comparison: BrakingComparison) -> WholeTable:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from operator import attrgetter
 from typing import Any, TypeVar
 
@@ -100,6 +100,8 @@ class Cause:
     neighbours
         Robustness of these changes by themselves, estimated from the setting's neighbours; None in a rated study, where the simulations
         would take too long.
+    short_changes, short_boundary
+        `changes` and `boundary` in as few digits as a vehicle needs to end alike, for commands.
     """
 
     changes: dict[str, float]
@@ -111,6 +113,8 @@ class Cause:
     end: BoundaryState = BoundaryState.SAFE
     at_threshold: str | None = None
     neighbours: Robustness | None = None
+    short_changes: dict[str, float] = field(default_factory=dict)
+    short_boundary: dict[str, float] = field(default_factory=dict)
 
     @property
     def robustness(self) -> float | None:

@@ -28,7 +28,8 @@ def print_risk(console: Console, result: Risk) -> None:
     sampling = "" if result.method == "monte_carlo" else f", drawn by {result.method.replace('_', ' ')}"
     print_text(console, f"Unsafe: {result.unsafe.description}. {result.failures} of {result.samples} vehicles{sampling}.")
     label = "Share of the domain that is unsafe:" if result.is_share_of_domain else "Probability"
-    print_text(console, f"{label} {result.probability:.4g}, with {100 * result.confidence:g} % confidence from {low:.4g} to {high:.4g}.")
+    print_text(console, f"{label} {result.probability:.4g}, with {100 * result.confidence:g} % confidence from {low:.4g} "
+                        f"to {high:.4g}.")
     if result.remark:
         print_text(console, f"note: {result.remark}.")
     if result.design_point is not None:
@@ -56,8 +57,8 @@ def print_risk(console: Console, result: Risk) -> None:
     if result.sensitivity_of_unsafe["total"].isna().all():
         print_text(console, "There are no indices of the unsafe outcome, because too few settings are unsafe or too few are safe.")
     print_meanings(console, CharacteristicSet.of(result.study.vehicle.characteristics))
-    print_text(console, f"Sobol indices, first order and total, with half of their {100 * result.confidence:g} % intervals: estimates, "
-                        "which may exceed 1 or fall below 0 by their error.")
+    print_text(console, f"Sobol indices, first order and total, with half of their {100 * result.confidence:g} % "
+                        "intervals: estimates, which may exceed 1 or fall below 0 by their error.")
 
 
 def _how_vehicles_vary(study: Study) -> str:
@@ -66,7 +67,8 @@ def _how_vehicles_vary(study: Study) -> str:
                    for name, distribution in study.variation.items() if distribution != Uniform()]
     pairs = ", ".join(f"{' with '.join(correlation.between)} {correlation.value:g}" for correlation in study.correlations)
     others = "" if len(not_uniform) == len(study.vehicle.characteristics) else "; the others uniformly"
-    manner = f"as the study specifies: {'; '.join(not_uniform)}{others}" if not_uniform else "uniformly over the whole domain"
+    specified = f"as the study specifies: {'; '.join(not_uniform)}{others}"
+    manner = specified if not_uniform else "uniformly over the whole domain"
     return f"They vary {manner}{f', correlated: {pairs}' if pairs else ''}."
 
 
