@@ -87,7 +87,8 @@ def explain(source: str, full: bool, point: str | None, jobs: int | None, as_jso
         click.echo(f"Causes: {out}", err=as_json)
 
 
-@add_question(OpinionOptions, "DIR", click.option("--solutions", "lists", multiple=True, hidden=True),
+@add_question(OpinionOptions, "DIR", click.option("--solutions", "lists", multiple=True, hidden=True,
+                                                  help="Another name of --solution."),
               click.argument("handles", nargs=-1, metavar=""))
 def opinion(source: str, lists: tuple[str, ...], handles: tuple[str, ...], point: str | None, jobs: int | None,
             as_json: bool, **values: Any) -> None:
