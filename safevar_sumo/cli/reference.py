@@ -38,8 +38,7 @@ from safevar_sumo.vehicles import CharacteristicSet
               help="Plot simulated against reference values.")
 @json_option
 @click.option("--totals", type=click.Path(path_type=Path), metavar="FILE.toml",
-              help="Also save rank correlations, errors and counts of collisions to this file, without any row of the "
-                   "data.")
+              help="Also save rank correlations, errors and counts of collisions to this file, without any row.")
 @click.option("--effects", "with_effects", is_flag=True,
               help="Compare the characteristics' linear effects here and in the reference.")
 @click.option("--spread", "with_spread", is_flag=True,
@@ -62,8 +61,8 @@ def validate(study: str, reference: Path, jobs: int | None, plot: Path | None, a
         vehicle = "any row" if evaluations.valid[0] else "the original vehicle"
         raise SimulationError(f"study {study!r} cannot be simulated with {vehicle}")
     if not valid.all():
-        click.echo(f"warning: {reference}: {np.count_nonzero(~valid)} rows could not be simulated and are left out",
-                   err=True)
+        number = np.count_nonzero(~valid)
+        click.echo(f"warning: {reference}: {number} rows could not be simulated and are left out", err=True)
     data, simulated = data.take(valid), evaluations.take(1 + np.flatnonzero(valid))
     result = measure_agreement(data, simulated, loaded_study, evaluations.take([0]))
     if plot is not None:

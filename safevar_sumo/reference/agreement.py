@@ -173,17 +173,15 @@ def plot_agreement(path: Path, title: str, characteristics: CharacteristicSet, r
         If the file cannot be written or its ending names no picture format.
     """
     figure, axes = new_panels(title, 2 * len(reference.metrics) + len(characteristics), 4, (3.0, 2.4), 12.0, 0.8)
-    for axis, error_axis, (metric, values) in zip(axes, axes[len(reference.metrics):], reference.metrics.items(),
-                                                  strict=False):
+    for i, (metric, values) in enumerate(reference.metrics.items()):
         here = evaluations.metrics[metric]
         label = f"{METRICS[metric].title} [{as_formula(METRICS[metric].unit)}]"
-        _draw_scatter(axis, values, here, reference.collided | evaluations.collided, label)
-        _draw_error(error_axis, here, here - values, f"here: {label}", "mean error")
+        _draw_scatter(axes[i], values, here, reference.collided | evaluations.collided, label)
+        _draw_error(axes[len(reference.metrics) + i], here, here - values, f"here: {label}", "mean error")
     error, panels = evaluations.f_safe - reference.metrics[SAFETY_DEGREE], axes[2 * len(reference.metrics):]
     for axis in panels[1:]:
         axis.sharey(panels[0])
-    for axis, characteristic, values in zip(panels, characteristics, evaluations.settings.T,
-                                            strict=True):
+    for axis, characteristic, values in zip(panels, characteristics, evaluations.settings.T, strict=True):
         _draw_error(axis, values, error, characteristic.name + as_formula(unit_text(characteristic.unit, " [{}]")),
                     "error of SD")
     figure.supxlabel("orange: collides in the reference or here", fontsize=FONT)
@@ -204,9 +202,8 @@ def _draw_error(axis: Axes, values: FloatArray, error: FloatArray, label: str, e
     """Draw the mean error and the quartiles of the error over bins of `values`."""
     bins = _bins_of(np.where(np.isnan(error), np.nan, values))
     centres = [values[rows].mean() for rows in bins]
-    quartiles = [np.quantile(error[rows], [0.25, 0.75]) for rows in bins]
-    axis.fill_between(centres, [low for low, _ in quartiles], [high for _, high in quartiles], color=BLUE, alpha=0.2,
-                      linewidth=0)
+    low, high = ([np.quantile(error[rows], share) for rows in bins] for share in (0.25, 0.75))
+    axis.fill_between(centres, low, high, color=BLUE, alpha=0.2, linewidth=0)
     axis.plot(centres, [error[rows].mean() for rows in bins], marker="o", markersize=3, color=BLUE)
     axis.axhline(0, color="black", linewidth=0.8, linestyle="--")
     axis.set(xlabel=label, ylabel=error_label)

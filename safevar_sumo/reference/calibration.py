@@ -180,30 +180,28 @@ def _measure_agreements(study: Study, references: Mapping[str, ReferenceData], p
     original, agreements = CharacteristicSet.of(study.vehicle.characteristics).original, {}
     for name, data in references.items():
         evaluations = evaluate_all(study, np.concatenate([original[np.newaxis], data.settings]), pool)
-        agreements[name] = measure_agreement(data, evaluations.take(np.arange(1, len(evaluations))), study,
-                                             evaluations.take([0]))
+        rows = evaluations.take(np.arange(1, len(evaluations)))
+        agreements[name] = measure_agreement(data, rows, study, evaluations.take([0]))
     return agreements
 
 
 def describe_fit(subject: FitSubject, result: Calibration, studies: Sequence[Study], *, from_scratch: bool) -> str:
-    """The fit of one of `studies` in words: search, data with fingerprints, shared parameters, loss, order, values on a
-    bound.
-    """
+    """The fit of one of `studies` in words: search, loss, data with fingerprints, order, parameters of its own, bounds."""
     (study, references), fit, values = subject, studies[0].fit, result.values.items()
     together = "".join(f", together with {other.name!r}" for other in studies if other is not study)
     start = "random places only" if from_scratch else f"its own values and {fit.starts} random places"
     own_names = ", ".join(name for name, value in values if not value.is_shared)
-    lines = [f"Study {study.name!r}, calibrated{together} by CMA-ES: {fit.trials} trials, seed {fit.seed}, from "
-             f"{start}.",
-             "Fitted to the original vehicle's published values, and to rows of these files, of which one in "
-             f"{study.fit.hold_out} is held back.",
-             *(f"  {name}, SHA-256 {data.fingerprint}, without {data.skipped} rows outside the domains; rho of the "
-               "safety degree "
-               f"{_order(result.used[name])}, held back {_order(result.held_back[name])}"
-               for name, data in references.items())]
-    return "\n".join([*lines, *([f"Parameters of its own: {own_names}; it shares the others."] if together else []),
-                      f"{result.loss_line}.",
-                      *(f"{name} lies on its bound." for name, value in values if value.is_on_bound)])
+    lines = [f"Study {study.name!r}, calibrated{together}.",
+             f"CMA-ES: {fit.trials} trials, seed {fit.seed}, from {start}. {result.loss_line}.",
+             "Fitted to the original vehicle's published values and to rows of files, "
+             f"of which one in {study.fit.hold_out} is held back."]
+    for name, data in references.items():
+        orders = f"{_order(result.used[name])}, held back {_order(result.held_back[name])}"
+        lines.append(f"  {name}, SHA-256 {data.fingerprint}, {data.skipped} rows left out; "
+                     f"rho of the safety degree {orders}")
+    if together:
+        lines.append(f"Parameters of its own: {own_names}; it shares the others.")
+    return "\n".join([*lines, *(f"{name} lies on its bound." for name, value in values if value.is_on_bound)])
 
 
 def _order(result: Agreement) -> str:

@@ -214,8 +214,8 @@ def _read_change_numbers(rows: Rows) -> Iterator[Conclusion]:
             mean, published_mean = numbers @ percents / percents.sum(axis=0)
             yield Conclusion("RQ3.1", case, f"most critical solutions change {published_mode} characteristics",
                              _judge(mode == published_mode, abs(mean - published_mean) <= 1),
-                             f"most frequent {mode} here, {published_mode} published; mean {mean:.1f} and "
-                             f"{published_mean:.1f}")
+                             f"most frequent {mode} here, {published_mode} published; "
+                             f"mean {mean:.1f} and {published_mean:.1f}")
 
 
 def _read_orders(question: str, keys: Sequence[str], quantity: str, rows: Rows) -> Iterator[Conclusion]:

@@ -81,10 +81,9 @@ class Regression(NamedTuple):
 def effects_of(data: ReferenceData, evaluations: Evaluations, characteristics: CharacteristicSet) -> dict[str, Effect]:
     """The effect of each characteristic on the safety degree, in the order of the study."""
     regression = Regression.over(data.settings, characteristics)
-    effects = zip(*(regression.effects(values) for values in (data.metrics[SAFETY_DEGREE], evaluations.f_safe)),
-                  strict=True)
-    return {name: Effect.of(*map(finite_or_none, pair)) for name,
-            pair in zip(characteristics.names, effects, strict=True)}
+    published, here = (regression.effects(values) for values in (data.metrics[SAFETY_DEGREE], evaluations.f_safe))
+    return {name: Effect.of(finite_or_none(published[i]), finite_or_none(here[i]))
+            for i, name in enumerate(characteristics.names)}
 
 
 class Coverage(NamedTuple):

@@ -27,9 +27,8 @@ def study(published: dict[str, float], repeatability: float) -> Study:
 def reference(safety: list[float], tet: list[float]) -> ReferenceData:
     values = np.array(safety)
     tet_values = np.where(values <= 0, np.nan, np.array(tet))
-    return ReferenceData(np.linspace(1, 9, len(values))[:, np.newaxis],
-                         {"safety_degree": values, "tet": tet_values, "tit": tet_values, "ave_dece": values * np.nan},
-                         0)
+    metrics = {"safety_degree": values, "tet": tet_values, "tit": tet_values, "ave_dece": values * np.nan}
+    return ReferenceData(np.linspace(1, 9, len(values))[:, np.newaxis], metrics, 0)
 
 
 def here(safety: list[float], tet: list[float]) -> Evaluations:

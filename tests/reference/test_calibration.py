@@ -132,8 +132,8 @@ def test_errors_count_in_repeats_and_each_collision_on_one_side_alone_its_share(
     for unit in (1.0, 2.0):
         study = msgspec.structs.replace(mine(0.8), repeatability={"safety_degree": unit}, fit=only)
         assert ReferenceLoss(data, study).of(here) == pytest.approx(error / unit)
-    there = data.take(np.arange(24) < 6)._replace(metrics={"safety_degree": np.array([-1.0, -2.0, -3.0, -1.0, 0.5,
-                                                                                      2.0])})
+    published = {"safety_degree": np.array([-1.0, -2.0, -3.0, -1.0, 0.5, 2.0])}
+    there = data.take(np.arange(24) < 6)._replace(metrics=published)
     study = msgspec.structs.replace(mine(0.8), fit=FitTable(rank=0.0, collisions=6.0, weights={}))
     loss = ReferenceLoss(there, study).of(evaluations([-2.0, -2.0, -2.0, 0.5, -1.5, 2.0]))
     assert loss == pytest.approx(6 * 2 / 6), "four there and four here, three of them the same: two rows of six differ"

@@ -141,8 +141,7 @@ def _notes(question: str, case: Case, *, alone: bool) -> list[str]:
     if question == "rq2" and not case.has_runs:
         notes.append("igd, igd_plus and hypervolume need runs, which imported solutions do not have.")
     if question == "rq2" and case.has_runs:
-        empty_runs = len(set(case.finished_runs) - set(zip(case.solutions["algorithm"], case.solutions["run"],
-                                                           strict=True)))
+        empty_runs = len(set(case.finished_runs) - set(case.solutions.groupby(["algorithm", "run"]).groups))
         if empty_runs:
             notes.append(f"{empty_runs} finished runs found no solution; they have no igd, igd_plus or hypervolume.")
     if question.startswith("rq3") or question in ("combinations", WEATHER):

@@ -190,9 +190,9 @@ def _load_case(directory: Path) -> Case:
     except msgspec.ValidationError as error:
         raise error_with_key(directory / MANIFEST, manifest["study"], error, "study") from None
     scoring = msgspec.convert(manifest["scoring"], Scoring) if "scoring" in manifest else PUBLISHED_SCORING
-    return build_case(msgspec.structs.replace(study, origin=Origin(places=folders_of(directory))), manifest["original"],
-                      solutions,
-                      evaluations, finished, has_runs="imported" not in manifest, failures=failures, scoring=scoring)
+    study = msgspec.structs.replace(study, origin=Origin(places=folders_of(directory)))
+    return build_case(study, manifest["original"], solutions, evaluations, finished,
+                      has_runs="imported" not in manifest, failures=failures, scoring=scoring)
 
 
 def build_case(study: Study, original: Mapping[str, Any], solutions: pd.DataFrame, evaluations: pd.DataFrame,

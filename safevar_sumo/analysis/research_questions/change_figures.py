@@ -86,10 +86,9 @@ def draw_change_sizes(case: Case) -> Figure:
     """The distribution of each characteristic's signed changes in the critical solutions."""
     solution_count = _count_critical_solutions(case)
     title = f"{case.name}: changes in critical solutions"
-    figure, axes = new_panels(title, len(case.characteristics), max_columns=4, panel_size=(2.25, 1.85), min_width=9.0,
-                              title_height=1.0)
-    for axis, characteristic, changes in zip(axes, case.characteristics, changes_of(case, critical_solutions(case)).T,
-                                             strict=True):
+    figure, axes = new_panels(title, len(case.characteristics), 4, (2.25, 1.85), min_width=9.0, title_height=1.0)
+    changes_by_characteristic = changes_of(case, critical_solutions(case)).T
+    for axis, characteristic, changes in zip(axes, case.characteristics, changes_by_characteristic, strict=True):
         low, high = (float(f"{end - characteristic.original:.9g}")
                      for end in (characteristic.lower, characteristic.upper))
         increases, decreases = changes[changes > 0], changes[changes < 0]

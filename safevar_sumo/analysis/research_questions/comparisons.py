@@ -114,8 +114,8 @@ def rq2(case: Case) -> pd.DataFrame:
     UnanswerableError
         If NSGA-II is missing, or there is no other algorithm.
     """
-    return pd.DataFrame(_rows_of_pairs(case, _nsga2_pairs(case), _samples(case, pooled_values)), columns=RQ2_COLUMNS,
-                        dtype=object)
+    rows = _rows_of_pairs(case, _nsga2_pairs(case), _samples(case, pooled_values))
+    return pd.DataFrame(rows, columns=RQ2_COLUMNS, dtype=object)
 
 
 def _nsga2_pairs(case: Case) -> list[tuple[str, str]]:
@@ -358,10 +358,9 @@ def summary_lines(case: Case) -> list[str]:
             is_any_testable = bool(defined_tests["enough"].any())
             named_metrics = f"{', '.join(untestable)}: " if is_any_testable else ""
             too_few = f"; {named_metrics}too few runs for a test ({fewest_runs(question)} are needed)"
-            effects = ", ".join(f"{test['metric']} " + ("-" if test["effect_size"] is None or test["p_holm"] is None
-                                                        else
-                                f"{test['effect_size']:.2f}{'*' if test['p_holm'] < ALPHA else ''}")
-                                for test in group.to_dict("records"))
-            lines.append(f"  {heading.format(name)}: {effects}{too_few if len(untestable) else ''}")
+            effects = [f"{test['metric']} -" if test["p_holm"] is None else
+                       f"{test['metric']} {test['effect_size']:.2f}{'*' if test['p_holm'] < ALPHA else ''}"
+                       for test in group.to_dict("records")]
+            lines.append(f"  {heading.format(name)}: {', '.join(effects)}{too_few if len(untestable) else ''}")
             any_testable = any_testable or is_any_testable
     return [*lines, significance_change_line(case)] if any_testable else lines

@@ -100,11 +100,12 @@ def compute_indicators(case: Case) -> pd.DataFrame:
     runs = [(algorithm, run) for algorithm in case.algorithms for run in case.runs_of(algorithm)]
     reference = reference_front(case)
     fronts = {key: defined_minimised_values(case, group) for key, group in case.solutions.groupby(["algorithm", "run"])}
-    rows = {run: (igd(front, reference), igd_plus(scaled := normalised(front, reference),
-                                                  normalised(reference, reference)),
-                  hypervolume(scaled)) for run in runs if len(front := fronts.get(run, reference[:0]))}
-    return pd.DataFrame(rows.values(), pd.MultiIndex.from_tuples(rows, names=["algorithm", "run"]),
-                        list(MORE_IS_BETTER))
+    rows = {}
+    for run in (run for run in runs if len(fronts.get(run, ()))):
+        scaled_front, scaled_reference = (normalised(points, reference) for points in (fronts[run], reference))
+        rows[run] = igd(fronts[run], reference), igd_plus(scaled_front, scaled_reference), hypervolume(scaled_front)
+    index = pd.MultiIndex.from_tuples(rows, names=["algorithm", "run"])
+    return pd.DataFrame(rows.values(), index, list(MORE_IS_BETTER))
 
 
 def compute_convergence(case: Case) -> pd.DataFrame:
@@ -129,8 +130,7 @@ def compute_convergence(case: Case) -> pd.DataFrame:
         points = normalised(minimised_values(case, by_run[algorithm, run]), reference)
         is_defined = np.isfinite(points).all(axis=1)
         points = points[is_defined]
-        ends = np.searchsorted(by_run[algorithm, run]["evaluation"].to_numpy()[is_defined], evaluation_counts,
-                               side="left")
+        ends = np.searchsorted(by_run[algorithm, run]["evaluation"].to_numpy()[is_defined], evaluation_counts)
         front, volumes = points[:0], []
         for new_points in np.split(points, ends)[:-1]:
             front = np.concatenate([front, new_points])

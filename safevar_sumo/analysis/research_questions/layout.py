@@ -84,8 +84,8 @@ LAYOUTS: Layouts = {
     "rq1-runs": [Layout(["algorithm", "metric"], [*HOLM_TESTS, "runs"])],
     "rq2-runs": [Layout(["baseline", "metric"], [*HOLM_TESTS, "n1", "n2"])],
     "rq2-pairs": [Layout(["algorithm", "other", "metric"], HOLM_TESTS)],
-    "rq2-ranks": [Layout(["metric", "runs", "p_value", "p_holm", "critical_difference"], "mean_rank", "algorithm",
-                         ["setting"])],
+    "rq2-ranks": [Layout(["metric", "runs", "p_value", "p_holm", "critical_difference"],
+                         "mean_rank", "algorithm", ["setting"])],
     "rq3.1": [Layout(["j"], ["min", "Q1", "median", "Q3", "max"])],
     "rq3.2": [Layout(["characteristic", "rank"], "percent", "j", ["setting"])],
     "rq3.3": [Layout(["characteristic", "direction"], "pc", "j", ["setting"], ", PC"),
@@ -94,9 +94,9 @@ LAYOUTS: Layouts = {
                    Layout(["quantity"], "percent", "j", ["setting"], ", % of the original")],
     "collisions": [Layout(["algorithm"], ["solutions", "collisions", "share"])],
     "combinations": [Layout(["setting", "rank", "characteristics"], ["percent"], None)],
-    "weather": [Layout(["characteristic"], ["percent", "percent_other", "difference", "rank", "rank_other", "increase",
-                                            "increase_other",
-                                            "decrease", "decrease_other"], None, ["setting", "other"])]}
+    "weather": [Layout(["characteristic"], ["percent", "percent_other", "difference", "rank", "rank_other",
+                                            "increase", "increase_other", "decrease", "decrease_other"],
+                       None, ["setting", "other"])]}
 PAPER_LAYOUTS: Layouts = {
     **LAYOUTS, "rq1": [Layout(["setting", "algorithm"], "p / A12", "metric")],
     "rq2": [Layout(["setting", "baseline"], "p / A12", "metric")],
@@ -212,8 +212,9 @@ def _test_cells(answer: Answer) -> dict[str, list[str]]:
     if "p_holm" in frame:
         is_significant = frame["p_holm"].astype(float) < ALPHA
         cells = {"p_value": p, "p_holm": _bold_where(frame["p_holm"].map(format_p_value), is_significant)}
-        return cells if "effect_size" not in frame else {**cells, "effect_size": _bold_where(_effects(frame),
-                                                                                             is_significant)}
+        if "effect_size" in frame:
+            cells["effect_size"] = _bold_where(_effects(frame), is_significant)
+        return cells
     algorithms = frame["algorithm" if answer.name == "rq1" else "baseline"]
     is_tested = np.array([pair not in answer.untested for pair in zip(frame["setting"], algorithms, strict=True)])
     is_significant = (frame["p_value"].astype(float) < ALPHA) & is_tested

@@ -13,7 +13,8 @@ from safevar_sumo.analysis.research_questions.layout import LAYOUTS, BoldText, L
 LATEX_NEEDS = "% In the preamble: " + " ".join(
     rf"\usepackage{name}" for name in ("[T1]{fontenc}", "{textcomp}", "{booktabs}", "{graphicx}"))
 _LATEX_CODES = str.maketrans({
-    **{character: "\\" + character for character in "{}$&#%_"}, **{character: f"{{{character}}}" for character in "[]*"},
+    **{character: "\\" + character for character in "{}$&#%_"},
+    **{character: f"{{{character}}}" for character in "[]*"},  # LaTeX reads these as arguments of the line before
     "\\": r"\textbackslash{}", "^": r"\textasciicircum{}", "~": r"\textasciitilde{}"})
 
 
@@ -63,8 +64,8 @@ def _render_latex(table: Table, label: str) -> str:
     lines = [r"\begin{table}[htbp]", r"\centering", rf"\caption{{{escaped_for_latex(table.title)}}}",
              rf"\label{{tab:{label}}}"]
     if not table.frame.empty:
-        style = table.frame.style.format(_latex_cell).format_index(_latex_cell, axis=0).format_index(_latex_cell,
-                                                                                                     axis=1)
+        style = table.frame.style.format(_latex_cell)
+        style = style.format_index(_latex_cell, axis=0).format_index(_latex_cell, axis=1)
         alignment = "l" * table.frame.index.nlevels + "r" * len(table.frame.columns)
         lines += [r"\resizebox{\ifdim\width>\linewidth\linewidth\else\width\fi}{!}{%",
                   style.to_latex(hrules=True, sparse_index=False, multicol_align="c", column_format=alignment).rstrip()
