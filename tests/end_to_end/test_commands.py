@@ -139,11 +139,14 @@ def test_an_ads_that_exits_is_a_fault_and_no_success(where: str, in_tmp: Path) -
     refused("simulate", "mine.toml", message=("my_ads:Careful", "SystemExit", "my_ads.py:10"))
 
 
-def test_an_ads_that_hangs_is_stopped_at_its_line(in_tmp: Path) -> None:
-    Path("my_ads.py").write_text("import time\nfrom safevar_sumo.ads import ScalarAds\n\n\nclass Careful(ScalarAds):\n"
-                                 "    def drive(self, seen):\n        time.sleep(1000)\n")
-    Path("mine.toml").write_text('extends = "smoke"\nname = "mine"\n[ads]\nmodel = "my_ads:Careful"\n[search]\ntime_limit = 1.0\n')
-    refused("simulate", "mine.toml", message=("my_ads:Careful", "longer than 1 s", "my_ads.py:7", "search.time_limit"))
+def test_an_ads_that_closes_standard_output_ends_in_one_line(in_tmp: Path) -> None:
+    Path("my_ads.py").write_text("import sys\nfrom safevar_sumo.ads import ScalarAds\n\n\nclass Careful(ScalarAds):\n"
+                                 "    def drive(self, seen):\n        sys.stdout.close()\n        return 0.5, 0.0\n")
+    Path("mine.toml").write_text('extends = "smoke"\nname = "mine"\n[ads]\nmodel = "my_ads:Careful"\n')
+    done = subprocess.run([sys.executable, "-m", "safevar_sumo", "simulate", "mine.toml"], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (1, "")
+    assert done.stderr.splitlines()[-1] == "safevar-sumo: user code has closed standard output"
+    assert "Traceback" not in done.stderr
 
 
 def test_a_title_is_no_markup(in_tmp: Path) -> None:
