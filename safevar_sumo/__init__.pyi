@@ -15,7 +15,7 @@ from .analysis.rules.compute import Rules as Rules
 from .analysis.subject import Results as Results
 from .analysis.subject import load as load
 from .analysis.tolerance import tolerance as tolerance
-from .analysis.tolerance.compute import Tolerance as Tolerance
+from .analysis.tolerance.answer import Tolerance as Tolerance
 from .api.research_questions import Figures as Figures
 from .api.research_questions import Tables as Tables
 from .api.research_questions import figures as figures

@@ -64,14 +64,29 @@ def print_text(console: Console, text: str) -> None:
     console.print(text, soft_wrap=True, markup=False, highlight=False)
 
 
-def print_meanings(console: Console, characteristics: Iterable[Characteristic]) -> None:
-    """Print the descriptions of characteristics, one line each; a characteristic without description is left out."""
+def meanings(characteristics: Iterable[Characteristic]) -> Table:
+    """The descriptions of characteristics, one row each; a characteristic without description is left out."""
     table = Table.grid(padding=(0, 2))
     for characteristic in characteristics:
         if characteristic.words:
             table.add_row(printable_text(characteristic.name), printable_text(characteristic.words))
-    if table.row_count:
+    return table
+
+
+def print_meanings(console: Console, characteristics: Iterable[Characteristic]) -> None:
+    """Print the descriptions of characteristics."""
+    if (table := meanings(characteristics)).row_count:
         console.print(table)
+
+
+def print_answer(console: Console, study: Study, no_verdict: str, parts: Iterable[str | Table]) -> None:
+    """Print the answer to a question about a study: sentences and tables, of which those without rows are left out."""
+    print_heading(console, study.title, no_verdict)
+    for part in parts:
+        if isinstance(part, str):
+            print_text(console, part)
+        elif part.row_count:
+            console.print(part)
 
 
 def print_heading(console: Console, title: str, no_verdict: str) -> None:
@@ -81,12 +96,18 @@ def print_heading(console: Console, title: str, no_verdict: str) -> None:
     print_text(console, title)
 
 
+def constraints_in_words(study: Study) -> list[str]:
+    """The constraints that all settings satisfy, in a sentence; empty if the study has none."""
+    characteristics = study.vehicle.characteristics
+    conditions = "; ".join(f"{constraint.quantity} {constraint.bounds_in_words(characteristics)}"
+                           for constraint in study.constraints)
+    return [f"Only settings that satisfy the study's constraints: {conditions}."] if conditions else []
+
+
 def print_constraints(console: Console, study: Study) -> None:
     """Print the constraints that all settings satisfy, if the study has any."""
-    characteristics = study.vehicle.characteristics
-    if study.constraints:
-        conditions = "; ".join(f"{constraint.quantity} {constraint.bounds_in_words(characteristics)}" for constraint in study.constraints)
-        print_text(console, f"Only settings that satisfy the study's constraints: {conditions}.")
+    for sentence in constraints_in_words(study):
+        print_text(console, sentence)
 
 
 def print_names(console: Console, title: str, rows: Iterable[tuple[str, ...]], heads: tuple[str, ...]) -> None:

@@ -31,7 +31,7 @@ from safevar_sumo.cli.target import (
 from safevar_sumo.errors import InputError
 from safevar_sumo.progress import open_progress
 from safevar_sumo.results import make_directory, write_whole
-from safevar_sumo.terminal import print_heading, print_text
+from safevar_sumo.terminal import print_answer
 
 
 def add_question(options: type[Options], metavar: str, *further_decorators: Callable[[CommandFunction], CommandFunction]
@@ -56,6 +56,13 @@ def _compute_with_bar(compute: Callable[..., Any], subject: Any, options: Option
 
 def _to_json(result: Any) -> str:
     return json.dumps(result.to_dict(), indent=2, allow_nan=False)
+
+
+def _print(result: Any, as_json: bool) -> None:
+    if as_json:
+        click.echo(_to_json(result))
+    else:
+        print_answer(Console(), result.study, result.no_verdict, result.sentences())
 
 
 def _plot_option(help_text: str) -> Callable[[CommandFunction], CommandFunction]:
@@ -101,11 +108,7 @@ def opinion(source: str, lists: tuple[str, ...], handles: tuple[str, ...], point
     if as_json:
         for note in result.notes:
             click.echo(f"note: {note}", err=True)
-        click.echo(_to_json(result))
-        return
-    print_heading(Console(), result.study.title, result.no_verdict)
-    for sentence in result.sentences():
-        print_text(Console(), sentence)
+    _print(result, as_json)
 
 
 @add_question(ToleranceOptions, "STUDY|DIR",
@@ -114,22 +117,18 @@ def tolerance(source: str, point: str | None, jobs: int | None, as_json: bool, p
     """Find how far each characteristic of STUDY may go: alone, in pairs, and all together."""
     from safevar_sumo.analysis.figures import save
     from safevar_sumo.analysis.tolerance.compute import find_tolerances
-    from safevar_sumo.analysis.tolerance.render import pairs_figure, print_tolerance, profiles_figure
 
     options, subject = ToleranceOptions(**values), load_results_or_study(source, point)
-    pairs_plot = None if plot is None else plot.with_stem(f"{plot.stem}-pairs")
-    for path in (plot, pairs_plot if options.pairs else None):
+    pairs_plot = None if plot is None or not options.pairs else plot.with_stem(f"{plot.stem}-pairs")
+    for path in (plot, pairs_plot):
         if path is not None:
             check_output(path, "--plot", PICTURE_ENDINGS)
     result = _compute_with_bar(find_tolerances, subject, options, jobs)
-    if as_json:
-        click.echo(_to_json(result))
-    else:
-        print_tolerance(Console(), result)
-    if plot is not None and pairs_plot is not None:
-        save(profiles_figure(result), plot, "--plot")
-        if result.pairs:
-            save(pairs_figure(result), pairs_plot, "--plot")
+    _print(result, as_json)
+    if plot is not None:
+        save(result.figure(), plot, "--plot")
+    if pairs_plot is not None:
+        save(result.pairs_figure(), pairs_plot, "--plot")
 
 
 @add_question(RiskOptions, "STUDY|DIR", _plot_option("Draw the sensitivity indices to this file: png, pdf or svg."))

@@ -16,8 +16,8 @@ from safevar_sumo import tolerance
 from safevar_sumo.analysis.evaluator import Evaluator
 from safevar_sumo.analysis.research_questions.case import build_case
 from safevar_sumo.analysis.tolerance import ToleranceOptions, safe_box
-from safevar_sumo.analysis.tolerance.compute import Tolerance, find_tolerances
-from safevar_sumo.analysis.tolerance.render import profiles_figure
+from safevar_sumo.analysis.tolerance.answer import Tolerance
+from safevar_sumo.analysis.tolerance.compute import find_tolerances
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.results import record, solutions_frame
@@ -37,7 +37,7 @@ def test_islands_and_the_safe_interval_around_the_original() -> None:
     assert first.safe[1] <= 6.5
     assert first.unsafe[0][0] - first.safe[1] <= 1.001 * 0.05 / 4096, "a 4096th of the distance of two values"
     assert [pytest.approx(interval, abs=1e-4) for interval in [(6.5, 7.0), (9.0, 10.0)]] == first.unsafe
-    assert first.margins == (pytest.approx(3.0), pytest.approx(6.5, abs=1e-3))
+    assert first.margins == [pytest.approx(3.0), pytest.approx(6.5, abs=1e-3)]
     assert (second.safe, second.unsafe) == ((0.0, 10.0), [])
     assert len(first.profile) > 201
 
@@ -87,7 +87,7 @@ def test_what_cannot_be_simulated_is_neither_safe_nor_unsafe() -> None:
     assert first.safe == (0.0, pytest.approx(5.75, abs=1e-4))
     assert first.not_simulated == [(pytest.approx(5.75, abs=1e-4), pytest.approx(6.75, abs=1e-4))]
     assert first.unsafe == [(pytest.approx(6.75, abs=1e-4), pytest.approx(7, abs=1e-4)), (pytest.approx(9, abs=1e-4), 10.0)]
-    assert first.to_dict()["not_simulated"] == [list(first.not_simulated[0])]
+    assert first.to_dict()["not_simulated"] == first.not_simulated
     assert result.pairs is not None
     assert result.pairs[0].not_simulated_share == pytest.approx(0.1, abs=0.026)
     assert result.pairs[0].unsafe_share == pytest.approx(1.25 / 9, abs=0.06)
@@ -167,4 +167,4 @@ def test_the_promised_record() -> None:
     (nowhere, "dot: the original vehicle"),
     (two_islands, "dot: the original vehicle;\nhatched: unsafe;\nbelow the dashed line: collisions")])
 def test_the_figure_explains_what_it_draws_and_nothing_else(region: Region, expected: str) -> None:
-    assert profiles_figure(of(1, region)).get_supxlabel() == expected
+    assert of(1, region).figure().get_supxlabel() == expected

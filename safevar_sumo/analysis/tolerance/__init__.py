@@ -14,7 +14,7 @@ from safevar_sumo.analysis.subject import Results, answer_question, study_or_cas
 from safevar_sumo.study import StudyLike
 
 if TYPE_CHECKING:
-    from safevar_sumo.analysis.tolerance.compute import Tolerance
+    from safevar_sumo.analysis.tolerance.answer import Tolerance
     from safevar_sumo.metrics import Criterion
     from safevar_sumo.progress import Progress
     from safevar_sumo.workers.evaluation import Pool

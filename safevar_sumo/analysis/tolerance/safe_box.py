@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -32,27 +32,23 @@ MIN_FACTOR = 1e-6
 class SafeBox(NamedTuple):
     """A box around the original, `factor` times as wide as the domain; no setting of a random sample in it is unsafe.
 
-    With `confidence`, at most `unsafe_at_most` of all settings in the box are unsafe or cannot be simulated: `failed` of the `samples`
-    settings could not be simulated, and count as unsafe in that bound. `attempts` boxes were tested. Only `characteristics` vary; the
-    others keep their original values. If no box is safe, `factor` is 0 and the bound is 1.
+    With `confidence`, at most `unsafe_at_most` of all settings in the box are unsafe or cannot be simulated: `failed` of the
+    `samples` settings could not be simulated, and count as unsafe in that bound. `attempts` boxes were tested. Only
+    `characteristics` vary; the others keep their original values. If no box is safe, because the original or a setting
+    arbitrarily near to it is unsafe, `factor` is 0 and the bound is 1.
     """
 
-    factor: float
-    confidence: float
-    samples: int
-    failed: int
-    attempts: int
-    unsafe_at_most: float
-    characteristics: tuple[str, ...]
-
-    def to_dict(self) -> dict[str, Any]:
-        """The entry `joint` of `tolerance --json`."""
-        return {**self._asdict(), "characteristics": list(self.characteristics)}
+    factor: float = 0.0
+    confidence: float = CONFIDENCE
+    samples: int = 0
+    failed: int = 0
+    attempts: int = 0
+    unsafe_at_most: float = 1.0
+    characteristics: tuple[str, ...] = ()
 
 
-def no_safe_box(evaluator: Evaluator, columns: Sequence[int], attempts: int = 0) -> SafeBox:
-    """The result if no box is safe because the original vehicle, or a setting arbitrarily near to the original, is unsafe."""
-    return SafeBox(0.0, CONFIDENCE, 0, 0, attempts, 1.0, tuple(evaluator.characteristics.names[column] for column in columns))
+def names_of(evaluator: Evaluator, columns: Sequence[int]) -> tuple[str, ...]:
+    return tuple(evaluator.characteristics.names[column] for column in columns)
 
 
 def find_safe_box(evaluator: Evaluator, columns: Sequence[int], unsafe: Unsafe, unsafe_settings: FloatArray,
@@ -107,17 +103,15 @@ def find_safe_box(evaluator: Evaluator, columns: Sequence[int], unsafe: Unsafe, 
             attempt += 1
             error_probability = (1 - CONFIDENCE) / 2**attempt
             samples = math.ceil(math.log(error_probability) / math.log1p(-MAX_UNSAFE_SHARE))
-            settings = _random_settings(evaluator, columns, factor, samples, np.random.default_rng((evaluator.study.search.seed, attempt)))
+            rng = np.random.default_rng((evaluator.study.search.seed, attempt))
+            settings = _random_settings(evaluator, columns, factor, samples, rng)
             samples = len(settings)
             unsafe_found, failed = _unsafe_in_box(evaluator, factor, settings, unsafe)
             if not len(unsafe_found):
-                unsafe_at_most = 1.0
-                if failed < samples:
-                    unsafe_at_most = float(scipy.stats.beta.ppf(1 - error_probability, failed + 1, samples - failed))
-                return SafeBox(factor, CONFIDENCE, samples, failed, attempt, unsafe_at_most,
-                               tuple(evaluator.characteristics.names[column] for column in columns))
+                bound = scipy.stats.beta.ppf(1 - error_probability, failed + 1, samples - failed) if failed < samples else 1.0
+                return SafeBox(factor, CONFIDENCE, samples, failed, attempt, float(bound), names_of(evaluator, columns))
         factor = shrunk(factor, unsafe_found)
-    return no_safe_box(evaluator, columns, attempt)
+    return SafeBox(attempts=attempt, characteristics=names_of(evaluator, columns))
 
 
 def _solutions_of_columns(evaluator: Evaluator, columns: Sequence[int], solutions: pd.DataFrame | None) -> FloatArray:

@@ -1,0 +1,223 @@
+"""The answer on tolerances: how far characteristics may go, as JSON, table, sentences and figures."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pandas as pd
+from rich.table import Table
+
+from safevar_sumo.analysis.figures import BLUE, DEGREE_LABEL, FONT, VERMILION, as_formula, escape_dollars, new_panels
+from safevar_sumo.analysis.tolerance.safe_box import SafeBox
+from safevar_sumo.analysis.tolerance.scans import WHOLE_POINT_LOSS, OneAtATimeScan, Pair
+from safevar_sumo.analysis.words import two_decimals
+from safevar_sumo.errors import InputError
+from safevar_sumo.metrics import RATING_POINTS, Unsafe
+from safevar_sumo.protocol.rater import is_rated
+from safevar_sumo.records import Evaluations
+from safevar_sumo.study import SAFETY_DEGREE, Study
+from safevar_sumo.sumo.empty_road import driven_entry
+from safevar_sumo.terminal import WholeTable, constraints_in_words, meanings
+from safevar_sumo.vehicles import Characteristic
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.collections import QuadMesh
+    from matplotlib.figure import Figure
+
+MAX_PAIRS, MAX_PAIRS_DRAWN = 12, 6
+"""Maximum number of pairs in the table and in the figure."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Tolerance:
+    """How far characteristics may go: each by itself (`alone`), two together (`pairs`, None if not requested), and all (`joint`)."""
+
+    study: Study
+    unsafe: Unsafe
+    original: Evaluations
+    alone: list[OneAtATimeScan]
+    pairs: list[Pair] | None
+    joint: SafeBox
+    no_verdict: str = ""
+
+    @property
+    def unsafe_pairs(self) -> list[Pair]:
+        return [pair for pair in self.pairs or [] if pair.nearest is not None]
+
+    @property
+    def verdict(self) -> str:
+        """One sentence on the characteristics and pairs that are unsafe by themselves."""
+        if self.no_verdict:
+            return self.no_verdict
+        if self.unsafe.of(self.original)[0]:
+            return "The original vehicle itself is unsafe."
+        if names := [scan.characteristic.name for scan in self.alone if scan.unsafe]:
+            return f"Unsafe alone, all others as in the original: {', '.join(names)}."
+        if self.unsafe_pairs:
+            pairs = ", ".join(" with ".join(pair.names) for pair in self.unsafe_pairs)
+            return (f"No single characteristic makes it unsafe, but {len(self.unsafe_pairs)} of {len(self.pairs or [])} pairs: "
+                    f"{pairs}.")
+        return f"No single characteristic {'makes' if self.pairs is None else 'and no pair makes'} it unsafe."
+
+    def to_frame(self) -> pd.DataFrame:
+        """One row for each characteristic alone.
+
+        Columns: `characteristic`, `unit`, `original`, `lower` and `upper` of the domain, `safe_from`, `safe_to` [unit],
+        `margin_from`, `margin_to`, the safety degrees there [m], and `unsafe` and `not_simulated`, lists of intervals.
+        """
+        columns = ["characteristic", "unit", "original", "lower", "upper", "safe_from", "safe_to", "margin_from", "margin_to",
+                   "unsafe", "not_simulated"]
+        members = [(scan, scan.characteristic) for scan in self.alone]
+        return pd.DataFrame([(one.name, one.unit, one.original, one.lower, one.upper, *(scan.safe or (None, None)),
+                              *scan.margins, scan.unsafe, scan.not_simulated) for scan, one in members], columns=columns)
+
+    def to_dict(self) -> dict[str, Any]:
+        """The JSON of `tolerance`."""
+        return {"study": self.study.name, **driven_entry(self.no_verdict), "unsafe": str(self.unsafe),
+                "alone": [scan.to_dict() for scan in self.alone],
+                "pairs": [pair.to_dict() for pair in self.pairs or []], "joint": self.joint._asdict()}
+
+    def __repr__(self) -> str:
+        return f"<Tolerance of {self.study.name}, unsafe {self.unsafe}: {self.verdict}>"
+
+    def sentences(self) -> Iterator[str | Table]:
+        """The verdict, the limits of each characteristic by itself, the worst pairs, and the safe box."""
+        yield (f"Unsafe: {self.unsafe.description}. The original vehicle: {self.original.outcome[0]}, "
+               f"SD {two_decimals(self.original.f_safe[0])}.")
+        if not self.no_verdict:
+            yield self.verdict
+        yield from constraints_in_words(self.study)
+        yield _scan_table(self.alone)
+        yield "* the end of the domain: values beyond it were not simulated."
+        yield meanings(scan.characteristic for scan in self.alone)
+        worst = sorted(self.unsafe_pairs, key=lambda pair: -pair.unsafe_share)
+        table = WholeTable("pair", right=("unsafe share", "nearest unsafe setting"),
+                           title=f"Pairs with unsafe settings: {len(worst)} of {len(self.pairs or [])}")
+        for pair in worst[:MAX_PAIRS]:
+            nearest = ", ".join(f"{name} {value:.5g}" for name, value in zip(pair.names, pair.nearest or (), strict=True))
+            lost = pair.not_simulated_share
+            failed = f" ({100 * lost:.1f} % could not be simulated)" if lost else ""
+            table.add_row(" with ".join(pair.names), f"{100 * pair.unsafe_share:.1f} %{failed}", nearest)
+        yield table
+        if len(worst) > MAX_PAIRS:
+            yield f"... and {len(worst) - MAX_PAIRS} more (--json has all)."
+        yield from map(_losses_in_words, self.alone) if is_rated(self.study) else [self._box_in_words()]
+
+    def _box_in_words(self) -> str:
+        box = self.joint
+        subset = len(box.characteristics) < len(self.study.vehicle.characteristics)
+        subject = f"{', '.join(box.characteristics)} together, the others as in the original" if subset else "All together"
+        if not box.factor:
+            return f"{subject}: no box around the original is safe."
+        failed = f"; {box.failed} of them could not be simulated and count as unsafe in what follows" if box.failed else ""
+        which = f"all settings in the box{' that satisfy the constraints' if self.study.constraints else ''}"
+        return (f"{subject}: each may go {100 * box.factor:.1f} % of the way from its original value to either end of its "
+                f"domain. None of {box.samples} settings drawn at random in this box is unsafe{failed}. With "
+                f"{100 * box.confidence:.0f} % confidence at most {100 * box.unsafe_at_most:.2f} % of {which} are unsafe"
+                f"{' or cannot be simulated' if box.failed else ''}.")
+
+    def figure(self) -> Figure:
+        """The safety degree, or points, over each domain; the original is marked, unsafe intervals are shaded."""
+        column = RATING_POINTS.name if is_rated(self.study) else SAFETY_DEGREE
+        title = f"{self.study.name}: one characteristic at a time (unsafe: {self.unsafe})"
+        figure, axes = new_panels(title, len(self.alone), 4, (2.3, 1.75), min_width=4.6, title_height=1.0)
+        degrees = np.concatenate([scan.profile[column].dropna() for scan in self.alone])
+        margin = 0.05 * (np.ptp(degrees) if degrees.size else 0.0) or 0.5
+        for axis, scan in zip(axes, self.alone, strict=True):
+            _draw_profile(axis, scan, column)
+            if degrees.size:  # equal for all panels, so that steep profiles stand out
+                axis.set_ylim(degrees.min() - margin, degrees.max() + margin)
+        figure.supylabel(DEGREE_LABEL if column == SAFETY_DEGREE else RATING_POINTS.title, fontsize=FONT)
+        notes = {"dot: the original vehicle": True, "hatched: unsafe": any(scan.unsafe for scan in self.alone),
+                 "below the dashed line: collisions": column == SAFETY_DEGREE and bool(degrees.size) and degrees.min() <= 0}
+        figure.supxlabel(";\n".join(words for words, is_drawn in notes.items() if is_drawn), fontsize=FONT)
+        return figure
+
+    def pairs_figure(self) -> Figure:
+        """The planes of the worst pairs: with the largest unsafe share, or the lowest safety degree where nothing is unsafe.
+
+        Raises
+        ------
+        InputError
+            If the result has no pairs.
+        """
+        if not self.pairs:
+            raise InputError("pairs", "there is no pair to draw", "at least two characteristics, evaluated in pairs")
+        worst = sorted(self.pairs, key=lambda pair: (-pair.unsafe_share, np.nanmin(pair.safety_degree)))[:MAX_PAIRS_DRAWN]
+        degrees = np.stack([pair.safety_degree for pair in worst])
+        title = f"{self.study.name}: the worst pairs (unsafe: {self.unsafe})"
+        figure, axes = new_panels(title, len(worst), 3, (3.0, 2.4), min_width=4.6, title_height=1.1)
+        limits = float(np.nanmin(degrees)), float(np.nanmax(degrees))
+        colours = [_draw_plane(axis, pair, limits) for axis, pair in zip(axes, worst, strict=True)]
+        bar = figure.colorbar(colours[-1], ax=figure.axes, shrink=0.9)
+        bar.set_label(DEGREE_LABEL, fontsize=FONT)
+        bar.ax.tick_params(labelsize=FONT)
+        figure.supxlabel("dot: the original vehicle; hatched: unsafe;\ncross: the unsafe setting nearest to the original",
+                         fontsize=FONT)
+        return figure
+
+
+def _scan_table(scans: list[OneAtATimeScan]) -> WholeTable:
+    states = {"unsafe": "unsafe", "not_simulated": "could not be simulated", "infeasible": "violates a constraint"}
+    shown = [state for state in states if state == "unsafe" or any(scan.intervals(state) for scan in scans)]
+    table = WholeTable("characteristic", title="Each alone, all others as in the original",
+                       right=("original", "safe from", "to", "SD at the ends", *map(states.__getitem__, shown)))
+    for scan in scans:
+        one = scan.characteristic
+        limits = ["nowhere"] * 2 if scan.safe is None else [_limit_in_words(one, value) for value in scan.safe]
+        margins = "-" if scan.safe is None else " / ".join(map(two_decimals, scan.margins))
+        intervals = (", ".join(f"{low:.5g} to {high:.5g}" for low, high in scan.intervals(state)) for state in shown)
+        table.add_row(f"{one.name} [{one.unit}]", f"{one.original:g}", *limits, margins,
+                      *(text or "nowhere" for text in intervals))
+    return table
+
+
+def _limit_in_words(characteristic: Characteristic, value: float) -> str:
+    """A value with its change from the original, and a star if it is an end of the domain."""
+    at_end = "*" if value in (characteristic.lower, characteristic.upper) else ""
+    return f"{value:.5g} ({(value - characteristic.original) / abs(characteristic.original):+.1%}){at_end}"
+
+
+def _losses_in_words(scan: OneAtATimeScan) -> str:
+    """A sentence on the values at which a characteristic alone costs points."""
+    characteristic, any_loss, whole_point = scan.characteristic, scan.first_loss(), scan.first_loss(WHOLE_POINT_LOSS)
+    if any_loss is None:
+        return f"{characteristic.name}: costs no points anywhere in its domain."
+    first = ("it never costs a whole point" if whole_point is None else
+             f"the first point is lost at {whole_point:.5g}{characteristic.suffix}")
+    return (f"{characteristic.name}: points are lost from {any_loss:.5g}{characteristic.suffix} on; {first}; the minimum is "
+            f"{min((scan.points or {}).values()):.2f} points.")
+
+
+def _draw_profile(axis: Axes, scan: OneAtATimeScan, column: str) -> None:
+    characteristic, profile = scan.characteristic, scan.profile.set_index("value")[column]
+    axis.plot(profile, color=BLUE, linewidth=1.2)
+    for low, high in scan.unsafe:
+        axis.axvspan(low, high, facecolor=VERMILION, alpha=0.35, hatch="////", edgecolor="white", linewidth=0)
+    axis.plot(characteristic.original, profile[characteristic.original], marker="o", color="black", markersize=4)
+    if column == SAFETY_DEGREE and profile.min() <= 0:
+        axis.axhline(0, color="black", linewidth=0.8, linestyle="--")
+    axis.set_xlim(characteristic.lower, characteristic.upper)
+    axis.set_title(escape_dollars(characteristic.name), fontsize=FONT)
+    axis.set_xlabel(f"[{as_formula(characteristic.unit)}]")
+    axis.locator_params(axis="x", nbins=4)
+
+
+def _draw_plane(axis: Axes, pair: Pair, limits: tuple[float, float]) -> QuadMesh:
+    """Draw one plane, with the first characteristic on the horizontal axis."""
+    colours = axis.pcolormesh(*pair.values, pair.safety_degree.T, cmap="cividis", vmin=limits[0], vmax=limits[1], shading="nearest")
+    if pair.unsafe.any():
+        axis.contourf(*pair.values, pair.unsafe.T.astype(float), levels=[0.5, 1.5], colors="none", hatches=["////"])
+        axis.contour(*pair.values, pair.unsafe.T.astype(float), levels=[0.5], colors=VERMILION, linewidths=1.2)
+    first, second = pair.characteristics
+    axis.plot(first.original, second.original, marker="o", color="white", markeredgecolor="black", markersize=5)
+    if pair.nearest is not None:
+        axis.plot(*pair.nearest, marker="X", color=VERMILION, markeredgecolor="white", markersize=7)
+    xlabel, ylabel = (f"{escape_dollars(one.name)} [{as_formula(one.unit)}]" for one in pair.characteristics)
+    axis.set(xlabel=xlabel, ylabel=ylabel, xlim=(first.lower, first.upper), ylim=(second.lower, second.upper))
+    axis.grid(visible=False)
+    return colours

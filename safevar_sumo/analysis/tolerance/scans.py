@@ -1,0 +1,261 @@
+"""Scans of the domains of characteristics one at a time, and of the plane of two; all others keep their original values."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Generator, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from safevar_sumo.analysis.evaluator import Evaluator
+from safevar_sumo.metrics import RATING_POINTS, Unsafe
+from safevar_sumo.protocol.rater import is_rated
+from safevar_sumo.records import BoolArray, FloatArray, finite_or_none
+from safevar_sumo.study import SAFETY_DEGREE
+from safevar_sumo.vehicles import Characteristic
+
+SCAN_VALUES, RATED_SCAN_VALUES = 201, 33
+"""Number of values over the domain, besides the original; fewer in a rated study: each takes a whole test matrix."""
+PARTS_PER_ROUND, ROUNDS, RATED_ROUNDS = 8, 4, 1
+"""Parts into which a round divides each interval with a change of state; rounds, and rounds in a rated study."""
+WHOLE_POINT_LOSS = 1 - 1e-6
+"""A loss of more rating points than this counts as a whole point."""
+POINT_ROUNDING = 1e-9
+"""A loss of at most so many rating points is a rounding error."""
+GRID_VALUES = 21
+"""Number of values of each of two characteristics, evenly spaced over its domain, ends included."""
+PARTS_PER_SIDE, PLANE_ROUNDS, MAX_SQUARES = 4, 4, 12
+"""Search for the nearest unsafe setting of a plane: number of parts of a divided square's side, of rounds (down to a
+5120th of the domain), and maximum number of squares divided in each round."""
+Interval = tuple[float, float]
+_TRAPEZOIDAL_WEIGHTS = np.outer(*[np.where(np.isin(np.arange(GRID_VALUES), (0, GRID_VALUES - 1)), 0.5, 1.0)] * 2)
+
+
+@dataclass(frozen=True, kw_only=True)
+class OneAtATimeScan:
+    """The scan of one characteristic.
+
+    Attributes
+    ----------
+    profile
+        Columns `value` [unit], `safety_degree` [m, or -m/s], `state` ("safe", "unsafe", "not_simulated" or "infeasible"),
+        and in a rated study `rating_points`, in the order of the values, which are closer together where the state changes.
+    """
+
+    characteristic: Characteristic
+    profile: pd.DataFrame
+
+    def intervals(self, state: str) -> list[Interval]:
+        """All intervals of a state, each from its first to its last value."""
+        states = self.profile["state"]
+        sections = self.profile["value"][states == state].groupby((states != states.shift()).cumsum())
+        return list(zip(sections.min().tolist(), sections.max().tolist(), strict=True))
+
+    @property
+    def safe(self) -> Interval | None:
+        """The safe interval around the original; None if the original itself is unsafe."""
+        original = self.characteristic.original
+        return next((ends for ends in self.intervals("safe") if ends[0] <= original <= ends[1]), None)
+
+    @property
+    def unsafe(self) -> list[Interval]:
+        """All unsafe intervals."""
+        return self.intervals("unsafe")
+
+    @property
+    def not_simulated(self) -> list[Interval]:
+        """All intervals that could not be simulated."""
+        return self.intervals("not_simulated")
+
+    @property
+    def margins(self) -> list[float | None]:
+        """Safety degrees at the ends of the safe interval [m]."""
+        degrees = self.profile.set_index("value")[SAFETY_DEGREE]
+        return [None, None] if self.safe is None else [finite_or_none(degrees[end]) for end in self.safe]
+
+    @property
+    def points(self) -> dict[float, float] | None:
+        """The vehicle's rating points at each value, in ascending order; None if the study is not rated."""
+        if RATING_POINTS.name not in self.profile:
+            return None
+        return dict(zip(self.profile["value"].tolist(), self.profile[RATING_POINTS.name].tolist(), strict=True))
+
+    def first_loss(self, points: float = 0.0) -> float | None:
+        """The value nearest to the original that loses more than `points` rating points; None if no value does."""
+        kept, original = self.points or {}, self.characteristic.original
+        limit = kept.get(original, math.nan) - points - POINT_ROUNDING
+        return min((value for value in kept if kept[value] < limit), key=lambda value: abs(value - original), default=None)
+
+    def to_dict(self) -> dict[str, Any]:
+        """An entry of `alone` in `tolerance --json`; in a rated study with points, and where points are first lost."""
+        rating_entries = {} if self.points is None else {
+            "points": [list(pair) for pair in self.points.items()], "any_lost": self.first_loss(),
+            "first_point_lost": self.first_loss(WHOLE_POINT_LOSS)}
+        infeasible = self.intervals("infeasible")
+        return {**rating_entries, "characteristic": self.characteristic.name, "unit": self.characteristic.unit,
+                "original": self.characteristic.original, "safe": self.safe, "unsafe": self.unsafe,
+                "not_simulated": self.not_simulated, **({"infeasible": infeasible} if infeasible else {})}
+
+
+def scan(evaluator: Evaluator, columns: Sequence[int], unsafe: Unsafe) -> list[OneAtATimeScan]:
+    """Scan the domains of some characteristics, one at a time."""
+    scanned, rated = [evaluator.characteristics.members[column] for column in columns], is_rated(evaluator.study)
+    number = RATED_SCAN_VALUES if rated else SCAN_VALUES
+    values = [np.union1d(np.linspace(one.lower, one.upper, number), one.original) for one in scanned]
+    profiles = _evaluate_profiles(evaluator, columns, values, unsafe)
+    for _ in range(RATED_ROUNDS if rated else ROUNDS):
+        values = [_values_between_states(profile) for profile in profiles]
+        if not any(map(len, values)):
+            break
+        finer_profiles = _evaluate_profiles(evaluator, columns, values, unsafe)
+        profiles = [pd.concat(both, ignore_index=True).sort_values("value", ignore_index=True)
+                    for both in zip(profiles, finer_profiles, strict=True)]
+    return [OneAtATimeScan(characteristic=one, profile=profile) for one, profile in zip(scanned, profiles, strict=True)]
+
+
+def _values_between_states(profile: pd.DataFrame) -> FloatArray:
+    """New values between neighbouring values of different states."""
+    values, states = profile["value"].to_numpy(), profile["state"].to_numpy()
+    rows = np.flatnonzero(states[1:] != states[:-1])[:, np.newaxis]
+    inner = values[rows] + (values[rows + 1] - values[rows]) * np.arange(1, PARTS_PER_ROUND) / PARTS_PER_ROUND
+    return np.setdiff1d(inner, values)
+
+
+def _evaluate_profiles(evaluator: Evaluator, columns: Sequence[int], values: Sequence[FloatArray],
+                       unsafe: Unsafe) -> list[pd.DataFrame]:
+    """The profile of each characteristic at its `values`."""
+    original, ends = evaluator.characteristics.original, np.cumsum([len(its_values) for its_values in values])[:-1]
+    settings = np.concatenate([_settings_with(original, [column], its_values[:, np.newaxis])
+                               for column, its_values in zip(columns, values, strict=True)])
+    evaluations = evaluator.evaluate(settings, "one characteristic at a time")
+    state = np.select([evaluations.infeasible, ~evaluations.valid, unsafe.of(evaluations)],
+                      ["infeasible", "not_simulated", "unsafe"], "safe")
+    points = {name: degrees for name, degrees in evaluations.metrics.items() if name == RATING_POINTS.name}
+    frame = pd.DataFrame({"value": np.concatenate(values), SAFETY_DEGREE: evaluations.f_safe, "state": state, **points})
+    return [frame.iloc[rows].reset_index(drop=True) for rows in np.split(np.arange(len(frame)), ends)]
+
+
+def _settings_with(original: FloatArray, columns: Sequence[int], values: FloatArray) -> FloatArray:
+    """The original with K rows of values in some columns, shape (K, n)."""
+    settings = np.tile(original, (len(values), 1))
+    settings[:, list(columns)] = values
+    return settings
+
+
+@dataclass(frozen=True, kw_only=True)
+class Pair:
+    """The plane of two characteristics.
+
+    Attributes
+    ----------
+    values
+        Values of both characteristics, shape (2, GRID_VALUES), each in its unit.
+    safety_degree, unsafe, valid, infeasible
+        Evaluations on the grid, shape (GRID_VALUES, GRID_VALUES), with the first characteristic on axis 0; safety degrees
+        in m, or -m/s. A setting that is not valid could not be simulated, or violates a constraint (`infeasible`), and is
+        neither safe nor unsafe.
+    nearest
+        The two values of the unsafe setting that is nearest to the original by distance in domain widths, exact to a 5120th
+        of them; None if no setting of the grid is unsafe. Unsafe settings that lie only between safe values of the grid are
+        not found.
+    """
+
+    characteristics: tuple[Characteristic, ...]
+    values: FloatArray
+    safety_degree: FloatArray
+    unsafe: BoolArray
+    valid: BoolArray
+    infeasible: BoolArray
+    nearest: tuple[float, float] | None
+
+    @property
+    def unsafe_share(self) -> float:
+        """Unsafe share of the simulated part of the plane, by the trapezoidal rule."""
+        weight = np.sum(_TRAPEZOIDAL_WEIGHTS * self.valid)
+        return float(np.sum(_TRAPEZOIDAL_WEIGHTS * self.unsafe) / weight) if weight else 0.0
+
+    @property
+    def not_simulated_share(self) -> float:
+        """Share of the plane that could not be simulated, by the same rule."""
+        lost = ~self.valid & ~self.infeasible
+        return float(np.sum(_TRAPEZOIDAL_WEIGHTS * lost) / np.sum(_TRAPEZOIDAL_WEIGHTS))
+
+    @property
+    def names(self) -> list[str]:
+        return [characteristic.name for characteristic in self.characteristics]
+
+    def to_dict(self) -> dict[str, Any]:
+        """The entry of `pairs` in `tolerance --json`."""
+        return {"characteristics": self.names, "unsafe_share": self.unsafe_share,
+                "not_simulated_share": self.not_simulated_share,
+                "nearest": None if self.nearest is None else dict(zip(self.names, self.nearest, strict=True))}
+
+
+def scan_pairs(evaluator: Evaluator, columns: Sequence[int], unsafe: Unsafe) -> list[Pair]:
+    """The plane of every pair of characteristics, with the plane's unsafe setting nearest to the original."""
+    characteristics, planes = evaluator.characteristics, [list(plane) for plane in combinations(columns, 2)]
+    axes = np.linspace(characteristics.lower, characteristics.upper, GRID_VALUES).T
+    grids = [np.stack(np.meshgrid(*axes[plane], indexing="ij"), axis=-1).reshape(-1, 2) for plane in planes]
+    settings = [_settings_with(characteristics.original, plane, grid) for plane, grid in zip(planes, grids, strict=True)]
+    evaluations = evaluator.evaluate(np.concatenate(settings), "two characteristics at a time")
+    shape = len(planes), GRID_VALUES, GRID_VALUES
+    degrees, is_unsafe = evaluations.f_safe.reshape(shape), unsafe.of(evaluations).reshape(shape)
+    valid, infeasible = evaluations.valid.reshape(shape), evaluations.infeasible.reshape(shape)
+    ends = [(values[plane] for values in (characteristics.original, characteristics.lower, characteristics.upper))
+            for plane in planes]
+    searches = [_search_nearest(grid, *its_ends) for grid, its_ends in zip(is_unsafe, ends, strict=True)]
+    answers: dict[int, BoolArray | None] = dict.fromkeys(range(len(planes)))
+    nearest: list[tuple[float, float] | None] = [None] * len(planes)
+    while answers:
+        requests = {}
+        for number, answer in answers.items():
+            try:
+                requests[number] = searches[number].send(answer)
+            except StopIteration as stop:
+                nearest[number] = stop.value
+        answers = {}
+        if requests:
+            settings = [_settings_with(characteristics.original, planes[k], values) for k, values in requests.items()]
+            found = unsafe.of(evaluator.evaluate(np.concatenate(settings), "nearest unsafe settings"))
+            answers = dict(zip(requests, np.split(found, np.cumsum(list(map(len, settings)))[:-1]), strict=True))
+    return [Pair(characteristics=tuple(characteristics.members[column] for column in plane), values=axes[plane],
+                 safety_degree=degrees[k], unsafe=is_unsafe[k], valid=valid[k], infeasible=infeasible[k], nearest=nearest[k])
+            for k, plane in enumerate(planes)]
+
+
+def _search_nearest(grid: BoolArray, original: FloatArray, lower: FloatArray, upper: FloatArray
+                    ) -> Generator[FloatArray, BoolArray | None, tuple[float, float] | None]:
+    """Find the unsafe setting of a plane nearest to the original, from where its grid is unsafe; distances are in domain widths.
+
+    Yields values of the two characteristics, shape (K, 2), and is sent which are unsafe. A branch and bound search: a square
+    with an unsafe corner is divided into smaller squares if it comes nearer to the original than the nearest unsafe setting
+    so far; each round divides the `MAX_SQUARES` nearest squares.
+    """
+    def distances(offset: FloatArray) -> FloatArray:
+        return np.asarray(np.sqrt(np.sum((offset / width) ** 2, axis=-1)))
+
+    width = upper - lower
+    size = width / (GRID_VALUES - 1)
+    values = lower + np.argwhere(np.ones_like(grid)) * size
+    steps = np.argwhere(np.ones((PARTS_PER_SIDE + 1,) * 2))
+    nearest, least = None, math.inf
+    corners, grids = lower[np.newaxis], grid[np.newaxis]
+    for round_number in range(PLANE_ROUNDS + 1):
+        found = values[grids.ravel()]
+        if len(found) and (closest := np.min(distances(found - original))) < least:
+            least, nearest = closest, found[np.argmin(distances(found - original))]
+        square, i, j = np.nonzero(grids[:, 1:, 1:] | grids[:, :-1, 1:] | grids[:, 1:, :-1] | grids[:, :-1, :-1])
+        corners = corners[square] + np.stack([i, j], axis=1) * size
+        offset = corners - original
+        gaps = distances(np.maximum(np.maximum(offset, -offset - size), 0.0))
+        squares = [k for k in np.argsort(gaps, kind="stable") if gaps[k] < least][:MAX_SQUARES]
+        if round_number == PLANE_ROUNDS or not squares:
+            break
+        corners, size = corners[squares], size / PARTS_PER_SIDE
+        values = np.minimum(corners[:, np.newaxis] + steps * size, lower + width).reshape(-1, 2)
+        grids = np.asarray((yield values)).reshape(-1, PARTS_PER_SIDE + 1, PARTS_PER_SIDE + 1)
+    return None if nearest is None else (float(nearest[0]), float(nearest[1]))
