@@ -8,7 +8,7 @@ from .analysis.opinion.result import Opinions as Opinions
 from .analysis.rating import rating as rating
 from .analysis.rating.compute import Rating as Rating
 from .analysis.risk import risk as risk
-from .analysis.risk.compute import Risk as Risk
+from .analysis.risk.answer import Risk as Risk
 from .analysis.rules import rules as rules
 from .analysis.rules.compute import Rule as Rule
 from .analysis.rules.compute import Rules as Rules

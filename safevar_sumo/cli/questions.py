@@ -136,7 +136,6 @@ def risk(source: str, point: str | None, jobs: int | None, as_json: bool, plot: 
     """Estimate how likely an unsafe outcome is if vehicles vary as defined in STUDY's [variation], and which characteristics decide it."""
     from safevar_sumo.analysis.figures import save
     from safevar_sumo.analysis.risk.compute import estimate_risk
-    from safevar_sumo.analysis.risk.render import print_risk, sensitivity_figure
 
     options, subject = RiskOptions(**values), load_results_or_study(source, point)
     study = study_in(subject)
@@ -151,12 +150,9 @@ def risk(source: str, point: str | None, jobs: int | None, as_json: bool, plot: 
         click.echo("note: no sensitivity indices: they are not defined for correlated characteristics", err=True)
     if result.errors:
         click.echo(f"warning: {result.errors} vehicles could not be simulated and are left out", err=True)
-    if as_json:
-        click.echo(_to_json(result))
-    else:
-        print_risk(Console(), result)
+    _print(result, as_json)
     if plot is not None:
-        save(sensitivity_figure(result), plot, "--plot")
+        save(result.figure(), plot, "--plot")
 
 
 @add_question(RulesOptions, "STUDY|DIR")

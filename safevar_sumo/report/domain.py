@@ -7,7 +7,8 @@ from typing import Any
 
 from markupsafe import Markup
 
-from safevar_sumo.analysis.risk.compute import FLEET_VEHICLES, estimate_risk
+from safevar_sumo.analysis.risk.answer import FLEET_VEHICLES
+from safevar_sumo.analysis.risk.compute import estimate_risk
 from safevar_sumo.analysis.rules.compute import RULES_NOTE, find_rules, rule_in_words
 from safevar_sumo.analysis.tolerance.compute import find_tolerances
 from safevar_sumo.analysis.words import number_of

@@ -19,7 +19,7 @@ from safevar_sumo.analysis.opinion import OpinionOptions
 from safevar_sumo.analysis.options import Options
 from safevar_sumo.analysis.research_questions.case import Case, load_cases
 from safevar_sumo.analysis.risk import RiskOptions
-from safevar_sumo.analysis.risk.sensitivity import BASE_POINTS
+from safevar_sumo.analysis.risk.variation import BASE_POINTS
 from safevar_sumo.analysis.rules import RulesOptions
 from safevar_sumo.analysis.subject import at_point, changes_since
 from safevar_sumo.analysis.tolerance import ToleranceOptions

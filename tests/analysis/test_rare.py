@@ -13,7 +13,7 @@ import scipy
 
 from safevar_sumo import risk
 from safevar_sumo.analysis.risk import compute
-from safevar_sumo.analysis.risk.compute import Risk
+from safevar_sumo.analysis.risk.answer import Risk
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.study.variation import Uniform

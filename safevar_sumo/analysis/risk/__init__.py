@@ -14,7 +14,7 @@ from safevar_sumo.errors import InputError, unknown_name
 from safevar_sumo.study import StudyLike
 
 if TYPE_CHECKING:
-    from safevar_sumo.analysis.risk.compute import Risk
+    from safevar_sumo.analysis.risk.answer import Risk
     from safevar_sumo.metrics import Criterion
     from safevar_sumo.progress import Progress
     from safevar_sumo.workers.evaluation import Pool

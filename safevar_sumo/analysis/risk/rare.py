@@ -9,13 +9,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import scipy
 
 from safevar_sumo.analysis.evaluator import Evaluator
+from safevar_sumo.analysis.risk.answer import Estimate
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray
@@ -58,20 +58,6 @@ class RareMethodError(Exception):
     """A method for rare failures does not find its way to a failure; the text says why."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Estimate:
-    """A probability, its coefficient of variation and interval, the most probable failure in standard normal space, and a remark."""
-
-    probability: float
-    coefficient_of_variation: float
-    interval: tuple[float, float]
-    failures: int
-    errors: int
-    simulations: int
-    design_point: FloatArray | None
-    remark: str
-
-
 class Response:
     """The response g(u) at a point u of standard normal space, below 0 where the vehicle is unsafe; counts simulations, stores failures."""
 
@@ -88,6 +74,13 @@ class Response:
     def failure_points(self) -> FloatArray:
         """Distinct points of unsafe vehicles, shape (k, n)."""
         return np.unique(np.concatenate([np.zeros((0, self.dimensions)), *self._failure_batches]), axis=0)
+
+    def values_at(self, point: FloatArray | None) -> dict[str, float] | None:
+        """The values of the vehicle at a point by characteristic."""
+        if point is None:
+            return None
+        setting = self._settings_of(point[np.newaxis])[0].tolist()
+        return dict(zip(self._evaluator.characteristics.names, setting, strict=True))
 
     def __call__(self, points: Any) -> FloatArray:
         """The response at points, shape (N, n)."""
@@ -160,20 +153,22 @@ def estimate_rare(response: Response, method: str, confidence: float, seed: int)
             if completed == REPEATS and method == "subset_simulation" and np.mean(probabilities) < VERY_RARE_BELOW:
                 repeats = VERY_RARE_REPEATS
                 response.expected_simulations = response.simulations * repeats // REPEATS
-    mean = float(np.mean(probabilities))
-    if mean <= 0:
-        return Estimate(probability=0.0, coefficient_of_variation=math.nan, interval=(0.0, MIN_PROBABILITY),
-                        failures=response.failure_count, errors=response.errors, simulations=response.simulations, design_point=None,
-                        remark="no failure was found: either there is none, or the response does not lead to it")
-    spread = float(np.std(probabilities, ddof=1)) / mean / math.sqrt(repeats)
-    variation = max(spread, INFLATION * math.sqrt(float(np.mean(np.square(variations))) / repeats))
-    quantile = float(scipy.stats.t.ppf((1 + confidence) / 2, repeats + PRIOR_DEGREES))
-    factor = math.exp(quantile * math.sqrt(math.log1p(variation**2)))
-    rng = np.random.default_rng(seed)
-    remark = _remark_on_islands(response, thresholds, rng)
-    return Estimate(probability=mean, coefficient_of_variation=variation, interval=(mean / factor, min(mean * factor, 1.0)),
-                    failures=response.failure_count, errors=response.errors, design_point=_find_design_point(response, rng), remark=remark,
-                    simulations=response.simulations)
+    mean, design_point = float(np.mean(probabilities)), None
+    variation, interval, rng = math.nan, (0.0, MIN_PROBABILITY), np.random.default_rng(seed)
+    remark = "no failure was found: either there is none, or the response does not lead to it"
+    if mean > 0:
+        spread = float(np.std(probabilities, ddof=1)) / mean / math.sqrt(repeats)
+        variation = max(spread, INFLATION * math.sqrt(float(np.mean(np.square(variations))) / repeats))
+        quantile = float(scipy.stats.t.ppf((1 + confidence) / 2, repeats + PRIOR_DEGREES))
+        factor = math.exp(quantile * math.sqrt(math.log1p(variation**2)))
+        interval = (mean / factor, min(mean * factor, 1.0))
+        remark = _remark_on_islands(response, thresholds, rng)
+    failures, errors = response.failure_count, response.errors  # without those around the design point
+    if mean > 0:
+        design_point = response.values_at(_find_design_point(response, rng))
+    return Estimate(probability=max(mean, 0.0), coefficient_of_variation=variation, interval=interval,
+                    failures=failures, errors=errors, simulations=response.simulations,
+                    method=method, design_point=design_point, remark=remark)
 
 
 def _failure_event(ot: Any, response: Callable[[Any], FloatArray], dimensions: int) -> Any:
