@@ -158,12 +158,9 @@ def risk(source: str, point: str | None, jobs: int | None, as_json: bool, plot: 
 @add_question(RulesOptions, "STUDY|DIR")
 def rules(source: str, point: str | None, jobs: int | None, as_json: bool, **values: Any) -> None:
     """Find rules, in physical units, that describe the unsafe settings of STUDY, from evenly spread settings instead of a search."""
-    from safevar_sumo.analysis.rules.compute import find_rules, print_rules
+    from safevar_sumo.analysis.rules.compute import find_rules
 
     result = _compute_with_bar(find_rules, load_results_or_study(source, point), RulesOptions(**values), jobs)
-    if not as_json:
-        print_rules(Console(), result)
-        return
-    if result.remark:
+    if as_json and result.remark:
         click.echo(f"note: {result.remark}", err=True)
-    click.echo(_to_json(result))
+    _print(result, as_json)

@@ -9,7 +9,7 @@ from markupsafe import Markup
 
 from safevar_sumo.analysis.risk.answer import FLEET_VEHICLES
 from safevar_sumo.analysis.risk.compute import estimate_risk
-from safevar_sumo.analysis.rules.compute import RULES_NOTE, find_rules, rule_in_words
+from safevar_sumo.analysis.rules.compute import RULES_NOTE, find_rules
 from safevar_sumo.analysis.tolerance.compute import find_tolerances
 from safevar_sumo.analysis.words import number_of
 from safevar_sumo.metrics import Unsafe
@@ -50,7 +50,7 @@ def make_rules_section(data: ReportInput, jobs: int | None, progress: Progress) 
     def compute() -> Section:
         result = find_rules(data.case, data.options["rules"], jobs=jobs, progress=progress)
         significant = [rule for rule in result.rules if rule.is_denser_than(result.unsafe_share)]
-        words = [superscript_powers(rule_in_words(rule, data.case.characteristics, result.unsafe)) for rule in significant]
+        words = [superscript_powers(rule.in_words(data.case.characteristics, result.unsafe)) for rule in significant]
         omitted_rules = number_of(len(result.rules) - len(significant), "rule")
         remark = (result.remark and f"{result.remark}.") if len(significant) == len(result.rules) else (
             f"Left out: {omitted_rules} that may be due to chance, as few vehicles were simulated; the command rules simulates more.")

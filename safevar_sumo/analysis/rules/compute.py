@@ -8,13 +8,13 @@ then loses the conditions that do not make it denser.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import pandas as pd
-from rich.console import Console
+from rich.table import Table
 
 from safevar_sumo.analysis.evaluator import CONFIDENCE, clopper_pearson, open_evaluator
 from safevar_sumo.analysis.research_questions.case import Case
@@ -26,7 +26,7 @@ from safevar_sumo.progress import Progress, show_no_progress
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.study import Study
 from safevar_sumo.sumo.empty_road import summary_entry
-from safevar_sumo.terminal import print_constraints, print_heading, print_meanings, print_text
+from safevar_sumo.terminal import constraints_in_words, meanings
 from safevar_sumo.vehicles import Characteristic, CharacteristicSet
 from safevar_sumo.workers.evaluation import Pool
 
@@ -41,8 +41,6 @@ RULES_NOTE = ("Shares of vehicles that did not form the rules. In a rule all cha
 """What the shares of rules are shares of."""
 LIMIT_DIGITS = 3
 """Limits are rounded to this many digits of the domain's width."""
-Limits = dict[int, tuple[float | None, float | None]]
-"""Lower and upper limit by column; None if there is no such limit."""
 
 
 @dataclass(frozen=True)
@@ -85,6 +83,17 @@ class Rule:
         """Whether the density is significantly above a share; always true of a rule without limits."""
         return not self.limits or (self.density_interval is not None and self.density_interval[0] > share)
 
+    def in_words(self, characteristics: CharacteristicSet, unsafe: Unsafe) -> str:
+        """Itself with its shares: `mass above 2500 kg, the others anywhere: collides in 92 % (..), covers 61 % (..)`."""
+        others = ", the others anywhere" if 0 < len(self.limits) < len(characteristics) else ""
+        conditions = [_condition_in_words(characteristic, *self.limits[characteristic.name])
+                      for characteristic in characteristics if characteristic.name in self.limits]
+        shares = [f"{word} -" if share is None or interval is None else
+                  f"{word} {100 * share:.0f} % ({100 * interval[0]:.0f} % to {100 * interval[1]:.0f} %)"
+                  for word, share, interval in ((f"{unsafe.in_words} in", self.density, self.density_interval),
+                                                ("covers", self.coverage, self.coverage_interval))]
+        return f"{join_phrases(conditions) if conditions else 'everywhere'}{others}: {', '.join(shares)}"
+
     def to_dict(self) -> dict[str, Any]:
         """An entry of `rules --json`."""
         return {
@@ -125,6 +134,28 @@ class Rules:
         share = f"{self.unsafe_share:.2%} of {self.samples}"
         return f"<Rules of {self.study.name}, unsafe {self.unsafe}: {share} settings, {len(self.rules)} rules>"
 
+    def sentences(self) -> Iterator[str | Table]:
+        """Every rule with its density and coverage."""
+        characteristics, (low, high) = CharacteristicSet.of(self.study.vehicle.characteristics), self.unsafe_interval
+        yield (f"Unsafe: {self.unsafe.description}; {100 * self.unsafe_share:.2f} % of {self.samples} vehicles drawn evenly over "
+               f"the whole domain ({100 * low:.2f} % to {100 * high:.2f} %).")
+        yield from constraints_in_words(self.study)
+        if self.remark:
+            yield f"No rule: {self.remark}."
+        elif not self.rules:
+            yield "Nothing unsafe found."
+        yield from (f"- {rule.in_words(characteristics, self.unsafe)}" for rule in self.rules)
+        if self.rules:
+            named = {name for rule in self.rules for name in rule.limits}
+            yield meanings(characteristic for characteristic in characteristics if characteristic.name in named)
+            yield f"{RULES_NOTE} In brackets: {100 * self.rules[0].confidence:.0f} % intervals."
+
+
+def _condition_in_words(characteristic: Characteristic, low: float | None, high: float | None) -> str:
+    if low is not None and high is not None:
+        return f"{characteristic.name} from {low:g} to {high:g}{characteristic.suffix}"
+    return f"{characteristic.name} {f'below {high:g}' if low is None else f'above {low:g}'}{characteristic.suffix}"
+
 
 def find_rules(source: Study | Case, options: RulesOptions, *, pool: Pool | None = None, jobs: int | None = None,
                progress: Progress = show_no_progress) -> Rules:
@@ -146,27 +177,37 @@ def find_rules(source: Study | Case, options: RulesOptions, *, pool: Pool | None
     is_unsafe, is_unsafe_validation = unsafe.of(training), unsafe.of(validation)
     unsafe_count, samples = int(np.count_nonzero(is_unsafe)), len(training) + len(validation)
     all_unsafe = unsafe_count + int(np.count_nonzero(is_unsafe_validation))
-    remark, boxes = "", list[Limits]()
+    remark, boxes = "", list[FloatArray]()
     if unsafe_count == len(is_unsafe) > 0:
-        boxes = [{}]
+        boxes = [np.repeat([[-np.inf], [np.inf]], len(characteristics), axis=1)]
     elif min(unsafe_count, len(is_unsafe) - unsafe_count) < MIN_SETTINGS:
         remark = (f"{unsafe_count} of {len(is_unsafe)} settings are unsafe: rules need at least {MIN_SETTINGS} unsafe and as many safe "
                   "settings (the command rules --samples N simulates more)")
     else:
         boxes = _find_boxes(training.settings, is_unsafe, characteristics)
-    rules = [_validate_rule(limits, validation.settings, is_unsafe_validation, characteristics) for limits in boxes]
+    rules = [_validate_rule(box, validation.settings, is_unsafe_validation, characteristics.names) for box in boxes]
     return Rules(study=study, unsafe=unsafe, rules=sorted(rules, key=lambda rule: -rule.unsafe_inside), remark=remark,
                  no_verdict=no_verdict, samples=samples, unsafe_share=all_unsafe / samples,
                  unsafe_interval=clopper_pearson(all_unsafe, samples))
 
 
-def _find_boxes(settings: FloatArray, is_unsafe: BoolArray, characteristics: CharacteristicSet) -> list[Limits]:
-    """The distinct boxes that become rules."""
-    tree = _fit_pruned_tree((settings - characteristics.lower) / (characteristics.upper - characteristics.lower), is_unsafe)
-    leaves = [(_round_limits(limits, characteristics), density) for limits, density in _boxes_of_leaves(tree, characteristics)]
-    dense_boxes = [limits for limits, density in leaves if density > 0.5] or [max(leaves, key=lambda leaf: leaf[1])[0]]
-    simple_boxes = [_drop_useless_conditions(limits, settings, is_unsafe) for limits in dense_boxes]
-    return _order_by_coverage(simple_boxes, settings, is_unsafe)
+def _find_boxes(settings: FloatArray, is_unsafe: BoolArray, characteristics: CharacteristicSet) -> list[FloatArray]:
+    """The boxes that become rules, ordered by coverage; a box that adds few unsafe settings to those before it is dropped."""
+    lower, width = characteristics.lower, characteristics.upper - characteristics.lower
+    tree = _fit_pruned_tree((settings - lower) / width, is_unsafe).tree_
+    everywhere = np.repeat([[-np.inf], [np.inf]], len(width), axis=1)
+    leaves = list(_boxes_of_leaves(tree, 0, everywhere, lower, width))
+    dense_boxes = [box for box, density in leaves if density > 0.5] or [max(leaves, key=lambda leaf: leaf[1])[0]]
+    digits = [LIMIT_DIGITS - 1 - math.floor(math.log10(its_width)) for its_width in width]
+    rounded = [np.array([list(map(round, ends, digits)) for ends in box.tolist()]) for box in dense_boxes]
+    boxes = [_drop_useless_conditions(box, settings, is_unsafe) for box in rounded]
+    chosen, uncovered = list[FloatArray](), is_unsafe.copy()
+    for box in sorted(boxes, key=lambda box: -np.count_nonzero(is_unsafe & is_within(box, settings))):
+        is_inside = is_within(box, settings)
+        if not chosen or np.count_nonzero(uncovered & is_inside) >= MIN_ADDED_SHARE * np.count_nonzero(is_unsafe):
+            chosen.append(box)
+            uncovered &= ~is_inside
+    return chosen
 
 
 def _fit_pruned_tree(inputs: FloatArray, is_unsafe: BoolArray) -> Any:
@@ -186,111 +227,46 @@ def _fit_pruned_tree(inputs: FloatArray, is_unsafe: BoolArray) -> Any:
     return new_tree(prunings[np.flatnonzero(means >= means[best] - errors[best])[-1]]).fit(inputs, is_unsafe)
 
 
-def _boxes_of_leaves(tree: Any, characteristics: CharacteristicSet) -> list[tuple[Limits, float]]:
-    """The boxes of a tree, each with its share of unsafe settings."""
-    nodes, boxes = tree.tree_, []
-    stack: list[tuple[int, Limits]] = [(0, {})]
-    while stack:
-        node, limits = stack.pop()
-        if nodes.children_left[node] < 0:
-            counts = nodes.value[node][0]
-            boxes.append((limits, float(counts[-1] / counts.sum())))
-            continue
-        column = int(nodes.feature[node])
-        cut = float(characteristics.lower[column] + nodes.threshold[node] * (characteristics.upper - characteristics.lower)[column])
-        low, high = limits.get(column, (None, None))
-        stack.append((int(nodes.children_left[node]), {**limits, column: (low, cut)}))
-        stack.append((int(nodes.children_right[node]), {**limits, column: (cut, high)}))
-    return boxes
+def _boxes_of_leaves(tree: Any, node: int, box: FloatArray, lower: FloatArray, width: FloatArray
+                     ) -> Iterator[tuple[FloatArray, float]]:
+    """The boxes of a tree below a node, each with its share of unsafe settings."""
+    if tree.children_left[node] < 0:
+        counts = tree.value[node][0]
+        yield box, float(counts[-1] / counts.sum())
+        return
+    column = int(tree.feature[node])
+    for end, children in enumerate((tree.children_right, tree.children_left)):
+        part = box.copy()
+        part[end, column] = lower[column] + tree.threshold[node] * width[column]
+        yield from _boxes_of_leaves(tree, int(children[node]), part, lower, width)
 
 
-def _round_limits(limits: Limits, characteristics: CharacteristicSet) -> Limits:
-    """Limits rounded to `LIMIT_DIGITS` of the domain's width, in the order of the characteristics."""
-    def rounded(value: float | None, width: float) -> float | None:
-        return None if value is None else round(value, LIMIT_DIGITS - 1 - math.floor(math.log10(width)))
-
-    widths = characteristics.upper - characteristics.lower
-    return {column: (rounded(limits[column][0], widths[column]), rounded(limits[column][1], widths[column])) for column in sorted(limits)}
-
-
-def _drop_useless_conditions(limits: Limits, settings: FloatArray, is_unsafe: BoolArray) -> Limits:
+def _drop_useless_conditions(box: FloatArray, settings: FloatArray, is_unsafe: BoolArray) -> FloatArray:
     """Drop conditions while the lower bound of the density does not fall."""
-    def least_density(box: Limits) -> float:
+    def least_density(box: FloatArray) -> float:
         is_inside = is_within(box, settings)
         count = int(np.count_nonzero(is_inside))
         return clopper_pearson(int(np.count_nonzero(is_unsafe & is_inside)), count)[0] if count else 0.0
 
-    while limits:
-        candidates = [{column: ends for column, ends in limits.items() if column != dropped} for dropped in limits]
-        best = max(candidates, key=least_density)
-        if least_density(best) < least_density(limits):
+    while np.isfinite(box).any():
+        columns = np.flatnonzero(np.isfinite(box).any(axis=0))
+        wider = [np.where(np.arange(box.shape[1]) == column, [[-np.inf], [np.inf]], box) for column in columns]
+        best = max(wider, key=least_density)
+        if least_density(best) < least_density(box):
             break
-        limits = best
-    return limits
+        box = best
+    return box
 
 
-def _order_by_coverage(boxes: list[Limits], settings: FloatArray, is_unsafe: BoolArray) -> list[Limits]:
-    """Order boxes by coverage, and drop boxes that add few unsafe settings to the boxes before them, but not the first box."""
-    chosen: list[Limits] = []
-    uncovered = is_unsafe.copy()
-    for limits in sorted(boxes, key=lambda box: -np.count_nonzero(is_unsafe & is_within(box, settings))):
-        is_inside = is_within(limits, settings)
-        if not chosen or np.count_nonzero(uncovered & is_inside) >= MIN_ADDED_SHARE * np.count_nonzero(is_unsafe):
-            chosen.append(limits)
-            uncovered &= ~is_inside
-    return chosen
+def is_within(box: FloatArray, settings: FloatArray) -> BoolArray:
+    """Whether each of M settings lies within a box; shape (M,)."""
+    return np.asarray(((settings >= box[0]) & (settings <= box[1])).all(axis=1))
 
 
-def is_within(limits: Limits, settings: FloatArray) -> BoolArray:
-    """Whether each of M settings lies within limits; shape (M,)."""
-    is_inside = np.ones(len(settings), dtype=bool)
-    for column, (low, high) in limits.items():
-        is_inside &= settings[:, column] >= (-np.inf if low is None else low)
-        is_inside &= settings[:, column] <= (np.inf if high is None else high)
-    return is_inside
-
-
-def _validate_rule(limits: Limits, settings: FloatArray, is_unsafe: BoolArray, characteristics: CharacteristicSet) -> Rule:
+def _validate_rule(box: FloatArray, settings: FloatArray, is_unsafe: BoolArray, names: Sequence[str]) -> Rule:
     """The rule of a box, with the numbers of validation settings."""
-    is_inside = is_within(limits, settings)
-    return Rule(limits={characteristics.names[column]: ends for column, ends in limits.items()}, inside=int(np.count_nonzero(is_inside)),
-                unsafe_inside=int(np.count_nonzero(is_inside & is_unsafe)), unsafe_everywhere=int(np.count_nonzero(is_unsafe)),
-                confidence=CONFIDENCE)
-
-
-def print_rules(console: Console, result: Rules) -> None:
-    """Print every rule with its density and coverage."""
-    characteristics = CharacteristicSet.of(result.study.vehicle.characteristics)
-    print_heading(console, result.study.title, result.no_verdict)
-    low, high = result.unsafe_interval
-    print_text(console, f"Unsafe: {result.unsafe.description}; {100 * result.unsafe_share:.2f} % of {result.samples} vehicles "
-                        f"drawn evenly over the whole domain ({100 * low:.2f} % to {100 * high:.2f} %).")
-    print_constraints(console, result.study)
-    if result.remark:
-        print_text(console, f"No rule: {result.remark}.")
-    elif not result.rules:
-        print_text(console, "Nothing unsafe found.")
-    for rule in result.rules:
-        print_text(console, f"- {rule_in_words(rule, characteristics, result.unsafe)}")
-    if result.rules:
-        named = {name for rule in result.rules for name in rule.limits}
-        print_meanings(console, [characteristic for characteristic in characteristics if characteristic.name in named])
-        print_text(console, f"{RULES_NOTE} In brackets: {100 * result.rules[0].confidence:.0f} % intervals.")
-
-
-def rule_in_words(rule: Rule, characteristics: CharacteristicSet, unsafe: Unsafe) -> str:
-    """A rule with its density and coverage: `mass above 2500 kg, the others anywhere: collides in 92 % (..), covers 61 % (..)`."""
-    others = ", the others anywhere" if 0 < len(rule.limits) < len(characteristics) else ""
-    conditions = [_condition_in_words(characteristic, *rule.limits[characteristic.name])
-                  for characteristic in characteristics if characteristic.name in rule.limits]
-    shares = [f"{word} -" if share is None or interval is None else
-              f"{word} {100 * share:.0f} % ({100 * interval[0]:.0f} % to {100 * interval[1]:.0f} %)"
-              for word, share, interval in ((f"{unsafe.in_words} in", rule.density, rule.density_interval),
-                                            ("covers", rule.coverage, rule.coverage_interval))]
-    return f"{join_phrases(conditions) if conditions else 'everywhere'}{others}: {', '.join(shares)}"
-
-
-def _condition_in_words(characteristic: Characteristic, low: float | None, high: float | None) -> str:
-    if low is not None and high is not None:
-        return f"{characteristic.name} from {low:g} to {high:g}{characteristic.suffix}"
-    return f"{characteristic.name} {f'below {high:g}' if low is None else f'above {low:g}'}{characteristic.suffix}"
+    is_inside = is_within(box, settings)
+    limits = {name: (None if low == -np.inf else low, None if high == np.inf else high)
+              for name, low, high in zip(names, *box.tolist(), strict=True) if np.isfinite([low, high]).any()}
+    return Rule(limits=limits, inside=int(np.count_nonzero(is_inside)), confidence=CONFIDENCE,
+                unsafe_inside=int(np.count_nonzero(is_inside & is_unsafe)), unsafe_everywhere=int(np.count_nonzero(is_unsafe)))
