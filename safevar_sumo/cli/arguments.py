@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import math
 import re
 from itertools import product
 from pathlib import Path
-from typing import Any
 
 import click
 import numpy as np
@@ -15,7 +13,7 @@ from click.shell_completion import CompletionItem
 from safevar_sumo.errors import InputError, SafevarError, unknown_name
 from safevar_sumo.output import check_writable
 from safevar_sumo.records import FloatArray
-from safevar_sumo.results import FILES, MANIFEST
+from safevar_sumo.results import SOLUTIONS
 from safevar_sumo.study import load_study, study_names, unit_text
 from safevar_sumo.vehicles import CharacteristicSet
 
@@ -23,46 +21,23 @@ PICTURE_ENDINGS = (".png", ".pdf", ".svg")
 
 
 def check_output(path: Path, flag: str, endings: tuple[str, ...]) -> None:
-    """Refuse an output file that has an unknown ending or cannot be written.
+    """Refuse an output file that has an unknown ending, is the solutions of results, or cannot be written.
 
     Raises
     ------
     InputError
-        Names the flag and the accepted endings.
+        Names the flag and what it expects.
     """
     if path.suffix.lower() not in endings:
         raise InputError(flag, str(path), f"a file that ends in {', '.join(endings)}")
+    refuse_overwriting(path, flag, path.with_name(SOLUTIONS))
     check_writable(path, flag)
 
 
 def refuse_overwriting(path: Path, flag: str, *inputs: str | Path) -> None:
-    """Refuse to overwrite an input of the command (a file, or a file of a directory), or a file of any results directory.
-
-    Raises
-    ------
-    InputError
-        Names the flag and the file.
-    """
-    if not path.exists():
-        return
-    for source in map(Path, inputs):
-        files = [source, *source.glob("*.*"), *source.glob("runs/*")] if source.is_dir() else [source]
-        if any(file.exists() and path.samefile(file) for file in files if file.suffix not in PICTURE_ENDINGS):
-            raise InputError(flag, f"{path} is an input of the command", "another file")
-    for folder in path.resolve().parents[:2]:
-        if (folder / MANIFEST).is_file() and any(path.samefile(file) for item in FILES for file in folder.glob(item.name)):
-            raise InputError(flag, f"{path} is a file of a results directory", "another file")
-
-
-class NumberRange(click.FloatRange):
-    """Type of an option whose number must lie in a range; refuses NaN, too."""
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """Return the number if it is within the range."""
-        number = super().convert(value, param, ctx)
-        if math.isnan(number):
-            self.fail(f"{value} is not in the range {self._describe_range()}.", param, ctx)
-        return number
+    """Refuse to overwrite an input of the command; raises InputError, which names the flag and the file."""
+    if path.exists() and any(Path(source).exists() and path.samefile(source) for source in inputs):
+        raise InputError(flag, f"{path} is an input of the command, or holds results", "another file")
 
 
 NUMBER_PATTERN = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import click
 import numpy as np
@@ -16,21 +16,12 @@ from safevar_sumo.analysis.model_spread import ModelSpread, compute_model_spread
 from safevar_sumo.analysis.rating import RatingOptions
 from safevar_sumo.analysis.words import points_in_words
 from safevar_sumo.api.simulation import Simulation, evaluate_settings, simulate_with_original
-from safevar_sumo.cli.arguments import (
-    PICTURE_ENDINGS,
-    NumberRange,
-    check_output,
-    combine_values,
-    complete_changes,
-    complete_study,
-    read_changes,
-    refuse_overwriting,
-)
+from safevar_sumo.cli.arguments import PICTURE_ENDINGS, check_output, combine_values, complete_changes, complete_study, read_changes
 from safevar_sumo.cli.program import commands
 from safevar_sumo.cli.target import CommandTarget, as_it_is_now_option, json_option, load_target, point_option, replay_options
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import METRICS
-from safevar_sumo.output import check_writable, unwritable, whole_file
+from safevar_sumo.output import whole_file
 from safevar_sumo.records import KMH_PER_MS, Evaluations, FloatArray, Outcome
 from safevar_sumo.results import record
 from safevar_sumo.scenarios import LOCATION_DIMENSION, SPEED_DIMENSION, pre_crash_sentence
@@ -38,9 +29,8 @@ from safevar_sumo.study import SAFETY_DEGREE, Study, unit_text
 from safevar_sumo.sumo.empty_road import summary_entry, why_no_verdict
 from safevar_sumo.sumo.matrix import PointResult, point_record, remarks_of, simulate_all_points, system_at_point, vehicle_remarks
 from safevar_sumo.sumo.system import System, assemble
-from safevar_sumo.terminal import WholeTable, print_meanings, print_text
+from safevar_sumo.terminal import WholeTable, print_heading, print_meanings, print_text
 from safevar_sumo.vehicles import CharacteristicSet
-from safevar_sumo.workers.identity import input_files
 
 FILE = click.Path(path_type=Path)
 
@@ -52,20 +42,21 @@ FILE = click.Path(path_type=Path)
               help="A characteristic's value in its unit, +10% of the original, or a sweep FROM..TO; repeat --set for others.")
 @click.option("--no-filter", is_flag=True, help="Keep changes that are smaller than the filter's thresholds.")
 @click.option("--beyond", is_flag=True, help="Also accept values beyond the domains, and settings that violate a constraint.")
-@click.option("--trace", type=click.Path(path_type=Path), metavar="FILE.csv", help="Write the simulation step by step.")
+@click.option("--trace", type=FILE, metavar="FILE.csv", help="Write the simulation step by step.")
 @click.option("--plot", type=FILE, metavar="FILE", help="Draw the simulation beside the original vehicle's to this file: png, pdf or svg.")
 @click.option("--animate", type=FILE, metavar="FILE", help="Animate both simulations, seen from above, in this file: gif, mp4 or html.")
 @click.option("--gui", is_flag=True, help="Show both simulations in sumo-gui, each on its own road.")
-@click.option("--slower", type=NumberRange(0.01, 1000), default=1.0, show_default=True, metavar="TIMES",
-              help="How many times slower than real time --gui plays.")
+@click.option("--slower", type=click.FloatRange(0.01, 1000), metavar="TIMES",
+              help="How many times slower than real time --gui plays.  [default: 1]")
 @as_it_is_now_option
 @point_option
 @click.option("--spread", is_flag=True, help="Add the vehicle model's own uncertainty: other parameters that fit published data as well.")
 @json_option
-def simulate_command(study: str, solution: str | None, choice: str | None, changes: tuple[str, ...], no_filter: bool, beyond: bool,
-                     trace: Path | None, point: str | None, spread: bool, as_json: bool, **replay_outputs: Any) -> None:
+def simulate_command(study: str, solution: str | None, choice: str | None, changes: tuple[str, ...], no_filter: bool,
+                     beyond: bool, trace: Path | None, plot: Path | None, animate: Path | None, gui: bool,
+                     slower: float | None, point: str | None, spread: bool, as_json: bool) -> None:
     """Simulate STUDY once, or a solution of the results directory DIR with the study as recorded there."""
-    target, outputs = load_target(study, solution, choice), ReplayOutputs(**replay_outputs)
+    target = load_target(study, solution, choice)
     system = assemble(target.study, target.source)
     if point is not None:
         system = system_at_point(system, point, source="--point")
@@ -74,9 +65,11 @@ def simulate_command(study: str, solution: str | None, choice: str | None, chang
     requested_settings = combine_values(values_by_name, base, system.characteristics)
     if not beyond and changes:
         system.check_feasible(requested_settings, "--set", filtered=not no_filter, switch="--beyond")
-    _check_outputs([study, *input_files(target.study, system)], trace, outputs)
+    _check_outputs(trace, plot, animate)
+    if slower is not None and not gui:
+        raise InputError("--slower", f"{slower:g} without --gui", "together with --gui")
     if any(len(values) > 1 for values in values_by_name.values()):
-        if trace is not None or outputs.are_requested or spread:
+        if trace or plot or animate or gui or spread:
             expected = "one value for each characteristic with --trace, --plot, --animate, --gui or --spread"
             raise InputError("--set", f"{' '.join(changes)} is a sweep", expected)
         _simulate_sweep(target, system, requested_settings, tuple(values_by_name), not no_filter, as_json)
@@ -88,37 +81,58 @@ def simulate_command(study: str, solution: str | None, choice: str | None, chang
     if target.row is not None and not changes:
         _warn_of_differences(target, simulation)
     if trace is not None:
-        _write_trace(trace, simulation)
-    if outputs.are_requested:
-        outputs.show(target.study, system, simulation.evaluation.settings[0])
+        with whole_file(trace, "--trace") as file:
+            simulation.trace.to_csv(file, index=False, lineterminator="\n")
+    if plot or animate or gui:
+        _show(target.study, system, simulation.evaluation.settings[0], plot, animate, (slower or 1.0) if gui else None)
     settings = np.stack([simulation.evaluation.settings[0], system.characteristics.original])
     spreads = compute_model_spreads(target.study, settings, point or "") if parameter_sets else []
     _print_results(target, system, simulation, spreads, as_json)
 
 
-def _check_outputs(inputs: Sequence[str | Path], trace: Path | None, outputs: ReplayOutputs) -> None:
+def _check_outputs(trace: Path | None, plot: Path | None, animation: Path | None) -> None:
+    """Before any simulation, refuse files that cannot be written."""
     if trace is not None:
-        refuse_overwriting(trace, "--trace", *inputs)
-        check_writable(trace, "--trace")
-    outputs.check(inputs)
-    if trace is not None and trace.resolve() in outputs.files:
-        raise InputError("--trace", f"{trace} is what --plot or --animate writes", "another file")
+        check_output(trace, "--trace", (".csv",))
+    if plot is not None:
+        check_output(plot, "--plot", PICTURE_ENDINGS)
+    if animation is not None:
+        from safevar_sumo.replay.animation import ANIMATION_WRITERS, require_ffmpeg
+
+        check_output(animation, "--animate", tuple(ANIMATION_WRITERS))
+        require_ffmpeg(animation)
+
+
+def _show(study: Study, system: System, setting: FloatArray, plot: Path | None, animation: Path | None,
+          slower: float | None) -> None:
+    """Simulate a filtered setting, shape (n,), beside the original vehicle, and show both: as files, and `slower` in sumo-gui."""
+    from safevar_sumo.analysis.figures import save
+    from safevar_sumo.replay.animation import animate
+    from safevar_sumo.replay.comparison import compare_setting
+    from safevar_sumo.replay.figure import draw_comparison
+    from safevar_sumo.replay.gui import show_in_gui
+
+    comparison = compare_setting(study, system, setting)
+    if plot is not None:
+        save(draw_comparison(comparison), plot, "--plot")
+    if animation is not None:
+        animate(comparison, animation)
+    if slower is not None:
+        show_in_gui(comparison, slower=slower)
 
 
 def _simulate_sweep(target: CommandTarget, system: System, requested_settings: FloatArray, names: tuple[str, ...], filtered: bool,
                     as_json: bool) -> None:
     settings = system.characteristics.filter(requested_settings) if filtered else requested_settings
     evaluations = evaluate_settings(target.study, np.concatenate([system.characteristics.original[np.newaxis], settings]))
-    original, variants = evaluations.take([0]), evaluations.take(np.arange(1, len(evaluations)))
     no_verdict = why_no_verdict(system)
     if as_json:
-        values = [dict(zip(system.characteristics.names, setting, strict=True)) for setting in variants.settings.tolist()]
-        records = [{"study": target.study.name, "vcs": values[row], **record(variants, row)} for row in range(len(variants))]
-        click.echo(json.dumps([*records, *summary_entry(no_verdict)], indent=2, allow_nan=False))
+        records = [{"study": target.study.name, "vcs": dict(zip(system.characteristics.names, setting, strict=True)),
+                    **record(evaluations, row)} for row, setting in enumerate(evaluations.settings.tolist())]
+        click.echo(json.dumps([*records[1:], *summary_entry(no_verdict)], indent=2, allow_nan=False))
     else:
-        if no_verdict:
-            click.echo(no_verdict)
-        print_sweep(Console(), target.study, names, original, variants)
+        print_heading(Console(), target.study.title, no_verdict)
+        print_sweep(Console(), system.characteristics, names, evaluations)
     reset_count = int(np.count_nonzero((settings != requested_settings).any(axis=1)))
     if reset_count:
         click.echo(f"note: in {reset_count} of {len(requested_settings)} settings the filter reset small changes; --no-filter keeps them",
@@ -169,63 +183,6 @@ def _warn_of_differences(target: CommandTarget, simulation: Simulation) -> None:
         click.echo(f"warning: {target.handle} of {target.source}: {difference}; have versions or code changed since the study?", err=True)
 
 
-def _write_trace(path: Path, simulation: Simulation) -> None:
-    """Write one row per time step; the header gives the units."""
-    try:
-        with whole_file(path) as file, file.open("w", encoding="utf-8", newline="") as stream:
-            simulation.trace.to_csv(stream, index=False, lineterminator="\n")
-    except OSError as error:
-        raise unwritable(path, "--trace", error) from None
-
-
-class ReplayOutputs(NamedTuple):
-    """The figure, animation and window of a replay: files to write, or None, and options of the window."""
-
-    plot: Path | None
-    animate: Path | None
-    gui: bool = False
-    slower: float = 1.0
-
-    @property
-    def are_requested(self) -> bool:
-        return self.plot is not None or self.animate is not None or self.gui
-
-    @property
-    def files(self) -> list[Path]:
-        """Absolute paths of the files to write."""
-        return [path.resolve() for path in (self.plot, self.animate) if path is not None]
-
-    def check(self, inputs: Sequence[str | Path]) -> None:
-        """Before any simulation, refuse a file that cannot be written or is one of the `inputs`; raises InputError."""
-        if self.slower != 1 and not self.gui:
-            raise InputError("--slower", f"{self.slower:g} without --gui", "together with --gui")
-        if self.plot is not None:
-            refuse_overwriting(self.plot, "--plot", *inputs)
-            check_output(self.plot, "--plot", PICTURE_ENDINGS)
-        if self.animate is not None:
-            from safevar_sumo.replay.animation import ANIMATION_WRITERS, require_ffmpeg
-
-            refuse_overwriting(self.animate, "--animate", *inputs)
-            check_output(self.animate, "--animate", tuple(ANIMATION_WRITERS))
-            require_ffmpeg(self.animate)
-
-    def show(self, study: Study, system: System, setting: FloatArray) -> None:
-        """Simulate a filtered setting, shape (n,), beside the original vehicle, and show both."""
-        from safevar_sumo.analysis.figures import save
-        from safevar_sumo.replay.animation import animate
-        from safevar_sumo.replay.comparison import compare_setting
-        from safevar_sumo.replay.figure import draw_comparison
-        from safevar_sumo.replay.gui import show_in_gui
-
-        comparison = compare_setting(study, system, setting)
-        if self.plot is not None:
-            save(draw_comparison(comparison), self.plot, "--plot")
-        if self.animate is not None:
-            animate(comparison, self.animate)
-        if self.gui:
-            show_in_gui(comparison, slower=self.slower)
-
-
 def print_simulation(console: Console, simulation: Simulation) -> None:
     """Print a setting beside the original vehicle: its values, outcome, metrics and objectives, and a verdict."""
     if simulation.no_verdict:
@@ -263,21 +220,19 @@ def _safety_comparison(simulation: Simulation) -> str:
     return f"{'less safe' if degree < original else 'safer'} than the original, SD {degree:.2f} against {original:.2f}"
 
 
-def print_sweep(console: Console, study: Study, names: Sequence[str], original: Evaluations, variants: Evaluations) -> None:
-    """Print a row for the original vehicle and for each variant: values of the named characteristics, outcome and metrics."""
-    characteristics = CharacteristicSet.of(study.vehicle.characteristics)
+def print_sweep(console: Console, characteristics: CharacteristicSet, names: Sequence[str],
+                evaluations: Evaluations) -> None:
+    """Print a row for each setting, of which the first is the original: the named characteristics, outcome and metrics."""
     columns = [characteristics.names.index(name) for name in names]
     units = [characteristics.members[column].unit for column in columns]
-    table = WholeTable(right=(name + unit_text(unit, ", {}") for name, unit in zip(names, units, strict=True)),
-                       title=study.title)
+    table = WholeTable(right=(name + unit_text(unit, ", {}") for name, unit in zip(names, units, strict=True)))
     table.add_column("outcome")
-    for name in variants.metrics:
+    for name in evaluations.metrics:
         table.add_column(METRICS[name].heading if name in METRICS else name, justify="right")
-    for evaluations in (original, variants):
-        for row in range(len(evaluations)):
-            metrics = [evaluations.metrics[name][row] for name in variants.metrics]
-            table.add_row(*(f"{evaluations.settings[row, column]:g}" for column in columns), str(evaluations.outcome[row]),
-                          *("-" if np.isnan(value) else f"{value:.3f}" for value in metrics), end_section=evaluations is original)
+    for row, outcome in enumerate(evaluations.outcome):
+        metrics = [values[row] for values in evaluations.metrics.values()]
+        table.add_row(*(f"{value:g}" for value in evaluations.settings[row, columns]), str(outcome),
+                      *("-" if np.isnan(value) else f"{value:.3f}" for value in metrics), end_section=row == 0)
     console.print(table)
     print_text(console, "First row: the original vehicle. SD: least distance in m, or minus the collision speed in m/s.")
 
@@ -289,35 +244,27 @@ COLOUR_BANDS = ((5.0, "green"), (15.0, "yellow"), (25.0, "dark_orange"), (35.0, 
 def print_matrix(console: Console, results: Sequence[PointResult]) -> None:
     """Print a table for each test and weather: rows are speeds and other dimensions, columns are impact locations."""
     records = [point_record(result) for result in results]
-    tables: dict[tuple[str, str], list[tuple[dict[str, Any], dict[str, Any]]]] = {}
-    for result, result_record in zip(results, records, strict=True):
+    tables: dict[str, dict[str, dict[Any, Text]]] = {}
+    for result, entry in zip(results, records, strict=True):
         coordinates = dict(result.point.parameters)
-        tables.setdefault((coordinates.pop("test"), coordinates.pop("weather")), []).append((coordinates, result_record))
-    for (test, weather), cells in tables.items():
-        _print_test_table(console, f"{test}, {weather}", cells)
+        title, location = f"{coordinates.pop('test')}, {coordinates.pop('weather')}", coordinates.pop(LOCATION_DIMENSION, None)
+        tables.setdefault(title, {}).setdefault(_row_name(coordinates), {})[location] = _cell_text(entry)
+    for title, rows in tables.items():
+        columns = dict.fromkeys(location for cells in rows.values() for location in cells)
+        table = WholeTable("speed", right=("" if column is None else f"{column:g} %" for column in columns), title=title)
+        for name, cells in rows.items():
+            table.add_row(name, *(cells.get(column, "") for column in columns))
+        console.print(table)
     if records:
-        collision_points = [entry["point"] for entry in records if entry["impact_speed"] is not None]
-        summary = points_in_words(collision_points, len(records))
-        invalid = sum(entry["outcome"] == Outcome.INVALID_TEST for entry in records)
-        if invalid:
+        summary = points_in_words([entry["point"] for entry in records if entry["impact_speed"] is not None], len(records))
+        if invalid := sum(entry["outcome"] == Outcome.INVALID_TEST for entry in records):
             summary += f" {invalid} are invalid tests: the vehicle violates the test's speed tolerance before the ADS acts."
         print_text(console, summary)
 
 
-def _print_test_table(console: Console, title: str, cells: Sequence[tuple[dict[str, Any], dict[str, Any]]]) -> None:
-    columns = list(dict.fromkeys(coordinates.get(LOCATION_DIMENSION) for coordinates, _ in cells))
-    table = WholeTable("speed", right=("" if column is None else f"{column:g} %" for column in columns), title=title)
-    texts_by_row: dict[str, dict[Any, Text]] = {}
-    for coordinates, result in cells:
-        texts_by_row.setdefault(_row_name(coordinates), {})[coordinates.get(LOCATION_DIMENSION)] = _cell_text(result)
-    for name, texts in texts_by_row.items():
-        table.add_row(name, *(texts.get(column, Text("")) for column in columns))
-    console.print(table)
-
-
 def _row_name(coordinates: dict[str, Any]) -> str:
     speed = [f"{coordinates[SPEED_DIMENSION]:g} km/h"] if SPEED_DIMENSION in coordinates else []
-    others = (f"{name} {value}" for name, value in coordinates.items() if name not in (SPEED_DIMENSION, LOCATION_DIMENSION))
+    others = (f"{name} {value}" for name, value in coordinates.items() if name != SPEED_DIMENSION)
     return ", ".join([*speed, *others])
 
 

@@ -21,7 +21,7 @@ from safevar_sumo.analysis.research_questions.indicators import nondominated_poi
 from safevar_sumo.analysis.words import change_texts
 from safevar_sumo.api.running import ENGINE_NAMES, carry_out_runs, choose_engine, load_for_search, open_observer, open_pool
 from safevar_sumo.campaign import Campaign, Forecast, RunKey, all_runs, forecast
-from safevar_sumo.cli.arguments import NumberRange, complete_study
+from safevar_sumo.cli.arguments import complete_study
 from safevar_sumo.cli.program import commands, print_remarks
 from safevar_sumo.cli.target import jobs_option
 from safevar_sumo.errors import InputError
@@ -112,7 +112,7 @@ def _select_runs(keys: list[RunKey], only: str | None, shard: str | None) -> lis
 @commands.command()
 @click.argument("directory", metavar="DIR")
 @click.option("--watch", is_flag=True, help="Keep showing progress until the study is finished.")
-@click.option("--every", type=NumberRange(0.1, 86400), default=2.0, show_default=True, metavar="SECONDS",
+@click.option("--every", type=click.FloatRange(0.1, 86400), default=2.0, show_default=True, metavar="SECONDS",
               help="Interval of --watch.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON; with --watch, a line at every interval.")
 def status(directory: str, watch: bool, every: float, as_json: bool) -> None:

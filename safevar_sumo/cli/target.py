@@ -11,7 +11,6 @@ import click
 
 from safevar_sumo.analysis.options import Option, Options
 from safevar_sumo.analysis.subject import study_in
-from safevar_sumo.cli.arguments import NumberRange
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import FloatArray
 from safevar_sumo.results import SolutionId, choose_handle, row_of_handle
@@ -109,7 +108,7 @@ def _add_flag(flag: str, name: str, default: Any, option: Option) -> Callable[[C
     if option.kind is int:
         click_type = click.IntRange(option.low, option.high)  # type: ignore[arg-type]
     elif option.kind is float:
-        click_type = NumberRange(option.low, option.high, min_open=low_is_open, max_open=high_is_open)
+        click_type = click.FloatRange(option.low, option.high, min_open=low_is_open, max_open=high_is_open)
     return click.option(flag, name, type=click_type, default=default, show_default=show_default, metavar=option.metavar, help=option.help)
 
 

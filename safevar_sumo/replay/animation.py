@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from safevar_sumo.errors import InputError, SafevarError
-from safevar_sumo.output import unwritable, whole_file
+from safevar_sumo.output import whole_file
 from safevar_sumo.records import FloatArray
 from safevar_sumo.replay.comparison import CHANGED, ORIGINAL, Comparison
 from safevar_sumo.replay.film import LaneLine
@@ -191,11 +191,8 @@ def animate(comparison: Comparison, path: Path) -> None:
     ending = path.suffix.lower()
     if ending not in ANIMATION_WRITERS:
         raise InputError("animate", str(path), f"a file that ends in {', '.join(ANIMATION_WRITERS)}")
-    try:
-        with whole_file(path) as file:
-            ANIMATION_WRITERS[ending](lay_out_scene(comparison), file)
-    except OSError as error:
-        raise unwritable(path, "animate", error) from None
+    with whole_file(path, "animate") as file:
+        ANIMATION_WRITERS[ending](lay_out_scene(comparison), file)
 
 
 def require_ffmpeg(path: Path) -> None:

@@ -13,7 +13,7 @@ import msgspec
 import tomli_w
 
 from safevar_sumo.errors import InputError
-from safevar_sumo.output import unwritable, whole_file
+from safevar_sumo.output import whole_file
 from safevar_sumo.shipped import STUDIES
 from safevar_sumo.study.fitted import contradictions_of_file
 from safevar_sumo.study.schema import NAME_PATTERN, Origin, SearchTable, Study, StudyLike, is_file, study_path, tables_of
@@ -205,8 +205,5 @@ def write_study(path: Path, study: Study, comment: str) -> None:
     tables = {name: value for name, value in drop_nulls(tables_of(study)).items() if value != {}}
     lines = ("".join(character if character.isprintable() else "?" for character in line) for line in comment.splitlines())
     text = "".join(f"# {line}".rstrip() + "\n" for line in lines) + "\n" + tomli_w.dumps(tables)
-    try:
-        with whole_file(path) as file:
-            file.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise unwritable(path, "out", error) from None
+    with whole_file(path, "out") as file:
+        file.write_text(text, encoding="utf-8")

@@ -5,10 +5,8 @@ from __future__ import annotations
 import ast
 import importlib
 import json
-import os
 import pkgutil
 import re
-import shutil
 import subprocess
 import sys
 from io import StringIO
@@ -24,9 +22,9 @@ from safevar_sumo import cli
 from safevar_sumo.cli import catalogue
 from safevar_sumo.cli.program import COMMANDS, commands, main
 from safevar_sumo.errors import InputError
-from safevar_sumo.shipped import STUDIES
 from safevar_sumo.study import load_study, study_names
 from safevar_sumo.terminal import WholeTable
+from tests.in_process import refused
 
 ROOT = Path(__file__).parents[2]
 HEAVY = {"libsumo", "traci", "matplotlib", "pandas", "scipy", "seaborn", "cma"}
@@ -187,22 +185,14 @@ def test_a_section_of_the_list_comes_alone() -> None:
     assert "'weathers'" in str(CliRunner().invoke(commands, ["list", "weather"], standalone_mode=False).exception)
 
 
-@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="POSIX alone has named pipes")
 @pytest.mark.parametrize("arguments", [
-    "validate sun pipe", "calibrate sun pipe", "calibrate sun", "calibrate mine.toml pipe", "import sun --out published --nsga2 pipe",
-    "import sun --out published --rs pipe", "study pipe", "simulate pipe", "simulate mine.toml", "tables stored", "status stored",
-    "simulate smoke --trace pipe", "simulate smoke --plot pipe.png", "simulate smoke --animate pipe.gif", "tolerance smoke --plot pipe.png",
-    "risk smoke --plot pipe.svg", "validate sun sun.csv --plot pipe.png", "replicate stored --published stored --out pipe"])
-def test_a_pipe_is_refused_by_its_name(arguments: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "stored").mkdir()
-    for pipe in ("pipe", "pipe.png", "pipe.gif", "pipe.svg", "stored/manifest.json", "sun-calibrated.toml"):
-        os.mkfifo(tmp_path / pipe)
-    shutil.copy(STUDIES / "sun.toml", "sun.csv")
-    (tmp_path / "mine.toml").write_text('extends = "pipe"\nname = "mine"\n')
-    error = CliRunner().invoke(commands, arguments.split()).exception
-    assert isinstance(error, InputError)
-    assert "is no regular file" in str(error)
+    "validate sun folder", "import sun --out published --rs folder", "simulate folder", "tables folder", "status folder",
+    "simulate smoke --trace folder.csv", "tolerance smoke --plot folder.png", "study smoke --out file", "figures file --out folder"])
+def test_a_folder_is_no_file_and_a_file_no_folder(arguments: str, in_tmp: Path) -> None:
+    for folder in ("folder", "folder.csv", "folder.png"):
+        Path(folder).mkdir()
+    Path("file").touch()
+    refused(*arguments.split(), message=(arguments.rpartition(" ")[2] if "figures" not in arguments else "file",))
 
 
 def test_the_program_runs_where_stderr_is_no_file() -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import errno
 import json
 import os
-import shutil
 from pathlib import Path
 
 import pytest
@@ -14,7 +13,6 @@ from click.testing import CliRunner, Result
 from safevar_sumo.cli.arguments import read_changes
 from safevar_sumo.cli.program import commands
 from safevar_sumo.errors import InputError
-from safevar_sumo.shipped import NETWORKS
 from safevar_sumo.study import load_study
 from safevar_sumo.vehicles import CharacteristicSet
 from tests.in_process import refused
@@ -74,20 +72,6 @@ def test_an_output_that_fails_leaves_the_old_file_and_no_new_one(in_tmp: Path, m
         Path(name).unlink()
 
 
-def test_an_output_replaces_no_file_that_the_study_is_made_of(in_tmp: Path) -> None:
-    Path("my_braking.py").write_text("from safevar_sumo.ads import ScalarAds\nfrom my_numbers import BRAKE\n\n\n"
-                                 "class Mine(ScalarAds):\n    def drive(self, seen):\n        return (0.0, BRAKE)\n")
-    Path("my_numbers.py").write_text("BRAKE = 1.0\n")
-    shutil.copytree(NETWORKS / "pedestrian_crossing", "my_net")
-    Path("base.toml").write_text('extends = "sun"\n[ads]\nmodel = "my_braking:Mine"\n[scenario.parameters]\nnetwork = "my_net"\n')
-    Path("child.toml").write_text('extends = "base.toml"\n')
-    files = ["child.toml", "base.toml", "my_braking.py", "my_numbers.py", "my_net/traffic.rou.xml", "my_net/network.edg.xml"]
-    contents = {file: Path(file).read_bytes() for file in files}
-    for file in files:
-        refused("simulate", "child.toml", "--trace", file, message=("--trace", file, "an input of the command"))
-    assert {file: Path(file).read_bytes() for file in files} == contents
-
-
 @pytest.mark.slow
 def test_a_sweep_is_a_table_under_the_original_or_a_list() -> None:
     result = simulate("rain", "--set", "tireFric=1.0..1.5:3", "--json")
@@ -99,30 +83,20 @@ def test_a_sweep_is_a_table_under_the_original_or_a_list() -> None:
     assert [float(row[1]) for row in rows] == [3.5, 1.0, 1.25, 1.5]
 
 
-def test_nothing_that_is_read_is_written_over(in_tmp: Path) -> None:
-    Path("mine.toml").write_text('extends = "smoke"\nname = "mine"\n')
-    for flag in ("--trace", "--plot"):
-        refused = simulate("mine.toml", flag, "mine.toml")
-        assert isinstance(refused.exception, InputError)
-        assert flag in str(refused.exception)
-    assert Path("mine.toml").read_text().startswith("extends")
-    assert isinstance(simulate("sun", "--set", "mass=2100..2200", "--trace", "x.csv").exception, InputError)
-    assert not Path("x.csv").exists()
-
-
-def test_no_output_replaces_a_file_of_a_results_directory(in_tmp: Path, slippery: Path) -> None:
-    shutil.copytree(slippery, "results")
-    for file in ("solutions.csv", "manifest.json", "runs/original.journal"):
-        before = Path("results", file).read_bytes()
-        refused("simulate", "smoke", "--trace", f"results/{file}", message=("--trace", file, "a file of a results directory"))
-        assert Path("results", file).read_bytes() == before
-    assert simulate("smoke", "--trace", "results/trace.csv").exit_code == 0
+def test_no_output_replaces_a_study_or_solutions(in_tmp: Path) -> None:
+    Path("solutions.csv").write_text("stored")
+    for flag, file in (("--trace", "mine.toml"), ("--plot", "mine.toml"), ("--trace", "solutions.csv")):
+        refused("simulate", "smoke", flag, file, message=(flag, file))
+    assert Path("solutions.csv").read_text() == "stored"
+    assert not Path("mine.toml").exists()
 
 
 @pytest.mark.parametrize(("arguments", "message"), [
     (("simulate", "sun", "--set", "tireFric=1..2:1"), ("tireFric=1..2:1", "at least 2")),
     (("simulate", "sun", "--set", "mass=2_404"), ("mass=2_404",)),
     (("simulate", "sun", "--slower", "2"), ("--slower", "--gui")),
+    (("simulate", "sun", "--set", "mass=2100..2200", "--trace", "x.csv"), ("--set", "is a sweep")),
+    (("risk", "sun", "--confidence", "nan"), ("--confidence", "nan", "below 1")),
     (("study", "smoke", "--algorithms", "rs,rs", "--dry-run"), ("search.algorithms", "same name")),
     (("tolerance", "sun", "--characteristics", "mass,mass"), ("characteristics", "mass,mass", "once")),
     (("tolerance", "sun", "--characteristics", "mass", "--pairs"), ("pairs", "at least two")),

@@ -18,7 +18,7 @@ from openpyxl.utils.exceptions import InvalidFileException
 
 from safevar_sumo.analysis.rating.compute import RatedVehicle
 from safevar_sumo.errors import InputError
-from safevar_sumo.output import unwritable, whole_file
+from safevar_sumo.output import whole_file
 from safevar_sumo.protocol import EURO_NCAP_2026, CellMatrix, protocol_of
 from safevar_sumo.protocol.points import DECIMALS, round_half_up
 
@@ -62,11 +62,8 @@ class _Spreadsheet:
             raise InputError(self.source, f"sheet {VERSION!r}, cell B1: version {version!r}", self._expected_file)
 
     def _save(self) -> None:
-        try:
-            with whole_file(self.output) as file:
-                self._workbook.save(file)
-        except OSError as error:
-            raise unwritable(self.output, "xlsx", error) from None
+        with whole_file(self.output, "xlsx") as file:
+            self._workbook.save(file)
 
 
 class Template(_Spreadsheet):
