@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -87,12 +87,12 @@ class Simulation:
 
     study: Study
     setting: Mapping[str, float]
-    reset_values: Mapping[str, float]
     evaluation: Evaluations
     runs: SimulationRuns
     scoring: Scoring
     _observations: Sequence[Observation]
-    no_verdict: str = ""
+    no_verdict: str
+    reset_values: Mapping[str, float] = field(default_factory=dict)
     _original: Simulation | None = None
 
     @property
@@ -155,8 +155,6 @@ def simulate(study: StudyLike, changes: Mapping[str, float] | None = None, *, fi
              gui: bool = False) -> Simulation:
     """Simulate one setting in this process, and the original vehicle for comparison.
 
-    User code that hangs is stopped after the study's `search.time_limit` in the main thread (not on Windows, not with `gui`).
-
     Parameters
     ----------
     study
@@ -175,7 +173,7 @@ def simulate(study: StudyLike, changes: Mapping[str, float] | None = None, *, fi
     InputError
         If the study or a change cannot be used.
     UserCodeError
-        If user code fails or hangs.
+        If user code fails.
     SimulationError
         If SUMO fails.
     """
@@ -191,16 +189,18 @@ def changed_setting(system: System, changes: Mapping[str, float] | None, filtere
     return setting
 
 
-def simulate_with_original(study: Study, system: System, requested: FloatArray, *, filtered: bool = True, gui: bool = False) -> Simulation:
+def simulate_with_original(study: Study, system: System, requested: FloatArray, *, filtered: bool = True,
+                           gui: bool = False) -> Simulation:
     """Simulate a setting, shape (n,), that is yet to be filtered, and the original vehicle."""
     characteristics = system.characteristics
     setting = characteristics.filter(requested) if filtered else requested
-    original = _simulate_one(study, system, requested=characteristics.original, setting=characteristics.original)
-    original = replace(original, no_verdict=why_no_verdict(system))
-    if np.array_equal(setting, characteristics.original) and not gui:
-        return replace(original, reset_values=_reset_values(system, requested, setting))
-    simulation = _simulate_one(study, system, requested, setting, Engine.GUI if gui else Engine.LIBSUMO)
-    return replace(simulation, _original=original, no_verdict=original.no_verdict)
+    no_verdict = why_no_verdict(system)
+    original = _simulate_one(study, system, characteristics.original, no_verdict)
+    compared = gui or not np.array_equal(setting, characteristics.original)
+    simulation = _simulate_one(study, system, setting, no_verdict, gui) if compared else original
+    values = zip(characteristics.names, requested.tolist(), setting.tolist(), strict=True)
+    return replace(simulation, _original=original if compared else None,
+                   reset_values={name: value for name, value, kept in values if value != kept})
 
 
 def load_and_assemble(study: StudyLike, source: str = "") -> tuple[Study, System]:
@@ -209,22 +209,14 @@ def load_and_assemble(study: StudyLike, source: str = "") -> tuple[Study, System
     return loaded_study, assemble(loaded_study, source or (str(study) if isinstance(study, str | Path) else ""))
 
 
-def _simulate_one(study: Study, system: System, requested: FloatArray, setting: FloatArray, engine: Engine = Engine.LIBSUMO) -> Simulation:
+def _simulate_one(study: Study, system: System, setting: FloatArray, no_verdict: str, gui: bool = False) -> Simulation:
     settings, observations = setting[np.newaxis], list[Observation]()
-
-    def record_observation(seen: Observation) -> None:
-        observations.append(Observation._make(map(np.copy, seen)))
-
-    runs = drive_all(system_at_worst_point(system, settings), settings, engine, listen=record_observation)
+    runs = drive_all(system_at_worst_point(system, settings), settings, Engine.GUI if gui else Engine.LIBSUMO,
+                     listen=lambda seen: observations.append(Observation._make(map(np.copy, seen))))
     return Simulation(
         study=study, setting=dict(zip(system.characteristics.names, setting.tolist(), strict=True)),
-        reset_values=_reset_values(system, requested, setting), evaluation=score(system, settings, runs), runs=runs,
-        scoring=system.measuring.scoring, _observations=observations)
-
-
-def _reset_values(system: System, requested: FloatArray, setting: FloatArray) -> dict[str, float]:
-    values = zip(system.characteristics.names, requested, setting, strict=True)
-    return {name: float(requested_value) for name, requested_value, filtered_value in values if requested_value != filtered_value}
+        evaluation=score(system, settings, runs), runs=runs, scoring=system.measuring.scoring,
+        no_verdict=no_verdict, _observations=observations)
 
 
 SETTINGS_FORMAT = ("a list of mappings such as [{'mass': 2500}], a pandas.DataFrame with a column for each characteristic that is changed, "
@@ -300,32 +292,20 @@ def _read_settings(settings: Any, characteristics: CharacteristicSet) -> tuple[F
     import pandas as pd
 
     names = list(characteristics.names)
-    if isinstance(settings, Sequence) and not isinstance(settings, str) and all(isinstance(setting, Mapping) for setting in settings):
+    if isinstance(settings, Sequence) and all(isinstance(setting, Mapping) for setting in settings):
         settings = pd.DataFrame(list(settings), index=range(len(settings)))
-    if isinstance(settings, pd.DataFrame):
-        for name in settings.columns:
-            if name not in names:
-                raise unknown_name("settings", f"column {name!r} is no characteristic", name, names)
-        if settings.columns.has_duplicates:
-            raise InputError("settings", "a column appears twice", "each characteristic once")
-        table = pd.DataFrame(dict(zip(names, characteristics.original, strict=True)), index=settings.index)
-        for name in settings.columns:
-            values = settings[name].astype(object)
-            table[name] = values.where(values.notna(), table[name])
-        return _float_array(table), settings.index
-    if isinstance(settings, Mapping):
-        raise InputError("settings", f"is a {type(settings).__name__}", SETTINGS_FORMAT)
-    array = _float_array(settings)
-    if array.ndim != 2 or array.shape[1] != len(names):
-        raise InputError("settings", f"an array of shape {array.shape}", f"shape (M, {len(names)}): {', '.join(names)}")
-    return array, pd.RangeIndex(len(array))
-
-
-def _float_array(settings: Any) -> FloatArray:
     try:
-        return np.array(settings, dtype=float)
+        if not isinstance(settings, pd.DataFrame):
+            array = np.array(settings, dtype=float)
+            if array.ndim != 2 or array.shape[1] != len(names):
+                raise InputError("settings", f"an array of shape {array.shape}", f"shape (M, {len(names)}): {', '.join(names)}")
+            return array, pd.RangeIndex(len(array))
+        for name in settings.columns.difference(names, sort=False):
+            raise unknown_name("settings", f"column {name!r} is no characteristic", name, names)
+        values = settings.reindex(columns=names).to_numpy(dtype=float, na_value=np.nan)
     except (TypeError, ValueError) as error:
         raise InputError("settings", str(error), SETTINGS_FORMAT) from None
+    return np.where(np.isnan(values), characteristics.original, values), settings.index
 
 
 def _refuse_illegal_values(requested: FloatArray, characteristics: CharacteristicSet, beyond: bool) -> None:

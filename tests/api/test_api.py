@@ -150,7 +150,7 @@ def test_a_report_of_results_is_a_page(results: sv.Results, tmp_path: Path) -> N
 
 @pytest.mark.parametrize(("settings", "expected"), [
     (pd.DataFrame({"weight": [1.0]}), "weight"), (pd.DataFrame({"mass": ["heavy"]}), "heavy"), ([[1.0, 2.0]], r"shape \(1, 2\)"),
-    ({"mass": [2500.0]}, "a dict\nexpected: a list of mappings"), ([{"mass": 2500.0}, {"weight": 1.0}], "weight"),
+    ({"mass": [2500.0]}, "'dict'\nexpected: a list of mappings"), ([{"mass": 2500.0}, {"weight": 1.0}], "weight"),
     (pd.DataFrame({"mass": [2404.0, 9999.0]}), "row 1: mass = 9999"), (np.full((1, 17), np.nan), "shape|= nan"),
 ])
 def test_unusable_settings_are_reported_before_any_simulation(settings: object, expected: str) -> None:
