@@ -151,8 +151,8 @@ class Simulation:
         return f"<Simulation of {self.study.name}: {self.outcome}, {metrics}>"
 
 
-def simulate(study: StudyLike, changes: Mapping[str, float] | None = None, *, filtered: bool = True, beyond: bool = False,
-             gui: bool = False) -> Simulation:
+def simulate(study: StudyLike, changes: Mapping[str, float] | None = None, *, filtered: bool = True,
+             beyond: bool = False) -> Simulation:
     """Simulate one setting in this process, and the original vehicle for comparison.
 
     Parameters
@@ -165,8 +165,6 @@ def simulate(study: StudyLike, changes: Mapping[str, float] | None = None, *, fi
         Put changes that are smaller than their thresholds back to the original, as every search does.
     beyond
         Also accept values outside the domains, and settings that violate the study's constraints.
-    gui
-        Show the setting in sumo-gui.
 
     Raises
     ------
@@ -178,7 +176,7 @@ def simulate(study: StudyLike, changes: Mapping[str, float] | None = None, *, fi
         If SUMO fails.
     """
     loaded_study, system = load_and_assemble(study)
-    return simulate_with_original(loaded_study, system, changed_setting(system, changes, filtered, beyond), filtered=filtered, gui=gui)
+    return simulate_with_original(loaded_study, system, changed_setting(system, changes, filtered, beyond), filtered=filtered)
 
 
 def changed_setting(system: System, changes: Mapping[str, float] | None, filtered: bool, beyond: bool) -> FloatArray:
@@ -189,15 +187,14 @@ def changed_setting(system: System, changes: Mapping[str, float] | None, filtere
     return setting
 
 
-def simulate_with_original(study: Study, system: System, requested: FloatArray, *, filtered: bool = True,
-                           gui: bool = False) -> Simulation:
+def simulate_with_original(study: Study, system: System, requested: FloatArray, *, filtered: bool = True) -> Simulation:
     """Simulate a setting, shape (n,), that is yet to be filtered, and the original vehicle."""
     characteristics = system.characteristics
     setting = characteristics.filter(requested) if filtered else requested
     no_verdict = why_no_verdict(system)
     original = _simulate_one(study, system, characteristics.original, no_verdict)
-    compared = gui or not np.array_equal(setting, characteristics.original)
-    simulation = _simulate_one(study, system, setting, no_verdict, gui) if compared else original
+    compared = not np.array_equal(setting, characteristics.original)
+    simulation = _simulate_one(study, system, setting, no_verdict) if compared else original
     values = zip(characteristics.names, requested.tolist(), setting.tolist(), strict=True)
     return replace(simulation, _original=original if compared else None,
                    reset_values={name: value for name, value, kept in values if value != kept})
@@ -209,9 +206,9 @@ def load_and_assemble(study: StudyLike, source: str = "") -> tuple[Study, System
     return loaded_study, assemble(loaded_study, source or (str(study) if isinstance(study, str | Path) else ""))
 
 
-def _simulate_one(study: Study, system: System, setting: FloatArray, no_verdict: str, gui: bool = False) -> Simulation:
+def _simulate_one(study: Study, system: System, setting: FloatArray, no_verdict: str) -> Simulation:
     settings, observations = setting[np.newaxis], list[Observation]()
-    runs = drive_all(system_at_worst_point(system, settings), settings, Engine.GUI if gui else Engine.LIBSUMO,
+    runs = drive_all(system_at_worst_point(system, settings), settings, Engine.LIBSUMO,
                      listen=lambda seen: observations.append(Observation._make(map(np.copy, seen))))
     return Simulation(
         study=study, setting=dict(zip(system.characteristics.names, setting.tolist(), strict=True)),

@@ -97,10 +97,11 @@ def _check_outputs(trace: Path | None, plot: Path | None, animation: Path | None
     if plot is not None:
         check_output(plot, "--plot", PICTURE_ENDINGS)
     if animation is not None:
-        from safevar_sumo.replay.animation import ANIMATION_WRITERS, require_ffmpeg
+        from safevar_sumo.replay.animation import ENDINGS, find_ffmpeg
 
-        check_output(animation, "--animate", tuple(ANIMATION_WRITERS))
-        require_ffmpeg(animation)
+        check_output(animation, "--animate", ENDINGS)
+        if animation.suffix.lower() == ".mp4":
+            find_ffmpeg()
 
 
 def _show(study: Study, system: System, setting: FloatArray, plot: Path | None, animation: Path | None,

@@ -49,6 +49,8 @@ def find_moments(runs: SimulationRuns, row: int) -> Moments:
 
 ORIGINAL, CHANGED = 0, 1
 """Rows of a comparison."""
+COLOURS = {ORIGINAL: "#0072b2", CHANGED: "#d55e00"}
+"""Okabe and Ito's blue and vermillion."""
 
 
 def find_divergence(runs: SimulationRuns) -> int | None:

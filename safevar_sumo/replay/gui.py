@@ -1,28 +1,55 @@
-"""A comparison in sumo-gui: the original's road above and the changed vehicle's road below, at the same time."""
+"""A comparison in sumo-gui, which draws vehicles and persons at their recorded positions: the original's road above the changed one's."""
 
 from __future__ import annotations
 
+import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator
+from contextlib import contextmanager
+from itertools import pairwise, product
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from safevar_sumo.replay.animation import ACTOR_COLOUR, PERSON_COLOUR, VEHICLE_COLOURS, crossing_stripes, strip_corners
-from safevar_sumo.replay.comparison import CHANGED, ORIGINAL, Comparison
-from safevar_sumo.replay.film import LaneLine
-from safevar_sumo.replay.scene import FlatScene, lay_out_scene
-from safevar_sumo.replay.window import ActorPose, Colour, Window, open_window
+from safevar_sumo.errors import SimulationError
+from safevar_sumo.records import FloatArray
+from safevar_sumo.replay.animation import ACTOR_COLOUR, PATH_COLOUR, PERSON_COLOUR, ROAD_COLOUR
+from safevar_sumo.replay.comparison import CHANGED, COLOURS, Comparison
+from safevar_sumo.replay.film import ActorTrack, LaneLine
+from safevar_sumo.replay.scene import FlatScene, crossing_stripes, lay_out_scene, strip_corners
 from safevar_sumo.scenarios import VUT
+from safevar_sumo.sumo.engine import Engine, engine_api, program_path, start_engine, stop_engine
+from safevar_sumo.sumo.network import Network, copied_network
 
-COLOUR_NAMES = {ORIGINAL: "blue", CHANGED: "orange"}
 PAUSE = 2.0
 """Pause at the nearest moment and at the end [s]."""
 ROAD_SPACING = 5.0
 """Space between the two roads [m]."""
-ROAD_COLOUR, PATH_COLOUR, WHITE = (154, 161, 169, 255), (207, 211, 207, 255), (255, 255, 255, 255)
 LEGEND_HEIGHT = 1.8
 """Height of the legend above the lower edge of the view [m]."""
+BRAKE_LIGHT = 8
+"""Signal of a vehicle (TraCI, "change vehicle state": bit 3)."""
+ANY_POSITION = 2
+"""Value of keepRoute that allows positions beside every road (TraCI, "move to XY")."""
+VIEW_NAME = "View #0"
+VIEW_SETTINGS = """<viewsettings>
+    <scheme name="safevar_sumo">
+        <opengl antialiase="1" dither="0"/>
+        <background backgroundColor="238,240,236" showGrid="0"/>
+        <edges laneEdgeMode="0" laneShowBorders="1" showLinkDecals="1">
+            <colorScheme name="uniform"><entry color="154,161,169" name="road"/><entry color="207,211,207" name="sidewalk"/></colorScheme>
+        </edges>
+        <junctions junctionMode="0" drawShape="1" drawCrossingsAndWalkingareas="1">
+            <colorScheme name="uniform"><entry color="154,161,169"/><entry color="154,161,169" name="waterway"/></colorScheme>
+        </junctions>
+        <vehicles vehicleMode="0" vehicleQuality="2" showBlinker="1" vehicle_minSize="1.00" vehicle_exaggeration="1.00"/>
+        <persons personMode="0" personQuality="2" person_minSize="1.00" person_exaggeration="1.00"/>
+        <pois poiTextParam="words" poi_minSize="0.00" poi_exaggeration="0.01" poiText_show="1" poiText_size="85"
+              poiText_color="29,35,41" poiText_bgColor="255,255,255,0" poiText_constantSize="1"/>
+    </scheme>
+</viewsettings>
+"""
 
 
 def show_in_gui(comparison: Comparison, *, slower: float = 1.0, rest: float = PAUSE, pictures: Path | None = None) -> None:
@@ -39,110 +66,108 @@ def show_in_gui(comparison: Comparison, *, slower: float = 1.0, rest: float = PA
 
     Raises
     ------
-    InputError, SimulationError
-        If `replay.window.open_window` raises it.
+    InputError
+        If there is no display.
+    SimulationError
+        If SUMO cannot load the network, or its window was closed before the end.
     """
-    scene = lay_out_scene(comparison)
-    layout = _Layout(scene)
-    with open_window(comparison.network, scene.step) as window:
+    scene, tracks = lay_out_scene(comparison), comparison.film.tracks
+    heading = np.deg2rad(90 - tracks[VUT].angle[0, 0])
+    leftward = np.array([-np.sin(heading), np.cos(heading)])
+    offsets = [-leftward * row * (scene.view.height + ROAD_SPACING) for row in comparison.rows]
+    with _open_window(comparison.network, scene.step) as api:
+        for row, (name, track) in product(comparison.rows, tracks.items()):
+            colour = COLOURS[row] if name == VUT else PERSON_COLOUR if track.is_person else ACTOR_COLOUR
+            _add_actor(api, f"{row}.{name}", track, colour)
+        if len(offsets) > 1:  # SUMO draws only the original's road
+            for i, lane in enumerate(comparison.film.road):
+                _paint_lane(api, f"lane.{i}", lane, offsets[CHANGED])
         for row in comparison.rows:
-            _add_road_and_actors(window, scene, row, layout)
-        pauses = {moments.nearest for moments in scene.moments if moments.nearest is not None} | {scene.sample_count - 1}
+            api.poi.add(f"legend.{row}", 0, 0, (0, 0, 0, 0), layer=200)
+        pauses = {moments.nearest for moments in scene.moments} | {scene.sample_count - 1}
         start = time.monotonic()
         for sample in range(scene.sample_count):
-            _show_sample(window, scene, sample, layout)
+            _show_sample(api, scene, sample, offsets, heading)
             if sample in pauses:
                 if pictures is not None:
-                    window.save_picture(pictures / f"{sample:04d}.png")
+                    api.gui.screenshot(VIEW_NAME, str(pictures / f"{sample:04d}.png"))
+                    api.simulationStep()
                 time.sleep(rest)
                 start += rest
             time.sleep(max(0.0, start + (sample + 1) * scene.step * slower - time.monotonic()))
 
 
-class _Layout:
-    """Positions of the roads in the window: the changed vehicle's road lies below the original's road by the height of the view."""
-
-    def __init__(self, scene: FlatScene) -> None:
-        self._road_distance = scene.view.height + ROAD_SPACING
-        track = scene.comparison.film.tracks[VUT]
-        heading = np.deg2rad(90 - track.angle[0, 0])
-        self._rightward = np.array([np.sin(heading), -np.cos(heading)])
-
-    def offset(self, row: int) -> np.ndarray:
-        """Offset of a row's road, shape (2,) [m]."""
-        return self._rightward * self._road_distance * (row == CHANGED)
-
-
-def _add_road_and_actors(window: Window, scene: FlatScene, row: int, layout: _Layout) -> None:
-    """Add the actors of a row, and the changed vehicle's road: SUMO draws only the original's road."""
-    film = scene.comparison.film
-    if row == CHANGED:
-        for i, lane in enumerate(film.road):
-            for j, points in enumerate(_lane_outlines(lane)):
-                outline = _point_pairs(points + layout.offset(row))
-                window.paint(f"road.{i}.{j}", outline, _colour_of(lane), layer=2 if lane.kind == "crossing" else 0)
-    for name, track in film.tracks.items():
-        colour = _rgba(VEHICLE_COLOURS[row] if name == VUT else PERSON_COLOUR if track.is_person else ACTOR_COLOUR)
-        window.add(_actor_id(row, name), track.is_person, track.length, track.width, colour)
+@contextmanager
+def _open_window(network: Network, step: float) -> Iterator[Any]:
+    """Open a window on one copy of a network without traffic; yields TraCI."""
+    api = engine_api(Engine.GUI)
+    with tempfile.TemporaryDirectory() as folder:
+        settings_file = Path(folder) / "view.xml"
+        settings_file.write_text(VIEW_SETTINGS, encoding="utf-8")
+        options = {"-n": copied_network(network, 1).network, "--step-length": repr(step), "--collision.action": "none",
+                   "--gui-settings-file": settings_file, "--start": "true", "--quit-on-end": "true", "--no-step-log": "true",
+                   "--no-warnings": "true", "--window-size": "1200,700", "--time-to-teleport": -1, "--xml-validation": "never",
+                   "--xml-validation.net": "never"}
+        try:
+            start_engine(api, Engine.GUI, [program_path(Engine.GUI), *(str(text) for item in options.items() for text in item)])
+            lanes = [lane for lane in api.lane.getIDList() if not lane.startswith(":") and "passenger" not in api.lane.getDisallowed(lane)]
+            api.route.add("route", [api.lane.getEdgeID(lanes[0])])
+            yield api
+        except (api.TraCIException, api.FatalTraCIError) as error:
+            raise SimulationError(f"sumo-gui failed: {str(error).strip() or 'its window was closed'}") from None
+        finally:
+            stop_engine(api)
 
 
-def _show_sample(window: Window, scene: FlatScene, sample: int, layout: _Layout) -> None:
-    """Show one sample: the camera, the actors' poses, the legend."""
-    comparison, poses = scene.comparison, []
-    film = comparison.film
-    corners = []
-    for row in comparison.rows:
-        offset, run_sample = layout.offset(row), min(sample, scene.moments[row].end)
-        for name, track in film.tracks.items():
-            x, y = float(track.x[run_sample, row]), float(track.y[run_sample, row])
+def _add_actor(api: Any, name: str, track: ActorTrack, colour: str) -> None:
+    """Add an actor, which is a vehicle in sumo-gui; persons only have another shape."""
+    length, width = (max(track.length, track.width),) * 2 if track.is_person else (track.length, track.width)
+    api.vehicletype.copy("DEFAULT_VEHTYPE", name)
+    api.vehicletype.setShapeClass(name, "pedestrian" if track.is_person else "evehicle")
+    api.vehicletype.setLength(name, length)
+    api.vehicletype.setWidth(name, width)
+    api.vehicletype.setColor(name, _rgba(colour))
+    api.vehicletype.setMinGap(name, 0)
+    api.vehicle.add(name, "route", name)
+    api.vehicle.setSpeedMode(name, 0)
+    api.vehicle.setLaneChangeMode(name, 0)
+
+
+def _paint_lane(api: Any, name: str, lane: LaneLine, offset: FloatArray) -> None:
+    strips = [strip_corners(start, end, lane.width - 0.1) for start, end in pairwise(lane.line)]
+    outlines = {"area": [lane.line], "crossing": list(crossing_stripes(lane))}.get(lane.kind, strips)
+    colour = _rgba({"road": ROAD_COLOUR, "crossing": "#ffffff"}.get(lane.kind, PATH_COLOUR))
+    for i, outline in enumerate(outlines):
+        points = [tuple(point) for point in (outline + offset).tolist()]
+        api.polygon.add(f"{name}.{i}", points, colour, fill=True, layer=2 if lane.kind == "crossing" else 0)
+
+
+def _show_sample(api: Any, scene: FlatScene, sample: int, offsets: list[FloatArray], heading: float) -> None:
+    """Show the actors, the camera and the legend at one sample."""
+    comparison, view, trace = scene.comparison, scene.view, scene.comparison.film.runs.trace
+    vut, (cos, sin) = comparison.film.tracks[VUT], (np.cos(heading), np.sin(heading))
+    left = float(view.left_ends[sample])
+    flat = np.array([[x, y] for x in (left, left + view.width) for y in (view.bottom, view.bottom + view.height)])
+    corners = flat @ np.array([[cos, sin], [-sin, cos]]) + [vut.x[0, 0], vut.y[0, 0]]
+    for row, offset in enumerate(offsets):
+        moments = scene.moments[row]
+        now = min(sample, moments.end)
+        for name, track in comparison.film.tracks.items():
+            x, y, angle = (float(values[now, row]) for values in (track.x, track.y, track.angle))
             if not np.isnan(x):
-                brakes = name == VUT and bool(film.runs.trace.brake[run_sample, row] > 0)
-                angle = float(track.angle[run_sample, row])
-                poses.append(ActorPose(_actor_id(row, name), x + float(offset[0]), y + float(offset[1]), angle, brakes))
-        view_corners = _view_corners(scene, sample) + offset
-        corners.append(view_corners)
-        legend = f"{comparison.name(row)} ({COLOUR_NAMES[row]}): {film.runs.trace.speed[run_sample, row]:.1f} m/s"
-        is_finished = sample >= (scene.moments[row].end if scene.moments[row].nearest is None else int(scene.moments[row].nearest or 0))
-        middle = view_corners.mean(axis=0)
-        window.write(f"legend.{row}", float(middle[0]), float(view_corners[:, 1].min()) + LEGEND_HEIGHT,
-                     f"{legend}, {comparison.verdict(row)}" if is_finished else f"{legend}, {sample * scene.step:.2f} s")
-    all_corners = np.concatenate(corners)
-    window.set_view(*(float(value) for value in (*all_corners.min(axis=0), *all_corners.max(axis=0))))
-    window.show(poses)
+                api.vehicle.moveToXY(f"{row}.{name}", "", 0, x + offset[0], y + offset[1], angle, keepRoute=ANY_POSITION)
+                api.vehicle.setSignals(f"{row}.{name}", BRAKE_LIGHT if name == VUT and trace.brake[now, row] > 0 else 0)
+        is_finished = sample >= (moments.end if moments.nearest is None else moments.nearest)
+        ending = comparison.verdict(row) if is_finished else f"{sample * scene.step:.2f} s"
+        x, y = (corners + offset).mean(axis=0)[0], (corners + offset).min(axis=0)[1] + LEGEND_HEIGHT
+        api.poi.setPosition(f"legend.{row}", x, y)
+        api.poi.setParameter(f"legend.{row}", "words", f"{comparison.name(row)} ({('blue', 'orange')[row]}): "
+                                                       f"{trace.speed[now, row]:.1f} m/s, {ending}")
+    everything = np.concatenate([corners + offset for offset in offsets])
+    api.gui.setBoundary(VIEW_NAME, *everything.min(axis=0), *everything.max(axis=0))
+    api.simulationStep()
 
 
-def _view_corners(scene: FlatScene, sample: int) -> np.ndarray:
-    """The corners of a scene's view, in the film's plane; shape (4, 2)."""
-    view, track = scene.view, scene.comparison.film.tracks[VUT]
-    heading = np.deg2rad(90 - track.angle[0, 0])
-    forward, leftward = np.array([np.cos(heading), np.sin(heading)]), np.array([-np.sin(heading), np.cos(heading)])
-    start = np.array([track.x[0, 0], track.y[0, 0]])
-    return np.array([start + forward * x + leftward * y for x in (view.left_ends[sample], view.left_ends[sample] + view.width)
-                     for y in (view.bottom, view.bottom + view.height)])
-
-
-def _lane_outlines(lane: LaneLine) -> Sequence[np.ndarray]:
-    if lane.kind == "area":
-        return [lane.line]
-    if lane.kind == "crossing":
-        return list(crossing_stripes(lane))
-    return [strip_corners(start, end, lane.width - 0.1) for start, end in zip(lane.line[:-1], lane.line[1:], strict=True)]
-
-
-def _colour_of(lane: LaneLine) -> Colour:
-    return {"road": ROAD_COLOUR, "crossing": WHITE}.get(lane.kind, PATH_COLOUR)
-
-
-def _point_pairs(points: np.ndarray) -> list[tuple[float, float]]:
-    return [(float(x), float(y)) for x, y in points]
-
-
-def _rgba(colour: str) -> Colour:
-    red, green, blue = (int(colour[i:i + 2], 16) for i in (1, 3, 5))
+def _rgba(colour: str) -> tuple[int, int, int, int]:
+    red, green, blue = bytes.fromhex(colour[1:])
     return red, green, blue, 255
-
-
-def _actor_id(row: int, name: str) -> str:
-    return f"{'original' if row == ORIGINAL else 'changed'}.{name}"
-
-

@@ -10,7 +10,7 @@ import numpy as np
 
 from safevar_sumo.records import FloatArray
 from safevar_sumo.replay.comparison import CHANGED, ORIGINAL
-from safevar_sumo.replay.scene import MARK_DISTANCE, SEAM_WIDTH, FlatBody, FlatScene
+from safevar_sumo.replay.scene import SEAM_WIDTH, FlatBody, FlatScene
 
 if TYPE_CHECKING:
     from jinja2 import Environment
@@ -59,8 +59,7 @@ def player_data(scene: FlatScene) -> dict[str, Any]:
         "description": _describe_scene(scene), "moments": _list_jumps(scene), "bottom": round(-view.bottom, DECIMALS),
         "letters": round(view.width / WIDTH_IN_TEXT_HEIGHTS, DECIMALS),
         "road": [_lane_data(lane) for kind in ("area", "path", "road", "crossing") for lane in scene.road if lane.kind == kind],
-        "ticks": list(range(int(np.floor(view.left_ends.min() / MARK_DISTANCE)) * MARK_DISTANCE,
-                            int(view.left_ends.max() + view.width) + MARK_DISTANCE, MARK_DISTANCE)),
+        "ticks": scene.all_marks,
         "bodies": [_still_body_data(body, scene) for body in bodies],
         "played": {**common_data, "bodies": [_moving_body_data(body) for body in bodies]}}
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -44,13 +46,6 @@ class FlatBody(NamedTuple):
     y: FloatArray
     heading: FloatArray
 
-    def corners(self, sample: int) -> FloatArray:
-        """The outline of a vehicle, shape (4, 2): front left, front right, rear right, rear left."""
-        direction = np.array([np.cos(self.heading[sample]), np.sin(self.heading[sample])])
-        half_width, front = np.array([-direction[1], direction[0]]) * self.width / 2, np.array([self.x[sample], self.y[sample]])
-        rear = front - direction * self.length
-        return np.array([front + half_width, front - half_width, rear - half_width, rear + half_width])
-
 
 class View(NamedTuple):
     """The part of the road that is shown: its left end at every sample, shape (T,), its lower end, and its size [m]."""
@@ -79,10 +74,11 @@ class FlatScene:
         last = self.moments[-1]
         return last.nearest if last.nearest is not None else last.end
 
-    def marks(self, sample: int) -> list[int]:
-        """The marks in view, by their distance from the start [m]."""
-        left = float(self.view.left_ends[sample])
-        return list(range(math.ceil(left / MARK_DISTANCE) * MARK_DISTANCE, math.floor(left + self.view.width) + 1, MARK_DISTANCE))
+    @property
+    def all_marks(self) -> list[int]:
+        """The marks that ever come into view, by their distance from the start [m]."""
+        left, right = float(self.view.left_ends.min()), float(self.view.left_ends.max()) + self.view.width
+        return list(range(math.floor(left / MARK_DISTANCE) * MARK_DISTANCE, int(right) + MARK_DISTANCE, MARK_DISTANCE))
 
 
 def lay_out_scene(comparison: Comparison) -> FlatScene:
@@ -139,3 +135,22 @@ def _choose_view(bodies: tuple[FlatBody, ...], sample_count: int) -> View:
     front = np.mean([body.x for body in bodies if body.is_vut], axis=0)
     left = np.clip(front - CAMERA_LENGTH * 0.45, left_end, max(left_end, right_end - CAMERA_LENGTH))
     return View(left, bottom - padding, CAMERA_LENGTH, top - bottom + 2 * padding)
+
+
+STRIPE_LENGTH = 0.5
+"""Length of a crossing's stripes, and of the space between them [m]."""
+
+
+def strip_corners(start: FloatArray, end: FloatArray, width: float) -> FloatArray:
+    """The corners of a straight strip from start to end, shape (4, 2)."""
+    direction = end - start
+    half_width = np.array([-direction[1], direction[0]]) / (np.hypot(*direction) or 1.0) * width / 2
+    return np.array([start + half_width, end + half_width, end - half_width, start - half_width])
+
+
+def crossing_stripes(lane: LaneLine) -> Iterator[FloatArray]:
+    """The stripes of a crossing, each of shape (4, 2)."""
+    for start, end in pairwise(lane.line):
+        direction = (end - start) / (np.hypot(*(end - start)) or 1.0)
+        for distance in np.arange(STRIPE_LENGTH / 2, np.hypot(*(end - start)) - STRIPE_LENGTH, 2 * STRIPE_LENGTH):
+            yield strip_corners(start + direction * distance, start + direction * (distance + STRIPE_LENGTH), lane.width)

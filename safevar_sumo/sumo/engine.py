@@ -46,7 +46,7 @@ def open_world(files: CopiedNetwork, n: int, engine: Engine = Engine.LIBSUMO, op
     api = engine_api(engine)
     try:
         start_engine(api, engine, [*sumo_command(engine, files), *options])
-        yield SumoWorld(api, n, watched=engine is Engine.GUI)
+        yield SumoWorld(api, n)
     except (api.TraCIException, api.FatalTraCIError) as error:
         raise SimulationError(f"SUMO failed: {str(error).strip() or 'it closed the connection'}") from None
     finally:
@@ -65,11 +65,10 @@ def engine_api(engine: Engine) -> Any:
 
 def sumo_command(engine: Engine, files: CopiedNetwork) -> list[str]:
     """The command line that starts SUMO on copies of a network."""
-    window = ["--start", "true", "--quit-on-end", "true", "--window-size", "1200,700"] if engine is Engine.GUI else []
     return [
         program_path(engine), "-c", str(files.options), "-n", str(files.network), "-r", str(files.traffic),
         "--no-step-log", "true", "--no-warnings", "true", "--xml-validation", "never", "--xml-validation.net", "never",
-        "--xml-validation.routes", "never", *window]
+        "--xml-validation.routes", "never"]
 
 
 def start_engine(api: Any, engine: Engine, command: list[str]) -> None:

@@ -167,12 +167,12 @@ def simulate(system: System, settings: FloatArray, engine: Engine = Engine.RECOR
              watch: Watcher | None = None) -> SimulationRuns:
     """Run the scenario once for every setting, shape (N, n); `watch` is called with the world at every sample.
 
-    In a matrix, the result holds each setting's run at its worst point; with `watch` or a window, all settings run at the worst point of
+    In a matrix, the result holds each setting's run at its worst point; with `watch`, all settings run at the worst point of
     the last setting. Raises the errors of `drive_all`.
     """
     if not system.matrix:
         return drive_all(system, settings, engine, watch)
-    if watch is not None or engine is Engine.GUI:
+    if watch is not None:
         return drive_all(system_at_worst_point(system, settings), settings, engine, watch)
     at_points = simulate_all_points(system, settings, engine)
     return _select_runs([result.runs for result in at_points], worst_points(at_points))

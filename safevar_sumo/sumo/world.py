@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable, Sequence
 from itertools import chain
 from typing import Any, NamedTuple
@@ -50,7 +49,7 @@ class Body(NamedTuple):
 class SumoWorld:
     """N copies of a network in a running simulation, created by `open_world`. Arrays have shape (N,) or (N, 2)."""
 
-    def __init__(self, api: Any, n: int, *, watched: bool = False) -> None:
+    def __init__(self, api: Any, n: int) -> None:
         self._api, self.n = api, n
         self._set_speed, self._get_speed = _api_function(api, "vehicle", "setSpeed"), _api_function(api, "vehicle", "getSpeed")
         self._vehicle_position, self._person_position = (_api_function(api, domain, "getPosition") for domain in ("vehicle", "person"))
@@ -67,7 +66,6 @@ class SumoWorld:
         self._commanded_speeds = np.full(len(self._driving_numbers), np.nan)
         """Last speeds commanded to the vehicles under test [m/s]."""
         self.step_length: float = api.simulation.getDeltaT()
-        self._pause = self.step_length if watched else 0.0
         self.sensors = Sensors.perfect(n)
         """The vehicles' sensors in their weather, for ADSs that read the world instead of getting observations."""
 
@@ -127,8 +125,6 @@ class SumoWorld:
         self._api.simulationStep()
         self._positions.clear()
         self._speeds_now = None
-        if self._pause:
-            time.sleep(self._pause)
 
     def collisions(self, is_open: BoolArray) -> dict[int, float]:
         """Speeds [m/s] of the vehicles under test of open runs that collide in this step, by copy.

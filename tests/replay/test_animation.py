@@ -10,15 +10,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from PIL import Image
 
 from safevar_sumo.analysis.research_questions.case import load_cases
 from safevar_sumo.errors import InputError
-from safevar_sumo.replay.animation import PANEL_HEIGHT, VEHICLE_COLOURS, WIDTH, animate, draw_frames, require_ffmpeg
-from safevar_sumo.replay.comparison import Comparison, compare_setting
+from safevar_sumo.replay.animation import PANEL_HEIGHT, WIDTH, animate, draw_scene, find_ffmpeg
+from safevar_sumo.replay.comparison import COLOURS, Comparison, compare_setting
 from safevar_sumo.replay.page import animation_page
-from safevar_sumo.replay.scene import lay_out_scene
+from safevar_sumo.replay.scene import FlatScene, lay_out_scene
 from safevar_sumo.sumo.system import assemble
+from tests.in_process import refused
 
 
 @pytest.fixture(scope="module")
@@ -27,24 +29,33 @@ def crash(slippery: Path) -> Comparison:
     return compare_setting(case.study, assemble(case.study), case.solutions[list(case.characteristics.names)].to_numpy()[0])
 
 
-def where(picture: Image.Image, colour: str) -> tuple[np.ndarray, np.ndarray]:
+def frame(scene: FlatScene, sample: int) -> np.ndarray:
+    """The picture of a sample, shape (height, width, 3)."""
+    figure, show = draw_scene(scene)
+    show(sample)
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    return np.asarray(canvas.buffer_rgba())[:, :, :3]
+
+
+def where(picture: np.ndarray, colour: str) -> tuple[np.ndarray, np.ndarray]:
     """Rows and columns of the pixels of a colour, below the words."""
-    pixels = np.asarray(picture.convert("RGB")).astype(int)[PANEL_HEIGHT:]
+    pixels = picture.astype(int)[PANEL_HEIGHT:]
     wanted = [int(colour[i:i + 2], 16) for i in (1, 3, 5)]
     return np.nonzero(np.abs(pixels - wanted).max(axis=2) < 26)
 
 
 def test_both_vehicles_are_drawn_at_their_positions_to_scale(crash: Comparison) -> None:
     scene = lay_out_scene(crash)
-    picture = next(draw_frames(scene, scene.sample_count))  # the start: the changed vehicle stands on the original's place
+    picture = frame(scene, 0)  # the changed vehicle stands on the original's place
     scale = WIDTH / scene.view.width
-    rows, columns = where(picture, VEHICLE_COLOURS[0])
+    rows, columns = where(picture, COLOURS[0])
     vut = next(body for body in scene.bodies if body.is_vut)
     assert columns.max() - columns.min() == pytest.approx(vut.length * scale, abs=4)
     assert rows.max() - rows.min() == pytest.approx(vut.width * scale, abs=4)
-    end = list(draw_frames(scene, scene.sample_count))[-1]
+    end = frame(scene, scene.sample_count - 1)
     for row, body in enumerate(one for one in scene.bodies if one.is_vut):
-        _, columns = where(end, VEHICLE_COLOURS[row])
+        _, columns = where(end, COLOURS[row])
         assert columns.max() == pytest.approx((body.x[-1] - scene.view.left_ends[-1]) * scale, abs=4)
 
 
@@ -105,4 +116,5 @@ def test_without_ffmpeg_a_film_is_refused_before_anything_runs(tmp_path: Path, m
     monkeypatch.setenv("PATH", "/nowhere")
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     with pytest.raises(InputError, match="ffmpeg"):
-        require_ffmpeg(tmp_path / "it.mp4")
+        find_ffmpeg()
+    refused("simulate", "sun", "--animate", str(tmp_path / "it.mp4"), message=("--animate", "ffmpeg"))
