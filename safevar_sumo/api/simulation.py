@@ -176,7 +176,8 @@ def simulate(study: StudyLike, changes: Mapping[str, float] | None = None, *, fi
         If SUMO fails.
     """
     loaded_study, system = load_and_assemble(study)
-    return simulate_with_original(loaded_study, system, changed_setting(system, changes, filtered, beyond), filtered=filtered)
+    return simulate_with_original(loaded_study, system, changed_setting(system, changes, filtered, beyond),
+                                  filtered=filtered)
 
 
 def changed_setting(system: System, changes: Mapping[str, float] | None, filtered: bool, beyond: bool) -> FloatArray:

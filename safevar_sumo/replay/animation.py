@@ -26,7 +26,8 @@ if TYPE_CHECKING:
 WIDTH, PANEL_HEIGHT, DPI = 880, 62, 100
 """Width of a frame, and height of the panel with texts above the road [pixels]; resolution [pixels per inch]."""
 GROUND_COLOUR, ROAD_COLOUR, SEAM_COLOUR, PATH_COLOUR = "#eef0ec", "#9aa1a9", "#e8eaec", "#cfd3cf"
-TEXT_COLOUR, PALE_TEXT_COLOUR, ACTOR_COLOUR, PERSON_COLOUR, BRAKE_COLOUR = "#1d2329", "#5d666f", "#3f464d", "#1d2329", "#e60000"
+TEXT_COLOUR, PALE_TEXT_COLOUR, ACTOR_COLOUR = "#1d2329", "#5d666f", "#3f464d"
+PERSON_COLOUR, BRAKE_COLOUR = "#1d2329", "#e60000"
 ENDINGS = (".gif", ".mp4", ".html")
 """Endings of the files that `animate` writes."""
 SECONDS_PER_FRAME = 0.1
@@ -35,7 +36,8 @@ LAST_FRAME_DURATION = 2.0
 """Duration of the last frame [s]."""
 MAX_GIF_SIZE = 1_000_000
 """Size above which a gif gets fewer frames [bytes]."""
-EXACT = ["-threads", "1", "-pix_fmt", "yuv420p", "-crf", "26", "-movflags", "+faststart", "-fflags", "+bitexact", "-flags:v", "+bitexact",
+EXACT = ["-threads", "1", "-pix_fmt", "yuv420p", "-crf", "26", "-movflags", "+faststart", "-fflags", "+bitexact",
+         "-flags:v", "+bitexact",
          "-map_metadata", "-1"]
 """Options of ffmpeg for small files of the same bytes each time."""
 
@@ -118,18 +120,19 @@ def draw_scene(scene: FlatScene) -> tuple[Figure, Callable[[int], list[Patch]]]:
                            ylim=(view.bottom, view.bottom + view.height))
     axis.spines[:].set_visible(False)
     _draw_road(axis, scene)
-    bodies = [(body, *_draw_body(axis, body, scene)) for body in sorted(scene.bodies, key=lambda body: (body.is_vut, body.row))]
+    in_order = sorted(scene.bodies, key=lambda body: (body.is_vut, body.row))
+    bodies = [(body, *_draw_body(axis, body, scene)) for body in in_order]
     clock = figure.text(0.014, 0.98, "", fontsize=18, color=TEXT_COLOUR, va="top")
-    texts = [figure.text(0.15, 1 - (8 + 26 * row) / (PANEL_HEIGHT + height), "", fontsize=11, color=COLOURS[row], va="top",
-                         family="monospace") for row in scene.comparison.rows]
+    texts = [figure.text(0.15, 1 - (8 + 26 * row) / (PANEL_HEIGHT + height), "", fontsize=11, color=COLOURS[row],
+                         va="top", family="monospace") for row in scene.comparison.rows]
 
     def show(sample: int) -> list[Patch]:
         axis.set_xlim(view.left_ends[sample], view.left_ends[sample] + view.width)
         for body, patches, lights in bodies:
-            transform = Affine2D().rotate(body.heading[sample]).translate(body.x[sample], body.y[sample]) + axis.transData
+            pose = Affine2D().rotate(body.heading[sample]).translate(body.x[sample], body.y[sample])
             brakes = trace.brake[min(sample, scene.moments[body.row].end), body.row] > 0
             for patch in [*patches, *lights]:
-                patch.set_transform(transform)
+                patch.set_transform(pose + axis.transData)
                 patch.set_visible(bool(np.isfinite(body.x[sample]) and (brakes or patch not in lights)))
         clock.set_text(f"{sample * scene.step:.2f} s")
         for row, text in enumerate(texts):
@@ -161,18 +164,19 @@ def _draw_road(axis: Axes, scene: FlatScene) -> None:
                     for start, end in pairwise(lane.line):
                         axis.add_patch(Polygon(strip_corners(start, end, width), color=colour, linewidth=0))
     for mark in scene.all_marks:
-        axis.annotate(f" {mark} m", (mark, scene.view.bottom), (0, 2), textcoords="offset points", color=PALE_TEXT_COLOUR, fontsize=8,
-                      annotation_clip=True)
+        axis.annotate(f" {mark} m", (mark, scene.view.bottom), (0, 2), textcoords="offset points",
+                      color=PALE_TEXT_COLOUR, fontsize=8, annotation_clip=True)
         axis.vlines(mark, scene.view.bottom, scene.view.bottom + 0.7, color=PALE_TEXT_COLOUR, linewidth=0.7)
 
 
 def _draw_body(axis: Axes, body: FlatBody, scene: FlatScene) -> tuple[list[Patch], list[Patch]]:
-    """Draw an actor with its front bumper, or a person's middle, at the origin and heading along x; its brake lights come second."""
+    """Draw an actor with its front bumper, or a person's middle, at the origin, heading along x; brake lights come second."""
     from matplotlib.patches import Circle, Rectangle
 
     length, width = body.length, body.width
     if body.is_person:
-        return [axis.add_patch(Circle((0, 0), max(length, width) / 2, facecolor=PERSON_COLOUR, edgecolor="white", zorder=3))], []
+        return [axis.add_patch(Circle((0, 0), max(length, width) / 2, facecolor=PERSON_COLOUR, edgecolor="white",
+                                      zorder=3))], []
     colour = COLOURS[body.row] if body.is_vut else ACTOR_COLOUR
     alpha = 0.6 if body.is_vut and body.row == ORIGINAL and len(scene.moments) > 1 else 0.9
     corner = (-length, -width / 2)

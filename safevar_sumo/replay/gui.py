@@ -1,4 +1,4 @@
-"""A comparison in sumo-gui, which draws vehicles and persons at their recorded positions: the original's road above the changed one's."""
+"""A comparison in sumo-gui, which draws actors at their recorded positions: the original's road above the changed one's."""
 
 from __future__ import annotations
 
@@ -38,12 +38,15 @@ VIEW_SETTINGS = """<viewsettings>
         <opengl antialiase="1" dither="0"/>
         <background backgroundColor="238,240,236" showGrid="0"/>
         <edges laneEdgeMode="0" laneShowBorders="1" showLinkDecals="1">
-            <colorScheme name="uniform"><entry color="154,161,169" name="road"/><entry color="207,211,207" name="sidewalk"/></colorScheme>
+            <colorScheme name="uniform"><entry color="154,161,169" name="road"/>
+                <entry color="207,211,207" name="sidewalk"/></colorScheme>
         </edges>
         <junctions junctionMode="0" drawShape="1" drawCrossingsAndWalkingareas="1">
-            <colorScheme name="uniform"><entry color="154,161,169"/><entry color="154,161,169" name="waterway"/></colorScheme>
+            <colorScheme name="uniform"><entry color="154,161,169"/>
+                <entry color="154,161,169" name="waterway"/></colorScheme>
         </junctions>
-        <vehicles vehicleMode="0" vehicleQuality="2" showBlinker="1" vehicle_minSize="1.00" vehicle_exaggeration="1.00"/>
+        <vehicles vehicleMode="0" vehicleQuality="2" showBlinker="1" vehicle_minSize="1.00"
+            vehicle_exaggeration="1.00"/>
         <persons personMode="0" personQuality="2" person_minSize="1.00" person_exaggeration="1.00"/>
         <pois poiTextParam="words" poi_minSize="0.00" poi_exaggeration="0.01" poiText_show="1" poiText_size="85"
               poiText_color="29,35,41" poiText_bgColor="255,255,255,0" poiText_constantSize="1"/>
@@ -105,13 +108,15 @@ def _open_window(network: Network, step: float) -> Iterator[Any]:
         settings_file = Path(folder) / "view.xml"
         settings_file.write_text(VIEW_SETTINGS, encoding="utf-8")
         options = {"-n": copied_network(network, 1).network, "--step-length": repr(step), "--collision.action": "none",
-                   "--gui-settings-file": settings_file, "--start": "true", "--quit-on-end": "true", "--no-step-log": "true",
-                   "--no-warnings": "true", "--window-size": "1200,700", "--time-to-teleport": -1, "--xml-validation": "never",
-                   "--xml-validation.net": "never"}
+                   "--gui-settings-file": settings_file, "--start": "true", "--quit-on-end": "true",
+                   "--no-step-log": "true", "--no-warnings": "true", "--window-size": "1200,700",
+                   "--time-to-teleport": -1, "--xml-validation": "never", "--xml-validation.net": "never"}
         try:
-            start_engine(api, Engine.GUI, [program_path(Engine.GUI), *(str(text) for item in options.items() for text in item)])
-            lanes = [lane for lane in api.lane.getIDList() if not lane.startswith(":") and "passenger" not in api.lane.getDisallowed(lane)]
-            api.route.add("route", [api.lane.getEdgeID(lanes[0])])
+            command = [program_path(Engine.GUI), *(str(text) for item in options.items() for text in item)]
+            start_engine(api, Engine.GUI, command)
+            lane = next(lane for lane in api.lane.getIDList()
+                        if not lane.startswith(":") and "passenger" not in api.lane.getDisallowed(lane))
+            api.route.add("route", [api.lane.getEdgeID(lane)])
             yield api
         except (api.TraCIException, api.FatalTraCIError) as error:
             raise SimulationError(f"sumo-gui failed: {str(error).strip() or 'its window was closed'}") from None
@@ -155,7 +160,8 @@ def _show_sample(api: Any, scene: FlatScene, sample: int, offsets: list[FloatArr
         for name, track in comparison.film.tracks.items():
             x, y, angle = (float(values[now, row]) for values in (track.x, track.y, track.angle))
             if not np.isnan(x):
-                api.vehicle.moveToXY(f"{row}.{name}", "", 0, x + offset[0], y + offset[1], angle, keepRoute=ANY_POSITION)
+                api.vehicle.moveToXY(f"{row}.{name}", "", 0, x + offset[0], y + offset[1], angle,
+                                     keepRoute=ANY_POSITION)
                 api.vehicle.setSignals(f"{row}.{name}", BRAKE_LIGHT if name == VUT and trace.brake[now, row] > 0 else 0)
         is_finished = sample >= (moments.end if moments.nearest is None else moments.nearest)
         ending = comparison.verdict(row) if is_finished else f"{sample * scene.step:.2f} s"

@@ -153,4 +153,5 @@ def crossing_stripes(lane: LaneLine) -> Iterator[FloatArray]:
     for start, end in pairwise(lane.line):
         direction = (end - start) / (np.hypot(*(end - start)) or 1.0)
         for distance in np.arange(STRIPE_LENGTH / 2, np.hypot(*(end - start)) - STRIPE_LENGTH, 2 * STRIPE_LENGTH):
-            yield strip_corners(start + direction * distance, start + direction * (distance + STRIPE_LENGTH), lane.width)
+            yield strip_corners(start + direction * distance, start + direction * (distance + STRIPE_LENGTH),
+                                lane.width)

@@ -167,8 +167,8 @@ def simulate(system: System, settings: FloatArray, engine: Engine = Engine.RECOR
              watch: Watcher | None = None) -> SimulationRuns:
     """Run the scenario once for every setting, shape (N, n); `watch` is called with the world at every sample.
 
-    In a matrix, the result holds each setting's run at its worst point; with `watch`, all settings run at the worst point of
-    the last setting. Raises the errors of `drive_all`.
+    In a matrix, the result holds each setting's run at its worst point; with `watch`, all settings run at the worst
+    point of the last setting. Raises the errors of `drive_all`.
     """
     if not system.matrix:
         return drive_all(system, settings, engine, watch)
