@@ -14,7 +14,7 @@ from rich.progress import Progress as Bar
 from rich.text import Text
 
 Progress = Callable[[str, int, int], None]
-"""A function that shows progress. Its arguments: the stage, the amount done in it, and its total. A stage begins with nothing done."""
+"""A function that shows progress, called with the stage, the amount done in it, and its total; first with nothing done."""
 SECONDS_BETWEEN_LINES = 30.0
 """Interval of the lines that show progress without a terminal [s]."""
 SETTLING_TIME = 2.0
@@ -47,7 +47,7 @@ class _TimeLeft(ProgressColumn):
 
 @contextmanager
 def open_progress(progress: bool | Progress, console: Console | None = None) -> Iterator[Progress]:
-    """Yield the function to call: `progress` itself, for True one that moves a bar or prints lines, for False one that does nothing."""
+    """Yield the function to call: `progress` itself, or one that moves a bar or prints lines (True) or does nothing."""
     if progress is not True:
         yield progress or show_no_progress
         return
@@ -64,7 +64,8 @@ def open_progress(progress: bool | Progress, console: Console | None = None) -> 
         while not ended.wait(SECONDS_BETWEEN_LINES) and not console.is_terminal:
             console.print(f"{line}, {time_left.render()}", soft_wrap=True, markup=False, highlight=False)
 
-    columns = (TextColumn("{task.description}", markup=False), BarColumn(bar_width=None), MofNCompleteColumn(), time_left)
+    stage = TextColumn("{task.description}", markup=False)
+    columns = (stage, BarColumn(bar_width=None), MofNCompleteColumn(), time_left)
     lines = Thread(target=print_lines, name="progress", daemon=True)
     with Bar(*columns, console=console, disable=not console.is_terminal) as bar:
         task = bar.add_task(line, total=None)

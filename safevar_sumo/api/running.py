@@ -48,8 +48,8 @@ def run(study: StudyLike, out: str | Path | None = None, *, jobs: int | None = N
     pool
         Pool that simulates, in place of new worker processes or a cluster.
     progress
-        True for a bar on the terminal; a function called with the study's name and what it has found, the number of evaluations done, and
-        the number to do at most; or an `Observer`.
+        True for a bar on the terminal; a function called with the study's name and what it has found, the number of
+        evaluations done, and the number to do at most; or an `Observer`.
     only
         The only runs to carry out, as (algorithm, number from 0); the results are complete once every run is finished.
     batch
@@ -159,9 +159,10 @@ def open_observer(progress: bool | Progress | Observer, study: Study, keys: Sequ
 
 
 class CampaignProgress:
-    """Passes on the progress of a campaign: evaluations, without those of journals, of all that are left; and what runs have found."""
+    """Passes on the progress of a campaign: evaluations, without those of journals, and what runs have found."""
 
-    def __init__(self, progress: Progress, study: Study, keys: Sequence[RunKey], show_warning: Callable[[str], None] = warn) -> None:
+    def __init__(self, progress: Progress, study: Study, keys: Sequence[RunKey],
+                 show_warning: Callable[[str], None] = warn) -> None:
         self.warned, self._progress, self._study, self._run_count = show_warning, progress, study, len(keys)
         self._done, self._total = 0, len(keys) * study.search.evaluations
         self._counts, self._colliding_settings = Counter[RunKey](), dict[RunKey, set[bytes]]()
@@ -177,7 +178,8 @@ class CampaignProgress:
             self._total -= len(evaluations)
         collisions = self._colliding_settings.setdefault(key, set())
         collisions.update(setting.tobytes() for setting in evaluations.settings[evaluations.collided])
-        self._lowest_degree = min(self._lowest_degree, float(np.min(evaluations.f_safe[evaluations.valid], initial=np.inf)))
+        degrees = evaluations.f_safe[evaluations.valid]
+        self._lowest_degree = float(np.min(degrees, initial=self._lowest_degree))
         self._show()
 
     def finished(self, key: RunKey, asked: int) -> None:
@@ -189,4 +191,5 @@ class CampaignProgress:
     def _show(self) -> None:
         collisions = sum(map(len, self._colliding_settings.values()))
         found = "" if np.isinf(self._lowest_degree) else f", {collisions} collisions, best SD {self._lowest_degree:.2f}"
-        self._progress(f"{self._study.name}: runs {self._finished_runs}/{self._run_count}{found}", self._done, self._total)
+        stage = f"{self._study.name}: runs {self._finished_runs}/{self._run_count}{found}"
+        self._progress(stage, self._done, self._total)

@@ -76,8 +76,10 @@ class LazyCommands(click.Group):
         except InputError as error:
             command = super().get_command(ctx, str(ctx.invoked_subcommand))
             flags = {option.name: option.opts[-1] for option in command.params if isinstance(option, click.Option)} if command else {}
-            error.source = flags.get(error.source, error.source) if isinstance(error.source, str) else error.source  # a path is no argument
-            error.problem, error.legal = (ARGUMENT.sub(partial(_to_flag, flags), text) for text in (error.problem, error.legal))
+            if isinstance(error.source, str):  # a path is no argument
+                error.source = flags.get(error.source, error.source)
+            to_flag = partial(_to_flag, flags)
+            error.problem, error.legal = (ARGUMENT.sub(to_flag, text) for text in (error.problem, error.legal))
             raise
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:

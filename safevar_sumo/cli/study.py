@@ -74,8 +74,10 @@ def study(study: str, batch: int | None, engine: str, out: Path | None, jobs: in
             print_forecast(Console(), loaded_study, len(keys), cost, f"{ENGINE_NAMES[used_engine]}: {reason}")
             return
         try:
-            with open_observer(not quiet, loaded_study, keys, lambda message: click.echo(f"warning: {message}", err=True)) as observer:
-                campaign = carry_out_runs(loaded_study, system, keys, directory, pool, observer, batch, engine, retry_failed=retry_failed)
+            with open_observer(not quiet, loaded_study, keys,
+                               lambda message: click.echo(f"warning: {message}", err=True)) as observer:
+                campaign = carry_out_runs(loaded_study, system, keys, directory, pool, observer, batch, engine,
+                                          retry_failed=retry_failed)
         except KeyboardInterrupt:
             click.echo(f"finished evaluations are kept in {directory}: run the same command again to continue", err=True)
             raise

@@ -183,7 +183,8 @@ def _make_cause_section(data: ReportInput, rank: int, cause: CauseEntry, failure
         cause_robustness="" if cause.robustness is None else robustness_in_words(cause.robustness))
 
 
-def replay_solutions(data: ReportInput, explanations: Explanations | None, progress: Progress) -> list[ReplayedSolution]:
+def replay_solutions(data: ReportInput, explanations: Explanations | None,
+                     progress: Progress) -> list[ReplayedSolution]:
     """Replay solutions: `FIRST_CHOICES`, explained solutions, and non-dominated unsafe solutions."""
     entries, handles = [], _select_handles(data, explanations.failures if explanations else [])
     if data.system is not None and handles:

@@ -184,8 +184,8 @@ class ReportInput:
     def simulation_counts(self) -> dict[str, int]:
         """About how many simulations each section takes, at most."""
         n = len(self.case.characteristics)
-        return {"causes": EXPLAIN_SIMULATIONS, "tolerance": 200 * n + 6000, "risk": SAMPLED_VEHICLES + (n + 2) * BASE_POINTS,
-                "rules": SAMPLED_VEHICLES}
+        return {"causes": EXPLAIN_SIMULATIONS, "tolerance": 200 * n + 6000,
+                "risk": SAMPLED_VEHICLES + (n + 2) * BASE_POINTS, "rules": SAMPLED_VEHICLES}
 
     @property
     def original_fails(self) -> bool:

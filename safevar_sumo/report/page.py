@@ -182,7 +182,8 @@ def make_report(directories: Iterable[str | Path], only: Sequence[str] = (), job
     sections = [name for name in SECTIONS if not only or name in only]
     if point is not None:
         if "questions" in only:
-            raise InputError("only", "the research questions are about whole studies", "sections other than questions with `point`")
+            raise InputError("only", "the research questions are about whole studies",
+                             "sections other than questions with `point`")
         sections = [name for name in sections if name != "questions"]
     inputs = read_inputs(directories, point, as_it_is_now=as_it_is_now)
     for data in inputs:
@@ -213,15 +214,16 @@ def make_report(directories: Iterable[str | Path], only: Sequence[str] = (), job
     return page + "\n"
 
 
-def _study_data(data: ReportInput, sections: Sequence[str], jobs: int | None, parts: PartsProgress) -> Mapping[str, Any]:
+def _study_data(data: ReportInput, sections: Sequence[str], jobs: int | None,
+                parts: PartsProgress) -> Mapping[str, Any]:
     """Make the data of one study that the templates of these sections need."""
     explanations, solutions = None, list[ReplayedSolution]()
     if "causes" in sections:
         progress = parts.begin(f"{data.directory}: causes")
         explanations = None if data.system is None else explain_main_failures(data, jobs, progress)
         solutions = replay_solutions(data, explanations, progress)
-    domain_sections = {name: make(data, jobs, parts.begin(f"{data.directory}: {name}")) for name, make in DOMAIN_SECTIONS.items()
-                       if name in sections and data.system is not None}
+    domain_sections = {name: make(data, jobs, parts.begin(f"{data.directory}: {name}"))
+                       for name, make in DOMAIN_SECTIONS.items() if name in sections and data.system is not None}
     makers: dict[str, Callable[[], Any]] = {
         "tested": lambda: describe_tested_system(data),
         "verdict": lambda: reach_verdict(data, explanations, domain_sections.get("tolerance")),

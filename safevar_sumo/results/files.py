@@ -74,7 +74,8 @@ def make_directory(path: Path) -> None:
         with tempfile.TemporaryFile(dir=path):
             pass
     except OSError as error:
-        problem = "it is a link whose target does not exist" if path.is_symlink() and not path.exists() else error.strerror
+        is_dangling = path.is_symlink() and not path.exists()
+        problem = "it is a link whose target does not exist" if is_dangling else error.strerror
         raise InputError("out", f"cannot write to {path}: {problem}", "a directory that can be written") from None
 
 

@@ -29,8 +29,8 @@ SUMO_CONTROL = -1.0
 """Value of a speed or speed mode with which a command returns control to SUMO's own driver."""
 QUERY_FUNCTIONS = re.compile("(get|is|has|find|convert|couldChangeLane).*")
 DISPLAY_FUNCTIONS = ("setColor", "highlight")
-LOOP_FUNCTIONS = ("start", "init", "connect", "load", "close", "switch", "switchConnection", "setOrder", "loadState", "saveState",
-                  "simulationStep", "simulationStepLegacy", "executeMove", "step")
+LOOP_FUNCTIONS = ("start", "init", "connect", "load", "close", "switch", "switchConnection", "setOrder", "loadState",
+                  "saveState", "simulationStep", "simulationStepLegacy", "executeMove", "step")
 """Functions that begin, advance or end simulations."""
 VISIBLE_PROPERTIES = re.compile("get(Length|Width|Height|MinGap|VehicleClass|ShapeClass|TypeID|Color|(Emergency|Apparent)?Decel|Accel"
                                 "|MaxSpeed|Tau|Mass)")

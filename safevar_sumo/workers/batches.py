@@ -56,7 +56,8 @@ def evaluate_all(study: Study, settings: FloatArray, pool: Pool, done: Callable[
     if work not in _batch_sizes:
         _batch_sizes[work] = choose_batch_size(study)
     best_size, is_recorded = _batch_sizes[work]
-    size = min(best_size, math.ceil(max(len(distinct_settings) / (BATCHES_PER_CALL_AND_WORKER * pool.workers), SMALLEST_BATCH * best_size)))
+    share = len(distinct_settings) / (BATCHES_PER_CALL_AND_WORKER * pool.workers)
+    size = min(best_size, math.ceil(max(share, SMALLEST_BATCH * best_size)))
     starts = range(0, len(distinct_settings), size)
     futures = {retrying_pool.submit(work, distinct_settings[start:start + size]): start for start in starts}
     sample_size = min(VERIFIED_SETTINGS - _verified_counts.get(work, 0), len(distinct_settings))

@@ -45,7 +45,7 @@ def evaluations_of(number: int, first: int = 0) -> Evaluations:
 
 
 def shown(study: Study, clock: list[float], width: int) -> list[str]:
-    """What a terminal shows of 500 evaluations, one hundred every ten seconds, of two algorithms in turn, and then a run that ends."""
+    """What a terminal shows of 500 evaluations, 100 every ten seconds, of two algorithms in turn; then a run ends."""
     out = StringIO()
     console = Console(file=out, force_terminal=True, width=width, _environ={})
     with open_progress(True, console) as show:
@@ -57,7 +57,8 @@ def shown(study: Study, clock: list[float], width: int) -> list[str]:
     return [re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", line).rstrip() for line in out.getvalue().splitlines()]
 
 
-def test_elsewhere_a_line_shows_the_time_left_even_if_a_batch_takes_longer(clock: list[float], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_elsewhere_a_line_shows_the_time_left_even_if_a_batch_takes_longer(
+        clock: list[float], monkeypatch: pytest.MonkeyPatch) -> None:
     """25 of 100 in 10 s: the others take 30 s, of which 6 have passed."""
     monkeypatch.setattr(progress, "SECONDS_BETWEEN_LINES", 0.02)
     out = StringIO()
@@ -81,7 +82,7 @@ def test_on_a_terminal_all_fits_in_its_line(width: int, study: Study, clock: lis
 
 
 def test_what_comes_from_journals_is_not_left_to_be_done(study: Study) -> None:
-    """A run of 1000 that was finished before, of 600 different settings; 500 settings of the next one; then 100 simulated, and again."""
+    """A finished run of 1000, of 600 different settings; 500 settings of the next run; then 100 simulated, and again."""
     shows: list[tuple[str, int, int]] = []
     observer = CampaignProgress(lambda *values: shows.append(values), study, all_runs(study))
     observer.evaluated(RunKey("nsga2", 0), evaluations_of(600), 0)
@@ -101,8 +102,8 @@ def test_parts_have_one_counter_that_never_passes_its_end() -> None:
         show = parts.begin(part)
         for stage in stages:
             show(*stage)
-    assert shows == [("starting", 0, 160), ("causes: a", 0, 160), ("causes: a", 20, 160), ("causes: b", 20, 160), ("causes: b", 40, 160),
-                     ("rules: c", 40, 70), ("rules: c", 55, 70), ("rules: c", 70, 70)]
+    assert shows == [("starting", 0, 160), ("causes: a", 0, 160), ("causes: a", 20, 160), ("causes: b", 20, 160),
+                     ("causes: b", 40, 160), ("rules: c", 40, 70), ("rules: c", 55, 70), ("rules: c", 70, 70)]
 
 
 def test_a_few_settings_in_a_long_matrix_are_several_batches(monkeypatch: pytest.MonkeyPatch) -> None:
