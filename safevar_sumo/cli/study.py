@@ -5,20 +5,21 @@ from __future__ import annotations
 import json
 import shlex
 import time
+from collections import Counter
+from contextlib import nullcontext
 from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
 import click
 import msgspec
-import numpy as np
 from rich import filesize
 from rich.console import Console, Group, RenderableType
 from rich.live import Live
 from rich.text import Text
 
 from safevar_sumo.analysis.research_questions.indicators import nondominated_points
-from safevar_sumo.analysis.words import change_texts
+from safevar_sumo.analysis.words import change_texts, two_decimals
 from safevar_sumo.api.running import ENGINE_NAMES, carry_out_runs, choose_engine, load_for_search, open_observer, open_pool
 from safevar_sumo.campaign import Campaign, Forecast, RunKey, all_runs, forecast
 from safevar_sumo.cli.arguments import complete_study
@@ -26,8 +27,8 @@ from safevar_sumo.cli.program import commands, print_remarks
 from safevar_sumo.cli.target import jobs_option
 from safevar_sumo.errors import InputError
 from safevar_sumo.progress import open_progress
-from safevar_sumo.records import Evaluations, FloatArray
-from safevar_sumo.results import RunStatus, Status, failure_lines, record, solutions_frame
+from safevar_sumo.records import Outcome
+from safevar_sumo.results import Status, evaluations_frame, failure_lines, record, solutions_frame
 from safevar_sumo.shipped import PROGRAM_COMMAND
 from safevar_sumo.study import Study, load_study
 from safevar_sumo.sumo import Engine, settings_per_batch, vehicle_remarks
@@ -114,35 +115,32 @@ def _select_runs(keys: list[RunKey], only: str | None, shard: str | None) -> lis
 @commands.command()
 @click.argument("directory", metavar="DIR")
 @click.option("--watch", is_flag=True, help="Keep showing progress until the study is finished.")
-@click.option("--every", type=click.FloatRange(0.1, 86400), default=2.0, show_default=True, metavar="SECONDS",
-              help="Interval of --watch.")
+@click.option("--every", type=click.FloatRange(0.1, 86400), metavar="SECONDS", help="Interval of --watch.  [default: 2]")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON; with --watch, a line at every interval.")
-def status(directory: str, watch: bool, every: float, as_json: bool) -> None:
+def status(directory: str, watch: bool, every: float | None, as_json: bool) -> None:
     """Show the progress of the study in DIR, without disturbing it: runs, front, collisions, time left."""
     from safevar_sumo.results import status as read_status
 
-    if not watch and click.get_current_context().get_parameter_source("every") is not click.core.ParameterSource.DEFAULT:
+    if every is not None and not watch:
         raise InputError("--every", f"{every:g} without --watch", "together with --watch")
-    progress, start_time = read_status(directory), time.monotonic()
-    start_share = progress.share
+    progress, start_time, console = read_status(directory), time.monotonic(), Console()
+    start_share, rate = progress.share, None
     for remark in progress.remarks:
         click.echo(remark, err=True)
-    if as_json:
-        click.echo(json.dumps(progress.record(), indent=None if watch else 2))
-        while watch and not progress.finished:
-            time.sleep(every)
+    with Live(console=console, auto_refresh=False) if watch and not as_json else nullcontext() as live:
+        while True:
+            if as_json:
+                click.echo(json.dumps(progress.record(), indent=None if watch else 2))
+            elif live is not None:
+                live.update(status_view(progress, rate), refresh=True)
+            else:
+                console.print(status_view(progress, rate))
+            if not watch or progress.finished:
+                break
+            time.sleep(every or 2.0)
             progress = read_status(directory)
-            click.echo(json.dumps(progress.record()))
-        return
-    if not watch:
-        Console().print(status_view(progress, rate=None))
-        return
-    with Live(status_view(progress, rate=None), console=(console := Console()), auto_refresh=False) as live:
-        while not progress.finished:
-            time.sleep(every)
-            progress = read_status(directory)
-            live.update(status_view(progress, (progress.share - start_share) / (time.monotonic() - start_time)), refresh=True)
-    if not console.is_terminal:
+            rate = (progress.share - start_share) / (time.monotonic() - start_time)
+    if live is not None and not console.is_terminal:
         console.line()  # on a terminal, `Live` ends its last line itself
 
 
@@ -178,56 +176,38 @@ def print_summary(console: Console, study: Study, campaign: Campaign, directory:
             lines = summarise_failures(study, solutions, campaign.original, pool, str(directory), progress)
         for line in lines:
             print_text(console, line)
-    evaluations_by_vehicle = {"original vehicle": campaign.original}
-    for algorithm in study.search.labels:
-        solutions_of_runs = [solutions_of_run for key, solutions_of_run in campaign.solutions.items() if key.algorithm == algorithm]
-        if solutions_of_runs:
-            evaluations_by_vehicle[algorithm] = Evaluations.concatenate(solutions_of_runs)
-    table = WholeTable("", right=evaluations_by_vehicle, title=study.title)
-    table.add_row("solutions", "-", *(str(len(evaluations)) for evaluations in list(evaluations_by_vehicle.values())[1:]))
-    table.add_row("solutions that collide", *(
-        str(int(np.count_nonzero(evaluations.collided))) for evaluations in evaluations_by_vehicle.values()))
-    collisions = [sum(count for key, count in campaign.collisions.items() if key.algorithm == name)
-                  for name in list(evaluations_by_vehicle)[1:]]
+    original = evaluations_frame(names, [(("", 0), campaign.original)])
+    algorithms = [name for name in study.search.labels if any(key.algorithm == name for key in campaign.solutions)]
+    frames = {"original vehicle": original, **{name: solutions[solutions["algorithm"] == name] for name in algorithms}}
+    collisions = [sum(count for key, count in campaign.collisions.items() if key.algorithm == name) for name in algorithms]
+    table = WholeTable("", right=frames, title=study.title)
+    table.add_row("solutions", "-", *(str(len(frames[name])) for name in algorithms))
+    table.add_row("solutions that collide", *(str((frame["outcome"] == Outcome.COLLISION).sum()) for frame in frames.values()))
     table.add_row("collisions simulated", *map(str, [int(campaign.original.collided[0]), *collisions]))
     for metric in campaign.scoring.metrics:
-        table.add_row(f"mean {metric.heading}", *(
-            _mean_text(evaluations.metrics[metric.name]) for evaluations in evaluations_by_vehicle.values()))
+        table.add_row(f"mean {metric.heading}", *(two_decimals(frame[metric.name].mean()) for frame in frames.values()))
     console.print(table)
     console.print(SAFETY_NOTE)
     if campaign.failures:
         console.print(f"{len(campaign.failures)} settings could not be simulated (simulator-error); no result contains them:")
         for line in failure_lines(campaign.failures):
             print_text(console, f"  {line}")
-    invalid = sum(campaign.invalid_tests.values())
-    if invalid:
+    if invalid := sum(campaign.invalid_tests.values()):
         print_text(console, f"{invalid} settings violate a test's speed tolerance before the ADS acts (invalid-test): "
                             "they are neither failures nor successes, and no result contains them.")
-    _print_most_critical(console, study, campaign)
+    if solutions.empty:
+        console.print("No solution.")
+    for worst in solutions.sort_values(["f_safe", "f_num_diff", "f_diff"], kind="stable").head(1).to_dict("records"):
+        print_text(console, f"Most critical setting: SD {worst['f_safe']:.2f} ({worst['outcome']}), "
+                            f"the original's {campaign.original.f_safe[0]:.2f} ({campaign.original.outcome[0]}). Its changes:")
+        changes = change_texts(CharacteristicSet.of(study.vehicle.characteristics), {name: worst[name] for name in names})
+        for change in changes or ["no change"]:
+            print_text(console, f"  {change}")
     case = build_case(study, record(campaign.original, row=0), solutions, solutions_frame(names, []), tuple(campaign.solutions),
                       scoring=campaign.scoring)
     for line in summary_lines(case):
         print_text(console, line)
     print_text(console, f"All tables: {PROGRAM_COMMAND} tables {shlex.quote(str(directory))}")
-
-
-def _mean_text(values: FloatArray) -> str:
-    defined_values = values[~np.isnan(values)]
-    return f"{np.mean(defined_values):.2f}" if defined_values.size else "-"
-
-
-def _print_most_critical(console: Console, study: Study, campaign: Campaign) -> None:
-    if not any(map(len, campaign.solutions.values())):
-        console.print("No solution.")
-        return
-    solutions = Evaluations.concatenate(list(campaign.solutions.values()))
-    characteristics = CharacteristicSet.of(study.vehicle.characteristics)
-    most_critical = solutions.take([int(np.lexsort((solutions.f_diff, solutions.f_num_diff, solutions.f_safe))[0])])
-    changes = change_texts(characteristics, dict(zip(characteristics.names, most_critical.settings[0].tolist(), strict=True)))
-    console.print(f"Most critical setting: SD {most_critical.f_safe[0]:.2f} ({most_critical.outcome[0]}), "
-                  f"the original's {campaign.original.f_safe[0]:.2f} ({campaign.original.outcome[0]}). Its changes:")
-    for change in changes or ["no change"]:
-        print_text(console, f"  {change}")
 
 
 MAX_FRONT_ROWS = 5
@@ -241,29 +221,17 @@ def status_view(progress: Status, rate: float | None) -> RenderableType:
     table = WholeTable("algorithm", right=("runs", "under\nway", "simulated", "collisions", "simulator\nerrors", "best\nSD"),
                        title=progress.title)
     for algorithm in dict.fromkeys(run.algorithm for run in progress.runs):
-        table.add_row(algorithm, *_count_texts([run for run in progress.runs if run.algorithm == algorithm]))
-    return Group(table, Text(_list_runs(progress)), Text(_remaining_time(progress, rate)), _front_table(progress))
-
-
-def _count_texts(runs: list[RunStatus]) -> list[str]:
-    degrees = [run.best for run in runs if run.best is not None]
-    return [f"{sum(run.state == 'finished' for run in runs)}/{len(runs)}", str(sum(run.state == "begun" for run in runs)),
-            str(sum(run.simulated for run in runs)), str(sum(run.collisions for run in runs)),
-            str(sum(run.simulator_errors for run in runs)), f"{min(degrees):.2f}" if degrees else "-"]
-
-
-def _list_runs(progress: Status) -> str:
-    runs = [f"{run.algorithm}:{run.run} {run.simulated}/{progress.budget}" for run in progress.runs if run.state == "begun"]
-    rest = f" and {len(runs) - MAX_RUNS_NAMED} more" if len(runs) > MAX_RUNS_NAMED else ""
-    return f"Under way: {', '.join(runs[:MAX_RUNS_NAMED])}{rest}" if runs else ""
-
-
-def _remaining_time(progress: Status, rate: float | None) -> str:
-    if progress.finished:
-        return "Finished."
-    if not rate:
-        return f"{progress.share:.0%} done."
-    return f"{progress.share:.0%} done, {timedelta(seconds=round((1 - progress.share) / rate))} left at this pace."
+        runs = [run for run in progress.runs if run.algorithm == algorithm]
+        states = Counter(run.state for run in runs)
+        counts = [sum(run.simulated for run in runs), sum(run.collisions for run in runs), sum(run.simulator_errors for run in runs)]
+        best = min((run.best for run in runs if run.best is not None), default=None)
+        table.add_row(algorithm, f"{states['finished']}/{len(runs)}", str(states["begun"]), *map(str, counts), two_decimals(best))
+    begun = [f"{run.algorithm}:{run.run} {run.simulated}/{progress.budget}" for run in progress.runs if run.state == "begun"]
+    rest = f" and {len(begun) - MAX_RUNS_NAMED} more" if len(begun) > MAX_RUNS_NAMED else ""
+    under_way = f"Under way: {', '.join(begun[:MAX_RUNS_NAMED])}{rest}" if begun else ""
+    left = f", {timedelta(seconds=round((1 - progress.share) / rate))} left at this pace" if rate else ""
+    done = "Finished." if progress.finished else f"{progress.share:.0%} done{left}."
+    return Group(table, Text(under_way), Text(done), _front_table(progress))
 
 
 def _front_table(progress: Status) -> RenderableType:
