@@ -1,8 +1,8 @@
-"""A controller that was written for SUMO: it reads the running simulation and commands the vehicle through TraCI's functions.
+"""A controller that was written for SUMO: it reads the running simulation and commands the vehicle through TraCI.
 
-The controller's `step(traci, vehicle_id)` sees one copy of the network, with the ids of the traffic file, and other actors through the
-vehicle's sensors. Queries of the vehicle's type return the values of the original vehicle. Commanded speeds and accelerations are
-converted to pedal positions of the vehicle model.
+The controller's `step(traci, vehicle_id)` sees one copy of the network, with the ids of the traffic file, and other
+actors through the vehicle's sensors. Queries of the vehicle's type return the values of the original vehicle. Commanded
+speeds and accelerations are converted to pedal positions of the vehicle model.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ from safevar_sumo.plugins import Guard
 from safevar_sumo.records import Command, Nominal, Observation
 from safevar_sumo.scenarios import VUT
 from safevar_sumo.sumo.sensing import SensedTraffic
-from safevar_sumo.sumo.traci_module import Subscriptions, bind_traci, substitute_traci, traci_module
+from safevar_sumo.sumo.traci_module import bind_traci, substitute_traci, traci_module
 from safevar_sumo.sumo.traci_view import TraciView
 from safevar_sumo.sumo.world import current_world
 from safevar_sumo.vehicles import SumoType
 
 
 class TraciController:
-    """Drives each vehicle with a controller of its own: a function `step(traci, vehicle_id)` or a class with `start` and `step`.
+    """Drives each vehicle with a controller of its own: a function `step(traci, vehicle_id)`, or a class with `step`.
 
     Parameters
     ----------
@@ -39,11 +39,11 @@ class TraciController:
         world = current_world()
         values = nominal.mass, nominal.accel, nominal.decel, nominal.max_speed, nominal.actuator_lag
         world.set_types(SumoType(*(np.full(n, value) for value in values)))
-        names, traffic = world.names(), SensedTraffic(world, step)
-        views = [TraciView(world, copy, names, traffic, nominal, step) for copy in range(n)]
+        traffic = SensedTraffic(world, step)
         traffic.record_step()
         with substitute_traci():
-            drivers = [_Driver(view, self._create(), self._guard) for view in views]
+            drivers = [_Driver(TraciView(world, copy, traffic, nominal, step), self._create(), self._guard)
+                       for copy in range(n)]
         return _Memory(nominal, traffic, drivers, initial_trim=None)
 
     def drive(self, seen: Observation, memory: _Memory) -> tuple[Command, _Memory]:
@@ -55,11 +55,12 @@ class TraciController:
             for i, driver in enumerate(memory.drivers):
                 if driver.view.on_the_road:
                     accelerations[i] = driver.step(seen.time, float(seen.speed[i]))
-        return pedals_for(memory.nominal, seen.speed, accelerations, initial_trim), memory._replace(initial_trim=initial_trim)
+        command = pedals_for(memory.nominal, seen.speed, accelerations, initial_trim)
+        return command, memory._replace(initial_trim=initial_trim)
 
 
 class _Memory(NamedTuple):
-    """The original vehicle, the traffic that the vehicles sense, each vehicle's driver, and the trim at the first observation."""
+    """The original vehicle, the sensed traffic, each vehicle's driver, and the trim at the first observation."""
 
     nominal: Nominal
     traffic: SensedTraffic
@@ -71,8 +72,7 @@ class _Driver:
     """The controller of one vehicle."""
 
     def __init__(self, view: TraciView, controller: Any, guard: Guard) -> None:
-        self.view, self._guard = view, guard
-        self._subscriptions, self._step = Subscriptions(view), getattr(controller, "step", controller)
+        self.view, self._guard, self._step = view, guard, getattr(controller, "step", controller)
         if hasattr(controller, "start"):
             self._call("start", controller.start)
 
@@ -83,7 +83,7 @@ class _Driver:
         return self.view.commanded_speed.acceleration(speed, time, self.view.speed_of_sumo(speed))
 
     def _call(self, method: str, function: Callable[..., Any]) -> None:
-        with bind_traci(self.view, self._subscriptions):
+        with bind_traci(self.view.call):
             self._guard.call(method, function, traci_module(), VUT)
         if self.view.last_error is not None:  # the controller caught the error and continued
             raise self._guard.failure(method, self.view.last_error)

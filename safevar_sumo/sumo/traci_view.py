@@ -1,62 +1,92 @@
-"""TraCI as one controller sees it: one copy of the network, with the traffic file's ids, and other actors through sensors."""
+"""TraCI as one controller sees it: one copy of the network, ids of the traffic file, other actors through sensors."""
 
 from __future__ import annotations
 
-import inspect
 import math
 import re
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
-from functools import cache
-from types import SimpleNamespace
+from collections.abc import Mapping
 from typing import Any
-
-import numpy as np
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import Nominal
 from safevar_sumo.scenarios import VUT
 from safevar_sumo.sumo.copies import copied_id
-from safevar_sumo.sumo.engine import Engine, engine_api
 from safevar_sumo.sumo.sensing import SENSED_FUNCTIONS, SensedTraffic
+from safevar_sumo.sumo.traci_module import all_arguments, full_name, real_traci, refuse_own_loop
 from safevar_sumo.sumo.world import SumoWorld
 
 COMMANDS: Mapping[str, tuple[str, ...]] = {
-    "setSpeed": ("speed",), "slowDown": ("speed", "duration"), "setAcceleration": ("acceleration", "duration"), "setAccel": ("accel",),
-    "setDecel": ("decel",), "setMaxSpeed": ("speed",), "setSpeedMode": ("mode",)}
+    "setSpeed": ("speed",), "slowDown": ("speed", "duration"), "setAcceleration": ("acceleration", "duration"),
+    "setAccel": ("accel",), "setDecel": ("decel",), "setMaxSpeed": ("speed",), "setSpeedMode": ("mode",)}
 """The commands that a controller may give, each with its numeric arguments."""
 SUMO_CONTROL = -1.0
 """Value of a speed or speed mode with which a command returns control to SUMO's own driver."""
-QUERY_FUNCTIONS = re.compile("(get|is|has|find|convert|couldChangeLane).*")
 DISPLAY_FUNCTIONS = ("setColor", "highlight")
-LOOP_FUNCTIONS = ("start", "init", "connect", "load", "close", "switch", "switchConnection", "setOrder", "loadState",
-                  "saveState", "simulationStep", "simulationStepLegacy", "executeMove", "step")
-"""Functions that begin, advance or end simulations."""
-VISIBLE_PROPERTIES = re.compile("get(Length|Width|Height|MinGap|VehicleClass|ShapeClass|TypeID|Color|(Emergency|Apparent)?Decel|Accel"
-                                "|MaxSpeed|Tau|Mass)")
-"""Functions that return properties of other actors that are visible at once or follow from the actor's type."""
-UNSENSED_FUNCTIONS: Mapping[str, re.Pattern[str]] = {
-    "vehicle": re.compile("getFollower|get(Left|Right)(Followers|Leaders)|getNeighbors|getJunctionFoes|.*LaneChange.*|couldChangeLane"
-                          "|getLoadedIDList|getTeleportingIDList|getTaxiFleet|getSpeedWithoutTraCI"),
-    "person": re.compile("getTaxiReservations"),
-    "simulation": re.compile("get(Arrived|BusStop|Colli|Departed|Emergency|Ending|Loaded|Parking|Pending|Starting|Stop).*"),
-    "trafficlight": re.compile("get(Blocking|Rival|Priority|Served).*"),
+LARGEST_MODE = 127
+LEGAL_NUMBERS = (f"a whole number from 0 to {LARGEST_MODE}, or -1 for SUMO's own mode",
+                 "a finite number, of an acceleration any, else from 0 on; a speed of -1 gives control back to SUMO")
+LISTS = ("getIDList", "getIDCount")
+CONSTANT_FUNCTIONS = (
+    "getTypeID", "getLength", "getWidth", "getHeight", "getMinGap", "getVehicleClass", "getShapeClass", "getColor",
+    "getAccel", "getDecel", "getEmergencyDecel", "getApparentDecel", "getMaxSpeed", "getTau", "getMass")
+"""Functions that return properties of actors that are visible at once or follow from the actor's type."""
+OWN_FUNCTIONS = (
+    "getLeader", "getRoute", "getRouteID", "getRouteIndex", "getDistance", "getDrivingDistance",
+    "getDrivingDistance2D", "getAllowedSpeed", "getSpeedFactor", "getSpeedMode", "getSlope", "getWaitingTime",
+    "getAccumulatedWaitingTime", "getTimeLoss", "getNextTLS", "isStopped", "getFollowSpeed", "getSecureGap",
+    "getStopSpeed", "getImperfection", "getActionStepLength", "getDeparture")
+"""Functions that return values of the vehicle under test alone."""
+ACTORS_ON_ROAD = ("getLastStepVehicleIDs", "getLastStepVehicleNumber", "getLastStepPersonIDs")
+QUERIES: Mapping[str, tuple[str, ...]] = {
+    "": ("getVersion", "isLibsumo", "hasGUI"),
+    "vehicle": (*LISTS, *SENSED_FUNCTIONS["vehicle"], *CONSTANT_FUNCTIONS, *OWN_FUNCTIONS),
+    "person": (*LISTS, *SENSED_FUNCTIONS["person"], *CONSTANT_FUNCTIONS),
+    "simulation": ("getTime", "getDeltaT", "getMinExpectedNumber", "getNetBoundary", "getDistance2D", "getDistanceRoad",
+                   "convert2D", "convert3D", "convertGeo", "convertRoad"),
+    "edge": (*LISTS, *ACTORS_ON_ROAD, "getLaneNumber", "getStreetName", "getFromJunction", "getToJunction", "getAngle"),
+    "lane": (*LISTS, *ACTORS_ON_ROAD[:2], "getEdgeID", "getLength", "getWidth", "getShape", "getMaxSpeed",
+             "getFriction", "getAllowed", "getDisallowed", "getLinkNumber", "getLinks", "getFoes", "getInternalFoes"),
+    "junction": (*LISTS, "getPosition", "getShape", "getIncomingEdges", "getOutgoingEdges"),
+    "trafficlight": (*LISTS, "getRedYellowGreenState", "getPhase", "getPhaseName", "getPhaseDuration",
+                     "getSpentDuration", "getNextSwitch", "getProgram", "getControlledLanes", "getControlledLinks"),
+    "vehicletype": (*LISTS, *CONSTANT_FUNCTIONS[1:], "getSpeedFactor", "getImperfection"),
+    "route": (*LISTS, "getEdges"),
 }
-UNSENSED_ROAD_FUNCTIONS = re.compile("getLastStep.*|getWaitingTime|getTraveltime|getPendingVehicles|get.*(Emission|Consumption)")
-"""Functions that return values of other actors that no sensor of the vehicle measures."""
-MEASURED_VALUES = "getLeader, getIDList, and positions, speeds, angles and lanes of vehicles and persons: these pass the sensors"
+"""The functions that a controller may query, by domain; "" is the module itself."""
+VARIABLES: Mapping[str, str] = {
+    "TRACI_ID_LIST": "getIDList", "ID_COUNT": "getIDCount", "VAR_POSITION": "getPosition",
+    "VAR_POSITION3D": "getPosition3D", "VAR_SPEED": "getSpeed", "VAR_ANGLE": "getAngle", "VAR_ROAD_ID": "getRoadID",
+    "VAR_LANE_ID": "getLaneID", "VAR_LANE_INDEX": "getLaneIndex", "VAR_LANEPOSITION": "getLanePosition",
+    "VAR_LANEPOSITION_LAT": "getLateralLanePosition", "VAR_SPEED_LAT": "getLateralSpeed",
+    "VAR_ACCELERATION": "getAcceleration", "VAR_SIGNALS": "getSignals", "VAR_LEADER": "getLeader",
+    "VAR_DISTANCE": "getDistance", "VAR_LENGTH": "getLength", "VAR_WIDTH": "getWidth", "VAR_HEIGHT": "getHeight",
+    "VAR_TYPE": "getTypeID", "VAR_VEHICLECLASS": "getVehicleClass", "VAR_MINGAP": "getMinGap",
+    "VAR_ALLOWED_SPEED": "getAllowedSpeed", "VAR_MAXSPEED": "getMaxSpeed", "VAR_ACCEL": "getAccel",
+    "VAR_DECEL": "getDecel", "VAR_TAU": "getTau", "VAR_ROUTE_ID": "getRouteID", "VAR_WAITING_TIME": "getWaitingTime",
+    "VAR_TIME": "getTime", "VAR_DELTA_T": "getDeltaT",
+}
+"""TraCI's variables for subscriptions, each with the function that returns the same value."""
+DEFAULT_VARIABLES: Mapping[str, tuple[str, ...]] = {
+    "vehicle": ("VAR_ROAD_ID", "VAR_LANEPOSITION"), "person": ("VAR_ROAD_ID", "VAR_LANEPOSITION"),
+    "simulation": ("VAR_TIME",)}
+"""Domains for subscriptions, each with the variables of a subscription that names none."""
+CONTEXT_DOMAINS = {"CMD_GET_VEHICLE_VARIABLE": "vehicle", "CMD_GET_PERSON_VARIABLE": "person"}
 INVALID_NUMBER = -1073741824
 """Value that SUMO returns for a property of an actor that is not on the road."""
+
+Variables = dict[int, tuple[str, tuple[Any, ...]]]
+"""Requested variables, each with its function and that function's arguments after the actor's id."""
 
 
 class CommandedSpeed:
     """A controller's commands, and the acceleration that results from them under SUMO's speed modes."""
 
-    LIMIT_TO_SAFE_SPEED, LIMIT_ACCELERATION, LIMIT_DECELERATION, DEFAULT_MODE, LARGEST_MODE = 1, 2, 4, 31, 127
+    LIMIT_TO_SAFE_SPEED, LIMIT_ACCELERATION, LIMIT_DECELERATION, DEFAULT_MODE = 1, 2, 4, 31
 
     def __init__(self, nominal: Nominal, step: float) -> None:
         self._step = step
-        self._accel, self._decel, self._max_speed, self._mode = nominal.accel, nominal.decel, np.inf, self.DEFAULT_MODE
+        self._limits = {"setAccel": nominal.accel, "setDecel": nominal.decel, "setMaxSpeed": math.inf}
+        self._mode = self.DEFAULT_MODE
         self._speed: float | None = None
         self._end_time, self._speed_rate = -1.0, 0.0
 
@@ -68,7 +98,7 @@ class CommandedSpeed:
         InputError
             If an argument is no legal number.
         """
-        numbers = [self._number(name, argument, value) for argument, value in zip(COMMANDS[name], values, strict=True)]
+        numbers = [_legal_number(name, argument, value) for argument, value in zip(COMMANDS[name], values, strict=True)]
         if name == "setSpeed":
             self._speed, self._end_time = (None if numbers[0] == SUMO_CONTROL else numbers[0]), -1.0
         elif name == "slowDown":
@@ -79,39 +109,37 @@ class CommandedSpeed:
         elif name == "setSpeedMode":
             self._mode = self.DEFAULT_MODE if numbers[0] == SUMO_CONTROL else int(numbers[0])
         else:
-            setattr(self, {"setAccel": "_accel", "setDecel": "_decel", "setMaxSpeed": "_max_speed"}[name], numbers[0])
-
-    def _number(self, name: str, argument: str, value: Any) -> float:
-        try:
-            number = float(value)
-        except (TypeError, ValueError):
-            number = math.nan
-        returns_control = number == SUMO_CONTROL and name in ("setSpeed", "setSpeedMode")
-        is_legal = math.isfinite(number) and (number >= 0 or argument == "acceleration" or returns_control)
-        legal = "a finite number" if argument == "acceleration" else "a finite number from 0 on"
-        if name == "setSpeedMode":
-            is_legal, legal = is_legal and number == int(number) <= self.LARGEST_MODE, f"a whole number from 0 to {self.LARGEST_MODE}"
-        if not is_legal:
-            alternative = ", or -1, which gives control back to SUMO's own driver" if name in ("setSpeed", "setSpeedMode") else ""
-            raise InputError(f"traci.vehicle.{name}", f"{argument} = {value!r}", legal + alternative)
-        return number
+            self._limits[name] = numbers[0]
 
     def acceleration(self, speed: float, time: float, sumo_speed: float) -> float:
-        """The acceleration that results from the commands [m/s^2]; SUMO's own driver would choose `sumo_speed` next [m/s]."""
-        next_speed = speed + self._speed_rate * self._step if time < self._end_time else sumo_speed if self._speed is None else self._speed
-        if self._mode & self.LIMIT_TO_SAFE_SPEED:
-            next_speed = min(next_speed, max(sumo_speed, speed - self._decel * self._step) if next_speed > sumo_speed else next_speed)
-        acceleration = (min(next_speed, self._max_speed) - speed) / self._step
-        acceleration = min(acceleration, self._accel) if self._mode & self.LIMIT_ACCELERATION else acceleration
-        return max(acceleration, -self._decel) if self._mode & self.LIMIT_DECELERATION else acceleration
+        """The acceleration by the commands [m/s^2]; SUMO's own driver would choose `sumo_speed` next [m/s]."""
+        accel, decel, max_speed = self._limits.values()
+        next_speed = sumo_speed if self._speed is None else self._speed
+        if time < self._end_time:
+            next_speed = speed + self._speed_rate * self._step
+        if self._mode & self.LIMIT_TO_SAFE_SPEED and next_speed > sumo_speed:
+            next_speed = min(next_speed, max(sumo_speed, speed - decel * self._step))
+        acceleration = (min(next_speed, max_speed) - speed) / self._step
+        acceleration = min(acceleration, accel) if self._mode & self.LIMIT_ACCELERATION else acceleration
+        return max(acceleration, -decel) if self._mode & self.LIMIT_DECELERATION else acceleration
+
+
+def _legal_number(name: str, argument: str, value: Any) -> float:
+    number = float(value)
+    returns_control = number == SUMO_CONTROL and name in ("setSpeed", "setSpeedMode")
+    is_legal = math.isfinite(number) and (number >= 0 or returns_control or argument == "acceleration")
+    if not is_legal or (argument == "mode" and number not in range(-1, LARGEST_MODE + 1)):
+        raise InputError(f"traci.vehicle.{name}", f"{argument} = {value!r}", LEGAL_NUMBERS[name != "setSpeedMode"])
+    return number
 
 
 class TraciView:
     """TraCI's functions for one vehicle, with the ids of the traffic file."""
 
-    def __init__(self, world: SumoWorld, copy: int, names: frozenset[str], traffic: SensedTraffic, nominal: Nominal, step: float) -> None:
-        self._world, self._copy, self._names, self._traffic, self._decel = world, copy, names, traffic, nominal.decel
+    def __init__(self, world: SumoWorld, copy: int, traffic: SensedTraffic, nominal: Nominal, step: float) -> None:
+        self._world, self._copy, self._traffic, self._decel = world, copy, traffic, nominal.decel
         self._vut = copied_id(copy, VUT)
+        self._subscriptions: dict[tuple[bool, str, str], tuple[str, float, Variables]] = {}
         self.commanded_speed, self.time = CommandedSpeed(nominal, step), 0.0
         self.last_error: InputError | None = None
         """The last error raised to the controller, even if the controller caught it."""
@@ -121,15 +149,15 @@ class TraciView:
         return not self._world.has_left(self._vut)
 
     def speed_of_sumo(self, speed: float) -> float:
-        """Speed that SUMO's own driver, with the original vehicle's type, would choose next for road and leader [m/s]."""
+        """Speed that SUMO's driver, with the original vehicle's type, would choose next for road and leader [m/s]."""
         vehicle, vut, snapshot = self._world.api.vehicle, self._vut, self._traffic.snapshot(self._copy)
         free_speed = min(speed + vehicle.getAccel(vut) * self._world.step_length, vehicle.getAllowedSpeed(vut))
         if snapshot.leader is None:
             return float(free_speed)
         name, gap = snapshot.leader
-        leader = copied_id(self._copy, name)
-        leader_speed = snapshot.vehicle[name]["getSpeed"]
-        return float(min(free_speed, vehicle.getFollowSpeed(vut, speed, gap, leader_speed, vehicle.getDecel(leader), leader)))
+        leader, leader_speed = copied_id(self._copy, name), snapshot.actors["vehicle"][name]["getSpeed"]
+        follow_speed = vehicle.getFollowSpeed(vut, speed, gap, leader_speed, vehicle.getDecel(leader), leader)
+        return float(min(free_speed, follow_speed))
 
     def call(self, domain: str, name: str, arguments: tuple[Any, ...], named: Mapping[str, Any]) -> Any:
         """Call a TraCI function in this copy; `domain` is "" for functions of the module itself.
@@ -137,83 +165,75 @@ class TraciView:
         Raises
         ------
         InputError
-            If a controller must not call the function.
+            If a controller must not call the function; kept in `last_error`.
         TraCIException
-            If SUMO refuses the call.
+            If SUMO refuses the call; its message has the traffic file's ids.
         """
-        with self.translated_errors():
-            return self._dispatch(domain, name, positional_arguments(domain, name, arguments, named))
-
-    @contextmanager
-    def translated_errors(self) -> Iterator[None]:
-        """Context that stores errors for the controller, and replaces ids of copies in SUMO's errors by the traffic file's ids."""
         api = self._world.api
         try:
-            yield
+            refuse_own_loop(domain, name)
+            if "ubscri" in name and domain in DEFAULT_VARIABLES:
+                return self._subscription(domain, name, all_arguments(domain, name, arguments, named))
+            if domain == "vehicle" and name in (*COMMANDS, *DISPLAY_FUNCTIONS):
+                return self._command(name, all_arguments(domain, name, arguments, named))
+            return self._query(domain, name, *arguments, **named)
         except InputError as error:
             self.last_error = error
             raise
         except (api.TraCIException, api.FatalTraCIError) as error:
-            raise traci_exception()(str(error).replace(f"'{self._copy}.", "'")) from None
+            raise real_traci().exceptions.TraCIException(re.sub(r"'([:!]?)\d+\.", r"'\1", str(error))) from None
 
-    def _dispatch(self, domain: str, name: str, arguments: tuple[Any, ...]) -> Any:
-        full_name = f"traci.{domain}.{name}" if domain else f"traci.{name}"
-        refuse_own_loop(domain, name, full_name)
-        if not QUERY_FUNCTIONS.fullmatch(name):
-            return self._command(domain, name, full_name, arguments)
-        if not domain:
-            return getattr(self._world.api, name)(*arguments)
-        unsensed_functions = UNSENSED_ROAD_FUNCTIONS if domain in ("edge", "lane") else UNSENSED_FUNCTIONS.get(domain)
-        if domain in SENSED_FUNCTIONS:
-            value = self._sensed_value(domain, name, arguments)
-            if value is not NotImplemented:
-                return value
-        elif domain in ("edge", "lane") and name in ("getLastStepVehicleIDs", "getLastStepVehicleNumber", "getLastStepPersonIDs"):
-            return self._actors_on_road(domain, name, arguments[0])
-        elif domain == "simulation" and name in ("getTime", "getCurrentTime"):
-            return self.time if name == "getTime" else round(self.time * 1000)
-        elif domain == "simulation" and name == "getMinExpectedNumber":
-            return sum(len(self._ids(actors)) for actors in SENSED_FUNCTIONS)
-        if unsensed_functions is not None and unsensed_functions.fullmatch(name):
-            raise InputError(full_name, "returns values of other actors that no sensor of the vehicle measures", MEASURED_VALUES)
-        if name == "getIDCount":
-            return len(self._to_original_ids(getattr(self._world.api, domain).getIDList()))
-        return self._sumo_value(domain, name, arguments)
-
-    def _command(self, domain: str, name: str, full_name: str, arguments: tuple[Any, ...]) -> Any:
-        if domain != "vehicle" or name not in (*COMMANDS, *DISPLAY_FUNCTIONS):
-            raise InputError(full_name, f"is not for a controller of {VUT!r}", f"of traci.vehicle {', '.join(COMMANDS)}")
-        if not arguments or arguments[0] != VUT:
-            vehicle_id = repr(arguments[0]) if arguments else "nothing"
-            raise InputError(full_name, f"vehID = {vehicle_id} is not the vehicle under test",
+    def _command(self, name: str, arguments: tuple[Any, ...]) -> None:
+        if arguments[0] != VUT:
+            raise InputError(f"traci.vehicle.{name}", f"vehID = {arguments[0]!r} is not the vehicle under test",
                              f"{VUT!r}: a controller commands no other vehicle")
         if name in DISPLAY_FUNCTIONS:
-            return self._sumo_value(domain, name, arguments)
-        speed = float(self._world.api.vehicle.getSpeed(self._vut))
-        return self.commanded_speed.command(name, self.time, speed, arguments[1:])
+            self._sumo_value("vehicle", name, arguments)
+        else:
+            speed = float(self._world.api.vehicle.getSpeed(self._vut))
+            self.commanded_speed.command(name, self.time, speed, arguments[1:])
 
-    def _sensed_value(self, domain: str, name: str, arguments: tuple[Any, ...]) -> Any:
-        """An actor's value as the sensors report it; NotImplemented if the function does not depend on sensors."""
-        if name in ("getIDList", "getIDCount"):
+    def _query(self, domain: str, name: str, /, *given: Any, **named: Any) -> Any:
+        allowed = QUERIES.get(domain, ())
+        if name not in allowed:
+            legal = (*allowed, *COMMANDS) if domain == "vehicle" else allowed or QUERIES
+            problem = f"is not for a controller of {VUT!r}"
+            raise InputError(full_name(domain, name), problem, ", ".join(filter(None, legal)))
+        arguments = all_arguments(domain, name, given, named) if named else given
+        if name in LISTS:
             ids = self._ids(domain)
             return ids if name == "getIDList" else len(ids)
-        if domain == "vehicle" and arguments[:1] == (VUT,):
-            return self._leader(*arguments[1:]) if name == "getLeader" else NotImplemented
-        actors = self._traffic.snapshot(self._copy).actors(domain)
-        if not arguments or VISIBLE_PROPERTIES.fullmatch(name):
-            return NotImplemented
+        is_own = (domain, *arguments[:1]) == ("vehicle", VUT)
+        if domain in SENSED_FUNCTIONS and name not in CONSTANT_FUNCTIONS and not is_own:
+            return self._sensed_value(domain, name, arguments)
+        if name == "getLeader":
+            return self._leader(*arguments[1:])
+        if name in ACTORS_ON_ROAD:
+            return self._actors_on_road(domain, name, arguments[0])
+        if name == "getTime":
+            return self.time
+        if name == "getMinExpectedNumber":
+            return sum(len(self._ids(actors)) for actors in SENSED_FUNCTIONS)
+        return self._sumo_value(domain, name, arguments)
+
+    def _sensed_value(self, domain: str, name: str, arguments: tuple[Any, ...]) -> Any:
+        """Another actor's value as the sensors report it."""
         if name not in SENSED_FUNCTIONS[domain]:
-            raise InputError(f"traci.{domain}.{name}", f"returns a value of {arguments[0]!r} that no sensor of the vehicle measures",
-                             MEASURED_VALUES)
+            problem = f"returns a value of {arguments[0]!r} that no sensor of the vehicle measures"
+            legal = (*SENSED_FUNCTIONS[domain], *CONSTANT_FUNCTIONS)
+            raise InputError(full_name(domain, name), problem, ", ".join(legal))
+        actors = self._traffic.snapshot(self._copy).actors[domain]
         if arguments[0] in actors:
-            return self._to_original_ids(actors[arguments[0]][name])
+            return _original_ids(actors[arguments[0]][name])
         return _invalid_value(self._sumo_value(domain, name, arguments))
 
     def _ids(self, domain: str) -> tuple[str, ...]:
-        return (*((VUT,) if domain == "vehicle" else ()), *self._traffic.snapshot(self._copy).actors(domain))
+        if domain in SENSED_FUNCTIONS:
+            return (*((VUT,) if domain == "vehicle" else ()), *self._traffic.snapshot(self._copy).actors[domain])
+        return tuple(dict.fromkeys(map(_original_ids, getattr(self._world.api, domain).getIDList())))
 
     def _leader(self, dist: float = 100.0) -> tuple[str, float] | None:
-        """The leader and the gap to it minus the vehicle's minGap, if at most `dist` [m]; a `dist` of 0 means the stopping distance."""
+        """The leader and the gap to it minus minGap, if at most `dist` [m]; 0 means the stopping distance."""
         speed = float(self._world.api.vehicle.getSpeed(self._vut))
         leader = self._traffic.snapshot(self._copy).leader
         return leader if leader and leader[1] <= (dist or speed**2 / (2 * self._decel)) else None
@@ -221,51 +241,80 @@ class TraciView:
     def _actors_on_road(self, domain: str, name: str, road: str) -> Any:
         """Actors on a lane or edge, or their number, as the sensors report them."""
         snapshot, function = self._traffic.snapshot(self._copy), "getLaneID" if domain == "lane" else "getRoadID"
-        actors = snapshot.person if name == "getLastStepPersonIDs" else {VUT: snapshot.own_values, **snapshot.vehicle}
+        persons, vehicles = snapshot.actors["person"], {VUT: snapshot.own, **snapshot.actors["vehicle"]}
+        actors = persons if name == "getLastStepPersonIDs" else vehicles
         names = tuple(actor for actor, values in actors.items() if values.get(function) == copied_id(self._copy, road))
         return len(names) if name == "getLastStepVehicleNumber" else names
 
     def _sumo_value(self, domain: str, name: str, arguments: tuple[Any, ...]) -> Any:
-        function = getattr(getattr(self._world.api, domain), name)
-        return self._to_original_ids(function(*(self._to_copied_ids(argument) for argument in arguments)))
+        api = self._world.api
+        function = getattr(getattr(api, domain) if domain else api, name)
+        return _original_ids(function(*(_copied_ids(self._copy, argument) for argument in arguments)))
 
-    def _to_copied_ids(self, value: Any) -> Any:
-        snapshot = self._traffic.snapshot(self._copy)
-        if isinstance(value, str) and (value in self._names or value in snapshot.vehicle or value in snapshot.person):
-            return copied_id(self._copy, value)
-        return type(value)(map(self._to_copied_ids, value)) if type(value) in (list, tuple) else value
+    def _subscription(self, domain: str, name: str, arguments: tuple[Any, ...]) -> Any:
+        """Subscribe, unsubscribe, or return the values of functions subscribed to, as the sensors report them."""
+        is_context = "Context" in name
+        if name.startswith("get"):
+            results = self._results(is_context, domain)
+            return results if name.startswith("getAll") else results.get(arguments[0] if arguments else "", {})
+        actor, *details = ("", *arguments) if domain == "simulation" else arguments
+        if name.startswith("unsubscribe"):
+            self._subscriptions.pop((is_context, domain, actor), None)
+            return None
+        around, dist = details[:2] if is_context else (0, 0.0)
+        domains = {_constant(name): other for name, other in CONTEXT_DOMAINS.items()} if is_context else {0: domain}
+        if name not in ("subscribe", "subscribeContext") or around not in domains:
+            raise InputError(full_name(domain, name), f"is not for a controller of {VUT!r}",
+                             f"subscribe, or subscribeContext with {' or '.join(CONTEXT_DOMAINS)}")
+        variables = _requested_variables(domains[around], details[-4], details[-1])
+        self._subscriptions[is_context, domain, actor] = domains[around], dist, variables
+        return None
 
-    def _to_original_ids(self, value: Any) -> Any:
-        """A result with the ids of the traffic file, and without elements of other copies."""
-        if isinstance(value, str):
-            for prefix in ("", ":", "!"):
-                if value.startswith(f"{prefix}{self._copy}."):
-                    name = value.removeprefix(f"{prefix}{self._copy}.")
-                    return value if name.isdecimal() and name not in self._names else prefix + name
-            return value
-        if value is None or isinstance(value, bool | int | float | bytes):
-            return value
-        if isinstance(value, tuple | list):
-            elements = [self._to_original_ids(element) for element in value if not self._is_of_other_copy(element)]
-            return type(value)(*elements) if hasattr(value, "_fields") else type(value)(elements)
-        if isinstance(value, Mapping):
-            return {self._to_original_ids(key): self._to_original_ids(element)
-                    for key, element in value.items() if not self._is_of_other_copy(key)}
-        fields = {name: getattr(value, name) for name in dir(value) if not name.startswith("_") and name not in ("this", "thisown")}
-        return SimpleNamespace(**{name: self._to_original_ids(field) for name, field in fields.items() if not callable(field)})
+    def _results(self, is_context: bool, domain: str) -> dict[str, dict[Any, Any]]:
+        results: dict[str, dict[Any, Any]] = {}
+        for (*kind, actor), (other_domain, dist, variables) in self._subscriptions.items():
+            if kind == [is_context, domain] and actor in (("",) if domain == "simulation" else self._ids(domain)):
+                results[actor] = self._values(domain, actor, variables) if not is_context else {
+                    other: self._values(other_domain, other, variables) for other in self._ids(other_domain)
+                    if math.dist(*(self._query(*of)[:2] for of in (
+                        (domain, "getPosition", actor), (other_domain, "getPosition", other)))) <= dist}
+        return results
 
-    def _is_of_other_copy(self, value: Any) -> bool:
-        if not isinstance(value, str):
-            return False
-        copy, dot, name = value.removeprefix(":").removeprefix("!").partition(".")
-        return bool(dot and copy.isdecimal() and name in self._names and int(copy) != self._copy)
+    def _values(self, domain: str, actor: str, variables: Variables) -> dict[int, Any]:
+        return {variable: self._query(domain, function, *((actor,) if actor else ()), *arguments)
+                for variable, (function, arguments) in variables.items()}
 
 
-def refuse_own_loop(domain: str, name: str, full_name: str) -> None:
-    """Refuse a function that begins, advances or ends the simulation; raises InputError."""
-    if name in LOOP_FUNCTIONS and domain in ("", "simulation"):
-        raise InputError(full_name, "safevar_sumo itself starts, advances and ends the simulation",
-                         "the body of your script's loop, without this call, as a function step(traci, vehicle_id)")
+def _requested_variables(domain: str, requested: Any, parameters: Any) -> Variables:
+    functions = {_constant(name): function for name, function in VARIABLES.items()}
+    variables = map(_constant, DEFAULT_VARIABLES[domain]) if requested is None else requested
+    result: Variables = {}
+    for variable in variables:
+        if variable not in functions:
+            raise InputError(f"traci.{domain}.subscribe", f"variable {variable!r}", ", ".join(VARIABLES))
+        argument = (parameters or {}).get(variable, ())
+        result[variable] = functions[variable], argument[1:] if isinstance(argument, tuple) else (argument,)
+    return result
+
+
+def _copied_ids(copy: int, value: Any) -> Any:
+    """Arguments for a copy: every text is an id; default types of SUMO are the same in all copies."""
+    if isinstance(value, str):
+        return re.sub(r"^(?!DEFAULT_)([:!]?)(?=.)", rf"\g<1>{copy}.", value)
+    return type(value)(_copied_ids(copy, element) for element in value) if isinstance(value, list | tuple) else value
+
+
+def _original_ids(value: Any) -> Any:
+    """A result with the ids of the traffic file."""
+    if isinstance(value, str):
+        return re.sub(r"^([:!]?)\d+\.", r"\1", value)
+    if isinstance(value, dict):
+        return {_original_ids(key): _original_ids(element) for key, element in value.items()}
+    return type(value)(map(_original_ids, value)) if type(value) in (list, tuple) else value
+
+
+def _constant(name: str) -> int:
+    return int(getattr(real_traci().constants, name))
 
 
 def _invalid_value(value: Any) -> Any:
@@ -273,34 +322,3 @@ def _invalid_value(value: Any) -> Any:
     if isinstance(value, tuple):
         return tuple(map(_invalid_value, value))
     return "" if isinstance(value, str) else type(value)(INVALID_NUMBER)
-
-
-def traci_exception() -> type[Exception]:
-    """The exception that controllers catch, whatever the engine."""
-    return real_traci().exceptions.TraCIException  # type: ignore[no-any-return]
-
-
-@cache
-def real_traci() -> Any:
-    """The original module traci, not its substitute for controllers; must be called before controllers run."""
-    return engine_api(Engine.TRACI)
-
-
-def positional_arguments(domain: str, name: str, arguments: tuple[Any, ...], named: Mapping[str, Any]) -> tuple[Any, ...]:
-    """Positional and named arguments as positional arguments, in the order of TraCI's function."""
-    signature = _signature(domain, name)
-    if signature is None or not (named or name in COMMANDS):
-        return arguments
-    bound = signature.bind(*arguments, **named)
-    bound.apply_defaults()
-    return bound.args
-
-
-@cache
-def _signature(domain: str, name: str) -> inspect.Signature | None:
-    api = real_traci()
-    function: Callable[..., Any] | None = getattr(getattr(api, domain, None) if domain else api, name, None)
-    try:
-        return None if function is None else inspect.signature(function)
-    except (TypeError, ValueError):
-        return None

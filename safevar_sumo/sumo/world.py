@@ -199,12 +199,6 @@ class SumoWorld:
         """Whether a vehicle under test has left the road, for good."""
         return id_ not in self._driving_copies
 
-    def names(self) -> frozenset[str]:
-        """Names of vehicles, persons, roads and types in the original network."""
-        api = self._api
-        domains = (api.vehicle, api.person, api.edge, api.lane, api.route, api.vehicletype, api.junction)
-        return frozenset(id_.removeprefix(":").partition(".")[2] for domain in domains for id_ in domain.getIDList())
-
     def actor_poses(self) -> dict[str, tuple[float, float, float]]:
         """x and y of the front bumper or person [m], and heading clockwise from north [degrees], of all actors on the road, by id."""
         domains = (self._api.vehicle, self._api.person)
