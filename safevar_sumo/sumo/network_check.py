@@ -98,6 +98,9 @@ def _check_files(network: Network) -> None:
     if not SHORTEST_STEP <= (parse_seconds(step) or 0.0) <= LONGEST_STEP:
         raise InputError(network.path(OPTIONS_FILE), f"step-length = {step!r}",
                          f"a number from {SHORTEST_STEP:g} to {LONGEST_STEP:g} [s]")
+    if "remote-port" in options:  # SUMO would wait for a client
+        raise InputError(network.path(OPTIONS_FILE), f"remote-port = {options['remote-port']!r}",
+                         "no remote-port: safevar_sumo starts SUMO itself")
     if options.get("route-files", TRAFFIC_FILE) != TRAFFIC_FILE:
         raise InputError(network.path(OPTIONS_FILE), f"route-files = {options['route-files']!r}",
                          f"{TRAFFIC_FILE}, all traffic in one file")

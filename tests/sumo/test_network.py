@@ -206,6 +206,14 @@ def test_illegal_traffic_is_refused_with_its_name(mine: Path, what: str) -> None
     assert message in str(caught.value)
 
 
+def test_a_configuration_that_waits_for_a_client_is_refused(mine: Path) -> None:
+    file = mine / "scenario.sumocfg"
+    port = '<traci_server><remote-port value="8813"/></traci_server>'
+    file.write_text(file.read_text().replace("</configuration>", f"{port}</configuration>"))
+    with pytest.raises(InputError, match=r"scenario\.sumocfg: remote-port = '8813'"):
+        check_network(str(mine), "study")
+
+
 def test_persons_who_dawdle_are_refused(mine: Path) -> None:
     file = mine / "scenario.sumocfg"
     file.write_text(file.read_text().replace('dawdling value="0"', 'dawdling value="0.2"'))
