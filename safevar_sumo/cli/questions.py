@@ -76,7 +76,7 @@ def _plot_option(help_text: str) -> Callable[[CommandFunction], CommandFunction]
 def explain(source: str, full: bool, point: str | None, jobs: int | None, as_json: bool, out: Path | None, **values: Any) -> None:
     """Explain failures of results in DIR, or across the domain of STUDY: which changes cause them, how small a change is enough, why."""
     from safevar_sumo.analysis.explain.compute import explain_failures
-    from safevar_sumo.analysis.explain.render import necessity_figure, print_explained
+    from safevar_sumo.analysis.explain.render import print_explained
     from safevar_sumo.analysis.figures import save
 
     subject = load_results_or_study(source, point)
@@ -90,7 +90,7 @@ def explain(source: str, full: bool, point: str | None, jobs: int | None, as_jso
     if out is not None:
         write_whole(out / "causes.json", _to_json(result) + "\n")
         write_whole(out / "causes.csv", result.to_frame().to_csv(index=False, lineterminator="\n"))
-        save(necessity_figure(result), out / "necessity.png")
+        save(result.figure(), out / "necessity.png")
         click.echo(f"Causes: {out}", err=as_json)
 
 

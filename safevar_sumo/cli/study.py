@@ -169,11 +169,13 @@ def print_summary(console: Console, study: Study, campaign: Campaign, directory:
 
     names = tuple(study.vehicle.characteristics)
     solutions = solutions_frame(names, campaign.solutions.items())
+    case = build_case(study, record(campaign.original, row=0), solutions, solutions_frame(names, []), tuple(campaign.solutions),
+                      scoring=campaign.scoring)
     if campaign.no_verdict:
         print_text(console, campaign.no_verdict)
     if len(solutions):
         with open_progress(True) as progress:
-            lines = summarise_failures(study, solutions, campaign.original, pool, str(directory), progress)
+            lines = summarise_failures(case, campaign.original, pool, str(directory), progress)
         for line in lines:
             print_text(console, line)
     original = evaluations_frame(names, [(("", 0), campaign.original)])
@@ -203,8 +205,6 @@ def print_summary(console: Console, study: Study, campaign: Campaign, directory:
         changes = change_texts(CharacteristicSet.of(study.vehicle.characteristics), {name: worst[name] for name in names})
         for change in changes or ["no change"]:
             print_text(console, f"  {change}")
-    case = build_case(study, record(campaign.original, row=0), solutions, solutions_frame(names, []), tuple(campaign.solutions),
-                      scoring=campaign.scoring)
     for line in summary_lines(case):
         print_text(console, line)
     print_text(console, f"All tables: {PROGRAM_COMMAND} tables {shlex.quote(str(directory))}")

@@ -65,8 +65,9 @@ def find_divergence(runs: SimulationRuns) -> int | None:
 class Comparison:
     """Runs of the original vehicle (row 0) and of a changed one (row 1; missing if nothing is changed).
 
-    `title` is the study's title, `network` the scenario's network with the lanes that the scenario's parameters define; `evaluations` and
-    `film` have one row for each vehicle. `objectives` are metrics that the study optimises besides the paper's metrics.
+    `title` is the study's title and the `point` of its matrix, `network` the scenario's network with the lanes that the
+    scenario's parameters define; `evaluations` and `film` have one row for each vehicle. `objectives` are metrics that the study
+    optimises besides the paper's metrics.
     """
 
     title: str
@@ -76,6 +77,7 @@ class Comparison:
     evaluations: Evaluations
     film: Film
     objectives: tuple[MetricFacts, ...] = ()
+    point: str = ""
 
     @property
     def rows(self) -> range:
@@ -164,10 +166,10 @@ def compare_setting(study: Study, system: System, setting: FloatArray) -> Compar
     original = system.characteristics.original
     settings = np.stack([original]) if np.array_equal(original, setting) else np.stack([original, setting])
     worst_system = system_at_worst_point(system, settings)
-    point_names = [f" ({point.name})" for point in system.matrix
-                   if (point.scenario, point.weather) == (worst_system.scenario, worst_system.weather)]
+    point = next((point.name for point in system.matrix
+                  if (point.scenario, point.weather) == (worst_system.scenario, worst_system.weather)), "")
     recording = record_film(worst_system, settings)
-    return Comparison(title=study.title + "".join(point_names[:1]), characteristics=system.characteristics,
+    return Comparison(title=f"{study.title} ({point})" if point else study.title, point=point, characteristics=system.characteristics,
                       ttc_threshold=system.metrics_table.ttc_threshold, network=stage_network(worst_system.scenario),
                       evaluations=score(worst_system, settings, recording.runs),
                       film=replace(recording, runs=_with_pedals_before_impacts(recording.runs)),

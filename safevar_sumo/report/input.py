@@ -1,17 +1,15 @@
-"""The input of a report: results, replays and stored answers of a study; the table of the points at which a setting fails."""
+"""The input of a report: results, simulations of their settings, and the table of the points at which a setting fails."""
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cache, cached_property
-from hashlib import sha256
-from importlib.metadata import version
+from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import pandas as pd
 
 from safevar_sumo.analysis.explain import ExplainOptions
 from safevar_sumo.analysis.explain.compute import unsafe_points_of
@@ -23,74 +21,50 @@ from safevar_sumo.analysis.risk.variation import BASE_POINTS
 from safevar_sumo.analysis.rules import RulesOptions
 from safevar_sumo.analysis.subject import at_point, changes_since
 from safevar_sumo.analysis.tolerance import ToleranceOptions
-from safevar_sumo.errors import InputError, SafevarError, warn
-from safevar_sumo.records import Evaluations, FloatArray
+from safevar_sumo.errors import InputError, warn
+from safevar_sumo.records import FloatArray
 from safevar_sumo.replay.comparison import Comparison, changes_in_words, compare_setting
 from safevar_sumo.replay.page import player_data
 from safevar_sumo.replay.scene import lay_out_scene
-from safevar_sumo.results import ANSWERS, MANIFEST, RESULTS, SOLUTIONS, choose_handle, handles_of, read_manifest, write_whole
+from safevar_sumo.results import choose_handle, handles_of, read_manifest
 from safevar_sumo.scenarios import LOCATION_DIMENSION, SPEED_DIMENSION, Point
-from safevar_sumo.shipped import PACKAGE
-from safevar_sumo.study import SAFETY_DEGREE, refuse_other_than_file, user_code_names
 from safevar_sumo.sumo.empty_road import why_no_verdict
-from safevar_sumo.sumo.matrix import evaluations_at_worst_points, simulate_all_points
+from safevar_sumo.sumo.matrix import simulate_all_points
 from safevar_sumo.sumo.system import System, assemble
-
-
-class FailingPointsTable(NamedTuple):
-    """The failing points of a matrix: a sentence, the heads of the columns, and rows with a name and a text for each column."""
-
-    summary: str
-    heads: list[str]
-    rows: list[tuple[str, list[str]]]
-
-
-class ChangeRow(NamedTuple):
-    """A change: both values in a text, and the characteristic's short name and description, empty if it has none."""
-
-    text: str
-    short_name: str
-    description: str
-
-
-AVOIDED_TEXT, FAILURE_TEXT = "–", "fails"  # noqa: RUF001
-
-
-def tabulate_failing_points(matrix: Sequence[Point], failing: Collection[str]) -> FailingPointsTable:
-    """Make a table of the points whose names are in `failing`: rows for tests and weathers, columns for speeds.
-
-    A cell lists the impact locations that fail; a cell without a test is empty.
-    """
-    coordinates_of_points = [(point.name in failing, dict(point.parameters)) for point in matrix]
-    speeds = sorted({coordinates[SPEED_DIMENSION] for _, coordinates in coordinates_of_points if SPEED_DIMENSION in coordinates})
-    rows: dict[str, dict[Any, list[str]]] = {}
-    for fails, coordinates in coordinates_of_points:
-        speed, location = coordinates.pop(SPEED_DIMENSION, None), coordinates.pop(LOCATION_DIMENSION, None)
-        test, weather = str(coordinates.pop("test", "")), str(coordinates.pop("weather", ""))
-        name = ", ".join([test, weather, *(f"{key} {value}" for key, value in coordinates.items())])
-        texts = rows.setdefault(name, {}).setdefault(speed, [])
-        if fails:
-            texts.append(FAILURE_TEXT if location is None else f"{location:g} %")
-    speeds_or_none = [*speeds, *([None] if any(None in cells for cells in rows.values()) else [])]
-    has_location = any(LOCATION_DIMENSION in dict(point.parameters) for point in matrix if point.name in failing)
-    return FailingPointsTable(
-        summary=f"Fails at {len(failing)} of {len(matrix)} points.{' Percentages are impact locations.' if has_location else ''}",
-        heads=["" if speed is None else f"{speed:g} km/h" for speed in speeds_or_none],
-        rows=[(name, [", ".join(cells[speed]) or AVOIDED_TEXT if speed in cells else "" for speed in speeds_or_none])
-              for name, cells in rows.items() if any(cells.values())])
-
 
 SAMPLED_VEHICLES = 4000
 """Number of vehicles sampled for the section on risk, and for the one on rules."""
 EXPLAIN_SIMULATIONS = 30_000
 """Approximate number of simulations for the minimal causes of all failures, and for the search for a robust failure."""
+AVOIDED_TEXT, FAILURE_TEXT = "–", "fails"  # noqa: RUF001
 
 
-class Resimulation(NamedTuple):
-    """A new simulation of a recorded setting: its evaluation, and the points of the matrix at which the setting is unsafe."""
+class FailingPoints(NamedTuple):
+    """The failing points of a matrix: a sentence, and a frame of tests and weathers by speeds."""
 
-    evaluation: Evaluations
-    unsafe_points: tuple[str, ...]
+    summary: str
+    frame: pd.DataFrame
+
+
+def tabulate_failing_points(matrix: Sequence[Point], failing: Collection[str]) -> FailingPoints:
+    """Tabulate the points whose names are in `failing`: a cell lists impact locations; one without a test is empty."""
+    rows: dict[str, dict[float | None, list[str]]] = {}
+    has_location = False
+    for point in matrix:
+        coordinates = dict(point.parameters)
+        speed, location = coordinates.pop(SPEED_DIMENSION, None), coordinates.pop(LOCATION_DIMENSION, None)
+        test, weather = str(coordinates.pop("test", "")), str(coordinates.pop("weather", ""))
+        name = ", ".join([test, weather, *(f"{key} {value}" for key, value in coordinates.items())])
+        texts = rows.setdefault(name, {}).setdefault(speed, [])
+        if point.name in failing:
+            texts.append(FAILURE_TEXT if location is None else f"{location:g} %")
+            has_location = has_location or location is not None
+    speeds = sorted({speed for cells in rows.values() for speed in cells}, key=lambda speed: (speed is None, speed or 0.0))
+    frame = pd.DataFrame(
+        [[", ".join(cells[speed]) or AVOIDED_TEXT if speed in cells else "" for speed in speeds] for cells in rows.values()],
+        index=pd.Index(rows, name="test"), columns=["" if speed is None else f"{speed:g} km/h" for speed in speeds])
+    note = " Percentages are impact locations." if has_location else ""
+    return FailingPoints(f"Fails at {len(failing)} of {len(matrix)} points.{note}", frame[[any(cells.values()) for cells in rows.values()]])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -111,7 +85,7 @@ class ReportInput:
     point: str = ""
     later_changes: Sequence[str] = ()
     _comparisons: dict[bytes, Comparison] = field(default_factory=dict)
-    _resimulations: dict[bytes, Resimulation] = field(default_factory=dict)
+    _failing: dict[bytes, FailingPoints] = field(default_factory=dict)
 
     @cached_property
     def solutions(self) -> dict[str, dict[str, Any]]:
@@ -119,61 +93,49 @@ class ReportInput:
         pairs = zip(handles_of(self.case.solutions), self.case.solutions.to_dict("records"), strict=True)
         return {str(handle): {**{str(name): value for name, value in row.items()}, "handle": str(handle)} for handle, row in pairs}
 
-    @cached_property
-    def unsafe_solutions(self) -> list[bool]:
-        """Whether each solution is unsafe."""
-        return [] if self.case.solutions.empty else list(self.case.unsafe.rows(self.case.solutions).tolist())
+    @property
+    def any_unsafe(self) -> bool:
+        return bool(len(self.case.solutions)) and bool(self.case.unsafe.rows(self.case.solutions).any())
 
-    def select_handle(self, choice: str) -> str:
-        """The handle of the solution that a choice selects: fewest, smallest or most_severe."""
-        return str(choose_handle(self.case.solutions, self.case.unsafe, choice, self.directory))
+    def select_handles(self, *choices: str) -> list[str]:
+        """The distinct handles of the solutions that choices select: the most severe one alone if none is unsafe."""
+        if self.case.solutions.empty:
+            return []
+        possible = choices if self.any_unsafe else ("most_severe",)
+        return list(dict.fromkeys(str(choose_handle(self.case.solutions, self.case.unsafe, choice, self.directory)) for choice in possible))
 
     def setting_of(self, handle: str) -> FloatArray:
         """A solution's setting, shape (n,)."""
-        row = self.solutions[handle]
-        return np.array([row[name] for name in self.case.characteristics.names], dtype=float)
+        return np.array([self.solutions[handle][name] for name in self.case.characteristics.names], dtype=float)
 
-    def setting_with(self, changes: Mapping[str, float]) -> FloatArray:
-        """The original setting with some values changed, shape (n,)."""
-        setting = self.case.characteristics.original.copy()
-        for name, value in changes.items():
-            setting[self.case.characteristics.names.index(name)] = value
-        return setting
-
-    def list_changes(self, setting: FloatArray) -> list[ChangeRow]:
-        """A setting's changes from the original."""
+    def list_changes(self, setting: FloatArray) -> list[tuple[str, str, str]]:
+        """A setting's changes from the original: both values in a text, the characteristic's short name and its description."""
         changed = [item for item, value in zip(self.case.characteristics, setting.tolist(), strict=True) if value != item.original]
         texts = changes_in_words(self.case.characteristics, setting)
-        return [ChangeRow(text, item.short_name, item.words) for item, text in zip(changed, texts, strict=True)]
+        return [(text, item.short_name, item.words) for item, text in zip(changed, texts, strict=True)]
 
     def compare_with_original(self, setting: FloatArray) -> Comparison:
-        """Simulate a setting, once, beside the original vehicle."""
+        """Simulate a setting, once, beside the original vehicle; of a matrix, at the setting's worst point."""
         assert self.system is not None
         key = setting.tobytes()
         if key not in self._comparisons:
             self._comparisons[key] = compare_setting(self.case.study, self.system, setting)
         return self._comparisons[key]
 
-    def simulate_again(self, settings: Sequence[FloatArray]) -> list[Resimulation]:
-        """Simulate recorded settings again, in one batch and each only once; the page warns of results that differ."""
-        assert self.system is not None
-        batch = {setting.tobytes(): setting for setting in settings if setting.tobytes() not in self._resimulations}
-        if batch:
-            results_at_points = simulate_all_points(self.system, np.stack(list(batch.values())))
-            evaluations = evaluations_at_worst_points(results_at_points)
-            unsafe_points = unsafe_points_of(self.system, results_at_points, self.case.unsafe)
-            for row, key in enumerate(batch):
-                self._resimulations[key] = Resimulation(evaluations.take([row]), unsafe_points[row])
-        return [self._resimulations[setting.tobytes()] for setting in settings]
+    def player_data_of(self, setting: FloatArray) -> dict[str, Any]:
+        """A setting's animation, in the form that the template `player` takes, with the point of the matrix that it shows."""
+        comparison = self.compare_with_original(setting)
+        return {**player_data(lay_out_scene(comparison)), "point": comparison.point}
 
-    @cached_property
-    def options(self) -> dict[str, Any]:
-        """Each question's options on the page: one criterion for all questions, and smaller samples than the commands take."""
-        unsafe = None if self.case.solutions.empty else str(self.case.unsafe)
-        all_options: tuple[Options, ...] = (
-            ExplainOptions(unsafe=unsafe, limit=EXPLAIN_SIMULATIONS), OpinionOptions(unsafe=unsafe), ToleranceOptions(unsafe=unsafe),
-            RiskOptions(unsafe=unsafe, samples=SAMPLED_VEHICLES), RulesOptions(unsafe=unsafe, samples=SAMPLED_VEHICLES))
-        return {options.question: options for options in all_options}
+    def failing_points(self, setting: FloatArray) -> FailingPoints | None:
+        """The points of the matrix at which a setting fails; None without a matrix, or if the page is about one point."""
+        if self.system is None or not self.system.matrix or self.point:
+            return None
+        key = setting.tobytes()
+        if key not in self._failing:
+            (points,) = unsafe_points_of(self.system, simulate_all_points(self.system, setting[np.newaxis]), self.case.unsafe)
+            self._failing[key] = tabulate_failing_points(self.system.matrix, points)
+        return self._failing[key]
 
     @cached_property
     def no_verdict(self) -> str:
@@ -187,20 +149,13 @@ class ReportInput:
         return {"causes": EXPLAIN_SIMULATIONS, "tolerance": 200 * n + 6000,
                 "risk": SAMPLED_VEHICLES + (n + 2) * BASE_POINTS, "rules": SAMPLED_VEHICLES}
 
-    @property
-    def original_fails(self) -> bool:
-        """Whether the original vehicle itself collides; if so, no change is a cause."""
-        return self.case.original[SAFETY_DEGREE] < 0
-
-    def failing_points(self, setting: FloatArray) -> FailingPointsTable | None:
-        """The points of the matrix at which a setting fails; None without a matrix, or if the page is about one point."""
-        if self.system is None or not self.system.matrix or self.point:
-            return None
-        return tabulate_failing_points(self.system.matrix, self.simulate_again([setting])[0].unsafe_points)
-
-    def player_data_of(self, setting: FloatArray) -> dict[str, Any]:
-        """A setting's animation, in the form that the template `player` takes."""
-        return player_data(lay_out_scene(self.compare_with_original(setting)))
+    @cached_property
+    def options(self) -> dict[str, Any]:
+        """Each question's options on the page: smaller samples than the commands take."""
+        all_options: tuple[Options, ...] = (
+            ExplainOptions(limit=EXPLAIN_SIMULATIONS), OpinionOptions(), ToleranceOptions(),
+            RiskOptions(samples=SAMPLED_VEHICLES), RulesOptions(samples=SAMPLED_VEHICLES))
+        return {options.question: options for options in all_options}
 
     def anchor(self, *parts: object) -> str:
         """The HTML anchor of an element of the page, in this study's section."""
@@ -234,49 +189,3 @@ def read_inputs(directories: Iterable[str | Path], point: str | None = None, *, 
         inputs.append(ReportInput(study_number=study_number, directory=path, case=case, manifest=read_manifest(path), system=system,
                                   problem=problem, point=point or "", later_changes=later_changes))
     return inputs
-
-
-def load_or_compute(data: ReportInput, name: str, compute: Callable[[], Any]) -> Any:
-    """The result of `compute` as plain values: stored in the results directory, and read from there the next time.
-
-    Nothing is stored if the directory cannot be written, or if inputs have changed since the study. Nothing is stored for imported results
-    of a study with user code either, as they record no digest of this code.
-    """
-    if data.later_changes or ("imported" in data.manifest and user_code_names(data.case.study)):
-        return json.loads(json.dumps(compute(), allow_nan=False))
-    suffix = f"-{data.anchor(data.point)}" if data.point else ""
-    file, identity = data.directory / ANSWERS / f"{name}{suffix}.json", _answer_digest(data, name)
-    try:
-        refuse_other_than_file(file)
-        content = json.loads(file.read_text(encoding="utf-8"))
-        if content["identity"] == identity:
-            return content["value"]
-    except (OSError, ValueError, KeyError, TypeError):
-        pass  # not stored, or stored by another version of the package: compute it now
-    text = json.dumps({"identity": identity, "value": compute()}, indent=1, allow_nan=False) + "\n"
-    try:
-        file.parent.mkdir(exist_ok=True)
-        write_whole(file, text)
-    except (OSError, SafevarError):
-        pass  # results on a read-only disk get a report, too
-    return json.loads(text)["value"]
-
-
-def _answer_digest(data: ReportInput, name: str) -> str:
-    """Digest of everything that an answer depends on: the results, the options, the package's code."""
-    digest = sha256(_package_identity().encode())
-    for file_name in (MANIFEST, SOLUTIONS):
-        file = data.directory / file_name
-        content = file.read_bytes() if file.is_file() else b""
-        digest.update(len(content).to_bytes(8, "big") + content)
-    inputs = [data.case.finished_runs, data.point, data.options.get(name, data.case.study.spread)]
-    digest.update(repr(inputs).encode())
-    return digest.hexdigest()
-
-
-@cache
-def _package_identity() -> str:
-    """Identity of the code of the whole package: answers depend on more of it than results do."""
-    files = sorted(PACKAGE.rglob("*.py"))
-    return repr([version("safevar_sumo"), RESULTS, [(file.relative_to(PACKAGE).as_posix(), sha256(file.read_bytes()).hexdigest())
-                                                    for file in files]])

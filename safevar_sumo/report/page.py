@@ -1,4 +1,4 @@
-"""The page of a report: its sections, research questions, and the commands that reproduce its numbers."""
+"""The page of a report: its sections, from the answers to the questions, and the commands that reproduce its numbers."""
 
 from __future__ import annotations
 
@@ -7,40 +7,35 @@ import re
 import shlex
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
 import msgspec
-import numpy as np
+import pandas as pd
 from markupsafe import Markup
 
+from safevar_sumo.analysis.explain.compute import explain_failures
+from safevar_sumo.analysis.explain.result import Explained
 from safevar_sumo.analysis.research_questions.answer import answer_questions
 from safevar_sumo.analysis.research_questions.case import Case, UnanswerableError
 from safevar_sumo.analysis.research_questions.gallery import draw_figures
-from safevar_sumo.analysis.research_questions.layout import BoldText, Table, lay_out
+from safevar_sumo.analysis.research_questions.layout import BoldText, lay_out
+from safevar_sumo.analysis.risk.compute import estimate_risk
+from safevar_sumo.analysis.rules.compute import find_rules
+from safevar_sumo.analysis.tolerance.compute import find_tolerances
 from safevar_sumo.errors import InputError, did_you_mean, warn
 from safevar_sumo.progress import PartsProgress, Progress, show_no_progress
 from safevar_sumo.protocol.rater import is_rated
-from safevar_sumo.replay.comparison import superscript_powers
+from safevar_sumo.replay.comparison import format_number, superscript_powers
 from safevar_sumo.replay.page import player_files, template_environment
-from safevar_sumo.report.causes import (
-    ReplayedSolution,
-    draw_necessity,
-    evenly_spaced_indices,
-    explain_main_failures,
-    make_cause_sections,
-    nondominated_rows,
-    reason_without_opinion,
-    replay_solutions,
-)
-from safevar_sumo.report.domain import DOMAIN_SECTIONS
+from safevar_sumo.report.causes import make_cause_sections, make_verdict, reason_without_opinion, replay_solutions
 from safevar_sumo.report.input import ReportInput, read_inputs
 from safevar_sumo.report.rated import rated_study_data
-from safevar_sumo.report.svg import Dot, draw_scatter
-from safevar_sumo.report.verdict import describe_limits, describe_tested_system, reach_verdict
+from safevar_sumo.report.tested import describe_tested_system
+from safevar_sumo.report.trust import describe_agreement, describe_limits
 from safevar_sumo.shipped import PROGRAM_COMMAND
 from safevar_sumo.study import Study, load_study, study_names
 
@@ -49,9 +44,11 @@ if TYPE_CHECKING:
 
 LONG_DECIMALS = re.compile(r"(\d\.\d\d)\d+")
 """Numbers with more decimals than a screen can show."""
-MAX_DOTS = 150
-"""Maximum number of points in a scatter chart."""
 SVG_STYLE = {"svg.fonttype": "none", "svg.hashsalt": "safevar_sumo", "font.family": ["sans-serif"]}
+DOMAIN_QUESTIONS: Mapping[str, Callable[..., Any]] = {"tolerance": find_tolerances, "risk": estimate_risk, "rules": find_rules}
+"""Functions that answer the questions about the whole domain, by the name of the section and of the command."""
+HIDDEN_COLUMNS = ("lower", "upper", "not_simulated")
+"""Columns of an answer's frame that the table beside its figure leaves out."""
 
 
 def list_tables(cases: Sequence[Case]) -> list[dict[str, Any]]:
@@ -59,19 +56,34 @@ def list_tables(cases: Sequence[Case]) -> list[dict[str, Any]]:
     try:
         answers = answer_questions(cases)
     except UnanswerableError as error:
-        return [{"title": "RQ1 to RQ3", "heads": (), "spans": (), "rows": [], "labels": 0, "notes": [f"{error.source}: {error.problem}."]}]
-    return [_table_data(table) for question_table in answers for table in lay_out(question_table)]
+        return [table_data(pd.DataFrame(), "RQ1 to RQ3", [f"{error.source}: {error.problem}."])]
+    return [table_data(table.frame, table.title, table.notes) for answer in answers for table in lay_out(answer)]
 
 
-def _table_data(table: Table) -> dict[str, Any]:
-    columns, labels = table.frame.columns, table.frame.index.nlevels
+def table_data(frame: pd.DataFrame, title: str, notes: Iterable[str] = ()) -> dict[str, Any]:
+    """A frame as the template's table: the index as labels, the outer level of columns as headings over several columns."""
+    columns, labels = frame.columns, frame.index.nlevels
     blocks = Counter(columns.get_level_values(0)) if columns.nlevels > 1 else {}
-    heads = [] if table.frame.empty else [*table.frame.index.names, *columns.get_level_values(-1)]
-    rows = [[{"text": superscript_powers(cell), "bold": isinstance(cell, BoldText)} for cell in row]
-            for row in table.frame.reset_index().to_numpy().tolist()]
-    return {"title": superscript_powers(table.title), "heads": list(map(superscript_powers, heads)), "rows": rows, "labels": labels,
+    rows = [[{"text": _cell_text(cell), "bold": isinstance(cell, BoldText)} for cell in row]
+            for row in frame.reset_index().to_numpy(dtype=object).tolist()]
+    heads = [] if frame.empty else [*frame.index.names, *columns.get_level_values(-1)]
+    return {"title": superscript_powers(title), "heads": [superscript_powers(str(head)) for head in heads], "rows": rows, "labels": labels,
             "spans": [("", labels), *((superscript_powers(name), width) for name, width in blocks.items())] if blocks else [],
-            "notes": list(map(superscript_powers, table.notes))}
+            "notes": list(map(superscript_powers, notes))}
+
+
+def _cell_text(value: Any) -> str:
+    if isinstance(value, list):
+        return ", ".join(f"{format_number(low)} to {format_number(high)}" for low, high in value)
+    if isinstance(value, float):
+        return "" if pd.isna(value) else format_number(value)
+    return "" if value is None else superscript_powers(str(value))
+
+
+def figure_data(figure: Figure, frame: pd.DataFrame) -> dict[str, Any]:
+    """An answer's figure, with its values as a table."""
+    shown = frame[[name for name in frame if name not in HIDDEN_COLUMNS]].set_index("characteristic")
+    return {**_picture("", figure), "table": table_data(shown, "Values of the figure")}
 
 
 def embed_figures(cases: Sequence[Case]) -> list[dict[str, str]]:
@@ -80,40 +92,19 @@ def embed_figures(cases: Sequence[Case]) -> list[dict[str, str]]:
         figures_by_name, _ = draw_figures(cases)
     except UnanswerableError:
         return []
-    return [{"name": name, "alt": _alt_text(figure), "source": _data_url(figure)} for name, figure in figures_by_name.items()]
+    return [_picture(name, figure) for name, figure in figures_by_name.items()]
 
 
-def _alt_text(figure: Figure) -> str:
-    axis = figure.axes[0]
-    return f"{figure.get_suptitle()}: {axis.get_ylabel() or 'values'} over {axis.get_xlabel() or 'characteristics'}".replace("\n", " ")
-
-
-def _data_url(figure: Figure) -> str:
+def _picture(name: str, figure: Figure) -> dict[str, str]:
+    """A figure as Matplotlib's SVG, in a link that holds it; equal figures give equal bytes."""
     import matplotlib
 
-    buffer = BytesIO()
+    axis, buffer = figure.axes[0], BytesIO()
     with matplotlib.rc_context(SVG_STYLE):  # type: ignore[arg-type]
         figure.savefig(buffer, format="svg", metadata={"Date": None})
-    picture = LONG_DECIMALS.sub(r"\1", buffer.getvalue().decode())
-    return "data:image/svg+xml," + quote(picture, safe=" =:/;,()'!?@&+$*")
-
-
-def draw_front(data: ReportInput, handles: Sequence[str]) -> Markup:
-    """Draw non-dominated solutions by largest change and safety degree; those of `handles` link to their replays."""
-    rows = [row for row in data.solutions.values() if not np.isnan([row["f_safe"], row["f_diff"]]).any()]
-    best = nondominated_rows(rows)
-    selection = [best[index] for index in evenly_spaced_indices(len(best), MAX_DOTS)] + [row for row in rows if row["handle"] in handles]
-    dots = {row["handle"]: _dot(data, row, row["handle"] in handles) for row in selection}
-    return draw_scatter(f"{data.case.name}: safety degree over the largest change of the solutions that no other solution beats",
-                        list(dots.values()), "largest change [% of the original]", "safety degree [m, or -m/s]", line=0.0,
-                        line_title="collision below")
-
-
-def _dot(data: ReportInput, row: dict[Any, Any], has_replay: bool) -> Dot:
-    words = (f"{row['handle']}: {row['outcome']}, safety degree {row['f_safe']:.2f}, largest change {row['f_diff']:.0%}, "
-             f"{row['f_num_diff']} changed")
-    css_class = "hit" if row["outcome"] == "collision" else "miss"
-    return Dot(100 * row["f_diff"], row["f_safe"], words, css_class, data.anchor("replay", row["handle"]) if has_replay else "")
+    svg = LONG_DECIMALS.sub(r"\1", buffer.getvalue().decode())
+    words = f"{figure.get_suptitle()}: {axis.get_ylabel() or 'values'} over {axis.get_xlabel() or 'characteristics'}"
+    return {"name": name, "alt": words.replace("\n", " "), "source": "data:image/svg+xml," + quote(svg, safe=" =:/;,()'!?@&+$*")}
 
 
 def commands_to_reproduce(inputs: Sequence[ReportInput], questions: Sequence[str]) -> list[dict[str, str]]:
@@ -168,7 +159,7 @@ SECTIONS = {
 """Headings of the sections in order, by the names that `--only` accepts."""
 
 
-COMMAND_OF_SECTION = {"causes": "explain", **{name: name for name in DOMAIN_SECTIONS}}
+COMMAND_OF_SECTION = {"causes": "explain", **{name: name for name in DOMAIN_QUESTIONS}}
 """The command that computes each section that needs simulations."""
 
 
@@ -182,8 +173,7 @@ def make_report(directories: Iterable[str | Path], only: Sequence[str] = (), job
     sections = [name for name in SECTIONS if not only or name in only]
     if point is not None:
         if "questions" in only:
-            raise InputError("only", "the research questions are about whole studies",
-                             "sections other than questions with `point`")
+            raise InputError("only", "the research questions are about whole studies", "sections other than questions with `point`")
         sections = [name for name in sections if name != "questions"]
     inputs = read_inputs(directories, point, as_it_is_now=as_it_is_now)
     for data in inputs:
@@ -199,49 +189,49 @@ def make_report(directories: Iterable[str | Path], only: Sequence[str] = (), job
     cases = [data.case for data in inputs] if "questions" in sections else []
     parts = PartsProgress(progress, {f"{data.directory}: {name}": number for data in inputs
                                      for name, number in data.simulation_counts.items() if name in sections})
-    with ThreadPoolExecutor(1) as drawing_thread:  # meanwhile this process only waits for workers, and nothing else in it draws
-        questions = drawing_thread.submit(lambda: (list_tables(cases), embed_figures(cases)) if cases else ([], []))
-        studies = [_study_data(data, sections, jobs, parts) for data in inputs]
-        progress("tables and figures", 0, 1)
-        answers, pictures = questions.result()
+    studies = [_study_data(data, sections, jobs, parts) for data in inputs]
+    progress("tables and figures", 0, 1)
     page = template_environment(TEMPLATE_FOLDER).get_template("report.html.j2").render(
         title=f"Safety report: {', '.join(data.case.name for data in inputs)}", sections={name: SECTIONS[name] for name in sections},
-        studies=studies, tables=answers, figures=pictures,
+        studies=studies, tables=list_tables(cases) if cases else [], figures=embed_figures(cases) if cases else [],
         commands=commands_to_reproduce(inputs, [command for name, command in COMMAND_OF_SECTION.items() if name in sections])
         if "reproduce" in sections else [],
-        simulated_sections=list(COMMAND_OF_SECTION), player=player_files(), css=_web_file("report.css"), js=_web_file("report.js"))
+        simulated_sections=list(COMMAND_OF_SECTION), as_table=partial(table_data, title="Failing points"),
+        player=player_files(), css=_web_file("report.css"), js=_web_file("report.js"))
     progress("tables and figures", 1, 1)
     return page + "\n"
 
 
-def _study_data(data: ReportInput, sections: Sequence[str], jobs: int | None,
-                parts: PartsProgress) -> Mapping[str, Any]:
+def _study_data(data: ReportInput, sections: Sequence[str], jobs: int | None, parts: PartsProgress) -> Mapping[str, Any]:
     """Make the data of one study that the templates of these sections need."""
-    explanations, solutions = None, list[ReplayedSolution]()
-    if "causes" in sections:
-        progress = parts.begin(f"{data.directory}: causes")
-        explanations = None if data.system is None else explain_main_failures(data, jobs, progress)
-        solutions = replay_solutions(data, explanations, progress)
-    domain_sections = {name: make(data, jobs, parts.begin(f"{data.directory}: {name}"))
-                       for name, make in DOMAIN_SECTIONS.items() if name in sections and data.system is not None}
-    makers: dict[str, Callable[[], Any]] = {
-        "tested": lambda: describe_tested_system(data),
-        "verdict": lambda: reach_verdict(data, explanations, domain_sections.get("tolerance")),
-        "causes": lambda: make_cause_sections(explanations.failures if explanations else [], data),
-        "opinion_problem": lambda: "" if data.system is None else reason_without_opinion(data),
-        "necessity": lambda: draw_necessity(explanations.summary, data) if explanations else None,
-        "trust": lambda: describe_limits(data, explanations)}
-    different_handles = [solution.handle for solution in solutions if solution.differences]
-    if different_handles:
-        warn(f"{data.directory}: simulated again with different results: {', '.join(different_handles)}; "
+    def answer(name: str, compute: Callable[..., Any], progress: Progress, **options: bool) -> Any:
+        return compute(data.case, data.options[name], jobs=jobs, progress=progress, **options)
+
+    progress = parts.begin(f"{data.directory}: causes") if "causes" in sections else show_no_progress
+    explained: Explained | None = None
+    if data.system is not None and {"verdict", "causes"} & {*sections} and len(data.case.solutions):
+        explained = answer("explain", explain_failures, progress, statistics="causes" in sections)
+    solutions = replay_solutions(data, explained, progress) if "causes" in sections else []
+    answers = {name: answer(name, compute, parts.begin(f"{data.directory}: {name}"))
+               for name, compute in DOMAIN_QUESTIONS.items() if name in sections and data.system is not None}
+    different = [solution["handle"] for solution in solutions if solution["differences"]]
+    if different:
+        warn(f"{data.directory}: simulated again with different results: {', '.join(different)}; "
              "have versions or code changed since the study?")
+    makers: dict[str, Callable[[], Any]] = {
+        "tested": lambda: describe_tested_system(data), "verdict": lambda: make_verdict(data, explained, answers.get("tolerance")),
+        "causes": lambda: make_cause_sections(data, explained) if explained else [],
+        "trust": lambda: describe_limits(data, explained)}
     return {"name": data.case.name, "title": data.case.study.title, "anchor": data.anchor(), "replays": solutions,
-            "different": different_handles,
-            "problem": data.problem, "no_verdict": data.no_verdict,
-            "later_changes": data.later_changes, "original_fails": data.original_fails,
-            "front": draw_front(data, [solution.handle for solution in solutions]) if solutions else None,
-            **domain_sections, **{name: make() for name, make in makers.items()
-                         if name in sections or (name in ("necessity", "opinion_problem") and "causes" in sections)}}
+            "different": different, "agreement": describe_agreement(data.case.study), "problem": data.problem,
+             "no_verdict": data.no_verdict, "later_changes": data.later_changes,
+            "opinion_problem": "" if data.system is None else reason_without_opinion(data),
+            "statistics": figure_data(explained.figure(), explained.necessity) if explained and explained.analysed else None,
+            "answers": {name: [superscript_powers(sentence) for sentence in result.sentences() if isinstance(sentence, str)]
+                        for name, result in answers.items()},
+            "figures": {name: figure_data(result.figure(), result.to_frame()) for name, result in answers.items()
+                        if name != "rules" and not result.to_frame().empty},
+            **{name: make() for name, make in makers.items() if name in sections}}
 
 
 def _web_file(name: str) -> Markup:

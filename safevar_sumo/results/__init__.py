@@ -1,7 +1,6 @@
 """Results of campaigns: journalled, written, and read back."""
 
 from safevar_sumo.results.files import (
-    ANSWERS,
     FILES,
     MANIFEST,
     ORIGINAL,
@@ -19,7 +18,6 @@ from safevar_sumo.results.solution_id import CHOICES, SolutionId, choose_handle,
 from safevar_sumo.results.store import ResultsDirectory, evaluations_frame, record, solutions_frame
 
 __all__ = [
-    "ANSWERS",
     "CHOICES",
     "FILES",
     "MANIFEST",

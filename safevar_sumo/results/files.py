@@ -17,7 +17,7 @@ from safevar_sumo.output import whole_file
 from safevar_sumo.plugins import DIGEST_LENGTH, Files
 from safevar_sumo.study import Study, refuse_other_than_file
 
-MANIFEST, SOLUTIONS, RUNS, ANSWERS = "manifest.json", "solutions.csv", "runs", "answers"
+MANIFEST, SOLUTIONS, RUNS = "manifest.json", "solutions.csv", "runs"
 ORIGINAL = "original"
 """Name of the original vehicle's journal; the study that writes it first owns the directory."""
 FOLDERS_FILE, LATE_FILE_PATTERN = "places.json", "read-*.json"
@@ -40,9 +40,7 @@ FILES = (
     ResultsFile(f"{RUNS}/{ORIGINAL}.journal", "the original vehicle's evaluation", "`study` before its first run"),
     ResultsFile(f"{RUNS}/{FOLDERS_FILE}", "folders of your own code and files, relative to the directory", "`study` before its first run"),
     ResultsFile(f"{RUNS}/{LATE_FILE_PATTERN}", "a file that your own code read in the middle of a study, with its digest",
-                "`study` after each batch"),
-    ResultsFile(f"{ANSWERS}/*.json", "results that `report` computed; reused for the same results, options and program; safe to delete",
-                "`report`"))
+                "`study` after each batch"))
 """Every file of a results directory; the manual lists them."""
 
 

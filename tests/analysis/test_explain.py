@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import json
 import re
+from dataclasses import replace
 from io import StringIO
 from itertools import combinations
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import pytest
@@ -33,11 +33,11 @@ from safevar_sumo.analysis.explain.causes import (
 )
 from safevar_sumo.analysis.explain.compute import explain_failures
 from safevar_sumo.analysis.explain.necessity import count_distinct_causes, necessity_frame
-from safevar_sumo.analysis.explain.paragraph import NUMBER_WORDS, FailureDescription, failures_paragraph
-from safevar_sumo.analysis.explain.render import _print_explanation, _sample_in_words, print_explained
-from safevar_sumo.analysis.explain.result import Cause, Explained, Explanation, most_robust
+from safevar_sumo.analysis.explain.render import print_explained
+from safevar_sumo.analysis.explain.result import Cause, Explained, Explanation
 from safevar_sumo.analysis.explain.robustness import Robustness, estimate_robustness
-from safevar_sumo.analysis.explain.summary import _estimate_robustnesses, summarise_failures
+from safevar_sumo.analysis.explain.sentences import NUMBER_WORDS, situation_in_words, verdict_in_words
+from safevar_sumo.analysis.explain.summary import summarise_failures
 from safevar_sumo.analysis.preventability import Preventability
 from safevar_sumo.analysis.research_questions.case import Case, load_cases
 from safevar_sumo.analysis.words import share_in_words
@@ -187,7 +187,8 @@ def test_the_answer_takes_ten_lines_and_the_rest_is_asked_for(explained: Explain
     assert len(short) <= 10
     assert short[:-1] == full.splitlines()[:len(short) - 1]
     assert short[-1].endswith("python -m safevar_sumo explain here --full")
-    assert_tells_a_manager(short[2], explained)
+    assert short[1:1 + len(explained.sentences())] == explained.sentences()
+    assert_tells_a_manager(short[1], explained)
     braking = explained.explanations[0].because.original.braking
     assert braking is not None
     assert f"decides every 0.05 s, in which the vehicle covers {braking.speed * 0.05:.2f} m at {braking.speed:.1f} m/s" in full
@@ -226,39 +227,47 @@ def assert_tells_a_manager(paragraph: str, explained: Explained) -> None:
 
 
 def test_how_many_failures_were_analysed_in_words() -> None:
-    counts = [SimpleNamespace(analysed=number, failures=number) for number in (1, 2, 3)]
-    assert [_sample_in_words(cast("Explained", count)) for count in counts] == ["the only failure", "both failures", "all 3 failures"]
-
-
-def test_the_heading_of_a_failure_is_whole() -> None:
-    """The reasons stand below the heading, which is cut at the width of the terminal."""
-    printed = StringIO()
-    run = RunSummary("stopped", np.nan, None, np.nan, np.nan)
-    failure = Explanation(
-        handle=SolutionId("nsga2", 123, 45), setting={}, outcome="stopped", safety_degree=None, changed=(), causes=(), necessary=(),
-        robustness=Robustness({}), because=BrakingComparison(run, run, {}), reasons=("fewest changes", "smallest robust", "most severe"))
-    characteristics = CharacteristicSet.of(load_study("smoke").vehicle.characteristics)
-    _print_explanation(Console(file=printed, width=60), str, failure, characteristics, cast("Explained", None))
-    assert printed.getvalue().startswith("nsga2:123:45 ")
-    assert "Chosen as: fewest changes, robust with the fewest" in printed.getvalue()
+    counts = [replace(answer_of(), analysed=number, failures=number).sample for number in (1, 2, 3)]
+    assert counts == ["the only failure", "both failures", "all 3 failures"]
 
 
 @pytest.mark.slow
 def test_the_summary_of_a_study_leads_with_the_answer(case: Case, explained: Explained) -> None:
+    """It is the answer of `explain`: the same failures, the same cause of each."""
     original = Evaluator(case.study, InlinePool()).evaluate_original()
-    paragraph, first, *others, more = summarise_failures(case.study, case.solutions, original, InlinePool(), "my results")
-    crashes = int((case.solutions["outcome"] == "collision").sum())
+    paragraph, count, *others, more = summarise_failures(case, original, InlinePool(), "my results")
     assert_tells_a_manager(paragraph, explained)
-    distinct = len(np.unique(case.solutions[list(case.study.vehicle.characteristics)].to_numpy(dtype=float), axis=0))
-    settings = "" if distinct == len(case.solutions) else f" ({distinct} different settings)"
-    assert first == f"{crashes} of {len(case.solutions)} solutions{settings} collide."
-    assert [line.partition(":")[0] for line in others] == ["Fewest changes", "Smallest largest change", "Most severe"]
-    assert all(" These changes alone cause it: " in line for line in others)
-    safe = case.solutions[case.solutions["f_safe"] > 2]
+    assert [paragraph, count] == explained.sentences()[:2]
+    assert len(others) >= len(explained.choices)
+    for failure in explained.choices:
+        (line,) = [line for line in others if line.startswith(f"{failure.title.capitalize()}: {failure.handle}, collision, SD ")]
+        assert failure.cause is not None
+        named = re.findall(r"(\w+) [\d.]+ -> ", line.partition(" These changes alone cause it: ")[2])
+        assert named == list(failure.cause.changes)
     assert more == "Causes and limits: python -m safevar_sumo explain 'my results'"
-    nothing, more = summarise_failures(case.study, safe, original, InlinePool(), "out")
-    assert nothing.startswith(f"Nothing unsafe found in {len(safe)} solution{'s' * (len(safe) > 1)}:")
-    assert more == "How far each characteristic may go: python -m safevar_sumo tolerance out"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("share", "degrees"), [(0.6, "stops"), (0.3, "stops")])
+def test_where_nothing_collides_the_verdict_says_so_first(case: Case, share: float, degrees: str) -> None:
+    """Half of the original's distance is a screening limit: what is below it is no failure, whatever its robustness."""
+    original = Evaluator(case.study, InlinePool()).evaluate_original()
+    degree = float(original.f_safe[0])
+    safe = case.solutions[case.solutions["f_safe"] > share * degree].reset_index(drop=True)
+    for few in (safe, safe[safe["f_safe"] < 0.9 * degree].reset_index(drop=True)):
+        screened = replace(case, solutions=few)
+        first, count, *_, more = summarise_failures(screened, original, InlinePool(), "out")
+        answer = explain_failures(screened, ExplainOptions(), pool=InlinePool())
+        distinct = few.drop_duplicates(list(case.characteristics.names))
+        assert [first, count] == answer.sentences()[:2]
+        assert first.startswith(f"No collision in {len(distinct)} vehicles; the worst {degrees} {few['f_safe'].min():.2f} m short of the "
+                                f"pedestrian, the original {degree:.2f} m, with the weather 'wet leaves'. ")
+        below = int((distinct["f_safe"] < degree / 2).sum())
+        assert count == (f"{below} of {len(distinct)} different vehicles are unsafe: safety degree below {degree / 2:.3g} m "
+                         "(half of the original's, a screening limit).")
+        assert ("Nothing unsafe was found." in first) is (below == 0)
+        command = "explain out" if below else "tolerance out"
+        assert more.endswith(f": python -m safevar_sumo {command}")
 
 
 COLLISION = Unsafe()
@@ -367,16 +376,43 @@ def test_robustness_in_words_says_where_a_time_step_disagrees() -> None:
     assert str(Robustness({0.05: 0.5, 0.025: 0.4, 0.1: 0.3})) == "borderline: only 40 % of the neighbours are unsafe too"
 
 
-def test_the_paragraph_says_how_robust_the_changes_that_suffice_are_by_themselves() -> None:
-    system, changes = assemble(load_study("sun")), {"tireFric": 1.04, "radius": 32.05, "mass": 2500.0}
-    finding = FailureDescription("rs:0:0", changes, "collision", -1.5, Robustness({0.05: 0.98}), 2, Robustness({0.05: 0.44}))
-    original = evaluate(system, system.characteristics.original[None])
-    paragraph = failures_paragraph(system, original, finding, finding, Preventability(counts={}, collisions=0, later=0))
-    assert "a collision at 1.5 m/s, 5 km/h (rs:0:0, robust: 98 % of" in paragraph.lower()
+SUN = load_study("sun")
+ORIGINALS = {name: table.original for name, table in SUN.vehicle.characteristics.items()}
+
+
+def failure_of(changes: dict[str, float], degree: float, *reasons: str, needed: int = 0, shares: tuple[float, ...] = ()) -> Explanation:
+    """A robust failure of `SUN`, with a cause of the first `needed` of its changes for each of these shares."""
+    run, part = RunSummary("stopped", np.nan, None, np.nan, np.nan), dict(list(changes.items())[:needed or len(changes)])
+    causes = [Cause(changes=part, boundary=part, fraction=1.0, alone=part, outcome="collision", safety_degree=-1.0,
+                    neighbours=Robustness({0.05: share})) for share in shares or (0.98,)]
+    return Explanation(handle=SolutionId("rs", 0, round(-10 * degree)), setting={**ORIGINALS, **changes}, outcome="collision",
+                       safety_degree=degree, changed=tuple(changes), causes=tuple(causes), robustness=Robustness({0.05: 0.98}),
+                       because=BrakingComparison(run, run, {}), reasons=reasons)
+
+
+def answer_of(*failures: Explanation) -> Explained:
+    system = assemble(SUN)
+    original, characteristics = evaluate(system, system.characteristics.original[np.newaxis]), system.characteristics
+    return Explained(
+        study=SUN, unsafe=COLLISION, original=original, nearest=original.take([]), explanations=failures, looked_at=9, failures=1,
+        necessity=necessity_frame(characteristics, np.zeros((0, len(ORIGINALS)), dtype=bool), [], 0), analysed=0, otherwise=0,
+        distinct=count_distinct_causes(characteristics, []), preventability=Preventability(counts={}, collisions=0, later=0))
+
+
+def test_the_verdict_names_the_most_robust_cause_and_says_how_robust_it_is() -> None:
+    one = failure_of({"tireFric": 1.04, "radius": 32.05, "mass": 2500.0}, -1.5, "fewest changes", "smallest robust", needed=2,
+                     shares=(0.02, 0.44))
+    paragraph = " ".join(verdict_in_words(answer_of(one)))
+    assert "a collision at 1.5 m/s, 5 km/h (rs:0:15, robust: 98 % of" in paragraph.lower()
     assert "; two of them suffice (borderline: only 44 % of the neighbours are unsafe too)." in paragraph
-    alike = load_study("sun", vehicle={"characteristics": {name: {"meaning": "x"} for name in ("radius", "mass")}})
-    paragraph = failures_paragraph(assemble(alike), original, finding, finding, Preventability(counts={}, collisions=0, later=0))
-    assert "x -10 %, x +4 %" in paragraph, "two characteristics with one short name"
+
+
+def test_the_verdict_leads_with_the_robust_failure_if_it_has_as_few_changes() -> None:
+    severe, robust, larger = (failure_of(changes, degree, reason) for changes, degree, reason in (
+        ({"radius": 32.0}, -3.0, "fewest changes"), ({"radius": 33.0}, -1.0, "smallest robust"),
+        ({"radius": 34.0, "mass": 2600.0}, -1.0, "smallest robust")))
+    for other, leads in ((robust, "rs:0:10"), (larger, "rs:0:30")):
+        assert re.findall(r"rs:0:\d+", " ".join(verdict_in_words(answer_of(other, severe)))) == [leads]
 
 
 @pytest.mark.parametrize(("weather", "words"), [
@@ -386,39 +422,19 @@ def test_the_paragraph_says_how_robust_the_changes_that_suffice_are_by_themselve
     ({"name": "wet", "road_friction": 0.9, "visibility": 1.0}, "With the weather 'wet', the original")])
 def test_a_weather_that_is_not_shipped_is_named(weather: str | dict[str, Any], words: str) -> None:
     system = assemble(load_study("smoke", weather=weather))
-    original = evaluate(system, system.characteristics.original[np.newaxis])
-    nobody = Preventability(counts={}, collisions=0, later=0)
-    assert failures_paragraph(system, original, None, None, nobody).startswith(words)
-
-
-def test_the_paragraph_leads_with_the_robust_failure_if_it_has_as_few_changes() -> None:
-    system = assemble(load_study("smoke"))
-    original = evaluate(system, system.characteristics.original[None])
-    severe, robust, larger = (
-        FailureDescription(name, changes, "collision", degree, Robustness({0.05: 0.98}), len(changes))
-        for name, changes, degree in (("rs:0:1", {"radius": 32.0}, -3.0), ("rs:0:4", {"radius": 33.0}, -1.0),
-                                      ("rs:0:7", {"radius": 34.0, "mass": 2600.0}, -1.0)))
-    nobody = Preventability(counts={}, collisions=0, later=0)
-    assert failures_paragraph(system, original, severe, robust, nobody) == failures_paragraph(system, original, robust, robust, nobody)
-    assert failures_paragraph(system, original, severe, larger, nobody) == failures_paragraph(system, original, severe, None, nobody)
-
-
-def test_the_summary_names_the_most_robust_of_all_causes_or_none() -> None:
-    """Any two changes suffice; only the last pair is not at the edge of the unsafe region."""
-    evaluator = made_up_evaluator(5, lambda settings: np.asarray((settings > 7).sum(axis=1) >= 2))
-    settings = np.array([[7.001, 7.001, 7.001, 9.0, 9.0]])
-    causes = find_minimal_causes(evaluator, settings, COLLISION)
-    assert [cause.columns for cause in causes[0]] == list(combinations(range(5), 2))
-    ((failure, cause),) = _estimate_robustnesses(evaluator, settings, causes, 0.1, COLLISION)
-    assert (failure.share, cause and cause.share) == (1.0, 1.0)
-    ((failure, cause),) = _estimate_robustnesses(evaluator, settings, [causes[0] * 3], 0.1, COLLISION)
-    assert (failure.share, cause) == (1.0, None)
+    assert situation_in_words(system, evaluate(system, system.characteristics.original[np.newaxis])).startswith(words)
 
 
 def test_of_several_causes_the_most_robust_is_named() -> None:
-    causes = [Cause(changes={"mass": 2600.0}, boundary={}, fraction=1.0, alone={}, outcome="collision", safety_degree=-1.0,
-                    neighbours=neighbours)
-              for neighbours in (None, Robustness({0.05: 0.02}), Robustness({0.05: 0.75}))]
-    assert most_robust(causes) is causes[2]
-    assert most_robust(causes[:1]) is causes[0]
-    assert most_robust([]) is None
+    failure = failure_of({"mass": 2600.0}, -1.0, "requested", shares=(0.02, 0.75, 0.75))
+    assert failure.cause is failure.causes[1]
+    assert replace(failure, causes=()).cause is None
+
+
+def test_the_heading_of_a_failure_is_whole() -> None:
+    """The reasons stand below the heading, which is cut at the width of the terminal."""
+    failure = failure_of({"mass": 2600.0}, -1.0, "fewest changes", "smallest robust", "most severe")
+    printed = StringIO()
+    print_explained(Console(file=printed, width=60), "here", answer_of(failure), full=True)
+    assert "\nrs:0:10 " in printed.getvalue()
+    assert "Chosen as: robust with the fewest changes; fewest changes" in " ".join(printed.getvalue().split())

@@ -13,8 +13,9 @@ import scipy
 
 from safevar_sumo.ads.competent_driver import CompetentDriver
 from safevar_sumo.analysis.evaluator import Evaluator
+from safevar_sumo.analysis.explain import ExplainOptions
 from safevar_sumo.analysis.explain.braking_comparison import sentence
-from safevar_sumo.analysis.explain.compute import PointComparison, compare_at_points
+from safevar_sumo.analysis.explain.compute import PointComparison, compare_at_points, explain_failures
 from safevar_sumo.analysis.explain.summary import summarise_failures
 from safevar_sumo.analysis.preventability import (
     Preventability,
@@ -23,10 +24,13 @@ from safevar_sumo.analysis.preventability import (
     assess_preventability,
     classify_collisions,
 )
+from safevar_sumo.analysis.research_questions.case import build_case
+from safevar_sumo.analysis.tolerance.answer import Tolerance
+from safevar_sumo.analysis.tolerance.safe_box import SafeBox
 from safevar_sumo.analysis.words import points_in_words
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import Evaluations, FloatArray
-from safevar_sumo.results import solutions_frame
+from safevar_sumo.results import record, solutions_frame
 from safevar_sumo.study import ModelTable, load_study
 from safevar_sumo.sumo.matrix import evaluate, simulate
 from safevar_sumo.sumo.system import System, assemble
@@ -180,8 +184,7 @@ def weak(system: System) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def failure(system: System, weak: np.ndarray) -> PointComparison:
-    (one,), step = compare_at_points(system, system.characteristics.original[np.newaxis], weak, Unsafe())
-    assert step == 0.05
+    (one,) = compare_at_points(system, system.characteristics.original[np.newaxis], weak, Unsafe())
     return one
 
 
@@ -207,9 +210,21 @@ def test_points_in_words() -> None:
 
 
 @pytest.mark.slow
-def test_the_summary_of_a_matrix_asks_why_at_the_worst_point_alone(system: System, weak: np.ndarray, failure: PointComparison) -> None:
+def test_the_summary_of_a_matrix_names_the_point_of_what_belongs_to_one(system: System, weak: np.ndarray, failure: PointComparison) -> None:
+    """The original vehicle has one safety degree, that at its worst point; that at another point stands with the point's name."""
     study = load_study("euro_ncap_pedestrian", matrix={"tests": TESTS})
     solutions = solutions_frame(system.characteristics.names, [(("nsga2", 0), evaluate(system, weak))])
     original = evaluate(system, system.characteristics.original[np.newaxis])
-    more = summarise_failures(study, solutions, original, InlinePool(), "out")[-1]
+    case = build_case(study, record(original, 0), solutions, solutions.iloc[:0], [("nsga2", 0)])
+    first, count, there, *_, more = summarise_failures(case, original, InlinePool(), "out")
+    assert first == f"At the worst of 5 test points, the original vehicle passes with a safety degree of {original.f_safe[0]:.2f} m."
+    assert count == "1 of 1 different vehicles are unsafe: collision."
+    degree = failure.braking.original.safety_degree
+    assert degree > original.f_safe[0] + 0.01
+    assert there.startswith(f"At {failure.braking.point}, the original vehicle stops {degree:.2f} m short of the pedestrian. ")
     assert more.endswith(f": python -m safevar_sumo explain out --point '{failure.braking.point}'")
+    whole = explain_failures(case, ExplainOptions(), pool=InlinePool(), statistics=False)
+    tolerated = Tolerance(study=study, unsafe=Unsafe(), original=original, alone=[], pairs=None,
+                          joint=SafeBox(1.0, 0.95, 1, 0, 1, 0.003, ("mass",)))
+    assert whole.sentences()[0].startswith(first)
+    assert str(next(iter(tolerated.sentences()))).endswith(first)

@@ -130,7 +130,7 @@ def test_only_cells_of_a_worse_colour_explain_a_failure(monkeypatch: pytest.Monk
     monkeypatch.setattr(Evaluator, "simulate_cells", lambda self, settings, stage: None)
     monkeypatch.setattr(rater.Rater, "points", lambda self, cells: SimpleNamespace(colours=colours))
     original = evaluator.characteristics.original[np.newaxis]
-    (comparison,), _ = compare_at_cells(evaluator, original, original)
+    (comparison,) = compare_at_cells(evaluator, original, original)
     assert comparison.failing_points == (matrix[0].name, matrix[4].name)
     assert comparison.braking.point == matrix[4].name
 

@@ -6,8 +6,6 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import msgspec
 import numpy as np
@@ -29,7 +27,7 @@ from safevar_sumo.reference.conclusions import (
     draw_conclusions,
     judge_test,
 )
-from safevar_sumo.report.verdict import PublishedAgreement, describe_agreement
+from safevar_sumo.report.trust import describe_agreement
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo import simulate
 from safevar_sumo.sumo.batch import score
@@ -139,11 +137,6 @@ MADE_UP = Agreement(
     undecided={}, by_predicted=[])
 
 
-def page_of(study: Any) -> PublishedAgreement:
-    material: Any = SimpleNamespace(case=SimpleNamespace(study=study))
-    return describe_agreement(material)
-
-
 @pytest.fixture
 def totals(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The only entry is made up: 10 of 40 published collisions collide here, which are half of the 20 here."""
@@ -156,13 +149,13 @@ def totals(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def test_the_page_says_how_well_the_study_agrees_with_every_file(totals: Path) -> None:
     worse = Agreement(**{**MADE_UP.to_dict(), "rows": 90, "spearman": {"safety_degree": 0.1}})
     write_totals(totals, load_study("rain"), "worse.csv", worse)
-    page = page_of(load_study("rain", title="Mine", search={"seed": 5, "evaluations": 100}))
+    sentence, rows = describe_agreement(load_study("rain", title="Mine", search={"seed": 5, "evaluations": 100}))
     for words in ("made_up.csv, 80 vehicles",
                   "rank correlation of the safety degrees is 0.61 (1: the same order, 0: none)",
                   "10 of the 40 published collisions", "recall 0.25", "precision 0.50", "worse.csv, 90 vehicles",
                   "is 0.10"):
-        assert words in page.sentence
-    assert page.rows[0] == ["made_up.csv", "80", "0.61", "0.25", "40", "20", "10", "0.25", "0.50"]
+        assert words in sentence
+    assert rows[0] == ["made_up.csv", "80", "0.61", "0.25", "40", "20", "10", "0.25", "0.50"]
 
 
 @pytest.mark.usefixtures("totals")
@@ -173,7 +166,7 @@ def test_nobody_elses_agreement_is_claimed() -> None:
                                                                                             "margin": 9.0}))
     for study in (load_study("sun"), other):
         assert shipped_totals_of(study) == {}
-        assert "was not compared with published data" in page_of(study).sentence
+        assert "was not compared with published data" in describe_agreement(study)[0]
 
 
 def test_an_entry_is_replaced_and_others_stay(totals: Path) -> None:

@@ -1,11 +1,10 @@
-"""The answer of `explain`: its records, their JSON and their frames."""
+"""The answer of `explain`: its records, with their JSON, frame, figure and sentences."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from operator import attrgetter
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 import pandas as pd
@@ -13,72 +12,18 @@ import pandas as pd
 from safevar_sumo.analysis.explain.braking_comparison import BrakingComparison, sentence
 from safevar_sumo.analysis.explain.causes import BoundaryState
 from safevar_sumo.analysis.explain.robustness import Robustness
-from safevar_sumo.analysis.preventability import Preventability, PreventedShares
+from safevar_sumo.analysis.explain.sentences import DISTINCT_CAUSE, LABELS, answer_in_words
+from safevar_sumo.analysis.figures import BLUE, FONT, GREY, SKY_BLUE, escape_dollars, new_figure
+from safevar_sumo.analysis.preventability import Preventability
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import Evaluations
 from safevar_sumo.results import SolutionId
 from safevar_sumo.study import SAFETY_DEGREE, Study
+from safevar_sumo.sumo.empty_road import driven_entry
 from safevar_sumo.vehicles import CharacteristicSet
 
-ROBUST = "smallest robust"
-"""The reason for choosing the robust failure with the fewest changes."""
-REASONS = {"fewest": "fewest changes", "smallest": "smallest changes", "most_severe": "most severe"}
-"""The other reasons for choosing a failure, by the name of the choice in `CHOICES`; the JSON contains these texts."""
-DISTINCT_CAUSE = "a cause of its own"
-"""The reason for choosing the simplest failure with a cause that no other chosen failure has."""
-LABELS = {ROBUST: "robust with the fewest changes", REASONS["smallest"]: "smallest largest change", DISTINCT_CAUSE: "distinct cause"}
-"""Titles of failures by the reason for their choice; any other reason is itself the title."""
-
-
-class CauseEntry(msgspec.Struct, frozen=True, kw_only=True):
-    """A minimal cause in the JSON of `explain`; fields as in `Cause`, which also explains `end`."""
-
-    changes: dict[str, float]
-    boundary: dict[str, float]
-    fraction: float
-    outcome: str
-    safety_degree: float | None
-    end: BoundaryState
-    robustness: float | None = None
-
-
-class FailureEntry(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """A failure in the JSON of `explain`; fields as in `Explanation`, but `because` is its comparison as a sentence.
-
-    `algorithm`, `run` and `index` form the handle, None if the setting is no solution; `robustness` is the unsafe share of the neighbours.
-    """
-
-    algorithm: str | None
-    run: int | None
-    index: int | None
-    setting: dict[str, float]
-    outcome: str
-    safety_degree: float | None
-    changed: list[str]
-    minimal_causes: list[CauseEntry]
-    robustness: float
-    because: str
-    reasons: list[str]
-    points: list[str] = []
-
-    @property
-    def handle(self) -> str:
-        """The handle of the solution; empty if the setting is no solution."""
-        return "" if self.algorithm is None else f"{self.algorithm}:{self.run}:{self.index}"
-
-
-class SummaryEntry(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """The last entry in the JSON of `explain`.
-
-    `necessary` and `changed` are shares of the analysed failures by characteristic; `necessary_interval` has 95 % intervals of `necessary`.
-    """
-
-    necessary: dict[str, float]
-    changed: dict[str, float]
-    necessary_interval: dict[str, list[float]]
-    preventable: PreventedShares
-    driven: bool = True
-
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 @dataclass(frozen=True, kw_only=True)
 class Cause:
@@ -91,17 +36,17 @@ class Cause:
     boundary
         The values after every change is multiplied by `fraction`, the smallest factor at which the vehicle stays unsafe.
     alone
-        For each characteristic, the value to which it can return towards the original while the other values stay as in `changes`.
+        For each characteristic, the value to which it can return towards the original while the others stay as in `changes`.
     outcome, safety_degree
         Outcome, and safety degree [m, or -m/s], of a vehicle with these changes only.
     end, at_threshold
-        The end of the shrinking: the state just below `fraction`; at the filter's threshold, the characteristic whose change the filter
-        would remove.
-    neighbours
-        Robustness of these changes by themselves, estimated from the setting's neighbours; None in a rated study, where the simulations
-        would take too long.
+        The end of the shrinking: the state just below `fraction`; at the filter's threshold, the characteristic whose change
+        the filter would remove.
     short_changes, short_boundary
         `changes` and `boundary` in as few digits as a vehicle needs to end alike, for commands.
+    neighbours
+        Robustness of these changes by themselves, estimated from the setting's neighbours; None in a rated study, where the
+        simulations would take too long.
     """
 
     changes: dict[str, float]
@@ -130,26 +75,20 @@ class Cause:
                  BoundaryState.NOT_SIMULATED: "slightly less could not be simulated"}[self.end]
         return f"Scaling all changes to {100 * self.fraction:.1f} % is still unsafe; {below}."
 
-
-SomeCause = TypeVar("SomeCause")
-
-
-def most_robust(causes: Iterable[SomeCause], share: Callable[[SomeCause], float | None] = attrgetter("robustness")) -> SomeCause | None:
-    """The cause of a failure that is named: the one with the largest `share` of unsafe neighbours, among all of the failure's causes.
-
-    The first of several, or in a rated study, whose causes have no shares; None without a cause.
-    """
-    return max(causes, key=lambda cause: share(cause) or 0.0, default=None)
+    def to_dict(self) -> dict[str, Any]:
+        """An entry of `minimal_causes` in `explain --json`."""
+        return {"changes": self.changes, "boundary": self.boundary, "fraction": self.fraction, "outcome": self.outcome,
+                "safety_degree": self.safety_degree, "end": str(self.end), "robustness": self.robustness}
 
 
 @dataclass(frozen=True, kw_only=True)
 class Explanation:
     """The explanation of one failure; `handle` is None if the setting is no solution.
 
-    `reasons` state why the failure was chosen. `safety_degree` is in m, or -m/s. `necessary` are the `changed` characteristics that every
-    minimal cause contains. `because` states why it is less safe: the comparison of its braking with the original vehicle's. `preventable`
-    is the `PreventableBy` of a collision, as text. `points` are the names of the test points at which the setting is unsafe; in a rated
-    study, of the cells whose colour is worse than the original's.
+    `reasons` state why the failure was chosen. `safety_degree` is in m, or -m/s. `because` states why it is less safe: the
+    comparison of its braking with the original vehicle's. `preventable` is the `PreventableBy` of a collision, as text.
+    `points` are the names of the test points at which the setting is unsafe; in a rated study, of the cells whose colour is
+    worse than the original's.
     """
 
     handle: SolutionId | None
@@ -158,22 +97,44 @@ class Explanation:
     outcome: str
     safety_degree: float | None
     changed: tuple[str, ...]
-    necessary: tuple[str, ...]
     causes: tuple[Cause, ...]
     robustness: Robustness
     because: BrakingComparison
     preventable: str = ""
     points: tuple[str, ...] = ()
 
+    @property
+    def name(self) -> str:
+        return str(self.handle or "a sampled setting")
+
+    @property
+    def title(self) -> str:
+        """Why it was chosen, as a title."""
+        return "; ".join(label for reason, label in LABELS.items() if reason in self.reasons) or ", ".join(self.reasons)
+
+    @property
+    def changes(self) -> dict[str, float]:
+        """The changed values by name, in their units."""
+        return {name: self.setting[name] for name in self.changed}
+
+    @property
+    def cause(self) -> Cause | None:
+        """The cause that is named: the most robust, the first of several or in a rated study; None if the setting is not unsafe."""
+        return max(self.causes, key=lambda cause: cause.robustness or 0.0, default=None)
+
+    @property
+    def necessary(self) -> tuple[str, ...]:
+        """The changed characteristics that every minimal cause contains."""
+        return tuple(name for name in self.changed if self.causes and all(name in cause.changes for cause in self.causes))
+
     def to_dict(self) -> dict[str, Any]:
         """An entry of `explain --json`."""
         algorithm, run, index = self.handle or (None, None, None)
-        entry = FailureEntry(
-            algorithm=algorithm, run=run, index=index, setting=self.setting, outcome=self.outcome, safety_degree=self.safety_degree,
-            changed=list(self.changed),
-            minimal_causes=[CauseEntry(**{name: getattr(cause, name) for name in CauseEntry.__struct_fields__}) for cause in self.causes],
-            robustness=self.robustness.share, because=sentence(self.because), reasons=list(self.reasons), points=list(self.points))
-        return dict(msgspec.to_builtins(entry))
+        return {"algorithm": algorithm, "run": run, "index": index, "setting": self.setting, "outcome": self.outcome,
+                "safety_degree": self.safety_degree, "changed": list(self.changed),
+                "minimal_causes": [cause.to_dict() for cause in self.causes], "robustness": self.robustness.share,
+                "because": sentence(self.because), "reasons": list(self.reasons),
+                **({"points": list(self.points)} if self.points else {})}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -182,6 +143,8 @@ class Explained:
 
     Attributes
     ----------
+    original, nearest
+        Evaluations of the original vehicle, and of the least safe of the evaluated settings; of none, an empty one.
     explanations
         Explanations of the chosen failures.
     necessity, distinct
@@ -192,11 +155,14 @@ class Explained:
         Number of solutions that ended otherwise than in the results: with another outcome than the recorded one.
     preventability
         Shares of the collisions among the evaluated settings that reference drivers avoid.
+    no_verdict
+        Why simulations tell nothing about the driving system; "" if they do.
     """
 
     study: Study
     unsafe: Unsafe
     original: Evaluations
+    nearest: Evaluations
     explanations: tuple[Explanation, ...]
     necessity: pd.DataFrame
     distinct: pd.DataFrame
@@ -207,19 +173,42 @@ class Explained:
     preventability: Preventability
     no_verdict: str = ""
 
+    @property
+    def choices(self) -> list[Explanation]:
+        """The failures that were chosen by their size or severity, in the order in which they are shown."""
+        titles = [reason for reason in LABELS if reason != DISTINCT_CAUSE]
+        return list({id(failure): failure for reason in titles if (failure := self.by_reason.get(reason))}.values())
+
+    @property
+    def by_reason(self) -> Mapping[str, Explanation]:
+        """The chosen failures by the reasons for their choice."""
+        return {reason: failure for failure in self.explanations for reason in failure.reasons}
+
+    @property
+    def sample(self) -> str:
+        """Which failures the statistics cover, in words."""
+        if self.analysed == self.failures:
+            return {1: "the only failure", 2: "both failures"}.get(self.failures, f"all {self.failures} failures")
+        return f"random sample: {self.analysed} of {self.failures} failures"
+
+    def sentences(self) -> list[str]:
+        """The answer in sentences, the verdict first."""
+        return answer_in_words(self)
+
     def to_dict(self) -> list[dict[str, Any]]:
         """The JSON of `explain`: a list with an entry for each explained failure, and a summary."""
-        def columns(*names: str) -> Iterable[Any]:
-            return self.necessity[["characteristic", *names]].itertuples(index=False)
+        def columns(*names: str) -> dict[str, Any]:
+            rows = self.necessity[["characteristic", *names]].itertuples(index=False)
+            return {name: values[0] if len(values) == 1 else values for name, *values in rows}
 
-        summary = SummaryEntry(
-            necessary=dict(columns("necessary")), changed=dict(columns("changed")),
-            necessary_interval={name: ends for name, *ends in columns("necessary_lower", "necessary_upper")},
-            preventable=self.preventability.shares, driven=not self.no_verdict)
-        return [*(failure.to_dict() for failure in self.explanations), {"summary": msgspec.to_builtins(summary)}]
+        summary = {"necessary": columns("necessary"), "changed": columns("changed"),
+                   "necessary_interval": columns("necessary_lower", "necessary_upper"),
+                   "preventable": msgspec.to_builtins(self.preventability.shares)}
+        return [*(failure.to_dict() for failure in self.explanations), {"summary": summary | driven_entry(self.no_verdict)}]
 
     def __repr__(self) -> str:
-        return f"<Explained {self.study.name}, unsafe {self.unsafe}: {self.failures} of {self.looked_at}, {len(self.explanations)} in full>"
+        counts = f"{self.failures} of {self.looked_at}, {len(self.explanations)} in full"
+        return f"<Explained {self.study.name}, unsafe {self.unsafe}: {counts}>"
 
     def to_frame(self) -> pd.DataFrame:
         """One row for each change of each minimal cause of each explanation.
@@ -228,14 +217,26 @@ class Explained:
         `original`, `value`, `boundary`, `alone` [unit], `fraction`, `outcome`, `safety_degree` [m or -m/s], `robustness`,
         `whose`, the class `preventable` of the failure, and `points`, separated by semicolons.
         """
-        rows = []
-        for failure_index, failure in enumerate(self.explanations):
-            algorithm, run, index = failure.handle or (None, None, None)
-            for cause_index, cause in enumerate(failure.causes):
-                for characteristic in CharacteristicSet.of(self.study.vehicle.characteristics):
-                    if (name := characteristic.name) in cause.changes:
-                        rows.append((failure_index, algorithm, run, index, cause_index, name, characteristic.unit, characteristic.original,
-                                     cause.changes[name], cause.boundary[name], cause.alone[name], cause.fraction, cause.outcome,
-                                     cause.safety_degree, failure.robustness.share, failure.preventable, "; ".join(failure.points)))
-        return pd.DataFrame(rows, columns=["failure", "algorithm", "run", "index", "cause", "characteristic", "unit", "original", "value",
-                                           "boundary", "alone", "fraction", "outcome", SAFETY_DEGREE, "robustness", "whose", "points"])
+        rows = [(failure_index, *(failure.handle or (None, None, None)), cause_index, item.name, item.unit, item.original,
+                 cause.changes[item.name], cause.boundary[item.name], cause.alone[item.name], cause.fraction, cause.outcome,
+                 cause.safety_degree, failure.robustness.share, failure.preventable, "; ".join(failure.points))
+                for failure_index, failure in enumerate(self.explanations) for cause_index, cause in enumerate(failure.causes)
+                for item in CharacteristicSet.of(self.study.vehicle.characteristics) if item.name in cause.changes]
+        return pd.DataFrame(rows, columns=[
+            "failure", "algorithm", "run", "index", "cause", "characteristic", "unit", "original", "value", "boundary", "alone",
+            "fraction", "outcome", SAFETY_DEGREE, "robustness", "whose", "points"])
+
+    def figure(self) -> Figure:
+        """How often each characteristic is necessary, beside how often it is changed (as RQ3.2 counts)."""
+        frame, size = self.necessity.iloc[::-1], (6.4, 1.4 + 0.3 * max(len(self.necessity), 4))
+        figure, ((axis,),) = new_figure(f"{self.study.name}: changed vs. necessary", 1, 1, size)
+        names = [escape_dollars(name) for name in frame["characteristic"]]
+        for column, label, colour, height in (
+                ("changed", "changed", GREY, 0.8), ("involved", "in some minimal cause", SKY_BLUE, 0.5),
+                ("necessary", "necessary: in every minimal cause", BLUE, 0.24)):
+            axis.barh(names, 100 * frame[column], height=height, color=colour, label=label)
+        axis.set_xlim(0, 100)
+        axis.set_xlabel(f"share of {self.analysed} failures [%]")
+        axis.grid(visible=False, axis="y")
+        figure.legend(*axis.get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False, fontsize=FONT)
+        return figure

@@ -20,7 +20,7 @@ from safevar_sumo.analysis.evaluator import CONFIDENCE, clopper_pearson, open_ev
 from safevar_sumo.analysis.research_questions.case import Case
 from safevar_sumo.analysis.rules import RulesOptions
 from safevar_sumo.analysis.subject import study_in
-from safevar_sumo.analysis.words import join_phrases
+from safevar_sumo.analysis.words import join_phrases, number_of
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.progress import Progress, show_no_progress
 from safevar_sumo.records import BoolArray, FloatArray
@@ -144,9 +144,13 @@ class Rules:
             yield f"No rule: {self.remark}."
         elif not self.rules:
             yield "Nothing unsafe found."
-        yield from (f"- {rule.in_words(characteristics, self.unsafe)}" for rule in self.rules)
+        dense = [rule for rule in self.rules if rule.is_denser_than(self.unsafe_share)]
+        yield from (f"- {rule.in_words(characteristics, self.unsafe)}" for rule in dense)
+        if len(dense) < len(self.rules):
+            omitted = number_of(len(self.rules) - len(dense), "rule")
+            yield f"Left out: {omitted} that may be due to chance; more samples decide."
         if self.rules:
-            named = {name for rule in self.rules for name in rule.limits}
+            named = {name for rule in dense for name in rule.limits}
             yield meanings(characteristic for characteristic in characteristics if characteristic.name in named)
             yield f"{RULES_NOTE} In brackets: {100 * self.rules[0].confidence:.0f} % intervals."
 

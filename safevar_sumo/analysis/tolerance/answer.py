@@ -10,6 +10,7 @@ import numpy as np
 import pandas as pd
 from rich.table import Table
 
+from safevar_sumo.analysis.explain.sentences import situation_in_words
 from safevar_sumo.analysis.figures import BLUE, DEGREE_LABEL, FONT, VERMILION, as_formula, escape_dollars, new_panels
 from safevar_sumo.analysis.tolerance.safe_box import SafeBox
 from safevar_sumo.analysis.tolerance.scans import WHOLE_POINT_LOSS, OneAtATimeScan, Pair
@@ -20,6 +21,7 @@ from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.records import Evaluations
 from safevar_sumo.study import SAFETY_DEGREE, Study
 from safevar_sumo.sumo.empty_road import driven_entry
+from safevar_sumo.sumo.system import assemble
 from safevar_sumo.terminal import WholeTable, constraints_in_words, meanings
 from safevar_sumo.vehicles import Characteristic
 
@@ -86,8 +88,7 @@ class Tolerance:
 
     def sentences(self) -> Iterator[str | Table]:
         """The verdict, the limits of each characteristic by itself, the worst pairs, and the safe box."""
-        yield (f"Unsafe: {self.unsafe.description}. The original vehicle: {self.original.outcome[0]}, "
-               f"SD {two_decimals(self.original.f_safe[0])}.")
+        yield f"Unsafe: {self.unsafe.description}. {situation_in_words(assemble(self.study), self.original)}"
         if not self.no_verdict:
             yield self.verdict
         yield from constraints_in_words(self.study)
