@@ -2,9 +2,8 @@
 
     python benchmarks/campaign.py [STUDY] [--runs N] [--evaluations N] [--turns N] [--json]
 
-Time outside the simulation is what is left of all processor time when that of the same batches, computed by one process
-with nothing else to do, is taken away: search, journal and hand-over. Workers start, and load the network, before the
-clock does. The floor is bare libsumo for one population. What two workers bring is told by the clock: only an idle
+Time outside the simulation is search, journal and progress of a share that this process carries out by itself. Workers start, and load
+the network, before the clock does. The floor is bare libsumo for one population. What two workers bring is told by the clock: only an idle
 machine tells the truth. `ceiling` is what two processes bring on this machine that only compute the same batches, and
 `two_workers_of_ceiling` the share of it that two workers reach.
 """
@@ -15,9 +14,10 @@ import argparse
 import multiprocessing
 import statistics
 import tempfile
+import time
 from collections.abc import Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
 from typing import NamedTuple
 
@@ -25,9 +25,15 @@ import msgspec
 import numpy as np
 import psutil
 from evaluation import bare
-from measuring import Record, clock_seconds, print_records, processor_seconds
+from measuring import Record, clock_seconds, print_records
 
-from safevar_sumo.campaign import RunKey, all_runs, run_campaign
+from safevar_sumo.campaign import all_runs, run_campaign
+from safevar_sumo.campaign.cluster import cluster_pool
+from safevar_sumo.campaign.evaluation import evaluate_batch, pack_study
+from safevar_sumo.campaign.identity import identity_of
+from safevar_sumo.campaign.local import local_pool
+from safevar_sumo.campaign.pool import Pool, Report, Share
+from safevar_sumo.campaign.share import carry_out_share
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.results import ResultsDirectory
 from safevar_sumo.study import Study, load_study
@@ -36,10 +42,6 @@ from safevar_sumo.sumo.matrix import MAX_VEHICLES, simulate
 from safevar_sumo.sumo.staging import stage_network
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet
-from safevar_sumo.workers.cluster import cluster_pool
-from safevar_sumo.workers.evaluation import Pool, evaluate_batch, pack_study
-from safevar_sumo.workers.identity import identity_of
-from safevar_sumo.workers.local import local_pool
 
 Batch = tuple[bytes, FloatArray]
 """A packed study, which says where its vehicles drive, and the settings."""
@@ -48,42 +50,44 @@ Batch = tuple[bytes, FloatArray]
 class Silent:
     """Hears how a campaign goes on, and says nothing."""
 
-    def evaluated(self, key: RunKey, evaluations: Evaluations, simulated: int) -> None:
-        pass
-
-    def finished(self, key: RunKey, asked: int) -> None:
-        pass
-
-    def warned(self, message: str) -> None:
-        pass
+    def progressed(self, runs: object) -> None: ...
+    def finished(self, run: object) -> None: ...
+    def warned(self, message: str) -> None: ...
 
 
-class Recording:
-    """A pool that keeps the batches that went through it."""
+class ThisProcess:
+    """A pool that computes in this process, keeps the batches, and measures the processor time of simulations [s]."""
 
-    def __init__(self, pool: Pool) -> None:
-        self._pool = pool
+    workers = 1
+
+    def __init__(self) -> None:
         self.batches: list[Batch] = []
+        self.simulation = 0.0
 
-    @property
-    def workers(self) -> int:
-        return self._pool.workers
+    def submit(self, work: bytes, settings: FloatArray) -> Future[Evaluations]:
+        future: Future[Evaluations] = Future()
+        future.set_result(self._evaluate(work, settings))
+        return future
 
-    def submit(self, study: bytes, settings: FloatArray) -> Future[Evaluations]:
-        self.batches.append((study, settings))
-        return self._pool.submit(study, settings)
+    def carry(self, share: Share, report: Report) -> Future[None]:
+        future: Future[None] = Future()
+        self.batches, self.simulation = [], 0.0  # without the batches that warmed this process up
+        future.set_result(carry_out_share(share, report, self._evaluate))
+        return future
+
+    def _evaluate(self, work: bytes, settings: FloatArray) -> Evaluations:
+        self.batches.append((work, settings))
+        start = time.process_time()
+        evaluations = evaluate_batch(work, settings)
+        self.simulation += time.process_time() - start
+        return evaluations
 
 
 class Cost(NamedTuple):
-    """What a campaign took [s of the clock, s of processors], and its batches."""
+    """What a campaign took [s of the clock, s of processors]."""
 
     clock: float
     processor: float
-    batches: list[Batch]
-
-    @property
-    def simulated(self) -> int:
-        return sum(len(settings) for _, settings in self.batches)
 
 
 def processors() -> float:
@@ -103,18 +107,11 @@ def campaign(study: Study, opened: AbstractContextManager[Pool]) -> Cost:
     with tempfile.TemporaryDirectory() as folder, opened as pool:
         for future in [pool.submit(pack_study(study), drawn(study, MAX_VEHICLES)) for _ in range(4 * pool.workers)]:
             future.result()
-        recording = Recording(pool)
         before = processors()
         results = ResultsDirectory(Path(folder), study, identity_of(study, assemble(study)))
-        clock = clock_seconds(lambda: run_campaign(study, all_runs(study), results, recording, Silent(), MAX_VEHICLES,
+        clock = clock_seconds(lambda: run_campaign(study, all_runs(study), results, pool, Silent(), MAX_VEHICLES,
                                                    engine=Engine.RECORDED))
-        return Cost(clock, processors() - before, recording.batches)
-
-
-def simulation(batches: list[Batch]) -> float:
-    """Processor seconds of the same batches, in recorded scenes and in SUMO, in one process that has nothing else to do."""
-    compute(batches[:1])
-    return processor_seconds(lambda: compute(batches))
+        return Cost(clock, processors() - before)
 
 
 def compute(batches: list[Batch]) -> None:
@@ -153,12 +150,13 @@ def two_dask_workers(study: Study) -> Iterator[Pool]:
 
 def turn(study: Study) -> dict[str, float]:
     """Every ratio once: what is compared is measured one right after the other."""
-    one = campaign(study, local_pool(1, study.search.time_limit))
-    alone, bare_each = simulation(one.batches), floor(study)
-    two = campaign(study, local_pool(2, study.search.time_limit))
+    alone = ThisProcess()
+    whole = campaign(study, nullcontext(alone))
+    simulated, bare_each = sum(len(settings) for _, settings in alone.batches), floor(study)
+    one, two = (campaign(study, local_pool(jobs, study.search.time_limit)) for jobs in (1, 2))
     cluster = campaign(study, two_dask_workers(study))
-    most = ceiling(one.batches)
-    return {"campaign": one.processor / one.simulated / bare_each, "outside_simulation": 1 - alone / one.processor,
+    most = ceiling(alone.batches)
+    return {"campaign": whole.processor / simulated / bare_each, "outside_simulation": 1 - alone.simulation / whole.processor,
             "two_workers": one.clock / two.clock, "ceiling": most, "two_workers_of_ceiling": one.clock / two.clock / most,
             "cluster": two.clock / cluster.clock}
 

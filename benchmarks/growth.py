@@ -14,10 +14,10 @@ import psutil
 from campaign import drawn
 from measuring import Record, print_records
 
+from safevar_sumo.campaign.evaluation import pack_study
+from safevar_sumo.campaign.local import local_pool
 from safevar_sumo.study import Study, load_study
 from safevar_sumo.sumo.matrix import MAX_VEHICLES
-from safevar_sumo.workers.evaluation import pack_study
-from safevar_sumo.workers.local import local_pool
 
 FIRST = 5000
 """Evaluations after which a worker counts as grown up."""

@@ -25,6 +25,7 @@ from .api.simulation import Simulation as Simulation
 from .api.simulation import evaluate as evaluate
 from .api.simulation import simulate as simulate
 from .campaign import Observer as Observer
+from .campaign.pool import Pool as Pool
 from .errors import InputError as InputError
 from .errors import SafevarError as SafevarError
 from .errors import SimulationError as SimulationError
@@ -46,6 +47,5 @@ from .study import StudyLike as StudyLike
 from .study import Weather as Weather
 from .study import load_study as load_study
 from .study import study_names as study_names
-from .workers.evaluation import Pool as Pool
 
 __version__: str

@@ -14,13 +14,13 @@ from safevar_sumo.analysis.explain import ExplainOptions
 from safevar_sumo.analysis.explain.compute import explain_failures
 from safevar_sumo.analysis.explain.result import Explained
 from safevar_sumo.analysis.research_questions.case import load_cases
+from safevar_sumo.campaign import local
 from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.study import load_study, study_names
 from safevar_sumo.sumo.system import System, assemble
-from safevar_sumo.workers import local
 from tests.in_process import InlinePool, searched
 
-collect_ignore = [] if os.name == "posix" else ["workers/test_local_pool.py", "end_to_end/test_processes.py"]
+collect_ignore = [] if os.name == "posix" else ["campaign/test_local_pool.py", "end_to_end/test_processes.py"]
 """Tests that send POSIX signals to processes; other systems skip them."""
 
 hypothesis.settings.register_profile("default", deadline=None, derandomize=True)

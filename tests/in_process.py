@@ -13,13 +13,15 @@ from typing import NamedTuple
 import pytest
 
 from safevar_sumo.campaign import all_runs, run_campaign
+from safevar_sumo.campaign.evaluation import evaluate_batch
+from safevar_sumo.campaign.identity import identity_of
+from safevar_sumo.campaign.pool import Report, Share
+from safevar_sumo.campaign.share import carry_out_share
 from safevar_sumo.cli.program import main
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.results import ResultsDirectory
 from safevar_sumo.study import Study
 from safevar_sumo.sumo.system import assemble
-from safevar_sumo.workers.evaluation import evaluate_batch
-from safevar_sumo.workers.identity import identity_of
 
 
 class InlinePool:
@@ -37,13 +39,21 @@ class InlinePool:
             future.set_exception(error)
         return future
 
+    def carry(self, share: Share, report: Report) -> Future[None]:
+        future: Future[None] = Future()
+        try:
+            future.set_result(carry_out_share(share, report, evaluate_batch))
+        except Exception as error:
+            future.set_exception(error)
+        return future
+
     def close(self) -> None: ...
 
 
 class SilentObserver:
     """An observer that ignores all reports."""
 
-    def evaluated(self, *_: object) -> None: ...
+    def progressed(self, *_: object) -> None: ...
     def finished(self, *_: object) -> None: ...
     def warned(self, message: str) -> None: ...
 

@@ -11,6 +11,12 @@ import msgspec
 import numpy as np
 
 from safevar_sumo.analysis.research_questions.case import Case
+from safevar_sumo.campaign.batches import ask_why_no_verdict, evaluate_all, inputs_of
+from safevar_sumo.campaign.evaluation import pack_study
+from safevar_sumo.campaign.interrupts import wait_for_first
+from safevar_sumo.campaign.local import available_cores, local_pool
+from safevar_sumo.campaign.pool import Pool
+from safevar_sumo.campaign.retrying import RetryingPool
 from safevar_sumo.errors import InputError, SimulationError
 from safevar_sumo.metrics import METRICS, RATING_POINTS, Unsafe
 from safevar_sumo.progress import Progress, show_no_progress
@@ -20,11 +26,6 @@ from safevar_sumo.records import CellResults, Evaluations, FloatArray, Outcome
 from safevar_sumo.study import Study
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet, region_of
-from safevar_sumo.workers.batches import ask_why_no_verdict, evaluate_all, inputs_of
-from safevar_sumo.workers.evaluation import Pool, pack_study
-from safevar_sumo.workers.interrupts import wait_for_first
-from safevar_sumo.workers.local import available_cores, local_pool
-from safevar_sumo.workers.retrying import RetryingPool
 
 PARTS_PER_WORKER = 2
 """Number of parts per worker into which the cells of a rating are divided."""

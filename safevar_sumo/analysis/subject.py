@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from safevar_sumo.analysis.options import Options
 from safevar_sumo.errors import InputError, did_you_mean, one_of, warn
 from safevar_sumo.progress import open_progress
-from safevar_sumo.results import MANIFEST, differences_now, make_inputs_comparable, manifest_of, read_late_files, read_manifest
+from safevar_sumo.results import MANIFEST, input_differences, manifest_of, read_manifest
 from safevar_sumo.study import Study, StudyLike, load_study, study_names
 
 if TYPE_CHECKING:
@@ -163,10 +163,10 @@ def changes_since(directory: Path, case: Case, *, as_it_is_now: bool = False) ->
         If an input has changed and `as_it_is_now` is false; the message names the changes.
     """
     from safevar_sumo.campaign import files_read_by_algorithms
+    from safevar_sumo.campaign.batches import source_digests
+    from safevar_sumo.campaign.identity import identity_of
+    from safevar_sumo.campaign.local import local_pool
     from safevar_sumo.sumo.system import assemble
-    from safevar_sumo.workers.batches import source_digests
-    from safevar_sumo.workers.identity import identity_of
-    from safevar_sumo.workers.local import local_pool
 
     manifest, study = read_manifest(directory), case.study
     if "imported" in manifest:
@@ -174,8 +174,8 @@ def changes_since(directory: Path, case: Case, *, as_it_is_now: bool = False) ->
     system = assemble(study, str(directory))
     with local_pool(1, study.search.time_limit) as pool:
         sources = {**source_digests(study, pool), **files_read_by_algorithms(study)}
-    manifest, sources = make_inputs_comparable(manifest, sources, read_late_files(directory), study.origin.places)
-    changes = differences_now(manifest, manifest_of(study, identity_of(study, system, sources)))
+    present = manifest_of(study, identity_of(study, system, sources))
+    changes = [change.text for change in input_differences(directory, manifest, present, study) if change.changes_simulations]
     if changes and not as_it_is_now:
         rest = f" (and {len(changes) - MAX_CHANGES_NAMED} more)" if len(changes) > MAX_CHANGES_NAMED else ""
         named = f"{'; '.join(changes[:MAX_CHANGES_NAMED])}{rest}"

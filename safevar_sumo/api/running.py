@@ -2,33 +2,30 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
 
-import numpy as np
-
 from safevar_sumo.analysis.subject import Results, load
 from safevar_sumo.analysis.words import number_of
 from safevar_sumo.api.simulation import load_and_assemble
-from safevar_sumo.campaign import Campaign, Observer, RunKey, algorithm_of, all_runs, files_read_by_algorithms, run_campaign
+from safevar_sumo.campaign import Campaign, Observer, RunKey, RunProgress, algorithm_of, all_runs, files_read_by_algorithms, run_campaign
+from safevar_sumo.campaign.batches import ask_why_no_verdict, source_digests
+from safevar_sumo.campaign.cluster import cluster_pool
+from safevar_sumo.campaign.identity import identity_of
+from safevar_sumo.campaign.local import available_cores, local_pool
+from safevar_sumo.campaign.pool import Pool
 from safevar_sumo.errors import InputError, SafevarError, one_of, warn
 from safevar_sumo.progress import Progress, open_progress
-from safevar_sumo.records import Evaluations
 from safevar_sumo.results import MANIFEST, ResultsDirectory, read_manifest
 from safevar_sumo.results.files import stored_runs
 from safevar_sumo.study import Study, StudyLike
 from safevar_sumo.sumo import Engine, reason_for_sumo, settings_per_batch
 from safevar_sumo.sumo.system import System
-from safevar_sumo.workers.batches import ask_why_no_verdict, source_digests
-from safevar_sumo.workers.cluster import cluster_pool
-from safevar_sumo.workers.evaluation import Pool
-from safevar_sumo.workers.identity import identity_of
-from safevar_sumo.workers.local import available_cores, local_pool
 
-ENGINE_NAMES = {Engine.RECORDED: "recorded", Engine.LIBSUMO: "sumo"}
-"""Names of the engines in commands and manifests."""
+ENGINES = (str(Engine.RECORDED), str(Engine.LIBSUMO))
+"""The engines that a study may name."""
+
 
 def run(study: StudyLike, out: str | Path | None = None, *, jobs: int | None = None, cluster: str | None = None,
         pool: Pool | None = None, progress: bool | Progress | Observer = False, only: Sequence[tuple[str, int]] | None = None,
@@ -104,7 +101,7 @@ def carry_out_runs(study: Study, system: System, keys: list[RunKey], directory: 
     engine_used, reason = choose_engine(system, engine)
     for remark in _extent_remarks(results, study):
         observer.warned(remark)
-    results.manifest["engine"] = {"name": ENGINE_NAMES[engine_used], "reason": reason}
+    results.manifest["engine"] = {"name": str(engine_used), "reason": reason}
     no_verdict = ask_why_no_verdict(study, pool)
     if no_verdict:
         observer.warned(f"study {study.name!r}: {no_verdict}")
@@ -133,9 +130,9 @@ def _extent_remarks(results: ResultsDirectory, study: Study) -> list[str]:
 
 def choose_engine(system: System, name: str) -> tuple[Engine, str]:
     """Choose the engine that moves a system's vehicles, and say why; raises InputError for an unknown engine."""
-    if name not in ENGINE_NAMES.values():
-        raise InputError("engine", repr(name), one_of(ENGINE_NAMES.values()))
-    if name == ENGINE_NAMES[Engine.LIBSUMO]:
+    if name not in ENGINES:
+        raise InputError("engine", repr(name), one_of(ENGINES))
+    if name == Engine.LIBSUMO:
         return Engine.LIBSUMO, "requested"
     reason = reason_for_sumo(system)
     return (Engine.LIBSUMO, reason) if reason else (Engine.RECORDED, "nobody reacts to the vehicle under test")
@@ -164,32 +161,23 @@ class CampaignProgress:
     def __init__(self, progress: Progress, study: Study, keys: Sequence[RunKey],
                  show_warning: Callable[[str], None] = warn) -> None:
         self.warned, self._progress, self._study, self._run_count = show_warning, progress, study, len(keys)
-        self._done, self._total = 0, len(keys) * study.search.evaluations
-        self._counts, self._colliding_settings = Counter[RunKey](), dict[RunKey, set[bytes]]()
-        self._finished_runs, self._lowest_degree = 0, np.inf
-        self._show()
+        self._runs, self._replayed, self._finished_runs = dict[RunKey, RunProgress](), dict[RunKey, int](), set[RunKey]()
+        self.progressed([])
 
-    def evaluated(self, key: RunKey, evaluations: Evaluations, simulated: int) -> None:
-        """Take note that a population was evaluated; what a journal holds is not left to be done."""
-        self._counts[key] += len(evaluations)
-        if simulated:
-            self._done += len(evaluations)
-        else:
-            self._total -= len(evaluations)
-        collisions = self._colliding_settings.setdefault(key, set())
-        collisions.update(setting.tobytes() for setting in evaluations.settings[evaluations.collided])
-        degrees = evaluations.f_safe[evaluations.valid]
-        self._lowest_degree = float(np.min(degrees, initial=self._lowest_degree))
-        self._show()
+    def progressed(self, runs: Sequence[RunProgress]) -> None:
+        """Take note of the state of some runs; what a journal held at first is not left to be done."""
+        for run in runs:
+            self._runs[run.key] = run
+            self._replayed.setdefault(run.key, run.replayed)
+        budget, replayed = self._study.search.evaluations, sum(self._replayed.values())
+        unused = sum(budget - self._runs[key].asked for key in self._finished_runs)
+        degrees = [run.best for run in self._runs.values() if run.best is not None]
+        collisions = sum(run.collisions for run in self._runs.values())
+        found = f", {collisions} collisions, best SD {min(degrees):.2f}" if degrees else ""
+        self._progress(f"{self._study.name}: runs {len(self._finished_runs)}/{self._run_count}{found}",
+                       sum(run.asked for run in self._runs.values()) - replayed, self._run_count * budget - unused - replayed)
 
-    def finished(self, key: RunKey, asked: int) -> None:
-        """Take note that a run is finished, which may have taken fewer evaluations than it was allowed."""
-        self._finished_runs += 1
-        self._total -= self._study.search.evaluations - self._counts[key]
-        self._show()
-
-    def _show(self) -> None:
-        collisions = sum(map(len, self._colliding_settings.values()))
-        found = "" if np.isinf(self._lowest_degree) else f", {collisions} collisions, best SD {self._lowest_degree:.2f}"
-        stage = f"{self._study.name}: runs {self._finished_runs}/{self._run_count}{found}"
-        self._progress(stage, self._done, self._total)
+    def finished(self, run: RunProgress) -> None:
+        """Take note of the last state of a run, which may have taken fewer evaluations than it was allowed."""
+        self._finished_runs.add(run.key)
+        self.progressed([run])

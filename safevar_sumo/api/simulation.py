@@ -29,8 +29,8 @@ from safevar_sumo.vehicles import CharacteristicSet
 if TYPE_CHECKING:
     import pandas as pd
 
+    from safevar_sumo.campaign.pool import Pool
     from safevar_sumo.progress import Progress
-    from safevar_sumo.workers.evaluation import Pool
 
 
 OBSERVATION_HEADS = {"speed": "seen speed [m/s]", "gap": "seen gap [m]", "closing_speed": "seen closing speed [m/s]",

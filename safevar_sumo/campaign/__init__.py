@@ -1,20 +1,22 @@
-"""Carries out a study: many runs at once on a pool of workers, each run with its journal.
+"""Carries out a study: its runs, dealt out in shares to the workers of a pool.
 
 A search is a generator that requests evaluations of settings. The run of the search looks each setting up in its journal and memory,
-has new settings evaluated, journals the evaluations and sends them to the search; a resumed run replays its journal. Batches gather new
-settings of all runs for the pool: a lost worker costs a batch, and no result depends on the worker or on other settings in the batch.
+has new settings evaluated, journals the evaluations and sends them to the search; a resumed run replays its journal. A worker carries a
+share of the runs: its batches gather new settings of all of them. A worker that dies is replaced, and the next one continues from the
+journals; no result depends on the worker or on other settings in the batch. Questions ask the same pool for single batches.
 """
 
-from safevar_sumo.campaign.campaign import Campaign, run_campaign
+from safevar_sumo.campaign.campaign import Campaign, Observer, run_campaign
 from safevar_sumo.campaign.forecast import Forecast, forecast
 from safevar_sumo.campaign.keys import RunKey, algorithm_class, algorithm_of, all_runs, files_read_by_algorithms, random_generator_of
-from safevar_sumo.campaign.run import Observer
+from safevar_sumo.campaign.pool import RunProgress
 
 __all__ = [
     "Campaign",
     "Forecast",
     "Observer",
     "RunKey",
+    "RunProgress",
     "algorithm_class",
     "algorithm_of",
     "all_runs",

@@ -1,35 +1,51 @@
-"""Many runs at once on one pool, each run with its journal."""
+"""A study's runs, dealt out to the workers of a pool in shares."""
 
 from __future__ import annotations
 
+import math
 from collections import deque
-from collections.abc import Iterable
-from concurrent.futures import ThreadPoolExecutor
-from typing import NamedTuple
+from collections.abc import Generator, Iterable, Sequence
+from concurrent.futures import Future
+from contextlib import closing
+from functools import partial
+from queue import SimpleQueue
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from safevar_sumo.campaign.batcher import Batcher
-from safevar_sumo.campaign.keys import RunKey, make_search
-from safevar_sumo.campaign.run import Observer, Run
-from safevar_sumo.campaign.verification import Verification
+from safevar_sumo.campaign.checks import check_code, works_for_sumo
+from safevar_sumo.campaign.evaluation import pack_study
+from safevar_sumo.campaign.interrupts import wait_for_next, wait_for_result
+from safevar_sumo.campaign.keys import RunKey
+from safevar_sumo.campaign.pool import Attempt, Busy, Message, Pool, PoolLostError, RunProgress, RunResult, Share, WorkerLostError
+from safevar_sumo.campaign.retrying import ATTEMPTS, RetryingPool
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import PUBLISHED_SCORING, Scoring
 from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.records import Evaluations
 from safevar_sumo.results import ORIGINAL, Failure, JournalBusyError, ResultsDirectory
-from safevar_sumo.search import Problem, Search
 from safevar_sumo.study import Study
 from safevar_sumo.sumo import Engine
 from safevar_sumo.sumo.matrix import MAX_COPIES
-from safevar_sumo.vehicles import CharacteristicSet, region_of
-from safevar_sumo.workers.evaluation import Pool, pack_study
-from safevar_sumo.workers.interrupts import wait_for_first, wait_for_result
-from safevar_sumo.workers.isolation import check_code
-from safevar_sumo.workers.retrying import RetryingPool
+from safevar_sumo.vehicles import CharacteristicSet
 
-JOURNALS_AT_ONCE = 8
-"""Maximum number of journals written at the same time: a run waits until its evaluations are on the disk."""
+BATCHES_PER_SHARE = 2
+"""Number of largest batches that the populations of a share's runs fill at most."""
+MAX_RUNS = 256
+"""Maximum number of runs in a share: each keeps a file open."""
+
+
+class Observer(Protocol):
+    """Receives the progress of a campaign."""
+
+    def progressed(self, runs: Sequence[RunProgress]) -> None:
+        """The state of some runs under way."""
+
+    def finished(self, run: RunProgress) -> None:
+        """The last state of a run."""
+
+    def warned(self, message: str) -> None:
+        """A warning for the user."""
 
 
 class Campaign(NamedTuple):
@@ -61,7 +77,7 @@ def run_campaign(study: Study, keys: Iterable[RunKey], results: ResultsDirectory
     results
         The directory of their journals.
     pool
-        Computes batches.
+        Carries the shares of the runs.
     batch
         Maximum number of settings in a batch, which may hold settings of several runs.
     engine
@@ -74,91 +90,133 @@ def run_campaign(study: Study, keys: Iterable[RunKey], results: ResultsDirectory
     SafevarError
         If a journal cannot be written, or the study is at fault.
     """
-    characteristics = CharacteristicSet.of(study.vehicle.characteristics)
-    retrying_pool, work = RetryingPool(pool, study, results.record_late_files), pack_study(study, results.inputs, engine=engine)
+    retrying_pool, work, batch = RetryingPool(pool, study), pack_study(study, results.inputs, engine=engine), batch or MAX_COPIES
     for remark in check_code(study, results.inputs, retrying_pool):
         observer.warned(remark)
-    original = _evaluate_original(study, work, characteristics, results, retrying_pool, observer)
+    original = _evaluate_original(study, work, results, retrying_pool, observer)
     if not original.valid[0]:
         raise InputError(study.source, "the original vehicle violates a test's speed tolerance before the ADS acts (invalid-test), "
                          "so there is no baseline", "tests whose speed the vehicle can hold")
     if original.collided[0] and not is_rated(study):
         observer.warned(f"study {study.name!r}: the original vehicle itself collides: no change is needed")
     results.begin(original)
-    problem = Problem(characteristics=characteristics, original=original, evaluations=study.search.evaluations,
-                      population=study.search.population, scoring=results.scoring, region=region_of(study))
-    campaign = Campaign(original, solutions={}, failures=[], busy=[], collisions={}, invalid_tests={}, scoring=results.scoring)
-    keys_left, runs = deque(keys), set[Run]()
+    sumo_work, recorded_work = works_for_sumo(study, results.inputs) if engine is Engine.RECORDED else (b"", b"")
+    share = Share(work, sumo_work, recorded_work, batch, (), results.path.absolute(), results.head("").study, original, retry_failed)
+    runs_at_once = min(math.ceil(BATCHES_PER_SHARE * batch / study.search.population), MAX_RUNS)
+    shares = [share._replace(keys=tuple(keys_of_share)) for keys_of_share in deal(list(keys), pool.workers, runs_at_once)]
+    run_results, busy = dict[RunKey, RunResult](), list[RunKey]()
+    with closing(_carry_out(shares, pool)) as messages:
+        for message in messages:
+            if isinstance(message, RunResult):
+                run_results[message.progress.key] = message
+                observer.finished(message.progress)
+            elif isinstance(message, Busy):
+                busy.append(message.key)
+            elif isinstance(message, str):
+                observer.warned(message)
+            elif isinstance(message, list):
+                observer.progressed(message)
+    runs = [(key, run_results[key]) for key in sorted(run_results)]
+    return Campaign(
+        original=original, solutions={key: run.solutions for key, run in runs}, busy=busy, scoring=results.scoring,
+        failures=sorted(failure for _, run in runs for failure in run.failures),
+        collisions={key: run.progress.collisions for key, run in runs},
+        invalid_tests={key: run.invalid_tests for key, run in runs})
 
-    def begin_search(key: RunKey) -> Search:
-        return make_search(key, study, problem, results.record_late_files)
 
-    batcher = Batcher(retrying_pool, work, batch or MAX_COPIES)
-    verification = Verification(study, results, retrying_pool, begin_search, engine, observer)
+def deal(keys: Sequence[RunKey], workers: int, runs_at_once: int) -> list[Sequence[RunKey]]:
+    """Deal runs out in shares of equal size and with equally many runs of each algorithm, a multiple of the number of workers.
 
-    def advance(run: Run) -> None:
-        """Advance a run as far as its known evaluations allow, then queue the missing settings, verify the run or finish it."""
-        if not run.advance():
-            batcher.add(run, run.missing_settings)
-        elif run.finished or not verification.begin(run):
-            finish(run)
+    All runs of a share are under way at the same time: they fill large batches, which cost least for each setting.
+    """
+    count = min(workers * math.ceil(len(keys) / (workers * runs_at_once)), len(keys))
+    return [keys[number::count] for number in range(count)]
 
-    def finish(run: Run) -> None:
-        run.finish()
-        campaign.solutions[run.key], campaign.collisions[run.key] = run.result, run.collisions
-        campaign.invalid_tests[run.key] = run.invalid_tests
-        campaign.failures.extend(run.failures)
-        runs.discard(run)
-        run.close()
 
-    journalling = ThreadPoolExecutor(JOURNALS_AT_ONCE, thread_name_prefix="journal")
+class _ShareUnderWay:
+    """A share, the attempt that its worker makes now, and the number of workers that died outside of an attempt."""
+
+    def __init__(self, share: Share) -> None:
+        self.share = share
+        self._attempt: Attempt | None = None
+        self._other_deaths = 0
+
+    def note(self, message: Message) -> None:
+        """Note what a worker reports: the next worker does not carry out finished runs, and knows of deaths in the present round only."""
+        if isinstance(message, Attempt):
+            self._attempt = message
+        elif isinstance(message, list):
+            self._attempt, self._other_deaths, self.share = None, 0, self.share._replace(deaths={})
+        elif isinstance(message, RunResult | Busy):
+            finished = message.key if isinstance(message, Busy) else message.progress.key
+            self.share = self.share._replace(keys=tuple(key for key in self.share.keys if key != finished))
+
+    def note_death(self, error: WorkerLostError) -> None:
+        """Note the death of a worker; raises its error if it is not the fault of a batch and occurs again and again."""
+        if self._attempt is None:
+            self._other_deaths += 1
+            if self._other_deaths > ATTEMPTS:
+                raise error
+            return
+        setting, deaths = self._attempt.setting, self.share.deaths
+        self.share = self.share._replace(deaths={**deaths, setting: (*deaths.get(setting, ()), str(error))})
+        self._attempt = None
+
+
+def _carry_out(shares: Iterable[Share], pool: Pool) -> Generator[Message]:
+    """Carry out shares on a pool, again from their journals after the death of a worker; yields the workers' messages."""
+    events: SimpleQueue[tuple[_ShareUnderWay, Message | Future[None]]] = SimpleQueue()
+    waiting, under_way, is_over = deque(map(_ShareUnderWay, shares)), set[_ShareUnderWay](), False
+
+    def report(share: _ShareUnderWay, message: Message) -> None:
+        if is_over:
+            raise PoolLostError("the campaign is over")
+        events.put((share, message))
+
+    def done(share: _ShareUnderWay, future: Future[None]) -> None:
+        events.put((share, future))
+
     try:
-        while keys_left or runs:
-            while keys_left and len(runs) < batcher.wanted_run_count(study.search.population):
-                key = keys_left.popleft()
-                try:
-                    journal = results.journal(str(key))
-                except JournalBusyError:
-                    campaign.busy.append(key)
-                    continue
-                runs.add(run := Run(key, begin_search(key), journal, observer, study.search.evaluations, retry=retry_failed))
-                advance(run)
-            batcher.send()
-            verification.send()
-            for future in wait_for_first([*batcher.under_way, *verification.under_way]):
-                if future in verification.under_way:
-                    for run in verification.collect(future):
-                        finish(run)
-                    continue
-                runs_of_batch, evaluations_of_runs = zip(*batcher.collect(future), strict=True)
-                for run, is_complete in zip(runs_of_batch, journalling.map(Run.receive, runs_of_batch, evaluations_of_runs), strict=True):
-                    if is_complete:
-                        advance(run)
+        while waiting or under_way:
+            while waiting and len(under_way) < pool.workers:
+                under_way.add(share := waiting.popleft())
+                pool.carry(share.share, partial(report, share)).add_done_callback(partial(done, share))
+            share, event = wait_for_next(events)
+            if not isinstance(event, Future):
+                share.note(event)
+                yield event
+                continue
+            under_way.discard(share)
+            error = PoolLostError("the pool was closed") if event.cancelled() else event.exception()
+            if error is None and share.share.keys:
+                error = WorkerLostError("a worker ended before its runs")
+            if isinstance(error, WorkerLostError):
+                share.note_death(error)
+                waiting.appendleft(share)
+            elif error is not None:
+                raise error
     finally:
-        journalling.shutdown()
-        for run in runs:
-            run.close()
-    return campaign._replace(solutions={key: campaign.solutions[key] for key in sorted(campaign.solutions)},
-                             failures=sorted(campaign.failures))
+        is_over = True
 
 
-def _evaluate_original(study: Study, work: bytes, characteristics: CharacteristicSet, results: ResultsDirectory, pool: RetryingPool,
-                       observer: Observer) -> Evaluations:
+def _evaluate_original(study: Study, work: bytes, results: ResultsDirectory, pool: RetryingPool, observer: Observer) -> Evaluations:
     """Evaluate the original vehicle, or read its journal; raises an error if the simulation fails."""
+    setting = CharacteristicSet.of(study.vehicle.characteristics).original[np.newaxis]
+
     def simulate() -> Evaluations:
-        return wait_for_result(pool.submit(work, characteristics.original[np.newaxis], must_succeed=True))
+        return wait_for_result(pool.submit(work, setting, must_succeed=True))
 
     try:
         journal = results.journal(ORIGINAL)
     except JournalBusyError:  # another process, such as a job of an array, writes this journal
         return simulate()
     try:
-        if journal.cut_bytes:
-            observer.warned(f"{journal.path}: the last {journal.cut_bytes} bytes were torn; what they held is simulated again")
+        if journal.content.tail_size:
+            observer.warned(f"{journal.path}: the last {journal.content.tail_size} bytes were torn; what they held is simulated again")
         if journal.content.evaluations is not None:
             return journal.content.evaluations
         evaluations = simulate()
-        journal.append(positions=[0], evaluations=evaluations)
+        journal.append([0], evaluations, evaluations.files)
         return evaluations
     finally:
         journal.close()

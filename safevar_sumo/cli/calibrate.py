@@ -10,6 +10,9 @@ import click
 import msgspec
 from rich.console import Console
 
+from safevar_sumo.campaign.identity import input_files
+from safevar_sumo.campaign.interrupts import terminate_as_interrupt
+from safevar_sumo.campaign.local import available_cores, local_pool
 from safevar_sumo.cli.arguments import PICTURE_ENDINGS, check_output, complete_study, refuse_overwriting
 from safevar_sumo.cli.program import commands
 from safevar_sumo.cli.reference import find_owner, print_by_metric, read_rows
@@ -22,9 +25,6 @@ from safevar_sumo.reference.profiles import plot_profiles
 from safevar_sumo.study import FITTED_TABLES, Study, load_study, study_names, write_study
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.terminal import WholeTable, print_text
-from safevar_sumo.workers.identity import input_files
-from safevar_sumo.workers.interrupts import terminate_as_interrupt
-from safevar_sumo.workers.local import available_cores, local_pool
 
 SECONDS_BETWEEN_SAVES = 60.0
 """Least time between two study files with the best values so far, which remain if the process is killed [s]."""

@@ -20,8 +20,9 @@ from rich.text import Text
 
 from safevar_sumo.analysis.research_questions.indicators import nondominated_points
 from safevar_sumo.analysis.words import change_texts, two_decimals
-from safevar_sumo.api.running import ENGINE_NAMES, carry_out_runs, choose_engine, load_for_search, open_observer, open_pool
+from safevar_sumo.api.running import ENGINES, carry_out_runs, choose_engine, load_for_search, open_observer, open_pool
 from safevar_sumo.campaign import Campaign, Forecast, RunKey, all_runs, forecast
+from safevar_sumo.campaign.pool import Pool
 from safevar_sumo.cli.arguments import complete_study
 from safevar_sumo.cli.program import commands, print_remarks
 from safevar_sumo.cli.target import jobs_option
@@ -31,10 +32,9 @@ from safevar_sumo.records import Outcome
 from safevar_sumo.results import Status, evaluations_frame, failure_lines, record, solutions_frame
 from safevar_sumo.shipped import PROGRAM_COMMAND
 from safevar_sumo.study import Study, load_study
-from safevar_sumo.sumo import Engine, settings_per_batch, vehicle_remarks
+from safevar_sumo.sumo import settings_per_batch, vehicle_remarks
 from safevar_sumo.terminal import WholeTable, print_text
 from safevar_sumo.vehicles import CharacteristicSet
-from safevar_sumo.workers.evaluation import Pool
 
 
 @commands.command()
@@ -45,7 +45,7 @@ from safevar_sumo.workers.evaluation import Pool
 @click.option("--seed", type=click.IntRange(min=0, max=2**63 - 1), help="Seed of the whole study.")
 @click.option("--batch", type=click.IntRange(1, 10_000),
               help="Maximum settings per batch, gathered from several runs; does not change results.  [default: the fastest]")
-@click.option("--engine", type=click.Choice(list(ENGINE_NAMES.values())), default=ENGINE_NAMES[Engine.RECORDED], show_default=True,
+@click.option("--engine", type=click.Choice(ENGINES), default=ENGINES[0], show_default=True,
               help="What moves the vehicles. recorded: numpy, in a scene that SUMO has played once, if no actor reacts to the vehicles; "
                    "results are verified in SUMO. sumo: always SUMO.")
 @click.option("--out", type=click.Path(path_type=Path), help="Directory of the results.  [default: results/STUDY]")
@@ -72,7 +72,7 @@ def study(study: str, batch: int | None, engine: str, out: Path | None, jobs: in
             if system.matrix:
                 click.echo(f"note: measuring the time of a few vehicles at {len(system.matrix)} points", err=True)
             cost = forecast(loaded_study, len(keys), pool, size, used_engine)
-            print_forecast(Console(), loaded_study, len(keys), cost, f"{ENGINE_NAMES[used_engine]}: {reason}")
+            print_forecast(Console(), loaded_study, len(keys), cost, f"{used_engine}: {reason}")
             return
         try:
             with open_observer(not quiet, loaded_study, keys,
@@ -125,8 +125,6 @@ def status(directory: str, watch: bool, every: float | None, as_json: bool) -> N
         raise InputError("--every", f"{every:g} without --watch", "together with --watch")
     progress, start_time, console = read_status(directory), time.monotonic(), Console()
     start_share, rate = progress.share, None
-    for remark in progress.remarks:
-        click.echo(remark, err=True)
     with Live(console=console, auto_refresh=False) if watch and not as_json else nullcontext() as live:
         while True:
             if as_json:

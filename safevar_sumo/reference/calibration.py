@@ -9,6 +9,8 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 
+from safevar_sumo.campaign.batches import evaluate_all
+from safevar_sumo.campaign.pool import Pool
 from safevar_sumo.errors import InputError, SimulationError
 from safevar_sumo.reference.agreement import Agreement, measure_agreement
 from safevar_sumo.reference.effects import error_beyond_spread, is_held_back
@@ -20,8 +22,6 @@ from safevar_sumo.reference.rows import COLUMNS, ReferenceData
 from safevar_sumo.reference.search import CmaSearch, SearchRace
 from safevar_sumo.study import SAFETY_DEGREE, Study
 from safevar_sumo.vehicles import CharacteristicSet
-from safevar_sumo.workers.batches import evaluate_all
-from safevar_sumo.workers.evaluation import Pool
 
 START_DEVIATION = 0.02
 """Initial standard deviation of a search that begins at known values, as a share of the bounds' width."""

@@ -14,6 +14,11 @@ from typing import NamedTuple
 import numpy as np
 
 from safevar_sumo.analysis.parameters import value_of, with_values
+from safevar_sumo.campaign.batches import inputs_of
+from safevar_sumo.campaign.evaluation import pack_study
+from safevar_sumo.campaign.interrupts import wait_for_result
+from safevar_sumo.campaign.pool import Pool
+from safevar_sumo.campaign.retrying import RetryingPool
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.reference.loss import MAX_LOSS, ReferenceLoss, original_misfit
@@ -23,10 +28,6 @@ from safevar_sumo.study import FreeParameter, Study
 from safevar_sumo.sumo import Engine, settings_per_batch
 from safevar_sumo.sumo.system import assemble, models_of
 from safevar_sumo.vehicles import CharacteristicSet
-from safevar_sumo.workers.batches import inputs_of
-from safevar_sumo.workers.evaluation import Pool, pack_study
-from safevar_sumo.workers.interrupts import wait_for_result
-from safevar_sumo.workers.retrying import RetryingPool
 
 SIGNIFICANT_DIGITS = 6
 """Significant digits of the values that are tried."""

@@ -13,7 +13,8 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import Evaluations
 from safevar_sumo.results.files import MANIFEST, RUNS, SOLUTIONS, make_directory, write_whole
-from safevar_sumo.results.manifest import DIGESTS_KEY, FORMAT, digest_of_table, read_manifest, refuse_edited_table, write_manifest
+from safevar_sumo.results.journal import FORMAT
+from safevar_sumo.results.manifest import read_manifest, write_manifest
 from safevar_sumo.results.store import solutions_frame
 from safevar_sumo.study import Study, refuse_other_than_file, tables_of
 
@@ -53,19 +54,16 @@ def write_imported(path: Path, study: Study, solutions: Mapping[str, Evaluations
     frame = frame.drop(columns="run")
     replaced_counts: dict[str, int] = {}
     if earlier_manifest:
-        refuse_edited_table(path / SOLUTIONS, earlier_manifest, "the file as it was, or another directory")
         stored = read_imported(path, characteristics)
         is_replaced = stored["algorithm"].isin(list(solutions))
         replaced_counts = {str(name): int(count) for name, count in stored["algorithm"][is_replaced].value_counts().items()}
         frame = pd.concat([stored[~is_replaced], frame], ignore_index=True)
         frame = frame.sort_values(["algorithm", "f_safe", "f_diff", "f_num_diff", *characteristics], kind="stable", ignore_index=True)
-    text = frame.to_csv(index=False, lineterminator="\n")
     manifest: dict[str, Any] = {
         "format": FORMAT, "study": tables, "imported": {"files": {**earlier_manifest.get("imported", {}).get("files", {}), **files}},
         "versions": {"safevar_sumo": version("safevar_sumo")},
-        "original": dict(earlier_manifest.get("original", {}) if original is None else original),
-        DIGESTS_KEY: {SOLUTIONS: digest_of_table(text)}}
-    write_whole(path / SOLUTIONS, text)
+        "original": dict(earlier_manifest.get("original", {}) if original is None else original)}
+    write_whole(path / SOLUTIONS, frame.to_csv(index=False, lineterminator="\n"))
     write_manifest(path, manifest)
     return replaced_counts
 

@@ -12,8 +12,8 @@ import numpy as np
 from safevar_sumo.errors import InputError, warn
 from safevar_sumo.results.files import MANIFEST, SOLUTIONS, journal_file, run_name
 from safevar_sumo.results.imported import read_imported
-from safevar_sumo.results.journal import JournalContent, read_journal
-from safevar_sumo.results.manifest import DIGESTS_KEY, is_edited, owner_digest, read_manifest, refuse_edited_table
+from safevar_sumo.results.journal import Head, JournalContent, read_journal
+from safevar_sumo.results.manifest import identity_digest, read_manifest
 from safevar_sumo.results.store import evaluations_frame, solutions_frame
 from safevar_sumo.study import label_of
 
@@ -85,7 +85,7 @@ class Status(NamedTuple):
     """Progress of a study.
 
     `budget` is the largest number of evaluations of a run, `points` are (f_safe, f_diff, f_num_diff) of all M settings so far, shape
-    (M, 3), `remarks` name problems of the directory.
+    (M, 3).
     """
 
     study: str
@@ -93,7 +93,6 @@ class Status(NamedTuple):
     budget: int
     runs: tuple[RunStatus, ...]
     points: np.ndarray
-    remarks: tuple[str, ...] = ()
 
     @property
     def finished(self) -> bool:
@@ -133,24 +132,21 @@ def _read_search(folder: Path, manifest: Mapping[str, Any]) -> _Search:
         raise InputError(folder / MANIFEST, "has no characteristics or no search", "what the command `study` has written") from None
 
 
-def _read_journals(folder: Path, manifest: Mapping[str, Any],
-                   runs: Sequence[tuple[str, int]]) -> Iterator[tuple[str, int, JournalContent | None]]:
+def _read_journals(folder: Path, manifest: Mapping[str, Any], search: _Search) -> Iterator[tuple[str, int, JournalContent | None]]:
     """Algorithm, number and journal's content of every run; None for a run without a journal."""
-    owner = owner_digest(manifest)
-    for algorithm, run in runs:
+    digest = identity_digest(manifest)
+    for algorithm, run in search.runs:
         path = journal_file(folder, run_name(algorithm, run))
-        yield algorithm, run, read_journal(path, owner, path.stem) if path.exists() else None
+        yield algorithm, run, read_journal(path, Head(digest, path.stem, search.characteristics)) if path.exists() else None
 
 
-def _lost_journals(folder: Path, manifest: Mapping[str, Any], runs: Sequence[tuple[str, int]]) -> list[Path]:
-    """Missing journals of runs that the table of solutions holds: `study` writes it, and its digest, after the last run."""
-    table = folder / SOLUTIONS
-    if SOLUTIONS not in manifest.get(DIGESTS_KEY, {}) or not table.exists():
+def _lost_runs(folder: Path) -> list[tuple[str, int]]:
+    """Runs whose solutions are in the table, which `study` writes after the last run, but whose journal is missing."""
+    if not (folder / SOLUTIONS).exists():
         return []
-    with table.open(encoding="utf-8", errors="replace", newline="") as file:
-        finished_runs = {(row["algorithm"], row["run"]) for row in csv.DictReader(file)}
-    journals = [journal_file(folder, run_name(algorithm, run)) for algorithm, run in runs if (algorithm, str(run)) in finished_runs]
-    return [journal for journal in journals if not journal.exists()]
+    with (folder / SOLUTIONS).open(encoding="utf-8", newline="") as file:
+        runs = {(row["algorithm"], int(row["run"])) for row in csv.DictReader(file)}
+    return sorted(run for run in runs if not journal_file(folder, run_name(*run)).exists())
 
 
 def load_runs(directory: str | Path) -> StoredResults:
@@ -159,38 +155,32 @@ def load_runs(directory: str | Path) -> StoredResults:
     Raises
     ------
     InputError
-        If the directory holds no results, a file in it is damaged, was edited or belongs to another study, or the journal of a finished run
-        is missing.
+        If the directory holds no results, or a file in it is damaged or belongs to another study.
     """
     folder = Path(directory)
     manifest = read_manifest(folder)
     search = _read_search(folder, manifest)
-    remedy = "the same import again" if "imported" in manifest else "the same study again, which writes it from the journals"
-    refuse_edited_table(folder / SOLUTIONS, manifest, f"the file as it was, or {remedy}")
     if "imported" in manifest:
         no_evaluations = evaluations_frame(search.characteristics, []).assign(evaluation=0)
         return StoredResults(manifest, no_evaluations, read_imported(folder, search.characteristics))
-    for journal in (lost_journals := _lost_journals(folder, manifest, search.runs))[:1]:
-        others = f" (and {len(lost_journals) - 1} more)" if len(lost_journals) > 1 else ""
-        raise InputError(journal, f"is missing{others}, although {SOLUTIONS} holds solutions of this run",
+    for algorithm, run in _lost_runs(folder):
+        raise InputError(journal_file(folder, run_name(algorithm, run)), f"is missing, although {SOLUTIONS} holds solutions of this run",
                          "the file as it was, or the same study again, which computes the run anew")
-    evaluations_of_runs, solutions_of_runs, positions, failures = [], [], [], []
-    for algorithm, run, content in _read_journals(folder, manifest, search.runs):
-        if content is not None and content.tail_size and content.result(search.budget) is None:
+    evaluations_of_runs, solutions_of_runs, all_positions, failures = [], [], list[int](), list[Failure]()
+    for algorithm, run, content in _read_journals(folder, manifest, search):
+        if content is not None and content.tail_size and search.budget not in content.results:
             warn(f"{journal_file(folder, run_name(algorithm, run))}: the last {content.tail_size} bytes are torn, "
                  "so the run counts as unfinished; running the same study again simulates the lost evaluations")
-        if content is None or content.evaluations is None:
+        positions, evaluations = content.requested_within(search.budget) if content is not None else ([], None)
+        if content is None or evaluations is None:
             continue
-        requests = sorted((position, row) for row, position in enumerate(content.positions) if 0 <= position < search.budget)
-        evaluations = content.evaluations.take([row for _, row in requests])
         evaluations_of_runs.append(((algorithm, run), evaluations))
-        positions += [position for position, _ in requests]
-        failures += [Failure(algorithm, run, requests[i][0], evaluations.reason(i)) for i in np.flatnonzero(evaluations.failed).tolist()]
-        result = content.result(search.budget)
-        if result is not None:
-            solutions_of_runs.append(((algorithm, run), content.take_positions(result.positions)))
+        all_positions += positions
+        failures += [Failure(algorithm, run, positions[i], evaluations.reason(i)) for i in np.flatnonzero(evaluations.failed).tolist()]
+        if search.budget in content.results:
+            solutions_of_runs.append(((algorithm, run), content.take_positions(content.results[search.budget].positions)))
     frame = evaluations_frame(search.characteristics, evaluations_of_runs)
-    frame.insert(2, "evaluation", positions)
+    frame.insert(2, "evaluation", all_positions)
     solutions = solutions_frame(search.characteristics, solutions_of_runs)
     return StoredResults(manifest, frame, solutions, tuple(run_key for run_key, _ in solutions_of_runs), tuple(failures))
 
@@ -208,24 +198,19 @@ def status(directory: str | Path) -> Status:
     if "imported" in manifest:
         raise InputError(folder, "holds imported solutions, which have no runs", "results of the command `study`")
     search = _read_search(folder, manifest)
-    runs = [_summarise_run(*journal, search.budget) for journal in _read_journals(folder, manifest, search.runs)]
-    if is_edited(folder / SOLUTIONS, manifest):
-        remarks = [f"{folder / SOLUTIONS} was edited: it no longer holds the computed solutions"]
-    else:
-        remarks = [f"{journal} is missing: the same study again computes the run anew"
-                   for journal in _lost_journals(folder, manifest, search.runs)]
+    runs = [_summarise_run(*journal, search.budget) for journal in _read_journals(folder, manifest, search)]
     return Status(study=str(manifest["study"].get("name")), title=str(manifest["study"].get("title")), budget=search.budget,
-                  runs=tuple(run for run, _ in runs), points=np.concatenate([objectives for _, objectives in runs]), remarks=tuple(remarks))
+                  runs=tuple(run for run, _ in runs), points=np.concatenate([objectives for _, objectives in runs]))
 
 
 def _summarise_run(algorithm: str, run: int, content: JournalContent | None, budget: int) -> tuple[RunStatus, np.ndarray]:
     """Progress of a run, and objectives of its valid evaluations."""
-    evaluations = content.requested_within(budget) if content is not None else None
+    _, evaluations = content.requested_within(budget) if content is not None else ([], None)
     if content is None or evaluations is None:
         state = "waiting" if content is None else "begun"
         return RunStatus(algorithm, run, state, simulated=0, collisions=0, simulator_errors=0, best=None), np.zeros((0, 3))
     valid_evaluations = evaluations.take(evaluations.valid)
-    state = "finished" if content.result(budget) is not None else "begun"
+    state = "finished" if budget in content.results else "begun"
     best = float(np.min(valid_evaluations.f_safe)) if len(valid_evaluations) else None
     return (RunStatus(algorithm, run, state, simulated=len(evaluations), collisions=int(np.count_nonzero(evaluations.collided)),
                       simulator_errors=int(np.count_nonzero(evaluations.failed)), best=best), valid_evaluations.objectives)

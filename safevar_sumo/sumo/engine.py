@@ -29,7 +29,7 @@ class Engine(StrEnum):
     """
 
     RECORDED = "recorded"
-    LIBSUMO = "libsumo"
+    LIBSUMO = "sumo"
     TRACI = "traci"
     GUI = "gui"
 

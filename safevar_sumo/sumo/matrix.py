@@ -27,8 +27,8 @@ from safevar_sumo.sumo.system import System, assemble
 
 MAX_COPIES = 200
 """Largest number of copies of a network in one simulation; beyond it, the processor's caches overflow and each copy costs more time."""
-MAX_VEHICLES = 2000
-"""Largest number of vehicles in recorded scenes at once; 200 steps of these vehicles take about 100 MB."""
+MAX_VEHICLES = 4000
+"""Largest number of vehicles in recorded scenes at once; 200 steps of these vehicles take about 200 MB."""
 MAX_LANES = 100_000
 """Largest number of lanes in all copies of one simulation; loading more lanes takes minutes and gigabytes."""
 N_SIMILAR_POINTS = 4

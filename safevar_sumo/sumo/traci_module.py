@@ -58,7 +58,7 @@ def real_traci() -> Any:
 @cache
 def traci_module(name: str = "traci") -> ModuleType:
     """The substitute for the module traci or libsumo."""
-    return _Module(engine_api(Engine(name)))
+    return _Module(engine_api(Engine.LIBSUMO if name == "libsumo" else Engine.TRACI))
 
 
 class _Module(ModuleType):

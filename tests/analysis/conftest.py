@@ -6,8 +6,8 @@ from typing import Any
 
 import pytest
 
+from safevar_sumo.campaign import batches as many
 from safevar_sumo.study import Study
-from safevar_sumo.workers import batches as many
 
 
 @pytest.fixture(autouse=True)

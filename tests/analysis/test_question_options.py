@@ -93,7 +93,7 @@ def test_python_and_the_command_refuse_the_same_values(typed: dict[str, Any], le
 
 @pytest.mark.parametrize("question", ["explain", "opinion", "tolerance", "risk", "rules", "rating"])
 def test_a_warning_of_what_has_changed_names_the_callers_line(question: str, slippery: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("safevar_sumo.workers.identity.RESULTS", 0)
+    monkeypatch.setattr("safevar_sumo.campaign.identity.RESULTS", 0)
     monkeypatch.setattr(f"safevar_sumo.analysis.{question}.answer_question", lambda *_: None)
     with pytest.warns(UserWarning, match="simulated as it is now") as caught:
         getattr(sv, question)(slippery, as_it_is_now=True)

@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 
 import msgspec
 import numpy as np
 
-from safevar_sumo.campaign import Campaign, RunKey, all_runs, run_campaign
+from safevar_sumo.campaign import Campaign, RunKey, RunProgress, all_runs, run_campaign
+from safevar_sumo.campaign.pool import PoolLostError, Report, Share, WorkerLostError
+from safevar_sumo.campaign.share import carry_out_share
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import Evaluations
 from safevar_sumo.results import ResultsDirectory
 from safevar_sumo.study import Study, load_study
 from safevar_sumo.vehicles import CharacteristicSet
-from safevar_sumo.workers.evaluation import PoolLostError
 
 SUN = CharacteristicSet.of(load_study("sun").vehicle.characteristics)
 
@@ -31,41 +32,69 @@ def evaluated(settings: np.ndarray) -> Evaluations:
         metrics={name: safety if name == "safety_degree" else np.where(collided, np.nan, share[:, i]) for i, name in enumerate(METRICS)})
 
 
-class FormulaPool:
-    """Answers in the order of submission or, if `shuffled`, in the order of threads; fails after `limit` batches."""
+class Death(BaseException):
+    """The end of a worker that carries a share."""
 
-    def __init__(self, workers: int = 1, limit: int | None = None, shuffled: bool = False) -> None:
+
+class FormulaPool:
+    """Computes in this process, or in a thread for each worker; fails after `limit` batches."""
+
+    def __init__(self, workers: int = 1, limit: int | None = None) -> None:
         self.workers, self._limit = workers, limit
         self.simulated: list[bytes] = []
-        self._threads = ThreadPoolExecutor(4) if shuffled else None
+        self.sizes: list[int] = []
+        self._threads = ThreadPoolExecutor(workers) if workers > 1 else None
 
-    def submit(self, study: bytes, settings: np.ndarray) -> Future[Evaluations]:
+    def evaluate(self, work: bytes, settings: np.ndarray) -> Evaluations:
         if self._limit is not None:
             if not self._limit:
                 raise PoolLostError("broken down")
             self._limit -= 1
         self.simulated += [row.tobytes() for row in settings]
+        self.sizes.append(len(settings))
+        return evaluated(settings)
+
+    def submit(self, work: bytes, settings: np.ndarray) -> Future[Evaluations]:
+        return self._start(self.evaluate, work, settings)
+
+    def carry(self, share: Share, report: Report) -> Future[None]:
+        return self._start(carry_out_share, share, report, self.evaluate)
+
+    def _start(self, function: object, *arguments: object) -> Future:  # type: ignore[type-arg]
         if self._threads:
-            return self._threads.submit(evaluated, settings)
-        future: Future[Evaluations] = Future()
-        future.set_result(evaluated(settings))
+            return self._threads.submit(_called, function, *arguments)
+        future: Future[object] = Future()
+        try:
+            future.set_result(_called(function, *arguments))
+        except Exception as error:
+            future.set_exception(error)
         return future
+
+
+def _called(function: object, *arguments: object) -> object:
+    try:
+        return function(*arguments)  # type: ignore[operator]
+    except Death as death:
+        raise WorkerLostError(str(death)) from None
 
 
 class EventLog:
     """An observer that records all reports."""
 
     def __init__(self) -> None:
-        self.simulated = self.asked = 0
+        self.runs: dict[RunKey, RunProgress] = {}
         self.finished_runs: dict[RunKey, int] = {}
         self.warnings: list[str] = []
 
-    def evaluated(self, key: RunKey, evaluations: Evaluations, simulated: int) -> None:
-        self.asked += len(evaluations)
-        self.simulated += simulated
+    @property
+    def simulated(self) -> int:
+        return sum(run.asked - run.replayed for run in self.runs.values())
 
-    def finished(self, key: RunKey, asked: int) -> None:
-        self.finished_runs[key] = asked
+    def progressed(self, runs: Sequence[RunProgress]) -> None:
+        self.runs |= {run.key: run for run in runs}
+
+    def finished(self, run: RunProgress) -> None:
+        self.runs[run.key], self.finished_runs[run.key] = run, run.asked
 
     def warned(self, message: str) -> None:
         self.warnings.append(message)
@@ -76,10 +105,10 @@ def with_search(study: Study, **changes: object) -> Study:
 
 
 def carried_out(study: Study, path: Path, pool: FormulaPool | None = None, keys: Iterable[RunKey] | None = None,
-                batch: int | None = None) -> tuple[Campaign, EventLog]:
+                batch: int | None = None, **options: bool) -> tuple[Campaign, EventLog]:
     observer = EventLog()
     results = ResultsDirectory(path, study)
-    campaign = run_campaign(study, all_runs(study) if keys is None else keys, results, pool or FormulaPool(), observer, batch)
+    campaign = run_campaign(study, all_runs(study) if keys is None else keys, results, pool or FormulaPool(), observer, batch, **options)
     results.finish(campaign.solutions)
     return campaign, observer
 

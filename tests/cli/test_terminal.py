@@ -7,17 +7,14 @@ import time
 from io import StringIO
 
 import msgspec
-import numpy as np
 import pytest
 from rich.console import Console
 
 from safevar_sumo import progress
 from safevar_sumo.analysis.evaluator import Evaluator
 from safevar_sumo.api.running import CampaignProgress
-from safevar_sumo.campaign import RunKey, all_runs
-from safevar_sumo.metrics import METRICS
+from safevar_sumo.campaign import RunKey, RunProgress, all_runs
 from safevar_sumo.progress import PartsProgress, open_progress
-from safevar_sumo.records import Evaluations
 from safevar_sumo.study import Study, load_study
 from tests.in_process import InlinePool
 
@@ -36,12 +33,9 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     return now
 
 
-def evaluations_of(number: int, first: int = 0) -> Evaluations:
-    """Collisions of different settings, from the first on."""
-    values = np.full(number, -5.63)
-    settings = np.tile(np.arange(first, first + number, dtype=float)[:, np.newaxis], 12)
-    return Evaluations(settings=settings, outcome=np.full(number, "collision"), collision_speed=-values,
-                       metrics=dict.fromkeys(METRICS, values), f_diff=values, f_num_diff=values)
+def state(algorithm: str, run: int, asked: int, replayed: int = 0) -> RunProgress:
+    """A run whose settings all collide."""
+    return RunProgress(RunKey(algorithm, run), asked, replayed, collisions=asked, best=-5.63)
 
 
 def shown(study: Study, clock: list[float], width: int) -> list[str]:
@@ -52,8 +46,8 @@ def shown(study: Study, clock: list[float], width: int) -> list[str]:
         observer = CampaignProgress(show, study, all_runs(study))
         for i in range(5):
             clock[0] += 10
-            observer.evaluated(RunKey(("nsga2", "rs")[i % 2], 0), evaluations_of(100, 100 * i), 100)
-        observer.finished(RunKey("nsga2", 0), 300)
+            observer.progressed([state(("nsga2", "rs")[i % 2], 0, 100 * (i // 2 + 1))])
+        observer.finished(state("nsga2", 0, 300))
     return [re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", line).rstrip() for line in out.getvalue().splitlines()]
 
 
@@ -85,11 +79,9 @@ def test_what_comes_from_journals_is_not_left_to_be_done(study: Study) -> None:
     """A finished run of 1000, of 600 different settings; 500 settings of the next run; then 100 simulated, and again."""
     shows: list[tuple[str, int, int]] = []
     observer = CampaignProgress(lambda *values: shows.append(values), study, all_runs(study))
-    observer.evaluated(RunKey("nsga2", 0), evaluations_of(600), 0)
-    observer.finished(RunKey("nsga2", 0), 1000)
-    observer.evaluated(RunKey("nsga2", 1), evaluations_of(500), 0)
-    for _ in range(2):
-        observer.evaluated(RunKey("nsga2", 1), evaluations_of(100, 500), 100)
+    observer.finished(state("nsga2", 0, 1000, replayed=1000)._replace(collisions=600))
+    for asked in (500, 600, 700):
+        observer.progressed([state("nsga2", 1, asked, replayed=500)._replace(collisions=min(asked, 600))])
     assert shows[0] == ("rain: runs 0/6", 0, 6000)
     assert shows[-1] == ("rain: runs 1/6, 1200 collisions, best SD -5.63", 200, 4500)
 

@@ -43,7 +43,7 @@ def until(condition: Callable[[], bool], process: subprocess.Popen[str] | None =
 
 def written(out: Path) -> int:
     """Number of bytes in the journals of the runs."""
-    return sum(path.stat().st_size for path in out.glob("runs/*-*.journal"))
+    return sum(path.stat().st_size for path in out.glob("runs/*-*.jsonl"))
 
 
 def workers_of(process: subprocess.Popen[str]) -> list[psutil.Process]:

@@ -13,7 +13,7 @@ from click.testing import CliRunner
 import safevar_sumo as sv
 from safevar_sumo.cli.program import commands
 from safevar_sumo.errors import InputError
-from safevar_sumo.results import FILES, load_runs
+from safevar_sumo.results import FILES
 from safevar_sumo.shipped import NETWORKS
 from tests.in_process import run
 
@@ -157,15 +157,3 @@ def test_a_file_that_is_read_later_counts_from_then_on() -> None:
     Path("tile.txt").write_text("another tile")
     assert "tile.txt has changed since" in refused("study", "mine.toml", "--out", "out", "--runs", "2")
     assert "tile.txt has changed since" in refused("rules", "out")
-
-
-@pytest.mark.slow
-def test_a_table_that_was_edited_is_refused_until_the_study_writes_it_again() -> None:
-    study()
-    before = Path("out/solutions.csv").read_text()
-    Path("out/solutions.csv").write_text(before.replace("stopped", "collision"))
-    for words in ("simulate out", "tables out", "explain out", "report out", "figures out --out pictures"):
-        assert "was edited" in refused(*words.split())
-    study()
-    assert Path("out/solutions.csv").read_text() == before
-    assert len(load_runs("out").solutions)

@@ -9,11 +9,11 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
+from safevar_sumo.campaign.identity import identity_of
 from safevar_sumo.results import ResultsDirectory, load_runs
 from safevar_sumo.results.manifest import write_manifest
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.system import assemble
-from safevar_sumo.workers.identity import identity_of
 from tests.end_to_end.processes import STUDY, solutions, study, written
 from tests.in_process import refused, run
 
@@ -32,14 +32,14 @@ def test_shards_and_one_run_are_the_same_as_in_the_whole(whole: Path) -> None:
     assert solutions("out") == solutions(whole)
     assert "No solution." in run("study", "small.toml", "--out", "none", "--shard", "9/9").stdout
     study("--out", "alone", "--only", "nsga2:1")
-    assert [path.name for path in Path("alone/runs").glob("*-*")] == ["nsga2-01.journal"]
+    assert [path.name for path in Path("alone/runs").glob("*-*")] == ["nsga2-01.jsonl"]
     expected = load_runs(whole).solutions.query("algorithm == 'nsga2' and run == 1").reset_index(drop=True)
     pd.testing.assert_frame_equal(load_runs("alone").solutions, expected)
 
 
 @pytest.mark.slow
 def test_more_runs_extend_what_is_there(copied: Path) -> None:
-    fewer = copied / "runs" / "rs-01.journal"
+    fewer = copied / "runs" / "rs-01.jsonl"
     stamp = fewer.stat().st_mtime_ns
     done = run("study", "small.toml", "--quiet", "--out", "out", "--runs", "3")
     assert (done.stdout, done.stderr) == ("", "")
@@ -80,26 +80,24 @@ def test_results_of_another_version_or_seed_are_refused_and_left_alone(copied: P
     write_manifest(copied, manifest)
     assert "version of libsumo was '1.20.0' and is '1.28.0' now" in study("--out", "out", expect=2)
     (copied / "manifest.json").unlink()
-    (copied / "runs" / "original.journal").unlink()
+    (copied / "runs" / "original.jsonl").unlink()
     Path("small.toml").write_text(STUDY + "seed = 2\n")
     assert "belongs to another study or version" in study("--out", "out", expect=2)
 
 
 def test_torn_tails_are_cut_off_with_a_warning_and_damage_in_the_middle_names_its_place(copied: Path, whole: Path) -> None:
     for name, lost in (("nsga2-00", 20), ("safe_fuzzer-01", 9000)):
-        path = copied / "runs" / f"{name}.journal"
+        path = copied / "runs" / f"{name}.jsonl"
         os.truncate(path, path.stat().st_size - lost)
-    with (copied / "runs" / "rs-00.journal").open("ab") as file:
-        file.write(b"SVJ\n rubbish")
+    with (copied / "runs" / "rs-00.jsonl").open("ab") as file:
+        file.write(b'{"evaluation":[7, rubbish')
     result = study("--out", "out")
     assert result.count("warning") == 3
-    assert "nsga2-00.journal" in result
+    assert "nsga2-00.jsonl" in result
     assert solutions("out") == solutions(whole)
-    path = copied / "runs" / "rs-00.journal"
-    content = bytearray(path.read_bytes())
-    content[len(content) // 2] ^= 1
-    path.write_bytes(content)
-    assert "rs-00.journal: is damaged at byte" in study("--out", "out", expect=2)
+    path = copied / "runs" / "rs-00.jsonl"
+    path.write_bytes(content := path.read_bytes().replace(b'"outcome":', b'"outcome', 1))
+    assert "rs-00.jsonl: is damaged in line 2" in study("--out", "out", expect=2)
     assert path.read_bytes() == content
 
 

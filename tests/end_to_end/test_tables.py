@@ -131,31 +131,19 @@ def test_what_is_no_result_is_refused(results: Path, in_tmp: Path) -> None:
     assert not Path("pictures").exists()
 
 
-@pytest.mark.parametrize(("command", "table", "key", "value"), [
-    ("tables", "original", "safety_degree", 99.0), ("explain", "study", "title", "Another"), ("status", "study", "title", "Another")])
-def test_an_edited_manifest_is_refused_in_one_line(command: str, table: str, key: str, value: object, results: Path, in_tmp: Path) -> None:
-    shutil.copytree(results, "out")
-    manifest = json.loads(Path("out/manifest.json").read_text())
-    manifest[table][key] = value
-    Path("out/manifest.json").write_text(json.dumps(manifest, indent=2))
-    message = run(command, "out", expect=2).stderr.strip()
-    assert "manifest.json: was edited" in message
-    assert len(message.splitlines()) == 1
-
-
 def test_results_are_no_published_data_of_themselves(results: Path) -> None:
     refused("replicate", str(results), "--published", str(results), message=("--published", "given as results too"))
 
 
 def test_an_unfinished_campaign_is_answered_as_far_as_it_went(results: Path, in_tmp: Path) -> None:
     shutil.copytree(results, "part")
-    Path("part/runs/rs-01.journal").unlink()
+    Path("part/runs/rs-01.jsonl").unlink()
     Path("part/solutions.csv").unlink()
     output = run("tables", "part").stdout
     assert "unfinished, rs 1 of 2 runs" in output
     records = json.loads(run("tables", "part", "--rq", "rq2", "--format", "json").stdout)
     assert next(one for one in records if one["metric"] == "igd")["n2"] == 1
-    Path("part/runs/rs-00.journal").unlink()
+    Path("part/runs/rs-00.jsonl").unlink()
     refused("tables", "part", "--rq", "rq2", message=("only nsga2",))
     for path in Path("part/runs").glob("nsga2-*"):
         path.write_bytes(path.read_bytes()[:-20])

@@ -28,6 +28,7 @@ from safevar_sumo.analysis.subject import at_point
 from safevar_sumo.analysis.tolerance import ToleranceOptions
 from safevar_sumo.analysis.tolerance.compute import find_tolerances
 from safevar_sumo.api.simulation import Simulation
+from safevar_sumo.campaign.pool import WorkerLostError
 from safevar_sumo.cli.program import commands
 from safevar_sumo.cli.simulate import _rating_command
 from safevar_sumo.cli.target import CommandTarget
@@ -39,7 +40,6 @@ from safevar_sumo.report.rated import draw_matrices
 from safevar_sumo.results import SolutionId, record, solutions_frame
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.system import assemble
-from safevar_sumo.workers.evaluation import WorkerLostError
 from tests.in_process import InlinePool
 
 STUDY = load_study("euro_ncap_rating")

@@ -26,6 +26,7 @@ from safevar_sumo.analysis.preventability import Preventability, PreventableBy
 from safevar_sumo.analysis.research_questions.case import load_cases
 from safevar_sumo.analysis.tolerance.answer import Tolerance
 from safevar_sumo.analysis.tolerance.safe_box import SafeBox
+from safevar_sumo.campaign import local
 from safevar_sumo.cli.program import commands
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
@@ -41,7 +42,6 @@ from safevar_sumo.report.tested import describe_conditions, describe_tested_syst
 from safevar_sumo.results.manifest import write_manifest
 from safevar_sumo.scenarios import Point, weather_of
 from safevar_sumo.sumo.system import assemble
-from safevar_sumo.workers import local
 from tests.analysis.known_regions import Plant
 
 

@@ -3,27 +3,31 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import os
 import re
 import subprocess
 import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from safevar_sumo.errors import InputError, SafevarError
 from safevar_sumo.records import Evaluations
-from safevar_sumo.results import Journal, JournalBusyError
-from safevar_sumo.results.journal import SPARE_POSITION, JournalContent, Result, make_batch, owner_of, read_journal
+from safevar_sumo.results import Head, Journal, JournalBusyError
+from safevar_sumo.results.journal import SPARE_POSITION, JournalContent, Result, files_read_later, read_journal
 
 BATCHES = 4
 ROWS = 3
 RESULT = [1, 5]
 BUDGET = 99
+HEAD = Head("study", "nsga2-00", ("a", "b"))
 in_one_folder = settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=100)
 
 
@@ -41,10 +45,10 @@ def places(number: int) -> list[int]:
 
 
 def write(path: Path, batches: int = BATCHES, finished: bool = True) -> list[int]:
-    """Write a new journal; returns the offsets at which its frames end."""
+    """Write a new journal; returns the offsets at which its lines end."""
     path.unlink(missing_ok=True)
     ends = []
-    journal = Journal(path, "study", "nsga2-00")
+    journal = Journal(path, HEAD)
     ends.append(path.stat().st_size)
     for number in range(batches):
         journal.append(places(number), batch(number))
@@ -72,62 +76,98 @@ def holds_the_first(batches: int, content: JournalContent) -> bool:
 
 
 def test_a_journal_returns_its_evaluations(tmp_path: Path) -> None:
-    path = tmp_path / "runs" / "a.journal"
+    path = tmp_path / "runs" / "a.jsonl"
     write(path)
-    journal = Journal(path, "study", "nsga2-00")
+    journal = Journal(path, HEAD)
     assert holds_the_first(BATCHES, journal.content)
-    assert journal.content.result(BUDGET) == Result(positions=RESULT, asked=99, budget=BUDGET)
-    assert journal.cut_bytes == 0
+    assert journal.content.results == {BUDGET: Result(RESULT, asked=99)}
+    assert journal.content.tail_size == 0
     journal.close()
-    content = read_journal(path, "study", "nsga2-00")
+    content = read_journal(path, HEAD)
     assert holds_the_first(BATCHES, content)
-    assert content.result(BUDGET) == Result(positions=RESULT, asked=99, budget=BUDGET)
-    assert content.result(BUDGET + 1) is None
-    first = content.requested_within(ROWS)
+    assert content.results == {BUDGET: Result(RESULT, asked=99)}
+    _, first = content.requested_within(ROWS)
     assert first is not None
     assert same(first, batch(0)), "positions count from 0: the first three"
+
+
+def test_a_journal_is_a_table_that_pandas_reads(tmp_path: Path) -> None:
+    write(tmp_path / "a.jsonl")
+    head, *lines = map(json.loads, (tmp_path / "a.jsonl").read_text().splitlines())
+    assert head["characteristics"] == ["a", "b"]
+    frame = pd.concat([pd.DataFrame(line) for line in lines if "evaluation" in line])
+    expected = Evaluations.concatenate([batch(number) for number in range(BATCHES)])
+    assert frame["evaluation"].tolist() == list(range(ROWS * BATCHES))
+    for name, column in (("b", expected.settings[:, 1]), ("tet", expected.metrics["tet"]), ("collision_speed", expected.collision_speed)):
+        assert np.array_equal(frame[name].to_numpy(dtype=float), column, equal_nan=True)
+    assert lines[0]["tet"][2] is None, "undefined"
+
+
+@in_one_folder
+@given(st.lists(st.floats(allow_nan=False, allow_infinity=False), min_size=1))
+def test_numbers_return_to_the_last_bit(tmp_path: Path, numbers: list[float]) -> None:
+    (tmp_path / "a.jsonl").unlink(missing_ok=True)
+    values = np.array(numbers)
+    evaluations = dataclasses.replace(batch(0), settings=np.stack([values, values], axis=1), outcome=np.full(len(values), "stopped"),
+                                      collision_speed=values, metrics={"tet": values}, f_diff=values, f_num_diff=values)
+    journal = Journal(tmp_path / "a.jsonl", HEAD)
+    journal.append(range(len(values)), evaluations)
+    journal.close()
+    stored = read_journal(tmp_path / "a.jsonl", HEAD).evaluations
+    assert stored is not None
+    assert stored.settings.tobytes() == evaluations.settings.tobytes()
+    assert stored.metrics["tet"].tobytes() == values.tobytes()
 
 
 @pytest.mark.slow
 @in_one_folder
 @given(st.data())
-def test_a_truncated_journal_loads_its_whole_frames_and_continues(tmp_path: Path, data: st.DataObject) -> None:
-    path = tmp_path / "a.journal"
+def test_a_truncated_journal_loads_its_whole_lines_and_continues(tmp_path: Path, data: st.DataObject) -> None:
+    path = tmp_path / "a.jsonl"
     ends = write(path)
     left = data.draw(st.integers(0, ends[-1] - 1))
     os.truncate(path, left)
     whole = sum(end <= left for end in ends)
-    journal = Journal(path, "study", "nsga2-00")
+    journal = Journal(path, HEAD)
     assert holds_the_first(max(0, whole - 1), journal.content)
     assert not journal.content.results
-    assert journal.cut_bytes == left - max([0, *(end for end in ends if end <= left)])
+    assert journal.content.tail_size == left - max([0, *(end for end in ends if end <= left)])
     for number in range(max(0, whole - 1), BATCHES):
         journal.append(places(number), batch(number))
     journal.close()
-    content = read_journal(path, "study", "nsga2-00")
+    content = read_journal(path, HEAD)
     assert holds_the_first(BATCHES, content)
 
 
-@in_one_folder
-@given(st.data())
-def test_a_changed_byte_is_cut_with_the_tail_or_is_an_error_with_its_offset(tmp_path: Path, data: st.DataObject) -> None:
-    path = tmp_path / "a.journal"
-    ends = write(path)
-    content = bytearray(path.read_bytes())
-    place, change = data.draw(st.integers(0, len(content) - 1)), data.draw(st.integers(1, 255))
-    content[place] ^= change
-    path.write_bytes(content)
-    start = max([0, *(end for end in ends if end <= place)])
-    if start == ends[-2]:
-        content = read_journal(path, "study", "nsga2-00")
+@pytest.mark.parametrize("line", range(1 + BATCHES + 1))
+def test_a_damaged_line_is_cut_at_the_end_and_an_error_with_its_number_elsewhere(line: int, tmp_path: Path) -> None:
+    path = tmp_path / "a.jsonl"
+    write(path)
+    lines = path.read_bytes().splitlines(keepends=True)
+    lines[line] = lines[line].replace(b":", b"\0", 2)
+    path.write_bytes(damaged := b"".join(lines))
+    if line == BATCHES + 1:
+        content = read_journal(path, HEAD)
         assert holds_the_first(BATCHES, content)
-        assert not content.results
-    else:
-        with pytest.raises(InputError) as caught:
-            Journal(path, "study", "nsga2-00")
-        assert str(path) in str(caught.value)
-        assert f"byte {start}" in str(caught.value)
-        assert path.read_bytes() == content, "a damaged file is left as it is"
+        assert (content.results, content.tail_size) == ({}, len(lines[-1]))
+        return
+    with pytest.raises(InputError, match=rf"a\.jsonl: is damaged in line {line + 1}:"):
+        Journal(path, HEAD)
+    assert path.read_bytes() == damaged, "a damaged file is left as it is"
+
+
+@pytest.mark.parametrize(("old", "new"), [('"tet"', '"tat"'), ("[10.0,", "["), ('"outcome"', '"income"'), ("[3,4,5]", "[3,4]")])
+def test_an_edited_journal_is_an_error(old: str, new: str, tmp_path: Path) -> None:
+    path = tmp_path / "a.jsonl"
+    write(path)
+    head, first, second, *rest = path.read_text().splitlines(keepends=True)
+    assert old in second
+    path.write_text("".join([head, first, second.replace(old, new, 1), *rest]))
+    if new == '"tat"':  # another metric, undefined in the other batches
+        assert "tat" in read_journal(path, HEAD).evaluations.metrics  # type: ignore[union-attr]
+        return
+    with pytest.raises(InputError, match=r"a\.jsonl: was edited"):
+        read_journal(path, HEAD)
 
 
 @pytest.mark.parametrize(("study", "run", "reason"), [
@@ -136,30 +176,31 @@ def test_a_changed_byte_is_cut_with_the_tail_or_is_an_error_with_its_offset(tmp_
 @pytest.mark.parametrize("opened", [Journal, read_journal])
 def test_a_journal_of_another_study_or_run_is_refused(tmp_path: Path, opened: Callable[..., object], study: str, run: str,
                                                       reason: str) -> None:
-    write(tmp_path / "a.journal")
+    write(tmp_path / "a.jsonl")
     with pytest.raises(InputError, match=re.escape(reason)):
-        opened(tmp_path / "a.journal", study, run)
+        opened(tmp_path / "a.jsonl", Head(study, run, ("a", "b")))
 
 
 def test_a_run_has_one_owner_and_the_lock_ends_with_the_process(tmp_path: Path) -> None:
-    path = tmp_path / "a.journal"
-    code = f"from safevar_sumo.results import Journal\nfrom pathlib import Path\nJ = Journal(Path({str(path)!r}), 'study', 'nsga2-00')\n"
+    path = tmp_path / "a.jsonl"
+    code = "from safevar_sumo.results import Head, Journal\nfrom pathlib import Path\n"
+    code += f"J = Journal(Path({str(path)!r}), Head{tuple(HEAD)})\n"
     code += "print('locked', flush=True)\nimport time\ntime.sleep(60)\n"
     other = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
     assert other.stdout is not None
     assert other.stdout.readline() == "locked\n"
     with pytest.raises(JournalBusyError):
-        Journal(path, "study", "nsga2-00")
+        Journal(path, HEAD)
     other.kill()
+    Journal(path, HEAD, time.monotonic() + 9).close()  # waits until the other has ended
     other.communicate()
-    Journal(path, "study", "nsga2-00").close()
 
 
 @pytest.mark.parametrize("written", [0, 7, 40])
 def test_a_full_disk_leaves_an_intact_journal_that_continues(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, written: int) -> None:
-    path = tmp_path / "a.journal"
+    path = tmp_path / "a.jsonl"
     end = write(path, batches=2, finished=False)[-1]
-    journal = Journal(path, "study", "nsga2-00")
+    journal = Journal(path, HEAD)
 
     class Full:
         """A file that takes `written` more bytes."""
@@ -185,7 +226,7 @@ def test_a_full_disk_leaves_an_intact_journal_that_continues(tmp_path: Path, mon
     journal._file = file
     journal.append(places(2), batch(2))
     journal.close()
-    content = read_journal(path, "study", "nsga2-00")
+    content = read_journal(path, HEAD)
     assert holds_the_first(3, content)
 
 
@@ -194,47 +235,58 @@ def test_a_reason_is_stored_with_its_setting_and_adds_nothing_to_other_batches(t
     result = dataclasses.replace(failed, reasons={failed.settings[2].tobytes(): "SUMO failed: it said so"})
     sizes = []
     for name, one in (("without", failed), ("with", result)):
-        journal = Journal(tmp_path / name, "study", "nsga2-00")
+        journal = Journal(tmp_path / name, HEAD)
         journal.append(places(0), one)
         journal.close()
         sizes.append((tmp_path / name).stat().st_size)
-    content = read_journal(tmp_path / "with", "study", "nsga2-00")
+    content = read_journal(tmp_path / "with", HEAD)
     assert content.evaluations is not None
     assert content.evaluations.reason(2) == "SUMO failed: it said so"
-    assert make_batch(places(0), failed).reasons == {}
+    assert "reason" not in (tmp_path / "without").read_text()
     assert sizes[1] > sizes[0]
 
 
 def test_evaluations_after_a_failure_are_spare_after_a_retry(tmp_path: Path) -> None:
-    path = tmp_path / "a.journal"
+    path = tmp_path / "a.jsonl"
     write(path, batches=2)
-    journal = Journal(path, "study", "nsga2-00")
+    journal = Journal(path, HEAD)
     journal.retry()
-    for content in (journal.content, read_journal(path, "study", "nsga2-00")):
+    for content in (journal.content, read_journal(path, HEAD)):
         assert content.positions == [0, 1, SPARE_POSITION, SPARE_POSITION], "the third and the sixth have failed"
         assert content.evaluations is not None
         assert content.evaluations.f_diff.tolist() == [0.0, 1 / 3, 10 / 3, 11 / 3]
-        assert content.result(BUDGET) is None
+        assert content.results == {}
     journal.close()
 
 
 def test_a_journal_without_evaluations_passes_to_the_next_owner(tmp_path: Path) -> None:
-    Journal(tmp_path / "a.journal", "study", "nsga2-00").close()
-    taken_over = Journal(tmp_path / "a.journal", "other", "nsga2-00")
+    other = Head("other", "nsga2-00", ("a", "b"))
+    Journal(tmp_path / "a.jsonl", HEAD).close()
+    taken_over = Journal(tmp_path / "a.jsonl", other)
     taken_over.close()
-    assert taken_over.cut_bytes == 0, "nothing was torn"
-    assert owner_of(tmp_path / "a.journal") == "other"
+    assert taken_over.content.tail_size == 0, "nothing was torn"
+    assert read_journal(tmp_path / "a.jsonl", other).positions == []
     with pytest.raises(InputError, match="belongs to another study"):
-        read_journal(tmp_path / "a.journal", "study", "nsga2-00")
+        read_journal(tmp_path / "a.jsonl", HEAD)
+
+
+def test_files_that_were_read_later_are_collected_from_all_journals(tmp_path: Path) -> None:
+    for number, files in enumerate(({"tile.txt": "1"}, {}, {"map.txt": "2"})):
+        journal = Journal(tmp_path / "runs" / f"{number}.jsonl", HEAD)
+        journal.append(places(0), batch(0), files)
+        journal.append(places(1), batch(1))
+        journal.close()
+        assert holds_the_first(2, read_journal(journal.path, HEAD))
+    assert files_read_later(tmp_path) == {"tile.txt": "1", "map.txt": "2"}
 
 
 def test_a_file_that_is_no_journal_is_refused_and_not_changed(tmp_path: Path) -> None:
-    path = tmp_path / "a.journal"
+    path = tmp_path / "a.jsonl"
     path.write_text("my notes")
     with pytest.raises(InputError, match="is no journal"):
-        Journal(path, "study", "nsga2-00")
+        Journal(path, HEAD)
     assert path.read_text() == "my notes"
     path.unlink()
     path.mkdir()
     with pytest.raises(InputError, match="is no regular file"):
-        Journal(path, "study", "nsga2-00")
+        Journal(path, HEAD)

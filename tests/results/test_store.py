@@ -18,6 +18,7 @@ from safevar_sumo.analysis.research_questions.case import load_cases
 from safevar_sumo.cli.program import commands
 from safevar_sumo.errors import InputError, SafevarError
 from safevar_sumo.metrics import Unsafe
+from safevar_sumo.plugins import digest_of
 from safevar_sumo.records import Evaluations
 from safevar_sumo.results import (
     JournalBusyError,
@@ -26,16 +27,13 @@ from safevar_sumo.results import (
     choose_handle,
     handles_of,
     load_runs,
-    read_late_files,
     record,
     row_of_handle,
     solutions_frame,
     status,
 )
-from safevar_sumo.results.manifest import FORMAT, differences_now, owner_digest
+from safevar_sumo.results.manifest import differences, identity_digest
 from safevar_sumo.study import ModelTable, Study, load_study, tables_of
-from safevar_sumo.sumo.system import assemble
-from safevar_sumo.workers.identity import identity_of
 
 NAMES = ("a", "b")
 
@@ -128,7 +126,7 @@ def test_a_change_without_effect_on_results_is_accepted(tmp_path: Path, study: S
                   with_search(study, time_limit=7, runs=3, evaluations=900),
                   msgspec.structs.replace(study, search=msgspec.structs.replace(study.search, algorithms=["rs"]))):
         directory = ResultsDirectory(tmp_path, other)
-        assert owner_digest(directory.manifest) == owner_digest(ResultsDirectory(tmp_path, study).manifest)
+        assert identity_digest(directory.manifest) == identity_digest(ResultsDirectory(tmp_path, study).manifest)
 
 
 def test_a_whole_number_is_not_the_same_as_one_with_a_point(tmp_path: Path, study: Study) -> None:
@@ -149,7 +147,7 @@ def test_a_directory_belongs_to_its_first_study(tmp_path: Path, study: Study) ->
     first = ResultsDirectory(tmp_path, study)
     second, same = ResultsDirectory(tmp_path, with_search(study, seed=2)), ResultsDirectory(tmp_path, study)
     journal = first.journal("original")
-    with pytest.raises(InputError, match="is in use by another study that is running now"):
+    with pytest.raises(InputError, match="belongs to another study"):
         second.journal("original")
     with pytest.raises(JournalBusyError):
         same.journal("original")
@@ -182,10 +180,16 @@ def test_a_failed_write_leaves_the_file_unchanged(tmp_path: Path, study: Study, 
 
 
 def test_simulations_depend_on_files_and_the_number_of_results_but_not_on_new_keys() -> None:
-    stored = {"format": FORMAT, "resolved": {"a": 1}, "network": {}, "sources": {"x.py": "0"}, "results": 1, "versions": {"numpy": "1"}}
-    assert differences_now(stored, {**stored, "resolved": {"a": 1, "b": False}, "versions": {"numpy": "2"}}) == []
-    assert differences_now(stored, {**stored, "resolved": {"a": 2}, "sources": {}, "results": 2}) == [
-        "a was 1 and is 2 now", "x.py no longer exists", "the version of the package's results was 1 and is 2 now"]
+    stored = {"resolved": {"a": 1}, "network": {}, "sources": {"x.py": "0"}, "results": 1, "versions": {"numpy": "1", "libsumo": "1"}}
+
+    def changed(**layers: object) -> list[tuple[str, bool]]:
+        return [(difference.text, difference.changes_simulations) for difference in differences(stored, {**stored, **layers})]
+
+    assert changed(resolved={"a": 1, "b": False}, versions={"numpy": "2", "libsumo": "1"}) == [
+        ("b was None and is False now", False), ("version of numpy was '1' and is '2' now", False)]
+    assert changed(resolved={"a": 2}, sources={}, results=2, versions={"numpy": "1", "libsumo": "2"}) == [
+        ("a was 1 and is 2 now", True), ("x.py no longer exists", True), ("the version of the package's results was 1 and is 2 now", True),
+        ("version of libsumo was '1' and is '2' now", True)]
 
 
 FRAME = pd.DataFrame({
@@ -246,85 +250,50 @@ def test_a_criterion_in_words_is_rounded_but_its_text_is_exact() -> None:
         "collision", "safety degree below 0.847 m", "safety degree below -2 m/s", "at most 3.5 points"]
 
 
-STORED = Path(__file__).with_name("stored")
-
-
-@pytest.mark.parametrize("stored", ["format-1", "format-2", "format-3"])
-def test_stored_results_are_read_as_they_were_written(stored: str) -> None:
-    result = load_runs(STORED / stored)
-    assert result.finished == (("nsga2", 0), ("rs", 0))
-    assert len(result.evaluations) == 20
-    assert result.solutions.to_csv(index=False, lineterminator="\n").encode() == (STORED / stored / "solutions.csv").read_bytes()
-    keys = ["algorithm", "run", *list(result.solutions.columns[2:14])]
-    assert len(result.solutions.merge(result.evaluations, on=keys)) == len(result.solutions), "what is solved was evaluated"
-    if stored == "format-2":
-        pd.testing.assert_frame_equal(result.evaluations, load_runs(STORED / "format-1").evaluations)
-
-
-def test_the_format_that_is_written_now_is_stored_here() -> None:
-    assert (STORED / f"format-{FORMAT}").is_dir()
-
-
-@pytest.mark.parametrize(("stored", "expected"), [
-    ("format-1", r"version 0\.[12]\.0 wrote them"), ("format-2", r"version 0\.2\.0 wrote them"),
-    ("format-3", "holds results of another study")])
-def test_other_code_does_not_continue_stored_results(stored: str, expected: str, tmp_path: Path) -> None:
-    shutil.copytree(STORED / stored, tmp_path / "out")
-    study = load_study("smoke", search={"algorithms": ["nsga2", "rs"], "evaluations": 10})
-    with pytest.raises(InputError, match=expected):
-        ResultsDirectory(tmp_path / "out", study, identity_of(study, assemble(study)) | {"results": 0})
-
-
-def test_a_format_of_the_future_is_refused(tmp_path: Path) -> None:
-    shutil.copytree(STORED / f"format-{FORMAT}", tmp_path / "out")
-    manifest = tmp_path / "out" / "manifest.json"
-    manifest.write_text(manifest.read_text().replace(f'"format": {FORMAT}', f'"format": {FORMAT + 1}'))
-    with pytest.raises(InputError, match="is not a manifest of this version of the program"):
-        load_runs(tmp_path / "out")
-
-
-def test_a_torn_manifest_is_called_torn(tmp_path: Path) -> None:
-    shutil.copytree(STORED / f"format-{FORMAT}", tmp_path / "out")
-    manifest = tmp_path / "out" / "manifest.json"
-    manifest.write_text(text := manifest.read_text()[:300])
-    with pytest.raises(InputError, match=rf"manifest\.json: is torn or was edited, line {len(text.splitlines())} is no JSON"):
-        load_runs(tmp_path / "out")
-
-
-def test_an_edited_manifest_is_refused_until_it_is_removed(tmp_path: Path, study: Study) -> None:
-    directory = written(tmp_path, study)
-    directory.journal("original").close()
-    (tmp_path / "answers").mkdir()
-    file = tmp_path / "manifest.json"
-    file.write_text(file.read_text().replace('"safety_degree": 2.5', '"safety_degree": 9.5'))
-    with pytest.raises(InputError, match=r"manifest\.json: was edited"):
-        ResultsDirectory(tmp_path, study)
-    file.unlink()
-    ResultsDirectory(tmp_path, study).begin(evaluations(2.5))
-    assert json.loads(file.read_text())["original"]["safety_degree"] == 2.5
-
-
-@pytest.mark.parametrize("content", [b"", b'{"my_table.csv": "ab', b"{}", b"[]", b"3", b'["\xff"]', b'{"other.csv": "ab"}'])
-def test_a_damaged_record_of_an_input_is_an_error_not_a_forgotten_input(tmp_path: Path, study: Study, content: bytes) -> None:
-    written(tmp_path, study).record_late_files({"my_table.csv": "ab"})
-    assert read_late_files(tmp_path) == {"my_table.csv": "ab"}
-    (file,) = (tmp_path / "runs").glob("read-*.json")
-    file.write_bytes(content)
+@pytest.mark.parametrize(("number", "release"), [(None, "0.1.0"), (2, "0.2.0"), (3, "0.2.0"), (5, "9.0.0")])
+def test_results_in_another_format_are_refused_with_the_release_that_wrote_them(
+        number: int | None, release: str, slippery: Path, tmp_path: Path) -> None:
+    shutil.copytree(slippery, tmp_path / "it")
+    manifest = json.loads((slippery / "manifest.json").read_text())
+    manifest = {key: value for key, value in manifest.items() if key != "format"} | ({} if number is None else {"format": number})
+    manifest["versions"]["safevar_sumo"] = release
+    (tmp_path / "it" / "manifest.json").write_text(json.dumps(manifest))
     before = contents(tmp_path)
-    with pytest.raises(InputError, match=rf"{file.name}: (is torn or )?was edited"):
-        ResultsDirectory(tmp_path, study)
+    for words in ("tables", "status", "explain", "report"):
+        error = CliRunner().invoke(commands, [words, str(tmp_path / "it")]).exception
+        assert isinstance(error, InputError)
+        assert f"in format {number or 1}" in error.problem
+        assert f"the release that wrote them, safevar_sumo {release}" in str(error.legal)
+    with pytest.raises(InputError, match=f"safevar_sumo {release}"):
+        ResultsDirectory(tmp_path / "it", load_study("smoke"))
     assert contents(tmp_path) == before
 
 
-@pytest.mark.parametrize("content", [b"", b'["..', b"{}", b"3", b"[3]", b'["\xff"]'])
-def test_a_damaged_record_of_folders_is_an_error_until_it_is_removed(slippery: Path, tmp_path: Path, content: bytes) -> None:
-    shutil.copytree(slippery, tmp_path / "it")
-    file = tmp_path / "it/runs/places.json"
-    file.write_bytes(content)
-    with pytest.raises(InputError, match=r"places\.json: is torn or was edited"):
-        load_cases([tmp_path / "it"])
-    file.unlink()
-    load_cases([tmp_path / "it"])
+def test_a_torn_manifest_is_called_torn_and_written_again(tmp_path: Path, study: Study) -> None:
+    written(tmp_path, study)
+    manifest = tmp_path / "manifest.json"
+    manifest.write_text(text := manifest.read_text()[:300])
+    with pytest.raises(InputError, match=rf"manifest\.json: is torn or was edited, line {len(text.splitlines())} is no JSON"):
+        load_runs(tmp_path)
+    manifest.unlink()
+    (tmp_path / "runs").mkdir()
+    written(tmp_path, study)
+    assert json.loads(manifest.read_text())["original"]["safety_degree"] == 2.5
+
+
+def test_a_file_that_was_read_later_is_an_input(tmp_path: Path, in_tmp: Path) -> None:
+    study = msgspec.structs.replace(load_study("smoke"), ads=ModelTable(model="my_ads:Mine"))
+    Path("tile.txt").write_text("a tile")
+    journal = written(tmp_path / "out", study).journal("rs-00")
+    journal.append([0], wide(study), {"tile.txt": digest_of("tile.txt")})
+    journal.close()
+    assert "tile.txt" in ResultsDirectory(tmp_path / "out", study).inputs["sources"]
+    Path("tile.txt").write_text("another tile")
+    with pytest.raises(InputError, match=r"tile\.txt has changed since"):
+        ResultsDirectory(tmp_path / "out", study)
+    Path("tile.txt").unlink()
+    with pytest.raises(InputError, match=r"tile\.txt no longer exists"):
+        ResultsDirectory(tmp_path / "out", study)
 
 
 def contents(place: Path) -> dict[str, tuple[bytes, int]]:
@@ -348,7 +317,7 @@ def test_the_status_of_a_finished_study_agrees_with_its_journals(slippery: Path)
 
 def test_a_study_under_way(slippery: Path, tmp_path: Path) -> None:
     shutil.copytree(slippery, tmp_path / "it")
-    nsga2, rs = tmp_path / "it/runs/nsga2-00.journal", tmp_path / "it/runs/rs-00.journal"
+    nsga2, rs = tmp_path / "it/runs/nsga2-00.jsonl", tmp_path / "it/runs/rs-00.jsonl"
     rs.unlink()
     (tmp_path / "it/solutions.csv").unlink()  # written after the last run
     nsga2.write_bytes(nsga2.read_bytes()[:len(nsga2.read_bytes()) * 2 // 3])  # torn, as while somebody writes
@@ -369,28 +338,23 @@ def test_a_study_under_way(slippery: Path, tmp_path: Path) -> None:
 
 def test_reading_a_torn_run_warns(slippery: Path, tmp_path: Path) -> None:
     shutil.copytree(slippery, tmp_path / "it")
-    journal = tmp_path / "it/runs/nsga2-00.journal"
+    journal = tmp_path / "it/runs/nsga2-00.jsonl"
     journal.write_bytes(journal.read_bytes()[:-7])
-    with pytest.warns(UserWarning, match=r"nsga2-00\.journal: the last \d+ bytes are torn, so the run counts as unfinished"):
+    with pytest.warns(UserWarning, match=r"nsga2-00\.jsonl: the last \d+ bytes are torn, so the run counts as unfinished"):
         (case,) = load_cases([tmp_path / "it"])
     assert ("nsga2", 0) not in case.finished_runs
 
 
 def test_a_lost_journal_of_a_finished_study_is_named_with_its_remedy(slippery: Path, tmp_path: Path) -> None:
     shutil.copytree(slippery, tmp_path / "it")
-    lost = tmp_path / "it/runs/rs-00.journal"
-    lost.unlink()
-    with pytest.raises(InputError, match=r"rs-00\.journal: is missing, although solutions\.csv holds.*\nexpected: .*the same study again"):
-        load_runs(tmp_path / "it")
-    assert f"{lost} is missing" in status(tmp_path / "it").remarks[0]
-    (tmp_path / "it/runs/nsga2-00.journal").unlink()
-    with pytest.raises(InputError, match=r"nsga2-00\.journal: is missing \(and 1 more\)"):
+    (tmp_path / "it/runs/rs-00.jsonl").unlink()
+    with pytest.raises(InputError, match=r"rs-00\.jsonl: is missing, although solutions\.csv holds.*\nexpected: .*the same study again"):
         load_runs(tmp_path / "it")
 
 
 def test_every_command_about_solutions_says_which_runs_are_unfinished(slippery: Path, tmp_path: Path) -> None:
     shutil.copytree(slippery, tmp_path / "it")
-    (tmp_path / "it/runs/rs-00.journal").unlink()
+    (tmp_path / "it/runs/rs-00.jsonl").unlink()
     (tmp_path / "it/solutions.csv").unlink()
     for command in (["explain", str(tmp_path / "it"), "--top", "1"], ["simulate", str(tmp_path / "it"), "--most-severe"]):
         done = CliRunner().invoke(commands, command)
@@ -407,13 +371,3 @@ def test_watching_ends_with_the_study_and_json_is_json(slippery: Path) -> None:
     output = json.loads(CliRunner().invoke(commands, ["status", str(slippery), "--json"]).output)
     assert output["finished"] is True
     assert np.isfinite(output["runs"][0]["best"])
-
-
-def test_an_edited_table_is_reported(slippery: Path, tmp_path: Path) -> None:
-    shutil.copytree(slippery, tmp_path / "it")
-    file = tmp_path / "it/solutions.csv"
-    file.write_text(file.read_text().replace("nsga2,0,", "nsga2,1,", 1))
-    done = CliRunner().invoke(commands, ["status", str(tmp_path / "it"), "--json"])
-    assert done.exit_code == 0
-    assert f"{file} was edited" in done.stderr
-    json.loads(done.stdout)

@@ -31,6 +31,7 @@ from safevar_sumo.analysis.explain.sentences import DISTINCT_CAUSE, REASONS, ROB
 from safevar_sumo.analysis.preventability import assess_preventability, classify_collisions
 from safevar_sumo.analysis.research_questions.case import Case
 from safevar_sumo.analysis.subject import study_in
+from safevar_sumo.campaign.pool import Pool
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.progress import Progress, show_no_progress
@@ -41,7 +42,6 @@ from safevar_sumo.results import CHOICES, UNKNOWN, SolutionId, handles_of, row_o
 from safevar_sumo.study import Study
 from safevar_sumo.sumo.matrix import PointResult, simulate, simulate_all_points, worst_points
 from safevar_sumo.sumo.system import System, assemble
-from safevar_sumo.workers.evaluation import Pool
 
 CausesByRow = Mapping[int, list[MinimalCause]]
 """The minimal causes of settings, by the setting's row."""

@@ -17,13 +17,13 @@ from safevar_sumo.analysis.rating.summary import summarise_rated_solutions
 from safevar_sumo.analysis.research_questions.case import Case
 from safevar_sumo.analysis.subject import at_point
 from safevar_sumo.analysis.words import points_in_words, question_command
+from safevar_sumo.campaign.pool import Pool
 from safevar_sumo.metrics import RATING_POINTS
 from safevar_sumo.progress import Progress, show_no_progress
 from safevar_sumo.records import Evaluations
 from safevar_sumo.results import choose_handle, row_of_handle
 from safevar_sumo.sumo.matrix import simulate_all_points
 from safevar_sumo.sumo.system import assemble
-from safevar_sumo.workers.evaluation import Pool
 
 
 def summarise_failures(case: Case, original: Evaluations, pool: Pool, directory: str,

@@ -15,9 +15,9 @@ from safevar_sumo.analysis.subject import Results, answer_question, study_or_cas
 
 if TYPE_CHECKING:
     from safevar_sumo.analysis.opinion.result import Opinions
+    from safevar_sumo.campaign.pool import Pool
     from safevar_sumo.metrics import Criterion
     from safevar_sumo.progress import Progress
-    from safevar_sumo.workers.evaluation import Pool
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -16,6 +16,7 @@ from safevar_sumo.analysis.opinion.multi_body import load_bmw_parameters
 from safevar_sumo.analysis.opinion.result import Opinion, Opinions, RunEnd, Verdict
 from safevar_sumo.analysis.opinion.second_vehicle import SPIN_LIMIT, SecondVehicle
 from safevar_sumo.analysis.research_questions.case import Case
+from safevar_sumo.campaign.pool import Pool
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.progress import Progress, show_no_progress
@@ -23,7 +24,6 @@ from safevar_sumo.records import BoolArray, Evaluations, FloatArray, finite_or_n
 from safevar_sumo.study import Study
 from safevar_sumo.sumo.matrix import evaluate
 from safevar_sumo.sumo.system import System, assemble
-from safevar_sumo.workers.evaluation import Pool
 
 SIMULATION_LIMIT = 12_000
 """Approximate number of simulations that search the minimal causes, the same as for a report."""

@@ -14,6 +14,7 @@ from safevar_sumo.analysis.evaluator import Evaluator, open_evaluator
 from safevar_sumo.analysis.rating import RatingOptions
 from safevar_sumo.analysis.research_questions.case import Case
 from safevar_sumo.analysis.words import join_phrases
+from safevar_sumo.campaign.pool import Pool
 from safevar_sumo.errors import InputError
 from safevar_sumo.progress import Progress, show_no_progress
 from safevar_sumo.protocol import (
@@ -37,7 +38,6 @@ from safevar_sumo.scenarios import weather_of
 from safevar_sumo.study import Study
 from safevar_sumo.sumo.empty_road import driven_entry
 from safevar_sumo.vehicles import CharacteristicSet, region_of
-from safevar_sumo.workers.evaluation import Pool
 
 POINT_KINDS = ("standard", "extended", "robustness")
 DECIMALS = 9

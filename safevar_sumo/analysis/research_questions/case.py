@@ -190,7 +190,7 @@ def _load_case(directory: Path) -> Case:
     except msgspec.ValidationError as error:
         raise error_with_key(directory / MANIFEST, manifest["study"], error, "study") from None
     scoring = msgspec.convert(manifest["scoring"], Scoring) if "scoring" in manifest else PUBLISHED_SCORING
-    study = msgspec.structs.replace(study, origin=Origin(places=folders_of(directory)))
+    study = msgspec.structs.replace(study, origin=Origin(places=folders_of(directory, manifest)))
     return build_case(study, manifest["original"], solutions, evaluations, finished,
                       has_runs="imported" not in manifest, failures=failures, scoring=scoring)
 

@@ -15,13 +15,13 @@ from safevar_sumo.analysis.risk.answer import Estimate, Risk
 from safevar_sumo.analysis.risk.rare import RareMethodError, Response, estimate_rare, is_plateau, load_openturns
 from safevar_sumo.analysis.risk.variation import VariationModel, compute_sensitivities
 from safevar_sumo.analysis.subject import study_in
+from safevar_sumo.campaign.pool import Pool
 from safevar_sumo.errors import InputError, SimulationError
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.progress import Progress, show_no_progress
 from safevar_sumo.records import FloatArray
 from safevar_sumo.study import Study
 from safevar_sumo.vehicles.region import REJECTIONS
-from safevar_sumo.workers.evaluation import Pool
 
 VEHICLES_PER_CHECK = 1000
 """Number of vehicles drawn between two checks of the interval's width."""

@@ -14,9 +14,9 @@ from safevar_sumo.study import StudyLike
 
 if TYPE_CHECKING:
     from safevar_sumo.analysis.rules.compute import Rules
+    from safevar_sumo.campaign.pool import Pool
     from safevar_sumo.metrics import Criterion
     from safevar_sumo.progress import Progress
-    from safevar_sumo.workers.evaluation import Pool
 
 
 @dataclass(frozen=True, kw_only=True)

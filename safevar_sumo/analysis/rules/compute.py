@@ -21,6 +21,7 @@ from safevar_sumo.analysis.research_questions.case import Case
 from safevar_sumo.analysis.rules import RulesOptions
 from safevar_sumo.analysis.subject import study_in
 from safevar_sumo.analysis.words import join_phrases, number_of
+from safevar_sumo.campaign.pool import Pool
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.progress import Progress, show_no_progress
 from safevar_sumo.records import BoolArray, FloatArray
@@ -28,7 +29,6 @@ from safevar_sumo.study import Study
 from safevar_sumo.sumo.empty_road import summary_entry
 from safevar_sumo.terminal import constraints_in_words, meanings
 from safevar_sumo.vehicles import Characteristic, CharacteristicSet
-from safevar_sumo.workers.evaluation import Pool
 
 MIN_SETTINGS = 10
 """Minimum number of unsafe settings, and of safe settings, that rules need."""

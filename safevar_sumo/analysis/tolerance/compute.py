@@ -13,12 +13,12 @@ from safevar_sumo.analysis.tolerance import ToleranceOptions
 from safevar_sumo.analysis.tolerance.answer import Tolerance
 from safevar_sumo.analysis.tolerance.safe_box import SafeBox, find_safe_box, names_of, refuse_tied
 from safevar_sumo.analysis.tolerance.scans import OneAtATimeScan, Pair, scan, scan_pairs
+from safevar_sumo.campaign.pool import Pool
 from safevar_sumo.errors import InputError, unknown_name
 from safevar_sumo.progress import Progress, show_no_progress
 from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.records import FloatArray
 from safevar_sumo.study import Study
-from safevar_sumo.workers.evaluation import Pool
 
 
 def find_tolerances(source: Study | Case, options: ToleranceOptions, *, pool: Pool | None = None, jobs: int | None = None,

@@ -1,30 +1,40 @@
-"""Computation of batches in worker processes of this machine."""
+"""Workers in processes of this machine."""
 
 from __future__ import annotations
 
+import faulthandler
 import multiprocessing
 import os
+import re
 import signal
 import sys
+import tempfile
 import threading
 import traceback
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
+from functools import partial
 from multiprocessing import connection
+from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+from safevar_sumo.campaign.evaluation import Evaluate, evaluate_in_time
+from safevar_sumo.campaign.interrupts import block_interrupts, defer_interrupts
+from safevar_sumo.campaign.pool import PoolLostError, Report, Share, WorkerLostError
+from safevar_sumo.campaign.share import carry_out_share
 from safevar_sumo.errors import EnvironmentFault, SafevarError, describe_error
 from safevar_sumo.plugins import added_import_folders, inherit_import_folders
+from safevar_sumo.plugins.files import is_user_file
 from safevar_sumo.records import Evaluations, FloatArray
-from safevar_sumo.workers.evaluation import PoolLostError, WorkerLostError, evaluate_batch
-from safevar_sumo.workers.interrupts import block_interrupts, defer_interrupts
 
 MAX_START_TIME = 120.0
 """Longest time until a worker process is ready for its first batch [s]."""
 START_ATTEMPTS = 5
 """Number of workers in a row that may die before they are ready, which is never the fault of a batch."""
+TIMEOUT_MARK = "Timeout ("
+"""Begin of what the interpreter writes when a process exceeds its time limit."""
 _start_lock = threading.Lock()
 
 
@@ -42,7 +52,7 @@ def local_pool(jobs: int, time_limit: float) -> Iterator[LocalPool]:
     jobs
         Number of worker processes.
     time_limit
-        Time limit of a batch [s]; a worker that exceeds it is stopped.
+        Time limit of a batch [s]; a worker that exceeds it ends.
     """
     with defer_interrupts():
         pool = LocalPool(jobs, time_limit)
@@ -53,7 +63,7 @@ def local_pool(jobs: int, time_limit: float) -> Iterator[LocalPool]:
 
 
 class LocalPool:
-    """Computes batches in processes. For each process, a thread of this process waits for answers.
+    """Computes batches and carries shares in processes. For each process, a thread of this process waits for its messages.
 
     Workers share no queue and no lock: a worker may die at any moment without harm to the others.
     """
@@ -66,10 +76,10 @@ class LocalPool:
         self._closed = False
 
     def submit(self, work: bytes, settings: FloatArray) -> Future[Evaluations]:
-        try:
-            return self._threads.submit(self._compute, work, settings)
-        except RuntimeError:
-            raise PoolLostError("the worker processes are closed down") from None
+        return self._start(_evaluate, (work, settings), lambda message: None)
+
+    def carry(self, share: Share, report: Report) -> Future[None]:
+        return self._start(carry_out_share, share, report)
 
     def close(self) -> None:
         """Drop waiting batches and end all workers."""
@@ -80,27 +90,39 @@ class LocalPool:
                 self._end(worker)
         self._threads.shutdown()
 
-    def _compute(self, work: bytes, settings: FloatArray) -> Evaluations:
+    def _start(self, function: Callable[..., Any], argument: Any, report: Report) -> Future[Any]:
+        try:
+            return self._threads.submit(self._call, function, argument, report)
+        except RuntimeError:
+            raise PoolLostError("the worker processes are closed down") from None
+
+    def _call(self, function: Callable[..., Any], argument: Any, report: Report) -> Any:
+        """Call a function in this thread's worker; if the worker is lost or `report` fails, the worker is ended."""
         worker: _Worker | None = getattr(self._thread_data, "worker", None)
         if worker is None or not worker.alive:
             worker = self._thread_data.worker = self._new_worker()
         try:
-            return worker.compute(work, settings, self._time_limit)
-        except WorkerLostError:
+            is_answer, answer = worker.call(function, argument)
+            while not is_answer:
+                report(answer)
+                is_answer, answer = worker.receive()
+        except BaseException:
             self._end(worker)
-            self._thread_data.worker = None
             raise
+        if isinstance(answer, Exception):
+            raise answer
+        return answer
 
     def _new_worker(self) -> _Worker:
         for _ in range(START_ATTEMPTS):
             if self._closed:
                 raise PoolLostError("the worker processes are closed down")
-            worker = _Worker()
+            worker = _Worker(self._time_limit)
             self._live_workers.add(worker)
             if self._closed:
                 worker.end()
             try:
-                worker.wait_until_ready()
+                worker.receive(MAX_START_TIME)
             except WorkerLostError as error:
                 self._end(worker)
                 cause = error
@@ -114,13 +136,18 @@ class LocalPool:
 
 
 class _Worker:
-    """A process and the pipe to it. The process is spawned, because libsumo must not be forked."""
+    """A process and the pipe to it. The process is spawned, because libsumo must not be forked.
 
-    def __init__(self) -> None:
-        context = multiprocessing.get_context("spawn")
+    Its last words are a file: where the process was when it exceeded the time limit of a batch or crashed.
+    """
+
+    def __init__(self, time_limit: float) -> None:
+        self._time_limit, context = time_limit, multiprocessing.get_context("spawn")
         try:
+            self._last_words = tempfile.NamedTemporaryFile(prefix="safevar-", suffix=".txt")  # noqa: SIM115
             self._pipe, worker_end = context.Pipe()
-            self._process = context.Process(target=_serve, args=(worker_end, added_import_folders()), daemon=True)
+            arguments = worker_end, added_import_folders(), time_limit, self._last_words.name
+            self._process = context.Process(target=serve, args=arguments, daemon=True)
             with _hide_main():
                 self._process.start()
         except OSError as error:
@@ -131,33 +158,35 @@ class _Worker:
     def alive(self) -> bool:
         return self._process.is_alive()
 
-    def wait_until_ready(self) -> None:
-        """Wait for the first message of the process; raises WorkerLostError without a message."""
-        self._receive(MAX_START_TIME, "start")
+    def call(self, function: Callable[..., Any], argument: Any) -> tuple[bool, Any]:
+        """Let the process call a function; returns the first message."""
+        with suppress(OSError):  # `receive` notices a dead worker
+            self._pipe.send((function, argument))
+        return self.receive()
 
-    def compute(self, work: bytes, settings: FloatArray, time_limit: float) -> Evaluations:
-        """Compute a batch; raises the error of the batch, or WorkerLostError."""
-        with suppress(OSError):  # `_receive` notices a dead worker
-            self._pipe.send((work, settings))
-        answer = self._receive(time_limit, "simulation")
-        if isinstance(answer, Exception):
-            raise answer
-        return answer  # type: ignore[no-any-return]
-
-    def _receive(self, time_limit: float, activity: str) -> Any:
+    def receive(self, time_limit: float | None = None) -> tuple[bool, Any]:
+        """The process's next message: whether it is the answer to a call, and the answer or report."""
         ready = connection.wait([self._pipe, self._process.sentinel], time_limit)
         if not ready:
-            raise WorkerLostError(f"the {activity} took longer than {time_limit:g} s")
+            raise WorkerLostError(f"the start took longer than {time_limit:g} s")
         with suppress(EOFError, OSError):
             if self._pipe in ready:
-                return self._pipe.recv()
+                return self._pipe.recv()  # type: ignore[no-any-return]
         self._process.join()
-        raise WorkerLostError(f"the worker process died (exit code {self._process.exitcode})")
+        raise WorkerLostError(self._cause_of_death())
 
     def end(self) -> None:
-        """Kill the process; a thread in `_receive` then raises WorkerLostError."""
+        """Kill the process; a thread in `receive` then raises WorkerLostError."""
         self._process.kill()
         self._process.join()
+
+    def _cause_of_death(self) -> str:
+        words = Path(self._last_words.name).read_text(encoding="utf-8", errors="replace")
+        frames = [(file, line) for file, line in re.findall(r'File "(.+)", line (\d+) in', words) if is_user_file(file)]
+        place = f" in {frames[0][0]}, line {frames[0][1]}" if frames else ""
+        if TIMEOUT_MARK in words:
+            return f"the simulation took longer than {self._time_limit:g} s{place}"
+        return f"the worker process died (exit code {self._process.exitcode}){place}"
 
 
 @contextmanager
@@ -172,22 +201,27 @@ def _hide_main() -> Iterator[None]:
             sys.modules["__main__"] = main
 
 
-def _serve(pipe: connection.Connection[Any, Any], folders: list[str]) -> None:
-    """The main function of a worker process, which answers batches until the other end of the pipe is closed."""
+def serve(pipe: connection.Connection[Any, Any], folders: list[str], time_limit: float, last_words: str) -> None:
+    """The main function of a worker process, which answers calls until the other end of the pipe is closed."""
     inherit_import_folders(folders)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_caller, daemon=True).start()
-    try:
-        pipe.send(None)
+    with open(last_words, "w", encoding="utf-8") as file, suppress(EOFError, OSError):
+        faulthandler.enable(file=file, all_threads=False)
+        evaluate = partial(evaluate_in_time, time_limit=time_limit, last_words=file)
+        pipe.send((False, None))
         while True:
-            pipe.send(_evaluate_or_return_error(*pipe.recv()))
-    except (EOFError, OSError):
-        return
+            function, argument = pipe.recv()
+            pipe.send((True, _answer_or_error(function, argument, lambda message: pipe.send((False, message)), evaluate)))
 
 
-def _evaluate_or_return_error(work: bytes, settings: FloatArray) -> Evaluations | Exception:
+def _evaluate(batch: tuple[bytes, FloatArray], report: Report, evaluate: Evaluate) -> Evaluations:
+    return evaluate(*batch)
+
+
+def _answer_or_error(function: Callable[..., Any], *arguments: Any) -> Any:
     try:
-        return evaluate_batch(work, settings)
+        return function(*arguments)
     except SafevarError as error:
         return error
     except (OSError, MemoryError) as error:

@@ -1,4 +1,4 @@
-"""Checks that user code does not mix settings up: the result of a setting depends on this setting alone."""
+"""Checks of results: user code does not mix settings up, and recorded scenes give the same results as SUMO."""
 
 from __future__ import annotations
 
@@ -10,17 +10,23 @@ from importlib.metadata import version
 import numpy as np
 import platformdirs
 
-from safevar_sumo.errors import UserCodeError
+from safevar_sumo.campaign.evaluation import pack_study
+from safevar_sumo.campaign.identity import Inputs, network_digests
+from safevar_sumo.campaign.interrupts import wait_for_result
+from safevar_sumo.campaign.retrying import RetryingPool
+from safevar_sumo.errors import InputError, UserCodeError
 from safevar_sumo.output import whole_file
-from safevar_sumo.records import Evaluations
+from safevar_sumo.protocol.rater import study_for_sumo_check
+from safevar_sumo.records import BoolArray, Evaluations
 from safevar_sumo.results import RESULTS
 from safevar_sumo.study import Study, tables_of, user_code_names
+from safevar_sumo.sumo import Engine, assemble
 from safevar_sumo.vehicles import CharacteristicSet
-from safevar_sumo.workers.evaluation import pack_study
-from safevar_sumo.workers.identity import Inputs
-from safevar_sumo.workers.interrupts import wait_for_result
-from safevar_sumo.workers.retrying import RetryingPool
 
+VERIFIED_SETTINGS = 50
+"""Number of settings to verify in SUMO: of a study in questions; and of each run of a campaign, besides the solutions."""
+ROUNDING = 1e-9
+"""Largest accepted difference between a metric in a recorded scene and in SUMO."""
 EXPECTED_RESULTS = (
     "results of a vehicle that depend on this vehicle alone: nothing kept in a class, a module or the model itself from one call or "
     "setting to another, no mean or sum over the batch, nothing random")
@@ -86,3 +92,45 @@ def find_difference(evaluations: Evaluations, other_evaluations: Evaluations,
         if not np.allclose(values, other_values, rtol=0, atol=tolerance, equal_nan=True):
             return name, float(values[0]), float(other_values[0])
     return None
+
+
+def works_for_sumo(study: Study, inputs: Inputs) -> tuple[bytes, bytes]:
+    """The packed study with which SUMO verifies results, and a packed study with comparable results from recorded scenes.
+
+    SUMO repeats only a few cells of a rating; the second study then has the same cells. Otherwise it is empty.
+    """
+    sumo_study = study_for_sumo_check(study, assemble(study).weather)
+    if sumo_study is study:
+        return pack_study(study, inputs, engine=Engine.LIBSUMO), b""
+    inputs = {**inputs, "network": network_digests(assemble(sumo_study))}
+    return pack_study(sumo_study, inputs, engine=Engine.LIBSUMO), pack_study(sumo_study, inputs)
+
+
+def refuse_unlike_sumo(study: Study, recorded: Evaluations, in_sumo: Evaluations) -> None:
+    """Refuse settings with different results in a recorded scene and in SUMO; skip settings that SUMO could not simulate.
+
+    Raises
+    ------
+    InputError
+        With the first such setting and both values.
+    """
+    if in_sumo.failed.all():
+        return  # such evaluations lack the user's metrics
+    for row in np.flatnonzero(~_are_alike(recorded, in_sumo, ROUNDING) & ~in_sumo.failed).tolist():
+        setting = recorded.settings[row]
+        difference = find_difference(recorded.take([row]), in_sumo.take([row]), ROUNDING)
+        if difference:
+            name, value, sumo_value = difference
+            values = ", ".join(f"{key} = {value:.17g}" for key, value in zip(study.vehicle.characteristics, setting, strict=True))
+            raise InputError(f"study {study.name!r}", f"{name} is {value} in the recorded scene and {sumo_value} in SUMO with {values}",
+                             "scenario: reactive_actors = True, if anybody reacts to the vehicle under test; or `engine=sumo`")
+
+
+def _are_alike(batch: Evaluations, other_batch: Evaluations, tolerance: float) -> BoolArray:
+    """Whether each of N settings has the same outcome, and numbers that differ by at most `tolerance`; shape (N,)."""
+    is_alike = batch.outcome == other_batch.outcome
+    quantities = ((batch.collision_speed, other_batch.collision_speed),
+                  *((batch.metrics[name], other_batch.metrics[name]) for name in batch.metrics))
+    for values, other_values in quantities:
+        is_alike &= np.isclose(values, other_values, rtol=0, atol=tolerance, equal_nan=True)
+    return np.asarray(is_alike)

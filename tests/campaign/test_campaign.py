@@ -1,36 +1,34 @@
-"""Runs driven over pools whose evaluations are formulas: reordered, alone and together, with more or fewer of them."""
+"""Runs carried by pools whose evaluations are formulas: in any shares, alone and together, with more or fewer evaluations."""
 
 from __future__ import annotations
 
-from concurrent.futures import Future
+from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 
-import msgspec
 import numpy as np
 import pandas as pd
 import pytest
 
 from safevar_sumo.api.running import CampaignProgress
 from safevar_sumo.campaign import RunKey, all_runs, forecast, run_campaign
-from safevar_sumo.campaign.batcher import BATCHES_PER_WORKER
+from safevar_sumo.campaign.campaign import deal
+from safevar_sumo.campaign.pool import PoolLostError, WorkerLostError
 from safevar_sumo.campaign.run import Run
 from safevar_sumo.errors import SimulationError
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import Evaluations
-from safevar_sumo.results import Journal, ResultsDirectory, load_runs, status
+from safevar_sumo.results import Head, Journal, ResultsDirectory, load_runs, status
 from safevar_sumo.results.journal import read_journal
 from safevar_sumo.search import Search
-from safevar_sumo.study import MatrixTable, Study, tables_of
-from safevar_sumo.workers.evaluation import PoolLostError, WorkerLostError
-from tests.campaign.formulas import SUN, EventLog, FormulaPool, carried_out, evaluated, solutions, with_search
+from safevar_sumo.study import Study, load_study, tables_of
+from tests.campaign.formulas import SUN, Death, EventLog, FormulaPool, carried_out, evaluated, solutions, with_search
 
 
 @pytest.mark.slow
 def test_results_depend_neither_on_workers_nor_on_order_nor_on_batches(study: Study, tmp_path: Path) -> None:
     carried_out(study, tmp_path / "a")
-    for name, pool, batch in (("b", FormulaPool(workers=7), None), ("c", FormulaPool(workers=3, shuffled=True), 3),
-                              ("d", FormulaPool(workers=2, shuffled=True), 1)):
+    for name, pool, batch in (("b", FormulaPool(workers=7), None), ("c", FormulaPool(workers=3), 3), ("d", FormulaPool(workers=2), 1)):
         carried_out(study, tmp_path / name, pool, batch=batch)
         assert solutions(tmp_path / name) == solutions(tmp_path / "a")
         pd.testing.assert_frame_equal(load_runs(tmp_path / name).evaluations, load_runs(tmp_path / "a").evaluations)
@@ -52,36 +50,36 @@ def test_bar_status_and_campaign_count_the_same_collisions(study: Study, tmp_pat
         assert done == total == (0 if again else study.search.evaluations * len(all_runs(study)))
 
 
-class Sizes(FormulaPool):
-    """Keeps the batches' sizes."""
-
-    def __init__(self, workers: int) -> None:
-        super().__init__(workers)
-        self.sizes: list[int] = []
-
-    def submit(self, study: bytes, settings: np.ndarray) -> Future[Evaluations]:
-        self.sizes.append(len(settings))
-        return super().submit(study, settings)
-
-
-def test_runs_share_batches_and_one_run_is_shared_out(study: Study, tmp_path: Path) -> None:
+def test_runs_of_a_share_share_batches(study: Study, tmp_path: Path) -> None:
     large = with_search(study, population=40, evaluations=400, runs=10, algorithms=["rs"])
-    together, alone = Sizes(workers=2), Sizes(workers=2)
+    together, alone = FormulaPool(workers=2), FormulaPool(workers=2)
     carried_out(large, tmp_path / "together", together)
     carried_out(large, tmp_path / "alone", alone, keys=[RunKey("rs", 3)])
     assert np.mean(together.sizes[1:]) > 3 * large.search.population
-    assert alone.sizes[1:3] == [20, 20]
+    assert alone.sizes[1:3] == [40, 40]
     one, other = (load_runs(tmp_path / name).evaluations.query("algorithm == 'rs' and run == 3") for name in ("together", "alone"))
     pd.testing.assert_frame_equal(one.reset_index(drop=True), other.reset_index(drop=True))
+
+
+@pytest.mark.parametrize(("workers", "runs_at_once", "sizes"), [
+    (2, 160, {45}), (1, 80, {45}), (4, 160, {22, 23}), (16, 160, {5, 6}), (200, 160, {1}), (2, 8, {7, 8})])
+def test_runs_are_dealt_in_equal_shares_with_equally_many_runs_of_each_algorithm(
+        workers: int, runs_at_once: int, sizes: set[int]) -> None:
+    keys = [RunKey(name, run) for name in ("nsga2", "rs", "safe_fuzzer") for run in range(30)]
+    shares = deal(keys, workers, runs_at_once)
+    assert sorted(key for share in shares for key in share) == sorted(keys)
+    assert {len(share) for share in shares} == sizes
+    assert workers > 90 or len(shares) % workers == 0
+    for share in shares:
+        numbers = Counter(key.algorithm for key in share)
+        assert len(share) < 3 or max(numbers.values()) - min(numbers.values()) <= 1
 
 
 class Colliding(FormulaPool):
     """Everybody collides, the original vehicle too."""
 
-    def submit(self, study: bytes, settings: np.ndarray) -> Future[Evaluations]:
-        future = Future[Evaluations]()
-        future.set_result(replace(evaluated(settings), outcome=np.full(len(settings), "collision")))
-        return future
+    def evaluate(self, work: bytes, settings: np.ndarray) -> Evaluations:
+        return replace(evaluated(settings), outcome=np.full(len(settings), "collision"))
 
 
 def test_an_original_vehicle_that_collides_is_told(study: Study, tmp_path: Path) -> None:
@@ -101,7 +99,7 @@ def test_a_campaign_that_breaks_down_anywhere_is_resumed_where_it_was(study: Stu
         carried_out(study, out, second)
         assert solutions(out) == solutions(tmp_path / "whole")
         assert set(first.simulated + second.simulated) == set(whole.simulated)
-        under_way = BATCHES_PER_WORKER * study.search.population
+        under_way = len(all_runs(study)) * study.search.population
         assert len(first.simulated) + len(second.simulated) <= len(whole.simulated) + under_way
 
 
@@ -164,7 +162,7 @@ def test_more_or_fewer_evaluations_go_on_and_end_as_if_there_had_never_been_othe
 
 
 def test_every_evaluation_is_read_in_the_order_in_which_it_was_asked_for(study: Study, tmp_path: Path) -> None:
-    carried_out(study, tmp_path, FormulaPool(workers=4, shuffled=True), batch=3)
+    carried_out(study, tmp_path, FormulaPool(workers=4), batch=3)
     results = load_runs(tmp_path)
     frame = results.evaluations
     assert list(frame.columns[:3]) == ["algorithm", "run", "evaluation"]
@@ -180,32 +178,28 @@ def test_every_evaluation_is_read_in_the_order_in_which_it_was_asked_for(study: 
     assert results.manifest["study"] == tables_of(study)
 
 
-def test_a_forecast_counts_and_measures(study: Study) -> None:
-    ahead = forecast(study, 6, FormulaPool())
-    assert ahead.evaluations == 600
-    assert ahead.seconds == pytest.approx(600 / ahead.rate)
-    assert ahead.size >= 600 * 8 * (12 + len(METRICS))
-
-
 @pytest.mark.parametrize("workers", [1, 4])
-def test_a_forecast_tells_what_all_workers_do_together(workers: int, study: Study, monkeypatch: pytest.MonkeyPatch) -> None:
-    seconds = iter(range(100))
+def test_a_forecast_counts_and_measures_the_search_itself(workers: int, study: Study, monkeypatch: pytest.MonkeyPatch) -> None:
+    seconds = iter(range(100_000))
     monkeypatch.setattr("time.perf_counter", lambda: float(next(seconds)))
     pool = FormulaPool(workers)
-    rate = forecast(study, 6, pool).rate
-    assert rate == 4 / 5 * (len(pool.simulated) - workers), "settings of the second probe, in a second; the first one warms up"
+    ahead = forecast(study, 6, pool)
+    assert ahead.evaluations == 600
+    assert ahead.seconds == pytest.approx(600 / ahead.rate)
+    assert 600 * 8 * (12 + len(METRICS)) <= ahead.size <= 600 * 20 * (17 + len(METRICS))
+    assert study.search.population / 4 < ahead.rate <= 6 * study.search.population, "at most a generation of all runs in a second"
 
 
 def test_a_forecast_of_many_points_measures_few_vehicles(study: Study) -> None:
-    rated, pool = msgspec.structs.replace(study, matrix=MatrixTable(protocol="euro_ncap_2026")), FormulaPool()
+    rated, pool = load_study("smoke", matrix={"protocol": "euro_ncap_2026"}), FormulaPool()
     forecast(rated, 6, pool)
-    assert (1 + 4) * 1 <= len(pool.simulated) <= 1 + (1 + 4) * 8000 // 1859
+    assert max(pool.sizes[:5]) <= 8000 // 1859
 
 
 def test_a_torn_tail_is_told_and_simulated_again(study: Study, tmp_path: Path) -> None:
     carried_out(study, tmp_path)
     before = solutions(tmp_path)
-    torn = tmp_path / "runs" / "nsga2-01.journal"
+    torn = tmp_path / "runs" / "nsga2-01.jsonl"
     torn.write_bytes(torn.read_bytes()[:-700])
     pool = FormulaPool()
     _, observer = carried_out(study, tmp_path, pool)
@@ -221,64 +215,85 @@ def test_a_setting_that_is_asked_for_twice_stands_where_it_was_asked_for_first(t
     def twice() -> Search:
         return (yield settings).take([0])
 
-    run = Run(RunKey("nsga2", 0), twice(), Journal(tmp_path / "a.journal", "study", "nsga2-00"), EventLog(), budget=3)
+    head = Head("study", "nsga2-00", SUN.names)
+    run = Run(RunKey("nsga2", 0), twice(), Journal(tmp_path / "a.jsonl", head), budget=3)
     assert not run.advance()
-    assert run.receive(evaluated(run.missing_settings))
-    run.advance()
+    run.receive(evaluated(run.missing_settings), {})
+    assert run.advance()
     run.close()
-    assert read_journal(tmp_path / "a.journal", "study", "nsga2-00").positions == [0, 1]
+    assert read_journal(tmp_path / "a.jsonl", head).positions == [0, 1]
+
+
+class Deadly(FormulaPool):
+    """A worker dies of low tyre friction, at every attempt or only at each setting's first."""
+
+    def __init__(self, workers: int = 1, *, always: bool = True) -> None:
+        super().__init__(workers)
+        self._always = always
+        self._killed = set[bytes]()
+
+    def evaluate(self, work: bytes, settings: np.ndarray) -> Evaluations:
+        deadly = {setting.tobytes() for setting in settings if setting[8] < 1.3}
+        if deadly if self._always else not deadly <= self._killed:
+            self._killed |= deadly
+            raise Death("died")
+        return super().evaluate(work, settings)
 
 
 @pytest.mark.slow
-def test_failures_are_counted_kept_out_and_not_met_again(study: Study, tmp_path: Path) -> None:
-    class Deadly(FormulaPool):
-        """A worker dies of low tyre friction."""
-
-        def submit(self, work: bytes, settings: np.ndarray) -> Future[Evaluations]:
-            if np.any(settings[:, 8] < 1.3):
-                future: Future[Evaluations] = Future()
-                future.set_exception(WorkerLostError("died"))
-                return future
-            return super().submit(work, settings)
-
-    campaign, _ = carried_out(study, tmp_path, Deadly())
+@pytest.mark.parametrize("workers", [1, 2])
+def test_settings_that_a_worker_dies_of_are_counted_kept_out_and_not_met_again(workers: int, study: Study, tmp_path: Path) -> None:
+    pool = Deadly(workers)
+    campaign, _ = carried_out(study, tmp_path, pool)
     frame = load_runs(tmp_path).evaluations
     failed = frame["outcome"] == "simulator-error"
     assert failed.sum() == len(campaign.failures) > 0
     assert np.array_equal(failed, frame["tireFric"] < 1.3)
     assert not (load_runs(tmp_path).solutions["tireFric"] < 1.3).any()
+    repeated = Counter(pool.simulated)
+    del repeated[SUN.original.tobytes()]
+    assert max(repeated.values()) <= 3, "an intact row is journalled at once: what kills a worker costs no other result"
     before = solutions(tmp_path)
     again, _ = carried_out(study, tmp_path, FormulaPool(limit=0))
     assert again.failures == campaign.failures
     assert solutions(tmp_path) == before
-    for path in (tmp_path / "runs").glob("*-*.journal"):
-        path.write_bytes(path.read_bytes()[:-3])
-    again, _ = carried_out(study, tmp_path, FormulaPool(limit=0))
-    assert again.failures == campaign.failures
-    assert solutions(tmp_path) == before
+
+
+def test_a_worker_that_dies_once_leaves_the_same_bytes(study: Study, tmp_path: Path) -> None:
+    carried_out(study, tmp_path / "whole")
+    campaign, _ = carried_out(study, tmp_path / "out", Deadly(always=False))
+    assert campaign.failures == []
+    assert solutions(tmp_path / "out") == solutions(tmp_path / "whole")
+
+
+def test_a_worker_that_always_dies_outside_of_batches_ends_the_study(
+        study: Study, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def die(*_: object) -> bool:
+        raise Death("died in the search")
+
+    monkeypatch.setattr(Run, "advance", die)
+    with pytest.raises(WorkerLostError, match="died in the search"):
+        carried_out(study, tmp_path)
+
+
+class Outage(FormulaPool):
+    """Cannot simulate low tyre friction today."""
+
+    def evaluate(self, work: bytes, settings: np.ndarray) -> Evaluations:
+        if np.any(settings[:, 8] < 1.3):
+            raise SimulationError("SUMO failed: it has its day off")
+        return super().evaluate(work, settings)
 
 
 @pytest.mark.slow
 def test_failed_settings_are_tried_again_when_that_is_asked_for(study: Study, tmp_path: Path) -> None:
-    class Outage(FormulaPool):
-        """Cannot simulate low tyre friction today."""
-
-        def submit(self, work: bytes, settings: np.ndarray) -> Future[Evaluations]:
-            if np.any(settings[:, 8] < 1.3):
-                future: Future[Evaluations] = Future()
-                future.set_exception(SimulationError("SUMO failed: it has its day off"))
-                return future
-            return super().submit(work, settings)
-
     failed, _ = carried_out(study, tmp_path / "out", Outage())
     results = load_runs(tmp_path / "out")
     assert list(results.failures) == failed.failures != []
     assert {one.reason for one in failed.failures} == {"SUMO failed: it has its day off"}
     with pytest.raises(PoolLostError):  # a retry that breaks down is gone on with
-        run_campaign(study, all_runs(study), ResultsDirectory(tmp_path / "out", study), FormulaPool(limit=7), EventLog(), retry_failed=True)
-    pool = FormulaPool()
-    campaign = run_campaign(study, all_runs(study), ResultsDirectory(tmp_path / "out", study), pool, EventLog(), retry_failed=True)
-    ResultsDirectory(tmp_path / "out", study).finish(campaign.solutions)
+        carried_out(study, tmp_path / "out", FormulaPool(limit=7), retry_failed=True)
+    campaign, _ = carried_out(study, tmp_path / "out", retry_failed=True)
     carried_out(study, tmp_path / "whole")
     assert campaign.failures == []
     assert solutions(tmp_path / "out") == solutions(tmp_path / "whole")

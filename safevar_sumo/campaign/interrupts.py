@@ -11,10 +11,13 @@ import sys
 import threading
 from collections.abc import Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, wait
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from queue import Empty, SimpleQueue
+from typing import TypeVar
 
 from safevar_sumo.records import Evaluations
 
+Item = TypeVar("Item")
 SECONDS_BETWEEN_CHECKS = 0.2
 """Longest time for which Ctrl-C goes unnoticed [s]."""
 _interrupt = threading.Event()
@@ -22,7 +25,7 @@ _interrupt = threading.Event()
 
 @contextmanager
 def defer_interrupts() -> Iterator[None]:
-    """Raise Ctrl-C only in `wait_for_first` and `wait_for_result`, and at the end of this context."""
+    """Raise Ctrl-C only in the functions that wait, and at the end of this context."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -63,6 +66,14 @@ def wait_for_result(future: Future[Evaluations]) -> Evaluations:
     return future.result()
 
 
+def wait_for_next(queue: SimpleQueue[Item]) -> Item:
+    """The next item of a queue that other threads fill."""
+    while True:
+        _raise_pending_interrupt()
+        with suppress(Empty):
+            return queue.get(timeout=SECONDS_BETWEEN_CHECKS)
+
+
 def _raise_pending_interrupt() -> None:
     if _interrupt.is_set():
         _interrupt.clear()
@@ -71,7 +82,7 @@ def _raise_pending_interrupt() -> None:
 
 def block_interrupts() -> None:
     """Block Ctrl-C in this thread and, because the mask is inherited, in the processes that the thread starts."""
-    if sys.platform == "win32":  # Windows has no signal masks; `_serve` in local.py ignores interrupts
+    if sys.platform == "win32":  # Windows has no signal masks; `serve` in local.py ignores interrupts
         return
     from multiprocessing import resource_tracker
 

@@ -9,26 +9,23 @@ from typing import Any
 
 import numpy as np
 
+from safevar_sumo.campaign.checks import VERIFIED_SETTINGS, check_code, refuse_unlike_sumo, works_for_sumo
+from safevar_sumo.campaign.evaluation import pack_study
+from safevar_sumo.campaign.identity import Inputs, network_digests
+from safevar_sumo.campaign.interrupts import wait_for_first, wait_for_result
+from safevar_sumo.campaign.pool import Pool
+from safevar_sumo.campaign.retrying import RetryingPool
 from safevar_sumo.errors import warn
 from safevar_sumo.plugins import Files, digest_of, digests, file_by_name, files_named_in
-from safevar_sumo.protocol.rater import study_for_sumo_check
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.study import Study, fmus_of, user_code_names
 from safevar_sumo.sumo import Engine, assemble, reason_for_sumo, settings_per_batch
 from safevar_sumo.vehicles import CharacteristicSet
-from safevar_sumo.workers.evaluation import Pool, pack_study
-from safevar_sumo.workers.identity import Inputs, network_digests
-from safevar_sumo.workers.interrupts import wait_for_first, wait_for_result
-from safevar_sumo.workers.isolation import check_code
-from safevar_sumo.workers.retrying import RetryingPool
-from safevar_sumo.workers.sumo_check import refuse_unlike_sumo
 
 BATCHES_PER_CALL_AND_WORKER = 4
 """Number of batches per worker: with several small batches, no worker waits long for another."""
 SMALLEST_BATCH = 1 / 20
 """Smallest batch, as a share of the most economical one: a smaller batch takes as long."""
-VERIFIED_SETTINGS = 50
-"""Number of settings to verify in SUMO: of a study, over all calls of `evaluate_all`; and of each run of a campaign."""
 _batch_sizes: dict[bytes, tuple[int, bool]] = {}
 """Results of `choose_batch_size`, by packed study."""
 _verified_counts: dict[bytes, int] = {}
@@ -64,11 +61,10 @@ def evaluate_all(study: Study, settings: FloatArray, pool: Pool, done: Callable[
     sample = np.linspace(0, len(distinct_settings) - 1, sample_size).astype(int)
     sumo_future = recorded_future = None
     if is_recorded and len(sample):
-        sumo_study = study_for_sumo_check(study, assemble(study).weather)
-        sumo_inputs = inputs if sumo_study is study else inputs_of(sumo_study, pool)
-        sumo_future = retrying_pool.submit(pack_study(sumo_study, sumo_inputs, engine=Engine.LIBSUMO), distinct_settings[sample])
-        if sumo_study is not study:
-            recorded_future = retrying_pool.submit(pack_study(sumo_study, sumo_inputs), distinct_settings[sample])
+        sumo_work, recorded_work = works_for_sumo(study, inputs)
+        sumo_future = retrying_pool.submit(sumo_work, distinct_settings[sample])
+        if recorded_work:
+            recorded_future = retrying_pool.submit(recorded_work, distinct_settings[sample])
     evaluations_by_start: dict[int, Evaluations] = {}
     while len(evaluations_by_start) < len(futures):
         for future in wait_for_first([future for future, start in futures.items() if start not in evaluations_by_start]):

@@ -15,6 +15,12 @@ import numpy as np
 import psutil
 import pytest
 
+from safevar_sumo.campaign.checks import find_difference, refuse_unlike_sumo
+from safevar_sumo.campaign.evaluation import pack_study
+from safevar_sumo.campaign.interrupts import defer_interrupts, wait_for_first, wait_for_result
+from safevar_sumo.campaign.local import LocalPool, local_pool
+from safevar_sumo.campaign.pool import PoolLostError, WorkerLostError
+from safevar_sumo.campaign.retrying import RetryingPool, reproduction_command
 from safevar_sumo.errors import EnvironmentFault, InputError, SimulationError, UserCodeError
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import Evaluations, Outcome
@@ -22,11 +28,6 @@ from safevar_sumo.study import ModelTable, Origin, Study, load_study
 from safevar_sumo.sumo.matrix import study_at
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet
-from safevar_sumo.workers.evaluation import PoolLostError, WorkerLostError, pack_study
-from safevar_sumo.workers.interrupts import defer_interrupts, wait_for_first, wait_for_result
-from safevar_sumo.workers.isolation import find_difference
-from safevar_sumo.workers.local import LocalPool, local_pool
-from safevar_sumo.workers.retrying import ATTEMPTS, RetryingPool, reproduction_command
 
 pytestmark = pytest.mark.usefixtures("worker_processes")
 SMOKE = pack_study(load_study("smoke"))
@@ -169,6 +170,15 @@ def test_metrics_that_only_one_side_has_are_a_difference() -> None:
         assert sum("safety_degree" in str(names) for names in lists) == 1
 
 
+def test_settings_that_all_fail_in_sumo_lack_the_users_metrics() -> None:
+    once = evaluated(settings(1))
+    recorded = replace(once, metrics={**once.metrics, "mine": np.array([1.0])})
+    failed = replace(once, outcome=np.array([Outcome.SIMULATOR_ERROR.value], dtype="U16"))
+    refuse_unlike_sumo(STUDY, recorded, failed)
+    with pytest.raises(InputError, match=r"mine is 1\.0 in the recorded scene and 2\.0 in SUMO"):
+        refuse_unlike_sumo(STUDY, recorded, replace(recorded, metrics={**once.metrics, "mine": np.array([2.0])}))
+
+
 def died() -> WorkerLostError:
     return WorkerLostError("the worker process died (exit code -9)")
 
@@ -193,7 +203,7 @@ def test_the_setting_that_kills_its_worker_alone_is_told_from_the_others() -> No
     assert np.isnan(result.objectives[2, 0])
     assert np.array_equal(result.f_safe[result.valid], settings(8)[result.valid, 0] / 3)
     assert np.array_equal(result.f_num_diff, SUN.number_changed(settings(8)))
-    assert pool.tried.count(1) == 6 + 2 * (ATTEMPTS + 2), "each twice alone, the original in between, and once more"
+    assert pool.tried == [8, 8] + [1] * (6 + 2 * 3), "each alone, the original, and once more"
 
 
 def test_what_the_study_is_at_fault_for_ends_at_once_with_that_fault() -> None:

@@ -5,15 +5,13 @@ from __future__ import annotations
 import platform
 import sys
 from collections.abc import Mapping
-from functools import cache
-from hashlib import sha256
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
 import msgspec
 
-from safevar_sumo.plugins import DIGEST_LENGTH, files_named_in
+from safevar_sumo.plugins import files_named_in
 from safevar_sumo.results import RESULTS, evaluation_keys
 from safevar_sumo.study import Study, tables_of
 from safevar_sumo.sumo.network import open_network
@@ -21,10 +19,6 @@ from safevar_sumo.sumo.system import System
 
 Inputs = dict[str, dict[str, str]]
 """Digests of files, by layer and name."""
-EXPONENTS = (1 / 21, 1 / 20, -21.0, 21.0)
-"""Exponents of the powers that NSGA-II's operators compute (distribution index 20)."""
-BASES = 2000
-"""Number of bases for each exponent."""
 
 
 def identity_of(study: Study, system: System, sources: Mapping[str, str] = MappingProxyType({})) -> dict[str, Any]:
@@ -36,7 +30,7 @@ def identity_of(study: Study, system: System, sources: Mapping[str, str] = Mappi
     Parameters
     ----------
     sources
-        Digests of the files that user code reads: see `safevar_sumo.workers.batches.source_digests`.
+        Digests of the files that user code reads: see `safevar_sumo.campaign.batches.source_digests`.
     """
     resolved = evaluation_keys(study)
     for table, model in (("vehicle", system.vehicle), ("ads", system.ads), ("scenario", system.scenario)):
@@ -47,7 +41,8 @@ def identity_of(study: Study, system: System, sources: Mapping[str, str] = Mappi
     resolved["weather"] = msgspec.to_builtins(system.weather)
     if system.matrix and system.rater is None:
         resolved["weathers"] = [msgspec.to_builtins(point.weather) for point in system.matrix]
-    return {"resolved": resolved, "network": network_digests(system), "sources": dict(sources), "results": RESULTS, "platform": _platform()}
+    return {"resolved": resolved, "network": network_digests(system), "sources": dict(sources), "results": RESULTS,
+            "platform": {"system": platform.system(), "machine": platform.machine()}}
 
 
 def input_files(study: Study, system: System) -> list[Path]:
@@ -65,13 +60,3 @@ def network_digests(system: System) -> dict[str, str]:
         return dict(open_network(folders[0]).digests)
     return {f"{Path(folder).name}/{name}": digest for folder in folders for name, digest in open_network(folder).digests}
 
-
-@cache
-def _platform() -> dict[str, str]:
-    return {"system": platform.system(), "machine": platform.machine(), "powers": powers_digest()}
-
-
-def powers_digest() -> str:
-    """Digest of sample powers: of all operations, only powers depend on the mathematical library and not on IEEE 754 alone."""
-    bases = [(i + 0.5) / BASES * 2 for i in range(BASES)]
-    return sha256(repr([[base ** exponent for base in bases] for exponent in EXPONENTS]).encode()).hexdigest()[:DIGEST_LENGTH]

@@ -9,23 +9,23 @@ from pathlib import Path
 import msgspec
 import pytest
 
+from safevar_sumo.campaign.batches import source_digests
+from safevar_sumo.campaign.evaluation import evaluate_batch, pack_study
+from safevar_sumo.campaign.identity import identity_of, network_digests
 from safevar_sumo.errors import InputError
 from safevar_sumo.plugins import changed_files, digest_of
-from safevar_sumo.results.manifest import LAYERS
+from safevar_sumo.results.manifest import IDENTITY
 from safevar_sumo.shipped import NETWORKS
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet
-from safevar_sumo.workers.batches import source_digests
-from safevar_sumo.workers.evaluation import evaluate_batch, pack_study
-from safevar_sumo.workers.identity import identity_of, network_digests, powers_digest
 from tests.in_process import InlinePool
 
 
 def test_names_and_defaults_are_resolved_to_numbers() -> None:
     study = load_study("rain")
     identity = identity_of(study, assemble(study))
-    assert set(identity) <= set(LAYERS)
+    assert set(identity) <= set(IDENTITY)
     assert json.dumps(identity, allow_nan=False)
     assert identity["resolved"]["weather"]["road_friction"] == 1
     given = load_study("rain", ads={"parameters": {}}).ads.parameters
@@ -57,12 +57,6 @@ def test_a_network_that_changes_between_two_batches_is_noticed(tmp_path: Path) -
     traffic.write_text(traffic.read_text() + "<!-- -->")
     with pytest.raises(InputError, match=r"traffic\.rou\.xml: is not the file"):
         evaluate_batch(work, original)
-
-
-def test_powers_that_are_rounded_differently_are_told_apart(monkeypatch: pytest.MonkeyPatch) -> None:
-    before = powers_digest()
-    monkeypatch.setattr("safevar_sumo.workers.identity.EXPONENTS", (1 / 21 * (1 + 2**-52), 1 / 20, -21.0, 21.0))
-    assert powers_digest() != before
 
 
 ADS = """

@@ -1,0 +1,144 @@
+"""Evaluation of a batch: a pure function for any process on any machine."""
+
+from __future__ import annotations
+
+import faulthandler
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from functools import lru_cache
+from typing import IO, Any
+
+import msgspec
+
+from safevar_sumo.campaign.identity import Inputs, network_digests
+from safevar_sumo.errors import InputError
+from safevar_sumo.metrics import METRICS
+from safevar_sumo.plugins import Files, changed_files, digests, note_inputs, unload_user_modules
+from safevar_sumo.records import Evaluations, FloatArray
+from safevar_sumo.results import LAYERS_OF_FILES
+from safevar_sumo.study import Study, user_code_packages
+from safevar_sumo.sumo.empty_road import why_no_verdict
+from safevar_sumo.sumo.engine import Engine
+from safevar_sumo.sumo.matrix import evaluate, evaluate_cells
+from safevar_sumo.sumo.system import System, assemble
+
+Evaluate = Callable[[bytes, FloatArray], Evaluations]
+"""A function that evaluates settings of a packed study, as `evaluate_batch` does."""
+
+
+class Task(msgspec.Struct, frozen=True):
+    """A study for a worker, with digests of the files that its results depend on, and the way to evaluate its settings.
+
+    See `pack_study` for the fields.
+    """
+
+    study: Study
+    inputs: Inputs
+    engine: Engine
+    afresh: bool
+    check: bool
+    cells: tuple[int, int] | None
+    empty_road: bool
+
+
+def pack_study(study: Study, inputs: Mapping[str, Any] | None = None, *, engine: Engine = Engine.RECORDED, afresh: bool = False,
+               check: bool = False, cells: tuple[int, int] | None = None, empty_road: bool = False) -> bytes:
+    """Pack a study for a worker as bytes.
+
+    Parameters
+    ----------
+    inputs
+        Digests of files by layer and name; by default those of the present networks. A worker refuses to compute with other files, and
+        reports files that user code reads and `sources` lacks.
+    engine
+        What moves the vehicles.
+    afresh
+        Whether models are reloaded, which removes all state of earlier batches from their modules and classes.
+    check
+        Whether the worker only checks the user code; the `reasons` of the result are then remarks on this code.
+    cells
+        (k, n): for a rated study, results in part k of n parts of the cells, instead of points for all cells.
+    empty_road
+        Whether the worker only applies `why_no_verdict`; the sentence, if any, is the only one of the result's `reasons`.
+    """
+    if inputs is None:
+        inputs = {"network": network_digests(assemble(study))}
+    shared_inputs = {layer: dict(inputs[layer]) for layer in LAYERS_OF_FILES if layer in inputs}
+    return msgspec.msgpack.encode(Task(study, shared_inputs, engine, afresh, check, cells, empty_road))
+
+
+@lru_cache(maxsize=8)
+def task_of(work: bytes) -> Task:
+    """The unpacked task."""
+    return msgspec.msgpack.decode(work, type=Task)
+
+
+def evaluate_batch(work: bytes, settings: FloatArray) -> Evaluations:
+    """Evaluate settings, shape (k, n), of a packed study.
+
+    Raises
+    ------
+    InputError
+        If files of the study have changed since the campaign began.
+    """
+    task = task_of(work)
+    if task.check:
+        from safevar_sumo.plugins.check import refuse_defects  # slow to import, and rarely needed
+
+        remarks = refuse_defects(task.study)
+        return replace(Evaluations.none(settings.shape[1], METRICS), reasons={remark.encode(): remark for remark in remarks})
+    if task.afresh:
+        unload_user_modules()
+    with note_inputs() as reading:
+        system = assemble(task.study) if task.afresh else system_of(work)
+        _refuse_changed_networks(task.inputs, system)
+        if task.empty_road:
+            reason = why_no_verdict(system)
+            evaluations = replace(Evaluations.none(settings.shape[1], METRICS), reasons={b"": reason} if reason else {})
+        elif task.cells is not None:
+            evaluations = evaluate_cells(system, settings, task.cells, task.engine)
+        else:
+            evaluations = evaluate(system, settings, task.engine)
+    _refuse_changed_networks(task.inputs, system)
+    files_read = digests(reading.files(user_code_packages(task.study)), task.study.origin.places)
+    return replace(evaluations, files=_find_unknown_files(task, files_read))
+
+
+def evaluate_in_time(work: bytes, settings: FloatArray, time_limit: float, last_words: IO[str]) -> Evaluations:
+    """Evaluate a batch; a process that takes longer than the time limit [s] writes to a file what it is doing, and ends."""
+    faulthandler.dump_traceback_later(time_limit, exit=True, file=last_words)
+    try:
+        return evaluate_batch(work, settings)
+    finally:
+        faulthandler.cancel_dump_traceback_later()
+
+
+def system_of(work: bytes) -> System:
+    """The system of a packed study; it is kept, and stays the same even if source files change."""
+    task = task_of(work)
+    return _assemble_packed(msgspec.msgpack.encode((task.study, task.inputs)))
+
+
+@lru_cache(maxsize=4)
+def _assemble_packed(study_and_inputs: bytes) -> System:
+    study, _ = msgspec.msgpack.decode(study_and_inputs, type=tuple[Study, Inputs])
+    return assemble(study)
+
+
+def _refuse_changed_networks(expected: Inputs, system: System) -> None:
+    if "network" in expected:
+        refuse_changed_files(changed_files(expected["network"], network_digests(system)))
+
+
+def _find_unknown_files(task: Task, files: Files) -> Files:
+    """The files that were not known when the study began; refuses known files that have changed."""
+    sources = task.inputs.get("sources", {})
+    refuse_changed_files([name for name, digest in files.items() if sources.get(name, digest) != digest])
+    return {name: digest for name, digest in files.items() if name not in sources}
+
+
+def refuse_changed_files(files: list[str]) -> None:
+    """Raise an error if there are files that have changed since the study began."""
+    if files:
+        raise InputError(files[0], "is not the file that this study began with: it was changed meanwhile, or a worker has another one",
+                         "the file as it was, and the same command; or another `out`")

@@ -1,1 +1,0 @@
-"""Computation of batches, in processes of this machine or on a cluster."""
