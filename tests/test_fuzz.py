@@ -18,7 +18,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import safevar_sumo.cli.study
-from safevar_sumo.ads import GuardedAds, PerVehicleAds
+from safevar_sumo.ads import Ads, GuardedAds, PerVehicleAds
 from safevar_sumo.cli.program import commands
 from safevar_sumo.errors import InputError, SafevarError, UserCodeError
 from safevar_sumo.metrics import METRICS
@@ -74,7 +74,7 @@ COMMANDS = st.one_of(ANYTHING, st.none(), st.tuples(ANYTHING, ANYTHING), st.tupl
                      st.tuples(st.floats(0, 1), st.sampled_from([0, True, np.float32(0.5), np.array(0.5), np.array([0.5])])))
 
 
-class Returning:
+class Returning(Ads):
     """An ADS, for one vehicle or for many, that returns what it is given."""
 
     def __init__(self, what: object) -> None:

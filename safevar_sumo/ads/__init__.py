@@ -6,7 +6,7 @@ from typing import Any
 from safevar_sumo.ads.acc import Acc
 from safevar_sumo.ads.aeb import Aeb
 from safevar_sumo.ads.apollo import Apollo
-from safevar_sumo.ads.base import ADS_CONTRACT, REACTION_PARAMETERS, SCALAR_ADS_CONTRACT, Ads, GuardedAds, PerVehicleAds, ScalarAds
+from safevar_sumo.ads.base import REACTION_PARAMETERS, Ads, GuardedAds, PerVehicleAds, ScalarAds
 from safevar_sumo.ads.competent_driver import CompetentDriver
 from safevar_sumo.ads.fmu import FmuAds
 from safevar_sumo.ads.full_braking import FullBraking
@@ -31,4 +31,4 @@ ADS: Mapping[str, type[Any]] = {
     "world_on_rails": WorldOnRails,
 }
 
-__all__ = ["ADS", "ADS_CONTRACT", "REACTION_PARAMETERS", "SCALAR_ADS_CONTRACT", "Ads", "FmuAds", "GuardedAds", "PerVehicleAds", "ScalarAds"]
+__all__ = ["ADS", "REACTION_PARAMETERS", "Ads", "FmuAds", "GuardedAds", "PerVehicleAds", "ScalarAds"]

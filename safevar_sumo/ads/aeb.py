@@ -7,7 +7,7 @@ from typing import Annotated, NamedTuple
 import numpy as np
 from msgspec import Meta, Struct
 
-from safevar_sumo.ads.base import NonNegativeParameter, PositiveParameter
+from safevar_sumo.ads.base import Ads, NonNegativeParameter, PositiveParameter
 from safevar_sumo.ads.driver import Trim, is_in_the_way, pedals_for, time_to_reach, trim_at
 from safevar_sumo.records import BoolArray, Command, FloatArray, Nominal, Observation
 
@@ -29,7 +29,7 @@ class _Memory(NamedTuple):
     warns: BoolArray
 
 
-class Aeb(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class Aeb(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Holds its speed; brakes in part, then fully, when the gap to an obstacle in its way falls below its braking distances.
 
     distance = v rt + max(v_rel^2 / (2 b), v^2 / (2 b) - u^2 / (2 b_u)) + margin, with

@@ -7,6 +7,7 @@ from typing import Annotated, NamedTuple
 import numpy as np
 from msgspec import Meta, Struct
 
+from safevar_sumo.ads.base import Ads
 from safevar_sumo.ads.driver import interpolate_tables
 from safevar_sumo.records import BoolArray, Command, FloatArray, Nominal, Observation
 
@@ -29,7 +30,7 @@ class _Memory(NamedTuple):
     creeping_time: FloatArray
 
 
-class Apollo(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class Apollo(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Cruises, plans a comfortable stop before the obstacle, creeps to the end of the stop and holds.
 
     Parameters

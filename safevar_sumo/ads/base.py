@@ -5,36 +5,53 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from itertools import repeat
-from typing import Annotated, Any, Protocol
+from typing import Annotated, Any
 
 import numpy as np
 from msgspec import Meta
 
-from safevar_sumo.plugins import Contract, Guard, open_rows, read_only_copy
+from safevar_sumo.plugins import Guard, open_rows, read_only_copy
 from safevar_sumo.records import BoolArray, Command, FloatArray, Nominal, Observation
 
 PositiveParameter = Annotated[float, Meta(gt=0, le=1e3)]
 """A driver's parameter above 0, in SI units."""
 NonNegativeParameter = Annotated[float, Meta(ge=0, le=1e3)]
 """A driver's parameter that may be 0, in SI units."""
+
+
 REACTION_PARAMETERS = ("recognition_delay", "hesitation")
 """Names of the parameters of an ADS that delay its reaction [s]; a study may raise them in bad weather."""
 
 
-class Ads(Protocol):
+class Ads:
     """An ADS that drives N vehicles at once. The study's table `ads.parameters` fills its fields.
 
     It gets an `Observation` and knows the original vehicle (`Nominal`), never the setting.
     Element i of a command depends only on element i of the observations, bit for bit: neither on N nor on other vehicles.
 
-    Optional: a method `warns(memory) -> BoolArray`, called after `drive`, returns which drivers are warned, shape (N,).
+    Attributes
+    ----------
+    recognition_delay, hesitation
+        Delays of its reaction [s]; a study may raise them in bad weather.
+    max_vehicles
+        Largest number of vehicles at once; None if any number will do.
     """
 
+    __slots__ = ()
+    recognition_delay = hesitation = 0.0
+    max_vehicles: int | None = None
+
+    @abstractmethod
     def start(self, n: int, nominal: Nominal, step: float) -> Any:
         """Memory at the start of a run of `n` vehicles with `step` seconds between two calls of `drive`."""
 
+    @abstractmethod
     def drive(self, seen: Observation, memory: Any) -> tuple[Command, Any]:
         """Command the pedals for the coming step; returns the memory for the next call."""
+
+    def warns(self, memory: Any) -> BoolArray | None:
+        """Which drivers are warned after `drive`, shape (N,); None if the ADS never warns."""
+        return None
 
 
 class ScalarAds(ABC):
@@ -57,21 +74,15 @@ class ScalarAds(ABC):
         """Command throttle and brake, each in [0, 1], from an observation whose fields are numbers."""
 
 
-ADS_CONTRACT = Contract.of(Ads, "an ADS")
-SCALAR_ADS_CONTRACT = Contract.of(ScalarAds, "a ScalarAds")
-
-
-class GuardedAds:
+class GuardedAds(Ads):
     """Guards an ADS that is user code: passes read-only copies to it, and checks its commands."""
 
     def __init__(self, ads: Ads, guard: Guard) -> None:
         self._ads, self._guard = ads, guard
-        if hasattr(ads, "warns"):
-            self.warns = self._warns
 
-    def _warns(self, memory: Any) -> BoolArray:
-        ads: Any = self._ads
-        return self._guard.booleans("warns", "warnings", self._guard.call("warns", ads.warns, memory), (self._vehicle_count,))
+    def warns(self, memory: Any) -> BoolArray | None:
+        warned = self._guard.call("warns", self._ads.warns, memory)
+        return None if warned is None else self._guard.booleans("warns", "warnings", warned, (self._vehicle_count,))
 
     def start(self, n: int, nominal: Nominal, step: float) -> Any:
         self._vehicle_count = n
@@ -87,7 +98,7 @@ class GuardedAds:
         return self._guard.numbers("drive", name, value, seen.speed.shape, lowest=0.0, highest=1.0)
 
 
-class PerVehicleAds:
+class PerVehicleAds(Ads):
     """Drives N vehicles with N instances of a `ScalarAds`."""
 
     def __init__(self, create: Callable[[], ScalarAds], guard: Guard) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 from msgspec import Struct
 
 from safevar_sumo.ads.acc import KEEPING_GAINS
-from safevar_sumo.ads.base import NonNegativeParameter, PositiveParameter
+from safevar_sumo.ads.base import Ads, NonNegativeParameter, PositiveParameter
 from safevar_sumo.ads.driver import HARDEST_BRAKING, Reaction, StartThrottle, initial_reaction, is_in_the_way, react, time_to_reach
 from safevar_sumo.records import TIME_ROUNDING, BoolArray, Command, FloatArray, Nominal, Observation
 
@@ -24,7 +24,7 @@ class _Memory(NamedTuple):
     stray_time: FloatArray
 
 
-class CompetentDriver(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class CompetentDriver(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Holds its speed or a headway; perceives obstacles that move into its way, reacts to a TTC below 2 s, and brakes with up to 0.774 g.
 
     UN R157 means this driver for cars that cut in, cut out or brake on motorways; its use for pedestrians is ours.

@@ -7,6 +7,7 @@ from typing import Annotated, NamedTuple
 import numpy as np
 from msgspec import Meta, Struct
 
+from safevar_sumo.ads.base import Ads
 from safevar_sumo.records import GRAVITY, TIME_ROUNDING, BoolArray, Command, FloatArray, Nominal, Observation
 
 
@@ -192,7 +193,7 @@ class FollowingMemory(NamedTuple):
     initial_trim: Trim | None
 
 
-class CarFollowing(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class CarFollowing(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Base of car-following models: an acceleration from gap and speeds, converted to pedals.
 
     They ignore obstacles beside the way.

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from safevar_sumo.ads.base import Ads
 from safevar_sumo.ads.driver import Trim, pedals_for, trim_at
 from safevar_sumo.errors import InputError
 from safevar_sumo.fmu import Description, Fleet, History, Instances, constants_of, ports_of
@@ -37,7 +38,7 @@ class _Memory(NamedTuple):
     warns: BoolArray | None = None
 
 
-class FmuAds:
+class FmuAds(Ads):
     """N vehicles driven by an instance of an FMU each; see `Ads`.
 
     Parameters
@@ -70,8 +71,6 @@ class FmuAds:
         constants = constants_of(description, parameters, [*input_ports.values()], source, "ads.parameters")
         self._instances = Instances(description, [*input_ports.values()], [*output_ports.values()], constants)
         self.max_vehicles = self._instances.max_vehicles
-        if "warns" in output_ports:
-            self.warns = self._warns
 
     def start(self, n: int, nominal: Nominal, step: float) -> _Memory:
         constants = {"step": step, **{name: getattr(nominal, name.removeprefix(NOMINAL_PREFIX))
@@ -97,6 +96,5 @@ class FmuAds:
         values = {**seen._asdict(), "detected": np.isfinite(seen.gap), **constants}
         return np.stack([np.broadcast_to(np.asarray(values[name], dtype=float), seen.speed.shape) for name in self._inputs])
 
-    def _warns(self, memory: _Memory) -> BoolArray:
-        assert memory.warns is not None
+    def warns(self, memory: _Memory) -> BoolArray | None:
         return memory.warns

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from msgspec import Struct
 
-from safevar_sumo.ads.base import PositiveParameter
+from safevar_sumo.ads.base import Ads, PositiveParameter
 from safevar_sumo.ads.driver import Reaction, StartThrottle, initial_reaction, is_in_the_way, react
 from safevar_sumo.records import Command, Nominal, Observation
 
@@ -13,7 +13,7 @@ UNLIMITED_BRAKING = 1e6
 """Deceleration beyond every brake [m/s^2]; it presses the pedal fully."""
 
 
-class FullBraking(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class FullBraking(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Holds its speed; brakes fully as soon as an obstacle is in its way or will be there when the vehicle arrives.
 
     Parameters

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from msgspec import Struct
 
-from safevar_sumo.ads.base import NonNegativeParameter, PositiveParameter
+from safevar_sumo.ads.base import Ads, NonNegativeParameter, PositiveParameter
 from safevar_sumo.ads.driver import HARDEST_BRAKING, Reaction, initial_reaction, is_in_the_way, react
 from safevar_sumo.records import Command, FloatArray, Nominal, Observation
 
@@ -16,7 +16,7 @@ LEAST_DIVISOR = 1e-9
 """Lower bound of accelerations and widths by which numbers are divided [m/s^2, m]."""
 
 
-class FuzzySafety(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class FuzzySafety(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Holds its speed; brakes according to two fuzzy metrics: PFS rises as the gap falls below the safe distance, CFS as a collision nears.
 
     Parameters

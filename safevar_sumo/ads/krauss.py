@@ -7,6 +7,7 @@ from typing import Annotated, NamedTuple
 import numpy as np
 from msgspec import Meta, Struct
 
+from safevar_sumo.ads.base import Ads
 from safevar_sumo.ads.driver import LARGEST_GAP
 from safevar_sumo.records import Command, Nominal, Observation
 
@@ -18,7 +19,7 @@ class _Memory(NamedTuple):
     step: float
 
 
-class Krauss(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class Krauss(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Never drives faster than a speed from which the original vehicle can stop behind the obstacle after a reaction time.
 
     Parameters

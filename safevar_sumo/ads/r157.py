@@ -7,12 +7,12 @@ from typing import Annotated
 import numpy as np
 from msgspec import Meta, Struct
 
-from safevar_sumo.ads.base import PositiveParameter
+from safevar_sumo.ads.base import Ads, PositiveParameter
 from safevar_sumo.ads.driver import Reaction, initial_reaction, is_in_the_way, react, time_to_reach
 from safevar_sumo.records import Command, Nominal, Observation
 
 
-class R157(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class R157(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Holds its speed; reacts to a TTC below (v - u) / (2 * 6 m/s^2) + 0.35 s + 0.1 s, and brakes with 6 m/s^2 at once.
 
     v and u are the speeds of the vehicle and the obstacle. UN R157 means this for cars that cut in, cut out or

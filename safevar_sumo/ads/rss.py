@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 from msgspec import Struct
 
-from safevar_sumo.ads.base import NonNegativeParameter, PositiveParameter
+from safevar_sumo.ads.base import Ads, NonNegativeParameter, PositiveParameter
 from safevar_sumo.ads.driver import HARDEST_BRAKING, Reaction, initial_reaction, is_in_the_way, react
 from safevar_sumo.records import Command, FloatArray, Nominal, Observation
 
 
-class Rss(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class Rss(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Holds its speed; a gap below the safe distance is a danger, to which it reacts and brakes with up to 0.774 g.
 
     safe distance = v rt + a rt^2 / 2 + (v + rt a)^2 / (2 b) - u^2 / (2 b_u), with the speeds v and u of vehicle and leader.

@@ -7,6 +7,7 @@ from typing import Annotated, NamedTuple
 import numpy as np
 from msgspec import Meta, Struct
 
+from safevar_sumo.ads.base import Ads
 from safevar_sumo.ads.driver import DelayLine
 from safevar_sumo.records import KMH_PER_MS, BoolArray, Command, FloatArray, Nominal, Observation
 
@@ -35,7 +36,7 @@ class _Memory(NamedTuple):
     hesitation_line: DelayLine
 
 
-class WorldOnRails(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class WorldOnRails(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Full brake for a near obstacle in its corridor, else throttle up to its speed limit.
 
     Parameters

@@ -11,7 +11,7 @@ import numpy as np
 from safevar_sumo.errors import InputError, unknown_name
 from safevar_sumo.plugins import Files, Lookup, Member, digests, instance_of, note_inputs, unload_user_modules
 from safevar_sumo.results.files import run_name
-from safevar_sumo.search import ALGORITHM_CONTRACT, ALGORITHMS, Algorithm, GuardedAlgorithm, MapElites, MoCell, Problem, Search
+from safevar_sumo.search import ALGORITHMS, Algorithm, GuardedAlgorithm, MapElites, MoCell, Problem, Search
 from safevar_sumo.study import SearchTable, Study
 
 
@@ -95,7 +95,7 @@ def _user_packages(study: Study) -> list[str]:
 def algorithm_class(name: str, study: Study) -> Member:
     """The class of an algorithm, by its name in a study."""
     lookup = Lookup(study.source, study.origin.places)
-    return lookup.class_of(ALGORITHMS, name, "search.algorithms", ALGORITHM_CONTRACT)
+    return lookup.class_of(ALGORITHMS, name, "search.algorithms", Algorithm)
 
 
 def random_generator_of(study: Study, key: RunKey) -> np.random.Generator:

@@ -27,7 +27,7 @@ from safevar_sumo.results import record
 from safevar_sumo.scenarios import LOCATION_DIMENSION, SPEED_DIMENSION, pre_crash_sentence
 from safevar_sumo.study import SAFETY_DEGREE, Study, unit_text
 from safevar_sumo.sumo.empty_road import summary_entry, why_no_verdict
-from safevar_sumo.sumo.matrix import PointResult, point_record, remarks_of, simulate_all_points, system_at_point, vehicle_remarks
+from safevar_sumo.sumo.matrix import PointResult, point_record, simulate_all_points, system_at_point, vehicle_remarks
 from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.terminal import WholeTable, print_heading, print_meanings, print_text
 from safevar_sumo.vehicles import CharacteristicSet
@@ -158,7 +158,7 @@ def _print_results(target: CommandTarget, system: System, simulation: Simulation
             print_text(Console(), f"{len(system.matrix)} cells and variations: run `{_rating_command(target, system, simulation)}`")
         if types := pre_crash_sentence(system.points):
             print_text(Console(), types)
-    remarks = [remark for point in system.points for remark in remarks_of(point.scenario)]
+    remarks = [remark for point in system.points for remark in point.scenario.remarks()]
     for remark in dict.fromkeys([*remarks, *system.remarks, *vehicle_remarks(system)]):
         click.echo(f"note: {remark}", err=True)
     for name, value in simulation.reset_values.items():

@@ -14,7 +14,7 @@ from safevar_sumo.plugins.files import (
     note_inputs,
     unload_user_modules,
 )
-from safevar_sumo.plugins.guard import Contract, Guard, accepts, check_open_runs, open_rows, read_only_copy
+from safevar_sumo.plugins.guard import Guard, accepts, check_open_runs, open_rows, read_only_copy
 from safevar_sumo.plugins.lookup import (
     Lookup,
     Member,
@@ -26,6 +26,6 @@ from safevar_sumo.plugins.lookup import (
 )
 
 __all__ = [
-    "DIGEST_LENGTH", "Contract", "Files", "Guard", "Lookup", "Member", "accepts", "add_import_folders", "added_import_folders",
+    "DIGEST_LENGTH", "Files", "Guard", "Lookup", "Member", "accepts", "add_import_folders", "added_import_folders",
     "changed_files", "check_open_runs", "check_parameters", "digest_of", "digests", "file_by_name", "files_named_in",
     "inherit_import_folders", "instance_of", "note_inputs", "open_rows", "read_only_copy", "unload_user_modules"]

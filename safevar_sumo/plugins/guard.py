@@ -5,13 +5,14 @@ from __future__ import annotations
 import inspect
 import os
 import traceback
-from collections.abc import Callable, Iterable, Iterator, Mapping
+import types
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, NamedTuple, ParamSpec, Self, TypeVar
+from typing import Any, NamedTuple, ParamSpec, TypeVar
 
 import numpy as np
 
@@ -29,71 +30,44 @@ _open_runs: ContextVar[BoolArray | None] = ContextVar("open_runs", default=None)
 """Which of N runs have not ended yet, shape (N,); None outside a simulation."""
 
 
-class Contract(NamedTuple):
-    """The methods and attributes that a class must have, taken from the protocol or base class that documents them.
+def violation(candidate: Any, base: type) -> str:
+    """The reason why a class does not meet the contract of a base class, found by inspection only; "" if it does.
 
-    Attributes
-    ----------
-    title
-        Words for an instance, such as "an ADS".
-    methods, optional
-        Required and optional methods: by a method's name, the names of its parameters without default.
-    attributes
-        Attributes of an instance besides its methods.
-    base
-        The class that a user's class must derive from, if any.
+    The abstract methods of the base must exist, and every method of the base must take the parameters that it takes there. The class need
+    not derive from the base: see `completed`.
     """
-
-    title: str
-    methods: Mapping[str, tuple[str, ...]]
-    optional: Mapping[str, tuple[str, ...]]
-    attributes: tuple[str, ...]
-    base: type | None = None
-
-    @classmethod
-    def of(cls, protocol: type, title: str, optional: Iterable[str] = ()) -> Self:
-        """The public methods and annotated attributes of a protocol or base class; methods named in `optional` may be missing."""
-        methods = {name: _required_parameters(attribute) for name, attribute in vars(protocol).items()
-                   if not name.startswith("_") and inspect.isfunction(attribute)}
-        return cls(title, {name: parameters for name, parameters in methods.items() if name not in optional},
-                   {name: parameters for name, parameters in methods.items() if name in optional},
-                   tuple(inspect.get_annotations(protocol)), None if getattr(protocol, "_is_protocol", False) else protocol)
-
-    def applies_to(self, candidate: Any) -> bool:
-        """Whether a class derives from the base; a contract without a base applies to everything."""
-        return self.base is None or (inspect.isclass(candidate) and issubclass(candidate, self.base))
-
-    def violation(self, candidate: Any) -> str:
-        """The reason why `candidate` does not meet the contract, found by inspection only; "" if `candidate` meets it."""
-        if not inspect.isclass(candidate):
-            value = f"value of type {_type_name(candidate)}"
-            return f"is a {'module' if inspect.ismodule(candidate) else 'function' if callable(candidate) else value}, not a class"
-        for name, parameters in {**self.methods, **self.optional}.items():
-            attribute = getattr(candidate, name, None)
-            signature = ", ".join(parameters)
-            if attribute is None and name in self.optional:
-                continue
-            if attribute is None or name in getattr(candidate, "__abstractmethods__", ()):
-                return f"has no method {name}({signature})"
-            if not callable(attribute):
-                return f"has {name} = {attribute!r} instead of a method {name}({signature})"
-            self_count = 1 if inspect.isfunction(inspect.getattr_static(candidate, name)) else 0
-            if not accepts(attribute, self_count + len(parameters)):
-                return f"has a method {name} that does not take ({signature})"
-        return ""
-
-    def __str__(self) -> str:
-        abstract = self.methods if self.base is None else getattr(self.base, "__abstractmethods__", ())
-        methods = [f"{name}({', '.join(parameters)})" for name, parameters in self.methods.items() if name in abstract]
-        if self.base is not None:
-            return f"a subclass of {self.base.__module__.rpartition('.')[0]}.{self.base.__name__} with {', '.join(methods)}"
-        return f"{self.title}: a class with {', '.join([*methods, *self.attributes])}"
+    if not inspect.isclass(candidate):
+        value = f"value of type {type(candidate).__name__}"
+        return f"is a {'module' if inspect.ismodule(candidate) else 'function' if callable(candidate) else value}, not a class"
+    for name, parameters in _methods(base).items():
+        attribute, signature = getattr(candidate, name, getattr(base, name)), ", ".join(parameters)
+        if getattr(attribute, "__isabstractmethod__", False):
+            return f"has no method {name}({signature})"
+        if not callable(attribute):
+            return f"has {name} = {attribute!r} instead of a method {name}({signature})"
+        takes_self = inspect.isfunction(inspect.getattr_static(candidate, name, getattr(base, name)))
+        if not accepts(attribute, takes_self + len(parameters)):
+            return f"has a method {name} that does not take ({signature})"
+    return ""
 
 
-def _required_parameters(method: Any) -> tuple[str, ...]:
-    """Names of a method's parameters that have no default, without `self`."""
-    parameters = inspect.signature(method).parameters.values()
-    return tuple(parameter.name for parameter in parameters if parameter.default is parameter.empty)[1:]
+def contract_of(base: type) -> str:
+    """What a class of this base must have, in words."""
+    methods = [f"{name}({', '.join(parameters)})" for name, parameters in _methods(base).items()
+               if getattr(getattr(base, name), "__isabstractmethod__", False)]
+    return f"a class such as {base.__module__.rpartition('.')[0]}.{base.__name__} with {', '.join(methods)}"
+
+
+def completed(candidate: type, base: type) -> type:
+    """A class with the defaults of a base class for all members that it lacks."""
+    return candidate if issubclass(candidate, base) else types.new_class(candidate.__name__, (candidate, base))
+
+
+def _methods(base: type) -> dict[str, tuple[str, ...]]:
+    """The public methods of a class, and the names of their parameters without default."""
+    functions = {name: value for name, value in vars(base).items() if inspect.isfunction(value) and not name.startswith("_")}
+    return {name: tuple(parameter.name for parameter in inspect.signature(function).parameters.values()
+                        if parameter.default is parameter.empty)[1:] for name, function in functions.items()}
 
 
 def accepts(function: Any, count: int) -> bool:
@@ -274,13 +248,9 @@ class Guard(NamedTuple):
         return "{}:{}".format(*frames_outside[-1]) if frames_outside else ""
 
 
-def _type_name(value: object) -> str:
-    return type(value).__name__
-
-
 def _short_text(value: object) -> str:
     """A returned value in a few words on one line."""
     if isinstance(value, np.ndarray) and value.size > 4:
         return f"an array of {value.dtype}, shape {value.shape}"
     text = " ".join(repr(value).split())
-    return text if len(text) <= 80 else f"a {_type_name(value)}"
+    return text if len(text) <= 80 else f"a {type(value).__name__}"

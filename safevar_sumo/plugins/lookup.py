@@ -17,7 +17,7 @@ import msgspec
 
 from safevar_sumo.errors import InputError, UserCodeError, did_you_mean, one_of
 from safevar_sumo.plugins.files import audit_hook, file_beside, file_of_module
-from safevar_sumo.plugins.guard import Contract, Guard
+from safevar_sumo.plugins.guard import Guard, completed, contract_of, violation
 from safevar_sumo.study import convert_table
 
 
@@ -69,18 +69,19 @@ class Lookup(NamedTuple):
             raise InputError(self.source, problem, expected)
         return Member(target, guard._replace(target=target))
 
-    def class_of(self, shipped: Mapping[str, Any], name: str, key: str, *contracts: Contract, otherwise: str = "") -> Member:
-        """A class by name; a user's class must meet the first contract that applies to it.
+    def class_of(self, shipped: Mapping[str, Any], name: str, key: str, *bases: type, otherwise: str = "") -> Member:
+        """A class by name; a user's class must meet the contract of the first base that it derives from, else of the last one.
 
         `otherwise` is what the study may give in place of a class, for the error.
         """
         member = self.find(shipped, name, key)
-        contract = next(contract for contract in contracts if contract.applies_to(member.target))
-        reason = contract.violation(member.target) if member.guard else ""
-        if member.guard and reason:
-            raise UserCodeError(self.source, f"{key} = {name!r} {reason}", "; or ".join([*map(str, contracts), *filter(None, [otherwise])]),
-                                member.guard.definition(""))
-        return member
+        if member.guard is None:
+            return member
+        base = next((base for base in bases if inspect.isclass(member.target) and issubclass(member.target, base)), bases[-1])
+        if reason := violation(member.target, base):
+            expected = "; or ".join([*map(contract_of, bases), *filter(None, [otherwise])])
+            raise UserCodeError(self.source, f"{member.guard.name} {reason}", expected, member.guard.definition(""))
+        return member._replace(target=completed(member.target, base))
 
     def with_paths(self, member: Member, parameters: Mapping[str, Any], key: str) -> dict[str, Any]:
         """Parameters for a member that is user code, in which names of files beside the study's file are absolute paths.

@@ -40,13 +40,13 @@ class DrivingRobot:
 
     def __init__(self, points: Sequence[Point], vehicle: Vehicle, prepared: Any, state: VehicleState, step: float) -> None:
         n = len(state.speed)
-        speeds = [getattr(point.scenario, "test_speed", None) for point in points]
+        speeds = [point.scenario.test_speed for point in points]
         self._test_speed = np.repeat([np.nan if speed is None else speed for speed in speeds], n // len(points))
         self.has_test_speed: BoolArray = ~np.isnan(self._test_speed)
         """Which vehicles are in a scenario with a `test_speed`."""
         self._is_driving = self.has_test_speed.copy()
         self._is_needed = bool(self.has_test_speed.any())
-        self._prepared, self._hold_gear = prepared, getattr(vehicle, "hold_gear", None)
+        self._prepared, self._vehicle = prepared, vehicle
         self._start_pedal, self._brake_threshold = state.throttle - state.brake, state.brake + ACTION_THRESHOLD
         self._step, self._integral = step, np.zeros(n)
         self._has_braked, self._max_system_pedal = ~self.has_test_speed, np.full(n, -np.inf)
@@ -71,7 +71,7 @@ class DrivingRobot:
         pedal = self._start_pedal - PROPORTIONAL_GAIN * error + INTEGRAL_GAIN * self._integral
         robot_command = Command(np.where(self._is_driving, np.minimum(np.maximum(pedal, 0.0), 1.0), command.throttle),
                                 np.where(self._is_driving, np.minimum(np.maximum(-pedal, 0.0), 1.0), command.brake))
-        return robot_command, state if self._hold_gear is None else self._hold_gear(self._prepared, state, self._is_driving)
+        return robot_command, self._vehicle.hold_gear(self._prepared, state, self._is_driving)
 
     @property
     def invalid(self) -> BoolArray:

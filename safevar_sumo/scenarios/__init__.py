@@ -6,7 +6,6 @@ from typing import Any
 from safevar_sumo.scenarios.along import Along
 from safevar_sumo.scenarios.base import (
     LOCATION_DIMENSION,
-    SCENARIO_CONTRACT,
     SPEED_DIMENSION,
     VUT,
     GuardedScenario,
@@ -34,5 +33,5 @@ SCENARIOS: Mapping[str, type[Any]] = {
 }
 
 __all__ = [
-    "LOCATION_DIMENSION", "SCENARIOS", "SCENARIO_CONTRACT", "SPEED_DIMENSION", "VUT", "WEATHERS", "GuardedScenario", "Lane", "Point",
+    "LOCATION_DIMENSION", "SCENARIOS", "SPEED_DIMENSION", "VUT", "WEATHERS", "GuardedScenario", "Lane", "Point",
     "PreCrash", "Scenario", "Scene", "World", "distance_in_words", "equals_clear", "pre_crash_sentence", "weather_in_words", "weather_of"]

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from abc import abstractmethod
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from enum import StrEnum
-from typing import Annotated, Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, Protocol
 
 import numpy as np
 from msgspec import Meta
 
-from safevar_sumo.plugins import Contract, Guard, read_only_copy
+from safevar_sumo.plugins import Guard, read_only_copy
 from safevar_sumo.records import ALL_TRUE, ZERO, BoolArray, Encounter, FloatArray, Trace
 from safevar_sumo.study import Weather
 
@@ -111,34 +112,66 @@ class Scene(NamedTuple):
     visible: BoolArray = ALL_TRUE
 
 
-class Scenario(Protocol):
+class Scenario:
     """A scenario. Its fields are the parameters of `scenario.parameters`.
 
-    `network` is a folder of `sumo_nets/`, or the path of a folder with the same files; `duration` is the length of a run [s].
-
-    Optional members:
-
-    - `reactive_actors = False` declares that no actor reacts to the vehicle under test: SUMO can play the scene once for all vehicles.
-    - `grade` is the rise of the road [%]. SUMO's plane then stands for the inclined road; the vehicle models add the force of gravity.
-    - `pre_crash` is the scenario's type in NHTSA's typology.
-    - `centre_to_centre = True` says that the safety degree is the distance between the centres of two vehicles.
-    - `lanes(roads)` and `actors(roads)` return `XmlChanges` to the built network and to the traffic on it.
-    - `remarks() -> list[str]` returns remarks for the user on the scenario's parameters.
-    - `test_speed` [m/s] is held by a robot until the ADS brakes. A run that leaves the tolerance before that is an invalid test. Only
-      contacts at the vehicle's front are collisions.
+    Attributes
+    ----------
+    network
+        A folder of `sumo_nets/`, or the path of a folder with the same files.
+    duration
+        Length of a run [s].
+    reactive_actors
+        False declares that no actor reacts to the vehicle under test: SUMO can play the scene once for all vehicles.
+    grade
+        Rise of the road [%]. SUMO's plane then stands for the inclined road; the vehicle models add the force of gravity.
+    centre_to_centre
+        Whether the safety degree is the distance between the centres of two vehicles.
+    pre_crash
+        The scenario's type in NHTSA's typology; "" if it has none.
+    test_speed
+        Speed that a robot holds until the ADS brakes [m/s]; None without a robot. A run that leaves the tolerance before that is an
+        invalid test. Only contacts at the vehicle's front are collisions.
     """
 
+    __slots__ = ()
     network: str
-    duration: float
+    reactive_actors: bool = True
+    grade: float = 0.0
+    centre_to_centre: bool = False
+    if TYPE_CHECKING:  # a scenario may set or compute these
+        @property
+        def duration(self) -> float: ...
+        @property
+        def pre_crash(self) -> str: ...
+        @property
+        def test_speed(self) -> float | None: ...
+    else:
+        pre_crash, test_speed = "", None
 
+    @abstractmethod
     def begin(self, world: World) -> Any:
         """Prepare a run, before the first step; returns the memory for `observe`."""
 
+    @abstractmethod
     def observe(self, world: World, step: float, memory: Any) -> tuple[Scene, Any]:
         """The obstacle now, `step` seconds after the last call, and the new memory; may also command the actors."""
 
+    @abstractmethod
     def encounter(self, trace: Trace) -> Encounter:
         """The geometry that the metrics are computed from."""
+
+    def lanes(self, roads: Roads) -> XmlChanges:
+        """Changes to the lanes of the built network."""
+        return {}
+
+    def actors(self, roads: Roads) -> XmlChanges:
+        """Changes to the network's traffic."""
+        return {}
+
+    def remarks(self) -> list[str]:
+        """Remarks for the user on the scenario's parameters."""
+        return []
 
 
 SPEED_DIMENSION, LOCATION_DIMENSION = "speed", "impact_location"
@@ -166,35 +199,32 @@ class PreCrash(StrEnum):
     LEAD_DECELERATING = "lead vehicle decelerating"
 
 
-def pre_crash_of(scenario: Any) -> str:
-    """A scenario's pre-crash type; "" if it has none."""
-    return str(getattr(scenario, "pre_crash", ""))
-
-
 def distance_in_words(scenario: Any, safety_degree: float) -> str:
     """A safety degree above 0 in metres, and between which points it is, if not from the bumper on."""
-    return f"{safety_degree:.2f} m{' from centre to centre' if getattr(scenario, 'centre_to_centre', False) else ''}"
+    return f"{safety_degree:.2f} m{' from centre to centre' if scenario.centre_to_centre else ''}"
 
 
 def pre_crash_sentence(points: Iterable[Point]) -> str:
     """A sentence that lists the pre-crash types and the light of test points; "" if no scenario has a type."""
     points = tuple(points)
-    types = dict.fromkeys(filter(None, (pre_crash_of(point.scenario) for point in points)))
+    types = dict.fromkeys(filter(None, (point.scenario.pre_crash for point in points)))
     light = " and ".join(dict.fromkeys(f"by {point.weather.light}" for point in points))
     return f"NHTSA's pre-crash types: {'; '.join(types)}; {light}." if types else ""
 
 
-SCENARIO_CONTRACT = Contract.of(Scenario, "a scenario")
 MAX_DURATION = 3600.0
 """Longest run [s]."""
 MAX_TEST_SPEED = 100.0
 """Highest speed of a test [m/s]."""
 
 
-class GuardedScenario:
+class GuardedScenario(Scenario):
     """Guards a user's scenario: passes read-only copies to it, and checks its results."""
 
-    def __init__(self, scenario: Any, guard: Guard) -> None:
+    duration, pre_crash = 0.0, ""
+    test_speed: float | None = None
+
+    def __init__(self, scenario: Scenario, guard: Guard) -> None:
         self._scenario, self._guard = scenario, guard
         network = guard.field("__init__", scenario, "network")
         if not isinstance(network, str):
@@ -203,31 +233,27 @@ class GuardedScenario:
         duration = guard.numbers("__init__", "duration", guard.field("__init__", scenario, "duration"), shape=(),
                                  lowest=0.0, highest=MAX_DURATION, above=True)
         self.duration = float(duration)
-        grade = guard.numbers("__init__", "grade", getattr(scenario, "grade", 0.0), shape=(), lowest=-MAX_GRADE, highest=MAX_GRADE)
-        speed = getattr(scenario, "test_speed", None)
-        self.test_speed = speed if speed is None else float(
-            guard.numbers("__init__", "test_speed", speed, shape=(), lowest=0.0, highest=MAX_TEST_SPEED, above=True))
-        self.reactive_actors = bool(getattr(scenario, "reactive_actors", True))
-        self.grade, self.pre_crash = float(grade), str(getattr(scenario, "pre_crash", ""))
+        self.grade = float(guard.numbers("__init__", "grade", scenario.grade, shape=(), lowest=-MAX_GRADE, highest=MAX_GRADE))
+        if (speed := scenario.test_speed) is not None:
+            self.test_speed = float(guard.numbers("__init__", "test_speed", speed, (), lowest=0.0, highest=MAX_TEST_SPEED, above=True))
+        self.reactive_actors, self.centre_to_centre = bool(scenario.reactive_actors), bool(scenario.centre_to_centre)
+        self.pre_crash = str(scenario.pre_crash)
+
+    def lanes(self, roads: Roads) -> XmlChanges:
+        return self._changes("lanes", "the network", self._scenario.lanes, roads)
 
     def actors(self, roads: Roads) -> XmlChanges:
-        """The scenario's changes to the network's traffic; none if the scenario has no such method."""
-        return self._changes("actors", "the traffic file", roads)
+        return self._changes("actors", "the traffic file", self._scenario.actors, roads)
 
-    def _changes(self, method: str, file: str, roads: Roads) -> XmlChanges:
-        changes = self._guard.call(method, getattr(self._scenario, method, lambda roads: {}), roads)
+    def _changes(self, method: str, file: str, function: Callable[[Roads], XmlChanges], roads: Roads) -> XmlChanges:
+        changes = self._guard.call(method, function, roads)
         if not isinstance(changes, Mapping):
             raise self._guard.wrong_value(method, "changes", changes, f"a mapping from XPaths of {file} to attributes")
         return {str(path): change if change is None else {str(name): str(value) for name, value in change.items()}
                 for path, change in changes.items()}
 
-    def lanes(self, roads: Roads) -> XmlChanges:
-        """The scenario's changes to the network's lanes; none if the scenario has no such method (a parameter may have that name)."""
-        return {} if not callable(getattr(self._scenario, "lanes", None)) else self._changes("lanes", "the network", roads)
-
     def remarks(self) -> list[str]:
-        """Remarks on the scenario's parameters for the user."""
-        return [str(remark) for remark in self._guard.call("remarks", getattr(self._scenario, "remarks", list))]
+        return [str(remark) for remark in self._guard.call("remarks", self._scenario.remarks)]
 
     def begin(self, world: World) -> Any:
         return self._guard.call("begin", self._scenario.begin, _ReadOnlyWorld(world))

@@ -8,7 +8,7 @@ import numpy as np
 from msgspec import Meta, Struct
 
 from safevar_sumo.records import Encounter, FloatArray, Trace
-from safevar_sumo.scenarios.base import VUT, Grade, PreCrash, Scene, World
+from safevar_sumo.scenarios.base import VUT, Grade, PreCrash, Scenario, Scene, World
 from safevar_sumo.scenarios.frame import Frame
 
 PARKED_VEHICLE = "parked_ahead"
@@ -22,7 +22,7 @@ class _Memory(NamedTuple):
     zeros: FloatArray
 
 
-class LeadVehicleStopped(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class LeadVehicleStopped(Scenario, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The vehicle starts at rest and drives up to vehicles that are parked in both lanes.
 
     Parameters

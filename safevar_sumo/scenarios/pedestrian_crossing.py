@@ -9,7 +9,7 @@ from msgspec import Meta, Struct
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import Encounter, FloatArray, Trace
-from safevar_sumo.scenarios.base import VUT, Grade, PreCrash, Scene, World
+from safevar_sumo.scenarios.base import VUT, Grade, PreCrash, Scenario, Scene, World
 from safevar_sumo.scenarios.frame import MAX_SKEW, Frame
 
 Positive = Annotated[float, Meta(gt=0, le=3600)]
@@ -29,7 +29,7 @@ class _Memory(NamedTuple):
     has_turned: bool
 
 
-class PedestrianCrossing(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class PedestrianCrossing(Scenario, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A pedestrian crosses the lane at right angles, turns round and walks back, without reacting to the vehicle.
 
     Parameters

@@ -13,7 +13,7 @@ import numpy as np
 from msgspec import Struct
 
 from safevar_sumo.records import ALL_TRUE, BoolArray, FloatArray
-from safevar_sumo.scenarios.base import VUT, Scene, World
+from safevar_sumo.scenarios.base import VUT, Scenario, Scene, World
 from safevar_sumo.scenarios.frame import Frame
 
 APPROACH_SPEED = 0.5
@@ -95,7 +95,7 @@ class Memory(NamedTuple):
     approached: BoolArray
 
 
-class TargetTest(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class TargetTest(Scenario, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Base of a scenario whose target does not react."""
 
     reactive_actors = False

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 
-from safevar_sumo.search.base import ALGORITHM_CONTRACT, Algorithm, GuardedAlgorithm, Problem, Search
+from safevar_sumo.search.base import Algorithm, GuardedAlgorithm, Problem, Search
 from safevar_sumo.search.map_elites import MapElites
 from safevar_sumo.search.mocell import MoCell
 from safevar_sumo.search.nsga2 import Nsga2
@@ -19,4 +19,4 @@ ALGORITHMS: Mapping[str, type[Algorithm]] = {
     "safe_fuzzer": SafeFuzzer,
 }
 
-__all__ = ["ALGORITHMS", "ALGORITHM_CONTRACT", "Algorithm", "GuardedAlgorithm", "MapElites", "MoCell", "Problem", "Search"]
+__all__ = ["ALGORITHMS", "Algorithm", "GuardedAlgorithm", "MapElites", "MoCell", "Problem", "Search"]

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Generator
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
 from safevar_sumo.errors import UserCodeError
 from safevar_sumo.metrics import PUBLISHED_SCORING, Scoring
-from safevar_sumo.plugins import Contract, Guard, read_only_copy
+from safevar_sumo.plugins import Guard, read_only_copy
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray
 from safevar_sumo.vehicles import CharacteristicSet, FeasibleRegion
 
@@ -50,9 +51,12 @@ class Problem:
         return self.region.repaired(settings) if self.region else settings
 
 
-class Algorithm(Protocol):
+class Algorithm:
     """A search algorithm. Its fields are the parameters that a study gives in a table such as [search.nsga2]."""
 
+    __slots__ = ()
+
+    @abstractmethod
     def search(self, problem: Problem, rng: np.random.Generator) -> Search:
         """One run, which requests at most `problem.evaluations` evaluations.
 
@@ -61,10 +65,7 @@ class Algorithm(Protocol):
         """
 
 
-ALGORITHM_CONTRACT = Contract.of(Algorithm, "an algorithm")
-
-
-class GuardedAlgorithm:
+class GuardedAlgorithm(Algorithm):
     """A user's algorithm: it gets read-only copies, and this class checks its settings and its result."""
 
     def __init__(self, algorithm: Algorithm, guard: Guard) -> None:

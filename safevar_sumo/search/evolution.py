@@ -14,7 +14,7 @@ from deap import base, tools
 from msgspec import Meta, Struct
 
 from safevar_sumo.records import Evaluations, FloatArray
-from safevar_sumo.search.base import Problem
+from safevar_sumo.search.base import Algorithm, Problem
 
 Probability = Annotated[float, Meta(ge=0, le=1)]
 DistributionIndex = Annotated[float, Meta(ge=0, le=1000)]
@@ -48,7 +48,7 @@ class Individual(list[float]):
     has_failed: bool = False
 
 
-class Operators(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class Operators(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Simulated binary crossover and polynomial mutation, both bounded by the domains.
 
     The default mutation probability is 1/n per variable. A tournament has `tournament_size` individuals.

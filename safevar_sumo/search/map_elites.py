@@ -9,7 +9,7 @@ from msgspec import Meta, Struct
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import Evaluations, FloatArray, IntArray
-from safevar_sumo.search.base import Problem, Search
+from safevar_sumo.search.base import Algorithm, Problem, Search
 from safevar_sumo.search.evolution import Probability, TournamentSize
 
 MAX_CELLS = 2**16
@@ -21,7 +21,7 @@ QUALITY_OFFSET = 1e6
 """A number larger than any objective, which makes a collision better than any setting without a collision."""
 
 
-class MapElites(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class MapElites(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """An atlas of distinct failures, an elite for every cell; needs the extra `qd`.
 
     The elite of a cell is the collision whose largest change is smallest or, without a collision, the most severe setting. A child has an

@@ -8,10 +8,10 @@ from msgspec import Struct
 
 from safevar_sumo.metrics import Scoring
 from safevar_sumo.records import Evaluations
-from safevar_sumo.search.base import Problem, Search
+from safevar_sumo.search.base import Algorithm, Problem, Search
 
 
-class RandomSearch(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class RandomSearch(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Samples uniformly in the domains; the result is the non-dominated archive over all evaluations."""
 
     def search(self, problem: Problem, rng: np.random.Generator) -> Search:

@@ -9,7 +9,7 @@ from msgspec import Meta, Struct
 
 from safevar_sumo.metrics import F_DIFF, F_NUM_DIFF, PUBLISHED_SCORING, Scoring
 from safevar_sumo.records import Evaluations, FloatArray
-from safevar_sumo.search.base import Problem, Search
+from safevar_sumo.search.base import Algorithm, Problem, Search
 
 RESULT_SIZE = 50
 SAFETY_WEIGHT = 6.0
@@ -18,7 +18,7 @@ MAX_REDRAWS = 100
 PositiveCount = Annotated[int, Meta(ge=1, le=1_000_000)]
 
 
-class SafeFuzzer(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class SafeFuzzer(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Changes a few characteristics of the original vehicle, in ranges that narrow towards less safe settings.
 
     Parameters

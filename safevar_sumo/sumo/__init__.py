@@ -7,7 +7,6 @@ from safevar_sumo.sumo.matrix import (
     evaluate,
     evaluations_at_worst_points,
     point_record,
-    remarks_of,
     settings_per_batch,
     simulate,
     simulate_all_points,
@@ -21,5 +20,5 @@ from safevar_sumo.sumo.system import System, assemble, models_of
 
 __all__ = [
     "Engine", "PointResult", "System", "assemble", "evaluate", "evaluations_at_worst_points", "models_of",
-    "point_record", "reason_for_sumo", "remarks_of", "score", "settings_per_batch", "simulate",
+    "point_record", "reason_for_sumo", "score", "settings_per_batch", "simulate",
     "simulate_all_points", "study_at", "system_at_point", "system_at_worst_point", "vehicle_remarks", "worst_points"]

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from safevar_sumo.ads import Ads
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics.base import STUDY_SOURCE
 from safevar_sumo.plugins import check_open_runs, open_rows
@@ -26,7 +27,7 @@ from safevar_sumo.sumo.staging import stage_network
 from safevar_sumo.sumo.system import System
 from safevar_sumo.sumo.traci_controller import TraciController
 from safevar_sumo.sumo.world import INSERTION_DECELERATION, SumoWorld
-from safevar_sumo.vehicles import LEVEL, CharacteristicSet, Sensors, at_start, slope_of
+from safevar_sumo.vehicles import LEVEL, CharacteristicSet, Sensors, Slope, slope_of
 
 Watcher = Callable[[SumoWorld], None]
 """A function that is called with SUMO's world at every sample."""
@@ -112,14 +113,14 @@ def _simulate(system: System, settings: FloatArray, world: Any, outcomes: _Outco
               listen: Listener | None) -> SimulationRuns:
     vehicle, step, n = system.vehicle, world.step_length, len(settings)
     characteristics = dict(zip(system.characteristics.names, np.ascontiguousarray(settings.T), strict=True))
-    prepared = vehicle.prepare(characteristics, _road_friction(system.points, n), step, *_road_arguments(system.points, n))
+    prepared = vehicle.prepare(characteristics, _road_friction(system.points, n), step, *_slope_and_wetness(system.points, n))
     types = vehicle.sumo_type(prepared)
     world.set_types(types._replace(decel=np.maximum(types.decel, INSERTION_DECELERATION)))
     world.depart()
     world.set_decelerations(types.decel)
     vehicle_length, frame = world.vehicle_length(VUT), Frame.through_origin(Lane(*world.lane_of(VUT)))
 
-    state = at_start(vehicle, prepared, world.speeds())
+    state = vehicle.at_start(prepared, world.speeds())
     if isinstance(system.ads, TraciController):  # other ADSs get observations instead of reading the world
         world.sensors = _sensors_in_weather(system, prepared, n)
     ads_memory = system.ads.start(n, system.nominal, step)
@@ -180,20 +181,16 @@ def _road_friction(points: Sequence[Point], n: int) -> Any:
     return factors[0] if len(set(factors)) == 1 else np.repeat(factors, n // len(points))
 
 
-def _road_arguments(points: Sequence[Point], n: int) -> list[Any]:
-    """Slope and wetness of the roads of n vehicles, as arguments of `Vehicle.prepare`; none if all roads are level and dry.
-
-    Not every vehicle model accepts these arguments.
-    """
-    grades, wetness = [getattr(point.scenario, "grade", 0.0) for point in points], [point.weather.wet for point in points]
+def _slope_and_wetness(points: Sequence[Point], n: int) -> tuple[Slope, bool | BoolArray]:
+    """Slope and wetness of the roads of n vehicles."""
+    grades, wetness = [point.scenario.grade for point in points], [point.weather.wet for point in points]
     slope = slope_of(np.repeat(grades, n // len(points))) if any(grades) else LEVEL
-    return [slope, np.repeat(wetness, n // len(points))] if any(wetness) else [slope] if any(grades) else []
+    return slope, np.repeat(wetness, n // len(points)) if any(wetness) else False
 
 
 def _sensors_in_weather(system: System, prepared: Any, n: int) -> Sensors:
     """The vehicles' sensors: each point's weather adds its recognition delay and scales the range by its visibility."""
-    method = getattr(system.vehicle, "sensors", None)
-    sensors = (None if method is None else method(prepared)) or Sensors.perfect(n)
+    sensors = system.vehicle.sensors(prepared) or Sensors.perfect(n)
     weathers = [point.weather for point in system.points]
     delay = np.repeat([weather.recognition_delay for weather in weathers], n // len(weathers))
     visibility = np.repeat([weather.visibility for weather in weathers], n // len(weathers))
@@ -202,18 +199,19 @@ def _sensors_in_weather(system: System, prepared: Any, n: int) -> Sensors:
 
 
 class _FirstWarnings:
-    """The times to collision at which the ADSs of N vehicles first warn the driver [s]; NaN if an ADS never does, or has no `warns`."""
+    """The times to collision at which the ADSs of N vehicles first warn the driver [s]; NaN if an ADS never does."""
 
-    def __init__(self, ads: Any, n: int) -> None:
-        self._warns = getattr(ads, "warns", None)
+    def __init__(self, ads: Ads, n: int) -> None:
+        self._ads = ads
         self.time_to_collision = np.full(n, np.nan)
 
     def update(self, ads_memory: Any, speed: FloatArray, scene: Scene, is_open: BoolArray) -> None:
         """Process one sample; `scene` holds the true position of the obstacle, not the sensed position."""
-        if self._warns is None:
+        warned = self._ads.warns(ads_memory)
+        if warned is None:
             return
         closing_speed = speed - scene.obstacle_speed
-        is_first = self._warns(ads_memory) & is_open & np.isnan(self.time_to_collision) & (closing_speed > 0)
+        is_first = warned & is_open & np.isnan(self.time_to_collision) & (closing_speed > 0)
         if is_first.any():
             self.time_to_collision = np.where(is_first, scene.gap / closing_speed, self.time_to_collision)
 

@@ -67,17 +67,10 @@ def point_record(result: PointResult, row: int = 0) -> dict[str, Any]:
             **({"contact": {"side": str(side), "place": float(place)}} if side else {})}
 
 
-def remarks_of(scenario: Any) -> list[str]:
-    """Remarks for the user on a scenario's parameters."""
-    remarks = getattr(scenario, "remarks", None)
-    return [] if remarks is None else remarks()
-
-
 def vehicle_remarks(system: System) -> list[str]:
     """Remarks for the user on a vehicle that is tested at higher speeds than its model was fitted to."""
-    fitted_speed = getattr(system.vehicle, "FITTED_UP_TO", None)
-    speeds = [getattr(point.scenario, "test_speed", None) or 0.0 for point in system.points]
-    if fitted_speed is None or max(speeds) <= fitted_speed:
+    fitted_speed, speeds = system.vehicle.FITTED_UP_TO, [point.scenario.test_speed or 0.0 for point in system.points]
+    if max(speeds) <= fitted_speed:
         return []
     tables = system.nominal.tables()
     speed = min(max(speeds), float(tables.speeds[-1]))
@@ -139,7 +132,7 @@ def settings_per_batch(system: System, engine: Engine) -> int:
 
 def largest_batch(system: System) -> int:
     """Largest number of vehicles in one batch; it is smaller if each vehicle has its own instance of an FMU."""
-    return min(MAX_VEHICLES, *(getattr(model, "max_vehicles", MAX_VEHICLES) for model in (system.vehicle, system.ads)))
+    return min(MAX_VEHICLES, *(model.max_vehicles or MAX_VEHICLES for model in (system.vehicle, system.ads)))
 
 
 def _is_recorded(system: System, engine: Engine) -> bool:

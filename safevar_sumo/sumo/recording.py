@@ -123,7 +123,7 @@ def record_scenes(scenarios: Sequence[Scenario], options: Sequence[str]) -> list
 
 
 def _reason_for_sumo(scenario: Scenario) -> str:
-    if getattr(scenario, "reactive_actors", True):
+    if scenario.reactive_actors:
         return "an actor of the scenario may react to the vehicle under test"
     if not isinstance(scenario, GuardedScenario) and not is_shipped(scenario.network):  # shipped scenarios know only shipped networks
         return f"the traffic of the network {scenario.network!r} may react to the vehicle under test"

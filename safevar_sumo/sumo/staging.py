@@ -42,11 +42,10 @@ def stage_networks(scenarios: Sequence[Scenario]) -> list[Network]:
 
 
 @lru_cache(maxsize=10_000)
-def _stage(scenario: Any, network: Network) -> Network:
-    lanes, actors = (getattr(scenario, name, None) for name in ("lanes", "actors"))
-    if lanes is not None and (changes := lanes(_BuiltRoads(network))):
+def _stage(scenario: Scenario, network: Network) -> Network:
+    if changes := scenario.lanes(_BuiltRoads(network)):
         network = _variant(network, {NETWORK_FILE: _change_xml(built_network(network), changes)})
-    if actors is not None and (changes := actors(_BuiltRoads(network))):
+    if changes := scenario.actors(_BuiltRoads(network)):
         network = _variant(network, {TRAFFIC_FILE: _change_xml(network.path(TRAFFIC_FILE), changes)})
     return network
 

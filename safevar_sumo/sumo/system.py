@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import msgspec
 import numpy as np
 
-from safevar_sumo.ads import ADS, ADS_CONTRACT, REACTION_PARAMETERS, SCALAR_ADS_CONTRACT, Ads, FmuAds, GuardedAds, PerVehicleAds, ScalarAds
+from safevar_sumo.ads import ADS, Ads, FmuAds, GuardedAds, PerVehicleAds, ScalarAds
 from safevar_sumo.errors import InputError, one_of, unknown_name
 from safevar_sumo.fmu import description_of
 from safevar_sumo.metrics import METRIC_OF_OBJECTIVE, METRICS, OPTIONAL_METRICS, RATING_POINTS, Metric, Objective, Scoring, guard_metric
@@ -29,7 +29,7 @@ from safevar_sumo.plugins import (
 )
 from safevar_sumo.protocol.rater import Rater, expand_protocol, is_rated, rater_of
 from safevar_sumo.records import FloatArray, Nominal
-from safevar_sumo.scenarios import SCENARIO_CONTRACT, SCENARIOS, GuardedScenario, Point, Scenario, equals_clear, weather_of
+from safevar_sumo.scenarios import SCENARIOS, GuardedScenario, Point, Scenario, equals_clear, weather_of
 from safevar_sumo.study import MatrixTest, MetricsTable, ModelTable, Study, VehicleTable, Weather
 from safevar_sumo.sumo.network import NETWORK_KEY, is_network, is_shipped
 from safevar_sumo.sumo.network_check import check_network, network_remarks
@@ -37,7 +37,6 @@ from safevar_sumo.sumo.traci_controller import TraciController
 from safevar_sumo.sumo.traci_module import substitute_traci
 from safevar_sumo.vehicles import (
     CHANGES,
-    VEHICLE_CONTRACT,
     VEHICLES,
     Change,
     CharacteristicSet,
@@ -176,25 +175,23 @@ class System:
     def remarks(self) -> list[str]:
         """Remarks for the user on parts of networks and weathers that are not used or have no effect."""
         uses_traci = isinstance(self.ads, TraciController)
-        fmu_remarks = [remark for model in (self.vehicle, self.ads) for remark in getattr(model, "remarks", ())]
         networks = dict.fromkeys(point.scenario.network for point in self.points)
         remarks = [remark for network in networks for remark in network_remarks(network, self.nominal.max_speed, sumo_drives=uses_traci)]
-        remarks += fmu_remarks
+        remarks += self.vehicle.remarks
         visibilities = {point.weather.name: point.weather.visibility for point in self.points if point.weather.visibility != 1}
         if uses_traci and not self._has_limited_range():
             remarks += [f"weather {name!r}: visibility = {value:g} has no effect: the vehicle has no sensor range, so a controller written "
                       "for TraCI sees everything" for name, value in visibilities.items()]
-        if not any(getattr(self.ads, name, 0.0) for name in REACTION_PARAMETERS):
+        if not (self.ads.recognition_delay or self.ads.hesitation):
             remarks += [f"weather {name!r} has no effect: its road and its visibility are those of clear weather, and no key of "
                       "[ads.parameters] delays the ADS in it"
                       for name in dict.fromkeys(point.weather.name for point in self.points if equals_clear(point.weather))]
         return remarks
 
     def _has_limited_range(self) -> bool:
-        sensors = getattr(self.vehicle, "sensors", None)
         original = dict(zip(self.characteristics.names, self.characteristics.original[:, np.newaxis], strict=True))
-        values = None if sensors is None else sensors(self.vehicle.prepare(original, 1.0, 0.1))  # road friction 1, time step 0.1 s
-        return values is not None and bool(np.isfinite(values.reach).all())
+        sensors = self.vehicle.sensors(self.vehicle.prepare(original, 1.0, 0.1))  # road friction 1, time step 0.1 s
+        return sensors is not None and bool(np.isfinite(sensors.reach).all())
 
 
 def assemble(study: Study, source: str = "") -> System:
@@ -326,14 +323,14 @@ def _create_vehicle(table: VehicleTable, lookup: Lookup) -> Vehicle:
         units = {name: row.unit for name, row in table.characteristics.items()}
         description = description_of(table.model, lookup.folders, lookup.source, "vehicle.model")
         return FmuVehicle(description, units, fmu_table, guard)
-    member = lookup.class_of(VEHICLES, table.model, "vehicle.model", VEHICLE_CONTRACT)
+    member = lookup.class_of(VEHICLES, table.model, "vehicle.model", Vehicle)
     parameters = lookup.with_paths(member, table.parameters, "vehicle.parameters")
     vehicle = instance_of(member, parameters, f"vehicle.model = {table.model!r}", "vehicle.parameters", lookup.source)
     return vehicle if member.guard is None else GuardedVehicle(vehicle, member.guard)
 
 
 def _create_scenario(table: ModelTable, lookup: Lookup) -> Scenario:
-    member = lookup.class_of(SCENARIOS, table.model, "scenario.model", SCENARIO_CONTRACT)
+    member = lookup.class_of(SCENARIOS, table.model, "scenario.model", Scenario)
     parameters = lookup.with_paths(member, table.parameters, "scenario.parameters")
     scenario = instance_of(member, parameters, f"scenario.model = {table.model!r}", "scenario.parameters", lookup.source)
     located: Scenario = _locate_network(scenario if member.guard is None else GuardedScenario(scenario, member.guard), lookup.folders)
@@ -348,7 +345,7 @@ def _create_ads(table: ModelTable, lookup: Lookup) -> Ads:
         parameters = lookup.with_paths(Member(FmuAds, guard), table.parameters, "ads.parameters")
         description = description_of(table.model, lookup.folders, lookup.source, "ads.model")
         return FmuAds(description, table.inputs, table.outputs, parameters, table.step, guard)
-    member = lookup.class_of(ADS, table.model, "ads.model", SCALAR_ADS_CONTRACT, ADS_CONTRACT,
+    member = lookup.class_of(ADS, table.model, "ads.model", ScalarAds, Ads,
                              otherwise=f'with ads.kind = "traci" {CONTROLLER_FORMS}')
     name = f"ads.model = {table.model!r}"
     parameters = lookup.with_paths(member, table.parameters, "ads.parameters")

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from safevar_sumo.ads import Ads
 from safevar_sumo.ads.driver import Trim, pedals_for, trim_at
 from safevar_sumo.plugins import Guard
 from safevar_sumo.records import Command, Nominal, Observation
@@ -23,7 +24,7 @@ from safevar_sumo.sumo.world import current_world
 from safevar_sumo.vehicles import SumoType
 
 
-class TraciController:
+class TraciController(Ads):
     """Drives each vehicle with a controller of its own: a function `step(traci, vehicle_id)`, or a class with `step`.
 
     Parameters

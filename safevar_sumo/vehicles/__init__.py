@@ -5,13 +5,11 @@ from typing import Any
 
 from safevar_sumo.vehicles.base import (
     LEVEL,
-    VEHICLE_CONTRACT,
     GuardedVehicle,
     Slope,
     SumoType,
     Vehicle,
     VehicleState,
-    at_start,
     slope_of,
 )
 from safevar_sumo.vehicles.calibration_drive import calibration_drive
@@ -32,6 +30,6 @@ VEHICLES: Mapping[str, type[Any]] = {
 }
 
 __all__ = [
-    "CHANGES", "LEVEL", "VEHICLES", "VEHICLE_CONTRACT", "Carla", "Change", "Characteristic", "CharacteristicSet", "FeasibleRegion",
-    "FmuVehicle", "GuardedVehicle", "Sensors", "Slope", "SumoType", "Vehicle", "VehicleState", "at_start", "calibration_drive",
+    "CHANGES", "LEVEL", "VEHICLES", "Carla", "Change", "Characteristic", "CharacteristicSet", "FeasibleRegion",
+    "FmuVehicle", "GuardedVehicle", "Sensors", "Slope", "SumoType", "Vehicle", "VehicleState", "calibration_drive",
     "guard_change", "region_of", "slope_of"]

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Annotated, Any, NamedTuple, Protocol
+from abc import abstractmethod
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Any, ClassVar, NamedTuple, Protocol
 
 import numpy as np
 from msgspec import Meta
 
-from safevar_sumo.errors import UserCodeError
-from safevar_sumo.plugins import Contract, Guard, accepts, open_rows, read_only_copy
+from safevar_sumo.errors import InputError, UserCodeError
+from safevar_sumo.plugins import Guard, open_rows, read_only_copy
 from safevar_sumo.records import GRAVITY, BoolArray, Command, FloatArray, Observation
 from safevar_sumo.vehicles.sensors import Sensors
 
@@ -64,54 +65,76 @@ class VehicleState(Protocol):
     def gear(self) -> FloatArray: ...
 
 
-class Vehicle(Protocol):
+class Vehicle:
     """A vehicle model. Its fields are the parameters of `vehicle.parameters`.
 
     Every method is a pure function over arrays of N vehicles: element i of a result depends only on
     element i of the arguments, bit for bit. So methods use only + - * / and square roots, comparisons,
     minima and maxima: these operations give the same bits on every machine and for every N.
 
-    Optional: `hold_gear(prepared, state, holds)` returns the state in which vehicles do not change gear where `holds`, shape (N,), is true
-    (the driving robot of tests at a speed needs it); `FITTED_UP_TO` is the highest speed at which the parameters were identified [m/s].
+    Attributes
+    ----------
+    UNITS
+        Units of the characteristics by name.
+    FITTED_UP_TO
+        Highest speed at which the parameters were identified [m/s].
+    max_vehicles
+        Largest number of vehicles at once; None if any number will do.
+    remarks
+        Remarks for the user.
     """
 
+    __slots__ = ()
     UNITS: Mapping[str, str]
+    FITTED_UP_TO: ClassVar[float] = np.inf
+    max_vehicles: int | None = None
+    remarks: Sequence[str] = ()
 
+    @abstractmethod
     def prepare(self, characteristics: Characteristics, road_friction: float, step: float, slope: Slope = LEVEL,
                 wet: bool | BoolArray = False) -> Any:
         """Constants of a run with a time step of `step` seconds.
 
-        `road_friction` is the weather's factor on the tyres' friction; `wet` is for models in which water has further effects.
-        A model whose `prepare` lacks `slope` drives on level roads only; a `prepare` that lacks `wet` is called without `wet`.
+        `road_friction` is the weather's factor on the tyres' friction; `wet` is for models in which water has further effects. A user's
+        model gets `slope` and `wet` only on roads that have a slope or are wet.
         """
 
+    @abstractmethod
     def sumo_type(self, prepared: Any) -> SumoType:
         """The SUMO types of the vehicles."""
 
+    @abstractmethod
     def at_rest(self, prepared: Any) -> Any:
         """The state at the start: standing, pedals released."""
 
     def at_speed(self, prepared: Any, speed: FloatArray) -> Any:
         """The steady state at a speed above 0 [m/s], shape (N,), with the pedals that hold it."""
+        raise InputError(type(self).__name__, "has no method at_speed(prepared, speed), and the traffic puts it onto the road in motion",
+                         "a vehicle with that method, or traffic that departs with speed 0")
 
+    def at_start(self, prepared: Any, speed: FloatArray) -> Any:
+        """The initial state at a speed [m/s], shape (N,): at rest if the speed is 0, else the steady state."""
+        rest, is_rolling = self.at_rest(prepared), speed > 0
+        if not is_rolling.any():
+            return rest
+        steady = self.at_speed(prepared, np.where(is_rolling, speed, 1.0))
+        return steady if is_rolling.all() else _select_state(is_rolling, steady, rest)
+
+    def hold_gear(self, prepared: Any, state: Any, holds: BoolArray) -> Any:
+        """The state in which vehicles do not change gear where `holds`, shape (N,), is true; the robot of tests at a speed needs it."""
+        return state
+
+    def sensors(self, prepared: Any) -> Sensors | None:
+        """Sensors of the vehicles, for a controller that reads SUMO instead of observations; None if they see everything at once."""
+        return None
+
+    @abstractmethod
     def sense(self, prepared: Any, state: Any, seen: Observation) -> tuple[Observation, Any]:
         """What the vehicles' sensors report of an observation, and the state after it."""
 
+    @abstractmethod
     def advance(self, prepared: Any, state: Any, command: Command) -> Any:
         """The state one simulation step later."""
-
-
-def at_start(vehicle: Vehicle, prepared: Any, speed: FloatArray) -> Any:
-    """The initial state at a speed [m/s], shape (N,): at rest if the speed is 0, else the steady state."""
-    method = getattr(vehicle, "at_start", None)
-    if method is not None:
-        return method(prepared, speed)
-    rest = vehicle.at_rest(prepared)
-    is_rolling = speed > 0
-    if not is_rolling.any():
-        return rest
-    steady = vehicle.at_speed(prepared, np.where(is_rolling, speed, 1.0))
-    return steady if is_rolling.all() else _select_state(is_rolling, steady, rest)
 
 
 def _select_state(is_rolling: BoolArray, steady: Any, rest: Any) -> Any:
@@ -122,7 +145,6 @@ def _select_state(is_rolling: BoolArray, steady: Any, rest: Any) -> Any:
     return steady if steady is None else np.where(is_rolling, steady, rest)
 
 
-VEHICLE_CONTRACT = Contract.of(Vehicle, "a vehicle", optional=("at_speed",))
 HIGHEST_SPEED = 1000.0
 """Highest speed of a vehicle [m/s]; beyond it a model has diverged."""
 SPEED_ROUNDING = 1e-9  # relative tolerance of speeds
@@ -150,7 +172,7 @@ class _State(NamedTuple):
     model_state: Any
 
 
-class GuardedVehicle:
+class GuardedVehicle(Vehicle):
     """Guards a user's model: passes read-only copies to it, and checks its results."""
 
     UNITS: Mapping[str, str]
@@ -161,21 +183,12 @@ class GuardedVehicle:
         if not isinstance(units, Mapping) or not all(isinstance(text, str) for item in units.items() for text in item):
             raise guard.wrong_value("__init__", "UNITS", units, "a mapping from names of characteristics to their units")
         self.UNITS = dict(units)
-        self.takes_slope = accepts(vehicle.prepare, 4)
-        self.can_start_moving = hasattr(vehicle, "at_speed")
 
     def prepare(self, characteristics: Characteristics, road_friction: float, step: float, slope: Slope = LEVEL,
                 wet: bool | BoolArray = False) -> _Prepared:
-        n, method = len(next(iter(characteristics.values()))), self.model.prepare
-        if slope is not LEVEL and not self.takes_slope:
-            problem = f"{self._guard.name} has no slope in prepare(characteristics, road_friction, step, slope), and the road has a grade"
-            raise UserCodeError(self._guard.source, problem, "a vehicle with the argument slope, or scenarios with grade 0")
-        arguments: tuple[Any, ...] = (read_only_copy(characteristics), road_friction, step)
-        if np.any(wet) and accepts(method, 5):
-            arguments = (*arguments, read_only_copy(slope), read_only_copy(wet))
-        elif slope is not LEVEL:
-            arguments = (*arguments, read_only_copy(slope))
-        constants = self._guard.call("prepare", method, *arguments)
+        n, road = len(next(iter(characteristics.values()))), (slope, wet) if np.any(wet) else (slope,) if slope is not LEVEL else ()
+        arguments = read_only_copy(characteristics), road_friction, step, *read_only_copy(road)
+        constants = self._guard.call("prepare", self.model.prepare, *arguments)
         types = self._guard.call("sumo_type", self.model.sumo_type, constants)
         return _Prepared(n, constants, SumoType(*(
             self._guard.numbers("sumo_type", name, self._guard.field("sumo_type", types, name), (n,), lowest=0.0, above=True)
@@ -190,29 +203,22 @@ class GuardedVehicle:
         return state
 
     def at_speed(self, prepared: _Prepared, speed: FloatArray) -> _State:
-        if not self.can_start_moving:
-            problem = f"{self._guard.name} has no method at_speed(prepared, speed), and the traffic puts it onto the road in motion"
-            raise UserCodeError(self._guard.source, problem, "a vehicle with that method, or traffic that departs with speed 0")
         state = self._guard.call("at_speed", self.model.at_speed, prepared.constants, read_only_copy(speed))
         return self._checked_state("at_speed", prepared.n, state)
 
     def hold_gear(self, prepared: _Prepared, state: _State, holds: BoolArray) -> _State:
-        if not hasattr(self.model, "hold_gear"):
-            return state
         held = self._guard.call("hold_gear", self.model.hold_gear, prepared.constants, state.model_state, read_only_copy(holds))
         return self._checked_state("hold_gear", prepared.n, held)
 
     def sensors(self, prepared: _Prepared) -> Sensors | None:
-        """The model's sensors; None for a model without that method."""
-        if not hasattr(self.model, "sensors"):
-            return None
         sensors = self._guard.call("sensors", self.model.sensors, prepared.constants)
-        return Sensors(*(self._guard.numbers("sensors", name, self._guard.field("sensors", sensors, name), (prepared.n,), lowest=0.0,
-                                             above=name == "scale", infinite=name == "reach") for name in Sensors._fields))
+        return sensors if sensors is None else Sensors(*(
+            self._guard.numbers("sensors", name, self._guard.field("sensors", sensors, name), (prepared.n,), lowest=0.0,
+                                above=name == "scale", infinite=name == "reach") for name in Sensors._fields))
 
     def refuse_sense_without_sensors(self, characteristics: Characteristics) -> None:
         """Refuse a model that changes observations in `sense` but has no method `sensors`, because a TraCI controller bypasses `sense`."""
-        if hasattr(self.model, "sensors"):
+        if type(self.model).sensors is not Vehicle.sensors:
             return
         prepared = self.prepare(characteristics, road_friction=1.0, step=PROBE_STEP)
         state, zeros = self.at_rest(prepared), np.zeros(prepared.n)

@@ -14,7 +14,7 @@ import numpy as np
 from msgspec import Meta, Struct
 
 from safevar_sumo.records import GRAVITY, TIME_ROUNDING, BoolArray, Command, FloatArray, Observation
-from safevar_sumo.vehicles.base import LEVEL, Characteristics, Positive, Slope, SumoType
+from safevar_sumo.vehicles.base import LEVEL, Characteristics, Positive, Slope, SumoType, Vehicle
 from safevar_sumo.vehicles.sensors import Sensors
 
 Share = Annotated[float, Meta(gt=0, le=1)]
@@ -118,7 +118,7 @@ class _Driveline(NamedTuple):
         return cls(clutch, clutch_times_ratio, clutch_times_ratio * ratio, p.engine_inertia_per_step + damping, p.damping_full - damping)
 
 
-class Carla(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class Carla(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The vehicle of the studies sun and rain.
 
     Parameters

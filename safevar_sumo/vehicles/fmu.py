@@ -25,7 +25,7 @@ from safevar_sumo.fmu import (
 from safevar_sumo.plugins import Guard, open_rows
 from safevar_sumo.records import BoolArray, Command, FloatArray, Observation
 from safevar_sumo.study import CharacteristicTable
-from safevar_sumo.vehicles.base import HIGHEST_SPEED, LEVEL, SPEED_ROUNDING, Characteristics, Slope, SumoType
+from safevar_sumo.vehicles.base import HIGHEST_SPEED, LEVEL, SPEED_ROUNDING, Characteristics, Slope, SumoType, Vehicle
 from safevar_sumo.vehicles.sensors import Sensors, sensed_observation
 
 PEDALS: Mapping[str, str] = {"throttle": "-", "brake": "-"}
@@ -65,7 +65,7 @@ class _State(NamedTuple):
     history: History
 
 
-class FmuVehicle:
+class FmuVehicle(Vehicle):
     """N vehicles with an instance of an FMU each; see `Vehicle`.
 
     Parameters
@@ -123,7 +123,8 @@ class FmuVehicle:
         self._instances = Instances(description, ports, [*output_ports.values(), *type_ports.values()], constants)
         self.max_vehicles = self._instances.max_vehicles
         self.takes_slope, self.can_start_moving = "grade" in input_ports, "initial_speed" in input_ports
-        self._takes_friction = "road_friction" in input_ports
+        self.remarks = [] if "road_friction" in input_ports else [
+            f"{guard.name} has no vehicle.inputs.road_friction: weather has no effect on how it accelerates and brakes"]
 
     def _refuse_too_small(self, table: Mapping[str, CharacteristicTable], key: str, entry: str | float, *, may_be_0: bool) -> None:
         """Refuse a negative number, or a characteristic with a negative lower end; 0 is legal only with `may_be_0`."""
@@ -222,12 +223,6 @@ class FmuVehicle:
             raise self._guard.wrong_value("doStep", "speed", float(next_state.speed[i]),
                                           f"up to vehicle.sumo_type.max_speed = {max_speed[i]:g}")
         return next_state
-
-    @property
-    def remarks(self) -> list[str]:
-        """Remarks for the user."""
-        return [] if self._takes_friction else [
-            f"{self._guard.name} has no vehicle.inputs.road_friction: weather has no effect on how it accelerates and brakes"]
 
     def _start(self, fleet: Fleet, inputs: FloatArray) -> tuple[FloatArray, History]:
         outputs, history = self._guard.call("initialisation", fleet.start, inputs)

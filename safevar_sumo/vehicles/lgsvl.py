@@ -14,7 +14,7 @@ import numpy as np
 from msgspec import Meta, Struct
 
 from safevar_sumo.records import BoolArray, Command, FloatArray, Observation
-from safevar_sumo.vehicles.base import LEVEL, Characteristics, Slope, SumoType
+from safevar_sumo.vehicles.base import LEVEL, Characteristics, Slope, SumoType, Vehicle
 
 # Constants used with arrays in every step are arrays themselves: numpy would convert a float each time, which doubles the cost.
 ZERO, ONE, TWO, HALF = map(np.array, (0.0, 1.0, 2.0, 0.5))
@@ -99,7 +99,7 @@ class LgsvlState(NamedTuple):
     brake: FloatArray
 
 
-class Lgsvl(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class Lgsvl(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The vehicle of the study lgsvl.
 
     Parameters

@@ -8,7 +8,7 @@ import numpy as np
 from msgspec import Meta, Struct
 
 from safevar_sumo.records import BoolArray, Command, FloatArray, Observation
-from safevar_sumo.vehicles.base import LEVEL, Characteristics, Slope, SumoType
+from safevar_sumo.vehicles.base import LEVEL, Characteristics, Slope, SumoType, Vehicle
 from safevar_sumo.vehicles.sensors import Sensors, delay_signal, extend_history, sensed_observation, start_history
 
 
@@ -41,7 +41,7 @@ class SumoState(NamedTuple):
     brake_commands: FloatArray
 
 
-class SumoVehicle(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class SumoVehicle(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A SUMO vehicle type: greatest accelerations, top speed, and delays of sensors and actuators.
 
     Parameters

@@ -8,7 +8,7 @@ import numpy as np
 from msgspec import Meta, Struct
 
 from safevar_sumo.records import BoolArray, Command, FloatArray, Observation
-from safevar_sumo.vehicles.base import LEVEL, Characteristics, Positive, Slope, SumoType
+from safevar_sumo.vehicles.base import LEVEL, Characteristics, Positive, Slope, SumoType, Vehicle
 from safevar_sumo.vehicles.sensors import Sensors, delay_signal, extend_history, sensed_observation, start_history
 
 DEEP_TREAD, HALF_WORN_TREAD, LEGAL_TREAD = 6.7, 3.0, 1.6
@@ -51,7 +51,7 @@ class WornState(NamedTuple):
     brake_commands: FloatArray
 
 
-class WornVehicle(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class WornVehicle(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A car with two axles that never lock: each axle brakes up to the friction that its load allows.
 
     Parameters

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from safevar_sumo.ads import PerVehicleAds, ScalarAds
+from safevar_sumo.ads import Ads, PerVehicleAds, ScalarAds
 from safevar_sumo.errors import InputError
 from safevar_sumo.plugins import Guard
 from safevar_sumo.records import Command, Evaluations, Nominal, Observation
@@ -24,7 +24,7 @@ MASS = NATIVE.characteristics.names.index("mass")
 HEAVY = np.where(np.arange(len(ORIGINAL)) == MASS, 1700.0, ORIGINAL)
 
 
-class Brakes:
+class Brakes(Ads):
     """Full throttle; a vehicle brakes if it is the light one of two."""
 
     def start(self, n: int, nominal: Nominal, step: float) -> None:

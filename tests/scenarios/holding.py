@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from safevar_sumo.ads import Ads
 from safevar_sumo.records import Command, FloatArray, Nominal, Observation, SimulationRuns
 from safevar_sumo.scenarios import Scenario
 from safevar_sumo.study import load_study
@@ -17,7 +18,7 @@ CARLA = assemble(load_study("sun"))
 NATIVE = assemble(load_study("native"))
 
 
-class Hold:
+class Hold(Ads):
     """Holds the pedals; from `brakes_at[i]` on [s], brakes vehicle i fully."""
 
     def __init__(self, brakes_at: FloatArray | None = None) -> None:

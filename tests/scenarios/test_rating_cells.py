@@ -184,19 +184,15 @@ def test_other_targets_are_hit_in_a_recorded_scene_as_in_sumo_to_the_last_bit(sc
         np.testing.assert_array_equal(ours, theirs)
 
 
-def test_a_scenario_of_ones_own_may_turn_lanes_and_may_call_a_parameter_lanes(in_tmp: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_scenario_of_ones_own_may_turn_lanes(in_tmp: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(in_tmp)
     Path("mine_at_an_angle.py").write_text(
-        "from safevar_sumo.scenarios import Crossing, LeadVehicleStopped\n\n\n"
-        "class Mine(Crossing, frozen=True, kw_only=True):\n    pass\n\n\n"
-        "class Lanes(LeadVehicleStopped, frozen=True, kw_only=True):\n    lanes: int = 2\n")
+        "from safevar_sumo.scenarios import Crossing\n\n\nclass Mine(Crossing, frozen=True, kw_only=True):\n    pass\n")
     turned = {"test": "CBNA", "heading": 20}
     studies = [load_study("euro_ncap_pedestrian", title="", matrix=None, scenario={"model": model, "parameters": turned})
                for model in ("mine_at_an_angle:Mine", "crossing")]
     mine, ours = (simulate(system, system.characteristics.original[np.newaxis], Engine.LIBSUMO) for system in map(assemble, studies))
     np.testing.assert_array_equal(mine.trace.gap, ours.trace.gap)
-    lanes = assemble(load_study("native", title="", published={}, scenario={"model": "mine_at_an_angle:Lanes"}))
-    assert simulate(lanes, lanes.characteristics.original[np.newaxis]).outcome[0] == Outcome.STOPPED
 
 
 def test_a_cyclist_behind_parked_cars_is_seen_past_the_corner_whatever_his_direction() -> None:

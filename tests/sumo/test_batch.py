@@ -10,7 +10,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from safevar_sumo.ads import ADS
+from safevar_sumo.ads import ADS, Ads
 from safevar_sumo.ads.driver import DelayLine
 from safevar_sumo.records import Command, Evaluations, Nominal, Observation, Outcome, SimulationRuns, Trace
 from safevar_sumo.scenarios.base import Scene
@@ -115,7 +115,7 @@ def test_the_last_sample_counts() -> None:
     assert judged((3, False, None), (0, False, None))[0] == Outcome.STOPPED
 
 
-class _Pedals:
+class _Pedals(Ads):
     """Drives each vehicle with its own constant throttle, and brakes it from its own time on."""
 
     def __init__(self, throttle: np.ndarray, brakes_at: np.ndarray) -> None:

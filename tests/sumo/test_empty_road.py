@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from safevar_sumo.ads import Ads
 from safevar_sumo.records import Command, FloatArray, Nominal, Observation
 from safevar_sumo.study import Study, load_study, study_names
 from safevar_sumo.sumo.empty_road import why_no_verdict
@@ -21,7 +22,7 @@ STANDS = "The original vehicle never reaches the encounter (it gets 0.0 of 11.9 
 SIMPLE_STUDIES = [name for name in study_names() if load_study(name).matrix is None]
 
 
-class Pedals:
+class Pedals(Ads):
     """A driving system whose pedals are a function of the observation."""
 
     def __init__(self, pedals: Callable[[Observation], tuple[object, object]]) -> None:

@@ -9,6 +9,7 @@ import msgspec
 import numpy as np
 import pytest
 
+from safevar_sumo.ads import Ads
 from safevar_sumo.errors import InputError
 from safevar_sumo.protocol.driving_robot import DrivingRobot
 from safevar_sumo.records import Command, Evaluations, FloatArray, Nominal, Observation, Outcome, SimulationRuns
@@ -100,7 +101,7 @@ MAX_RPM = SUN.characteristics.names.index("max_rpm")
 EAST = np.array([1.0, 0.0])
 
 
-class Pedals:
+class Pedals(Ads):
     """Throttle and brake over time [s]."""
 
     def __init__(self, throttle: float = 0.5, *, brakes: tuple[float, float] = (99.0, 99.0), lets_go: float = 99.0) -> None:

@@ -14,6 +14,7 @@ import platformdirs
 import pytest
 
 import safevar_sumo as sv
+from safevar_sumo.ads import Ads
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import Command, Nominal, Observation, Outcome
 from safevar_sumo.scenarios import SCENARIOS
@@ -52,7 +53,7 @@ def assert_same(system: System, number: int, seed: int) -> list[str]:
     return outcomes
 
 
-class FullThrottle:
+class FullThrottle(Ads):
     """Drives at full throttle into any obstacle."""
 
     def start(self, n: int, nominal: Nominal, step: float) -> None:

@@ -15,7 +15,7 @@ from safevar_sumo.shipped import NETWORKS
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.matrix import simulate
 from safevar_sumo.sumo.system import assemble
-from safevar_sumo.vehicles import LEVEL, at_start, slope_of
+from safevar_sumo.vehicles import LEVEL, slope_of
 from tests.vehicles.runs import STEP, SYSTEMS, drawn, drive, original
 
 SPEEDS = (10, 20, 30, 40, 50, 60)  # km/h, where the original vehicles' gearboxes hold their gear
@@ -25,7 +25,7 @@ def moving(model: str, settings: np.ndarray, speed: float, grade: float = 0.0) -
     system = SYSTEMS[model]
     values = dict(zip(system.characteristics.names, np.ascontiguousarray(settings.T), strict=True))
     prepared = system.vehicle.prepare(values, 1.0, STEP, slope_of(np.full(len(settings), grade)))
-    return prepared, at_start(system.vehicle, prepared, np.full(len(settings), speed))
+    return prepared, system.vehicle.at_start(prepared, np.full(len(settings), speed))
 
 
 @pytest.mark.parametrize("model", sorted(SYSTEMS))
@@ -46,8 +46,8 @@ def test_whoever_stands_and_whoever_rolls_start_together_and_each_as_if_alone() 
         settings = drawn(model, 4, 9)
         values = dict(zip(system.characteristics.names, np.ascontiguousarray(settings.T), strict=True))
         prepared = system.vehicle.prepare(values, 1.0, STEP)
-        mixed = at_start(system.vehicle, prepared, np.array([0.0, 8.0, 0.0, 12.0]))
-        rest, rolling = system.vehicle.at_rest(prepared), at_start(system.vehicle, prepared, np.array([3.0, 8.0, 4.0, 12.0]))
+        mixed = system.vehicle.at_start(prepared, np.array([0.0, 8.0, 0.0, 12.0]))
+        rest, rolling = system.vehicle.at_rest(prepared), system.vehicle.at_start(prepared, np.array([3.0, 8.0, 4.0, 12.0]))
         for one, stands, rolls in zip(mixed, rest, rolling, strict=True):
             if one is not None:
                 assert one[..., [0, 2]].tolist() == stands[..., [0, 2]].tolist()

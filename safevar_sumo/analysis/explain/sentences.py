@@ -13,7 +13,6 @@ from safevar_sumo.analysis.words import OUTCOME_VERBS, list_of_changes, number_o
 from safevar_sumo.metrics import RATING_POINTS
 from safevar_sumo.records import KMH_PER_MS, Evaluations, Outcome
 from safevar_sumo.scenarios import distance_in_words, equals_clear, weather_in_words
-from safevar_sumo.scenarios.base import pre_crash_of
 from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.vehicles import Characteristic, CharacteristicSet
 
@@ -108,7 +107,7 @@ def _ending_in_words(system: System, run: Evaluations) -> str:
         return f"earns {run.metrics[RATING_POINTS.name][0]:.2f} points"
     if outcome == Outcome.COLLISION:
         return f"itself collides, at {_speed_in_words(degree)}"
-    if outcome == Outcome.STOPPED and all(pre_crash_of(point.scenario).startswith("pedestrian") for point in system.points):
+    if outcome == Outcome.STOPPED and all(point.scenario.pre_crash.startswith("pedestrian") for point in system.points):
         return f"stops {degree:.2f} m short of the pedestrian"
     distance = "" if np.isnan(degree) else f" with a safety degree of {distance_in_words(system.points[0].scenario, degree)}"
     return f"{OUTCOME_VERBS.get(outcome, outcome)}{distance}"

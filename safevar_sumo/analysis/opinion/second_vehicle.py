@@ -24,7 +24,7 @@ from safevar_sumo.analysis.opinion.multi_body import (
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import BoolArray, Command, FloatArray, Observation
 from safevar_sumo.study import Study, load_study
-from safevar_sumo.vehicles import LEVEL, VEHICLES, GuardedVehicle, Sensors, Slope, SumoType, Vehicle, at_start
+from safevar_sumo.vehicles import LEVEL, VEHICLES, GuardedVehicle, Sensors, Slope, SumoType, Vehicle
 from safevar_sumo.vehicles.base import Characteristics
 from safevar_sumo.vehicles.sensors import delay_signal, extend_history, start_history
 
@@ -63,7 +63,7 @@ class SecondState(NamedTuple):
     brake_commands: FloatArray
 
 
-class SecondVehicle:
+class SecondVehicle(Vehicle):
     """A vehicle of the second model for every setting of a study; the contract is `safevar_sumo.vehicles.Vehicle`.
 
     The study's vehicle is a shipped one, derived from one, or user code with all characteristics of a shipped one.
@@ -127,22 +127,20 @@ class SecondVehicle:
 
     def at_speed(self, prepared: Prepared, speed: FloatArray) -> SecondState:
         """The state in which the pedals hold the original vehicle's speed, which may be 0."""
-        original = at_start(self._engine, prepared.original, speed)
+        original = self._engine.at_start(prepared.original, speed)
         commands = start_history(float(np.max(prepared.plant.brake_delay)), prepared.step, original.brake)
-        vehicle, body = at_start(self._vehicle, prepared.vehicle, speed), balanced_state(prepared.plant, speed)
+        vehicle, body = self._vehicle.at_start(prepared.vehicle, speed), balanced_state(prepared.plant, speed)
         return SecondState(speed, original.throttle, original.brake, original.gear, vehicle, original, body, commands)
 
     def sensors(self, prepared: Prepared) -> Sensors | None:
-        sensors = getattr(self._vehicle, "sensors", None)
-        return None if sensors is None else sensors(prepared.vehicle)
+        return self._vehicle.sensors(prepared.vehicle)
 
     def sense(self, prepared: Prepared, state: SecondState, seen: Observation) -> tuple[Observation, SecondState]:
         observation, vehicle = self._vehicle.sense(prepared.vehicle, state.vehicle, seen)
         return observation, state._replace(vehicle=vehicle)
 
     def hold_gear(self, prepared: Prepared, state: SecondState, holds: BoolArray) -> SecondState:
-        hold = getattr(self._engine, "hold_gear", None)
-        return state if hold is None else state._replace(original=hold(prepared.original, state.original, holds))
+        return state._replace(original=self._engine.hold_gear(prepared.original, state.original, holds))
 
     def advance(self, prepared: Prepared, state: SecondState, command: Command) -> SecondState:
         plant, body, brake = prepared.plant, state.body, state.brake
