@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import configparser
 import importlib.util
 import json
 import re
@@ -21,7 +22,7 @@ from safevar_sumo.analysis.risk import RiskOptions
 from safevar_sumo.analysis.rules import RulesOptions
 from safevar_sumo.cli.program import commands
 from safevar_sumo.report import input as report_input
-from safevar_sumo.results.manifest import KEYS_WITHOUT_EFFECT_ON_EVALUATIONS, KEYS_WITHOUT_EFFECT_ON_RESULTS
+from safevar_sumo.results.manifest import KEYS_WITHOUT_EFFECT_ON_EVALUATIONS, KEYS_WITHOUT_EFFECT_ON_RESULTS, manifest_of
 from safevar_sumo.study import DESCRIPTION_KEYS, load_study, study_names
 from safevar_sumo.vehicles import VEHICLES
 
@@ -69,6 +70,17 @@ def run(line: str) -> None:
         assert re.search(rf"^{line.split()[1]}:", (ROOT / "Makefile").read_text(), flags=re.MULTILINE), line
     else:
         assert line.startswith(("pip install", "eval ", "#")) or not line, f"a line that nothing runs: {line}"
+
+
+def test_the_version_of_setup_cfg_is_that_of_the_program_its_results_its_citation_and_its_changes() -> None:
+    config = configparser.ConfigParser()
+    config.read(ROOT / "setup.cfg")
+    version = config["metadata"]["version"]
+    output = CliRunner().invoke(commands, ["--version"]).stdout
+    assert output.endswith(f", version {version}\n"), "install again: pip install --editable ."
+    assert manifest_of(load_study("smoke"), {})["versions"]["safevar_sumo"] == version
+    assert f"\nversion: {version}\n" in (ROOT / "CITATION.cff").read_text()
+    assert re.findall("^## (.*) [(]", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)[0] == version
 
 
 def test_every_command_that_a_page_names_exists() -> None:
