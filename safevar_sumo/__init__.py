@@ -4,9 +4,16 @@
 loaded on first use, so importing the package is fast.
 """
 
-from importlib.metadata import version
+from typing import Any
 
 import lazy_loader
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
-__version__ = version("safevar_sumo")
+_load, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+
+
+def __getattr__(name: str) -> Any:
+    if name == "__version__":
+        from importlib.metadata import version  # here, as it imports modules that a file of the working directory could replace
+
+        return version(__name__)
+    return _load(name)
