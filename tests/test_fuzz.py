@@ -19,6 +19,8 @@ from hypothesis import strategies as st
 
 import safevar_sumo.cli.study
 from safevar_sumo.ads import Ads, GuardedAds, PerVehicleAds
+from safevar_sumo.campaign.pool import Report, Share
+from safevar_sumo.campaign.share import carry_out_share
 from safevar_sumo.cli.program import commands
 from safevar_sumo.errors import InputError, SafevarError, UserCodeError
 from safevar_sumo.metrics import METRICS
@@ -131,11 +133,24 @@ class Formula:
 
     def submit(self, study: bytes, settings: FloatArray) -> Future[Evaluations]:
         future: Future[Evaluations] = Future()
-        safety = np.abs(settings / SMOKE.original - 1).max(axis=1)
-        future.set_result(Evaluations(
-            settings=settings, outcome=np.full(len(settings), "stopped", dtype="U16"), collision_speed=np.full(len(settings), np.nan),
-            metrics=dict.fromkeys(METRICS, 1.0 - safety), f_diff=SMOKE.largest_change(settings), f_num_diff=SMOKE.number_changed(settings)))
+        future.set_result(evaluated(study, settings))
         return future
+
+    def carry(self, share: Share, report: Report) -> Future[None]:
+        future: Future[None] = Future()
+        try:
+            future.set_result(carry_out_share(share, report, evaluated))
+        except Exception as error:
+            future.set_exception(error)
+        return future
+
+
+def evaluated(study: bytes, settings: FloatArray) -> Evaluations:
+    """Evaluations by a formula."""
+    safety = np.abs(settings / SMOKE.original - 1).max(axis=1)
+    return Evaluations(
+        settings=settings, outcome=np.full(len(settings), "stopped", dtype="U16"), collision_speed=np.full(len(settings), np.nan),
+        metrics=dict.fromkeys(METRICS, 1.0 - safety), f_diff=SMOKE.largest_change(settings), f_num_diff=SMOKE.number_changed(settings))
 
 
 @contextmanager

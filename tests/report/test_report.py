@@ -318,11 +318,11 @@ def test_of_an_original_that_collides_no_change_is_called_the_cause(
 
 def test_user_code_is_called_by_its_name_once(slippery: Path) -> None:
     (data,) = read_inputs([slippery])
-    scenario = SimpleNamespace()
+    scenario = SimpleNamespace(pre_crash="", centre_to_centre=False, test_speed=None)
     study = msgspec.structs.replace(data.case.study, ads=msgspec.structs.replace(data.case.study.ads, model="my_controller:Pilot"))
     points = [Point(scenario, data.case.weather)]  # type: ignore[arg-type]
     others: Any = SimpleNamespace(case=dataclasses.replace(data.case, study=study), manifest=data.manifest, problem="", point="",
-                                  system=SimpleNamespace(points=points, matrix=(), vehicle=None))
+                                  system=SimpleNamespace(points=points, matrix=(), vehicle=SimpleNamespace(FITTED_UP_TO=None)))
     result = describe_tested_system(others)
     assert "Driving system: my_controller:Pilot. Scenario: pedestrian_crossing (" in result["subject"]
     assert "NSGA-II (1 run)" in result["search"]
