@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import html
 import json
+import math
 import re
 import shutil
 from dataclasses import replace
@@ -322,7 +323,7 @@ def test_user_code_is_called_by_its_name_once(slippery: Path) -> None:
     study = msgspec.structs.replace(data.case.study, ads=msgspec.structs.replace(data.case.study.ads, model="my_controller:Pilot"))
     points = [Point(scenario, data.case.weather)]  # type: ignore[arg-type]
     others: Any = SimpleNamespace(case=dataclasses.replace(data.case, study=study), manifest=data.manifest, problem="", point="",
-                                  system=SimpleNamespace(points=points, matrix=(), vehicle=SimpleNamespace(FITTED_UP_TO=None)))
+                                  system=SimpleNamespace(points=points, matrix=(), vehicle=SimpleNamespace(FITTED_UP_TO=math.inf)))
     result = describe_tested_system(others)
     assert "Driving system: my_controller:Pilot. Scenario: pedestrian_crossing (" in result["subject"]
     assert "NSGA-II (1 run)" in result["search"]
