@@ -124,8 +124,7 @@ class Journal:
 
     def finish(self, positions: Sequence[int], asked: int, budget: int) -> None:
         """Add the result: the positions of the solutions, the number of requested evaluations, and their allowed number; sync all."""
-        self._write({"solutions": list(positions), "asked": asked, "budget": budget})
-        os.fsync(self._file.fileno())
+        self._write({"solutions": list(positions), "asked": asked, "budget": budget}, sync=True)
 
     def retry(self) -> None:
         """Drop failed evaluations, and results based on them."""
@@ -152,7 +151,7 @@ class Journal:
             self._write(head.line())
         return _content_of(lines, self.path)._replace(tail_size=len(data) - end)
 
-    def _write(self, line: Line) -> None:
+    def _write(self, line: Line, *, sync: bool = False) -> None:
         start = self._file.tell()
         try:
             remainder = memoryview(msgspec.json.encode(line) + b"\n")
@@ -160,6 +159,8 @@ class Journal:
                 remainder = remainder[self._file.write(remainder):]
             if not self.path.exists():
                 raise OSError(errno.ENOENT, "the file is gone")
+            if sync:
+                os.fsync(self._file.fileno())
         except OSError as error:
             with suppress(OSError):  # if this fails too, the next reader cuts off the torn line
                 self._truncate(start)
