@@ -205,7 +205,7 @@ def scan_pairs(evaluator: Evaluator, columns: Sequence[int], unsafe: Unsafe) -> 
     shape = len(planes), GRID_VALUES, GRID_VALUES
     degrees, is_unsafe = evaluations.f_safe.reshape(shape), unsafe.of(evaluations).reshape(shape)
     valid, infeasible = evaluations.valid.reshape(shape), evaluations.infeasible.reshape(shape)
-    ends = [(values[plane] for values in (characteristics.original, characteristics.lower, characteristics.upper))
+    ends = [[values[plane] for values in (characteristics.original, characteristics.lower, characteristics.upper)]
             for plane in planes]
     searches = [_search_nearest(grid, *its_ends) for grid, its_ends in zip(is_unsafe, ends, strict=True)]
     answers: dict[int, BoolArray | None] = dict.fromkeys(range(len(planes)))
