@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import os
 import sys
+import threading
 from concurrent.futures import Future
 from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
@@ -23,6 +24,9 @@ from safevar_sumo.results import ResultsDirectory
 from safevar_sumo.study import Study
 from safevar_sumo.sumo.system import assemble
 
+_libsumo_lock = threading.Lock()
+"""A process has one libsumo, and threads that retry batches ask for several at once."""
+
 
 class InlinePool:
     """A pool that computes in this process, at once; it has the interface of a pool of worker processes."""
@@ -34,7 +38,8 @@ class InlinePool:
     def submit(self, work: bytes, settings: FloatArray) -> Future[Evaluations]:
         future: Future[Evaluations] = Future()
         try:
-            future.set_result(evaluate_batch(work, settings))
+            with _libsumo_lock:
+                future.set_result(evaluate_batch(work, settings))
         except Exception as error:
             future.set_exception(error)
         return future

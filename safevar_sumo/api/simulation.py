@@ -17,7 +17,7 @@ from safevar_sumo.metrics import Scoring, time_to_collision
 from safevar_sumo.progress import Progress, open_progress, show_no_progress
 from safevar_sumo.records import STANDSTILL, TIME_DECIMALS, Evaluations, FloatArray, Observation, Outcome, SimulationRuns
 from safevar_sumo.results import evaluations_frame, record
-from safevar_sumo.scenarios import SCENARIOS, distance_in_words
+from safevar_sumo.scenarios import Scenario, distance_in_words
 from safevar_sumo.study import SAFETY_DEGREE, Study, StudyLike, load_study
 from safevar_sumo.sumo.batch import drive_all, score
 from safevar_sumo.sumo.empty_road import driven_entry, why_no_verdict
@@ -90,6 +90,7 @@ class Simulation:
     evaluation: Evaluations
     runs: SimulationRuns
     scoring: Scoring
+    _scenario: Scenario
     _observations: Sequence[Observation]
     no_verdict: str
     reset_values: Mapping[str, float] = field(default_factory=dict)
@@ -138,7 +139,7 @@ class Simulation:
         if self.outcome is Outcome.COLLISION:
             return f"collides at {self.collision_speed:.2f} m/s"
         safety_degree = self.metrics[SAFETY_DEGREE]
-        distance = distance_in_words(SCENARIOS.get(self.study.scenario.model), safety_degree)
+        distance = distance_in_words(self._scenario, safety_degree)
         return OUTCOME_VERBS[self.outcome] + ("" if np.isnan(safety_degree) else f", with a safety degree of {distance}")
 
     def to_dict(self) -> dict[str, Any]:
@@ -209,12 +210,13 @@ def load_and_assemble(study: StudyLike, source: str = "") -> tuple[Study, System
 
 def _simulate_one(study: Study, system: System, setting: FloatArray, no_verdict: str) -> Simulation:
     settings, observations = setting[np.newaxis], list[Observation]()
-    runs = drive_all(system_at_worst_point(system, settings), settings, Engine.LIBSUMO,
+    at_point = system_at_worst_point(system, settings)
+    runs = drive_all(at_point, settings, Engine.LIBSUMO,
                      listen=lambda seen: observations.append(Observation._make(map(np.copy, seen))))
     return Simulation(
         study=study, setting=dict(zip(system.characteristics.names, setting.tolist(), strict=True)),
         evaluation=score(system, settings, runs), runs=runs, scoring=system.measuring.scoring,
-        no_verdict=no_verdict, _observations=observations)
+        no_verdict=no_verdict, _scenario=at_point.points[0].scenario, _observations=observations)
 
 
 SETTINGS_FORMAT = ("a list of mappings such as [{'mass': 2500}], a pandas.DataFrame with a column for each characteristic that is changed, "

@@ -19,7 +19,8 @@ from safevar_sumo.metrics import PUBLISHED_SCORING
 from safevar_sumo.progress import Progress
 from safevar_sumo.replay.comparison import list_differences, quantity_text, superscript_powers
 from safevar_sumo.report.input import ReportInput
-from safevar_sumo.scenarios import SCENARIOS, distance_in_words
+from safevar_sumo.scenarios import distance_in_words
+from safevar_sumo.sumo.system import assemble
 
 MAX_CAUSES = 6
 """Maximum number of minimal causes in a report."""
@@ -67,7 +68,7 @@ def _key_figures(explained: Explained, tolerance: Tolerance | None) -> list[tupl
     else:
         figures.append(("Robust with the fewest changes", number_of(len(robust.changed), "change"), str(robust.robustness)))
     degree = float(explained.nearest.f_safe[0]) if len(explained.nearest) else np.nan
-    distance = distance_in_words(SCENARIOS.get(explained.study.scenario.model), degree)
+    distance = distance_in_words(assemble(explained.study).points[0].scenario, degree)
     collides = bool(explained.nearest.collided.any())
     figures.append(("Most severe", f"collision at {-degree:.1f} m/s" if collides else f"safety degree {distance}",
                     f"{-3.6 * degree:.0f} km/h" if collides else "no collision among the solutions"))

@@ -104,7 +104,7 @@ def test_explain_names_the_cells_of_a_worse_colour_and_the_summary_the_points_th
     console = Console(record=True, width=120, file=StringIO())
     print_explained(console, "it", result, full=True)
     assert " cells: CCRs" in console.export_text()
-    lines = summarise_failures(STUDY, case.solutions, original, TwoWorkers(), "it")
+    lines = summarise_failures(case, original, TwoWorkers(), "it")
     assert f"{points:.2f}" in lines[0]
     assert isinstance(case.solutions, pd.DataFrame)
 
