@@ -17,6 +17,7 @@ test-all: test
 
 lint: .venv/installed-test
 	$(RUN) -m ruff check .
+	$(RUN) -m ruff format --check --quiet .
 	$(RUN) -m mypy
 	.venv/bin/lint-imports --no-logo
 

@@ -109,8 +109,9 @@ def campaign(study: Study, opened: AbstractContextManager[Pool]) -> Cost:
             future.result()
         before = processors()
         results = ResultsDirectory(Path(folder), study, identity_of(study, assemble(study)))
-        clock = clock_seconds(lambda: run_campaign(study, all_runs(study), results, pool, Silent(), MAX_VEHICLES,
-                                                   engine=Engine.RECORDED))
+        clock = clock_seconds(
+            lambda: run_campaign(study, all_runs(study), results, pool, Silent(), MAX_VEHICLES, engine=Engine.RECORDED)
+        )
         return Cost(clock, processors() - before)
 
 
@@ -122,6 +123,7 @@ def compute(batches: list[Batch]) -> None:
 def ceiling(batches: list[Batch]) -> float:
     """How much faster two processes are than one that only compute the same batches."""
     with ProcessPoolExecutor(2, multiprocessing.get_context("spawn")) as processes:
+
         def together(n: int) -> None:
             for future in [processes.submit(compute, batches) for _ in range(n)]:
                 future.result()
@@ -143,8 +145,10 @@ def two_dask_workers(study: Study) -> Iterator[Pool]:
     """A cluster on this machine."""
     from distributed import LocalCluster
 
-    with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster, \
-            cluster_pool(cluster.scheduler_address, study.search.time_limit) as pool:
+    with (
+        LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster,
+        cluster_pool(cluster.scheduler_address, study.search.time_limit) as pool,
+    ):
         yield pool
 
 
@@ -156,9 +160,14 @@ def turn(study: Study) -> dict[str, float]:
     one, two = (campaign(study, local_pool(jobs, study.search.time_limit)) for jobs in (1, 2))
     cluster = campaign(study, two_dask_workers(study))
     most = ceiling(alone.batches)
-    return {"campaign": whole.processor / simulated / bare_each, "outside_simulation": 1 - alone.simulation / whole.processor,
-            "two_workers": one.clock / two.clock, "ceiling": most, "two_workers_of_ceiling": one.clock / two.clock / most,
-            "cluster": two.clock / cluster.clock}
+    return {
+        "campaign": whole.processor / simulated / bare_each,
+        "outside_simulation": 1 - alone.simulation / whole.processor,
+        "two_workers": one.clock / two.clock,
+        "ceiling": most,
+        "two_workers_of_ceiling": one.clock / two.clock / most,
+        "cluster": two.clock / cluster.clock,
+    }
 
 
 def records_of(study: Study, turns: int) -> Iterator[Record]:
@@ -177,7 +186,9 @@ def main() -> None:
     parser.add_argument("--json", action="store_true")
     arguments = parser.parse_args()
     study = load_study(arguments.study)
-    search = msgspec.structs.replace(study.search, algorithms=["nsga2"], runs=arguments.runs, evaluations=arguments.evaluations)
+    search = msgspec.structs.replace(
+        study.search, algorithms=["nsga2"], runs=arguments.runs, evaluations=arguments.evaluations
+    )
     print_records(records_of(msgspec.structs.replace(study, search=search), arguments.turns), as_json=arguments.json)
 
 

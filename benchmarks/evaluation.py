@@ -136,7 +136,11 @@ def records_of(study: str, populations: tuple[int, ...] = POPULATIONS) -> Iterat
         yield Record(study, "bare_libsumo", n, ours / loading)
         yield Record(study, "stepping_alone", n, ours / stepping)
         if n <= 200:
-            replayed = replace(system, vehicle=Replayed(system.vehicle, "prepare", "advance"), ads=Replayed(system.ads, "start", "drive"))
+            replayed = replace(
+                system,
+                vehicle=Replayed(system.vehicle, "prepare", "advance"),
+                ads=Replayed(system.ads, "start", "drive"),
+            )
             loading, ours = medians_in_turn(floor, partial(warm, replayed, settings))
             yield Record(study, "replayed", n, ours / loading)
             yield from beside_others(study, system, settings)
@@ -154,7 +158,9 @@ def beside_others(study: str, system: System, settings: FloatArray) -> Iterator[
             lambda: clock_seconds(lambda: evaluate(system, settings)),
             lambda: clock_seconds(lambda: [evaluate(system, one[None]) for one in few]),
             lambda: clock_seconds(lambda: evaluate(scalar, settings)),
-            lambda: clock_seconds(lambda: through_socket(system, few, command)), repetitions=5)
+            lambda: clock_seconds(lambda: through_socket(system, few, command)),
+            repetitions=5,
+        )
     yield Record(study, "batches_of_1", n, alone / len(few) / (together / n))
     yield Record(study, "scalar_ads", n, coasting / together)
     yield Record(study, "traci_socket", n, socket / len(few) / (together / n))

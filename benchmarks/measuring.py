@@ -44,7 +44,10 @@ def print_records(records: Iterable[Record], *, as_json: bool) -> None:
         print(json.dumps([record._asdict() for record in records], indent=2))
         return
     for record in records:
-        print(f"{record.study:8} {record.population:6d}  {record.measure:18} {record.ratio:7.2f}  {MEANINGS[record.measure]}", flush=True)
+        print(
+            f"{record.study:8} {record.population:6d}  {record.measure:18} {record.ratio:7.2f}  {MEANINGS[record.measure]}",
+            flush=True,
+        )
 
 
 def medians_in_turn(*measured: Callable[[], float], repetitions: int = REPETITIONS) -> list[float]:

@@ -17,7 +17,13 @@ from safevar_sumo.search import ALGORITHMS
 from safevar_sumo.study import Study
 from safevar_sumo.vehicles import VEHICLES
 
-PLAIN = {"StrType": "text", "IntType": "integer", "FloatType": "number", "BoolType": "true or false", "AnyType": "any value"}
+PLAIN = {
+    "StrType": "text",
+    "IntType": "integer",
+    "FloatType": "number",
+    "BoolType": "true or false",
+    "AnyType": "any value",
+}
 
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
@@ -39,8 +45,11 @@ def _default(value: Any) -> str:
 
 
 def _range(kind: Any) -> str:
-    bounds = [f"{sign} {value:g}" for name, sign in (("gt", ">"), ("ge", "at least"), ("lt", "<"), ("le", "at most"))
-              if (value := getattr(kind, name, None)) is not None]
+    bounds = [
+        f"{sign} {value:g}"
+        for name, sign in (("gt", ">"), ("ge", "at least"), ("lt", "<"), ("le", "at most"))
+        if (value := getattr(kind, name, None)) is not None
+    ]
     return f", {', '.join(bounds)}" if bounds else ""
 
 
@@ -79,27 +88,43 @@ def study_keys() -> str:
     """Every table of a study file with its keys."""
     parts = []
     for kind in {one.cls: one for one in _structs(type_info(Study)) if one.cls.__name__ != "Origin"}.values():
-        rows = [(f"`{field.encode_name}`", _words(field.type),
-                 _default(field.default if field.default_factory is msgspec.NODEFAULT else field.default_factory()))
-                for field in kind.fields if field.name != "origin"]
-        parts.append(f"### {kind.cls.__name__}\n\n{inspect.getdoc(kind.cls)}\n\n{_table(('key', 'value', 'default'), rows)}")
+        rows = [
+            (
+                f"`{field.encode_name}`",
+                _words(field.type),
+                _default(field.default if field.default_factory is msgspec.NODEFAULT else field.default_factory()),
+            )
+            for field in kind.fields
+            if field.name != "origin"
+        ]
+        parts.append(
+            f"### {kind.cls.__name__}\n\n{inspect.getdoc(kind.cls)}\n\n{_table(('key', 'value', 'default'), rows)}"
+        )
     return "\n".join(parts)
 
 
 def models(classes: dict[str, Any]) -> Callable[[], str]:
     """Every model of a kind with its parameters."""
+
     def text() -> str:
         parts = []
         for name, model in classes.items():
             doc = inspect.getdoc(model) or ""
-            described = {key.strip(): " ".join(meaning.split()) for keys, meaning in
-                         re.findall(r"^(\w[\w, ]*)\n((?:    .*\n?)+)", doc.partition("Parameters\n----------\n")[2], flags=re.MULTILINE)
-                         for key in keys.split(",")}
-            rows = [(f"`{one.name}`", described.get(one.name, ""), _bounds(one.annotation), _default(one.default))
-                    for one in inspect.signature(model).parameters.values()]
+            described = {
+                key.strip(): " ".join(meaning.split())
+                for keys, meaning in re.findall(
+                    r"^(\w[\w, ]*)\n((?:    .*\n?)+)", doc.partition("Parameters\n----------\n")[2], flags=re.MULTILINE
+                )
+                for key in keys.split(",")
+            }
+            rows = [
+                (f"`{one.name}`", described.get(one.name, ""), _bounds(one.annotation), _default(one.default))
+                for one in inspect.signature(model).parameters.values()
+            ]
             table = _table(("parameter", "meaning", "range", "default"), rows) if rows else "No parameters.\n"
             parts.append(f"### {name}\n\n{doc.partition('Parameters')[0].strip()}\n\n{table}")
         return "\n".join(parts)
+
     return text
 
 
@@ -112,7 +137,9 @@ def _bounds(annotation: Any) -> str:
 def metric_columns() -> str:
     """Columns of metrics and objectives in solutions.csv."""
     objectives = [(f"`{one.name}`", one.unit, f"objective: {one.title}") for one in PUBLISHED_SCORING.objectives]
-    metrics = [(f"`{name}`", metric.unit, metric.description) for name, metric in {**METRICS, **OPTIONAL_METRICS}.items()]
+    metrics = [
+        (f"`{name}`", metric.unit, metric.description) for name, metric in {**METRICS, **OPTIONAL_METRICS}.items()
+    ]
     return _table(("column", "unit", "content"), [*objectives, *metrics])
 
 
@@ -122,5 +149,10 @@ def results_files() -> str:
 
 
 TABLES: dict[str, Callable[[], str]] = {
-    "study_keys": study_keys, "vehicles": models(VEHICLES), "ads": models(ADS), "algorithms": models(ALGORITHMS),
-    "metric_columns": metric_columns, "results_files": results_files}
+    "study_keys": study_keys,
+    "vehicles": models(VEHICLES),
+    "ads": models(ADS),
+    "algorithms": models(ALGORITHMS),
+    "metric_columns": metric_columns,
+    "results_files": results_files,
+}

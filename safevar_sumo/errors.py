@@ -134,4 +134,6 @@ def refuse_other_than_file(path: Path, source: object = None, *, streams: bool =
     is_stream = streams and (str(path) in STREAM_PATHS or str(path.parent) in DESCRIPTOR_FOLDERS)
     if path.exists() and not path.is_file() and not is_stream:
         problem = "is no regular file but a directory" if path.is_dir() else "is no regular file"
-        raise InputError(path if source is None else source, problem if source is None else f"{path} {problem}", "a file")
+        raise InputError(
+            path if source is None else source, problem if source is None else f"{path} {problem}", "a file"
+        )

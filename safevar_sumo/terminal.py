@@ -56,7 +56,9 @@ class WholeTable(Table):
 
 def printable_text(text: object, style: str = "") -> Text:
     """Make text printable by rich: white space becomes a space, any other unprintable character a question mark."""
-    return Text("".join(letter if letter.isprintable() else " " if letter.isspace() else "?" for letter in str(text)), style)
+    return Text(
+        "".join(letter if letter.isprintable() else " " if letter.isspace() else "?" for letter in str(text)), style
+    )
 
 
 def print_text(console: Console, text: str) -> None:
@@ -99,8 +101,9 @@ def print_heading(console: Console, title: str, no_verdict: str) -> None:
 def constraints_in_words(study: Study) -> list[str]:
     """The constraints that all settings satisfy, in a sentence; empty if the study has none."""
     characteristics = study.vehicle.characteristics
-    conditions = "; ".join(f"{constraint.quantity} {constraint.bounds_in_words(characteristics)}"
-                           for constraint in study.constraints)
+    conditions = "; ".join(
+        f"{constraint.quantity} {constraint.bounds_in_words(characteristics)}" for constraint in study.constraints
+    )
     return [f"Only settings that satisfy the study's constraints: {conditions}."] if conditions else []
 
 

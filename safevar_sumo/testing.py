@@ -40,7 +40,9 @@ class Checks:
     @classmethod
     def report(cls) -> Report:
         """Check the subject, once for each study; returns the report."""
-        subject = cls.subject if isinstance(cls.subject, str) else f"{cls.subject.__module__}:{cls.subject.__qualname__}"
+        subject = (
+            cls.subject if isinstance(cls.subject, str) else f"{cls.subject.__module__}:{cls.subject.__qualname__}"
+        )
         key = subject, cls.study
         if key not in _REPORTS:
             _REPORTS[key] = check(subject, cls.study)
@@ -52,7 +54,9 @@ class Checks:
         report = self.report()
         assert self.kind in ("", report.kind), f"{report.subject} is of the kind {report.kind}, not {self.kind}"
         findings = [finding for finding in report.findings if finding.check == check_name]
-        assert not findings, "\n".join(f"{finding}\n  expected: {finding.expected}\n  advice: {finding.advice}" for finding in findings)
+        assert not findings, "\n".join(
+            f"{finding}\n  expected: {finding.expected}\n  advice: {finding.advice}" for finding in findings
+        )
 
 
 class AdsChecks(Checks, kind="ads"):

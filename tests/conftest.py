@@ -25,7 +25,9 @@ collect_ignore = [] if os.name == "posix" else ["campaign/test_local_pool.py", "
 
 hypothesis.settings.register_profile("default", deadline=None, derandomize=True)
 hypothesis.settings.load_profile("default")
-os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # so that programs started by tests need not compile the package each time
+os.environ.pop(
+    "PYTHONDONTWRITEBYTECODE", None
+)  # so that programs started by tests need not compile the package each time
 WORKER_PROCESSES = local.LocalPool
 SLIPPERY = """
 extends = "smoke"
@@ -49,7 +51,9 @@ def _own_cache_and_pools_of_this_process(tmp_path_factory: pytest.TempPathFactor
     """Each session of tests builds its own networks, once for all of its processes; commands start no worker processes."""
     session = tmp_path_factory.getbasetemp()
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("XDG_CACHE_HOME", str((session.parent if "PYTEST_XDIST_WORKER" in os.environ else session) / "cache"))
+        patch.setenv(
+            "XDG_CACHE_HOME", str((session.parent if "PYTEST_XDIST_WORKER" in os.environ else session) / "cache")
+        )
         patch.setattr(local, "LocalPool", InlinePool)
         yield
 

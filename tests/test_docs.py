@@ -22,7 +22,11 @@ from safevar_sumo.analysis.risk import RiskOptions
 from safevar_sumo.analysis.rules import RulesOptions
 from safevar_sumo.cli.program import commands
 from safevar_sumo.report import input as report_input
-from safevar_sumo.results.manifest import KEYS_WITHOUT_EFFECT_ON_EVALUATIONS, KEYS_WITHOUT_EFFECT_ON_RESULTS, manifest_of
+from safevar_sumo.results.manifest import (
+    KEYS_WITHOUT_EFFECT_ON_EVALUATIONS,
+    KEYS_WITHOUT_EFFECT_ON_RESULTS,
+    manifest_of,
+)
 from safevar_sumo.study import DESCRIPTION_KEYS, load_study, study_names
 from safevar_sumo.vehicles import VEHICLES
 
@@ -40,13 +44,17 @@ class Block(NamedTuple):
 
 
 def blocks(page: str) -> list[Block]:
-    result = re.findall(r'^```(\w*)(?: title="([^"]+)")?\n(.*?)^```$', (ROOT / page).read_text(), flags=re.DOTALL | re.MULTILINE)
+    result = re.findall(
+        r'^```(\w*)(?: title="([^"]+)")?\n(.*?)^```$', (ROOT / page).read_text(), flags=re.DOTALL | re.MULTILINE
+    )
     return [Block(*one) for one in result]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("page", [
-    pytest.param(page, marks=[] if page == "README.md" else [pytest.mark.slow]) for page in PAGES if blocks(page)])
+@pytest.mark.parametrize(
+    "page",
+    [pytest.param(page, marks=[] if page == "README.md" else [pytest.mark.slow]) for page in PAGES if blocks(page)],
+)
 def test_every_block_of_a_page_does_what_it_says(page: str, in_tmp: Path) -> None:
     names: dict[str, Any] = {}
     for block in blocks(page):
@@ -64,7 +72,9 @@ def test_every_block_of_a_page_does_what_it_says(page: str, in_tmp: Path) -> Non
 def run(line: str) -> None:
     """A line of a shell; what a reader's machine is set up with is not run."""
     if line.startswith(PROGRAM):
-        done = CliRunner().invoke(commands, shlex.split(line.removeprefix(PROGRAM), comments=True), catch_exceptions=False)
+        done = CliRunner().invoke(
+            commands, shlex.split(line.removeprefix(PROGRAM), comments=True), catch_exceptions=False
+        )
         assert done.exit_code == 0, f"{line}\n{done.output}"
     elif line.startswith("make "):
         assert re.search(rf"^{line.split()[1]}:", (ROOT / "Makefile").read_text(), flags=re.MULTILINE), line
@@ -101,23 +111,30 @@ def test_every_shipped_characteristic_is_explained_in_its_study_and_in_the_gloss
 @pytest.mark.parametrize("page", ["CONTRIBUTING.md", "docs/architecture.md"])
 def test_a_map_of_the_code_names_every_package_and_nothing_that_is_not_there(page: str) -> None:
     text, package = (ROOT / page).read_text(), ROOT / "safevar_sumo"
-    tree = text[text.index("```"):].split("\n## ")[0]
+    tree = text[text.index("```") :].split("\n## ")[0]
     folders = {path.parent.name for path in (*package.glob("*/__init__.py"), *package.glob("analysis/*/__init__.py"))}
     assert folders - set(re.findall(r"\w+", tree)) == set()
     named = re.findall(r"(?<![\w/])(\w+)/(?=[\s,;`])", tree)
-    assert [name for name in named if not any((place / name).is_dir() for place in (ROOT, package, ROOT / "tests"))] == []
+    assert [
+        name for name in named if not any((place / name).is_dir() for place in (ROOT, package, ROOT / "tests"))
+    ] == []
     files = re.findall(r"`?((?:[a-z_]+/)+[a-z_]+\.py)\b", text)
     assert [name for name in files if not any((place / name).is_file() for place in (ROOT, package))] == []
 
 
 def test_the_map_for_contributors_has_the_rows_that_import_linter_checks() -> None:
-    (contract,) = (contract for contract in tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["importlinter"]["contracts"]
-                   if contract["type"] == "layers")
+    (contract,) = (
+        contract
+        for contract in tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["importlinter"]["contracts"]
+        if contract["type"] == "layers"
+    )
     rows: list[set[str]] = []
     for line in (ROOT / "CONTRIBUTING.md").read_text().split("```")[1].split("\nsafevar_sumo/\n")[1].splitlines():
         if re.match(r"  \S", line):
             shares_row, names = line.startswith("  | "), re.split(r"\s{2,}", line.strip().removeprefix("| "))[0]
-            rows[len(rows) - shares_row:] = [{*(rows[-1] if shares_row else ()), *(name.rstrip("/") for name in names.split(" | "))}]
+            rows[len(rows) - shares_row :] = [
+                {*(rows[-1] if shares_row else ()), *(name.rstrip("/") for name in names.split(" | "))}
+            ]
     assert rows == [set(layer.split(" | ")) for layer in contract["layers"]]
 
 
@@ -144,8 +161,12 @@ def names_of(node: ast.stmt) -> set[str]:
 
 
 def test_every_name_of_code_that_a_page_mentions_is_in_the_file_that_it_names() -> None:
-    mentions = [(page, name, file) for page in ("CONTRIBUTING.md", *PAGES) for names, file in MENTION.findall((ROOT / page).read_text())
-                for name in re.findall(r"`([\w.]+)`", names)]
+    mentions = [
+        (page, name, file)
+        for page in ("CONTRIBUTING.md", *PAGES)
+        for names, file in MENTION.findall((ROOT / page).read_text())
+        for name in re.findall(r"`([\w.]+)`", names)
+    ]
     assert ("docs/architecture.md", "request_evaluations", "search/evolution.py") in mentions
     for page, name, file in mentions:
         path = next((place / file for place in (ROOT / "safevar_sumo", ROOT) if (place / file).is_file()), None)
@@ -165,10 +186,17 @@ def test_every_test_file_that_is_named_exists() -> None:
 
 
 def test_the_numbers_of_a_reports_questions_are_those_that_the_page_about_it_gives() -> None:
-    paragraph = re.search(r"A report asks all questions.*?\n\n", (ROOT / "docs" / "gallery.md").read_text(), flags=re.DOTALL)
+    paragraph = re.search(
+        r"A report asks all questions.*?\n\n", (ROOT / "docs" / "gallery.md").read_text(), flags=re.DOTALL
+    )
     assert paragraph is not None
-    numbers = (report_input.SAMPLED_VEHICLES, RiskOptions.samples, RulesOptions.samples, report_input.EXPLAIN_SIMULATIONS,
-               ExplainOptions.limit)
+    numbers = (
+        report_input.SAMPLED_VEHICLES,
+        RiskOptions.samples,
+        RulesOptions.samples,
+        report_input.EXPLAIN_SIMULATIONS,
+        ExplainOptions.limit,
+    )
     assert re.findall(r"\d+,\d+", paragraph[0]) == [f"{number:,}" for number in numbers]
 
 
@@ -176,7 +204,9 @@ def test_the_page_on_results_lists_every_key_that_may_change() -> None:
     page = (ROOT / "docs" / "results.md").read_text()
     (listed,) = re.findall(r"You may change these keys at any time[^:]*: (.*?)\. ", page, flags=re.DOTALL)
     keys = re.findall(r"`\[*(\w+)\]*`", listed)
-    assert sorted(keys) == sorted([*KEYS_WITHOUT_EFFECT_ON_RESULTS, *DESCRIPTION_KEYS, *KEYS_WITHOUT_EFFECT_ON_EVALUATIONS])
+    assert sorted(keys) == sorted(
+        [*KEYS_WITHOUT_EFFECT_ON_RESULTS, *DESCRIPTION_KEYS, *KEYS_WITHOUT_EFFECT_ON_EVALUATIONS]
+    )
 
 
 def test_every_generated_table_of_a_page_is_made_from_the_code() -> None:
@@ -204,7 +234,9 @@ class Numbers(NamedTuple):
 def marked(page: str) -> list[Numbers]:
     """Every comment that begins with `numbers:`: lines of commands, then lines of `path = number`."""
     result = []
-    for comment, paragraph in re.findall(r"<!-- numbers:\n(.*?)-->\n+(.*?)(?=\n\n|\Z)", (ROOT / page).read_text(), flags=re.DOTALL):
+    for comment, paragraph in re.findall(
+        r"<!-- numbers:\n(.*?)-->\n+(.*?)(?=\n\n|\Z)", (ROOT / page).read_text(), flags=re.DOTALL
+    ):
         lines = [line.strip() for line in comment.splitlines() if line.strip()]
         values = dict(line.split(" = ") for line in lines if not line.startswith(PROGRAM))
         result.append(Numbers(page, [line for line in lines if line.startswith(PROGRAM)], values, paragraph))

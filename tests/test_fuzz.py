@@ -32,11 +32,18 @@ from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet
 
 TABLES = drop_nulls(tables_of(load_study("smoke")))
-SCALARS = st.one_of(st.integers(), st.floats(), st.text(max_size=20), st.booleans(), st.dates(), st.datetimes(), st.times())
+SCALARS = st.one_of(
+    st.integers(), st.floats(), st.text(max_size=20), st.booleans(), st.dates(), st.datetimes(), st.times()
+)
 ANYTHING = st.recursive(
-    SCALARS, lambda inner: st.one_of(st.lists(inner, max_size=3), st.dictionaries(st.text(max_size=8), inner, max_size=3)), max_leaves=6)
-SLOW = settings(max_examples=25, suppress_health_check=[
-    HealthCheck.too_slow, HealthCheck.data_too_large, HealthCheck.function_scoped_fixture])
+    SCALARS,
+    lambda inner: st.one_of(st.lists(inner, max_size=3), st.dictionaries(st.text(max_size=8), inner, max_size=3)),
+    max_leaves=6,
+)
+SLOW = settings(
+    max_examples=25,
+    suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large, HealthCheck.function_scoped_fixture],
+)
 
 
 def paths(tables: dict[str, Any], before: tuple[str, ...] = ()) -> list[tuple[str, ...]]:
@@ -72,8 +79,13 @@ def test_a_study_with_anything_in_one_place_is_read_or_refused(path: tuple[str, 
 NOTHING = np.zeros(2)
 SEEN = Observation(0.0, NOTHING, NOTHING, NOTHING, NOTHING, NOTHING, 1.0)
 KNOWN = Nominal(1.0, 1.0, 1.0, 1.0, 1.0, lambda: PedalTables(NOTHING, NOTHING, NOTHING, 1.0))
-COMMANDS = st.one_of(ANYTHING, st.none(), st.tuples(ANYTHING, ANYTHING), st.tuples(st.floats(), st.floats()),
-                     st.tuples(st.floats(0, 1), st.sampled_from([0, True, np.float32(0.5), np.array(0.5), np.array([0.5])])))
+COMMANDS = st.one_of(
+    ANYTHING,
+    st.none(),
+    st.tuples(ANYTHING, ANYTHING),
+    st.tuples(st.floats(), st.floats()),
+    st.tuples(st.floats(0, 1), st.sampled_from([0, True, np.float32(0.5), np.array(0.5), np.array([0.5])])),
+)
 
 
 class Returning(Ads):
@@ -104,26 +116,109 @@ def test_whatever_an_ads_commands_is_two_pedals_for_each_vehicle_or_an_error(wha
 
 
 SMOKE = CharacteristicSet.of(load_study("smoke").vehicle.characteristics)
-FEW = settings(max_examples=12, suppress_health_check=[HealthCheck.too_slow, HealthCheck.function_scoped_fixture], deadline=None)
-NUMBERS = st.one_of(st.integers(1, 20).map(str), st.text(max_size=5), st.sampled_from(
-    ["0", "3", "2", "-1", "nan", "1e3", "\N{ARABIC-INDIC DIGIT THREE}", "1_0", "", " 2", "99999999999999999999", "0x1"]))
-RUNS = st.one_of(st.text(max_size=6), st.sampled_from(
-    ["nsga2:0", "rs:0", "rs:1", "nsga2:-1", ":", "nsga2:\N{ARABIC-INDIC DIGIT ZERO}", "1/1", "1/2", "2/2", "0/1", "3/2", "1/0", "/"]))
-NAMES = st.lists(st.one_of(st.sampled_from(["nsga2", "rs", "safe_fuzzer", " rs", "", "os:system"]), st.text(max_size=5)),
-                 max_size=3).map(",".join)
-STUDY = st.lists(st.one_of(
-    st.tuples(st.sampled_from(["--runs", "--evaluations", "--seed", "--batch", "--jobs"]), NUMBERS),
-    st.tuples(st.sampled_from(["--only", "--shard"]), RUNS), st.tuples(st.just("--algorithms"), NAMES),
-    st.sampled_from([("--quiet",), ("--dry-run",), ("--retry-failed",), ("--nothing",), ("--cluster", "nowhere")])), max_size=3)
-VALUES = st.one_of(st.floats().map(str), st.floats(-9, 9).map("{:+g}%".format), st.floats(-9, 9).map("{:+g}%".format), st.sampled_from(
-    ["+10%", "-200%", "1.0..1.5:3", "1..2:0", "1..2:-3", "2..1:2", "1e999", "5e-324", "nan", "inf", "1..2:1e9", "%", "..", ":", "1e300%"]),
-    st.text(max_size=8))
-CHANGES = st.tuples(st.sampled_from([*SMOKE.names, "mass ", "f_diff"]), st.sampled_from(["=", "=", " = ", "=="]), VALUES).map("".join)
-SIMULATE = st.lists(st.one_of(
-    st.tuples(st.just("--set"), CHANGES), st.tuples(st.just("--set"), CHANGES),
-    st.sampled_from([("--json",), ("--no-filter",), ("--beyond",), ("--trace", "t.csv")]),
-    st.sampled_from([("--fewest",), ("--nothing",), ("--trace", "."), ("--plot", "p.txt"), ("--slower", "0"), ("--point", "x"),
-                     ("--solution", "nsga2:0:0"), ("--json",)])), max_size=3)
+FEW = settings(
+    max_examples=12, suppress_health_check=[HealthCheck.too_slow, HealthCheck.function_scoped_fixture], deadline=None
+)
+NUMBERS = st.one_of(
+    st.integers(1, 20).map(str),
+    st.text(max_size=5),
+    st.sampled_from(
+        [
+            "0",
+            "3",
+            "2",
+            "-1",
+            "nan",
+            "1e3",
+            "\N{ARABIC-INDIC DIGIT THREE}",
+            "1_0",
+            "",
+            " 2",
+            "99999999999999999999",
+            "0x1",
+        ]
+    ),
+)
+RUNS = st.one_of(
+    st.text(max_size=6),
+    st.sampled_from(
+        [
+            "nsga2:0",
+            "rs:0",
+            "rs:1",
+            "nsga2:-1",
+            ":",
+            "nsga2:\N{ARABIC-INDIC DIGIT ZERO}",
+            "1/1",
+            "1/2",
+            "2/2",
+            "0/1",
+            "3/2",
+            "1/0",
+            "/",
+        ]
+    ),
+)
+NAMES = st.lists(
+    st.one_of(st.sampled_from(["nsga2", "rs", "safe_fuzzer", " rs", "", "os:system"]), st.text(max_size=5)), max_size=3
+).map(",".join)
+STUDY = st.lists(
+    st.one_of(
+        st.tuples(st.sampled_from(["--runs", "--evaluations", "--seed", "--batch", "--jobs"]), NUMBERS),
+        st.tuples(st.sampled_from(["--only", "--shard"]), RUNS),
+        st.tuples(st.just("--algorithms"), NAMES),
+        st.sampled_from([("--quiet",), ("--dry-run",), ("--retry-failed",), ("--nothing",), ("--cluster", "nowhere")]),
+    ),
+    max_size=3,
+)
+VALUES = st.one_of(
+    st.floats().map(str),
+    st.floats(-9, 9).map("{:+g}%".format),
+    st.floats(-9, 9).map("{:+g}%".format),
+    st.sampled_from(
+        [
+            "+10%",
+            "-200%",
+            "1.0..1.5:3",
+            "1..2:0",
+            "1..2:-3",
+            "2..1:2",
+            "1e999",
+            "5e-324",
+            "nan",
+            "inf",
+            "1..2:1e9",
+            "%",
+            "..",
+            ":",
+            "1e300%",
+        ]
+    ),
+    st.text(max_size=8),
+)
+CHANGES = st.tuples(
+    st.sampled_from([*SMOKE.names, "mass ", "f_diff"]), st.sampled_from(["=", "=", " = ", "=="]), VALUES
+).map("".join)
+SIMULATE = st.lists(
+    st.one_of(
+        st.tuples(st.just("--set"), CHANGES),
+        st.tuples(st.just("--set"), CHANGES),
+        st.sampled_from([("--json",), ("--no-filter",), ("--beyond",), ("--trace", "t.csv")]),
+        st.sampled_from(
+            [
+                ("--fewest",),
+                ("--nothing",),
+                ("--trace", "."),
+                ("--plot", "p.txt"),
+                ("--slower", "0"),
+                ("--point", "x"),
+                ("--solution", "nsga2:0:0"),
+                ("--json",),
+            ]
+        ),
+    ),
+    max_size=3,
+)
 
 
 class Formula:
@@ -149,8 +244,13 @@ def evaluated(study: bytes, settings: FloatArray) -> Evaluations:
     """Evaluations by a formula."""
     safety = np.abs(settings / SMOKE.original - 1).max(axis=1)
     return Evaluations(
-        settings=settings, outcome=np.full(len(settings), "stopped", dtype="U16"), collision_speed=np.full(len(settings), np.nan),
-        metrics=dict.fromkeys(METRICS, 1.0 - safety), f_diff=SMOKE.largest_change(settings), f_num_diff=SMOKE.number_changed(settings))
+        settings=settings,
+        outcome=np.full(len(settings), "stopped", dtype="U16"),
+        collision_speed=np.full(len(settings), np.nan),
+        metrics=dict.fromkeys(METRICS, 1.0 - safety),
+        f_diff=SMOKE.largest_change(settings),
+        f_num_diff=SMOKE.number_changed(settings),
+    )
 
 
 @contextmanager
@@ -164,7 +264,9 @@ def tried(*arguments: str) -> None:
         patch.chdir(folder)
         done = CliRunner().invoke(commands, arguments)
     error = done.exception
-    assert error is None or isinstance(error, SafevarError) or (isinstance(error, SystemExit) and error.code in (0, 2)), (arguments, error)
+    assert (
+        error is None or isinstance(error, SafevarError) or (isinstance(error, SystemExit) and error.code in (0, 2))
+    ), (arguments, error)
     if isinstance(error, SafevarError):
         assert error.exit_code in (1, 2), arguments
         assert len(str(error).splitlines()) <= 2, arguments

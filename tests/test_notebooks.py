@@ -72,8 +72,13 @@ def test_a_notebook_shows_its_tables_and_pictures(name: str, place: Path, monkey
 
 def _executed(name: str, place: Path, timeout: int) -> nbformat.NotebookNode:
     notebook = nbformat.read(NOTEBOOKS / f"{name}.ipynb", as_version=4)
-    NotebookClient(notebook, timeout=timeout, kernel_name="python3", record_timing=False,
-                   resources={"metadata": {"path": str(place)}}).execute()
+    NotebookClient(
+        notebook,
+        timeout=timeout,
+        kernel_name="python3",
+        record_timing=False,
+        resources={"metadata": {"path": str(place)}},
+    ).execute()
     return notebook
 
 
@@ -98,7 +103,9 @@ def test_every_question_has_its_table_picture_or_sentence(tmp_path: Path) -> Non
     outputs = [output for cell in notebook.cells if cell.cell_type == "code" for output in cell.outputs]
     shown = [output.get("data", {}) for output in outputs]
     assert (sum("text/html" in data for data in shown), sum("image/png" in data for data in shown)) == (3, 4)
-    printed = "".join(output["text"] for output in outputs if output.output_type == "stream" and output.name == "stdout")
+    printed = "".join(
+        output["text"] for output in outputs if output.output_type == "stream" and output.name == "stdout"
+    )
     for result in ("The original stops", "all together", "with 95 % confidence", "SD is below 1.1 in"):
         assert result in printed
     assert not [output for output in outputs if output.get("name") == "stderr"]
@@ -118,7 +125,9 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         for name in (*SHOWN, "answers", "rating"):
             notebook = _executed(name, Path(folder), timeout=1800)
-            for data in [output["data"] for cell in notebook.cells for output in cell.get("outputs", []) if "data" in output]:
+            for data in [
+                output["data"] for cell in notebook.cells for output in cell.get("outputs", []) if "data" in output
+            ]:
                 if "image/png" in data:
                     drawn, picture = Image.open(io.BytesIO(base64.b64decode(data["image/png"]))), io.BytesIO()
                     drawn.convert("RGB").quantize(128).save(picture, "png", optimize=True)

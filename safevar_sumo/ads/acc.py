@@ -43,8 +43,11 @@ class Acc(CarFollowing, frozen=True, kw_only=True):
         excess_speed, relative_speed = speed - self.cruise_speed, leader_speed - speed
         gap_error = gap - self.standing_gap - _standing_distance(speed) - self.headway * speed
         keeps_gap = (np.abs(gap_error) < GAP_TOLERANCE) & (np.abs(excess_speed) < SPEED_TOLERANCE)
-        gap_law = np.where(gap_error < 0, _acceleration_law(AVOIDING_GAINS, relative_speed, gap_error),
-                           _acceleration_law(CLOSING_GAINS, relative_speed, gap_error))
+        gap_law = np.where(
+            gap_error < 0,
+            _acceleration_law(AVOIDING_GAINS, relative_speed, gap_error),
+            _acceleration_law(CLOSING_GAINS, relative_speed, gap_error),
+        )
         acceleration = np.where(keeps_gap, _acceleration_law(KEEPING_GAINS, relative_speed, gap_error), gap_law)
         return np.where(gap - self.standing_gap > FOLLOWING_GAP, SPEED_GAIN * excess_speed, acceleration)
 

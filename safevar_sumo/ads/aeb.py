@@ -89,9 +89,14 @@ class Aeb(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         cruising = pedals_for(nominal, seen.speed, self.cruise_gain * (cruise_speed - seen.speed), cruise_trim)
         command = Command(
             np.where(has_intervened, 0.0, cruising.throttle),
-            np.where(stage == 2, 1.0, np.where(stage == 1, self.partial_share, np.where(has_intervened, 0.0, cruising.brake))))
+            np.where(
+                stage == 2, 1.0, np.where(stage == 1, self.partial_share, np.where(has_intervened, 0.0, cruising.brake))
+            ),
+        )
         warns = (is_threatened & (time_to_reach(seen) < self.warning_time)) | (stage > 0)
-        return command, _Memory(nominal, memory.step, (cruise_speed, cruise_trim), stage, has_intervened, _obstacle_speed(seen), warns)
+        return command, _Memory(
+            nominal, memory.step, (cruise_speed, cruise_trim), stage, has_intervened, _obstacle_speed(seen), warns
+        )
 
     def warns(self, memory: _Memory) -> BoolArray:
         """Whether each driver is warned now."""
@@ -106,15 +111,24 @@ class Aeb(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         deceleration = self.braking_share * memory.nominal.decel
         obstacle_deceleration = (memory.obstacle_speed - obstacle_speed) / memory.step
         stop_difference = speed * speed / (2 * deceleration) - obstacle_speed * obstacle_speed / (
-            2 * np.maximum(obstacle_deceleration, LEAST_DECELERATION))
+            2 * np.maximum(obstacle_deceleration, LEAST_DECELERATION)
+        )
         closing_speed = np.maximum(seen.closing_speed, 0.0)
-        braking_distance = np.maximum(closing_speed * closing_speed / (2 * deceleration),
-                                      np.where(obstacle_deceleration > LEAST_DECELERATION, stop_difference, 0.0))
+        braking_distance = np.maximum(
+            closing_speed * closing_speed / (2 * deceleration),
+            np.where(obstacle_deceleration > LEAST_DECELERATION, stop_difference, 0.0),
+        )
         full_gap = speed * self.response_time + braking_distance + self.margin
         partial_gap = full_gap + speed * self.partial_time
-        stage = np.where(is_threatened & (seen.gap < full_gap), 2.0, np.where(is_threatened & (seen.gap < partial_gap), 1.0, 0.0))
-        stays_in_way = np.isfinite(seen.gap) & (seen.gap > 0) & (closing_speed > 0) & (
-            (np.abs(seen.lateral) <= self.corridor) | (np.sign(seen.lateral) * seen.lateral_speed < 0))
+        stage = np.where(
+            is_threatened & (seen.gap < full_gap), 2.0, np.where(is_threatened & (seen.gap < partial_gap), 1.0, 0.0)
+        )
+        stays_in_way = (
+            np.isfinite(seen.gap)
+            & (seen.gap > 0)
+            & (closing_speed > 0)
+            & ((np.abs(seen.lateral) <= self.corridor) | (np.sign(seen.lateral) * seen.lateral_speed < 0))
+        )
         is_standing = speed <= 0
         return np.where(stays_in_way | is_standing, np.maximum(stage, memory.stage), stage)
 

@@ -70,7 +70,14 @@ class Apollo(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
 
     def start(self, n: int, nominal: Nominal, step: float) -> _Memory:
         zeros = np.zeros(n)
-        return _Memory(nominal, step, stops=zeros > 0, planned_deceleration=zeros, commanded_acceleration=zeros, creeping_time=zeros)
+        return _Memory(
+            nominal,
+            step,
+            stops=zeros > 0,
+            planned_deceleration=zeros,
+            commanded_acceleration=zeros,
+            creeping_time=zeros,
+        )
 
     def drive(self, seen: Observation, memory: _Memory) -> tuple[Command, _Memory]:
         plan = self._plan(seen, memory)
@@ -79,7 +86,9 @@ class Apollo(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
             return command, plan
         is_waiting = seen.speed == 0
         array_fields = (np.where(is_waiting, old, new) for old, new in zip(memory[2:], plan[2:], strict=True))
-        return Command(*(np.where(is_waiting, 0.0, pedal) for pedal in command)), _Memory(memory.nominal, memory.step, *array_fields)
+        return Command(*(np.where(is_waiting, 0.0, pedal) for pedal in command)), _Memory(
+            memory.nominal, memory.step, *array_fields
+        )
 
     def _plan(self, seen: Observation, memory: _Memory) -> _Memory:
         """Plan an acceleration: cruise, or brake with v^2 / (2 d) to stop within the distance d; then creep and hold."""
@@ -96,7 +105,9 @@ class Apollo(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
         if np.count_nonzero(begins_braking):
             # Planning is continuous in time: braking began within the last step, when the needed deceleration passed the limit.
             rise = np.maximum(planned_deceleration - memory.planned_deceleration, 1e-9)
-            share = np.where(begins_braking, np.minimum((planned_deceleration - self.comfortable_deceleration) / rise, 1.0), 1.0)
+            share = np.where(
+                begins_braking, np.minimum((planned_deceleration - self.comfortable_deceleration) / rise, 1.0), 1.0
+            )
             last_acceleration = np.where(begins_braking, np.minimum(last_acceleration, 0.0), last_acceleration)
             largest_change = largest_change * share
 
@@ -110,13 +121,19 @@ class Apollo(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
         creeping_time = memory.creeping_time + memory.step * is_creeping
         acceleration[is_creeping] = 0.0
         acceleration[creeping_time > self.creep_time] = -HOLDING_DECELERATION
-        return memory._replace(stops=stops, planned_deceleration=planned_deceleration, commanded_acceleration=acceleration,
-                               creeping_time=creeping_time)
+        return memory._replace(
+            stops=stops,
+            planned_deceleration=planned_deceleration,
+            commanded_acceleration=acceleration,
+            creeping_time=creeping_time,
+        )
 
     def _pedals(self, seen: Observation, memory: _Memory) -> Command:
         """Pedals for the commanded acceleration, from the calibration table of the original vehicle."""
         nominal = memory.nominal
-        coasting, full_throttle = interpolate_tables(nominal.speeds, seen.speed, nominal.coasting, nominal.full_throttle)
+        coasting, full_throttle = interpolate_tables(
+            nominal.speeds, seen.speed, nominal.coasting, nominal.full_throttle
+        )
         excess = memory.commanded_acceleration + coasting
         throttle = np.minimum(np.maximum(excess / (full_throttle + coasting), 0.0), 1.0)
         brake = np.minimum(np.maximum(-excess / nominal.braking, 0.0), 1.0)

@@ -92,7 +92,9 @@ class GuardedAds(Ads):
         result = self._guard.call("drive", self._ads.drive, read_only_copy(seen), memory)
         command, memory = self._guard.elements("drive", result, "(Command(throttle, brake), memory)")
         throttle, brake = self._guard.elements("drive", command, "(Command(throttle, brake), memory)")
-        return Command(self._checked_pedal("throttle", throttle, seen), self._checked_pedal("brake", brake, seen)), memory
+        return Command(
+            self._checked_pedal("throttle", throttle, seen), self._checked_pedal("brake", brake, seen)
+        ), memory
 
     def _checked_pedal(self, name: str, value: Any, seen: Observation) -> FloatArray:
         return self._guard.numbers("drive", name, value, seen.speed.shape, lowest=0.0, highest=1.0)
@@ -125,11 +127,15 @@ class PerVehicleAds(Ads):
             if type(throttle) is type(brake) is float and 0 <= throttle <= 1 and 0 <= brake <= 1:
                 return throttle, brake  # the fast path: this runs for every vehicle in every step
         throttle, brake = self._guard.elements("drive", command, "(throttle, brake), each in [0, 1]")
-        return (float(self._guard.numbers("drive", "throttle", throttle, (), lowest=0.0, highest=1.0)),
-                float(self._guard.numbers("drive", "brake", brake, (), lowest=0.0, highest=1.0)))
+        return (
+            float(self._guard.numbers("drive", "throttle", throttle, (), lowest=0.0, highest=1.0)),
+            float(self._guard.numbers("drive", "brake", brake, (), lowest=0.0, highest=1.0)),
+        )
 
 
 def _scalar_observations(seen: Observation) -> Iterator[Observation]:
     """The observation of each vehicle, as plain numbers."""
-    columns = [value.tolist() if isinstance(value, np.ndarray) and value.ndim else repeat(float(value)) for value in seen]
+    columns = [
+        value.tolist() if isinstance(value, np.ndarray) and value.ndim else repeat(float(value)) for value in seen
+    ]
     return map(Observation._make, zip(*columns, strict=False))  # a repeated number is endless

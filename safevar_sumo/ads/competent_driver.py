@@ -9,7 +9,15 @@ from msgspec import Struct
 
 from safevar_sumo.ads.acc import KEEPING_GAINS
 from safevar_sumo.ads.base import Ads, NonNegativeParameter, PositiveParameter
-from safevar_sumo.ads.driver import HARDEST_BRAKING, Reaction, StartThrottle, initial_reaction, is_in_the_way, react, time_to_reach
+from safevar_sumo.ads.driver import (
+    HARDEST_BRAKING,
+    Reaction,
+    StartThrottle,
+    initial_reaction,
+    is_in_the_way,
+    react,
+    time_to_reach,
+)
 from safevar_sumo.records import TIME_ROUNDING, BoolArray, Command, FloatArray, Nominal, Observation
 
 
@@ -63,22 +71,35 @@ class CompetentDriver(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fie
     start_throttle: StartThrottle = ()
 
     def start(self, n: int, nominal: Nominal, step: float) -> _Memory:
-        return _Memory(initial_reaction(n, nominal, step), first_lateral=np.full(n, np.inf), first_in_way=np.zeros(n, dtype=bool),
-                       stray_time=np.full(n, -1.0))
+        return _Memory(
+            initial_reaction(n, nominal, step),
+            first_lateral=np.full(n, np.inf),
+            first_in_way=np.zeros(n, dtype=bool),
+            stray_time=np.full(n, -1.0),
+        )
 
     def drive(self, seen: Observation, memory: _Memory) -> tuple[Command, _Memory]:
         is_perceived, memory = self._perceive(seen, memory)
         is_in_way = is_perceived & is_in_the_way(seen, self.corridor)
         command, reaction = react(
-            seen, memory.reaction, is_in_way & (time_to_reach(seen) < self.critical_ttc), np.full_like(seen.speed, HARDEST_BRAKING),
-            reaction_time=self.reaction_time, corridor=self.corridor, cruise_speed=self.cruise_speed,
-            start=self.start_throttle, following=self._following(seen, is_in_way))
+            seen,
+            memory.reaction,
+            is_in_way & (time_to_reach(seen) < self.critical_ttc),
+            np.full_like(seen.speed, HARDEST_BRAKING),
+            reaction_time=self.reaction_time,
+            corridor=self.corridor,
+            cruise_speed=self.cruise_speed,
+            start=self.start_throttle,
+            following=self._following(seen, is_in_way),
+        )
         return command, memory._replace(reaction=reaction)
 
     def _following(self, seen: Observation, is_in_way: BoolArray) -> FloatArray:
         """Acceleration that keeps the headway to a moving leader [m/s^2]; infinite if no leader is in the way."""
         gap = np.where(is_in_way, seen.gap, 0.0)
-        gap_control = KEEPING_GAINS[0] * (seen.obstacle_speed - seen.speed) + KEEPING_GAINS[1] * (gap - self.headway * seen.speed)
+        gap_control = KEEPING_GAINS[0] * (seen.obstacle_speed - seen.speed) + KEEPING_GAINS[1] * (
+            gap - self.headway * seen.speed
+        )
         return np.where(is_in_way & (seen.obstacle_speed > 0), np.maximum(gap_control, -self.lets_go), np.inf)
 
     def _perceive(self, seen: Observation, memory: _Memory) -> tuple[BoolArray, _Memory]:
@@ -90,6 +111,10 @@ class CompetentDriver(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fie
         first_in_way = memory.first_in_way | (appears & (np.abs(lateral) <= self.corridor))
         deviation = np.abs(lateral - np.where(np.isfinite(first_lateral), first_lateral, 0.0))
         is_astray = is_sighted & (deviation >= self.stray)
-        stray_time = np.where(memory.stray_time >= 0, memory.stray_time + memory.reaction.step, np.where(is_astray, 0.0, -1.0))
+        stray_time = np.where(
+            memory.stray_time >= 0, memory.stray_time + memory.reaction.step, np.where(is_astray, 0.0, -1.0)
+        )
         is_perceived = first_in_way | (stray_time >= self.perception_time - TIME_ROUNDING)
-        return is_perceived, memory._replace(first_lateral=first_lateral, first_in_way=first_in_way, stray_time=stray_time)
+        return is_perceived, memory._replace(
+            first_lateral=first_lateral, first_in_way=first_in_way, stray_time=stray_time
+        )

@@ -42,9 +42,15 @@ class DelayLine(NamedTuple):
         past = (*(self.past[1:] or (values,) * (self.steps + 1)), values)
         older, newer = past[0], past[1]
         if self.fraction:
-            with np.errstate(invalid="ignore"):  # a value that appears or vanishes between two steps keeps its old value
+            with np.errstate(
+                invalid="ignore"
+            ):  # a value that appears or vanishes between two steps keeps its old value
                 mixture = newer + (older - newer) * self.fraction
-            newer = mixture if np.count_nonzero(finite := np.isfinite(mixture)) == finite.size else np.where(finite, mixture, older)
+            newer = (
+                mixture
+                if np.count_nonzero(finite := np.isfinite(mixture)) == finite.size
+                else np.where(finite, mixture, older)
+            )
         return newer, DelayLine(self.steps, self.fraction, past)
 
 
@@ -103,7 +109,9 @@ def is_in_the_way(seen: Observation, corridor: float, reach: float = np.inf) -> 
 def blocks_the_way(seen: Observation, corridor: float) -> BoolArray:
     """Whether a detected obstacle ahead that does not move away is within `corridor` of the lane's middle [m] or on its way there."""
     is_ahead = np.isfinite(seen.gap) & (seen.gap > 0) & (seen.closing_speed >= 0)
-    return np.asarray(is_ahead & ((np.abs(seen.lateral) <= corridor) | (np.sign(seen.lateral) * seen.lateral_speed < 0)))
+    return np.asarray(
+        is_ahead & ((np.abs(seen.lateral) <= corridor) | (np.sign(seen.lateral) * seen.lateral_speed < 0))
+    )
 
 
 HARDEST_BRAKING = 0.774 * GRAVITY
@@ -137,9 +145,19 @@ def initial_reaction(n: int, nominal: Nominal, step: float) -> Reaction:
     return Reaction(nominal, step, None, np.zeros(n), np.full(n, -1.0), np.zeros(n), np.zeros(n))
 
 
-def react(seen: Observation, reaction: Reaction, danger: BoolArray, deceleration: FloatArray, *, reaction_time: float, corridor: float,
-          jerk: float = JERK, cruise_speed: float | None = None, start: StartThrottle = (),
-          following: FloatArray | float = np.inf) -> tuple[Command, Reaction]:
+def react(
+    seen: Observation,
+    reaction: Reaction,
+    danger: BoolArray,
+    deceleration: FloatArray,
+    *,
+    reaction_time: float,
+    corridor: float,
+    jerk: float = JERK,
+    cruise_speed: float | None = None,
+    start: StartThrottle = (),
+    following: FloatArray | float = np.inf,
+) -> tuple[Command, Reaction]:
     """Drive on, or react to a danger: release the accelerator, and brake when the reaction time is over.
 
     The danger is over when no obstacle ahead approaches or blocks the way. The original vehicle's tables were written
@@ -213,7 +231,9 @@ class CarFollowing(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields
         initial_trim = trim_at(memory.nominal, seen) if memory.initial_trim is None else memory.initial_trim
         gap = np.where(is_in_the_way(seen, self.corridor), seen.gap, LARGEST_GAP)
         acceleration = self.acceleration_at(gap, seen.speed, seen.obstacle_speed)
-        return pedals_for(memory.nominal, seen.speed, acceleration, initial_trim), memory._replace(initial_trim=initial_trim)
+        return pedals_for(memory.nominal, seen.speed, acceleration, initial_trim), memory._replace(
+            initial_trim=initial_trim
+        )
 
     def acceleration_at(self, gap: FloatArray, speed: FloatArray, leader_speed: FloatArray) -> FloatArray:
         """Commanded acceleration [m/s^2] at a gap from bumper to bumper [m] and speeds [m/s], shape (N,)."""

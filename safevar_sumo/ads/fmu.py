@@ -15,12 +15,27 @@ from safevar_sumo.plugins import Guard
 from safevar_sumo.records import BoolArray, Command, FloatArray, Nominal, Observation
 
 OBSERVATION_UNITS: Mapping[str, str] = {
-    "time": "s", "speed": "m/s", "gap": "m", "closing_speed": "m/s", "lateral": "m", "lateral_speed": "m/s", "visibility": "-",
-    "obstacle_speed": "m/s", "throttle": "-", "brake": "-", "detected": "-"}
+    "time": "s",
+    "speed": "m/s",
+    "gap": "m",
+    "closing_speed": "m/s",
+    "lateral": "m",
+    "lateral_speed": "m/s",
+    "visibility": "-",
+    "obstacle_speed": "m/s",
+    "throttle": "-",
+    "brake": "-",
+    "detected": "-",
+}
 """Quantities that an ADS observes, and their units; `detected` is 1 while an obstacle is detected."""
 CONSTANT_UNITS: Mapping[str, str] = {
-    "nominal_mass": "kg", "nominal_accel": "m/s^2", "nominal_decel": "m/s^2", "nominal_max_speed": "m/s", "nominal_actuator_lag": "s",
-    "step": "s"}
+    "nominal_mass": "kg",
+    "nominal_accel": "m/s^2",
+    "nominal_decel": "m/s^2",
+    "nominal_max_speed": "m/s",
+    "nominal_actuator_lag": "s",
+    "step": "s",
+}
 """Facts about the original vehicle, and the time between two calls: inputs, or parameters that are set at the start."""
 NOMINAL_PREFIX = "nominal_"
 OUTPUT_UNITS: Mapping[str, str] = {"throttle": "-", "brake": "-", "acceleration": "m/s^2", "warns": "-"}
@@ -56,15 +71,31 @@ class FmuAds(Ads):
         If the study does not fit the FMU.
     """
 
-    def __init__(self, description: Description, inputs: Mapping[str, str], outputs: Mapping[str, str], parameters: Mapping[str, Any],
-                 step: float | None, guard: Guard) -> None:
+    def __init__(
+        self,
+        description: Description,
+        inputs: Mapping[str, str],
+        outputs: Mapping[str, str],
+        parameters: Mapping[str, Any],
+        step: float | None,
+        guard: Guard,
+    ) -> None:
         source = guard.source
         self._guard, self._communication_step = guard, description.communication_step(step, source, "ads")
-        input_ports = ports_of(description, inputs, {**OBSERVATION_UNITS, **CONSTANT_UNITS}, ("input",), source, "ads.inputs",
-                               constants=CONSTANT_UNITS)
+        input_ports = ports_of(
+            description,
+            inputs,
+            {**OBSERVATION_UNITS, **CONSTANT_UNITS},
+            ("input",),
+            source,
+            "ads.inputs",
+            constants=CONSTANT_UNITS,
+        )
         output_ports = ports_of(description, outputs, OUTPUT_UNITS, ("output",), source, "ads.outputs")
         if ("acceleration" in output_ports) == bool({"throttle", "brake"} & output_ports.keys()):
-            raise InputError(source, f"ads.outputs = {sorted(outputs)}", "throttle, brake or both; alternatively acceleration")
+            raise InputError(
+                source, f"ads.outputs = {sorted(outputs)}", "throttle, brake or both; alternatively acceleration"
+            )
         if not input_ports.keys() & OBSERVATION_UNITS.keys():
             raise InputError(source, "ads.inputs: no observed quantity", f"some of {', '.join(OBSERVATION_UNITS)}")
         self._inputs, self._outputs = tuple(input_ports), tuple(output_ports)
@@ -73,8 +104,14 @@ class FmuAds(Ads):
         self.max_vehicles = self._instances.max_vehicles
 
     def start(self, n: int, nominal: Nominal, step: float) -> _Memory:
-        constants = {"step": step, **{name: getattr(nominal, name.removeprefix(NOMINAL_PREFIX))
-                                      for name in CONSTANT_UNITS if name.startswith(NOMINAL_PREFIX)}}
+        constants = {
+            "step": step,
+            **{
+                name: getattr(nominal, name.removeprefix(NOMINAL_PREFIX))
+                for name in CONSTANT_UNITS
+                if name.startswith(NOMINAL_PREFIX)
+            },
+        }
         return _Memory(Fleet(self._instances, n, step, self._communication_step), constants, nominal)
 
     def drive(self, seen: Observation, memory: _Memory) -> tuple[Command, _Memory]:
@@ -87,14 +124,22 @@ class FmuAds(Ads):
         if "acceleration" in outputs:
             acceleration = self._guard.numbers("doStep", "acceleration", outputs["acceleration"], seen.speed.shape)
             initial_trim = memory.trim or trim_at(memory.nominal, seen)
-            return pedals_for(memory.nominal, seen.speed, acceleration, initial_trim), memory._replace(trim=initial_trim)
+            return pedals_for(memory.nominal, seen.speed, acceleration, initial_trim), memory._replace(
+                trim=initial_trim
+            )
         zeros = np.zeros_like(seen.speed)
-        return Command(*(self._guard.numbers("doStep", name, outputs.get(name, zeros), seen.speed.shape, lowest=0.0, highest=1.0)
-                         for name in Command._fields)), memory
+        return Command(
+            *(
+                self._guard.numbers("doStep", name, outputs.get(name, zeros), seen.speed.shape, lowest=0.0, highest=1.0)
+                for name in Command._fields
+            )
+        ), memory
 
     def _input_values(self, seen: Observation, constants: Mapping[str, float]) -> FloatArray:
         values = {**seen._asdict(), "detected": np.isfinite(seen.gap), **constants}
-        return np.stack([np.broadcast_to(np.asarray(values[name], dtype=float), seen.speed.shape) for name in self._inputs])
+        return np.stack(
+            [np.broadcast_to(np.asarray(values[name], dtype=float), seen.speed.shape) for name in self._inputs]
+        )
 
     def warns(self, memory: _Memory) -> BoolArray | None:
         return memory.warns

@@ -35,6 +35,14 @@ class FullBraking(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=
 
     def drive(self, seen: Observation, memory: Reaction) -> tuple[Command, Reaction]:
         deceleration = np.full_like(seen.speed, UNLIMITED_BRAKING)
-        return react(seen, memory, is_in_the_way(seen, self.corridor), deceleration, reaction_time=0.0,
-                     jerk=UNLIMITED_BRAKING / memory.step, corridor=self.corridor, cruise_speed=self.cruise_speed,
-                     start=self.start_throttle)
+        return react(
+            seen,
+            memory,
+            is_in_the_way(seen, self.corridor),
+            deceleration,
+            reaction_time=0.0,
+            jerk=UNLIMITED_BRAKING / memory.step,
+            corridor=self.corridor,
+            cruise_speed=self.cruise_speed,
+            start=self.start_throttle,
+        )

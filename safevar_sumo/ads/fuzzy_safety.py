@@ -49,9 +49,18 @@ class FuzzySafety(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=
         gap = np.where(is_in_the_way(seen, self.corridor), seen.gap, np.inf)
         pfs = self.proactive_metric(gap, seen.speed, seen.obstacle_speed)
         cfs = self.critical_metric(gap, seen.speed, seen.obstacle_speed, acceleration)
-        deceleration = np.where(cfs > 0, cfs * (self.hardest - self.comfortable) + self.comfortable, pfs * self.comfortable)
-        return react(seen, memory, (pfs > 0) | (cfs > 0), np.minimum(deceleration, HARDEST_BRAKING),
-                     reaction_time=self.reaction_time, corridor=self.corridor, cruise_speed=self.cruise_speed)
+        deceleration = np.where(
+            cfs > 0, cfs * (self.hardest - self.comfortable) + self.comfortable, pfs * self.comfortable
+        )
+        return react(
+            seen,
+            memory,
+            (pfs > 0) | (cfs > 0),
+            np.minimum(deceleration, HARDEST_BRAKING),
+            reaction_time=self.reaction_time,
+            corridor=self.corridor,
+            cruise_speed=self.cruise_speed,
+        )
 
     def proactive_metric(self, gap: FloatArray, v: FloatArray, u: FloatArray) -> FloatArray:
         """PFS in [0, 1] at a gap [m] and speeds v and u (leader) [m/s], shape (N,): 0 above the safe distance, 1 below the unsafe one."""
@@ -66,8 +75,12 @@ class FuzzySafety(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=
         next_speed = v + self.reaction_time * acceleration
         approach = (v + acceleration * self.reaction_time / 2 - u) * self.reaction_time
         square = (next_speed - u) * (next_speed - u)
-        fuzzy_value = _falling_ramp(gap, approach + square / (2 * self.hardest), approach + square / (2 * self.comfortable))
-        slowing_value = np.where(gap < (v - u) * (v - u) / (2 * np.maximum(np.abs(acceleration), LEAST_DIVISOR)), 1.0, 0.0)
+        fuzzy_value = _falling_ramp(
+            gap, approach + square / (2 * self.hardest), approach + square / (2 * self.comfortable)
+        )
+        slowing_value = np.where(
+            gap < (v - u) * (v - u) / (2 * np.maximum(np.abs(acceleration), LEAST_DIVISOR)), 1.0, 0.0
+        )
         return np.where(v <= u, 0.0, np.where(next_speed < u, slowing_value, fuzzy_value))
 
 

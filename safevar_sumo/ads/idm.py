@@ -43,5 +43,11 @@ class Idm(CarFollowing, frozen=True, kw_only=True):
         closing_term = speed * (speed - leader_speed) / (2 * math.sqrt(self.acceleration * self.deceleration))
         desired_gap = self.standing_gap + np.maximum(speed * self.headway + closing_term, 0.0)
         positive_gap = np.maximum(gap, LEAST_GAP)
-        return np.asarray(self.acceleration * (1 - speed_ratio * speed_ratio * speed_ratio * speed_ratio
-                                               - desired_gap * desired_gap / (positive_gap * positive_gap)))
+        return np.asarray(
+            self.acceleration
+            * (
+                1
+                - speed_ratio * speed_ratio * speed_ratio * speed_ratio
+                - desired_gap * desired_gap / (positive_gap * positive_gap)
+            )
+        )

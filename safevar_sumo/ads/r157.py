@@ -40,5 +40,13 @@ class R157(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     def drive(self, seen: Observation, memory: Reaction) -> tuple[Command, Reaction]:
         critical_ttc = seen.closing_speed / (2 * self.deceleration) + self.reaction_time + self.margin
         danger = is_in_the_way(seen, self.corridor) & (time_to_reach(seen) < critical_ttc)
-        return react(seen, memory, danger, np.full_like(seen.speed, self.deceleration), reaction_time=self.reaction_time,
-                     jerk=self.deceleration / memory.step, corridor=self.corridor, cruise_speed=self.cruise_speed)
+        return react(
+            seen,
+            memory,
+            danger,
+            np.full_like(seen.speed, self.deceleration),
+            reaction_time=self.reaction_time,
+            jerk=self.deceleration / memory.step,
+            corridor=self.corridor,
+            cruise_speed=self.cruise_speed,
+        )

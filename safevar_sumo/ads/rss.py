@@ -39,11 +39,20 @@ class Rss(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
     def drive(self, seen: Observation, memory: Reaction) -> tuple[Command, Reaction]:
         danger = is_in_the_way(seen, self.corridor) & (seen.gap < self.safe_distance(seen.speed, seen.obstacle_speed))
-        return react(seen, memory, danger, np.full_like(seen.speed, self.deceleration), reaction_time=self.reaction_time,
-                     corridor=self.corridor, cruise_speed=self.cruise_speed)
+        return react(
+            seen,
+            memory,
+            danger,
+            np.full_like(seen.speed, self.deceleration),
+            reaction_time=self.reaction_time,
+            corridor=self.corridor,
+            cruise_speed=self.cruise_speed,
+        )
 
     def safe_distance(self, speed: FloatArray, leader_speed: FloatArray) -> FloatArray:
         """Smallest safe gap [m], at speeds [m/s] of shape (N,)."""
         rt, reaction_speed = self.reaction_time, speed + self.reaction_time * self.acceleration
-        distance = speed * rt + self.acceleration * rt * rt / 2 + reaction_speed * reaction_speed / (2 * self.deceleration)
+        distance = (
+            speed * rt + self.acceleration * rt * rt / 2 + reaction_speed * reaction_speed / (2 * self.deceleration)
+        )
         return np.asarray(np.maximum(distance - leader_speed * leader_speed / (2 * self.leader_deceleration), 0.0))

@@ -78,8 +78,12 @@ class WorldOnRails(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields
 
     def start(self, n: int, nominal: Nominal, step: float) -> _Memory:
         idle = Command(np.zeros(n), np.zeros(n))
-        return _Memory(np.zeros(n, dtype=bool), (idle,) * round(self.latency / step), DelayLine.by(self.recognition_delay, step),
-                       DelayLine.by(self.hesitation, step))
+        return _Memory(
+            np.zeros(n, dtype=bool),
+            (idle,) * round(self.latency / step),
+            DelayLine.by(self.recognition_delay, step),
+            DelayLine.by(self.hesitation, step),
+        )
 
     def drive(self, seen: Observation, memory: _Memory) -> tuple[Command, _Memory]:
         (gap, lateral), recognition_line = memory.recognition_line.delayed(np.array([seen.gap, seen.lateral]))
@@ -91,7 +95,9 @@ class WorldOnRails(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields
         memory = _Memory(is_braking, tuple(pending_commands), recognition_line, hesitation_line)
         return Command(command.throttle, np.minimum(command.brake, delayed_brake)), memory
 
-    def _decide_to_brake(self, seen: Observation, gap: FloatArray, lateral: FloatArray, was_braking: BoolArray) -> BoolArray:
+    def _decide_to_brake(
+        self, seen: Observation, gap: FloatArray, lateral: FloatArray, was_braking: BoolArray
+    ) -> BoolArray:
         """Whether the recognised obstacle is near and in the corridor; then the policy's probability of braking exceeds one half."""
         offset = lateral - self.brake_place
         reduction = self.brake_gap_past * np.maximum(offset, 0.0) + self.brake_gap_before * np.maximum(-offset, 0.0)

@@ -52,8 +52,15 @@ class Evaluator:
         self._pool, self.progress = pool, progress
         self.simulated = 0
 
-    def evaluate(self, settings: FloatArray, stage: str, done_before: int = 0, total: int | None = None, *,
-                 ignore_constraints: bool = False) -> Evaluations:
+    def evaluate(
+        self,
+        settings: FloatArray,
+        stage: str,
+        done_before: int = 0,
+        total: int | None = None,
+        *,
+        ignore_constraints: bool = False,
+    ) -> Evaluations:
         """Evaluate M settings, shape (M, n). Progress is shown for `stage`; `done_before` of its `total` settings are already done.
 
         Settings that violate a constraint of the study are not simulated and get the outcome `infeasible`, unless `ignore_constraints`
@@ -62,7 +69,10 @@ class Evaluator:
         if self.region and not ignore_constraints:
             feasible = self.region.feasible(settings)
             if not feasible.all():
-                groups = [self.evaluate(settings[feasible], stage, done_before, total), self._infeasible_evaluations(settings[~feasible])]
+                groups = [
+                    self.evaluate(settings[feasible], stage, done_before, total),
+                    self._infeasible_evaluations(settings[~feasible]),
+                ]
                 order = np.argsort(np.argsort(~feasible, kind="stable"), kind="stable")
                 return Evaluations.concatenate(groups).take(order)  # restores the order of the settings
         if not len(settings):
@@ -83,9 +93,13 @@ class Evaluator:
     def _infeasible_evaluations(self, settings: FloatArray) -> Evaluations:
         undefined = np.full(len(settings), np.nan)
         return Evaluations(
-            settings=settings, outcome=np.full(len(settings), Outcome.INFEASIBLE.value, dtype="U16"), collision_speed=undefined,
-            metrics=dict.fromkeys(METRICS, undefined), f_diff=self.characteristics.largest_change(settings),
-            f_num_diff=self.characteristics.number_changed(settings))
+            settings=settings,
+            outcome=np.full(len(settings), Outcome.INFEASIBLE.value, dtype="U16"),
+            collision_speed=undefined,
+            metrics=dict.fromkeys(METRICS, undefined),
+            f_diff=self.characteristics.largest_change(settings),
+            f_num_diff=self.characteristics.number_changed(settings),
+        )
 
     def feasible_settings(self, number: int, seed: int = 0, *, feasible_after_filter: bool = False) -> FloatArray:
         """`number` settings that cover the feasible part of the domain evenly; optionally, they also stay feasible when filtered."""
@@ -97,9 +111,11 @@ class Evaluator:
             """The next `count` settings of the Sobol sequence."""
             nonlocal drawn
             drawn += count
-            return sobol_settings(self.characteristics, drawn, seed)[drawn - count:]
+            return sobol_settings(self.characteristics, drawn, seed)[drawn - count :]
 
-        return self.region.draw_feasible(draw_next, number, rng, filtered=feasible_after_filter, rejections=MAX_REJECTIONS)
+        return self.region.draw_feasible(
+            draw_next, number, rng, filtered=feasible_after_filter, rejections=MAX_REJECTIONS
+        )
 
     def random_settings(self, number: int) -> FloatArray:
         """The first `number` random vehicles of the study, uniform over the domain's feasible part: those that `risk` draws, too."""
@@ -108,7 +124,9 @@ class Evaluator:
         def draw_next(count: int) -> FloatArray:
             return np.asarray(bounds.lower + rng.random((count, len(bounds))) * (bounds.upper - bounds.lower))
 
-        return self.region.draw_feasible(draw_next, number, np.random.default_rng(self.study.search.seed), rejections=MAX_REJECTIONS)
+        return self.region.draw_feasible(
+            draw_next, number, np.random.default_rng(self.study.search.seed), rejections=MAX_REJECTIONS
+        )
 
     def simulate_cells(self, settings: FloatArray, stage: str) -> CellResults:
         """Simulate M settings, shape (M, n), in every cell of a rated study; the workers share the cells.
@@ -124,7 +142,9 @@ class Evaluator:
         parts = min(PARTS_PER_WORKER * self._pool.workers, cell_count)
         inputs, pool = inputs_of(self.study, self._pool), RetryingPool(self._pool, self.study)
         self.progress(stage, 0, cell_count)
-        futures = {pool.submit(pack_study(self.study, inputs, cells=(part, parts)), settings): part for part in range(parts)}
+        futures = {
+            pool.submit(pack_study(self.study, inputs, cells=(part, parts)), settings): part for part in range(parts)
+        }
         results_by_part, done = dict[int, CellResults](), 0
         while len(results_by_part) < parts:
             for future in wait_for_first([future for future, part in futures.items() if part not in results_by_part]):
@@ -150,7 +170,9 @@ class Evaluator:
         """
         evaluations = self.evaluate(self.characteristics.original[np.newaxis], "original vehicle")
         if not evaluations.valid[0]:
-            raise SimulationError(f"study {self.study.name!r} cannot be simulated with the original vehicle: {evaluations.outcome[0]}")
+            raise SimulationError(
+                f"study {self.study.name!r} cannot be simulated with the original vehicle: {evaluations.outcome[0]}"
+            )
         return evaluations
 
     @cached_property
@@ -170,18 +192,24 @@ class Evaluator:
         original = self.evaluate_original() if original is None else original
         if RATING_POINTS.name in original.metrics:
             return Unsafe.default_among(original, original)  # a lost point: it depends on the original vehicle alone
-        return Unsafe.default_among(self.evaluate(self.feasible_settings(CRITERION_SETTINGS), "settings over the whole domain"), original)
+        return Unsafe.default_among(
+            self.evaluate(self.feasible_settings(CRITERION_SETTINGS), "settings over the whole domain"), original
+        )
 
     def parse_criterion(self, text: str) -> Unsafe:
         """Parse the criterion that an option states; raises what `Unsafe.parse` raises, and an error for points without a rating."""
         criterion = Unsafe.parse(text)
         if criterion.points is not None and not is_rated(self.study):
-            raise InputError("unsafe", f"{text!r}: study {self.study.name!r} is not rated and has no points", "collision or below=X")
+            raise InputError(
+                "unsafe", f"{text!r}: study {self.study.name!r} is not rated and has no points", "collision or below=X"
+            )
         return criterion
 
     def with_step(self, step: float) -> Evaluator:
         """An evaluator of the same study with another time step [s]."""
-        metrics = msgspec.structs.replace(self.study.metrics, sampling_interval=None)  # the interval may be no multiple of this step
+        metrics = msgspec.structs.replace(
+            self.study.metrics, sampling_interval=None
+        )  # the interval may be no multiple of this step
         return self.for_study(msgspec.structs.replace(self.study, step_length=step, metrics=metrics))
 
     def for_study(self, study: Study) -> Evaluator:
@@ -190,8 +218,9 @@ class Evaluator:
 
 
 @contextmanager
-def open_evaluator(study: Study, pool: Pool | None = None, jobs: int | None = None,
-                   progress: Progress = show_no_progress) -> Iterator[Evaluator]:
+def open_evaluator(
+    study: Study, pool: Pool | None = None, jobs: int | None = None, progress: Progress = show_no_progress
+) -> Iterator[Evaluator]:
     """An evaluator that simulates on `pool`; without a pool, on `jobs` new worker processes, by default one for each core.
 
     Raises
@@ -211,7 +240,9 @@ def sobol_points(number: int, dimensions: int, seed: int) -> FloatArray:
     """Scrambled Sobol points in the unit cube, shape (number, dimensions); they spread evenly if `number` is a power of two."""
     import scipy  # takes longer to load than a simulation
 
-    points = scipy.stats.qmc.Sobol(dimensions, rng=np.random.default_rng(seed)).random_base2(max(0, math.ceil(math.log2(number))))
+    points = scipy.stats.qmc.Sobol(dimensions, rng=np.random.default_rng(seed)).random_base2(
+        max(0, math.ceil(math.log2(number)))
+    )
     return np.asarray(points[:number])
 
 

@@ -25,25 +25,40 @@ GREY, SKY_BLUE, BLUE, VERMILION = "#bbbbbb", "#56b4e9", "#0072b2", "#d55e00"
 """Grey and colours of Okabe and Ito. Grey and the two blues differ in lightness, so that they differ in a print without colours too."""
 
 
-def new_figure(title: str, rows: int, columns: int, size: tuple[float, float], **options: Any) -> tuple[Figure, np.ndarray]:
+def new_figure(
+    title: str, rows: int, columns: int, size: tuple[float, float], **options: Any
+) -> tuple[Figure, np.ndarray]:
     """A figure outside pyplot's state, and its axes, shape (rows, columns). `size` is in inches; `options` go to `Figure.subplots`."""
     import matplotlib.style
     from matplotlib.figure import Figure
 
-    with matplotlib.style.context(["seaborn-v0_8-whitegrid", {"font.size": FONT, "axes.labelsize": FONT, "axes.titlesize": FONT,
-                                                              "xtick.labelsize": FONT, "ytick.labelsize": FONT}]):
+    with matplotlib.style.context(
+        [
+            "seaborn-v0_8-whitegrid",
+            {
+                "font.size": FONT,
+                "axes.labelsize": FONT,
+                "axes.titlesize": FONT,
+                "xtick.labelsize": FONT,
+                "ytick.labelsize": FONT,
+            },
+        ]
+    ):
         figure = Figure(figsize=size, layout="constrained")
         axes = figure.subplots(rows, columns, squeeze=False, **options)
     figure.suptitle(escape_dollars(title), fontsize=FONT + 2)
     return figure, axes
 
 
-def new_panels(title: str, number: int, max_columns: int, panel_size: tuple[float, float], min_width: float,
-               title_height: float) -> tuple[Figure, list[Axes]]:
+def new_panels(
+    title: str, number: int, max_columns: int, panel_size: tuple[float, float], min_width: float, title_height: float
+) -> tuple[Figure, list[Axes]]:
     """A figure with `number` panels, at most `max_columns` of them side by side, and the axes of the panels; all sizes are in inches."""
     columns = min(max_columns, number)
     rows = -(-number // columns)
-    figure, axes = new_figure(title, rows, columns, (max(panel_size[0] * columns, min_width), title_height + panel_size[1] * rows))
+    figure, axes = new_figure(
+        title, rows, columns, (max(panel_size[0] * columns, min_width), title_height + panel_size[1] * rows)
+    )
     for axis in axes.flat[number:]:
         axis.set_axis_off()
     return figure, list(axes.flat[:number])
@@ -63,8 +78,11 @@ def save(figure: Figure, path: Path, source: str = "out") -> None:
         with matplotlib.rc_context({"svg.hashsalt": "safevar_sumo"}), whole_file(path) as file:
             figure.savefig(file, dpi=DPI, metadata=PICTURE_METADATA.get(path.suffix.lower()))
     except (OSError, ValueError) as error:
-        raise InputError(source, f"cannot write {path}: {getattr(error, 'strerror', None) or error}",
-                         f"{WRITABLE}; its name ends in .png, .pdf or .svg") from None
+        raise InputError(
+            source,
+            f"cannot write {path}: {getattr(error, 'strerror', None) or error}",
+            f"{WRITABLE}; its name ends in .png, .pdf or .svg",
+        ) from None
 
 
 def escape_dollars(name: str) -> str:

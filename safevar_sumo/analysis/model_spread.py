@@ -55,8 +55,10 @@ class ModelSpread:
         if self.lower is None or self.upper is None:
             return f"no safety degree with any of {self.sets} parameter sets that fit the published data equally well"
         collisions = "none of them" if not self.collisions else f"{self.collisions} of them"
-        return (f"safety degree {self.lower:.2f} to {self.upper:.2f} ({BAND_SHARE:.0%} band of {self.sets} parameter sets that fit the "
-                f"published data equally well, of repeats and of the model's error); a collision with {collisions}")
+        return (
+            f"safety degree {self.lower:.2f} to {self.upper:.2f} ({BAND_SHARE:.0%} band of {self.sets} parameter sets that fit the "
+            f"published data equally well, of repeats and of the model's error); a collision with {collisions}"
+        )
 
 
 def compute_model_spreads(study: Study, settings: FloatArray, point: str = "") -> list[ModelSpread]:
@@ -72,14 +74,18 @@ def compute_model_spreads(study: Study, settings: FloatArray, point: str = "") -
     evaluations = evaluate_sets(study, settings, point)
     lower, upper = band_of(study, evaluations)
     collisions = np.stack([prediction.collided for prediction in evaluations]).sum(axis=0)
-    return [ModelSpread(sets=len(evaluations), lower=finite_or_none(low), upper=finite_or_none(high), collisions=int(count))
-            for low, high, count in zip(lower.tolist(), upper.tolist(), collisions.tolist(), strict=True)]
+    return [
+        ModelSpread(sets=len(evaluations), lower=finite_or_none(low), upper=finite_or_none(high), collisions=int(count))
+        for low, high, count in zip(lower.tolist(), upper.tolist(), collisions.tolist(), strict=True)
+    ]
 
 
 def band_of(study: Study, evaluations: Sequence[Evaluations]) -> tuple[FloatArray, FloatArray]:
     """Lower and upper ends, shape (M,) each, of the sets' predictions for M settings, widened by repeats and the model's error."""
     error = study.model_error.get(SAFETY_DEGREE, 0.0) * error_distance(study, evaluations[0].settings)
-    return prediction_band(np.stack([prediction.f_safe for prediction in evaluations]), study.repeatability.get(SAFETY_DEGREE, 0.0), error)
+    return prediction_band(
+        np.stack([prediction.f_safe for prediction in evaluations]), study.repeatability.get(SAFETY_DEGREE, 0.0), error
+    )
 
 
 def error_distance(study: Study, settings: FloatArray) -> FloatArray:
@@ -92,19 +98,27 @@ def error_distance(study: Study, settings: FloatArray) -> FloatArray:
     return np.asarray(np.maximum(np.linalg.norm(changes, axis=1), LEAST_DISTANCE))
 
 
-def prediction_band(safety_degrees: FloatArray, repeatability: float, error: FloatArray | float = 0.0) -> tuple[FloatArray, FloatArray]:
+def prediction_band(
+    safety_degrees: FloatArray, repeatability: float, error: FloatArray | float = 0.0
+) -> tuple[FloatArray, FloatArray]:
     """Ends, shape (M,) each, of the band of predictions, shape (sets, M); repeats of a simulation and `error` widen it on each side."""
     lower, upper = np.full(safety_degrees.shape[1], np.nan), np.full(safety_degrees.shape[1], np.nan)
     defined = np.isfinite(safety_degrees).any(axis=0)
-    lower[defined], upper[defined] = np.nanquantile(safety_degrees[:, defined], [(1 - BAND_SHARE) / 2, (1 + BAND_SHARE) / 2], axis=0)
+    lower[defined], upper[defined] = np.nanquantile(
+        safety_degrees[:, defined], [(1 - BAND_SHARE) / 2, (1 + BAND_SHARE) / 2], axis=0
+    )
     return lower - HALF_WIDTH * repeatability - error, upper + HALF_WIDTH * repeatability + error
 
 
 def evaluate_sets(study: Study, settings: FloatArray, point: str = "") -> list[Evaluations]:
     """Evaluate settings, shape (M, n), in this process with each parameter set, first with the study's values."""
-    systems = [assemble(variant, study.source if k == 0 else f"{study.source}: spread: set {k}")
-               for k, variant in enumerate(studies_of_sets(study))]
-    return [evaluate(system_at_point(system, point, source="point") if point else system, settings) for system in systems]
+    systems = [
+        assemble(variant, study.source if k == 0 else f"{study.source}: spread: set {k}")
+        for k, variant in enumerate(studies_of_sets(study))
+    ]
+    return [
+        evaluate(system_at_point(system, point, source="point") if point else system, settings) for system in systems
+    ]
 
 
 def studies_of_sets(study: Study) -> list[Study]:
@@ -116,14 +130,25 @@ def studies_of_sets(study: Study) -> list[Study]:
         If the study has no parameter sets, or lacks a parameter that they name.
     """
     if not study.spread:
-        raise InputError(study.source, "has no table [spread]", "a study that `calibrate` has fitted, such as sun or rain")
+        raise InputError(
+            study.source, "has no table [spread]", "a study that `calibrate` has fitted, such as sun or rain"
+        )
     outside_names = parameters_outside_sets(study)
     values_of_sets = {key: values for key, values in study.spread.items() if key not in outside_names}
     set_count = len(next(iter(study.spread.values())))
-    return [study, *(with_values(study, {key: values[k] for key, values in values_of_sets.items()}, "spread") for k in range(1, set_count))]
+    return [
+        study,
+        *(
+            with_values(study, {key: values[k] for key, values in values_of_sets.items()}, "spread")
+            for k in range(1, set_count)
+        ),
+    ]
 
 
 def parameters_outside_sets(study: Study) -> list[str]:
     """The parameters under [spread] whose value in `study` is not that of the first set: the sets say nothing on other values."""
-    return [key for key, values in study.spread.items()
-            if not np.isclose(value_of(study, key, "spread"), values[0], rtol=ROUNDING_TOLERANCE, atol=0)]
+    return [
+        key
+        for key, values in study.spread.items()
+        if not np.isclose(value_of(study, key, "spread"), values[0], rtol=ROUNDING_TOLERANCE, atol=0)
+    ]

@@ -62,10 +62,13 @@ def option(default: Any, text: str, **properties: Any) -> Any:
 
 def unsafe_option() -> Any:
     default = "a collision if any evaluated setting collides, else half of the original's safety degree; of a rated study, any point lost"
-    return option(None, f"What is unsafe: a collision, a safety degree below X, or at most X points of a rating.  [default: {default}]",
-                  metavar="collision|below=X|points=X",
-                  python="What is unsafe: `\"collision\"`, or a number X for a safety degree below X [m, or minus a collision's speed in "
-                         f"m/s], or an `Unsafe`. By default {default}.")
+    return option(
+        None,
+        f"What is unsafe: a collision, a safety degree below X, or at most X points of a rating.  [default: {default}]",
+        metavar="collision|below=X|points=X",
+        python='What is unsafe: `"collision"`, or a number X for a safety degree below X [m, or minus a collision\'s speed in '
+        f"m/s], or an `Unsafe`. By default {default}.",
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -106,7 +109,11 @@ class Options:
         """The command that asks this question about a study or results directory; it has a flag for each option not at its default."""
         parts = [PROGRAM_COMMAND, self.question, quote(subject)]
         for option_field in fields(self):
-            value, flag, definition = getattr(self, option_field.name), self.flags()[option_field.name], option_field.metadata["option"]
+            value, flag, definition = (
+                getattr(self, option_field.name),
+                self.flags()[option_field.name],
+                option_field.metadata["option"],
+            )
             if value == option_field.default:
                 continue
             if isinstance(value, Mapping):
@@ -140,8 +147,11 @@ QuestionFunction = TypeVar("QuestionFunction", bound=Callable[..., Any])
 
 def document_options(options: type[Options]) -> Callable[[QuestionFunction], QuestionFunction]:
     """Decorator: appends the options and the arguments common to all questions to a docstring, which must end with the first argument."""
+
     def append_arguments(function: QuestionFunction) -> QuestionFunction:
-        arguments = [f"{name}\n{indent(definition.argument_text, '    ')}" for name, definition in options.definitions().items()]
+        arguments = [
+            f"{name}\n{indent(definition.argument_text, '    ')}" for name, definition in options.definitions().items()
+        ]
         function.__doc__ = "\n".join([cleandoc(function.__doc__ or ""), *arguments, COMMON_ARGUMENTS])
         return function
 

@@ -125,10 +125,13 @@ class Preventability:
         interval = self.interval(PreventableBy.COMPETENT_DRIVER)
         later = self.later / self.looked_at if self.looked_at else None
         return PreventedShares(
-            competent_driver=self.share(PreventableBy.COMPETENT_DRIVER), full_braking=self.share(PreventableBy.FULL_BRAKING),
-            nobody=self.share(PreventableBy.NOBODY), looked_at=self.looked_at,
+            competent_driver=self.share(PreventableBy.COMPETENT_DRIVER),
+            full_braking=self.share(PreventableBy.FULL_BRAKING),
+            nobody=self.share(PreventableBy.NOBODY),
+            looked_at=self.looked_at,
             interval_competent_driver=None if interval is None else list(interval),
-            later=LaterReaction(reaction=LATER_REACTION, competent_driver=later))
+            later=LaterReaction(reaction=LATER_REACTION, competent_driver=later),
+        )
 
     def __str__(self) -> str:
         """A sentence; empty if no collision was simulated."""
@@ -145,8 +148,9 @@ class Preventability:
         return f"In the same vehicle, of {number_of(self.looked_at, 'collision')}{sample}, {join_phrases(parts)}."
 
 
-def assess_preventability(evaluator: Evaluator, collisions: Evaluations,
-                          max_simulations: int = MAX_SIMULATIONS) -> Preventability:
+def assess_preventability(
+    evaluator: Evaluator, collisions: Evaluations, max_simulations: int = MAX_SIMULATIONS
+) -> Preventability:
     """Classify M evaluated collisions by the weakest driver that avoids them; equal settings count once.
 
     If that takes more than about `max_simulations` simulations, only a random sample is simulated, drawn with the study's seed.
@@ -154,10 +158,13 @@ def assess_preventability(evaluator: Evaluator, collisions: Evaluations,
     """
     distinct = np.unique(collisions.settings, axis=0, return_index=True)[1]
     shuffled = np.random.default_rng(evaluator.study.search.seed).permutation(distinct)
-    sample = shuffled[:max(max_simulations // SIMULATIONS, 1)]
+    sample = shuffled[: max(max_simulations // SIMULATIONS, 1)]
     avoidances = [avoidance for avoidance in classify_collisions(evaluator, collisions.take(sample)) if avoidance]
-    return Preventability(counts=Counter(avoidance.by for avoidance in avoidances), collisions=len(distinct),
-                          later=sum(avoidance.later for avoidance in avoidances))
+    return Preventability(
+        counts=Counter(avoidance.by for avoidance in avoidances),
+        collisions=len(distinct),
+        later=sum(avoidance.later for avoidance in avoidances),
+    )
 
 
 def classify_collisions(evaluator: Evaluator, collisions: Evaluations) -> list[Avoidance | None]:
@@ -189,8 +196,10 @@ def _classify_at_point(evaluator: Evaluator, system: System, settings: FloatArra
     categories = [PreventableBy.COMPETENT_DRIVER if valid else None for valid in competent_driver.valid]
     for row, collided, valid in zip(collisions.tolist(), full_braking.collided, full_braking.valid, strict=True):
         categories[row] = (PreventableBy.NOBODY if collided else PreventableBy.FULL_BRAKING) if valid else None
-    return [None if category is None else Avoidance(category, avoided)
-            for category, avoided in zip(categories, (later.valid & ~later.collided).tolist(), strict=True)]
+    return [
+        None if category is None else Avoidance(category, avoided)
+        for category, avoided in zip(categories, (later.valid & ~later.collided).tolist(), strict=True)
+    ]
 
 
 def approach_parameters(system: System) -> dict[str, Any]:

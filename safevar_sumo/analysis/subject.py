@@ -90,7 +90,9 @@ def load(directory: str | Path) -> Results:
     return Results(Path(directory), load_cases([directory])[0])
 
 
-def study_or_case(source: StudyLike | Results, *, as_it_is_now: bool = False, results_only: bool = False) -> Study | Case:
+def study_or_case(
+    source: StudyLike | Results, *, as_it_is_now: bool = False, results_only: bool = False
+) -> Study | Case:
     """The subject of a question: a study, or the case of results, which may be named by their directory.
 
     With `results_only`, a name or path means a directory, even if a study has the same name.
@@ -106,9 +108,14 @@ def study_or_case(source: StudyLike | Results, *, as_it_is_now: bool = False, re
         If `source` is no study and no results, if an input of the results has changed, or if `as_it_is_now` is set for a study.
     """
     if isinstance(source, str | Path):
-        is_directory, is_study = os.path.isdir(source), str(source) in study_names()  # `os.path` accepts any text, unlike paths
+        is_directory, is_study = (
+            os.path.isdir(source),
+            str(source) in study_names(),
+        )  # `os.path` accepts any text, unlike paths
         if results_only and not is_directory and (is_study or os.path.isfile(source)):
-            raise InputError(source, "is a study and has no solutions", "a directory that the command `study` has written")
+            raise InputError(
+                source, "is a study and has no solutions", "a directory that the command `study` has written"
+            )
         if results_only or (is_directory and not is_study):
             source = load(source)
         elif not (is_study or os.path.lexists(source)):
@@ -120,7 +127,9 @@ def study_or_case(source: StudyLike | Results, *, as_it_is_now: bool = False, re
             warn(f"{source.directory}: {change}")
         return source.case
     if as_it_is_now:
-        raise InputError("as_it_is_now", "a study is simulated as it is now anyway", "results, which keep the study that they had")
+        raise InputError(
+            "as_it_is_now", "a study is simulated as it is now anyway", "results, which keep the study that they had"
+        )
     return load_study(source)
 
 
@@ -150,8 +159,13 @@ def at_point(case: Case, point: str) -> Case:
     columns = {"f_safe": evaluations.f_safe, **evaluations.metrics, "outcome": evaluations.outcome}
     solutions = case.solutions.drop(columns=[name for name in case.original if name not in evaluations.metrics])
     original = {metric.name: float(evaluations.metrics[metric.name][0]) for metric in scoring.metrics}
-    return replace(case, study=study, scoring=scoring, original=original,
-                   solutions=solutions.assign(**{name: values[1:] for name, values in columns.items()}))
+    return replace(
+        case,
+        study=study,
+        scoring=scoring,
+        original=original,
+        solutions=solutions.assign(**{name: values[1:] for name, values in columns.items()}),
+    )
 
 
 def changes_since(directory: Path, case: Case, *, as_it_is_now: bool = False) -> list[str]:
@@ -175,19 +189,26 @@ def changes_since(directory: Path, case: Case, *, as_it_is_now: bool = False) ->
     with local_pool(1, study.search.time_limit) as pool:
         sources = {**source_digests(study, pool), **files_read_by_algorithms(study)}
     present = manifest_of(study, identity_of(study, system, sources))
-    changes = [change.text for change in input_differences(directory, manifest, present, study) if change.changes_simulations]
+    changes = [
+        change.text for change in input_differences(directory, manifest, present, study) if change.changes_simulations
+    ]
     if changes and not as_it_is_now:
         rest = f" (and {len(changes) - MAX_CHANGES_NAMED} more)" if len(changes) > MAX_CHANGES_NAMED else ""
         named = f"{'; '.join(changes[:MAX_CHANGES_NAMED])}{rest}"
-        raise InputError(directory / MANIFEST, f"{named}: new simulations would not match these results",
-                         "the inputs of that time; or `as_it_is_now=True` to simulate with the present inputs and a warning")
+        raise InputError(
+            directory / MANIFEST,
+            f"{named}: new simulations would not match these results",
+            "the inputs of that time; or `as_it_is_now=True` to simulate with the present inputs and a warning",
+        )
     return [f"{difference}; simulated as it is now" for difference in changes]
 
 
 Answer = TypeVar("Answer")
 
 
-def answer_question(compute: Callable[..., Answer], subject: Study | Case, options: type[Options], arguments: Mapping[str, Any]) -> Answer:
+def answer_question(
+    compute: Callable[..., Answer], subject: Study | Case, options: type[Options], arguments: Mapping[str, Any]
+) -> Answer:
     """Compute the answer to a question; `arguments` are the arguments of the question's function, by name."""
     from safevar_sumo.metrics import Unsafe
 
@@ -195,4 +216,6 @@ def answer_question(compute: Callable[..., Answer], subject: Study | Case, optio
     if values.get("unsafe") is not None:
         values["unsafe"] = str(Unsafe.parse(values["unsafe"]))
     with open_progress(arguments["progress"]) as show_progress:
-        return compute(subject, options(**values), pool=arguments["pool"], jobs=arguments["jobs"], progress=show_progress)
+        return compute(
+            subject, options(**values), pool=arguments["pool"], jobs=arguments["jobs"], progress=show_progress
+        )

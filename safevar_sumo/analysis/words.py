@@ -11,9 +11,14 @@ from safevar_sumo.shipped import PROGRAM_COMMAND
 from safevar_sumo.vehicles import Characteristic, CharacteristicSet
 
 OUTCOME_VERBS = {
-    Outcome.STOPPED: "stops", Outcome.PASSED: "passes", Outcome.TIMEOUT: "is still under way at the end",
-    Outcome.NEVER_MOVED: "never moves", Outcome.SIMULATOR_ERROR: "could not be simulated",
-    Outcome.INVALID_TEST: "violates the test's speed tolerance", Outcome.INFEASIBLE: "violates a constraint"}
+    Outcome.STOPPED: "stops",
+    Outcome.PASSED: "passes",
+    Outcome.TIMEOUT: "is still under way at the end",
+    Outcome.NEVER_MOVED: "never moves",
+    Outcome.SIMULATOR_ERROR: "could not be simulated",
+    Outcome.INVALID_TEST: "violates the test's speed tolerance",
+    Outcome.INFEASIBLE: "violates a constraint",
+}
 """How a run ended, as the verb of a sentence; a collision is described with its speed instead."""
 
 
@@ -23,8 +28,10 @@ def change_texts(characteristics: CharacteristicSet, values: Mapping[str, float]
     for characteristic in characteristics:
         original, value = characteristic.original, values.get(characteristic.name, characteristic.original)
         if value != original:
-            texts.append(f"{characteristic.name} {original:g} -> {characteristic.text(value)}{characteristic.suffix} "
-                         f"({100 * (value - original) / abs(original):+.1f} %)")
+            texts.append(
+                f"{characteristic.name} {original:g} -> {characteristic.text(value)}{characteristic.suffix} "
+                f"({100 * (value - original) / abs(original):+.1f} %)"
+            )
     return texts
 
 

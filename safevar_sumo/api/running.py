@@ -9,7 +9,16 @@ from pathlib import Path
 from safevar_sumo.analysis.subject import Results, load
 from safevar_sumo.analysis.words import number_of
 from safevar_sumo.api.simulation import load_and_assemble
-from safevar_sumo.campaign import Campaign, Observer, RunKey, RunProgress, algorithm_of, all_runs, files_read_by_algorithms, run_campaign
+from safevar_sumo.campaign import (
+    Campaign,
+    Observer,
+    RunKey,
+    RunProgress,
+    algorithm_of,
+    all_runs,
+    files_read_by_algorithms,
+    run_campaign,
+)
 from safevar_sumo.campaign.batches import ask_why_no_verdict, source_digests
 from safevar_sumo.campaign.cluster import cluster_pool
 from safevar_sumo.campaign.identity import identity_of
@@ -27,9 +36,19 @@ ENGINES = (str(Engine.RECORDED), str(Engine.LIBSUMO))
 """The engines that a study may name."""
 
 
-def run(study: StudyLike, out: str | Path | None = None, *, jobs: int | None = None, cluster: str | None = None,
-        pool: Pool | None = None, progress: bool | Progress | Observer = False, only: Sequence[tuple[str, int]] | None = None,
-        batch: int | None = None, engine: str = Engine.RECORDED, retry_failed: bool = False) -> Results:
+def run(
+    study: StudyLike,
+    out: str | Path | None = None,
+    *,
+    jobs: int | None = None,
+    cluster: str | None = None,
+    pool: Pool | None = None,
+    progress: bool | Progress | Observer = False,
+    only: Sequence[tuple[str, int]] | None = None,
+    batch: int | None = None,
+    engine: str = Engine.RECORDED,
+    retry_failed: bool = False,
+) -> Results:
     """Search a study; a call with the same study and directory continues where an earlier one was stopped.
 
     Parameters
@@ -69,7 +88,9 @@ def run(study: StudyLike, out: str | Path | None = None, *, jobs: int | None = N
     directory = Path(out) if out is not None else Path("results") / loaded_study.name
     pool_context = nullcontext(pool) if pool is not None else open_pool(loaded_study, jobs, cluster)
     with pool_context as workers, open_observer(progress, loaded_study, keys) as observer:
-        carry_out_runs(loaded_study, system, keys, directory, workers, observer, batch, engine, retry_failed=retry_failed)
+        carry_out_runs(
+            loaded_study, system, keys, directory, workers, observer, batch, engine, retry_failed=retry_failed
+        )
     return load(directory)
 
 
@@ -87,8 +108,18 @@ def load_for_search(study: StudyLike, source: str = "") -> tuple[Study, System]:
     return loaded_study, system
 
 
-def carry_out_runs(study: Study, system: System, keys: list[RunKey], directory: Path, pool: Pool, observer: Observer,
-                   batch: int | None, engine: str = Engine.RECORDED, *, retry_failed: bool = False) -> Campaign:
+def carry_out_runs(
+    study: Study,
+    system: System,
+    keys: list[RunKey],
+    directory: Path,
+    pool: Pool,
+    observer: Observer,
+    batch: int | None,
+    engine: str = Engine.RECORDED,
+    *,
+    retry_failed: bool = False,
+) -> Campaign:
     """Carry out runs of a study in a directory with `run_campaign`; write the solutions once all of the study's runs are finished.
 
     Raises
@@ -105,10 +136,20 @@ def carry_out_runs(study: Study, system: System, keys: list[RunKey], directory: 
     no_verdict = ask_why_no_verdict(study, pool)
     if no_verdict:
         observer.warned(f"study {study.name!r}: {no_verdict}")
-    campaign = run_campaign(study, keys, results, pool, observer, batch or settings_per_batch(system, engine_used), engine=engine_used,
-                            retry_failed=retry_failed)
+    campaign = run_campaign(
+        study,
+        keys,
+        results,
+        pool,
+        observer,
+        batch or settings_per_batch(system, engine_used),
+        engine=engine_used,
+        retry_failed=retry_failed,
+    )
     if campaign.busy:
-        raise SafevarError(f"another process works on {', '.join(map(str, campaign.busy))}: run the study again later to finish it")
+        raise SafevarError(
+            f"another process works on {', '.join(map(str, campaign.busy))}: run the study again later to finish it"
+        )
     if keys == all_runs(study):
         results.finish(campaign.solutions)
     return campaign._replace(no_verdict=no_verdict)
@@ -118,13 +159,21 @@ def _extent_remarks(results: ResultsDirectory, study: Study) -> list[str]:
     """Remarks on earlier results in a directory: runs of other lengths, and runs that the study no longer has."""
     if not (results.path / MANIFEST).exists():
         return []
-    earlier, now, remarks = read_manifest(results.path)["study"]["search"]["evaluations"], study.search.evaluations, list[str]()
+    earlier, now, remarks = (
+        read_manifest(results.path)["study"]["search"]["evaluations"],
+        study.search.evaluations,
+        list[str](),
+    )
     if earlier != now:
-        remarks.append(f"{results.path}: each run had {earlier} evaluations before and has {now} now: an id such as nsga2:0:0 may "
-                       "name another solution than in earlier output and reports")
+        remarks.append(
+            f"{results.path}: each run had {earlier} evaluations before and has {now} now: an id such as nsga2:0:0 may "
+            "name another solution than in earlier output and reports"
+        )
     names = stored_runs(results.path) - set(map(str, all_runs(study)))
     if names:
-        remarks.append(f"{results.path}: {number_of(len(names), 'earlier run')} left out of the results: {', '.join(sorted(names))}")
+        remarks.append(
+            f"{results.path}: {number_of(len(names), 'earlier run')} left out of the results: {', '.join(sorted(names))}"
+        )
     return remarks
 
 
@@ -145,8 +194,12 @@ def open_pool(study: Study, jobs: int | None = None, cluster: str | None = None)
 
 
 @contextmanager
-def open_observer(progress: bool | Progress | Observer, study: Study, keys: Sequence[RunKey],
-                  show_warning: Callable[[str], None] = warn) -> Iterator[Observer]:
+def open_observer(
+    progress: bool | Progress | Observer,
+    study: Study,
+    keys: Sequence[RunKey],
+    show_warning: Callable[[str], None] = warn,
+) -> Iterator[Observer]:
     """Yield the observer for a value of `progress`."""
     if not (isinstance(progress, bool) or callable(progress)):
         yield progress
@@ -158,10 +211,15 @@ def open_observer(progress: bool | Progress | Observer, study: Study, keys: Sequ
 class CampaignProgress:
     """Passes on the progress of a campaign: evaluations, without those of journals, and what runs have found."""
 
-    def __init__(self, progress: Progress, study: Study, keys: Sequence[RunKey],
-                 show_warning: Callable[[str], None] = warn) -> None:
+    def __init__(
+        self, progress: Progress, study: Study, keys: Sequence[RunKey], show_warning: Callable[[str], None] = warn
+    ) -> None:
         self.warned, self._progress, self._study, self._run_count = show_warning, progress, study, len(keys)
-        self._runs, self._replayed, self._finished_runs = dict[RunKey, RunProgress](), dict[RunKey, int](), set[RunKey]()
+        self._runs, self._replayed, self._finished_runs = (
+            dict[RunKey, RunProgress](),
+            dict[RunKey, int](),
+            set[RunKey](),
+        )
         self.progressed([])
 
     def progressed(self, runs: Sequence[RunProgress]) -> None:
@@ -174,8 +232,11 @@ class CampaignProgress:
         degrees = [run.best for run in self._runs.values() if run.best is not None]
         collisions = sum(run.collisions for run in self._runs.values())
         found = f", {collisions} collisions, best SD {min(degrees):.2f}" if degrees else ""
-        self._progress(f"{self._study.name}: runs {len(self._finished_runs)}/{self._run_count}{found}",
-                       sum(run.asked for run in self._runs.values()) - replayed, self._run_count * budget - unused - replayed)
+        self._progress(
+            f"{self._study.name}: runs {len(self._finished_runs)}/{self._run_count}{found}",
+            sum(run.asked for run in self._runs.values()) - replayed,
+            self._run_count * budget - unused - replayed,
+        )
 
     def finished(self, run: RunProgress) -> None:
         """Take note of the last state of a run, which may have taken fewer evaluations than it was allowed."""

@@ -15,7 +15,15 @@ from safevar_sumo.analysis.words import OUTCOME_VERBS
 from safevar_sumo.errors import InputError, unknown_name
 from safevar_sumo.metrics import Scoring, time_to_collision
 from safevar_sumo.progress import Progress, open_progress, show_no_progress
-from safevar_sumo.records import STANDSTILL, TIME_DECIMALS, Evaluations, FloatArray, Observation, Outcome, SimulationRuns
+from safevar_sumo.records import (
+    STANDSTILL,
+    TIME_DECIMALS,
+    Evaluations,
+    FloatArray,
+    Observation,
+    Outcome,
+    SimulationRuns,
+)
 from safevar_sumo.results import evaluations_frame, record
 from safevar_sumo.scenarios import Scenario, distance_in_words
 from safevar_sumo.study import SAFETY_DEGREE, Study, StudyLike, load_study
@@ -33,8 +41,13 @@ if TYPE_CHECKING:
     from safevar_sumo.progress import Progress
 
 
-OBSERVATION_HEADS = {"speed": "seen speed [m/s]", "gap": "seen gap [m]", "closing_speed": "seen closing speed [m/s]",
-                     "lateral": "seen lateral [m]", "lateral_speed": "seen lateral speed [m/s]"}
+OBSERVATION_HEADS = {
+    "speed": "seen speed [m/s]",
+    "gap": "seen gap [m]",
+    "closing_speed": "seen closing speed [m/s]",
+    "lateral": "seen lateral [m]",
+    "lateral_speed": "seen lateral speed [m/s]",
+}
 
 
 def trace_frame(runs: SimulationRuns, observations: Sequence[Observation]) -> pd.DataFrame:
@@ -50,14 +63,28 @@ def trace_frame(runs: SimulationRuns, observations: Sequence[Observation]) -> pd
     active = trace.active[:, 0]
     ttc = np.where(trace.speed > STANDSTILL, time_to_collision(runs), np.inf)
     columns = {
-        "time [s]": trace.time, "position [m]": trace.position[:, 0], "speed [m/s]": trace.speed[:, 0],
-        "acceleration [m/s^2]": np.diff(trace.speed[:, 0], prepend=trace.speed[:1, 0]) / trace.step, "gap [m]": trace.gap[:, 0],
-        "ttc [s]": ttc[:, 0], "throttle [-]": trace.throttle[:, 0], "brake [-]": trace.brake[:, 0],
-        "gear [-]": trace.gear[:, 0], "lateral [m]": trace.lateral[:, 0], "lateral speed [m/s]": trace.lateral_speed[:, 0]}
+        "time [s]": trace.time,
+        "position [m]": trace.position[:, 0],
+        "speed [m/s]": trace.speed[:, 0],
+        "acceleration [m/s^2]": np.diff(trace.speed[:, 0], prepend=trace.speed[:1, 0]) / trace.step,
+        "gap [m]": trace.gap[:, 0],
+        "ttc [s]": ttc[:, 0],
+        "throttle [-]": trace.throttle[:, 0],
+        "brake [-]": trace.brake[:, 0],
+        "gear [-]": trace.gear[:, 0],
+        "lateral [m]": trace.lateral[:, 0],
+        "lateral speed [m/s]": trace.lateral_speed[:, 0],
+    }
     frame = pd.DataFrame({name: values[active] for name, values in columns.items()})
-    observed = pd.DataFrame([{"time [s]": round(float(observation.time), TIME_DECIMALS),
-                              **{head: float(getattr(observation, name)[0]) for name, head in OBSERVATION_HEADS.items()}}
-                             for observation in observations])
+    observed = pd.DataFrame(
+        [
+            {
+                "time [s]": round(float(observation.time), TIME_DECIMALS),
+                **{head: float(getattr(observation, name)[0]) for name, head in OBSERVATION_HEADS.items()},
+            }
+            for observation in observations
+        ]
+    )
     return frame.merge(observed, how="left", on="time [s]").replace([np.inf, -np.inf], np.nan)
 
 
@@ -119,14 +146,26 @@ class Simulation:
     def objectives(self) -> dict[str, float]:
         """f_safe [m, or -m/s on a collision], f_diff [fraction], f_num_diff [characteristics]; all are minimised."""
         fields = self.to_dict()
-        return {name: float(value) if value is not None else np.nan for name, value in fields.items() if name.startswith("f_")}
+        return {
+            name: float(value) if value is not None else np.nan
+            for name, value in fields.items()
+            if name.startswith("f_")
+        }
 
     @property
     def units(self) -> dict[str, str]:
         """The unit of every number of `to_dict`, by its name."""
         units_of_metrics = {metric.name: metric.unit for metric in self.scoring.metrics}
-        units_of_metrics |= {objective.name: objective.unit for objective in self.scoring.objectives if objective.name in self.metrics}
-        return {"collision_speed": "m/s", **units_of_metrics, "f_safe": "m, or -m/s", "f_diff": "fraction", "f_num_diff": "characteristics"}
+        units_of_metrics |= {
+            objective.name: objective.unit for objective in self.scoring.objectives if objective.name in self.metrics
+        }
+        return {
+            "collision_speed": "m/s",
+            **units_of_metrics,
+            "f_safe": "m, or -m/s",
+            "f_diff": "fraction",
+            "f_num_diff": "characteristics",
+        }
 
     @cached_property
     def trace(self) -> pd.DataFrame:
@@ -140,20 +179,27 @@ class Simulation:
             return f"collides at {self.collision_speed:.2f} m/s"
         safety_degree = self.metrics[SAFETY_DEGREE]
         distance = distance_in_words(self._scenario, safety_degree)
-        return OUTCOME_VERBS[self.outcome] + ("" if np.isnan(safety_degree) else f", with a safety degree of {distance}")
+        return OUTCOME_VERBS[self.outcome] + (
+            "" if np.isnan(safety_degree) else f", with a safety degree of {distance}"
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """The JSON of `simulate`: plain values, None where undefined."""
-        return {"study": self.study.name, **driven_entry(self.no_verdict), "vcs": dict(self.setting),
-                **record(self.evaluation, row=0)}
+        return {
+            "study": self.study.name,
+            **driven_entry(self.no_verdict),
+            "vcs": dict(self.setting),
+            **record(self.evaluation, row=0),
+        }
 
     def __repr__(self) -> str:
         metrics = ", ".join(f"{name}={value:.4g}" for name, value in self.metrics.items())
         return f"<Simulation of {self.study.name}: {self.outcome}, {metrics}>"
 
 
-def simulate(study: StudyLike, changes: Mapping[str, float] | None = None, *, filtered: bool = True,
-             beyond: bool = False) -> Simulation:
+def simulate(
+    study: StudyLike, changes: Mapping[str, float] | None = None, *, filtered: bool = True, beyond: bool = False
+) -> Simulation:
     """Simulate one setting in this process, and the original vehicle for comparison.
 
     Parameters
@@ -177,8 +223,9 @@ def simulate(study: StudyLike, changes: Mapping[str, float] | None = None, *, fi
         If SUMO fails.
     """
     loaded_study, system = load_and_assemble(study)
-    return simulate_with_original(loaded_study, system, changed_setting(system, changes, filtered, beyond),
-                                  filtered=filtered)
+    return simulate_with_original(
+        loaded_study, system, changed_setting(system, changes, filtered, beyond), filtered=filtered
+    )
 
 
 def changed_setting(system: System, changes: Mapping[str, float] | None, filtered: bool, beyond: bool) -> FloatArray:
@@ -198,8 +245,11 @@ def simulate_with_original(study: Study, system: System, requested: FloatArray, 
     compared = not np.array_equal(setting, characteristics.original)
     simulation = _simulate_one(study, system, setting, no_verdict) if compared else original
     values = zip(characteristics.names, requested.tolist(), setting.tolist(), strict=True)
-    return replace(simulation, _original=original if compared else None,
-                   reset_values={name: value for name, value, kept in values if value != kept})
+    return replace(
+        simulation,
+        _original=original if compared else None,
+        reset_values={name: value for name, value, kept in values if value != kept},
+    )
 
 
 def load_and_assemble(study: StudyLike, source: str = "") -> tuple[Study, System]:
@@ -211,20 +261,40 @@ def load_and_assemble(study: StudyLike, source: str = "") -> tuple[Study, System
 def _simulate_one(study: Study, system: System, setting: FloatArray, no_verdict: str) -> Simulation:
     settings, observations = setting[np.newaxis], list[Observation]()
     at_point = system_at_worst_point(system, settings)
-    runs = drive_all(at_point, settings, Engine.LIBSUMO,
-                     listen=lambda seen: observations.append(Observation._make(map(np.copy, seen))))
+    runs = drive_all(
+        at_point,
+        settings,
+        Engine.LIBSUMO,
+        listen=lambda seen: observations.append(Observation._make(map(np.copy, seen))),
+    )
     return Simulation(
-        study=study, setting=dict(zip(system.characteristics.names, setting.tolist(), strict=True)),
-        evaluation=score(system, settings, runs), runs=runs, scoring=system.measuring.scoring,
-        no_verdict=no_verdict, _scenario=at_point.points[0].scenario, _observations=observations)
+        study=study,
+        setting=dict(zip(system.characteristics.names, setting.tolist(), strict=True)),
+        evaluation=score(system, settings, runs),
+        runs=runs,
+        scoring=system.measuring.scoring,
+        no_verdict=no_verdict,
+        _scenario=at_point.points[0].scenario,
+        _observations=observations,
+    )
 
 
-SETTINGS_FORMAT = ("a list of mappings such as [{'mass': 2500}], a pandas.DataFrame with a column for each characteristic that is changed, "
-                   "or an array of numbers, shape (M, n)")
+SETTINGS_FORMAT = (
+    "a list of mappings such as [{'mass': 2500}], a pandas.DataFrame with a column for each characteristic that is changed, "
+    "or an array of numbers, shape (M, n)"
+)
 
 
-def evaluate(study: StudyLike, settings: pd.DataFrame | Sequence[Mapping[str, float | None]] | npt.ArrayLike, *, filtered: bool = True,
-             beyond: bool = False, pool: Pool | None = None, jobs: int | None = None, progress: bool | Progress = False) -> pd.DataFrame:
+def evaluate(
+    study: StudyLike,
+    settings: pd.DataFrame | Sequence[Mapping[str, float | None]] | npt.ArrayLike,
+    *,
+    filtered: bool = True,
+    beyond: bool = False,
+    pool: Pool | None = None,
+    jobs: int | None = None,
+    progress: bool | Progress = False,
+) -> pd.DataFrame:
     """Simulate many settings of a study in worker processes.
 
     Parameters
@@ -278,8 +348,13 @@ def evaluate(study: StudyLike, settings: pd.DataFrame | Sequence[Mapping[str, fl
     return frame.set_axis(index)
 
 
-def evaluate_settings(study: Study, settings: FloatArray, pool: Pool | None = None, jobs: int | None = None,
-                      progress: Progress = show_no_progress) -> Evaluations:
+def evaluate_settings(
+    study: Study,
+    settings: FloatArray,
+    pool: Pool | None = None,
+    jobs: int | None = None,
+    progress: Progress = show_no_progress,
+) -> Evaluations:
     """Simulate settings, shape (M, n), in worker processes, including settings that violate the study's constraints."""
     from safevar_sumo.analysis.evaluator import open_evaluator
 
@@ -298,7 +373,9 @@ def _read_settings(settings: Any, characteristics: CharacteristicSet) -> tuple[F
         if not isinstance(settings, pd.DataFrame):
             array = np.array(settings, dtype=float)
             if array.ndim != 2 or array.shape[1] != len(names):
-                raise InputError("settings", f"an array of shape {array.shape}", f"shape (M, {len(names)}): {', '.join(names)}")
+                raise InputError(
+                    "settings", f"an array of shape {array.shape}", f"shape (M, {len(names)}): {', '.join(names)}"
+                )
             return array, pd.RangeIndex(len(array))
         for name in settings.columns.difference(names, sort=False):
             raise unknown_name("settings", f"column {name!r} is no characteristic", name, names)
@@ -309,7 +386,11 @@ def _read_settings(settings: Any, characteristics: CharacteristicSet) -> tuple[F
 
 
 def _refuse_illegal_values(requested: FloatArray, characteristics: CharacteristicSet, beyond: bool) -> None:
-    is_legal = np.column_stack([characteristic.is_legal(values, beyond=beyond)
-                                for characteristic, values in zip(characteristics, requested.T, strict=True)])
+    is_legal = np.column_stack(
+        [
+            characteristic.is_legal(values, beyond=beyond)
+            for characteristic, values in zip(characteristics, requested.T, strict=True)
+        ]
+    )
     for row, column in np.argwhere(~is_legal)[:1]:
         characteristics.members[column].check(float(requested[row, column]), f"settings, row {row}", beyond=beyond)

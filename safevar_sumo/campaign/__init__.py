@@ -8,7 +8,14 @@ journals; no result depends on the worker or on other settings in the batch. Que
 
 from safevar_sumo.campaign.campaign import Campaign, Observer, run_campaign
 from safevar_sumo.campaign.forecast import Forecast, forecast
-from safevar_sumo.campaign.keys import RunKey, algorithm_class, algorithm_of, all_runs, files_read_by_algorithms, random_generator_of
+from safevar_sumo.campaign.keys import (
+    RunKey,
+    algorithm_class,
+    algorithm_of,
+    all_runs,
+    files_read_by_algorithms,
+    random_generator_of,
+)
 from safevar_sumo.campaign.pool import RunProgress
 
 __all__ = [

@@ -40,7 +40,9 @@ def choose_batch_size(study: Study) -> tuple[int, bool]:
     return settings_per_batch(system, Engine.RECORDED), not reason_for_sumo(system)
 
 
-def evaluate_all(study: Study, settings: FloatArray, pool: Pool, done: Callable[[int], None] = lambda number: None) -> Evaluations:
+def evaluate_all(
+    study: Study, settings: FloatArray, pool: Pool, done: Callable[[int], None] = lambda number: None
+) -> Evaluations:
     """Evaluate M filtered settings of n characteristics, shape (M, n); equal settings are simulated once.
 
     User code is checked first (`check_code`). A sample of the settings in a recorded scene is also simulated in SUMO.
@@ -56,7 +58,7 @@ def evaluate_all(study: Study, settings: FloatArray, pool: Pool, done: Callable[
     share = len(distinct_settings) / (BATCHES_PER_CALL_AND_WORKER * pool.workers)
     size = min(best_size, math.ceil(max(share, SMALLEST_BATCH * best_size)))
     starts = range(0, len(distinct_settings), size)
-    futures = {retrying_pool.submit(work, distinct_settings[start:start + size]): start for start in starts}
+    futures = {retrying_pool.submit(work, distinct_settings[start : start + size]): start for start in starts}
     sample_size = min(VERIFIED_SETTINGS - _verified_counts.get(work, 0), len(distinct_settings))
     sample = np.linspace(0, len(distinct_settings) - 1, sample_size).astype(int)
     sumo_future = recorded_future = None
@@ -67,7 +69,9 @@ def evaluate_all(study: Study, settings: FloatArray, pool: Pool, done: Callable[
             recorded_future = retrying_pool.submit(recorded_work, distinct_settings[sample])
     evaluations_by_start: dict[int, Evaluations] = {}
     while len(evaluations_by_start) < len(futures):
-        for future in wait_for_first([future for future, start in futures.items() if start not in evaluations_by_start]):
+        for future in wait_for_first(
+            [future for future, start in futures.items() if start not in evaluations_by_start]
+        ):
             batch = evaluations_by_start[futures[future]] = future.result()
             done(len(batch))
     evaluations = Evaluations.concatenate([evaluations_by_start[start] for start in starts])
@@ -81,7 +85,9 @@ def evaluate_all(study: Study, settings: FloatArray, pool: Pool, done: Callable[
 def ask_why_no_verdict(study: Study, pool: Pool) -> str:
     """Why simulations of a study tell nothing about its ADS, as `why_no_verdict` finds in a worker; "" if they do."""
     original = CharacteristicSet.of(study.vehicle.characteristics).original[np.newaxis]
-    result = wait_for_result(RetryingPool(pool, study).submit(pack_study(study, inputs_of(study, pool), empty_road=True), original))
+    result = wait_for_result(
+        RetryingPool(pool, study).submit(pack_study(study, inputs_of(study, pool), empty_road=True), original)
+    )
     return "" if len(result) else next(iter(result.reasons.values()), "")  # a failed simulation has a row
 
 
@@ -104,10 +110,14 @@ def source_digests(study: Study, pool: Pool) -> Files:
     if user_code_names(study):
         work = pack_study(study, {}, afresh=True)
         key = work, os.getcwd()
-        files_read = _files_read.get(key, {"": "never read"})  # without an entry, a file that does not exist: its digest differs
+        files_read = _files_read.get(
+            key, {"": "never read"}
+        )  # without an entry, a file that does not exist: its digest differs
         if any(digest_of(file_by_name(name, study.origin.places)) != digest for name, digest in files_read.items()):
             original = CharacteristicSet.of(study.vehicle.characteristics).original[np.newaxis]
-            _files_read[key] = dict(wait_for_result(RetryingPool(pool, study).submit(work, original, must_succeed=True)).files)
+            _files_read[key] = dict(
+                wait_for_result(RetryingPool(pool, study).submit(work, original, must_succeed=True)).files
+            )
         files |= _files_read[key]
     return dict(sorted(files.items()))
 
@@ -115,5 +125,11 @@ def source_digests(study: Study, pool: Pool) -> Files:
 def _all_parameters(study: Study) -> list[Any]:
     """All parameters of the models and algorithms of a study, and the paths of its FMUs."""
     tests = [] if study.matrix is None else study.matrix.tests
-    return [study.vehicle.parameters, study.ads.parameters, study.scenario.parameters, study.search.parameters,
-            *(table for test in tests for table in (test.parameters, test.over)), [path for _, path in fmus_of(study)]]
+    return [
+        study.vehicle.parameters,
+        study.ads.parameters,
+        study.scenario.parameters,
+        study.search.parameters,
+        *(table for test in tests for table in (test.parameters, test.over)),
+        [path for _, path in fmus_of(study)],
+    ]

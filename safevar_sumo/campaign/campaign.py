@@ -17,7 +17,17 @@ from safevar_sumo.campaign.checks import check_code, works_for_sumo
 from safevar_sumo.campaign.evaluation import pack_study
 from safevar_sumo.campaign.interrupts import wait_for_next, wait_for_result
 from safevar_sumo.campaign.keys import RunKey
-from safevar_sumo.campaign.pool import Attempt, Busy, Message, Pool, PoolLostError, RunProgress, RunResult, Share, WorkerLostError
+from safevar_sumo.campaign.pool import (
+    Attempt,
+    Busy,
+    Message,
+    Pool,
+    PoolLostError,
+    RunProgress,
+    RunResult,
+    Share,
+    WorkerLostError,
+)
 from safevar_sumo.campaign.retrying import ATTEMPTS, RetryingPool
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import PUBLISHED_SCORING, Scoring
@@ -66,8 +76,17 @@ class Campaign(NamedTuple):
     no_verdict: str = ""
 
 
-def run_campaign(study: Study, keys: Iterable[RunKey], results: ResultsDirectory, pool: Pool, observer: Observer,
-                 batch: int | None = None, *, engine: Engine = Engine.LIBSUMO, retry_failed: bool = False) -> Campaign:
+def run_campaign(
+    study: Study,
+    keys: Iterable[RunKey],
+    results: ResultsDirectory,
+    pool: Pool,
+    observer: Observer,
+    batch: int | None = None,
+    *,
+    engine: Engine = Engine.LIBSUMO,
+    retry_failed: bool = False,
+) -> Campaign:
     """Carry out runs of a study, or resume unfinished ones.
 
     Parameters
@@ -90,20 +109,40 @@ def run_campaign(study: Study, keys: Iterable[RunKey], results: ResultsDirectory
     SafevarError
         If a journal cannot be written, or the study is at fault.
     """
-    retrying_pool, work, batch = RetryingPool(pool, study), pack_study(study, results.inputs, engine=engine), batch or MAX_COPIES
+    retrying_pool, work, batch = (
+        RetryingPool(pool, study),
+        pack_study(study, results.inputs, engine=engine),
+        batch or MAX_COPIES,
+    )
     for remark in check_code(study, results.inputs, retrying_pool):
         observer.warned(remark)
     original = _evaluate_original(study, work, results, retrying_pool, observer)
     if not original.valid[0]:
-        raise InputError(study.source, "the original vehicle violates a test's speed tolerance before the ADS acts (invalid-test), "
-                         "so there is no baseline", "tests whose speed the vehicle can hold")
+        raise InputError(
+            study.source,
+            "the original vehicle violates a test's speed tolerance before the ADS acts (invalid-test), "
+            "so there is no baseline",
+            "tests whose speed the vehicle can hold",
+        )
     if original.collided[0] and not is_rated(study):
         observer.warned(f"study {study.name!r}: the original vehicle itself collides: no change is needed")
     results.begin(original)
     sumo_work, recorded_work = works_for_sumo(study, results.inputs) if engine is Engine.RECORDED else (b"", b"")
-    share = Share(work, sumo_work, recorded_work, batch, (), results.path.absolute(), results.head("").study, original, retry_failed)
+    share = Share(
+        work,
+        sumo_work,
+        recorded_work,
+        batch,
+        (),
+        results.path.absolute(),
+        results.head("").study,
+        original,
+        retry_failed,
+    )
     runs_at_once = min(math.ceil(BATCHES_PER_SHARE * batch / study.search.population), MAX_RUNS)
-    shares = [share._replace(keys=tuple(keys_of_share)) for keys_of_share in deal(list(keys), pool.workers, runs_at_once)]
+    shares = [
+        share._replace(keys=tuple(keys_of_share)) for keys_of_share in deal(list(keys), pool.workers, runs_at_once)
+    ]
     run_results, busy = dict[RunKey, RunResult](), list[RunKey]()
     with closing(_carry_out(shares, pool)) as messages:
         for message in messages:
@@ -118,10 +157,14 @@ def run_campaign(study: Study, keys: Iterable[RunKey], results: ResultsDirectory
                 observer.progressed(message)
     runs = [(key, run_results[key]) for key in sorted(run_results)]
     return Campaign(
-        original=original, solutions={key: run.solutions for key, run in runs}, busy=busy, scoring=results.scoring,
+        original=original,
+        solutions={key: run.solutions for key, run in runs},
+        busy=busy,
+        scoring=results.scoring,
         failures=sorted(failure for _, run in runs for failure in run.failures),
         collisions={key: run.progress.collisions for key, run in runs},
-        invalid_tests={key: run.invalid_tests for key, run in runs})
+        invalid_tests={key: run.invalid_tests for key, run in runs},
+    )
 
 
 def deal(keys: Sequence[RunKey], workers: int, runs_at_once: int) -> list[Sequence[RunKey]]:
@@ -199,7 +242,9 @@ def _carry_out(shares: Iterable[Share], pool: Pool) -> Generator[Message]:
         is_over = True
 
 
-def _evaluate_original(study: Study, work: bytes, results: ResultsDirectory, pool: RetryingPool, observer: Observer) -> Evaluations:
+def _evaluate_original(
+    study: Study, work: bytes, results: ResultsDirectory, pool: RetryingPool, observer: Observer
+) -> Evaluations:
     """Evaluate the original vehicle, or read its journal; raises an error if the simulation fails."""
     setting = CharacteristicSet.of(study.vehicle.characteristics).original[np.newaxis]
 
@@ -212,7 +257,9 @@ def _evaluate_original(study: Study, work: bytes, results: ResultsDirectory, poo
         return simulate()
     try:
         if journal.content.tail_size:
-            observer.warned(f"{journal.path}: the last {journal.content.tail_size} bytes were torn; what they held is simulated again")
+            observer.warned(
+                f"{journal.path}: the last {journal.content.tail_size} bytes were torn; what they held is simulated again"
+            )
         if journal.content.evaluations is not None:
             return journal.content.evaluations
         evaluations = simulate()

@@ -29,7 +29,8 @@ ROUNDING = 1e-9
 """Largest accepted difference between a metric in a recorded scene and in SUMO."""
 EXPECTED_RESULTS = (
     "results of a vehicle that depend on this vehicle alone: nothing kept in a class, a module or the model itself from one call or "
-    "setting to another, no mean or sum over the batch, nothing random")
+    "setting to another, no mean or sum over the batch, nothing random"
+)
 _passed_checks: dict[str, list[str]] = {}
 """Warnings by identity of the studies whose code has passed in this process, in case the cache folder is not writable."""
 
@@ -52,7 +53,11 @@ def check_code(study: Study, inputs: Inputs, pool: RetryingPool) -> list[str]:
     if name in _passed_checks:
         return _passed_checks[name]
     original = CharacteristicSet.of(study.vehicle.characteristics).original[np.newaxis]
-    remarks = list(wait_for_result(pool.submit(pack_study(study, inputs, check=True), original, must_succeed=True)).reasons.values())
+    remarks = list(
+        wait_for_result(
+            pool.submit(pack_study(study, inputs, check=True), original, must_succeed=True)
+        ).reasons.values()
+    )
     _passed_checks[name] = remarks
     with suppress(OSError):  # without the marker, the next process checks again
         marker.parent.mkdir(parents=True, exist_ok=True)
@@ -61,7 +66,9 @@ def check_code(study: Study, inputs: Inputs, pool: RetryingPool) -> list[str]:
     return remarks
 
 
-def refuse_difference(study: Study, run: str, evaluation_in_run: Evaluations, isolated_evaluation: Evaluations, command: str) -> None:
+def refuse_difference(
+    study: Study, run: str, evaluation_in_run: Evaluations, isolated_evaluation: Evaluations, command: str
+) -> None:
     """Refuse a setting whose evaluation in a run differs from its isolated evaluation, which `command` reproduces.
 
     Raises
@@ -72,13 +79,16 @@ def refuse_difference(study: Study, run: str, evaluation_in_run: Evaluations, is
     difference = find_difference(evaluation_in_run, isolated_evaluation)
     if difference:
         name, value, isolated_value = difference
-        problem = (f"with {' and '.join(user_code_names(study))} a result depends on what else is simulated: "
-                   f"{name} is {value} in run {run} and {isolated_value} alone; to reproduce it: {command}")
+        problem = (
+            f"with {' and '.join(user_code_names(study))} a result depends on what else is simulated: "
+            f"{name} is {value} in run {run} and {isolated_value} alone; to reproduce it: {command}"
+        )
         raise UserCodeError(f"study {study.name!r}", problem, EXPECTED_RESULTS)
 
 
-def find_difference(evaluations: Evaluations, other_evaluations: Evaluations,
-                    tolerance: float = 0.0) -> tuple[str, object, object] | None:
+def find_difference(
+    evaluations: Evaluations, other_evaluations: Evaluations, tolerance: float = 0.0
+) -> tuple[str, object, object] | None:
     """Name and both values of the first quantity that differs by more than `tolerance`; None if all agree or a simulation failed."""
     if evaluations.failed[0] or other_evaluations.failed[0]:
         return None
@@ -87,8 +97,10 @@ def find_difference(evaluations: Evaluations, other_evaluations: Evaluations,
     if evaluations.metrics.keys() != other_evaluations.metrics.keys():
         return "the list of metrics", ", ".join(evaluations.metrics), ", ".join(other_evaluations.metrics)
     for name in ("collision_speed", *evaluations.metrics):
-        values, other_values = (batch.collision_speed if name == "collision_speed" else batch.metrics[name]
-                                for batch in (evaluations, other_evaluations))
+        values, other_values = (
+            batch.collision_speed if name == "collision_speed" else batch.metrics[name]
+            for batch in (evaluations, other_evaluations)
+        )
         if not np.allclose(values, other_values, rtol=0, atol=tolerance, equal_nan=True):
             return name, float(values[0]), float(other_values[0])
     return None
@@ -121,16 +133,23 @@ def refuse_unlike_sumo(study: Study, recorded: Evaluations, in_sumo: Evaluations
         difference = find_difference(recorded.take([row]), in_sumo.take([row]), ROUNDING)
         if difference:
             name, value, sumo_value = difference
-            values = ", ".join(f"{key} = {value:.17g}" for key, value in zip(study.vehicle.characteristics, setting, strict=True))
-            raise InputError(f"study {study.name!r}", f"{name} is {value} in the recorded scene and {sumo_value} in SUMO with {values}",
-                             "scenario: reactive_actors = True, if anybody reacts to the vehicle under test; or `engine=sumo`")
+            values = ", ".join(
+                f"{key} = {value:.17g}" for key, value in zip(study.vehicle.characteristics, setting, strict=True)
+            )
+            raise InputError(
+                f"study {study.name!r}",
+                f"{name} is {value} in the recorded scene and {sumo_value} in SUMO with {values}",
+                "scenario: reactive_actors = True, if anybody reacts to the vehicle under test; or `engine=sumo`",
+            )
 
 
 def _are_alike(batch: Evaluations, other_batch: Evaluations, tolerance: float) -> BoolArray:
     """Whether each of N settings has the same outcome, and numbers that differ by at most `tolerance`; shape (N,)."""
     is_alike = batch.outcome == other_batch.outcome
-    quantities = ((batch.collision_speed, other_batch.collision_speed),
-                  *((batch.metrics[name], other_batch.metrics[name]) for name in batch.metrics))
+    quantities = (
+        (batch.collision_speed, other_batch.collision_speed),
+        *((batch.metrics[name], other_batch.metrics[name]) for name in batch.metrics),
+    )
     for values, other_values in quantities:
         is_alike &= np.isclose(values, other_values, rtol=0, atol=tolerance, equal_nan=True)
     return np.asarray(is_alike)

@@ -27,7 +27,9 @@ from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.results import RESULTS
 
 ADDRESS = re.compile(r"[a-z]+://[^\s/]+:\d+/?")
-CERTIFICATES = "for tls:// certificates in Dask's configuration: distributed.comm.tls.ca-file and .client.cert, .client.key"
+CERTIFICATES = (
+    "for tls:// certificates in Dask's configuration: distributed.comm.tls.ca-file and .client.cert, .client.key"
+)
 CONNECT_TIMEOUT = 10.0
 """Longest time for the scheduler to answer [s]."""
 SECONDS_BETWEEN_COUNTS, SECONDS_BETWEEN_LOOKS = 5.0, 0.5
@@ -97,7 +99,8 @@ class ClusterPool:
     def submit(self, work: bytes, settings: FloatArray) -> Future[Evaluations]:
         future: Future[Evaluations] = Future()
         self._submit(_evaluate, (self._time_limit, _versions(), work, settings)).add_done_callback(
-            lambda dask_future: _forward_result(dask_future, future))
+            lambda dask_future: _forward_result(dask_future, future)
+        )
         return future
 
     def carry(self, share: Share, report: Report) -> Future[None]:
@@ -115,7 +118,9 @@ class ClusterPool:
                         report(pickle.loads(messages.get(timeout=SECONDS_BETWEEN_LOOKS)))
             except Exception as error:
                 dask_future.cancel()
-                future.set_exception(error if isinstance(error, SafevarError) else PoolLostError("the cluster does not answer any more"))
+                future.set_exception(
+                    error if isinstance(error, SafevarError) else PoolLostError("the cluster does not answer any more")
+                )
             else:
                 _forward_result(dask_future, future)
 

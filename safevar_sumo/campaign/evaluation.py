@@ -41,8 +41,16 @@ class Task(msgspec.Struct, frozen=True):
     empty_road: bool
 
 
-def pack_study(study: Study, inputs: Mapping[str, Any] | None = None, *, engine: Engine = Engine.RECORDED, afresh: bool = False,
-               check: bool = False, cells: tuple[int, int] | None = None, empty_road: bool = False) -> bytes:
+def pack_study(
+    study: Study,
+    inputs: Mapping[str, Any] | None = None,
+    *,
+    engine: Engine = Engine.RECORDED,
+    afresh: bool = False,
+    check: bool = False,
+    cells: tuple[int, int] | None = None,
+    empty_road: bool = False,
+) -> bytes:
     """Pack a study for a worker as bytes.
 
     Parameters
@@ -86,7 +94,9 @@ def evaluate_batch(work: bytes, settings: FloatArray) -> Evaluations:
         from safevar_sumo.plugins.check import refuse_defects  # slow to import, and rarely needed
 
         remarks = refuse_defects(task.study)
-        return replace(Evaluations.none(settings.shape[1], METRICS), reasons={remark.encode(): remark for remark in remarks})
+        return replace(
+            Evaluations.none(settings.shape[1], METRICS), reasons={remark.encode(): remark for remark in remarks}
+        )
     if task.afresh:
         unload_user_modules()
     with note_inputs() as reading:
@@ -140,5 +150,8 @@ def _find_unknown_files(task: Task, files: Files) -> Files:
 def refuse_changed_files(files: list[str]) -> None:
     """Raise an error if there are files that have changed since the study began."""
     if files:
-        raise InputError(files[0], "is not the file that this study began with: it was changed meanwhile, or a worker has another one",
-                         "the file as it was, and the same command; or another `out`")
+        raise InputError(
+            files[0],
+            "is not the file that this study began with: it was changed meanwhile, or a worker has another one",
+            "the file as it was, and the same command; or another `out`",
+        )

@@ -73,14 +73,18 @@ class _Stopwatch:
     def warned(self, message: str) -> None: ...
 
 
-def forecast(study: Study, runs: int, pool: Pool, batch: int = MAX_COPIES, engine: Engine = Engine.RECORDED) -> Forecast:
+def forecast(
+    study: Study, runs: int, pool: Pool, batch: int = MAX_COPIES, engine: Engine = Engine.RECORDED
+) -> Forecast:
     """Estimate upper limits for a number of runs, from a short measurement of some of them in a temporary directory."""
     system = assemble(study, study.source)
     settings_at_once = min(batch, max(PROBE_VEHICLES // len(system.points), 1))
     search = study.search
-    probe = msgspec.structs.replace(study, search=msgspec.structs.replace(search, population=min(search.population, settings_at_once)))
+    probe = msgspec.structs.replace(
+        study, search=msgspec.structs.replace(search, population=min(search.population, settings_at_once))
+    )
     runs_of_worker = min(math.ceil(settings_at_once / probe.search.population), math.ceil(runs / pool.workers))
-    keys = all_runs(probe)[:max(runs_of_worker, 1) * pool.workers]
+    keys = all_runs(probe)[: max(runs_of_worker, 1) * pool.workers]
     stopwatch = _Stopwatch(len(keys))
     with tempfile.TemporaryDirectory(prefix="safevar-", ignore_cleanup_errors=True) as folder:
         identity = identity_of(probe, system, source_digests(probe, pool))
@@ -89,4 +93,6 @@ def forecast(study: Study, runs: int, pool: Pool, batch: int = MAX_COPIES, engin
             run_campaign(probe, keys, results, pool, stopwatch, batch, engine=engine)
     evaluations = runs * search.evaluations
     numbers = len(CharacteristicSet.of(study.vehicle.characteristics)) + len(METRICS) + NUMBERS_BESIDE_METRICS
-    return Forecast(evaluations, stopwatch.rate, evaluations / stopwatch.rate, evaluations * numbers * CHARACTERS_PER_NUMBER)
+    return Forecast(
+        evaluations, stopwatch.rate, evaluations / stopwatch.rate, evaluations * numbers * CHARACTERS_PER_NUMBER
+    )

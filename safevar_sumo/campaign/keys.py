@@ -41,7 +41,11 @@ def algorithm_of(label: str, study: Study) -> Algorithm:
     source, search = study.source, study.search
     name, key = search.labels.get(label, label), f"search.{label}"
     if len(search.labels) < len(search.algorithms):
-        raise InputError(source, f"search.algorithms = {search.algorithms}: two have the same name", "algorithms with different names")
+        raise InputError(
+            source,
+            f"search.algorithms = {search.algorithms}: two have the same name",
+            "algorithms with different names",
+        )
     for table in search.parameters:
         if table not in ALGORITHMS and table not in search.labels:
             legal = dict.fromkeys((*SearchTable.__struct_fields__, *ALGORITHMS, *search.labels))

@@ -212,7 +212,9 @@ def serve(pipe: connection.Connection[Any, Any], folders: list[str], time_limit:
         pipe.send((False, None))
         while True:
             function, argument = pipe.recv()
-            pipe.send((True, _answer_or_error(function, argument, lambda message: pipe.send((False, message)), evaluate)))
+            pipe.send(
+                (True, _answer_or_error(function, argument, lambda message: pipe.send((False, message)), evaluate))
+            )
 
 
 def _evaluate(batch: tuple[bytes, FloatArray], report: Report, evaluate: Evaluate) -> Evaluations:

@@ -36,7 +36,10 @@ class Retries:
 
     def __init__(self, study: Study) -> None:
         self._study, self._failures_in_a_row = study, 0
-        self._characteristics, self._user_code = CharacteristicSet.of(study.vehicle.characteristics), user_code_names(study)
+        self._characteristics, self._user_code = (
+            CharacteristicSet.of(study.vehicle.characteristics),
+            user_code_names(study),
+        )
 
     def evaluate(self, compute: Compute, settings: FloatArray, *, must_succeed: bool = False) -> Iterator[Evaluations]:
         """Yield the evaluations of k filtered settings, shape (k, n), in their order: of all together or, after failures, row by row.
@@ -68,7 +71,9 @@ class Retries:
                 self._failures_in_a_row = 0
                 yield evaluations
 
-    def _judge(self, compute: Compute, setting: FloatArray, failure: SafevarError, *, must_succeed: bool) -> Evaluations:
+    def _judge(
+        self, compute: Compute, setting: FloatArray, failure: SafevarError, *, must_succeed: bool
+    ) -> Evaluations:
         """The outcome of a setting that has failed: first the original vehicle is simulated, then the setting again."""
         if self._user_code and isinstance(failure, WorkerLostError):
             problem = f"{failure} at every attempt, probably in {' and '.join(self._user_code)}"
@@ -90,27 +95,34 @@ class Retries:
     def _failed_evaluation(self, setting: FloatArray, error: SafevarError) -> Evaluations:
         undefined = np.full(1, np.nan)
         return Evaluations(
-            settings=setting, outcome=np.array([Outcome.SIMULATOR_ERROR.value], dtype="U16"), collision_speed=undefined,
-            metrics=dict.fromkeys(METRICS, undefined), f_diff=self._characteristics.largest_change(setting),
-            f_num_diff=self._characteristics.number_changed(setting), reasons={setting[0].tobytes(): " ".join(str(error).split())})
+            settings=setting,
+            outcome=np.array([Outcome.SIMULATOR_ERROR.value], dtype="U16"),
+            collision_speed=undefined,
+            metrics=dict.fromkeys(METRICS, undefined),
+            f_diff=self._characteristics.largest_change(setting),
+            f_num_diff=self._characteristics.number_changed(setting),
+            reasons={setting[0].tobytes(): " ".join(str(error).split())},
+        )
 
     def _culprit(self, compute: Compute, settings: FloatArray) -> FloatArray:
         """A setting on which user code fails, found by halving, shape (1, n)."""
         while len(settings) > 1:
-            half = settings[:len(settings) // 2]
+            half = settings[: len(settings) // 2]
             try:
                 compute(half)
             except UserCodeError:
                 settings = half
             else:
-                settings = settings[len(half):]
+                settings = settings[len(half) :]
         return settings
 
     def _with_command(self, error: UserCodeError, setting: FloatArray) -> UserCodeError:
         """The error, with a command that reproduces it if the error has no command yet."""
         if COMMAND_PREFIX in error.problem:
             return error
-        return UserCodeError(error.source, f"{error.problem}{COMMAND_PREFIX}{reproduction_command(self._study, setting[0])}", error.legal)
+        return UserCodeError(
+            error.source, f"{error.problem}{COMMAND_PREFIX}{reproduction_command(self._study, setting[0])}", error.legal
+        )
 
 
 class RetryingPool:
@@ -127,6 +139,7 @@ class RetryingPool:
 
     def submit(self, work: bytes, settings: FloatArray, *, must_succeed: bool = False) -> Future[Evaluations]:
         """Evaluate k filtered settings of n characteristics, shape (k, n); with `must_succeed` a failure is an error, not an outcome."""
+
         def compute(batch: FloatArray) -> Evaluations:
             try:
                 return self._pool.submit(work, batch).result()
@@ -143,9 +156,14 @@ def reproduction_command(study: Study, setting: FloatArray) -> str:
     """The command that simulates a setting of n characteristics, shape (n,), in a study or at the point to which it was reduced."""
     characteristics = CharacteristicSet.of(study.vehicle.characteristics)
     point = ["--point", shlex.quote(study.origin.point)] if study.origin.point else []
-    changes = [f"--set {characteristic.name}={value!r}"
-               for characteristic, value in zip(characteristics, setting.tolist(), strict=True) if value != characteristic.original]
+    changes = [
+        f"--set {characteristic.name}={value!r}"
+        for characteristic, value in zip(characteristics, setting.tolist(), strict=True)
+        if value != characteristic.original
+    ]
     is_beyond = ((setting < characteristics.lower) | (setting > characteristics.upper)).any()
     switches = {"--no-filter": (characteristics.filter(setting) != setting).any(), "--beyond": is_beyond}
     switches_on = [switch for switch, is_on in switches.items() if is_on]
-    return " ".join([f"{PROGRAM_COMMAND} simulate", shlex.quote(study.origin.called or study.name), *point, *changes, *switches_on])
+    return " ".join(
+        [f"{PROGRAM_COMMAND} simulate", shlex.quote(study.origin.called or study.name), *point, *changes, *switches_on]
+    )

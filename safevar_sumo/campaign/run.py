@@ -20,7 +20,8 @@ RANDOM_SAMPLES = 10
 """Number of random evaluations of a run that are simulated again. 30 runs then reveal an error in 1 % of the evaluations with a
 probability of 1 - 0.99^300 = 95 %."""
 SIMULATOR_ERROR, COLLISION, INVALID_TEST = (
-    outcome.value for outcome in (Outcome.SIMULATOR_ERROR, Outcome.COLLISION, Outcome.INVALID_TEST))  # numpy compares enums slowly
+    outcome.value for outcome in (Outcome.SIMULATOR_ERROR, Outcome.COLLISION, Outcome.INVALID_TEST)
+)  # numpy compares enums slowly
 
 
 class _EvaluatedSetting(NamedTuple):
@@ -75,7 +76,9 @@ class Run:
     @property
     def missing_settings(self) -> FloatArray:
         """The distinct requested settings without a known evaluation, shape (k, n)."""
-        return self._settings[[position - self._requested for key, position in self._positions.items() if key not in self._entries]]
+        return self._settings[
+            [position - self._requested for key, position in self._positions.items() if key not in self._entries]
+        ]
 
     @property
     def progress(self) -> RunProgress:
@@ -87,8 +90,11 @@ class Run:
         if not self._positions:
             self._note_request(next(self._search))
         while self._positions.keys() <= self._entries.keys():
-            spares = [position - self._requested for key, position in self._positions.items()
-                      if self._entries[key].position == SPARE_POSITION]
+            spares = [
+                position - self._requested
+                for key, position in self._positions.items()
+                if self._entries[key].position == SPARE_POSITION
+            ]
             if spares:
                 self._store(self._evaluations_of(self._settings[spares]), {})
             evaluations = self._evaluations_of(self._settings)
@@ -120,8 +126,11 @@ class Run:
     def sample_for_sumo(self, rng: np.random.Generator) -> Evaluations:
         """Sample the evaluations to verify in SUMO: all solutions, and `VERIFIED_SETTINGS` random other settings."""
         solutions = {setting.tobytes() for setting in self.result.settings}
-        settings = [evaluations.settings[row] for _, evaluations, row in self._requested_entries()
-                    if evaluations.outcome[row] != SIMULATOR_ERROR]
+        settings = [
+            evaluations.settings[row]
+            for _, evaluations, row in self._requested_entries()
+            if evaluations.outcome[row] != SIMULATOR_ERROR
+        ]
         sample = [setting for setting in settings if setting.tobytes() in solutions]
         other_settings = [setting for setting in settings if setting.tobytes() not in solutions]
         sample += [other_settings[i] for i in rng.permutation(len(other_settings))[:VERIFIED_SETTINGS].tolist()]
@@ -133,8 +142,11 @@ class Run:
             positions = [self._entries[setting.tobytes()].position for setting in self.result.settings]
             self._journal.finish(positions, self._requested, self._budget)
         self._journal.close()
-        failures = [Failure(self.key.algorithm, self.key.run, position, evaluations.reason(row))
-                    for position, evaluations, row in self._requested_entries() if evaluations.outcome[row] == SIMULATOR_ERROR]
+        failures = [
+            Failure(self.key.algorithm, self.key.run, position, evaluations.reason(row))
+            for position, evaluations, row in self._requested_entries()
+            if evaluations.outcome[row] == SIMULATOR_ERROR
+        ]
         return RunResult(self.progress, self.result, failures, self._invalid_tests)
 
     def close(self) -> None:
@@ -143,7 +155,10 @@ class Run:
 
     def _requested_entries(self) -> list[_EvaluatedSetting]:
         """The known settings that this run requested, in the order of their positions."""
-        return sorted((entry for entry in self._entries.values() if 0 <= entry.position < self._budget), key=lambda entry: entry.position)
+        return sorted(
+            (entry for entry in self._entries.values() if 0 <= entry.position < self._budget),
+            key=lambda entry: entry.position,
+        )
 
     def _note_request(self, settings: FloatArray) -> None:
         """Note the settings that the search requests next, and the first position of each in the run."""

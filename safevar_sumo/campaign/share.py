@@ -50,13 +50,21 @@ class _Carrier:
         self._new_files: dict[str, str] = {}
         """Files that user code has read and that no journal holds yet."""
         self._characteristics, search = system.characteristics, self._study.search
-        self._problem = Problem(characteristics=system.characteristics, original=share.original, evaluations=search.evaluations,
-                                population=search.population, scoring=system.measuring.scoring, region=region_of(self._study))
+        self._problem = Problem(
+            characteristics=system.characteristics,
+            original=share.original,
+            evaluations=search.evaluations,
+            population=search.population,
+            scoring=system.measuring.scoring,
+            region=region_of(self._study),
+        )
 
     def carry_out(self) -> None:
         """Carry out all runs, together as far as their searches go."""
         if not (self._share.directory / MANIFEST).exists():
-            raise InputError("out", f"a worker does not see {self._share.directory}", "a directory on a disk that all workers share")
+            raise InputError(
+                "out", f"a worker does not see {self._share.directory}", "a directory on a disk that all workers share"
+            )
         runs = self._begin()
         try:
             while runs:
@@ -84,7 +92,9 @@ class _Carrier:
                     self._report(Busy(key))
                     continue
                 if journal.content.tail_size:
-                    self._report(f"{path}: the last {journal.content.tail_size} bytes were torn; what they held is simulated again")
+                    self._report(
+                        f"{path}: the last {journal.content.tail_size} bytes were torn; what they held is simulated again"
+                    )
                 search = make_search(key, self._study, self._problem, self._note_files)
                 runs.append(Run(key, search, journal, self._problem.evaluations, retry=self._share.retry_failed))
         except BaseException:
@@ -107,11 +117,16 @@ class _Carrier:
             return
         settings = np.concatenate([run.missing_settings for run in runs])
         for start, end in _parts(len(owners), self._share.batch):
-            for evaluations in self._retries.evaluate(lambda batch: self._compute(self._share.work, batch), settings[start:end]):
+            for evaluations in self._retries.evaluate(
+                lambda batch: self._compute(self._share.work, batch), settings[start:end]
+            ):
                 self._note_files(evaluations.files)
-                owners_of_rows = owners[start:start + len(evaluations)]
+                owners_of_rows = owners[start : start + len(evaluations)]
                 for run in dict.fromkeys(owners_of_rows):
-                    run.receive(evaluations.take([row for row, owner in enumerate(owners_of_rows) if owner is run]), self._new_files)
+                    run.receive(
+                        evaluations.take([row for row, owner in enumerate(owners_of_rows) if owner is run]),
+                        self._new_files,
+                    )
                     self._new_files = {}
                 start += len(evaluations)
 
@@ -136,7 +151,9 @@ class _Carrier:
         work = pack_study(self._study, self._task.inputs, engine=self._task.engine, afresh=True)
         for expected in run.sample_evaluations(self._generator("recheck", run.key)):
             (isolated,) = self._retries.evaluate(lambda batch: self._compute(work, batch), expected.settings)
-            refuse_difference(self._study, str(run.key), expected, isolated, reproduction_command(self._study, expected.settings[0]))
+            refuse_difference(
+                self._study, str(run.key), expected, isolated, reproduction_command(self._study, expected.settings[0])
+            )
 
     def _verify_in_sumo(self, runs: Sequence[Run]) -> None:
         samples = [run.sample_for_sumo(self._generator("verify", run.key)) for run in runs]
@@ -147,17 +164,25 @@ class _Carrier:
         if self._share.recorded_work:  # SUMO repeats a few cells of a rating; the runs have no values of single cells
             recorded = self._evaluate_all(self._share.recorded_work, recorded.settings)
         refuse_unlike_sumo(self._study, recorded, in_sumo)
-        for run, end, sample in zip(runs, np.cumsum([len(sample) for sample in samples]).tolist(), samples, strict=True):
+        for run, end, sample in zip(
+            runs, np.cumsum([len(sample) for sample in samples]).tolist(), samples, strict=True
+        ):
             failed_rows = [row for row in range(end - len(sample), end) if in_sumo.failed[row]]
             if failed_rows:
-                self._report(f"run {run.key}: {len(failed_rows)} of {len(sample)} settings could not be verified in SUMO: "
-                             f"{in_sumo.reason(failed_rows[0])}")
+                self._report(
+                    f"run {run.key}: {len(failed_rows)} of {len(sample)} settings could not be verified in SUMO: "
+                    f"{in_sumo.reason(failed_rows[0])}"
+                )
 
     def _evaluate_all(self, work: bytes, settings: FloatArray) -> Evaluations:
         """Evaluate settings for a verification, in batches that SUMO can simulate at once."""
-        return Evaluations.concatenate([
-            evaluations for start, end in _parts(len(settings), MAX_COPIES)
-            for evaluations in self._retries.evaluate(lambda batch: self._compute(work, batch), settings[start:end])])
+        return Evaluations.concatenate(
+            [
+                evaluations
+                for start, end in _parts(len(settings), MAX_COPIES)
+                for evaluations in self._retries.evaluate(lambda batch: self._compute(work, batch), settings[start:end])
+            ]
+        )
 
     def _generator(self, purpose: str, key: RunKey) -> np.random.Generator:
         """The random generator that draws the settings of a run to simulate again."""

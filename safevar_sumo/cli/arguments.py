@@ -49,11 +49,14 @@ DEFAULT_SWEEP_LENGTH = 11
 MAX_SETTINGS = 10_000
 """Maximum number of settings that all --set together may produce."""
 SINGLE_VALUE_FORMS = "one value for each: NAME=VALUE in the characteristic's unit, or NAME=+10% of the original"
-CHANGE_FORMS = "NAME=VALUE in the characteristic's unit, NAME=+10% of the original, or NAME=FROM..TO, NAME=FROM..TO:NUMBER"
+CHANGE_FORMS = (
+    "NAME=VALUE in the characteristic's unit, NAME=+10% of the original, or NAME=FROM..TO, NAME=FROM..TO:NUMBER"
+)
 
 
-def read_changes(changes: tuple[str, ...], characteristics: CharacteristicSet, beyond: bool, *, single: bool = False
-                 ) -> dict[str, list[float]]:
+def read_changes(
+    changes: tuple[str, ...], characteristics: CharacteristicSet, beyond: bool, *, single: bool = False
+) -> dict[str, list[float]]:
     """Parse --set into the values of each named characteristic; `single` refuses sweeps, without suggesting --beyond.
 
     Raises
@@ -79,11 +82,15 @@ def read_changes(changes: tuple[str, ...], characteristics: CharacteristicSet, b
             hint = f", or {name}={text}% of the original" if SIGNED_NUMBER.fullmatch(text) else ""
             characteristic.check(value, "--set", beyond=beyond, otherwise=hint, switch="" if single else "--beyond")
     if np.prod([len(values) for values in values_by_name.values()], dtype=float) > MAX_SETTINGS:
-        raise InputError("--set", f"{' '.join(changes)}: more than {MAX_SETTINGS} settings", "shorter sweeps, FROM..TO:NUMBER")
+        raise InputError(
+            "--set", f"{' '.join(changes)}: more than {MAX_SETTINGS} settings", "shorter sweeps, FROM..TO:NUMBER"
+        )
     return values_by_name
 
 
-def combine_values(values_by_name: dict[str, list[float]], base: FloatArray, characteristics: CharacteristicSet) -> FloatArray:
+def combine_values(
+    values_by_name: dict[str, list[float]], base: FloatArray, characteristics: CharacteristicSet
+) -> FloatArray:
     """Make M settings, shape (M, n): `base`, shape (n,), with each of the M combinations of values in turn."""
     columns = [characteristics.names.index(name) for name in values_by_name]
     settings = []
@@ -100,7 +107,9 @@ def _parse_values(change: str, text: str, original: float, forms: str) -> list[f
     if sweep := SWEEP.fullmatch(text):
         count = int(sweep[3] or DEFAULT_SWEEP_LENGTH)
         if count < 2:
-            raise InputError("--set", f"{change!r}: {count} values from {sweep[1]} to {sweep[2]}", "NUMBER of at least 2")
+            raise InputError(
+                "--set", f"{change!r}: {count} values from {sweep[1]} to {sweep[2]}", "NUMBER of at least 2"
+            )
         return np.linspace(float(sweep[1]), float(sweep[2]), count).tolist()  # type: ignore[no-any-return]
     if re.fullmatch(NUMBER_PATTERN, text):
         return [float(text)]
@@ -115,12 +124,17 @@ def complete_study(ctx: click.Context, param: click.Parameter, incomplete: str) 
 
 def complete_changes(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:
     """Complete `NAME=` for each characteristic of the study named earlier in the command line, with its domain as help."""
-    study = str(ctx.params.get("study") or next(iter(ctx.args), ""))  # while --set is incomplete, click has not parsed the rest
+    study = str(
+        ctx.params.get("study") or next(iter(ctx.args), "")
+    )  # while --set is incomplete, click has not parsed the rest
     if not study or Path(study).is_dir():
         return []
     try:
         characteristics = load_study(study).vehicle.characteristics
     except SafevarError:
         return []
-    return [CompletionItem(f"{name}=", help=f"{item.lower:g} to {item.upper:g}{unit_text(item.unit)}")
-            for name, item in characteristics.items() if name.startswith(incomplete)]
+    return [
+        CompletionItem(f"{name}=", help=f"{item.lower:g} to {item.upper:g}{unit_text(item.unit)}")
+        for name, item in characteristics.items()
+        if name.startswith(incomplete)
+    ]

@@ -33,20 +33,33 @@ SECONDS_BETWEEN_SAVES = 60.0
 @commands.command(name="calibrate")
 @click.argument("study", shell_complete=complete_study)
 @click.argument("words", nargs=-1, metavar="[STUDY]... [[STUDY=]REFERENCE.csv]...")
-@click.option("--trials", type=click.IntRange(min=1),
-              help="Number of parameter sets to try.  [default: the first study's]")
+@click.option(
+    "--trials", type=click.IntRange(min=1), help="Number of parameter sets to try.  [default: the first study's]"
+)
 @click.option("--seed", type=click.IntRange(min=0, max=2**31), help="Seed of the search.  [default: the first study's]")
-@click.option("--starts", type=click.IntRange(min=0, max=1000),
-              help="Number of additional random starts.  [default: the first study's]")
+@click.option(
+    "--starts",
+    type=click.IntRange(min=0, max=1000),
+    help="Number of additional random starts.  [default: the first study's]",
+)
 @click.option("--from-scratch", is_flag=True, help="Start only from random points, not from the values in the studies.")
 @jobs_option
 @click.option("--plot", type=click.Path(path_type=Path), metavar="FILE.png", help="Draw the loss over every parameter.")
-@click.option("--out", type=click.Path(path_type=Path), metavar="FILE.toml",
-              help="Study file to write; for several studies, the directory for their files.  [default: "
-                   "STUDY-calibrated.toml]")
-def calibrate_command(study: str, words: tuple[str, ...], from_scratch: bool, jobs: int | None, plot: Path | None,
-                      out: Path | None,
-                      **fit_options: int | None) -> None:
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path),
+    metavar="FILE.toml",
+    help="Study file to write; for several studies, the directory for their files.  [default: STUDY-calibrated.toml]",
+)
+def calibrate_command(
+    study: str,
+    words: tuple[str, ...],
+    from_scratch: bool,
+    jobs: int | None,
+    plot: Path | None,
+    out: Path | None,
+    **fit_options: int | None,
+) -> None:
     """Fit the parameters under [calibration] of STUDY to published values and to rows of reference files, as [fit]
     says.
 
@@ -56,8 +69,10 @@ def calibrate_command(study: str, words: tuple[str, ...], from_scratch: bool, jo
     """
     names = [study, *(word for word in words if word in study_names() or word.endswith(".toml"))]
     changes = {name: value for name, value in fit_options.items() if value is not None}
-    studies = [msgspec.structs.replace(item, fit=msgspec.structs.replace(item.fit, **changes))
-               for item in map(load_study, names)]
+    studies = [
+        msgspec.structs.replace(item, fit=msgspec.structs.replace(item.fit, **changes))
+        for item in map(load_study, names)
+    ]
     systems = [assemble(item, name) for item, name in zip(studies, names, strict=True)]
     if len({item.name for item in studies}) < len(studies):
         raise InputError("STUDY", f"two studies are called {studies[0].name!r}", "studies of different names")
@@ -71,15 +86,21 @@ def calibrate_command(study: str, words: tuple[str, ...], from_scratch: bool, jo
     for target in targets:
         refuse_overwriting(target, "--out", *names, *inputs, *(path for _, path in owners))
         check_writable(target)
-    subjects = [FitSubject(item, {path.name: read_rows(path, system.characteristics) for owner, path in owners if owner
-                                  == index})
-                for index, (item, system) in enumerate(zip(studies, systems, strict=True))]
+    subjects = [
+        FitSubject(
+            item, {path.name: read_rows(path, system.characteristics) for owner, path in owners if owner == index}
+        )
+        for index, (item, system) in enumerate(zip(studies, systems, strict=True))
+    ]
     results = _fit(subjects, targets, from_scratch, jobs)
     for subject, result in zip(subjects, results, strict=True):
-        print_calibration(Console(), subject.study, result,
-                          [item.name for item in studies if item is not subject.study])
-    comments = [describe_fit(subject, result, studies, from_scratch=from_scratch)
-                for subject, result in zip(subjects, results, strict=True)]
+        print_calibration(
+            Console(), subject.study, result, [item.name for item in studies if item is not subject.study]
+        )
+    comments = [
+        describe_fit(subject, result, studies, from_scratch=from_scratch)
+        for subject, result in zip(subjects, results, strict=True)
+    ]
     _write_studies(targets, studies, [result.study for result in results], comments)
     for target in targets:
         print_text(Console(), f"Study file: {target}")
@@ -87,8 +108,9 @@ def calibrate_command(study: str, words: tuple[str, ...], from_scratch: bool, jo
         plot_profiles(plot, results[0].profiles, studies)
 
 
-def _fit(subjects: Sequence[FitSubject], targets: Sequence[Path], from_scratch: bool, jobs: int
-         | None) -> list[Calibration]:
+def _fit(
+    subjects: Sequence[FitSubject], targets: Sequence[Path], from_scratch: bool, jobs: int | None
+) -> list[Calibration]:
     """Fit the studies with progress; now and then, and if it is interrupted, write the best so far, without the spread
     before the fit.
     """
@@ -97,8 +119,12 @@ def _fit(subjects: Sequence[FitSubject], targets: Sequence[Path], from_scratch: 
 
     def save_best(ending: str) -> None:
         comment = f"Best of {done} of {fit.trials} trials, {ending} (seed {fit.seed}). Loss {lowest_loss:.4f}."
-        _write_studies(targets, studies, [msgspec.structs.replace(item, spread={}, model_error={}) for item in best],
-                       [comment] * len(studies))
+        _write_studies(
+            targets,
+            studies,
+            [msgspec.structs.replace(item, spread={}, model_error={}) for item in best],
+            [comment] * len(studies),
+        )
 
     def after_trial(loss: float, best_studies: tuple[Study, ...]) -> None:
         nonlocal done, lowest_loss, best, last_save
@@ -109,9 +135,11 @@ def _fit(subjects: Sequence[FitSubject], targets: Sequence[Path], from_scratch: 
             last_save = time.monotonic()
 
     try:
-        with (local_pool(jobs or available_cores(), max(item.search.time_limit for item in studies)) as pool,
-              terminate_as_interrupt(),
-              open_progress(True) as show_progress):
+        with (
+            local_pool(jobs or available_cores(), max(item.search.time_limit for item in studies)) as pool,
+            terminate_as_interrupt(),
+            open_progress(True) as show_progress,
+        ):
             show_progress("trials", 0, fit.trials)
             return calibrate(subjects, pool, after_trial, from_scratch=from_scratch)
     except KeyboardInterrupt:
@@ -121,8 +149,9 @@ def _fit(subjects: Sequence[FitSubject], targets: Sequence[Path], from_scratch: 
         raise
 
 
-def _write_studies(targets: Sequence[Path], studies: Sequence[Study], fitted: Sequence[Study],
-                   comments: Sequence[str]) -> None:
+def _write_studies(
+    targets: Sequence[Path], studies: Sequence[Study], fitted: Sequence[Study], comments: Sequence[str]
+) -> None:
     """Write the fitted studies as `STUDY-calibrated`, so that they cannot be mistaken for those before the fit."""
     for target, study, fitted_study, comment in zip(targets, studies, fitted, comments, strict=True):
         write_study(target, msgspec.structs.replace(fitted_study, name=f"{study.name}-calibrated"), comment)
@@ -133,8 +162,9 @@ def _choose_targets(studies: Sequence[Study], out: Path | None) -> list[Path]:
     if len(studies) == 1:
         return [out or Path(f"{studies[0].name}-calibrated.toml")]
     if out is not None and not out.is_dir():
-        raise InputError("--out", f"{out} is not a directory",
-                         "an existing directory, for the files of several studies")
+        raise InputError(
+            "--out", f"{out} is not a directory", "an existing directory, for the files of several studies"
+        )
     return [(out or Path()) / f"{study.name}-calibrated.toml" for study in studies]
 
 
@@ -157,10 +187,15 @@ def print_calibration(console: Console, study: Study, result: Calibration, other
         print_text(console, f"* shared with {', '.join(others)}")
     for name, used in result.used.items():
         fits = (used, result.held_back[name])
-        print_by_metric(console, f"{name}: rows used / held back", {
-            "Spearman's rho": [fit.spearman for fit in fits],
-            "mean abs. error": [fit.mean_absolute_error for fit in fits],
-            "bias": [fit.bias for fit in fits]})
+        print_by_metric(
+            console,
+            f"{name}: rows used / held back",
+            {
+                "Spearman's rho": [fit.spearman for fit in fits],
+                "mean abs. error": [fit.mean_absolute_error for fit in fits],
+                "bias": [fit.bias for fit in fits],
+            },
+        )
     for name, fitted in result.values.items():
         if fitted.is_on_bound:
             console.print(f"{name} lies on its bound: a wider bound may fit better.", markup=False)

@@ -39,24 +39,57 @@ def list_command(section: str | None, as_json: bool) -> None:
 def _catalogue(studies: list[Study]) -> dict[str, Any]:
     characteristics: dict[str, list[dict[str, Any]]] = {}
     for study in studies:
-        characteristics.setdefault(study.vehicle.model, [
-            {"name": item.name, "unit": item.unit, "original": item.original, "lower": item.lower, "upper": item.upper,
-             "threshold": item.threshold, "meaning": item.meaning, "counterpart": item.counterpart}
-            for item in CharacteristicSet.of(study.vehicle.characteristics)])
+        characteristics.setdefault(
+            study.vehicle.model,
+            [
+                {
+                    "name": item.name,
+                    "unit": item.unit,
+                    "original": item.original,
+                    "lower": item.lower,
+                    "upper": item.upper,
+                    "threshold": item.threshold,
+                    "meaning": item.meaning,
+                    "counterpart": item.counterpart,
+                }
+                for item in CharacteristicSet.of(study.vehicle.characteristics)
+            ],
+        )
     return {
-        "studies": [{"name": study.name, "title": study.title, "vehicle": study.vehicle.model, "ads": study.ads.model,
-                     "scenario": study.scenario.model, "weather": _weather_name(study)} for study in studies],
+        "studies": [
+            {
+                "name": study.name,
+                "title": study.title,
+                "vehicle": study.vehicle.model,
+                "ads": study.ads.model,
+                "scenario": study.scenario.model,
+                "weather": _weather_name(study),
+            }
+            for study in studies
+        ],
         "vehicles": [{"name": name, "characteristics": characteristics.get(name, [])} for name in VEHICLES],
         "ads": [_name_and_description(name, cls) for name, cls in ADS.items()],
         "scenarios": [_name_and_description(name, cls) for name, cls in SCENARIOS.items()],
         "weathers": [msgspec.to_builtins(weather) for weather in WEATHERS.values()],
         "algorithms": [_name_and_description(name, cls) for name, cls in ALGORITHMS.items()],
-        "metrics": [{"name": name, "description": metric.description} for name, metric in {**METRICS, **OPTIONAL_METRICS}.items()],
+        "metrics": [
+            {"name": name, "description": metric.description}
+            for name, metric in {**METRICS, **OPTIONAL_METRICS}.items()
+        ],
         "objectives": [
-            *({"name": name, "description": f"The search drives {metric.name} to unsafe values."}
-              for name, metric in METRIC_OF_OBJECTIVE.items()),
-            *({"name": change.name, "description": f"{change.title.capitalize()} [{change.unit}]."} for change in CHANGES.values()),
-            {"name": RATING_POINTS.name, "description": f"Only in studies that a protocol rates: {RATING_POINTS.description}"}],
+            *(
+                {"name": name, "description": f"The search drives {metric.name} to unsafe values."}
+                for name, metric in METRIC_OF_OBJECTIVE.items()
+            ),
+            *(
+                {"name": change.name, "description": f"{change.title.capitalize()} [{change.unit}]."}
+                for change in CHANGES.values()
+            ),
+            {
+                "name": RATING_POINTS.name,
+                "description": f"Only in studies that a protocol rates: {RATING_POINTS.description}",
+            },
+        ],
     }
 
 
@@ -78,20 +111,39 @@ def _print_catalogue(console: Console, studies: list[Study], sections: Sequence[
     for study in studies:
         sets_by_vehicle.setdefault(study.vehicle.model, CharacteristicSet.of(study.vehicle.characteristics))
     for vehicle in catalogue["vehicles"]:
-        rows = [(row["name"], row["unit"], *(f"{row[key]:g}" for key in ("original", "lower", "upper", "threshold")))
-                for row in vehicle["characteristics"]]
+        rows = [
+            (row["name"], row["unit"], *(f"{row[key]:g}" for key in ("original", "lower", "upper", "threshold")))
+            for row in vehicle["characteristics"]
+        ]
         heads = ("characteristic", "unit", "original", "lower", "upper", "threshold")
         print_names(console, f"Vehicle {vehicle['name']}", rows, heads)
         if vehicle["name"] in sets_by_vehicle:
             print_meanings(console, sets_by_vehicle[vehicle["name"]])
     number_keys = ("road_friction", "visibility", "recognition_delay")
-    weather_rows = [(row["name"], *(f"{row[key]:g}" for key in number_keys), row["light"], "wet" if row["wet"] else "dry")
-                for row in catalogue["weathers"]]
+    weather_rows = [
+        (row["name"], *(f"{row[key]:g}" for key in number_keys), row["light"], "wet" if row["wet"] else "dry")
+        for row in catalogue["weathers"]
+    ]
     if weather_rows:
-        print_names(console, "Weathers", weather_rows, ("name", "friction", "visibility", "recognition\ndelay, s", "light", "road"))
+        print_names(
+            console,
+            "Weathers",
+            weather_rows,
+            ("name", "friction", "visibility", "recognition\ndelay, s", "light", "road"),
+        )
     for name in [row["name"] for row in catalogue["weathers"] if equals_clear(WEATHERS[row["name"]])]:
-        print_text(console, f"{name}: no effect on road and sensors; an ADS drives as in clear weather unless its parameters differ.")
-    for title, key in (("ADSs", "ads"), ("Scenarios", "scenarios"), ("Algorithms", "algorithms"), ("Metrics", "metrics"),
-                       ("Objectives (every metric can also be an objective)", "objectives")):
+        print_text(
+            console,
+            f"{name}: no effect on road and sensors; an ADS drives as in clear weather unless its parameters differ.",
+        )
+    for title, key in (
+        ("ADSs", "ads"),
+        ("Scenarios", "scenarios"),
+        ("Algorithms", "algorithms"),
+        ("Metrics", "metrics"),
+        ("Objectives (every metric can also be an objective)", "objectives"),
+    ):
         if catalogue[key]:
-            print_names(console, title, [(row["name"], row["description"]) for row in catalogue[key]], ("name", "description"))
+            print_names(
+                console, title, [(row["name"], row["description"]) for row in catalogue[key]], ("name", "description")
+            )

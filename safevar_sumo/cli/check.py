@@ -14,7 +14,11 @@ from safevar_sumo.terminal import print_text
 
 @commands.command(name="check")
 @click.argument("subject", metavar="SUBJECT")
-@click.option("--study", metavar="STUDY", help="Study to try SUBJECT in.  [default: a study beside it that names it, else a shipped study]")
+@click.option(
+    "--study",
+    metavar="STUDY",
+    help="Study to try SUBJECT in.  [default: a study beside it that names it, else a shipped study]",
+)
 @json_option
 def check_command(subject: str, study: str | None, as_json: bool) -> int:
     """Check whether your driving system, vehicle, scenario, metric, objective, algorithm or TraCI controller works with this package.

@@ -27,14 +27,20 @@ COMMANDS = {
     "study": ("study", "Search a study; run the same command again to continue where it stopped."),
     "status": ("study", "Show the progress of a study running in another process: runs, front, collisions, time left."),
     "simulate": ("simulate", "Simulate a study once: how it ends, its safety metrics and objectives."),
-    "check": ("check", "Check your own driving system, vehicle, scenario, metric, objective, algorithm or TraCI controller."),
+    "check": (
+        "check",
+        "Check your own driving system, vehicle, scenario, metric, objective, algorithm or TraCI controller.",
+    ),
     "list": ("catalogue", "List studies, vehicles, ADSs, scenarios, weathers, algorithms, metrics and objectives."),
     "explain": ("questions", "Explain failures: which changes cause them, how small a change is enough, and why."),
     "opinion": ("questions", "Check the minimal causes of failures with a second vehicle model."),
     "tolerance": ("questions", "Find how far each characteristic may go: alone, in pairs, and all together."),
     "risk": ("questions", "Estimate the probability of an unsafe outcome, and which characteristics decide it."),
     "rules": ("questions", "Find rules, in physical units, that describe the unsafe settings."),
-    "rating": ("rating", "Rate a vehicle and a worn variant of it as Euro NCAP does: points, colours, robustness layers."),
+    "rating": (
+        "rating",
+        "Rate a vehicle and a worn variant of it as Euro NCAP does: points, colours, robustness layers.",
+    ),
     "tables": ("report", "Answer the research questions as tables."),
     "figures": ("report", "Draw the figures of results."),
     "report": ("report", "Write one page about results: verdict, causes, replays, tables, figures."),
@@ -63,7 +69,9 @@ class LazyCommands(click.Group):
                 importlib.import_module(f"safevar_sumo.cli.{module}")
         return super().get_command(ctx, name)
 
-    def resolve_command(self, ctx: click.Context, args: list[str]) -> tuple[str | None, click.Command | None, list[str]]:
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
         """Suggest the nearest command if the name is unknown."""
         if args and args[0] not in COMMANDS and not args[0].startswith("-"):
             ctx.fail(f"there is no command {args[0]!r}{did_you_mean(args[0], COMMANDS)}")
@@ -75,7 +83,11 @@ class LazyCommands(click.Group):
             return super().invoke(ctx)
         except InputError as error:
             command = super().get_command(ctx, str(ctx.invoked_subcommand))
-            flags = {option.name: option.opts[-1] for option in command.params if isinstance(option, click.Option)} if command else {}
+            flags = (
+                {option.name: option.opts[-1] for option in command.params if isinstance(option, click.Option)}
+                if command
+                else {}
+            )
             if isinstance(error.source, str):  # a path is no argument
                 error.source = flags.get(error.source, error.source)
             to_flag = partial(_to_flag, flags)
@@ -133,8 +145,14 @@ def _error_in_two_lines(error: click.ClickException) -> str:
     return f"{' '.join(error.format_message().split())}\nexpected: see {command} --help"
 
 
-def _show_warning(message: Warning | str, category: type[Warning], filename: str, lineno: int, file: TextIO | None = None,
-                  line: str | None = None) -> None:
+def _show_warning(
+    message: Warning | str,
+    category: type[Warning],
+    filename: str,
+    lineno: int,
+    file: TextIO | None = None,
+    line: str | None = None,
+) -> None:
     """Show a warning without its file and line."""
     click.echo(f"warning: {message}", err=True)
 
@@ -142,6 +160,7 @@ def _show_warning(message: Warning | str, category: type[Warning], filename: str
 @contextmanager
 def _exit_on_interrupt() -> Iterator[None]:
     """End the program on Ctrl-C while modules load: compiled modules would swallow the exception. Later, Ctrl-C raises it."""
+
     def exit_at_once(*_: object) -> None:
         os.write(2, f"{PROGRAM}: interrupted\n".encode())
         os._exit(INTERRUPT_EXIT_CODE)

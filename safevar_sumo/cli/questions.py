@@ -34,13 +34,21 @@ from safevar_sumo.results import make_directory, write_whole
 from safevar_sumo.terminal import print_answer
 
 
-def add_question(options: type[Options], metavar: str, *further_decorators: Callable[[CommandFunction], CommandFunction]
-                  ) -> Callable[[CommandFunction], click.Command]:
+def add_question(
+    options: type[Options], metavar: str, *further_decorators: Callable[[CommandFunction], CommandFunction]
+) -> Callable[[CommandFunction], click.Command]:
     """Decorator of a question's command: adds flags for its options, and flags that all questions share."""
+
     def add(command: CommandFunction) -> click.Command:
         decorators: list[Callable[[CommandFunction], CommandFunction]] = [
-            click.argument("source", metavar=metavar), add_flags(options), point_option, as_it_is_now_option, jobs_option, json_option,
-            *further_decorators]
+            click.argument("source", metavar=metavar),
+            add_flags(options),
+            point_option,
+            as_it_is_now_option,
+            jobs_option,
+            json_option,
+            *further_decorators,
+        ]
         for decorator in reversed(decorators):
             command = decorator(command)
         return commands.command(name=options.question)(command)
@@ -69,11 +77,20 @@ def _plot_option(help_text: str) -> Callable[[CommandFunction], CommandFunction]
     return click.option("--plot", type=click.Path(path_type=Path), metavar="FILE", help=help_text)
 
 
-@add_question(ExplainOptions, "DIR|STUDY",
-               click.option("--full", is_flag=True, help="Print every explanation in full, not only the answer."),
-               click.option("--out", type=click.Path(path_type=Path), metavar="DIR",
-                            help="Write causes.json, causes.csv and a figure there."))
-def explain(source: str, full: bool, point: str | None, jobs: int | None, as_json: bool, out: Path | None, **values: Any) -> None:
+@add_question(
+    ExplainOptions,
+    "DIR|STUDY",
+    click.option("--full", is_flag=True, help="Print every explanation in full, not only the answer."),
+    click.option(
+        "--out",
+        type=click.Path(path_type=Path),
+        metavar="DIR",
+        help="Write causes.json, causes.csv and a figure there.",
+    ),
+)
+def explain(
+    source: str, full: bool, point: str | None, jobs: int | None, as_json: bool, out: Path | None, **values: Any
+) -> None:
     """Explain failures of results in DIR, or across the domain of STUDY: which changes cause them, how small a change is enough, why."""
     from safevar_sumo.analysis.explain.compute import explain_failures
     from safevar_sumo.analysis.explain.render import print_explained
@@ -94,11 +111,21 @@ def explain(source: str, full: bool, point: str | None, jobs: int | None, as_jso
         click.echo(f"Causes: {out}", err=as_json)
 
 
-@add_question(OpinionOptions, "DIR", click.option("--solutions", "lists", multiple=True, hidden=True,
-                                                  help="Another name of --solution."),
-              click.argument("handles", nargs=-1, metavar=""))
-def opinion(source: str, lists: tuple[str, ...], handles: tuple[str, ...], point: str | None, jobs: int | None,
-            as_json: bool, **values: Any) -> None:
+@add_question(
+    OpinionOptions,
+    "DIR",
+    click.option("--solutions", "lists", multiple=True, hidden=True, help="Another name of --solution."),
+    click.argument("handles", nargs=-1, metavar=""),
+)
+def opinion(
+    source: str,
+    lists: tuple[str, ...],
+    handles: tuple[str, ...],
+    point: str | None,
+    jobs: int | None,
+    as_json: bool,
+    **values: Any,
+) -> None:
     """Check the minimal causes of failures of results in DIR with a second vehicle model."""
     from safevar_sumo.analysis.opinion.compute import ask_for_opinions
 
@@ -111,9 +138,16 @@ def opinion(source: str, lists: tuple[str, ...], handles: tuple[str, ...], point
     _print(result, as_json)
 
 
-@add_question(ToleranceOptions, "STUDY|DIR",
-               _plot_option("Draw the profiles to this file: png, pdf or svg; with --pairs, the worst pairs to a second file beside it."))
-def tolerance(source: str, point: str | None, jobs: int | None, as_json: bool, plot: Path | None, **values: Any) -> None:
+@add_question(
+    ToleranceOptions,
+    "STUDY|DIR",
+    _plot_option(
+        "Draw the profiles to this file: png, pdf or svg; with --pairs, the worst pairs to a second file beside it."
+    ),
+)
+def tolerance(
+    source: str, point: str | None, jobs: int | None, as_json: bool, plot: Path | None, **values: Any
+) -> None:
     """Find how far each characteristic of STUDY may go: alone, in pairs, and all together."""
     from safevar_sumo.analysis.figures import save
     from safevar_sumo.analysis.tolerance.compute import find_tolerances
@@ -142,9 +176,15 @@ def risk(source: str, point: str | None, jobs: int | None, as_json: bool, plot: 
     if plot is not None:
         check_output(plot, "--plot", PICTURE_ENDINGS)
         if study.correlations:
-            raise InputError("--plot", "sensitivity indices of correlated characteristics are not defined", "a study without correlations")
+            raise InputError(
+                "--plot",
+                "sensitivity indices of correlated characteristics are not defined",
+                "a study without correlations",
+            )
         if options.requires_rare_method:
-            raise InputError("--plot", "a method for rare failures computes no sensitivity indices to draw", "--method auto")
+            raise InputError(
+                "--plot", "a method for rare failures computes no sensitivity indices to draw", "--method auto"
+            )
     result = _compute_with_bar(estimate_risk, subject, options, jobs)
     if study.correlations:
         click.echo("note: no sensitivity indices: they are not defined for correlated characteristics", err=True)

@@ -25,19 +25,47 @@ FILE = click.Path(path_type=Path)
 @commands.command(name="rating")
 @click.argument("source", metavar="STUDY|DIR")
 @add_flags(RatingOptions)
-@click.option("--matrix", is_flag=True, help="Print every matrix: speed by impact location, with the colours of the cells.")
+@click.option(
+    "--matrix", is_flag=True, help="Print every matrix: speed by impact location, with the colours of the cells."
+)
 @click.option("--plot", type=FILE, metavar="FILE", help="Draw the matrices to this file: png, pdf or svg.")
-@click.option("--xlsx", type=FILE, metavar="FILE", help="Write the official spreadsheet with the predictions of the variant, if any, else "
-                                                       "of the original, to this file; needs --template or --preprocessed.")
-@click.option("--template", type=FILE, metavar="FILE", help="Output of the official calculator's generate-template: ca_template.xlsx.")
-@click.option("--preprocessed", type=FILE, metavar="FILE", help="Output of the calculator's preprocess: its verification sheets are "
-                                                               "filled with simulated results, in --xlsx, or with --force in this file.")
+@click.option(
+    "--xlsx",
+    type=FILE,
+    metavar="FILE",
+    help="Write the official spreadsheet with the predictions of the variant, if any, else "
+    "of the original, to this file; needs --template or --preprocessed.",
+)
+@click.option(
+    "--template",
+    type=FILE,
+    metavar="FILE",
+    help="Output of the official calculator's generate-template: ca_template.xlsx.",
+)
+@click.option(
+    "--preprocessed",
+    type=FILE,
+    metavar="FILE",
+    help="Output of the calculator's preprocess: its verification sheets are "
+    "filled with simulated results, in --xlsx, or with --force in this file.",
+)
 @click.option("--force", is_flag=True, help="Overwrite existing files.")
 @as_it_is_now_option
 @jobs_option
 @json_option
-def rating(source: str, changes: tuple[str, ...], solution: str | None, matrix: bool, plot: Path | None, xlsx: Path | None,
-           template: Path | None, preprocessed: Path | None, force: bool, jobs: int | None, as_json: bool) -> None:
+def rating(
+    source: str,
+    changes: tuple[str, ...],
+    solution: str | None,
+    matrix: bool,
+    plot: Path | None,
+    xlsx: Path | None,
+    template: Path | None,
+    preprocessed: Path | None,
+    force: bool,
+    jobs: int | None,
+    as_json: bool,
+) -> None:
     """Rate the vehicle of STUDY as Euro NCAP does in 2026, and one variant: points, colours, robustness layers."""
     from safevar_sumo.analysis.figures import save
     from safevar_sumo.analysis.rating.compute import rate_variant, remarks
@@ -84,14 +112,21 @@ def _refuse_existing(path: Path, flag: str, force: bool) -> None:
 def _open_spreadsheet(xlsx: Path | None, template: Path | None, preprocessed: Path | None, force: bool) -> Any:
     """The spreadsheet to fill, read and checked before any simulation; None without --xlsx and --preprocessed."""
     if template is not None and preprocessed is not None:
-        raise InputError("--template", "--preprocessed is given too", "one of them: --preprocessed already holds the template's sheets")
+        raise InputError(
+            "--template",
+            "--preprocessed is given too",
+            "one of them: --preprocessed already holds the template's sheets",
+        )
     source_file = template if template is not None else preprocessed
     if source_file is None:
         if xlsx is not None:
-            raise InputError("--xlsx", f"{xlsx} needs the official template; to make it, run `python -m venv calculator`, "
-                                       "`calculator/bin/pip install euroncap-rating-2026` and "
-                                       "`calculator/bin/euroncap_rating_2026 crash_avoidance generate-template`",
-                             "--template FILE, or --preprocessed FILE")
+            raise InputError(
+                "--xlsx",
+                f"{xlsx} needs the official template; to make it, run `python -m venv calculator`, "
+                "`calculator/bin/pip install euroncap-rating-2026` and "
+                "`calculator/bin/euroncap_rating_2026 crash_avoidance generate-template`",
+                "--template FILE, or --preprocessed FILE",
+            )
         return None
     if template is not None and xlsx is None:
         raise InputError("--template", "there is no --xlsx to write to", "--xlsx FILE")

@@ -34,17 +34,38 @@ from safevar_sumo.vehicles import CharacteristicSet
 @click.argument("study", shell_complete=complete_study)
 @click.argument("reference", type=click.Path(path_type=Path), metavar="REFERENCE.csv")
 @jobs_option
-@click.option("--plot", type=click.Path(path_type=Path), metavar="FILE.png",
-              help="Plot simulated against reference values.")
+@click.option(
+    "--plot", type=click.Path(path_type=Path), metavar="FILE.png", help="Plot simulated against reference values."
+)
 @json_option
-@click.option("--totals", type=click.Path(path_type=Path), metavar="FILE.toml",
-              help="Also save rank correlations, errors and counts of collisions to this file, without any row.")
-@click.option("--effects", "with_effects", is_flag=True,
-              help="Compare the characteristics' linear effects here and in the reference.")
-@click.option("--spread", "with_spread", is_flag=True,
-              help="Count the published values within the spread of the model and of repeats.")
-def validate(study: str, reference: Path, jobs: int | None, plot: Path | None, as_json: bool, totals: Path | None,
-             with_effects: bool, with_spread: bool) -> None:
+@click.option(
+    "--totals",
+    type=click.Path(path_type=Path),
+    metavar="FILE.toml",
+    help="Also save rank correlations, errors and counts of collisions to this file, without any row.",
+)
+@click.option(
+    "--effects",
+    "with_effects",
+    is_flag=True,
+    help="Compare the characteristics' linear effects here and in the reference.",
+)
+@click.option(
+    "--spread",
+    "with_spread",
+    is_flag=True,
+    help="Count the published values within the spread of the model and of repeats.",
+)
+def validate(
+    study: str,
+    reference: Path,
+    jobs: int | None,
+    plot: Path | None,
+    as_json: bool,
+    totals: Path | None,
+    with_effects: bool,
+    with_spread: bool,
+) -> None:
     """Compare STUDY with settings and metrics in the published package's CSV format."""
     loaded_study = load_study(study)
     print_remarks(loaded_study)
@@ -76,19 +97,34 @@ def validate(study: str, reference: Path, jobs: int | None, plot: Path | None, a
         extras |= {} if coverage is None else {"spread": coverage._asdict()}
         click.echo(json.dumps({**result.to_dict(), **extras}, indent=2, allow_nan=False))
         return
-    console, original = Console(), {side: {name: pair[side] for name, pair in result.original.items()}
-                                    for side in ("reference", "here")}
-    print_by_metric(console, f"{loaded_study.title}: {result.rows} rows", {
-        "Spearman's rho": [result.spearman], "mean abs. error": [result.mean_absolute_error],
-        "error / scatter": [result.in_repeats],
-        "bias": [result.bias], "original, reference": [original["reference"]], "original, here": [original["here"]]})
+    console, original = (
+        Console(),
+        {side: {name: pair[side] for name, pair in result.original.items()} for side in ("reference", "here")},
+    )
+    print_by_metric(
+        console,
+        f"{loaded_study.title}: {result.rows} rows",
+        {
+            "Spearman's rho": [result.spearman],
+            "mean abs. error": [result.mean_absolute_error],
+            "error / scatter": [result.in_repeats],
+            "bias": [result.bias],
+            "original, reference": [original["reference"]],
+            "original, here": [original["here"]],
+        },
+    )
     if effects:
-        title = ("Linear effects on the safety degree over a domain, m (agree: within "
-                 f"{RELATIVE_TOLERANCE:.0%} or {ABSOLUTE_TOLERANCE:g} m)")
+        title = (
+            "Linear effects on the safety degree over a domain, m (agree: within "
+            f"{RELATIVE_TOLERANCE:.0%} or {ABSOLUTE_TOLERANCE:g} m)"
+        )
         table = WholeTable("characteristic", right=("reference", "here", "agree"), title=title)
         for name, (published, here, agrees) in effects.items():
-            table.add_row(name, *("-" if value is None else f"{value:+.2f}" for value in (published, here)),
-                          {None: "-", True: "yes", False: "no"}[agrees])
+            table.add_row(
+                name,
+                *("-" if value is None else f"{value:+.2f}" for value in (published, here)),
+                {None: "-", True: "yes", False: "no"}[agrees],
+            )
         console.print(table)
     for sentence in [*result.sentences(), *([] if coverage is None else [str(coverage)])]:
         console.print(sentence, markup=False)
@@ -98,9 +134,13 @@ def print_by_metric(console: Console, title: str, columns: Mapping[str, Sequence
     """Print a table with a row for each metric; a cell shows the metric's numbers in each mapping of its column."""
     table = WholeTable("", right=columns, title=title)
     for name in next(iter(columns.values()))[0]:
-        table.add_row(METRICS[name].heading, *(
-            " / ".join("-" if (number := numbers.get(name)) is None else f"{number:.3f}" for numbers in column)
-            for column in columns.values()))
+        table.add_row(
+            METRICS[name].heading,
+            *(
+                " / ".join("-" if (number := numbers.get(name)) is None else f"{number:.3f}" for numbers in column)
+                for column in columns.values()
+            ),
+        )
     console.print(table)
 
 
@@ -110,8 +150,11 @@ def print_by_metric(console: Console, title: str, columns: Mapping[str, Sequence
 @click.option("--nsga2", type=click.Path(path_type=Path), metavar="FILE.csv", help="Solutions of NSGA-II.")
 @click.option("--rs", type=click.Path(path_type=Path), metavar="FILE.csv", help="Solutions of random search.")
 @click.option("--safe-fuzzer", type=click.Path(path_type=Path), metavar="FILE.csv", help="Solutions of SafeFuzzer.")
-@click.option("--original", metavar="sd=2.7,tet=1.2,tit=0.44,ave_dece=5.97",
-              help="The original vehicle's metrics.  [default: those published for STUDY]")
+@click.option(
+    "--original",
+    metavar="sd=2.7,tet=1.2,tit=0.44,ave_dece=5.97",
+    help="The original vehicle's metrics.  [default: those published for STUDY]",
+)
 def import_command(study: str, out: Path, original: str | None, **paths: Path | None) -> None:
     """Import published CSV solutions of STUDY as a results directory, or add another algorithm's solutions to it."""
     loaded_study = load_study(study)
@@ -121,10 +164,13 @@ def import_command(study: str, out: Path, original: str | None, **paths: Path | 
     adds_to_results = original is None and (out / MANIFEST).exists()
     metrics = None if adds_to_results else original_metrics(original, loaded_study.published)
     characteristics = CharacteristicSet.of(loaded_study.vehicle.characteristics)
-    solutions = {algorithm: evaluations_of(read_rows(path, characteristics), characteristics) for algorithm,
-                 path in files.items()}
-    replaced_counts = write_imported(out, loaded_study, solutions, metrics,
-                                     {algorithm: path.name for algorithm, path in files.items()})
+    solutions = {
+        algorithm: evaluations_of(read_rows(path, characteristics), characteristics)
+        for algorithm, path in files.items()
+    }
+    replaced_counts = write_imported(
+        out, loaded_study, solutions, metrics, {algorithm: path.name for algorithm, path in files.items()}
+    )
     click.echo(f"Results: {out}, {', '.join(f'{len(rows)} solutions of {name}' for name, rows in solutions.items())}")
     for name, count in replaced_counts.items():
         click.echo(f"note: they replace {count} solutions of {name} of an earlier import", err=True)
@@ -149,8 +195,11 @@ def find_owner(word: str, studies: Sequence[Study]) -> tuple[int, Path]:
     path = Path(word)
     candidates = names if len(names) == 1 else [name for name in names if path.name.startswith(name)]
     if not candidates:
-        raise InputError("reference", f"{word} may belong to any of {', '.join(names)}",
-                         "STUDY=FILE.csv, or a file name that begins with the study's name")
+        raise InputError(
+            "reference",
+            f"{word} may belong to any of {', '.join(names)}",
+            "STUDY=FILE.csv, or a file name that begins with the study's name",
+        )
     return names.index(max(candidates, key=len)), path
 
 
@@ -175,22 +224,35 @@ class _MultivalueCommand(click.Command):
 
 @commands.command(cls=_MultivalueCommand)
 @click.argument("directories", nargs=-1, required=True, metavar="DIR...")
-@click.option("--published", "published", multiple=True, required=True, metavar="DIR...",
-              help="Imported results (command import).")
+@click.option(
+    "--published",
+    "published",
+    multiple=True,
+    required=True,
+    metavar="DIR...",
+    help="Imported results (command import).",
+)
 @click.option("--out", type=click.Path(path_type=Path), metavar="FILE.md", help="Write the page to this file.")
-@click.option("--reference", "references", multiple=True, metavar="[STUDY=]FILE.csv...",
-              help="Published rows to compare with the solutions nearby; name the study if the file's name does not "
-                   "begin with it.")
-def replicate(directories: tuple[str, ...], published: tuple[str, ...], out: Path | None,
-              references: tuple[str, ...]) -> None:
+@click.option(
+    "--reference",
+    "references",
+    multiple=True,
+    metavar="[STUDY=]FILE.csv...",
+    help="Published rows to compare with the solutions nearby; name the study if the file's name does not "
+    "begin with it.",
+)
+def replicate(
+    directories: tuple[str, ...], published: tuple[str, ...], out: Path | None, references: tuple[str, ...]
+) -> None:
     """Compare the results DIR... with published ones: tables side by side, and whether each conclusion holds."""
     if out is not None:
         refuse_overwriting(out, "--out", *directories, *published, *references)
         check_writable(out)
     for directory in published:
         if Path(directory).resolve() in [Path(other).resolve() for other in directories]:
-            raise InputError("--published", f"{directory} is given as results too",
-                             "results that the command `import` has written")
+            raise InputError(
+                "--published", f"{directory} is given as results too", "results that the command `import` has written"
+            )
     cases, data = load_cases(directories), dict[str, list[ReferenceData]]()
     for reference in references:
         index, path = find_owner(reference, [case.study for case in cases])

@@ -27,16 +27,37 @@ FORMATS_WITHOUT_NOTES = ("csv", "json")
 @commands.command()
 @click.argument("directories", nargs=-1, required=True, metavar="DIR...")
 @click.option("--rq", "question", type=click.Choice(QUESTIONS), help="Answer only this question.")
-@click.option("--format", "format_name", type=click.Choice(list(FORMATS)), default="text", show_default=True, help="Format of the tables.")
-@click.option("--layout", type=click.Choice(list(LAYOUTS_BY_NAME)), default="full", show_default=True,
-              help="Everything, or only RQ1, RQ2 and the combinations, laid out as in the paper.")
-@click.option("--out", type=click.Path(path_type=Path), metavar="DIR", help="Write each table to a file in this directory.")
+@click.option(
+    "--format",
+    "format_name",
+    type=click.Choice(list(FORMATS)),
+    default="text",
+    show_default=True,
+    help="Format of the tables.",
+)
+@click.option(
+    "--layout",
+    type=click.Choice(list(LAYOUTS_BY_NAME)),
+    default="full",
+    show_default=True,
+    help="Everything, or only RQ1, RQ2 and the combinations, laid out as in the paper.",
+)
+@click.option(
+    "--out", type=click.Path(path_type=Path), metavar="DIR", help="Write each table to a file in this directory."
+)
 def tables(directories: tuple[str, ...], question: str | None, format_name: str, layout: str, out: Path | None) -> None:
     """Answer the research questions as tables, from the results directories DIR..., one for each case."""
     if layout != "full" and format_name not in FORMATS_WITH_LAYOUT:
-        raise InputError("--layout", f"{layout!r}, but --format {format_name} has no layout", f"--format {', '.join(FORMATS_WITH_LAYOUT)}")
-    write = (partial(FORMATS_WITH_LAYOUT[format_name], layouts=LAYOUTS_BY_NAME[layout]) if format_name in FORMATS_WITH_LAYOUT
-             else FORMATS[format_name])
+        raise InputError(
+            "--layout",
+            f"{layout!r}, but --format {format_name} has no layout",
+            f"--format {', '.join(FORMATS_WITH_LAYOUT)}",
+        )
+    write = (
+        partial(FORMATS_WITH_LAYOUT[format_name], layouts=LAYOUTS_BY_NAME[layout])
+        if format_name in FORMATS_WITH_LAYOUT
+        else FORMATS[format_name]
+    )
     answers = answer_questions(load_cases(directories), question)
     if format_name in FORMATS_WITHOUT_NOTES:
         _print_notes(list(dict.fromkeys(note for answer in answers for note in answer.notes)))
@@ -54,9 +75,17 @@ def tables(directories: tuple[str, ...], question: str | None, format_name: str,
 
 @commands.command()
 @click.argument("directories", nargs=-1, required=True, metavar="DIR...")
-@click.option("--out", type=click.Path(path_type=Path), required=True, metavar="DIR", help="Directory for the pictures.")
-@click.option("--format", "format_name", type=click.Choice(PICTURE_FORMATS), default="png", show_default=True,
-              help="Format of the pictures.")
+@click.option(
+    "--out", type=click.Path(path_type=Path), required=True, metavar="DIR", help="Directory for the pictures."
+)
+@click.option(
+    "--format",
+    "format_name",
+    type=click.Choice(PICTURE_FORMATS),
+    default="png",
+    show_default=True,
+    help="Format of the pictures.",
+)
 def figures(directories: tuple[str, ...], out: Path, format_name: str) -> None:
     """Draw the figures of the results directories DIR..., one file for each figure and case."""
     cases = load_cases(directories)
@@ -74,9 +103,17 @@ def _print_notes(notes: list[str]) -> None:
 
 @commands.command()
 @click.argument("directories", nargs=-1, required=True, metavar="DIR...")
-@click.option("--out", type=click.Path(path_type=Path), default=Path("report.html"), show_default=True, metavar="FILE.html",
-              help="File to write the page to.")
-@click.option("--only", metavar="SECTION,...", help="Only these sections, separated by commas: tested, verdict, causes, ...")
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path),
+    default=Path("report.html"),
+    show_default=True,
+    metavar="FILE.html",
+    help="File to write the page to.",
+)
+@click.option(
+    "--only", metavar="SECTION,...", help="Only these sections, separated by commas: tested, verdict, causes, ..."
+)
 @point_option
 @as_it_is_now_option
 @jobs_option

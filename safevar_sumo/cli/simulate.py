@@ -12,13 +12,32 @@ import numpy as np
 from rich.console import Console
 from rich.text import Text
 
-from safevar_sumo.analysis.model_spread import ModelSpread, compute_model_spreads, parameters_outside_sets, studies_of_sets
+from safevar_sumo.analysis.model_spread import (
+    ModelSpread,
+    compute_model_spreads,
+    parameters_outside_sets,
+    studies_of_sets,
+)
 from safevar_sumo.analysis.rating import RatingOptions
 from safevar_sumo.analysis.words import points_in_words
 from safevar_sumo.api.simulation import Simulation, evaluate_settings, simulate_with_original
-from safevar_sumo.cli.arguments import PICTURE_ENDINGS, check_output, combine_values, complete_changes, complete_study, read_changes
+from safevar_sumo.cli.arguments import (
+    PICTURE_ENDINGS,
+    check_output,
+    combine_values,
+    complete_changes,
+    complete_study,
+    read_changes,
+)
 from safevar_sumo.cli.program import commands
-from safevar_sumo.cli.target import CommandTarget, as_it_is_now_option, json_option, load_target, point_option, replay_options
+from safevar_sumo.cli.target import (
+    CommandTarget,
+    as_it_is_now_option,
+    json_option,
+    load_target,
+    point_option,
+    replay_options,
+)
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.output import whole_file
@@ -38,23 +57,62 @@ FILE = click.Path(path_type=Path)
 @commands.command(name="simulate")
 @click.argument("study", metavar="STUDY|DIR", shell_complete=complete_study)
 @replay_options
-@click.option("--set", "changes", multiple=True, metavar="NAME=VALUE", shell_complete=complete_changes,
-              help="A characteristic's value in its unit, +10% of the original, or a sweep FROM..TO; repeat --set for others.")
+@click.option(
+    "--set",
+    "changes",
+    multiple=True,
+    metavar="NAME=VALUE",
+    shell_complete=complete_changes,
+    help="A characteristic's value in its unit, +10% of the original, or a sweep FROM..TO; repeat --set for others.",
+)
 @click.option("--no-filter", is_flag=True, help="Keep changes that are smaller than the filter's thresholds.")
-@click.option("--beyond", is_flag=True, help="Also accept values beyond the domains, and settings that violate a constraint.")
+@click.option(
+    "--beyond", is_flag=True, help="Also accept values beyond the domains, and settings that violate a constraint."
+)
 @click.option("--trace", type=FILE, metavar="FILE.csv", help="Write the simulation step by step.")
-@click.option("--plot", type=FILE, metavar="FILE", help="Draw the simulation beside the original vehicle's to this file: png, pdf or svg.")
-@click.option("--animate", type=FILE, metavar="FILE", help="Animate both simulations, seen from above, in this file: gif, mp4 or html.")
+@click.option(
+    "--plot",
+    type=FILE,
+    metavar="FILE",
+    help="Draw the simulation beside the original vehicle's to this file: png, pdf or svg.",
+)
+@click.option(
+    "--animate",
+    type=FILE,
+    metavar="FILE",
+    help="Animate both simulations, seen from above, in this file: gif, mp4 or html.",
+)
 @click.option("--gui", is_flag=True, help="Show both simulations in sumo-gui, each on its own road.")
-@click.option("--slower", type=click.FloatRange(0.01, 1000), metavar="TIMES",
-              help="How many times slower than real time --gui plays.  [default: 1]")
+@click.option(
+    "--slower",
+    type=click.FloatRange(0.01, 1000),
+    metavar="TIMES",
+    help="How many times slower than real time --gui plays.  [default: 1]",
+)
 @as_it_is_now_option
 @point_option
-@click.option("--spread", is_flag=True, help="Add the vehicle model's own uncertainty: other parameters that fit published data as well.")
+@click.option(
+    "--spread",
+    is_flag=True,
+    help="Add the vehicle model's own uncertainty: other parameters that fit published data as well.",
+)
 @json_option
-def simulate_command(study: str, solution: str | None, choice: str | None, changes: tuple[str, ...], no_filter: bool,
-                     beyond: bool, trace: Path | None, plot: Path | None, animate: Path | None, gui: bool,
-                     slower: float | None, point: str | None, spread: bool, as_json: bool) -> None:
+def simulate_command(
+    study: str,
+    solution: str | None,
+    choice: str | None,
+    changes: tuple[str, ...],
+    no_filter: bool,
+    beyond: bool,
+    trace: Path | None,
+    plot: Path | None,
+    animate: Path | None,
+    gui: bool,
+    slower: float | None,
+    point: str | None,
+    spread: bool,
+    as_json: bool,
+) -> None:
     """Simulate STUDY once, or a solution of the results directory DIR with the study as recorded there."""
     target = load_target(study, solution, choice)
     system = assemble(target.study, target.source)
@@ -104,8 +162,9 @@ def _check_outputs(trace: Path | None, plot: Path | None, animation: Path | None
             find_ffmpeg()
 
 
-def _show(study: Study, system: System, setting: FloatArray, plot: Path | None, animation: Path | None,
-          slower: float | None) -> None:
+def _show(
+    study: Study, system: System, setting: FloatArray, plot: Path | None, animation: Path | None, slower: float | None
+) -> None:
     """Simulate a filtered setting, shape (n,), beside the original vehicle, and show both: as files, and `slower` in sumo-gui."""
     from safevar_sumo.analysis.figures import save
     from safevar_sumo.replay.animation import animate
@@ -122,25 +181,43 @@ def _show(study: Study, system: System, setting: FloatArray, plot: Path | None, 
         show_in_gui(comparison, slower=slower)
 
 
-def _simulate_sweep(target: CommandTarget, system: System, requested_settings: FloatArray, names: tuple[str, ...], filtered: bool,
-                    as_json: bool) -> None:
+def _simulate_sweep(
+    target: CommandTarget,
+    system: System,
+    requested_settings: FloatArray,
+    names: tuple[str, ...],
+    filtered: bool,
+    as_json: bool,
+) -> None:
     settings = system.characteristics.filter(requested_settings) if filtered else requested_settings
-    evaluations = evaluate_settings(target.study, np.concatenate([system.characteristics.original[np.newaxis], settings]))
+    evaluations = evaluate_settings(
+        target.study, np.concatenate([system.characteristics.original[np.newaxis], settings])
+    )
     no_verdict = why_no_verdict(system)
     if as_json:
-        records = [{"study": target.study.name, "vcs": dict(zip(system.characteristics.names, setting, strict=True)),
-                    **record(evaluations, row)} for row, setting in enumerate(evaluations.settings.tolist())]
+        records = [
+            {
+                "study": target.study.name,
+                "vcs": dict(zip(system.characteristics.names, setting, strict=True)),
+                **record(evaluations, row),
+            }
+            for row, setting in enumerate(evaluations.settings.tolist())
+        ]
         click.echo(json.dumps([*records[1:], *summary_entry(no_verdict)], indent=2, allow_nan=False))
     else:
         print_heading(Console(), target.study.title, no_verdict)
         print_sweep(Console(), system.characteristics, names, evaluations)
     reset_count = int(np.count_nonzero((settings != requested_settings).any(axis=1)))
     if reset_count:
-        click.echo(f"note: in {reset_count} of {len(requested_settings)} settings the filter reset small changes; --no-filter keeps them",
-                   err=True)
+        click.echo(
+            f"note: in {reset_count} of {len(requested_settings)} settings the filter reset small changes; --no-filter keeps them",
+            err=True,
+        )
 
 
-def _print_results(target: CommandTarget, system: System, simulation: Simulation, spreads: Sequence[ModelSpread], as_json: bool) -> None:
+def _print_results(
+    target: CommandTarget, system: System, simulation: Simulation, spreads: Sequence[ModelSpread], as_json: bool
+) -> None:
     shows_points = system.matrix and (as_json or system.rater is None)
     results_at_points = simulate_all_points(system, simulation.evaluation.settings) if shows_points else []
     if as_json:
@@ -155,22 +232,31 @@ def _print_results(target: CommandTarget, system: System, simulation: Simulation
         if system.rater is None:
             print_matrix(Console(), results_at_points)
         else:
-            print_text(Console(), f"{len(system.matrix)} cells and variations: run `{_rating_command(target, system, simulation)}`")
+            print_text(
+                Console(),
+                f"{len(system.matrix)} cells and variations: run `{_rating_command(target, system, simulation)}`",
+            )
         if types := pre_crash_sentence(system.points):
             print_text(Console(), types)
     remarks = [remark for point in system.points for remark in point.scenario.remarks()]
     for remark in dict.fromkeys([*remarks, *system.remarks, *vehicle_remarks(system)]):
         click.echo(f"note: {remark}", err=True)
     for name, value in simulation.reset_values.items():
-        click.echo(f"note: {name} = {value:g} differs from the original by less than the filter threshold and was reset to "
-                   f"{simulation.setting[name]:g}; --no-filter keeps it", err=True)
+        click.echo(
+            f"note: {name} = {value:g} differs from the original by less than the filter threshold and was reset to "
+            f"{simulation.setting[name]:g}; --no-filter keeps it",
+            err=True,
+        )
 
 
 def _rating_command(target: CommandTarget, system: System, simulation: Simulation) -> str:
     """The command that rates the simulated vehicle: a solution, and the values that differ from it or from the original."""
     base = system.characteristics.original if target.setting is None else target.setting
-    changes = {name: simulation.setting[name] for name, value in zip(system.characteristics.names, base.tolist(), strict=True)
-               if simulation.setting[name] != value}
+    changes = {
+        name: simulation.setting[name]
+        for name, value in zip(system.characteristics.names, base.tolist(), strict=True)
+        if simulation.setting[name] != value
+    }
     solution = None if target.handle is None else str(target.handle)
     return f"{RatingOptions(changes=changes or None, solution=solution).command_line(target.source)} --matrix"
 
@@ -181,7 +267,10 @@ def _warn_of_differences(target: CommandTarget, simulation: Simulation) -> None:
 
     assert target.row is not None
     for difference in list_differences(simulation.evaluation, target.row):
-        click.echo(f"warning: {target.handle} of {target.source}: {difference}; have versions or code changed since the study?", err=True)
+        click.echo(
+            f"warning: {target.handle} of {target.source}: {difference}; have versions or code changed since the study?",
+            err=True,
+        )
 
 
 def print_simulation(console: Console, simulation: Simulation) -> None:
@@ -195,7 +284,9 @@ def print_simulation(console: Console, simulation: Simulation) -> None:
     table = WholeTable("result", "unit", right=("original", "simulated"))
     table.add_row("outcome", "", *(record["outcome"] for record in records))
     for name, unit in simulation.units.items():
-        table.add_row(name, unit, *("undefined" if record[name] is None else f"{record[name]:.4g}" for record in records))
+        table.add_row(
+            name, unit, *("undefined" if record[name] is None else f"{record[name]:.4g}" for record in records)
+        )
     console.print(table)
     print_text(console, f"The original vehicle {simulation.original.verdict}.")
     if simulation is not simulation.original and simulation.setting != simulation.original.setting:
@@ -221,8 +312,9 @@ def _safety_comparison(simulation: Simulation) -> str:
     return f"{'less safe' if degree < original else 'safer'} than the original, SD {degree:.2f} against {original:.2f}"
 
 
-def print_sweep(console: Console, characteristics: CharacteristicSet, names: Sequence[str],
-                evaluations: Evaluations) -> None:
+def print_sweep(
+    console: Console, characteristics: CharacteristicSet, names: Sequence[str], evaluations: Evaluations
+) -> None:
     """Print a row for each setting, of which the first is the original: the named characteristics, outcome and metrics."""
     columns = [characteristics.names.index(name) for name in names]
     units = [characteristics.members[column].unit for column in columns]
@@ -232,10 +324,16 @@ def print_sweep(console: Console, characteristics: CharacteristicSet, names: Seq
         table.add_column(METRICS[name].heading if name in METRICS else name, justify="right")
     for row, outcome in enumerate(evaluations.outcome):
         metrics = [values[row] for values in evaluations.metrics.values()]
-        table.add_row(*(f"{value:g}" for value in evaluations.settings[row, columns]), str(outcome),
-                      *("-" if np.isnan(value) else f"{value:.3f}" for value in metrics), end_section=row == 0)
+        table.add_row(
+            *(f"{value:g}" for value in evaluations.settings[row, columns]),
+            str(outcome),
+            *("-" if np.isnan(value) else f"{value:.3f}" for value in metrics),
+            end_section=row == 0,
+        )
     console.print(table)
-    print_text(console, "First row: the original vehicle. SD: least distance in m, or minus the collision speed in m/s.")
+    print_text(
+        console, "First row: the original vehicle. SD: least distance in m, or minus the collision speed in m/s."
+    )
 
 
 COLOUR_BANDS = ((5.0, "green"), (15.0, "yellow"), (25.0, "dark_orange"), (35.0, "orange4"))
@@ -248,18 +346,27 @@ def print_matrix(console: Console, results: Sequence[PointResult]) -> None:
     tables: dict[str, dict[str, dict[Any, Text]]] = {}
     for result, entry in zip(results, records, strict=True):
         coordinates = dict(result.point.parameters)
-        title, location = f"{coordinates.pop('test')}, {coordinates.pop('weather')}", coordinates.pop(LOCATION_DIMENSION, None)
+        title, location = (
+            f"{coordinates.pop('test')}, {coordinates.pop('weather')}",
+            coordinates.pop(LOCATION_DIMENSION, None),
+        )
         tables.setdefault(title, {}).setdefault(_row_name(coordinates), {})[location] = _cell_text(entry)
     for title, rows in tables.items():
         columns = dict.fromkeys(location for cells in rows.values() for location in cells)
-        table = WholeTable("speed", right=("" if column is None else f"{column:g} %" for column in columns), title=title)
+        table = WholeTable(
+            "speed", right=("" if column is None else f"{column:g} %" for column in columns), title=title
+        )
         for name, cells in rows.items():
             table.add_row(name, *(cells.get(column, "") for column in columns))
         console.print(table)
     if records:
-        summary = points_in_words([entry["point"] for entry in records if entry["impact_speed"] is not None], len(records))
+        summary = points_in_words(
+            [entry["point"] for entry in records if entry["impact_speed"] is not None], len(records)
+        )
         if invalid := sum(entry["outcome"] == Outcome.INVALID_TEST for entry in records):
-            summary += f" {invalid} are invalid tests: the vehicle violates the test's speed tolerance before the ADS acts."
+            summary += (
+                f" {invalid} are invalid tests: the vehicle violates the test's speed tolerance before the ADS acts."
+            )
         print_text(console, summary)
 
 
@@ -274,7 +381,10 @@ def _cell_text(result: dict[str, Any]) -> Text:
         return Text(f"{result['outcome']} ({result['test_speed_error']:+.1f} km/h)", "magenta")
     if result["impact_speed"] is None:
         contact = f", {result['contact']['side']} side touched" if "contact" in result else ""
-        return Text("avoided" + contact if result["outcome"] in (Outcome.STOPPED, Outcome.PASSED) else result["outcome"], "green")
+        return Text(
+            "avoided" + contact if result["outcome"] in (Outcome.STOPPED, Outcome.PASSED) else result["outcome"],
+            "green",
+        )
     relative_speed = (result["relative_impact_speed"] or 0.0) * KMH_PER_MS
     colour = next((colour for limit, colour in COLOUR_BANDS if relative_speed < limit), "red")
     return Text(f"{result['impact_speed'] * KMH_PER_MS:.1f} km/h", colour)

@@ -43,21 +43,45 @@ from safevar_sumo.vehicles import CharacteristicSet
 @click.option("--evaluations", type=click.IntRange(1, 10_000_000), help="Simulations of each run.")
 @click.option("--algorithms", help="Algorithms, separated by commas.")
 @click.option("--seed", type=click.IntRange(min=0, max=2**63 - 1), help="Seed of the whole study.")
-@click.option("--batch", type=click.IntRange(1, 10_000),
-              help="Maximum settings per batch, gathered from several runs; does not change results.  [default: the fastest]")
-@click.option("--engine", type=click.Choice(ENGINES), default=ENGINES[0], show_default=True,
-              help="What moves the vehicles. recorded: numpy, in a scene that SUMO has played once, if no actor reacts to the vehicles; "
-                   "results are verified in SUMO. sumo: always SUMO.")
+@click.option(
+    "--batch",
+    type=click.IntRange(1, 10_000),
+    help="Maximum settings per batch, gathered from several runs; does not change results.  [default: the fastest]",
+)
+@click.option(
+    "--engine",
+    type=click.Choice(ENGINES),
+    default=ENGINES[0],
+    show_default=True,
+    help="What moves the vehicles. recorded: numpy, in a scene that SUMO has played once, if no actor reacts to the vehicles; "
+    "results are verified in SUMO. sumo: always SUMO.",
+)
 @click.option("--out", type=click.Path(path_type=Path), help="Directory of the results.  [default: results/STUDY]")
 @jobs_option
 @click.option("--cluster", metavar="ADDRESS", help="Compute on the workers of this Dask scheduler instead.")
 @click.option("--only", metavar="ALGORITHM:RUN", help="Only this run; runs count from 0.")
 @click.option("--shard", metavar="K/N", help="Every N-th run, from the K-th (1..N): for job arrays that share --out.")
-@click.option("--retry-failed", is_flag=True, help="Simulate again the settings that could not be simulated before (simulator-error).")
+@click.option(
+    "--retry-failed",
+    is_flag=True,
+    help="Simulate again the settings that could not be simulated before (simulator-error).",
+)
 @click.option("--quiet", is_flag=True, help="Print only errors and warnings.")
 @click.option("--dry-run", is_flag=True, help="Estimate time and disk space without running anything.")
-def study(study: str, batch: int | None, engine: str, out: Path | None, jobs: int | None, cluster: str | None, only: str | None,
-          shard: str | None, retry_failed: bool, quiet: bool, dry_run: bool, **options: Any) -> None:
+def study(
+    study: str,
+    batch: int | None,
+    engine: str,
+    out: Path | None,
+    jobs: int | None,
+    cluster: str | None,
+    only: str | None,
+    shard: str | None,
+    retry_failed: bool,
+    quiet: bool,
+    dry_run: bool,
+    **options: Any,
+) -> None:
     """Search STUDY; run the same command again to continue where it stopped."""
     loaded_study, system = load_for_search(_apply_options(load_study(study), **options), study)
     print_remarks(loaded_study, [*system.remarks, *vehicle_remarks(system)])
@@ -75,12 +99,16 @@ def study(study: str, batch: int | None, engine: str, out: Path | None, jobs: in
             print_forecast(Console(), loaded_study, len(keys), cost, f"{used_engine}: {reason}")
             return
         try:
-            with open_observer(not quiet, loaded_study, keys,
-                               lambda message: click.echo(f"warning: {message}", err=True)) as observer:
-                campaign = carry_out_runs(loaded_study, system, keys, directory, pool, observer, batch, engine,
-                                          retry_failed=retry_failed)
+            with open_observer(
+                not quiet, loaded_study, keys, lambda message: click.echo(f"warning: {message}", err=True)
+            ) as observer:
+                campaign = carry_out_runs(
+                    loaded_study, system, keys, directory, pool, observer, batch, engine, retry_failed=retry_failed
+                )
         except KeyboardInterrupt:
-            click.echo(f"finished evaluations are kept in {directory}: run the same command again to continue", err=True)
+            click.echo(
+                f"finished evaluations are kept in {directory}: run the same command again to continue", err=True
+            )
             raise
         if not quiet:
             print_summary(Console(), loaded_study, campaign, directory, pool)
@@ -103,19 +131,23 @@ def _select_runs(keys: list[RunKey], only: str | None, shard: str | None) -> lis
         algorithm, _, run = only.rpartition(":")
         keys = [key for key in keys if key.algorithm == algorithm and str(key.run) == run]
         if not keys:
-            raise InputError("--only", repr(only), "ALGORITHM:RUN, an algorithm of the study and a run from 0 to less than --runs")
+            raise InputError(
+                "--only", repr(only), "ALGORITHM:RUN, an algorithm of the study and a run from 0 to less than --runs"
+            )
     if shard is not None:
         rank, _, count = shard.partition("/")
         if not (all(text.isdecimal() and len(text) < 10 for text in (rank, count)) and 1 <= int(rank) <= int(count)):
             raise InputError("--shard", repr(shard), "K/N, with K in 1..N")
-        keys = keys[int(rank) - 1::int(count)]
+        keys = keys[int(rank) - 1 :: int(count)]
     return keys
 
 
 @commands.command()
 @click.argument("directory", metavar="DIR")
 @click.option("--watch", is_flag=True, help="Keep showing progress until the study is finished.")
-@click.option("--every", type=click.FloatRange(0.1, 86400), metavar="SECONDS", help="Interval of --watch.  [default: 2]")
+@click.option(
+    "--every", type=click.FloatRange(0.1, 86400), metavar="SECONDS", help="Interval of --watch.  [default: 2]"
+)
 @click.option("--json", "as_json", is_flag=True, help="Print JSON; with --watch, a line at every interval.")
 def status(directory: str, watch: bool, every: float | None, as_json: bool) -> None:
     """Show the progress of the study in DIR, without disturbing it: runs, front, collisions, time left."""
@@ -142,7 +174,9 @@ def status(directory: str, watch: bool, every: float | None, as_json: bool) -> N
         console.line()  # on a terminal, `Live` ends its last line itself
 
 
-SAFETY_NOTE = "SD: least distance in m, or minus the collision's speed in m/s.\nTET, TIT: over solutions without collision."
+SAFETY_NOTE = (
+    "SD: least distance in m, or minus the collision's speed in m/s.\nTET, TIT: over solutions without collision."
+)
 
 
 def print_forecast(console: Console, study: Study, runs: int, cost: Forecast, engine: str) -> None:
@@ -154,7 +188,9 @@ def print_forecast(console: Console, study: Study, runs: int, cost: Forecast, en
     table.add_row("engine", engine)
     table.add_row("evaluations, at most", str(cost.evaluations))
     table.add_row("evaluations/s, measured by a short probe", f"{cost.rate:.{0 if cost.rate >= 10 else 1}f}")
-    table.add_row("search time, at most", f"{cost.seconds / 60:.1f} min" if cost.seconds >= 60 else f"{cost.seconds:.0f} s")
+    table.add_row(
+        "search time, at most", f"{cost.seconds / 60:.1f} min" if cost.seconds >= 60 else f"{cost.seconds:.0f} s"
+    )
     table.add_row("disk, at most", filesize.decimal(cost.size))
     console.print(table)
 
@@ -163,12 +199,20 @@ def print_summary(console: Console, study: Study, campaign: Campaign, directory:
     """Print the answer, a table of the original and of each algorithm's solutions, the most critical setting, and RQ1 and RQ2 in brief."""
     from safevar_sumo.analysis.explain.summary import summarise_failures
     from safevar_sumo.analysis.research_questions.case import build_case
-    from safevar_sumo.analysis.research_questions.comparisons import summary_lines  # loads more slowly than all other modules
+    from safevar_sumo.analysis.research_questions.comparisons import (
+        summary_lines,
+    )  # loads more slowly than all other modules
 
     names = tuple(study.vehicle.characteristics)
     solutions = solutions_frame(names, campaign.solutions.items())
-    case = build_case(study, record(campaign.original, row=0), solutions, solutions_frame(names, []), tuple(campaign.solutions),
-                      scoring=campaign.scoring)
+    case = build_case(
+        study,
+        record(campaign.original, row=0),
+        solutions,
+        solutions_frame(names, []),
+        tuple(campaign.solutions),
+        scoring=campaign.scoring,
+    )
     if campaign.no_verdict:
         print_text(console, campaign.no_verdict)
     if len(solutions):
@@ -179,28 +223,42 @@ def print_summary(console: Console, study: Study, campaign: Campaign, directory:
     original = evaluations_frame(names, [(("", 0), campaign.original)])
     algorithms = [name for name in study.search.labels if any(key.algorithm == name for key in campaign.solutions)]
     frames = {"original vehicle": original, **{name: solutions[solutions["algorithm"] == name] for name in algorithms}}
-    collisions = [sum(count for key, count in campaign.collisions.items() if key.algorithm == name) for name in algorithms]
+    collisions = [
+        sum(count for key, count in campaign.collisions.items() if key.algorithm == name) for name in algorithms
+    ]
     table = WholeTable("", right=frames, title=study.title)
     table.add_row("solutions", "-", *(str(len(frames[name])) for name in algorithms))
-    table.add_row("solutions that collide", *(str((frame["outcome"] == Outcome.COLLISION).sum()) for frame in frames.values()))
+    table.add_row(
+        "solutions that collide", *(str((frame["outcome"] == Outcome.COLLISION).sum()) for frame in frames.values())
+    )
     table.add_row("collisions simulated", *map(str, [int(campaign.original.collided[0]), *collisions]))
     for metric in campaign.scoring.metrics:
         table.add_row(f"mean {metric.heading}", *(two_decimals(frame[metric.name].mean()) for frame in frames.values()))
     console.print(table)
     console.print(SAFETY_NOTE)
     if campaign.failures:
-        console.print(f"{len(campaign.failures)} settings could not be simulated (simulator-error); no result contains them:")
+        console.print(
+            f"{len(campaign.failures)} settings could not be simulated (simulator-error); no result contains them:"
+        )
         for line in failure_lines(campaign.failures):
             print_text(console, f"  {line}")
     if invalid := sum(campaign.invalid_tests.values()):
-        print_text(console, f"{invalid} settings violate a test's speed tolerance before the ADS acts (invalid-test): "
-                            "they are neither failures nor successes, and no result contains them.")
+        print_text(
+            console,
+            f"{invalid} settings violate a test's speed tolerance before the ADS acts (invalid-test): "
+            "they are neither failures nor successes, and no result contains them.",
+        )
     if solutions.empty:
         console.print("No solution.")
     for worst in solutions.sort_values(["f_safe", "f_num_diff", "f_diff"], kind="stable").head(1).to_dict("records"):
-        print_text(console, f"Most critical setting: SD {worst['f_safe']:.2f} ({worst['outcome']}), "
-                            f"the original's {campaign.original.f_safe[0]:.2f} ({campaign.original.outcome[0]}). Its changes:")
-        changes = change_texts(CharacteristicSet.of(study.vehicle.characteristics), {name: worst[name] for name in names})
+        print_text(
+            console,
+            f"Most critical setting: SD {worst['f_safe']:.2f} ({worst['outcome']}), "
+            f"the original's {campaign.original.f_safe[0]:.2f} ({campaign.original.outcome[0]}). Its changes:",
+        )
+        changes = change_texts(
+            CharacteristicSet.of(study.vehicle.characteristics), {name: worst[name] for name in names}
+        )
         for change in changes or ["no change"]:
             print_text(console, f"  {change}")
     for line in summary_lines(case):
@@ -216,15 +274,26 @@ MAX_RUNS_NAMED = 12
 
 def status_view(progress: Status, rate: float | None) -> RenderableType:
     """The study's runs by algorithm and its front so far; `rate` is the share of all work that is done per second, None if unknown."""
-    table = WholeTable("algorithm", right=("runs", "under\nway", "simulated", "collisions", "simulator\nerrors", "best\nSD"),
-                       title=progress.title)
+    table = WholeTable(
+        "algorithm",
+        right=("runs", "under\nway", "simulated", "collisions", "simulator\nerrors", "best\nSD"),
+        title=progress.title,
+    )
     for algorithm in dict.fromkeys(run.algorithm for run in progress.runs):
         runs = [run for run in progress.runs if run.algorithm == algorithm]
         states = Counter(run.state for run in runs)
-        counts = [sum(run.simulated for run in runs), sum(run.collisions for run in runs), sum(run.simulator_errors for run in runs)]
+        counts = [
+            sum(run.simulated for run in runs),
+            sum(run.collisions for run in runs),
+            sum(run.simulator_errors for run in runs),
+        ]
         best = min((run.best for run in runs if run.best is not None), default=None)
-        table.add_row(algorithm, f"{states['finished']}/{len(runs)}", str(states["begun"]), *map(str, counts), two_decimals(best))
-    begun = [f"{run.algorithm}:{run.run} {run.simulated}/{progress.budget}" for run in progress.runs if run.state == "begun"]
+        table.add_row(
+            algorithm, f"{states['finished']}/{len(runs)}", str(states["begun"]), *map(str, counts), two_decimals(best)
+        )
+    begun = [
+        f"{run.algorithm}:{run.run} {run.simulated}/{progress.budget}" for run in progress.runs if run.state == "begun"
+    ]
     rest = f" and {len(begun) - MAX_RUNS_NAMED} more" if len(begun) > MAX_RUNS_NAMED else ""
     under_way = f"Under way: {', '.join(begun[:MAX_RUNS_NAMED])}{rest}" if begun else ""
     left = f", {timedelta(seconds=round((1 - progress.share) / rate))} left at this pace" if rate else ""
@@ -238,8 +307,10 @@ def _front_table(progress: Status) -> RenderableType:
         return Text("Nothing simulated yet.")
     front = nondominated_points(progress.points)
     front = front[front[:, 0].argsort(kind="stable")]
-    table = WholeTable(right=("safety degree [m, -m/s]", "f_diff [fraction]", "changed"),
-                       title=f"Front so far: {len(front)} points, the most severe ones")
+    table = WholeTable(
+        right=("safety degree [m, -m/s]", "f_diff [fraction]", "changed"),
+        title=f"Front so far: {len(front)} points, the most severe ones",
+    )
     for f_safe, f_diff, number in front[:MAX_FRONT_ROWS].tolist():
         table.add_row(f"{f_safe:.2f}", f"{f_diff:.3f}", f"{number:.0f}")
     return table

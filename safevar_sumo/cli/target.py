@@ -36,10 +36,19 @@ class CommandTarget(NamedTuple):
 def replay_options(command: CommandFunction) -> CommandFunction:
     """Add the options that choose a solution of a results directory."""
     for option in (
-            click.option("--smallest", "choice", flag_value="smallest", help="Replay the unsafe solution with the smallest changes."),
-            click.option("--fewest", "choice", flag_value="fewest", help="Replay the unsafe solution with the fewest changes."),
-            click.option("--most-severe", "choice", flag_value="most_severe", help="Replay the most severe solution."),
-            click.option("--solution", metavar="ALG:RUN:N", help="Replay solution N of a run in a results directory; N counts from 0.")):
+        click.option(
+            "--smallest", "choice", flag_value="smallest", help="Replay the unsafe solution with the smallest changes."
+        ),
+        click.option(
+            "--fewest", "choice", flag_value="fewest", help="Replay the unsafe solution with the fewest changes."
+        ),
+        click.option("--most-severe", "choice", flag_value="most_severe", help="Replay the most severe solution."),
+        click.option(
+            "--solution",
+            metavar="ALG:RUN:N",
+            help="Replay solution N of a run in a results directory; N counts from 0.",
+        ),
+    ):
         command = option(command)
     return command
 
@@ -53,7 +62,9 @@ def load_target(source: str, solution: str | None, choice: str | None) -> Comman
         If there is no such study, directory or solution.
     """
     if solution is not None and choice is not None:
-        raise InputError("--solution", f"{solution!r} and --{choice.replace('_', '-')} both choose a solution", "one of them")
+        raise InputError(
+            "--solution", f"{solution!r} and --{choice.replace('_', '-')} both choose a solution", "one of them"
+        )
     if solution is None and choice is None:
         return CommandTarget(study_in(_load_subject(source)), source)
     case = load_results_or_study(source, results_only=True)
@@ -62,11 +73,18 @@ def load_target(source: str, solution: str | None, choice: str | None) -> Comman
     handle = requested_handle or choose_handle(case.solutions, case.unsafe, str(choice), source)
     row = case.solutions.iloc[row_of_handle(case.solutions, handle)]
     setting = row[list(case.characteristics.names)].to_numpy(dtype=float)
-    return CommandTarget(study=case.study, source=source, handle=handle, setting=setting,
-                         row={str(name): value for name, value in row.items()})
+    return CommandTarget(
+        study=case.study,
+        source=source,
+        handle=handle,
+        setting=setting,
+        row={str(name): value for name, value in row.items()},
+    )
 
 
-jobs_option = click.option("--jobs", type=click.IntRange(1, 1024), help="Worker processes.  [default: the cores of this machine]")
+jobs_option = click.option(
+    "--jobs", type=click.IntRange(1, 1024), help="Worker processes.  [default: the cores of this machine]"
+)
 point_option = click.option("--point", metavar="NAME", help="Only this point of the study's matrix.")
 json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 AS_IT_IS_NOW_KEY = "safevar_sumo.as_it_is_now"
@@ -78,8 +96,12 @@ def _store_flag(context: click.Context, _option: click.Parameter, value: bool) -
 
 
 as_it_is_now_option = click.option(
-    "--as-it-is-now", is_flag=True, expose_value=False, callback=_store_flag,
-    help="If results were computed with other files or versions, simulate with the present ones and say so.")
+    "--as-it-is-now",
+    is_flag=True,
+    expose_value=False,
+    callback=_store_flag,
+    help="If results were computed with other files or versions, simulate with the present ones and say so.",
+)
 
 
 def as_it_is_now() -> bool:
@@ -89,9 +111,12 @@ def as_it_is_now() -> bool:
 
 def add_flags(question: type[Options]) -> Callable[[CommandFunction], CommandFunction]:
     """Decorator that adds the flags of a question's options; the command makes them by `question(**keywords)`."""
+
     def add(command: CommandFunction) -> CommandFunction:
         for field in reversed(fields(question)):
-            command = _add_flag(question.flags()[field.name], field.name, field.default, question.definitions()[field.name])(command)
+            command = _add_flag(
+                question.flags()[field.name], field.name, field.default, question.definitions()[field.name]
+            )(command)
         return command
 
     return add
@@ -101,15 +126,29 @@ def _add_flag(flag: str, name: str, default: Any, option: Option) -> Callable[[C
     if option.kind is bool:
         return click.option(flag, name, is_flag=True, default=default, help=option.help)
     if option.form != "one":
-        return click.option(flag, name, multiple=option.form == "repeated", metavar=option.metavar, help=option.help,
-                            callback=lambda _context, _option, value: _split_names(value) if option.form == "commas" else value)
+        return click.option(
+            flag,
+            name,
+            multiple=option.form == "repeated",
+            metavar=option.metavar,
+            help=option.help,
+            callback=lambda _context, _option, value: _split_names(value) if option.form == "commas" else value,
+        )
     (low_is_open, high_is_open), show_default = option.is_open, default is not None
     click_type: click.ParamType[Any] = click.STRING
     if option.kind is int:
         click_type = click.IntRange(option.low, option.high)  # type: ignore[arg-type]
     elif option.kind is float:
         click_type = click.FloatRange(option.low, option.high, min_open=low_is_open, max_open=high_is_open)
-    return click.option(flag, name, type=click_type, default=default, show_default=show_default, metavar=option.metavar, help=option.help)
+    return click.option(
+        flag,
+        name,
+        type=click_type,
+        default=default,
+        show_default=show_default,
+        metavar=option.metavar,
+        help=option.help,
+    )
 
 
 def _split_names(text: str | None) -> tuple[str, ...] | None:

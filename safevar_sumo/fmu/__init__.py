@@ -6,5 +6,18 @@ from safevar_sumo.fmu.ports import Port, constants_of, ports_of
 from safevar_sumo.fmu.units import COMMON_UNITS, SI, Unit
 
 __all__ = [
-    "COMMON_UNITS", "REAL_TYPES", "SI", "Description", "Fleet", "History", "Instances", "Port", "Unit", "constants_of", "declared",
-    "description_of", "file_of", "ports_of"]
+    "COMMON_UNITS",
+    "REAL_TYPES",
+    "SI",
+    "Description",
+    "Fleet",
+    "History",
+    "Instances",
+    "Port",
+    "Unit",
+    "constants_of",
+    "declared",
+    "description_of",
+    "file_of",
+    "ports_of",
+]

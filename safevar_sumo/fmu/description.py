@@ -20,7 +20,20 @@ if TYPE_CHECKING:
 
 REAL_TYPES = ("Real", "Float64", "Float32")
 """Types of variables that have units."""
-NUMBER_TYPES = (*REAL_TYPES, "Integer", "Boolean", "Int8", "UInt8", "Int16", "UInt16", "Int32", "UInt32", "Int64", "UInt64", "Enumeration")
+NUMBER_TYPES = (
+    *REAL_TYPES,
+    "Integer",
+    "Boolean",
+    "Int8",
+    "UInt8",
+    "Int16",
+    "UInt16",
+    "Int32",
+    "UInt32",
+    "Int64",
+    "UInt64",
+    "Enumeration",
+)
 """Types of variables that hold numbers."""
 SUPPORTED_FMU = "an FMU of FMI 2.0 or 3.0 for co-simulation"
 MAX_MEANING = 200
@@ -52,15 +65,21 @@ class Description:
         An FMU requires its internal step, or its default step if its step cannot change.
         """
         simulation, default = self.model.coSimulation, getattr(self.model.defaultExperiment, "stepSize", None)
-        required = simulation.fixedInternalStepSize or (None if simulation.canHandleVariableCommunicationStepSize else default)
+        required = simulation.fixedInternalStepSize or (
+            None if simulation.canHandleVariableCommunicationStepSize else default
+        )
         step = stated or float(required or 0.0)
         if step and not MIN_STEP <= step <= MAX_STEP:
-            raise InputError(source, f"{Path(self.path).name} requires a step of {step:g} s",
-                             f"a step from {MIN_STEP:g} to {MAX_STEP:g} s; {key}.step sets another")
+            raise InputError(
+                source,
+                f"{Path(self.path).name} requires a step of {step:g} s",
+                f"a step from {MIN_STEP:g} to {MAX_STEP:g} s; {key}.step sets another",
+            )
         return step or None
 
-    def variable(self, name: str, causalities: Collection[str], source: str, key: str,
-                 types: Collection[str] = NUMBER_TYPES) -> ModelVariable:
+    def variable(
+        self, name: str, causalities: Collection[str], source: str, key: str, types: Collection[str] = NUMBER_TYPES
+    ) -> ModelVariable:
         """A variable by name.
 
         Raises
@@ -68,7 +87,11 @@ class Description:
         InputError
             If the variable does not exist, or has another causality or type.
         """
-        names = [other.name for other in self.variables.values() if causality_of(other) in causalities and other.type in types]
+        names = [
+            other.name
+            for other in self.variables.values()
+            if causality_of(other) in causalities and other.type in types
+        ]
         listing = ", ".join(names[:MAX_LISTED]) + ", ..." * (len(names) > MAX_LISTED)
         variable = self.variables.get(name)
         if variable is None:
@@ -77,8 +100,11 @@ class Description:
             problem = f"that variable is {_with_article(causality_of(variable))} of type {variable.type}"
         else:
             return variable
-        raise InputError(source, f"{key} = {name!r}: {problem}", f"{_with_article(' or '.join(causalities))} of the FMU with a number: "
-                         f"{listing or 'it has none'}")
+        raise InputError(
+            source,
+            f"{key} = {name!r}: {problem}",
+            f"{_with_article(' or '.join(causalities))} of the FMU with a number: {listing or 'it has none'}",
+        )
 
     def unit_of(self, variable: ModelVariable) -> Unit | None:
         """The unit of a variable; None if it declares none, or one that is not defined."""
@@ -98,18 +124,27 @@ class Description:
         if variable.type not in REAL_TYPES or not name:
             return unit
         if variable_unit is None:
-            raise InputError(source, f"{key} = {variable.name!r}: its unit {name!r} has no BaseUnit in the UnitDefinitions",
-                             f"a unit with a BaseUnit of the same kind as {unit_name}")
+            raise InputError(
+                source,
+                f"{key} = {variable.name!r}: its unit {name!r} has no BaseUnit in the UnitDefinitions",
+                f"a unit with a BaseUnit of the same kind as {unit_name}",
+            )
         if not variable_unit.fits(unit):
             raise InputError(source, f"{key} = {variable.name!r}: its unit is {name!r}", f"a unit of {unit_name}")
         return variable_unit
 
     def table_rows(self, fixed_names: Collection[str]) -> dict[str, dict[str, str | float]]:
         """Rows of the characteristics' table for all real parameters with start, min and max, except those of `fixed_names`."""
-        rows = {name: self.table_row(name) for name, variable in self.variables.items()
-                if name not in fixed_names and variable.type in REAL_TYPES and variable.variability != "constant"}
-        return {name: row for name, row in rows.items()
-                if {"original", "lower", "upper"} <= row.keys() and row["lower"] != row["upper"] and row["original"] != 0}
+        rows = {
+            name: self.table_row(name)
+            for name, variable in self.variables.items()
+            if name not in fixed_names and variable.type in REAL_TYPES and variable.variability != "constant"
+        }
+        return {
+            name: row
+            for name, row in rows.items()
+            if {"original", "lower", "upper"} <= row.keys() and row["lower"] != row["upper"] and row["original"] != 0
+        }
 
     def table_row(self, name: str, unit: str = "") -> dict[str, str | float]:
         """The table row that a parameter declares, converted to `unit` if a unit is given; empty if the variable is no parameter."""
@@ -117,14 +152,21 @@ class Description:
         if variable is None or causality_of(variable) != "parameter":
             return {}
         declared_name, meaning = declared(variable, "unit"), " ".join((variable.description or "").split())
-        numbers = {key: number for key, attribute in (("original", "start"), ("lower", "min"), ("upper", "max"))
-                   if (number := number_of(variable, attribute)) is not None}
+        numbers = {
+            key: number
+            for key, attribute in (("original", "start"), ("lower", "min"), ("upper", "max"))
+            if (number := number_of(variable, attribute)) is not None
+        }
         row_unit, declared_unit = self.units.get(unit) or COMMON_UNITS.get(unit), self.unit_of(variable)
         if unit and declared_name not in ("", unit):
             if declared_unit is None or row_unit is None or not declared_unit.fits(row_unit):
                 return {}  # the vehicle model refuses the unit later
             numbers = {key: declared_unit.to(row_unit, number) for key, number in numbers.items()}
-        return {"unit": declared_name or "-", **numbers, **({"meaning": meaning} if 0 < len(meaning) <= MAX_MEANING else {})}
+        return {
+            "unit": declared_name or "-",
+            **numbers,
+            **({"meaning": meaning} if 0 < len(meaning) <= MAX_MEANING else {}),
+        }
 
 
 def causality_of(variable: ModelVariable) -> str:
@@ -149,7 +191,14 @@ def number_of(variable: ModelVariable, name: str) -> float | None:
 def file_of(model: str, folders: Sequence[str]) -> str:
     """The path of the FMU that a study names: relative to the folders of the study's files, else to the working directory."""
     try:
-        return next((os.path.abspath(path) for folder in (folders or (os.getcwd(),)) if (path := Path(folder, model)).is_file()), "")
+        return next(
+            (
+                os.path.abspath(path)
+                for folder in (folders or (os.getcwd(),))
+                if (path := Path(folder, model)).is_file()
+            ),
+            "",
+        )
     except (OSError, ValueError):  # not a valid path
         return ""
 
@@ -166,7 +215,9 @@ def description_of(model: str, folders: Sequence[str], source: str, key: str) ->
     path = file_of(model, folders)
     if not path:
         folder = folders[0] if folders else os.getcwd()
-        problem = "is a directory" if os.path.isdir(os.path.join(folder, model)) else f"there is no such file in {folder}"
+        problem = (
+            "is a directory" if os.path.isdir(os.path.join(folder, model)) else f"there is no such file in {folder}"
+        )
         raise InputError(source, f"{key} = {model!r}: {problem}", SUPPORTED_FMU)
     return _read_description(path, sha256(Path(path).read_bytes()).hexdigest(), source, f"{key} = {model!r}")
 
@@ -177,11 +228,15 @@ def _read_description(path: str, digest: str, source: str, name: str) -> Descrip
         from fmpy import platform, platform_tuple
         from fmpy.model_description import read_model_description
     except ImportError:
-        raise InputError(source, f"{name} needs FMPy, which is not installed", "in the checkout: pip install '.[fmu]'") from None
+        raise InputError(
+            source, f"{name} needs FMPy, which is not installed", "in the checkout: pip install '.[fmu]'"
+        ) from None
     try:
         model = read_model_description(path, validate=False)
         with ZipFile(path) as archive:
-            platforms = sorted({name.split("/")[1] for name in archive.namelist() if name.startswith("binaries/")} - {""})
+            platforms = sorted(
+                {name.split("/")[1] for name in archive.namelist() if name.startswith("binaries/")} - {""}
+            )
     except Exception as error:  # any error of FMPy about a user's file
         raise InputError(source, f"{name} cannot be read as an FMU: {describe_error(error)}", SUPPORTED_FMU) from None
     if not model.fmiVersion.startswith(("2.", "3.")):
@@ -191,9 +246,18 @@ def _read_description(path: str, digest: str, source: str, name: str) -> Descrip
         raise InputError(source, f"{name} is for {kind} only, without a solver of its own", SUPPORTED_FMU)
     if not {platform, platform_tuple} & set(platforms):
         others = f"only for {', '.join(platforms)}" if platforms else "nor for any other"
-        raise InputError(source, f"{name} has no binary for this machine ({platform}), {others}", f"binaries/{platform}")
-    units = {unit.name: Unit(tuple(int(getattr(unit.baseUnit, base)) for base in BASE_UNITS), float(unit.baseUnit.factor),
-                             float(unit.baseUnit.offset)) for unit in model.unitDefinitions if unit.baseUnit is not None}
+        raise InputError(
+            source, f"{name} has no binary for this machine ({platform}), {others}", f"binaries/{platform}"
+        )
+    units = {
+        unit.name: Unit(
+            tuple(int(getattr(unit.baseUnit, base)) for base in BASE_UNITS),
+            float(unit.baseUnit.factor),
+            float(unit.baseUnit.offset),
+        )
+        for unit in model.unitDefinitions
+        if unit.baseUnit is not None
+    }
     variables = {variable.name: variable for variable in model.modelVariables if not variable.dimensions}
     return Description(path, digest, model, units, variables)
 

@@ -29,6 +29,8 @@ MAX_INSTANCES = 200
 """Largest number of vehicles of a simulation; 1 for an FMU that allows only one instance in a process."""
 POINT_TOLERANCE = 1e-9
 """Tolerance for times of communication points, as a share of a step [-]."""
+
+
 class FmuError(Exception):
     """An FMU failed; the message says what it did and logged, and when."""
 
@@ -52,8 +54,13 @@ class Instances:
         Further parameters and their values.
     """
 
-    def __init__(self, description: Description, inputs: Sequence[Port], outputs: Sequence[Port],
-                 constants: Sequence[tuple[ModelVariable, Constant]]) -> None:
+    def __init__(
+        self,
+        description: Description,
+        inputs: Sequence[Port],
+        outputs: Sequence[Port],
+        constants: Sequence[tuple[ModelVariable, Constant]],
+    ) -> None:
         self._description, self._inputs, self._outputs, self._constants = description, inputs, outputs, constants
         self._is_3 = description.model.fmiVersion.startswith("3")
         self._free, self._messages = list["FMU2Slave"](), list[str]()
@@ -79,11 +86,14 @@ class Instances:
 
     def step(self, slaves: Sequence[FMU2Slave], time: float, length: float, values: FloatArray) -> FloatArray:
         """Advance N instances by a step from `time` [s]; returns the m outputs after it, shape (m, N)."""
+
         def step(slave: FMU2Slave, column: Sequence[float]) -> None:
             self._write_inputs(slave, column, are_inputs=True)
             result = slave.doStep(time, length)
             if self._is_3 and (result[1] or result[2]):
-                raise FmuError("it requests the end of the simulation" if result[1] else f"it returned early, at {result[3]:g} s")
+                raise FmuError(
+                    "it requests the end of the simulation" if result[1] else f"it returned early, at {result[3]:g} s"
+                )
 
         return self._on_each(f"is at {time:g} s", slaves, values, step)
 
@@ -101,17 +111,27 @@ class Instances:
         self._write_inputs(slave, column, are_inputs=True)
         slave.exitInitializationMode()
 
-    def _on_each(self, activity: str, slaves: Sequence[FMU2Slave], values: FloatArray,
-                 work: Callable[[FMU2Slave, Sequence[float]], None]) -> FloatArray:
+    def _on_each(
+        self,
+        activity: str,
+        slaves: Sequence[FMU2Slave],
+        values: FloatArray,
+        work: Callable[[FMU2Slave, Sequence[float]], None],
+    ) -> FloatArray:
         columns = np.array([port.to_fmu(row) for port, row in zip(self._inputs, values, strict=True)]).T.tolist()
         outputs = np.zeros((len(self._outputs), len(slaves)))
         try:
             for i, slave in enumerate(slaves):
                 work(slave, columns[i])
-                outputs[:, i] = [getattr(slave, f"get{self._function(port.variable)}")([port.variable.valueReference])[0]
-                                 for port in self._outputs]
+                outputs[:, i] = [
+                    getattr(slave, f"get{self._function(port.variable)}")([port.variable.valueReference])[0]
+                    for port in self._outputs
+                ]
         except Exception as error:  # any error of FMPy about an FMU
-            self._free, self.generation = [], self.generation + 1  # any further call of an instance that failed is undefined
+            self._free, self.generation = (
+                [],
+                self.generation + 1,
+            )  # any further call of an instance that failed is undefined
             messages, self._messages[:] = self._messages[-1:], []
             reason = (str(error).strip() or type(error).__name__).splitlines()[0].rstrip(".")
             raise FmuError(f"{': '.join([reason, *messages])} while it {activity}") from error
@@ -162,7 +182,10 @@ def _unpacked(description: Description) -> str:
         if sha256(content).hexdigest() != description.digest:
             raise FmuError("its file has changed since the study was read")
         folder.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=folder.parent, ignore_cleanup_errors=True) as new, ZipFile(BytesIO(content)) as archive:
+        with (
+            tempfile.TemporaryDirectory(dir=folder.parent, ignore_cleanup_errors=True) as new,
+            ZipFile(BytesIO(content)) as archive,
+        ):
             archive.extractall(new)
             with suppress(OSError):  # another process was faster
                 os.rename(new, folder)
@@ -189,7 +212,7 @@ class Fleet:
 
     def __init__(self, instances: Instances, n: int, step: float, communication_step: float | None) -> None:
         self._instances, self._n, self._step, self._interval = instances, n, step, communication_step or step
-        self._slaves, self._generation = list['FMU2Slave'](), -1
+        self._slaves, self._generation = list["FMU2Slave"](), -1
         self._history: History | None = None
         self._last_outputs: FloatArray
         """Outputs at the last two communication points, shape (2, m, N)."""
@@ -201,7 +224,10 @@ class Fleet:
             self._generation = self._instances.generation
             weakref.finalize(self, self._instances.give_back, self._slaves, self._generation)
         outputs = self._instances.start(self._slaves, inputs)
-        self._last_outputs, self._history = np.stack([outputs, outputs]), History(previous=None, inputs=inputs, step_number=-1)
+        self._last_outputs, self._history = (
+            np.stack([outputs, outputs]),
+            History(previous=None, inputs=inputs, step_number=-1),
+        )
         return outputs, self._history
 
     def advance(self, history: History, inputs: FloatArray) -> tuple[FloatArray, History]:

@@ -19,7 +19,11 @@ if TYPE_CHECKING:
 FloatArray = npt.NDArray[np.float64]
 Constant = str | bool | float
 """A value of a parameter."""
-PYTHON_TYPES: Mapping[str, tuple[type, ...]] = {"String": (str,), "Boolean": (bool,), **dict.fromkeys(REAL_TYPES, (int, float))}
+PYTHON_TYPES: Mapping[str, tuple[type, ...]] = {
+    "String": (str,),
+    "Boolean": (bool,),
+    **dict.fromkeys(REAL_TYPES, (int, float)),
+}
 """Python types that a study may give parameters of an FMI type; other FMI types take whole numbers."""
 
 
@@ -45,8 +49,15 @@ class Port(NamedTuple):
         return np.asarray(self.fmu_unit.to(self.outer_unit, values))
 
 
-def ports_of(description: Description, variable_names: Mapping[str, str], units: Mapping[str, str], causalities: Collection[str],
-             source: str, key: str, constants: Collection[str] = ()) -> dict[str, Port]:
+def ports_of(
+    description: Description,
+    variable_names: Mapping[str, str],
+    units: Mapping[str, str],
+    causalities: Collection[str],
+    source: str,
+    key: str,
+    constants: Collection[str] = (),
+) -> dict[str, Port]:
     """The ports that a table of a study names, by quantity.
 
     Parameters
@@ -72,14 +83,21 @@ def ports_of(description: Description, variable_names: Mapping[str, str], units:
         legal_causalities = (*causalities, "parameter") if quantity in constants else causalities
         variable = description.variable(name, legal_causalities, source, f"{key}.{quantity}")
         outer_unit = SI[units[quantity]]
-        port = Port(variable, description.unit_for(variable, outer_unit, units[quantity], source, f"{key}.{quantity}"), outer_unit)
+        port = Port(
+            variable,
+            description.unit_for(variable, outer_unit, units[quantity], source, f"{key}.{quantity}"),
+            outer_unit,
+        )
         lower, upper = (number_of(variable, end) if port.is_input else None for end in ("min", "max"))
-        ports[quantity] = port._replace(lower=-np.inf if lower is None else lower, upper=np.inf if upper is None else upper)
+        ports[quantity] = port._replace(
+            lower=-np.inf if lower is None else lower, upper=np.inf if upper is None else upper
+        )
     return ports
 
 
-def constants_of(description: Description, values: Mapping[str, Constant], ports: Collection[Port], source: str,
-                 key: str) -> list[tuple[ModelVariable, Constant]]:
+def constants_of(
+    description: Description, values: Mapping[str, Constant], ports: Collection[Port], source: str, key: str
+) -> list[tuple[ModelVariable, Constant]]:
     """Parameters of an FMU that a study sets besides the `ports` that it writes, with their values in the FMU's units.
 
     Raises
@@ -89,12 +107,17 @@ def constants_of(description: Description, values: Mapping[str, Constant], ports
     """
     constants = []
     for name, value in values.items():
-        variable = description.variable(name, ("parameter", "structuralParameter"), source, key, (*NUMBER_TYPES, "String"))
+        variable = description.variable(
+            name, ("parameter", "structuralParameter"), source, key, (*NUMBER_TYPES, "String")
+        )
         if type(value) not in PYTHON_TYPES.get(variable.type, (int,)):
             raise InputError(source, f"{key}.{name} = {value!r}", f"a value of type {variable.type}")
         constants.append((variable, value))
     for one, other in combinations([*(port.variable for port in ports), *(variable for variable, _ in constants)], 2):
         if (one.type, one.valueReference) == (other.type, other.valueReference):
-            raise InputError(source, f"{key.partition('.')[0]}: {one.name!r} and {other.name!r} have one value, and two keys set it",
-                             "one key for each value reference of the FMU")
+            raise InputError(
+                source,
+                f"{key.partition('.')[0]}: {one.name!r} and {other.name!r} have one value, and two keys set it",
+                "one key for each value reference of the FMU",
+            )
     return constants

@@ -8,23 +8,31 @@ from safevar_sumo.metrics.safety_degree import SAFETY_DEGREE_METRIC
 from safevar_sumo.metrics.time_to_collision import TET, TIT, time_to_collision
 from safevar_sumo.metrics.unsafe import Criterion, Unsafe
 
-METRICS = {metric.name: metric for metric in (
-    SAFETY_DEGREE_METRIC,
-    TET,
-    TIT,
-    AVE_DECE,
-)}
-OPTIONAL_METRICS = {metric.name: metric for metric in (
-    MAX_JERK,
-    RMS_ACCELERATION,
-    BRAKE_HARSHNESS,
-)}
+METRICS = {metric.name: metric for metric in (SAFETY_DEGREE_METRIC, TET, TIT, AVE_DECE)}
+OPTIONAL_METRICS = {metric.name: metric for metric in (MAX_JERK, RMS_ACCELERATION, BRAKE_HARSHNESS)}
 """Metrics that only the studies have that name them."""
 METRIC_OF_OBJECTIVE = {F_SAFE.name: SAFETY_DEGREE_METRIC, "f_comfort": MAX_JERK}
 """The metric that an objective uses, by the objective's name."""
-PUBLISHED_SCORING = Scoring(metrics=tuple(metric.facts for metric in METRICS.values()), objectives=(F_SAFE, F_DIFF, F_NUM_DIFF))
+PUBLISHED_SCORING = Scoring(
+    metrics=tuple(metric.facts for metric in METRICS.values()), objectives=(F_SAFE, F_DIFF, F_NUM_DIFF)
+)
 """Metrics and objectives of the published study (method sections 3 and 4)."""
 
 __all__ = [
-    "F_DIFF", "F_NUM_DIFF", "F_SAFE", "METRICS", "METRIC_OF_OBJECTIVE", "OPTIONAL_METRICS", "PUBLISHED_SCORING", "RATING_POINTS",
-    "Criterion", "Metric", "MetricFacts", "Objective", "Scoring", "Unsafe", "guard_metric", "time_to_collision"]
+    "F_DIFF",
+    "F_NUM_DIFF",
+    "F_SAFE",
+    "METRICS",
+    "METRIC_OF_OBJECTIVE",
+    "OPTIONAL_METRICS",
+    "PUBLISHED_SCORING",
+    "RATING_POINTS",
+    "Criterion",
+    "Metric",
+    "MetricFacts",
+    "Objective",
+    "Scoring",
+    "Unsafe",
+    "guard_metric",
+    "time_to_collision",
+]

@@ -34,7 +34,11 @@ def sampling_stride(step: float, interval: float | None) -> int:
         return 1
     steps = round(interval / step)
     if steps < 1 or abs(steps * step - interval) > TIME_TOLERANCE:
-        raise InputError(STUDY_SOURCE, f"metrics.sampling_interval = {interval}", f"a whole multiple of the simulation's step, {step:g} s")
+        raise InputError(
+            STUDY_SOURCE,
+            f"metrics.sampling_interval = {interval}",
+            f"a whole multiple of the simulation's step, {step:g} s",
+        )
     return steps
 
 
@@ -113,9 +117,15 @@ def guard_metric(metric: Any, guard: Guard) -> Metric:
     """
     expected = "a safevar_sumo.metrics.Metric(name=..., title=..., unit=..., more_is_unsafe=..., function=...)"
     if not isinstance(metric, Metric):
-        raise UserCodeError(guard.source, f"{guard.name} is of type {type(metric).__name__}, not Metric", expected, guard.definition(""))
+        raise UserCodeError(
+            guard.source, f"{guard.name} is of type {type(metric).__name__}, not Metric", expected, guard.definition("")
+        )
     if not callable(metric.function):
-        raise InputError(guard.source, f"{guard.name}: function = {metric.function!r}", "a function of simulation runs and thresholds")
+        raise InputError(
+            guard.source,
+            f"{guard.name}: function = {metric.function!r}",
+            "a function of simulation runs and thresholds",
+        )
     try:
         facts = msgspec.convert(msgspec.to_builtins(metric.facts), MetricFacts)
     except (msgspec.ValidationError, TypeError) as error:

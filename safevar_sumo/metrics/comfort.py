@@ -25,7 +25,9 @@ class _BiquadFilter(NamedTuple):
     output_coefficients: tuple[float, float]
 
     @classmethod
-    def bilinear(cls, numerator: tuple[float, float, float], denominator: tuple[float, float, float], step: float) -> _BiquadFilter:
+    def bilinear(
+        cls, numerator: tuple[float, float, float], denominator: tuple[float, float, float], step: float
+    ) -> _BiquadFilter:
         """The filter with a transfer function in s, by Tustin's rule; coefficients of polynomials from the highest power."""
         k = 2 / step
 
@@ -35,7 +37,10 @@ class _BiquadFilter(NamedTuple):
 
         leading, *outputs = in_z(denominator)
         inputs = in_z(numerator)
-        return cls((inputs[0] / leading, inputs[1] / leading, inputs[2] / leading), (outputs[0] / leading, outputs[1] / leading))
+        return cls(
+            (inputs[0] / leading, inputs[1] / leading, inputs[2] / leading),
+            (outputs[0] / leading, outputs[1] / leading),
+        )
 
     def apply(self, samples: FloatArray) -> FloatArray:
         """Filter samples along the first axis, from rest, sample by sample, so that results do not depend on N."""
@@ -54,9 +59,14 @@ def weight_acceleration(acceleration: FloatArray, step: float) -> FloatArray:
     The low pass at 100 Hz is omitted, since the samples of a simulation contain no frequencies above half the sampling rate.
     """
     high_pass_rate, transition = 2 * np.pi * HIGH_PASS, 2 * np.pi * TRANSITION
-    high_pass = _BiquadFilter.bilinear((1.0, 0.0, 0.0), (1.0, float(np.sqrt(2.0)) * high_pass_rate, high_pass_rate * high_pass_rate), step)
-    weighting = _BiquadFilter.bilinear((0.0, transition, transition * transition),
-                                       (1.0, transition / TRANSITION_QUALITY, transition * transition), step)
+    high_pass = _BiquadFilter.bilinear(
+        (1.0, 0.0, 0.0), (1.0, float(np.sqrt(2.0)) * high_pass_rate, high_pass_rate * high_pass_rate), step
+    )
+    weighting = _BiquadFilter.bilinear(
+        (0.0, transition, transition * transition),
+        (1.0, transition / TRANSITION_QUALITY, transition * transition),
+        step,
+    )
     return weighting.apply(high_pass.apply(acceleration))
 
 
@@ -71,7 +81,9 @@ def max_jerk(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
 def rms_acceleration(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
     """Root mean square of the weighted acceleration over the run [m/s^2]; shape (N,), NaN on a collision."""
     accelerations, is_counted = _accelerations(runs)
-    squares = np.where(is_counted, weight_acceleration(np.where(is_counted, accelerations, 0.0), runs.trace.step), 0.0) ** 2
+    squares = (
+        np.where(is_counted, weight_acceleration(np.where(is_counted, accelerations, 0.0), runs.trace.step), 0.0) ** 2
+    )
     return mask_collisions(runs, np.sqrt(sum_in_order(squares) / np.maximum(np.count_nonzero(is_counted, axis=0), 1)))
 
 
@@ -94,11 +106,29 @@ def _step_count(time: float, step: float, largest_count: int) -> int:
 
 
 MAX_JERK = Metric(
-    name="max_jerk", title="jerk", unit="m/s^3", more_is_unsafe=True, over_collisions=False, function=max_jerk,
-    description="Largest magnitude of the jerk, averaged over a second (ISO 15622); without a collision.")
+    name="max_jerk",
+    title="jerk",
+    unit="m/s^3",
+    more_is_unsafe=True,
+    over_collisions=False,
+    function=max_jerk,
+    description="Largest magnitude of the jerk, averaged over a second (ISO 15622); without a collision.",
+)
 RMS_ACCELERATION = Metric(
-    name="rms_acceleration", title="RMS a_w", unit="m/s^2", more_is_unsafe=True, over_collisions=False, function=rms_acceleration,
-    description="Root mean square of the acceleration along the vehicle, weighted with W_d of ISO 2631-1; without a collision.")
+    name="rms_acceleration",
+    title="RMS a_w",
+    unit="m/s^2",
+    more_is_unsafe=True,
+    over_collisions=False,
+    function=rms_acceleration,
+    description="Root mean square of the acceleration along the vehicle, weighted with W_d of ISO 2631-1; without a collision.",
+)
 BRAKE_HARSHNESS = Metric(
-    name="brake_harshness", title="harshness", unit="m/s^2", more_is_unsafe=True, over_collisions=False, function=brake_harshness,
-    description="Largest deceleration, averaged over half a second; without a collision.")
+    name="brake_harshness",
+    title="harshness",
+    unit="m/s^2",
+    more_is_unsafe=True,
+    over_collisions=False,
+    function=brake_harshness,
+    description="Largest deceleration, averaged over half a second; without a collision.",
+)

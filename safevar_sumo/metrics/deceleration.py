@@ -22,9 +22,16 @@ def average_deceleration(runs: SimulationRuns, thresholds: MetricsTable) -> Floa
     is_counted = is_braking[1:]
     sample_count = np.count_nonzero(is_counted, axis=0)
     deceleration_sum = sum_in_order(np.where(is_counted, decelerations, 0.0))
-    return np.asarray(np.divide(deceleration_sum, sample_count, out=np.full_like(deceleration_sum, np.nan), where=sample_count > 0))
+    return np.asarray(
+        np.divide(deceleration_sum, sample_count, out=np.full_like(deceleration_sum, np.nan), where=sample_count > 0)
+    )
 
 
 AVE_DECE = Metric(
-    name="ave_dece", title="aveDece", unit="m/s^2", more_is_unsafe=False, function=average_deceleration,
-    description="Mean loss of speed per time over the samples in which the brake is commanded and the vehicle moves.")
+    name="ave_dece",
+    title="aveDece",
+    unit="m/s^2",
+    more_is_unsafe=False,
+    function=average_deceleration,
+    description="Mean loss of speed per time over the samples in which the brake is commanded and the vehicle moves.",
+)

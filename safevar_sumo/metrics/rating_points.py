@@ -15,5 +15,10 @@ def _undefined_points(runs: SimulationRuns, thresholds: MetricsTable) -> FloatAr
 
 
 RATING_POINTS = Metric(
-    name="rating_points", title="points kept", unit="points", more_is_unsafe=False, function=_undefined_points,
-    description="Points of Euro NCAP's crash avoidance rating, frontal collisions, in all tests that are simulated.")
+    name="rating_points",
+    title="points kept",
+    unit="points",
+    more_is_unsafe=False,
+    function=_undefined_points,
+    description="Points of Euro NCAP's crash avoidance rating, frontal collisions, in all tests that are simulated.",
+)

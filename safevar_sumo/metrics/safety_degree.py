@@ -21,5 +21,11 @@ def safety_degree(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
 
 
 SAFETY_DEGREE_METRIC = Metric(
-    name=SAFETY_DEGREE, title="SD", unit="m, or -m/s", head="SD", more_is_unsafe=False, function=safety_degree,
-    description="Least separation during the encounter [m, > 0], or minus the speed of the collision [m/s, <= 0].")
+    name=SAFETY_DEGREE,
+    title="SD",
+    unit="m, or -m/s",
+    head="SD",
+    more_is_unsafe=False,
+    function=safety_degree,
+    description="Least separation during the encounter [m, > 0], or minus the speed of the collision [m/s, <= 0].",
+)

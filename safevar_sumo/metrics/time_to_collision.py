@@ -24,7 +24,9 @@ def time_to_collision(runs: SimulationRuns) -> FloatArray:
 def time_exposed(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
     """TET* = sum of dt over the samples with 0 <= TTC(t) <= TTC* [s]; shape (N,), NaN on a collision."""
     critical_ttc, interval = _critical_ttc(runs, thresholds)
-    return mask_collisions(runs, np.round(np.count_nonzero(np.isfinite(critical_ttc), axis=0) * interval, TIME_DECIMALS))
+    return mask_collisions(
+        runs, np.round(np.count_nonzero(np.isfinite(critical_ttc), axis=0) * interval, TIME_DECIMALS)
+    )
 
 
 def time_integrated(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
@@ -42,8 +44,20 @@ def _critical_ttc(runs: SimulationRuns, thresholds: MetricsTable) -> tuple[Float
 
 
 TET = Metric(
-    name="tet", title="TET", unit="s", more_is_unsafe=True, over_collisions=False, function=time_exposed,
-    description="TET* = sum of dt over the samples with 0 <= TTC(t) <= TTC* [s].")
+    name="tet",
+    title="TET",
+    unit="s",
+    more_is_unsafe=True,
+    over_collisions=False,
+    function=time_exposed,
+    description="TET* = sum of dt over the samples with 0 <= TTC(t) <= TTC* [s].",
+)
 TIT = Metric(
-    name="tit", title="TIT", unit="s^2", more_is_unsafe=True, over_collisions=False, function=time_integrated,
-    description="TIT* = sum of (TTC* - TTC(t)) dt over the same samples [s^2].")
+    name="tit",
+    title="TIT",
+    unit="s^2",
+    more_is_unsafe=True,
+    over_collisions=False,
+    function=time_integrated,
+    description="TIT* = sum of (TTC* - TTC(t)) dt over the same samples [s^2].",
+)

@@ -132,9 +132,15 @@ class Unsafe:
         outcomes = np.concatenate([original.outcome, evaluations.outcome])
         unsafe = cls.default({name: float(values[0]) for name, values in original.metrics.items()}, outcomes)
         if unsafe.points is not None and unsafe.points < 0:
-            raise InputError("unsafe", f"the original vehicle earns {unsafe.points + POINT_LOSS:g} points and has none to lose", CRITERIA)
+            raise InputError(
+                "unsafe",
+                f"the original vehicle earns {unsafe.points + POINT_LOSS:g} points and has none to lose",
+                CRITERIA,
+            )
         if unsafe == cls() and not (outcomes == COLLISION).any():
-            raise InputError("unsafe", "nothing collides, and the original vehicle has no safety degree to halve", CRITERIA)
+            raise InputError(
+                "unsafe", "nothing collides, and the original vehicle has no safety degree to halve", CRITERIA
+            )
         return unsafe
 
 

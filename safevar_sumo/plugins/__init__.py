@@ -26,6 +26,25 @@ from safevar_sumo.plugins.lookup import (
 )
 
 __all__ = [
-    "DIGEST_LENGTH", "Files", "Guard", "Lookup", "Member", "accepts", "add_import_folders", "added_import_folders",
-    "changed_files", "check_open_runs", "check_parameters", "digest_of", "digests", "file_by_name", "files_named_in",
-    "inherit_import_folders", "instance_of", "note_inputs", "open_rows", "read_only_copy", "unload_user_modules"]
+    "DIGEST_LENGTH",
+    "Files",
+    "Guard",
+    "Lookup",
+    "Member",
+    "accepts",
+    "add_import_folders",
+    "added_import_folders",
+    "changed_files",
+    "check_open_runs",
+    "check_parameters",
+    "digest_of",
+    "digests",
+    "file_by_name",
+    "files_named_in",
+    "inherit_import_folders",
+    "instance_of",
+    "note_inputs",
+    "open_rows",
+    "read_only_copy",
+    "unload_user_modules",
+]

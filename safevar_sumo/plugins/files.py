@@ -23,12 +23,28 @@ Files = dict[str, str]
 """Digests of files by the names that `digests` gives them."""
 LIBRARY_FOLDERS = ("site-packages", "dist-packages")
 """Names of folders of installed libraries; such folders may be anywhere."""
-KNOWN_FOLDERS = tuple(f"{folder}{os.sep}" for folder in sorted({
-    str(PACKAGE), str(STUDIES), str(NETWORKS),
-    *(os.path.realpath(sysconfig.get_path(name)) for name in ("stdlib", "platstdlib", "purelib", "platlib")),
-    *(os.path.realpath(os.path.join(prefix, name)) for prefix in (sys.prefix, sys.base_prefix, "/", "/usr", "/usr/local")
-      for name in ("bin", "etc", "include", "lib", "lib64", "sbin", "share")),
-    "/dev", "/proc", "/sys", "/System", "/Library", os.environ.get("SYSTEMROOT", "/dev")}))
+KNOWN_FOLDERS = tuple(
+    f"{folder}{os.sep}"
+    for folder in sorted(
+        {
+            str(PACKAGE),
+            str(STUDIES),
+            str(NETWORKS),
+            *(os.path.realpath(sysconfig.get_path(name)) for name in ("stdlib", "platstdlib", "purelib", "platlib")),
+            *(
+                os.path.realpath(os.path.join(prefix, name))
+                for prefix in (sys.prefix, sys.base_prefix, "/", "/usr", "/usr/local")
+                for name in ("bin", "etc", "include", "lib", "lib64", "sbin", "share")
+            ),
+            "/dev",
+            "/proc",
+            "/sys",
+            "/System",
+            "/Library",
+            os.environ.get("SYSTEMROOT", "/dev"),
+        }
+    )
+)
 """Folders without user code: of this package, the interpreter, installed libraries and the operating system."""
 CACHE_FOLDERS = ("__pycache__", ".cache", ".config")
 """Names of folders in which programs keep caches and settings."""
@@ -89,7 +105,11 @@ def note_inputs() -> Iterator[InputFiles]:
 def unload_user_modules() -> None:
     """Unload all modules that user code is made of, so that the next lookup loads them again."""
     for name in sorted(audit_hook.modules):
-        if (file := file_of_module(name)) and is_user_file(file) and name.partition(".")[0] not in ("safevar_sumo", "__main__"):
+        if (
+            (file := file_of_module(name))
+            and is_user_file(file)
+            and name.partition(".")[0] not in ("safevar_sumo", "__main__")
+        ):
             sys.modules.pop(name)
     audit_hook.modules.clear()
 
@@ -151,7 +171,7 @@ def _name_of(path: str, folders: Sequence[str], extra_parts: int = 0) -> str:
     for folder in (*folders, *_import_folders()):
         if not extra_parts and Path(path).is_relative_to(folder):
             return Path(path).relative_to(folder).as_posix()
-    return Path(*Path(path).parts[-2 - extra_parts:]).as_posix()
+    return Path(*Path(path).parts[-2 - extra_parts :]).as_posix()
 
 
 def file_by_name(name: str, folders: Sequence[str]) -> str:

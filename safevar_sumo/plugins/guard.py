@@ -53,8 +53,11 @@ def violation(candidate: Any, base: type) -> str:
 
 def contract_of(base: type) -> str:
     """What a class of this base must have, in words."""
-    methods = [f"{name}({', '.join(parameters)})" for name, parameters in _methods(base).items()
-               if getattr(getattr(base, name), "__isabstractmethod__", False)]
+    methods = [
+        f"{name}({', '.join(parameters)})"
+        for name, parameters in _methods(base).items()
+        if getattr(getattr(base, name), "__isabstractmethod__", False)
+    ]
     return f"a class such as {base.__module__.rpartition('.')[0]}.{base.__name__} with {', '.join(methods)}"
 
 
@@ -65,9 +68,17 @@ def completed(candidate: type, base: type) -> type:
 
 def _methods(base: type) -> dict[str, tuple[str, ...]]:
     """The public methods of a class, and the names of their parameters without default."""
-    functions = {name: value for name, value in vars(base).items() if inspect.isfunction(value) and not name.startswith("_")}
-    return {name: tuple(parameter.name for parameter in inspect.signature(function).parameters.values()
-                        if parameter.default is parameter.empty)[1:] for name, function in functions.items()}
+    functions = {
+        name: value for name, value in vars(base).items() if inspect.isfunction(value) and not name.startswith("_")
+    }
+    return {
+        name: tuple(
+            parameter.name
+            for parameter in inspect.signature(function).parameters.values()
+            if parameter.default is parameter.empty
+        )[1:]
+        for name, function in functions.items()
+    }
 
 
 def accepts(function: Any, count: int) -> bool:
@@ -136,8 +147,13 @@ class Guard(NamedTuple):
     folder: str = ""
     target: Any = None
 
-    def call(self, method: str, function: Callable[Parameters, Result], *arguments: Parameters.args,
-             **keywords: Parameters.kwargs) -> Result:
+    def call(
+        self,
+        method: str,
+        function: Callable[Parameters, Result],
+        *arguments: Parameters.args,
+        **keywords: Parameters.kwargs,
+    ) -> Result:
         """Call a function and return its result.
 
         Raises
@@ -168,7 +184,9 @@ class Guard(NamedTuple):
 
     def _wrong_result(self, result: str, method: str, expected: str) -> UserCodeError:
         place = self.definition(method)
-        return UserCodeError(self.source, f"{self.name} returned {result} from {method}{f' ({place})' if place else ''}", expected, place)
+        return UserCodeError(
+            self.source, f"{self.name} returned {result} from {method}{f' ({place})' if place else ''}", expected, place
+        )
 
     def definition(self, method: str) -> str:
         """File and line at which a method begins, else the class or function; "" for FMUs and compiled code."""
@@ -176,7 +194,11 @@ class Guard(NamedTuple):
         function = inspect.unwrap(getattr(target, method, target))
         code = getattr(function, "__code__", None)
         try:
-            return f"{code.co_filename}:{code.co_firstlineno}" if code else f"{inspect.getfile(target)}:{inspect.getsourcelines(target)[1]}"
+            return (
+                f"{code.co_filename}:{code.co_firstlineno}"
+                if code
+                else f"{inspect.getfile(target)}:{inspect.getsourcelines(target)[1]}"
+            )
         except (OSError, TypeError):
             return ""
 
@@ -193,8 +215,19 @@ class Guard(NamedTuple):
         except AttributeError:
             raise self._wrong_result(_short_text(value), method, f"an object with the attribute {name}") from None
 
-    def numbers(self, method: str, quantity: str, value: Any, shape: tuple[int, ...], lowest: float = -INFINITY, highest: float = INFINITY,
-                *, above: bool = False, infinite: bool = False, undefined: bool = False) -> FloatArray:
+    def numbers(
+        self,
+        method: str,
+        quantity: str,
+        value: Any,
+        shape: tuple[int, ...],
+        lowest: float = -INFINITY,
+        highest: float = INFINITY,
+        *,
+        above: bool = False,
+        infinite: bool = False,
+        undefined: bool = False,
+    ) -> FloatArray:
         """A result as a new array of float64; wrong values of runs that have ended become 0.
 
         Parameters
@@ -206,8 +239,13 @@ class Guard(NamedTuple):
         infinite, undefined
             Whether infinities and NaN are legal.
         """
-        bounds = "" if (lowest, highest) == (-INFINITY, INFINITY) else f" {'above' if above else 'from'} {lowest:g}" \
-            if highest == INFINITY else f" in {'(' if above else '['}{lowest:g}, {highest:g}]"
+        bounds = (
+            ""
+            if (lowest, highest) == (-INFINITY, INFINITY)
+            else f" {'above' if above else 'from'} {lowest:g}"
+            if highest == INFINITY
+            else f" in {'(' if above else '['}{lowest:g}, {highest:g}]"
+        )
         expected = f"numbers{bounds}, {'' if infinite else 'finite, '}shape {shape}"
         numbers = self._array(method, quantity, value, shape, "biuf", expected).astype(float)
         is_valid = (numbers > lowest) if above else (numbers >= lowest)
@@ -226,7 +264,9 @@ class Guard(NamedTuple):
         """A result as a new array of bool."""
         return self._array(method, quantity, value, shape, "b", f"truth values, shape {shape}").astype(bool)
 
-    def _array(self, method: str, quantity: str, value: Any, shape: tuple[int, ...], kinds: str, expected: str) -> np.ndarray:
+    def _array(
+        self, method: str, quantity: str, value: Any, shape: tuple[int, ...], kinds: str, expected: str
+    ) -> np.ndarray:
         try:
             array = np.asarray(value)
         except ValueError:
@@ -242,9 +282,13 @@ class Guard(NamedTuple):
         frames = [(frame.filename, frame.lineno) for frame in traceback.extract_tb(error.__traceback__)]
         if isinstance(error, SyntaxError) and error.filename:
             frames.append((error.filename, error.lineno))
-        frames = [frame for frame in frames if not frame[0].startswith((_PACKAGE_FOLDER, _STANDARD_LIBRARY_FOLDER, "<frozen"))]
+        frames = [
+            frame for frame in frames if not frame[0].startswith((_PACKAGE_FOLDER, _STANDARD_LIBRARY_FOLDER, "<frozen"))
+        ]
         user_frames = [frame for frame in frames if self.folder and frame[0].startswith(self.folder)]
-        frames_outside = [frame for frame in user_frames or frames if LIBRARY_FOLDER in self.folder or LIBRARY_FOLDER not in frame[0]]
+        frames_outside = [
+            frame for frame in user_frames or frames if LIBRARY_FOLDER in self.folder or LIBRARY_FOLDER not in frame[0]
+        ]
         return "{}:{}".format(*frames_outside[-1]) if frames_outside else ""
 
 

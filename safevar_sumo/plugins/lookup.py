@@ -77,7 +77,9 @@ class Lookup(NamedTuple):
         member = self.find(shipped, name, key)
         if member.guard is None:
             return member
-        base = next((base for base in bases if inspect.isclass(member.target) and issubclass(member.target, base)), bases[-1])
+        base = next(
+            (base for base in bases if inspect.isclass(member.target) and issubclass(member.target, base)), bases[-1]
+        )
         if reason := violation(member.target, base):
             expected = "; or ".join([*map(contract_of, bases), *filter(None, [otherwise])])
             raise UserCodeError(self.source, f"{member.guard.name} {reason}", expected, member.guard.definition(""))
@@ -93,7 +95,10 @@ class Lookup(NamedTuple):
         """
         if member.guard is None or not self.folders:
             return dict(parameters)
-        return {name: value if name == "network" else self._with_paths(value, f"{key}.{name}") for name, value in parameters.items()}
+        return {
+            name: value if name == "network" else self._with_paths(value, f"{key}.{name}")
+            for name, value in parameters.items()
+        }
 
     def _with_paths(self, value: Any, key: str) -> Any:
         if isinstance(value, dict):
@@ -104,13 +109,20 @@ class Lookup(NamedTuple):
             return value
         path = file_beside(value, self.folders)
         if not path and file_beside(value, [os.getcwd()]):
-            raise InputError(self.source, f"{key} = {value!r}: that file lies in the working directory, not beside the study's file",
-                             f"a path relative to {self.folders[0]}")
+            raise InputError(
+                self.source,
+                f"{key} = {value!r}: that file lies in the working directory, not beside the study's file",
+                f"a path relative to {self.folders[0]}",
+            )
         return path or value
 
     def _import(self, name: str, guard: Guard) -> ModuleType:
         if name.partition(".")[0] == "__main__":
-            raise InputError(self.source, f"{guard.name}: other processes cannot import from __main__", "a module in a file of its own")
+            raise InputError(
+                self.source,
+                f"{guard.name}: other processes cannot import from __main__",
+                "a module in a file of its own",
+            )
         folders = list(dict.fromkeys((*self.folders, os.getcwd())))
         importlib.invalidate_caches()
         add_import_folders(folders)
@@ -171,8 +183,14 @@ def instance_of(member: Member, parameters: Mapping[str, Any], name: str, key: s
     return (member.guard or Guard(source, name)).call("__init__", cls, **parameters)
 
 
-def check_parameters(function: Callable[..., Any], arguments: tuple[Any, ...], parameters: Mapping[str, Any], name: str, key: str,
-                     source: str) -> None:
+def check_parameters(
+    function: Callable[..., Any],
+    arguments: tuple[Any, ...],
+    parameters: Mapping[str, Any],
+    name: str,
+    key: str,
+    source: str,
+) -> None:
     """Raise an `InputError` if a class or function does not take these parameters besides the arguments."""
     try:
         inspect.signature(function).bind(*arguments, **parameters)

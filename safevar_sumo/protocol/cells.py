@@ -28,8 +28,12 @@ TARGET_DECELERATION, TARGET_HEADWAY = 4.0, 1.0
 """The target's deceleration [m/s^2] and its headway at the start [s] in CCRb and CMRb; robustness layers vary both."""
 
 
-class CellRow(Struct, frozen=True, forbid_unknown_fields=True,
-              rename={"vut_speed": "vut", "range_letters": "ranges", "target_speed": "target", "has_function_choice": "choice"}):
+class CellRow(
+    Struct,
+    frozen=True,
+    forbid_unknown_fields=True,
+    rename={"vut_speed": "vut", "range_letters": "ranges", "target_speed": "target", "has_function_choice": "choice"},
+):
     """A row of a matrix: speeds of the vehicle under test (VUT) and of the target [km/h].
 
     Letters of columns: S (standard range), E (extended range), - (no cell); `has_function_choice`: the manufacturer chooses AEB or FCW.
@@ -44,8 +48,12 @@ class CellRow(Struct, frozen=True, forbid_unknown_fields=True,
         return self.range_letters[column] != "-"
 
 
-class CellMatrix(Struct, frozen=True, forbid_unknown_fields=True,
-                 rename={"test_name": "test", "name_cell": "label", "first_cell": "first", "function_column": "function"}):
+class CellMatrix(
+    Struct,
+    frozen=True,
+    forbid_unknown_fields=True,
+    rename={"test_name": "test", "name_cell": "label", "first_cell": "first", "function_column": "function"},
+):
     """A matrix of a test; a test that is driven by day and by night has one matrix for each `light`.
 
     In the official template the matrix is on `sheet`, its name in `name_cell`, its first colour in `first_cell`, and the function of each
@@ -80,7 +88,9 @@ class Condition(Struct, frozen=True, forbid_unknown_fields=True, rename={"text":
     criterion: str
 
 
-class Layer(Struct, frozen=True, forbid_unknown_fields=True, rename={"test_name": "test", "name": "layer", "claim_cell": "cell"}):
+class Layer(
+    Struct, frozen=True, forbid_unknown_fields=True, rename={"test_name": "test", "name": "layer", "claim_cell": "cell"}
+):
     """A robustness layer that counts for a test; in the official template, `claim_cell` on `sheet` states whether the layer holds."""
 
     test_name: str
@@ -173,9 +183,20 @@ def _leading_number(condition: str) -> float:
     return float(match[1])
 
 
-class Protocol(Struct, frozen=True, eq=False, forbid_unknown_fields=True, dict=True, rename={
-        "calculator_version": "calculator", "starts_by_vut_speed": "mitigation", "starts_by_measure": "criteria",
-        "points_by_test": "scenarios", "matrices": "blocks"}):
+class Protocol(
+    Struct,
+    frozen=True,
+    eq=False,
+    forbid_unknown_fields=True,
+    dict=True,
+    rename={
+        "calculator_version": "calculator",
+        "starts_by_vut_speed": "mitigation",
+        "starts_by_measure": "criteria",
+        "points_by_test": "scenarios",
+        "matrices": "blocks",
+    },
+):
     """A protocol; `points_by_test` holds the points of every test, simulated or not, as in `CellMatrix.points`.
 
     Measured values at which colours begin: for `mitigation` in `starts_by_vut_speed`, for other measures in `starts_by_measure`.
@@ -197,8 +218,11 @@ class Protocol(Struct, frozen=True, eq=False, forbid_unknown_fields=True, dict=T
     @cached_property
     def matrix_cell_numbers(self) -> dict[tuple[str, int, int], int]:
         """Indices in `cells` of the cells of the matrices, by matrix name, row and column."""
-        return {(cell.matrix.name, cell.row, cell.column): number for number, cell in enumerate(self.cells)
-                if not cell.is_robustness_cell}
+        return {
+            (cell.matrix.name, cell.row, cell.column): number
+            for number, cell in enumerate(self.cells)
+            if not cell.is_robustness_cell
+        }
 
     @property
     def tests(self) -> dict[str, list[CellMatrix]]:
@@ -221,9 +245,16 @@ class Protocol(Struct, frozen=True, eq=False, forbid_unknown_fields=True, dict=T
             for row_number, row in enumerate(matrix.rows):
                 for column, letter in enumerate(row.range_letters):
                     if row.has_cell(column):
-                        yield Cell(matrix, row_number, column, range_or_layer=STANDARD if letter == "S" else EXTENDED, condition="",
-                                   criterion="", judged_by=WARNING if matrix.is_rated_by_warning(row_number) else matrix.criterion,
-                                   target_speed=matrix.target_speeds[column] if row.target_speed is None else row.target_speed)
+                        yield Cell(
+                            matrix,
+                            row_number,
+                            column,
+                            range_or_layer=STANDARD if letter == "S" else EXTENDED,
+                            condition="",
+                            criterion="",
+                            judged_by=WARNING if matrix.is_rated_by_warning(row_number) else matrix.criterion,
+                            target_speed=matrix.target_speeds[column] if row.target_speed is None else row.target_speed,
+                        )
 
     def _iterate_robustness_cells(self) -> Iterator[Cell]:
         standard_cells = [cell for cell in self._iterate_matrix_cells() if cell.range_or_layer == STANDARD]
@@ -232,19 +263,24 @@ class Protocol(Struct, frozen=True, eq=False, forbid_unknown_fields=True, dict=T
                 speed_increase = _leading_number(condition.text) if layer.name == SPEED else 0.0
                 for cell in standard_cells:
                     if cell.matrix.test_name == layer.test_name:
-                        yield cell._replace(range_or_layer=layer.name, condition=condition.text, criterion=condition.criterion,
-                                            target_speed=cell.target_speed + speed_increase)
+                        yield cell._replace(
+                            range_or_layer=layer.name,
+                            condition=condition.text,
+                            criterion=condition.criterion,
+                            target_speed=cell.target_speed + speed_increase,
+                        )
 
 
 def cells_of_part(protocol: Protocol, part: int, parts: int) -> list[int]:
     """Numbers of the cells in one of `parts` parts; cells with the same network share a part as far as possible."""
+
     def network_of(number: int) -> tuple[Any, ...]:
         cell = protocol.cells[number]
         variation = (cell.scenario.parameters.get("heading", 0.0), "start_share" in cell.scenario.parameters)
         return cell.scenario.model, cell.matrix.test_name in ("CPNA", "CPFA", "CPNCO"), variation, cell.matrix.test_name
 
     numbers = sorted(range(len(protocol.cells)), key=network_of)
-    return numbers[len(numbers) * part // parts:len(numbers) * (part + 1) // parts]
+    return numbers[len(numbers) * part // parts : len(numbers) * (part + 1) // parts]
 
 
 @lru_cache

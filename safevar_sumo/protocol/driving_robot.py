@@ -38,7 +38,9 @@ class DrivingRobot:
         Time between two commands [s].
     """
 
-    def __init__(self, points: Sequence[Point], vehicle: Vehicle, prepared: Any, state: VehicleState, step: float) -> None:
+    def __init__(
+        self, points: Sequence[Point], vehicle: Vehicle, prepared: Any, state: VehicleState, step: float
+    ) -> None:
         n = len(state.speed)
         speeds = [point.scenario.test_speed for point in points]
         self._test_speed = np.repeat([np.nan if speed is None else speed for speed in speeds], n // len(points))
@@ -65,12 +67,18 @@ class DrivingRobot:
         self._has_braked |= command.brake > self._brake_threshold
         system_pedal = command.throttle - command.brake
         self._max_system_pedal = np.maximum(self._max_system_pedal, system_pedal)
-        self._is_driving = ~self._has_braked & (system_pedal >= np.minimum(self._max_system_pedal, self._start_pedal) - ACTION_THRESHOLD)
+        self._is_driving = ~self._has_braked & (
+            system_pedal >= np.minimum(self._max_system_pedal, self._start_pedal) - ACTION_THRESHOLD
+        )
         error = np.where(self._is_driving, error, 0.0)
-        self._integral = np.minimum(np.maximum(self._integral - error * self._step, -1 / INTEGRAL_GAIN), 1 / INTEGRAL_GAIN)
+        self._integral = np.minimum(
+            np.maximum(self._integral - error * self._step, -1 / INTEGRAL_GAIN), 1 / INTEGRAL_GAIN
+        )
         pedal = self._start_pedal - PROPORTIONAL_GAIN * error + INTEGRAL_GAIN * self._integral
-        robot_command = Command(np.where(self._is_driving, np.minimum(np.maximum(pedal, 0.0), 1.0), command.throttle),
-                                np.where(self._is_driving, np.minimum(np.maximum(-pedal, 0.0), 1.0), command.brake))
+        robot_command = Command(
+            np.where(self._is_driving, np.minimum(np.maximum(pedal, 0.0), 1.0), command.throttle),
+            np.where(self._is_driving, np.minimum(np.maximum(-pedal, 0.0), 1.0), command.brake),
+        )
         return robot_command, self._vehicle.hold_gear(self._prepared, state, self._is_driving)
 
     @property

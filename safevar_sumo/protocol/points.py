@@ -10,7 +10,17 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from safevar_sumo.protocol.cells import EXTENDED, MITIGATION, NO_WORSE, NOT_RED, STANDARD, WARNING, CellMatrix, Layer, Protocol
+from safevar_sumo.protocol.cells import (
+    EXTENDED,
+    MITIGATION,
+    NO_WORSE,
+    NOT_RED,
+    STANDARD,
+    WARNING,
+    CellMatrix,
+    Layer,
+    Protocol,
+)
 from safevar_sumo.records import BoolArray, CellResults, FloatArray
 
 COLOURS = ("green", "yellow", "orange", "brown", "red")
@@ -39,9 +49,14 @@ class RequiredCells(NamedTuple):
 
     def numbers(self, protocol: Protocol) -> list[int]:
         """Numbers of these cells."""
-        return [number for number, cell in enumerate(protocol.cells)
-                if cell.matrix.test_name == self.test_name and cell.range_or_layer == STANDARD and cell.vut_speed <= self.max_speed
-                and self.impact_location in (None, cell.impact_location)]
+        return [
+            number
+            for number, cell in enumerate(protocol.cells)
+            if cell.matrix.test_name == self.test_name
+            and cell.range_or_layer == STANDARD
+            and cell.vut_speed <= self.max_speed
+            and self.impact_location in (None, cell.impact_location)
+        ]
 
 
 REQUIRED_CELLS = RequiredCells("CCRs", 20.0)
@@ -101,20 +116,37 @@ def _columns_of(protocol: Protocol) -> _Columns:
     numbers_by_measure: dict[tuple[str, str], list[int]] = {}
     for number, cell in enumerate(cells):
         listed_speed = str(int(min(cell.vut_speed, max(float(speed) for speed in protocol.starts_by_vut_speed))))
-        numbers_by_measure.setdefault((cell.judged_by, listed_speed if cell.judged_by == MITIGATION else ""), []).append(number)
+        numbers_by_measure.setdefault(
+            (cell.judged_by, listed_speed if cell.judged_by == MITIGATION else ""), []
+        ).append(number)
     bands = []
     for (judged_by, speed), numbers in numbers_by_measure.items():
         starts = protocol.starts_by_vut_speed[speed] if speed else protocol.starts_by_measure[judged_by]
-        bands.append((np.array(numbers), [(COLOURS.index(name), start) for name, start in starts.items()], judged_by == WARNING))
+        bands.append(
+            (np.array(numbers), [(COLOURS.index(name), start) for name, start in starts.items()], judged_by == WARNING)
+        )
 
     def cells_where(condition: object) -> npt.NDArray[np.intp]:
         return np.array([number for number, cell in enumerate(cells) if condition(cell)], dtype=np.intp)  # type: ignore[operator]
 
-    ranges = {(matrix.name, name): cells_where(lambda cell, b=matrix, n=name: cell.matrix is b and cell.range_or_layer == n)
-              for matrix in protocol.matrices for name in (STANDARD, EXTENDED)}
-    variations = [(layer, condition.criterion, cells_where(lambda cell, key=(layer.test_name, layer.name, condition.text): (
-        cell.matrix.test_name, cell.range_or_layer, cell.condition) == key))
-              for layer in protocol.layers for condition in layer.simulated_conditions]
+    ranges = {
+        (matrix.name, name): cells_where(lambda cell, b=matrix, n=name: cell.matrix is b and cell.range_or_layer == n)
+        for matrix in protocol.matrices
+        for name in (STANDARD, EXTENDED)
+    }
+    variations = [
+        (
+            layer,
+            condition.criterion,
+            cells_where(
+                lambda cell, key=(layer.test_name, layer.name, condition.text): (
+                    (cell.matrix.test_name, cell.range_or_layer, cell.condition) == key
+                )
+            ),
+        )
+        for layer in protocol.layers
+        for condition in layer.simulated_conditions
+    ]
     nominal_cells = np.array([protocol.matrix_cell_numbers[cell.matrix.name, cell.row, cell.column] for cell in cells])
     return _Columns(bands, nominal_cells, ranges, variations, np.array(REQUIRED_CELLS.numbers(protocol), dtype=np.intp))
 
@@ -143,12 +175,16 @@ def points_of(protocol: Protocol, results: CellResults, claims: Mapping[str, Seq
         shares = _layer_share(protocol, test, layers, claimed=(claims or {}).get(test, ()), m=len(colours))
         for matrix in matrices:
             points = np.stack([*_range_points(matrix, colours, columns), shares * matrix.points[2]], axis=1)
-            points[:, 2] = np.where(_rounded_share(points[:, 0]) >= _rounded_share(ROBUSTNESS_SHARE * matrix.points[0]), points[:, 2], 0.0)
+            points[:, 2] = np.where(
+                _rounded_share(points[:, 0]) >= _rounded_share(ROBUSTNESS_SHARE * matrix.points[0]), points[:, 2], 0.0
+            )
             tests[matrix.name] = np.where(fails[:, np.newaxis], 0.0, points)
     return Points(colours=colours, tests=tests, layers=layers, fails=fails)
 
 
-def _range_points(matrix: CellMatrix, colours: npt.NDArray[np.int8], columns: _Columns) -> tuple[FloatArray, FloatArray]:
+def _range_points(
+    matrix: CellMatrix, colours: npt.NDArray[np.int8], columns: _Columns
+) -> tuple[FloatArray, FloatArray]:
     """Points of the standard range and of the extended range, shape (M,) each."""
     weights = WEIGHTS[colours[:, columns.ranges[matrix.name, STANDARD]]]
     total = np.zeros(len(colours))
@@ -159,8 +195,11 @@ def _range_points(matrix: CellMatrix, colours: npt.NDArray[np.int8], columns: _C
     share_points = _rounded_share(share * matrix.points[1])
     earned_points = np.zeros(len(colours))
     for minimum, earned_share in reversed(EXTENDED_STEPS):
-        earned_points = np.where(share_points >= _rounded_share(np.array(minimum * matrix.points[1])), earned_share * matrix.points[1],
-                                 earned_points)
+        earned_points = np.where(
+            share_points >= _rounded_share(np.array(minimum * matrix.points[1])),
+            earned_share * matrix.points[1],
+            earned_points,
+        )
     return total / weights.shape[1] * matrix.points[0], earned_points
 
 
@@ -179,7 +218,9 @@ def _which_layers_hold(protocol: Protocol, colours: npt.NDArray[np.int8]) -> dic
     return holds
 
 
-def _layer_share(protocol: Protocol, test: str, layers: Mapping[tuple[str, str], BoolArray], claimed: Sequence[str], m: int) -> FloatArray:
+def _layer_share(
+    protocol: Protocol, test: str, layers: Mapping[tuple[str, str], BoolArray], claimed: Sequence[str], m: int
+) -> FloatArray:
     """Share of a test's layers that hold or are claimed, for M = `m` vehicles; shape (M,)."""
     test_layers, count = protocol.layers_of(test), np.zeros(m)
     for layer in test_layers:

@@ -35,7 +35,11 @@ class Rater:
 def rated_quantities(runs: SimulationRuns) -> tuple[FloatArray, FloatArray, Any]:
     """Rated quantities of N simulations of a cell: impact [km/h], warning [s], validity; shape (N,) each; see `CellResults`."""
     warning = np.broadcast_to(runs.warning_ttc, runs.relative_speed.shape)
-    return runs.relative_speed * KMH_PER_MS, warning, (runs.outcome != Outcome.INVALID_TEST) & (runs.outcome != Outcome.SIMULATOR_ERROR)
+    return (
+        runs.relative_speed * KMH_PER_MS,
+        warning,
+        (runs.outcome != Outcome.INVALID_TEST) & (runs.outcome != Outcome.SIMULATOR_ERROR),
+    )
 
 
 def join_cells(quantities: Sequence[tuple[FloatArray, FloatArray, Any]]) -> CellResults:
@@ -72,8 +76,11 @@ def rater_of(study: Study, source: str) -> Rater | None:
             if claimed not in is_simulated:
                 raise unknown_name(source, f"{key}: {claimed!r} does not count for {test}", claimed, is_simulated)
             if is_simulated[claimed]:
-                raise InputError(source, f"{key}: {claimed!r} is simulated for {test} and cannot be claimed",
-                                 "one of " + ", ".join(name for name in is_simulated if not is_simulated[name]))
+                raise InputError(
+                    source,
+                    f"{key}: {claimed!r} is simulated for {test} and cannot be claimed",
+                    "one of " + ", ".join(name for name in is_simulated if not is_simulated[name]),
+                )
     return Rater(protocol=protocol, claims=study.rating.claims)
 
 
@@ -100,8 +107,13 @@ def darken(weather: Weather) -> Weather:
     if weather.light == "night":
         return weather
     name = "night" if weather == weather_of("clear", "weather") else f"{weather.name} by night"
-    return replace(weather, name=name, visibility=weather.visibility * night.visibility, light="night",
-                   recognition_delay=weather.recognition_delay + night.recognition_delay)
+    return replace(
+        weather,
+        name=name,
+        visibility=weather.visibility * night.visibility,
+        light="night",
+        recognition_delay=weather.recognition_delay + night.recognition_delay,
+    )
 
 
 def expand_protocol(study: Study, weather: Weather) -> Study:
@@ -111,7 +123,13 @@ def expand_protocol(study: Study, weather: Weather) -> Study:
     weather_by_night, tests = darken(weather), []
     for cell in protocol_of(study.matrix.protocol).cells:
         scenario = cell.scenario
-        tests.append(MatrixTest(name=cell.name, model=scenario.model, parameters={**shared_parameters, **scenario.parameters},
-                                weathers=[weather_by_night if scenario.night else weather]))
+        tests.append(
+            MatrixTest(
+                name=cell.name,
+                model=scenario.model,
+                parameters={**shared_parameters, **scenario.parameters},
+                weathers=[weather_by_night if scenario.night else weather],
+            )
+        )
     no_parameters = replace(study.scenario, parameters={})  # each test has its own parameters
     return replace(study, matrix=MatrixTable(tests=tests), scenario=no_parameters)

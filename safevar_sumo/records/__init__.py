@@ -20,6 +20,29 @@ from safevar_sumo.records.evaluations import CellResults, Evaluations
 from safevar_sumo.records.runs import NO_CONTACT, Contact, Encounter, Outcome, SimulationRuns, Trace
 
 __all__ = [
-    "ALL_TRUE", "GRAVITY", "KMH_PER_MS", "NO_CONTACT", "STANDSTILL", "TIME_DECIMALS", "TIME_ROUNDING", "TOUCH_OVERLAP", "UNDEFINED", "ZERO",
-    "BoolArray", "CellResults", "Command", "Contact", "Encounter", "Evaluations", "FloatArray", "IntArray", "Nominal", "Observation",
-    "Outcome", "PedalTables", "SimulationRuns", "Trace", "finite_or_none"]
+    "ALL_TRUE",
+    "GRAVITY",
+    "KMH_PER_MS",
+    "NO_CONTACT",
+    "STANDSTILL",
+    "TIME_DECIMALS",
+    "TIME_ROUNDING",
+    "TOUCH_OVERLAP",
+    "UNDEFINED",
+    "ZERO",
+    "BoolArray",
+    "CellResults",
+    "Command",
+    "Contact",
+    "Encounter",
+    "Evaluations",
+    "FloatArray",
+    "IntArray",
+    "Nominal",
+    "Observation",
+    "Outcome",
+    "PedalTables",
+    "SimulationRuns",
+    "Trace",
+    "finite_or_none",
+]

@@ -97,17 +97,29 @@ class Evaluations:
     def take(self, rows: Sequence[int] | npt.NDArray[np.intp] | BoolArray) -> Evaluations:
         """The evaluations of `rows`, in that order."""
         return replace(
-            self, settings=self.settings[rows], outcome=self.outcome[rows], collision_speed=self.collision_speed[rows],
-            metrics={name: values[rows] for name, values in self.metrics.items()}, f_diff=self.f_diff[rows],
-            f_num_diff=self.f_num_diff[rows], cells=None if self.cells is None else self.cells.of(rows),
-            worst_points=None if self.worst_points is None else self.worst_points[rows])
+            self,
+            settings=self.settings[rows],
+            outcome=self.outcome[rows],
+            collision_speed=self.collision_speed[rows],
+            metrics={name: values[rows] for name, values in self.metrics.items()},
+            f_diff=self.f_diff[rows],
+            f_num_diff=self.f_num_diff[rows],
+            cells=None if self.cells is None else self.cells.of(rows),
+            worst_points=None if self.worst_points is None else self.worst_points[rows],
+        )
 
     @classmethod
     def none(cls, n: int, metrics: Iterable[str]) -> Evaluations:
         """Empty evaluations, for settings of `n` characteristics."""
         empty_array = np.zeros(0)
-        return cls(settings=np.zeros((0, n)), outcome=np.zeros(0, dtype="U16"), collision_speed=empty_array,
-                   metrics=dict.fromkeys(metrics, empty_array), f_diff=empty_array, f_num_diff=empty_array)
+        return cls(
+            settings=np.zeros((0, n)),
+            outcome=np.zeros(0, dtype="U16"),
+            collision_speed=empty_array,
+            metrics=dict.fromkeys(metrics, empty_array),
+            f_diff=empty_array,
+            f_num_diff=empty_array,
+        )
 
     @classmethod
     def concatenate(cls, batches: Sequence[Evaluations]) -> Evaluations:
@@ -115,18 +127,29 @@ class Evaluations:
 
         There are `cells` only if all batches have them; the worst point of a batch without `worst_points` is the first.
         """
+
         def join(name: str) -> np.ndarray:
             return np.concatenate([getattr(batch, name) for batch in batches])
 
         cells = [batch.cells for batch in batches if batch.cells is not None]
-        points = [np.zeros(len(batch), dtype=np.intp) if batch.worst_points is None else batch.worst_points
-                  for batch in batches]
+        points = [
+            np.zeros(len(batch), dtype=np.intp) if batch.worst_points is None else batch.worst_points
+            for batch in batches
+        ]
         return cls(
-            settings=join("settings"), outcome=join("outcome"), collision_speed=join("collision_speed"),
-            metrics={name: np.concatenate([batch.metrics.get(name, np.full(len(batch), np.nan)) for batch in batches])
-                     for name in dict.fromkeys(name for batch in batches for name in batch.metrics)},
-            f_diff=join("f_diff"), f_num_diff=join("f_num_diff"),
+            settings=join("settings"),
+            outcome=join("outcome"),
+            collision_speed=join("collision_speed"),
+            metrics={
+                name: np.concatenate([batch.metrics.get(name, np.full(len(batch), np.nan)) for batch in batches])
+                for name in dict.fromkeys(name for batch in batches for name in batch.metrics)
+            },
+            f_diff=join("f_diff"),
+            f_num_diff=join("f_num_diff"),
             reasons={setting: reason for batch in batches for setting, reason in batch.reasons.items()},
             files={name: digest for batch in batches for name, digest in batch.files.items()},
             worst_points=None if all(batch.worst_points is None for batch in batches) else np.concatenate(points),
-            cells=CellResults._make(map(np.concatenate, zip(*cells, strict=True))) if len(cells) == len(batches) else None)
+            cells=CellResults._make(map(np.concatenate, zip(*cells, strict=True)))
+            if len(cells) == len(batches)
+            else None,
+        )

@@ -106,14 +106,19 @@ class SimulationRuns:
 
     def of(self, vehicles: slice) -> SimulationRuns:
         """The runs of some of the vehicles."""
+
         def select(values: np.ndarray) -> np.ndarray:
             return values[vehicles] if values.ndim else values
 
         return SimulationRuns(
-            trace=self.trace.of(vehicles), encounter=Encounter._make(values[:, vehicles] for values in self.encounter),
-            outcome=self.outcome[vehicles], collision_speed=self.collision_speed[vehicles],
-            contact=Contact._make(map(select, self.contact)), test_speed_error=select(self.test_speed_error),
-            warning_ttc=select(self.warning_ttc))
+            trace=self.trace.of(vehicles),
+            encounter=Encounter._make(values[:, vehicles] for values in self.encounter),
+            outcome=self.outcome[vehicles],
+            collision_speed=self.collision_speed[vehicles],
+            contact=Contact._make(map(select, self.contact)),
+            test_speed_error=select(self.test_speed_error),
+            warning_ttc=select(self.warning_ttc),
+        )
 
     def nearest(self, vehicle: int) -> int | None:
         """The sample of the impact or, without a collision, of the smallest separation in conflict; None if never in conflict."""
@@ -121,7 +126,11 @@ class SimulationRuns:
         if np.isfinite(self.collision_speed[vehicle]):
             return int(np.flatnonzero(active)[-1])
         in_conflict = active & self.encounter.in_conflict[:, vehicle]
-        return int(np.argmin(np.where(in_conflict, self.encounter.separation[:, vehicle], np.inf))) if in_conflict.any() else None
+        return (
+            int(np.argmin(np.where(in_conflict, self.encounter.separation[:, vehicle], np.inf)))
+            if in_conflict.any()
+            else None
+        )
 
     @property
     def relative_speed(self) -> FloatArray:
@@ -133,8 +142,10 @@ class SimulationRuns:
         trace, vehicles = self.trace, np.arange(len(self.collision_speed))
         last_sample = len(trace.time) - 1 - np.argmax(trace.active[::-1], axis=0)
         obstacle_speed = np.broadcast_to(trace.obstacle_speed, trace.speed.shape)
-        (first_speed, end_speed), (gap, gap_after) = (([values[np.maximum(last_sample - 1, 0), vehicles], values[last_sample, vehicles]])
-                                                         for values in (trace.speed - obstacle_speed, trace.gap))
+        (first_speed, end_speed), (gap, gap_after) = (
+            ([values[np.maximum(last_sample - 1, 0), vehicles], values[last_sample, vehicles]])
+            for values in (trace.speed - obstacle_speed, trace.gap)
+        )
         gap_closes = (gap > -TOUCH_OVERLAP) & np.isfinite(gap) & (gap_after <= 0) & (first_speed > 0)
         distance = np.where(gap_closes, np.maximum(gap, 0.0), 0.0)
         squared_speed = first_speed * first_speed + 2 * (end_speed - first_speed) / trace.step * distance

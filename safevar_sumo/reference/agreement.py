@@ -85,33 +85,43 @@ class Agreement:
     def sentences(self) -> list[str]:
         """Sentences about collisions, and about errors by the safety degree here."""
         counts, speeds = self.collisions, {side: two_decimals(speed) for side, speed in self.collision_speed.items()}
-        lines = [f"Collisions: {counts['reference']} in the reference, {counts['here']} here, {counts['both']} in "
-                 "both: precision "
-                 f"{two_decimals(self.precision)}, recall {two_decimals(self.recall)}; their mean speed is "
-                 f"{speeds['reference']} m/s in "
-                 f"the reference, {speeds['here']} m/s here."]
+        lines = [
+            f"Collisions: {counts['reference']} in the reference, {counts['here']} here, {counts['both']} in "
+            "both: precision "
+            f"{two_decimals(self.precision)}, recall {two_decimals(self.recall)}; their mean speed is "
+            f"{speeds['reference']} m/s in "
+            f"the reference, {speeds['here']} m/s here."
+        ]
         if self.undecided["within_repeats"] is not None:
-            lines.append(f"Of {self.undecided['differ']} settings that collide only in the reference or only here, "
-                         f"{self.undecided['within_repeats']} may collide or not within the scatter of repeats.")
-        bins = ", ".join(f"{part['lowest']:.2f} to {part['highest']:.2f}: {part['bias']:+.2f}"
-                         for part in self.by_predicted)
+            lines.append(
+                f"Of {self.undecided['differ']} settings that collide only in the reference or only here, "
+                f"{self.undecided['within_repeats']} may collide or not within the scatter of repeats."
+            )
+        bins = ", ".join(
+            f"{part['lowest']:.2f} to {part['highest']:.2f}: {part['bias']:+.2f}" for part in self.by_predicted
+        )
         return [*lines, f"Mean error by the safety degree here: {bins}."]
 
 
-def measure_agreement(reference: ReferenceData, evaluations: Evaluations, study: Study,
-                      original: Evaluations) -> Agreement:
+def measure_agreement(
+    reference: ReferenceData, evaluations: Evaluations, study: Study, original: Evaluations
+) -> Agreement:
     """Compare evaluations of the reference's settings with the reference, row by row, and the original vehicle with the
     study's values.
     """
     pairs = {name: _defined_pairs(values, evaluations.metrics[name]) for name, values in reference.metrics.items()}
     errors = {name: _mean(np.abs(here - there)) for name, (there, here) in pairs.items()}
     both_collide, differ = reference.collided & evaluations.collided, reference.collided != evaluations.collided
-    counts = {"reference": int(reference.collided.sum()), "here": int(evaluations.collided.sum()),
-              "both": int(both_collide.sum())}
+    counts = {
+        "reference": int(reference.collided.sum()),
+        "here": int(evaluations.collided.sum()),
+        "both": int(both_collide.sum()),
+    }
     degrees, repeatability = reference.metrics[SAFETY_DEGREE], study.repeatability.get(SAFETY_DEGREE)
     distance = np.minimum(np.abs(degrees), np.abs(evaluations.f_safe))
-    within = None if repeatability is None else int(np.count_nonzero(differ & (distance <= SCATTER_WIDTH
-                                                                               * repeatability)))
+    within = (
+        None if repeatability is None else int(np.count_nonzero(differ & (distance <= SCATTER_WIDTH * repeatability)))
+    )
     error = evaluations.f_safe - degrees
     return Agreement(
         rows=len(evaluations),
@@ -119,20 +129,31 @@ def measure_agreement(reference: ReferenceData, evaluations: Evaluations, study:
         mean_absolute_error=errors,
         bias={name: _mean(here - there) for name, (there, here) in pairs.items()},
         collisions=counts,
-        original={name: {"reference": study.published.get(name), "here": finite_or_none(values[0])}
-                  for name, values in original.metrics.items()},
+        original={
+            name: {"reference": study.published.get(name), "here": finite_or_none(values[0])}
+            for name, values in original.metrics.items()
+        },
         precision=counts["both"] / counts["here"] if counts["here"] else None,
         recall=counts["both"] / counts["reference"] if counts["reference"] else None,
-        collision_speed={"reference": _mean(-degrees[both_collide]),
-                         "here": _mean(evaluations.collision_speed[both_collide])},
-        in_repeats={name: None if error is None or name not in study.repeatability else error
-                    / study.repeatability[name]
-                    for name, error in errors.items()},
+        collision_speed={
+            "reference": _mean(-degrees[both_collide]),
+            "here": _mean(evaluations.collision_speed[both_collide]),
+        },
+        in_repeats={
+            name: None if error is None or name not in study.repeatability else error / study.repeatability[name]
+            for name, error in errors.items()
+        },
         undecided={"differ": int(differ.sum()), "within_repeats": within},
-        by_predicted=[{"lowest": float(evaluations.f_safe[rows].min()),
-                       "highest": float(evaluations.f_safe[rows].max()),
-                       "rows": len(rows), "bias": float(error[rows].mean())}
-                      for rows in _bins_of(np.where(np.isnan(error), np.nan, evaluations.f_safe))])
+        by_predicted=[
+            {
+                "lowest": float(evaluations.f_safe[rows].min()),
+                "highest": float(evaluations.f_safe[rows].max()),
+                "rows": len(rows),
+                "bias": float(error[rows].mean()),
+            }
+            for rows in _bins_of(np.where(np.isnan(error), np.nan, evaluations.f_safe))
+        ],
+    )
 
 
 def _defined_pairs(values: FloatArray, other_values: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -162,8 +183,9 @@ def _mean(values: FloatArray) -> float | None:
     return float(np.mean(values)) if values.size else None
 
 
-def plot_agreement(path: Path, title: str, characteristics: CharacteristicSet, reference: ReferenceData,
-                   evaluations: Evaluations) -> None:
+def plot_agreement(
+    path: Path, title: str, characteristics: CharacteristicSet, reference: ReferenceData, evaluations: Evaluations
+) -> None:
     """Draw simulated over reference values, errors over simulated values, and errors of the safety degree over each
     characteristic.
 
@@ -178,12 +200,17 @@ def plot_agreement(path: Path, title: str, characteristics: CharacteristicSet, r
         label = f"{METRICS[metric].title} [{as_formula(METRICS[metric].unit)}]"
         _draw_scatter(axes[i], values, here, reference.collided | evaluations.collided, label)
         _draw_error(axes[len(reference.metrics) + i], here, here - values, f"here: {label}", "mean error")
-    error, panels = evaluations.f_safe - reference.metrics[SAFETY_DEGREE], axes[2 * len(reference.metrics):]
+    error, panels = evaluations.f_safe - reference.metrics[SAFETY_DEGREE], axes[2 * len(reference.metrics) :]
     for axis in panels[1:]:
         axis.sharey(panels[0])
     for axis, characteristic, values in zip(panels, characteristics, evaluations.settings.T, strict=True):
-        _draw_error(axis, values, error, characteristic.name + as_formula(unit_text(characteristic.unit, " [{}]")),
-                    "error of SD")
+        _draw_error(
+            axis,
+            values,
+            error,
+            characteristic.name + as_formula(unit_text(characteristic.unit, " [{}]")),
+            "error of SD",
+        )
     figure.supxlabel("orange: collides in the reference or here", fontsize=FONT)
     save(figure, path, "plot")
 
@@ -210,8 +237,10 @@ def _draw_error(axis: Axes, values: FloatArray, error: FloatArray, label: str, e
 
 
 SHIPPED_TOTALS = Path(__file__).with_name("published.toml")
-TOTALS_COMMENT = ("Agreement of studies with published data: totals, no row of it. "
-                  "`validate STUDY FILE --totals THIS_FILE` writes an entry.")
+TOTALS_COMMENT = (
+    "Agreement of studies with published data: totals, no row of it. "
+    "`validate STUDY FILE --totals THIS_FILE` writes an entry."
+)
 SIMULATION_KEYS = ("scenario", "vehicle", "ads", "weather", "metrics", "step_length", "matrix")
 """Study keys that affect the metrics of a setting."""
 
@@ -250,9 +279,12 @@ class Totals(msgspec.Struct, frozen=True, kw_only=True):
 def shipped_totals_of(study: Study) -> dict[str, Totals]:
     """Shipped totals that hold for a study, by file: those of shipped studies with the same `SIMULATION_KEYS`."""
     tables = _simulation_tables(study)
-    return {file: totals for name, files in _read_totals(SHIPPED_TOTALS).items()
-            if name in study_names() and _simulation_tables(load_study(name)) == tables for file,
-            totals in files.items()}
+    return {
+        file: totals
+        for name, files in _read_totals(SHIPPED_TOTALS).items()
+        if name in study_names() and _simulation_tables(load_study(name)) == tables
+        for file, totals in files.items()
+    }
 
 
 def write_totals(path: Path, study: Study, file: str, result: Agreement) -> None:
@@ -265,8 +297,11 @@ def write_totals(path: Path, study: Study, file: str, result: Agreement) -> None
     """
     totals = _read_totals(path) if path.exists() else {}
     totals.setdefault(study.name, {})[file] = Totals(
-        rows=result.rows, spearman=_rounded(result.spearman), mean_absolute_error=_rounded(result.mean_absolute_error),
-        collisions=result.collisions)
+        rows=result.rows,
+        spearman=_rounded(result.spearman),
+        mean_absolute_error=_rounded(result.mean_absolute_error),
+        collisions=result.collisions,
+    )
     write_whole(path, f"# {TOTALS_COMMENT}\n\n{msgspec.toml.encode(totals).decode()}")
 
 

@@ -87,9 +87,13 @@ class Calibration(NamedTuple):
         return f"Loss {self.loss:.4f}" + (f"; lowest loss of each search: {losses}" if losses else "")
 
 
-def calibrate(subjects: Sequence[FitSubject], pool: Pool, done: Callable[[float, StudyGroup], None] = lambda loss,
-              best: None, *,
-              from_scratch: bool = False) -> list[Calibration]:
+def calibrate(
+    subjects: Sequence[FitSubject],
+    pool: Pool,
+    done: Callable[[float, StudyGroup], None] = lambda loss, best: None,
+    *,
+    from_scratch: bool = False,
+) -> list[Calibration]:
     """Fit studies by CMA-ES (Hansen 2016), as their tables [fit] state; the first study's table sets trials, seed,
     starts and population.
 
@@ -112,12 +116,17 @@ def calibrate(subjects: Sequence[FitSubject], pool: Pool, done: Callable[[float,
     studies = [subject.study for subject in subjects]
     _check_subjects(subjects, from_scratch)
     fit, parameters = studies[0].fit, free_parameters(studies)
-    fit_data, test_data = ([{name: data.take(is_held_back(data, study.fit.hold_out) == is_test) for name,
-                             data in references.items()}
-                            for study, references in subjects] for is_test in (False, True))
+    fit_data, test_data = (
+        [
+            {name: data.take(is_held_back(data, study.fit.hold_out) == is_test) for name, data in references.items()}
+            for study, references in subjects
+        ]
+        for is_test in (False, True)
+    )
     space = FitSpace(parameters, [StudyFit(study, data, pool) for study, data in zip(studies, fit_data, strict=True)])
-    race = SearchRace(space.misfits_at, fit.population, fit.trials, lambda loss,
-                      place: done(loss, space.studies_at(place)))
+    race = SearchRace(
+        space.misfits_at, fit.population, fit.trials, lambda loss, place: done(loss, space.studies_at(place))
+    )
     if not from_scratch and race.try_places([space.own_place()])[0].loss >= MAX_LOSS:
         names = " and ".join(f"study {study.name!r}" for study in studies)
         raise SimulationError(f"{names} cannot be simulated with {'its' if len(studies) == 1 else 'their'} own values")
@@ -134,27 +143,41 @@ def calibrate(subjects: Sequence[FitSubject], pool: Pool, done: Callable[[float,
         best = msgspec.structs.replace(best, spread=profiles.spread(k))
         error = {SAFETY_DEGREE: round(error_beyond_spread(best, fit_data[k]), ERROR_DECIMALS)} if fit_data[k] else {}
         best = msgspec.structs.replace(best, model_error=error)
-        values = {parameter.key: FittedValue(parameter, float(profiles.values[0, i]), profiles.interval(i))
-                  for i, parameter in enumerate(parameters) if k in parameter.study_indices}
-        results.append(Calibration(values, best, race.lowest_loss, reached,
-                                   _measure_agreements(best, fit_data[k], pool),
-                                   _measure_agreements(best, test_data[k], pool), profiles))
+        values = {
+            parameter.key: FittedValue(parameter, float(profiles.values[0, i]), profiles.interval(i))
+            for i, parameter in enumerate(parameters)
+            if k in parameter.study_indices
+        }
+        results.append(
+            Calibration(
+                values,
+                best,
+                race.lowest_loss,
+                reached,
+                _measure_agreements(best, fit_data[k], pool),
+                _measure_agreements(best, test_data[k], pool),
+                profiles,
+            )
+        )
     return results
 
 
 def _check_subjects(subjects: Sequence[FitSubject], from_scratch: bool) -> None:
     first = subjects[0].study
     if not any(subject.study.calibration for subject in subjects):
-        raise InputError(first.source, "has no table [calibration]",
-                         "the free parameters with bounds, unit and meaning")
+        raise InputError(
+            first.source, "has no table [calibration]", "the free parameters with bounds, unit and meaning"
+        )
     for study, references in subjects:
         if not references and not study.published:
-            raise InputError(study.source, "has no table [published] and there is no reference file",
-                             "something to fit to")
+            raise InputError(
+                study.source, "has no table [published] and there is no reference file", "something to fit to"
+            )
         for name in study.fit.weights:
             if name not in COLUMNS:
-                raise InputError(study.source, f"fit.weights.{name} is no metric of the reference",
-                                 f"some of {', '.join(COLUMNS)}")
+                raise InputError(
+                    study.source, f"fit.weights.{name} is no metric of the reference", f"some of {', '.join(COLUMNS)}"
+                )
     if from_scratch and not first.fit.starts:
         raise InputError(first.source, "fit.starts = 0", "at least 1 for a fit from scratch")
 
@@ -164,8 +187,9 @@ def refining_population(population: int, parameter_count: int) -> int:
     return min(population, max(population // POPULATION_DIVISOR, 4 + int(3 * math.log(parameter_count))))
 
 
-def _begin_at_random(race: SearchRace, dimension: int, ensemble_size: int, max_trials: int,
-                     rng: np.random.Generator) -> CmaSearch:
+def _begin_at_random(
+    race: SearchRace, dimension: int, ensemble_size: int, max_trials: int, rng: np.random.Generator
+) -> CmaSearch:
     """Begin a search at the best place of an ensemble Kalman inversion; without an ensemble, or trials for one, at a
     random place.
     """
@@ -191,14 +215,17 @@ def describe_fit(subject: FitSubject, result: Calibration, studies: Sequence[Stu
     together = "".join(f", together with {other.name!r}" for other in studies if other is not study)
     start = "random places only" if from_scratch else f"its own values and {fit.starts} random places"
     own_names = ", ".join(name for name, value in values if not value.is_shared)
-    lines = [f"Study {study.name!r}, calibrated{together}.",
-             f"CMA-ES: {fit.trials} trials, seed {fit.seed}, from {start}. {result.loss_line}.",
-             "Fitted to the original vehicle's published values and to rows of files, "
-             f"of which one in {study.fit.hold_out} is held back."]
+    lines = [
+        f"Study {study.name!r}, calibrated{together}.",
+        f"CMA-ES: {fit.trials} trials, seed {fit.seed}, from {start}. {result.loss_line}.",
+        "Fitted to the original vehicle's published values and to rows of files, "
+        f"of which one in {study.fit.hold_out} is held back.",
+    ]
     for name, data in references.items():
         orders = f"{_order(result.used[name])}, held back {_order(result.held_back[name])}"
-        lines.append(f"  {name}, SHA-256 {data.fingerprint}, {data.skipped} rows left out; "
-                     f"rho of the safety degree {orders}")
+        lines.append(
+            f"  {name}, SHA-256 {data.fingerprint}, {data.skipped} rows left out; rho of the safety degree {orders}"
+        )
     if together:
         lines.append(f"Parameters of its own: {own_names}; it shares the others.")
     return "\n".join([*lines, *(f"{name} lies on its bound." for name, value in values if value.is_on_bound)])

@@ -39,8 +39,9 @@ class Effect(NamedTuple):
         """The effect, with `agrees` from both values."""
         if reference is None or here is None:
             return cls(reference, here, None)
-        return cls(reference, here, abs(here - reference)
-                   <= max(ABSOLUTE_TOLERANCE, RELATIVE_TOLERANCE * abs(reference)))
+        return cls(
+            reference, here, abs(here - reference) <= max(ABSOLUTE_TOLERANCE, RELATIVE_TOLERANCE * abs(reference))
+        )
 
 
 class Regression(NamedTuple):
@@ -82,8 +83,10 @@ def effects_of(data: ReferenceData, evaluations: Evaluations, characteristics: C
     """The effect of each characteristic on the safety degree, in the order of the study."""
     regression = Regression.over(data.settings, characteristics)
     published, here = (regression.effects(values) for values in (data.metrics[SAFETY_DEGREE], evaluations.f_safe))
-    return {name: Effect.of(finite_or_none(published[i]), finite_or_none(here[i]))
-            for i, name in enumerate(characteristics.names)}
+    return {
+        name: Effect.of(finite_or_none(published[i]), finite_or_none(here[i]))
+        for i, name in enumerate(characteristics.names)
+    }
 
 
 class Coverage(NamedTuple):
@@ -103,11 +106,13 @@ class Coverage(NamedTuple):
 
     def __str__(self) -> str:
         held_back = "none of them" if self.held_back is None else f"{self.held_back:.0%} of the rows"
-        return (f"The {BAND_SHARE:.0%} band of {self.sets} parameter sets, of repeats and of the model's error is "
-                f"{self.width:.2f} m wide "
-                f"(median) and covers {self.all_rows:.0%} of {self.rows} rows, {held_back} held back; "
-                f"{self.needed:.2f} m more on each side would "
-                f"cover {BAND_SHARE:.0%} of {'these rows' if self.held_back is None else 'the rows held back'}.")
+        return (
+            f"The {BAND_SHARE:.0%} band of {self.sets} parameter sets, of repeats and of the model's error is "
+            f"{self.width:.2f} m wide "
+            f"(median) and covers {self.all_rows:.0%} of {self.rows} rows, {held_back} held back; "
+            f"{self.needed:.2f} m more on each side would "
+            f"cover {BAND_SHARE:.0%} of {'these rows' if self.held_back is None else 'the rows held back'}."
+        )
 
 
 def measure_coverage(data: ReferenceData, study: Study) -> Coverage:
@@ -123,10 +128,14 @@ def measure_coverage(data: ReferenceData, study: Study) -> Coverage:
     distances = _distance_from_band(data.metrics[SAFETY_DEGREE], lower, upper)
     held_back = is_held_back(data, study.fit.hold_out)
     new_rows = held_back if held_back.any() else ~held_back
-    return Coverage(sets=len(evaluations), rows=len(distances), all_rows=float(np.mean(distances == 0)),
-                    held_back=float(np.mean(distances[held_back] == 0)) if held_back.any() else None,
-                    width=float(np.median(upper - lower)),
-                    needed=float(np.quantile(distances[new_rows], BAND_SHARE)))
+    return Coverage(
+        sets=len(evaluations),
+        rows=len(distances),
+        all_rows=float(np.mean(distances == 0)),
+        held_back=float(np.mean(distances[held_back] == 0)) if held_back.any() else None,
+        width=float(np.median(upper - lower)),
+        needed=float(np.quantile(distances[new_rows], BAND_SHARE)),
+    )
 
 
 def is_held_back(data: ReferenceData, hold_out: int) -> BoolArray:

@@ -25,8 +25,9 @@ STEP_SHARE = 0.5
 parameters."""
 
 
-def invert(race: SearchRace, dimension: int, size: int, max_trials: int, rng: np.random.Generator
-           ) -> tuple[FloatArray, FloatArray]:
+def invert(
+    race: SearchRace, dimension: int, size: int, max_trials: int, rng: np.random.Generator
+) -> tuple[FloatArray, FloatArray]:
     """Move an ensemble of `size` (2 to `max_trials`) random places until the residuals are as small as their noise.
 
     Returns the place with the lowest loss, shape (n,), and the axes of the places on the way to it, shape (n, n):
@@ -64,8 +65,9 @@ def _step_weight(residuals: FloatArray) -> float:
     """
     misfits, count = (residuals**2).sum(axis=1) / 2, residuals.shape[1]
     mean, variance = float(misfits.mean()), float(misfits.var())
-    return STEP_SHARE * max(count / (2 * mean) if mean else 1.0, float(np.sqrt(count / (2 * variance))) if variance
-                            else 1.0)
+    return STEP_SHARE * max(
+        count / (2 * mean) if mean else 1.0, float(np.sqrt(count / (2 * variance))) if variance else 1.0
+    )
 
 
 def _posterior_sample(places: FloatArray, residuals: FloatArray, weight: float, rng: np.random.Generator) -> FloatArray:
@@ -77,7 +79,8 @@ def _posterior_sample(places: FloatArray, residuals: FloatArray, weight: float, 
     deviations = (residuals - residuals.mean(axis=0)) / np.sqrt(size - 1)
     perturbed = residuals + rng.standard_normal(residuals.shape) / np.sqrt(weight)
     with threadpool_limits(limits=1):  # with several threads the last digits depend on their number
-        gain = np.linalg.solve(deviations @ deviations.T + np.eye(size) / weight, (logits - logits.mean(axis=0))
-                               / np.sqrt(size - 1))
+        gain = np.linalg.solve(
+            deviations @ deviations.T + np.eye(size) / weight, (logits - logits.mean(axis=0)) / np.sqrt(size - 1)
+        )
         moved_logits = logits - (perturbed @ deviations.T) @ gain
     return np.asarray(np.clip(expit(moved_logits), MARGIN, 1 - MARGIN).round(PLACE_DECIMALS))

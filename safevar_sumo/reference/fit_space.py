@@ -61,8 +61,9 @@ def free_parameters(studies: Sequence[Study]) -> list[FittedParameter]:
                 continue
             value = value_of(study, key)
             _check_bounds(study, key, value, bounds)
-            others = (k for k, other in enumerate(studies) if k > index and not bounds.own
-                      and _shares(other, key, value))
+            others = (
+                k for k, other in enumerate(studies) if k > index and not bounds.own and _shares(other, key, value)
+            )
             parameters.append(FittedParameter(key, (index, *others), bounds))
     return parameters
 
@@ -80,17 +81,20 @@ def _shares(study: Study, key: str, value: float) -> bool:
 def _check_bounds(study: Study, key: str, value: float, bounds: FreeParameter) -> None:
     """Refuse bounds without the study's value, and bounds that the models do not accept: the search may try both."""
     if not bounds.lower <= value <= bounds.upper:
-        raise InputError(study.source, f"{key} = {value}",
-                         f"a value in its bounds, [{bounds.lower:g}, {bounds.upper:g}]")
+        raise InputError(
+            study.source, f"{key} = {value}", f"a value in its bounds, [{bounds.lower:g}, {bounds.upper:g}]"
+        )
     if bounds.log and bounds.lower <= 0:
-        raise InputError(study.source, f"calibration.{key!r} has log = true and lower = {bounds.lower:g}",
-                         "a lower bound above 0")
+        raise InputError(
+            study.source, f"calibration.{key!r} has log = true and lower = {bounds.lower:g}", "a lower bound above 0"
+        )
     for end, bound in (("lower", bounds.lower), ("upper", bounds.upper)):
         try:
             models_of(with_values(study, {key: bound}), key)
         except InputError as error:
-            raise InputError(study.source, f"calibration.{key!r}.{end} = {bound:g}", error.legal
-                             or error.problem) from None
+            raise InputError(
+                study.source, f"calibration.{key!r}.{end} = {bound:g}", error.legal or error.problem
+            ) from None
 
 
 class FitSpace:
@@ -100,8 +104,9 @@ class FitSpace:
 
     def __init__(self, parameters: Sequence[FittedParameter], fits: Sequence[StudyFit]) -> None:
         self._parameters, self._fits = parameters, fits
-        self._lower, self._upper = np.array([(parameter.bounds.lower, parameter.bounds.upper)
-                                             for parameter in parameters]).T
+        self._lower, self._upper = np.array(
+            [(parameter.bounds.lower, parameter.bounds.upper) for parameter in parameters]
+        ).T
         self._log = np.array([parameter.bounds.log for parameter in parameters])
         self._start, self._width = self._scaled(self._lower), self._scaled(self._upper) - self._scaled(self._lower)
 
@@ -121,25 +126,37 @@ class FitSpace:
     def studies_at(self, place: FloatArray) -> StudyGroup:
         """The studies with the parameters' values at a place."""
         values = list(zip(self._parameters, self.values(place).tolist(), strict=True))
-        return tuple(with_values(fit.study, {parameter.key: value for parameter, value in values
-                                             if k in parameter.study_indices})
-                     for k, fit in enumerate(self._fits))
+        return tuple(
+            with_values(
+                fit.study, {parameter.key: value for parameter, value in values if k in parameter.study_indices}
+            )
+            for k, fit in enumerate(self._fits)
+        )
 
     def own_place(self) -> FloatArray:
         """The place at which the parameters have the values in the studies' files."""
-        values = np.array([value_of(self._fits[parameter.study_indices[0]].study, parameter.key)
-                           for parameter in self._parameters])
+        values = np.array(
+            [value_of(self._fits[parameter.study_indices[0]].study, parameter.key) for parameter in self._parameters]
+        )
         return np.asarray(np.clip((self._scaled(values) - self._start) / self._width, 0, 1))
 
     def misfits_at(self, places: Sequence[FloatArray]) -> list[Misfit]:
         """The mean loss of the studies at each place, and the residuals of all of them."""
-        futures = [[fit.submit(study) for fit, study in zip(self._fits, self.studies_at(place), strict=True)]
-                   for place in places]
-        misfits_at_places = ([fit.misfit(batches) for fit, batches in zip(self._fits, batches_of_studies, strict=True)]
-                             for batches_of_studies in futures)
-        return [Misfit(float(np.mean([misfit.loss for misfit in misfits])),
-                       np.concatenate([misfit.residuals for misfit in misfits]))
-                for misfits in misfits_at_places]
+        futures = [
+            [fit.submit(study) for fit, study in zip(self._fits, self.studies_at(place), strict=True)]
+            for place in places
+        ]
+        misfits_at_places = (
+            [fit.misfit(batches) for fit, batches in zip(self._fits, batches_of_studies, strict=True)]
+            for batches_of_studies in futures
+        )
+        return [
+            Misfit(
+                float(np.mean([misfit.loss for misfit in misfits])),
+                np.concatenate([misfit.residuals for misfit in misfits]),
+            )
+            for misfits in misfits_at_places
+        ]
 
 
 class StudyFit:
@@ -162,8 +179,10 @@ class StudyFit:
         settings.
         """
         work, size = pack_study(study, self._inputs), self._batch_size
-        return [self._pool.submit(work, self._settings[start:start + size])
-                for start in range(0, len(self._settings), size)]
+        return [
+            self._pool.submit(work, self._settings[start : start + size])
+            for start in range(0, len(self._settings), size)
+        ]
 
     def misfit(self, batches: Sequence[Future[Evaluations]]) -> Misfit:
         """The loss and the residuals, from the futures of all batches."""
@@ -171,8 +190,9 @@ class StudyFit:
         evaluations = distinct_evaluations.take(self._row_of.ravel())
         original, *files = [evaluations.take(np.arange(start, end)) for start, end in pairwise(self._ends)]
         loss, residuals = original_misfit(original, self.study.published, self.study.fit)
-        residuals = np.concatenate([residuals, *(loss.residuals(file) for loss,
-                                                 file in zip(self._losses, files, strict=True))])
+        residuals = np.concatenate(
+            [residuals, *(loss.residuals(file) for loss, file in zip(self._losses, files, strict=True))]
+        )
         if not evaluations.valid.all():
             return Misfit(MAX_LOSS, residuals)
         reference_losses = [loss.of(file) for loss, file in zip(self._losses, files, strict=True)]

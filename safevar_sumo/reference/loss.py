@@ -61,8 +61,9 @@ class ReferenceLoss:
     def __init__(self, data: ReferenceData, study: Study) -> None:
         self._data, self._study = data, study
         defined_values = {name: data.metrics[name][~np.isnan(data.metrics[name])] for name in study.fit.weights}
-        self._deviations = {name: float(np.std(values)) for name, values in defined_values.items() if values.size
-                            and np.ptp(values) > 0}
+        self._deviations = {
+            name: float(np.std(values)) for name, values in defined_values.items() if values.size and np.ptp(values) > 0
+        }
         self._regression = Regression.over(data.settings, CharacteristicSet.of(study.vehicle.characteristics))
         self._effects = self._regression.effects(data.metrics[SAFETY_DEGREE])
 
@@ -90,6 +91,7 @@ class ReferenceLoss:
         differences = [np.empty(0)]
         for name, deviation in self._deviations.items():
             errors = np.nan_to_num((evaluations.metrics[name] - self._data.metrics[name]) / (ROW_NOISE * deviation))
-            differences.append(np.sqrt(self._study.fit.weights[name])
-                               * np.where(evaluations.valid, errors, MAX_DEVIATION))
+            differences.append(
+                np.sqrt(self._study.fit.weights[name]) * np.where(evaluations.valid, errors, MAX_DEVIATION)
+            )
         return np.concatenate(differences)

@@ -56,8 +56,11 @@ class Profiles(NamedTuple):
 
     def spread(self, study: int) -> dict[str, list[float]]:
         """Values of each parameter of the study with this index, one for each of the `sets`: the table [spread]."""
-        return {parameter.key: self.values[self.sets, k].tolist()
-                for k, parameter in enumerate(self.parameters) if study in parameter.study_indices}
+        return {
+            parameter.key: self.values[self.sets, k].tolist()
+            for k, parameter in enumerate(self.parameters)
+            if study in parameter.study_indices
+        }
 
     def interval(self, k: int) -> tuple[float, float]:
         """Least and greatest value of parameter k in the trials that fit as well as the best."""
@@ -97,6 +100,8 @@ def plot_profiles(path: Path, profiles: Profiles, studies: Sequence[Study]) -> N
         axis.axvline(values[0], color="black", linewidth=0.8, linestyle="--")
         key = parameter.key.replace("vehicle.parameters.", "").replace("ads.parameters.", "")
         owners = [] if len(parameter.study_indices) == len(names) else [names[i] for i in parameter.study_indices]
-        axis.set(xlabel=f"{', '.join(owners)}: " * bool(owners) + key + unit_text(parameter.bounds.unit, " [{}]"),
-                 ylabel="loss")
+        axis.set(
+            xlabel=f"{', '.join(owners)}: " * bool(owners) + key + unit_text(parameter.bounds.unit, " [{}]"),
+            ylabel="loss",
+        )
     save(figure, path, "plot")

@@ -36,17 +36,21 @@ NEAREST_ROWS = 5
 """Number of published rows that a solution is compared with."""
 VERDICT_PLURALS = {HOLDS: "hold", IN_DIRECTION: "hold in direction", DIFFERS: "differ", UNDECIDED: "cannot be decided"}
 TITLES = {
-    "rq1": "RQ1: solutions against the original vehicle", "rq2": "RQ2: NSGA-II against the others",
+    "rq1": "RQ1: solutions against the original vehicle",
+    "rq2": "RQ2: NSGA-II against the others",
     "rq3.1": "RQ3.1: how many characteristics are changed [% of the critical solutions]",
     "rq3.2": "RQ3.2: which characteristics are changed [% of the critical solutions]",
     "rq3.3": "RQ3.3: how large the changes are",
-    "rq3.3-safety": "RQ3.3: how the changes affect safety", "collisions": "Collisions",
+    "rq3.3-safety": "RQ3.3: how the changes affect safety",
+    "collisions": "Collisions",
     "combinations": "Four changed together",
-    "weather": "One weather against another"}
+    "weather": "One weather against another",
+}
 
 
-def replicate(here: Sequence[Case], published: Sequence[Case],
-              references: Mapping[str, Sequence[ReferenceData]]) -> str:
+def replicate(
+    here: Sequence[Case], published: Sequence[Case], references: Mapping[str, Sequence[ReferenceData]]
+) -> str:
     """The page, as Markdown; `references` are published rows by the case that they are compared with.
 
     Raises
@@ -54,39 +58,68 @@ def replicate(here: Sequence[Case], published: Sequence[Case],
     InputError
         If one side has two results of a study, or no study has results on both sides.
     """
-    cases_by_name = {argument: {case.study.name: case for case in cases} for argument, cases in (
-        ("directories", here), ("published", published))}
+    cases_by_name = {
+        argument: {case.study.name: case for case in cases}
+        for argument, cases in (("directories", here), ("published", published))
+    }
     for (argument, by_name), cases in zip(cases_by_name.items(), (here, published), strict=True):
         if len(by_name) < len(cases):
-            raise InputError(argument, f"has two results of a study: {', '.join(case.study.name for case in cases)}",
-                             "one of each study")
+            raise InputError(
+                argument,
+                f"has two results of a study: {', '.join(case.study.name for case in cases)}",
+                "one of each study",
+            )
     ours, theirs = cases_by_name.values()
     pairs = [(case, theirs[name]) for name, case in ours.items() if name in theirs]
     if not pairs:
-        raise InputError("published", f"has {', '.join(theirs)} and none of {', '.join(ours)}",
-                         "published results of a study in DIR (the command `import` makes them)")
+        raise InputError(
+            "published",
+            f"has {', '.join(theirs)} and none of {', '.join(ours)}",
+            "published results of a study in DIR (the command `import` makes them)",
+        )
     tables = compare_tables(*zip(*pairs, strict=True))
     conclusions = draw_conclusions(tables)
-    lines = [*_head_lines(pairs, conclusions), *(f"- {name}: results here, none published given." for name in ours
-                                                 if name not in theirs),
-             *(f"- {name}: published results given, none here." for name in theirs if name not in ours), "",
-             "## Conclusions", "",
-             "Conclusions of the published results, and whether they hold here. The rules:", "",
-             *(f"- {rule}" for rule in RULES), "",
-             _markdown_table(("question", "setting", "published conclusion", "here", "why"), conclusions), ""]
-    near = [row for case, _ in pairs if references.get(case.name)
-            for row in compare_with_nearest_rows(case, references[case.name])]
+    lines = [
+        *_head_lines(pairs, conclusions),
+        *(f"- {name}: results here, none published given." for name in ours if name not in theirs),
+        *(f"- {name}: published results given, none here." for name in theirs if name not in ours),
+        "",
+        "## Conclusions",
+        "",
+        "Conclusions of the published results, and whether they hold here. The rules:",
+        "",
+        *(f"- {rule}" for rule in RULES),
+        "",
+        _markdown_table(("question", "setting", "published conclusion", "here", "why"), conclusions),
+        "",
+    ]
+    near = [
+        row
+        for case, _ in pairs
+        if references.get(case.name)
+        for row in compare_with_nearest_rows(case, references[case.name])
+    ]
     if near:
-        lines += ["## Does the search exploit the model?", "",
-                  f"Each solution beside its {NEAREST_ROWS} nearest published rows; distances are medians, in widths "
-                  "of the domains. "
-                  "If the search found holes in the model, the published rows next to its solutions would be as safe "
-                  "as others.", "",
-                  _markdown_table(list(near[0]), [list(row.values()) for row in near]), ""]
+        lines += [
+            "## Does the search exploit the model?",
+            "",
+            f"Each solution beside its {NEAREST_ROWS} nearest published rows; distances are medians, in widths "
+            "of the domains. "
+            "If the search found holes in the model, the published rows next to its solutions would be as safe "
+            "as others.",
+            "",
+            _markdown_table(list(near[0]), [list(row.values()) for row in near]),
+            "",
+        ]
     lines.append("## Tables side by side\n")
     for table in tables:
-        lines += [f"### {TITLES[table.name]}", "", *([_render_table(table), ""] if table.rows else []),
-                  *(f"{note}  " for note in table.notes), ""]
+        lines += [
+            f"### {TITLES[table.name]}",
+            "",
+            *([_render_table(table), ""] if table.rows else []),
+            *(f"{note}  " for note in table.notes),
+            "",
+        ]
     return "\n".join(lines)
 
 
@@ -96,8 +129,10 @@ def _head_lines(pairs: Sequence[tuple[Case, Case]], conclusions: Sequence[Conclu
     lines = ["# Does the published study replicate?", "", f"Of {len(conclusions)} conclusions: {summary}.", ""]
     for pair in pairs:
         name, sizes = pair[0].study.name, [Counter(case.solutions["algorithm"]) for case in pair]
-        texts = (" + ".join(f"{number} of {algorithm}" for algorithm, number in size.items()) or "no solution"
-                 for size in sizes)
+        texts = (
+            " + ".join(f"{number} of {algorithm}" for algorithm, number in size.items()) or "no solution"
+            for size in sizes
+        )
         lines.append(f"- {pair[0].study.title} ({name}): {' here, '.join(texts)} published.")
         for side, case, other in ((PUBLISHED, *pair), (HERE, *pair[::-1])):
             for algorithm in (algorithm for algorithm in case.algorithms if algorithm not in other.algorithms):
@@ -119,32 +154,46 @@ def compare_with_nearest_rows(case: Case, references: Sequence[ReferenceData]) -
     scaled_rows = np.concatenate([data.settings for data in references]) / width
     safety = np.concatenate([data.metrics[SAFETY_DEGREE] for data in references])
     tree, count = scipy.spatial.cKDTree(scaled_rows), min(NEAREST_ROWS, len(scaled_rows))
-    published_distances = tree.query(scaled_rows, count
-                                     + 1)[0][:, 1:] if len(scaled_rows) > count else np.full((1, 1), np.nan)
+    published_distances = (
+        tree.query(scaled_rows, count + 1)[0][:, 1:] if len(scaled_rows) > count else np.full((1, 1), np.nan)
+    )
     results = []
     for algorithm in case.algorithms:
         solutions = case.solutions_of(algorithm)
         if not solutions.empty:
             scaled_solutions = solutions[list(domains.names)].to_numpy(dtype=float) / width
-            distances, nearest_rows = (np.reshape(array, (len(scaled_solutions), count))
-                                       for array in tree.query(scaled_solutions, count))
+            distances, nearest_rows = (
+                np.reshape(array, (len(scaled_solutions), count)) for array in tree.query(scaled_solutions, count)
+            )
             is_collision = are_collisions(solutions).to_numpy()
-            results.append({
-                "setting": case.name, "algorithm": algorithm, "solutions": len(solutions),
-                "distance to published rows": float(np.median(distances)),
-                "distance among published rows": float(np.median(published_distances)),
-                "mean SD here": float(np.nanmean(solutions[SAFETY_DEGREE])),
-                "mean SD published": float(safety[nearest_rows].mean()),
-                "collisions here": int(is_collision.sum()), "published rows next to them that collide [%]":
-                    100 * float((safety[nearest_rows[is_collision]] <= 0).mean()) if is_collision.any() else np.nan})
+            results.append(
+                {
+                    "setting": case.name,
+                    "algorithm": algorithm,
+                    "solutions": len(solutions),
+                    "distance to published rows": float(np.median(distances)),
+                    "distance among published rows": float(np.median(published_distances)),
+                    "mean SD here": float(np.nanmean(solutions[SAFETY_DEGREE])),
+                    "mean SD published": float(safety[nearest_rows].mean()),
+                    "collisions here": int(is_collision.sum()),
+                    "published rows next to them that collide [%]": 100
+                    * float((safety[nearest_rows[is_collision]] <= 0).mean())
+                    if is_collision.any()
+                    else np.nan,
+                }
+            )
     return results
 
 
 def _render_table(table: ComparedTable) -> str:
     keys = KEY_COLUMNS[table.name]
-    rows = [[*(pair[0][key] for key in keys), *(" / ".join(_cell_text(row.get(name)) for row in pair)
-                                                for name in table.quantities)]
-            for pair in table.rows]
+    rows = [
+        [
+            *(pair[0][key] for key in keys),
+            *(" / ".join(_cell_text(row.get(name)) for row in pair) for name in table.quantities),
+        ]
+        for pair in table.rows
+    ]
     return _markdown_table([*keys, *(f"{name} {HERE} / {PUBLISHED}" for name in table.quantities)], rows)
 
 

@@ -61,8 +61,9 @@ class ReferenceData(NamedTuple):
 
     def take(self, rows: BoolArray) -> ReferenceData:
         """The data in the rows of a mask."""
-        return self._replace(settings=self.settings[rows],
-                             metrics={name: values[rows] for name, values in self.metrics.items()})
+        return self._replace(
+            settings=self.settings[rows], metrics={name: values[rows] for name, values in self.metrics.items()}
+        )
 
 
 def read_reference(path: Path, characteristics: CharacteristicSet) -> ReferenceData:
@@ -77,16 +78,18 @@ def read_reference(path: Path, characteristics: CharacteristicSet) -> ReferenceD
     try:
         refuse_other_than_file(path, streams=True)
         content = path.read_bytes()  # once: a pipe cannot be read again
-        lines = pd.read_csv(io.BytesIO(content), dtype=str, skipinitialspace=True, skip_blank_lines=False,
-                            encoding="utf-8-sig")
+        lines = pd.read_csv(
+            io.BytesIO(content), dtype=str, skipinitialspace=True, skip_blank_lines=False, encoding="utf-8-sig"
+        )
         if not isinstance(lines.index, pd.RangeIndex):
             raise ValueError("rows have more values than the header has columns")
         table = lines.rename(columns=str.strip).dropna(how="all")
     except OSError as error:
         raise InputError(path, f"cannot be read: {error.strerror or error}", "a CSV file") from None
     except ValueError as error:  # pandas' errors are of this kind
-        raise InputError(path, f"is not CSV: {str(error).splitlines()[0]}",
-                         "a CSV file with a header and rows") from None
+        raise InputError(
+            path, f"is not CSV: {str(error).splitlines()[0]}", "a CSV file with a header and rows"
+        ) from None
     by_plain_name = {_plain_name(str(column)): str(column) for column in table}
     columns = {name: by_plain_name.get(_plain_name(name), name) for name in characteristics.names}
     columns |= {name: column for name, column in COLUMNS.items() if name != OPTIONAL_METRIC or column in table}
@@ -94,18 +97,25 @@ def read_reference(path: Path, characteristics: CharacteristicSet) -> ReferenceD
     if missing_columns or table.empty:
         problem = f"lacks the columns {', '.join(missing_columns)}" if missing_columns else "has no rows"
         raise InputError(path, problem, "the format of the published package")
-    numbers = {name: _parse_numbers(path, table[column], *RANGES.get(name, (-np.inf, np.inf))) for name,
-               column in columns.items()}
+    numbers = {
+        name: _parse_numbers(path, table[column], *RANGES.get(name, (-np.inf, np.inf)))
+        for name, column in columns.items()
+    }
     settings = np.stack([numbers[name] for name in characteristics.names], axis=1)
     is_in_domain = np.all((settings >= characteristics.lower) & (settings <= characteristics.upper), axis=1)
     if not is_in_domain.any():
-        raise InputError(path, "has no row whose values are all in the domains of the study",
-                         "a file of this study's vehicle")
+        raise InputError(
+            path, "has no row whose values are all in the domains of the study", "a file of this study's vehicle"
+        )
     metrics = {name: numbers.get(name, np.full(len(table), np.nan))[is_in_domain] for name in COLUMNS}
     metrics["ave_dece"] = np.abs(metrics["ave_dece"])
     metrics |= {name: np.where(metrics[SAFETY_DEGREE] <= 0, np.nan, metrics[name]) for name in ("tet", "tit")}
-    return ReferenceData(package_filter(characteristics, settings[is_in_domain]), metrics, int(np.sum(~is_in_domain)),
-                         sha256(content).hexdigest())
+    return ReferenceData(
+        package_filter(characteristics, settings[is_in_domain]),
+        metrics,
+        int(np.sum(~is_in_domain)),
+        sha256(content).hexdigest(),
+    )
 
 
 def _plain_name(name: str) -> str:
@@ -132,8 +142,9 @@ def package_filter(characteristics: CharacteristicSet, settings: FloatArray) -> 
     return np.where(share >= characteristics.threshold / width - 1e-12, settings, characteristics.original)
 
 
-METRIC_NAMES = {accepted_name: metric.name for metric in METRICS.values()
-                for accepted_name in (metric.name, metric.title.lower())}
+METRIC_NAMES = {
+    accepted_name: metric.name for metric in METRICS.values() for accepted_name in (metric.name, metric.title.lower())
+}
 """Names of metrics by each name that a command accepts."""
 ORIGINAL_FORM = "sd=NUMBER,tet=NUMBER,tit=NUMBER,ave_dece=NUMBER"
 
@@ -141,9 +152,13 @@ ORIGINAL_FORM = "sd=NUMBER,tet=NUMBER,tit=NUMBER,ave_dece=NUMBER"
 def evaluations_of(data: ReferenceData, characteristics: CharacteristicSet) -> Evaluations:
     """Reference rows as evaluations, with f_diff and f_numDiff of the filtered settings (method section 3)."""
     return Evaluations(
-        settings=data.settings, outcome=np.where(data.collided, str(Outcome.COLLISION), UNKNOWN),
-        collision_speed=np.where(data.collided, -data.metrics[SAFETY_DEGREE], np.nan), metrics=data.metrics,
-        f_diff=characteristics.largest_change(data.settings), f_num_diff=characteristics.number_changed(data.settings))
+        settings=data.settings,
+        outcome=np.where(data.collided, str(Outcome.COLLISION), UNKNOWN),
+        collision_speed=np.where(data.collided, -data.metrics[SAFETY_DEGREE], np.nan),
+        metrics=data.metrics,
+        f_diff=characteristics.largest_change(data.settings),
+        f_num_diff=characteristics.number_changed(data.settings),
+    )
 
 
 def original_metrics(text: str | None, published: Mapping[str, float]) -> dict[str, float | None]:
@@ -166,8 +181,9 @@ def original_metrics(text: str | None, published: Mapping[str, float]) -> dict[s
                 raise ValueError
             given[name] = float(number)
     except (KeyError, ValueError):
-        raise InputError("original", f"{assignment!r} in {text!r}",
-                         f"{ORIGINAL_FORM}: each metric once, in its range") from None
+        raise InputError(
+            "original", f"{assignment!r} in {text!r}", f"{ORIGINAL_FORM}: each metric once, in its range"
+        ) from None
     if (original | given)[SAFETY_DEGREE] is None:
         raise InputError("original", "the study has no published values of the original vehicle", ORIGINAL_FORM)
     return original | given

@@ -35,8 +35,13 @@ class SearchRace:
         Called after every trial with the lowest loss so far, and the place with this loss.
     """
 
-    def __init__(self, misfits_at: Callable[[Sequence[FloatArray]], list[Misfit]], population: int, trials: int,
-                 done: Callable[[float, FloatArray], None]) -> None:
+    def __init__(
+        self,
+        misfits_at: Callable[[Sequence[FloatArray]], list[Misfit]],
+        population: int,
+        trials: int,
+        done: Callable[[float, FloatArray], None],
+    ) -> None:
         self._misfits_at, self.population, self.trials_left, self._done = misfits_at, population, trials, done
         self.best_place, self.lowest_loss = np.empty(0), np.inf
         self.kept: list[tuple[float, FloatArray]] = []
@@ -52,13 +57,20 @@ class SearchRace:
             self._done(self.lowest_loss, self.best_place)
         return misfits
 
-    def begin(self, place: FloatArray, deviation: float, seed: int, population: int | None = None,
-              axes: FloatArray | None = None) -> CmaSearch:
+    def begin(
+        self,
+        place: FloatArray,
+        deviation: float,
+        seed: int,
+        population: int | None = None,
+        axes: FloatArray | None = None,
+    ) -> CmaSearch:
         """Begin a search at a place, with `deviation` as initial standard deviation along `axes`, by default the
         cube's.
         """
-        return CmaSearch(self, place, deviation, seed, population or self.population, np.eye(len(place)) if axes is None
-                         else axes)
+        return CmaSearch(
+            self, place, deviation, seed, population or self.population, np.eye(len(place)) if axes is None else axes
+        )
 
     def run(self, searches: Sequence[CmaSearch]) -> None:
         """Spend all trials left by successive halving (Jamieson and Talwalkar 2016).
@@ -73,7 +85,7 @@ class SearchRace:
             trials = trials_per_round // len(competitors)
             for search in competitors:
                 search.advance(trials - trials % search.population if trials > search.population else trials)
-            competitors = sorted(competitors, key=lambda search: search.lowest_loss)[:(len(competitors) + 1) // 2]
+            competitors = sorted(competitors, key=lambda search: search.lowest_loss)[: (len(competitors) + 1) // 2]
         competitors[0].advance(self.trials_left)
 
 
@@ -83,14 +95,18 @@ class CmaSearch:
     Its first generation has the covariance `deviation`**2 * `axes` @ `axes`.T, where `axes` has the shape (n, n).
     """
 
-    def __init__(self, race: SearchRace, place: FloatArray, deviation: float, seed: int, population: int,
-                 axes: FloatArray) -> None:
+    def __init__(
+        self, race: SearchRace, place: FloatArray, deviation: float, seed: int, population: int, axes: FloatArray
+    ) -> None:
         import cma  # slow to import
 
         self._race, self.lowest_loss, self.population = race, np.inf, population
         self._axes, self._bounds = axes, cma.BoundTransform([0, 1])
-        self._strategy: Any = cma.CMAEvolutionStrategy(np.linalg.solve(axes, self._bounds.inverse(place)), deviation, {
-            "seed": seed, "verbose": -9, "popsize": population, "maxstd": np.inf})
+        self._strategy: Any = cma.CMAEvolutionStrategy(
+            np.linalg.solve(axes, self._bounds.inverse(place)),
+            deviation,
+            {"seed": seed, "verbose": -9, "popsize": population, "maxstd": np.inf},
+        )
 
     def advance(self, trials: int) -> None:
         """Run generations for a number of trials; CMA-ES does not learn from an incomplete last generation."""

@@ -36,9 +36,22 @@ LAST_FRAME_DURATION = 2.0
 """Duration of the last frame [s]."""
 MAX_GIF_SIZE = 1_000_000
 """Size above which a gif gets fewer frames [bytes]."""
-EXACT = ["-threads", "1", "-pix_fmt", "yuv420p", "-crf", "26", "-movflags", "+faststart", "-fflags", "+bitexact",
-         "-flags:v", "+bitexact",
-         "-map_metadata", "-1"]
+EXACT = [
+    "-threads",
+    "1",
+    "-pix_fmt",
+    "yuv420p",
+    "-crf",
+    "26",
+    "-movflags",
+    "+faststart",
+    "-fflags",
+    "+bitexact",
+    "-flags:v",
+    "+bitexact",
+    "-map_metadata",
+    "-1",
+]
 """Options of ffmpeg for small files of the same bytes each time."""
 
 
@@ -74,8 +87,11 @@ def find_ffmpeg() -> str:
 
         return str(imageio_ffmpeg.get_ffmpeg_exe())
     except (ImportError, RuntimeError):
-        raise InputError("animate", "an mp4 needs ffmpeg, which is not installed",
-                         "ffmpeg on the PATH, or in the checkout: pip install '.[film]'; a .gif or .html needs neither") from None
+        raise InputError(
+            "animate",
+            "an mp4 needs ffmpeg, which is not installed",
+            "ffmpeg on the PATH, or in the checkout: pip install '.[film]'; a .gif or .html needs neither",
+        ) from None
 
 
 def _write_gif(scene: FlatScene, path: Path) -> None:
@@ -116,15 +132,30 @@ def draw_scene(scene: FlatScene) -> tuple[Figure, Callable[[int], list[Patch]]]:
     view, trace = scene.view, scene.comparison.film.runs.trace
     height = round(WIDTH * view.height / view.width / 2) * 2
     figure = Figure(figsize=(WIDTH / DPI, (PANEL_HEIGHT + height) / DPI), dpi=DPI)
-    axis = figure.add_axes((0, 0, 1, height / (PANEL_HEIGHT + height)), facecolor=GROUND_COLOUR, xticks=[], yticks=[],
-                           ylim=(view.bottom, view.bottom + view.height))
+    axis = figure.add_axes(
+        (0, 0, 1, height / (PANEL_HEIGHT + height)),
+        facecolor=GROUND_COLOUR,
+        xticks=[],
+        yticks=[],
+        ylim=(view.bottom, view.bottom + view.height),
+    )
     axis.spines[:].set_visible(False)
     _draw_road(axis, scene)
     in_order = sorted(scene.bodies, key=lambda body: (body.is_vut, body.row))
     bodies = [(body, *_draw_body(axis, body, scene)) for body in in_order]
     clock = figure.text(0.014, 0.98, "", fontsize=18, color=TEXT_COLOUR, va="top")
-    texts = [figure.text(0.15, 1 - (8 + 26 * row) / (PANEL_HEIGHT + height), "", fontsize=11, color=COLOURS[row],
-                         va="top", family="monospace") for row in scene.comparison.rows]
+    texts = [
+        figure.text(
+            0.15,
+            1 - (8 + 26 * row) / (PANEL_HEIGHT + height),
+            "",
+            fontsize=11,
+            color=COLOURS[row],
+            va="top",
+            family="monospace",
+        )
+        for row in scene.comparison.rows
+    ]
 
     def show(sample: int) -> list[Patch]:
         axis.set_xlim(view.left_ends[sample], view.left_ends[sample] + view.width)
@@ -164,8 +195,15 @@ def _draw_road(axis: Axes, scene: FlatScene) -> None:
                     for start, end in pairwise(lane.line):
                         axis.add_patch(Polygon(strip_corners(start, end, width), color=colour, linewidth=0))
     for mark in scene.all_marks:
-        axis.annotate(f" {mark} m", (mark, scene.view.bottom), (0, 2), textcoords="offset points",
-                      color=PALE_TEXT_COLOUR, fontsize=8, annotation_clip=True)
+        axis.annotate(
+            f" {mark} m",
+            (mark, scene.view.bottom),
+            (0, 2),
+            textcoords="offset points",
+            color=PALE_TEXT_COLOUR,
+            fontsize=8,
+            annotation_clip=True,
+        )
         axis.vlines(mark, scene.view.bottom, scene.view.bottom + 0.7, color=PALE_TEXT_COLOUR, linewidth=0.7)
 
 
@@ -175,15 +213,21 @@ def _draw_body(axis: Axes, body: FlatBody, scene: FlatScene) -> tuple[list[Patch
 
     length, width = body.length, body.width
     if body.is_person:
-        return [axis.add_patch(Circle((0, 0), max(length, width) / 2, facecolor=PERSON_COLOUR, edgecolor="white",
-                                      zorder=3))], []
+        return [
+            axis.add_patch(Circle((0, 0), max(length, width) / 2, facecolor=PERSON_COLOUR, edgecolor="white", zorder=3))
+        ], []
     colour = COLOURS[body.row] if body.is_vut else ACTOR_COLOUR
     alpha = 0.6 if body.is_vut and body.row == ORIGINAL and len(scene.moments) > 1 else 0.9
     corner = (-length, -width / 2)
     window = (-0.44 * length, -0.42 * width), 0.16 * length, 0.84 * width
-    patches = [Rectangle(corner, length, width, color=colour, alpha=alpha, linewidth=0, zorder=3),
-               Rectangle(*window, color="white", alpha=0.56, linewidth=0, zorder=3),
-               Rectangle(corner, length, width, fill=False, edgecolor=colour, linewidth=1.5, zorder=4 - body.row)]
-    lights = [Rectangle((-length, side), 0.28, 0.3 * width, color=BRAKE_COLOUR, linewidth=0, zorder=4)
-              for side in (-width / 2, 0.2 * width) if body.is_vut]
+    patches = [
+        Rectangle(corner, length, width, color=colour, alpha=alpha, linewidth=0, zorder=3),
+        Rectangle(*window, color="white", alpha=0.56, linewidth=0, zorder=3),
+        Rectangle(corner, length, width, fill=False, edgecolor=colour, linewidth=1.5, zorder=4 - body.row),
+    ]
+    lights = [
+        Rectangle((-length, side), 0.28, 0.3 * width, color=BRAKE_COLOUR, linewidth=0, zorder=4)
+        for side in (-width / 2, 0.2 * width)
+        if body.is_vut
+    ]
     return [axis.add_patch(patch) for patch in patches], [axis.add_patch(light) for light in lights]

@@ -43,8 +43,11 @@ class Moments(NamedTuple):
 
 def find_moments(runs: SimulationRuns, row: int) -> Moments:
     """Find the moments of one of N runs."""
-    return Moments(braking_start=brake_onset(runs, row), nearest=runs.nearest(row),
-                   end=int(np.flatnonzero(runs.trace.active[:, row])[-1]))
+    return Moments(
+        braking_start=brake_onset(runs, row),
+        nearest=runs.nearest(row),
+        end=int(np.flatnonzero(runs.trace.active[:, row])[-1]),
+    )
 
 
 ORIGINAL, CHANGED = 0, 1
@@ -103,15 +106,20 @@ class Comparison:
         if nearest is not None and runs.outcome[row] == Outcome.STOPPED:
             ending = f"{ending} with {runs.trace.gap[nearest, row]:.2f} m to spare"
         values = [(metric, self.evaluations.metrics[metric.name][row]) for metric in self.objectives]
-        texts = (f"{metric.title} {value:.1f}{unit_text(metric.unit)}" for metric, value in values if np.isfinite(value))
+        texts = (
+            f"{metric.title} {value:.1f}{unit_text(metric.unit)}" for metric, value in values if np.isfinite(value)
+        )
         return ", ".join([ending, *texts])
 
 
 def changes_in_words(characteristics: CharacteristicSet, setting: FloatArray) -> list[str]:
     """The changes from the original: `tireFric 3.5 → 1.1 (-69 %)`."""
-    return [f"{item.name} {format_number(item.original)} → {quantity_text(value, item.unit)} "
-            f"({(value - item.original) / abs(item.original) * 100:+.0f}\N{NO-BREAK SPACE}%)"
-            for item, value in zip(characteristics, setting.tolist(), strict=True) if value != item.original]
+    return [
+        f"{item.name} {format_number(item.original)} → {quantity_text(value, item.unit)} "
+        f"({(value - item.original) / abs(item.original) * 100:+.0f}\N{NO-BREAK SPACE}%)"
+        for item, value in zip(characteristics, setting.tolist(), strict=True)
+        if value != item.original
+    ]
 
 
 def format_number(value: float) -> str:
@@ -129,7 +137,9 @@ def superscript_powers(text: str) -> str:
     return text.replace("^2", "²").replace("^3", "³")
 
 
-def compare(study: StudyLike, changes: Mapping[str, float] | None = None, *, filtered: bool = True, beyond: bool = False) -> Comparison:
+def compare(
+    study: StudyLike, changes: Mapping[str, float] | None = None, *, filtered: bool = True, beyond: bool = False
+) -> Comparison:
     """Simulate one setting beside the original vehicle, in this process; in a matrix, at the setting's worst point.
 
     Parameters
@@ -166,20 +176,33 @@ def compare_setting(study: Study, system: System, setting: FloatArray) -> Compar
     original = system.characteristics.original
     settings = np.stack([original]) if np.array_equal(original, setting) else np.stack([original, setting])
     worst_system = system_at_worst_point(system, settings)
-    point = next((point.name for point in system.matrix
-                  if (point.scenario, point.weather) == (worst_system.scenario, worst_system.weather)), "")
+    point = next(
+        (
+            point.name
+            for point in system.matrix
+            if (point.scenario, point.weather) == (worst_system.scenario, worst_system.weather)
+        ),
+        "",
+    )
     recording = record_film(worst_system, settings)
-    return Comparison(title=f"{study.title} ({point})" if point else study.title, point=point, characteristics=system.characteristics,
-                      ttc_threshold=system.metrics_table.ttc_threshold, network=stage_network(worst_system.scenario),
-                      evaluations=score(worst_system, settings, recording.runs),
-                      film=replace(recording, runs=_with_pedals_before_impacts(recording.runs)),
-                      objectives=_further_objectives(worst_system.measuring))
+    return Comparison(
+        title=f"{study.title} ({point})" if point else study.title,
+        point=point,
+        characteristics=system.characteristics,
+        ttc_threshold=system.metrics_table.ttc_threshold,
+        network=stage_network(worst_system.scenario),
+        evaluations=score(worst_system, settings, recording.runs),
+        film=replace(recording, runs=_with_pedals_before_impacts(recording.runs)),
+        objectives=_further_objectives(worst_system.measuring),
+    )
 
 
 def _further_objectives(measuring: Measuring) -> tuple[MetricFacts, ...]:
     """Objectives of one run besides the paper's; the points of a rating are none, as they belong to all cells together."""
     objectives = {objective.name for objective in measuring.scoring.objectives}
-    return tuple(metric for metric in measuring.scoring.metrics if metric.name in objectives - {*METRICS, RATING_POINTS.name})
+    return tuple(
+        metric for metric in measuring.scoring.metrics if metric.name in objectives - {*METRICS, RATING_POINTS.name}
+    )
 
 
 def _with_pedals_before_impacts(runs: SimulationRuns) -> SimulationRuns:
@@ -196,8 +219,12 @@ def _with_pedals_before_impacts(runs: SimulationRuns) -> SimulationRuns:
 def list_differences(replayed: Evaluations, recorded: Mapping[str, Any]) -> list[str]:
     """List where the replay of a solution differs from its row of solutions.csv, with both values; one cell has no rating points."""
     differing_metrics = [
-        f"{name} was {recorded[name]:.6g} and is {values[0]:.6g} now" for name, values in replayed.metrics.items()
-        if name in recorded and name != RATING_POINTS.name and not np.array_equal(float(recorded[name]), float(values[0]), equal_nan=True)]
+        f"{name} was {recorded[name]:.6g} and is {values[0]:.6g} now"
+        for name, values in replayed.metrics.items()
+        if name in recorded
+        and name != RATING_POINTS.name
+        and not np.array_equal(float(recorded[name]), float(values[0]), equal_nan=True)
+    ]
     if recorded["outcome"] not in (replayed.outcome[0], UNKNOWN):
         return [f"the outcome was {recorded['outcome']} and is {replayed.outcome[0]} now", *differing_metrics]
     return differing_metrics

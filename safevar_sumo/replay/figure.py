@@ -34,16 +34,24 @@ def draw_comparison(comparison: Comparison) -> Figure:
         axes = figure.subplots(2, 2, sharex=True).ravel()
     runs, divergence_time = comparison.film.runs, _divergence_time(comparison)
     trace, ttc = runs.trace, time_to_collision(runs)
-    quantities = {"speed [m/s]": trace.speed,
-                  "gap to the obstacle [m]": np.where(np.isfinite(trace.gap), trace.gap, np.nan),
-                  "brake     |     throttle": trace.throttle - trace.brake,
-                  "time to collision [s]": np.where(ttc <= MAX_TTC, ttc, np.nan)}
+    quantities = {
+        "speed [m/s]": trace.speed,
+        "gap to the obstacle [m]": np.where(np.isfinite(trace.gap), trace.gap, np.nan),
+        "brake     |     throttle": trace.throttle - trace.brake,
+        "time to collision [s]": np.where(ttc <= MAX_TTC, ttc, np.nan),
+    }
     for axis, (label, values) in zip(axes, quantities.items(), strict=True):
         axis.set_ylabel(label)
         for row in comparison.rows:
             end = find_moments(runs, row).end + 1
-            axis.plot(trace.time[:end], values[:end, row], color=COLOURS[row], linestyle="--" if row else "-",
-                      linewidth=1.6, zorder=3 + row)
+            axis.plot(
+                trace.time[:end],
+                values[:end, row],
+                color=COLOURS[row],
+                linestyle="--" if row else "-",
+                linewidth=1.6,
+                zorder=3 + row,
+            )
         if divergence_time is not None:
             axis.axvline(divergence_time, color="0.35", linewidth=0.9, linestyle="-.", zorder=1)
     speed_axis, gap_axis, pedal_axis, ttc_axis = axes
@@ -66,24 +74,55 @@ def _mark_moments(speed_axis: Axes, gap_axis: Axes, runs: SimulationRuns, row: i
     trace, moments, impact_speed = runs.trace, find_moments(runs, row), float(runs.collision_speed[row])
     has_impact = not np.isnan(impact_speed)
     if moments.braking_start is not None:
-        _draw_mark(speed_axis, row, (trace.time[moments.braking_start], trace.speed[moments.braking_start, row]),
-                   BRAKING_MARK)
+        _draw_mark(
+            speed_axis, row, (trace.time[moments.braking_start], trace.speed[moments.braking_start, row]), BRAKING_MARK
+        )
     if has_impact:
-        _draw_mark(speed_axis, row, (trace.time[moments.end], impact_speed), IMPACT_MARK, f"{impact_speed:.1f} m/s",
-                   (3, 7), "left")
+        _draw_mark(
+            speed_axis,
+            row,
+            (trace.time[moments.end], impact_speed),
+            IMPACT_MARK,
+            f"{impact_speed:.1f} m/s",
+            (3, 7),
+            "left",
+        )
     if moments.nearest is not None and np.isfinite(gap := trace.gap[moments.nearest, row]):
         is_largest = np.argmax(np.where(trace.active, trace.gap, np.inf).min(axis=0)) == row
         mark, text = (IMPACT_MARK, "impact") if has_impact else (NEAREST_MARK, f"{gap:.2f} m")
         _draw_mark(gap_axis, row, (trace.time[moments.nearest], gap), mark, text, (0, 9 if is_largest else -17))
 
 
-def _draw_mark(axis: Axes, row: int, point: tuple[float, float], mark: str, text: str = "",
-               offset: tuple[int, int] = (0, 0), alignment: str = "center") -> None:
+def _draw_mark(
+    axis: Axes,
+    row: int,
+    point: tuple[float, float],
+    mark: str,
+    text: str = "",
+    offset: tuple[int, int] = (0, 0),
+    alignment: str = "center",
+) -> None:
     """Draw a mark on a line. The original's mark is larger, to show behind the changed vehicle's mark."""
-    axis.plot(*point, marker=mark, color=COLOURS[row], markersize=12 - 4 * row + 2 * (mark == IMPACT_MARK),
-              linestyle="", zorder=6 + row, markeredgecolor="white")
-    axis.annotate(text, point, xytext=offset, textcoords="offset points", color=COLOURS[row], fontweight="bold",
-                  ha=alignment, bbox={"facecolor": "white", "edgecolor": "none", "pad": 0.8}, zorder=5)
+    axis.plot(
+        *point,
+        marker=mark,
+        color=COLOURS[row],
+        markersize=12 - 4 * row + 2 * (mark == IMPACT_MARK),
+        linestyle="",
+        zorder=6 + row,
+        markeredgecolor="white",
+    )
+    axis.annotate(
+        text,
+        point,
+        xytext=offset,
+        textcoords="offset points",
+        color=COLOURS[row],
+        fontweight="bold",
+        ha=alignment,
+        bbox={"facecolor": "white", "edgecolor": "none", "pad": 0.8},
+        zorder=5,
+    )
 
 
 def _end_time(comparison: Comparison) -> float:
@@ -99,14 +138,37 @@ def _draw_legend(figure: Figure, comparison: Comparison, divergence_time: float 
     from matplotlib.lines import Line2D
 
     has_impact = bool(np.isfinite(comparison.film.runs.collision_speed).any())
-    marks = {"begins to brake": BRAKING_MARK, "nearest": NEAREST_MARK, **({"impact": IMPACT_MARK} if has_impact else {})}
-    entries = [Line2D([], [], color=COLOURS[row], linestyle="--" if row else "-",
-                      label=f"{comparison.name(row)} vehicle: {comparison.verdict(row)}") for row in comparison.rows]
-    entries += [Line2D([], [], color="0.35", marker=mark, linestyle="", markersize=7, label=label) for label, mark in marks.items()]
+    marks = {
+        "begins to brake": BRAKING_MARK,
+        "nearest": NEAREST_MARK,
+        **({"impact": IMPACT_MARK} if has_impact else {}),
+    }
+    entries = [
+        Line2D(
+            [],
+            [],
+            color=COLOURS[row],
+            linestyle="--" if row else "-",
+            label=f"{comparison.name(row)} vehicle: {comparison.verdict(row)}",
+        )
+        for row in comparison.rows
+    ]
+    entries += [
+        Line2D([], [], color="0.35", marker=mark, linestyle="", markersize=7, label=label)
+        for label, mark in marks.items()
+    ]
     if divergence_time is not None:
         entries.append(Line2D([], [], color="0.35", linestyle="-.", linewidth=0.9, label="speeds diverge (by 0.1 m/s)"))
-    entries.append(Line2D([], [], color="0.4", linestyle=":", linewidth=0.9,
-                          label=f"TTC* = {comparison.ttc_threshold:g} s: critical below"))
+    entries.append(
+        Line2D(
+            [],
+            [],
+            color="0.4",
+            linestyle=":",
+            linewidth=0.9,
+            label=f"TTC* = {comparison.ttc_threshold:g} s: critical below",
+        )
+    )
     figure.legend(handles=entries, loc="outside lower center", ncols=3, frameon=False)
 
 

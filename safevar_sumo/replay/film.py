@@ -96,7 +96,9 @@ class _Camera:
         for actor in sorted(self._sizes):
             copy, name = copy_and_name(actor)
             if name not in by_name:
-                by_name[name] = ActorTrack(*self._sizes[actor], *(np.full((len(self._frames), self._copy_count), np.nan) for _ in range(3)))
+                by_name[name] = ActorTrack(
+                    *self._sizes[actor], *(np.full((len(self._frames), self._copy_count), np.nan) for _ in range(3))
+                )
             for sample, frame in enumerate(self._frames):
                 if actor in frame:
                     for array, value in zip(by_name[name][3:], frame[actor], strict=True):

@@ -55,7 +55,9 @@ VIEW_SETTINGS = """<viewsettings>
 """
 
 
-def show_in_gui(comparison: Comparison, *, slower: float = 1.0, rest: float = PAUSE, pictures: Path | None = None) -> None:
+def show_in_gui(
+    comparison: Comparison, *, slower: float = 1.0, rest: float = PAUSE, pictures: Path | None = None
+) -> None:
     """Play a comparison in SUMO's own window, with pauses at the nearest moments and at the end.
 
     Parameters
@@ -107,15 +109,28 @@ def _open_window(network: Network, step: float) -> Iterator[Any]:
     with tempfile.TemporaryDirectory() as folder:
         settings_file = Path(folder) / "view.xml"
         settings_file.write_text(VIEW_SETTINGS, encoding="utf-8")
-        options = {"-n": copied_network(network, 1).network, "--step-length": repr(step), "--collision.action": "none",
-                   "--gui-settings-file": settings_file, "--start": "true", "--quit-on-end": "true",
-                   "--no-step-log": "true", "--no-warnings": "true", "--window-size": "1200,700",
-                   "--time-to-teleport": -1, "--xml-validation": "never", "--xml-validation.net": "never"}
+        options = {
+            "-n": copied_network(network, 1).network,
+            "--step-length": repr(step),
+            "--collision.action": "none",
+            "--gui-settings-file": settings_file,
+            "--start": "true",
+            "--quit-on-end": "true",
+            "--no-step-log": "true",
+            "--no-warnings": "true",
+            "--window-size": "1200,700",
+            "--time-to-teleport": -1,
+            "--xml-validation": "never",
+            "--xml-validation.net": "never",
+        }
         try:
             command = [program_path(Engine.GUI), *(str(text) for item in options.items() for text in item)]
             start_engine(api, Engine.GUI, command)
-            lane = next(lane for lane in api.lane.getIDList()
-                        if not lane.startswith(":") and "passenger" not in api.lane.getDisallowed(lane))
+            lane = next(
+                lane
+                for lane in api.lane.getIDList()
+                if not lane.startswith(":") and "passenger" not in api.lane.getDisallowed(lane)
+            )
             api.route.add("route", [api.lane.getEdgeID(lane)])
             yield api
         except (api.TraCIException, api.FatalTraCIError) as error:
@@ -160,15 +175,19 @@ def _show_sample(api: Any, scene: FlatScene, sample: int, offsets: list[FloatArr
         for name, track in comparison.film.tracks.items():
             x, y, angle = (float(values[now, row]) for values in (track.x, track.y, track.angle))
             if not np.isnan(x):
-                api.vehicle.moveToXY(f"{row}.{name}", "", 0, x + offset[0], y + offset[1], angle,
-                                     keepRoute=ANY_POSITION)
+                api.vehicle.moveToXY(
+                    f"{row}.{name}", "", 0, x + offset[0], y + offset[1], angle, keepRoute=ANY_POSITION
+                )
                 api.vehicle.setSignals(f"{row}.{name}", BRAKE_LIGHT if name == VUT and trace.brake[now, row] > 0 else 0)
         is_finished = sample >= (moments.end if moments.nearest is None else moments.nearest)
         ending = comparison.verdict(row) if is_finished else f"{sample * scene.step:.2f} s"
         x, y = (corners + offset).mean(axis=0)[0], (corners + offset).min(axis=0)[1] + LEGEND_HEIGHT
         api.poi.setPosition(f"legend.{row}", x, y)
-        api.poi.setParameter(f"legend.{row}", "words", f"{comparison.name(row)} ({('blue', 'orange')[row]}): "
-                                                       f"{trace.speed[now, row]:.1f} m/s, {ending}")
+        api.poi.setParameter(
+            f"legend.{row}",
+            "words",
+            f"{comparison.name(row)} ({('blue', 'orange')[row]}): {trace.speed[now, row]:.1f} m/s, {ending}",
+        )
     everything = np.concatenate([corners + offset for offset in offsets])
     api.gui.setBoundary(VIEW_NAME, *everything.min(axis=0), *everything.max(axis=0))
     api.simulationStep()

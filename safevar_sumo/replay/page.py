@@ -34,15 +34,22 @@ def template_environment(*folders: Path) -> Environment:
     """The jinja2 environment for templates in these folders and for the player; it escapes all values."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
-    return Environment(loader=FileSystemLoader([*folders, PLAYER_FOLDER]), autoescape=True, undefined=StrictUndefined, trim_blocks=True,
-                       lstrip_blocks=True)
+    return Environment(
+        loader=FileSystemLoader([*folders, PLAYER_FOLDER]),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
 
 
 def animation_page(scene: FlatScene) -> str:
     """A self-contained page that shows one scene."""
     template = template_environment().get_template("animation.html.j2")
     comparison = scene.comparison
-    return template.render(title=comparison.title, changes=comparison.changes, data=player_data(scene), **player_files())
+    return template.render(
+        title=comparison.title, changes=comparison.changes, data=player_data(scene), **player_files()
+    )
 
 
 def player_data(scene: FlatScene) -> dict[str, Any]:
@@ -51,23 +58,37 @@ def player_data(scene: FlatScene) -> dict[str, Any]:
     drives = [_drive_data(scene, row) for row in scene.comparison.rows]
     bodies = sorted(scene.bodies, key=lambda body: (body.is_vut, body.row))
     left_ends = _rounded_or_constant(view.left_ends)
-    box = {"left": left_ends, "top": round(-view.bottom - view.height, DECIMALS), "width": round(view.width, DECIMALS),
-           "height": round(view.height, DECIMALS)}
+    box = {
+        "left": left_ends,
+        "top": round(-view.bottom - view.height, DECIMALS),
+        "width": round(view.width, DECIMALS),
+        "height": round(view.height, DECIMALS),
+    }
     common_data = {"step": scene.step, "length": scene.sample_count, "key": key_sample, "view": box, "drives": drives}
     return {
         **common_data,
-        "description": _describe_scene(scene), "moments": _list_jumps(scene), "bottom": round(-view.bottom, DECIMALS),
+        "description": _describe_scene(scene),
+        "moments": _list_jumps(scene),
+        "bottom": round(-view.bottom, DECIMALS),
         "letters": round(view.width / WIDTH_IN_TEXT_HEIGHTS, DECIMALS),
-        "road": [_lane_data(lane) for kind in ("area", "path", "road", "crossing") for lane in scene.road if lane.kind == kind],
+        "road": [
+            _lane_data(lane)
+            for kind in ("area", "path", "road", "crossing")
+            for lane in scene.road
+            if lane.kind == kind
+        ],
         "ticks": scene.all_marks,
         "bodies": [_still_body_data(body, scene) for body in bodies],
-        "played": {**common_data, "bodies": [_moving_body_data(body) for body in bodies]}}
+        "played": {**common_data, "bodies": [_moving_body_data(body) for body in bodies]},
+    }
 
 
 def _describe_scene(scene: FlatScene) -> str:
     """Describe the still picture in words."""
     comparison = scene.comparison
-    vehicles = " and ".join(f"the {comparison.name(row)} vehicle, which {comparison.verdict(row)}" for row in comparison.rows)
+    vehicles = " and ".join(
+        f"the {comparison.name(row)} vehicle, which {comparison.verdict(row)}" for row in comparison.rows
+    )
     return f"Seen from above after {scene.key_sample * scene.step:.2f} s: {vehicles}"
 
 
@@ -87,32 +108,58 @@ def _list_jumps(scene: FlatScene) -> list[dict[str, Any]]:
 def _drive_data(scene: FlatScene, row: int) -> dict[str, Any]:
     trace, moments = scene.comparison.film.runs.trace, scene.moments[row]
     samples = slice(0, moments.end + 1)
-    return {"name": scene.comparison.name(row), "verdict": scene.comparison.verdict(row), "end": moments.end,
-            "nearest": moments.end if moments.nearest is None else moments.nearest, "speed": _rounded_list(trace.speed[samples, row]),
-            "gap": _rounded_list(trace.gap[samples, row]), "brakes": (trace.brake[samples, row] > 0).astype(int).tolist()}
+    return {
+        "name": scene.comparison.name(row),
+        "verdict": scene.comparison.verdict(row),
+        "end": moments.end,
+        "nearest": moments.end if moments.nearest is None else moments.nearest,
+        "speed": _rounded_list(trace.speed[samples, row]),
+        "gap": _rounded_list(trace.gap[samples, row]),
+        "brakes": (trace.brake[samples, row] > 0).astype(int).tolist(),
+    }
 
 
 def _lane_data(lane: Any) -> dict[str, Any]:
-    return {"kind": lane.kind, "width": round(lane.width, 3), "inside": round(lane.width - SEAM_WIDTH, 3),
-            "points": " ".join(f"{x:.2f},{-y:.2f}" for x, y in lane.line.tolist())}
+    return {
+        "kind": lane.kind,
+        "width": round(lane.width, 3),
+        "inside": round(lane.width - SEAM_WIDTH, 3),
+        "points": " ".join(f"{x:.2f},{-y:.2f}" for x, y in lane.line.tolist()),
+    }
 
 
 def _moving_body_data(body: FlatBody) -> dict[str, Any]:
     degrees = -np.rad2deg(np.unwrap(body.heading)) if np.isfinite(body.heading).all() else -np.rad2deg(body.heading)
-    return {"drive": body.row if body.is_vut else None, "x": _rounded_or_constant(body.x), "y": _rounded_or_constant(-body.y),
-            "heading": _rounded_or_constant(degrees, decimals=1)}
+    return {
+        "drive": body.row if body.is_vut else None,
+        "x": _rounded_or_constant(body.x),
+        "y": _rounded_or_constant(-body.y),
+        "heading": _rounded_or_constant(degrees, decimals=1),
+    }
 
 
 def _still_body_data(body: FlatBody, scene: FlatScene) -> dict[str, Any]:
     """One body at the key sample."""
     key_sample = scene.key_sample
-    x, y, heading = (_rounded_list(values[key_sample:key_sample + 1])[0] for values in (body.x, -body.y, -np.rad2deg(body.heading)))
+    x, y, heading = (
+        _rounded_list(values[key_sample : key_sample + 1])[0] for values in (body.x, -body.y, -np.rad2deg(body.heading))
+    )
     style = {ORIGINAL: "original", CHANGED: "changed"}[body.row] if body.is_vut else "other"
     brake = scene.comparison.film.runs.trace.brake[min(key_sample, scene.moments[body.row].end), body.row]
-    return {"name": body.name, "person": body.is_person, "length": body.length, "width": body.width, "look": style,
-            "title": f"{scene.comparison.name(body.row)} vehicle" if body.is_vut else body.name,
-            "radius": max(body.length, body.width) / 2, "drive": body.row if body.is_vut else None,
-            "brakes_key": body.is_vut and brake > 0, "x_key": x, "y_key": y, "heading_key": heading}
+    return {
+        "name": body.name,
+        "person": body.is_person,
+        "length": body.length,
+        "width": body.width,
+        "look": style,
+        "title": f"{scene.comparison.name(body.row)} vehicle" if body.is_vut else body.name,
+        "radius": max(body.length, body.width) / 2,
+        "drive": body.row if body.is_vut else None,
+        "brakes_key": body.is_vut and brake > 0,
+        "x_key": x,
+        "y_key": y,
+        "heading_key": heading,
+    }
 
 
 def _rounded_list(values: FloatArray, decimals: int = DECIMALS) -> list[float | None]:

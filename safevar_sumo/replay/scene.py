@@ -90,21 +90,48 @@ def lay_out_scene(comparison: Comparison) -> FlatScene:
     start = np.array([vut.x[0, 0], vut.y[0, 0]])
     all_moments = tuple(find_moments(film.runs, row) for row in comparison.rows)
     sample_count = max(run_moments.end for run_moments in all_moments) + 1
-    bodies = tuple(_lay_out_body(name, track, row, all_moments[row].end, sample_count, rotation, start, turn)
-                   for name, track in film.tracks.items() for row in comparison.rows
-                   if name == VUT or (_is_near(film, name, row) and not _is_duplicate(comparison, name, row)))
+    bodies = tuple(
+        _lay_out_body(name, track, row, all_moments[row].end, sample_count, rotation, start, turn)
+        for name, track in film.tracks.items()
+        for row in comparison.rows
+        if name == VUT or (_is_near(film, name, row) and not _is_duplicate(comparison, name, row))
+    )
     road = tuple(lane._replace(line=(lane.line - start) @ rotation.T) for lane in film.road)
-    return FlatScene(comparison=comparison, step=film.runs.trace.step, sample_count=sample_count, road=road, bodies=bodies,
-                     moments=all_moments, view=_choose_view(bodies, sample_count))
+    return FlatScene(
+        comparison=comparison,
+        step=film.runs.trace.step,
+        sample_count=sample_count,
+        road=road,
+        bodies=bodies,
+        moments=all_moments,
+        view=_choose_view(bodies, sample_count),
+    )
 
 
-def _lay_out_body(name: str, track: ActorTrack, row: int, end: int, sample_count: int, rotation: FloatArray, start: FloatArray,
-                 turn: float) -> FlatBody:
+def _lay_out_body(
+    name: str,
+    track: ActorTrack,
+    row: int,
+    end: int,
+    sample_count: int,
+    rotation: FloatArray,
+    start: FloatArray,
+    turn: float,
+) -> FlatBody:
     """An actor until its simulation ends; afterwards the actor stays in place."""
     samples = np.minimum(np.arange(sample_count), end)
     x, y = rotation @ (np.stack([track.x[samples, row], track.y[samples, row]]) - start[:, np.newaxis])
-    return FlatBody(name=name, row=row, is_vut=name == VUT, is_person=track.is_person, length=track.length, width=track.width, x=x, y=y,
-                    heading=np.deg2rad(90 - track.angle[samples, row]) - turn)
+    return FlatBody(
+        name=name,
+        row=row,
+        is_vut=name == VUT,
+        is_person=track.is_person,
+        length=track.length,
+        width=track.width,
+        x=x,
+        y=y,
+        heading=np.deg2rad(90 - track.angle[samples, row]) - turn,
+    )
 
 
 def _is_near(film: Film, name: str, row: int) -> bool:
@@ -127,7 +154,9 @@ def _choose_view(bodies: tuple[FlatBody, ...], sample_count: int) -> View:
     """The whole road or, in a long scene, the view of a camera that follows the vehicles."""
     left_end = min(float(np.nanmin(body.x)) - body.length for body in bodies) - MARGIN / 2
     right_end = max(float(np.nanmax(body.x)) + (0 if body.is_vut else body.length) for body in bodies) + MARGIN
-    edges = [edge for body in bodies for edge in (np.nanmin(body.y) - body.width / 2, np.nanmax(body.y) + body.width / 2)]
+    edges = [
+        edge for body in bodies for edge in (np.nanmin(body.y) - body.width / 2, np.nanmax(body.y) + body.width / 2)
+    ]
     bottom, top = float(min(edges)) - MARGIN / 2, float(max(edges)) + MARGIN / 2
     padding = max(0.0, MIN_HEIGHT - (top - bottom)) / 2
     if right_end - left_end <= MAX_LENGTH:
@@ -153,5 +182,6 @@ def crossing_stripes(lane: LaneLine) -> Iterator[FloatArray]:
     for start, end in pairwise(lane.line):
         direction = (end - start) / (np.hypot(*(end - start)) or 1.0)
         for distance in np.arange(STRIPE_LENGTH / 2, np.hypot(*(end - start)) - STRIPE_LENGTH, 2 * STRIPE_LENGTH):
-            yield strip_corners(start + direction * distance, start + direction * (distance + STRIPE_LENGTH),
-                                lane.width)
+            yield strip_corners(
+                start + direction * distance, start + direction * (distance + STRIPE_LENGTH), lane.width
+            )

@@ -17,8 +17,15 @@ if TYPE_CHECKING:
     from safevar_sumo.progress import Progress
 
 
-def report(*results: Results | str | Path, out: str | Path | None = None, only: Sequence[str] = (), point: str | None = None,
-           jobs: int | None = None, progress: bool | Progress = False, as_it_is_now: bool = False) -> str:
+def report(
+    *results: Results | str | Path,
+    out: str | Path | None = None,
+    only: Sequence[str] = (),
+    point: str | None = None,
+    jobs: int | None = None,
+    progress: bool | Progress = False,
+    as_it_is_now: bool = False,
+) -> str:
     """Make one self-contained HTML page about the results of one or several studies; the same results give the same page.
 
     Parameters

@@ -59,12 +59,22 @@ def tabulate_failing_points(matrix: Sequence[Point], failing: Collection[str]) -
         if point.name in failing:
             texts.append(FAILURE_TEXT if location is None else f"{location:g} %")
             has_location = has_location or location is not None
-    speeds = sorted({speed for cells in rows.values() for speed in cells}, key=lambda speed: (speed is None, speed or 0.0))
+    speeds = sorted(
+        {speed for cells in rows.values() for speed in cells}, key=lambda speed: (speed is None, speed or 0.0)
+    )
     frame = pd.DataFrame(
-        [[", ".join(cells[speed]) or AVOIDED_TEXT if speed in cells else "" for speed in speeds] for cells in rows.values()],
-        index=pd.Index(rows, name="test"), columns=["" if speed is None else f"{speed:g} km/h" for speed in speeds])
+        [
+            [", ".join(cells[speed]) or AVOIDED_TEXT if speed in cells else "" for speed in speeds]
+            for cells in rows.values()
+        ],
+        index=pd.Index(rows, name="test"),
+        columns=["" if speed is None else f"{speed:g} km/h" for speed in speeds],
+    )
     note = " Percentages are impact locations." if has_location else ""
-    return FailingPoints(f"Fails at {len(failing)} of {len(matrix)} points.{note}", frame[[any(cells.values()) for cells in rows.values()]])
+    return FailingPoints(
+        f"Fails at {len(failing)} of {len(matrix)} points.{note}",
+        frame[[any(cells.values()) for cells in rows.values()]],
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -91,7 +101,10 @@ class ReportInput:
     def solutions(self) -> dict[str, dict[str, Any]]:
         """Rows of the solutions by handle; each row also holds its handle."""
         pairs = zip(handles_of(self.case.solutions), self.case.solutions.to_dict("records"), strict=True)
-        return {str(handle): {**{str(name): value for name, value in row.items()}, "handle": str(handle)} for handle, row in pairs}
+        return {
+            str(handle): {**{str(name): value for name, value in row.items()}, "handle": str(handle)}
+            for handle, row in pairs
+        }
 
     @property
     def any_unsafe(self) -> bool:
@@ -102,7 +115,11 @@ class ReportInput:
         if self.case.solutions.empty:
             return []
         possible = choices if self.any_unsafe else ("most_severe",)
-        return list(dict.fromkeys(str(choose_handle(self.case.solutions, self.case.unsafe, choice, self.directory)) for choice in possible))
+        return list(
+            dict.fromkeys(
+                str(choose_handle(self.case.solutions, self.case.unsafe, choice, self.directory)) for choice in possible
+            )
+        )
 
     def setting_of(self, handle: str) -> FloatArray:
         """A solution's setting, shape (n,)."""
@@ -110,7 +127,11 @@ class ReportInput:
 
     def list_changes(self, setting: FloatArray) -> list[tuple[str, str, str]]:
         """A setting's changes from the original: both values in a text, the characteristic's short name and its description."""
-        changed = [item for item, value in zip(self.case.characteristics, setting.tolist(), strict=True) if value != item.original]
+        changed = [
+            item
+            for item, value in zip(self.case.characteristics, setting.tolist(), strict=True)
+            if value != item.original
+        ]
         texts = changes_in_words(self.case.characteristics, setting)
         return [(text, item.short_name, item.words) for item, text in zip(changed, texts, strict=True)]
 
@@ -133,7 +154,9 @@ class ReportInput:
             return None
         key = setting.tobytes()
         if key not in self._failing:
-            (points,) = unsafe_points_of(self.system, simulate_all_points(self.system, setting[np.newaxis]), self.case.unsafe)
+            (points,) = unsafe_points_of(
+                self.system, simulate_all_points(self.system, setting[np.newaxis]), self.case.unsafe
+            )
             self._failing[key] = tabulate_failing_points(self.system.matrix, points)
         return self._failing[key]
 
@@ -146,15 +169,23 @@ class ReportInput:
     def simulation_counts(self) -> dict[str, int]:
         """About how many simulations each section takes, at most."""
         n = len(self.case.characteristics)
-        return {"causes": EXPLAIN_SIMULATIONS, "tolerance": 200 * n + 6000,
-                "risk": SAMPLED_VEHICLES + (n + 2) * BASE_POINTS, "rules": SAMPLED_VEHICLES}
+        return {
+            "causes": EXPLAIN_SIMULATIONS,
+            "tolerance": 200 * n + 6000,
+            "risk": SAMPLED_VEHICLES + (n + 2) * BASE_POINTS,
+            "rules": SAMPLED_VEHICLES,
+        }
 
     @cached_property
     def options(self) -> dict[str, Any]:
         """Each question's options on the page: smaller samples than the commands take."""
         all_options: tuple[Options, ...] = (
-            ExplainOptions(limit=EXPLAIN_SIMULATIONS), OpinionOptions(), ToleranceOptions(),
-            RiskOptions(samples=SAMPLED_VEHICLES), RulesOptions(samples=SAMPLED_VEHICLES))
+            ExplainOptions(limit=EXPLAIN_SIMULATIONS),
+            OpinionOptions(),
+            ToleranceOptions(),
+            RiskOptions(samples=SAMPLED_VEHICLES),
+            RulesOptions(samples=SAMPLED_VEHICLES),
+        )
         return {options.question: options for options in all_options}
 
     def anchor(self, *parts: object) -> str:
@@ -163,7 +194,9 @@ class ReportInput:
         return "".join(letter if letter.isascii() and letter.isalnum() else "-" for letter in text)
 
 
-def read_inputs(directories: Iterable[str | Path], point: str | None = None, *, as_it_is_now: bool = False) -> list[ReportInput]:
+def read_inputs(
+    directories: Iterable[str | Path], point: str | None = None, *, as_it_is_now: bool = False
+) -> list[ReportInput]:
     """Read results directories; with `point`, simulate their solutions again at this point of the matrix.
 
     Raises
@@ -186,6 +219,16 @@ def read_inputs(directories: Iterable[str | Path], point: str | None = None, *, 
         if point is not None:
             case = at_point(case, point)
             system = assemble(case.study, str(path))
-        inputs.append(ReportInput(study_number=study_number, directory=path, case=case, manifest=read_manifest(path), system=system,
-                                  problem=problem, point=point or "", later_changes=later_changes))
+        inputs.append(
+            ReportInput(
+                study_number=study_number,
+                directory=path,
+                case=case,
+                manifest=read_manifest(path),
+                system=system,
+                problem=problem,
+                point=point or "",
+                later_changes=later_changes,
+            )
+        )
     return inputs

@@ -39,18 +39,29 @@ def rated_study_data(data: ReportInput, jobs: int | None, progress: Progress) ->
         variants[str(handle)] = row[list(names)].to_numpy(dtype=float)
     rating = rate(case.study, variants, jobs=jobs, progress=progress)
     rating_command = RatingOptions(solution=None if handle is None else str(handle)).command_line(str(data.directory))
-    return {"title": case.study.title, "sentence": f"{rating.no_verdict} {rating_in_words(rating)}".lstrip(),
-            "notes": remarks(rating), "points": _point_rows(rating),
-            "lost": [(test_in_words(test), f"{lost:.2f}") for test, lost in lost_by_test(rating)],
-            "turned": colour_changes_in_words(rating), "picture": draw_matrices(rating),
-            "names": [vehicle.name for vehicle in rating.vehicles], "not_simulated": not_simulated(rating),
-            "commands": [rating_command, *(question_command(question, str(data.directory)) for question in ("tolerance", "explain"))]}
+    return {
+        "title": case.study.title,
+        "sentence": f"{rating.no_verdict} {rating_in_words(rating)}".lstrip(),
+        "notes": remarks(rating),
+        "points": _point_rows(rating),
+        "lost": [(test_in_words(test), f"{lost:.2f}") for test, lost in lost_by_test(rating)],
+        "turned": colour_changes_in_words(rating),
+        "picture": draw_matrices(rating),
+        "names": [vehicle.name for vehicle in rating.vehicles],
+        "not_simulated": not_simulated(rating),
+        "commands": [
+            rating_command,
+            *(question_command(question, str(data.directory)) for question in ("tolerance", "explain")),
+        ],
+    }
 
 
 def _point_rows(rating: Rating) -> Sequence[tuple[str, Sequence[str], str]]:
     """Rows of texts: a test, the points of each vehicle, and the points available."""
-    rows = [(tests[0].matrix.name, [f"{test.total:.2f}" for test in tests], f"{sum(tests[0].matrix.points):g}")
-            for tests in zip(*(vehicle.tests for vehicle in rating.vehicles), strict=True)]
+    rows = [
+        (tests[0].matrix.name, [f"{test.total:.2f}" for test in tests], f"{sum(tests[0].matrix.points):g}")
+        for tests in zip(*(vehicle.tests for vehicle in rating.vehicles), strict=True)
+    ]
     available = sum(sum(matrix.points) for matrix in rating.protocol.matrices)
     return [*rows, ("all", [f"{vehicle.points:.2f}" for vehicle in rating.vehicles], f"{available:g}")]
 
@@ -62,4 +73,4 @@ def draw_matrices(rating: Rating) -> Markup:
     file = io.StringIO()
     with matplotlib.rc_context({"svg.hashsalt": "safevar_sumo"}):
         matrices_figure(rating).savefig(file, format="svg", metadata={"Date": None})
-    return Markup(file.getvalue()[file.getvalue().index("<svg"):])
+    return Markup(file.getvalue()[file.getvalue().index("<svg") :])

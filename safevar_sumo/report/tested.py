@@ -25,15 +25,26 @@ def describe_tested_system(data: ReportInput) -> dict[str, Any]:
     case, study = data.case, data.case.study
     return {
         "subject": f"Vehicle: {_first_sentence(VEHICLES, study.vehicle.model) or study.vehicle.model} "
-                   f"({number_of(len(case.characteristics), 'varied characteristic')}). "
-                   f"Driving system: {_name_and_sentence(ADS, study.ads.model)}. "
-                   f"Scenario: {_name_and_sentence(SCENARIOS, study.scenario.model)}; {describe_conditions(data)}.",
-        "tags": "" if data.system is None else pre_crash_sentence(data.system.points), "search": _describe_search(data),
+        f"({number_of(len(case.characteristics), 'varied characteristic')}). "
+        f"Driving system: {_name_and_sentence(ADS, study.ads.model)}. "
+        f"Scenario: {_name_and_sentence(SCENARIOS, study.scenario.model)}; {describe_conditions(data)}.",
+        "tags": "" if data.system is None else pre_crash_sentence(data.system.points),
+        "search": _describe_search(data),
         "characteristics": [
-            (item.name, superscript_powers(unit_text(item.unit, "{}")),
-             *map(format_number, (item.original, item.lower, item.upper, item.threshold)), item.words)
-            for item in case.characteristics],
-        "remarks": [*case.remarks, *([data.problem] if data.problem else []), *(vehicle_remarks(data.system) if data.system else [])]}
+            (
+                item.name,
+                superscript_powers(unit_text(item.unit, "{}")),
+                *map(format_number, (item.original, item.lower, item.upper, item.threshold)),
+                item.words,
+            )
+            for item in case.characteristics
+        ],
+        "remarks": [
+            *case.remarks,
+            *([data.problem] if data.problem else []),
+            *(vehicle_remarks(data.system) if data.system else []),
+        ],
+    }
 
 
 def describe_conditions(data: ReportInput) -> str:
@@ -52,7 +63,10 @@ def _describe_tests(points: Sequence[Point]) -> list[str]:
     weathers_by_test: dict[str, list[str]] = {}
     for point in points:
         weathers_by_test.setdefault(str(dict(point.parameters)["test"]), []).append(point.weather.name)
-    return [f"{test} ({len(weathers)}, {' and '.join(dict.fromkeys(weathers))})" for test, weathers in weathers_by_test.items()]
+    return [
+        f"{test} ({len(weathers)}, {' and '.join(dict.fromkeys(weathers))})"
+        for test, weathers in weathers_by_test.items()
+    ]
 
 
 def _describe_search(data: ReportInput) -> str:
@@ -62,8 +76,10 @@ def _describe_search(data: ReportInput) -> str:
         return f"The {len(case.solutions)} solutions are imported ({versions})."
     runs = Counter(algorithm for algorithm, _ in case.finished_runs)
     names = [f"{ALGORITHM_TITLES.get(name, name)} ({number_of(count, 'run')})" for name, count in runs.items()]
-    return (f"Searched by {', '.join(names) or 'no finished run'} of at most {search.evaluations} simulations each, "
-            f"{len(case.evaluations)} different vehicles in all, from seed {search.seed}, with {versions}.")
+    return (
+        f"Searched by {', '.join(names) or 'no finished run'} of at most {search.evaluations} simulations each, "
+        f"{len(case.evaluations)} different vehicles in all, from seed {search.seed}, with {versions}."
+    )
 
 
 def _name_and_sentence(models: Mapping[str, Any], name: str) -> str:

@@ -24,12 +24,20 @@ class ResultsFile(NamedTuple):
 
 
 FILES = (
-    ResultsFile(MANIFEST, "the study as it was run, the original vehicle's metrics, versions, digests of files, and folders of your own "
-                "code and files: [what results depend on](results.md)", "`study`, `import`"),
+    ResultsFile(
+        MANIFEST,
+        "the study as it was run, the original vehicle's metrics, versions, digests of files, and folders of your own "
+        "code and files: [what results depend on](results.md)",
+        "`study`, `import`",
+    ),
     ResultsFile(SOLUTIONS, "a row for each solution of each finished run", "`study` after its last run, `import`"),
-    ResultsFile(f"{RUNS}/*-*.jsonl", "every evaluation of the run ALGORITHM-NN, from which an interrupted study continues",
-                "`study` after each batch"),
-    ResultsFile(f"{RUNS}/{ORIGINAL}.jsonl", "the original vehicle's evaluation", "`study` before its first run"))
+    ResultsFile(
+        f"{RUNS}/*-*.jsonl",
+        "every evaluation of the run ALGORITHM-NN, from which an interrupted study continues",
+        "`study` after each batch",
+    ),
+    ResultsFile(f"{RUNS}/{ORIGINAL}.jsonl", "the original vehicle's evaluation", "`study` before its first run"),
+)
 """Every file of a results directory; the manual lists them."""
 
 

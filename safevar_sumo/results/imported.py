@@ -25,8 +25,13 @@ UNKNOWN = "unknown"
 """Outcome of an imported solution that did not collide."""
 
 
-def write_imported(path: Path, study: Study, solutions: Mapping[str, Evaluations],
-                   original: Mapping[str, float | None] | None, files: Mapping[str, str]) -> dict[str, int]:
+def write_imported(
+    path: Path,
+    study: Study,
+    solutions: Mapping[str, Evaluations],
+    original: Mapping[str, float | None] | None,
+    files: Mapping[str, str],
+) -> dict[str, int]:
     """Write a results directory of imported solutions; returns the numbers of earlier solutions that they replace, by algorithm.
 
     Parameters
@@ -50,19 +55,28 @@ def write_imported(path: Path, study: Study, solutions: Mapping[str, Evaluations
     make_directory(path)
     tables, characteristics = tables_of(study), tuple(study.vehicle.characteristics)
     earlier_manifest = _earlier_manifest(path, tables)
-    frame = solutions_frame(characteristics, [((algorithm, 0), evaluations) for algorithm, evaluations in solutions.items()])
+    frame = solutions_frame(
+        characteristics, [((algorithm, 0), evaluations) for algorithm, evaluations in solutions.items()]
+    )
     frame = frame.drop(columns="run")
     replaced_counts: dict[str, int] = {}
     if earlier_manifest:
         stored = read_imported(path, characteristics)
         is_replaced = stored["algorithm"].isin(list(solutions))
-        replaced_counts = {str(name): int(count) for name, count in stored["algorithm"][is_replaced].value_counts().items()}
+        replaced_counts = {
+            str(name): int(count) for name, count in stored["algorithm"][is_replaced].value_counts().items()
+        }
         frame = pd.concat([stored[~is_replaced], frame], ignore_index=True)
-        frame = frame.sort_values(["algorithm", "f_safe", "f_diff", "f_num_diff", *characteristics], kind="stable", ignore_index=True)
+        frame = frame.sort_values(
+            ["algorithm", "f_safe", "f_diff", "f_num_diff", *characteristics], kind="stable", ignore_index=True
+        )
     manifest: dict[str, Any] = {
-        "format": FORMAT, "study": tables, "imported": {"files": {**earlier_manifest.get("imported", {}).get("files", {}), **files}},
+        "format": FORMAT,
+        "study": tables,
+        "imported": {"files": {**earlier_manifest.get("imported", {}).get("files", {}), **files}},
         "versions": {"safevar_sumo": version("safevar_sumo")},
-        "original": dict(earlier_manifest.get("original", {}) if original is None else original)}
+        "original": dict(earlier_manifest.get("original", {}) if original is None else original),
+    }
     write_whole(path / SOLUTIONS, frame.to_csv(index=False, lineterminator="\n"))
     write_manifest(path, manifest)
     return replaced_counts
@@ -76,8 +90,11 @@ def _earlier_manifest(path: Path, study: dict[str, Any]) -> dict[str, Any]:
     if (path / RUNS).exists() or "imported" not in manifest:
         raise InputError(path, "holds results of a campaign", "another directory")
     if manifest["study"] != study:
-        raise InputError(path, f"holds solutions of another study or another version of it, {manifest['study'].get('name')!r}",
-                         "another directory")
+        raise InputError(
+            path,
+            f"holds solutions of another study or another version of it, {manifest['study'].get('name')!r}",
+            "another directory",
+        )
     return manifest
 
 
@@ -96,13 +113,22 @@ def read_imported(path: Path, characteristics: tuple[str, ...]) -> pd.DataFrame:
     refuse_other_than_file(file)
     try:
         frame = pd.read_csv(file, dtype=str, keep_default_na=False)[["algorithm", *numeric_columns, "outcome"]]
-        table = frame.replace({name: {"": "nan"} for name in numeric_columns}).astype(dict.fromkeys(numeric_columns, float))
+        table = frame.replace({name: {"": "nan"} for name in numeric_columns}).astype(
+            dict.fromkeys(numeric_columns, float)
+        )
     except OSError as error:
-        raise InputError(file, f"cannot be read: {error.strerror or error}", "what the command `import` has written") from None
+        raise InputError(
+            file, f"cannot be read: {error.strerror or error}", "what the command `import` has written"
+        ) from None
     except (KeyError, ValueError) as error:
-        raise InputError(file, f"is damaged: {str(error).splitlines()[0]}", "what the command `import` has written") from None
+        raise InputError(
+            file, f"is damaged: {str(error).splitlines()[0]}", "what the command `import` has written"
+        ) from None
     required_columns = [name for name in numeric_columns if name not in METRICS]
     if not np.isfinite(table[required_columns].to_numpy()).all():
-        raise InputError(file, f"is damaged: a value in the columns {', '.join(required_columns)} is missing or infinite",
-                         "what the command `import` has written")
+        raise InputError(
+            file,
+            f"is damaged: a value in the columns {', '.join(required_columns)} is missing or infinite",
+            "what the command `import` has written",
+        )
     return table.astype({"f_num_diff": int})

@@ -116,7 +116,9 @@ class Journal:
             self._file.close()
             raise
 
-    def append(self, positions: Sequence[int], evaluations: Evaluations, files: Mapping[str, str] | None = None) -> None:
+    def append(
+        self, positions: Sequence[int], evaluations: Evaluations, files: Mapping[str, str] | None = None
+    ) -> None:
         """Add a batch; `files` are digests of files that user code has read for the first time."""
         if files:
             self._write({FILES_READ: dict(files)})
@@ -156,7 +158,7 @@ class Journal:
         try:
             remainder = memoryview(msgspec.json.encode(line) + b"\n")
             while remainder:
-                remainder = remainder[self._file.write(remainder):]
+                remainder = remainder[self._file.write(remainder) :]
             if not self.path.exists():
                 raise OSError(errno.ENOENT, "the file is gone")
             if sync:
@@ -218,8 +220,9 @@ def _open_and_lock(path: Path, deadline: float) -> IO[bytes]:
             time.sleep(0.05)
         except portalocker.LockException as error:
             file.close()
-            raise SafevarError(f"{path}: cannot be locked: {error.strerror or error}; "
-                               "results need a disk whose files can be locked") from None
+            raise SafevarError(
+                f"{path}: cannot be locked: {error.strerror or error}; results need a disk whose files can be locked"
+            ) from None
         else:
             file.seek(0)
             return file
@@ -240,14 +243,19 @@ def _parse(data: bytes, path: Path) -> tuple[list[Line], int]:
             line = msgspec.json.decode(text, type=Line) if text.endswith(b"\n") else None
         except msgspec.DecodeError as error:
             if end + len(text) < len(data):
-                raise InputError(path, f"is damaged in line {len(lines) + 1}: {error}",
-                                 "the file as it was, or no file: the run is then simulated again") from None
+                raise InputError(
+                    path,
+                    f"is damaged in line {len(lines) + 1}: {error}",
+                    "the file as it was, or no file: the run is then simulated again",
+                ) from None
             line = None
         if line is None:
             break
         lines.append(line)
         end += len(text)
-    if (lines[:1] and "format" not in lines[0]) or (not lines and data.strip(b"\0") and not data.startswith(b'{"format"'[:len(data)])):
+    if (lines[:1] and "format" not in lines[0]) or (
+        not lines and data.strip(b"\0") and not data.startswith(b'{"format"'[: len(data)])
+    ):
         raise InputError(path, "is no journal", "another `out`")
     return lines, end
 
@@ -257,17 +265,23 @@ def _refuse_another_owner(lines: Sequence[Line], head: Head, path: Path, expecte
     if not empty and not any(POSITION in line for line in lines):
         return
     if lines[0].get("study") == head.study and lines[0].get("run") != head.run:
-        raise InputError(path, f"is the journal of run {lines[0].get('run')}, not of {head.run}: was it renamed or swapped?",
-                         f"the journal of {head.run}")
+        raise InputError(
+            path,
+            f"is the journal of run {lines[0].get('run')}, not of {head.run}: was it renamed or swapped?",
+            f"the journal of {head.run}",
+        )
     raise InputError(path, "belongs to another study or version", expected)
 
 
 def _batch_line(positions: Sequence[int], evaluations: Evaluations, characteristics: Iterable[str]) -> Line:
     """A batch of evaluations as a table."""
-    line = {POSITION: list(positions), OUTCOME: evaluations.outcome.tolist(),
-            **dict(zip(characteristics, evaluations.settings.T.tolist(), strict=True)),
-            **{name: getattr(evaluations, name).tolist() for name in OBJECTIVE_COLUMNS},
-            **{name: values.tolist() for name, values in evaluations.metrics.items()}}
+    line = {
+        POSITION: list(positions),
+        OUTCOME: evaluations.outcome.tolist(),
+        **dict(zip(characteristics, evaluations.settings.T.tolist(), strict=True)),
+        **{name: getattr(evaluations, name).tolist() for name in OBJECTIVE_COLUMNS},
+        **{name: values.tolist() for name, values in evaluations.metrics.items()},
+    }
     if evaluations.reasons:
         reasons = [evaluations.reasons.get(setting.tobytes()) for setting in evaluations.settings]
         line |= {REASON: reasons} if any(reasons) else {}
@@ -278,12 +292,23 @@ def _evaluations_of(line: Line, characteristics: Sequence[str]) -> Evaluations:
     """The batch of evaluations in a line."""
     if len({len(values) for values in line.values()}) > 1:
         raise ValueError("columns of different lengths")
-    columns = {name: np.array(values, dtype=float) for name, values in line.items() if name not in (POSITION, OUTCOME, REASON)}
+    columns = {
+        name: np.array(values, dtype=float) for name, values in line.items() if name not in (POSITION, OUTCOME, REASON)
+    }
     settings = np.stack([columns.pop(name) for name in characteristics], axis=1)
-    reasons = {setting.tobytes(): reason for setting, reason in zip(settings, line.get(REASON, ()), strict=False) if reason}
+    reasons = {
+        setting.tobytes(): reason for setting, reason in zip(settings, line.get(REASON, ()), strict=False) if reason
+    }
     speed, f_diff, f_num_diff = (columns.pop(name) for name in OBJECTIVE_COLUMNS)
-    return Evaluations(settings=settings, outcome=np.array(line[OUTCOME], dtype="U16"), collision_speed=speed, f_diff=f_diff,
-                       f_num_diff=f_num_diff, metrics=columns, reasons=reasons)
+    return Evaluations(
+        settings=settings,
+        outcome=np.array(line[OUTCOME], dtype="U16"),
+        collision_speed=speed,
+        f_diff=f_diff,
+        f_num_diff=f_num_diff,
+        metrics=columns,
+        reasons=reasons,
+    )
 
 
 def _content_of(lines: Sequence[Line], path: Path) -> JournalContent:
@@ -303,7 +328,9 @@ def _content_of(lines: Sequence[Line], path: Path) -> JournalContent:
                 batches, results = [remaining_evaluations], {}
         return JournalContent(positions, Evaluations.concatenate(batches) if positions else None, results)
     except (KeyError, TypeError, ValueError) as error:
-        raise InputError(path, f"was edited: {error!r}", "the file as it was, or no file: the run is then simulated again") from None
+        raise InputError(
+            path, f"was edited: {error!r}", "the file as it was, or no file: the run is then simulated again"
+        ) from None
 
 
 def _drop_failures(positions: Sequence[int], evaluations: Evaluations) -> tuple[list[int], Evaluations]:

@@ -38,7 +38,10 @@ def failure_lines(failures: Sequence[Failure]) -> list[str]:
     failures_by_reason: dict[str, list[Failure]] = {}
     for failure in failures:
         failures_by_reason.setdefault(failure.reason, []).append(failure)
-    return [str(first) if not others else f"{first} (and {len(others)} more)" for first, *others in failures_by_reason.values()]
+    return [
+        str(first) if not others else f"{first} (and {len(others)} more)"
+        for first, *others in failures_by_reason.values()
+    ]
 
 
 class StoredResults(NamedTuple):
@@ -111,8 +114,14 @@ class Status(NamedTuple):
 
     def record(self) -> dict[str, Any]:
         """The object that `status --json` prints."""
-        return {"study": self.study, "finished": self.finished, "share": self.share, "simulated": self.simulated, "budget": self.budget,
-                "runs": [run._asdict() for run in self.runs]}
+        return {
+            "study": self.study,
+            "finished": self.finished,
+            "share": self.share,
+            "simulated": self.simulated,
+            "budget": self.budget,
+            "runs": [run._asdict() for run in self.runs],
+        }
 
 
 class _Search(NamedTuple):
@@ -126,18 +135,28 @@ class _Search(NamedTuple):
 def _read_search(folder: Path, manifest: Mapping[str, Any]) -> _Search:
     try:
         search = manifest["study"]["search"]
-        runs = [(name, run) for name in dict.fromkeys(map(label_of, search["algorithms"])) for run in range(search["runs"])]
+        runs = [
+            (name, run) for name in dict.fromkeys(map(label_of, search["algorithms"])) for run in range(search["runs"])
+        ]
         return _Search(runs, int(search["evaluations"]), tuple(manifest["study"]["vehicle"]["characteristics"]))
     except (KeyError, TypeError, ValueError):
-        raise InputError(folder / MANIFEST, "has no characteristics or no search", "what the command `study` has written") from None
+        raise InputError(
+            folder / MANIFEST, "has no characteristics or no search", "what the command `study` has written"
+        ) from None
 
 
-def _read_journals(folder: Path, manifest: Mapping[str, Any], search: _Search) -> Iterator[tuple[str, int, JournalContent | None]]:
+def _read_journals(
+    folder: Path, manifest: Mapping[str, Any], search: _Search
+) -> Iterator[tuple[str, int, JournalContent | None]]:
     """Algorithm, number and journal's content of every run; None for a run without a journal."""
     digest = identity_digest(manifest)
     for algorithm, run in search.runs:
         path = journal_file(folder, run_name(algorithm, run))
-        yield algorithm, run, read_journal(path, Head(digest, path.stem, search.characteristics)) if path.exists() else None
+        yield (
+            algorithm,
+            run,
+            read_journal(path, Head(digest, path.stem, search.characteristics)) if path.exists() else None,
+        )
 
 
 def _lost_runs(folder: Path) -> list[tuple[str, int]]:
@@ -164,25 +183,37 @@ def load_runs(directory: str | Path) -> StoredResults:
         no_evaluations = evaluations_frame(search.characteristics, []).assign(evaluation=0)
         return StoredResults(manifest, no_evaluations, read_imported(folder, search.characteristics))
     for algorithm, run in _lost_runs(folder):
-        raise InputError(journal_file(folder, run_name(algorithm, run)), f"is missing, although {SOLUTIONS} holds solutions of this run",
-                         "the file as it was, or the same study again, which computes the run anew")
+        raise InputError(
+            journal_file(folder, run_name(algorithm, run)),
+            f"is missing, although {SOLUTIONS} holds solutions of this run",
+            "the file as it was, or the same study again, which computes the run anew",
+        )
     evaluations_of_runs, solutions_of_runs, all_positions, failures = [], [], list[int](), list[Failure]()
     for algorithm, run, content in _read_journals(folder, manifest, search):
         if content is not None and content.tail_size and search.budget not in content.results:
-            warn(f"{journal_file(folder, run_name(algorithm, run))}: the last {content.tail_size} bytes are torn, "
-                 "so the run counts as unfinished; running the same study again simulates the lost evaluations")
+            warn(
+                f"{journal_file(folder, run_name(algorithm, run))}: the last {content.tail_size} bytes are torn, "
+                "so the run counts as unfinished; running the same study again simulates the lost evaluations"
+            )
         positions, evaluations = content.requested_within(search.budget) if content is not None else ([], None)
         if content is None or evaluations is None:
             continue
         evaluations_of_runs.append(((algorithm, run), evaluations))
         all_positions += positions
-        failures += [Failure(algorithm, run, positions[i], evaluations.reason(i)) for i in np.flatnonzero(evaluations.failed).tolist()]
+        failures += [
+            Failure(algorithm, run, positions[i], evaluations.reason(i))
+            for i in np.flatnonzero(evaluations.failed).tolist()
+        ]
         if search.budget in content.results:
-            solutions_of_runs.append(((algorithm, run), content.take_positions(content.results[search.budget].positions)))
+            solutions_of_runs.append(
+                ((algorithm, run), content.take_positions(content.results[search.budget].positions))
+            )
     frame = evaluations_frame(search.characteristics, evaluations_of_runs)
     frame.insert(2, "evaluation", all_positions)
     solutions = solutions_frame(search.characteristics, solutions_of_runs)
-    return StoredResults(manifest, frame, solutions, tuple(run_key for run_key, _ in solutions_of_runs), tuple(failures))
+    return StoredResults(
+        manifest, frame, solutions, tuple(run_key for run_key, _ in solutions_of_runs), tuple(failures)
+    )
 
 
 def status(directory: str | Path) -> Status:
@@ -199,18 +230,37 @@ def status(directory: str | Path) -> Status:
         raise InputError(folder, "holds imported solutions, which have no runs", "results of the command `study`")
     search = _read_search(folder, manifest)
     runs = [_summarise_run(*journal, search.budget) for journal in _read_journals(folder, manifest, search)]
-    return Status(study=str(manifest["study"].get("name")), title=str(manifest["study"].get("title")), budget=search.budget,
-                  runs=tuple(run for run, _ in runs), points=np.concatenate([objectives for _, objectives in runs]))
+    return Status(
+        study=str(manifest["study"].get("name")),
+        title=str(manifest["study"].get("title")),
+        budget=search.budget,
+        runs=tuple(run for run, _ in runs),
+        points=np.concatenate([objectives for _, objectives in runs]),
+    )
 
 
-def _summarise_run(algorithm: str, run: int, content: JournalContent | None, budget: int) -> tuple[RunStatus, np.ndarray]:
+def _summarise_run(
+    algorithm: str, run: int, content: JournalContent | None, budget: int
+) -> tuple[RunStatus, np.ndarray]:
     """Progress of a run, and objectives of its valid evaluations."""
     _, evaluations = content.requested_within(budget) if content is not None else ([], None)
     if content is None or evaluations is None:
         state = "waiting" if content is None else "begun"
-        return RunStatus(algorithm, run, state, simulated=0, collisions=0, simulator_errors=0, best=None), np.zeros((0, 3))
+        return RunStatus(algorithm, run, state, simulated=0, collisions=0, simulator_errors=0, best=None), np.zeros(
+            (0, 3)
+        )
     valid_evaluations = evaluations.take(evaluations.valid)
     state = "finished" if budget in content.results else "begun"
     best = float(np.min(valid_evaluations.f_safe)) if len(valid_evaluations) else None
-    return (RunStatus(algorithm, run, state, simulated=len(evaluations), collisions=int(np.count_nonzero(evaluations.collided)),
-                      simulator_errors=int(np.count_nonzero(evaluations.failed)), best=best), valid_evaluations.objectives)
+    return (
+        RunStatus(
+            algorithm,
+            run,
+            state,
+            simulated=len(evaluations),
+            collisions=int(np.count_nonzero(evaluations.collided)),
+            simulator_errors=int(np.count_nonzero(evaluations.failed)),
+            best=best,
+        ),
+        valid_evaluations.objectives,
+    )

@@ -20,14 +20,28 @@ RESULTS = 6
 SIMULATORS = ("libsumo", "eclipse-sumo")
 """Packages on whose versions a single simulation depends."""
 PACKAGES = ("safevar_sumo", *SIMULATORS, "deap", "numpy")
-KEYS_WITHOUT_EFFECT_ON_RESULTS = ("title", "published", "repeatability", "fit", "calibration", "spread", "model_error", "variation",
-                                  "correlations")
+KEYS_WITHOUT_EFFECT_ON_RESULTS = (
+    "title",
+    "published",
+    "repeatability",
+    "fit",
+    "calibration",
+    "spread",
+    "model_error",
+    "variation",
+    "correlations",
+)
 """Keys of a study that change no result."""
 KEYS_WITHOUT_EFFECT_ON_EVALUATIONS = ("runs", "algorithms", "evaluations", "time_limit")
 """Keys of a study's search table that change no evaluation, but decide which evaluations there are."""
 IDENTITY = {
-    "resolved": "the same study and options", "network": "the network's file as it was", "sources": "the file as it was",
-    "results": "that version", "versions": "those versions", "platform": "such a machine"}
+    "resolved": "the same study and options",
+    "network": "the network's file as it was",
+    "sources": "the file as it was",
+    "results": "that version",
+    "versions": "those versions",
+    "platform": "such a machine",
+}
 """Inputs that results depend on, each with the remedy if it has changed; an error says "expected: another `out` ..., or REMEDY"."""
 LAYERS_OF_FILES = ("network", "sources")
 """Inputs that are a digest for each file; all workers must have the same files."""
@@ -52,8 +66,14 @@ def manifest_of(study: Study, identity: Mapping[str, Any]) -> dict[str, Any]:
     identity
         Inputs of the results besides the study file, by `IDENTITY`; see `safevar_sumo.campaign.identity.identity_of`.
     """
-    return {"format": FORMAT, "study": tables_of(study), "seed": study.search.seed, "resolved": evaluation_keys(study), **identity,
-            "versions": {name: version(name) for name in PACKAGES}}
+    return {
+        "format": FORMAT,
+        "study": tables_of(study),
+        "seed": study.search.seed,
+        "resolved": evaluation_keys(study),
+        **identity,
+        "versions": {name: version(name) for name in PACKAGES},
+    }
 
 
 def evaluation_keys(study: Study) -> dict[str, Any]:
@@ -63,7 +83,10 @@ def evaluation_keys(study: Study) -> dict[str, Any]:
         for key in DESCRIPTION_KEYS:
             del characteristic[key]
     search = {key: value for key, value in tables["search"].items() if key not in KEYS_WITHOUT_EFFECT_ON_EVALUATIONS}
-    return {**{key: value for key, value in tables.items() if key not in KEYS_WITHOUT_EFFECT_ON_RESULTS}, "search": search}
+    return {
+        **{key: value for key, value in tables.items() if key not in KEYS_WITHOUT_EFFECT_ON_RESULTS},
+        "search": search,
+    }
 
 
 def identity_digest(manifest: Mapping[str, Any]) -> str:
@@ -80,8 +103,11 @@ def differences(stored: Mapping[str, Any], now: Mapping[str, Any]) -> Iterator[D
             else:
                 name = f"version of {key}" if layer == "versions" else key or "the version of the package's results"
                 text = f"{name} was {before!r} and is {after!r} now"
-            is_harmless = (layer == "platform" or (layer == "versions" and key not in SIMULATORS)
-                           or (layer == "resolved" and before is None))
+            is_harmless = (
+                layer == "platform"
+                or (layer == "versions" and key not in SIMULATORS)
+                or (layer == "resolved" and before is None)
+            )
             yield Difference(layer, text, not is_harmless)
 
 
@@ -112,20 +138,28 @@ def read_manifest(directory: Path) -> dict[str, Any]:
         study, written_by, number = manifest["study"], manifest["versions"]["safevar_sumo"], manifest.get("format", 1)
     except FileNotFoundError:
         likely_path = Path("results") / directory.name
-        hint = f"; did you mean {likely_path}?" if likely_path != directory and (likely_path / MANIFEST).is_file() else ""
+        hint = (
+            f"; did you mean {likely_path}?" if likely_path != directory and (likely_path / MANIFEST).is_file() else ""
+        )
         raise InputError(directory, f"is not a results directory: there is no {MANIFEST}{hint}", expected) from None
     except OSError as error:
         raise InputError(file, f"cannot be read: {error.strerror}") from None
     except json.JSONDecodeError as error:
-        raise InputError(file, f"is torn or was edited, line {error.lineno} is no JSON: {error.msg}",
-                         "the file as it was, or no file: the same command then writes it again") from None
+        raise InputError(
+            file,
+            f"is torn or was edited, line {error.lineno} is no JSON: {error.msg}",
+            "the file as it was, or no file: the same command then writes it again",
+        ) from None
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
         study = None
     if not isinstance(study, dict):
         raise InputError(file, "is not a manifest of this program", expected)
     if number != FORMAT:
-        raise InputError(directory, f"holds results in format {number}; this version reads format {FORMAT}",
-                         f"the release that wrote them, safevar_sumo {written_by}; or another `out`")
+        raise InputError(
+            directory,
+            f"holds results in format {number}; this version reads format {FORMAT}",
+            f"the release that wrote them, safevar_sumo {written_by}; or another `out`",
+        )
     return dict(manifest)
 
 

@@ -37,7 +37,9 @@ class SolutionId(NamedTuple):
         """
         algorithm, _, remainder = text.partition(":")
         run, _, row = remainder.partition(":")
-        if not (algorithm and all(number.isascii() and number.isdecimal() and len(number) < 10 for number in (run, row))):
+        if not (
+            algorithm and all(number.isascii() and number.isdecimal() and len(number) < 10 for number in (run, row))
+        ):
             raise InputError(source, repr(text), HANDLE_FORMAT)
         return cls(algorithm, int(run), int(row))
 
@@ -48,7 +50,10 @@ def handles_of(solutions: pd.DataFrame) -> list[SolutionId]:
 
     runs = solutions["run"] if "run" in solutions else pd.Series(0, index=solutions.index)
     rows = solutions.groupby([solutions["algorithm"], runs], sort=False).cumcount()
-    return [SolutionId(str(algorithm), int(run), int(row)) for algorithm, run, row in zip(solutions["algorithm"], runs, rows, strict=True)]
+    return [
+        SolutionId(str(algorithm), int(run), int(row))
+        for algorithm, run, row in zip(solutions["algorithm"], runs, rows, strict=True)
+    ]
 
 
 def row_of_handle(solutions: pd.DataFrame, handle: SolutionId, source: object = "solution") -> int:
@@ -67,7 +72,11 @@ def row_of_handle(solutions: pd.DataFrame, handle: SolutionId, source: object = 
         expected = f"N from 0 to {last_rows[handle.algorithm, handle.run]}"
     else:
         runs = [f"{algorithm}:{run}" for algorithm, run in last_rows]
-        expected = f"a run with solutions: {', '.join(runs[:6])}{', ...' if len(runs) > 6 else ''}" if runs else "results with a solution"
+        expected = (
+            f"a run with solutions: {', '.join(runs[:6])}{', ...' if len(runs) > 6 else ''}"
+            if runs
+            else "results with a solution"
+        )
     raise InputError(source, f"there is no solution {handle}", expected)
 
 
@@ -100,5 +109,7 @@ def choose_handle(solutions: pd.DataFrame, unsafe: Unsafe, choice: str, source: 
     if candidates.empty:
         if table.empty:
             raise InputError(source, "these results hold no solution", "results with a solution")
-        raise InputError(source, "these results hold no unsafe solution", "the most severe one, or a solution by its handle")
+        raise InputError(
+            source, "these results hold no unsafe solution", "the most severe one, or a solution by its handle"
+        )
     return SolutionId.parse(candidates.sort_values(CHOICES[choice], kind="stable")["handle"].iloc[0], source)

@@ -56,8 +56,13 @@ class ResultsDirectory:
         If the directory cannot be written, holds other files, or belongs to another study or version.
     """
 
-    def __init__(self, path: Path, study: Study, identity: Mapping[str, Any] = MappingProxyType({}),
-                 scoring: Scoring = PUBLISHED_SCORING) -> None:
+    def __init__(
+        self,
+        path: Path,
+        study: Study,
+        identity: Mapping[str, Any] = MappingProxyType({}),
+        scoring: Scoring = PUBLISHED_SCORING,
+    ) -> None:
         self.path, self._study, self.scoring = path, study, scoring
         self.manifest = {**manifest_of(study, identity), "folders": relative_folders(path, study)}
         if scoring != PUBLISHED_SCORING:
@@ -91,7 +96,9 @@ class ResultsDirectory:
             try:
                 (self.path / SOLUTIONS).unlink(missing_ok=True)
             except OSError as error:
-                raise SafevarError(f"{self.path / SOLUTIONS}: cannot be removed: {error.strerror}; it is outdated") from None
+                raise SafevarError(
+                    f"{self.path / SOLUTIONS}: cannot be removed: {error.strerror}; it is outdated"
+                ) from None
 
     def finish(self, solutions: Mapping[Any, Evaluations]) -> None:
         """Write the solutions of every run, by (algorithm, run)."""
@@ -101,25 +108,43 @@ class ResultsDirectory:
     def _refuse_another_study(self) -> None:
         expected = another_directory(self.path)
         if not (self.path / MANIFEST).exists():
-            other_files = sorted(name for path in self.path.iterdir()
-                                 if (name := path.name) not in (RUNS, SOLUTIONS) and name[0] != ".")
-            if other_files and not (self.path / RUNS).exists():  # if there are journals, their owner decides whose directory this is
-                raise InputError("out", f"{self.path} holds other files: {other_files[0]}", "an empty directory, or one of this study")
+            other_files = sorted(
+                name for path in self.path.iterdir() if (name := path.name) not in (RUNS, SOLUTIONS) and name[0] != "."
+            )
+            if (
+                other_files and not (self.path / RUNS).exists()
+            ):  # if there are journals, their owner decides whose directory this is
+                raise InputError(
+                    "out",
+                    f"{self.path} holds other files: {other_files[0]}",
+                    "an empty directory, or one of this study",
+                )
             return
         stored = read_manifest(self.path)
         if "imported" in stored:
             raise InputError(self.path, "holds results of another study: they are imported", expected)
         for difference in input_differences(self.path, stored, self.manifest, self._study):
-            raise InputError(self.path, f"holds results of another study: {difference.text}",
-                             f"{expected}, or {IDENTITY[difference.layer]}")
+            raise InputError(
+                self.path,
+                f"holds results of another study: {difference.text}",
+                f"{expected}, or {IDENTITY[difference.layer]}",
+            )
 
 
-def input_differences(directory: Path, stored: Mapping[str, Any], now: Mapping[str, Any], study: Study) -> list[Difference]:
+def input_differences(
+    directory: Path, stored: Mapping[str, Any], now: Mapping[str, Any], study: Study
+) -> list[Difference]:
     """The differences between the stored inputs of a directory's results, with files that were first read later, and present inputs."""
     later = _later_files(directory, study)
     later_now = {name: digest for name in later if (digest := digest_of(file_by_name(name, study.origin.places)))}
-    return list(differences(*({**manifest, "sources": {**files, **manifest.get("sources", {})}}
-                              for manifest, files in ((stored, later), (now, later_now)))))
+    return list(
+        differences(
+            *(
+                {**manifest, "sources": {**files, **manifest.get("sources", {})}}
+                for manifest, files in ((stored, later), (now, later_now))
+            )
+        )
+    )
 
 
 def _later_files(directory: Path, study: Study) -> dict[str, str]:
@@ -134,14 +159,18 @@ def another_directory(path: Path) -> str:
     return f"another `out`, such as `out={shlex.quote(str(free_path))}`"
 
 
-def solutions_frame(characteristics: tuple[str, ...], solutions: Iterable[tuple[tuple[str, int], Evaluations]]) -> pd.DataFrame:
+def solutions_frame(
+    characteristics: tuple[str, ...], solutions: Iterable[tuple[tuple[str, int], Evaluations]]
+) -> pd.DataFrame:
     """One row per solution of every run, in a fixed order; columns as in `evaluations_frame`."""
     frame = evaluations_frame(characteristics, solutions)
     columns = ["algorithm", "run", "f_safe", "f_diff", "f_num_diff", *characteristics]
     return frame.sort_values(columns, kind="stable", ignore_index=True)
 
 
-def evaluations_frame(characteristics: tuple[str, ...], runs: Iterable[tuple[tuple[str, int], Evaluations]]) -> pd.DataFrame:
+def evaluations_frame(
+    characteristics: tuple[str, ...], runs: Iterable[tuple[tuple[str, int], Evaluations]]
+) -> pd.DataFrame:
     """One row per evaluation.
 
     Columns: algorithm, run, the characteristics' filtered values in the units of the study, f_safe, f_diff [fraction],
@@ -152,12 +181,24 @@ def evaluations_frame(characteristics: tuple[str, ...], runs: Iterable[tuple[tup
     all_runs = list(runs)
     metrics = dict.fromkeys([*METRICS, *(name for _, evaluations in all_runs for name in evaluations.metrics)])
     empty = ("", 0), Evaluations.none(len(characteristics), metrics)  # all columns even without runs
-    return pd.concat([
-        pd.DataFrame({
-            "algorithm": np.full(len(evaluations), algorithm, dtype=object), "run": np.full(len(evaluations), run),
-            **dict(zip(characteristics, evaluations.settings.T, strict=True)), "f_safe": evaluations.f_safe, "f_diff": evaluations.f_diff,
-            "f_num_diff": evaluations.f_num_diff.astype(int), **evaluations.metrics, "outcome": evaluations.outcome.astype(object)})
-        for (algorithm, run), evaluations in [empty, *all_runs]], ignore_index=True)
+    return pd.concat(
+        [
+            pd.DataFrame(
+                {
+                    "algorithm": np.full(len(evaluations), algorithm, dtype=object),
+                    "run": np.full(len(evaluations), run),
+                    **dict(zip(characteristics, evaluations.settings.T, strict=True)),
+                    "f_safe": evaluations.f_safe,
+                    "f_diff": evaluations.f_diff,
+                    "f_num_diff": evaluations.f_num_diff.astype(int),
+                    **evaluations.metrics,
+                    "outcome": evaluations.outcome.astype(object),
+                }
+            )
+            for (algorithm, run), evaluations in [empty, *all_runs]
+        ],
+        ignore_index=True,
+    )
 
 
 def record(evaluations: Evaluations, row: int) -> dict[str, Any]:
@@ -165,8 +206,12 @@ def record(evaluations: Evaluations, row: int) -> dict[str, Any]:
     numbers = {
         "collision_speed": evaluations.collision_speed[row],
         **{name: values[row] for name, values in evaluations.metrics.items()},
-        "f_safe": evaluations.f_safe[row], "f_diff": evaluations.f_diff[row]}
+        "f_safe": evaluations.f_safe[row],
+        "f_diff": evaluations.f_diff[row],
+    }
     return {
-        "outcome": str(evaluations.outcome[row]), "collision": bool(evaluations.collided[row]),
+        "outcome": str(evaluations.outcome[row]),
+        "collision": bool(evaluations.collided[row]),
         **{name: finite_or_none(value) for name, value in numbers.items()},
-        "f_num_diff": int(evaluations.f_num_diff[row])}
+        "f_num_diff": int(evaluations.f_num_diff[row]),
+    }

@@ -33,5 +33,21 @@ SCENARIOS: Mapping[str, type[Any]] = {
 }
 
 __all__ = [
-    "LOCATION_DIMENSION", "SCENARIOS", "SPEED_DIMENSION", "VUT", "WEATHERS", "GuardedScenario", "Lane", "Point",
-    "PreCrash", "Scenario", "Scene", "World", "distance_in_words", "equals_clear", "pre_crash_sentence", "weather_in_words", "weather_of"]
+    "LOCATION_DIMENSION",
+    "SCENARIOS",
+    "SPEED_DIMENSION",
+    "VUT",
+    "WEATHERS",
+    "GuardedScenario",
+    "Lane",
+    "Point",
+    "PreCrash",
+    "Scenario",
+    "Scene",
+    "World",
+    "distance_in_words",
+    "equals_clear",
+    "pre_crash_sentence",
+    "weather_in_words",
+    "weather_of",
+]

@@ -58,13 +58,17 @@ class TargetAhead(NamedTuple):
             return {}
         frame, (along, left), length = Frame.of(roads.lane(VUT_LANE)), self.direction, self._body.length
         rear = frame.lane_coordinates(roads.lane(JUNCTION_LANE).start)[0], -self.offset
-        entry, exit_ = ((rear[0] + distance * along, rear[1] + distance * left) for distance in (-length, length - FRONT_POSITION))
+        entry, exit_ = (
+            (rear[0] + distance * along, rear[1] + distance * left) for distance in (-length, length - FRONT_POSITION)
+        )
         return change_target_lanes(frame, entry, exit_, self.direction)
 
     def actors(self, vut_speed: float, roads: Roads) -> XmlChanges:
         """The vehicle at `vut_speed` [m/s], and the target ahead of it."""
         if self.gap <= 0:
-            raise InputError("scenario.parameters", f"the target begins {-self.gap:.2f} m inside the vehicle", "a target ahead")
+            raise InputError(
+                "scenario.parameters", f"the target begins {-self.gap:.2f} m inside the vehicle", "a target ahead"
+            )
         start, target = self._place_at_junction(roads) if self._is_rotated else self._place_in_lane()
         return {
             "vType[@id='vut']": {"length": repr(self.vut.length), "width": repr(self.vut.width)},
@@ -76,9 +80,15 @@ class TargetAhead(NamedTuple):
         """The vehicle's start on the straight road [m], and a target in line with the lane."""
         old_type = REPLACED_TYPES.get(self.target, self.target)
         new_type = {f"vType[@id='{old_type}']": target_type(self.target)} if old_type != self.target else {}
-        return START_POSITION, {**new_type, "vehicle[@id='target']": {
-            "type": self.target, "departPos": repr(START_POSITION + self.gap + self._body.length), "departPosLat": repr(-self.offset),
-            "departSpeed": repr(self.speed_at(0.0))}}
+        return START_POSITION, {
+            **new_type,
+            "vehicle[@id='target']": {
+                "type": self.target,
+                "departPos": repr(START_POSITION + self.gap + self._body.length),
+                "departPosLat": repr(-self.offset),
+                "departSpeed": repr(self.speed_at(0.0)),
+            },
+        }
 
     def _place_at_junction(self, roads: Roads) -> tuple[float, XmlChanges]:
         """The vehicle's start before the junction [m], and a rotated target on it."""
@@ -87,8 +97,17 @@ class TargetAhead(NamedTuple):
         if start - self.vut.length < 0:
             raise InputError("scenario.parameters", f"a gap of {self.gap:.0f} m is longer than the road")
         parked = {f"vehicle[@id='parked_{size}']": None for size in ("small", "large")}
-        return start, {**parked, "vType[@id='target']": target_type(self.target), "vehicle[@id='target']": {
-            "type": self.target, "route": "beyond", "departPos": repr(FRONT_POSITION), "departPosLat": "0", "departSpeed": "0"}}
+        return start, {
+            **parked,
+            "vType[@id='target']": target_type(self.target),
+            "vehicle[@id='target']": {
+                "type": self.target,
+                "route": "beyond",
+                "departPos": repr(FRONT_POSITION),
+                "departPosLat": "0",
+                "departSpeed": "0",
+            },
+        }
 
     def motion(self, world: World) -> _MotionAhead:
         """The motion of the target in a run."""
@@ -133,7 +152,11 @@ class _MotionAhead(NamedTuple):
 
     def target(self, positions: FloatArray, times: Times) -> Target:
         along = self.frame.along(positions)
-        return Target(along - self.depth, np.full_like(along, self.target_ahead.offset), speed=value_at(times, self.target_ahead.speed_at))
+        return Target(
+            along - self.depth,
+            np.full_like(along, self.target_ahead.offset),
+            speed=value_at(times, self.target_ahead.speed_at),
+        )
 
     def next_speed(self, sample: int, step: float) -> float:
         return self.target_ahead.speed_at((sample + 1) * step)
@@ -153,7 +176,11 @@ def _first_contact_position(corners: list[Coordinates], half_width: float) -> fl
     """
     positions = [x for x, y in corners if abs(y) <= half_width]
     for (x, y), (to_x, to_y) in pairwise([*corners, corners[0]]):
-        positions += [x + (to_x - x) * (edge - y) / (to_y - y) for edge in (-half_width, half_width) if (y - edge) * (to_y - edge) < 0]
+        positions += [
+            x + (to_x - x) * (edge - y) / (to_y - y)
+            for edge in (-half_width, half_width)
+            if (y - edge) * (to_y - edge) < 0
+        ]
     return min(positions or [x for x, _ in corners])
 
 
@@ -191,16 +218,21 @@ class TargetAheadTest(TargetTest, frozen=True, kw_only=True, forbid_unknown_fiel
 
     def encounter(self, trace: Trace) -> Encounter:
         """Distance from the front bumper to the target's body; TTC is this distance over the difference of speeds."""
-        return Encounter(separation=trace.gap, distance=trace.gap, closing_speed=trace.speed - trace.obstacle_speed,
-                         in_conflict=trace.gap > 0)
+        return Encounter(
+            separation=trace.gap,
+            distance=trace.gap,
+            closing_speed=trace.speed - trace.obstacle_speed,
+            in_conflict=trace.gap > 0,
+        )
 
     @property
     def test_speed(self) -> float:
         """Speed that the vehicle holds until it brakes [m/s]."""
         return self.speed * KMH
 
-    def _target_at_impact_location(self, target: str, gap: float, speed_at: Callable[[float], float],
-                                   direction: Direction = SAME_DIRECTION) -> TargetAhead:
+    def _target_at_impact_location(
+        self, target: str, gap: float, speed_at: Callable[[float], float], direction: Direction = SAME_DIRECTION
+    ) -> TargetAhead:
         """The target with the middle of its rear at the impact location."""
         vut = BodySize(self.vut_length, self.vut_width)
         return TargetAhead(target, vut, gap, lateral_offset(self.impact_location, self.vut_width), speed_at, direction)

@@ -80,7 +80,9 @@ class Along(TargetAheadTest, frozen=True, kw_only=True):
 
     @property
     def _target_ahead(self) -> TargetAhead:
-        profile = SpeedProfile(begin=0.0, speed=self._parameter("target_speed") * KMH, run_up=self._parameter("acceleration_distance"))
+        profile = SpeedProfile(
+            begin=0.0, speed=self._parameter("target_speed") * KMH, run_up=self._parameter("acceleration_distance")
+        )
         gap = self.speed * KMH * self.time_to_impact - profile.travelled(self.time_to_impact)
         return self._target_at_impact_location(self._parameter("target"), gap, profile.speed_at)
 

@@ -45,8 +45,10 @@ def lane_through(name: str, points: Sequence[Coordinates]) -> Lane:
     """The lane `name`, whose centre line goes through these points [m]; a `BentLane` if they are not on one line."""
     (x, y), (to_x, to_y) = points[0], points[-1]
     length = math.hypot(to_x - x, to_y - y)
-    deviations = [abs((to_x - x) * (at_y - y) - (to_y - y) * (at_x - x)) / length if length else math.hypot(at_x - x, at_y - y)
-              for at_x, at_y in points]
+    deviations = [
+        abs((to_x - x) * (at_y - y) - (to_y - y) * (at_x - x)) / length if length else math.hypot(at_x - x, at_y - y)
+        for at_x, at_y in points
+    ]
     if max(deviations) <= MAX_BEND:
         return Lane(points[0], points[-1])
     bent = BentLane(points[0], points[-1])
@@ -140,6 +142,7 @@ class Scenario:
     grade: float = 0.0
     centre_to_centre: bool = False
     if TYPE_CHECKING:  # a scenario may set or compute these
+
         @property
         def duration(self) -> float: ...
         @property
@@ -230,12 +233,23 @@ class GuardedScenario(Scenario):
         if not isinstance(network, str):
             raise guard.wrong_value("__init__", "network", network, "the name or path of a folder with a network")
         self.network = network
-        duration = guard.numbers("__init__", "duration", guard.field("__init__", scenario, "duration"), shape=(),
-                                 lowest=0.0, highest=MAX_DURATION, above=True)
+        duration = guard.numbers(
+            "__init__",
+            "duration",
+            guard.field("__init__", scenario, "duration"),
+            shape=(),
+            lowest=0.0,
+            highest=MAX_DURATION,
+            above=True,
+        )
         self.duration = float(duration)
-        self.grade = float(guard.numbers("__init__", "grade", scenario.grade, shape=(), lowest=-MAX_GRADE, highest=MAX_GRADE))
+        self.grade = float(
+            guard.numbers("__init__", "grade", scenario.grade, shape=(), lowest=-MAX_GRADE, highest=MAX_GRADE)
+        )
         if (speed := scenario.test_speed) is not None:
-            self.test_speed = float(guard.numbers("__init__", "test_speed", speed, (), lowest=0.0, highest=MAX_TEST_SPEED, above=True))
+            self.test_speed = float(
+                guard.numbers("__init__", "test_speed", speed, (), lowest=0.0, highest=MAX_TEST_SPEED, above=True)
+            )
         self.reactive_actors, self.centre_to_centre = bool(scenario.reactive_actors), bool(scenario.centre_to_centre)
         self.pre_crash = str(scenario.pre_crash)
 
@@ -249,8 +263,10 @@ class GuardedScenario(Scenario):
         changes = self._guard.call(method, function, roads)
         if not isinstance(changes, Mapping):
             raise self._guard.wrong_value(method, "changes", changes, f"a mapping from XPaths of {file} to attributes")
-        return {str(path): change if change is None else {str(name): str(value) for name, value in change.items()}
-                for path, change in changes.items()}
+        return {
+            str(path): change if change is None else {str(name): str(value) for name, value in change.items()}
+            for path, change in changes.items()
+        }
 
     def remarks(self) -> list[str]:
         return [str(remark) for remark in self._guard.call("remarks", self._scenario.remarks)]
@@ -277,14 +293,18 @@ class GuardedScenario(Scenario):
         values = {name: self._guard.field("encounter", encounter, name) for name in Encounter._fields}
         in_conflict = self._guard.booleans("encounter", "in_conflict", values.pop("in_conflict"), shape)
         is_counted = in_conflict & trace.active
-        numbers = {name: self._guard.numbers("encounter", name, value, shape, infinite=True, undefined=True)
-                   for name, value in values.items()}
+        numbers = {
+            name: self._guard.numbers("encounter", name, value, shape, infinite=True, undefined=True)
+            for name, value in values.items()
+        }
         for name, array in numbers.items():
             if np.isnan(array[is_counted]).any():
                 raise self._guard.wrong_value("encounter", name, float("nan"), "numbers wherever in_conflict is true")
         least = np.where(is_counted, numbers["separation"], np.inf).min(axis=0)
         if (is_counted.any(axis=0) & (least == np.inf)).any():
-            raise self._guard.wrong_value("encounter", "separation", float("inf"), "a finite number at some time that in_conflict is true")
+            raise self._guard.wrong_value(
+                "encounter", "separation", float("inf"), "a finite number at some time that in_conflict is true"
+            )
         return Encounter(**numbers, in_conflict=in_conflict)
 
 

@@ -103,7 +103,11 @@ class CarToCar(TargetAheadTest, frozen=True, kw_only=True):
     @property
     def _target_ahead(self) -> TargetAhead:
         if self.heading and self._target_speed_at(0.0):
-            raise InputError("scenario.parameters", f"heading = {self.heading:g} with a moving target", "a heading for a standing target")
+            raise InputError(
+                "scenario.parameters",
+                f"heading = {self.heading:g} with a moving target",
+                "a heading for a standing target",
+            )
         direction = SAME_DIRECTION.turned(self.heading)
         return self._target_at_impact_location(TESTS[self.test].target, self._gap, self._target_speed_at, direction)
 
@@ -119,14 +123,19 @@ class CarToCar(TargetAheadTest, frozen=True, kw_only=True):
     def _target_speed(self) -> float:
         """Speed of the target at the start [m/s]."""
         slower_speed = 20.0 + max(self.speed - STEADY_SPEED_LIMIT, 0.0)
-        default = {PreCrash.LEAD_STOPPED: 0.0, PreCrash.LEAD_SLOWER: slower_speed}.get(TESTS[self.test].pre_crash, self.speed)
+        default = {PreCrash.LEAD_STOPPED: 0.0, PreCrash.LEAD_SLOWER: slower_speed}.get(
+            TESTS[self.test].pre_crash, self.speed
+        )
         return (default if self.target_speed is None else self.target_speed) * KMH
 
     def _target_speed_at(self, time: float) -> float:
         initial_speed = self._target_speed
         if not self._target_brakes:
             return initial_speed
-        return max(initial_speed - self.target_deceleration * max(time - self.brakes_at, 0.0), min(initial_speed, FINAL_SPEED * KMH))
+        return max(
+            initial_speed - self.target_deceleration * max(time - self.brakes_at, 0.0),
+            min(initial_speed, FINAL_SPEED * KMH),
+        )
 
     def _time_to_impact(self) -> float:
         """Time to the impact if the vehicle does not brake [s].
@@ -136,7 +145,9 @@ class CarToCar(TargetAheadTest, frozen=True, kw_only=True):
         closing_speed, gap = self.speed * KMH - self._target_speed, self._gap
         if not self._target_brakes:
             if closing_speed <= 0:
-                raise InputError("scenario.parameters", f"speed = {self.speed:g} km/h never reaches the target", "a slower target")
+                raise InputError(
+                    "scenario.parameters", f"speed = {self.speed:g} km/h never reaches the target", "a slower target"
+                )
             return gap / closing_speed
         remaining_gap = gap - closing_speed * self.brakes_at
         if remaining_gap <= 0:

@@ -69,8 +69,13 @@ TESTS = {  # side, target, its speed, lateral start, acceleration distance, hidd
     "CCCscp": _TestRow("near", "car", 40.0, None, 0.0, False, ProtocolRange(20, 80, (50.0,))),
     "CMCscp": _TestRow("near", "motorcyclist", 40.0, None, 0.0, False, ProtocolRange(20, 80, (50.0,))),
 }
-PRE_CRASH = {"adult": PreCrash.PEDESTRIAN, "child": PreCrash.PEDESTRIAN, "cyclist": PreCrash.CYCLIST,
-             "motorcyclist": PreCrash.STRAIGHT_PATHS, "car": PreCrash.STRAIGHT_PATHS}
+PRE_CRASH = {
+    "adult": PreCrash.PEDESTRIAN,
+    "child": PreCrash.PEDESTRIAN,
+    "cyclist": PreCrash.CYCLIST,
+    "motorcyclist": PreCrash.STRAIGHT_PATHS,
+    "car": PreCrash.STRAIGHT_PATHS,
+}
 
 
 class _Start(NamedTuple):
@@ -105,19 +110,30 @@ class _Start(NamedTuple):
         InputError
             If the target cannot reach the impact location in time.
         """
-        target, lateral_start, is_near = test.parameter("target"), test.parameter("lateral_start"), test.parameter("side") == "near"
+        target, lateral_start, is_near = (
+            test.parameter("target"),
+            test.parameter("lateral_start"),
+            test.parameter("side") == "near",
+        )
         speed, sign = test.parameter("target_speed") * KMH, 1.0 if is_near else -1.0
         impact_lateral = lateral_offset(test.impact_location, test.vut_width)
         direction = (FROM_RIGHT if is_near else FROM_LEFT).turned(test.heading)
         if lateral_start is None:
             if test.acceleration_distance is not None:
-                raise InputError("scenario.parameters", "acceleration_distance: the target starts at its speed", "lateral_start too")
+                raise InputError(
+                    "scenario.parameters", "acceleration_distance: the target starts at its speed", "lateral_start too"
+                )
             time = float(test.time_to_impact or TIME_TO_IMPACT) * test.start_share
             distance, profile = speed * time, SpeedProfile(begin=0.0, speed=speed, run_up=0.0)
         else:
-            distance, run_up = (lateral_start + impact_lateral) * test.start_share, test.parameter("acceleration_distance")
+            distance, run_up = (
+                (lateral_start + impact_lateral) * test.start_share,
+                test.parameter("acceleration_distance"),
+            )
             shortest_time = (distance + run_up) / speed
-            time = test.time_to_impact or float(max(TIME_TO_IMPACT, math.ceil(shortest_time / ROUNDING_STEP) * ROUNDING_STEP))
+            time = test.time_to_impact or float(
+                max(TIME_TO_IMPACT, math.ceil(shortest_time / ROUNDING_STEP) * ROUNDING_STEP)
+            )
             profile = SpeedProfile.with_arrival(distance, time, speed, run_up)
         mover = PersonMover(target, sign, -lateral_start) if test.is_on_foot else VehicleMover(target, direction)
         return cls(mover, direction, direction.extent(BODIES[target]), sign * impact_lateral, distance, time, profile)
@@ -143,8 +159,13 @@ class _CrossingMotion(NamedTuple):
         along, left = self.start.mover.middle(self.frame, positions)
         lateral = left if direction.left > 0 else -left
         ahead = np.zeros_like(left) if along is None else along - self.impact_position
-        return Target(self.impact_position - extent.length / 2 + ahead, lateral, is_clear=lateral > (self.vut_width + extent.width) / 2,
-                      speed=value_at(times, lambda time: direction.along * profile.speed_at(time)) if direction.along else 0.0, ahead=ahead)
+        return Target(
+            self.impact_position - extent.length / 2 + ahead,
+            lateral,
+            is_clear=lateral > (self.vut_width + extent.width) / 2,
+            speed=value_at(times, lambda time: direction.along * profile.speed_at(time)) if direction.along else 0.0,
+            ahead=ahead,
+        )
 
     def next_speed(self, sample: int, step: float) -> float:
         return self.start.mover.next_speed(self.start.profile, sample, step)
@@ -256,7 +277,9 @@ class Crossing(TargetTest, frozen=True, kw_only=True, forbid_unknown_fields=True
         impact_position = start.mover.impact_position(frame, roads, start.impact_left)
         front = impact_position - start.extent.length / 2 - self.speed * KMH * start.time_to_impact
         if front - self.vut_length < 0:
-            raise InputError("scenario.parameters", f"{self.speed:g} km/h for {start.time_to_impact:g} s is longer than the road")
+            raise InputError(
+                "scenario.parameters", f"{self.speed:g} km/h for {start.time_to_impact:g} s is longer than the road"
+            )
         return {
             "vType[@id='vut']": {"length": repr(self.vut_length), "width": repr(self.vut_width)},
             "vehicle[@id='vut']": {"departPos": repr(front), "departSpeed": repr(self.speed * KMH)},
@@ -281,9 +304,15 @@ class Crossing(TargetTest, frozen=True, kw_only=True, forbid_unknown_fields=True
         frame, start = Frame.of(world.lane(VUT_LANE)), _Start.of(self)
         constants = EncounterConstants(passed_gap=-start.extent.length - self.vut_length)
         if self.parameter("hidden"):
-            constants = constants._replace(hidden=True, edge_to_middle=start.extent.length / 2, setback=self.sensor_setback,
-                                           parked_offset=-self._parked_edge)
-        return _CrossingMotion(frame, constants, start.mover.impact_position(frame, world, start.impact_left), start, self.vut_width)
+            constants = constants._replace(
+                hidden=True,
+                edge_to_middle=start.extent.length / 2,
+                setback=self.sensor_setback,
+                parked_offset=-self._parked_edge,
+            )
+        return _CrossingMotion(
+            frame, constants, start.mover.impact_position(frame, world, start.impact_left), start, self.vut_width
+        )
 
     def encounter(self, trace: Trace) -> Encounter:
         """Distance between the vehicle's front and the target's body, along and across the lane; TTC from its rate of change."""
@@ -291,14 +320,22 @@ class Crossing(TargetTest, frozen=True, kw_only=True, forbid_unknown_fields=True
         ahead, across = np.maximum(trace.gap, 0.0), clear_gap(trace.lateral, (self.vut_width + extent.width) / 2)
         distance = np.sqrt(ahead * ahead + across * across)
         approach = (trace.speed - trace.obstacle_speed) * ahead - np.sign(trace.lateral) * trace.lateral_speed * across
-        return Encounter(separation=distance, distance=distance, closing_speed=approach / np.maximum(distance, 1e-9),
-                         in_conflict=trace.gap > -extent.length - self.vut_length)
+        return Encounter(
+            separation=distance,
+            distance=distance,
+            closing_speed=approach / np.maximum(distance, 1e-9),
+            in_conflict=trace.gap > -extent.length - self.vut_length,
+        )
 
     @property
     def is_on_foot(self) -> bool:
         """Whether the target is a person in SUMO: a pedestrian who crosses at right angles from a footpath."""
-        return self.parameter("target") in ("adult", "child") and self.parameter("lateral_start") is not None \
-            and self.heading == 0 and self.start_share == 1
+        return (
+            self.parameter("target") in ("adult", "child")
+            and self.parameter("lateral_start") is not None
+            and self.heading == 0
+            and self.start_share == 1
+        )
 
     @property
     def _parked_edge(self) -> float:

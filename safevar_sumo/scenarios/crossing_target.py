@@ -44,21 +44,29 @@ class PersonMover(NamedTuple):
         """Position of the target's middle along the lane when the target is `impact_left` metres to the left of the lane's middle [m]."""
         return frame.lane_coordinates(roads.lane(CROSSING_LANE).start)[0]
 
-    def actors(self, frame: Frame, roads: Roads, impact_left: float, distance: float, profile: SpeedProfile) -> XmlChanges:
+    def actors(
+        self, frame: Frame, roads: Roads, impact_left: float, distance: float, profile: SpeedProfile
+    ) -> XmlChanges:
         """The pedestrian beside the lane, `distance` metres before the impact."""
         edges = WALK_EDGES[self.sign]
         for lane in (CROSSING_LANE, *(f"{edge}_0" for edge in edges)):
             first, last = (frame.lane_coordinates(point)[0] for point in roads.lane(lane))
             if abs(last - first) > MAX_SKEW:
-                raise InputError("scenario.parameters.network", f"lane {lane!r} leads {abs(last - first):.2f} m along the road",
-                                 "a crossing at right angles")
+                raise InputError(
+                    "scenario.parameters.network",
+                    f"lane {lane!r} leads {abs(last - first):.2f} m along the road",
+                    "a crossing at right angles",
+                )
         half_length = BODIES[self.target].length / 2
         edge_start, edge_end = (self.sign * frame.lane_coordinates(point)[1] for point in roads.lane(f"{edges[0]}_0"))
         start_position = half_length + self.start
         if not min(edge_start, edge_end) <= start_position <= max(edge_start, edge_end):
             nearest, farthest = half_length - max(edge_start, edge_end), half_length - min(edge_start, edge_end)
-            raise InputError("scenario.parameters", f"lateral_start = {-self.start:g} m is not on the footpath",
-                             f"a number in [{nearest:.2f}, {farthest:.2f}] m")
+            raise InputError(
+                "scenario.parameters",
+                f"lateral_start = {-self.start:g} m is not on the footpath",
+                f"a number in [{nearest:.2f}, {farthest:.2f}] m",
+            )
         person = {"type": self.target, "departPos": repr(abs(start_position - edge_start))}
         walk = {"edges": " ".join(edges), "speed": repr(profile.speed), "arrivalPos": "-1" if self.sign > 0 else "1"}
         return {"person[@id='pedestrian']": person, "person[@id='pedestrian']/walk": walk}
@@ -98,14 +106,18 @@ class VehicleMover(NamedTuple):
             return {}
         (along, entry), (_, exit_) = (frame.lane_coordinates(point) for point in roads.lane(JUNCTION_LANE))
         (forward, left), half = self.direction, (exit_ - entry) / 2
-        return change_target_lanes(frame, (along - half * forward, -half * left), (along + half * forward, half * left), self.direction)
+        return change_target_lanes(
+            frame, (along - half * forward, -half * left), (along + half * forward, half * left), self.direction
+        )
 
     def impact_position(self, frame: Frame, roads: Roads | World, impact_left: float) -> float:
         """Position of the target's middle along the lane when the target is `impact_left` metres to the left of the lane's middle [m]."""
         along, left = frame.lane_coordinates(roads.lane(ENTRY_LANE).end)
         return along + (impact_left - left) * self.direction.along / self.direction.left
 
-    def actors(self, frame: Frame, roads: Roads, impact_left: float, distance: float, profile: SpeedProfile) -> XmlChanges:
+    def actors(
+        self, frame: Frame, roads: Roads, impact_left: float, distance: float, profile: SpeedProfile
+    ) -> XmlChanges:
         """The target on its lane, `distance` metres before the impact."""
         lane, (forward, left) = roads.lane(ENTRY_LANE), self.direction
         lane_start = self._along(frame, lane.start)
@@ -113,10 +125,19 @@ class VehicleMover(NamedTuple):
         front = impact_on_path - lane_start - distance + BODIES[self.target].length / 2
         length = self._along(frame, lane.end) - lane_start
         if not 0 < front <= length:
-            raise InputError("scenario.parameters", f"the target starts {distance:.2f} m before the impact, where it has no lane",
-                             f"a start from {distance - (length - front):.2f} to {distance + front:.2f} m before it")
-        return {"vType[@id='target']": target_type(self.target), "vehicle[@id='target']": {
-            "type": self.target, "departPos": repr(front), "departSpeed": repr(profile.speed_at(0.0))}}
+            raise InputError(
+                "scenario.parameters",
+                f"the target starts {distance:.2f} m before the impact, where it has no lane",
+                f"a start from {distance - (length - front):.2f} to {distance + front:.2f} m before it",
+            )
+        return {
+            "vType[@id='target']": target_type(self.target),
+            "vehicle[@id='target']": {
+                "type": self.target,
+                "departPos": repr(front),
+                "departSpeed": repr(profile.speed_at(0.0)),
+            },
+        }
 
     def _along(self, frame: Frame, point: tuple[float, float]) -> float:
         """Position of a point along the target's direction [m]."""
@@ -135,7 +156,9 @@ class VehicleMover(NamedTuple):
     def middle(self, frame: Frame, positions: FloatArray) -> tuple[FloatArray | None, FloatArray]:
         """Position of the target's middle along the lane and to the left [m], from `positions` of the front."""
         half_length = BODIES[self.target].length / 2
-        return frame.along(positions) - self.direction.along * half_length, frame.left(positions) - self.direction.left * half_length
+        return frame.along(positions) - self.direction.along * half_length, frame.left(
+            positions
+        ) - self.direction.left * half_length
 
     def next_speed(self, profile: SpeedProfile, sample: int, step: float) -> float:
         """Speed at the end of the coming step [m/s]."""

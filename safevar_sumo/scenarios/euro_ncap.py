@@ -35,10 +35,21 @@ class BodySize(NamedTuple):
     width: float
 
 
-BODIES = {"adult": BodySize(0.6, 0.5), "child": BodySize(0.711, 0.298), "cyclist": BodySize(1.9, 0.5), "motorcyclist": BodySize(2.1, 0.8),
-          "car": BodySize(4.023, 1.712)}
+BODIES = {
+    "adult": BodySize(0.6, 0.5),
+    "child": BodySize(0.711, 0.298),
+    "cyclist": BodySize(1.9, 0.5),
+    "motorcyclist": BodySize(2.1, 0.8),
+    "car": BodySize(4.023, 1.712),
+}
 """Bounding boxes of Euro NCAP's targets, including riders [m]."""
-SHAPES = {"adult": "pedestrian", "child": "pedestrian", "cyclist": "bicycle", "motorcyclist": "motorcycle", "car": "evehicle"}
+SHAPES = {
+    "adult": "pedestrian",
+    "child": "pedestrian",
+    "cyclist": "bicycle",
+    "motorcyclist": "motorcycle",
+    "car": "evehicle",
+}
 """Shapes that sumo-gui draws for the targets; SUMO does not cut off the corners of these shapes."""
 
 
@@ -83,17 +94,29 @@ def change_target_lanes(frame: Frame, entry: Coordinates, exit_: Coordinates, di
 
     Points are given along the vehicle's lane and to its left [m].
     """
-    begin, end = ((x + sign * TARGET_LANE_LENGTH * direction.along, y + sign * TARGET_LANE_LENGTH * direction.left)
-                  for (x, y), sign in ((entry, -1), (exit_, 1)))
-    return {f"edge/lane[@id='{lane}']": {"shape": " ".join(",".join(map(repr, frame.point(*end))) for end in ends),
-                                         "length": repr(math.dist(*ends))}
-            for lane, ends in ((ENTRY_LANE, (begin, entry)), (JUNCTION_LANE, (entry, exit_)), (EXIT_LANE, (exit_, end)))}
+    begin, end = (
+        (x + sign * TARGET_LANE_LENGTH * direction.along, y + sign * TARGET_LANE_LENGTH * direction.left)
+        for (x, y), sign in ((entry, -1), (exit_, 1))
+    )
+    return {
+        f"edge/lane[@id='{lane}']": {
+            "shape": " ".join(",".join(map(repr, frame.point(*end))) for end in ends),
+            "length": repr(math.dist(*ends)),
+        }
+        for lane, ends in ((ENTRY_LANE, (begin, entry)), (JUNCTION_LANE, (entry, exit_)), (EXIT_LANE, (exit_, end)))
+    }
 
 
 def target_type(target: str) -> dict[str, str]:
     """Attributes of the target's vehicle type in the traffic file."""
     body = BODIES[target]
-    return {"id": target, "length": repr(body.length), "width": repr(body.width), "guiShape": SHAPES[target], "maxSpeed": TARGET_TOP_SPEED}
+    return {
+        "id": target,
+        "length": repr(body.length),
+        "width": repr(body.width),
+        "guiShape": SHAPES[target],
+        "maxSpeed": TARGET_TOP_SPEED,
+    }
 
 
 class ProtocolRange(NamedTuple):
@@ -107,7 +130,9 @@ class ProtocolRange(NamedTuple):
         """Remarks on parameters outside the protocol's ranges and on a road that is not level."""
         remarks = []
         if not self.slowest <= speed <= self.fastest:
-            remarks.append(f"{test}: speed = {speed:g} km/h is outside the protocol's {self.slowest:g} to {self.fastest:g} km/h")
+            remarks.append(
+                f"{test}: speed = {speed:g} km/h is outside the protocol's {self.slowest:g} to {self.fastest:g} km/h"
+            )
         if location not in self.locations:
             legal = ", ".join(f"{protocol_location:g}" for protocol_location in self.locations)
             remarks.append(f"{test}: impact_location = {location:g} % is none of the protocol's {legal} %")
@@ -127,12 +152,18 @@ class SpeedProfile(NamedTuple):
     def with_arrival(cls, distance: float, time: float, speed: float, run_up: float) -> SpeedProfile:
         """The profile that covers `distance` [m] by `time` [s]; past the run-up, distance = speed * (time - begin) - run_up."""
         if distance < run_up:
-            raise InputError("scenario.parameters", f"acceleration_distance = {run_up:g} m is longer than the distance of {distance:g} m")
+            raise InputError(
+                "scenario.parameters",
+                f"acceleration_distance = {run_up:g} m is longer than the distance of {distance:g} m",
+            )
         begin = time - (distance + run_up) / speed
         if begin < 0:
             shortest_time = (distance + run_up) / speed
-            raise InputError("scenario.parameters", f"the target needs {shortest_time:.2f} s to the impact and has {time:g} s",
-                             "a faster target, a shorter distance or a longer time_to_impact")
+            raise InputError(
+                "scenario.parameters",
+                f"the target needs {shortest_time:.2f} s to the impact and has {time:g} s",
+                "a faster target, a shorter distance or a longer time_to_impact",
+            )
         return cls(begin, speed, run_up)
 
     def travelled(self, time: float) -> float:

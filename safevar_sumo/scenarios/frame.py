@@ -30,8 +30,11 @@ class Frame(NamedTuple):
         """
         (x, y), (to_x, to_y) = lane.start, lane.end
         if isinstance(lane, BentLane):
-            raise InputError("scenario.parameters.network", f"lane {lane.name!r} deviates {lane.bend:.2f} m from a straight line",
-                             "a straight lane")
+            raise InputError(
+                "scenario.parameters.network",
+                f"lane {lane.name!r} deviates {lane.bend:.2f} m from a straight line",
+                "a straight lane",
+            )
         length = math.sqrt((to_x - x) * (to_x - x) + (to_y - y) * (to_y - y))
         return cls(lane.start, ((to_x - x) / length, (to_y - y) / length))
 

@@ -59,4 +59,5 @@ class LeadVehicleStopped(Scenario, Struct, frozen=True, kw_only=True, forbid_unk
             separation=trace.gap + trace.vehicle_length,
             distance=trace.gap,
             closing_speed=trace.speed,
-            in_conflict=trace.gap > 0)
+            in_conflict=trace.gap > 0,
+        )

@@ -61,12 +61,18 @@ class PedestrianCrossing(Scenario, Struct, frozen=True, kw_only=True, forbid_unk
         (path_start, _), (path_end, _) = frame.lane_coordinates(crossing.start), frame.lane_coordinates(crossing.end)
         skew = abs(path_end - path_start)
         if skew > MAX_SKEW:
-            raise InputError("scenario.parameters.network", f"lane {CROSSING_LANE!r} leads {skew:.2f} m along the road",
-                             "a crossing at right angles")
+            raise InputError(
+                "scenario.parameters.network",
+                f"lane {CROSSING_LANE!r} leads {skew:.2f} m along the road",
+                "a crossing at right angles",
+            )
         lateral = frame.left(world.person_positions(PEDESTRIAN)) - frame.left(world.vehicle_positions(VUT))
         if self.turns_after is not None and lateral[0] > self.turns_after:
-            raise InputError("scenario.parameters.network", f"the pedestrian begins {lateral[0]:.2f} m to the left of the vehicle",
-                             "to the right of it, or turns_after = None")
+            raise InputError(
+                "scenario.parameters.network",
+                f"the pedestrian begins {lateral[0]:.2f} m to the left of the vehicle",
+                "to the right of it, or turns_after = None",
+            )
         half_width = world.person_width(PEDESTRIAN) / 2
         clear_point = path_start + half_width + world.vehicle_length(VUT)
         return _Memory(frame, path_start - half_width, clear_point, lateral, has_turned=False)
@@ -99,4 +105,5 @@ class PedestrianCrossing(Scenario, Struct, frozen=True, kw_only=True, forbid_unk
             separation=trace.gap,
             distance=centre_distance - half_length,
             closing_speed=approach / centre_distance,
-            in_conflict=trace.gap > 0)
+            in_conflict=trace.gap > 0,
+        )

@@ -104,7 +104,9 @@ class TargetTest(Scenario, Struct, frozen=True, kw_only=True, forbid_unknown_fie
         motion = self._motion(world)
         initial_speed = motion.begin(world)
         lateral = motion.target(motion.positions(world), 0.0).lateral
-        return Memory(motion, lateral, sample=0, last_speed=initial_speed, approached=np.zeros(len(lateral), dtype=bool))
+        return Memory(
+            motion, lateral, sample=0, last_speed=initial_speed, approached=np.zeros(len(lateral), dtype=bool)
+        )
 
     def observe(self, world: World, step: float, memory: Memory) -> tuple[Scene, Memory]:
         motion = memory.motion
@@ -133,8 +135,9 @@ class TargetTest(Scenario, Struct, frozen=True, kw_only=True, forbid_unknown_fie
         raise NotImplementedError
 
 
-def scene_of(constants: EncounterConstants, target: Target, front: FloatArray, speed: FloatArray,
-             approached: BoolArray) -> tuple[Scene, BoolArray]:
+def scene_of(
+    constants: EncounterConstants, target: Target, front: FloatArray, speed: FloatArray, approached: BoolArray
+) -> tuple[Scene, BoolArray]:
     """The scene of N vehicles, and which of them have approached; `front` is their fronts' position along the lane [m]."""
     gap, zeros = target.edge - front, np.zeros_like(front)
     over = np.asarray(target.is_clear | (gap < constants.passed_gap))
@@ -142,7 +145,9 @@ def scene_of(constants: EncounterConstants, target: Target, front: FloatArray, s
         approached = approached | (speed - target.speed > APPROACH_SPEED)
         over = over | (constants.follows & approached & (speed <= target.speed))
     visible = ALL_TRUE if constants.hidden is False else _visible(constants, target, gap)
-    return Scene(gap, zeros + target.lateral, zeros + target.lateral_speed, over, zeros + target.speed, visible), approached
+    return Scene(
+        gap, zeros + target.lateral, zeros + target.lateral_speed, over, zeros + target.speed, visible
+    ), approached
 
 
 def _visible(constants: EncounterConstants, target: Target, gap: FloatArray) -> BoolArray:

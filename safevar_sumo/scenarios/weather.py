@@ -35,7 +35,11 @@ def weather_of(choice: str | Weather, source: object) -> Weather:
 def equals_clear(weather: Weather) -> bool:
     """Whether a weather has the effects of clear weather under another name."""
     clear = WEATHERS["clear"]
-    return weather.name != clear.name and weather.light == clear.light and msgspec.structs.replace(weather, name=clear.name) == clear
+    return (
+        weather.name != clear.name
+        and weather.light == clear.light
+        and msgspec.structs.replace(weather, name=clear.name) == clear
+    )
 
 
 def weather_in_words(weather: Weather) -> str:

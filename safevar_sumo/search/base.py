@@ -39,7 +39,9 @@ class Problem:
         lower, upper = self.characteristics.lower, self.characteristics.upper
         if not self.region:
             return rng.uniform(lower, upper, (number, len(lower)))
-        return self.region.draw_feasible(lambda count: rng.uniform(lower, upper, (count, len(lower))), number, rng, filtered=True)
+        return self.region.draw_feasible(
+            lambda count: rng.uniform(lower, upper, (count, len(lower))), number, rng, filtered=True
+        )
 
     def feasible(self, settings: FloatArray) -> BoolArray:
         """Which settings, shape (k, n), satisfy the study's constraints after the filter; shape (k,)."""
@@ -74,8 +76,9 @@ class GuardedAlgorithm(Algorithm):
     def search(self, problem: Problem, rng: np.random.Generator) -> Search:
         search = self._guard.call("search", self._algorithm.search, read_only_copy(problem), rng)
         if not (hasattr(search, "send") and hasattr(search, "__next__")):
-            raise self._guard.wrong_value("search", "the search", search,
-                                          "a generator: a method that yields settings and returns its result")
+            raise self._guard.wrong_value(
+                "search", "the search", search, "a generator: a method that yields settings and returns its result"
+            )
         evaluations_by_setting: dict[bytes, Evaluations] = {}
         last_answer: Evaluations | None = None
         budget = problem.evaluations
@@ -92,35 +95,56 @@ class GuardedAlgorithm(Algorithm):
 
     def _check_settings(self, output: Any, problem: Problem, budget: int) -> FloatArray:
         characteristics = problem.characteristics
-        expected = f"an array of shape (k, {len(characteristics)}) with k from 1 to the {budget} evaluations that are left"
+        expected = (
+            f"an array of shape (k, {len(characteristics)}) with k from 1 to the {budget} evaluations that are left"
+        )
         is_matrix = isinstance(output, np.ndarray) and output.ndim == 2
         if not is_matrix or output.shape[1] != len(characteristics) or not 1 <= len(output) <= budget:
             raise self._guard.wrong_value("search", "settings", output, expected)
         settings = self._guard.numbers("search", "settings", output, output.shape)
         for characteristic, values in zip(characteristics, settings.T, strict=True):
-            self._guard.numbers("search", characteristic.name, values, (len(settings),), characteristic.lower, characteristic.upper)
+            self._guard.numbers(
+                "search", characteristic.name, values, (len(settings),), characteristic.lower, characteristic.upper
+            )
         unfiltered_values = np.argwhere(characteristics.filter(settings) != settings)
         if len(unfiltered_values):
             row, column = unfiltered_values[0]
-            raise self._guard.wrong_value("search", characteristics.names[column], float(settings[row, column]),
-                                          "filtered settings: problem.characteristics.filter(settings)")
+            raise self._guard.wrong_value(
+                "search",
+                characteristics.names[column],
+                float(settings[row, column]),
+                "filtered settings: problem.characteristics.filter(settings)",
+            )
         if problem.region and not problem.region.feasible(settings).all():
-            problem.region.check(settings, self._guard.source, otherwise=f", for every setting that {self._guard.name} yields: "
-                                 "problem.characteristics.filter(problem.repaired(settings))")
+            problem.region.check(
+                settings,
+                self._guard.source,
+                otherwise=f", for every setting that {self._guard.name} yields: "
+                "problem.characteristics.filter(problem.repaired(settings))",
+            )
         return settings
 
-    def _check_result(self, result: Any, evaluations_by_setting: dict[bytes, Evaluations], problem: Problem) -> Evaluations:
+    def _check_result(
+        self, result: Any, evaluations_by_setting: dict[bytes, Evaluations], problem: Problem
+    ) -> Evaluations:
         expected = "an Evaluations of settings that it was sent, such as evaluations.take(rows)"
         if not isinstance(result, Evaluations):
             raise self._guard.wrong_value("search", "its result", result, expected)
         if not evaluations_by_setting:
-            raise UserCodeError(self._guard.source, f"{self._guard.name} ended in search without yielding any setting",
-                                f"a generator that yields from 1 to {problem.evaluations} settings before it returns")
-        settings = self._guard.numbers("search", "its result's settings", result.settings, (len(result), len(problem.characteristics)))
+            raise UserCodeError(
+                self._guard.source,
+                f"{self._guard.name} ended in search without yielding any setting",
+                f"a generator that yields from 1 to {problem.evaluations} settings before it returns",
+            )
+        settings = self._guard.numbers(
+            "search", "its result's settings", result.settings, (len(result), len(problem.characteristics))
+        )
         if any(setting.tobytes() not in evaluations_by_setting for setting in settings):
             raise self._guard.wrong_value("search", "its result", "settings that it never yielded", expected)
         empty = next(iter(evaluations_by_setting.values())).take([])
-        evaluations = Evaluations.concatenate([empty, *(evaluations_by_setting[setting.tobytes()] for setting in settings)])
+        evaluations = Evaluations.concatenate(
+            [empty, *(evaluations_by_setting[setting.tobytes()] for setting in settings)]
+        )
         return evaluations.take(problem.scoring.valid(evaluations))
 
 

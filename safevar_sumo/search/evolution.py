@@ -29,6 +29,7 @@ MAX_MISSES = 50
 @cache
 def fitness_class(objective_count: int) -> type[Any]:
     """The class of a fitness with this number of objectives, all minimised."""
+
     def initialise(self: base.Fitness, values: tuple[float, ...] = ()) -> None:
         if values:  # DEAP's constructor also checks the type of the weights, which takes longer than everything else
             self.values = values
@@ -99,7 +100,9 @@ class Variation:
         self._candidates = []
         with self.randomness():
             while population and len(children) < number:
-                for child in self._feasible_children([self._mutate(child) for child in self._crossover(*self._parents(population))]):
+                for child in self._feasible_children(
+                    [self._mutate(child) for child in self._crossover(*self._parents(population))]
+                ):
                     is_repeated, draws = tuple(child) in existing, draws + 1
                     if not is_repeated or draws > MAX_REDRAWS * number:
                         existing.add(tuple(child))
@@ -154,21 +157,31 @@ class Variation:
         return children
 
     def _mutate(self, child: Individual) -> Individual:
-        tools.mutPolynomialBounded(child, self._operators.mutation_index, self._lower, self._upper, self._mutation_probability)
+        tools.mutPolynomialBounded(
+            child, self._operators.mutation_index, self._lower, self._upper, self._mutation_probability
+        )
         return child
 
 
 def initial_population(problem: Problem, rng: np.random.Generator) -> list[Individual]:
     """The first population, uniform in the domains."""
-    return [Individual(values) for values in problem.uniform(min(problem.population, problem.evaluations), rng).tolist()]
+    return [
+        Individual(values) for values in problem.uniform(min(problem.population, problem.evaluations), rng).tolist()
+    ]
 
 
 def request_evaluations(individuals: Sequence[Individual], problem: Problem) -> Generator[FloatArray, Evaluations, int]:
     """Request and store the evaluations of individuals; returns the number of evaluations."""
     evaluated = yield problem.characteristics.filter(np.array(individuals))
     fitness, valid = fitness_class(len(problem.scoring.objectives)), problem.scoring.valid(evaluated).tolist()
-    for i, (individual, objectives) in enumerate(zip(individuals, problem.scoring.values(evaluated).tolist(), strict=True)):
-        individual.evaluation, individual.fitness, individual.has_failed = (evaluated, i), fitness(tuple(objectives)), not valid[i]
+    for i, (individual, objectives) in enumerate(
+        zip(individuals, problem.scoring.values(evaluated).tolist(), strict=True)
+    ):
+        individual.evaluation, individual.fitness, individual.has_failed = (
+            (evaluated, i),
+            fitness(tuple(objectives)),
+            not valid[i],
+        )
     return len(individuals)
 
 
@@ -216,5 +229,7 @@ def run_tournament(population: list[Individual], size: int = 2) -> Individual:
 
 def join_evaluations(individuals: Sequence[Individual], problem: Problem) -> Evaluations:
     """Join the evaluations of individuals in one batch."""
-    evaluations_of_individuals = [evaluations.take([row]) for evaluations, row in (individual.evaluation for individual in individuals)]
+    evaluations_of_individuals = [
+        evaluations.take([row]) for evaluations, row in (individual.evaluation for individual in individuals)
+    ]
     return Evaluations.concatenate(evaluations_of_individuals) if individuals else problem.original.take([])

@@ -57,14 +57,21 @@ class MapElites(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknown_fie
         InputError
             If there are too many cells, or pyribs is not installed.
         """
-        cell_count = 2**characteristic_count if self.behaviour == "changes" else characteristic_count * (self.speeds + 1)
+        cell_count = (
+            2**characteristic_count if self.behaviour == "changes" else characteristic_count * (self.speeds + 1)
+        )
         if cell_count > MAX_CELLS:
-            raise InputError(source, f"search.map_elites.behaviour = 'changes' has 2^{characteristic_count} cells", "'speed'")
+            raise InputError(
+                source, f"search.map_elites.behaviour = 'changes' has 2^{characteristic_count} cells", "'speed'"
+            )
         try:
             import ribs  # noqa: F401
         except ImportError:
-            raise InputError(source, "search.algorithms = 'map_elites' needs pyribs, which is not installed",
-                             "in the checkout: pip install '.[qd]'") from None
+            raise InputError(
+                source,
+                "search.algorithms = 'map_elites' needs pyribs, which is not installed",
+                "in the checkout: pip install '.[qd]'",
+            ) from None
         return cell_count
 
     def search(self, problem: Problem, rng: np.random.Generator) -> Search:
@@ -82,7 +89,7 @@ class MapElites(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknown_fie
             children = self._draw_children(parents, generation_size, problem, rng)
             evaluated = yield problem.characteristics.filter(children[:number])
             batches.append(evaluated)
-            settings[used:used + number] = evaluated.settings
+            settings[used : used + number] = evaluated.settings
             valid = np.flatnonzero(problem.scoring.valid(evaluated))
             if len(valid):
                 quality[used + valid] = _qualities(evaluated, problem)[valid]
@@ -100,7 +107,9 @@ class MapElites(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknown_fie
         candidates = rng.choice(elites, (number, self.tournament_size))
         return np.asarray(candidates[np.arange(number), np.argmax(quality[candidates], axis=1)])
 
-    def _draw_children(self, parents: FloatArray | None, number: int, problem: Problem, rng: np.random.Generator) -> FloatArray:
+    def _draw_children(
+        self, parents: FloatArray | None, number: int, problem: Problem, rng: np.random.Generator
+    ) -> FloatArray:
         """Unfiltered settings, feasible after the filter; without parents, each setting has random changes."""
         characteristics = problem.characteristics
         size, width = len(characteristics), characteristics.upper - characteristics.lower
@@ -111,9 +120,15 @@ class MapElites(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknown_fie
         mutated_values = parents + rng.normal(0, self.reach, parents.shape) * width
         children = np.where(changed, np.clip(mutated_values, characteristics.lower, characteristics.upper), parents)
         new_values = rng.uniform(characteristics.lower, characteristics.upper, parents.shape)
-        for probability, values in ((self.added, new_values), (self.removed, np.broadcast_to(characteristics.original, parents.shape))):
-            columns = rng.integers(0, size, number) if values is new_values else np.argmax(
-                np.where(changed, rng.random(parents.shape), -1.0), axis=1)
+        for probability, values in (
+            (self.added, new_values),
+            (self.removed, np.broadcast_to(characteristics.original, parents.shape)),
+        ):
+            columns = (
+                rng.integers(0, size, number)
+                if values is new_values
+                else np.argmax(np.where(changed, rng.random(parents.shape), -1.0), axis=1)
+            )
             rows = np.flatnonzero(rng.random(number) < probability)
             children[rows, columns[rows]] = values[rows, columns[rows]]
         return problem.repaired(children)
@@ -123,7 +138,11 @@ class MapElites(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknown_fie
         if self.behaviour == "changes":
             return np.asarray(changed @ (1 << np.arange(changed.shape[1])))
         speed = np.nan_to_num(evaluated.collision_speed, nan=-1.0)
-        interval = np.where(speed < 0, 0, 1 + np.minimum(np.floor(np.maximum(speed, 0) / FASTEST_COLLISION * self.speeds), self.speeds - 1))
+        interval = np.where(
+            speed < 0,
+            0,
+            1 + np.minimum(np.floor(np.maximum(speed, 0) / FASTEST_COLLISION * self.speeds), self.speeds - 1),
+        )
         further_changes = np.maximum(changed.sum(axis=1) - 1, 0)
         return np.asarray(further_changes * (self.speeds + 1) + interval.astype(int))
 

@@ -67,8 +67,11 @@ class MoCell(Operators, frozen=True, kw_only=True, forbid_unknown_fields=True):
             rows = next(side for side in range(math.isqrt(population), 0, -1) if population % side == 0)
             return rows, population // rows
         if math.prod(self.grid) != population:
-            raise InputError(source, f"search.mocell.grid = {list(self.grid)} has {math.prod(self.grid)} cells",
-                             f"two sides whose product is search.population = {population}")
+            raise InputError(
+                source,
+                f"search.mocell.grid = {list(self.grid)} has {math.prod(self.grid)} cells",
+                f"two sides whose product is search.population = {population}",
+            )
         return self.grid
 
     def search(self, problem: Problem, rng: np.random.Generator) -> Search:
@@ -82,10 +85,13 @@ class MoCell(Operators, frozen=True, kw_only=True, forbid_unknown_fields=True):
             set_standings(valid)
             neighbourhoods = [[cells[i] for i in indices if not cells[i].has_failed] for indices in neighbours]
             with variation.randomness():
-                offspring = [variation.draw_child(mates or archive, archive) for mates in neighbourhoods[:problem.evaluations - used]]
+                offspring = [
+                    variation.draw_child(mates or archive, archive)
+                    for mates in neighbourhoods[: problem.evaluations - used]
+                ]
             used += yield from request_evaluations(offspring, problem)
             families = zip(cells, offspring, neighbourhoods, strict=False)  # the last generation may be incomplete
-            cells[:len(offspring)] = [choose_survivor(cell, child, mates) for cell, child, mates in families]
+            cells[: len(offspring)] = [choose_survivor(cell, child, mates) for cell, child, mates in families]
             archive = update_archive(archive, offspring, size)
         return join_evaluations(archive, problem)
 
@@ -93,8 +99,11 @@ class MoCell(Operators, frozen=True, kw_only=True, forbid_unknown_fields=True):
         """Indices of each cell and its neighbours, without repetition."""
         rows, columns = self.grid_sides(population)
         offsets = ((0, 0), *NEIGHBOURHOODS[self.neighbourhood])
-        return [list(dict.fromkeys((row + down) % rows * columns + (column + right) % columns for down, right in offsets))
-                for row in range(rows) for column in range(columns)]
+        return [
+            list(dict.fromkeys((row + down) % rows * columns + (column + right) % columns for down, right in offsets))
+            for row in range(rows)
+            for column in range(columns)
+        ]
 
 
 def choose_survivor(cell: Individual, child: Individual, mates: list[Individual]) -> Individual:

@@ -18,8 +18,10 @@ class RandomSearch(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknown_
         settings = problem.characteristics.filter(problem.uniform(problem.evaluations, rng))
         archive: Evaluations | None = None
         for start in range(0, len(settings), problem.population):
-            evaluated = yield settings[start:start + problem.population]
-            archive = _keep_non_dominated(evaluated if archive is None else Evaluations.concatenate([archive, evaluated]), problem.scoring)
+            evaluated = yield settings[start : start + problem.population]
+            archive = _keep_non_dominated(
+                evaluated if archive is None else Evaluations.concatenate([archive, evaluated]), problem.scoring
+            )
         assert archive is not None
         return archive
 

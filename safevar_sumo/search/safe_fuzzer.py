@@ -55,13 +55,17 @@ class SafeFuzzer(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknown_fi
             batches.append(evaluated)
             window.append(evaluated)
             if earlier is not None and len(earlier) >= self.warm_up:
-                unimproved = 0 if _improves(evaluated, earlier, problem.scoring, self.safety_weight, self.kept) else unimproved + 1
+                unimproved = (
+                    0
+                    if _improves(evaluated, earlier, problem.scoring, self.safety_weight, self.kept)
+                    else unimproved + 1
+                )
             if used >= self.warm_up and generation % self.generations_between_updates == 0:
                 ranges.narrow(Evaluations.concatenate(window))
                 window = []
         evaluations = Evaluations.concatenate(batches)
         valid = evaluations.take(problem.scoring.valid(evaluations))
-        return valid.take(np.argsort(_scores(valid, problem.scoring, self.safety_weight), kind="stable")[:self.kept])
+        return valid.take(np.argsort(_scores(valid, problem.scoring, self.safety_weight), kind="stable")[: self.kept])
 
 
 class _Ranges:
@@ -105,7 +109,9 @@ class _Ranges:
 
     def narrow(self, window: Evaluations) -> None:
         """Narrow each range to the mean increase and mean decrease in the settings of `window` that are less safe than the original."""
-        less_safe = window.take(self._scoring.valid(window) & (self._scoring.values(window)[:, 0] < self._original_objective))
+        less_safe = window.take(
+            self._scoring.valid(window) & (self._scoring.values(window)[:, 0] < self._original_objective)
+        )
         if not len(less_safe):
             return
         for i, original in enumerate(self._characteristics.original):
@@ -117,17 +123,24 @@ class _Ranges:
         self.max_changes = max(1, int(np.floor(np.mean(less_safe.f_num_diff) + 0.5)))
 
 
-def _improves(generation: Evaluations, earlier: Evaluations, scoring: Scoring = PUBLISHED_SCORING, safety_weight: float = SAFETY_WEIGHT,
-              kept: int = RESULT_SIZE) -> bool:
+def _improves(
+    generation: Evaluations,
+    earlier: Evaluations,
+    scoring: Scoring = PUBLISHED_SCORING,
+    safety_weight: float = SAFETY_WEIGHT,
+    kept: int = RESULT_SIZE,
+) -> bool:
     """Whether the best score of a generation is lower than the worst of the `kept` best earlier scores."""
     scores = _scores(Evaluations.concatenate([earlier, generation]), scoring, safety_weight)
-    earlier_scores, new_scores = scores[:len(earlier)], scores[len(earlier):]
+    earlier_scores, new_scores = scores[: len(earlier)], scores[len(earlier) :]
     best = np.sort(earlier_scores[~np.isnan(earlier_scores)])[:kept]
     new_scores = new_scores[~np.isnan(new_scores)]
     return bool(new_scores.size and (not best.size or new_scores.min() < best[-1]))
 
 
-def _scores(evaluations: Evaluations, scoring: Scoring = PUBLISHED_SCORING, safety_weight: float = SAFETY_WEIGHT) -> FloatArray:
+def _scores(
+    evaluations: Evaluations, scoring: Scoring = PUBLISHED_SCORING, safety_weight: float = SAFETY_WEIGHT
+) -> FloatArray:
     """The score (6 SD_norm + f_diff + num_norm) / 8, of which the search prefers low values; NaN where invalid.
 
     SD_norm is the safety degree scaled to [0, 1] over `evaluations`; num_norm = (f_num_diff - 1) / (n - 1) for n characteristics.

@@ -66,7 +66,7 @@ def select_archive(individuals: list[Individual], size: int, *, normalised: bool
     is_nondominated = ~dominates.any(axis=0)
     selection = _truncate(np.flatnonzero(is_nondominated), distances, size)
     dominated = np.flatnonzero(~is_nondominated)
-    selection += dominated[np.argsort(fitness[dominated], kind="stable")][:size - len(selection)].tolist()
+    selection += dominated[np.argsort(fitness[dominated], kind="stable")][: size - len(selection)].tolist()
     return [individuals[i] for i in selection]
 
 

@@ -36,8 +36,10 @@ class Constraint(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         """The quantity in words, such as `mass - 2 radius`."""
         if self.function:
             return self.function
-        terms = [f"{'-' if weight < 0 else '+'} {'' if abs(weight) == 1 else f'{abs(weight):g} '}{name}"
-                 for name, weight in self.sum.items()]
+        terms = [
+            f"{'-' if weight < 0 else '+'} {'' if abs(weight) == 1 else f'{abs(weight):g} '}{name}"
+            for name, weight in self.sum.items()
+        ]
         return re.sub("^- ", "-", " ".join(terms).removeprefix("+ "))
 
     def unit_of(self, table: Mapping[str, CharacteristicTable]) -> str:
@@ -52,13 +54,18 @@ class Constraint(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         return " and ".join(f"{word} {value:g}{unit}" for word, value in bounds.items() if value is not None)
 
 
-def constraint_mistakes(source: object, table: Mapping[str, CharacteristicTable],
-                        constraints: Sequence[Constraint]) -> Iterator[InputError]:
+def constraint_mistakes(
+    source: object, table: Mapping[str, CharacteristicTable], constraints: Sequence[Constraint]
+) -> Iterator[InputError]:
     """Errors for constraints that name unknown characteristics, add quantities of different units, or have no bounds."""
     for index, constraint in enumerate(constraints):
         key = f"constraints[{index}]"
         if bool(constraint.sum) == bool(constraint.function):
-            yield InputError(source, f"{key}: {'both sum and function' if constraint.sum else 'neither sum nor function'}", "one of them")
+            yield InputError(
+                source,
+                f"{key}: {'both sum and function' if constraint.sum else 'neither sum nor function'}",
+                "one of them",
+            )
         for name, weight in constraint.sum.items():
             if name not in table:
                 yield unknown_name(source, f"{key}.sum.{name}: there is no such characteristic", name, table)
@@ -66,21 +73,38 @@ def constraint_mistakes(source: object, table: Mapping[str, CharacteristicTable]
                 yield InputError(source, f"{key}.sum.{name} = 0", "a number other than 0")
         if constraint.at_least is None and constraint.at_most is None:
             yield InputError(source, f"{key}: neither at_least nor at_most", "one of them, or both")
-        elif constraint.at_least is not None and constraint.at_most is not None and constraint.at_least > constraint.at_most:
-            yield InputError(source, f"{key}: at_least = {constraint.at_least:g} and at_most = {constraint.at_most:g}",
-                             "at_least <= at_most")
+        elif (
+            constraint.at_least is not None
+            and constraint.at_most is not None
+            and constraint.at_least > constraint.at_most
+        ):
+            yield InputError(
+                source,
+                f"{key}: at_least = {constraint.at_least:g} and at_most = {constraint.at_most:g}",
+                "at_least <= at_most",
+            )
         yield from _unit_mistakes(source, key, constraint, table)
 
 
-def _unit_mistakes(source: object, key: str, constraint: Constraint, table: Mapping[str, CharacteristicTable]) -> Iterator[InputError]:
+def _unit_mistakes(
+    source: object, key: str, constraint: Constraint, table: Mapping[str, CharacteristicTable]
+) -> Iterator[InputError]:
     units = dict.fromkeys(table[name].unit for name in constraint.sum if name in table)
     known_units = list(dict.fromkeys(["-", *(row.unit for row in table.values())]))
     if constraint.unit is None and len(units) > 1:
         terms = ", ".join(f"{name} [{table[name].unit}]" for name in constraint.sum if name in table)
-        yield InputError(source, f"{key}.sum adds {terms}", "characteristics of the same unit, or weights that convert units, and "
-                         f"unit = {one_of(known_units)}")
+        yield InputError(
+            source,
+            f"{key}.sum adds {terms}",
+            f"characteristics of the same unit, or weights that convert units, and unit = {one_of(known_units)}",
+        )
     elif constraint.unit is not None and len(units) == 1 and constraint.unit not in (*units, "-"):
-        yield InputError(source, f"{key}.unit = {constraint.unit!r}",
-                         f"{next(iter(units))!r}, the unit of {' and '.join(constraint.sum)}, or '-'")
+        yield InputError(
+            source,
+            f"{key}.unit = {constraint.unit!r}",
+            f"{next(iter(units))!r}, the unit of {' and '.join(constraint.sum)}, or '-'",
+        )
     elif constraint.unit is not None and constraint.unit not in known_units:
-        yield unknown_name(source, f"{key}.unit = {constraint.unit!r} is no unit of this study", constraint.unit, known_units)
+        yield unknown_name(
+            source, f"{key}.unit = {constraint.unit!r} is no unit of this study", constraint.unit, known_units
+        )

@@ -16,7 +16,16 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.output import whole_file
 from safevar_sumo.shipped import STUDIES
 from safevar_sumo.study.fitted import contradictions_of_file
-from safevar_sumo.study.schema import NAME_PATTERN, Origin, SearchTable, Study, StudyLike, is_file, study_path, tables_of
+from safevar_sumo.study.schema import (
+    NAME_PATTERN,
+    Origin,
+    SearchTable,
+    Study,
+    StudyLike,
+    is_file,
+    study_path,
+    tables_of,
+)
 from safevar_sumo.study.validation import contradictions, convert_table, infinite_numbers, raise_mistakes
 
 WHOLE_TABLES = ("calibration", "published", "repeatability", "spread", "model_error")
@@ -74,19 +83,31 @@ def _with_fmu(raw: _RawStudy) -> dict[str, Any]:
     """A study's tables, with rows of characteristics completed from the parameters that the vehicle's FMU declares."""
     tables = raw.tables
     vehicle = tables.get("vehicle")
-    if not isinstance(vehicle, dict) or vehicle.get("kind") != "fmu" or not isinstance(model := vehicle.get("model"), str):
+    if (
+        not isinstance(vehicle, dict)
+        or vehicle.get("kind") != "fmu"
+        or not isinstance(model := vehicle.get("model"), str)
+    ):
         return tables
     stated_rows, parameters = vehicle.get("characteristics", {}), vehicle.get("parameters", {})
-    if not (isinstance(stated_rows, dict) and isinstance(parameters, dict) and all(isinstance(row, dict) for row in stated_rows.values())):
+    if not (
+        isinstance(stated_rows, dict)
+        and isinstance(parameters, dict)
+        and all(isinstance(row, dict) for row in stated_rows.values())
+    ):
         return tables
     from safevar_sumo.fmu.description import description_of, file_of  # only a study with an FMU needs FMPy
 
-    is_complete = stated_rows and all({"unit", "original", "lower", "upper"} <= row.keys() for row in stated_rows.values())
+    is_complete = stated_rows and all(
+        {"unit", "original", "lower", "upper"} <= row.keys() for row in stated_rows.values()
+    )
     if is_complete and not file_of(model, raw.origin.places):
         return tables  # so results can be read without their FMU
     description = description_of(model, raw.origin.places, str(raw.source), "vehicle.model")
-    rows = {**description.table_rows(parameters),
-            **{name: {**description.table_row(name, str(row.get("unit", ""))), **row} for name, row in stated_rows.items()}}
+    rows = {
+        **description.table_rows(parameters),
+        **{name: {**description.table_row(name, str(row.get("unit", ""))), **row} for name, row in stated_rows.items()},
+    }
     return {**tables, "vehicle": {**vehicle, "characteristics": rows}}
 
 
@@ -95,7 +116,11 @@ def _with_algorithms(tables: dict[str, Any]) -> dict[str, Any]:
     search = tables.get("search")
     if not isinstance(search, dict) or not isinstance(search.get("parameters", {}), dict):
         return tables
-    algorithm_tables = {key: value for key, value in search.items() if isinstance(value, dict) and key not in SearchTable.__struct_fields__}
+    algorithm_tables = {
+        key: value
+        for key, value in search.items()
+        if isinstance(value, dict) and key not in SearchTable.__struct_fields__
+    }
     other_keys = {key: value for key, value in search.items() if key not in algorithm_tables}
     parameters = {**other_keys.get("parameters", {}), **algorithm_tables}
     return {**tables, "search": {**other_keys, "parameters": parameters}} if algorithm_tables else tables
@@ -112,7 +137,9 @@ def _read_file(path: Path, visited_paths: tuple[Path, ...]) -> _RawStudy:
     except OSError as error:
         raise InputError(path, f"cannot be read: {error.strerror}") from None
     folders = () if path.parent == STUDIES else (str(path.resolve().parent),)
-    origin = Origin(called=str(path) if folders else "", places=folders, files=(os.path.abspath(path),) if folders else ())
+    origin = Origin(
+        called=str(path) if folders else "", places=folders, files=(os.path.abspath(path),) if folders else ()
+    )
     return _with_base(_RawStudy(path, tables, origin), path, visited_paths)
 
 
@@ -133,33 +160,52 @@ def _with_base(raw: _RawStudy, path: Path, visited_paths: tuple[Path, ...]) -> _
     except InputError as error:
         raise InputError(raw.source, f"extends = {base!r}: {error.problem}", error.legal) from None
     if base_path in (*visited_paths, path):
-        raise InputError(raw.source, f"extends = {base!r} leads back to {'this file' if base_path == path else base_path}",
-                         "a study that does not extend this one")
+        raise InputError(
+            raw.source,
+            f"extends = {base!r} leads back to {'this file' if base_path == path else base_path}",
+            "a study that does not extend this one",
+        )
     base_study = _read_file(base_path, (*visited_paths, path))
     merged_study = _with_overrides(base_study, tables, raw.source)
     folders = tuple(dict.fromkeys((*raw.origin.places, *base_study.origin.places)))
     remarks = () if path.parent == STUDIES else merged_study.origin.remarks  # shipped studies leave keys out on purpose
-    origin = msgspec.structs.replace(merged_study.origin, called=raw.origin.called, places=folders, remarks=remarks,
-                                     files=(*raw.origin.files, *base_study.origin.files))
+    origin = msgspec.structs.replace(
+        merged_study.origin,
+        called=raw.origin.called,
+        places=folders,
+        remarks=remarks,
+        files=(*raw.origin.files, *base_study.origin.files),
+    )
     return merged_study._replace(origin=origin)
 
 
 def _with_overrides(base: _RawStudy, overrides: Mapping[str, Any], source: object) -> _RawStudy:
     """Override a study's tables; a study of another system does not inherit `SYSTEM_KEYS`."""
     tables = _merge(base.tables, overrides)
-    changed_keys = [key for key in ("weather", "vehicle", "ads", "scenario", "matrix")
-                    if _model_and_network(tables.get(key)) != _model_and_network(base.tables.get(key))]
+    changed_keys = [
+        key
+        for key in ("weather", "vehicle", "ads", "scenario", "matrix")
+        if _model_and_network(tables.get(key)) != _model_and_network(base.tables.get(key))
+    ]
     remarks = base.origin.remarks
     if changed_keys:
         omitted_keys = [key for key in ("title", "published") if key in base.tables and key not in overrides]
-        tables = {**{key: value for key, value in tables.items() if key not in SYSTEM_KEYS}, "title": tables.get("name", ""),
-                  **{key: overrides[key] for key in SYSTEM_KEYS if key in overrides}}
+        tables = {
+            **{key: value for key, value in tables.items() if key not in SYSTEM_KEYS},
+            "title": tables.get("name", ""),
+            **{key: overrides[key] for key in SYSTEM_KEYS if key in overrides},
+        }
         if "vehicle" in changed_keys or "ads" in changed_keys:  # spread and model_error concern their parameters
-            tables = {key: value for key, value in tables.items() if key in overrides or key not in ("spread", "model_error")}
+            tables = {
+                key: value for key, value in tables.items() if key in overrides or key not in ("spread", "model_error")
+            }
         if omitted_keys:
             differences = " and a different ".join("ADS" if key == "ads" else key for key in changed_keys)
-            remarks = (*remarks, f"{source}: has a different {differences} than study {base.tables.get('name')!r}, so "
-                                 f"it does not inherit that study's {' and '.join(f'[{key}]' for key in omitted_keys)}")
+            remarks = (
+                *remarks,
+                f"{source}: has a different {differences} than study {base.tables.get('name')!r}, so "
+                f"it does not inherit that study's {' and '.join(f'[{key}]' for key in omitted_keys)}",
+            )
     raise_mistakes(contradictions_of_file(source, overrides, tables))
     return _RawStudy(source, tables, msgspec.structs.replace(base.origin, remarks=remarks))
 
@@ -184,7 +230,9 @@ def _refines(key: str, base_value: object, override: object) -> bool:
     """Whether an override changes single keys of the table that it overrides."""
     if key in WHOLE_TABLES or not (isinstance(base_value, dict) and isinstance(override, dict)):
         return False
-    return all(override.get(choice, base_value.get(choice)) == base_value.get(choice) for choice in ("model", "distribution"))
+    return all(
+        override.get(choice, base_value.get(choice)) == base_value.get(choice) for choice in ("model", "distribution")
+    )
 
 
 def drop_nulls(raw: Any) -> Any:
@@ -203,7 +251,9 @@ def write_study(path: Path, study: Study, comment: str) -> None:
     if re.fullmatch(NAME_PATTERN, path.stem):
         study = msgspec.structs.replace(study, name=path.stem)
     tables = {name: value for name, value in drop_nulls(tables_of(study)).items() if value != {}}
-    lines = ("".join(character if character.isprintable() else "?" for character in line) for line in comment.splitlines())
+    lines = (
+        "".join(character if character.isprintable() else "?" for character in line) for line in comment.splitlines()
+    )
     text = "".join(f"# {line}".rstrip() + "\n" for line in lines) + "\n" + tomli_w.dumps(tables)
     with whole_file(path, "out") as file:
         file.write_text(text, encoding="utf-8")

@@ -34,11 +34,16 @@ def _key_or_index(table: Any, name: str) -> int | str:
 
 def missing_parameter(source: object, table: str, name: str) -> InputError:
     """The error for a parameter that a table such as `spread` names and the study does not have."""
-    return InputError(source, f"{table}.{name!r} is no parameter of the study",
-                      f"a number that is given under {', '.join(prefix.rstrip('.') for prefix in FITTED_TABLES)}")
+    return InputError(
+        source,
+        f"{table}.{name!r} is no parameter of the study",
+        f"a number that is given under {', '.join(prefix.rstrip('.') for prefix in FITTED_TABLES)}",
+    )
 
 
-def contradictions_of_file(source: object, stated: Mapping[str, Any], tables: Mapping[str, Any]) -> Iterator[InputError]:
+def contradictions_of_file(
+    source: object, stated: Mapping[str, Any], tables: Mapping[str, Any]
+) -> Iterator[InputError]:
     """Errors for tables that a file states itself, not inherits, and that do not fit the complete `tables` of its study."""
     for table in ("calibration", "spread"):
         values = stated.get(table)
@@ -48,5 +53,9 @@ def contradictions_of_file(source: object, stated: Mapping[str, Any], tables: Ma
             if locate_parameter(tables, name) is None:
                 yield missing_parameter(source, table, name)
     rating, matrix = stated.get("rating"), tables.get("matrix")
-    if isinstance(rating, Mapping) and rating.get("claims") and not (isinstance(matrix, Mapping) and matrix.get("protocol")):
+    if (
+        isinstance(rating, Mapping)
+        and rating.get("claims")
+        and not (isinstance(matrix, Mapping) and matrix.get("protocol"))
+    ):
         yield InputError(source, "rating.claims: the study is not rated", "matrix.protocol, or no claims")

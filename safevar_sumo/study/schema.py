@@ -22,7 +22,9 @@ Weight = Annotated[float, Meta(ge=0, le=1e6)]
 Seed = Annotated[int, Meta(ge=0, le=2**63 - 1)]
 Parameters = dict[str, Any]
 NAME_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9_.-]*\Z"
-Name = Annotated[str, Meta(pattern=NAME_PATTERN, description="letters, digits, _, . and -, the first a letter or digit")]
+Name = Annotated[
+    str, Meta(pattern=NAME_PATTERN, description="letters, digits, _, . and -, the first a letter or digit")
+]
 SAFETY_DEGREE: Final = "safety_degree"
 """Column and key of the metric."""
 OBJECTIVES = (SAFETY_DEGREE, "f_diff", "f_num_diff")
@@ -110,7 +112,9 @@ class SearchTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     runs: Annotated[int, Meta(ge=1, le=100_000)]
     seed: Seed
     time_limit: Annotated[float, Meta(gt=0, le=86400)] = 300.0
-    objectives: Annotated[list[str], Meta(min_length=2, max_length=6)] = msgspec.field(default_factory=lambda: list(OBJECTIVES))
+    objectives: Annotated[list[str], Meta(min_length=2, max_length=6)] = msgspec.field(
+        default_factory=lambda: list(OBJECTIVES)
+    )
     parameters: dict[str, Parameters] = {}
 
     @property
@@ -219,7 +223,8 @@ class FitTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     effects: Weight = 0.0
     alike: Annotated[float, Meta(ge=0, le=1)] = 0.05
     weights: dict[str, Weight] = msgspec.field(
-        default_factory=lambda: {SAFETY_DEGREE: 1.0, "tet": 0.3, "tit": 0.3, "ave_dece": 0.5})
+        default_factory=lambda: {SAFETY_DEGREE: 1.0, "tet": 0.3, "tit": 0.3, "ave_dece": 0.5}
+    )
 
 
 class Study(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -276,7 +281,9 @@ def tables_of(study: Study) -> dict[str, Any]:
     for name in ("vehicle", "ads", "scenario"):
         if tables[name].get("kind") != "fmu":
             kept_keys = () if name == "vehicle" else ("kind",)
-            tables[name] = {key: value for key, value in tables[name].items() if key not in FMU_KEYS or key in kept_keys}
+            tables[name] = {
+                key: value for key, value in tables[name].items() if key not in FMU_KEYS or key in kept_keys
+            }
     return tables
 
 
@@ -309,7 +316,9 @@ def study_path(study: str) -> Path:
         pass
     except OSError as error:
         raise InputError(path, f"cannot be read: {error.strerror}", "the path of a study file (TOML)") from None
-    raise unknown_name("study", f"there is no study or file {study!r}", study, study_names(), ", or the path of a study file (TOML)")
+    raise unknown_name(
+        "study", f"there is no study or file {study!r}", study, study_names(), ", or the path of a study file (TOML)"
+    )
 
 
 def user_code_names(study: Study) -> list[str]:
@@ -319,7 +328,11 @@ def user_code_names(study: Study) -> list[str]:
 
 def fmus_of(study: Study) -> list[tuple[str, str]]:
     """Keys and paths of a study's FMUs."""
-    return [(f"{key}.model", table.model) for key, table in (("vehicle", study.vehicle), ("ads", study.ads)) if table.kind == "fmu"]
+    return [
+        (f"{key}.model", table.model)
+        for key, table in (("vehicle", study.vehicle), ("ads", study.ads))
+        if table.kind == "fmu"
+    ]
 
 
 def user_code_packages(study: Study) -> list[str]:
@@ -330,13 +343,22 @@ def user_code_packages(study: Study) -> list[str]:
 def _keys_of_user_code(study: Study) -> list[tuple[str, str]]:
     """Keys and names of a study's user code."""
     tests = [] if study.matrix is None else [test.model for test in study.matrix.tests]
-    names_by_key = {"vehicle.model": [study.vehicle.model], "ads.model": [study.ads.model],
-                    "scenario.model": [study.scenario.model, *tests], "metrics.also": study.metrics.also,
-                    "search.objectives": study.search.objectives}
+    names_by_key = {
+        "vehicle.model": [study.vehicle.model],
+        "ads.model": [study.ads.model],
+        "scenario.model": [study.scenario.model, *tests],
+        "metrics.also": study.metrics.also,
+        "search.objectives": study.search.objectives,
+    }
     functions = [constraint.function for constraint in study.constraints]
     names_by_key["constraints.function"] = [name for name in functions if name]
     fmus = fmus_of(study)
-    return [(key, name) for key, names in names_by_key.items() for name in dict.fromkeys(names) if ":" in name and (key, name) not in fmus]
+    return [
+        (key, name)
+        for key, names in names_by_key.items()
+        for name in dict.fromkeys(names)
+        if ":" in name and (key, name) not in fmus
+    ]
 
 
 def is_file(path: Path) -> bool:

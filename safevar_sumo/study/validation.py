@@ -23,8 +23,14 @@ MAX_MISTAKES = 8
 """Largest number of mistakes of a file that an error lists."""
 MAX_MAGNITUDE = 1e12
 """Largest magnitude of a characteristic, in its unit."""
-TYPE_NAMES = {"number": "a number", "integer": "a whole number", "string": "a text", "boolean": "true or false", "array": "a list",
-              "object": "a table"}
+TYPE_NAMES = {
+    "number": "a number",
+    "integer": "a whole number",
+    "string": "a text",
+    "boolean": "true or false",
+    "array": "a list",
+    "object": "a table",
+}
 
 
 def convert_table(source: object, raw: object, table: type[T], prefix: str = "") -> T:
@@ -50,8 +56,10 @@ def raise_mistakes(errors: Iterable[InputError]) -> None:
         raise first_mistakes[0]
     if first_mistakes:
         legal = [error.legal for error in first_mistakes]
-        texts = [error.problem + (f" (expected: {error.legal})" if error.legal and error.legal not in legal[:number] else "")
-                 for number, error in enumerate(first_mistakes)]
+        texts = [
+            error.problem + (f" (expected: {error.legal})" if error.legal and error.legal not in legal[:number] else "")
+            for number, error in enumerate(first_mistakes)
+        ]
         more = ["and more"] if next(mistakes, None) else []
         count = f"more than {MAX_MISTAKES}" if more else len(texts)
         raise InputError(first_mistakes[0].source, f"{count} mistakes: {'; '.join(texts + more)}")
@@ -82,8 +90,11 @@ def _leaves(error: Any) -> Iterator[Any]:
     branches: dict[int, list[Any]] = {}
     for inner in error.context:
         branches.setdefault(inner.schema_path[0], []).append(inner)
-    fitting = [branch for branch in branches.values() if not any(
-        (not inner.path and inner.validator == "type") or list(inner.path) == [tag] for inner in branch)]
+    fitting = [
+        branch
+        for branch in branches.values()
+        if not any((not inner.path and inner.validator == "type") or list(inner.path) == [tag] for inner in branch)
+    ]
     for inner in fitting[0] if len(fitting) == 1 else []:
         yield from _leaves(inner)
     if len(fitting) != 1:
@@ -108,10 +119,14 @@ def _mistakes_of(source: object, error: Any, raw: object, path: Sequence[str | i
         yield _unknown_choice(source, key_path, value, schema["enum"])
     else:
         text = f"{key_path} is a table" if isinstance(value, dict) else f"{key_path} = {short_text(value)}"
-        yield InputError(source, text, " or ".join(dict.fromkeys(filter(None, map(_expectation, schema.get("anyOf", [schema]))))))
+        yield InputError(
+            source, text, " or ".join(dict.fromkeys(filter(None, map(_expectation, schema.get("anyOf", [schema])))))
+        )
 
 
-def _missing_keys(source: object, names: Sequence[str], table: Mapping[str, Any], raw: Any, path: Sequence[str | int]) -> InputError:
+def _missing_keys(
+    source: object, names: Sequence[str], table: Mapping[str, Any], raw: Any, path: Sequence[str | int]
+) -> InputError:
     """The error for required keys that a table lacks; it may be meant to override single keys of a table with a similar name."""
     siblings: Any = raw
     for key in path[:-1]:
@@ -126,14 +141,19 @@ def _missing_keys(source: object, names: Sequence[str], table: Mapping[str, Any]
 def _unknown_key(source: object, key_path: str, key: str, names: Iterable[str], *, top_level: bool) -> InputError:
     """The error for an unknown key: it suggests tables of a study that have this key or a similar one, else the nearest known key."""
     definitions = json_schema(Study)["$defs"]
-    tables = {name: definitions[schema["$ref"].rpartition("/")[2]]["properties"]
-              for name, schema in definitions["Study"]["properties"].items() if "$ref" in schema}
+    tables = {
+        name: definitions[schema["$ref"].rpartition("/")[2]]["properties"]
+        for name, schema in definitions["Study"]["properties"].items()
+        if "$ref" in schema
+    }
     paths = [f"{table}.{name}" for table, table_names in tables.items() for name in table_names if name == key]
     nearest = {name: table for table, table_names in tables.items() for name in table_names}
     if not paths and top_level and (hint := did_you_mean(key, [*nearest, *names])):
         paths = [f"{nearest[name]}.{name}" for name in nearest if repr(name) in hint and name not in names]
     if paths and "[" not in key_path:
-        return InputError(source, f"{key_path}: there is no such key; did you mean {' or '.join(paths)}?", one_of(names))
+        return InputError(
+            source, f"{key_path}: there is no such key; did you mean {' or '.join(paths)}?", one_of(names)
+        )
     return unknown_name(source, f"{key_path}: there is no such key", key, names)
 
 
@@ -150,8 +170,12 @@ def _expectation(schema: Mapping[str, Any]) -> str:
     kind = "object" if "$ref" in schema else schema.get("type", "")
     words = {"exclusiveMinimum": "above", "minimum": "from", "maximum": "to", "exclusiveMaximum": "below"}
     bounds = [f"{word} {schema[key]:g}" for key, word in words.items() if key in schema]
-    sizes = {"minItems": "of at least {} entries", "maxItems": "of at most {} entries", "minLength": "that is not empty",
-             "maxLength": "of at most {} characters"}
+    sizes = {
+        "minItems": "of at least {} entries",
+        "maxItems": "of at most {} entries",
+        "minLength": "that is not empty",
+        "maxLength": "of at most {} characters",
+    }
     bounds += [text.format(schema[key]) for key, text in sizes.items() if key in schema]
     return " ".join([TYPE_NAMES.get(kind, ""), *bounds]).strip()
 
@@ -207,17 +231,28 @@ def contradictions(source: object, study: Study) -> Iterator[InputError]:
     yield from constraint_mistakes(source, characteristics, study.constraints)
     for name, bounds in study.calibration.items():
         if bounds.lower >= bounds.upper:
-            yield InputError(source, f"calibration.{name!r}: lower = {bounds.lower} and upper = {bounds.upper}", "numbers, lower < upper")
+            yield InputError(
+                source,
+                f"calibration.{name!r}: lower = {bounds.lower} and upper = {bounds.upper}",
+                "numbers, lower < upper",
+            )
     if study.fit.ensemble == 1:
         yield InputError(source, "fit.ensemble = 1", "0 for starts without an ensemble, or at least 2 places")
     if study.matrix is not None and bool(study.matrix.tests) == bool(study.matrix.protocol):
-        yield InputError(source, f"matrix: {len(study.matrix.tests)} tests and protocol = {study.matrix.protocol!r}",
-                         "tests, or a protocol")
+        yield InputError(
+            source,
+            f"matrix: {len(study.matrix.tests)} tests and protocol = {study.matrix.protocol!r}",
+            "tests, or a protocol",
+        )
     if len({len(values) for values in study.spread.values()}) > 1 or not all(study.spread.values()):
-        yield InputError(source, "spread: its lists differ in length or are empty", "a list for each parameter, all of one length")
+        yield InputError(
+            source, "spread: its lists differ in length or are empty", "a list for each parameter, all of one length"
+        )
     for name, count in Counter(study.metrics.also).items():
         if count > 1:
-            yield InputError(source, f"metrics.also = {study.metrics.also}: {name!r} is listed {count} times", "each metric once")
+            yield InputError(
+                source, f"metrics.also = {study.metrics.also}: {name!r} is listed {count} times", "each metric once"
+            )
     for name, value in study.published.items():
         if value == 0:
             yield InputError(source, f"published.{name} = 0", "a number other than 0")
@@ -228,8 +263,11 @@ def _keys_of_fmus(source: object, study: Study) -> Iterator[InputError]:
     for name, table in (("vehicle", study.vehicle), ("ads", study.ads), ("scenario", study.scenario)):
         for key in FMU_KEYS if name == "scenario" else FMU_KEYS[1:] if table.kind != "fmu" else ():
             if getattr(table, key, None):
-                yield InputError(source, f"{name}.{key}: {table.model!r} is no FMU",
-                                 "no such key" if name == "scenario" else f'no such key, or {name}.kind = "fmu"')
+                yield InputError(
+                    source,
+                    f"{name}.{key}: {table.model!r} is no FMU",
+                    "no such key" if name == "scenario" else f'no such key, or {name}.kind = "fmu"',
+                )
 
 
 def _characteristic_mistakes(source: object, key: str, row: CharacteristicTable) -> Iterator[InputError]:

@@ -19,6 +19,22 @@ from safevar_sumo.sumo.matrix import (
 from safevar_sumo.sumo.system import System, assemble, models_of
 
 __all__ = [
-    "Engine", "PointResult", "System", "assemble", "evaluate", "evaluations_at_worst_points", "models_of",
-    "point_record", "reason_for_sumo", "score", "settings_per_batch", "simulate",
-    "simulate_all_points", "study_at", "system_at_point", "system_at_worst_point", "vehicle_remarks", "worst_points"]
+    "Engine",
+    "PointResult",
+    "System",
+    "assemble",
+    "evaluate",
+    "evaluations_at_worst_points",
+    "models_of",
+    "point_record",
+    "reason_for_sumo",
+    "score",
+    "settings_per_batch",
+    "simulate",
+    "simulate_all_points",
+    "study_at",
+    "system_at_point",
+    "system_at_worst_point",
+    "vehicle_remarks",
+    "worst_points",
+]

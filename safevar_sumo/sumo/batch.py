@@ -13,7 +13,17 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.metrics.base import STUDY_SOURCE
 from safevar_sumo.plugins import check_open_runs, open_rows
 from safevar_sumo.protocol.driving_robot import DrivingRobot
-from safevar_sumo.records import STANDSTILL, TIME_DECIMALS, BoolArray, Evaluations, FloatArray, Observation, Outcome, SimulationRuns, Trace
+from safevar_sumo.records import (
+    STANDSTILL,
+    TIME_DECIMALS,
+    BoolArray,
+    Evaluations,
+    FloatArray,
+    Observation,
+    Outcome,
+    SimulationRuns,
+    Trace,
+)
 from safevar_sumo.scenarios import VUT, Lane, Point
 from safevar_sumo.scenarios.base import Scene
 from safevar_sumo.scenarios.frame import Frame
@@ -51,10 +61,16 @@ def score(system: System, settings: FloatArray, runs: SimulationRuns) -> Evaluat
         settings=settings,
         outcome=runs.outcome,
         collision_speed=runs.collision_speed,
-        metrics={**metrics,
-                 **{name: change.function(settings, system.characteristics) for name, change in system.measuring.changes.items()}},
+        metrics={
+            **metrics,
+            **{
+                name: change.function(settings, system.characteristics)
+                for name, change in system.measuring.changes.items()
+            },
+        },
         f_diff=system.characteristics.largest_change(settings),
-        f_num_diff=system.characteristics.number_changed(settings))
+        f_num_diff=system.characteristics.number_changed(settings),
+    )
 
 
 def reason_for_sumo(system: System) -> str:
@@ -65,8 +81,13 @@ def reason_for_sumo(system: System) -> str:
     return next((reason for reason in scenes_or_reasons if isinstance(reason, str)), "")
 
 
-def drive_all(system: System, settings: FloatArray, engine: Engine = Engine.RECORDED, watch: Watcher | None = None,
-              listen: Listener | None = None) -> SimulationRuns:
+def drive_all(
+    system: System,
+    settings: FloatArray,
+    engine: Engine = Engine.RECORDED,
+    watch: Watcher | None = None,
+    listen: Listener | None = None,
+) -> SimulationRuns:
     """Simulate N settings of n characteristics, shape (N, n), at every point.
 
     `watch` is called with SUMO's world at every sample, `listen` with what the ADS observes.
@@ -88,7 +109,9 @@ def drive_all(system: System, settings: FloatArray, engine: Engine = Engine.RECO
             return drive(system, np.tile(settings, (len(system.points), 1)), world, listen=listen)
         engine = Engine.LIBSUMO
     (scenario,) = scenarios
-    with open_world(copied_network(stage_network(scenario), len(settings)), len(settings), engine, options) as sumo_world:
+    with open_world(
+        copied_network(stage_network(scenario), len(settings)), len(settings), engine, options
+    ) as sumo_world:
         return drive(system, settings, sumo_world, watch, listen)
 
 
@@ -98,8 +121,13 @@ def step_options(system: System) -> tuple[str, ...]:
 
 
 @np.errstate(all="ignore")
-def drive(system: System, settings: FloatArray, world: SumoWorld | RecordedWorld, watch: Watcher | None = None,
-          listen: Listener | None = None) -> SimulationRuns:
+def drive(
+    system: System,
+    settings: FloatArray,
+    world: SumoWorld | RecordedWorld,
+    watch: Watcher | None = None,
+    listen: Listener | None = None,
+) -> SimulationRuns:
     """Simulate vehicles in an open world that has not taken its first step; see `drive_all`.
 
     With K points, `settings` holds K groups of equal size, and group k drives at point k.
@@ -109,11 +137,19 @@ def drive(system: System, settings: FloatArray, world: SumoWorld | RecordedWorld
         return _simulate(system, settings, world, outcomes, watch, listen)
 
 
-def _simulate(system: System, settings: FloatArray, world: Any, outcomes: _Outcomes, watch: Watcher | None,
-              listen: Listener | None) -> SimulationRuns:
+def _simulate(
+    system: System,
+    settings: FloatArray,
+    world: Any,
+    outcomes: _Outcomes,
+    watch: Watcher | None,
+    listen: Listener | None,
+) -> SimulationRuns:
     vehicle, step, n = system.vehicle, world.step_length, len(settings)
     characteristics = dict(zip(system.characteristics.names, np.ascontiguousarray(settings.T), strict=True))
-    prepared = vehicle.prepare(characteristics, _road_friction(system.points, n), step, *_slope_and_wetness(system.points, n))
+    prepared = vehicle.prepare(
+        characteristics, _road_friction(system.points, n), step, *_slope_and_wetness(system.points, n)
+    )
     types = vehicle.sumo_type(prepared)
     world.set_types(types._replace(decel=np.maximum(types.decel, INSERTION_DECELERATION)))
     world.depart()
@@ -144,9 +180,20 @@ def _simulate(system: System, settings: FloatArray, world: Any, outcomes: _Outco
         command, ads_memory = system.ads.drive(observation, ads_memory)
         warnings.update(ads_memory, speed, scene, outcomes.is_open)
         command, state = robot.drive(command, state, outcomes.is_open)
-        log.write(sample, position=world.vehicle_positions(VUT), speed=speed, gap=scene.gap, lateral=scene.lateral,
-                  lateral_speed=scene.lateral_speed, throttle=command.throttle, brake=command.brake, gear=state.gear, active=active,
-                  obstacle_speed=scene.obstacle_speed, pedal=state.brake)
+        log.write(
+            sample,
+            position=world.vehicle_positions(VUT),
+            speed=speed,
+            gap=scene.gap,
+            lateral=scene.lateral,
+            lateral_speed=scene.lateral_speed,
+            throttle=command.throttle,
+            brake=command.brake,
+            gear=state.gear,
+            active=active,
+            obstacle_speed=scene.obstacle_speed,
+            pedal=state.brake,
+        )
         if not np.count_nonzero(outcomes.is_open):
             break
         if watch is None:
@@ -157,9 +204,14 @@ def _simulate(system: System, settings: FloatArray, world: Any, outcomes: _Outco
         world.advance(np.where(outcomes.is_open, state.speed, 0.0))
     trace = log.trace(sample + 1, step, vehicle_length)
     return SimulationRuns(
-        trace=trace, encounter=batch.encounter(trace), outcome=np.where(robot.invalid, Outcome.INVALID_TEST, outcomes.classify()),
-        collision_speed=np.where(robot.invalid, np.nan, outcomes.collision_speed), contact=contacts.first_contacts(),
-        test_speed_error=robot.error, warning_ttc=warnings.time_to_collision)
+        trace=trace,
+        encounter=batch.encounter(trace),
+        outcome=np.where(robot.invalid, Outcome.INVALID_TEST, outcomes.classify()),
+        collision_speed=np.where(robot.invalid, np.nan, outcomes.collision_speed),
+        contact=contacts.first_contacts(),
+        test_speed_error=robot.error,
+        warning_ttc=warnings.time_to_collision,
+    )
 
 
 def _check_finite(speed: FloatArray, settings: FloatArray, characteristics: CharacteristicSet) -> None:
@@ -169,10 +221,15 @@ def _check_finite(speed: FloatArray, settings: FloatArray, characteristics: Char
     """
     if np.count_nonzero(np.isfinite(speed)) < len(speed):
         for copy in open_rows(~np.isfinite(speed))[:1]:
-            changes = [f"{characteristic.name} = {value:g}" for characteristic, value in zip(characteristics, settings[copy], strict=True)
-                       if value != characteristic.original]
+            changes = [
+                f"{characteristic.name} = {value:g}"
+                for characteristic, value in zip(characteristics, settings[copy], strict=True)
+                if value != characteristic.original
+            ]
             values = ", ".join(changes) or "the original's values"
-            raise InputError("vehicle", f"its speed is {speed[copy]} with {values}", "values that the model can compute with")
+            raise InputError(
+                "vehicle", f"its speed is {speed[copy]} with {values}", "values that the model can compute with"
+            )
 
 
 def _road_friction(points: Sequence[Point], n: int) -> Any:
@@ -219,7 +276,18 @@ class _FirstWarnings:
 class _Log:
     """T samples of N runs in arrays of shape (T, N), and positions of the vehicles on SUMO's plane, shape (T, N, 2)."""
 
-    _NAMES = ("speed", "gap", "lateral", "lateral_speed", "throttle", "brake", "gear", "active", "obstacle_speed", "pedal")
+    _NAMES = (
+        "speed",
+        "gap",
+        "lateral",
+        "lateral_speed",
+        "throttle",
+        "brake",
+        "gear",
+        "active",
+        "obstacle_speed",
+        "pedal",
+    )
 
     def __init__(self, n: int, length: int, frame: Frame) -> None:
         self.length, self._frame = length, frame
@@ -234,7 +302,9 @@ class _Log:
     def trace(self, length: int, step: float, vehicle_length: float) -> Trace:
         columns = {name: values[:length] for name, values in self._columns.items()}
         columns["position"] = self._frame.along(self._positions[:length].reshape(-1, 2)).reshape(length, -1)
-        return Trace(step=step, vehicle_length=vehicle_length, time=np.round(np.arange(length) * step, TIME_DECIMALS), **columns)
+        return Trace(
+            step=step, vehicle_length=vehicle_length, time=np.round(np.arange(length) * step, TIME_DECIMALS), **columns
+        )
 
 
 class _Outcomes:
@@ -251,7 +321,9 @@ class _Outcomes:
         self._has_stopped = np.zeros(n, dtype=bool)
         self._is_over = np.zeros(n, dtype=bool)
 
-    def judge(self, speed: FloatArray, over: BoolArray, collisions: dict[int, float], *, last: BoolArray | bool) -> BoolArray:
+    def judge(
+        self, speed: FloatArray, over: BoolArray, collisions: dict[int, float], *, last: BoolArray | bool
+    ) -> BoolArray:
         """Process one sample; returns for which vehicles the sample is part of the run."""
         was_open, active = self.is_open.copy(), self.is_open & ~over
         for copy, collision_speed in collisions.items():

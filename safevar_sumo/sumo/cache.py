@@ -66,7 +66,9 @@ def _new_folder(parent: Path) -> Iterator[Path]:
 def _move(folder: Path, target: Path) -> None:
     try:
         folder.rename(target)
-    except OSError:  # `target` exists: its files are missing or damaged, or another process was faster with the same bytes
+    except (
+        OSError
+    ):  # `target` exists: its files are missing or damaged, or another process was faster with the same bytes
         target.mkdir(exist_ok=True)  # Windows moves no folder of which a file is open
         for file in folder.iterdir():
             os.replace(file, target / file.name)

@@ -42,7 +42,9 @@ class Contacts:
         touch = find_touches(own, other)
         self._side[copies] = touch.side
         lateral = scene.lateral[copies] - np.broadcast_to(scene.lateral_speed, scene.lateral.shape)[copies] * touch.age
-        share = np.where(np.isin(touch.side, (FRONT, REAR)), lateral / own.width + 0.5, touch.distance_behind_front / own.length)
+        share = np.where(
+            np.isin(touch.side, (FRONT, REAR)), lateral / own.width + 0.5, touch.distance_behind_front / own.length
+        )
         self._position_on_side[copies] = 100 * np.minimum(np.maximum(share, 0.0), 1.0)
 
     def first_contacts(self) -> Contact:
@@ -66,9 +68,13 @@ def find_touches(own: Body, other: Body) -> Touch:
     x_ahead, x_left = _dot(to_other, own.along), _dot(to_other, across)
     speed_ahead = _dot(relative_velocity, own.along)
     age_along = _overlap_age(extent_along - np.abs(x_ahead), np.copysign(1.0, x_ahead) * speed_ahead)
-    age_across = _overlap_age(extent_across - np.abs(x_left), np.copysign(1.0, x_left) * _dot(relative_velocity, across))
+    age_across = _overlap_age(
+        extent_across - np.abs(x_left), np.copysign(1.0, x_left) * _dot(relative_velocity, across)
+    )
     is_approaching = np.isfinite(np.minimum(age_along, age_across))
-    is_lengthwise = np.where(is_approaching, age_along < age_across, extent_along - np.abs(x_ahead) < extent_across - np.abs(x_left))
+    is_lengthwise = np.where(
+        is_approaching, age_along < age_across, extent_along - np.abs(x_ahead) < extent_across - np.abs(x_left)
+    )
     age = np.where(is_approaching, np.where(is_lengthwise, age_along, age_across), 0.0)
     side = np.where(is_lengthwise, np.where(x_ahead > 0, FRONT, REAR), np.where(x_left > 0, LEFT, RIGHT))
     return Touch(side, age, own.length / 2 - (x_ahead + age * speed_ahead))
@@ -80,4 +86,6 @@ def _dot(first: FloatArray, second: FloatArray) -> FloatArray:
 
 def _overlap_age(overlap: FloatArray, closing_speed: FloatArray) -> FloatArray:
     """Time since bodies began to overlap in one direction, at a closing speed [s]; infinite if they do not approach each other."""
-    return np.where(closing_speed > 0, np.maximum(overlap, 0.0) / np.where(closing_speed > 0, closing_speed, 1.0), np.inf)
+    return np.where(
+        closing_speed > 0, np.maximum(overlap, 0.0) / np.where(closing_speed > 0, closing_speed, 1.0), np.inf
+    )

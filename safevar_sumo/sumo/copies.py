@@ -14,19 +14,33 @@ IdAttributes = Mapping[str, tuple[str, ...]]
 """Attributes that contain ids, by element; an attribute may contain several ids, separated by spaces."""
 
 ROAD_IDS: IdAttributes = {
-    "edge": ("id", "from", "to", "crossingEdges", "bidi"), "lane": ("id",), "neigh": ("lane",), "stopOffset": (),
-    "tlLogic": ("id",), "phase": (), "junction": ("id", "incLanes", "intLanes"), "request": (),
-    "connection": ("from", "to", "via", "tl"), "roundabout": ("nodes", "edges"), "param": (),
+    "edge": ("id", "from", "to", "crossingEdges", "bidi"),
+    "lane": ("id",),
+    "neigh": ("lane",),
+    "stopOffset": (),
+    "tlLogic": ("id",),
+    "phase": (),
+    "junction": ("id", "incLanes", "intLanes"),
+    "request": (),
+    "connection": ("from", "to", "via", "tl"),
+    "roundabout": ("nodes", "edges"),
+    "param": (),
 }
 """Elements of a built network, with their attributes that contain ids."""
 SHARED_ELEMENTS = ("location", "type", "prohibition")
 """Elements of a built network that all copies share; SUMO ignores prohibitions, as junctions contain them."""
 DEMAND_IDS: IdAttributes = {
-    "vType": ("id",), "route": ("id", "edges"), "vehicle": ("id", "type", "route", "via"), "trip": ("id", "type", "from", "to", "via"),
+    "vType": ("id",),
+    "route": ("id", "edges"),
+    "vehicle": ("id", "type", "route", "via"),
+    "trip": ("id", "type", "from", "to", "via"),
     "flow": ("id", "type", "route", "from", "to", "via"),
-    "person": ("id", "type"), "personFlow": ("id", "type"), "walk": ("edges", "route", "from", "to"),
+    "person": ("id", "type"),
+    "personFlow": ("id", "type"),
+    "walk": ("edges", "route", "from", "to"),
     "personTrip": ("from", "to", "via", "vTypes"),
-    "stop": ("lane", "edge", "expected", "permitted", "join", "split"), "param": (),
+    "stop": ("lane", "edge", "expected", "permitted", "join", "split"),
+    "param": (),
 }
 """Elements of a traffic file, with their attributes that contain ids."""
 _COPY_PLACEHOLDER = "\x01"
@@ -105,7 +119,7 @@ def parse_seconds(text: str) -> float | None:
     """Convert a time in SUMO's format, seconds or [days:]hours:minutes:seconds, into seconds; None if the text is no time."""
     try:
         total, fields = 0.0, text.split(":")
-        for factor, field in zip((86400, 3600, 60, 1)[-len(fields):], fields, strict=True):
+        for factor, field in zip((86400, 3600, 60, 1)[-len(fields) :], fields, strict=True):
             total += factor * float(field)
     except ValueError:
         return None
@@ -119,8 +133,12 @@ def _marked_xml(element: ElementTree.Element, ids: IdAttributes, source: Path) -
 def _mark_ids(element: ElementTree.Element, ids: IdAttributes, source: Path) -> ElementTree.Element:
     if element.tag not in ids:
         raise InputError(source, f"has a {element.tag!r}, which cannot be copied for every vehicle", ", ".join(ids))
-    attributes = {name: " ".join(copied_id(_COPY_PLACEHOLDER, id_) for id_ in value.split()) if name in ids.get(element.tag, ()) else value
-                  for name, value in element.attrib.items()}
+    attributes = {
+        name: " ".join(copied_id(_COPY_PLACEHOLDER, id_) for id_ in value.split())
+        if name in ids.get(element.tag, ())
+        else value
+        for name, value in element.attrib.items()
+    }
     result = ElementTree.Element(element.tag, attributes)
     result.text, result.tail = element.text, element.tail
     result.extend([_mark_ids(child, ids, source) for child in element])
@@ -129,6 +147,8 @@ def _mark_ids(element: ElementTree.Element, ids: IdAttributes, source: Path) -> 
 
 def _write(root: ElementTree.Element, blocks: Sequence[str], file: Path) -> None:
     attributes = {name: value for name, value in root.attrib.items() if not name.startswith("{")}
-    empty_text = ElementTree.tostring(ElementTree.Element(root.tag, attributes), encoding="unicode", short_empty_elements=False)
+    empty_text = ElementTree.tostring(
+        ElementTree.Element(root.tag, attributes), encoding="unicode", short_empty_elements=False
+    )
     head, _, tail = empty_text.rpartition("</")
     file.write_text(f"<?xml version='1.0' encoding='utf-8'?>\n{head}{''.join(blocks)}</{tail}", encoding="utf-8")

@@ -49,7 +49,9 @@ def summary_entry(no_verdict: str) -> list[dict[str, dict[str, bool]]]:
 def _problem(runs: SimulationRuns) -> str:
     trace = runs.trace
     until_end = slice(int(np.count_nonzero(trace.active)) + 1)  # the sample after the last active one ended the run
-    gap, speed, brake, position = (values[until_end, 0] for values in (trace.gap, trace.speed, trace.brake, trace.position))
+    gap, speed, brake, position = (
+        values[until_end, 0] for values in (trace.gap, trace.speed, trace.brake, trace.position)
+    )
     if ((brake > MIN_PEDAL) & (speed < np.maximum.accumulate(speed) - MIN_SLOWDOWN)).any():
         return "brakes without an obstacle"
     if gap[-1] <= 0 or runs.outcome[0] == Outcome.COLLISION:

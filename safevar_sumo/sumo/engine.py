@@ -35,7 +35,9 @@ class Engine(StrEnum):
 
 
 @contextmanager
-def open_world(files: CopiedNetwork, n: int, engine: Engine = Engine.LIBSUMO, options: Sequence[str] = ()) -> Iterator[SumoWorld]:
+def open_world(
+    files: CopiedNetwork, n: int, engine: Engine = Engine.LIBSUMO, options: Sequence[str] = ()
+) -> Iterator[SumoWorld]:
     """Start SUMO on `n` copies of a network and its traffic; close SUMO at the end, also after an error.
 
     Raises
@@ -66,9 +68,24 @@ def engine_api(engine: Engine) -> Any:
 def sumo_command(engine: Engine, files: CopiedNetwork) -> list[str]:
     """The command line that starts SUMO on copies of a network."""
     return [
-        program_path(engine), "-c", str(files.options), "-n", str(files.network), "-r", str(files.traffic),
-        "--no-step-log", "true", "--no-warnings", "true", "--xml-validation", "never", "--xml-validation.net", "never",
-        "--xml-validation.routes", "never"]
+        program_path(engine),
+        "-c",
+        str(files.options),
+        "-n",
+        str(files.network),
+        "-r",
+        str(files.traffic),
+        "--no-step-log",
+        "true",
+        "--no-warnings",
+        "true",
+        "--xml-validation",
+        "never",
+        "--xml-validation.net",
+        "never",
+        "--xml-validation.routes",
+        "never",
+    ]
 
 
 def start_engine(api: Any, engine: Engine, command: list[str]) -> None:
@@ -78,7 +95,11 @@ def start_engine(api: Any, engine: Engine, command: list[str]) -> None:
         except (api.TraCIException, api.FatalTraCIError) as error:
             raise EnvironmentFault(f"SUMO does not start: {str(error).strip()}") from None
         return
-    if engine is Engine.GUI and sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+    if (
+        engine is Engine.GUI
+        and sys.platform == "linux"
+        and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+    ):
         raise InputError("gui", "sumo-gui needs a display", "a desktop session, or DISPLAY in the environment")
     with redirect_stdout(StringIO()), warnings.catch_warnings():  # traci prints that it waits for SUMO
         warnings.simplefilter("ignore")

@@ -15,7 +15,17 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import RATING_POINTS
 from safevar_sumo.protocol import cells_of_part
 from safevar_sumo.protocol.rater import join_cells, rated_quantities, reduce_to_cells
-from safevar_sumo.records import CellResults, Contact, Encounter, Evaluations, FloatArray, Outcome, SimulationRuns, Trace, finite_or_none
+from safevar_sumo.records import (
+    CellResults,
+    Contact,
+    Encounter,
+    Evaluations,
+    FloatArray,
+    Outcome,
+    SimulationRuns,
+    Trace,
+    finite_or_none,
+)
 from safevar_sumo.scenarios import Point
 from safevar_sumo.scenarios.euro_ncap import KMH
 from safevar_sumo.study import SAFETY_DEGREE, Study
@@ -57,14 +67,21 @@ def point_record(result: PointResult, row: int = 0) -> dict[str, Any]:
     collision at the first warning [s]; the side of the contact, and the position along that side [%].
     """
     evaluations, relative_speed = result.evaluations, result.runs.relative_speed
-    values = {"impact_speed": evaluations.collision_speed[row], "relative_impact_speed": relative_speed[row],
-               SAFETY_DEGREE: evaluations.f_safe[row],
-               "test_speed_error": np.broadcast_to(result.runs.test_speed_error, relative_speed.shape)[row] / KMH,
-               "warning_ttc": np.broadcast_to(result.runs.warning_ttc, relative_speed.shape)[row]}
+    values = {
+        "impact_speed": evaluations.collision_speed[row],
+        "relative_impact_speed": relative_speed[row],
+        SAFETY_DEGREE: evaluations.f_safe[row],
+        "test_speed_error": np.broadcast_to(result.runs.test_speed_error, relative_speed.shape)[row] / KMH,
+        "warning_ttc": np.broadcast_to(result.runs.warning_ttc, relative_speed.shape)[row],
+    }
     side, place = (np.broadcast_to(column, relative_speed.shape)[row] for column in result.runs.contact)
-    return {"point": result.point.name, **dict(result.point.parameters), "outcome": str(evaluations.outcome[row]),
-            **{name: finite_or_none(value) for name, value in values.items()},
-            **({"contact": {"side": str(side), "place": float(place)}} if side else {})}
+    return {
+        "point": result.point.name,
+        **dict(result.point.parameters),
+        "outcome": str(evaluations.outcome[row]),
+        **{name: finite_or_none(value) for name, value in values.items()},
+        **({"contact": {"side": str(side), "place": float(place)}} if side else {}),
+    }
 
 
 def vehicle_remarks(system: System) -> list[str]:
@@ -75,9 +92,11 @@ def vehicle_remarks(system: System) -> list[str]:
     tables = system.nominal.tables()
     speed = min(max(speeds), float(tables.speeds[-1]))
     drag = float(np.interp(speed, tables.speeds, tables.coasting))
-    return [f"the vehicle was fitted to drives of up to {fitted_speed / KMH:.0f} km/h, and is tested at up to {max(speeds) / KMH:.0f} "
-            f"km/h. Beyond its fit the model extrapolates: with the accelerator released, it loses {drag:.1f} m/s^2 at "
-            f"{speed / KMH:.0f} km/h"]
+    return [
+        f"the vehicle was fitted to drives of up to {fitted_speed / KMH:.0f} km/h, and is tested at up to {max(speeds) / KMH:.0f} "
+        f"km/h. Beyond its fit the model extrapolates: with the accelerator released, it loses {drag:.1f} m/s^2 at "
+        f"{speed / KMH:.0f} km/h"
+    ]
 
 
 def evaluate(system: System, settings: FloatArray, engine: Engine = Engine.RECORDED) -> Evaluations:
@@ -87,7 +106,7 @@ def evaluate(system: System, settings: FloatArray, engine: Engine = Engine.RECOR
     setting i at its worst point.
     """
     size = _batch_size(system, engine)
-    batches = [settings[start:start + size] for start in range(0, len(settings), size)] or [settings]
+    batches = [settings[start : start + size] for start in range(0, len(settings), size)] or [settings]
     evaluations = [_evaluate_batch(system, batch, engine) for batch in batches]
     return evaluations[0] if len(evaluations) == 1 else Evaluations.concatenate(evaluations)
 
@@ -100,7 +119,9 @@ def _evaluate_batch(system: System, settings: FloatArray, engine: Engine) -> Eva
     return score(system, settings, simulate(system, settings, engine))
 
 
-def rate_settings(system: System, settings: FloatArray, engine: Engine = Engine.RECORDED) -> tuple[Evaluations, CellResults]:
+def rate_settings(
+    system: System, settings: FloatArray, engine: Engine = Engine.RECORDED
+) -> tuple[Evaluations, CellResults]:
     """Simulate settings, shape (N, n), in all cells of a protocol: their evaluations with rating points, and their results in every cell.
 
     Traces are dropped, as they would take gigabytes.
@@ -109,15 +130,22 @@ def rate_settings(system: System, settings: FloatArray, engine: Engine = Engine.
     for group in _simulate_groups(system, settings, engine):
         for result in group:
             name = result.point.name
-            scored[name], quantities[name] = PointEvaluations(result.point, result.evaluations), rated_quantities(result.runs)
+            scored[name], quantities[name] = (
+                PointEvaluations(result.point, result.evaluations),
+                rated_quantities(result.runs),
+            )
     cells = join_cells([quantities[point.name] for point in system.points])
     evaluations = evaluations_at_worst_points([scored[point.name] for point in system.points])
     if system.rater is None:  # the system has only some of the protocol's cells
         return evaluations, cells
-    return replace(evaluations, metrics={**evaluations.metrics, RATING_POINTS.name: system.rater.points(cells).total}), cells
+    return replace(
+        evaluations, metrics={**evaluations.metrics, RATING_POINTS.name: system.rater.points(cells).total}
+    ), cells
 
 
-def evaluate_cells(system: System, settings: FloatArray, part: tuple[int, int], engine: Engine = Engine.RECORDED) -> Evaluations:
+def evaluate_cells(
+    system: System, settings: FloatArray, part: tuple[int, int], engine: Engine = Engine.RECORDED
+) -> Evaluations:
     """Evaluations, including `cells`, of settings, shape (N, n), in the k-th of m parts of a protocol's cells; `part` is (k, m)."""
     assert system.rater is not None
     points = tuple(system.matrix[number] for number in cells_of_part(system.rater.protocol, *part))
@@ -144,7 +172,9 @@ def _batch_size(system: System, engine: Engine) -> int:
     """Largest number of vehicles in one simulation, in recorded scenes or in copies of the largest network."""
     if _is_recorded(system, engine):
         return largest_batch(system)
-    lanes = max(number_of_lanes(open_network(network)) for network in {point.scenario.network for point in system.points})
+    lanes = max(
+        number_of_lanes(open_network(network)) for network in {point.scenario.network for point in system.points}
+    )
     return min(max(MAX_LANES // max(lanes, 1), 1), MAX_COPIES, largest_batch(system))
 
 
@@ -156,8 +186,9 @@ def evaluations_at_worst_points(at_points: Sequence[PointResult | PointEvaluatio
     return replace(evaluations.take(point_numbers * len(settings) + setting_numbers), worst_points=point_numbers)
 
 
-def simulate(system: System, settings: FloatArray, engine: Engine = Engine.RECORDED,
-             watch: Watcher | None = None) -> SimulationRuns:
+def simulate(
+    system: System, settings: FloatArray, engine: Engine = Engine.RECORDED, watch: Watcher | None = None
+) -> SimulationRuns:
     """Run the scenario once for every setting, shape (N, n); `watch` is called with the world at every sample.
 
     In a matrix, the result holds each setting's run at its worst point; with `watch`, all settings run at the worst
@@ -186,8 +217,10 @@ def _simulate_groups(system: System, settings: FloatArray, engine: Engine) -> It
     for points in groups:
         runs = drive_all(replace(system, matrix=points), settings, engine)
         evaluations = score(system, np.tile(settings, (len(points), 1)), runs)
-        yield [PointResult(point, evaluations.take(np.arange(start, start + n)), runs.of(slice(start, start + n)))
-               for point, start in zip(points, range(0, len(points) * n, n), strict=True)]
+        yield [
+            PointResult(point, evaluations.take(np.arange(start, start + n)), runs.of(slice(start, start + n)))
+            for point, start in zip(points, range(0, len(points) * n, n), strict=True)
+        ]
 
 
 def system_at_worst_point(system: System, settings: FloatArray) -> System:
@@ -214,7 +247,9 @@ def _list_similar_points(name: str, names: Sequence[str]) -> str:
     if not names:
         return "a study with a matrix"
     words = {word.strip() for word in name.split(",")}
-    points = sorted(names, key=lambda point: (-len(words & set(point.split(", "))), -SequenceMatcher(None, point, name).ratio()))
+    points = sorted(
+        names, key=lambda point: (-len(words & set(point.split(", "))), -SequenceMatcher(None, point, name).ratio())
+    )
     legal = "; ".join(points[:N_SIMILAR_POINTS])
     return legal if len(names) <= N_SIMILAR_POINTS else f"one of {len(names)} points, the most similar: {legal}"
 
@@ -235,9 +270,16 @@ def study_at(study: Study, name: str, source: object) -> Study:
         reduced_study = reduce_to_cells(study, system.weather, [[point.name for point in system.matrix].index(name)])
         return replace_in(reduced_study, origin=origin)
     test_name, weather = parameters.pop("test"), parameters.pop("weather")
-    test = next(test for test in study.matrix.tests if test.name == test_name and test.over.keys() == parameters.keys()
-                and all(value in test.over[key] for key, value in parameters.items()))
-    reduced_test = replace_in(test, over={key: [value] for key, value in parameters.items()}, weathers=[weather] if test.weathers else [])
+    test = next(
+        test
+        for test in study.matrix.tests
+        if test.name == test_name
+        and test.over.keys() == parameters.keys()
+        and all(value in test.over[key] for key, value in parameters.items())
+    )
+    reduced_test = replace_in(
+        test, over={key: [value] for key, value in parameters.items()}, weathers=[weather] if test.weathers else []
+    )
     return replace_in(study, matrix=replace_in(study.matrix, tests=[reduced_test]), origin=origin)
 
 
@@ -249,7 +291,7 @@ def _group_points(points: Sequence[Point], size: int, options: Sequence[str]) ->
     for group in groups.values():
         group.sort(key=lambda point: point.scenario.duration)
         for start in range(0, len(group), max(size, 1)):
-            yield tuple(group[start:start + max(size, 1)])
+            yield tuple(group[start : start + max(size, 1)])
 
 
 def worst_points(at_points: Sequence[PointResult | PointEvaluations]) -> npt.NDArray[np.intp]:
@@ -273,20 +315,34 @@ def _select_runs(runs_at_points: Sequence[SimulationRuns], point_numbers: npt.ND
     length, vehicle_numbers = max(len(runs.trace.time) for runs in runs_at_points), np.arange(len(point_numbers))
 
     def select_samples(values: Sequence[np.ndarray]) -> np.ndarray:
-        padded = [np.concatenate([samples, np.repeat(samples[-1:], length - len(samples), axis=0)]) for samples in values]
+        padded = [
+            np.concatenate([samples, np.repeat(samples[-1:], length - len(samples), axis=0)]) for samples in values
+        ]
         return np.stack(padded)[point_numbers, :, vehicle_numbers].T
 
     def select(values: Iterable[np.ndarray]) -> np.ndarray:
-        return np.stack([np.broadcast_to(column, point_numbers.shape) for column in values])[point_numbers, vehicle_numbers]
+        return np.stack([np.broadcast_to(column, point_numbers.shape) for column in values])[
+            point_numbers, vehicle_numbers
+        ]
 
     longest_trace = max((runs.trace for runs in runs_at_points), key=lambda trace: len(trace.time))
     names = [field.name for field in fields(Trace) if np.ndim(getattr(longest_trace, field.name)) == 2]
-    columns_of: dict[str, Any] = {name: select_samples([getattr(runs.trace, name) for runs in runs_at_points]) for name in names}
+    columns_of: dict[str, Any] = {
+        name: select_samples([getattr(runs.trace, name) for runs in runs_at_points]) for name in names
+    }
     trace = replace(longest_trace, **columns_of)
     lengths = np.array([len(runs.trace.time) for runs in runs_at_points])[point_numbers]
     active = trace.active & (np.arange(length)[:, np.newaxis] < lengths)
-    encounters, contacts = ([*zip(*(getattr(runs, name) for runs in runs_at_points), strict=True)] for name in ("encounter", "contact"))
-    vehicle_values: dict[str, Any] = {name: select(getattr(runs, name) for runs in runs_at_points)
-                                  for name in ("outcome", "collision_speed", "test_speed_error", "warning_ttc")}
-    return SimulationRuns(trace=replace(trace, active=active), encounter=Encounter._make(map(select_samples, encounters)),
-                          contact=Contact._make(map(select, contacts)), **vehicle_values)
+    encounters, contacts = (
+        [*zip(*(getattr(runs, name) for runs in runs_at_points), strict=True)] for name in ("encounter", "contact")
+    )
+    vehicle_values: dict[str, Any] = {
+        name: select(getattr(runs, name) for runs in runs_at_points)
+        for name in ("outcome", "collision_speed", "test_speed_error", "warning_ttc")
+    }
+    return SimulationRuns(
+        trace=replace(trace, active=active),
+        encounter=Encounter._make(map(select_samples, encounters)),
+        contact=Contact._make(map(select, contacts)),
+        **vehicle_values,
+    )

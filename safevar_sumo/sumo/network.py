@@ -26,8 +26,10 @@ from safevar_sumo.sumo.copies import parse_xml, write_demand, write_roads
 
 TRAFFIC_FILE, OPTIONS_FILE, NETWORK_FILE = "traffic.rou.xml", "scenario.sumocfg", "network.net.xml"
 NETWORK_ENDING, RECIPE_ENDING = ".net.xml", ".netccfg"
-LEGAL_FOLDERS = (f"a folder with a recipe of netconvert (*{RECIPE_ENDING}) or a *{NETWORK_ENDING}, "
-                 f"beside {TRAFFIC_FILE} and {OPTIONS_FILE}")
+LEGAL_FOLDERS = (
+    f"a folder with a recipe of netconvert (*{RECIPE_ENDING}) or a *{NETWORK_ENDING}, "
+    f"beside {TRAFFIC_FILE} and {OPTIONS_FILE}"
+)
 NETWORK_KEY = "scenario.parameters.network"
 """Key of a study that names the network, the source of errors about a network that does not exist."""
 SOURCE_OPTION = re.compile(r"sumo-net-file|(osm|opendrive|node|edge|connection|type|tllogic|polygon)-files")
@@ -66,8 +68,11 @@ def open_network(network: str, source: str = NETWORK_KEY) -> Network:
     path = NETWORKS / network if is_shipped(network) else Path(network)
     if not is_network(path):
         names = sorted(path.name for path in NETWORKS.iterdir() if path.is_dir())
-        raise InputError(source, f"there is no network {network!r}{did_you_mean(network, names)}",
-                         f"one of {', '.join(names)}, or {LEGAL_FOLDERS}")
+        raise InputError(
+            source,
+            f"there is no network {network!r}{did_you_mean(network, names)}",
+            f"one of {', '.join(names)}, or {LEGAL_FOLDERS}",
+        )
     folder, roads = (path, _roads_in(path)) if path.is_dir() else (path.parent, path.name)
     names = [roads, *_sources_of(folder / roads), TRAFFIC_FILE, OPTIONS_FILE]
     for name in names:
@@ -91,7 +96,9 @@ def is_network(path: Path) -> bool:
 
 def options_of(file: Path) -> dict[str, str]:
     """The options that a configuration of SUMO or netconvert sets."""
-    return {element.tag: element.attrib["value"].strip() for element in parse_xml(file).iter() if "value" in element.attrib}
+    return {
+        element.tag: element.attrib["value"].strip() for element in parse_xml(file).iter() if "value" in element.attrib
+    }
 
 
 def _roads_in(folder: Path) -> str:
@@ -101,7 +108,11 @@ def _roads_in(folder: Path) -> str:
         if len(names) > 1 and (folder / OPTIONS_FILE).is_file():
             names = [name for name in names if name == options_of(folder / OPTIONS_FILE).get("net-file")] or names
         if len(names) > 1:
-            raise InputError(folder, f"has {' and '.join(names)}", f"one of them, or net-file in {OPTIONS_FILE} that names one network")
+            raise InputError(
+                folder,
+                f"has {' and '.join(names)}",
+                f"one of them, or net-file in {OPTIONS_FILE} that names one network",
+            )
         if names:
             return names[0]
     raise InputError(folder, "has no network", LEGAL_FOLDERS)
@@ -136,8 +147,11 @@ def copied_network(network: Network, n: int) -> CopiedNetwork:
     size = round_up(n)
     roads = cache_folder(network, size, _road_digests(network))
     traffic = cache_folder(network, n, [dict(network.digests)[TRAFFIC_FILE]])
-    return CopiedNetwork(ensure_cached(roads, NETWORK_FILE, partial(_copy_roads, network, size)),
-                         ensure_cached(traffic, TRAFFIC_FILE, partial(_copy_demand, network, n)), network.path(OPTIONS_FILE))
+    return CopiedNetwork(
+        ensure_cached(roads, NETWORK_FILE, partial(_copy_roads, network, size)),
+        ensure_cached(traffic, TRAFFIC_FILE, partial(_copy_demand, network, n)),
+        network.path(OPTIONS_FILE),
+    )
 
 
 def built_network(network: Network) -> Path:
@@ -179,8 +193,14 @@ def run_program(folder: Path, program: str, *arguments: str) -> tuple[int, str]:
     import sumo
 
     process = subprocess.run(
-        [str(Path(sumo.SUMO_HOME) / "bin" / program), *arguments, "--xml-validation", "never"], capture_output=True,
-        text=True, errors="replace", check=False, cwd=folder, env={**os.environ, "SUMO_HOME": sumo.SUMO_HOME})
+        [str(Path(sumo.SUMO_HOME) / "bin" / program), *arguments, "--xml-validation", "never"],
+        capture_output=True,
+        text=True,
+        errors="replace",
+        check=False,
+        cwd=folder,
+        env={**os.environ, "SUMO_HOME": sumo.SUMO_HOME},
+    )
     lines = [line.strip() for line in process.stderr.splitlines() if line.strip() and not line.startswith("Quitting")]
     return process.returncode, " ".join(lines).removeprefix("Error: ")[:500]
 
@@ -209,12 +229,15 @@ def _copy_demand(network: Network, n: int, into: Path) -> None:
 
 def _build(network: Network, into: Path) -> None:
     file = into / NETWORK_FILE
-    exit_code, errors = run_program(network.folder, "netconvert", "-c", network.roads, "-o", str(file), "--no-warnings",
-                                    "true")
+    exit_code, errors = run_program(
+        network.folder, "netconvert", "-c", network.roads, "-o", str(file), "--no-warnings", "true"
+    )
     if exit_code < 0 or "bad_alloc" in errors or ("Could not" in errors and "output" in errors):
         raise EnvironmentFault(f"{network.folder}: netconvert fails: {errors or f'exit code {exit_code}'}")
     if exit_code != 0:
-        raise InputError(network.folder, f"netconvert refuses the network: {errors}", "sources that netconvert builds a network from")
+        raise InputError(
+            network.folder, f"netconvert refuses the network: {errors}", "sources that netconvert builds a network from"
+        )
     _drop_header(file)
 
 
@@ -225,4 +248,4 @@ def _drop_header(file: Path) -> None:
         ElementTree.fromstring(text)
     except (ElementTree.ParseError, UnicodeDecodeError) as error:
         raise EnvironmentFault(f"{file}: netconvert left an incomplete network: {error}") from None
-    file.write_text(text[text.index("<net "):], encoding="utf-8")
+    file.write_text(text[text.index("<net ") :], encoding="utf-8")

@@ -36,8 +36,10 @@ MAX_SLOPE = 0.005
 N_STEPS = 600
 """Number of steps in which the traffic of two copies is compared."""
 WARNINGS_FILE = "warnings.txt"
-DRIVER_ATTRIBUTES = re.compile("carFollowModel|speedFactor|speedDev|sigma.*|desiredMaxSpeed|impatience|laneChangeModel|lc[A-Z].*|jm[A-Z].*"
-                               "|actionStepLength|startupDelay|delta|stepping|minGapLat|maxSpeedLat|latAlignment")
+DRIVER_ATTRIBUTES = re.compile(
+    "carFollowModel|speedFactor|speedDev|sigma.*|desiredMaxSpeed|impatience|laneChangeModel|lc[A-Z].*|jm[A-Z].*"
+    "|actionStepLength|startupDelay|delta|stepping|minGapLat|maxSpeedLat|latAlignment"
+)
 """Attributes of SUMO's own driver."""
 SETTING_ATTRIBUTES = ("mass", "accel", "decel", "emergencyDecel", "apparentDecel", "maxSpeed", "tau")
 """Attributes of the type of the vehicle under test that the vehicle model replaces by values of the setting."""
@@ -77,16 +79,28 @@ def network_remarks(name: str, max_speed: float, *, sumo_drives: bool) -> list[s
     network = open_network(name)
     file = network.path(TRAFFIC_FILE)
     traffic = parse_xml(file)
-    attributes = [f"{name} = {value}" for element in traffic.findall(f"*[@id='{VUT}']") for name, value in element.items()
-                  if name in SETTING_ATTRIBUTES
-                  or (DRIVER_ATTRIBUTES.fullmatch(name) and not sumo_drives and value != NO_EFFECT.get(name))]
+    attributes = [
+        f"{name} = {value}"
+        for element in traffic.findall(f"*[@id='{VUT}']")
+        for name, value in element.items()
+        if name in SETTING_ATTRIBUTES
+        or (DRIVER_ATTRIBUTES.fullmatch(name) and not sumo_drives and value != NO_EFFECT.get(name))
+    ]
     lanes = [] if sumo_drives else _lanes_of_vut(traffic, parse_xml(built_network(network)))
     slow_lanes = [lane for lane in lanes if float(lane.get("speed", "inf")) < max_speed]
     if slow_lanes:
-        attributes.append(f"the speed limit of lane {slow_lanes[0].get('id')!r} ({float(slow_lanes[0].get('speed', 'nan')):g} m/s)"
-                          f"{f' and of {len(slow_lanes) - 1} more' if len(slow_lanes) > 1 else ''}")
-    unused = [f"{file}: no effect on vehicle {VUT!r}: {', '.join(dict.fromkeys(attributes))}; the study's vehicle and ADS "
-              "determine how it drives"] if attributes else []
+        attributes.append(
+            f"the speed limit of lane {slow_lanes[0].get('id')!r} ({float(slow_lanes[0].get('speed', 'nan')):g} m/s)"
+            f"{f' and of {len(slow_lanes) - 1} more' if len(slow_lanes) > 1 else ''}"
+        )
+    unused = (
+        [
+            f"{file}: no effect on vehicle {VUT!r}: {', '.join(dict.fromkeys(attributes))}; the study's vehicle and ADS "
+            "determine how it drives"
+        ]
+        if attributes
+        else []
+    )
     warnings = _warnings_file(network).read_text(encoding="utf-8")
     return [*unused, *([f"{network.folder}: {warnings}"] if warnings else [])]
 
@@ -96,14 +110,23 @@ def _check_files(network: Network) -> None:
     options = options_of(network.path(OPTIONS_FILE))
     step = options.get("step-length", "1")
     if not SHORTEST_STEP <= (parse_seconds(step) or 0.0) <= LONGEST_STEP:
-        raise InputError(network.path(OPTIONS_FILE), f"step-length = {step!r}",
-                         f"a number from {SHORTEST_STEP:g} to {LONGEST_STEP:g} [s]")
+        raise InputError(
+            network.path(OPTIONS_FILE),
+            f"step-length = {step!r}",
+            f"a number from {SHORTEST_STEP:g} to {LONGEST_STEP:g} [s]",
+        )
     if "remote-port" in options:  # SUMO would wait for a client
-        raise InputError(network.path(OPTIONS_FILE), f"remote-port = {options['remote-port']!r}",
-                         "no remote-port: safevar_sumo starts SUMO itself")
+        raise InputError(
+            network.path(OPTIONS_FILE),
+            f"remote-port = {options['remote-port']!r}",
+            "no remote-port: safevar_sumo starts SUMO itself",
+        )
     if options.get("route-files", TRAFFIC_FILE) != TRAFFIC_FILE:
-        raise InputError(network.path(OPTIONS_FILE), f"route-files = {options['route-files']!r}",
-                         f"{TRAFFIC_FILE}, all traffic in one file")
+        raise InputError(
+            network.path(OPTIONS_FILE),
+            f"route-files = {options['route-files']!r}",
+            f"{TRAFFIC_FILE}, all traffic in one file",
+        )
     traffic = parse_xml(network.path(TRAFFIC_FILE))
     _check_vut(network, traffic)
     _check_types(network, traffic, options)
@@ -117,15 +140,20 @@ def _check_sources(network: Network) -> None:
     names = [name for name, _ in network.digests]
     for file in sorted(network.folder.glob("*.???.xml")):
         if file.name not in names and re.search(r"\.(nod|edg|con|typ|tll)\.xml$", file.name):
-            raise InputError(file, f"is not used: {network.roads} does not name it", f"sources that {network.roads} names")
+            raise InputError(
+                file, f"is not used: {network.roads} does not name it", f"sources that {network.roads} names"
+            )
     file = network.path(options_of(network.path(network.roads)).get("output-file", NETWORK_FILE))
     sources = [network.path(name) for name in names[:-2]]
     if not file.is_file() or max(source.stat().st_mtime for source in sources) >= file.stat().st_mtime:
         return
     header, _, roads = file.read_text(encoding="utf-8", errors="replace").partition("<net ")
     if "netedit" in header and f"<net {roads}".strip() != built_network(network).read_text(encoding="utf-8").strip():
-        raise InputError(file, f"has edits by netedit that {', '.join(names[:-2])} do not have",
-                         "those files saved from netedit as plain XML, too; or a folder without those files, so that this network is used")
+        raise InputError(
+            file,
+            f"has edits by netedit that {', '.join(names[:-2])} do not have",
+            "those files saved from netedit as plain XML, too; or a folder without those files, so that this network is used",
+        )
 
 
 def _check_types(network: Network, traffic: ElementTree.Element, options: Mapping[str, str]) -> None:
@@ -138,11 +166,16 @@ def _check_types(network: Network, traffic: ElementTree.Element, options: Mappin
             continue
         values = {"speedDev": kind.get("speedDev", options.get("default.speeddev", "0.1"))}
         if name in vehicles and model not in DETERMINISTIC_MODELS:
-            values["sigma" if model in SIGMA_MODELS else "carFollowModel"] = kind.get("sigma", "0.5") if model in SIGMA_MODELS else model
+            values["sigma" if model in SIGMA_MODELS else "carFollowModel"] = (
+                kind.get("sigma", "0.5") if model in SIGMA_MODELS else model
+            )
         for attribute, value in values.items():
             if not re.fullmatch(r"0*\.?0*", value):
-                raise InputError(network.path(TRAFFIC_FILE), f"vType {name!r} drives at random: {attribute} = {value}",
-                                 f'speedDev="0"; for vehicles sigma="0" or carFollowModel {", ".join(DETERMINISTIC_MODELS)}')
+                raise InputError(
+                    network.path(TRAFFIC_FILE),
+                    f"vType {name!r} drives at random: {attribute} = {value}",
+                    f'speedDev="0"; for vehicles sigma="0" or carFollowModel {", ".join(DETERMINISTIC_MODELS)}',
+                )
 
 
 def _check_vut(network: Network, traffic: ElementTree.Element) -> None:
@@ -150,29 +183,47 @@ def _check_vut(network: Network, traffic: ElementTree.Element) -> None:
     file = network.path(TRAFFIC_FILE)
     vut = next((actor for actor in traffic if actor.tag in ("vehicle", "trip") and actor.get("id") == VUT), None)
     if vut is None:
-        raise InputError(file, f"has no vehicle {VUT!r}", f'<vehicle id="{VUT}" type="{VUT}" depart="0" ...>, the vehicle under test')
+        raise InputError(
+            file, f"has no vehicle {VUT!r}", f'<vehicle id="{VUT}" type="{VUT}" depart="0" ...>, the vehicle under test'
+        )
     if vut.get("type") != VUT or len(traffic.findall(f"*[@type='{VUT}']")) > 1:
-        raise InputError(file, f"vehicle {VUT!r}: type = {vut.get('type')!r}", f"{VUT!r}, a vType of its own, which each setting changes")
+        raise InputError(
+            file,
+            f"vehicle {VUT!r}: type = {vut.get('type')!r}",
+            f"{VUT!r}, a vType of its own, which each setting changes",
+        )
     if parse_seconds(vut.get("depart", "")) != 0:
         raise InputError(file, f"vehicle {VUT!r}: depart = {vut.get('depart')!r}", "0")
-    if any(element.find("stop") is not None for element in (vut, *vut, *traffic.findall(f"route[@id='{vut.get('route')}']"))):
+    if any(
+        element.find("stop") is not None
+        for element in (vut, *vut, *traffic.findall(f"route[@id='{vut.get('route')}']"))
+    ):
         raise InputError(file, f"vehicle {VUT!r} has a stop", "none: its ADS drives it")
     for lane in _lanes_of_vut(traffic, parse_xml(built_network(network))):
         heights = [float((*point.split(","), "0")[2]) for point in lane.get("shape", "").split()]
         climb = max(heights, default=0.0) - min(heights, default=0.0)
         if climb > MAX_SLOPE * float(lane.get("length", 0)):
-            raise InputError(file, f"vehicle {VUT!r} drives on lane {lane.get('id')!r}, which rises {climb:.2f} m",
-                             "a level road, as netconvert's option `flatten` makes it; the scenario's `grade` sets a slope")
+            raise InputError(
+                file,
+                f"vehicle {VUT!r} drives on lane {lane.get('id')!r}, which rises {climb:.2f} m",
+                "a level road, as netconvert's option `flatten` makes it; the scenario's `grade` sets a slope",
+            )
         if float(lane.get("friction", 1)) != 1:
-            raise InputError(file, f"vehicle {VUT!r} drives on lane {lane.get('id')!r} of friction {lane.get('friction')}",
-                             "friction 1; `road_friction` of the study's [weather] sets another one")
+            raise InputError(
+                file,
+                f"vehicle {VUT!r} drives on lane {lane.get('id')!r} of friction {lane.get('friction')}",
+                "friction 1; `road_friction` of the study's [weather] sets another one",
+            )
 
 
 def _lanes_of_vut(traffic: ElementTree.Element, roads: ElementTree.Element) -> list[ElementTree.Element]:
     """The lanes of the edges that the traffic names for the vehicle under test."""
     edges = {edge.get("id"): edge for edge in roads.iter("edge")}
-    routes = [route for vut in traffic.findall(f"*[@id='{VUT}']")
-              for route in (vut, *vut.findall("route"), *traffic.findall(f"route[@id='{vut.get('route')}']"))]
+    routes = [
+        route
+        for vut in traffic.findall(f"*[@id='{VUT}']")
+        for route in (vut, *vut.findall("route"), *traffic.findall(f"route[@id='{vut.get('route')}']"))
+    ]
     names = " ".join(route.get(name, "") for route in routes for name in ("edges", "from", "via", "to")).split()
     return [lane for name in dict.fromkeys(names) if name in edges for lane in edges[name].iter("lane")]
 
@@ -187,19 +238,38 @@ def _try_network(network: Network, into: Path) -> None:
     """Load a network in a separate SUMO process, because some broken networks crash SUMO; then compare the traffic of two copies."""
     legal = "options and traffic that SUMO loads without an error"
     exit_code, messages = run_program(
-        network.folder, "sumo", "-c", OPTIONS_FILE, "-n", str(built_network(network).absolute()), "-r", TRAFFIC_FILE,
-        "--begin", "0", "--end", "1", "--no-step-log", "true")
+        network.folder,
+        "sumo",
+        "-c",
+        OPTIONS_FILE,
+        "-n",
+        str(built_network(network).absolute()),
+        "-r",
+        TRAFFIC_FILE,
+        "--begin",
+        "0",
+        "--end",
+        "1",
+        "--no-step-log",
+        "true",
+    )
     if exit_code != 0:
-        raise InputError(network.folder, f"SUMO refuses the network, {OPTIONS_FILE} or {TRAFFIC_FILE}: "
-                         f"{messages or f'exit code {exit_code}'}", legal)
+        raise InputError(
+            network.folder,
+            f"SUMO refuses the network, {OPTIONS_FILE} or {TRAFFIC_FILE}: {messages or f'exit code {exit_code}'}",
+            legal,
+        )
     try:
         actor, time = _first_difference(network)
     except (SimulationError, EnvironmentFault) as error:
         raise InputError(network.folder, f"SUMO refuses copies of the network: {error}", legal) from None
     if actor:
-        raise InputError(network.path(TRAFFIC_FILE), f"{actor!r} moves at random: two copies of it differ at {time:g} s",
-                         'traffic without random numbers: vTypes with speedDev="0" and sigma="0", no probabilities and '
-                         f"distributions, and pedestrian.striping.dawdling 0 in {OPTIONS_FILE}")
+        raise InputError(
+            network.path(TRAFFIC_FILE),
+            f"{actor!r} moves at random: two copies of it differ at {time:g} s",
+            'traffic without random numbers: vTypes with speedDev="0" and sigma="0", no probabilities and '
+            f"distributions, and pedestrian.striping.dawdling 0 in {OPTIONS_FILE}",
+        )
     (into / WARNINGS_FILE).write_text(messages, encoding="utf-8")
 
 

@@ -133,7 +133,10 @@ class RecordedWorld:
     def __init__(self, recordings: Sequence[Recording], size: int) -> None:
         self._recordings, self._size, first_recording = recordings, size, recordings[0]
         self.n, self.step_length, self.sample = size * len(recordings), first_recording.step_length, 0
-        self.slices = [RecordedWorldSlice(self, recording, slice(k * size, (k + 1) * size)) for k, recording in enumerate(recordings)]
+        self.slices = [
+            RecordedWorldSlice(self, recording, slice(k * size, (k + 1) * size))
+            for k, recording in enumerate(recordings)
+        ]
         self.vehicle_length, self.lane_of = self.slices[0].vehicle_length, self.slices[0].lane_of
         self._speeds = np.repeat([recording.speed for recording in recordings], size)
         self._lane_number = np.zeros(self.n, dtype=np.intp)
@@ -144,7 +147,10 @@ class RecordedWorld:
         self.sensors = Sensors.perfect(self.n)
         self._last_fronts, self._last_speeds = self.vehicle_positions(VUT), self._speeds
         self._last_coordinates = self._last_fronts @ first_recording.along
-        self._extents, self._tracks = _joined_extents(recordings), [[*recording.tracks.values()] for recording in recordings]
+        self._extents, self._tracks = (
+            _joined_extents(recordings),
+            [[*recording.tracks.values()] for recording in recordings],
+        )
 
     def set_types(self, *_: object) -> None:
         """Do nothing: all vehicles have departed, and their types and decelerations do not limit the commanded speeds."""
@@ -166,7 +172,10 @@ class RecordedWorld:
         self._last_fronts, self._last_speeds = self.vehicle_positions(VUT), self._speeds
         distances = distance_covered(self._speeds, speeds, self.step_length)
         if np.count_nonzero(self._is_frozen):
-            speeds, distances = np.where(self._is_frozen, self._speeds, speeds), np.where(self._is_frozen, 0.0, distances)
+            speeds, distances = (
+                np.where(self._is_frozen, self._speeds, speeds),
+                np.where(self._is_frozen, 0.0, distances),
+            )
         self._lane_position = self._lane_position + distances
         self._speeds, self._fronts, self.sample = speeds, None, self.sample + 1
         while np.count_nonzero(is_beyond := self._lane_position > self._lanes.end):
@@ -199,27 +208,47 @@ class RecordedWorld:
         tracks = [self._tracks[scene][actor] for scene, actor in pairs.tolist()]
         others = Body.columns([_body_at(track, self.sample) for track in tracks])
         persons = np.array([track.is_person for track in tracks])
-        fronts_at_checks, speeds_at_checks = (self._last_fronts, self.vehicle_positions(VUT)), (self._last_speeds, self._speeds)
-        hits = [(body, vehicle, check) for check, fronts in enumerate(fronts_at_checks) if check or persons.any()
-                for body, vehicle in self._overlaps(fronts, is_open, pairs[:, 0], others, persons, only_persons=not check)]
+        fronts_at_checks, speeds_at_checks = (
+            (self._last_fronts, self.vehicle_positions(VUT)),
+            (self._last_speeds, self._speeds),
+        )
+        hits = [
+            (body, vehicle, check)
+            for check, fronts in enumerate(fronts_at_checks)
+            if check or persons.any()
+            for body, vehicle in self._overlaps(fronts, is_open, pairs[:, 0], others, persons, only_persons=not check)
+        ]
         for body, vehicle, check in sorted(hits, key=itemgetter(0, 2)):
             if vehicle not in collision_speeds:
                 collision_speeds[vehicle] = float(speeds_at_checks[check][vehicle])
                 self._struck_bodies[vehicle] = Body._make(column[body] for column in others)
         return dict(sorted(collision_speeds.items()))
 
-    def _overlaps(self, fronts: FloatArray, is_open: BoolArray, scene_numbers: Any, others: Body, persons: BoolArray, *,
-                  only_persons: bool) -> Iterator[tuple[int, int]]:
+    def _overlaps(
+        self,
+        fronts: FloatArray,
+        is_open: BoolArray,
+        scene_numbers: Any,
+        others: Body,
+        persons: BoolArray,
+        *,
+        only_persons: bool,
+    ) -> Iterator[tuple[int, int]]:
         """Yield the numbers of a body of `others` and of a vehicle that overlap: no edge of either rectangle separates them.
 
         Two parallel vehicles must overlap by more than a millimetre (SUMO, `MSLane::detectCollisionBetween`).
         """
         direction, length, width = self._recordings[0].along, self._recordings[0].length, self._recordings[0].width
-        normal, other_normals = np.array([-direction[1], direction[0]]), np.stack([-others.along[:, 1], others.along[:, 0]], axis=1)
+        normal, other_normals = (
+            np.array([-direction[1], direction[0]]),
+            np.stack([-others.along[:, 1], others.along[:, 0]], axis=1),
+        )
         cosine, sine = np.abs(others.along @ direction), np.abs(other_normals @ direction)
         min_overlap = np.where(persons | (cosine < PARALLEL_COSINE), 0.0, NUMERICAL_EPS)
         max_distance = (length + others.length * cosine + others.width * sine) / 2 - min_overlap
-        front_targets = others.middle + direction * (length / 2)  # where a vehicle's front is if its middle is the other body's middle
+        front_targets = others.middle + direction * (
+            length / 2
+        )  # where a vehicle's front is if its middle is the other body's middle
         candidates = is_open.reshape(-1, self._size)[scene_numbers]
         if only_persons:
             candidates = candidates & persons[:, np.newaxis]
@@ -228,11 +257,20 @@ class RecordedWorld:
         if not len(body):
             return
         vehicle = scene_numbers[body] * self._size + vehicle_in_scene
-        to_other, cosine, sine, min_overlap = front_targets[body] - fronts[vehicle], cosine[body], sine[body], min_overlap[body]
+        to_other, cosine, sine, min_overlap = (
+            front_targets[body] - fronts[vehicle],
+            cosine[body],
+            sine[body],
+            min_overlap[body],
+        )
         other_length, other_width = others.length[body], others.width[body]
-        is_separated = np.abs(to_other @ normal) >= (width + other_length * sine + other_width * cosine) / 2 - min_overlap
-        for axis, joint_extent in ((others.along, other_length + length * cosine + width * sine),
-                                   (other_normals, other_width + length * sine + width * cosine)):
+        is_separated = (
+            np.abs(to_other @ normal) >= (width + other_length * sine + other_width * cosine) / 2 - min_overlap
+        )
+        for axis, joint_extent in (
+            (others.along, other_length + length * cosine + width * sine),
+            (other_normals, other_width + length * sine + width * cosine),
+        ):
             is_separated |= np.abs((to_other * axis[body]).sum(axis=1)) >= joint_extent / 2 - min_overlap
         yield from zip(body[~is_separated].tolist(), vehicle[~is_separated].tolist(), strict=True)
 
@@ -253,8 +291,10 @@ class RecordedWorld:
         """The bodies of vehicles that collide in this step, and of the actors that they collide with, both in columns."""
         vut, n = self._recordings[0], len(copies)
         own = Body.behind(self.vehicle_positions(VUT)[copies], vut.along, vut.length, vut.width, self._speeds[copies])
-        return (own._replace(along=np.tile(vut.along, (n, 1)), length=np.full(n, vut.length), width=np.full(n, vut.width)),
-                Body.columns([self._struck_bodies[copy] for copy in copies]))
+        return (
+            own._replace(along=np.tile(vut.along, (n, 1)), length=np.full(n, vut.length), width=np.full(n, vut.width)),
+            Body.columns([self._struck_bodies[copy] for copy in copies]),
+        )
 
 
 def _joined_extents(recordings: Sequence[Recording]) -> FloatArray:
@@ -262,7 +302,7 @@ def _joined_extents(recordings: Sequence[Recording]) -> FloatArray:
     _, n_samples, n_actors = np.max([recording.extents.shape for recording in recordings], axis=0)
     joined = np.full((2, n_samples, len(recordings), n_actors), np.nan)
     for k, recording in enumerate(recordings):
-        joined[:, :recording.extents.shape[1], k, :recording.extents.shape[2]] = recording.extents
+        joined[:, : recording.extents.shape[1], k, : recording.extents.shape[2]] = recording.extents
     return joined
 
 

@@ -97,7 +97,13 @@ class Recording:
     @property
     def batch_key(self) -> tuple[Hashable, ...]:
         """Vehicles in scenes with the same key may share a batch."""
-        return self.step_length, self.length, self.width, self.along.tobytes(), *(column.tobytes() for column in self.way)
+        return (
+            self.step_length,
+            self.length,
+            self.width,
+            self.along.tobytes(),
+            *(column.tobytes() for column in self.way),
+        )
 
 
 def record_scenes(scenarios: Sequence[Scenario], options: Sequence[str]) -> list[Recording | str]:
@@ -112,10 +118,15 @@ def record_scenes(scenarios: Sequence[Scenario], options: Sequence[str]) -> list
     """
     reasons = [_reason_for_sumo(scenario) for scenario in scenarios]
     recordable = [scenario for scenario, reason in zip(scenarios, reasons, strict=True) if not reason]
-    keys = [_Key(scenario, network, tuple(options)) for scenario, network in zip(recordable, stage_networks(recordable), strict=True)]
+    keys = [
+        _Key(scenario, network, tuple(options))
+        for scenario, network in zip(recordable, stage_networks(recordable), strict=True)
+    ]
     new_keys = [key for key in dict.fromkeys(keys) if key not in _recordings]
     if new_keys:
-        for old_key in [key for key in _recordings if key not in keys][:max(len(_recordings) + len(new_keys) - MAX_RECORDINGS, 0)]:
+        for old_key in [key for key in _recordings if key not in keys][
+            : max(len(_recordings) + len(new_keys) - MAX_RECORDINGS, 0)
+        ]:
             del _recordings[old_key]
         _recordings.update(zip(new_keys, _recordings_of(new_keys), strict=True))
     scenes = {key.scenario: _recordings[key] for key in keys}
@@ -125,7 +136,9 @@ def record_scenes(scenarios: Sequence[Scenario], options: Sequence[str]) -> list
 def _reason_for_sumo(scenario: Scenario) -> str:
     if scenario.reactive_actors:
         return "an actor of the scenario may react to the vehicle under test"
-    if not isinstance(scenario, GuardedScenario) and not is_shipped(scenario.network):  # shipped scenarios know only shipped networks
+    if not isinstance(scenario, GuardedScenario) and not is_shipped(
+        scenario.network
+    ):  # shipped scenarios know only shipped networks
         return f"the traffic of the network {scenario.network!r} may react to the vehicle under test"
     return ""
 
@@ -144,13 +157,17 @@ _recordings: dict[_Key, Recording | str] = {}
 
 def _recordings_of(keys: Sequence[_Key]) -> list[Recording | str]:
     """The scenes, read from the cache or played by SUMO."""
+
     def play() -> list[Recording | str]:
         return [_play(*key) for key in keys]
 
     if any(isinstance(key.scenario, GuardedScenario) for key in keys):
         return play()
-    inputs = [(type(key.scenario).__name__, to_builtins(key.scenario), key.network.digests, key.options) for key in keys]
+    inputs = [
+        (type(key.scenario).__name__, to_builtins(key.scenario), key.network.digests, key.options) for key in keys
+    ]
     digest = sha256(_code_bytes() + repr(inputs).encode())
+
     def build(folder: Path) -> None:
         (folder / SCENES_FILE).write_bytes(msgpack.encode(play(), enc_hook=_packed_array))
 
@@ -161,7 +178,9 @@ def _recordings_of(keys: Sequence[_Key]) -> list[Recording | str]:
 @cache
 def _code_bytes() -> bytes:
     """SUMO's version and the code that plays scenes: a scene depends on them and on its scenario."""
-    files = sorted(file for folder in ("sumo", "scenarios") for file in (Path(__file__).parents[1] / folder).glob("*.py"))
+    files = sorted(
+        file for folder in ("sumo", "scenarios") for file in (Path(__file__).parents[1] / folder).glob("*.py")
+    )
     return b"".join([sumo_version().encode(), *(file.read_bytes() for file in files)])
 
 
@@ -189,8 +208,13 @@ def _record(scenario: Scenario, world: SumoWorld) -> Recording:
     api, vut, step = world.api, copied_id(0, VUT), world.step_length
     lane_sequence, along = _lane_sequence_of(api, vut)
     start, speed = float(api.vehicle.getLanePosition(vut)), float(api.vehicle.getSpeed(vut))
-    lane_of = {name: copy_and_name(api.vehicle.getLaneID(id_))[1] for id_, name in _ids_in_first_copy(api.vehicle.getIDList())}
-    lanes = {name: tuple((float(x), float(y)) for x, y in api.lane.getShape(id_)) for id_, name in _ids_in_first_copy(api.lane.getIDList())}
+    lane_of = {
+        name: copy_and_name(api.vehicle.getLaneID(id_))[1] for id_, name in _ids_in_first_copy(api.vehicle.getIDList())
+    }
+    lanes = {
+        name: tuple((float(x), float(y)) for x, y in api.lane.getShape(id_))
+        for id_, name in _ids_in_first_copy(api.lane.getIDList())
+    }
     length = round(scenario.duration / step) + 1
     samples, sizes, memory = dict[str, FloatArray](), dict[str, tuple[bool, float, float]](), begin(scenario, world)
     for sample in range(length):
@@ -203,16 +227,33 @@ def _record(scenario: Scenario, world: SumoWorld) -> Recording:
                     sizes[name] = domain is api.person, float(domain.getLength(id_)), float(domain.getWidth(id_))
                 samples[name][sample] = *domain.getPosition(id_), domain.getAngle(id_), domain.getSpeed(id_)
         if sample < length - 1:
-            memory = scenario.move(world, step, memory) if isinstance(scenario, TargetTest) else scenario.observe(world, step, memory)[1]
+            memory = (
+                scenario.move(world, step, memory)
+                if isinstance(scenario, TargetTest)
+                else scenario.observe(world, step, memory)[1]
+            )
             world.advance(np.zeros(1))
-    tracks = {name: Track(rows[:, :2].copy(), rows[:, 2].copy(), rows[:, 3].copy(), *sizes[name]) for name, rows in samples.items()}
+    tracks = {
+        name: Track(rows[:, :2].copy(), rows[:, 2].copy(), rows[:, 3].copy(), *sizes[name])
+        for name, rows in samples.items()
+    }
     vut_length = world.vehicle_length(VUT)
     extents = np.full((2, length, len(tracks)), np.nan)
     for actor, track in enumerate(tracks.values()):
         extents[:, :, actor] = _extent_beside(track, along, vut_length)
     return Recording(
-        step_length=step, start=start, speed=speed, length=vut_length, width=world.vehicle_width(VUT), way=lane_sequence,
-        along=along, lanes=lanes, lane_of=lane_of, tracks=tracks, extents=extents)
+        step_length=step,
+        start=start,
+        speed=speed,
+        length=vut_length,
+        width=world.vehicle_width(VUT),
+        way=lane_sequence,
+        along=along,
+        lanes=lanes,
+        lane_of=lane_of,
+        tracks=tracks,
+        extents=extents,
+    )
 
 
 def _extent_beside(track: Track, along: FloatArray, vut_length: float) -> FloatArray:
@@ -243,7 +284,7 @@ def _lane_sequence_of(api: Any, vut: str) -> tuple[LaneSequence, FloatArray]:
     if api.vehicle.getLateralLanePosition(vut):
         raise UnrecordableError("the vehicle under test does not depart in the middle of its lane")
     lanes = [api.vehicle.getLaneID(vut)]
-    for edge in api.vehicle.getRoute(vut)[api.vehicle.getRouteIndex(vut) + 1:]:
+    for edge in api.vehicle.getRoute(vut)[api.vehicle.getRouteIndex(vut) + 1 :]:
         links = [link for link in api.lane.getLinks(lanes[-1]) if api.lane.getEdgeID(link[0]) == edge]
         if len(links) != 1:
             raise UnrecordableError(f"there are {len(links)} lanes from {lanes[-1]!r} to {edge!r}")

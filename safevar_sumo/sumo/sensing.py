@@ -18,7 +18,8 @@ LEADER_RANGE = 1000.0  # distance within which SUMO looks for a leader [m]
 MOTION = ("getPosition", "getPosition3D", "getSpeed", "getAngle", "getRoadID", "getLaneID", "getLanePosition")
 SENSED_FUNCTIONS: Mapping[str, tuple[str, ...]] = {
     "vehicle": (*MOTION, "getLaneIndex", "getAcceleration", "getLateralSpeed", "getLateralLanePosition", "getSignals"),
-    "person": MOTION}
+    "person": MOTION,
+}
 """TraCI's functions, by domain, that return values of other actors that sensors can measure."""
 HELD_FUNCTIONS = ("getAngle", "getSignals", "getLaneIndex")
 """Functions whose values are held between steps instead of interpolated."""
@@ -69,8 +70,10 @@ class SensedTraffic:
         actors: dict[str, dict[str, Values]] = {}
         for domain, functions in SENSED_FUNCTIONS.items():
             getters = [(name, getattr(getattr(api, domain), name)) for name in (*functions, "getLength")]
-            actors[domain] = {actor: {name: get(copied_id(copy, actor)) for name, get in getters}
-                              for actor in self._names[copy][domain]}
+            actors[domain] = {
+                actor: {name: get(copied_id(copy, actor)) for name, get in getters}
+                for actor in self._names[copy][domain]
+            }
         own, leader = actors["vehicle"].pop(VUT), api.vehicle.getLeader(vut, LEADER_RANGE)
         return Snapshot(own, actors, (copy_and_name(leader[0])[1], float(leader[1])) if leader and leader[0] else None)
 
@@ -90,9 +93,14 @@ def _limit_to_range(snapshot: Snapshot, reach: float, scale: float) -> Snapshot:
     if not snapshot.own or (reach == math.inf and scale == 1):
         return snapshot
     position = snapshot.own["getPosition"]
-    actors = {domain: {name: _scale_values(values, snapshot.own, scale) for name, values in members.items()
-                       if _distance(position, values, values["getLength"] * (domain == "vehicle")) <= reach}
-              for domain, members in snapshot.actors.items()}
+    actors = {
+        domain: {
+            name: _scale_values(values, snapshot.own, scale)
+            for name, values in members.items()
+            if _distance(position, values, values["getLength"] * (domain == "vehicle")) <= reach
+        }
+        for domain, members in snapshot.actors.items()
+    }
     leader = snapshot.leader if snapshot.leader and snapshot.leader[0] in actors["vehicle"] else None
     return Snapshot(snapshot.own, actors, leader and (leader[0], leader[1] * scale))
 
@@ -127,8 +135,13 @@ def _delay_snapshot(snapshots: deque[Snapshot], age: float) -> Snapshot:
     after, before = snapshots[max(newest - int(steps), 0)], snapshots[max(newest - int(steps) - 1, 0)]
     if not fraction or after is before or not after.own:
         return after
-    actors = {domain: {name: _interpolate_values(after.actors[domain].get(name, values), values, fraction)
-                       for name, values in members.items()} for domain, members in before.actors.items()}
+    actors = {
+        domain: {
+            name: _interpolate_values(after.actors[domain].get(name, values), values, fraction)
+            for name, values in members.items()
+        }
+        for domain, members in before.actors.items()
+    }
     leader = before.leader
     if after.leader and leader and after.leader[0] == leader[0]:
         leader = leader[0], _interpolate(after.leader[1], leader[1], fraction)
@@ -138,8 +151,10 @@ def _delay_snapshot(snapshots: deque[Snapshot], age: float) -> Snapshot:
 def _interpolate_values(after: Values, before: Values, fraction: float) -> Values:
     is_same_lane = after["getLaneID"] == before["getLaneID"]
     held = HELD_FUNCTIONS if is_same_lane else (*HELD_FUNCTIONS, "getLanePosition", "getLateralLanePosition")
-    return {function: old if function in held else _interpolate(after[function], old, fraction)
-            for function, old in before.items()}
+    return {
+        function: old if function in held else _interpolate(after[function], old, fraction)
+        for function, old in before.items()
+    }
 
 
 def _interpolate(after: Any, before: Any, fraction: float) -> Any:

@@ -14,7 +14,15 @@ from safevar_sumo.scenarios import GuardedScenario, Lane, Scenario
 from safevar_sumo.scenarios.base import XmlChanges, lane_through
 from safevar_sumo.sumo.cache import ensure_all_cached
 from safevar_sumo.sumo.copies import parse_xml
-from safevar_sumo.sumo.network import NETWORK_FILE, OPTIONS_FILE, TRAFFIC_FILE, Network, built_network, open_network, options_of
+from safevar_sumo.sumo.network import (
+    NETWORK_FILE,
+    OPTIONS_FILE,
+    TRAFFIC_FILE,
+    Network,
+    built_network,
+    open_network,
+    options_of,
+)
 
 
 def stage_network(scenario: Scenario) -> Network:
@@ -67,7 +75,9 @@ class _BuiltRoads:
 def _read_lanes(network: Network) -> dict[str, Lane]:
     lanes = {}
     for lane in ElementTree.fromstring(built_network(network).read_bytes()).iter("lane"):
-        coordinates = [(float(x), float(y)) for x, y in (point.split(",")[:2] for point in lane.attrib["shape"].split())]
+        coordinates = [
+            (float(x), float(y)) for x, y in (point.split(",")[:2] for point in lane.attrib["shape"].split())
+        ]
         lanes[lane.attrib["id"]] = lane_through(lane.attrib["id"], coordinates)
     return lanes
 
@@ -75,7 +85,10 @@ def _read_lanes(network: Network) -> dict[str, Lane]:
 def _variant(network: Network, changed_files: Mapping[str, bytes]) -> Network:
     """A built network with changed files, in the cache."""
     gui_settings = options_of(network.path(OPTIONS_FILE)).get("gui-settings-file", "")
-    sources = {NETWORK_FILE: built_network(network), **{name: network.path(name) for name in (TRAFFIC_FILE, OPTIONS_FILE, gui_settings)}}
+    sources = {
+        NETWORK_FILE: built_network(network),
+        **{name: network.path(name) for name in (TRAFFIC_FILE, OPTIONS_FILE, gui_settings)},
+    }
     contents = {name: changed_files.get(name) or file.read_bytes() for name, file in sources.items() if file.is_file()}
     return _store_network(network.folder.name, tuple(contents.items()))
 

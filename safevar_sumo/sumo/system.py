@@ -17,16 +17,17 @@ import numpy as np
 from safevar_sumo.ads import ADS, Ads, FmuAds, GuardedAds, PerVehicleAds, ScalarAds
 from safevar_sumo.errors import InputError, one_of, unknown_name
 from safevar_sumo.fmu import description_of
-from safevar_sumo.metrics import METRIC_OF_OBJECTIVE, METRICS, OPTIONAL_METRICS, RATING_POINTS, Metric, Objective, Scoring, guard_metric
-from safevar_sumo.plugins import (
-    Guard,
-    Lookup,
-    Member,
-    accepts,
-    check_parameters,
-    instance_of,
-    unload_user_modules,
+from safevar_sumo.metrics import (
+    METRIC_OF_OBJECTIVE,
+    METRICS,
+    OPTIONAL_METRICS,
+    RATING_POINTS,
+    Metric,
+    Objective,
+    Scoring,
+    guard_metric,
 )
+from safevar_sumo.plugins import Guard, Lookup, Member, accepts, check_parameters, instance_of, unload_user_modules
 from safevar_sumo.protocol.rater import Rater, expand_protocol, is_rated, rater_of
 from safevar_sumo.records import FloatArray, Nominal
 from safevar_sumo.scenarios import SCENARIOS, GuardedScenario, Point, Scenario, equals_clear, weather_of
@@ -50,7 +51,18 @@ from safevar_sumo.vehicles import (
 )
 
 RESULT_COLUMNS = (
-    "algorithm", "run", "evaluation", "outcome", "handle", "collision", "collision_speed", "setting", "f_safe", "f_diff", "f_num_diff")
+    "algorithm",
+    "run",
+    "evaluation",
+    "outcome",
+    "handle",
+    "collision",
+    "collision_speed",
+    "setting",
+    "f_safe",
+    "f_diff",
+    "f_num_diff",
+)
 """Names of result columns, which no characteristic or metric may use."""
 OBJECTIVES_KEY = "search.objectives"
 
@@ -79,7 +91,11 @@ def measuring_of(study: Study, lookup: Lookup) -> Measuring:
     def look_up(name: str, key: str) -> Metric | Change:
         if name in by_name:
             return by_name[name]
-        shipped = {**default_metrics, **OPTIONAL_METRICS, **({**CHANGES, **METRIC_OF_OBJECTIVE} if key == OBJECTIVES_KEY else {})}
+        shipped = {
+            **default_metrics,
+            **OPTIONAL_METRICS,
+            **({**CHANGES, **METRIC_OF_OBJECTIVE} if key == OBJECTIVES_KEY else {}),
+        }
         member = lookup.find(shipped, name, key)
         if member.guard is None:
             if name in OPTIONAL_METRICS:
@@ -98,10 +114,15 @@ def measuring_of(study: Study, lookup: Lookup) -> Measuring:
 
     for name in study.metrics.also:
         if name in METRICS:
-            raise InputError(lookup.source, f"metrics.also = {study.metrics.also}: every study has {name!r}",
-                             f"{one_of(OPTIONAL_METRICS)}, or package.module:Name")
+            raise InputError(
+                lookup.source,
+                f"metrics.also = {study.metrics.also}: every study has {name!r}",
+                f"{one_of(OPTIONAL_METRICS)}, or package.module:Name",
+            )
         look_up(name, "metrics.also")
-    names = [METRIC_OF_OBJECTIVE[name].name if name in METRIC_OF_OBJECTIVE else name for name in study.search.objectives]
+    names = [
+        METRIC_OF_OBJECTIVE[name].name if name in METRIC_OF_OBJECTIVE else name for name in study.search.objectives
+    ]
     objectives = [_objective_of(look_up(name, OBJECTIVES_KEY)) for name in names]
     _check_duplicates(objectives, lookup.source)
     scoring = Scoring(metrics=tuple(metric.facts for metric in metrics.values()), objectives=tuple(objectives))
@@ -167,25 +188,40 @@ class System:
         """The system reduced to one point."""
         return replace(self, scenario=point.scenario, weather=point.weather, matrix=(), rater=None)
 
-    def check_feasible(self, settings: FloatArray, source: object, *, filtered: bool, switch: str = "beyond=True") -> None:
+    def check_feasible(
+        self, settings: FloatArray, source: object, *, filtered: bool, switch: str = "beyond=True"
+    ) -> None:
         """Refuse settings, shape (M, n), that violate a constraint; raises the errors of `FeasibleRegion.check`."""
-        self.region.check(self.characteristics.filter(settings) if filtered else settings, source, otherwise=f", or any with {switch}")
+        self.region.check(
+            self.characteristics.filter(settings) if filtered else settings, source, otherwise=f", or any with {switch}"
+        )
 
     @property
     def remarks(self) -> list[str]:
         """Remarks for the user on parts of networks and weathers that are not used or have no effect."""
         uses_traci = isinstance(self.ads, TraciController)
         networks = dict.fromkeys(point.scenario.network for point in self.points)
-        remarks = [remark for network in networks for remark in network_remarks(network, self.nominal.max_speed, sumo_drives=uses_traci)]
+        remarks = [
+            remark
+            for network in networks
+            for remark in network_remarks(network, self.nominal.max_speed, sumo_drives=uses_traci)
+        ]
         remarks += self.vehicle.remarks
-        visibilities = {point.weather.name: point.weather.visibility for point in self.points if point.weather.visibility != 1}
+        visibilities = {
+            point.weather.name: point.weather.visibility for point in self.points if point.weather.visibility != 1
+        }
         if uses_traci and not self._has_limited_range():
-            remarks += [f"weather {name!r}: visibility = {value:g} has no effect: the vehicle has no sensor range, so a controller written "
-                      "for TraCI sees everything" for name, value in visibilities.items()]
+            remarks += [
+                f"weather {name!r}: visibility = {value:g} has no effect: the vehicle has no sensor range, so a controller written "
+                "for TraCI sees everything"
+                for name, value in visibilities.items()
+            ]
         if not (self.ads.recognition_delay or self.ads.hesitation):
-            remarks += [f"weather {name!r} has no effect: its road and its visibility are those of clear weather, and no key of "
-                      "[ads.parameters] delays the ADS in it"
-                      for name in dict.fromkeys(point.weather.name for point in self.points if equals_clear(point.weather))]
+            remarks += [
+                f"weather {name!r} has no effect: its road and its visibility are those of clear weather, and no key of "
+                "[ads.parameters] delays the ADS in it"
+                for name in dict.fromkeys(point.weather.name for point in self.points if equals_clear(point.weather))
+            ]
         return remarks
 
     def _has_limited_range(self) -> bool:
@@ -208,35 +244,58 @@ def assemble(study: Study, source: str = "") -> System:
     is_shipped_vehicle = study.vehicle.model in VEHICLES
     _check_units(study, models.vehicle, is_shipped_vehicle, source)
     measuring = measuring_of(study, Lookup(source, study.origin.places))
-    tables_by_metric = {"published": study.published, "repeatability": study.repeatability, "model_error": study.model_error,
-                        "fit.weights": study.fit.weights}
+    tables_by_metric = {
+        "published": study.published,
+        "repeatability": study.repeatability,
+        "model_error": study.model_error,
+        "fit.weights": study.fit.weights,
+    }
     for key, table in tables_by_metric.items():
         for name in table:
             if name not in measuring.metrics:
                 raise unknown_name(source, f"{key}.{name} is no metric", name, measuring.metrics)
     rater = rater_of(study, source)
     matrix = _matrix_points(study if rater is None else expand_protocol(study, models.weather), source)
-    for network in dict.fromkeys(scenario.network for scenario in (models.scenario, *(point.scenario for point in matrix))):
+    for network in dict.fromkeys(
+        scenario.network for scenario in (models.scenario, *(point.scenario for point in matrix))
+    ):
         check_network(network, f"{source}: {NETWORK_KEY}")
     region = region_of(study, source)
     characteristics = region.characteristics
     nominal = calibration_drive(models.vehicle, characteristics)
     if isinstance(models.ads, TraciController) and isinstance(models.vehicle, GuardedVehicle):
         extremes = np.stack([characteristics.original, characteristics.lower, characteristics.upper])
-        models.vehicle.refuse_sense_without_sensors(dict(zip(characteristics.names, np.ascontiguousarray(extremes.T), strict=True)))
+        models.vehicle.refuse_sense_without_sensors(
+            dict(zip(characteristics.names, np.ascontiguousarray(extremes.T), strict=True))
+        )
     if not is_shipped_vehicle:
         nominal.tables()  # so that errors of a user's vehicle do not depend on the ADS
     return System(
-        characteristics=characteristics, vehicle=models.vehicle, ads=models.ads, scenario=models.scenario, weather=models.weather,
-        metrics_table=study.metrics, nominal=nominal, measuring=measuring, region=region, source=source,
-        step_length=study.step_length, matrix=matrix, rater=rater)
+        characteristics=characteristics,
+        vehicle=models.vehicle,
+        ads=models.ads,
+        scenario=models.scenario,
+        weather=models.weather,
+        metrics_table=study.metrics,
+        nominal=nominal,
+        measuring=measuring,
+        region=region,
+        source=source,
+        step_length=study.step_length,
+        matrix=matrix,
+        rater=rater,
+    )
 
 
 def models_of(study: Study, source: str) -> Models:
     """The study's models with their parameters; raises the errors of `assemble`."""
     lookup = Lookup(source, study.origin.places)
-    return Models(_create_vehicle(study.vehicle, lookup), _create_ads(study.ads, lookup), _create_scenario(study.scenario, lookup),
-                  weather_of(study.weather, source))
+    return Models(
+        _create_vehicle(study.vehicle, lookup),
+        _create_ads(study.ads, lookup),
+        _create_scenario(study.scenario, lookup),
+        weather_of(study.weather, source),
+    )
 
 
 def _create_traci_controller(table: ModelTable, lookup: Lookup) -> Ads:
@@ -251,19 +310,28 @@ def _create_traci_controller(table: ModelTable, lookup: Lookup) -> Ads:
             raise InputError(lookup.source, f"{name} cannot be called as step(traci, vehicle_id)", CONTROLLER_FORMS)
         if not is_class:
             check_parameters(controller, (None, None), parameters, name, "ads.parameters", lookup.source)
-        create = partial(instance_of, member, parameters, name, "ads.parameters", lookup.source) if is_class else partial(
-            partial, controller, **parameters)
+        create = (
+            partial(instance_of, member, parameters, name, "ads.parameters", lookup.source)
+            if is_class
+            else partial(partial, controller, **parameters)
+        )
         create()  # so that wrong parameters raise errors here
     return TraciController(create, member.guard or Guard(lookup.source, name))
 
 
 def _matrix_points(study: Study, source: str) -> tuple[Point, ...]:
     """The points of a study's matrix; raises an error if several points share a name."""
-    points = [] if study.matrix is None else [point for test in study.matrix.tests for point in _points_of(test, study, source)]
+    points = (
+        []
+        if study.matrix is None
+        else [point for test in study.matrix.tests for point in _points_of(test, study, source)]
+    )
     counts = Counter(point.name for point in points)
     for name, count in counts.items():
         if count > 1:
-            raise InputError(source, f"matrix.tests: {count} points are {name!r}", "unique names of tests, and each value once")
+            raise InputError(
+                source, f"matrix.tests: {count} points are {name!r}", "unique names of tests, and each value once"
+            )
     return tuple(points)
 
 
@@ -274,7 +342,9 @@ def _points_of(test: MatrixTest, study: Study, source: str) -> Iterator[Point]:
     weathers: list[str | Weather] = list(test.weathers) or [study.weather]
     for values in product(*test.over.values()):
         over = dict(zip(test.over, values, strict=True))
-        scenario = _create_scenario(ModelTable(model=test.model or study.scenario.model, parameters={**base, **over}), lookup)
+        scenario = _create_scenario(
+            ModelTable(model=test.model or study.scenario.model, parameters={**base, **over}), lookup
+        )
         for choice in weathers:
             weather = weather_of(choice, lookup.source)
             parameters = {"test": test.name, **over, "weather": weather.name}
@@ -289,7 +359,9 @@ def _locate_network(scenario: Any, search_folders: Sequence[str]) -> Any:
     """
     name = scenario.network
     paths = [path for folder in search_folders if is_network(path := Path(folder, name))]
-    network = str(next((path for path in paths if path.is_file() or any(path.glob("*.xml"))), paths[0] if paths else name))
+    network = str(
+        next((path for path in paths if path.is_file() or any(path.glob("*.xml"))), paths[0] if paths else name)
+    )
     if network == name or is_shipped(name):
         return scenario
     if isinstance(scenario, msgspec.Struct):
@@ -302,10 +374,15 @@ def _check_units(study: Study, vehicle: Vehicle, is_shipped_vehicle: bool, sourc
     table, units = study.vehicle.characteristics, vehicle.UNITS
     for name in table:
         if name in RESULT_COLUMNS:
-            raise InputError(source, f"vehicle.characteristics.{name}: the name is a column of results",
-                             f"none of {', '.join(RESULT_COLUMNS)}")
+            raise InputError(
+                source,
+                f"vehicle.characteristics.{name}: the name is a column of results",
+                f"none of {', '.join(RESULT_COLUMNS)}",
+            )
         if name not in units:
-            raise unknown_name(source, f"vehicle.characteristics.{name}: {study.vehicle.model} has no such characteristic", name, units)
+            raise unknown_name(
+                source, f"vehicle.characteristics.{name}: {study.vehicle.model} has no such characteristic", name, units
+            )
         if table[name].unit != units[name]:
             raise InputError(source, f"vehicle.characteristics.{name}.unit = {table[name].unit!r}", repr(units[name]))
         if is_shipped_vehicle and table[name].lower <= 0:
@@ -318,8 +395,10 @@ def _check_units(study: Study, vehicle: Vehicle, is_shipped_vehicle: bool, sourc
 def _create_vehicle(table: VehicleTable, lookup: Lookup) -> Vehicle:
     if table.kind == "fmu":
         guard = Guard(lookup.source, f"vehicle.model = {table.model!r}")
-        fmu_table = {**msgspec.structs.asdict(table),
-                     "parameters": lookup.with_paths(Member(FmuVehicle, guard), table.parameters, "vehicle.parameters")}
+        fmu_table = {
+            **msgspec.structs.asdict(table),
+            "parameters": lookup.with_paths(Member(FmuVehicle, guard), table.parameters, "vehicle.parameters"),
+        }
         units = {name: row.unit for name, row in table.characteristics.items()}
         description = description_of(table.model, lookup.folders, lookup.source, "vehicle.model")
         return FmuVehicle(description, units, fmu_table, guard)
@@ -332,8 +411,12 @@ def _create_vehicle(table: VehicleTable, lookup: Lookup) -> Vehicle:
 def _create_scenario(table: ModelTable, lookup: Lookup) -> Scenario:
     member = lookup.class_of(SCENARIOS, table.model, "scenario.model", Scenario)
     parameters = lookup.with_paths(member, table.parameters, "scenario.parameters")
-    scenario = instance_of(member, parameters, f"scenario.model = {table.model!r}", "scenario.parameters", lookup.source)
-    located: Scenario = _locate_network(scenario if member.guard is None else GuardedScenario(scenario, member.guard), lookup.folders)
+    scenario = instance_of(
+        member, parameters, f"scenario.model = {table.model!r}", "scenario.parameters", lookup.source
+    )
+    located: Scenario = _locate_network(
+        scenario if member.guard is None else GuardedScenario(scenario, member.guard), lookup.folders
+    )
     return located
 
 
@@ -345,8 +428,9 @@ def _create_ads(table: ModelTable, lookup: Lookup) -> Ads:
         parameters = lookup.with_paths(Member(FmuAds, guard), table.parameters, "ads.parameters")
         description = description_of(table.model, lookup.folders, lookup.source, "ads.model")
         return FmuAds(description, table.inputs, table.outputs, parameters, table.step, guard)
-    member = lookup.class_of(ADS, table.model, "ads.model", ScalarAds, Ads,
-                             otherwise=f'with ads.kind = "traci" {CONTROLLER_FORMS}')
+    member = lookup.class_of(
+        ADS, table.model, "ads.model", ScalarAds, Ads, otherwise=f'with ads.kind = "traci" {CONTROLLER_FORMS}'
+    )
     name = f"ads.model = {table.model!r}"
     parameters = lookup.with_paths(member, table.parameters, "ads.parameters")
     create_ads = partial(instance_of, member, parameters, name, "ads.parameters", lookup.source)

@@ -27,10 +27,19 @@ class TargetObserver:
         The K recordings at all samples, which tell when a target is not on the road.
     """
 
-    def __init__(self, frame: Frame, constants: Sequence[EncounterConstants], targets: Sequence[Target],
-                 sampled_recordings: Sequence[SampledRecording], world: RecordedWorld, size: int) -> None:
+    def __init__(
+        self,
+        frame: Frame,
+        constants: Sequence[EncounterConstants],
+        targets: Sequence[Target],
+        sampled_recordings: Sequence[SampledRecording],
+        world: RecordedWorld,
+        size: int,
+    ) -> None:
         self._frame, self._world, self._size, self._sampled_recordings = frame, world, size, sampled_recordings
-        self._constants = EncounterConstants._make(_per_vehicle(column, size) for column in zip(*constants, strict=True))
+        self._constants = EncounterConstants._make(
+            _per_vehicle(column, size) for column in zip(*constants, strict=True)
+        )
         length = max(len(target.edge) for target in targets)
         self._target = [_table(column, length) for column in zip(*targets, strict=True)]
         self._absence = _table([sampled.absence for sampled in sampled_recordings], length)
@@ -42,8 +51,13 @@ class TargetObserver:
         if not all(isinstance(scenario, TargetTest) for scenario in scenarios):
             return None
         sampled_recordings = [world_slice.at_all_samples() for world_slice in world.slices]
-        motions, targets = zip(*(scenario.at_all_samples(*arguments, world.step_length)  # type: ignore[attr-defined]
-                                 for scenario, *arguments in zip(scenarios, world.slices, sampled_recordings, strict=True)), strict=True)
+        motions, targets = zip(
+            *(
+                scenario.at_all_samples(*arguments, world.step_length)  # type: ignore[attr-defined]
+                for scenario, *arguments in zip(scenarios, world.slices, sampled_recordings, strict=True)
+            ),
+            strict=True,
+        )
         frames, constants = {motion.frame for motion in motions}, [motion.constants for motion in motions]
         return cls(frames.pop(), constants, targets, sampled_recordings, world, size) if len(frames) == 1 else None
 
@@ -54,7 +68,9 @@ class TargetObserver:
             absent_scenes = np.flatnonzero(self._absence[sample] & is_open.reshape(-1, self._size).any(axis=1))
             if len(absent_scenes):
                 raise absence_error(self._sampled_recordings[absent_scenes[0]].actor, self._sample * world.step_length)
-        target = Target._make(column if column.ndim == 0 else column[sample].repeat(self._size) for column in self._target)
+        target = Target._make(
+            column if column.ndim == 0 else column[sample].repeat(self._size) for column in self._target
+        )
         front = self._frame.along(world.vehicle_positions(VUT))
         scene, self._has_approached = scene_of(self._constants, target, front, world.speeds(), self._has_approached)
         self._sample += 1

@@ -43,8 +43,10 @@ class TraciController(Ads):
         traffic = SensedTraffic(world, step)
         traffic.record_step()
         with substitute_traci():
-            drivers = [_Driver(TraciView(world, copy, traffic, nominal, step), self._create(), self._guard)
-                       for copy in range(n)]
+            drivers = [
+                _Driver(TraciView(world, copy, traffic, nominal, step), self._create(), self._guard)
+                for copy in range(n)
+            ]
         return _Memory(nominal, traffic, drivers, initial_trim=None)
 
     def drive(self, seen: Observation, memory: _Memory) -> tuple[Command, _Memory]:

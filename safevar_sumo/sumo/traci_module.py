@@ -13,8 +13,20 @@ from typing import Any
 from safevar_sumo.errors import InputError
 from safevar_sumo.sumo.engine import Engine, engine_api
 
-LOOP_FUNCTIONS = ("start", "init", "connect", "load", "close", "switch", "setOrder", "loadState", "saveState",
-                  "simulationStep", "executeMove", "step")
+LOOP_FUNCTIONS = (
+    "start",
+    "init",
+    "connect",
+    "load",
+    "close",
+    "switch",
+    "setOrder",
+    "loadState",
+    "saveState",
+    "simulationStep",
+    "executeMove",
+    "step",
+)
 """Functions that begin, advance or end simulations."""
 Call = Callable[[str, str, tuple[Any, ...], Mapping[str, Any]], Any]
 """Calls a function of a domain, "" for the module itself, with positional and named arguments."""
@@ -92,15 +104,21 @@ def _call(domain: str, name: str, /, *arguments: Any, **named: Any) -> Any:
     if _driven_vehicles:
         return _driven_vehicles[-1](domain, name, arguments, named)
     refuse_own_loop(domain, name)
-    raise InputError(full_name(domain, name), "is called while no vehicle is driven",
-                     "calls within start and step, not where a module is imported")
+    raise InputError(
+        full_name(domain, name),
+        "is called while no vehicle is driven",
+        "calls within start and step, not where a module is imported",
+    )
 
 
 def refuse_own_loop(domain: str, name: str) -> None:
     """Refuse a function that begins, advances or ends the simulation; raises InputError."""
     if name in LOOP_FUNCTIONS and domain in ("", "simulation"):
-        raise InputError(full_name(domain, name), "safevar_sumo itself starts, advances and ends the simulation",
-                         "the body of your script's loop, without this call, as a function step(traci, vehicle_id)")
+        raise InputError(
+            full_name(domain, name),
+            "safevar_sumo itself starts, advances and ends the simulation",
+            "the body of your script's loop, without this call, as a function step(traci, vehicle_id)",
+        )
 
 
 def full_name(domain: str, name: str) -> str:

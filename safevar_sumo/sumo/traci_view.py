@@ -16,59 +16,157 @@ from safevar_sumo.sumo.traci_module import all_arguments, full_name, real_traci,
 from safevar_sumo.sumo.world import SumoWorld
 
 COMMANDS: Mapping[str, tuple[str, ...]] = {
-    "setSpeed": ("speed",), "slowDown": ("speed", "duration"), "setAcceleration": ("acceleration", "duration"),
-    "setAccel": ("accel",), "setDecel": ("decel",), "setMaxSpeed": ("speed",), "setSpeedMode": ("mode",)}
+    "setSpeed": ("speed",),
+    "slowDown": ("speed", "duration"),
+    "setAcceleration": ("acceleration", "duration"),
+    "setAccel": ("accel",),
+    "setDecel": ("decel",),
+    "setMaxSpeed": ("speed",),
+    "setSpeedMode": ("mode",),
+}
 """The commands that a controller may give, each with its numeric arguments."""
 SUMO_CONTROL = -1.0
 """Value of a speed or speed mode with which a command returns control to SUMO's own driver."""
 DISPLAY_FUNCTIONS = ("setColor", "highlight")
 LARGEST_MODE = 127
-LEGAL_NUMBERS = (f"a whole number from 0 to {LARGEST_MODE}, or -1 for SUMO's own mode",
-                 "a finite number, of an acceleration any, else from 0 on; a speed of -1 gives control back to SUMO")
+LEGAL_NUMBERS = (
+    f"a whole number from 0 to {LARGEST_MODE}, or -1 for SUMO's own mode",
+    "a finite number, of an acceleration any, else from 0 on; a speed of -1 gives control back to SUMO",
+)
 LISTS = ("getIDList", "getIDCount")
 CONSTANT_FUNCTIONS = (
-    "getTypeID", "getLength", "getWidth", "getHeight", "getMinGap", "getVehicleClass", "getShapeClass", "getColor",
-    "getAccel", "getDecel", "getEmergencyDecel", "getApparentDecel", "getMaxSpeed", "getTau", "getMass")
+    "getTypeID",
+    "getLength",
+    "getWidth",
+    "getHeight",
+    "getMinGap",
+    "getVehicleClass",
+    "getShapeClass",
+    "getColor",
+    "getAccel",
+    "getDecel",
+    "getEmergencyDecel",
+    "getApparentDecel",
+    "getMaxSpeed",
+    "getTau",
+    "getMass",
+)
 """Functions that return properties of actors that are visible at once or follow from the actor's type."""
 OWN_FUNCTIONS = (
-    "getLeader", "getRoute", "getRouteID", "getRouteIndex", "getDistance", "getDrivingDistance",
-    "getDrivingDistance2D", "getAllowedSpeed", "getSpeedFactor", "getSpeedMode", "getSlope", "getWaitingTime",
-    "getAccumulatedWaitingTime", "getTimeLoss", "getNextTLS", "isStopped", "getFollowSpeed", "getSecureGap",
-    "getStopSpeed", "getImperfection", "getActionStepLength", "getDeparture")
+    "getLeader",
+    "getRoute",
+    "getRouteID",
+    "getRouteIndex",
+    "getDistance",
+    "getDrivingDistance",
+    "getDrivingDistance2D",
+    "getAllowedSpeed",
+    "getSpeedFactor",
+    "getSpeedMode",
+    "getSlope",
+    "getWaitingTime",
+    "getAccumulatedWaitingTime",
+    "getTimeLoss",
+    "getNextTLS",
+    "isStopped",
+    "getFollowSpeed",
+    "getSecureGap",
+    "getStopSpeed",
+    "getImperfection",
+    "getActionStepLength",
+    "getDeparture",
+)
 """Functions that return values of the vehicle under test alone."""
 ACTORS_ON_ROAD = ("getLastStepVehicleIDs", "getLastStepVehicleNumber", "getLastStepPersonIDs")
 QUERIES: Mapping[str, tuple[str, ...]] = {
     "": ("getVersion", "isLibsumo", "hasGUI"),
     "vehicle": (*LISTS, *SENSED_FUNCTIONS["vehicle"], *CONSTANT_FUNCTIONS, *OWN_FUNCTIONS),
     "person": (*LISTS, *SENSED_FUNCTIONS["person"], *CONSTANT_FUNCTIONS),
-    "simulation": ("getTime", "getDeltaT", "getMinExpectedNumber", "getNetBoundary", "getDistance2D", "getDistanceRoad",
-                   "convert2D", "convert3D", "convertGeo", "convertRoad"),
+    "simulation": (
+        "getTime",
+        "getDeltaT",
+        "getMinExpectedNumber",
+        "getNetBoundary",
+        "getDistance2D",
+        "getDistanceRoad",
+        "convert2D",
+        "convert3D",
+        "convertGeo",
+        "convertRoad",
+    ),
     "edge": (*LISTS, *ACTORS_ON_ROAD, "getLaneNumber", "getStreetName", "getFromJunction", "getToJunction", "getAngle"),
-    "lane": (*LISTS, *ACTORS_ON_ROAD[:2], "getEdgeID", "getLength", "getWidth", "getShape", "getMaxSpeed",
-             "getFriction", "getAllowed", "getDisallowed", "getLinkNumber", "getLinks", "getFoes", "getInternalFoes"),
+    "lane": (
+        *LISTS,
+        *ACTORS_ON_ROAD[:2],
+        "getEdgeID",
+        "getLength",
+        "getWidth",
+        "getShape",
+        "getMaxSpeed",
+        "getFriction",
+        "getAllowed",
+        "getDisallowed",
+        "getLinkNumber",
+        "getLinks",
+        "getFoes",
+        "getInternalFoes",
+    ),
     "junction": (*LISTS, "getPosition", "getShape", "getIncomingEdges", "getOutgoingEdges"),
-    "trafficlight": (*LISTS, "getRedYellowGreenState", "getPhase", "getPhaseName", "getPhaseDuration",
-                     "getSpentDuration", "getNextSwitch", "getProgram", "getControlledLanes", "getControlledLinks"),
+    "trafficlight": (
+        *LISTS,
+        "getRedYellowGreenState",
+        "getPhase",
+        "getPhaseName",
+        "getPhaseDuration",
+        "getSpentDuration",
+        "getNextSwitch",
+        "getProgram",
+        "getControlledLanes",
+        "getControlledLinks",
+    ),
     "vehicletype": (*LISTS, *CONSTANT_FUNCTIONS[1:], "getSpeedFactor", "getImperfection"),
     "route": (*LISTS, "getEdges"),
 }
 """The functions that a controller may query, by domain; "" is the module itself."""
 VARIABLES: Mapping[str, str] = {
-    "TRACI_ID_LIST": "getIDList", "ID_COUNT": "getIDCount", "VAR_POSITION": "getPosition",
-    "VAR_POSITION3D": "getPosition3D", "VAR_SPEED": "getSpeed", "VAR_ANGLE": "getAngle", "VAR_ROAD_ID": "getRoadID",
-    "VAR_LANE_ID": "getLaneID", "VAR_LANE_INDEX": "getLaneIndex", "VAR_LANEPOSITION": "getLanePosition",
-    "VAR_LANEPOSITION_LAT": "getLateralLanePosition", "VAR_SPEED_LAT": "getLateralSpeed",
-    "VAR_ACCELERATION": "getAcceleration", "VAR_SIGNALS": "getSignals", "VAR_LEADER": "getLeader",
-    "VAR_DISTANCE": "getDistance", "VAR_LENGTH": "getLength", "VAR_WIDTH": "getWidth", "VAR_HEIGHT": "getHeight",
-    "VAR_TYPE": "getTypeID", "VAR_VEHICLECLASS": "getVehicleClass", "VAR_MINGAP": "getMinGap",
-    "VAR_ALLOWED_SPEED": "getAllowedSpeed", "VAR_MAXSPEED": "getMaxSpeed", "VAR_ACCEL": "getAccel",
-    "VAR_DECEL": "getDecel", "VAR_TAU": "getTau", "VAR_ROUTE_ID": "getRouteID", "VAR_WAITING_TIME": "getWaitingTime",
-    "VAR_TIME": "getTime", "VAR_DELTA_T": "getDeltaT",
+    "TRACI_ID_LIST": "getIDList",
+    "ID_COUNT": "getIDCount",
+    "VAR_POSITION": "getPosition",
+    "VAR_POSITION3D": "getPosition3D",
+    "VAR_SPEED": "getSpeed",
+    "VAR_ANGLE": "getAngle",
+    "VAR_ROAD_ID": "getRoadID",
+    "VAR_LANE_ID": "getLaneID",
+    "VAR_LANE_INDEX": "getLaneIndex",
+    "VAR_LANEPOSITION": "getLanePosition",
+    "VAR_LANEPOSITION_LAT": "getLateralLanePosition",
+    "VAR_SPEED_LAT": "getLateralSpeed",
+    "VAR_ACCELERATION": "getAcceleration",
+    "VAR_SIGNALS": "getSignals",
+    "VAR_LEADER": "getLeader",
+    "VAR_DISTANCE": "getDistance",
+    "VAR_LENGTH": "getLength",
+    "VAR_WIDTH": "getWidth",
+    "VAR_HEIGHT": "getHeight",
+    "VAR_TYPE": "getTypeID",
+    "VAR_VEHICLECLASS": "getVehicleClass",
+    "VAR_MINGAP": "getMinGap",
+    "VAR_ALLOWED_SPEED": "getAllowedSpeed",
+    "VAR_MAXSPEED": "getMaxSpeed",
+    "VAR_ACCEL": "getAccel",
+    "VAR_DECEL": "getDecel",
+    "VAR_TAU": "getTau",
+    "VAR_ROUTE_ID": "getRouteID",
+    "VAR_WAITING_TIME": "getWaitingTime",
+    "VAR_TIME": "getTime",
+    "VAR_DELTA_T": "getDeltaT",
 }
 """TraCI's variables for subscriptions, each with the function that returns the same value."""
 DEFAULT_VARIABLES: Mapping[str, tuple[str, ...]] = {
-    "vehicle": ("VAR_ROAD_ID", "VAR_LANEPOSITION"), "person": ("VAR_ROAD_ID", "VAR_LANEPOSITION"),
-    "simulation": ("VAR_TIME",)}
+    "vehicle": ("VAR_ROAD_ID", "VAR_LANEPOSITION"),
+    "person": ("VAR_ROAD_ID", "VAR_LANEPOSITION"),
+    "simulation": ("VAR_TIME",),
+}
 """Domains for subscriptions, each with the variables of a subscription that names none."""
 CONTEXT_DOMAINS = {"CMD_GET_VEHICLE_VARIABLE": "vehicle", "CMD_GET_PERSON_VARIABLE": "person"}
 INVALID_NUMBER = -1073741824
@@ -185,8 +283,11 @@ class TraciView:
 
     def _command(self, name: str, arguments: tuple[Any, ...]) -> None:
         if arguments[0] != VUT:
-            raise InputError(f"traci.vehicle.{name}", f"vehID = {arguments[0]!r} is not the vehicle under test",
-                             f"{VUT!r}: a controller commands no other vehicle")
+            raise InputError(
+                f"traci.vehicle.{name}",
+                f"vehID = {arguments[0]!r} is not the vehicle under test",
+                f"{VUT!r}: a controller commands no other vehicle",
+            )
         if name in DISPLAY_FUNCTIONS:
             self._sumo_value("vehicle", name, arguments)
         else:
@@ -264,8 +365,11 @@ class TraciView:
         around, dist = details[:2] if is_context else (0, 0.0)
         domains = {_constant(name): other for name, other in CONTEXT_DOMAINS.items()} if is_context else {0: domain}
         if name not in ("subscribe", "subscribeContext") or around not in domains:
-            raise InputError(full_name(domain, name), f"is not for a controller of {VUT!r}",
-                             f"subscribe, or subscribeContext with {' or '.join(CONTEXT_DOMAINS)}")
+            raise InputError(
+                full_name(domain, name),
+                f"is not for a controller of {VUT!r}",
+                f"subscribe, or subscribeContext with {' or '.join(CONTEXT_DOMAINS)}",
+            )
         variables = _requested_variables(domains[around], details[-4], details[-1])
         self._subscriptions[is_context, domain, actor] = domains[around], dist, variables
         return None
@@ -274,15 +378,28 @@ class TraciView:
         results: dict[str, dict[Any, Any]] = {}
         for (*kind, actor), (other_domain, dist, variables) in self._subscriptions.items():
             if kind == [is_context, domain] and actor in (("",) if domain == "simulation" else self._ids(domain)):
-                results[actor] = self._values(domain, actor, variables) if not is_context else {
-                    other: self._values(other_domain, other, variables) for other in self._ids(other_domain)
-                    if math.dist(*(self._query(*of)[:2] for of in (
-                        (domain, "getPosition", actor), (other_domain, "getPosition", other)))) <= dist}
+                results[actor] = (
+                    self._values(domain, actor, variables)
+                    if not is_context
+                    else {
+                        other: self._values(other_domain, other, variables)
+                        for other in self._ids(other_domain)
+                        if math.dist(
+                            *(
+                                self._query(*of)[:2]
+                                for of in ((domain, "getPosition", actor), (other_domain, "getPosition", other))
+                            )
+                        )
+                        <= dist
+                    }
+                )
         return results
 
     def _values(self, domain: str, actor: str, variables: Variables) -> dict[int, Any]:
-        return {variable: self._query(domain, function, *((actor,) if actor else ()), *arguments)
-                for variable, (function, arguments) in variables.items()}
+        return {
+            variable: self._query(domain, function, *((actor,) if actor else ()), *arguments)
+            for variable, (function, arguments) in variables.items()
+        }
 
 
 def _requested_variables(domain: str, requested: Any, parameters: Any) -> Variables:

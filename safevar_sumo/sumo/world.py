@@ -51,8 +51,13 @@ class SumoWorld:
 
     def __init__(self, api: Any, n: int) -> None:
         self._api, self.n = api, n
-        self._set_speed, self._get_speed = _api_function(api, "vehicle", "setSpeed"), _api_function(api, "vehicle", "getSpeed")
-        self._vehicle_position, self._person_position = (_api_function(api, domain, "getPosition") for domain in ("vehicle", "person"))
+        self._set_speed, self._get_speed = (
+            _api_function(api, "vehicle", "setSpeed"),
+            _api_function(api, "vehicle", "getSpeed"),
+        )
+        self._vehicle_position, self._person_position = (
+            _api_function(api, domain, "getPosition") for domain in ("vehicle", "person")
+        )
         self._last_speeds, self._last_positions = np.zeros(n), np.zeros((n, 2))
         """Speeds and positions of vehicles under test that have left the road."""
         self._speeds_now: FloatArray | None = None
@@ -143,19 +148,29 @@ class SumoWorld:
 
     def bodies(self, copies: Sequence[int]) -> tuple[Body, Body]:
         """The bodies of vehicles that collide in this step, and of the actors that they collide with, both in columns."""
-        return (Body.columns([self._body_of(self.ids(VUT)[copy]) for copy in copies]),
-                Body.columns([self._body_of(self._struck_ids[copy]) for copy in copies]))
+        return (
+            Body.columns([self._body_of(self.ids(VUT)[copy]) for copy in copies]),
+            Body.columns([self._body_of(self._struck_ids[copy]) for copy in copies]),
+        )
 
     def _body_of(self, id_: str) -> Body:
         domain = self._api.person if id_ in self._api.person.getIDList() else self._api.vehicle
-        return Body.behind(np.array(domain.getPosition(id_)), direction_of(domain.getAngle(id_)), domain.getLength(id_),
-                           domain.getWidth(id_), domain.getSpeed(id_))
+        return Body.behind(
+            np.array(domain.getPosition(id_)),
+            direction_of(domain.getAngle(id_)),
+            domain.getLength(id_),
+            domain.getWidth(id_),
+            domain.getSpeed(id_),
+        )
 
     def end_runs(self, copies: Sequence[int]) -> None:
         """Remove vehicles whose runs end from SUMO's simulation, and keep their last positions and speeds."""
         if not copies:
             return
-        self._last_speeds[copies], self._last_positions[copies] = self.speeds()[copies], self.vehicle_positions(VUT)[copies]
+        self._last_speeds[copies], self._last_positions[copies] = (
+            self.speeds()[copies],
+            self.vehicle_positions(VUT)[copies],
+        )
         for id_ in [self.ids(VUT)[copy] for copy in copies]:
             self._api.vehicle.remove(id_)
             del self._driving_copies[id_]
@@ -202,7 +217,9 @@ class SumoWorld:
     def actor_poses(self) -> dict[str, tuple[float, float, float]]:
         """x and y of the front bumper or person [m], and heading clockwise from north [degrees], of all actors on the road, by id."""
         domains = (self._api.vehicle, self._api.person)
-        return {id_: (*domain.getPosition(id_), domain.getAngle(id_)) for domain in domains for id_ in domain.getIDList()}
+        return {
+            id_: (*domain.getPosition(id_), domain.getAngle(id_)) for domain in domains for id_ in domain.getIDList()
+        }
 
     def actor_size(self, id_: str) -> tuple[bool, float, float]:
         """Whether an actor is a person, and its length and width [m]."""
@@ -257,8 +274,11 @@ def begin(scenario: Scenario, world: Any) -> Any:
     try:
         return scenario.begin(world)
     except world.lookup_errors as error:
-        raise InputError("scenario.parameters.network", f"the network lacks an element of the scenario: {str(error).strip()}",
-                         "a network and traffic with the ids that the scenario names") from None
+        raise InputError(
+            "scenario.parameters.network",
+            f"the network lacks an element of the scenario: {str(error).strip()}",
+            "a network and traffic with the ids that the scenario names",
+        ) from None
 
 
 _current_world: SumoWorld | None = None

@@ -91,8 +91,14 @@ class Vehicle:
     remarks: Sequence[str] = ()
 
     @abstractmethod
-    def prepare(self, characteristics: Characteristics, road_friction: float, step: float, slope: Slope = LEVEL,
-                wet: bool | BoolArray = False) -> Any:
+    def prepare(
+        self,
+        characteristics: Characteristics,
+        road_friction: float,
+        step: float,
+        slope: Slope = LEVEL,
+        wet: bool | BoolArray = False,
+    ) -> Any:
         """Constants of a run with a time step of `step` seconds.
 
         `road_friction` is the weather's factor on the tyres' friction; `wet` is for models in which water has further effects. A user's
@@ -109,8 +115,11 @@ class Vehicle:
 
     def at_speed(self, prepared: Any, speed: FloatArray) -> Any:
         """The steady state at a speed above 0 [m/s], shape (N,), with the pedals that hold it."""
-        raise InputError(type(self).__name__, "has no method at_speed(prepared, speed), and the traffic puts it onto the road in motion",
-                         "a vehicle with that method, or traffic that departs with speed 0")
+        raise InputError(
+            type(self).__name__,
+            "has no method at_speed(prepared, speed), and the traffic puts it onto the road in motion",
+            "a vehicle with that method, or traffic that departs with speed 0",
+        )
 
     def at_start(self, prepared: Any, speed: FloatArray) -> Any:
         """The initial state at a speed [m/s], shape (N,): at rest if the speed is 0, else the steady state."""
@@ -181,24 +190,46 @@ class GuardedVehicle(Vehicle):
         self.model, self._guard = vehicle, guard
         units = guard.field("__init__", vehicle, "UNITS")
         if not isinstance(units, Mapping) or not all(isinstance(text, str) for item in units.items() for text in item):
-            raise guard.wrong_value("__init__", "UNITS", units, "a mapping from names of characteristics to their units")
+            raise guard.wrong_value(
+                "__init__", "UNITS", units, "a mapping from names of characteristics to their units"
+            )
         self.UNITS = dict(units)
 
-    def prepare(self, characteristics: Characteristics, road_friction: float, step: float, slope: Slope = LEVEL,
-                wet: bool | BoolArray = False) -> _Prepared:
-        n, road = len(next(iter(characteristics.values()))), (slope, wet) if np.any(wet) else (slope,) if slope is not LEVEL else ()
+    def prepare(
+        self,
+        characteristics: Characteristics,
+        road_friction: float,
+        step: float,
+        slope: Slope = LEVEL,
+        wet: bool | BoolArray = False,
+    ) -> _Prepared:
+        n, road = (
+            len(next(iter(characteristics.values()))),
+            (slope, wet) if np.any(wet) else (slope,) if slope is not LEVEL else (),
+        )
         arguments = read_only_copy(characteristics), road_friction, step, *read_only_copy(road)
         constants = self._guard.call("prepare", self.model.prepare, *arguments)
         types = self._guard.call("sumo_type", self.model.sumo_type, constants)
-        return _Prepared(n, constants, SumoType(*(
-            self._guard.numbers("sumo_type", name, self._guard.field("sumo_type", types, name), (n,), lowest=0.0, above=True)
-            for name in SumoType._fields)))
+        return _Prepared(
+            n,
+            constants,
+            SumoType(
+                *(
+                    self._guard.numbers(
+                        "sumo_type", name, self._guard.field("sumo_type", types, name), (n,), lowest=0.0, above=True
+                    )
+                    for name in SumoType._fields
+                )
+            ),
+        )
 
     def sumo_type(self, prepared: _Prepared) -> SumoType:
         return prepared.types
 
     def at_rest(self, prepared: _Prepared) -> _State:
-        state = self._checked_state("at_rest", prepared.n, self._guard.call("at_rest", self.model.at_rest, prepared.constants))
+        state = self._checked_state(
+            "at_rest", prepared.n, self._guard.call("at_rest", self.model.at_rest, prepared.constants)
+        )
         self._guard.numbers("at_rest", "speed", state.speed, (prepared.n,), lowest=0.0, highest=0.0)
         return state
 
@@ -207,14 +238,31 @@ class GuardedVehicle(Vehicle):
         return self._checked_state("at_speed", prepared.n, state)
 
     def hold_gear(self, prepared: _Prepared, state: _State, holds: BoolArray) -> _State:
-        held = self._guard.call("hold_gear", self.model.hold_gear, prepared.constants, state.model_state, read_only_copy(holds))
+        held = self._guard.call(
+            "hold_gear", self.model.hold_gear, prepared.constants, state.model_state, read_only_copy(holds)
+        )
         return self._checked_state("hold_gear", prepared.n, held)
 
     def sensors(self, prepared: _Prepared) -> Sensors | None:
         sensors = self._guard.call("sensors", self.model.sensors, prepared.constants)
-        return sensors if sensors is None else Sensors(*(
-            self._guard.numbers("sensors", name, self._guard.field("sensors", sensors, name), (prepared.n,), lowest=0.0,
-                                above=name == "scale", infinite=name == "reach") for name in Sensors._fields))
+        return (
+            sensors
+            if sensors is None
+            else Sensors(
+                *(
+                    self._guard.numbers(
+                        "sensors",
+                        name,
+                        self._guard.field("sensors", sensors, name),
+                        (prepared.n,),
+                        lowest=0.0,
+                        above=name == "scale",
+                        infinite=name == "reach",
+                    )
+                    for name in Sensors._fields
+                )
+            )
+        )
 
     def refuse_sense_without_sensors(self, characteristics: Characteristics) -> None:
         """Refuse a model that changes observations in `sense` but has no method `sensors`, because a TraCI controller bypasses `sense`."""
@@ -223,35 +271,60 @@ class GuardedVehicle(Vehicle):
         prepared = self.prepare(characteristics, road_friction=1.0, step=PROBE_STEP)
         state, zeros = self.at_rest(prepared), np.zeros(prepared.n)
         for sample, gap in enumerate((60.0, 5.0, 2000.0)):
-            seen = Observation(time=sample * PROBE_STEP, speed=zeros, gap=zeros + gap, closing_speed=zeros + sample,
-                               lateral=zeros - 1 - sample, lateral_speed=zeros + sample, visibility=0.5, obstacle_speed=zeros - sample,
-                               throttle=zeros, brake=zeros)
+            seen = Observation(
+                time=sample * PROBE_STEP,
+                speed=zeros,
+                gap=zeros + gap,
+                closing_speed=zeros + sample,
+                lateral=zeros - 1 - sample,
+                lateral_speed=zeros + sample,
+                visibility=0.5,
+                obstacle_speed=zeros - sample,
+                throttle=zeros,
+                brake=zeros,
+            )
             sensed, state = self.sense(prepared, state, seen)
             for name, value in seen._asdict().items():
                 if not np.array_equal(getattr(sensed, name), value):
                     problem = f"{self._guard.name} changes {name} in sense, but a controller that reads through TraCI bypasses sense"
-                    raise UserCodeError(self._guard.source, problem, "a method sensors(prepared) that returns "
-                                        "safevar_sumo.vehicles.Sensors(latency, reach, scale); or an ADS that gets the sensed values, "
-                                        'without ads.kind = "traci"')
+                    raise UserCodeError(
+                        self._guard.source,
+                        problem,
+                        "a method sensors(prepared) that returns "
+                        "safevar_sumo.vehicles.Sensors(latency, reach, scale); or an ADS that gets the sensed values, "
+                        'without ads.kind = "traci"',
+                    )
 
     def sense(self, prepared: _Prepared, state: _State, seen: Observation) -> tuple[Observation, _State]:
-        result = self._guard.call("sense", self.model.sense, prepared.constants, state.model_state, read_only_copy(seen))
+        result = self._guard.call(
+            "sense", self.model.sense, prepared.constants, state.model_state, read_only_copy(seen)
+        )
         sensed, next_state = self._guard.elements("sense", result, "(Observation, state)")
         values: dict[str, Any] = {}
         for name, value in seen._asdict().items():
             shape = (prepared.n,) if hasattr(value, "shape") else ()
-            numbers = self._guard.numbers("sense", name, self._guard.field("sense", sensed, name), shape, infinite=name in _MAY_BE_INFINITE)
+            numbers = self._guard.numbers(
+                "sense", name, self._guard.field("sense", sensed, name), shape, infinite=name in _MAY_BE_INFINITE
+            )
             values[name] = numbers if shape else float(numbers)
         return Observation(**values), self._checked_state("sense", prepared.n, next_state)
 
     def advance(self, prepared: _Prepared, state: _State, command: Command) -> _State:
-        result = self._guard.call("advance", self.model.advance, prepared.constants, state.model_state, read_only_copy(command))
+        result = self._guard.call(
+            "advance", self.model.advance, prepared.constants, state.model_state, read_only_copy(command)
+        )
         state, max_speed = self._checked_state("advance", prepared.n, result), prepared.types.max_speed
         for i in open_rows(state.speed > max_speed * (1 + SPEED_ROUNDING))[:1]:  # SUMO itself accepts any speed
-            raise self._guard.wrong_value("advance", "speed", float(state.speed[i]), f"up to max_speed = {max_speed[i]:g} of its sumo_type")
+            raise self._guard.wrong_value(
+                "advance", "speed", float(state.speed[i]), f"up to max_speed = {max_speed[i]:g} of its sumo_type"
+            )
         return state
 
     def _checked_state(self, method: str, n: int, model_state: Any) -> _State:
-        columns = {name: self._guard.numbers(method, name, self._guard.field(method, model_state, name), (n,), *_LEGAL_RANGES.get(name, ()))
-                for name in _State._fields[:-1]}
+        columns = {
+            name: self._guard.numbers(
+                method, name, self._guard.field(method, model_state, name), (n,), *_LEGAL_RANGES.get(name, ())
+            )
+            for name in _State._fields[:-1]
+        }
         return _State(**columns, model_state=model_state)

@@ -48,9 +48,16 @@ def _simulated_tables(vehicle: Vehicle, characteristics: CharacteristicSet) -> P
     launch, fast_state = drive(rest, throttle=1.0, brake=0.0)
     coasting_speeds, _ = drive(fast_state, throttle=0.0, brake=0.0)
     braking_speeds, _ = drive(fast_state, throttle=0.0, brake=LIGHT_BRAKE)
-    coasting, braking = _accelerations(coasting_speeds[::-1]), _accelerations(braking_speeds[::-1])  # decelerations: time reversed
-    tables = PedalTables(speeds=SPEEDS, full_throttle=_accelerations(launch), coasting=coasting,
-                         braking=float(np.median(braking - coasting)) / LIGHT_BRAKE)
+    coasting, braking = (
+        _accelerations(coasting_speeds[::-1]),
+        _accelerations(braking_speeds[::-1]),
+    )  # decelerations: time reversed
+    tables = PedalTables(
+        speeds=SPEEDS,
+        full_throttle=_accelerations(launch),
+        coasting=coasting,
+        braking=float(np.median(braking - coasting)) / LIGHT_BRAKE,
+    )
     for table in tables[:3]:
         table.flags.writeable = False  # many ADSs read them
     return tables
@@ -67,4 +74,6 @@ def _accelerations(speeds: list[float]) -> FloatArray:
     if len(grid) < 2:
         return np.zeros(len(SPEEDS))
     accelerations = np.diff(grid) / np.diff(np.interp(grid, distinct_speeds, samples * STEP))
-    return np.asarray(accelerations[np.clip(np.arange(len(SPEEDS)) - round(grid[0] / SPEEDS[1]), 0, len(accelerations) - 1)])
+    return np.asarray(
+        accelerations[np.clip(np.arange(len(SPEEDS)) - round(grid[0] / SPEEDS[1]), 0, len(accelerations) - 1)]
+    )

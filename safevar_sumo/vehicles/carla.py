@@ -25,7 +25,9 @@ RPM = 2 * math.pi / 60  # rad/s per r/min
 ENGINE_INERTIA = 1.0  # kg m^2; PxVehicleEngineData.mMOI, CARLA's default
 # Torque curve of CARLA's default car: (0, 400), (1890, 500), (5730, 400) r/min, N m, stretched over max_rpm.
 TORQUE_IDLE, TORQUE_PEAK, TORQUE_END = map(np.array, (400.0, 500.0, 400.0))  # N m
-PEAK_SPEED, END_SPEED = map(np.array, (1890 / 5800, 5730 / 5800))  # relative to the maximum engine speed; the falling line extends to 1
+PEAK_SPEED, END_SPEED = map(
+    np.array, (1890 / 5800, 5730 / 5800)
+)  # relative to the maximum engine speed; the falling line extends to 1
 TORQUE_RISE = np.array((TORQUE_PEAK - TORQUE_IDLE) / PEAK_SPEED)
 TORQUE_FALL = np.array((TORQUE_PEAK - TORQUE_END) / (END_SPEED - PEAK_SPEED))
 GEAR_RATIOS = np.array([0.0, 2.85, 2.02, 1.35, 1.0])  # neutral first; blueprint of the LincolnMkz2017
@@ -115,7 +117,13 @@ class _Driveline(NamedTuple):
         clutch = p.clutch * in_gear
         damping = np.where(in_gear, p.damping_engaged, p.damping_neutral)
         clutch_times_ratio = ratio * clutch
-        return cls(clutch, clutch_times_ratio, clutch_times_ratio * ratio, p.engine_inertia_per_step + damping, p.damping_full - damping)
+        return cls(
+            clutch,
+            clutch_times_ratio,
+            clutch_times_ratio * ratio,
+            p.engine_inertia_per_step + damping,
+            p.damping_full - damping,
+        )
 
 
 class Carla(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -143,9 +151,18 @@ class Carla(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     """
 
     UNITS = {
-        "max_rpm": "r/min", "dampRateFullT": "kg m^2/s", "dampRateZeroT_CE": "kg m^2/s", "dampRateZeroT_CD": "kg m^2/s",
-        "gearSwitchTime": "s", "clutchStrength": "kg m^2/s", "mass": "kg", "dragCoeff": "-", "tireFric": "-",
-        "dampRate": "kg m^2/s", "radius": "cm", "maxBrakeTorque": "N m",
+        "max_rpm": "r/min",
+        "dampRateFullT": "kg m^2/s",
+        "dampRateZeroT_CE": "kg m^2/s",
+        "dampRateZeroT_CD": "kg m^2/s",
+        "gearSwitchTime": "s",
+        "clutchStrength": "kg m^2/s",
+        "mass": "kg",
+        "dragCoeff": "-",
+        "tireFric": "-",
+        "dampRate": "kg m^2/s",
+        "radius": "cm",
+        "maxBrakeTorque": "N m",
     }
     FITTED_UP_TO: ClassVar[float] = 6.5  # m/s; highest speed in simulations of the published settings of sun and rain
 
@@ -163,8 +180,14 @@ class Carla(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     camera_height: Annotated[float, Meta(ge=0.1, le=10)]
     camera_design_radius: Annotated[float, Meta(ge=0.1, le=1)] = 0.355
 
-    def prepare(self, characteristics: Characteristics, road_friction: float, step: float, slope: Slope = LEVEL,
-                wet: bool | BoolArray = False) -> _Prepared:
+    def prepare(
+        self,
+        characteristics: Characteristics,
+        road_friction: float,
+        step: float,
+        slope: Slope = LEVEL,
+        wet: bool | BoolArray = False,
+    ) -> _Prepared:
         c = characteristics
         radius = c["radius"] / 100
         grip = c["tireFric"] * (self.tyre_friction * road_friction) * c["mass"] * slope.down
@@ -174,23 +197,41 @@ class Carla(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         wheel_inertia, wheel_damping = WHEELS * 0.5 * WHEEL_MASS * radius * radius, WHEELS * c["dampRate"]
         air_drag, speed_by_force = 0.5 * AIR_DENSITY * FRONTAL_AREA * c["dragCoeff"], tyre_step / c["mass"]
         prepared = _Prepared(
-            substeps=substeps, step=substep, mass=c["mass"], radius=radius,
+            substeps=substeps,
+            step=substep,
+            mass=c["mass"],
+            radius=radius,
             throttle_rates=(np.array(-self.throttle_fall * substep), np.array(self.throttle_rise * substep)),
             brake_rates=(np.array(-self.brake_fall * substep), np.array(self.brake_rise * substep)),
-            engine_inertia_per_step=np.array(ENGINE_INERTIA / tyre_step), wheel_inertia=wheel_inertia,
+            engine_inertia_per_step=np.array(ENGINE_INERTIA / tyre_step),
+            wheel_inertia=wheel_inertia,
             wheel_inertia_per_step=wheel_inertia / tyre_step,
             unbraked_wheel_inertia=wheel_inertia / tyre_step + wheel_damping,
-            wheel_damping=wheel_damping, brake_torque=WHEELS * c["maxBrakeTorque"],
-            grip=grip, slip_stiffness=WHEELS * GRAVITY * self.longitudinal_stiffness / (3 * grip),
-            clutch=c["clutchStrength"], engine_torque=np.array(self.engine_torque),
-            engine_limit=c["max_rpm"] * RPM, damping_full=c["dampRateFullT"], damping_engaged=c["dampRateZeroT_CE"],
-            damping_neutral=c["dampRateZeroT_CD"], shift_time=c["gearSwitchTime"],
-            shift_end=c["gearSwitchTime"] - TIME_ROUNDING, shift_latency=np.array(self.shift_latency),
-            shift_up=np.array(self.shift_up), shift_down=np.array(self.shift_down),
-            air_drag=air_drag, speed_by_force=speed_by_force, speed_by_air=speed_by_force * air_drag,
-            pull=c["mass"] * slope.back, speed_by_slope=np.zeros_like(radius) + slope.back * tyre_step,
+            wheel_damping=wheel_damping,
+            brake_torque=WHEELS * c["maxBrakeTorque"],
+            grip=grip,
+            slip_stiffness=WHEELS * GRAVITY * self.longitudinal_stiffness / (3 * grip),
+            clutch=c["clutchStrength"],
+            engine_torque=np.array(self.engine_torque),
+            engine_limit=c["max_rpm"] * RPM,
+            damping_full=c["dampRateFullT"],
+            damping_engaged=c["dampRateZeroT_CE"],
+            damping_neutral=c["dampRateZeroT_CD"],
+            shift_time=c["gearSwitchTime"],
+            shift_end=c["gearSwitchTime"] - TIME_ROUNDING,
+            shift_latency=np.array(self.shift_latency),
+            shift_up=np.array(self.shift_up),
+            shift_down=np.array(self.shift_down),
+            air_drag=air_drag,
+            speed_by_force=speed_by_force,
+            speed_by_air=speed_by_force * air_drag,
+            pull=c["mass"] * slope.back,
+            speed_by_slope=np.zeros_like(radius) + slope.back * tyre_step,
             assumed_height=self.camera_height / (self.camera_height + (radius - self.camera_design_radius)),
-            slip_offset=np.full_like(radius, self.slip_offset), zeros=np.zeros_like(radius), standstill=np.zeros_like(radius))
+            slip_offset=np.full_like(radius, self.slip_offset),
+            zeros=np.zeros_like(radius),
+            standstill=np.zeros_like(radius),
+        )
         creep_speed, _ = self._rim_at(prepared._replace(pull=np.abs(prepared.pull)), prepared.zeros)
         return prepared._replace(standstill=HOLD_SPEED + creep_speed)
 
@@ -202,7 +243,8 @@ class Carla(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
             accel=np.minimum(drive, p.grip) / p.mass,
             decel=np.minimum(p.brake_torque / p.radius, p.grip) / p.mass,
             max_speed=p.engine_limit / OVERALL_RATIOS[-1] * p.radius,
-            tau=np.full_like(p.mass, p.step * p.substeps + 1 / self.brake_rise))
+            tau=np.full_like(p.mass, p.step * p.substeps + 1 / self.brake_rise),
+        )
 
     def at_rest(self, prepared: _Prepared) -> CarlaState:
         zeros = np.zeros_like(prepared.mass)
@@ -223,8 +265,11 @@ class Carla(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
             # Downhill the engine brakes and the brake supplies the rest; then w_e = G w_w + m / k_c with the clutch torque m = -c_e w_e.
             engine_drag = -p.damping_engaged * ratio * wheel_speed / (1 + p.damping_engaged / p.clutch)
             clutch_torque = np.maximum(resistance / ratio, engine_drag)
-            return (clutch_torque, ratio * (engine_drag - resistance / ratio),
-                    np.minimum(ratio * wheel_speed + clutch_torque / p.clutch, p.engine_limit))
+            return (
+                clutch_torque,
+                ratio * (engine_drag - resistance / ratio),
+                np.minimum(ratio * wheel_speed + clutch_torque / p.clutch, p.engine_limit),
+            )
 
         gear = zeros + 1
         for ratio in OVERALL_RATIOS[1:-1]:
@@ -236,7 +281,9 @@ class Carla(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         throttle = (p.damping_engaged * engine_speed + clutch_torque) / np.maximum(throttle_torque, 1.0)
         throttle = np.where(brake > 0, 0.0, np.minimum(throttle, 1.0))
         shifts_down = (gear > 1) & (engine_speed < p.shift_down * p.engine_limit)
-        return state._replace(throttle=throttle, brake=brake, since_shift=np.where(shifts_down, p.shift_time, p.shift_latency))
+        return state._replace(
+            throttle=throttle, brake=brake, since_shift=np.where(shifts_down, p.shift_time, p.shift_latency)
+        )
 
     def hold_gear(self, prepared: _Prepared, state: CarlaState, holds: BoolArray) -> CarlaState:
         """Hold the gear where `holds`, shape (N,), is true, as a selector lever does; once released, the gearbox may shift at once."""
@@ -274,8 +321,9 @@ class Carla(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
             s.speed[is_held] = s.wheel_speed[is_held] = ZERO
         return s
 
-    def _roll(self, p: _Prepared, s: CarlaState, driveline: _Driveline, throttle: FloatArray,
-              brake: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def _roll(
+        self, p: _Prepared, s: CarlaState, driveline: _Driveline, throttle: FloatArray, brake: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Engine, clutch, wheels, tyres and body over one substep; returns the speeds of vehicle [m/s], wheels and engine [rad/s].
 
         I_e dw_e/dt = throttle T(w_e) - c_e w_e - k_c (w_e - G w_w)
@@ -289,7 +337,10 @@ class Carla(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         engine = driveline.engine_without_throttle + driveline.damping_by_throttle * throttle + clutch
         wheel = p.unbraked_wheel_inertia + driveline.clutch_at_wheel * (ONE - clutch / engine)
         # Coefficients of a tyre step for the speeds (of a wheel, at its rim), for torques and for the tyre force:
-        engine_share, engine_gain = p.engine_inertia_per_step / engine, throttle * self._torque(p, s.engine_speed) / engine
+        engine_share, engine_gain = (
+            p.engine_inertia_per_step / engine,
+            throttle * self._torque(p, s.engine_speed) / engine,
+        )
         rim_by_torque = p.radius / wheel
         rim_share, rim_by_engine = p.wheel_inertia_per_step / wheel, clutch_times_ratio * rim_by_torque
         rim_loss = brake * p.brake_torque * rim_by_torque

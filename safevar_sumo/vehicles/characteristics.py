@@ -72,8 +72,9 @@ class Characteristic:
         """The unit as text after a number; empty without a unit."""
         return unit_text(self.unit)
 
-    def check(self, value: float, source: object, *, beyond: bool = False, otherwise: str = "",
-              switch: str = "beyond=True") -> None:
+    def check(
+        self, value: float, source: object, *, beyond: bool = False, otherwise: str = "", switch: str = "beyond=True"
+    ) -> None:
         """Refuse a value that is not a number or not legal (`is_legal`).
 
         `otherwise` describes further legal values; `switch` is the option that allows values beyond the domain, empty if there is none.
@@ -84,12 +85,18 @@ class Characteristic:
             Naming the value and what is expected.
         """
         if not isinstance(value, Real) or not self.is_legal(value, beyond=beyond):
-            expected = (f"a finite number{' above 0' if self.lower > 0 else ''}, up to {self.largest_plausible:g}" if beyond else
-                        f"a number in [{self.lower:g}, {self.upper:g}]")
+            expected = (
+                f"a finite number{' above 0' if self.lower > 0 else ''}, up to {self.largest_plausible:g}"
+                if beyond
+                else f"a number in [{self.lower:g}, {self.upper:g}]"
+            )
             is_plausible = not beyond and isinstance(value, Real) and self.is_legal(value, beyond=True)
             hint = f", or any with {switch}" if is_plausible and switch else ""
-            raise InputError(source, f"{self.name} = {value}{' is outside its domain' if is_plausible else ''}",
-                             f"{expected}{self.suffix}{otherwise}{hint}")
+            raise InputError(
+                source,
+                f"{self.name} = {value}{' is outside its domain' if is_plausible else ''}",
+                f"{expected}{self.suffix}{otherwise}{hint}",
+            )
 
     def is_legal(self, values: Any, *, beyond: bool = False) -> Any:
         """Whether values, a number or an array, are in the domain; with `beyond`, whether they are plausible.
@@ -164,7 +171,9 @@ class CharacteristicSet:
         """f_numDiff, the number of characteristics changed, shape (N,) (method section 3)."""
         return np.asarray(np.count_nonzero(self.changed(filtered), axis=1), dtype=float)
 
-    def setting(self, values: Mapping[str, float], source: object, *, beyond: bool = False, switch: str = "beyond=True") -> FloatArray:
+    def setting(
+        self, values: Mapping[str, float], source: object, *, beyond: bool = False, switch: str = "beyond=True"
+    ) -> FloatArray:
         """The original setting with some values replaced, shape (n,); with `beyond`, plausible values outside the domain are legal.
 
         `switch` is passed to `Characteristic.check`.
@@ -175,7 +184,9 @@ class CharacteristicSet:
             If a name is unknown or a value is outside its domain.
         """
         if not isinstance(values, Mapping):
-            raise InputError(source, f"is a {type(values).__name__}", "values by characteristic, such as {'mass': 2500}")
+            raise InputError(
+                source, f"is a {type(values).__name__}", "values by characteristic, such as {'mass': 2500}"
+            )
         setting = self.original.copy()
         for name, value in values.items():
             if name not in self.names:
@@ -206,10 +217,13 @@ def _number_changed(settings: FloatArray, characteristics: CharacteristicSet) ->
     return characteristics.number_changed(settings)
 
 
-CHANGES = {change.name: change for change in (
-    Change(name="f_diff", title="largest change", unit="fraction", function=_largest_change),
-    Change(name="f_num_diff", title="characteristics changed", unit="-", function=_number_changed),
-)}
+CHANGES = {
+    change.name: change
+    for change in (
+        Change(name="f_diff", title="largest change", unit="fraction", function=_largest_change),
+        Change(name="f_num_diff", title="characteristics changed", unit="-", function=_number_changed),
+    )
+}
 
 
 def guard_change(change: Any, guard: Guard) -> Change:
@@ -222,9 +236,13 @@ def guard_change(change: Any, guard: Guard) -> Change:
     """
     texts = (change.name, change.title, change.unit)
     if not (all(isinstance(text, str) and text.isprintable() for text in texts) and change.name.isidentifier()):
-        raise InputError(guard.source, f"{guard.name}: name, title, unit = {texts!r}", "printable texts, the name an identifier")
+        raise InputError(
+            guard.source, f"{guard.name}: name, title, unit = {texts!r}", "printable texts, the name an identifier"
+        )
     if not callable(change.function):
-        raise InputError(guard.source, f"{guard.name}: function = {change.function!r}", "a function of settings and characteristics")
+        raise InputError(
+            guard.source, f"{guard.name}: function = {change.function!r}", "a function of settings and characteristics"
+        )
 
     def guarded_function(settings: FloatArray, characteristics: CharacteristicSet) -> FloatArray:
         values = guard.call(change.name, change.function, read_only_copy(settings), characteristics)

@@ -38,8 +38,10 @@ DEFAULT_LAG = 0.1
 SENSOR_UNITS: Mapping[str, str] = {"latency": "s", "range": "m"}
 SENSOR_FIELDS = {"latency": "latency", "range": "reach"}  # fields of `Sensors` by the study's names
 LEGAL_ENTRIES = {
-    "inputs": "the input for that pedal", "outputs": "the output that holds the speed",
-    "sumo_type": "a number in SI units; or a characteristic, or an output or parameter of the FMU"}
+    "inputs": "the input for that pedal",
+    "outputs": "the output that holds the speed",
+    "sumo_type": "a number in SI units; or a characteristic, or an output or parameter of the FMU",
+}
 READABLE_CAUSALITIES = ("output", "calculatedParameter", "parameter", "local")
 
 
@@ -87,50 +89,99 @@ class FmuVehicle(Vehicle):
 
     UNITS: Mapping[str, str]
 
-    def __init__(self, description: Description, units: Mapping[str, str], table: Mapping[str, Any], guard: Guard) -> None:
+    def __init__(
+        self, description: Description, units: Mapping[str, str], table: Mapping[str, Any], guard: Guard
+    ) -> None:
         source, self._guard = guard.source, guard
         self._communication_step = description.communication_step(table["step"], source, "vehicle")
         self.UNITS = dict(units)
         self._sensor_entries, self._type_entries = dict(table["sensors"]), {"tau": DEFAULT_LAG, **table["sumo_type"]}
-        for key, entries, quantities in (("sensors", self._sensor_entries, SENSOR_UNITS), ("sumo_type", self._type_entries, TYPE_UNITS)):
+        for key, entries, quantities in (
+            ("sensors", self._sensor_entries, SENSOR_UNITS),
+            ("sumo_type", self._type_entries, TYPE_UNITS),
+        ):
             for name, entry in entries.items():
                 if name not in quantities:
                     raise unknown_name(source, f"vehicle.{key}.{name}: there is no such quantity", name, quantities)
                 if key == "sensors" and isinstance(entry, str) and entry not in units:
-                    raise unknown_name(source, f"vehicle.{key}.{name} = {entry!r}: there is no such characteristic", entry, units,
-                                       ", or a number")
-                self._refuse_too_small(table["characteristics"], f"vehicle.{key}.{name}", entry, may_be_0=name == "latency")
-        input_ports = ports_of(description, table["inputs"], {**PEDALS, **CONSTANTS}, ("input",), source, "vehicle.inputs",
-                               constants=CONSTANTS)
+                    raise unknown_name(
+                        source,
+                        f"vehicle.{key}.{name} = {entry!r}: there is no such characteristic",
+                        entry,
+                        units,
+                        ", or a number",
+                    )
+                self._refuse_too_small(
+                    table["characteristics"], f"vehicle.{key}.{name}", entry, may_be_0=name == "latency"
+                )
+        input_ports = ports_of(
+            description,
+            table["inputs"],
+            {**PEDALS, **CONSTANTS},
+            ("input",),
+            source,
+            "vehicle.inputs",
+            constants=CONSTANTS,
+        )
         output_ports = ports_of(description, table["outputs"], OUTPUTS, ("output",), source, "vehicle.outputs")
-        for key, entries, required in (("inputs", input_ports, PEDALS), ("outputs", output_ports, ("speed",)),
-                                       ("sumo_type", self._type_entries, TYPE_UNITS)):
+        for key, entries, required in (
+            ("inputs", input_ports, PEDALS),
+            ("outputs", output_ports, ("speed",)),
+            ("sumo_type", self._type_entries, TYPE_UNITS),
+        ):
             for name in required:
                 if name not in entries:
                     raise InputError(source, f"vehicle.{key}.{name} is missing", LEGAL_ENTRIES[key])
         self._characteristic_units = {
             entry: self._unit_pair(description, entry, units[entry], unit, f"vehicle.{key}.{name}")
-            for key, entries, quantities in (("sensors", self._sensor_entries, SENSOR_UNITS), ("sumo_type", self._type_entries, TYPE_UNITS))
-            for name, unit in quantities.items() if isinstance(entry := entries.get(name), str) and entry in units}
-        characteristic_ports = {name: self._characteristic_port(description, name, unit) for name, unit in units.items()
-                                if name in description.variables or name not in self._sensor_entries.values()}
-        type_variables = {name: entry for name, entry in self._type_entries.items() if isinstance(entry, str) and entry not in units}
-        type_ports = ports_of(description, type_variables, TYPE_UNITS, READABLE_CAUSALITIES, source, "vehicle.sumo_type")
-        self._inputs, self._characteristics, self._outputs = tuple(input_ports), tuple(characteristic_ports), (*output_ports, *type_ports)
+            for key, entries, quantities in (
+                ("sensors", self._sensor_entries, SENSOR_UNITS),
+                ("sumo_type", self._type_entries, TYPE_UNITS),
+            )
+            for name, unit in quantities.items()
+            if isinstance(entry := entries.get(name), str) and entry in units
+        }
+        characteristic_ports = {
+            name: self._characteristic_port(description, name, unit)
+            for name, unit in units.items()
+            if name in description.variables or name not in self._sensor_entries.values()
+        }
+        type_variables = {
+            name: entry for name, entry in self._type_entries.items() if isinstance(entry, str) and entry not in units
+        }
+        type_ports = ports_of(
+            description, type_variables, TYPE_UNITS, READABLE_CAUSALITIES, source, "vehicle.sumo_type"
+        )
+        self._inputs, self._characteristics, self._outputs = (
+            tuple(input_ports),
+            tuple(characteristic_ports),
+            (*output_ports, *type_ports),
+        )
         self._reads_type = bool(type_ports)
         ports = [*input_ports.values(), *characteristic_ports.values()]
         constants = constants_of(description, table["parameters"], ports, source, "vehicle.parameters")
         self._instances = Instances(description, ports, [*output_ports.values(), *type_ports.values()], constants)
         self.max_vehicles = self._instances.max_vehicles
         self.takes_slope, self.can_start_moving = "grade" in input_ports, "initial_speed" in input_ports
-        self.remarks = [] if "road_friction" in input_ports else [
-            f"{guard.name} has no vehicle.inputs.road_friction: weather has no effect on how it accelerates and brakes"]
+        self.remarks = (
+            []
+            if "road_friction" in input_ports
+            else [
+                f"{guard.name} has no vehicle.inputs.road_friction: weather has no effect on how it accelerates and brakes"
+            ]
+        )
 
-    def _refuse_too_small(self, table: Mapping[str, CharacteristicTable], key: str, entry: str | float, *, may_be_0: bool) -> None:
+    def _refuse_too_small(
+        self, table: Mapping[str, CharacteristicTable], key: str, entry: str | float, *, may_be_0: bool
+    ) -> None:
         """Refuse a negative number, or a characteristic with a negative lower end; 0 is legal only with `may_be_0`."""
         lower = table[entry].lower if isinstance(entry, str) and entry in table else entry
         if not isinstance(lower, str) and (lower < 0 or (lower == 0 and not may_be_0)):
-            problem = f"{key} = {lower:g}" if lower is entry else f"vehicle.characteristics.{entry}.lower = {lower:g}, the value of {key}"
+            problem = (
+                f"{key} = {lower:g}"
+                if lower is entry
+                else f"vehicle.characteristics.{entry}.lower = {lower:g}, the value of {key}"
+            )
             raise InputError(self._guard.source, problem, "a number of at least 0" if may_be_0 else "a number above 0")
 
     def _characteristic_port(self, description: Description, name: str, unit: str) -> Port:
@@ -142,29 +193,56 @@ class FmuVehicle(Vehicle):
         defined_unit = description.units.get(unit) or COMMON_UNITS.get(unit)
         if defined_unit is None:
             raise InputError(self._guard.source, f"{key}.unit = {unit!r}: the unit is not defined", repr(variable_unit))
-        return Port(variable, description.unit_for(variable, defined_unit, unit, self._guard.source, f"{key}.unit"), defined_unit)
+        return Port(
+            variable,
+            description.unit_for(variable, defined_unit, unit, self._guard.source, f"{key}.unit"),
+            defined_unit,
+        )
 
-    def _unit_pair(self, description: Description, name: str, unit: str, quantity_unit: str, key: str) -> tuple[Unit, Unit]:
+    def _unit_pair(
+        self, description: Description, name: str, unit: str, quantity_unit: str, key: str
+    ) -> tuple[Unit, Unit]:
         """The units of a characteristic that sets a quantity, and of the quantity."""
         defined_unit = description.units.get(unit) or COMMON_UNITS.get(unit)
         if defined_unit is None or not defined_unit.fits(SI[quantity_unit]):
-            raise InputError(self._guard.source, f"{key} = {name!r}: the unit of that characteristic is {unit!r}",
-                             f"a unit of {quantity_unit}")
+            raise InputError(
+                self._guard.source,
+                f"{key} = {name!r}: the unit of that characteristic is {unit!r}",
+                f"a unit of {quantity_unit}",
+            )
         return defined_unit, SI[quantity_unit]
 
-    def prepare(self, characteristics: Characteristics, road_friction: float | FloatArray, step: float, slope: Slope = LEVEL,
-                wet: bool | BoolArray = False) -> _Prepared:
+    def prepare(
+        self,
+        characteristics: Characteristics,
+        road_friction: float | FloatArray,
+        step: float,
+        slope: Slope = LEVEL,
+        wet: bool | BoolArray = False,
+    ) -> _Prepared:
         n = len(next(iter(characteristics.values())))
         if slope is not LEVEL and not self.takes_slope:
-            raise UserCodeError(self._guard.source, f"{self._guard.name} has no vehicle.inputs.grade, and the road has a grade",
-                                "a variable for the grade, or scenarios with grade 0")
+            raise UserCodeError(
+                self._guard.source,
+                f"{self._guard.name} has no vehicle.inputs.grade, and the road has a grade",
+                "a variable for the grade, or scenarios with grade 0",
+            )
         zeros = np.zeros(n)
-        inputs = {"throttle": zeros, "brake": zeros, "road_friction": zeros + road_friction, "wet": zeros + wet,
-                  "grade": zeros + slope.back / slope.down, "step": zeros + step, "initial_speed": zeros}
+        inputs = {
+            "throttle": zeros,
+            "brake": zeros,
+            "road_friction": zeros + road_friction,
+            "wet": zeros + wet,
+            "grade": zeros + slope.back / slope.down,
+            "step": zeros + step,
+            "initial_speed": zeros,
+        }
         fleet = Fleet(self._instances, n, step, self._communication_step)
         outputs = {}
         if self._reads_type:
-            outputs = dict(zip(self._outputs, self._start(fleet, self._input_array(inputs, characteristics))[0], strict=True))
+            outputs = dict(
+                zip(self._outputs, self._start(fleet, self._input_array(inputs, characteristics))[0], strict=True)
+            )
 
         def quantity_values(entry: str | float, name: str) -> FloatArray:
             """Values of the quantity `name`, shape (n,): its entry is a number, a characteristic, or an output of the FMU."""
@@ -175,10 +253,17 @@ class FmuVehicle(Vehicle):
             unit, quantity_unit = self._characteristic_units[entry]
             return np.asarray(unit.to(quantity_unit, characteristics[entry]))
 
-        types = SumoType(*(self._guard.numbers("sumo_type", name, quantity_values(self._type_entries[name], name), (n,), 0.0, above=True)
-                           for name in TYPE_UNITS))
-        sensors = Sensors.perfect(n)._replace(**{SENSOR_FIELDS[name]: quantity_values(entry, name)
-                                                 for name, entry in self._sensor_entries.items()})
+        types = SumoType(
+            *(
+                self._guard.numbers(
+                    "sumo_type", name, quantity_values(self._type_entries[name], name), (n,), 0.0, above=True
+                )
+                for name in TYPE_UNITS
+            )
+        )
+        sensors = Sensors.perfect(n)._replace(
+            **{SENSOR_FIELDS[name]: quantity_values(entry, name) for name, entry in self._sensor_entries.items()}
+        )
         return _Prepared(fleet, inputs, characteristics, types, sensors, step)
 
     def sumo_type(self, prepared: _Prepared) -> SumoType:
@@ -194,13 +279,17 @@ class FmuVehicle(Vehicle):
         """The initial state at a speed [m/s], shape (N,)."""
         if np.any(speed > 0) and not self.can_start_moving:
             problem = f"{self._guard.name} has no vehicle.inputs.initial_speed, and the traffic puts it onto the road in motion"
-            raise UserCodeError(self._guard.source, problem, "a variable for the initial speed, or traffic that departs with speed 0")
+            raise UserCodeError(
+                self._guard.source, problem, "a variable for the initial speed, or traffic that departs with speed 0"
+            )
         inputs = self._input_array({**prepared.inputs, "initial_speed": speed}, prepared.characteristics)
         outputs, history = self._start(prepared.fleet, inputs)
         released = Command(np.zeros_like(speed), np.zeros_like(speed))
         state = self._state(dict(zip(self._outputs, outputs, strict=True)), released, None, history)
         for i in np.flatnonzero(np.abs(state.speed - speed) > 1e-6)[:1]:
-            raise self._guard.wrong_value("initialisation", "speed", float(state.speed[i]), f"{speed[i]:g} m/s, the initial speed")
+            raise self._guard.wrong_value(
+                "initialisation", "speed", float(state.speed[i]), f"{speed[i]:g} m/s, the initial speed"
+            )
         return state._replace(speed=np.asarray(speed, dtype=float))
 
     def sensors(self, prepared: _Prepared) -> Sensors:
@@ -210,18 +299,23 @@ class FmuVehicle(Vehicle):
         """Sensors report the scene as it was one latency ago, and nothing beyond their range times the visibility."""
         if not self._sensor_entries:
             return seen, state
-        sensed, past = sensed_observation(seen, state.seen, prepared.sensors.latency, prepared.sensors.reach, prepared.step)
+        sensed, past = sensed_observation(
+            seen, state.seen, prepared.sensors.latency, prepared.sensors.reach, prepared.step
+        )
         return sensed, state._replace(seen=past)
 
     def advance(self, prepared: _Prepared, state: _State, command: Command) -> _State:
         inputs = self._input_array({**prepared.inputs, **command._asdict()}, prepared.characteristics)
-        (point_outputs, step_outputs), history = self._guard.call("doStep", prepared.fleet.advance, state.history, inputs)
+        (point_outputs, step_outputs), history = self._guard.call(
+            "doStep", prepared.fleet.advance, state.history, inputs
+        )
         outputs = dict(zip(self._outputs, point_outputs, strict=True))
         outputs["speed"] = dict(zip(self._outputs, step_outputs, strict=True))["speed"]
         next_state, max_speed = self._state(outputs, command, state.seen, history), prepared.types.max_speed
         for i in open_rows(next_state.speed > np.maximum(max_speed, state.speed) * (1 + SPEED_ROUNDING))[:1]:
-            raise self._guard.wrong_value("doStep", "speed", float(next_state.speed[i]),
-                                          f"up to vehicle.sumo_type.max_speed = {max_speed[i]:g}")
+            raise self._guard.wrong_value(
+                "doStep", "speed", float(next_state.speed[i]), f"up to vehicle.sumo_type.max_speed = {max_speed[i]:g}"
+            )
         return next_state
 
     def _start(self, fleet: Fleet, inputs: FloatArray) -> tuple[FloatArray, History]:
@@ -229,12 +323,19 @@ class FmuVehicle(Vehicle):
         return outputs, history
 
     def _input_array(self, inputs: Mapping[str, FloatArray], characteristics: Characteristics) -> FloatArray:
-        return np.stack([*(inputs[name] for name in self._inputs), *(characteristics[name] for name in self._characteristics)])
+        return np.stack(
+            [*(inputs[name] for name in self._inputs), *(characteristics[name] for name in self._characteristics)]
+        )
 
-    def _state(self, outputs: Mapping[str, FloatArray], command: Command, seen: FloatArray | None, history: History) -> _State:
+    def _state(
+        self, outputs: Mapping[str, FloatArray], command: Command, seen: FloatArray | None, history: History
+    ) -> _State:
         n = command.throttle.shape
         speed = np.where(np.abs(outputs["speed"]) < SPEED_ROUNDING, 0.0, outputs["speed"])
         values = {"gear": np.ones(n), **command._asdict(), **outputs, "speed": speed}
         bounds = {"speed": (0.0, HIGHEST_SPEED), "gear": (-np.inf, np.inf)}
-        columns = {name: self._guard.numbers("doStep", name, values[name], n, *bounds.get(name, (0.0, 1.0))) for name in _State._fields[:4]}
+        columns = {
+            name: self._guard.numbers("doStep", name, values[name], n, *bounds.get(name, (0.0, 1.0)))
+            for name in _State._fields[:4]
+        }
         return _State(**columns, seen=seen, history=history)

@@ -115,8 +115,17 @@ class Lgsvl(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     """
 
     UNITS = {
-        "mass": "kg", "wheelMass": "kg", "radius": "m", "maxRpm": "r/min", "minRpm": "r/min", "maxBrakeTorque": "N m",
-        "maxMotorTorque": "N m", "maxSteeringAngle": "deg", "tireDragCoeff": "-", "wheelDamping": "kg m^2/s", "shiftTime": "s",
+        "mass": "kg",
+        "wheelMass": "kg",
+        "radius": "m",
+        "maxRpm": "r/min",
+        "minRpm": "r/min",
+        "maxBrakeTorque": "N m",
+        "maxMotorTorque": "N m",
+        "maxSteeringAngle": "deg",
+        "tireDragCoeff": "-",
+        "wheelDamping": "kg m^2/s",
+        "shiftTime": "s",
         "tractionControlSlipLimit": "-",
     }
 
@@ -125,22 +134,47 @@ class Lgsvl(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     wheel_damping_share: Annotated[float, Meta(ge=0, le=1)]
     steering_design_angle: Annotated[float, Meta(gt=0, lt=90)] = 39.4
 
-    def prepare(self, characteristics: Characteristics, road_friction: float, step: float, slope: Slope = LEVEL,
-                wet: bool | BoolArray = False) -> _Prepared:
+    def prepare(
+        self,
+        characteristics: Characteristics,
+        road_friction: float,
+        step: float,
+        slope: Slope = LEVEL,
+        wet: bool | BoolArray = False,
+    ) -> _Prepared:
         c, substep = characteristics, step / SUBSTEPS
         inertia = WHEELS * 0.5 * c["wheelMass"] * c["radius"] * c["radius"]
         damping = WHEELS * self.wheel_damping_share * c["wheelDamping"]
         prepared = _Prepared(
-            step=np.array(step), substep=np.array(substep), pedal_share=np.array(step / (step + self.pedal_lag)),
-            engine_share=np.array(RPM_RATE * substep / (1 + RPM_RATE * substep)), mass=c["mass"], weight=c["mass"] * slope.down,
-            body=c["mass"] + self.wheel_mass_share * WHEELS * c["wheelMass"], slope_deceleration=slope.back,
-            slope_loss=np.asarray(slope.back * substep), standstill=HOLD_SPEED, radius=c["radius"],
-            pull_by_stiffness=substep * c["radius"], inertia=inertia, damping=damping,
-            damped_inertia=inertia + substep * damping, brake_torque=WHEELS * c["maxBrakeTorque"], motor_torque=c["maxMotorTorque"],
-            least_rpm=c["minRpm"], largest_rpm=c["maxRpm"], steering=c["maxSteeringAngle"] * RADIANS, rolling_drag=c["tireDragCoeff"],
-            shift_time=c["shiftTime"], slip_limit=c["tractionControlSlipLimit"], traction_change=np.array(TRACTION_RATE * substep),
-            friction=np.asarray(FRICTION * road_friction))
-        creep_speed = _rim_at(prepared, np.zeros_like(prepared.mass), np.abs(prepared.body * prepared.slope_deceleration))
+            step=np.array(step),
+            substep=np.array(substep),
+            pedal_share=np.array(step / (step + self.pedal_lag)),
+            engine_share=np.array(RPM_RATE * substep / (1 + RPM_RATE * substep)),
+            mass=c["mass"],
+            weight=c["mass"] * slope.down,
+            body=c["mass"] + self.wheel_mass_share * WHEELS * c["wheelMass"],
+            slope_deceleration=slope.back,
+            slope_loss=np.asarray(slope.back * substep),
+            standstill=HOLD_SPEED,
+            radius=c["radius"],
+            pull_by_stiffness=substep * c["radius"],
+            inertia=inertia,
+            damping=damping,
+            damped_inertia=inertia + substep * damping,
+            brake_torque=WHEELS * c["maxBrakeTorque"],
+            motor_torque=c["maxMotorTorque"],
+            least_rpm=c["minRpm"],
+            largest_rpm=c["maxRpm"],
+            steering=c["maxSteeringAngle"] * RADIANS,
+            rolling_drag=c["tireDragCoeff"],
+            shift_time=c["shiftTime"],
+            slip_limit=c["tractionControlSlipLimit"],
+            traction_change=np.array(TRACTION_RATE * substep),
+            friction=np.asarray(FRICTION * road_friction),
+        )
+        creep_speed = _rim_at(
+            prepared, np.zeros_like(prepared.mass), np.abs(prepared.body * prepared.slope_deceleration)
+        )
         return prepared._replace(standstill=HOLD_SPEED + creep_speed)
 
     def sumo_type(self, prepared: _Prepared) -> SumoType:
@@ -152,15 +186,26 @@ class Lgsvl(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
             accel=np.minimum(drive, grip) / p.mass,
             decel=np.minimum(p.brake_torque / p.radius, grip) / p.mass,
             max_speed=p.largest_rpm / RPM_PER_RAD_S / (GEAR_RATIOS[-1] * FINAL_RATIO) * p.radius,
-            tau=np.full_like(p.mass, p.step + self.pedal_lag))
+            tau=np.full_like(p.mass, p.step + self.pedal_lag),
+        )
 
     def at_rest(self, prepared: _Prepared) -> LgsvlState:
         p, zeros = prepared, np.zeros_like(prepared.mass)
         first_ratio = zeros + GEAR_RATIOS[0]
         return LgsvlState(
-            speed=zeros, wheel_speed=zeros, engine_rpm=p.least_rpm, gear=zeros + 1, old_ratio=first_ratio, new_ratio=first_ratio,
-            since_shift=zeros + SHIFT_DELAY, traction_torque=TRACTION_START * p.motor_torque, lateral=zeros + LATERAL_ERROR,
-            heading=zeros + HEADING_ERROR, throttle=zeros, brake=zeros)
+            speed=zeros,
+            wheel_speed=zeros,
+            engine_rpm=p.least_rpm,
+            gear=zeros + 1,
+            old_ratio=first_ratio,
+            new_ratio=first_ratio,
+            since_shift=zeros + SHIFT_DELAY,
+            traction_torque=TRACTION_START * p.motor_torque,
+            lateral=zeros + LATERAL_ERROR,
+            heading=zeros + HEADING_ERROR,
+            throttle=zeros,
+            brake=zeros,
+        )
 
     def at_speed(self, prepared: _Prepared, speed: FloatArray) -> LgsvlState:
         """The steady state at a speed: every equation with its rate of change set to zero.
@@ -182,9 +227,19 @@ class Lgsvl(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         throttle = np.minimum(np.maximum(needed_torque, 0.0) / np.maximum(full_torque, 1.0), 1.0)
         brake = np.minimum(np.maximum(-needed_torque, 0.0) / p.brake_torque, 1.0)
         return LgsvlState(
-            speed=speed, wheel_speed=wheel_speed, engine_rpm=engine_rpm, gear=gear, old_ratio=ratio, new_ratio=ratio,
-            since_shift=zeros + SHIFT_DELAY, traction_torque=p.motor_torque, lateral=zeros, heading=zeros,
-            throttle=throttle, brake=brake)
+            speed=speed,
+            wheel_speed=wheel_speed,
+            engine_rpm=engine_rpm,
+            gear=gear,
+            old_ratio=ratio,
+            new_ratio=ratio,
+            since_shift=zeros + SHIFT_DELAY,
+            traction_torque=p.motor_torque,
+            lateral=zeros,
+            heading=zeros,
+            throttle=throttle,
+            brake=brake,
+        )
 
     def sense(self, prepared: _Prepared, state: LgsvlState, seen: Observation) -> tuple[Observation, LgsvlState]:
         return seen, state
@@ -194,7 +249,10 @@ class Lgsvl(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         lateral, heading, cornering_drag = self._steer(p, state)
         state = _shift(p, state)._replace(
             throttle=state.throttle + (command.throttle - state.throttle) * p.pedal_share,
-            brake=state.brake + (command.brake - state.brake) * p.pedal_share, lateral=lateral, heading=heading)
+            brake=state.brake + (command.brake - state.brake) * p.pedal_share,
+            lateral=lateral,
+            heading=heading,
+        )
         gearing = _ratio(p, state) * FINAL_RATIO
         for _ in range(SUBSTEPS):
             state = _roll(p, state, gearing, cornering_drag)
@@ -224,9 +282,11 @@ def _shift(p: _Prepared, s: LgsvlState) -> LgsvlState:
         return s
     gear = s.gear + up - down
     return s._replace(
-        gear=gear, old_ratio=np.where(shifts, _ratio(p, s), s.old_ratio),
+        gear=gear,
+        old_ratio=np.where(shifts, _ratio(p, s), s.old_ratio),
         new_ratio=np.where(shifts, GEAR_RATIOS[gear.astype(np.intp) - 1], s.new_ratio),
-        since_shift=np.where(shifts, ZERO, s.since_shift))
+        since_shift=np.where(shifts, ZERO, s.since_shift),
+    )
 
 
 def _ratio(p: _Prepared, s: LgsvlState) -> FloatArray:
@@ -254,14 +314,20 @@ def _roll(p: _Prepared, s: LgsvlState, gearing: FloatArray, cornering_drag: Floa
     pull = p.pull_by_stiffness * stiffness
     damped_mass = p.body + h * (stiffness + AIR_DRAG * s.speed + p.rolling_drag + cornering_drag)
     slope_speed = s.speed - p.slope_loss
-    wheel_momentum = p.inertia * s.wheel_speed + h * (drive - s.brake * p.brake_torque) + pull * p.body * slope_speed / damped_mass
+    wheel_momentum = (
+        p.inertia * s.wheel_speed + h * (drive - s.brake * p.brake_torque) + pull * p.body * slope_speed / damped_mass
+    )
     wheel_speed = np.maximum(wheel_momentum, ZERO) / (p.damped_inertia + pull * p.radius - pull * pull / damped_mass)
     speed = np.maximum((p.body * slope_speed + pull * wheel_speed) / damped_mass, ZERO)
     is_held = (wheel_speed <= ZERO) & (speed < p.standstill)
     if np.count_nonzero(is_held):
         speed[is_held] = ZERO
-    return s._replace(speed=speed, wheel_speed=wheel_speed, engine_rpm=engine_rpm,
-                      traction_torque=np.minimum(np.maximum(traction_torque, ZERO), p.motor_torque))
+    return s._replace(
+        speed=speed,
+        wheel_speed=wheel_speed,
+        engine_rpm=engine_rpm,
+        traction_torque=np.minimum(np.maximum(traction_torque, ZERO), p.motor_torque),
+    )
 
 
 def _torque_share(share: FloatArray) -> FloatArray:

@@ -87,14 +87,22 @@ class FeasibleRegion:
             for bound in self.bounds:
                 if bound.excess(setting[np.newaxis])[0] > SLACK / len(self.bounds):
                     quantity = f"{bound.constraint.quantity} = {bound.quantity(setting[np.newaxis])[0]:g}{bound.suffix}"
-                    raise InputError(source, f"violates a constraint: {quantity} ({self._describe_values(bound, setting)})",
-                                     bound.condition + otherwise)
+                    raise InputError(
+                        source,
+                        f"violates a constraint: {quantity} ({self._describe_values(bound, setting)})",
+                        bound.condition + otherwise,
+                    )
 
     def _describe_values(self, bound: _Bounds, setting: FloatArray) -> str:
-        return ", ".join(f"{characteristic.name} = {value:g}{characteristic.suffix}"
-                         for characteristic, value in zip(self.characteristics, setting, strict=True)
-                         if characteristic.name in bound.constraint.sum
-                         or (bound.constraint.function and value != characteristic.original)) or "the original"
+        return (
+            ", ".join(
+                f"{characteristic.name} = {value:g}{characteristic.suffix}"
+                for characteristic, value in zip(self.characteristics, setting, strict=True)
+                if characteristic.name in bound.constraint.sum
+                or (bound.constraint.function and value != characteristic.original)
+            )
+            or "the original"
+        )
 
     def repaired(self, settings: FloatArray, *, filtered: bool = True) -> FloatArray:
         """Settings moved towards the original until they are feasible; if `filtered`, feasible after the filter. Shape (N, n)."""
@@ -108,8 +116,15 @@ class FeasibleRegion:
             infeasible = infeasible[~self._are_accepted(repaired[infeasible], filtered)]
         return repaired
 
-    def draw_feasible(self, draw: DrawSettings, number: int, rng: np.random.Generator | None = None, *, filtered: bool = False,
-                      rejections: int = REJECTIONS) -> FloatArray:
+    def draw_feasible(
+        self,
+        draw: DrawSettings,
+        number: int,
+        rng: np.random.Generator | None = None,
+        *,
+        filtered: bool = False,
+        rejections: int = REJECTIONS,
+    ) -> FloatArray:
         """The first `number` feasible settings drawn (if `filtered`, feasible after the filter), shape (number, n).
 
         If `rejections` draws per setting do not suffice, random mixtures of the region's vertices fill the rest; without `rng`, fewer
@@ -144,48 +159,86 @@ def region_of(study: Study, source: str = "") -> FeasibleRegion:
     if not study.constraints:
         return FeasibleRegion(characteristics, (), np.zeros((0, len(characteristics))))
     lookup = Lookup(source, study.origin.places)
-    bounds = tuple(_bounds_of(constraint, study, characteristics, lookup, f"constraints[{number}]")
-                   for number, constraint in enumerate(study.constraints))
-    linear = [(tuple(bound.constraint.sum.get(name, 0.0) for name in characteristics.names), bound.minimum, bound.maximum)
-              for bound in bounds if bound.constraint.sum]
+    bounds = tuple(
+        _bounds_of(constraint, study, characteristics, lookup, f"constraints[{number}]")
+        for number, constraint in enumerate(study.constraints)
+    )
+    linear = [
+        (tuple(bound.constraint.sum.get(name, 0.0) for name in characteristics.names), bound.minimum, bound.maximum)
+        for bound in bounds
+        if bound.constraint.sum
+    ]
     domain_ends = tuple(characteristics.lower.tolist()), tuple(characteristics.upper.tolist())
     for bound in bounds:
         if bound.constraint.sum:
             _refuse_unreachable(source, bound, characteristics)
     vertices = _vertices(tuple(linear), *domain_ends) if linear else np.zeros((0, len(characteristics)))
     if vertices is None:
-        raise InputError(source, f"constraints: no setting in the domains satisfies all of them: {'; '.join(map(str, bounds))}",
-                         "constraints that leave a region, with the original in it")
+        raise InputError(
+            source,
+            f"constraints: no setting in the domains satisfies all of them: {'; '.join(map(str, bounds))}",
+            "constraints that leave a region, with the original in it",
+        )
     region = FeasibleRegion(characteristics, bounds, vertices)
-    region.check(characteristics.original[np.newaxis], f"{source}: the original vehicle",
-                 otherwise="; the original vehicle must satisfy every constraint")
+    region.check(
+        characteristics.original[np.newaxis],
+        f"{source}: the original vehicle",
+        otherwise="; the original vehicle must satisfy every constraint",
+    )
     if not _has_feasible_change(region):
-        raise InputError(source, f"constraints leave only the original vehicle, as no feasible change passes the filter: {region}",
-                         "constraints that leave a region around the original")
+        raise InputError(
+            source,
+            f"constraints leave only the original vehicle, as no feasible change passes the filter: {region}",
+            "constraints that leave a region around the original",
+        )
     return region
 
 
-def _bounds_of(constraint: Constraint, study: Study, characteristics: CharacteristicSet, lookup: Lookup,
-               key: str) -> _Bounds:
+def _bounds_of(
+    constraint: Constraint, study: Study, characteristics: CharacteristicSet, lookup: Lookup, key: str
+) -> _Bounds:
     minimum = -np.inf if constraint.at_least is None else constraint.at_least
     maximum = np.inf if constraint.at_most is None else constraint.at_most
-    condition, unit = constraint.bounds_in_words(study.vehicle.characteristics), constraint.unit_of(study.vehicle.characteristics)
+    condition, unit = (
+        constraint.bounds_in_words(study.vehicle.characteristics),
+        constraint.unit_of(study.vehicle.characteristics),
+    )
     suffix = unit_text(unit)
     if constraint.sum:
         weights = [(characteristics.names.index(name), weight) for name, weight in constraint.sum.items()]
         width = sum(abs(weight) * (characteristics.upper - characteristics.lower)[column] for column, weight in weights)
-        return _Bounds(constraint, condition, suffix, lambda settings: _weighted_sum(settings, weights), minimum, maximum, float(width))
+        return _Bounds(
+            constraint,
+            condition,
+            suffix,
+            lambda settings: _weighted_sum(settings, weights),
+            minimum,
+            maximum,
+            float(width),
+        )
     member = lookup.find({}, constraint.function, f"{key}.function")
     guard = member.guard or Guard(lookup.source, f"{key}.function = {constraint.function!r}")
     if not callable(member.target):
-        raise InputError(lookup.source, f"{guard.name} is of type {type(member.target).__name__}", "a function of a mapping of arrays")
+        raise InputError(
+            lookup.source,
+            f"{guard.name} is of type {type(member.target).__name__}",
+            "a function of a mapping of arrays",
+        )
 
     def quantity(settings: FloatArray) -> FloatArray:
         columns = read_only_copy(dict(zip(characteristics.names, settings.T, strict=True)))
         return guard.numbers("its call", "values", guard.call("its call", member.target, columns), (len(settings),))
 
     samples = quantity(np.stack([characteristics.original, characteristics.lower, characteristics.upper]))
-    return _Bounds(constraint, condition, suffix, quantity, minimum, maximum, float(np.ptp(samples)) or max(1.0, abs(float(samples[0]))))
+    return _Bounds(
+        constraint,
+        condition,
+        suffix,
+        quantity,
+        minimum,
+        maximum,
+        float(np.ptp(samples)) or max(1.0, abs(float(samples[0]))),
+    )
 
 
 def _weighted_sum(settings: FloatArray, weights: Sequence[tuple[int, float]]) -> FloatArray:
@@ -197,8 +250,12 @@ def _weighted_sum(settings: FloatArray, weights: Sequence[tuple[int, float]]) ->
 
 
 def _refuse_unreachable(source: str, bound: _Bounds, characteristics: CharacteristicSet) -> None:
-    terms = np.array([[getattr(characteristics, end)[characteristics.names.index(name)] * weight for end in ("lower", "upper")]
-                      for name, weight in bound.constraint.sum.items()])
+    terms = np.array(
+        [
+            [getattr(characteristics, end)[characteristics.names.index(name)] * weight for end in ("lower", "upper")]
+            for name, weight in bound.constraint.sum.items()
+        ]
+    )
     smallest, largest = (float(extreme(terms, axis=1).sum()) for extreme in (np.min, np.max))
     if largest < bound.minimum or smallest > bound.maximum:
         problem = f"constraints: {bound.constraint.quantity} is between {smallest:g} and {largest:g} in the domains"
@@ -210,14 +267,22 @@ def _vertices(linear: tuple[Any, ...], lower: tuple[float, ...], upper: tuple[fl
     """For each characteristic, settings with its least and its greatest value under the linear constraints; None if no setting fits."""
     from scipy.optimize import linprog  # loading takes half a second
 
-    inequalities = [(sign * np.array(weights), sign * limit) for weights, minimum, maximum in linear
-                    for sign, limit in ((-1, minimum), (1, maximum)) if np.isfinite(limit)]
+    inequalities = [
+        (sign * np.array(weights), sign * limit)
+        for weights, minimum, maximum in linear
+        for sign, limit in ((-1, minimum), (1, maximum))
+        if np.isfinite(limit)
+    ]
     vertices = []
     for column in range(len(lower)):
         for sign in (1.0, -1.0):
-            result = linprog(sign * np.eye(len(lower))[column], A_ub=np.array([weights for weights, _ in inequalities]),
-                             b_ub=np.array([limit for _, limit in inequalities]), bounds=list(zip(lower, upper, strict=True)),
-                             method="highs")
+            result = linprog(
+                sign * np.eye(len(lower))[column],
+                A_ub=np.array([weights for weights, _ in inequalities]),
+                b_ub=np.array([limit for _, limit in inequalities]),
+                bounds=list(zip(lower, upper, strict=True)),
+                method="highs",
+            )
             if not result.success:
                 return None
             vertices.append(np.clip(result.x, lower, upper))
@@ -238,8 +303,15 @@ def _candidate_changes(region: FeasibleRegion) -> Iterator[FloatArray]:
     """Settings to try: vertices and ends of the domains first, then random settings."""
     characteristics, original = region.characteristics, region.characteristics.original
     size = len(characteristics)
-    yield np.concatenate([region.vertices, *(np.where(np.eye(size, dtype=bool), end, original)
-                                             for end in (characteristics.lower, characteristics.upper))])
+    yield np.concatenate(
+        [
+            region.vertices,
+            *(
+                np.where(np.eye(size, dtype=bool), end, original)
+                for end in (characteristics.lower, characteristics.upper)
+            ),
+        ]
+    )
     rng = np.random.default_rng(0)
     probes = rng.uniform(characteristics.lower, characteristics.upper, (N_PROBES, size))
     sparse_probes = np.where(rng.random((N_PROBES, size)) < 2 / size, probes, original)

@@ -61,13 +61,19 @@ class Sensors(NamedTuple):
         return cls(np.zeros(n), np.full(n, np.inf), np.ones(n))
 
 
-def sensed_observation(seen: Observation, past: FloatArray | None, latency: FloatArray, reach: FloatArray,
-                       step: float) -> tuple[Observation, FloatArray]:
+def sensed_observation(
+    seen: Observation, past: FloatArray | None, latency: FloatArray, reach: FloatArray, step: float
+) -> tuple[Observation, FloatArray]:
     """The observation `latency` [s] ago, without obstacles beyond `reach` [m] times the visibility; also the history for the next call."""
     obstacle_speed = np.broadcast_to(seen.obstacle_speed, seen.gap.shape)
     sample = np.stack([seen.gap, seen.closing_speed, seen.lateral, seen.lateral_speed, obstacle_speed])
     past = start_history(float(np.max(latency)), step, sample) if past is None else extend_history(past, sample)
     gap, closing_speed, lateral, lateral_speed, obstacle_speed = delay_signal(past, latency, step)
     is_detected = gap <= reach * seen.visibility
-    return seen._replace(gap=np.where(is_detected, gap, np.inf), closing_speed=closing_speed, lateral=lateral,
-                         lateral_speed=lateral_speed, obstacle_speed=obstacle_speed), past
+    return seen._replace(
+        gap=np.where(is_detected, gap, np.inf),
+        closing_speed=closing_speed,
+        lateral=lateral,
+        lateral_speed=lateral_speed,
+        obstacle_speed=obstacle_speed,
+    ), past

@@ -53,28 +53,54 @@ class SumoVehicle(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fie
     """
 
     UNITS = {
-        "mass": "kg", "accel": "m/s^2", "decel": "m/s^2", "maxSpeed": "m/s", "tau": "s",
-        "sensorRange": "m", "reactionTime": "s", "brakeDelay": "s", "brakeGain": "-",
+        "mass": "kg",
+        "accel": "m/s^2",
+        "decel": "m/s^2",
+        "maxSpeed": "m/s",
+        "tau": "s",
+        "sensorRange": "m",
+        "reactionTime": "s",
+        "brakeDelay": "s",
+        "brakeGain": "-",
     }
 
     reference_mass: Annotated[float, Meta(gt=0)] = 1500.0
     tyre_friction: Annotated[float, Meta(gt=0)] = 0.9
 
-    def prepare(self, characteristics: Characteristics, road_friction: float, step: float, slope: Slope = LEVEL,
-                wet: bool | BoolArray = False) -> _Prepared:
+    def prepare(
+        self,
+        characteristics: Characteristics,
+        road_friction: float,
+        step: float,
+        slope: Slope = LEVEL,
+        wet: bool | BoolArray = False,
+    ) -> _Prepared:
         c = characteristics
         mass_ratio = self.reference_mass / c["mass"]
         return _Prepared(
-            step=step, mass=c["mass"], accel=c["accel"] * mass_ratio, decel=c["decel"] * mass_ratio,
-            grip=self.tyre_friction * road_friction * slope.down, max_speed=c["maxSpeed"], actuator_lag=c["tau"],
+            step=step,
+            mass=c["mass"],
+            accel=c["accel"] * mass_ratio,
+            decel=c["decel"] * mass_ratio,
+            grip=self.tyre_friction * road_friction * slope.down,
+            max_speed=c["maxSpeed"],
+            actuator_lag=c["tau"],
             sensor_range=c["sensorRange"],
-            reaction_time=c["reactionTime"], brake_delay=c["brakeDelay"], brake_gain=c["brakeGain"],
-            back=slope.back)
+            reaction_time=c["reactionTime"],
+            brake_delay=c["brakeDelay"],
+            brake_gain=c["brakeGain"],
+            back=slope.back,
+        )
 
     def sumo_type(self, prepared: _Prepared) -> SumoType:
         p = prepared
-        return SumoType(mass=p.mass, accel=np.minimum(p.accel, p.grip), decel=np.minimum(p.decel, p.grip), max_speed=p.max_speed,
-                        tau=p.actuator_lag)
+        return SumoType(
+            mass=p.mass,
+            accel=np.minimum(p.accel, p.grip),
+            decel=np.minimum(p.decel, p.grip),
+            max_speed=p.max_speed,
+            tau=p.actuator_lag,
+        )
 
     def at_rest(self, prepared: _Prepared) -> SumoState:
         zeros = np.zeros_like(prepared.mass)
@@ -86,15 +112,22 @@ class SumoVehicle(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fie
         p, rest = prepared, self.at_rest(prepared)
         brake = np.minimum(np.maximum(-p.back / (p.brake_gain * p.decel), 0.0), 1.0)
         throttle = np.minimum(np.maximum(p.back / p.accel, 0.0), 1.0)
-        return rest._replace(speed=speed, acceleration=rest.acceleration + p.back, throttle=throttle, brake=brake,
-                             brake_commands=rest.brake_commands + brake)
+        return rest._replace(
+            speed=speed,
+            acceleration=rest.acceleration + p.back,
+            throttle=throttle,
+            brake=brake,
+            brake_commands=rest.brake_commands + brake,
+        )
 
     def sensors(self, prepared: _Prepared) -> Sensors:
         return Sensors(prepared.reaction_time, prepared.sensor_range, np.ones_like(prepared.sensor_range))
 
     def sense(self, prepared: _Prepared, state: SumoState, seen: Observation) -> tuple[Observation, SumoState]:
         """Sensors report the scene as it was `reactionTime` ago, and nothing beyond `sensorRange` times the visibility."""
-        sensed, past = sensed_observation(seen, state.seen, prepared.reaction_time, prepared.sensor_range, prepared.step)
+        sensed, past = sensed_observation(
+            seen, state.seen, prepared.reaction_time, prepared.sensor_range, prepared.step
+        )
         return sensed, state._replace(seen=past)
 
     def advance(self, prepared: _Prepared, state: SumoState, command: Command) -> SumoState:
@@ -107,7 +140,13 @@ class SumoVehicle(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fie
         acceleration = state.acceleration + (target - state.acceleration) * (p.step / (p.actuator_lag + p.step))
         # Braking ends a positive acceleration at once, without lag.
         acceleration = np.where(brake > 0, np.minimum(acceleration, 0.0), acceleration)
-        speed = np.minimum(np.maximum(state.speed + (acceleration - p.back) * p.step, 0.0), np.maximum(p.max_speed, state.speed))
+        speed = np.minimum(
+            np.maximum(state.speed + (acceleration - p.back) * p.step, 0.0), np.maximum(p.max_speed, state.speed)
+        )
         return state._replace(
-            speed=speed, acceleration=(speed - state.speed) / p.step + p.back, throttle=np.where(brake > 0, 0.0, command.throttle),
-            brake=brake, brake_commands=commands)
+            speed=speed,
+            acceleration=(speed - state.speed) / p.step + p.back,
+            throttle=np.where(brake > 0, 0.0, command.throttle),
+            brake=brake,
+            brake_commands=commands,
+        )

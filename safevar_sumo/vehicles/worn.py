@@ -83,7 +83,12 @@ class WornVehicle(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fie
     """
 
     UNITS = {
-        "treadDepth": "mm", "brakeTorque": "-", "brakeResponse": "s", "payload": "kg", "payloadCentre": "m", "sensorRange": "m",
+        "treadDepth": "mm",
+        "brakeTorque": "-",
+        "brakeResponse": "s",
+        "payload": "kg",
+        "payloadCentre": "m",
+        "sensorRange": "m",
         "sensorLatency": "s",
     }
 
@@ -98,27 +103,48 @@ class WornVehicle(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fie
     tread_loss: Annotated[float, Meta(ge=0, lt=0.5)] = 1 - 1 / DEEP_TREAD_RATIO
     max_speed: Positive = 55.56
 
-    def prepare(self, characteristics: Characteristics, road_friction: float, step: float, slope: Slope = LEVEL,
-                wet: bool | BoolArray = False) -> _Prepared:
+    def prepare(
+        self,
+        characteristics: Characteristics,
+        road_friction: float,
+        step: float,
+        slope: Slope = LEVEL,
+        wet: bool | BoolArray = False,
+    ) -> _Prepared:
         c = characteristics
         mass = self.kerb_mass + c["payload"]
         rear_load = (self.kerb_mass * self.kerb_centre + c["payload"] * c["payloadCentre"]) / mass / self.wheelbase
         grip_share = np.where(wet, 1 - self.tread_loss * _loss_share(np.maximum(c["treadDepth"], 0.0)), 1.0)
         return _Prepared(
-            step=step, mass=mass, drive=self.drive_force / mass,
-            brake=c["brakeTorque"] * (self.brake_force / mass), grip=self.tyre_friction * road_friction * grip_share,
-            front_load=1 - rear_load, rear_load=rear_load, response=c["brakeResponse"], sensor_range=c["sensorRange"],
-            latency=c["sensorLatency"], slope=slope)
+            step=step,
+            mass=mass,
+            drive=self.drive_force / mass,
+            brake=c["brakeTorque"] * (self.brake_force / mass),
+            grip=self.tyre_friction * road_friction * grip_share,
+            front_load=1 - rear_load,
+            rear_load=rear_load,
+            response=c["brakeResponse"],
+            sensor_range=c["sensorRange"],
+            latency=c["sensorLatency"],
+            slope=slope,
+        )
 
     def sumo_type(self, prepared: _Prepared) -> SumoType:
         p = prepared
         decel = self._deceleration(p, np.ones_like(p.mass))
-        return SumoType(mass=p.mass, accel=np.minimum(p.drive, p.grip * p.slope.down), decel=decel,
-                        max_speed=np.full_like(p.mass, self.max_speed), tau=p.response + p.step)
+        return SumoType(
+            mass=p.mass,
+            accel=np.minimum(p.drive, p.grip * p.slope.down),
+            decel=decel,
+            max_speed=np.full_like(p.mass, self.max_speed),
+            tau=p.response + p.step,
+        )
 
     def at_rest(self, prepared: _Prepared) -> WornState:
         zeros = np.zeros_like(prepared.mass)
-        return WornState(zeros, zeros, zeros, zeros + 1, None, start_history(float(np.max(prepared.response)), prepared.step, zeros))
+        return WornState(
+            zeros, zeros, zeros, zeros + 1, None, start_history(float(np.max(prepared.response)), prepared.step, zeros)
+        )
 
     def at_speed(self, prepared: _Prepared, speed: FloatArray) -> WornState:
         """The pedals balance the slope, the only resistance; on a level road they are released."""
@@ -141,8 +167,13 @@ class WornVehicle(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fie
         brake = delay_signal(commands, p.response, p.step)
         drive = np.minimum(command.throttle * p.drive, p.grip * p.slope.down)
         acceleration = np.where(brake > 0, -self._deceleration(p, brake), drive)
-        speed = np.minimum(np.maximum(state.speed + (acceleration - p.slope.back) * p.step, 0.0), np.maximum(self.max_speed, state.speed))
-        return state._replace(speed=speed, throttle=np.where(brake > 0, 0.0, command.throttle), brake=brake, brake_commands=commands)
+        speed = np.minimum(
+            np.maximum(state.speed + (acceleration - p.slope.back) * p.step, 0.0),
+            np.maximum(self.max_speed, state.speed),
+        )
+        return state._replace(
+            speed=speed, throttle=np.where(brake > 0, 0.0, command.throttle), brake=brake, brake_commands=commands
+        )
 
     def _deceleration(self, p: _Prepared, pedal: FloatArray) -> FloatArray:
         """Deceleration by the brakes of both axles together [m/s^2]."""

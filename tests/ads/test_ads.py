@@ -20,7 +20,9 @@ STEP = 0.05
 GUARD = Guard("study 'mine'", "ads.model = 'my_module:Wrong'", __file__)
 STUDIES = {load_study(name).ads.model: load_study(name) for name in study_names()}
 NATIVE = load_study("native")
-SYSTEMS = {name: assemble(STUDIES.get(name, msgspec.structs.replace(NATIVE, ads=ModelTable(model=name)))) for name in ADS}
+SYSTEMS = {
+    name: assemble(STUDIES.get(name, msgspec.structs.replace(NATIVE, ads=ModelTable(model=name)))) for name in ADS
+}
 TAKE_OVER = {"aeb", "competent_driver", "full_braking", "fuzzy_safety", "r157", "rss"}
 """ADSs that keep the initial speed."""
 KNOWN = assemble(load_study("sun")).nominal
@@ -71,9 +73,20 @@ def test_an_open_road_makes_it_drive(name: str) -> None:
 
 
 @given(lateral=st.floats(-3, 3), speed=st.floats(0, 8), gap=st.floats(0, 12))
-def test_world_on_rails_brakes_up_to_a_gap_that_shrinks_before_and_past_its_place(lateral: float, speed: float, gap: float) -> None:
-    ads = WorldOnRails(first_command=0.0, latency=0.0, corridor=2.5, brake_gap=9.0, brake_gap_per_speed=-0.5, brake_place=-0.4,
-                       brake_gap_before=10.0, brake_gap_past=2.0, throttle=(0.8, 0.8, 0.5))
+def test_world_on_rails_brakes_up_to_a_gap_that_shrinks_before_and_past_its_place(
+    lateral: float, speed: float, gap: float
+) -> None:
+    ads = WorldOnRails(
+        first_command=0.0,
+        latency=0.0,
+        corridor=2.5,
+        brake_gap=9.0,
+        brake_gap_per_speed=-0.5,
+        brake_place=-0.4,
+        brake_gap_before=10.0,
+        brake_gap_past=2.0,
+        throttle=(0.8, 0.8, 0.5),
+    )
     short, past = max(-0.4 - lateral, 0.0), max(lateral + 0.4, 0.0)
     limit = 0.9 * (9.0 - 0.5 * speed - 10.0 * short - 2.0 * past)
     assume(abs(gap - limit) > 1e-9)

@@ -16,8 +16,19 @@ STEP = 0.05
 FAR = 1e6
 COASTING, FULL, BRAKING = 0.1, 2.0, 10.0
 SPEEDS = np.arange(0.0, 20.5, 0.5)
-KNOWN = Nominal(mass=1500.0, accel=3.0, decel=8.0, max_speed=50.0, actuator_lag=0.2, tables=lambda: PedalTables(
-    speeds=SPEEDS, full_throttle=np.full(len(SPEEDS), FULL), coasting=np.full(len(SPEEDS), COASTING), braking=BRAKING))
+KNOWN = Nominal(
+    mass=1500.0,
+    accel=3.0,
+    decel=8.0,
+    max_speed=50.0,
+    actuator_lag=0.2,
+    tables=lambda: PedalTables(
+        speeds=SPEEDS,
+        full_throttle=np.full(len(SPEEDS), FULL),
+        coasting=np.full(len(SPEEDS), COASTING),
+        braking=BRAKING,
+    ),
+)
 
 
 def seen(time: float, speed: float, gap: float, lateral: float = 0.0, visibility: float = 1.0) -> Observation:
@@ -26,20 +37,60 @@ def seen(time: float, speed: float, gap: float, lateral: float = 0.0, visibility
 
 
 def world_on_rails(**changes: object) -> WorldOnRails:
-    return WorldOnRails(**{**{
-        "first_command": 0.0, "latency": 0.0, "corridor": 2.5, "brake_gap": 9.0, "brake_gap_per_speed": 0.0, "brake_place": 0.0,
-        "brake_gap_before": 0.0, "brake_gap_past": 0.0, "throttle": (0.9, 0.7, 0.4)}, **changes})  # type: ignore[arg-type]
+    return WorldOnRails(
+        **{
+            **{
+                "first_command": 0.0,
+                "latency": 0.0,
+                "corridor": 2.5,
+                "brake_gap": 9.0,
+                "brake_gap_per_speed": 0.0,
+                "brake_place": 0.0,
+                "brake_gap_before": 0.0,
+                "brake_gap_past": 0.0,
+                "throttle": (0.9, 0.7, 0.4),
+            },
+            **changes,
+        }
+    )  # type: ignore[arg-type]
 
 
 def apollo(**changes: float) -> Apollo:
-    return Apollo(**{**{
-        "first_command": 0.0, "cruise_speed": 8.0, "cruise_gain": 1.0, "cruise_acceleration": 1.5, "jerk": 5.0, "stop_gap": 5.0,
-        "comfortable_deceleration": 2.0, "largest_deceleration": 3.0, "creep_speed": 0.5, "creep_time": 1.0, "pedal_lag": 0.1}, **changes})
+    return Apollo(
+        **{
+            **{
+                "first_command": 0.0,
+                "cruise_speed": 8.0,
+                "cruise_gain": 1.0,
+                "cruise_acceleration": 1.5,
+                "jerk": 5.0,
+                "stop_gap": 5.0,
+                "comfortable_deceleration": 2.0,
+                "largest_deceleration": 3.0,
+                "creep_speed": 0.5,
+                "creep_time": 1.0,
+                "pedal_lag": 0.1,
+            },
+            **changes,
+        }
+    )
 
 
-@pytest.mark.parametrize(("speed", "throttle"), [
-    (0.0, 0.9), (4 / 3, 0.8), (8 / 3, 0.7), (4.0, 0.55), (16 / 3, 0.4), (20 / 3.6 - 1e-6, 0.4), (20 / 3.6 + 1e-6, 0.0)])
-def test_world_on_rails_throttle_is_linear_between_its_speeds_and_none_above_20_kmh(speed: float, throttle: float) -> None:
+@pytest.mark.parametrize(
+    ("speed", "throttle"),
+    [
+        (0.0, 0.9),
+        (4 / 3, 0.8),
+        (8 / 3, 0.7),
+        (4.0, 0.55),
+        (16 / 3, 0.4),
+        (20 / 3.6 - 1e-6, 0.4),
+        (20 / 3.6 + 1e-6, 0.0),
+    ],
+)
+def test_world_on_rails_throttle_is_linear_between_its_speeds_and_none_above_20_kmh(
+    speed: float, throttle: float
+) -> None:
     ads = world_on_rails()
     command, _ = ads.drive(seen(1.0, speed, FAR), ads.start(1, KNOWN, STEP))
     assert command.throttle[0] == pytest.approx(throttle)
@@ -60,8 +111,12 @@ def test_world_on_rails_waits_for_its_first_command_only_where_it_stands() -> No
         assert ads.drive(seen(0.0, speed, FAR), ads.start(1, KNOWN, STEP))[0].throttle[0] == pytest.approx(throttle)
 
 
-@pytest.mark.parametrize(("gap", "begins", "goes_on"), [(-0.4, True, True), (-0.6, False, True), (-0.9, False, True), (-1.1, False, False)])
-def test_world_on_rails_begins_to_brake_for_nobody_beside_it_and_lets_go_a_metre_past_him(gap: float, begins: bool, goes_on: bool) -> None:
+@pytest.mark.parametrize(
+    ("gap", "begins", "goes_on"), [(-0.4, True, True), (-0.6, False, True), (-0.9, False, True), (-1.1, False, False)]
+)
+def test_world_on_rails_begins_to_brake_for_nobody_beside_it_and_lets_go_a_metre_past_him(
+    gap: float, begins: bool, goes_on: bool
+) -> None:
     ads = world_on_rails()
     command, _ = ads.drive(seen(1.0, 3.0, gap), ads.start(1, KNOWN, STEP))
     assert bool(command.brake[0]) == begins
@@ -82,7 +137,9 @@ def onset(ads: Apollo, speed: float, visibility: float = 1.0, start: float = 60.
 
 
 @pytest.mark.parametrize(("speed", "lag"), [(4.0, 0.1), (8.0, 0.1), (8.0, 0.6)])
-def test_apollo_begins_where_a_comfortable_stop_and_the_way_lost_in_pedals_and_jerk_need_it(speed: float, lag: float) -> None:
+def test_apollo_begins_where_a_comfortable_stop_and_the_way_lost_in_pedals_and_jerk_need_it(
+    speed: float, lag: float
+) -> None:
     """gap = stop gap + v^2 / (2 b) + v (lag + b / (2 jerk))."""
     expected = 5.0 + speed**2 / (2 * 2.0) + speed * (lag + 0.5 * 2.0 / 5.0)
     onset_gap = onset(apollo(pedal_lag=lag, cruise_speed=speed), speed)
@@ -108,7 +165,9 @@ def test_apollo_asks_for_what_is_needed_to_stand_at_its_gap_through_the_original
 
 
 @pytest.mark.parametrize(("speed", "deceleration"), [(1.1, 2.0), (0.95, 1.5), (0.8, 1.0), (0.65, 0.5)])
-def test_apollos_deceleration_fades_into_the_creep_within_three_tenths_of_a_second(speed: float, deceleration: float) -> None:
+def test_apollos_deceleration_fades_into_the_creep_within_three_tenths_of_a_second(
+    speed: float, deceleration: float
+) -> None:
     """5 cm before its stop Apollo would need its largest deceleration, 3 m/s^2; it brakes with (v - 0.5) / 0.3."""
     ads = apollo(jerk=1e4)
     _, memory = ads.drive(seen(0.0, 8.0, 10.0), ads.start(1, KNOWN, STEP))

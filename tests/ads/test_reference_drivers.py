@@ -23,10 +23,20 @@ from safevar_sumo.sumo.network import CopiedNetwork
 
 STEP = 0.05
 TABLE = np.arange(0.0, 20.5, 0.5)
-KNOWN = Nominal(mass=1500.0, accel=3.0, decel=10.0, max_speed=50.0, actuator_lag=0.1, tables=lambda: PedalTables(
-    speeds=TABLE, full_throttle=np.full(len(TABLE), 3.0), coasting=np.zeros(len(TABLE)), braking=10.0))
+KNOWN = Nominal(
+    mass=1500.0,
+    accel=3.0,
+    decel=10.0,
+    max_speed=50.0,
+    actuator_lag=0.1,
+    tables=lambda: PedalTables(
+        speeds=TABLE, full_throttle=np.full(len(TABLE), 3.0), coasting=np.zeros(len(TABLE)), braking=10.0
+    ),
+)
 """A vehicle whose brake pedal is the deceleration over 10 m/s^2."""
-GAPS, SPEEDS, LEADERS = (values.ravel() for values in np.meshgrid([1.0, 4.0, 12.0, 30.0, 80.0, 150.0], [2.0, 8.0, 13.0], [0.0, 5.0, 12.5]))
+GAPS, SPEEDS, LEADERS = (
+    values.ravel() for values in np.meshgrid([1.0, 4.0, 12.0, 30.0, 80.0, 150.0], [2.0, 8.0, 13.0], [0.0, 5.0, 12.5])
+)
 
 
 @pytest.fixture(scope="module")
@@ -34,9 +44,11 @@ def sumo(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
     """libsumo with a vehicle of every model, all with SUMO's default parameters of a passenger car, cruising at 13.89 m/s."""
     folder = NETWORKS / "car_to_car"
     traffic = tmp_path_factory.mktemp("models") / "traffic.rou.xml"
-    kinds = [f'<vType id="{name}" carFollowModel="{name}" minGap="2.5" tau="1" accel="2.6" decel="4.5" maxSpeed="13.89" speedDev="0"'
-             f' sigma="0"/><vehicle id="{name}" type="{name}" route="r" depart="0" departPos="{100 + 300 * i}"/>'
-             for i, name in enumerate(("IDM", "ACC", "Krauss"))]
+    kinds = [
+        f'<vType id="{name}" carFollowModel="{name}" minGap="2.5" tau="1" accel="2.6" decel="4.5" maxSpeed="13.89" speedDev="0"'
+        f' sigma="0"/><vehicle id="{name}" type="{name}" route="r" depart="0" departPos="{100 + 300 * i}"/>'
+        for i, name in enumerate(("IDM", "ACC", "Krauss"))
+    ]
     traffic.write_text('<routes><route id="r" edges="road"/>' + "".join(kinds) + "</routes>")
     with open_world(CopiedNetwork(folder / "network.net.xml", traffic, folder / "scenario.sumocfg"), 0):
         import libsumo
@@ -47,7 +59,10 @@ def sumo(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
 
 def sumo_accelerations(sumo: Any, model: str, net_of: float) -> np.ndarray:
     """Acceleration by SUMO's model in every state [m/s^2]."""
-    speeds = [sumo.vehicle.getFollowSpeed(model, v, gap - net_of, u, 4.5) for gap, v, u in zip(GAPS, SPEEDS, LEADERS, strict=True)]
+    speeds = [
+        sumo.vehicle.getFollowSpeed(model, v, gap - net_of, u, 4.5)
+        for gap, v, u in zip(GAPS, SPEEDS, LEADERS, strict=True)
+    ]
     return (np.array(speeds) - SPEEDS) / STEP
 
 
@@ -78,16 +93,26 @@ def test_krauss_means_to_keep_just_the_speed_that_sumos_keeps_behind_somebody_wh
     assert kept == pytest.approx(safe, abs=1e-4)
 
 
-def braking(driver: Any, speed: float, gap: float, leader: float = 0.0, lateral: float = 0.0,
-            lateral_speed: float = 0.0) -> tuple[float, np.ndarray]:
+def braking(
+    driver: Any, speed: float, gap: float, leader: float = 0.0, lateral: float = 0.0, lateral_speed: float = 0.0
+) -> tuple[float, np.ndarray]:
     """Gap at which a driver first brakes, at constant speed towards an obstacle, and the decelerations from then on."""
     one, memory, first, decelerations = np.ones(1), driver.start(1, KNOWN, STEP), np.nan, []
     for k in range(400):
         now = gap - (speed - leader) * k * STEP
         if now <= 0:
             break
-        seen = Observation(k * STEP, speed * one, now * one, (speed - leader) * one, (lateral + lateral_speed * k * STEP) * one,
-                           lateral_speed * one, 1.0, leader * one, 0 * one)
+        seen = Observation(
+            k * STEP,
+            speed * one,
+            now * one,
+            (speed - leader) * one,
+            (lateral + lateral_speed * k * STEP) * one,
+            lateral_speed * one,
+            1.0,
+            leader * one,
+            0 * one,
+        )
         command, memory = driver.drive(seen, memory)
         if command.brake[0] > 0.05 and np.isnan(first):  # more than the accelerator let go
             first = now
@@ -175,14 +200,24 @@ def test_fuzzy_metrics_are_those_worked_out_by_hand() -> None:
     assert model.critical_metric(1.0 * one, 10 * one, 10 * one, 0 * one)[0] == 0
 
 
-def driven(driver: Any, seconds: float, speed: float, gap: float, leader: float = 0.0,
-           lateral: Any = lambda time: (0.0, 0.0)) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def driven(
+    driver: Any, seconds: float, speed: float, gap: float, leader: float = 0.0, lateral: Any = lambda time: (0.0, 0.0)
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Gaps, speeds and brake pedals of a point mass behind a leader at a constant speed [m, m/s, -]."""
     one, memory, samples = np.ones(1), driver.start(1, KNOWN, STEP), []
     for k in range(round(seconds / STEP)):
         position, lateral_speed = lateral(k * STEP)
-        seen = Observation(k * STEP, speed * one, gap * one, (speed - leader) * one, position * one, lateral_speed * one, 1.0,
-                           leader * one, 0 * one)
+        seen = Observation(
+            k * STEP,
+            speed * one,
+            gap * one,
+            (speed - leader) * one,
+            position * one,
+            lateral_speed * one,
+            1.0,
+            leader * one,
+            0 * one,
+        )
         command, memory = driver.drive(seen, memory)
         samples.append((gap, speed, float(command.brake[0])))
         next_speed = max(speed + (3 * float(command.throttle[0]) - 10 * samples[-1][2]) * STEP, 0.0)
@@ -192,6 +227,7 @@ def driven(driver: Any, seconds: float, speed: float, gap: float, leader: float 
 
 def test_who_has_stopped_for_a_pedestrian_waits_until_the_way_is_clear() -> None:
     """The pedestrian stands in the way for 10 s and leaves at 1 m/s, 1.4 m to the edge of the way; then the vehicle goes on."""
+
     def lateral(time: float) -> tuple[float, float]:
         return max(time - 10, 0.0), float(time >= 10)
 

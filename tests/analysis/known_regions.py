@@ -20,8 +20,12 @@ Region = Callable[[FloatArray], BoolArray]
 
 def made_up_study(n: int) -> Study:
     smoke = load_study("smoke")
-    rows = {name: CharacteristicTable(unit="N m", original=ORIGINAL, lower=LOWER, upper=UPPER) for name in "abcdefgh"[:n]}
-    return msgspec.structs.replace(smoke, name="made-up", vehicle=msgspec.structs.replace(smoke.vehicle, characteristics=rows))
+    rows = {
+        name: CharacteristicTable(unit="N m", original=ORIGINAL, lower=LOWER, upper=UPPER) for name in "abcdefgh"[:n]
+    }
+    return msgspec.structs.replace(
+        smoke, name="made-up", vehicle=msgspec.structs.replace(smoke.vehicle, characteristics=rows)
+    )
 
 
 class Plant:
@@ -29,8 +33,13 @@ class Plant:
 
     workers = 1
 
-    def __init__(self, study: Study, region: Region, degree: Callable[[FloatArray], FloatArray] | None = None,
-                 failing: Region | None = None):
+    def __init__(
+        self,
+        study: Study,
+        region: Region,
+        degree: Callable[[FloatArray], FloatArray] | None = None,
+        failing: Region | None = None,
+    ):
         self._characteristics, self._region = CharacteristicSet.of(study.vehicle.characteristics), region
         self._degree = degree or (lambda settings: np.full(len(settings), 2.0))
         self._failing = failing or nowhere
@@ -43,11 +52,18 @@ class Plant:
         degree = np.where(fails, np.nan, np.where(collides, -1.0, self._degree(settings)))
         self.seen |= {row.tobytes() for row in settings}
         future: Future[Evaluations] = Future()
-        future.set_result(Evaluations(
-            settings=settings, outcome=np.where(fails, "simulator-error", np.where(collides, "collision", "stopped")).astype("U16"),
-            collision_speed=np.where(collides, 1.0, np.nan),
-            metrics={name: degree if name == "safety_degree" else np.full(len(settings), np.nan) for name in METRICS},
-            f_diff=self._characteristics.largest_change(settings), f_num_diff=self._characteristics.number_changed(settings)))
+        future.set_result(
+            Evaluations(
+                settings=settings,
+                outcome=np.where(fails, "simulator-error", np.where(collides, "collision", "stopped")).astype("U16"),
+                collision_speed=np.where(collides, 1.0, np.nan),
+                metrics={
+                    name: degree if name == "safety_degree" else np.full(len(settings), np.nan) for name in METRICS
+                },
+                f_diff=self._characteristics.largest_change(settings),
+                f_num_diff=self._characteristics.number_changed(settings),
+            )
+        )
         return future
 
     def close(self) -> None: ...

@@ -22,18 +22,37 @@ def drive_of(*vehicles: tuple[float, float, float, float]) -> SimulationRuns:
         braking = np.maximum(time - begins - delay, 0.0)
         speed = np.maximum(v - deceleration * braking, 0.0)
         braking = np.minimum(braking, v / deceleration)
-        place = np.where(time < begins + delay, v * time, v * (begins + delay) + v * braking - deceleration * braking**2 / 2)
+        place = np.where(
+            time < begins + delay, v * time, v * (begins + delay) + v * braking - deceleration * braking**2 / 2
+        )
         columns.append((speed, place, np.where(time >= begins, 1.0, 0.0), np.where(time >= begins + delay, 1.0, 0.0)))
     speed, place, brake, pedal = (np.stack(part, axis=1) for part in zip(*columns, strict=True))
     hit = place >= OBSTACLE
     collision_speed = np.where(hit.any(axis=0), speed[np.argmax(hit, axis=0), np.arange(len(vehicles))], np.nan)
     active = np.cumsum(hit, axis=0) <= 1
     nothing, throttle = np.zeros_like(speed), np.zeros_like(speed)
-    trace = Trace(step=STEP, vehicle_length=5.0, time=time, position=place, speed=speed, gap=OBSTACLE - place, lateral=nothing,
-                  lateral_speed=nothing, throttle=throttle, brake=brake, gear=nothing, active=active, pedal=pedal)
+    trace = Trace(
+        step=STEP,
+        vehicle_length=5.0,
+        time=time,
+        position=place,
+        speed=speed,
+        gap=OBSTACLE - place,
+        lateral=nothing,
+        lateral_speed=nothing,
+        throttle=throttle,
+        brake=brake,
+        gear=nothing,
+        active=active,
+        pedal=pedal,
+    )
     outcome = np.where(np.isnan(collision_speed), Outcome.STOPPED.value, Outcome.COLLISION.value)
-    return SimulationRuns(trace=trace, encounter=Encounter(trace.gap, trace.gap, speed, trace.gap > 0), outcome=outcome,
-                  collision_speed=collision_speed)
+    return SimulationRuns(
+        trace=trace,
+        encounter=Encounter(trace.gap, trace.gap, speed, trace.gap > 0),
+        outcome=outcome,
+        collision_speed=collision_speed,
+    )
 
 
 def compared(one: tuple[float, float, float, float], other: tuple[float, float, float, float]) -> BrakingComparison:
@@ -44,13 +63,17 @@ def compared(one: tuple[float, float, float, float], other: tuple[float, float, 
 SAME = (10.0, 15.0, 0.2, 6.0)
 
 
-@pytest.mark.parametrize(("other", "part", "lost"), [
-    ((10.0, 13.5, 0.2, 6.0), "gap", 1.5),
-    ((10.0, 15.0, 0.4, 6.0), "delay", 10 * 0.2),
-    ((10.0, 15.0, 0.2, 5.0), "deceleration", 100 / 10 - 100 / 12),
-    ((11.0, 15.0, 0.2, 6.0), "speed", 1 * 0.2 + (121 - 100) / 12),
-    ((10.0, 15.0, 0.2, 3.5), "deceleration", 100 / 7 - 100 / 12),  # which hits
-    ((8.0, 15.0, 0.2, 6.0), "speed", -2 * 0.2 - (100 - 64) / 12)])  # which gains
+@pytest.mark.parametrize(
+    ("other", "part", "lost"),
+    [
+        ((10.0, 13.5, 0.2, 6.0), "gap", 1.5),
+        ((10.0, 15.0, 0.4, 6.0), "delay", 10 * 0.2),
+        ((10.0, 15.0, 0.2, 5.0), "deceleration", 100 / 10 - 100 / 12),
+        ((11.0, 15.0, 0.2, 6.0), "speed", 1 * 0.2 + (121 - 100) / 12),
+        ((10.0, 15.0, 0.2, 3.5), "deceleration", 100 / 7 - 100 / 12),  # which hits
+        ((8.0, 15.0, 0.2, 6.0), "speed", -2 * 0.2 - (100 - 64) / 12),
+    ],
+)  # which gains
 def test_one_difference_is_one_part(other: tuple[float, float, float, float], part: str, lost: float) -> None:
     comparison = compared(SAME, other)
     assert comparison.parts[part] == pytest.approx(lost, abs=0.05)
@@ -88,7 +111,7 @@ def test_pulses_are_one_braking() -> None:
     runs = drive_of(SAME, SAME)
     for share in (0.95, 0.25):
         at = int(np.argmax(runs.trace.speed[:, 1] < share * 10))
-        runs.trace.brake[at:at + 50, 1] = 0.0
+        runs.trace.brake[at : at + 50, 1] = 0.0
     assert summarise_run(runs, 1, 1.0).braking == summarise_run(runs, 0, 1.0).braking is not None
 
 
@@ -108,11 +131,22 @@ def test_a_creeping_deceleration_is_no_late_pedal() -> None:
     assert "decelerates less with the pedal down" in sentence(comparison)
 
 
-@pytest.mark.parametrize(("original_gain", "changed_gain", "phrase"), [
-    (0.0, 3.0, "because it speeds up while the pedal moves and the gear changes from 0 to 2 (from 10.00 to 10.60 instead of from 10.00 to"),
-    (1.0, 3.0, "because it speeds up more while the pedal moves"), (3.0, 1.0, "because it speeds up less while the pedal moves"),
-    (3.0, 0.0, "because it does not speed up while the pedal moves")])
-def test_a_vehicle_that_speeds_up_while_its_pedal_moves_does_not_slow_less(original_gain: float, changed_gain: float, phrase: str) -> None:
+@pytest.mark.parametrize(
+    ("original_gain", "changed_gain", "phrase"),
+    [
+        (
+            0.0,
+            3.0,
+            "because it speeds up while the pedal moves and the gear changes from 0 to 2 (from 10.00 to 10.60 instead of from 10.00 to",
+        ),
+        (1.0, 3.0, "because it speeds up more while the pedal moves"),
+        (3.0, 1.0, "because it speeds up less while the pedal moves"),
+        (3.0, 0.0, "because it does not speed up while the pedal moves"),
+    ],
+)
+def test_a_vehicle_that_speeds_up_while_its_pedal_moves_does_not_slow_less(
+    original_gain: float, changed_gain: float, phrase: str
+) -> None:
     """The pedal moves for 0.2 s, in which the vehicles gain speed; then both decelerate alike."""
     runs = drive_of(SAME, SAME)
     for column, gain in enumerate((original_gain, changed_gain)):

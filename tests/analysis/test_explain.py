@@ -71,20 +71,30 @@ def test_every_minimal_cause_is_unsafe_and_no_proper_subset_of_it_is(case: Case,
     causes = [cause.changes for one in explained.explanations for cause in one.causes]
     assert causes
     assert all(collides(case, causes))
-    proper = [dict(subset) for changes in causes for size in range(len(changes)) for subset in combinations(changes.items(), size)]
+    proper = [
+        dict(subset)
+        for changes in causes
+        for size in range(len(changes))
+        for subset in combinations(changes.items(), size)
+    ]
     assert not any(collides(case, proper))
 
 
 @pytest.mark.slow
 def test_a_command_has_as_many_digits_as_it_needs(case: Case, explained: Explained) -> None:
     causes = [cause for one in explained.explanations for cause in one.causes]
-    settings = [case.characteristics.setting(values, "test") for cause in causes
-                for values in (cause.changes, cause.short_changes, cause.short_boundary)]
+    settings = [
+        case.characteristics.setting(values, "test")
+        for cause in causes
+        for values in (cause.changes, cause.short_changes, cause.short_boundary)
+    ]
     evaluations = evaluate(assemble(case.study), np.array(settings))
     exact, short, boundary = (evaluations.f_safe[start::3] for start in range(3))
     assert np.abs(exact - short).max() < 0.01
     assert (boundary < 0).all()
-    digits = [len(f"{value!r}".replace(".", "").strip("0")) for cause in causes for value in cause.short_changes.values()]
+    digits = [
+        len(f"{value!r}".replace(".", "").strip("0")) for cause in causes for value in cause.short_changes.values()
+    ]
     assert max(digits) <= 8
     assert np.median(digits) <= 5
 
@@ -94,8 +104,13 @@ def test_every_boundary_is_unsafe_and_just_below_it_is_safe(case: Case, explaine
     causes = [cause for one in explained.explanations for cause in one.causes]
     assert all(collides(case, [cause.boundary for cause in causes]))
     original = dict(zip(case.characteristics.names, case.characteristics.original, strict=True))
-    below = [{name: original[name] + (cause.fraction - 2 * RESOLUTION) * (value - original[name]) for name, value in cause.changes.items()}
-             for cause in causes]
+    below = [
+        {
+            name: original[name] + (cause.fraction - 2 * RESOLUTION) * (value - original[name])
+            for name, value in cause.changes.items()
+        }
+        for cause in causes
+    ]
     assert not any(collides(case, below))
 
 
@@ -105,8 +120,19 @@ def test_the_records_are_those_of_the_solutions(case: Case, explained: Explained
     *records, last = json.loads(json.dumps(explained.to_dict(), allow_nan=False))
     output = [str(handle) for handle in handles_of(case.solutions)]
     for one in records:
-        assert list(one) == ["algorithm", "run", "index", "setting", "outcome", "safety_degree", "changed", "minimal_causes", "robustness",
-                             "because", "reasons"]
+        assert list(one) == [
+            "algorithm",
+            "run",
+            "index",
+            "setting",
+            "outcome",
+            "safety_degree",
+            "changed",
+            "minimal_causes",
+            "robustness",
+            "because",
+            "reasons",
+        ]
         row = case.solutions.iloc[output.index(f"{one['algorithm']}:{one['run']}:{one['index']}")]
         assert one["setting"] == row[list(case.characteristics.names)].to_dict()
         assert (one["outcome"], one["safety_degree"]) == (row["outcome"], row["safety_degree"])
@@ -142,7 +168,9 @@ def test_the_failure_to_lead_with_is_the_smallest_that_is_not_borderline(case: C
     (robust,) = [one for one in explained.explanations if "smallest robust" in one.reasons]
     assert explained.explanations[0] == robust
     assert robust.robustness.share >= 0.8
-    crashes = case.solutions[case.solutions["outcome"] == "collision"].sort_values(["f_num_diff", "f_diff", "f_safe"], kind="stable")
+    crashes = case.solutions[case.solutions["outcome"] == "collision"].sort_values(
+        ["f_num_diff", "f_diff", "f_safe"], kind="stable"
+    )
     settings = crashes[list(case.characteristics.names)].to_numpy()
     place = next(i for i, setting in enumerate(settings) if setting.tolist() == list(robust.setting.values()))
     if place:
@@ -154,7 +182,9 @@ def test_the_failure_to_lead_with_is_the_smallest_that_is_not_borderline(case: C
 def test_a_named_solution_is_explained_whatever_it_is(case: Case) -> None:
     safe = case.solutions["f_safe"].idxmax()
     handle = str(handles_of(case.solutions)[safe])
-    (one,) = explain_failures(case, ExplainOptions(solutions=(handle,), unsafe="collision"), pool=InlinePool()).explanations
+    (one,) = explain_failures(
+        case, ExplainOptions(solutions=(handle,), unsafe="collision"), pool=InlinePool()
+    ).explanations
     assert (str(one.handle), one.causes, one.reasons) == (handle, (), ("requested",))
     with pytest.raises(InputError, match="nsga2:7:0"):
         explain_failures(case, ExplainOptions(solutions=("nsga2:7:0",)), pool=InlinePool())
@@ -166,8 +196,14 @@ def test_nothing_unsafe_is_an_answer(slippery: Path) -> None:
     assert (done.exit_code, only["summary"]["necessary"], only["summary"]["changed"]) == (0, {}, {})
 
 
-@pytest.mark.parametrize(("arguments", "says"), [
-    (["--unsafe", "bad"], "below=X"), (["--unsafe", "below=nan"], "below=X"), (["--solution", "nsga2"], "ALGORITHM:RUN:N")])
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["--unsafe", "bad"], "below=X"),
+        (["--unsafe", "below=nan"], "below=X"),
+        (["--solution", "nsga2"], "ALGORITHM:RUN:N"),
+    ],
+)
 def test_what_cannot_be_read_is_refused(slippery: Path, arguments: list[str], says: str) -> None:
     done = CliRunner().invoke(commands, ["explain", str(slippery), "--jobs", "1", *arguments])
     assert isinstance(done.exception, InputError)
@@ -185,13 +221,16 @@ def test_the_answer_takes_ten_lines_and_the_rest_is_asked_for(explained: Explain
     """The vehicle covers v dt between two decisions: that is how high the sawtooth of a profile is."""
     short, full = printed(explained, full=False).splitlines(), printed(explained, full=True)
     assert len(short) <= 10
-    assert short[:-1] == full.splitlines()[:len(short) - 1]
+    assert short[:-1] == full.splitlines()[: len(short) - 1]
     assert short[-1].endswith("python -m safevar_sumo explain here --full")
-    assert short[1:1 + len(explained.sentences())] == explained.sentences()
+    assert short[1 : 1 + len(explained.sentences())] == explained.sentences()
     assert_tells_a_manager(short[1], explained)
     braking = explained.explanations[0].because.original.braking
     assert braking is not None
-    assert f"decides every 0.05 s, in which the vehicle covers {braking.speed * 0.05:.2f} m at {braking.speed:.1f} m/s" in full
+    assert (
+        f"decides every 0.05 s, in which the vehicle covers {braking.speed * 0.05:.2f} m at {braking.speed:.1f} m/s"
+        in full
+    )
     assert re.search(r"max_rpm 5800 -> \d+ r/min", full), "28 r/min are no change at all: no decimals"
     assert not re.search(r"max_rpm 5800 -> \d+\.", full)
 
@@ -201,16 +240,22 @@ def assert_tells_a_manager(paragraph: str, explained: Explained) -> None:
     by_reason = {reason: one for one in explained.explanations for reason in one.reasons}
     fewest, robust = by_reason["fewest changes"], by_reason["smallest robust"]
     degree = float(explained.original.f_safe[0])
-    assert paragraph.startswith(f"With the weather 'wet leaves', the original vehicle stops {degree:.2f} m short of the pedestrian. ")
+    assert paragraph.startswith(
+        f"With the weather 'wet leaves', the original vehicle stops {degree:.2f} m short of the pedestrian. "
+    )
     as_few = len(robust.changed) == len(fewest.changed)
     for one in (robust,) if as_few else (fewest, robust):
         word = "borderline: only" if one.robustness.borderline else "robust:"
         share = f"{word} {100 * one.robustness.share:.0f} % of the neighbours are unsafe too"
         needed, number = len(one.causes[0].changes), len(one.changed)
         step, least = min(one.robustness.shares_by_step.items(), key=lambda item: item[1])
-        exception = f", but only {100 * least:.0f} % with a step of {step:g} s" if least < 0.8 <= one.robustness.share else ""
+        exception = (
+            f", but only {100 * least:.0f} % with a step of {step:g} s" if least < 0.8 <= one.robustness.share else ""
+        )
         speed = -(one.safety_degree or 0)
-        collision = re.escape(f"a collision at {speed:.1f} m/s, {3.6 * speed:.0f} km/h ({one.handle}, {share}{exception})")
+        collision = re.escape(
+            f"a collision at {speed:.1f} m/s, {3.6 * speed:.0f} km/h ({one.handle}, {share}{exception})"
+        )
         if needed < number:
             counts = rf"{NUMBER_WORDS[number]} changes: [^;]*; {NUMBER_WORDS[needed]} of them suffice"
             assert re.search(rf"{collision} was found with {counts}", paragraph, re.IGNORECASE)
@@ -219,8 +264,10 @@ def assert_tells_a_manager(paragraph: str, explained: Explained) -> None:
     assert ("The robust failure with the fewest changes: " in paragraph) is not as_few
     members = CharacteristicSet.of(explained.study.vehicle.characteristics)
     fewest = robust if as_few else fewest
-    largest = max((member for member in members if member.name in fewest.changed),
-                  key=lambda member: abs(fewest.setting[member.name] / member.original - 1))
+    largest = max(
+        (member for member in members if member.name in fewest.changed),
+        key=lambda member: abs(fewest.setting[member.name] / member.original - 1),
+    )
     assert f"{largest.short_name} {100 * (fewest.setting[largest.name] / largest.original - 1):+.0f} %" in paragraph
     shares = explained.preventability.shares
     assert f"a competent driver avoids {share_in_words(shares.competent_driver)} ({shares.later})" in paragraph
@@ -240,7 +287,11 @@ def test_the_summary_of_a_study_leads_with_the_answer(case: Case, explained: Exp
     assert [paragraph, count] == explained.sentences()[:2]
     assert len(others) >= len(explained.choices)
     for failure in explained.choices:
-        (line,) = [line for line in others if line.startswith(f"{failure.title.capitalize()}: {failure.handle}, collision, SD ")]
+        (line,) = [
+            line
+            for line in others
+            if line.startswith(f"{failure.title.capitalize()}: {failure.handle}, collision, SD ")
+        ]
         assert failure.cause is not None
         named = re.findall(r"(\w+) [\d.]+ -> ", line.partition(" These changes alone cause it: ")[2])
         assert named == list(failure.cause.changes)
@@ -260,11 +311,15 @@ def test_where_nothing_collides_the_verdict_says_so_first(case: Case, share: flo
         answer = explain_failures(screened, ExplainOptions(), pool=InlinePool())
         distinct = few.drop_duplicates(list(case.characteristics.names))
         assert [first, count] == answer.sentences()[:2]
-        assert first.startswith(f"No collision in {len(distinct)} vehicles; the worst {degrees} {few['f_safe'].min():.2f} m short of the "
-                                f"pedestrian, the original {degree:.2f} m, with the weather 'wet leaves'. ")
+        assert first.startswith(
+            f"No collision in {len(distinct)} vehicles; the worst {degrees} {few['f_safe'].min():.2f} m short of the "
+            f"pedestrian, the original {degree:.2f} m, with the weather 'wet leaves'. "
+        )
         below = int((distinct["f_safe"] < degree / 2).sum())
-        assert count == (f"{below} of {len(distinct)} different vehicles are unsafe: safety degree below {degree / 2:.3g} m "
-                         "(half of the original's, a screening limit).")
+        assert count == (
+            f"{below} of {len(distinct)} different vehicles are unsafe: safety degree below {degree / 2:.3g} m "
+            "(half of the original's, a screening limit)."
+        )
         assert ("Nothing unsafe was found." in first) is (below == 0)
         command = "explain out" if below else "tolerance out"
         assert more.endswith(f": python -m safevar_sumo {command}")
@@ -282,8 +337,12 @@ def test_all_smallest_unsafe_subsets_and_no_other_whatever_the_outcomes(table: l
 
     setting = np.where(full >> np.arange(5) & 1, 9.0, ORIGINAL)
     columns = np.flatnonzero(setting != ORIGINAL).tolist()
-    unsafe = [set(subset) for size in range(len(columns) + 1) for subset in combinations(columns, size)
-              if table[sum(1 << column for column in subset)]]
+    unsafe = [
+        set(subset)
+        for size in range(len(columns) + 1)
+        for subset in combinations(columns, size)
+        if table[sum(1 << column for column in subset)]
+    ]
     smallest = [subset for subset in unsafe if len(subset) == min(map(len, unsafe))]
     (result,) = find_minimal_causes(made_up_evaluator(5, outcome), setting[np.newaxis], COLLISION)
     assert [set(cause.columns) for cause in result] == smallest
@@ -312,7 +371,9 @@ def test_subsets_are_made_a_limited_number_at_a_time(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(causes_module, "_Subset", Counted)
     monkeypatch.setattr(causes_module, "MAX_SUBSETS", 10)
     result = find_minimal_causes(evaluator, settings, COLLISION)
-    assert [[cause.columns for cause in row] for row in result] == [[cause.columns for cause in row] for row in expected]
+    assert [[cause.columns for cause in row] for row in result] == [
+        [cause.columns for cause in row] for row in expected
+    ]
     assert most <= 2 * 10 + 2, "a batch, and the next one while it is made"
 
 
@@ -338,7 +399,9 @@ def test_nothing_is_shrunk_into_what_the_filter_takes_for_no_change() -> None:
 
 def test_a_boundary_that_ends_where_nothing_can_be_simulated_says_so() -> None:
     study = made_up_study(1)
-    evaluator = Evaluator(study, Plant(study, lambda rows: rows[:, 0] > 7, failing=lambda rows: (rows[:, 0] > 6) & (rows[:, 0] <= 7)))
+    evaluator = Evaluator(
+        study, Plant(study, lambda rows: rows[:, 0] > 7, failing=lambda rows: (rows[:, 0] > 6) & (rows[:, 0] <= 7))
+    )
     (causes,) = find_minimal_causes(evaluator, np.array([[9.0]]), COLLISION)
     (result,) = find_boundaries(evaluator, causes, COLLISION)
     assert (result.setting[0], result.state_below) == (pytest.approx(7, abs=1e-3), BoundaryState.NOT_SIMULATED)
@@ -348,7 +411,9 @@ def test_necessary_and_changed_over_failures() -> None:
     evaluator = made_up_evaluator(3, lambda settings: box(settings) | (settings[:, 2] > 9))
     settings = np.array([[9.0, 1.0, 5.0], [9.0, 1.0, 8.0], [9.0, 1.0, 9.5]])
     causes = find_minimal_causes(evaluator, settings, COLLISION)
-    frame = necessity_frame(evaluator.characteristics, evaluator.characteristics.changed(settings), causes, 3).set_index("characteristic")
+    frame = necessity_frame(
+        evaluator.characteristics, evaluator.characteristics.changed(settings), causes, 3
+    ).set_index("characteristic")
     assert frame["changed"].to_dict() == pytest.approx({"a": 1, "b": 1, "c": 2 / 3})
     assert frame["necessary"].to_dict() == pytest.approx({"a": 2 / 3, "b": 2 / 3, "c": 1 / 3})
     assert frame["necessary_lower"].equals(frame["necessary"]), "of all failures the shares are exact"
@@ -368,58 +433,110 @@ def test_more_failures_than_can_be_afforded_are_sampled_and_always_the_same() ->
     assert 0 < len(few) < 50
     assert select_affordable_rows(settings, evaluator, 10**6) == list(range(50))
     settings[:, 3:] = ORIGINAL
-    assert len(select_affordable_rows(settings, evaluator, 70)) == 10, "of three changes no, one and two of them: 1 + 3 + 3 simulations"
+    assert len(select_affordable_rows(settings, evaluator, 70)) == 10, (
+        "of three changes no, one and two of them: 1 + 3 + 3 simulations"
+    )
 
 
 def test_robustness_in_words_says_where_a_time_step_disagrees() -> None:
     assert str(Robustness({0.05: 1.0, 0.025: 1.0, 0.1: 0.53})).endswith("too, but only 53 % with a step of 0.1 s")
-    assert str(Robustness({0.05: 0.5, 0.025: 0.4, 0.1: 0.3})) == "borderline: only 40 % of the neighbours are unsafe too"
+    assert (
+        str(Robustness({0.05: 0.5, 0.025: 0.4, 0.1: 0.3})) == "borderline: only 40 % of the neighbours are unsafe too"
+    )
 
 
 SUN = load_study("sun")
 ORIGINALS = {name: table.original for name, table in SUN.vehicle.characteristics.items()}
 
 
-def failure_of(changes: dict[str, float], degree: float, *reasons: str, needed: int = 0, shares: tuple[float, ...] = ()) -> Explanation:
+def failure_of(
+    changes: dict[str, float], degree: float, *reasons: str, needed: int = 0, shares: tuple[float, ...] = ()
+) -> Explanation:
     """A robust failure of `SUN`, with a cause of the first `needed` of its changes for each of these shares."""
-    run, part = RunSummary("stopped", np.nan, None, np.nan, np.nan), dict(list(changes.items())[:needed or len(changes)])
-    causes = [Cause(changes=part, boundary=part, fraction=1.0, alone=part, outcome="collision", safety_degree=-1.0,
-                    neighbours=Robustness({0.05: share})) for share in shares or (0.98,)]
-    return Explanation(handle=SolutionId("rs", 0, round(-10 * degree)), setting={**ORIGINALS, **changes}, outcome="collision",
-                       safety_degree=degree, changed=tuple(changes), causes=tuple(causes), robustness=Robustness({0.05: 0.98}),
-                       because=BrakingComparison(run, run, {}), reasons=reasons)
+    run, part = (
+        RunSummary("stopped", np.nan, None, np.nan, np.nan),
+        dict(list(changes.items())[: needed or len(changes)]),
+    )
+    causes = [
+        Cause(
+            changes=part,
+            boundary=part,
+            fraction=1.0,
+            alone=part,
+            outcome="collision",
+            safety_degree=-1.0,
+            neighbours=Robustness({0.05: share}),
+        )
+        for share in shares or (0.98,)
+    ]
+    return Explanation(
+        handle=SolutionId("rs", 0, round(-10 * degree)),
+        setting={**ORIGINALS, **changes},
+        outcome="collision",
+        safety_degree=degree,
+        changed=tuple(changes),
+        causes=tuple(causes),
+        robustness=Robustness({0.05: 0.98}),
+        because=BrakingComparison(run, run, {}),
+        reasons=reasons,
+    )
 
 
 def answer_of(*failures: Explanation) -> Explained:
     system = assemble(SUN)
     original, characteristics = evaluate(system, system.characteristics.original[np.newaxis]), system.characteristics
     return Explained(
-        study=SUN, unsafe=COLLISION, original=original, nearest=original.take([]), explanations=failures, looked_at=9, failures=1,
-        necessity=necessity_frame(characteristics, np.zeros((0, len(ORIGINALS)), dtype=bool), [], 0), analysed=0, otherwise=0,
-        distinct=count_distinct_causes(characteristics, []), preventability=Preventability(counts={}, collisions=0, later=0))
+        study=SUN,
+        unsafe=COLLISION,
+        original=original,
+        nearest=original.take([]),
+        explanations=failures,
+        looked_at=9,
+        failures=1,
+        necessity=necessity_frame(characteristics, np.zeros((0, len(ORIGINALS)), dtype=bool), [], 0),
+        analysed=0,
+        otherwise=0,
+        distinct=count_distinct_causes(characteristics, []),
+        preventability=Preventability(counts={}, collisions=0, later=0),
+    )
 
 
 def test_the_verdict_names_the_most_robust_cause_and_says_how_robust_it_is() -> None:
-    one = failure_of({"tireFric": 1.04, "radius": 32.05, "mass": 2500.0}, -1.5, "fewest changes", "smallest robust", needed=2,
-                     shares=(0.02, 0.44))
+    one = failure_of(
+        {"tireFric": 1.04, "radius": 32.05, "mass": 2500.0},
+        -1.5,
+        "fewest changes",
+        "smallest robust",
+        needed=2,
+        shares=(0.02, 0.44),
+    )
     paragraph = " ".join(verdict_in_words(answer_of(one)))
     assert "a collision at 1.5 m/s, 5 km/h (rs:0:15, robust: 98 % of" in paragraph.lower()
     assert "; two of them suffice (borderline: only 44 % of the neighbours are unsafe too)." in paragraph
 
 
 def test_the_verdict_leads_with_the_robust_failure_if_it_has_as_few_changes() -> None:
-    severe, robust, larger = (failure_of(changes, degree, reason) for changes, degree, reason in (
-        ({"radius": 32.0}, -3.0, "fewest changes"), ({"radius": 33.0}, -1.0, "smallest robust"),
-        ({"radius": 34.0, "mass": 2600.0}, -1.0, "smallest robust")))
+    severe, robust, larger = (
+        failure_of(changes, degree, reason)
+        for changes, degree, reason in (
+            ({"radius": 32.0}, -3.0, "fewest changes"),
+            ({"radius": 33.0}, -1.0, "smallest robust"),
+            ({"radius": 34.0, "mass": 2600.0}, -1.0, "smallest robust"),
+        )
+    )
     for other, leads in ((robust, "rs:0:10"), (larger, "rs:0:30")):
         assert re.findall(r"rs:0:\d+", " ".join(verdict_in_words(answer_of(other, severe)))) == [leads]
 
 
-@pytest.mark.parametrize(("weather", "words"), [
-    ("hard_rain", "In hard rain, the original"),
-    ("carla_hard_rain", "In hard rain (which changes neither road nor sensors), the original"),
-    ({"name": "black ice", "road_friction": 0.2, "visibility": 1.0}, "With the weather 'black ice', the original"),
-    ({"name": "wet", "road_friction": 0.9, "visibility": 1.0}, "With the weather 'wet', the original")])
+@pytest.mark.parametrize(
+    ("weather", "words"),
+    [
+        ("hard_rain", "In hard rain, the original"),
+        ("carla_hard_rain", "In hard rain (which changes neither road nor sensors), the original"),
+        ({"name": "black ice", "road_friction": 0.2, "visibility": 1.0}, "With the weather 'black ice', the original"),
+        ({"name": "wet", "road_friction": 0.9, "visibility": 1.0}, "With the weather 'wet', the original"),
+    ],
+)
 def test_a_weather_that_is_not_shipped_is_named(weather: str | dict[str, Any], words: str) -> None:
     system = assemble(load_study("smoke", weather=weather))
     assert situation_in_words(system, evaluate(system, system.characteristics.original[np.newaxis])).startswith(words)

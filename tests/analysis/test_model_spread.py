@@ -34,17 +34,26 @@ def test_the_models_error_makes_the_band_wider_with_the_distance_from_the_origin
     for name, share in (("tireFric", -0.75), ("dampRateZeroT_CE", -0.5)):
         i = list(ch.names).index(name)
         settings[1, i] += share * (ch.upper[i] - ch.lower[i])
-    for here, wide, more in zip(compute_model_spreads(bare, settings), compute_model_spreads(study, settings),
-                                (0.4 * 0.3, 0.4 * 0.8125**0.5), strict=True):
+    for here, wide, more in zip(
+        compute_model_spreads(bare, settings),
+        compute_model_spreads(study, settings),
+        (0.4 * 0.3, 0.4 * 0.8125**0.5),
+        strict=True,
+    ):
         assert here.lower is not None
         assert here.upper is not None
         assert (wide.lower, wide.upper) == pytest.approx((here.lower - more, here.upper + more), abs=1e-9)
 
 
 def test_the_sets_are_simulated_one_by_one() -> None:
-    study = load_study("sun", spread={GAP: [OWN, OWN - 1, OWN + 1]}, repeatability={"safety_degree": 1e-9}, model_error={})
+    study = load_study(
+        "sun", spread={GAP: [OWN, OWN - 1, OWN + 1]}, repeatability={"safety_degree": 1e-9}, model_error={}
+    )
     setting = assemble(study).characteristics.setting({"tireFric": 1.3}, "a test")[np.newaxis]
-    alone = [evaluate(assemble(load_study("sun", ads={"parameters": {"brake_gap": gap}})), setting) for gap in (OWN, OWN - 1, OWN + 1)]
+    alone = [
+        evaluate(assemble(load_study("sun", ads={"parameters": {"brake_gap": gap}})), setting)
+        for gap in (OWN, OWN - 1, OWN + 1)
+    ]
     (band,) = compute_model_spreads(study, setting)
     degrees = [float(one.f_safe[0]) for one in alone]
     assert (band.lower, band.upper) == pytest.approx(np.quantile(degrees, [0.05, 0.95]).tolist(), abs=1e-6)
@@ -68,8 +77,10 @@ def test_another_vehicle_or_driver_has_no_spread_and_lists_are_of_one_length() -
         load_study("sun", spread={"vehicle.parameters.tyre": [5.0, 6.0]})
     own = load_study("sun").vehicle.parameters["tyre_friction"]
     with pytest.raises(InputError, match=r"study 'sun': spread: set 1: vehicle.parameters.tyre_friction = -1.0"):
-        compute_model_spreads(study := load_study("sun", spread={"vehicle.parameters.tyre_friction": [own, -1.0]}),
-                              assemble(study).characteristics.original[np.newaxis])
+        compute_model_spreads(
+            study := load_study("sun", spread={"vehicle.parameters.tyre_friction": [own, -1.0]}),
+            assemble(study).characteristics.original[np.newaxis],
+        )
     with pytest.raises(InputError, match="spread"):
         studies_of_sets(load_study("native"))
 

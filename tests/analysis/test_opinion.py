@@ -46,8 +46,17 @@ ONE = np.ones(1)
 def bmw() -> Plant:
     """The package's vehicle 2 with its own masses."""
     p = parameters_vehicle2()
-    plant = build_plant(p.m * ONE, p.m, LEVEL, radius=p.R_w, wheel_inertia=p.I_y_w, friction=p.tire.p_dx1,
-                        brake_torque=9 * p.m * p.R_w, front_brake_share=p.T_sb, front_drive_share=p.T_se)
+    plant = build_plant(
+        p.m * ONE,
+        p.m,
+        LEVEL,
+        radius=p.R_w,
+        wheel_inertia=p.I_y_w,
+        friction=p.tire.p_dx1,
+        brake_torque=9 * p.m * p.R_w,
+        front_brake_share=p.T_sb,
+        front_drive_share=p.T_se,
+    )
     return plant._replace(sprung_mass=p.m_s * ONE, unsprung_mass=p.m_uf * ONE, height=p.h_s * ONE)
 
 
@@ -64,8 +73,13 @@ def test_the_right_hand_side_is_the_packages(seed: int) -> None:
     acceleration = rng.uniform(-9, 3)
     theirs = vehicle_dynamics_mb(list(x), [0.0, acceleration], p)
     torque, share = p.m * p.R_w * acceleration * ONE, p.T_sb if acceleration < 0 else p.T_se
-    body = MultiBodyState(x[3] * ONE, *(np.array([values]).T for values in (
-        (x[11], x[8], x[16], x[21]), (x[12], x[9], x[17], x[22]), (front, rear), (1.0, 1.0))))
+    body = MultiBodyState(
+        x[3] * ONE,
+        *(
+            np.array([values]).T
+            for values in ((x[11], x[8], x[16], x[21]), (x[12], x[9], x[17], x[22]), (front, rear), (1.0, 1.0))
+        ),
+    )
     torques = np.stack([share * torque, (1 - share) * torque])
     speed, heights, wheels = derivatives(bmw(), body, torques, tyre_forces(bmw(), body).force)
     flat = np.concatenate([speed, *heights, *wheels])
@@ -86,11 +100,18 @@ def stopping_distance(study: str, speed: float, road: float, **changes: float) -
 
 @pytest.mark.slow
 @pytest.mark.parametrize("speed", [8.0, 25.0])
-@pytest.mark.parametrize(("study", "changes", "deceleration"), [
-    ("wear", {"brakeTorque": 0.3}, 0.3 * 16500 / 1575), ("wear", {"brakeTorque": 0.5, "payload": 525.0}, 0.5 * 16500 / 2025),
-    ("sun", {"mass": 2700.0, "radius": 37.0, "maxBrakeTorque": 1200.0}, 4 * 1200 / 0.37 / 2700),
-    ("native", {"decel": 4.0, "mass": 1800.0}, 4.0 * 1500 / 1800)])
-def test_below_the_tyres_limit_braking_is_the_closed_form(study: str, changes: dict[str, float], deceleration: float, speed: float) -> None:
+@pytest.mark.parametrize(
+    ("study", "changes", "deceleration"),
+    [
+        ("wear", {"brakeTorque": 0.3}, 0.3 * 16500 / 1575),
+        ("wear", {"brakeTorque": 0.5, "payload": 525.0}, 0.5 * 16500 / 2025),
+        ("sun", {"mass": 2700.0, "radius": 37.0, "maxBrakeTorque": 1200.0}, 4 * 1200 / 0.37 / 2700),
+        ("native", {"decel": 4.0, "mass": 1800.0}, 4.0 * 1500 / 1800),
+    ],
+)
+def test_below_the_tyres_limit_braking_is_the_closed_form(
+    study: str, changes: dict[str, float], deceleration: float, speed: float
+) -> None:
     """v^2 / 2a with a = F / m, within 3 %."""
     assert stopping_distance(study, speed, 1.0, **changes) == pytest.approx(speed**2 / (2 * deceleration), rel=0.03)
 
@@ -109,7 +130,13 @@ def test_every_characteristic_is_in_the_table_or_outside_and_acts_as_the_table_s
     system, vehicle = assemble_both_systems(study)
     table = vehicle.table
     assert vehicle.name == name
-    section = (Path(__file__).parents[2] / "docs" / "opinion.md").read_text().split(f"### {name}\n")[1].split("\n## ")[0].split("### ")[0]
+    section = (
+        (Path(__file__).parents[2] / "docs" / "opinion.md")
+        .read_text()
+        .split(f"### {name}\n")[1]
+        .split("\n## ")[0]
+        .split("### ")[0]
+    )
     documented = dict(re.findall(r"^\| `(\w+)` \| (.+?) \|", section, flags=re.MULTILINE))
     assert documented == {key: unit for key, unit in VEHICLES[name].UNITS.items() if key not in table.outside}
     assert table.outside.keys() == VEHICLES[name].UNITS.keys() - documented.keys()
@@ -117,7 +144,9 @@ def test_every_characteristic_is_in_the_table_or_outside_and_acts_as_the_table_s
     original = {one.name: one.original * ONE for one in system.characteristics}
 
     def constants(**changes: float) -> list[float]:
-        prepared = vehicle.prepare({**original, **{key: value * ONE for key, value in changes.items()}}, 0.8, 0.05, LEVEL, True)
+        prepared = vehicle.prepare(
+            {**original, **{key: value * ONE for key, value in changes.items()}}, 0.8, 0.05, LEVEL, True
+        )
         flat = [*prepared.plant, prepared.engine_mass, *(vehicle.sensors(prepared) or ())]
         return [float(value) for part in flat for value in np.ravel(part)]
 
@@ -190,20 +219,37 @@ ONE_TEST = {"tests": [{"name": "CPNA", "parameters": {"test": "CPNA", "speed": 4
 
 @pytest.mark.slow
 @pytest.mark.parametrize("made", ["Made", "Wrapping"])
-def test_a_failure_that_our_model_alone_has_is_contradicted(made: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_failure_that_our_model_alone_has_is_contradicted(
+    made: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A vehicle of a user's whose brakes fail for payloads around 300 kg; without brakes at all it fails there too."""
     (tmp_path / f"glitch_{made.lower()}.py").write_text(GLITCHY)
     monkeypatch.syspath_prepend(tmp_path)
-    rows = {name: {"unit": row.unit, "original": row.original, "lower": row.lower, "upper": row.upper}
-            for name, row in load_study("wear").vehicle.characteristics.items()}
-    study = load_study({"extends": "wear", "name": "glitch", "matrix": ONE_TEST,
-                        "vehicle": {"model": f"glitch_{made.lower()}:{made}", "characteristics": rows}})
-    causes = [CauseToJudge("nsga2:0:0", {"payload": 300.0}, 0.9, 1.0), CauseToJudge("nsga2:0:1", {"brakeResponse": 0.4}, 0.9, 1.0)]
+    rows = {
+        name: {"unit": row.unit, "original": row.original, "lower": row.lower, "upper": row.upper}
+        for name, row in load_study("wear").vehicle.characteristics.items()
+    }
+    study = load_study(
+        {
+            "extends": "wear",
+            "name": "glitch",
+            "matrix": ONE_TEST,
+            "vehicle": {"model": f"glitch_{made.lower()}:{made}", "characteristics": rows},
+        }
+    )
+    causes = [
+        CauseToJudge("nsga2:0:0", {"payload": 300.0}, 0.9, 1.0),
+        CauseToJudge("nsga2:0:1", {"brakeResponse": 0.4}, 0.9, 1.0),
+    ]
     planted, true = judge_causes(study, causes, Unsafe()).opinions
     assert msgspec.to_builtins(planted) | {"because": ""} == {
-        "solution": "nsga2:0:0", "changes": {"payload": 300.0},
+        "solution": "nsga2:0:0",
+        "changes": {"payload": 300.0},
         "here": {"outcome": "collision", "safety_degree": planted.here.safety_degree},
-        "there": {"outcome": "passed", "safety_degree": planted.there.safety_degree}, "opinion": "contradicted", "because": ""}
+        "there": {"outcome": "passed", "safety_degree": planted.there.safety_degree},
+        "opinion": "contradicted",
+        "because": "",
+    }
     assert true.opinion == "confirmed"
     assert judge_causes(study, causes, Unsafe()).opinions == (planted, true)
 
@@ -255,13 +301,17 @@ def test_a_cause_that_is_borderline_in_either_model_is_called_borderline() -> No
     study = load_study("rain")
     (here,) = judge_causes(study, [CauseToJudge(None, WORN_TYRES, 0.99, 0.79)], Unsafe()).opinions
     assert (here.opinion, here.because.split(";")[0]) == (
-        "borderline", "with our model borderline: only 79 % of the neighbours are unsafe too")
+        "borderline",
+        "with our model borderline: only 79 % of the neighbours are unsafe too",
+    )
     system, vehicle = assemble_both_systems(study)
     frictions, characteristics = np.linspace(1.0, 3.5, 60), system.characteristics
     settings = np.stack([characteristics.setting({**WORN_TYRES, "tireFric": one}, "cause") for one in frictions])
     runs = evaluate(replace(system, vehicle=vehicle), settings)
     least = float(frictions[runs.collided].max())
-    (there,) = judge_causes(study, [CauseToJudge(None, {**WORN_TYRES, "tireFric": least}, 0.99, 1.0)], Unsafe()).opinions
+    (there,) = judge_causes(
+        study, [CauseToJudge(None, {**WORN_TYRES, "tireFric": least}, 0.99, 1.0)], Unsafe()
+    ).opinions
     assert (there.opinion, there.there.outcome) == ("borderline", "collision")
     assert re.match(r"with the second model only \d\d% of the neighbours are unsafe, too; also unsafe", there.because)
 
@@ -270,8 +320,14 @@ def test_what_cannot_be_represented_at_all_is_refused(tmp_path: Path, monkeypatc
     (tmp_path / "glitch_boat.py").write_text(GLITCHY)
     monkeypatch.syspath_prepend(tmp_path)
     rows = {"sails": {"unit": "m^2", "original": 3.0, "lower": 1.0, "upper": 4.0}}
-    study = load_study({"extends": "wear", "name": "boat", "matrix": ONE_TEST,
-                        "vehicle": {"model": "glitch_boat:Boat", "characteristics": rows}})
+    study = load_study(
+        {
+            "extends": "wear",
+            "name": "boat",
+            "matrix": ONE_TEST,
+            "vehicle": {"model": "glitch_boat:Boat", "characteristics": rows},
+        }
+    )
     with pytest.raises(InputError, match=r"glitch_boat:Boat.*sails"):
         assemble_both_systems(study)
 
@@ -289,7 +345,9 @@ def test_the_command_asks_about_the_failures_or_about_those_named(slippery: Path
         assert (one["there"]["outcome"] is None) == (one["opinion"] == "outside")
         assert all(name in one["because"] for name in outside & set(one["changes"]))
     first, *others = dict.fromkeys(one["solution"] for one in every)
-    some = CliRunner().invoke(commands, ["opinion", str(slippery), "--json", "--solution", first, "--solution", others[0]])
+    some = CliRunner().invoke(
+        commands, ["opinion", str(slippery), "--json", "--solution", first, "--solution", others[0]]
+    )
     assert json.loads(some.stdout) == [one for one in every if one["solution"] in (first, others[0])]
     for alias in (["--solutions", f"{first},{others[0]}"], ["--solutions", first, others[0]]):
         assert CliRunner().invoke(commands, ["opinion", str(slippery), "--json", *alias]).stdout == some.stdout
@@ -298,7 +356,9 @@ def test_the_command_asks_about_the_failures_or_about_those_named(slippery: Path
 
 
 @pytest.mark.slow
-def test_a_report_has_a_badge_for_each_cause_or_says_how_to_install(slippery: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_report_has_a_badge_for_each_cause_or_says_how_to_install(
+    slippery: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     page = make_report([slippery], only=["causes", "reproduce"], jobs=1)
     verdicts = re.findall(r"second vehicle model: (\w+)", page)
     assert len(verdicts) == len(re.findall(r"<h4[^>]*>Cause \d", page)) > 0
@@ -311,10 +371,18 @@ def test_a_report_has_a_badge_for_each_cause_or_says_how_to_install(slippery: Pa
     assert "pip install &#39;.[opinion]&#39;" in without
 
 
-@pytest.mark.parametrize(("typed", "told"), [
-    (("smoke",), "smoke: is a study and has no solutions\nexpected: a directory"),
-    (("nowhere",), "nowhere: is not a results directory: there is no manifest.json\nexpected: a directory written by the command `study`"),
-    (("{}", "--solution", "nsga2:0:999"), "solution nsga2:0:999"), (("{}", "--solutions", "first"), "'first'")])
+@pytest.mark.parametrize(
+    ("typed", "told"),
+    [
+        (("smoke",), "smoke: is a study and has no solutions\nexpected: a directory"),
+        (
+            ("nowhere",),
+            "nowhere: is not a results directory: there is no manifest.json\nexpected: a directory written by the command `study`",
+        ),
+        (("{}", "--solution", "nsga2:0:999"), "solution nsga2:0:999"),
+        (("{}", "--solutions", "first"), "'first'"),
+    ],
+)
 def test_bad_input_is_refused(typed: tuple[str, ...], told: str, slippery: Path) -> None:
     refused("opinion", *(part.format(slippery) for part in typed), message=(told,))
 

@@ -70,12 +70,27 @@ def categories(here: Evaluator, *settings: FloatArray) -> list[PreventableBy | N
 def test_shares_are_told_as_a_range_over_reaction_times_with_two_digits() -> None:
     by, full_braking = PreventableBy, "only full braking at the first possible moment avoids"
     for counts, later, number, words in (
-            ({by.COMPETENT_DRIVER: 5, by.FULL_BRAKING: 1, by.NOBODY: 1}, 3, 7, "of 7 collisions, a competent driver "
-             f"avoids 71 % (43 % if he needs 0.4 s longer), {full_braking} another 14 % and 14 % are physically unavoidable."),
-            ({by.COMPETENT_DRIVER: 999, by.FULL_BRAKING: 1}, 390, 3000, "of 1000 collisions, drawn at random from "
-             f"3000, a competent driver avoids nearly all (39 % if he needs 0.4 s longer) and {full_braking} hardly any."),
-            ({by.FULL_BRAKING: 17}, 0, 17, "of 17 collisions, a competent driver avoids none "
-             f"(none if he needs 0.4 s longer) and {full_braking} all.")):
+        (
+            {by.COMPETENT_DRIVER: 5, by.FULL_BRAKING: 1, by.NOBODY: 1},
+            3,
+            7,
+            "of 7 collisions, a competent driver "
+            f"avoids 71 % (43 % if he needs 0.4 s longer), {full_braking} another 14 % and 14 % are physically unavoidable.",
+        ),
+        (
+            {by.COMPETENT_DRIVER: 999, by.FULL_BRAKING: 1},
+            390,
+            3000,
+            "of 1000 collisions, drawn at random from "
+            f"3000, a competent driver avoids nearly all (39 % if he needs 0.4 s longer) and {full_braking} hardly any.",
+        ),
+        (
+            {by.FULL_BRAKING: 17},
+            0,
+            17,
+            f"of 17 collisions, a competent driver avoids none (none if he needs 0.4 s longer) and {full_braking} all.",
+        ),
+    ):
         assert str(Preventability(counts=counts, collisions=number, later=later)) == f"In the same vehicle, {words}"
 
 
@@ -98,8 +113,13 @@ def test_shares_are_those_of_all_collisions_and_a_sample_is_random() -> None:
     every = collisions(here, *brakeless, *(vehicle(1.0, 1 - k / 1e6) for k in range(20)))
     whole = msgspec.to_builtins(assess_preventability(here, Evaluations.concatenate([every, every])).shares)
     later = whole.pop("later")
-    assert whole == {"competent_driver": pytest.approx(1 / 3), "full_braking": 0, "nobody": pytest.approx(2 / 3), "looked_at": 60,
-                     "interval_competent_driver": [pytest.approx(1 / 3)] * 2}
+    assert whole == {
+        "competent_driver": pytest.approx(1 / 3),
+        "full_braking": 0,
+        "nobody": pytest.approx(2 / 3),
+        "looked_at": 60,
+        "interval_competent_driver": [pytest.approx(1 / 3)] * 2,
+    }
     assert (later["reaction"], later["competent_driver"]) == (pytest.approx(1.15), pytest.approx(1 / 3))
     sample = msgspec.to_builtins(assess_preventability(here, every, max_simulations=90).shares)
     assert sample["looked_at"] == 30
@@ -120,8 +140,9 @@ def test_the_shares_do_not_change_with_the_gear_of_the_calibration_drive(monkeyp
     here, names = Evaluator(rain, InlinePool()), assemble(rain).characteristics.names
     settings = np.tile(here.characteristics.original, (27, 1))
     changed = ("mass", "gearSwitchTime", "max_rpm", "dampRateZeroT_CE", "maxBrakeTorque")
-    settings[:, [names.index(name) for name in changed]] = list(itertools.product(
-        (2690,), (0.41,), (4900, 5030, 5220), (1.0, 1.01, 1.03), (1200, 1203, 1210)))
+    settings[:, [names.index(name) for name in changed]] = list(
+        itertools.product((2690,), (0.41,), (4900, 5030, 5220), (1.0, 1.01, 1.03), (1200, 1203, 1210))
+    )
     evaluations = here.evaluate(settings, "less engine drag, weaker brakes")
     colliding = evaluations.take(evaluations.collided)
     shipped = classify_collisions(here, colliding)
@@ -151,7 +172,7 @@ def test_reference_drivers_approach_as_the_driving_system_does() -> None:
     theirs, his = (simulate(one, original).trace for one in (rain, replace(rain, ads=driver)))
     danger = int(np.argmax(theirs.gap[:, 0] < 2 * theirs.speed[:, 0]))
     assert theirs.speed[danger, 0] > 4
-    assert np.array_equal(theirs.position[:danger + 1], his.position[:danger + 1])
+    assert np.array_equal(theirs.position[: danger + 1], his.position[: danger + 1])
     assert approach_parameters(assemble(evaluator(test="CPFA", speed=30).study)) == {}
 
 
@@ -159,14 +180,19 @@ def test_reference_drivers_approach_as_the_driving_system_does() -> None:
 def test_in_a_matrix_the_worst_point_counts() -> None:
     """The child that comes out late is hit at twice the speed: full braking avoids it, a competent driver does not."""
     speeds = {"CPFA": 20, "CPNCO": 40}
-    tests = [msgspec.structs.replace(one, over={}, parameters={**one.parameters, "speed": speeds[one.name]}, weathers=[])
-             for one in STUDY.matrix.tests if one.name in speeds]
+    tests = [
+        msgspec.structs.replace(one, over={}, parameters={**one.parameters, "speed": speeds[one.name]}, weathers=[])
+        for one in STUDY.matrix.tests
+        if one.name in speeds
+    ]
     study = msgspec.structs.replace(STUDY, ads=BLIND, matrix=msgspec.structs.replace(STUDY.matrix, tests=tests))
     assert categories(Evaluator(study, InlinePool()), vehicle()) == [PreventableBy.FULL_BRAKING]
 
 
-TESTS = [{"name": "CPLA", "model": "along", "over": {"speed": [20, 40]}, "weathers": ["clear", "night"]},
-         {"name": "CPFA", "parameters": {"test": "CPFA"}, "over": {"speed": [30]}}]
+TESTS = [
+    {"name": "CPLA", "model": "along", "over": {"speed": [20, 40]}, "weathers": ["clear", "night"]},
+    {"name": "CPFA", "parameters": {"test": "CPFA"}, "over": {"speed": [30]}},
+]
 
 
 @pytest.fixture(scope="module")
@@ -189,13 +215,20 @@ def failure(system: System, weak: np.ndarray) -> PointComparison:
 
 
 @pytest.mark.slow
-def test_it_fails_where_it_collides_when_simulated_there_alone(system: System, weak: np.ndarray, failure: PointComparison) -> None:
+def test_it_fails_where_it_collides_when_simulated_there_alone(
+    system: System, weak: np.ndarray, failure: PointComparison
+) -> None:
     alone = [point.name for point in system.points if evaluate(system.at(point), weak).collided[0]]
-    assert list(failure.failing_points) == alone == ["CPLA, speed 40, clear", "CPLA, speed 40, night", "CPFA, speed 30, clear"]
+    assert (
+        list(failure.failing_points)
+        == alone
+        == ["CPLA, speed 40, clear", "CPLA, speed 40, night", "CPFA, speed 30, clear"]
+    )
 
 
-def test_both_vehicles_are_compared_at_the_point_where_the_failure_is_worst(system: System, weak: np.ndarray,
-                                                                            failure: PointComparison) -> None:
+def test_both_vehicles_are_compared_at_the_point_where_the_failure_is_worst(
+    system: System, weak: np.ndarray, failure: PointComparison
+) -> None:
     assert failure.braking.changed.safety_degree == evaluate(system, weak).f_safe[0]
     at = next(point for point in system.points if point.name == failure.braking.point)
     original = evaluate(system.at(at), system.characteristics.original[np.newaxis])
@@ -210,21 +243,34 @@ def test_points_in_words() -> None:
 
 
 @pytest.mark.slow
-def test_the_summary_of_a_matrix_names_the_point_of_what_belongs_to_one(system: System, weak: np.ndarray, failure: PointComparison) -> None:
+def test_the_summary_of_a_matrix_names_the_point_of_what_belongs_to_one(
+    system: System, weak: np.ndarray, failure: PointComparison
+) -> None:
     """The original vehicle has one safety degree, that at its worst point; that at another point stands with the point's name."""
     study = load_study("euro_ncap_pedestrian", matrix={"tests": TESTS})
     solutions = solutions_frame(system.characteristics.names, [(("nsga2", 0), evaluate(system, weak))])
     original = evaluate(system, system.characteristics.original[np.newaxis])
     case = build_case(study, record(original, 0), solutions, solutions.iloc[:0], [("nsga2", 0)])
     first, count, there, *_, more = summarise_failures(case, original, InlinePool(), "out")
-    assert first == f"At the worst of 5 test points, the original vehicle passes with a safety degree of {original.f_safe[0]:.2f} m."
+    assert (
+        first
+        == f"At the worst of 5 test points, the original vehicle passes with a safety degree of {original.f_safe[0]:.2f} m."
+    )
     assert count == "1 of 1 different vehicles are unsafe: collision."
     degree = failure.braking.original.safety_degree
     assert degree > original.f_safe[0] + 0.01
-    assert there.startswith(f"At {failure.braking.point}, the original vehicle stops {degree:.2f} m short of the pedestrian. ")
+    assert there.startswith(
+        f"At {failure.braking.point}, the original vehicle stops {degree:.2f} m short of the pedestrian. "
+    )
     assert more.endswith(f": python -m safevar_sumo explain out --point '{failure.braking.point}'")
     whole = explain_failures(case, ExplainOptions(), pool=InlinePool(), statistics=False)
-    tolerated = Tolerance(study=study, unsafe=Unsafe(), original=original, alone=[], pairs=None,
-                          joint=SafeBox(1.0, 0.95, 1, 0, 1, 0.003, ("mass",)))
+    tolerated = Tolerance(
+        study=study,
+        unsafe=Unsafe(),
+        original=original,
+        alone=[],
+        pairs=None,
+        joint=SafeBox(1.0, 0.95, 1, 0, 1, 0.003, ("mass",)),
+    )
     assert whole.sentences()[0].startswith(first)
     assert str(next(iter(tolerated.sentences()))).endswith(first)

@@ -54,21 +54,35 @@ def test_a_default_that_changes_changes_everywhere() -> None:
     assert done.stdout.split() == ["5"] * 3 + ["False", "True"]
 
 
-@pytest.mark.parametrize("options", [ExplainOptions, OpinionOptions, RatingOptions, RiskOptions, RulesOptions, ToleranceOptions])
+@pytest.mark.parametrize(
+    "options", [ExplainOptions, OpinionOptions, RatingOptions, RiskOptions, RulesOptions, ToleranceOptions]
+)
 def test_a_function_takes_and_documents_the_options_of_its_record(options: type[Options]) -> None:
     function = getattr(sv, options.question)
     arguments = inspect.signature(function).parameters
     record = {one.name: one.default for one in fields(options)}
     assert {name: one.default for name, one in list(arguments.items())[1:]} == {
-        **record, "pool": None, "jobs": None, "progress": False, "as_it_is_now": False}
+        **record,
+        "pool": None,
+        "jobs": None,
+        "progress": False,
+        "as_it_is_now": False,
+    }
     heads = re.findall(r"^(\w+)\n    \w", inspect.getdoc(function) or "", re.MULTILINE)
     assert sorted(heads) == sorted([*arguments, "InputError", "SimulationError"])
 
 
-@pytest.mark.parametrize("options", [
-    ExplainOptions(), ExplainOptions(solutions=("nsga2:3:0", "rs:1:2"), unsafe="below=0.5", top=3, limit=12_000),
-    ToleranceOptions(unsafe="collision", characteristics=("mass", "tireFric"), pairs=True), RiskOptions(samples=4000, width=0.01),
-    RulesOptions(samples=4000, unsafe="collision"), OpinionOptions(solutions="nsga2:3:0")])
+@pytest.mark.parametrize(
+    "options",
+    [
+        ExplainOptions(),
+        ExplainOptions(solutions=("nsga2:3:0", "rs:1:2"), unsafe="below=0.5", top=3, limit=12_000),
+        ToleranceOptions(unsafe="collision", characteristics=("mass", "tireFric"), pairs=True),
+        RiskOptions(samples=4000, width=0.01),
+        RulesOptions(samples=4000, unsafe="collision"),
+        OpinionOptions(solutions="nsga2:3:0"),
+    ],
+)
 def test_a_printed_command_asks_for_the_same_options(options: Options) -> None:
     """The command, parsed by its own flags, makes the record that printed it."""
     typed = shlex.split(options.command_line("its results", "CPNA, night"))
@@ -77,13 +91,23 @@ def test_a_printed_command_asks_for_the_same_options(options: Options) -> None:
     given = command.make_context(options.question, typed[4:]).params
     assert given["point"] == "CPNA, night"
     assert type(options)(**{name: given[name] for name in options.definitions()}) == options
-    assert len(typed) == 7 + sum(len(value) * 2 if name == "solutions" else 1 if value is True else 2
-                                 for name, value in vars(options).items() if value != getattr(type(options), name))
+    assert len(typed) == 7 + sum(
+        len(value) * 2 if name == "solutions" else 1 if value is True else 2
+        for name, value in vars(options).items()
+        if value != getattr(type(options), name)
+    )
 
 
-@pytest.mark.parametrize(("typed", "legal"), [
-    ({"samples": 0}, "at least 1 "), ({"samples": 10.5}, "whole number"), ({"confidence": 1.0}, "below 1"),
-    ({"confidence": float("nan")}, "above 0"), ({"width": True}, "a number")])
+@pytest.mark.parametrize(
+    ("typed", "legal"),
+    [
+        ({"samples": 0}, "at least 1 "),
+        ({"samples": 10.5}, "whole number"),
+        ({"confidence": 1.0}, "below 1"),
+        ({"confidence": float("nan")}, "above 0"),
+        ({"width": True}, "a number"),
+    ],
+)
 def test_python_and_the_command_refuse_the_same_values(typed: dict[str, Any], legal: str) -> None:
     with pytest.raises(InputError, match=legal):
         RiskOptions(**typed)
@@ -93,7 +117,9 @@ def test_python_and_the_command_refuse_the_same_values(typed: dict[str, Any], le
 
 
 @pytest.mark.parametrize("question", ["explain", "opinion", "tolerance", "risk", "rules", "rating"])
-def test_a_warning_of_what_has_changed_names_the_callers_line(question: str, slippery: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_warning_of_what_has_changed_names_the_callers_line(
+    question: str, slippery: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("safevar_sumo.campaign.identity.RESULTS", 0)
     monkeypatch.setattr(f"safevar_sumo.analysis.{question}.answer_question", lambda *_: None)
     with pytest.warns(UserWarning, match="simulated as it is now") as caught:
@@ -103,9 +129,15 @@ def test_a_warning_of_what_has_changed_names_the_callers_line(question: str, sli
 
 @pytest.mark.slow
 def test_the_same_bytes_whatever_the_number_of_workers(slippery: Path) -> None:
-    commanded = (["explain", str(slippery)], ["tolerance", str(slippery), "--characteristics", "mass,tireFric", "--pairs"],
-                 ["risk", str(slippery), "--samples", "300"], ["rules", str(slippery), "--samples", "1000"])
+    commanded = (
+        ["explain", str(slippery)],
+        ["tolerance", str(slippery), "--characteristics", "mass,tireFric", "--pairs"],
+        ["risk", str(slippery), "--samples", "300"],
+        ["rules", str(slippery), "--samples", "1000"],
+    )
     for arguments in commanded:
-        one, two, again = (CliRunner().invoke(commands, [*arguments, "--json", "--jobs", jobs]).stdout for jobs in ("1", "2", "2"))
+        one, two, again = (
+            CliRunner().invoke(commands, [*arguments, "--json", "--jobs", jobs]).stdout for jobs in ("1", "2", "2")
+        )
         assert one == two == again
         assert one

@@ -42,10 +42,11 @@ def islands(beta: float) -> Limit:
 
 def rare(limit: Limit, n: int, seed: int = 1, **options: object) -> Risk:
     study = made_up_study(n)
-    study = msgspec.structs.replace(study, search=msgspec.structs.replace(study.search, seed=seed), variation={"a": Uniform()})
+    study = msgspec.structs.replace(
+        study, search=msgspec.structs.replace(study.search, seed=seed), variation={"a": Uniform()}
+    )
     plant = Plant(study, lambda settings: limit(of_normal(settings)) < 0, lambda settings: limit(of_normal(settings)))
-    return risk(study, unsafe="collision", pool=plant, progress=passes_no_end,
-                **{"rare": True, **options})  # type: ignore[arg-type]
+    return risk(study, unsafe="collision", pool=plant, progress=passes_no_end, **{"rare": True, **options})  # type: ignore[arg-type]
 
 
 def passes_no_end(stage: str, done: int, total: int) -> None:
@@ -61,9 +62,16 @@ def radius_of(probability: float, n: int) -> float:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("method", "shape", "n", "probability"), [
-    ("subset_simulation", "linear", 3, 1e-4), ("subset_simulation", "linear", 8, 1e-6), ("subset_simulation", "curved", 2, 1e-4),
-    ("subset_simulation", "curved", 4, 1e-6), ("cross_entropy", "linear", 8, 1e-6)])
+@pytest.mark.parametrize(
+    ("method", "shape", "n", "probability"),
+    [
+        ("subset_simulation", "linear", 3, 1e-4),
+        ("subset_simulation", "linear", 8, 1e-6),
+        ("subset_simulation", "curved", 2, 1e-4),
+        ("subset_simulation", "curved", 4, 1e-6),
+        ("cross_entropy", "linear", 8, 1e-6),
+    ],
+)
 def test_analytic_probabilities_over_twenty_seeds(method: str, shape: str, n: int, probability: float) -> None:
     limit = linear(beta_of(probability)) if shape == "linear" else curved(radius_of(probability, n))
     estimates = [rare(limit, n, seed, method=method) for seed in range(20)]
@@ -134,13 +142,18 @@ def test_a_pilot_that_cannot_be_simulated_is_not_called_unsafe() -> None:
 def test_the_limit_of_rare_failures_has_one_owner(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(compute, "RARE_BELOW", 0.02)
     monkeypatch.setattr(compute, "find_spec", lambda name: None)
-    assert rare(linear(beta_of(1e-3)), 2, rare=False).remark.startswith("fewer than 2 % of the first vehicles are unsafe; ")
+    assert rare(linear(beta_of(1e-3)), 2, rare=False).remark.startswith(
+        "fewer than 2 % of the first vehicles are unsafe; "
+    )
 
 
 def test_a_share_of_the_domain_is_counted_whatever_is_installed() -> None:
     """Without [variation] it is no probability, and the shares of `risk`, `rules` and a report are counted on the same vehicles."""
     study = made_up_study(2)
-    assert risk(study, unsafe="collision", pool=Plant(study, lambda rows: rows[:, 0] > 9.99), samples=3000).method == "monte_carlo"
+    assert (
+        risk(study, unsafe="collision", pool=Plant(study, lambda rows: rows[:, 0] > 9.99), samples=3000).method
+        == "monte_carlo"
+    )
 
 
 @pytest.mark.slow

@@ -19,7 +19,16 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.records import FloatArray
 from safevar_sumo.study import load_study
 from safevar_sumo.study.variation import Distribution
-from tests.analysis.known_regions import Plant, Region, box, diagonal_band, everywhere, made_up_study, nowhere, two_islands
+from tests.analysis.known_regions import (
+    Plant,
+    Region,
+    box,
+    diagonal_band,
+    everywhere,
+    made_up_study,
+    nowhere,
+    two_islands,
+)
 
 
 def of(region: Region, **options: Any) -> Risk:
@@ -27,7 +36,9 @@ def of(region: Region, **options: Any) -> Risk:
     return risk(study, unsafe="collision", pool=Plant(study, region), **options)
 
 
-@pytest.mark.parametrize(("region", "volume"), [(box, 0.09), (two_islands, 0.15), (diagonal_band, 0.06), (nowhere, 0.0), (everywhere, 1.0)])
+@pytest.mark.parametrize(
+    ("region", "volume"), [(box, 0.09), (two_islands, 0.15), (diagonal_band, 0.06), (nowhere, 0.0), (everywhere, 1.0)]
+)
 def test_the_interval_holds_the_analytic_volume(region: Region, volume: float) -> None:
     result = of(region, samples=8000, confidence=0.999)
     low, high = result.interval
@@ -38,7 +49,9 @@ def test_the_interval_holds_the_analytic_volume(region: Region, volume: float) -
 
 @pytest.mark.parametrize(("region", "share"), [(box, 0.09), (lambda rows: rows[:, 0] < 5, 0.5), (everywhere, 1.0)])
 def test_the_coefficient_of_variation_is_that_of_a_binomial_share(region: Region, share: float) -> None:
-    assert of(region, samples=8000).coefficient_of_variation == pytest.approx(math.sqrt((1 - share) / (8000 * share)), rel=0.05)
+    assert of(region, samples=8000).coefficient_of_variation == pytest.approx(
+        math.sqrt((1 - share) / (8000 * share)), rel=0.05
+    )
 
 
 def test_it_stops_as_soon_as_it_is_sure_enough() -> None:
@@ -68,8 +81,13 @@ def test_sobol_indices_of_ishigamis_function() -> None:
     assert outputs["unsafe"].isna().all()
 
 
-@pytest.mark.parametrize(("variation", "says", "warns"), [
-    ({}, "Share of the domain that is unsafe: 0.", True), ({"a": {"distribution": "normal", "deviation": 1.0}}, "Probability 0.", False)])
+@pytest.mark.parametrize(
+    ("variation", "says", "warns"),
+    [
+        ({}, "Share of the domain that is unsafe: 0.", True),
+        ({"a": {"distribution": "normal", "deviation": 1.0}}, "Probability 0.", False),
+    ],
+)
 def test_a_share_of_the_domain_is_not_called_a_probability(variation: dict[str, Any], says: str, warns: bool) -> None:
     study = msgspec.structs.replace(made_up_study(2), variation=msgspec.convert(variation, dict[str, Distribution]))
     printed = list(map(str, risk(study, unsafe="collision", samples=200, pool=Plant(study, box)).sentences()))
@@ -95,9 +113,28 @@ def test_the_promised_record_and_the_same_again() -> None:
     first, again = (json.dumps(of(box, samples=500).to_dict(), allow_nan=False) for _ in range(2))
     assert first == again
     record = json.loads(first)
-    assert list(record) == ["study", "unsafe", "samples", "failures", "probability", "interval", "confidence", "sensitivity", "method",
-                            "simulations", "coefficient_of_variation", "design_point", "remark"]
-    assert list(record["sensitivity"][0]) == ["characteristic", "first_order", "total", "first_order_interval", "total_interval"]
+    assert list(record) == [
+        "study",
+        "unsafe",
+        "samples",
+        "failures",
+        "probability",
+        "interval",
+        "confidence",
+        "sensitivity",
+        "method",
+        "simulations",
+        "coefficient_of_variation",
+        "design_point",
+        "remark",
+    ]
+    assert list(record["sensitivity"][0]) == [
+        "characteristic",
+        "first_order",
+        "total",
+        "first_order_interval",
+        "total_interval",
+    ]
     infinite_intervals = of(box, samples=500, confidence=1 - 2**-53).to_dict()
     assert json.dumps(infinite_intervals, allow_nan=False)
 
@@ -109,8 +146,9 @@ def drawn(**variation: dict[str, Any]) -> FloatArray:
 
 
 def test_every_distribution_has_its_moments() -> None:
-    normal, triangular = drawn(a={"distribution": "normal", "deviation": 0.5, "mean": 6.0},
-                               b={"distribution": "triangular", "upper": 8.0}).T
+    normal, triangular = drawn(
+        a={"distribution": "normal", "deviation": 0.5, "mean": 6.0}, b={"distribution": "triangular", "upper": 8.0}
+    ).T
     assert (normal.mean(), normal.std()) == pytest.approx((6.0, 0.5), abs=0.02)
     assert (triangular.mean(), triangular.max()) == pytest.approx((13 / 3, 8.0), abs=0.1)
     fixed, uniform = drawn(a={"distribution": "fixed", "value": 7.0}, b={"distribution": "uniform", "lower": 2.0}).T
@@ -131,23 +169,53 @@ def test_correlations_are_those_of_the_copula() -> None:
     assert result.to_frame().empty
 
 
-@pytest.mark.parametrize(("changes", "says"), [
-    ({"variation": {"wings": {"distribution": "fixed"}}}, "variation.wings"),
-    ({"variation": {"mass": {"distribution": "normal", "deviation": -1}}}, "deviation"),
-    ({"variation": {"mass": {"distribution": "normal", "deviation": 1, "mean": 9999}}}, "variation.mass.mean = 9999"),
-    ({"variation": {"mass": {"distribution": "uniform", "lower": 2600, "upper": 2100}}}, "lower = 2600 and upper = 2100"),
-    ({"variation": {"mass": {"distribution": "triangular", "lower": 2100, "mode": 2050}}}, "variation.mass.mode = 2050"),
-    ({"variation": {"mass": {"distribution": "cauchy"}}}, "cauchy"),
-    ({"correlations": [{"between": ["mass", "wings"], "value": 0.5}]}, "'wings'"),
-    ({"correlations": [{"between": ["mass", "mass"], "value": 0.5}]}, "two different"),
-    ({"correlations": [{"between": ["mass", "radius"], "value": 1.5}]}, "correlations"),
-    ({"correlations": [{"between": pair, "value": -0.9} for pair in (["mass", "radius"], ["mass", "tireFric"], ["radius", "tireFric"])]},
-     "contradict each other"),
-    ({"correlations": [{"between": ["mass", "radius"], "value": 0.5}, {"between": ["radius", "mass"], "value": -0.5}]},
-     "radius and mass are given twice, with 0.5 and -0.5"),
-    ({"correlations": [{"between": ["mass", "radius"], "value": 0.5}] * 2}, "are given twice"),
-    ({"variation": {"mass": {"distribution": "normal", "deviation": 1e300}}}, "variation.mass.deviation = 1e+300\nexpected: at most 66000"),
-    ({"variation": {"mass": {"distribution": "lognormal", "sigma": 1e300}}}, "variation.mass.sigma")])
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"variation": {"wings": {"distribution": "fixed"}}}, "variation.wings"),
+        ({"variation": {"mass": {"distribution": "normal", "deviation": -1}}}, "deviation"),
+        (
+            {"variation": {"mass": {"distribution": "normal", "deviation": 1, "mean": 9999}}},
+            "variation.mass.mean = 9999",
+        ),
+        (
+            {"variation": {"mass": {"distribution": "uniform", "lower": 2600, "upper": 2100}}},
+            "lower = 2600 and upper = 2100",
+        ),
+        (
+            {"variation": {"mass": {"distribution": "triangular", "lower": 2100, "mode": 2050}}},
+            "variation.mass.mode = 2050",
+        ),
+        ({"variation": {"mass": {"distribution": "cauchy"}}}, "cauchy"),
+        ({"correlations": [{"between": ["mass", "wings"], "value": 0.5}]}, "'wings'"),
+        ({"correlations": [{"between": ["mass", "mass"], "value": 0.5}]}, "two different"),
+        ({"correlations": [{"between": ["mass", "radius"], "value": 1.5}]}, "correlations"),
+        (
+            {
+                "correlations": [
+                    {"between": pair, "value": -0.9}
+                    for pair in (["mass", "radius"], ["mass", "tireFric"], ["radius", "tireFric"])
+                ]
+            },
+            "contradict each other",
+        ),
+        (
+            {
+                "correlations": [
+                    {"between": ["mass", "radius"], "value": 0.5},
+                    {"between": ["radius", "mass"], "value": -0.5},
+                ]
+            },
+            "radius and mass are given twice, with 0.5 and -0.5",
+        ),
+        ({"correlations": [{"between": ["mass", "radius"], "value": 0.5}] * 2}, "are given twice"),
+        (
+            {"variation": {"mass": {"distribution": "normal", "deviation": 1e300}}},
+            "variation.mass.deviation = 1e+300\nexpected: at most 66000",
+        ),
+        ({"variation": {"mass": {"distribution": "lognormal", "sigma": 1e300}}}, "variation.mass.sigma"),
+    ],
+)
 def test_impossible_distributions_are_refused(changes: dict[str, Any], says: str) -> None:
     with pytest.raises(InputError, match=says.replace("[", r"\[").replace("+", r"\+")):
         VariationModel(load_study("smoke", **changes))

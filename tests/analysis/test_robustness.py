@@ -8,7 +8,12 @@ import numpy as np
 import pytest
 
 from safevar_sumo.analysis.evaluator import Evaluator
-from safevar_sumo.analysis.explain.robustness import STEP_FACTORS, Robustness, estimate_robustness, find_smallest_robust_failure
+from safevar_sumo.analysis.explain.robustness import (
+    STEP_FACTORS,
+    Robustness,
+    estimate_robustness,
+    find_smallest_robust_failure,
+)
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import FloatArray
 from tests.analysis.known_regions import box, made_up_evaluator
@@ -35,18 +40,29 @@ def test_the_smallest_robust_failure_is_the_first_whose_neighbours_are_unsafe_to
     assert find_smallest_robust_failure(evaluator, failures.take([1]), 0.1, COLLISION, max_evaluations=1) is None
 
 
-@pytest.mark.parametrize(("shares", "row"), [
-    ([(0.5, 1.0, 1.0), (0.9, 0.9, 0.9)], 0), ([(0.39, 1.0, 1.0), (0.9, 0.9, 0.9)], 1), ([(0.9, 0.6, 0.8), (0.41, 1.0, 1.0)], 1),
-    ([(0.79, 0.79, 0.79), (1.0, 1.0, 0.3)], None)])
-def test_a_failure_is_robust_by_the_mean_of_all_time_steps(shares: list[tuple[float, ...]], row: int | None,
-                                                           monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("shares", "row"),
+    [
+        ([(0.5, 1.0, 1.0), (0.9, 0.9, 0.9)], 0),
+        ([(0.39, 1.0, 1.0), (0.9, 0.9, 0.9)], 1),
+        ([(0.9, 0.6, 0.8), (0.41, 1.0, 1.0)], 1),
+        ([(0.79, 0.79, 0.79), (1.0, 1.0, 0.3)], None),
+    ],
+)
+def test_a_failure_is_robust_by_the_mean_of_all_time_steps(
+    shares: list[tuple[float, ...]], row: int | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Whatever the study's own time step says, if the other steps can make up for it."""
     evaluator, factors_of_calls = made_up_evaluator(2, box), []
 
-    def estimates(_: Evaluator, settings: FloatArray, step: float, unsafe: Unsafe, factors: Sequence[float]) -> list[Robustness]:
+    def estimates(
+        _: Evaluator, settings: FloatArray, step: float, unsafe: Unsafe, factors: Sequence[float]
+    ) -> list[Robustness]:
         factors_of_calls.append((len(settings), tuple(factors)))
-        return [Robustness({step * factor: shares[int(setting[0]) - 8][STEP_FACTORS.index(factor)] for factor in factors})
-                for setting in settings]
+        return [
+            Robustness({step * factor: shares[int(setting[0]) - 8][STEP_FACTORS.index(factor)] for factor in factors})
+            for setting in settings
+        ]
 
     monkeypatch.setattr("safevar_sumo.analysis.explain.robustness.estimate_robustness", estimates)
     failures = evaluator.evaluate(np.array([[8.0, 1.0], [9.0, 1.0]]), "failures")

@@ -12,7 +12,16 @@ from safevar_sumo import risk, rules
 from safevar_sumo.analysis.rules.compute import Rule, Rules
 from safevar_sumo.study import load_study
 from safevar_sumo.vehicles import CharacteristicSet
-from tests.analysis.known_regions import Plant, Region, box, diagonal_band, everywhere, made_up_study, nowhere, two_islands
+from tests.analysis.known_regions import (
+    Plant,
+    Region,
+    box,
+    diagonal_band,
+    everywhere,
+    made_up_study,
+    nowhere,
+    two_islands,
+)
 
 
 def of(region: Region, n: int = 4, **options: Any) -> Rules:
@@ -97,7 +106,10 @@ def test_the_share_of_unsafe_vehicles_is_that_of_risk(constraint: dict[str, Any]
     shares = {number: rules(study, unsafe="collision", pool=pool, samples=number) for number, pool in asked.items()}
     estimate = risk(study, unsafe="collision", pool=(plant := Plant(study, box)), samples=1000, method="monte_carlo")
     assert asked[400].seen < asked[1000].seen <= plant.seen
-    assert (shares[1000].unsafe_share, shares[1000].unsafe_interval) == (estimate.probability, pytest.approx(estimate.interval))
+    assert (shares[1000].unsafe_share, shares[1000].unsafe_interval) == (
+        estimate.probability,
+        pytest.approx(estimate.interval),
+    )
     for one, other in ((400, 1000), (1000, 400)):
         low, high = shares[one].unsafe_interval
         assert low < shares[other].unsafe_share < high
@@ -107,5 +119,8 @@ def test_rules_say_over_what_they_hold() -> None:
     """In a rule all characteristics vary, in a tolerance one alone: otherwise their limits contradict each other."""
     printed = " ".join(map(str, of(box).sentences()))
     assert "a above 7 N m and b below 3 N m, the others anywhere: collides in" in printed
-    assert "all characteristics vary together over the whole domain; how far one may go while all others stay as in the original" in printed
+    assert (
+        "all characteristics vary together over the whole domain; how far one may go while all others stay as in the original"
+        in printed
+    )
     assert "% of 16384 vehicles drawn evenly over the whole domain (" in printed

@@ -24,11 +24,22 @@ from safevar_sumo.results import record, solutions_frame
 from tests.analysis.known_regions import Plant, Region, box, everywhere, made_up_study, nowhere, two_islands
 
 
-def of(n: int, region: Region, pairs: bool = False, unsafe: str | None = "collision", failing: Region = nowhere,
-       characteristics: Sequence[str] | None = None) -> Tolerance:
+def of(
+    n: int,
+    region: Region,
+    pairs: bool = False,
+    unsafe: str | None = "collision",
+    failing: Region = nowhere,
+    characteristics: Sequence[str] | None = None,
+) -> Tolerance:
     study = made_up_study(n)
-    return tolerance(study, unsafe=unsafe, pairs=pairs, characteristics=characteristics,
-                     pool=Plant(study, region, lambda rows: 8 - np.abs(rows[:, 0] - 5), failing))
+    return tolerance(
+        study,
+        unsafe=unsafe,
+        pairs=pairs,
+        characteristics=characteristics,
+        pool=Plant(study, region, lambda rows: 8 - np.abs(rows[:, 0] - 5), failing),
+    )
 
 
 def test_islands_and_the_safe_interval_around_the_original() -> None:
@@ -68,9 +79,16 @@ def test_a_plane_with_a_box_in_its_corner() -> None:
     assert result.verdict == "No single characteristic makes it unsafe, but 1 of 3 pairs: a with b."
 
 
-@pytest.mark.parametrize(("region", "n", "factor"), [
-    (box, 2, 0.4), (two_islands, 3, 0.3), (nowhere, 4, 1.0), (everywhere, 2, 0.0),
-    (lambda rows: np.sum(rows - 5, axis=1) > 12, 4, 0.6)])  # a corner of all four, which no pair reaches
+@pytest.mark.parametrize(
+    ("region", "n", "factor"),
+    [
+        (box, 2, 0.4),
+        (two_islands, 3, 0.3),
+        (nowhere, 4, 1.0),
+        (everywhere, 2, 0.0),
+        (lambda rows: np.sum(rows - 5, axis=1) > 12, 4, 0.6),
+    ],
+)  # a corner of all four, which no pair reaches
 def test_the_joint_factor_ends_before_what_is_unsafe(region: Region, n: int, factor: float) -> None:
     result = of(n, region).joint
     assert result.factor == pytest.approx(factor, rel=0.02)
@@ -86,7 +104,10 @@ def test_what_cannot_be_simulated_is_neither_safe_nor_unsafe() -> None:
     first = result.alone[0]
     assert first.safe == (0.0, pytest.approx(5.75, abs=1e-4))
     assert first.not_simulated == [(pytest.approx(5.75, abs=1e-4), pytest.approx(6.75, abs=1e-4))]
-    assert first.unsafe == [(pytest.approx(6.75, abs=1e-4), pytest.approx(7, abs=1e-4)), (pytest.approx(9, abs=1e-4), 10.0)]
+    assert first.unsafe == [
+        (pytest.approx(6.75, abs=1e-4), pytest.approx(7, abs=1e-4)),
+        (pytest.approx(9, abs=1e-4), 10.0),
+    ]
     assert first.to_dict()["not_simulated"] == first.not_simulated
     assert result.pairs is not None
     assert result.pairs[0].not_simulated_share == pytest.approx(0.1, abs=0.026)
@@ -94,7 +115,9 @@ def test_what_cannot_be_simulated_is_neither_safe_nor_unsafe() -> None:
     box = result.joint
     assert box.factor == pytest.approx(0.35, rel=0.02), "3.25 to 6.75, of which 1 could not be simulated"
     assert box.failed / box.samples == pytest.approx(1 / 3.5, abs=0.03)
-    exact = scipy.stats.binomtest(box.failed, box.samples, alternative="less").proportion_ci(1 - 0.05 / 2**box.attempts, method="exact")
+    exact = scipy.stats.binomtest(box.failed, box.samples, alternative="less").proportion_ci(
+        1 - 0.05 / 2**box.attempts, method="exact"
+    )
     assert box.unsafe_at_most == pytest.approx(exact.high)
 
 
@@ -108,16 +131,26 @@ def test_the_box_varies_the_characteristics_that_are_asked_for() -> None:
 
 def test_the_box_holds_no_unsafe_solution_of_a_search() -> None:
     """A sliver that begins half of the way to the domain's end; no scan, no random setting and no corner of the domain hits it."""
+
     def sliver(rows: FloatArray) -> BoolArray:
-        return np.asarray((np.abs(rows[:, 0] - rows[:, 1]) < 0.001) & (rows[:, 0] > 7) & (np.abs(rows[:, 2:] - 2).max(axis=1) < 0.5))
+        return np.asarray(
+            (np.abs(rows[:, 0] - rows[:, 1]) < 0.001) & (rows[:, 0] > 7) & (np.abs(rows[:, 2:] - 2).max(axis=1) < 0.5)
+        )
 
     study = made_up_study(4)
     found = [[8.5, 8.5, 2.0, 2.2], [5.0, 5.0, 5.0, 5.0]]
     evaluations = Plant(study, sliver).submit(b"", np.array(found)).result()
-    case = build_case(study, record(Plant(study, sliver).submit(b"", np.full((1, 4), 5.0)).result(), 0),
-                      solutions_frame(tuple("abcd"), [(("rs", 0), evaluations)]), solutions_frame(tuple("abcd"), []), [("rs", 0)])
+    case = build_case(
+        study,
+        record(Plant(study, sliver).submit(b"", np.full((1, 4), 5.0)).result(), 0),
+        solutions_frame(tuple("abcd"), [(("rs", 0), evaluations)]),
+        solutions_frame(tuple("abcd"), []),
+        [("rs", 0)],
+    )
     pool = Plant(study, sliver)
-    assert find_tolerances(study, ToleranceOptions(unsafe="collision"), pool=pool).joint.factor == pytest.approx(1, abs=0.01)
+    assert find_tolerances(study, ToleranceOptions(unsafe="collision"), pool=pool).joint.factor == pytest.approx(
+        1, abs=0.01
+    )
     result = find_tolerances(case, ToleranceOptions(), pool=pool)
     assert str(result.unsafe) == "collision", "as the solutions do, and as `explain` takes it"
     assert 0.49 < result.joint.factor < 0.5
@@ -132,7 +165,12 @@ def test_the_bound_of_the_box_holds_where_every_box_is_as_unsafe(monkeypatch: py
     Boxes that are drawn anew until a sample of one has no unsafe setting would all be wrong. The search is switched off: it would
     find that out before the tests do.
     """
-    for name, value in (("FIRST_SEARCH_POINTS", 1), ("SECOND_SEARCH_POINTS", 1), ("MIN_FACTOR", 1e-3), ("MAX_UNSAFE_SHARE", 0.03)):
+    for name, value in (
+        ("FIRST_SEARCH_POINTS", 1),
+        ("SECOND_SEARCH_POINTS", 1),
+        ("MIN_FACTOR", 1e-3),
+        ("MAX_UNSAFE_SHARE", 0.03),
+    ):
         monkeypatch.setattr(safe_box, name, value)
     q, wrong, seeds, study = 0.031, 0, 100, made_up_study(2)
     for seed in range(seeds):
@@ -160,11 +198,22 @@ def test_the_promised_record() -> None:
     assert list(record["pairs"][0]) == ["characteristics", "unsafe_share", "not_simulated_share", "nearest"]
     assert list(record["pairs"][0]["nearest"]) == ["a", "b"]
     assert list(record["joint"]) == [
-        "factor", "confidence", "samples", "failed", "attempts", "unsafe_at_most", "characteristics"]
+        "factor",
+        "confidence",
+        "samples",
+        "failed",
+        "attempts",
+        "unsafe_at_most",
+        "characteristics",
+    ]
 
 
-@pytest.mark.parametrize(("region", "expected"), [
-    (nowhere, "dot: the original vehicle"),
-    (two_islands, "dot: the original vehicle;\nhatched: unsafe;\nbelow the dashed line: collisions")])
+@pytest.mark.parametrize(
+    ("region", "expected"),
+    [
+        (nowhere, "dot: the original vehicle"),
+        (two_islands, "dot: the original vehicle;\nhatched: unsafe;\nbelow the dashed line: collisions"),
+    ],
+)
 def test_the_figure_explains_what_it_draws_and_nothing_else(region: Region, expected: str) -> None:
     assert of(1, region).figure().get_supxlabel() == expected

@@ -39,7 +39,9 @@ def test_every_public_name_is_there_and_nothing_else() -> None:
 
 def test_changes_override_a_study_as_a_file_that_extends_it_would(in_tmp: Path) -> None:
     changed = sv.load_study("rain", weather="fog", search={"runs": 2}, ads={"parameters": {"corridor": 3.0}})
-    Path("mine.toml").write_text('extends = "rain"\nname = "rain"\nweather = "fog"\n[search]\nruns = 2\n[ads.parameters]\ncorridor = 3.0\n')
+    Path("mine.toml").write_text(
+        'extends = "rain"\nname = "rain"\nweather = "fog"\n[search]\nruns = 2\n[ads.parameters]\ncorridor = 3.0\n'
+    )
     same = sv.load_study("mine.toml")
     assert (changed.weather, changed.search, changed.ads) == (same.weather, same.search, same.ads)
     assert changed.search.evaluations == sv.load_study("rain").search.evaluations
@@ -62,7 +64,9 @@ def test_simulate_returns_the_setting_and_the_original_beside_it() -> None:
     assert result.objectives["f_num_diff"] == 1
     assert result.objectives["f_diff"] == pytest.approx(2 / 3.5)
     assert result.metrics["safety_degree"] == result.objectives["f_safe"]
-    assert result.original.setting == {one.name: one.original for one in CharacteristicSet.of(result.study.vehicle.characteristics)}
+    assert result.original.setting == {
+        one.name: one.original for one in CharacteristicSet.of(result.study.vehicle.characteristics)
+    }
     assert result.original.original is result.original
     assert result.original.metrics != result.metrics
     assert sv.simulate("rain", {"mass": 2410.0}, filtered=False).objectives["f_num_diff"] == 1
@@ -86,7 +90,10 @@ def test_undefined_physics_are_reported_and_not_taken_for_a_standing_vehicle() -
     system = assemble(sv.load_study("smoke"))
     settings = system.characteristics.original[np.newaxis].copy()
     settings[0, system.characteristics.names.index("radius")] = 1e200
-    with warnings.catch_warnings(action="error"), pytest.raises(sv.InputError, match=r"vehicle: its speed is nan with radius = 1e\+200\n"):
+    with (
+        warnings.catch_warnings(action="error"),
+        pytest.raises(sv.InputError, match=r"vehicle: its speed is nan with radius = 1e\+200\n"),
+    ):
         simulate(system, settings)
 
 
@@ -119,7 +126,22 @@ def test_a_value_that_is_missing_is_the_originals() -> None:
 def test_the_functions_share_one_convention_and_its_types_are_public() -> None:
     """Every argument is documented in its function, every class of a signature is a name of the package."""
     several = [sv.run, sv.evaluate, sv.explain, sv.tolerance, sv.risk, sv.rules, report]
-    others = ["None", "str", "int", "float", "bool", "Path", "Sequence", "Mapping", "tuple", "list", "pd", "DataFrame", "npt", "ArrayLike"]
+    others = [
+        "None",
+        "str",
+        "int",
+        "float",
+        "bool",
+        "Path",
+        "Sequence",
+        "Mapping",
+        "tuple",
+        "list",
+        "pd",
+        "DataFrame",
+        "npt",
+        "ArrayLike",
+    ]
     for function in (*several, sv.simulate, sv.compare, sv.load, sv.tables, sv.figures):
         signature = inspect.signature(function)
         annotations = [*(str(one.annotation) for one in signature.parameters.values()), signature.return_annotation]
@@ -140,19 +162,32 @@ def test_a_criterion_is_a_number_a_word_or_an_object() -> None:
 def test_compare_needs_a_study_and_changes_alone() -> None:
     comparison = sv.compare("sun", {"tireFric": 1.2})
     assert comparison.changes == ["tireFric 3.5 → 1.2 (-66\N{NO-BREAK SPACE}%)"]
-    assert comparison.evaluations.f_safe.tolist() == sv.evaluate("sun", [{}, {"tireFric": 1.2}], jobs=1)["f_safe"].tolist()
+    assert (
+        comparison.evaluations.f_safe.tolist() == sv.evaluate("sun", [{}, {"tireFric": 1.2}], jobs=1)["f_safe"].tolist()
+    )
 
 
 def test_a_report_of_results_is_a_page(results: sv.Results, tmp_path: Path) -> None:
     page = sv.report(results, out=tmp_path / "page.html", only=["tested", "reproduce"], jobs=1)
-    assert (tmp_path / "page.html").read_text(encoding="utf-8") == page == sv.make_report([results.directory], ["tested", "reproduce"], 1)
+    assert (
+        (tmp_path / "page.html").read_text(encoding="utf-8")
+        == page
+        == sv.make_report([results.directory], ["tested", "reproduce"], 1)
+    )
 
 
-@pytest.mark.parametrize(("settings", "expected"), [
-    (pd.DataFrame({"weight": [1.0]}), "weight"), (pd.DataFrame({"mass": ["heavy"]}), "heavy"), ([[1.0, 2.0]], r"shape \(1, 2\)"),
-    ({"mass": [2500.0]}, "'dict'\nexpected: a list of mappings"), ([{"mass": 2500.0}, {"weight": 1.0}], "weight"),
-    (pd.DataFrame({"mass": [2404.0, 9999.0]}), "row 1: mass = 9999"), (np.full((1, 17), np.nan), "shape|= nan"),
-])
+@pytest.mark.parametrize(
+    ("settings", "expected"),
+    [
+        (pd.DataFrame({"weight": [1.0]}), "weight"),
+        (pd.DataFrame({"mass": ["heavy"]}), "heavy"),
+        ([[1.0, 2.0]], r"shape \(1, 2\)"),
+        ({"mass": [2500.0]}, "'dict'\nexpected: a list of mappings"),
+        ([{"mass": 2500.0}, {"weight": 1.0}], "weight"),
+        (pd.DataFrame({"mass": [2404.0, 9999.0]}), "row 1: mass = 9999"),
+        (np.full((1, 17), np.nan), "shape|= nan"),
+    ],
+)
 def test_unusable_settings_are_reported_before_any_simulation(settings: object, expected: str) -> None:
     with pytest.raises(sv.InputError, match=expected):
         sv.evaluate("sun", settings)  # type: ignore[arg-type]
@@ -186,7 +221,8 @@ def test_a_script_needs_no_main_guard(in_tmp: Path) -> None:
     Path("script.py").write_text(
         "import safevar_sumo as sv\nprint('begun')\n"
         "results = sv.run(sv.load_study('smoke', search={'evaluations': 20}), 'out', jobs=2, progress=True)\n"
-        "print(len(sv.evaluate('smoke', results.solutions[['mass']], jobs=2)) == len(results.solutions))\n")
+        "print(len(sv.evaluate('smoke', results.solutions[['mass']], jobs=2)) == len(results.solutions))\n"
+    )
     done = subprocess.run([sys.executable, "script.py"], capture_output=True, text=True, check=True)
     assert done.stdout.split() == ["begun", "True"]
 

@@ -27,9 +27,16 @@ def evaluated(settings: np.ndarray) -> Evaluations:
     safety = 3.0 - 4.0 * np.add.accumulate(np.abs(share), axis=1)[:, -1]
     collided = safety <= 0
     return Evaluations(
-        settings=settings, outcome=np.where(collided, "collision", "stopped").astype("U16"),
-        collision_speed=np.where(collided, -safety, np.nan), f_diff=SUN.largest_change(settings), f_num_diff=SUN.number_changed(settings),
-        metrics={name: safety if name == "safety_degree" else np.where(collided, np.nan, share[:, i]) for i, name in enumerate(METRICS)})
+        settings=settings,
+        outcome=np.where(collided, "collision", "stopped").astype("U16"),
+        collision_speed=np.where(collided, -safety, np.nan),
+        f_diff=SUN.largest_change(settings),
+        f_num_diff=SUN.number_changed(settings),
+        metrics={
+            name: safety if name == "safety_degree" else np.where(collided, np.nan, share[:, i])
+            for i, name in enumerate(METRICS)
+        },
+    )
 
 
 class Death(BaseException):
@@ -104,11 +111,19 @@ def with_search(study: Study, **changes: object) -> Study:
     return msgspec.structs.replace(study, search=msgspec.structs.replace(study.search, **changes))
 
 
-def carried_out(study: Study, path: Path, pool: FormulaPool | None = None, keys: Iterable[RunKey] | None = None,
-                batch: int | None = None, **options: bool) -> tuple[Campaign, EventLog]:
+def carried_out(
+    study: Study,
+    path: Path,
+    pool: FormulaPool | None = None,
+    keys: Iterable[RunKey] | None = None,
+    batch: int | None = None,
+    **options: bool,
+) -> tuple[Campaign, EventLog]:
     observer = EventLog()
     results = ResultsDirectory(path, study)
-    campaign = run_campaign(study, all_runs(study) if keys is None else keys, results, pool or FormulaPool(), observer, batch, **options)
+    campaign = run_campaign(
+        study, all_runs(study) if keys is None else keys, results, pool or FormulaPool(), observer, batch, **options
+    )
     results.finish(campaign.solutions)
     return campaign, observer
 

@@ -28,7 +28,11 @@ from tests.campaign.formulas import SUN, Death, EventLog, FormulaPool, carried_o
 @pytest.mark.slow
 def test_results_depend_neither_on_workers_nor_on_order_nor_on_batches(study: Study, tmp_path: Path) -> None:
     carried_out(study, tmp_path / "a")
-    for name, pool, batch in (("b", FormulaPool(workers=7), None), ("c", FormulaPool(workers=3), 3), ("d", FormulaPool(workers=2), 1)):
+    for name, pool, batch in (
+        ("b", FormulaPool(workers=7), None),
+        ("c", FormulaPool(workers=3), 3),
+        ("d", FormulaPool(workers=2), 1),
+    ):
         carried_out(study, tmp_path / name, pool, batch=batch)
         assert solutions(tmp_path / name) == solutions(tmp_path / "a")
         pd.testing.assert_frame_equal(load_runs(tmp_path / name).evaluations, load_runs(tmp_path / "a").evaluations)
@@ -42,7 +46,9 @@ def test_bar_status_and_campaign_count_the_same_collisions(study: Study, tmp_pat
         campaign = run_campaign(study, all_runs(study), results, FormulaPool(), progress)
         results.finish(campaign.solutions)
         evaluations = load_runs(tmp_path).evaluations
-        expected = len(evaluations[evaluations["outcome"] == "collision"].drop_duplicates(["algorithm", "run", *SUN.names]))
+        expected = len(
+            evaluations[evaluations["outcome"] == "collision"].drop_duplicates(["algorithm", "run", *SUN.names])
+        )
         assert expected > 0
         assert sum(campaign.collisions.values()) == sum(run.collisions for run in status(tmp_path).runs) == expected
         stage, done, total = shows[-1]
@@ -57,14 +63,19 @@ def test_runs_of_a_share_share_batches(study: Study, tmp_path: Path) -> None:
     carried_out(large, tmp_path / "alone", alone, keys=[RunKey("rs", 3)])
     assert np.mean(together.sizes[1:]) > 3 * large.search.population
     assert alone.sizes[1:3] == [40, 40]
-    one, other = (load_runs(tmp_path / name).evaluations.query("algorithm == 'rs' and run == 3") for name in ("together", "alone"))
+    one, other = (
+        load_runs(tmp_path / name).evaluations.query("algorithm == 'rs' and run == 3") for name in ("together", "alone")
+    )
     pd.testing.assert_frame_equal(one.reset_index(drop=True), other.reset_index(drop=True))
 
 
-@pytest.mark.parametrize(("workers", "runs_at_once", "sizes"), [
-    (2, 160, {45}), (1, 80, {45}), (4, 160, {22, 23}), (16, 160, {5, 6}), (200, 160, {1}), (2, 8, {7, 8})])
+@pytest.mark.parametrize(
+    ("workers", "runs_at_once", "sizes"),
+    [(2, 160, {45}), (1, 80, {45}), (4, 160, {22, 23}), (16, 160, {5, 6}), (200, 160, {1}), (2, 8, {7, 8})],
+)
 def test_runs_are_dealt_in_equal_shares_with_equally_many_runs_of_each_algorithm(
-        workers: int, runs_at_once: int, sizes: set[int]) -> None:
+    workers: int, runs_at_once: int, sizes: set[int]
+) -> None:
     keys = [RunKey(name, run) for name in ("nsga2", "rs", "safe_fuzzer") for run in range(30)]
     shares = deal(keys, workers, runs_at_once)
     assert sorted(key for share in shares for key in share) == sorted(keys)
@@ -84,7 +95,11 @@ class Colliding(FormulaPool):
 
 def test_an_original_vehicle_that_collides_is_told(study: Study, tmp_path: Path) -> None:
     _, observer = carried_out(study, tmp_path / "unsafe", Colliding())
-    assert [line for line in observer.warnings if "the original vehicle itself collides" in line] == observer.warnings != []
+    assert (
+        [line for line in observer.warnings if "the original vehicle itself collides" in line]
+        == observer.warnings
+        != []
+    )
     assert carried_out(study, tmp_path / "safe")[1].warnings == []
 
 
@@ -110,7 +125,11 @@ def test_a_finished_campaign_answers_without_simulating(study: Study, tmp_path: 
     assert solutions(tmp_path) == before
     assert again.failures == first.failures == []
     assert observer_again.simulated == 0
-    assert observer_again.finished_runs == observer.finished_runs == dict.fromkeys(all_runs(study), study.search.evaluations)
+    assert (
+        observer_again.finished_runs
+        == observer.finished_runs
+        == dict.fromkeys(all_runs(study), study.search.evaluations)
+    )
 
 
 def test_more_runs_extend_and_fewer_leave_out(study: Study, tmp_path: Path) -> None:
@@ -147,7 +166,8 @@ def test_a_run_in_other_hands_is_left_to_them(study: Study, tmp_path: Path) -> N
 @pytest.mark.slow
 @pytest.mark.parametrize("budgets", [(60, 100), (55, 130), (100, 60), (550, 800)])
 def test_more_or_fewer_evaluations_go_on_and_end_as_if_there_had_never_been_others(
-        study: Study, tmp_path: Path, budgets: tuple[int, int]) -> None:
+    study: Study, tmp_path: Path, budgets: tuple[int, int]
+) -> None:
     first, second = (with_search(study, evaluations=budget, runs=1) for budget in budgets)
     pools = [FormulaPool() for _ in range(3)]
     carried_out(first, tmp_path / "out", pools[0])
@@ -157,7 +177,9 @@ def test_more_or_fewer_evaluations_go_on_and_end_as_if_there_had_never_been_othe
     results, fresh = load_runs(tmp_path / "out"), load_runs(tmp_path / "fresh")
     pd.testing.assert_frame_equal(results.evaluations, fresh.evaluations)
     pd.testing.assert_frame_equal(results.solutions, fresh.solutions)
-    assert len(set(pools[0].simulated)) + len(set(pools[1].simulated)) == len(set(pools[0].simulated) | set(pools[1].simulated))
+    assert len(set(pools[0].simulated)) + len(set(pools[1].simulated)) == len(
+        set(pools[0].simulated) | set(pools[1].simulated)
+    )
     carried_out(first, tmp_path / "out", FormulaPool(limit=0))
 
 
@@ -179,7 +201,9 @@ def test_every_evaluation_is_read_in_the_order_in_which_it_was_asked_for(study: 
 
 
 @pytest.mark.parametrize("workers", [1, 4])
-def test_a_forecast_counts_and_measures_the_search_itself(workers: int, study: Study, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_forecast_counts_and_measures_the_search_itself(
+    workers: int, study: Study, monkeypatch: pytest.MonkeyPatch
+) -> None:
     seconds = iter(range(100_000))
     monkeypatch.setattr("time.perf_counter", lambda: float(next(seconds)))
     pool = FormulaPool(workers)
@@ -187,7 +211,9 @@ def test_a_forecast_counts_and_measures_the_search_itself(workers: int, study: S
     assert ahead.evaluations == 600
     assert ahead.seconds == pytest.approx(600 / ahead.rate)
     assert 600 * 8 * (12 + len(METRICS)) <= ahead.size <= 600 * 20 * (17 + len(METRICS))
-    assert study.search.population / 4 < ahead.rate <= 6 * study.search.population, "at most a generation of all runs in a second"
+    assert study.search.population / 4 < ahead.rate <= 6 * study.search.population, (
+        "at most a generation of all runs in a second"
+    )
 
 
 def test_a_forecast_of_many_points_measures_few_vehicles(study: Study) -> None:
@@ -242,7 +268,9 @@ class Deadly(FormulaPool):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("workers", [1, 2])
-def test_settings_that_a_worker_dies_of_are_counted_kept_out_and_not_met_again(workers: int, study: Study, tmp_path: Path) -> None:
+def test_settings_that_a_worker_dies_of_are_counted_kept_out_and_not_met_again(
+    workers: int, study: Study, tmp_path: Path
+) -> None:
     pool = Deadly(workers)
     campaign, _ = carried_out(study, tmp_path, pool)
     frame = load_runs(tmp_path).evaluations
@@ -267,7 +295,8 @@ def test_a_worker_that_dies_once_leaves_the_same_bytes(study: Study, tmp_path: P
 
 
 def test_a_worker_that_always_dies_outside_of_batches_ends_the_study(
-        study: Study, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    study: Study, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def die(*_: object) -> bool:
         raise Death("died in the search")
 

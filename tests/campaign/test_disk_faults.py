@@ -58,7 +58,7 @@ class File:
 
     def write(self, content: Any) -> int:
         half = self._disk.step() and isinstance(content, memoryview) and len(content) > 1
-        return int(self._inner.write(content[:len(content) // 2] if half else content))
+        return int(self._inner.write(content[: len(content) // 2] if half else content))
 
     def truncate(self, size: int) -> int:
         self._disk.step()

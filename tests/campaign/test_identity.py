@@ -50,7 +50,9 @@ def test_every_file_of_a_network_that_results_hang_on_counts(file: str, tmp_path
 def test_a_network_that_changes_between_two_batches_is_noticed(tmp_path: Path) -> None:
     shutil.copytree(NETWORKS / "lead_vehicle_stopped", tmp_path / "mine")
     study = load_study("native")
-    study = msgspec.structs.replace(study, scenario=msgspec.structs.replace(study.scenario, parameters={"network": str(tmp_path / "mine")}))
+    study = msgspec.structs.replace(
+        study, scenario=msgspec.structs.replace(study.scenario, parameters={"network": str(tmp_path / "mine")})
+    )
     work, original = pack_study(study), CharacteristicSet.of(study.vehicle.characteristics).original[None]
     evaluate_batch(work, original)
     traffic = tmp_path / "mine" / "traffic.rou.xml"
@@ -84,9 +86,19 @@ class Mine(ScalarAds):
         return (0.0, 1.0) if seen.gap < self.gap else (0.5, 0.0)
 """
 FILES = {
-    "my_ads.py": ADS, "my_maps/__init__.py": "", "my_maps/rules.py": "import numpy\n", "my_maps/unused.py": "", "my_space/roads.py": "",
-    "my_lazy.py": "X = 1\n", "weights.json": '{"gap": 9.0}', "tiles/1.txt": "tile", "tiles/2.txt": "another tile", "unused.py": "",
-    "table.bin": "read by compiled code", "both.txt": "opened to be read and written"}
+    "my_ads.py": ADS,
+    "my_maps/__init__.py": "",
+    "my_maps/rules.py": "import numpy\n",
+    "my_maps/unused.py": "",
+    "my_space/roads.py": "",
+    "my_lazy.py": "X = 1\n",
+    "weights.json": '{"gap": 9.0}',
+    "tiles/1.txt": "tile",
+    "tiles/2.txt": "another tile",
+    "unused.py": "",
+    "table.bin": "read by compiled code",
+    "both.txt": "opened to be read and written",
+}
 STUDY = """
 extends = "smoke"
 [ads]
@@ -94,8 +106,16 @@ model = "my_ads:Mine"
 parameters = { weights = "weights.json", table = "table.bin" }
 """
 READ = {
-    "my_ads.py", "my_maps/__init__.py", "my_maps/rules.py", "my_space/roads.py", "my_lazy.py", "weights.json", "tiles/1.txt", "table.bin",
-    "both.txt"}
+    "my_ads.py",
+    "my_maps/__init__.py",
+    "my_maps/rules.py",
+    "my_space/roads.py",
+    "my_lazy.py",
+    "weights.json",
+    "tiles/1.txt",
+    "table.bin",
+    "both.txt",
+}
 
 
 @pytest.fixture
@@ -113,7 +133,8 @@ def read(place: Path) -> dict[str, str]:
 
 
 def test_what_is_read_while_models_are_loaded_made_and_first_run_counts_wherever_the_command_is_started(
-        place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    place: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     result = read(place)
     assert set(result) == READ
     monkeypatch.chdir(place / "tiles")
@@ -123,7 +144,9 @@ def test_what_is_read_while_models_are_loaded_made_and_first_run_counts_wherever
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["my_ads.py", "my_maps/rules.py", "my_space/roads.py", "my_lazy.py", "tiles/1.txt", "table.bin"])
+@pytest.mark.parametrize(
+    "name", ["my_ads.py", "my_maps/rules.py", "my_space/roads.py", "my_lazy.py", "tiles/1.txt", "table.bin"]
+)
 def test_an_edit_of_whatever_was_read_is_seen(name: str, place: Path) -> None:
     before = read(place)
     (place / name).write_text((place / name).read_text().replace("9.0", "8.0").replace("0.5", "0.4") + "\n")

@@ -121,7 +121,9 @@ def test_ctrl_c_during_a_wait_is_noticed_soon() -> None:
 
 STUDY = load_study("sun")
 SUN = CharacteristicSet.of(STUDY.vehicle.characteristics)
-WITH_USER_CODE = msgspec.structs.replace(STUDY, ads=ModelTable(model="my_ads:Mine"), origin=Origin(called="my study.toml"))
+WITH_USER_CODE = msgspec.structs.replace(
+    STUDY, ads=ModelTable(model="my_ads:Mine"), origin=Origin(called="my study.toml")
+)
 
 
 def settings(number: int) -> np.ndarray:
@@ -133,8 +135,13 @@ def settings(number: int) -> np.ndarray:
 
 def evaluated(rows: np.ndarray) -> Evaluations:
     return Evaluations(
-        settings=rows, outcome=np.full(len(rows), "stopped", dtype="U16"), collision_speed=np.full(len(rows), np.nan),
-        metrics={name: rows[:, 0] / 3 for name in METRICS}, f_diff=SUN.largest_change(rows), f_num_diff=SUN.number_changed(rows))
+        settings=rows,
+        outcome=np.full(len(rows), "stopped", dtype="U16"),
+        collision_speed=np.full(len(rows), np.nan),
+        metrics={name: rows[:, 0] / 3 for name in METRICS},
+        f_diff=SUN.largest_change(rows),
+        f_num_diff=SUN.number_changed(rows),
+    )
 
 
 class ToldPool:
@@ -220,7 +227,9 @@ def test_a_setting_is_blamed_only_if_the_original_vehicle_can_be_simulated(fault
 
 
 def test_a_fault_of_the_surroundings_is_an_error_and_no_outcome() -> None:
-    pool = ToldPool(lambda rows, before: EnvironmentFault("the disk is full") if np.isin(rows[:, 0], 4302).any() else None)
+    pool = ToldPool(
+        lambda rows, before: EnvironmentFault("the disk is full") if np.isin(rows[:, 0], 4302).any() else None
+    )
     with pytest.raises(EnvironmentFault, match="the disk is full"):
         RetryingPool(pool, STUDY).submit(b"", settings(4)).result(timeout=5)
     assert pool.tried == [4, 4]
@@ -228,12 +237,18 @@ def test_a_fault_of_the_surroundings_is_an_error_and_no_outcome() -> None:
 
 def test_what_a_users_code_does_on_one_setting_is_an_error_that_names_it() -> None:
     def fault(rows: np.ndarray, before: int) -> Exception | None:
-        return UserCodeError("study", "ads.model = 'my_ads:Mine' raised in drive: ZeroDivisionError") if 4313 in rows[:, 0] else None
+        return (
+            UserCodeError("study", "ads.model = 'my_ads:Mine' raised in drive: ZeroDivisionError")
+            if 4313 in rows[:, 0]
+            else None
+        )
 
     pool = ToldPool(fault)
     with pytest.raises(UserCodeError) as caught:
         RetryingPool(pool, WITH_USER_CODE).submit(b"", settings(50)).result(timeout=5)
-    assert "ZeroDivisionError; to reproduce it: python -m safevar_sumo simulate 'my study.toml' --set " in str(caught.value)
+    assert "ZeroDivisionError; to reproduce it: python -m safevar_sumo simulate 'my study.toml' --set " in str(
+        caught.value
+    )
     assert f"--set {SUN.names[0]}=4313.0" in str(caught.value)
     assert str(caught.value).count("--set") == 1, "what is not changed need not be set"
     assert len(pool.tried) < 15
@@ -251,7 +266,10 @@ def test_the_command_that_reproduces_a_setting_keeps_small_changes_and_the_point
     assert reproduced(study, mass=original + 5) == f" --set mass={original + 5} --no-filter"
     assert reproduced(study, mass=original * 9) == f" --set mass={original * 9} --beyond"
     point = assemble(study).matrix[3].name
-    assert reproduced(study_at(study, point, "test"), mass=original + 200) == f" --point '{point}' --set mass={original + 200}"
+    assert (
+        reproduced(study_at(study, point, "test"), mass=original + 200)
+        == f" --point '{point}' --set mass={original + 200}"
+    )
     rated = load_study("euro_ncap_rating")
     cell = assemble(rated).matrix[3].name
     assert f"--point '{cell}'" in reproduced(study_at(rated, cell, "test"))

@@ -33,7 +33,11 @@ HEAVY = {"libsumo", "traci", "matplotlib", "pandas", "scipy", "seaborn", "cma"}
 def loaded(code: str) -> set[str]:
     """Which of the heavy packages a fresh interpreter has loaded after some code."""
     result = f"import sys\n{code}\nprint(*(set(sys.modules) & {HEAVY!r}))"
-    return set(subprocess.run([sys.executable, "-c", result], capture_output=True, text=True, check=True).stdout.splitlines()[-1].split())
+    return set(
+        subprocess.run([sys.executable, "-c", result], capture_output=True, text=True, check=True)
+        .stdout.splitlines()[-1]
+        .split()
+    )
 
 
 def test_every_command_is_listed_and_every_listed_one_is_there() -> None:
@@ -63,7 +67,9 @@ def test_the_package_and_the_help_load_nothing_heavy() -> None:
 
 
 def test_a_subject_that_is_nothing_is_refused_in_plain_words() -> None:
-    with pytest.raises(InputError, match=r"rian: is neither a results directory, a study nor a file; did you mean 'rain'\?"):
+    with pytest.raises(
+        InputError, match=r"rian: is neither a results directory, a study nor a file; did you mean 'rain'\?"
+    ):
         commands.main(["rules", "rian"], standalone_mode=False)
 
 
@@ -71,13 +77,19 @@ def test_a_subject_that_is_nothing_is_refused_in_plain_words() -> None:
 def test_one_simulation_loads_sumo_and_no_statistics() -> None:
     code = "from click.testing import CliRunner\nfrom safevar_sumo.cli.program import commands\n"
     assert loaded(code + "print(CliRunner().invoke(commands, ['list']).exit_code)") == set()
-    assert loaded(code + "print(CliRunner().invoke(commands, ['simulate', 'sun', '--json']).exit_code)") <= {"libsumo", "traci"}
+    assert loaded(code + "print(CliRunner().invoke(commands, ['simulate', 'sun', '--json']).exit_code)") <= {
+        "libsumo",
+        "traci",
+    }
 
 
 def test_what_the_library_says_of_a_parameter_is_said_of_its_flag(in_tmp: Path) -> None:
     Path("file").write_text("")
-    for arguments in (["import", "native", "--rs", "x.csv", "--out", "o", "--original", "sd"], ["study", "smoke", "--cluster", "nowhere"],
-                      ["study", "smoke", "--out", "file"]):
+    for arguments in (
+        ["import", "native", "--rs", "x.csv", "--out", "o", "--original", "sd"],
+        ["study", "smoke", "--cluster", "nowhere"],
+        ["study", "smoke", "--out", "file"],
+    ):
         result = CliRunner().invoke(commands, arguments).exception
         assert isinstance(result, InputError)
         assert result.source == arguments[-2]
@@ -91,22 +103,38 @@ def test_errors_of_the_library_speak_of_arguments_and_not_of_flags() -> None:
                     assert not re.search(r"--[a-z]", re.sub(r"`[^`]*`", "", ast.unparse(node))), f"{file}:{node.lineno}"
 
 
-@pytest.mark.parametrize(("typed", "says"), [
-    ("simulate rian", "did you mean 'rain'?"), ("explain rian", "did you mean 'rain'?"), ("simlate rain", "did you mean 'simulate'?"),
-    ("simulate rain --set tirefric=1", "did you mean 'tireFric'?"), ("tolerance rain --characteristics mas", "did you mean 'mass'?"),
-    ("report results/rain --only verdct", "did you mean 'verdict'?"),
-    ("simulate weather.toml", "did you mean 'fog'?"), ("simulate model.toml", "did you mean 'world_on_rails'?"),
-    ("simulate key.toml", "runns: there is no such key; did you mean 'runs'?"),
-    ("simulate rain --set mass=+8", "is outside its domain\nexpected: a number in [2040, 2700] kg, or mass=+8% of the original, or any "
-                                    "with --beyond"),
-    ("simulate rain --set mass=2000", "a number in [2040, 2700] kg, or any with --beyond"),
-    ("rating euro_ncap_rating --set treadDepth=300", "is outside its domain\nexpected: a number in [1.6, 8] mm\n"),
-    ("rating euro_ncap_rating --set treadDepth", "NAME=+10% of the original\n"),
-    ("tables smoke", "did you mean results/smoke?"), ("status smoke", "did you mean results/smoke?"),
-])
-def test_an_error_names_what_was_probably_meant(typed: str, says: str, in_tmp: Path, monkeypatch: pytest.MonkeyPatch,
-                                                capsys: pytest.CaptureFixture[str]) -> None:
-    for name, text in (("weather", 'weather = "fogg"'), ("model", '[ads]\nmodel = "world_on_rail"'), ("key", "[search]\nrunns = 3")):
+@pytest.mark.parametrize(
+    ("typed", "says"),
+    [
+        ("simulate rian", "did you mean 'rain'?"),
+        ("explain rian", "did you mean 'rain'?"),
+        ("simlate rain", "did you mean 'simulate'?"),
+        ("simulate rain --set tirefric=1", "did you mean 'tireFric'?"),
+        ("tolerance rain --characteristics mas", "did you mean 'mass'?"),
+        ("report results/rain --only verdct", "did you mean 'verdict'?"),
+        ("simulate weather.toml", "did you mean 'fog'?"),
+        ("simulate model.toml", "did you mean 'world_on_rails'?"),
+        ("simulate key.toml", "runns: there is no such key; did you mean 'runs'?"),
+        (
+            "simulate rain --set mass=+8",
+            "is outside its domain\nexpected: a number in [2040, 2700] kg, or mass=+8% of the original, or any "
+            "with --beyond",
+        ),
+        ("simulate rain --set mass=2000", "a number in [2040, 2700] kg, or any with --beyond"),
+        ("rating euro_ncap_rating --set treadDepth=300", "is outside its domain\nexpected: a number in [1.6, 8] mm\n"),
+        ("rating euro_ncap_rating --set treadDepth", "NAME=+10% of the original\n"),
+        ("tables smoke", "did you mean results/smoke?"),
+        ("status smoke", "did you mean results/smoke?"),
+    ],
+)
+def test_an_error_names_what_was_probably_meant(
+    typed: str, says: str, in_tmp: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name, text in (
+        ("weather", 'weather = "fogg"'),
+        ("model", '[ads]\nmodel = "world_on_rail"'),
+        ("key", "[search]\nrunns = 3"),
+    ):
         Path(f"{name}.toml").write_text(f'extends = "sun"\n{text}\n')
     results = in_tmp / "results" / "smoke"
     results.mkdir(parents=True)
@@ -119,14 +147,23 @@ def test_an_error_names_what_was_probably_meant(typed: str, says: str, in_tmp: P
     assert says in result
 
 
-@pytest.mark.parametrize(("words", "incomplete", "expected"), [
-    ([], "s", {name for name in COMMANDS if name.startswith("s")}), (["study"], "ra", {"rain"}), (["simulate"], "su", {"sun"}),
-    (["simulate", "native", "--set"], "t", {"tau="}), (["simulate", "sun", "--set"], "ma", {"mass=", "max_rpm=", "maxBrakeTorque="}),
-    (["simulate", "nothing", "--set"], "t", set()), (["validate"], "lg", {"lgsvl"}),
-])
+@pytest.mark.parametrize(
+    ("words", "incomplete", "expected"),
+    [
+        ([], "s", {name for name in COMMANDS if name.startswith("s")}),
+        (["study"], "ra", {"rain"}),
+        (["simulate"], "su", {"sun"}),
+        (["simulate", "native", "--set"], "t", {"tau="}),
+        (["simulate", "sun", "--set"], "ma", {"mass=", "max_rpm=", "maxBrakeTorque="}),
+        (["simulate", "nothing", "--set"], "t", set()),
+        (["validate"], "lg", {"lgsvl"}),
+    ],
+)
 def test_names_complete(words: list[str], incomplete: str, expected: set[str]) -> None:
     result = ShellComplete(commands, {}, "safevar-sumo", "_SAFEVAR_SUMO_COMPLETE").get_completions(words, incomplete)
-    assert expected == {item.value for item in result if item.type == "plain"} or expected <= {item.value for item in result}
+    assert expected == {item.value for item in result if item.type == "plain"} or expected <= {
+        item.value for item in result
+    }
 
 
 def printed(table: WholeTable, width: int) -> list[str]:
@@ -185,9 +222,20 @@ def test_a_section_of_the_list_comes_alone() -> None:
     assert "'weathers'" in str(CliRunner().invoke(commands, ["list", "weather"], standalone_mode=False).exception)
 
 
-@pytest.mark.parametrize("arguments", [
-    "validate sun folder", "import sun --out published --rs folder", "simulate folder", "tables folder", "status folder",
-    "simulate smoke --trace folder.csv", "tolerance smoke --plot folder.png", "study smoke --out file", "figures file --out folder"])
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        "validate sun folder",
+        "import sun --out published --rs folder",
+        "simulate folder",
+        "tables folder",
+        "status folder",
+        "simulate smoke --trace folder.csv",
+        "tolerance smoke --plot folder.png",
+        "study smoke --out file",
+        "figures file --out folder",
+    ],
+)
 def test_a_folder_is_no_file_and_a_file_no_folder(arguments: str, in_tmp: Path) -> None:
     for folder in ("folder", "folder.csv", "folder.png"):
         Path(folder).mkdir()
@@ -196,7 +244,9 @@ def test_a_folder_is_no_file_and_a_file_no_folder(arguments: str, in_tmp: Path) 
 
 
 def test_the_program_runs_where_stderr_is_no_file() -> None:
-    code = ("import contextlib, io, sys; from safevar_sumo.__main__ import main; sys.argv = ['safevar-sumo', '--version']\n"
-            "with contextlib.redirect_stderr(io.StringIO()): main()")
+    code = (
+        "import contextlib, io, sys; from safevar_sumo.__main__ import main; sys.argv = ['safevar-sumo', '--version']\n"
+        "with contextlib.redirect_stderr(io.StringIO()): main()"
+    )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert (done.returncode, "version" in done.stdout) == (0, True), done.stderr

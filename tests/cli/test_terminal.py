@@ -52,7 +52,8 @@ def shown(study: Study, clock: list[float], width: int) -> list[str]:
 
 
 def test_elsewhere_a_line_shows_the_time_left_even_if_a_batch_takes_longer(
-        clock: list[float], monkeypatch: pytest.MonkeyPatch) -> None:
+    clock: list[float], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """25 of 100 in 10 s: the others take 30 s, of which 6 have passed."""
     monkeypatch.setattr(progress, "SECONDS_BETWEEN_LINES", 0.02)
     out = StringIO()
@@ -89,13 +90,24 @@ def test_what_comes_from_journals_is_not_left_to_be_done(study: Study) -> None:
 def test_parts_have_one_counter_that_never_passes_its_end() -> None:
     shows: list[tuple[str, int, int]] = []
     parts = PartsProgress(lambda *values: shows.append(values), {"causes": 100, "stored": 50, "rules": 10})
-    for part, stages in {"causes": (("a", 0, 20), ("a", 20, 20), ("b", 0, 20), ("b", 20, 20)), "stored": (),
-                         "rules": (("c", 0, 30), ("c", 15, 30), ("c", 30, 30))}.items():
+    for part, stages in {
+        "causes": (("a", 0, 20), ("a", 20, 20), ("b", 0, 20), ("b", 20, 20)),
+        "stored": (),
+        "rules": (("c", 0, 30), ("c", 15, 30), ("c", 30, 30)),
+    }.items():
         show = parts.begin(part)
         for stage in stages:
             show(*stage)
-    assert shows == [("starting", 0, 160), ("causes: a", 0, 160), ("causes: a", 20, 160), ("causes: b", 20, 160),
-                     ("causes: b", 40, 160), ("rules: c", 40, 70), ("rules: c", 55, 70), ("rules: c", 70, 70)]
+    assert shows == [
+        ("starting", 0, 160),
+        ("causes: a", 0, 160),
+        ("causes: a", 20, 160),
+        ("causes: b", 20, 160),
+        ("causes: b", 40, 160),
+        ("rules: c", 40, 70),
+        ("rules: c", 55, 70),
+        ("rules: c", 70, 70),
+    ]
 
 
 def test_a_few_settings_in_a_long_matrix_are_several_batches(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -28,8 +28,16 @@ running: list[subprocess.Popen[str]] = []
 
 def started(*arguments: str, **options: object) -> subprocess.Popen[str]:
     """Start a command in its own process group, as a shell does."""
-    running.append(subprocess.Popen([sys.executable, "-m", "safevar_sumo", *arguments], stdout=subprocess.PIPE,  # type: ignore[call-overload]
-                                    stderr=subprocess.PIPE, text=True, start_new_session=True, **options))
+    running.append(
+        subprocess.Popen(
+            [sys.executable, "-m", "safevar_sumo", *arguments],
+            stdout=subprocess.PIPE,  # type: ignore[call-overload]
+            stderr=subprocess.PIPE,
+            text=True,
+            start_new_session=True,
+            **options,
+        )
+    )
     return running[-1]
 
 

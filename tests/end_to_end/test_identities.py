@@ -63,7 +63,11 @@ def edited(path: str, old: str, new: str) -> None:
 def test_results_go_with_the_files_that_they_were_computed_with() -> None:
     study()
     before = Path("out/solutions.csv").read_bytes()
-    edits = ("my_ads.py", "0.5", "0.65"), ("my_map.py", "9.0", "8.25"), ("my_net/traffic.rou.xml", "<route", "<!-- --><route")
+    edits = (
+        ("my_ads.py", "0.5", "0.65"),
+        ("my_map.py", "9.0", "8.25"),
+        ("my_net/traffic.rou.xml", "<route", "<!-- --><route"),
+    )
     for path, old, new in edits:
         edited(path, old, new)
         result = refused("study", "mine.toml", "--out", "out")
@@ -109,7 +113,9 @@ def refused(*words: str) -> str:
 
 
 @pytest.mark.slow
-def test_whatever_a_matrix_reads_counts_and_every_command_that_simulates_results_refuses_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_whatever_a_matrix_reads_counts_and_every_command_that_simulates_results_refuses_by_name(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     Path("mine.toml").write_text(STUDY.replace("evaluations = 30", "evaluations = 4\npopulation = 2") + MATRIX)
     files = {"my_test.py": TEST, "table.txt": "1", "near.txt": "2", "far.txt": "3"}
     for name, text in files.items():
@@ -124,7 +130,14 @@ def test_whatever_a_matrix_reads_counts_and_every_command_that_simulates_results
         assert f"{name} has changed since" in refused("study", "../mine.toml", "--out", "../out", "--runs", "3")
         Path("..", name).write_text(text)
     Path("../far.txt").write_text("another")
-    for words in ("simulate ../out --most-severe", "explain ../out", "tolerance ../out", "risk ../out", "rules ../out", "report ../out"):
+    for words in (
+        "simulate ../out --most-severe",
+        "explain ../out",
+        "tolerance ../out",
+        "risk ../out",
+        "rules ../out",
+        "report ../out",
+    ):
         result = refused(*words.split())
         assert "far.txt has changed since" in result
         assert "--as-it-is-now" in result
@@ -133,7 +146,9 @@ def test_whatever_a_matrix_reads_counts_and_every_command_that_simulates_results
     done = CliRunner().invoke(commands, ["rules", "../out", "--samples", "8", "--json", "--as-it-is-now"])
     assert done.exit_code == 0, done.exception
     assert "warning: ../out: far.txt has changed since; simulated as it is now" in done.stderr
-    done = CliRunner().invoke(commands, ["report", "../out", "--only", "verdict,reproduce", "--as-it-is-now", "--out", "page.html"])
+    done = CliRunner().invoke(
+        commands, ["report", "../out", "--only", "verdict,reproduce", "--as-it-is-now", "--out", "page.html"]
+    )
     assert "far.txt has changed since" in done.stderr
     assert "far.txt has changed since" in Path("page.html").read_text()
 
@@ -141,16 +156,25 @@ def test_whatever_a_matrix_reads_counts_and_every_command_that_simulates_results
 @pytest.mark.slow
 def test_a_file_that_is_read_later_counts_from_then_on() -> None:
     top = sv.simulate("mine.toml").runs.trace.speed.max()
-    Path("my_ads.py").write_text(ADS.replace("def drive(self, seen):", f"""def drive(self, seen):
+    Path("my_ads.py").write_text(
+        ADS.replace(
+            "def drive(self, seen):",
+            f"""def drive(self, seen):
         if seen.speed > {float(top)!r}:
-            open("tile.txt").read()"""))
+            open("tile.txt").read()""",
+        )
+    )
     Path("tile.txt").write_text("a tile")
     edited("mine.toml", "evaluations = 30", "evaluations = 60")
     study()
     files = [path.relative_to("out").as_posix() for path in Path("out").rglob("*") if path.is_file()]
     assert {row.name for row in FILES if any(fnmatch(name, row.name) for name in files)} == {row.name for row in FILES}
-    assert [name for name in files if not any(fnmatch(name, row.name) for row in FILES)] == [], "a file that the manual does not list"
-    assert "tile.txt" not in json.loads(Path("out/manifest.json").read_text())["sources"], "the original vehicle is never so fast"
+    assert [name for name in files if not any(fnmatch(name, row.name) for row in FILES)] == [], (
+        "a file that the manual does not list"
+    )
+    assert "tile.txt" not in json.loads(Path("out/manifest.json").read_text())["sources"], (
+        "the original vehicle is never so fast"
+    )
     before = Path("out/solutions.csv").read_bytes()
     study()
     assert Path("out/solutions.csv").read_bytes() == before

@@ -19,7 +19,18 @@ import pytest
 from safevar_sumo.campaign import cluster
 from safevar_sumo.errors import InputError
 from safevar_sumo.results import load_runs
-from tests.end_to_end.processes import STUDY, ended, killed, left_of_group, solutions, started, study, until, workers_of, written
+from tests.end_to_end.processes import (
+    STUDY,
+    ended,
+    killed,
+    left_of_group,
+    solutions,
+    started,
+    study,
+    until,
+    workers_of,
+    written,
+)
 from tests.in_process import refused, run
 
 pytestmark = pytest.mark.usefixtures("small")
@@ -72,7 +83,9 @@ def test_two_workers_that_are_killed_leave_the_same_bytes(whole: Path) -> None:
     assert (load_runs(OUT).evaluations["outcome"] != "simulator-error").all()
 
 
-@pytest.mark.parametrize("when", ["mid-run", *(pytest.param(moment, marks=SLOW) for moment in ("loading", 0.0, 0.15, 0.4, "twice"))])
+@pytest.mark.parametrize(
+    "when", ["mid-run", *(pytest.param(moment, marks=SLOW) for moment in ("loading", 0.0, 0.15, 0.4, "twice"))]
+)
 def test_ctrl_c_ends_everything_with_code_130(when: float | str) -> None:
     process = started("study", "rain", "--out", "out", "--jobs", "1", "--engine", "sumo")
     if when == "loading":
@@ -81,7 +94,9 @@ def test_ctrl_c_ends_everything_with_code_130(when: float | str) -> None:
         until(lambda: written(OUT) > 0, process)
         loaded = " ".join(one.path for one in workers_of(process)[0].memory_maps())
         assert "libsumo" in loaded
-        assert not any(name in loaded for name in ("pandas", "pyarrow", "matplotlib")), "a worker loads neither frames nor figures"
+        assert not any(name in loaded for name in ("pandas", "pyarrow", "matplotlib")), (
+            "a worker loads neither frames nor figures"
+        )
     else:
         until(lambda: len(workers_of(process)) > 0, process)
         time.sleep(when)
@@ -106,7 +121,8 @@ def test_sigterm_leaves_no_worker_behind() -> None:
 def test_a_worker_that_hangs_does_not_outlive_a_killed_study() -> None:
     Path("my_ads.py").write_text(
         "import time\nfrom pathlib import Path\nfrom safevar_sumo.ads import ScalarAds\n\n\nclass Dozing(ScalarAds):\n"
-        "    def drive(self, seen):\n        Path('dozing').touch()\n        time.sleep(1000)\n")
+        "    def drive(self, seen):\n        Path('dozing').touch()\n        time.sleep(1000)\n"
+    )
     Path("dozing.toml").write_text('extends = "small.toml"\nname = "dozing"\n[ads]\nmodel = "my_ads:Dozing"\n')
     process = started("study", "dozing.toml", "--out", "out")
     until(Path("dozing").exists, process)
@@ -116,8 +132,10 @@ def test_a_worker_that_hangs_does_not_outlive_a_killed_study() -> None:
 
 @SLOW
 def test_a_crash_of_compiled_code_names_the_line_that_called_it() -> None:
-    Path("my_ads.py").write_text("import ctypes\nfrom safevar_sumo.ads import ScalarAds\n\n\nclass Crashing(ScalarAds):\n"
-                                 "    def drive(self, seen):\n        ctypes.string_at(0)\n")
+    Path("my_ads.py").write_text(
+        "import ctypes\nfrom safevar_sumo.ads import ScalarAds\n\n\nclass Crashing(ScalarAds):\n"
+        "    def drive(self, seen):\n        ctypes.string_at(0)\n"
+    )
     Path("crashing.toml").write_text('extends = "small.toml"\nname = "crashing"\n[ads]\nmodel = "my_ads:Crashing"\n')
     process = started("simulate", "crashing.toml")
     _, errors = process.communicate(timeout=120)
@@ -154,13 +172,22 @@ libsumo.vehicletype.setMass = deadly
 
 
 @SLOW
-@pytest.mark.parametrize(("end", "number", "why"), [
-    ("refuse", 2, "SUMO failed: That is too heavy."), ("hang", 1, "the simulation took longer than 8 s"),
-    ("exit", 2, "the worker process died (exit code 3)"), ("kill", 1, "the worker process died (exit code -9)")])
-def test_settings_that_sumo_dies_of_are_recorded_and_left_out(end: str, number: int, why: str, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("end", "number", "why"),
+    [
+        ("refuse", 2, "SUMO failed: That is too heavy."),
+        ("hang", 1, "the simulation took longer than 8 s"),
+        ("exit", 2, "the worker process died (exit code 3)"),
+        ("kill", 1, "the worker process died (exit code -9)"),
+    ],
+)
+def test_settings_that_sumo_dies_of_are_recorded_and_left_out(
+    end: str, number: int, why: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     Path("deadly.toml").write_text(
         'extends = "smoke"\nname = "deadly"\n[search]\nalgorithms = ["rs"]\nevaluations = 40\nruns = 1\n'
-        + ("time_limit = 8.0\n" if end == "hang" else ""))
+        + ("time_limit = 8.0\n" if end == "hang" else "")
+    )
     run("study", "deadly.toml", "--out", "healthy")
     healthy = load_runs("healthy").evaluations  # in a recorded scene, where nobody sets masses
     masses = np.sort(healthy["mass"].unique())
@@ -207,7 +234,9 @@ def start(small: None) -> Iterator[Start]:
         command = [sys.executable, "-m", f"distributed.cli.dask_{program}", *arguments, "--no-dashboard"]
         environment = {**os.environ, "DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": "0"}
         with open(f"{program}-{len(running)}.log", "w") as log:
-            running.append(subprocess.Popen(command, stdout=log, stderr=log, text=True, start_new_session=True, env=environment))
+            running.append(
+                subprocess.Popen(command, stdout=log, stderr=log, text=True, start_new_session=True, env=environment)
+            )
         return running[-1]
 
     yield begin
@@ -237,7 +266,8 @@ def busy(process: subprocess.Popen[str]) -> bool:
 
 @pytest.mark.slow
 def test_two_workers_of_which_one_is_killed_leave_the_same_bytes(
-        scheduler: tuple[subprocess.Popen[str], str], start: Start, whole: Path) -> None:
+    scheduler: tuple[subprocess.Popen[str], str], start: Start, whole: Path
+) -> None:
     _, address = scheduler
     workers = [worker(start, address, "--no-nanny") for _ in range(2)]
     until(lambda: all("Registered to" in Path(f"worker-{i}.log").read_text() for i in (1, 2)), workers[0])
@@ -252,13 +282,17 @@ def test_two_workers_of_which_one_is_killed_leave_the_same_bytes(
 
 
 @pytest.mark.slow
-def test_a_simulation_that_hangs_is_stopped_on_a_cluster_too(scheduler: tuple[subprocess.Popen[str], str], start: Start) -> None:
+def test_a_simulation_that_hangs_is_stopped_on_a_cluster_too(
+    scheduler: tuple[subprocess.Popen[str], str], start: Start
+) -> None:
     Path("my_ads.py").write_text(
         "import time\nfrom safevar_sumo.ads import ScalarAds\n\n\nclass Dozing(ScalarAds):\n    def drive(self, seen):\n"
-        "        time.sleep(1000)\n")
+        "        time.sleep(1000)\n"
+    )
     Path("dozing.toml").write_text(
         'extends = "smoke"\nname = "dozing"\n[ads]\nmodel = "my_ads:Dozing"\n'
-        '[search]\nalgorithms = ["rs"]\nruns = 1\nevaluations = 10\ntime_limit = 2\n')
+        '[search]\nalgorithms = ["rs"]\nruns = 1\nevaluations = 10\ntime_limit = 2\n'
+    )
     _, address = scheduler
     worker(start, address, "--nanny")
     errors = ended(started("study", "dozing.toml", "--cluster", address, "--out", "out"), 2)
@@ -268,13 +302,24 @@ def test_a_simulation_that_hangs_is_stopped_on_a_cluster_too(scheduler: tuple[su
 @pytest.mark.slow
 def test_an_address_that_nobody_answers_is_told_in_time(in_tmp: Path) -> None:
     began = time.monotonic()
-    refused("study", "smoke", "--cluster", "tcp://127.0.0.1:9", "--out", "out", message=("--cluster: no scheduler answers at 'tcp://127.0.0.1:9'",))
+    refused(
+        "study",
+        "smoke",
+        "--cluster",
+        "tcp://127.0.0.1:9",
+        "--out",
+        "out",
+        message=("--cluster: no scheduler answers at 'tcp://127.0.0.1:9'",),
+    )
     assert time.monotonic() - began < 15
     assert not Path("out").exists()
 
 
 def test_an_encrypted_scheduler_needs_certificates_from_the_configuration() -> None:
-    with pytest.raises(InputError, match=r"certificates in Dask's configuration"), cluster.cluster_pool("tls://127.0.0.1:9", 9.0):
+    with (
+        pytest.raises(InputError, match=r"certificates in Dask's configuration"),
+        cluster.cluster_pool("tls://127.0.0.1:9", 9.0),
+    ):
         pass
 
 

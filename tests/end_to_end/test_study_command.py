@@ -53,7 +53,10 @@ def test_more_runs_extend_what_is_there(copied: Path) -> None:
 def test_results_of_another_size_are_continued_with_a_warning(copied: Path) -> None:
     assert "warning" not in study("--out", "out")
     longer = study("--out", "out", "--evaluations", "160")
-    assert "out: each run had 150 evaluations before and has 160 now: an id such as nsga2:0:0 may name another solution" in longer
+    assert (
+        "out: each run had 150 evaluations before and has 160 now: an id such as nsga2:0:0 may name another solution"
+        in longer
+    )
     assert "left out" not in longer
     fewer = study("--out", "out", "--evaluations", "160", "--runs", "1", "--algorithms", "nsga2,rs")
     assert "out: 4 earlier runs left out of the results: nsga2-01, rs-01, safe_fuzzer-00, safe_fuzzer-01" in fewer
@@ -85,7 +88,9 @@ def test_results_of_another_version_or_seed_are_refused_and_left_alone(copied: P
     assert "belongs to another study or version" in study("--out", "out", expect=2)
 
 
-def test_torn_tails_are_cut_off_with_a_warning_and_damage_in_the_middle_names_its_place(copied: Path, whole: Path) -> None:
+def test_torn_tails_are_cut_off_with_a_warning_and_damage_in_the_middle_names_its_place(
+    copied: Path, whole: Path
+) -> None:
     for name, lost in (("nsga2-00", 20), ("safe_fuzzer-01", 9000)):
         path = copied / "runs" / f"{name}.jsonl"
         os.truncate(path, path.stat().st_size - lost)
@@ -101,15 +106,18 @@ def test_torn_tails_are_cut_off_with_a_warning_and_damage_in_the_middle_names_it
     assert path.read_bytes() == content
 
 
-@pytest.mark.parametrize(("arguments", "expected"), [
-    (["--jobs", "0"], ("--jobs", "0")),
-    (["--shard", "3/2"], ("--shard", "'3/2'", "K in 1..N")),
-    (["--shard", "0/2"], ("--shard", "'0/2'")),
-    (["--only", "nonsense"], ("--only", "'nonsense'", "ALGORITHM:RUN")),
-    (["--only", "nsga2:2"], ("--only", "'nsga2:2'")),
-    (["--cluster", "nowhere"], ("--cluster", "'nowhere'", "tcp://host:8786")),
-    (["--cluster", ""], ("--cluster", "''")),
-])
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (["--jobs", "0"], ("--jobs", "0")),
+        (["--shard", "3/2"], ("--shard", "'3/2'", "K in 1..N")),
+        (["--shard", "0/2"], ("--shard", "'0/2'")),
+        (["--only", "nonsense"], ("--only", "'nonsense'", "ALGORITHM:RUN")),
+        (["--only", "nsga2:2"], ("--only", "'nsga2:2'")),
+        (["--cluster", "nowhere"], ("--cluster", "'nowhere'", "tcp://host:8786")),
+        (["--cluster", ""], ("--cluster", "''")),
+    ],
+)
 def test_bad_options_are_refused(arguments: list[str], expected: tuple[str, ...]) -> None:
     refused("study", "small.toml", "--out", "out", *arguments, message=expected)
     assert not Path("out/runs").exists()
@@ -133,8 +141,10 @@ def test_a_dry_run_tells_what_it_would_take_and_writes_nothing() -> None:
 
 
 def test_an_ads_that_always_fails_ends_the_study_with_that_fault() -> None:
-    Path("my_ads.py").write_text("from safevar_sumo.ads import ScalarAds\n\n\nclass Bad(ScalarAds):\n"
-                                 "    def drive(self, seen):\n        return 1 / 0\n")
+    Path("my_ads.py").write_text(
+        "from safevar_sumo.ads import ScalarAds\n\n\nclass Bad(ScalarAds):\n"
+        "    def drive(self, seen):\n        return 1 / 0\n"
+    )
     Path("bad.toml").write_text('extends = "small.toml"\nname = "bad"\n[ads]\nmodel = "my_ads:Bad"\n')
     for options in ([], ["--dry-run"]):
         refused("study", "bad.toml", "--out", "out", *options, message=("ZeroDivisionError", "simulate bad.toml"))

@@ -34,7 +34,13 @@ def package_csv(path: Path, rows: int, seed: int, **constant: float) -> Path:
     sd = np.round(rng.uniform(-1, 3, rows), 3)
     names = [name.replace("ZeroT", "Zero") for name in characteristics.names]
     frame = pd.DataFrame(settings, columns=names).assign(
-        MaxPercentage=0.5, SaftyDegree=sd, numbers=12.0, TIT=np.where(sd > 0, 0.5, 0), TET=np.where(sd > 0, 1.5, 0), Dece=5.0)
+        MaxPercentage=0.5,
+        SaftyDegree=sd,
+        numbers=12.0,
+        TIT=np.where(sd > 0, 0.5, 0),
+        TET=np.where(sd > 0, 1.5, 0),
+        Dece=5.0,
+    )
     frame.assign(**constant).to_csv(path, index=False)
     return path
 
@@ -52,8 +58,17 @@ def test_a_second_import_says_what_it_replaces(imported: Path) -> None:
     done = run("import", "sun", "--out", "imported", "--nsga2", "new.csv")
     assert "20 solutions of nsga2" in done.stdout
     assert done.stderr == "note: they replace 40 solutions of nsga2 of an earlier import\n"
-    refused("import", "sun", "--out", "imported", "--rs", "rs.csv", "--original", "sd=1,sd=2",
-            message=("--original", "'sd=2' in 'sd=1,sd=2'", "each metric once"))
+    refused(
+        "import",
+        "sun",
+        "--out",
+        "imported",
+        "--rs",
+        "rs.csv",
+        "--original",
+        "sd=1,sd=2",
+        message=("--original", "'sd=2' in 'sd=1,sd=2'", "each metric once"),
+    )
 
 
 def test_tables_agree_with_the_solutions_that_are_stored(results: Path) -> None:
@@ -89,7 +104,9 @@ def test_imported_solutions_are_filtered_and_counted_anew(imported: Path) -> Non
     assert len(frame) == 70
     characteristics = CharacteristicSet.of(load_study("sun").vehicle.characteristics)
     settings = frame[list(characteristics.names)].to_numpy()
-    assert (settings[:, :6] == characteristics.original[:6]).any(axis=0).all(), "changes below the threshold are put back"
+    assert (settings[:, :6] == characteristics.original[:6]).any(axis=0).all(), (
+        "changes below the threshold are put back"
+    )
     assert frame["f_num_diff"].tolist() == (settings != characteristics.original).sum(axis=1).tolist()
     assert np.allclose(frame["f_diff"], np.max(np.abs(settings / characteristics.original - 1), axis=1))
     assert set(frame.loc[frame["safety_degree"] <= 0, "outcome"]) == {"collision"}
@@ -109,7 +126,7 @@ def test_imported_results_answer_what_needs_no_runs(imported: Path) -> None:
 def test_a_csv_of_another_vehicle_is_refused(in_tmp: Path) -> None:
     package_csv(in_tmp / "a.csv", 5, 1)
     refused("import", "native", "--out", "out", "--nsga2", "a.csv", message=("--original",))
-    refused("import", "lgsvl", "--out", "out", "--nsga2", "a.csv", message=("a.csv", "lacks the columns",))
+    refused("import", "lgsvl", "--out", "out", "--nsga2", "a.csv", message=("a.csv", "lacks the columns"))
     refused("import", "sun", "--out", "out", "--nsga2", ".", message=("is no regular file",))
     assert not Path("out").exists()
 
@@ -153,9 +170,11 @@ def test_an_unfinished_campaign_is_answered_as_far_as_it_went(results: Path, in_
 
 @pytest.mark.slow
 def test_sumo_is_not_needed(results: Path, in_tmp: Path) -> None:
-    code = ("import sys\nfrom click.testing import CliRunner\nfrom safevar_sumo.cli.program import commands\n"
-            f"for line in (['tables', {str(results)!r}], ['figures', {str(results)!r}, '--out', 'pictures']):\n"
-            "    assert CliRunner().invoke(commands, line).exit_code == 0\n"
-            "print(sorted({name.partition('.')[0] for name in sys.modules} & {'libsumo', 'traci', 'sumo'}))")
+    code = (
+        "import sys\nfrom click.testing import CliRunner\nfrom safevar_sumo.cli.program import commands\n"
+        f"for line in (['tables', {str(results)!r}], ['figures', {str(results)!r}, '--out', 'pictures']):\n"
+        "    assert CliRunner().invoke(commands, line).exit_code == 0\n"
+        "print(sorted({name.partition('.')[0] for name in sys.modules} & {'libsumo', 'traci', 'sumo'}))"
+    )
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "[]\n"
     assert {path.read_bytes()[:4] for path in Path("pictures").iterdir()} == {b"\x89PNG"}, "the default"

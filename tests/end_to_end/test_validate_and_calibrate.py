@@ -34,7 +34,11 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     system = assemble(load_study("sun"))
     characteristics = system.characteristics
     settings = np.random.default_rng(3).uniform(characteristics.lower, characteristics.upper, (40, 12))
-    filtered = np.where(np.abs(settings - characteristics.original) > 1.2 * characteristics.threshold, settings, characteristics.original)
+    filtered = np.where(
+        np.abs(settings - characteristics.original) > 1.2 * characteristics.threshold,
+        settings,
+        characteristics.original,
+    )
     result = evaluate(system, filtered)
     frame = pd.DataFrame(filtered, columns=list(characteristics.names))
     for name, column in COLUMNS.items():
@@ -46,9 +50,23 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.slow
 def test_validate_agrees_perfectly_with_itself(data: Path, in_tmp: Path) -> None:
-    output = json.loads(run("validate", "sun", str(data), "--json", "--plot", "plot.png", "--totals", "kept.toml").stdout)
-    assert list(output) == ["rows", "spearman", "mean_absolute_error", "bias", "collisions", "original", "precision", "recall",
-                          "collision_speed", "in_repeats", "undecided", "by_predicted"]
+    output = json.loads(
+        run("validate", "sun", str(data), "--json", "--plot", "plot.png", "--totals", "kept.toml").stdout
+    )
+    assert list(output) == [
+        "rows",
+        "spearman",
+        "mean_absolute_error",
+        "bias",
+        "collisions",
+        "original",
+        "precision",
+        "recall",
+        "collision_speed",
+        "in_repeats",
+        "undecided",
+        "by_predicted",
+    ]
     assert output["rows"] == 40
     for name in COLUMNS:
         assert output["spearman"][name] == pytest.approx(1.0)
@@ -75,7 +93,8 @@ def test_calibrate_finds_back_what_was_changed(data: Path, in_tmp: Path) -> None
     """A study that starts from another brake gap comes nearer to the one that the data was made with."""
     Path("mine.toml").write_text(
         'extends = "sun"\nname = "mine"\n[ads.parameters]\nbrake_gap = 8.0\n'
-        '[calibration]\n"ads.parameters.brake_gap" = { lower = 6, upper = 12, unit = "m", meaning = "gap" }\n')
+        '[calibration]\n"ads.parameters.brake_gap" = { lower = 6, upper = 12, unit = "m", meaning = "gap" }\n'
+    )
     truth = load_study("sun").ads.parameters["brake_gap"]
     done = run("calibrate", "mine.toml", str(data), "--trials", "37", "--seed", "3", "--out", "found.toml")
     result = tomllib.loads(Path("found.toml").read_text())
@@ -92,27 +111,37 @@ def test_calibrate_finds_back_what_was_changed(data: Path, in_tmp: Path) -> None
     assert len(contents) == 1
 
 
-@pytest.mark.parametrize(("key", "expected"), [
-    ("vehicle.characteristics.mass.original", ("vehicle.characteristics.mass.original",)),
-    ("ads.parameters.nothing", ("ads.parameters.nothing",)),
-    ("weather.name", ("weather.name",)),
-    ("ads.parameters.throttle.00", ("ads.parameters.throttle.00",)),
-])
+@pytest.mark.parametrize(
+    ("key", "expected"),
+    [
+        ("vehicle.characteristics.mass.original", ("vehicle.characteristics.mass.original",)),
+        ("ads.parameters.nothing", ("ads.parameters.nothing",)),
+        ("weather.name", ("weather.name",)),
+        ("ads.parameters.throttle.00", ("ads.parameters.throttle.00",)),
+    ],
+)
 def test_calibrate_touches_nothing_but_parameters(key: str, expected: tuple[str, ...], in_tmp: Path) -> None:
     Path("mine.toml").write_text(
-        f'extends = "sun"\nname = "mine"\n[calibration]\n"{key}" = {{ lower = 1, upper = 2, unit = "-", meaning = "none" }}\n')
+        f'extends = "sun"\nname = "mine"\n[calibration]\n"{key}" = {{ lower = 1, upper = 2, unit = "-", meaning = "none" }}\n'
+    )
     refused("calibrate", "mine.toml", "--trials", "1", "--out", "x.toml", message=expected)
 
 
-@pytest.mark.parametrize(("key", "lower", "upper", "expected"), [
-    ("weather.road_friction", -3, 3, ("weather.road_friction", "lower = -3", "> 0")),
-    ("weather.road_friction", 0.5, 3, ("weather.road_friction", "upper = 3", "<= 1.5")),
-    ("vehicle.parameters.camera_height", 0.01, 3, ("camera_height", "lower = 0.01", "0.1")),
-])
-def test_calibrate_refuses_bounds_that_the_models_do_not_take(key: str, lower: float, upper: float, expected: tuple[str, ...],
-                                                              in_tmp: Path) -> None:
-    Path("mine.toml").write_text(f'extends = "sun"\nname = "mine"\n[calibration]\n'
-                                 f'"{key}" = {{ lower = {lower}, upper = {upper}, unit = "-", meaning = "none" }}\n')
+@pytest.mark.parametrize(
+    ("key", "lower", "upper", "expected"),
+    [
+        ("weather.road_friction", -3, 3, ("weather.road_friction", "lower = -3", "> 0")),
+        ("weather.road_friction", 0.5, 3, ("weather.road_friction", "upper = 3", "<= 1.5")),
+        ("vehicle.parameters.camera_height", 0.01, 3, ("camera_height", "lower = 0.01", "0.1")),
+    ],
+)
+def test_calibrate_refuses_bounds_that_the_models_do_not_take(
+    key: str, lower: float, upper: float, expected: tuple[str, ...], in_tmp: Path
+) -> None:
+    Path("mine.toml").write_text(
+        f'extends = "sun"\nname = "mine"\n[calibration]\n'
+        f'"{key}" = {{ lower = {lower}, upper = {upper}, unit = "-", meaning = "none" }}\n'
+    )
     refused("calibrate", "mine.toml", "--trials", "13", "--out", "x.toml", message=expected)
 
 
@@ -124,7 +153,15 @@ def test_calibrate_does_not_write_over_what_it_starts_from(data: Path, in_tmp: P
 def test_calibrate_does_not_write_over_a_study_that_its_study_extends(in_tmp: Path) -> None:
     Path("base.toml").write_text('extends = "sun"\n')
     Path("child.toml").write_text('extends = "base.toml"\nname = "child"\n')
-    refused("calibrate", "child.toml", "--trials", "1", "--out", "base.toml", message=("--out", "base.toml", "an input of the command"))
+    refused(
+        "calibrate",
+        "child.toml",
+        "--trials",
+        "1",
+        "--out",
+        "base.toml",
+        message=("--out", "base.toml", "an input of the command"),
+    )
     assert Path("base.toml").read_text() == 'extends = "sun"\n'
 
 
@@ -132,7 +169,8 @@ def small_fit() -> tuple[str, ...]:
     """Write a study with a free parameter, and return the command that fits it in few trials."""
     Path("mine.toml").write_text(
         'extends = "sun"\nname = "mine"\n[ads.parameters]\nbrake_gap = 8.0\n'
-        '[calibration]\n"ads.parameters.brake_gap" = { lower = 6, upper = 12, unit = "m", meaning = "gap" }\n')
+        '[calibration]\n"ads.parameters.brake_gap" = { lower = 6, upper = 12, unit = "m", meaning = "gap" }\n'
+    )
     return "calibrate", "mine.toml", "--trials", "5", "--out", "found.toml"
 
 
@@ -163,8 +201,9 @@ def test_a_full_disk_loses_neither_the_old_file_nor_the_fit(in_tmp: Path, monkey
 
 
 def test_the_best_so_far_is_saved_now_and_then(in_tmp: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def killed(subjects: Sequence[FitSubject], pool: object, done: Callable[[float, tuple[Study]], None], *,
-                  from_scratch: bool) -> None:
+    def killed(
+        subjects: Sequence[FitSubject], pool: object, done: Callable[[float, tuple[Study]], None], *, from_scratch: bool
+    ) -> None:
         done(1.0, (with_values(subjects[0].study, {"ads.parameters.brake_gap": 5.5}),))
         raise SystemExit
 
@@ -179,12 +218,15 @@ def test_the_best_so_far_is_saved_now_and_then(in_tmp: Path, monkeypatch: pytest
 def test_settings_that_cannot_be_simulated_are_told(data: Path, in_tmp: Path, worker_processes: None) -> None:
     Path("hasty.toml").write_text('extends = "sun"\nname = "hasty"\n[search]\ntime_limit = 0.001\n')
     pd.read_csv(data).head(1).to_csv("one.csv", index=False)
-    assert "the original vehicle cannot be simulated either" in run("validate", "hasty.toml", "one.csv", expect=1).stderr
+    assert (
+        "the original vehicle cannot be simulated either" in run("validate", "hasty.toml", "one.csv", expect=1).stderr
+    )
 
 
 def test_an_interrupted_calibration_leaves_the_best_so_far(in_tmp: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def interrupted(subjects: Sequence[FitSubject], pool: object, done: Callable[[float, tuple[Study]], None], *,
-                       from_scratch: bool) -> None:
+    def interrupted(
+        subjects: Sequence[FitSubject], pool: object, done: Callable[[float, tuple[Study]], None], *, from_scratch: bool
+    ) -> None:
         done(2.0, (subjects[0].study,))
         done(1.0, (with_values(subjects[0].study, {"ads.parameters.brake_gap": 5.5}),))
         raise KeyboardInterrupt
@@ -216,7 +258,15 @@ def test_several_studies_are_fitted_together(data: Path, in_tmp: Path) -> None:
     assert "late_rows.csv, SHA-256" in heads[1]
     assert "late_rows.csv" not in heads[0]
     Path("rows.csv").write_bytes(data.read_bytes())
-    refused("calibrate", "mine.toml", "late.toml", "rows.csv", "--trials", "1", message=("rows.csv", "mine, late", "STUDY=FILE.csv"))
+    refused(
+        "calibrate",
+        "mine.toml",
+        "late.toml",
+        "rows.csv",
+        "--trials",
+        "1",
+        message=("rows.csv", "mine, late", "STUDY=FILE.csv"),
+    )
 
 
 def test_validate_tells_effects_when_asked(in_tmp: Path) -> None:
@@ -224,7 +274,8 @@ def test_validate_tells_effects_when_asked(in_tmp: Path) -> None:
     characteristics = system.characteristics
     settings = np.random.default_rng(5).uniform(characteristics.lower, characteristics.upper, (160, 12))
     frame = pd.DataFrame(settings, columns=list(characteristics.names)).assign(
-        SaftyDegree=evaluate(system, settings).f_safe + 0.3 * settings[:, 0] / 2800, TIT=0.0, TET=0.0)
+        SaftyDegree=evaluate(system, settings).f_safe + 0.3 * settings[:, 0] / 2800, TIT=0.0, TET=0.0
+    )
     frame.to_csv("rows.csv", index=False)
     effects = json.loads(run("validate", "sun", "rows.csv", "--json", "--effects").stdout)["effects"]
     assert list(effects) == list(characteristics.names)

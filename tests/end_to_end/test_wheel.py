@@ -25,21 +25,34 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
         shutil.copytree(ROOT / name, source / name, ignore=shutil.ignore_patterns("__pycache__"))
     for name in ("setup.cfg", "pyproject.toml", "README.md", "LICENSE"):
         shutil.copy(ROOT / name, source)
-    subprocess.run([sys.executable, "-m", "build", "--wheel", "--outdir", str(folder), str(source)], check=True, capture_output=True)
+    subprocess.run(
+        [sys.executable, "-m", "build", "--wheel", "--outdir", str(folder), str(source)],
+        check=True,
+        capture_output=True,
+    )
     wheel = next(folder.glob("*.whl"))
-    subprocess.run([sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--target", str(folder / "site"), str(wheel)],
-                   check=True, capture_output=True)
+    subprocess.run(
+        [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--target", str(folder / "site"), str(wheel)],
+        check=True,
+        capture_output=True,
+    )
     return folder / "site"
 
 
 def run(site: Path, cwd: Path, *arguments: str) -> str:
     environment = {**os.environ, "PYTHONPATH": str(site)}
-    return subprocess.run([sys.executable, *arguments], cwd=cwd, env=environment, check=True, capture_output=True, text=True).stdout
+    return subprocess.run(
+        [sys.executable, *arguments], cwd=cwd, env=environment, check=True, capture_output=True, text=True
+    ).stdout
 
 
 def test_every_module_study_and_network_is_in_the_wheel(site: Path) -> None:
-    kept = {path.relative_to(ROOT) for folder in ("safevar_sumo", "studies", "sumo_nets") for path in (ROOT / folder).rglob("*")
-            if path.is_file() and "__pycache__" not in path.parts}
+    kept = {
+        path.relative_to(ROOT)
+        for folder in ("safevar_sumo", "studies", "sumo_nets")
+        for path in (ROOT / folder).rglob("*")
+        if path.is_file() and "__pycache__" not in path.parts
+    }
     inside = {Path("safevar_sumo") / path if path.parts[0] != "safevar_sumo" else path for path in kept}
     assert {path for path in inside if not (site / path).is_file()} == set()
 

@@ -75,8 +75,10 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     exported(aeb(assemble(study).nominal), folder, "aeb")
     exported(VEHICLE, folder, "vehicle")
     exported(SMALL_3, folder, "small_3", third=True)
-    rows = "".join(f'{name} = {{ unit = "{row.unit}", original = {row.original}, lower = {row.lower}, upper = {row.upper} }}\n'
-                   for name, row in study.vehicle.characteristics.items())
+    rows = "".join(
+        f'{name} = {{ unit = "{row.unit}", original = {row.original}, lower = {row.lower}, upper = {row.upper} }}\n'
+        for name, row in study.vehicle.characteristics.items()
+    )
     exported(SMALL.format(then="self.pedal = 8.0 - self.speed if self.gap > 15 else -9.0"), folder, "small")
     exported(CART, folder, "cart")
     (folder / "small.toml").write_text(QUICK_ADS)
@@ -91,8 +93,13 @@ def small(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Syst
     """The system of an FMU that runs `then` within a gap of 25 m; `table` replaces the study's table, `edit` changes the FMU's file."""
     monkeypatch.chdir(tmp_path)
 
-    def system(then: str = "self.pedal = 1.0", table: str = "", edit: Callable[[Path], object] = lambda fmu: None, time_limit: float = 300,
-               options: dict[str, str] | None = None) -> System:
+    def system(
+        then: str = "self.pedal = 1.0",
+        table: str = "",
+        edit: Callable[[Path], object] = lambda fmu: None,
+        time_limit: float = 300,
+        options: dict[str, str] | None = None,
+    ) -> System:
         fmu = exported(SMALL.format(then=then), tmp_path, "small", **options or {})
         edit(fmu)
         (tmp_path / "small.toml").write_text(f"""
@@ -101,9 +108,12 @@ name = "small"
 [ads]
 kind = "fmu"
 model = "Small.fmu"
-{table or '''parameters = { where = 25.0 }
+{
+            table
+            or '''parameters = { where = 25.0 }
 inputs = { gap = "gap", speed = "speed" }
-outputs = { brake = "pedal" }'''}
+outputs = { brake = "pedal" }'''
+        }
 [search]
 time_limit = {time_limit}
 """)

@@ -176,11 +176,18 @@ def exported(source: str, folder: Path, name: str, *, third: bool = False, **opt
 def aeb(nominal: Nominal) -> str:
     """The source of the shipped AEB with the data of the original vehicle."""
     tables = nominal.tables()
-    return AEB.format(facts=tuple(nominal[:5]), tables=[table.tolist() for table in tables[:3]], braking=tables.braking, seen=SEEN)
+    return AEB.format(
+        facts=tuple(nominal[:5]), tables=[table.tolist() for table in tables[:3]], braking=tables.braking, seen=SEEN
+    )
 
 
-def changed(fmu: Path, into: Path, edit: Callable[[str], str], keep: Callable[[str], bool] = lambda name: True,
-            other: Callable[[str, bytes], bytes] = lambda name, content: content) -> Path:
+def changed(
+    fmu: Path,
+    into: Path,
+    edit: Callable[[str], str],
+    keep: Callable[[str], bool] = lambda name: True,
+    other: Callable[[str, bytes], bytes] = lambda name, content: content,
+) -> Path:
     """Write an FMU with an edited model description, only the files to `keep`, and `other` contents of these files."""
     with zipfile.ZipFile(fmu) as old, zipfile.ZipFile(into, "w") as new:
         for name in filter(keep, old.namelist()):

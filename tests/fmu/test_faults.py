@@ -18,12 +18,13 @@ from safevar_sumo.sumo.system import System
 from tests.fmu.exported import changed
 
 Make = Callable[..., System]
-OUT = '''outputs = { brake = "pedal" }'''
-IN = '''inputs = { gap = "gap" }'''
+OUT = """outputs = { brake = "pedal" }"""
+IN = """inputs = { gap = "gap" }"""
 
 
 def edited(old: str, new: str) -> Callable[[Path], object]:
     """Replaces text in a model description."""
+
     def edit(fmu: Path) -> None:
         copy = fmu.with_suffix(".copy")
         changed(fmu, copy, lambda text: re.sub(old, new, text))
@@ -41,34 +42,60 @@ def with_step(step: str) -> Callable[[Path], object]:
 
 def without_binaries(fmu: Path) -> None:
     copy = fmu.with_suffix(".copy")
-    changed(fmu, copy, str, lambda name: not name.startswith("binaries/linux") and not name.startswith("binaries/darwin"))
+    changed(
+        fmu, copy, str, lambda name: not name.startswith("binaries/linux") and not name.startswith("binaries/darwin")
+    )
     copy.replace(fmu)
 
 
-@pytest.mark.parametrize(("edit", "table", "message"), [
-    (edited('fmiVersion="2.0"', 'fmiVersion="1.0"'), "", "cannot be read as an FMU"),
-    (edited("CoSimulation", "ModelExchange"), "", "is for model exchange only"),
-    (without_binaries, "", "has no binary for this machine"),
-    (lambda fmu: fmu.write_text("no archive"), "", "cannot be read as an FMU: BadZipFile"),
-    (Path.unlink, "", "there is no such file"),
-    (lambda fmu: (fmu.unlink(), fmu.mkdir()), "", "ads.model = 'Small.fmu': is a directory"),
-    (str, 'inputs = { gap = "gap", speed = "gap" }\n' + OUT, "ads: 'gap' and 'gap' have one value, and two keys set it"),
-    (edited('(name="speed" valueReference=)"1"', '\\1"0"'), 'inputs = { gap = "gap", speed = "speed" }\n' + OUT,
-     "ads: 'gap' and 'speed' have one value, and two keys set it"),
-    (with_step("1e9"), "", "requires a step of 1e+09 s"),
-    (with_step("1e-9"), "", "requires a step of 1e-09 s"),
-    (str, IN + "\n" + OUT + "\nparameters = { where = true }", "ads.parameters.where = True"),
-    (str, IN.replace('"gap" }', '"gsp" }') + "\n" + OUT, "ads.inputs.gap = 'gsp': Small.fmu has no such variable; did you mean 'gap'?"),
-    (str, IN.replace('"gap" }', '"pedal" }') + "\n" + OUT, "ads.inputs.gap = 'pedal': that variable is an output"),
-    (str, IN + '\noutputs = { brake = "where" }', "ads.outputs.brake = 'where': that variable is a parameter"),
-    (str, IN + '\noutputs = { gas = "pedal" }', "ads.outputs.gas: there is no such quantity"),
-    (str, IN + '\noutputs = { brake = "pedal", acceleration = "steps" }', "ads.outputs = ['acceleration', 'brake']"),
-    (str, IN + "\n" + OUT + "\nparameters = { wear = 1 }", "has no such variable"),
-    (str, IN + "\n" + OUT + '\nparameters = { where = "far" }', "ads.parameters.where = 'far'"),
-    (edited('(name="gap"[^>]*>\\s*<Real) ', '\\1 unit="kg" '), IN + "\n" + OUT, "ads.inputs.gap = 'gap': its unit is 'kg'"),
-    (edited('(name="gap"[^>]*>\\s*<Real) ', '\\1 unit="ell" '), IN + "\n" + OUT, "its unit 'ell' has no BaseUnit"),
-])
-def test_what_cannot_be_used_is_refused_in_one_line(small: Make, edit: Callable[[Path], object], table: str, message: str) -> None:
+@pytest.mark.parametrize(
+    ("edit", "table", "message"),
+    [
+        (edited('fmiVersion="2.0"', 'fmiVersion="1.0"'), "", "cannot be read as an FMU"),
+        (edited("CoSimulation", "ModelExchange"), "", "is for model exchange only"),
+        (without_binaries, "", "has no binary for this machine"),
+        (lambda fmu: fmu.write_text("no archive"), "", "cannot be read as an FMU: BadZipFile"),
+        (Path.unlink, "", "there is no such file"),
+        (lambda fmu: (fmu.unlink(), fmu.mkdir()), "", "ads.model = 'Small.fmu': is a directory"),
+        (
+            str,
+            'inputs = { gap = "gap", speed = "gap" }\n' + OUT,
+            "ads: 'gap' and 'gap' have one value, and two keys set it",
+        ),
+        (
+            edited('(name="speed" valueReference=)"1"', '\\1"0"'),
+            'inputs = { gap = "gap", speed = "speed" }\n' + OUT,
+            "ads: 'gap' and 'speed' have one value, and two keys set it",
+        ),
+        (with_step("1e9"), "", "requires a step of 1e+09 s"),
+        (with_step("1e-9"), "", "requires a step of 1e-09 s"),
+        (str, IN + "\n" + OUT + "\nparameters = { where = true }", "ads.parameters.where = True"),
+        (
+            str,
+            IN.replace('"gap" }', '"gsp" }') + "\n" + OUT,
+            "ads.inputs.gap = 'gsp': Small.fmu has no such variable; did you mean 'gap'?",
+        ),
+        (str, IN.replace('"gap" }', '"pedal" }') + "\n" + OUT, "ads.inputs.gap = 'pedal': that variable is an output"),
+        (str, IN + '\noutputs = { brake = "where" }', "ads.outputs.brake = 'where': that variable is a parameter"),
+        (str, IN + '\noutputs = { gas = "pedal" }', "ads.outputs.gas: there is no such quantity"),
+        (
+            str,
+            IN + '\noutputs = { brake = "pedal", acceleration = "steps" }',
+            "ads.outputs = ['acceleration', 'brake']",
+        ),
+        (str, IN + "\n" + OUT + "\nparameters = { wear = 1 }", "has no such variable"),
+        (str, IN + "\n" + OUT + '\nparameters = { where = "far" }', "ads.parameters.where = 'far'"),
+        (
+            edited('(name="gap"[^>]*>\\s*<Real) ', '\\1 unit="kg" '),
+            IN + "\n" + OUT,
+            "ads.inputs.gap = 'gap': its unit is 'kg'",
+        ),
+        (edited('(name="gap"[^>]*>\\s*<Real) ', '\\1 unit="ell" '), IN + "\n" + OUT, "its unit 'ell' has no BaseUnit"),
+    ],
+)
+def test_what_cannot_be_used_is_refused_in_one_line(
+    small: Make, edit: Callable[[Path], object], table: str, message: str
+) -> None:
     with pytest.raises(InputError) as error:
         small(table=table, edit=edit)
     assert message in error.value.problem
@@ -96,16 +123,21 @@ def driven(system: System, gaps: list[float], step: float = 0.1) -> np.ndarray:
     memory, commands = system.ads.start(1, NOMINAL, step), []
     for sample, gap in enumerate(gaps):
         one = np.ones(1)
-        command, memory = system.ads.drive(Observation(sample * step, 10 * one, gap * one, 10 * one, one, one, 1.0), memory)
+        command, memory = system.ads.drive(
+            Observation(sample * step, 10 * one, gap * one, 10 * one, one, one, 1.0), memory
+        )
         commands.append([command.throttle[0], command.brake[0]])
     return np.array(commands).T
 
 
-@pytest.mark.parametrize(("then", "message"), [
-    ("raise ValueError('the map is empty')", "while it is at 0.2 s"),
-    ("self.pedal = 3.0", "returned brake = 3.0 from doStep"),
-    ("self.pedal = float('nan')", "returned brake = nan from doStep"),
-])
+@pytest.mark.parametrize(
+    ("then", "message"),
+    [
+        ("raise ValueError('the map is empty')", "while it is at 0.2 s"),
+        ("self.pedal = 3.0", "returned brake = 3.0 from doStep"),
+        ("self.pedal = float('nan')", "returned brake = nan from doStep"),
+    ],
+)
 def test_what_it_does_wrong_is_told_and_when(small: Make, then: str, message: str) -> None:
     system = small(then)
     with pytest.raises(UserCodeError) as error:
@@ -116,12 +148,19 @@ def test_what_it_does_wrong_is_told_and_when(small: Make, then: str, message: st
     np.testing.assert_array_equal(driven(system, [100.0, 50.0]), 0, err_msg="it drives again after the fault")
 
 
-def test_an_fmu_with_a_broken_library_is_named_and_leaves_no_folder(small: Make, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_an_fmu_with_a_broken_library_is_named_and_leaves_no_folder(
+    small: Make, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
 
     def broken(fmu: Path) -> None:
-        changed(fmu, copy := fmu.with_suffix(".copy"), str, other=lambda name, content: b"" if name.startswith("binaries") else content)
+        changed(
+            fmu,
+            copy := fmu.with_suffix(".copy"),
+            str,
+            other=lambda name, content: b"" if name.startswith("binaries") else content,
+        )
         copy.replace(fmu)
 
     system = small(edit=broken)

@@ -21,6 +21,7 @@ inputs = { gap = "gap" }
 outputs = { brake = "pedal" }
 """
 
+
 def test_an_fmu_of_fmi_3_is_given_and_tells_its_own_units(made: Path) -> None:
     """36 km/h are 10 m/s: 1.8 %; within 30,000 mm, 100 %."""
     (made / "third.toml").write_text("""
@@ -34,27 +35,41 @@ inputs = { speed = "speed", gap = "gap" }
 outputs = { brake = "wish" }
 """)
     system = assemble(load_study(str(made / "third.toml")))
-    np.testing.assert_allclose(driven(system, [40.0, 30.1, 29.9, 35.0]), [[0] * 4, [0.018, 0.018, 1.0, 0.018]], rtol=0, atol=1e-15)
+    np.testing.assert_allclose(
+        driven(system, [40.0, 30.1, 29.9, 35.0]), [[0] * 4, [0.018, 0.018, 1.0, 0.018]], rtol=0, atol=1e-15
+    )
 
 
-@pytest.mark.parametrize(("own", "step", "expected"), [
-    (None, 0.1, [1, 2, 3, 4, 5, 6]), (0.02, 0.1, [5, 10, 15, 20, 25, 30]), (0.2, 0.1, [1, 1, 2, 2, 3, 3]),
-    (0.06, 0.1, [2, 4, 5, 7, 9, 10]), (0.05, 0.025, [1, 1, 2, 2, 3, 3])])
+@pytest.mark.parametrize(
+    ("own", "step", "expected"),
+    [
+        (None, 0.1, [1, 2, 3, 4, 5, 6]),
+        (0.02, 0.1, [5, 10, 15, 20, 25, 30]),
+        (0.2, 0.1, [1, 1, 2, 2, 3, 3]),
+        (0.06, 0.1, [2, 4, 5, 7, 9, 10]),
+        (0.05, 0.025, [1, 1, 2, 2, 3, 3]),
+    ],
+)
 def test_an_fmu_is_called_at_its_own_step(small: Make, own: float | None, step: float, expected: list[int]) -> None:
     """By the end of step k it has been called ceil((k + 1) step / own) times; between calls its outputs hold."""
     table = TABLE + (f"step = {own}" if own else "")
-    np.testing.assert_allclose(driven(small("self.pedal = self.steps / 100", table), [20.0] * 6, step)[1], np.array(expected) / 100)
+    np.testing.assert_allclose(
+        driven(small("self.pedal = self.steps / 100", table), [20.0] * 6, step)[1], np.array(expected) / 100
+    )
     np.testing.assert_allclose(driven(small("self.pedal = step", table), [20.0] * 2, step)[1], own or step)
 
 
 def test_the_step_that_an_fmu_cannot_change_is_taken(small: Make) -> None:
     """In FMI 2.0: its default step, if it handles no other step."""
-    np.testing.assert_allclose(driven(small("self.pedal = self.steps / 100", edit=with_step("0.025")), [20.0] * 3)[1], [0.04, 0.08, 0.12])
+    np.testing.assert_allclose(
+        driven(small("self.pedal = self.steps / 100", edit=with_step("0.025")), [20.0] * 3)[1], [0.04, 0.08, 0.12]
+    )
 
 
 @pytest.mark.slow
 def test_one_instance_in_a_process_is_enough(small: Make) -> None:
     """Then each vehicle drives alone."""
+
     def degrees(system: System) -> np.ndarray:
         members = system.characteristics
         settings = members.original + np.linspace(0, 1, 9)[:, np.newaxis] * (members.upper - members.original)
@@ -84,8 +99,13 @@ sumo_type = {{ mass = 1500, accel = "power", decel = "grip", max_speed = "top" }
 {more}
 """
 DECLARED = {
-    "power": 'unit="km/h/s" min="7.2" max="14.4"', "grip": 'unit="m/s2" min="5" max="9"', "top": 'unit="m/s" min="20"'}
-UNITS = '<UnitDefinitions><Unit name="km/h/s"><BaseUnit m="1" s="-2" factor="0.2777777777777778"/></Unit></UnitDefinitions>'
+    "power": 'unit="km/h/s" min="7.2" max="14.4"',
+    "grip": 'unit="m/s2" min="5" max="9"',
+    "top": 'unit="m/s" min="20"',
+}
+UNITS = (
+    '<UnitDefinitions><Unit name="km/h/s"><BaseUnit m="1" s="-2" factor="0.2777777777777778"/></Unit></UnitDefinitions>'
+)
 
 
 @pytest.fixture
@@ -105,11 +125,14 @@ def cart(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def test_a_vehicles_characteristics_are_the_parameters_that_its_fmu_declares(cart: Path) -> None:
     """The study's rows override them and may have another unit; a parameter without a bound needs a row to be a characteristic."""
+
     def rows(more: str) -> dict[str, tuple[str, float, float, float]]:
         (cart / "cart.toml").write_text(CART_TABLE.format(more=more))
         study = load_study("cart.toml")
         assert load_study(study) == study
-        return {name: (row.unit, row.original, row.lower, row.upper) for name, row in study.vehicle.characteristics.items()}
+        return {
+            name: (row.unit, row.original, row.lower, row.upper) for name, row in study.vehicle.characteristics.items()
+        }
 
     declared = {"power": ("km/h/s", 3.0, 7.2, 14.4), "grip": ("m/s2", 8.0, 5.0, 9.0)}
     with pytest.raises(InputError, match=r"characteristics.power.original = 3.0"):
@@ -118,7 +141,9 @@ def test_a_vehicles_characteristics_are_the_parameters_that_its_fmu_declares(car
     assert rows(over) == {**declared, "power": ("km/h/s", 10.8, 7.2, 14.4)}
     assert rows(f"parameters = {{ grip = 7.0 }}\n{over}").keys() == {"power"}
     assert rows(over + "\ntop = { upper = 40 }")["top"] == ("m/s", 30.0, 20.0, 40.0)
-    assert rows("[vehicle.characteristics]\npower = { unit = 'm/s^2', original = 3.0 }")["power"] == pytest.approx(("m/s^2", 3.0, 2.0, 4.0))
+    assert rows("[vehicle.characteristics]\npower = { unit = 'm/s^2', original = 3.0 }")["power"] == pytest.approx(
+        ("m/s^2", 3.0, 2.0, 4.0)
+    )
 
 
 def test_a_characteristic_reaches_its_fmu_in_the_unit_that_it_declares(cart: Path) -> None:
@@ -139,19 +164,39 @@ def test_a_characteristic_reaches_its_fmu_in_the_unit_that_it_declares(cart: Pat
 def test_a_characteristic_is_no_input_too(cart: Path) -> None:
     """Otherwise the value from the scenario or the weather would be lost."""
     text = CART_TABLE.replace("inputs = {{", 'inputs = {{ initial_speed = "top",')
-    (cart / "cart.toml").write_text(text.format(more="[vehicle.characteristics]\npower = { original = 10.8 }\ntop = { upper = 40 }"))
+    (cart / "cart.toml").write_text(
+        text.format(more="[vehicle.characteristics]\npower = { original = 10.8 }\ntop = { upper = 40 }")
+    )
     with pytest.raises(InputError, match="'top' and 'top' have one value"):
         assemble(load_study("cart.toml"))
 
 
-@pytest.mark.parametrize(("old", "new", "problem"), [
-    ("[vehicle.ch", "sensors = { range = 0.0 }\n[vehicle.ch", "vehicle.sensors.range = 0\nexpected: a number above 0"),
-    ("[vehicle.ch", "sensors = { latency = -1 }\n[vehicle.ch", "vehicle.sensors.latency = -1\nexpected: a number of at least 0"),
-    ("[vehicle.ch", 'sensors = { range = "v" }\n[vehicle.ch', "vehicle.sensors.range = 'v': there is no such characteristic"),
-    ("mass = 1500", "mass = 0.0", "vehicle.sumo_type.mass = 0"),
-    ("10.8", "10.8, lower = 0",
-     "vehicle.characteristics.power.lower = 0, the value of vehicle.sumo_type.accel\nexpected: a number above 0"),
-])
+@pytest.mark.parametrize(
+    ("old", "new", "problem"),
+    [
+        (
+            "[vehicle.ch",
+            "sensors = { range = 0.0 }\n[vehicle.ch",
+            "vehicle.sensors.range = 0\nexpected: a number above 0",
+        ),
+        (
+            "[vehicle.ch",
+            "sensors = { latency = -1 }\n[vehicle.ch",
+            "vehicle.sensors.latency = -1\nexpected: a number of at least 0",
+        ),
+        (
+            "[vehicle.ch",
+            'sensors = { range = "v" }\n[vehicle.ch',
+            "vehicle.sensors.range = 'v': there is no such characteristic",
+        ),
+        ("mass = 1500", "mass = 0.0", "vehicle.sumo_type.mass = 0"),
+        (
+            "10.8",
+            "10.8, lower = 0",
+            "vehicle.characteristics.power.lower = 0, the value of vehicle.sumo_type.accel\nexpected: a number above 0",
+        ),
+    ],
+)
 def test_what_no_vehicle_has_is_refused(old: str, new: str, problem: str, cart: Path) -> None:
     text = CART_TABLE.format(more="[vehicle.characteristics]\npower = { original = 10.8 }")
     (cart / "cart.toml").write_text(text.replace(old, new, 1))
@@ -160,9 +205,13 @@ def test_what_no_vehicle_has_is_refused(old: str, new: str, problem: str, cart: 
     assert str(error.value).startswith(f"cart.toml: {problem}")
 
 
-def test_a_vehicle_of_another_step_is_where_its_line_between_two_points_is_and_goes_back_to_where_it_was(cart: Path) -> None:
+def test_a_vehicle_of_another_step_is_where_its_line_between_two_points_is_and_goes_back_to_where_it_was(
+    cart: Path,
+) -> None:
     """A step of 0.4 s in a simulation with steps of 0.1 s; a second drive from a state in the middle is the same as the first."""
-    (cart / "cart.toml").write_text(CART_TABLE.format(more="step = 0.4\n[vehicle.characteristics]\npower = { original = 10.8 }"))
+    (cart / "cart.toml").write_text(
+        CART_TABLE.format(more="step = 0.4\n[vehicle.characteristics]\npower = { original = 10.8 }")
+    )
     vehicle = assemble(load_study("cart.toml")).vehicle
     prepared = vehicle.prepare({"power": np.array([10.0]), "grip": np.array([8.0])}, 1.0, 0.1)
     states = [vehicle.at_rest(prepared)]

@@ -25,7 +25,8 @@ WHY = {
     "rain": "the same in rain: friction, sight, recognition delay and hesitation act",
     "lgsvl": "another vehicle model, driving system and scenario: a lead vehicle stands",
     "native": "SUMO's own car-following model with modelled sensors and actuators",
-    "smoke": "the study that a user runs first"}
+    "smoke": "the study that a user runs first",
+}
 """Studies, each with the reason for its entry."""
 FILE = Path(__file__).with_name("golden.json")
 
@@ -33,7 +34,9 @@ FILE = Path(__file__).with_name("golden.json")
 def small(name: str) -> Study:
     """A shipped study with a search that takes a second."""
     study = load_study(name)
-    search = msgspec.structs.replace(study.search, algorithms=["nsga2", "rs", "safe_fuzzer"], population=10, evaluations=40, runs=1)
+    search = msgspec.structs.replace(
+        study.search, algorithms=["nsga2", "rs", "safe_fuzzer"], population=10, evaluations=40, runs=1
+    )
     return msgspec.structs.replace(study, search=search)
 
 
@@ -44,9 +47,14 @@ def computed(name: str) -> dict[str, Any]:
         results = load_runs(searched(study, Path(folder)))
     original = results.manifest["original"]
     changed = {member: row.original for member, row in study.vehicle.characteristics.items()}
-    solutions = {str(algorithm): _of_algorithm(rows, changed) for algorithm, rows in results.solutions.groupby("algorithm")}
-    return {"why": WHY[name], "original": {**_rounded(original), "digest": _digest(json.dumps(original, sort_keys=True))},
-            "solutions": solutions}
+    solutions = {
+        str(algorithm): _of_algorithm(rows, changed) for algorithm, rows in results.solutions.groupby("algorithm")
+    }
+    return {
+        "why": WHY[name],
+        "original": {**_rounded(original), "digest": _digest(json.dumps(original, sort_keys=True))},
+        "solutions": solutions,
+    }
 
 
 def _of_algorithm(rows: pd.DataFrame, original: dict[str, float]) -> dict[str, Any]:
@@ -54,8 +62,12 @@ def _of_algorithm(rows: pd.DataFrame, original: dict[str, float]) -> dict[str, A
     most_severe = rows.sort_values(CHOICES["most_severe"], kind="stable").iloc[0]
     values = {name: float(most_severe[name]) for name in CHOICES["most_severe"]}
     values |= {name: float(most_severe[name]) for name, value in original.items() if most_severe[name] != value}
-    return {"number": len(rows), "collisions": int((rows["outcome"] == "collision").sum()), "most_severe": _rounded(values),
-            "digest": _digest(rows.to_csv(index=False, lineterminator="\n"))}
+    return {
+        "number": len(rows),
+        "collisions": int((rows["outcome"] == "collision").sum()),
+        "most_severe": _rounded(values),
+        "digest": _digest(rows.to_csv(index=False, lineterminator="\n")),
+    }
 
 
 def _rounded(values: dict[str, Any]) -> dict[str, Any]:
@@ -77,6 +89,8 @@ def platform_here() -> dict[str, str]:
 if __name__ == "__main__":
     stored, studies = json.loads(FILE.read_text(encoding="utf-8")), {name: computed(name) for name in WHY}
     if studies != stored["studies"] and stored["results"] == RESULTS:
-        raise SystemExit(f"results have changed: raise RESULTS in safevar_sumo/results/manifest.py above {RESULTS} first")
+        raise SystemExit(
+            f"results have changed: raise RESULTS in safevar_sumo/results/manifest.py above {RESULTS} first"
+        )
     golden = {"platform": platform_here(), "results": RESULTS, "studies": studies}
     FILE.write_text(json.dumps(golden, indent=2) + "\n", encoding="utf-8", newline="\n")

@@ -23,10 +23,26 @@ STEP = 0.05
 def comfort(name: str, speed: np.ndarray, until: float = np.inf, collision_speed: float = np.nan) -> np.ndarray:
     v = speed.reshape(len(speed), -1)
     time, zero = np.arange(len(v)) * STEP, np.zeros_like(v)
-    trace = Trace(step=STEP, vehicle_length=4.0, time=time, position=zero, speed=v, gap=zero, lateral=zero, lateral_speed=zero,
-                  throttle=zero, brake=zero, gear=zero, active=np.repeat((time <= until)[:, np.newaxis], v.shape[1], axis=1))
-    runs = SimulationRuns(trace=trace, encounter=Encounter(zero, zero, zero, zero > 0), outcome=np.full(v.shape[1], "stopped"),
-                          collision_speed=np.full(v.shape[1], collision_speed))
+    trace = Trace(
+        step=STEP,
+        vehicle_length=4.0,
+        time=time,
+        position=zero,
+        speed=v,
+        gap=zero,
+        lateral=zero,
+        lateral_speed=zero,
+        throttle=zero,
+        brake=zero,
+        gear=zero,
+        active=np.repeat((time <= until)[:, np.newaxis], v.shape[1], axis=1),
+    )
+    runs = SimulationRuns(
+        trace=trace,
+        encounter=Encounter(zero, zero, zero, zero > 0),
+        outcome=np.full(v.shape[1], "stopped"),
+        collision_speed=np.full(v.shape[1], collision_speed),
+    )
     return OPTIONAL_METRICS[name](runs, MetricsTable(ttc_threshold=2.0))
 
 
@@ -39,7 +55,9 @@ def test_harshness_of_a_constant_deceleration_equals_it_and_jerk_occurs_only_at_
     speed = sampled(lambda t: np.maximum(15 - 5 * t, 0))
     assert comfort("brake_harshness", speed)[0] == pytest.approx(5.0)
     assert comfort("max_jerk", speed)[0] == pytest.approx(5.0)
-    assert comfort("max_jerk", speed, until=2.9)[0] == pytest.approx(0.0, abs=1e-9), "what follows the run's end does not count"
+    assert comfort("max_jerk", speed, until=2.9)[0] == pytest.approx(0.0, abs=1e-9), (
+        "what follows the run's end does not count"
+    )
 
 
 def test_jerk_of_a_ramp_is_its_slope_and_harshness_the_mean_of_its_last_half_second() -> None:
@@ -57,7 +75,7 @@ def test_weighting_agrees_with_iso_2631_1(frequency: float) -> None:
     time = np.arange(0, 40, step)
     low = np.abs(1j * f) ** 2 / np.abs((1j * f) ** 2 + np.sqrt(2) * 0.4 * 1j * f + 0.4**2)
     shape = np.abs((1 + 1j * f / 2) / (1 + 1j * f / (0.63 * 2) - (f / 2) ** 2))
-    settled = weight_acceleration(np.sin(2 * np.pi * f * time)[:, np.newaxis], step)[len(time) // 2:]
+    settled = weight_acceleration(np.sin(2 * np.pi * f * time)[:, np.newaxis], step)[len(time) // 2 :]
     assert np.sqrt(2 * np.mean(settled**2)) == pytest.approx(low * shape, rel=2e-3)
 
 
@@ -75,7 +93,9 @@ def test_rms_agrees_with_scipys_filters() -> None:
 
 def test_rms_is_over_the_run_and_not_over_what_follows_its_end() -> None:
     speed = np.cumsum(np.random.default_rng(3).normal(size=(200, 2)), axis=0)
-    assert comfort("rms_acceleration", speed, until=99 * STEP + STEP / 2) == pytest.approx(comfort("rms_acceleration", speed[:100]))
+    assert comfort("rms_acceleration", speed, until=99 * STEP + STEP / 2) == pytest.approx(
+        comfort("rms_acceleration", speed[:100])
+    )
 
 
 @pytest.mark.parametrize("name", OPTIONAL_METRICS)
@@ -98,6 +118,11 @@ def test_the_study_makes_braking_as_jerky_as_it_can_and_reports_what_it_costs(in
 
 
 def test_studies_that_name_no_comfort_have_none() -> None:
-    assert [one.name for one in assemble(load_study("sun")).measuring.scoring.metrics] == ["safety_degree", "tet", "tit", "ave_dece"]
+    assert [one.name for one in assemble(load_study("sun")).measuring.scoring.metrics] == [
+        "safety_degree",
+        "tet",
+        "tit",
+        "ave_dece",
+    ]
     with pytest.raises(InputError, match="did you mean 'max_jerk'"):
         assemble(load_study("sun", metrics={"also": ["max_jark"]}))

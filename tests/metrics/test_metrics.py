@@ -26,11 +26,27 @@ def braking_run(speed: float, deceleration: float, gap: float, collision_speed: 
     x = (speed * moving - deceleration * moving**2 / 2)[:, np.newaxis]
     v[time >= stop] = 0
     zero, gaps = np.zeros_like(v), gap - x
-    trace = Trace(step=STEP, vehicle_length=4.0, time=time, position=x, speed=v, gap=gaps, lateral=zero, lateral_speed=zero,
-                  throttle=zero, brake=np.ones_like(v), gear=zero, active=np.ones_like(v, dtype=bool))
+    trace = Trace(
+        step=STEP,
+        vehicle_length=4.0,
+        time=time,
+        position=x,
+        speed=v,
+        gap=gaps,
+        lateral=zero,
+        lateral_speed=zero,
+        throttle=zero,
+        brake=np.ones_like(v),
+        gear=zero,
+        active=np.ones_like(v, dtype=bool),
+    )
     outcome = Outcome.STOPPED if np.isnan(collision_speed) else Outcome.COLLISION
-    return SimulationRuns(trace=trace, encounter=Encounter(gaps, gaps, v, gaps > 0), outcome=np.array([outcome.value]),
-               collision_speed=np.array([collision_speed]))
+    return SimulationRuns(
+        trace=trace,
+        encounter=Encounter(gaps, gaps, v, gaps > 0),
+        outcome=np.array([outcome.value]),
+        collision_speed=np.array([collision_speed]),
+    )
 
 
 def value(name: str, run: SimulationRuns, thresholds: MetricsTable = THRESHOLDS) -> float:
@@ -49,7 +65,9 @@ def test_safety_degree_is_the_least_separation_of_the_encounter_alone() -> None:
     """The encounter ends after 1 s and 7.5 m, at a gap of 4.5 m; the last gap is 2 m. Without an encounter it is undefined."""
     run = braking_run(10, 5, 12)
     while_it_lasts = run.encounter._replace(in_conflict=run.trace.time[:, np.newaxis] < 1.0)
-    assert value("safety_degree", dataclasses.replace(run, encounter=while_it_lasts)) == pytest.approx(4.5, abs=10 * STEP)
+    assert value("safety_degree", dataclasses.replace(run, encounter=while_it_lasts)) == pytest.approx(
+        4.5, abs=10 * STEP
+    )
     never = run.encounter._replace(in_conflict=run.trace.gap < 0)
     assert np.isnan(value("safety_degree", dataclasses.replace(run, encounter=never)))
 
@@ -60,10 +78,26 @@ def test_exposed_and_integrated_time_of_even_approach() -> None:
     v = np.full((len(time), 1), 4.0)
     gap = 20 - 4.0 * time[:, np.newaxis]
     zero = np.zeros_like(v)
-    trace = Trace(step=STEP, vehicle_length=4.0, time=time, position=-gap, speed=v, gap=gap, lateral=zero, lateral_speed=zero,
-                  throttle=zero, brake=zero, gear=zero, active=np.ones_like(v, dtype=bool))
-    run = SimulationRuns(trace=trace, encounter=Encounter(gap, gap, v, gap > -1), outcome=np.array(["stopped"]),
-                         collision_speed=np.array([np.nan]))
+    trace = Trace(
+        step=STEP,
+        vehicle_length=4.0,
+        time=time,
+        position=-gap,
+        speed=v,
+        gap=gap,
+        lateral=zero,
+        lateral_speed=zero,
+        throttle=zero,
+        brake=zero,
+        gear=zero,
+        active=np.ones_like(v, dtype=bool),
+    )
+    run = SimulationRuns(
+        trace=trace,
+        encounter=Encounter(gap, gap, v, gap > -1),
+        outcome=np.array(["stopped"]),
+        collision_speed=np.array([np.nan]),
+    )
     assert time_to_collision(run)[0, 0] == pytest.approx(5.0)
     assert value("tet", run) == pytest.approx(2.0, abs=2 * STEP)
     assert value("tit", run) == pytest.approx(2.0, abs=4 * STEP)
@@ -85,8 +119,15 @@ def test_exposure_is_undefined_on_a_collision() -> None:
 
 def test_time_to_collision_ends_with_the_first_standstill() -> None:
     run = braking_run(10, 5, 12)
-    still = Encounter(run.encounter.separation, run.encounter.distance, np.ones_like(run.encounter.distance), run.encounter.in_conflict)
-    ttc = time_to_collision(SimulationRuns(trace=run.trace, encounter=still, outcome=run.outcome, collision_speed=run.collision_speed))
+    still = Encounter(
+        run.encounter.separation,
+        run.encounter.distance,
+        np.ones_like(run.encounter.distance),
+        run.encounter.in_conflict,
+    )
+    ttc = time_to_collision(
+        SimulationRuns(trace=run.trace, encounter=still, outcome=run.outcome, collision_speed=run.collision_speed)
+    )
     assert np.all(np.isinf(ttc[run.trace.time > 2.0]))
 
 
@@ -94,7 +135,9 @@ def test_a_vehicle_that_stands_at_the_start_has_a_time_to_collision_once_it_driv
     run = braking_run(10, 5, 12)
     speed = np.where(run.trace.time[:, np.newaxis] < 1.0, 0.0, 2.0)
     gap = 20.0 + 0 * speed
-    later = dataclasses.replace(run, trace=dataclasses.replace(run.trace, speed=speed), encounter=Encounter(gap, gap, speed, gap > 0))
+    later = dataclasses.replace(
+        run, trace=dataclasses.replace(run.trace, speed=speed), encounter=Encounter(gap, gap, speed, gap > 0)
+    )
     ttc = time_to_collision(later)[:, 0]
     assert np.isinf(ttc[run.trace.time < 1.0]).all()
     assert ttc[run.trace.time >= 1.0] == pytest.approx(10.0)
@@ -102,8 +145,12 @@ def test_a_vehicle_that_stands_at_the_start_has_a_time_to_collision_once_it_driv
 
 def test_a_vehicle_that_never_brakes_has_no_average_deceleration() -> None:
     run = braking_run(10, 5, 12)
-    coasting = Trace(**{**{name: getattr(run.trace, name) for name in run.trace.__dataclass_fields__}, "brake": run.trace.throttle})
-    never = SimulationRuns(trace=coasting, encounter=run.encounter, outcome=run.outcome, collision_speed=run.collision_speed)
+    coasting = Trace(
+        **{**{name: getattr(run.trace, name) for name in run.trace.__dataclass_fields__}, "brake": run.trace.throttle}
+    )
+    never = SimulationRuns(
+        trace=coasting, encounter=run.encounter, outcome=run.outcome, collision_speed=run.collision_speed
+    )
     assert np.isnan(value("ave_dece", never))
 
 
@@ -115,7 +162,9 @@ def with_end(run: SimulationRuns, after: float) -> SimulationRuns:
 @pytest.mark.parametrize("name", ["tet", "tit", "ave_dece"])
 def test_samples_that_are_not_active_do_not_count(name: str) -> None:
     run = braking_run(10, 5, 12)
-    slower = dataclasses.replace(run.trace, speed=np.where(run.trace.time[:, np.newaxis] < 1.0, run.trace.speed, run.trace.speed / 2))
+    slower = dataclasses.replace(
+        run.trace, speed=np.where(run.trace.time[:, np.newaxis] < 1.0, run.trace.speed, run.trace.speed / 2)
+    )
     assert value(name, with_end(run, 0.5)) != value(name, run) or name == "ave_dece"
     assert value(name, with_end(run, 1.0)) == value(name, with_end(dataclasses.replace(run, trace=slower), 1.0))
 
@@ -152,8 +201,14 @@ def test_a_time_to_collision_at_the_threshold_is_exposed() -> None:
 def test_a_batch_that_failed_as_a_whole_has_no_valid_objective() -> None:
     """Without a simulation, a user's metric is undefined, and so is the safety degree."""
     undefined = np.full(2, np.nan)
-    failed = Evaluations(settings=np.ones((2, 1)), outcome=np.full(2, "simulator-error"), collision_speed=undefined,
-                         metrics={"safety_degree": undefined}, f_diff=np.zeros(2), f_num_diff=np.zeros(2))
+    failed = Evaluations(
+        settings=np.ones((2, 1)),
+        outcome=np.full(2, "simulator-error"),
+        collision_speed=undefined,
+        metrics={"safety_degree": undefined},
+        f_diff=np.zeros(2),
+        f_num_diff=np.zeros(2),
+    )
     scoring = Scoring(metrics=(), objectives=(F_SAFE, F_DIFF, Objective(name="jerk", title="jerk", unit="m/s^3")))
     assert scoring.valid(failed).tolist() == [False, False]
     assert np.isnan(scoring.values(failed)[:, 2]).all()
@@ -167,12 +222,23 @@ def test_measures_of_change_are_the_published_objectives() -> None:
 
 def test_average_deceleration_is_that_of_the_braking_cycle() -> None:
     assert value("ave_dece", braking_run(10, 5, 12)) == pytest.approx(5.0, rel=1e-9)
-    assert value("ave_dece", braking_run(10, 5, 12), MetricsTable(ttc_threshold=2, sampling_interval=0.2)) == pytest.approx(5.0)
+    assert value(
+        "ave_dece", braking_run(10, 5, 12), MetricsTable(ttc_threshold=2, sampling_interval=0.2)
+    ) == pytest.approx(5.0)
 
 
 def test_a_vehicle_with_exactly_the_points_of_the_limit_is_unsafe() -> None:
     """The original has 40 points: a vehicle is unsafe from a loss of one point on."""
-    unsafe, undefined = Unsafe.default({"rating_points": 40.0, "safety_degree": np.nan}, np.array(["stopped"])), np.full(4, np.nan)
-    rated = Evaluations(settings=np.ones((4, 1)), outcome=np.full(4, "stopped"), collision_speed=undefined, f_diff=np.zeros(4),
-                        f_num_diff=np.zeros(4), metrics={"safety_degree": undefined, "rating_points": np.array([40.0, 39.25, 39.0, 38.5])})
+    unsafe, undefined = (
+        Unsafe.default({"rating_points": 40.0, "safety_degree": np.nan}, np.array(["stopped"])),
+        np.full(4, np.nan),
+    )
+    rated = Evaluations(
+        settings=np.ones((4, 1)),
+        outcome=np.full(4, "stopped"),
+        collision_speed=undefined,
+        f_diff=np.zeros(4),
+        f_num_diff=np.zeros(4),
+        metrics={"safety_degree": undefined, "rating_points": np.array([40.0, 39.25, 39.0, 38.5])},
+    )
     assert unsafe.of(rated).tolist() == [False, False, True, True]

@@ -23,6 +23,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 @pytest.fixture
 def mine(folder: Path) -> Mine:
     """Write mine.py and mine.toml, which extends smoke, and assemble the system."""
+
     def result(module: str, table: str = ADS) -> System:
         (folder / "mine.py").write_text(module)
         (folder / "mine.toml").write_text(f'extends = "smoke"\nname = "mine"\n{table}')

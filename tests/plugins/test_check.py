@@ -48,8 +48,15 @@ class Mine:
         return Command(np.where(~near & (seen.speed < 5), 0.5, 0.0), np.where(near, 1.0, 0.0)), memory
 """
 VEHICLE, SCENARIO, METRIC, OBJECTIVE, ALGORITHM = (
-    (SIX / f"{file}.py").read_text().replace(name, "Mine") for file, name in (
-        ("my_vehicle", "Cart"), ("my_scenario", "Wall"), ("my_metrics", "JERK"), ("my_objective", "MEAN"), ("my_search", "Halving")))
+    (SIX / f"{file}.py").read_text().replace(name, "Mine")
+    for file, name in (
+        ("my_vehicle", "Cart"),
+        ("my_scenario", "Wall"),
+        ("my_metrics", "JERK"),
+        ("my_objective", "MEAN"),
+        ("my_search", "Halving"),
+    )
+)
 VEHICLE_STUDY = """extends = "native"
 [vehicle]
 model = "mine:Mine"
@@ -103,45 +110,107 @@ RUN = "in another run"
 DEFECTS = {
     "random": planted("ads", "repetition", SCALAR, "BODY", "stopping += random.random()", AGAIN),
     "clock": planted("ads", "repetition", SCALAR, "BODY", "stopping += time.time() * 1e3 % 10", AGAIN),
-    "class variable": planted("ads", "order", SCALAR, "BODY", "Mine.seen_one = stopping = stopping + 0.01 * Mine.seen_one", ORDER),
-    "shared list": planted("ads", "repetition", SCALAR, "BODY", "self.past.append(1); stopping += len(self.past) / 1e3", AGAIN),
+    "class variable": planted(
+        "ads", "order", SCALAR, "BODY", "Mine.seen_one = stopping = stopping + 0.01 * Mine.seen_one", ORDER
+    ),
+    "shared list": planted(
+        "ads", "repetition", SCALAR, "BODY", "self.past.append(1); stopping += len(self.past) / 1e3", AGAIN
+    ),
     "misspelt": planted("ads", "contract", SCALAR, "def drive(", "def drvie(", "has no method drive(seen)"),
-    "mean over vehicles": planted("ads", "alone", ARRAYS, "BODY", "seen = seen._replace(gap=seen.gap + np.mean(seen.speed))", ALONE),
-    "place in the batch": planted("ads", "order", ARRAYS, "BODY", "memory = memory + np.arange(len(seen.speed))", ORDER),
+    "mean over vehicles": planted(
+        "ads", "alone", ARRAYS, "BODY", "seen = seen._replace(gap=seen.gap + np.mean(seen.speed))", ALONE
+    ),
+    "place in the batch": planted(
+        "ads", "order", ARRAYS, "BODY", "memory = memory + np.arange(len(seen.speed))", ORDER
+    ),
     "first vehicle": planted(
-        "ads", "order", ARRAYS, "BODY", "Mine.first = Mine.first or memory * seen.gap[0]; memory += Mine.first / 99", ORDER),
-    "changes what it sees": planted("ads", "contract", ARRAYS, "BODY", "seen.gap[:] = np.minimum(seen.gap, 50)", "read-only"),
+        "ads",
+        "order",
+        ARRAYS,
+        "BODY",
+        "Mine.first = Mine.first or memory * seen.gap[0]; memory += Mine.first / 99",
+        ORDER,
+    ),
+    "changes what it sees": planted(
+        "ads", "contract", ARRAYS, "BODY", "seen.gap[:] = np.minimum(seen.gap, 50)", "read-only"
+    ),
     "no number": planted(
-        "ads", "contract", SCALAR, "return 0.5 if", "return seen.gap * np.nan, 0.0\n        return 0.5 if", "throttle = nan"),
-    "out of range": planted("ads", "contract", SCALAR, "return 0.0, 1.0", "return 0.0, 100.0", "returned brake = 100.0 from drive"),
-    "wrong shape": planted("ads", "contract", ARRAYS, "BODY", "return (seen.speed[:2] * 0, 0), memory", "throttle of shape (2,)"),
-    "signature": planted("ads", "contract", ARRAYS, "def drive(self, seen, memory):", "def drive(self, seen):", "does not take"),
-    "vehicle divides by nothing": planted("vehicle", "contract", VEHICLE, "* 1000 / prepared[\"mass\"]",
-                                          "* np.sqrt(1500 - prepared[\"mass\"])", "speed = nan from advance"),
+        "ads",
+        "contract",
+        SCALAR,
+        "return 0.5 if",
+        "return seen.gap * np.nan, 0.0\n        return 0.5 if",
+        "throttle = nan",
+    ),
+    "out of range": planted(
+        "ads", "contract", SCALAR, "return 0.0, 1.0", "return 0.0, 100.0", "returned brake = 100.0 from drive"
+    ),
+    "wrong shape": planted(
+        "ads", "contract", ARRAYS, "BODY", "return (seen.speed[:2] * 0, 0), memory", "throttle of shape (2,)"
+    ),
+    "signature": planted(
+        "ads", "contract", ARRAYS, "def drive(self, seen, memory):", "def drive(self, seen):", "does not take"
+    ),
+    "vehicle divides by nothing": planted(
+        "vehicle",
+        "contract",
+        VEHICLE,
+        '* 1000 / prepared["mass"]',
+        '* np.sqrt(1500 - prepared["mass"])',
+        "speed = nan from advance",
+    ),
     "vehicle keeps state": planted(
-        "vehicle", "repetition", VEHICLE, "        grip = ", "        self.top_speed *= 0.999\n        grip = ", AGAIN),
-    "vehicle maximum": planted("vehicle", "alone", VEHICLE, "* command.throttle -", "* np.max(state.speed + 1) -", ALONE),
+        "vehicle", "repetition", VEHICLE, "        grip = ", "        self.top_speed *= 0.999\n        grip = ", AGAIN
+    ),
+    "vehicle maximum": planted(
+        "vehicle", "alone", VEHICLE, "* command.throttle -", "* np.max(state.speed + 1) -", ALONE
+    ),
     "scenario truth values": planted("scenario", "contract", SCENARIO, "gap < -100)", "gap)", "returned over"),
     "scenario undeclared reaction": Defect("scenario", "contract", REACTS, "in SUMO and in the recorded scene, with "),
     "metric over runs": planted(
-        "metric", "alone", METRIC, "    return np.max(", "    jerk = jerk - np.mean(jerk)\n    return np.max(", ALONE),
+        "metric", "alone", METRIC, "    return np.max(", "    jerk = jerk - np.mean(jerk)\n    return np.max(", ALONE
+    ),
     "metric shape": planted("metric", "contract", METRIC, ", axis=0)\n\n", ", axis=1)\n\n", "values of shape"),
-    "objective no number": planted("objective", "contract", OBJECTIVE, "/ characteristics.original",
-                                   "/ (settings - characteristics.original)", "values = nan"),
-    "algorithm own random numbers": planted("algorithm", "repetition", ALGORITHM, "result, original,",
-                                            "rng = np.random.default_rng()\n        result, original,", RUN),
-    "algorithm learns": planted("algorithm", "repetition", ALGORITHM, "reach *= self.factor",
-                                "Mine.reach = reach = reach * 0.5 * getattr(Mine, 'reach', 1)", RUN),
+    "objective no number": planted(
+        "objective",
+        "contract",
+        OBJECTIVE,
+        "/ characteristics.original",
+        "/ (settings - characteristics.original)",
+        "values = nan",
+    ),
+    "algorithm own random numbers": planted(
+        "algorithm",
+        "repetition",
+        ALGORITHM,
+        "result, original,",
+        "rng = np.random.default_rng()\n        result, original,",
+        RUN,
+    ),
+    "algorithm learns": planted(
+        "algorithm",
+        "repetition",
+        ALGORITHM,
+        "reach *= self.factor",
+        "Mine.reach = reach = reach * 0.5 * getattr(Mine, 'reach', 1)",
+        RUN,
+    ),
     "algorithm unfiltered": planted(
-        "algorithm", "contract", ALGORITHM, "problem.characteristics.filter(settings)", "settings", "from search"),
-    "controller module variable": planted("traci", "repetition", CONTROLLER, "BODY", "calls.append(1); speed += len(calls) / 1e3", AGAIN),
+        "algorithm", "contract", ALGORITHM, "problem.characteristics.filter(settings)", "settings", "from search"
+    ),
+    "controller module variable": planted(
+        "traci", "repetition", CONTROLLER, "BODY", "calls.append(1); speed += len(calls) / 1e3", AGAIN
+    ),
     "controller other vehicle": planted(
-        "traci", "contract", CONTROLLER, "BODY", "traci.vehicle.setSpeed('parked_ahead', 0)", "parked_ahead"),
+        "traci", "contract", CONTROLLER, "BODY", "traci.vehicle.setSpeed('parked_ahead', 0)", "parked_ahead"
+    ),
 }
 FAST = ("random", "mean over vehicles", "out of range", "scenario undeclared reaction", "algorithm learns")
 
 
-@pytest.mark.parametrize("name", [pytest.param(name, marks=[] if name in FAST else pytest.mark.slow) for name in DEFECTS])
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[] if name in FAST else pytest.mark.slow) for name in DEFECTS]
+)
 def test_a_planted_defect_is_found_with_the_input_that_shows_it(name: str, in_tmp: Path) -> None:
     defect = DEFECTS[name]
     (in_tmp / "mine.py").write_text(defect.module)
@@ -156,11 +225,20 @@ def test_a_planted_defect_is_found_with_the_input_that_shows_it(name: str, in_tm
     assert all((finding.expected, finding.got, finding.advice))
 
 
-@pytest.mark.parametrize(("drive", "reason"), [
-    ("return 0.0, 0.0", "never reaches the encounter"), ("return (0.5, 0.0) if seen.time < 3 else (0.0, 1.0)", "brakes")])
-def test_a_driver_who_does_not_get_to_the_encounter_does_not_pass_in_a_study_that_names_him(drive: str, reason: str, in_tmp: Path) -> None:
-    (in_tmp / "mine.py").write_text(f"from safevar_sumo.ads import ScalarAds\n\n\nclass Mine(ScalarAds):\n"
-                                    f"    def drive(self, seen):\n        {drive}\n")
+@pytest.mark.parametrize(
+    ("drive", "reason"),
+    [
+        ("return 0.0, 0.0", "never reaches the encounter"),
+        ("return (0.5, 0.0) if seen.time < 3 else (0.0, 1.0)", "brakes"),
+    ],
+)
+def test_a_driver_who_does_not_get_to_the_encounter_does_not_pass_in_a_study_that_names_him(
+    drive: str, reason: str, in_tmp: Path
+) -> None:
+    (in_tmp / "mine.py").write_text(
+        f"from safevar_sumo.ads import ScalarAds\n\n\nclass Mine(ScalarAds):\n"
+        f"    def drive(self, seen):\n        {drive}\n"
+    )
     (in_tmp / "mine.toml").write_text('extends = "smoke"\n[ads]\nmodel = "mine:Mine"\n')
     for subject in ("mine:Mine", "mine.toml"):
         assert [(finding.check, reason in finding.got) for finding in check(subject).findings] == [("reaction", True)]
@@ -169,10 +247,14 @@ def test_a_driver_who_does_not_get_to_the_encounter_does_not_pass_in_a_study_tha
 RIGHT = {
     "scalar ads": SCALAR.replace("BODY", "self.far = seen.gap"),
     "ads over arrays": ARRAYS.replace("BODY", "memory = memory + 0 * seen.gap.shape[0]"),
-    "vehicle": VEHICLE, "scenario": SCENARIO, "metric": METRIC, "objective": OBJECTIVE, "algorithm": ALGORITHM,
+    "vehicle": VEHICLE,
+    "scenario": SCENARIO,
+    "metric": METRIC,
+    "objective": OBJECTIVE,
+    "algorithm": ALGORITHM,
     "controller": CONTROLLER.replace("BODY", "calls.append(speed)"),
     "controller class": "class Mine:\n    def start(self, traci, vehicle_id):\n        self.speeds = []\n\n"
-                        "    def step(self, traci, vehicle_id):\n        self.speeds.append(traci.vehicle.getSpeed(vehicle_id))\n",
+    "    def step(self, traci, vehicle_id):\n        self.speeds.append(traci.vehicle.getSpeed(vehicle_id))\n",
 }
 
 
@@ -185,7 +267,9 @@ def test_what_is_right_passes(name: str, in_tmp: Path) -> None:
     assert report.passed, "\n".join(map(str, report.findings))
 
 
-@pytest.mark.parametrize("study", [name if name == "smoke" else pytest.param(name, marks=pytest.mark.slow) for name in study_names()])
+@pytest.mark.parametrize(
+    "study", [name if name == "smoke" else pytest.param(name, marks=pytest.mark.slow) for name in study_names()]
+)
 def test_what_is_shipped_passes(study: str) -> None:
     report = check(study)
     assert report.passed, "\n".join(map(str, report.findings))
@@ -197,12 +281,21 @@ def test_every_shipped_name_is_found_and_of_its_kind() -> None:
             assert find_subject(name).kind == kind
 
 
-@pytest.mark.parametrize(("subject", "message"), [
-    (("mine:Nothing",), "has no 'Nothing'"), (("nothing:Mine",), "No module named 'nothing'"), (("aebb",), "did you mean 'aeb'?"),
-    (("missing.toml",), "missing.toml"), (("builtins:int",), "no study names 'builtins:int'"), (("missing.fmu",), "there is no file"),
-    (("smoke", "--study", "smoke"), "is itself a study"), (("mine:Mine", "--study", "nope"), "nope"),
-    (("broken:Mine",), "ZeroDivisionError: division by zero"), (("cart:Mine",), "no study gives the characteristics of 'cart:Mine'"),
-])
+@pytest.mark.parametrize(
+    ("subject", "message"),
+    [
+        (("mine:Nothing",), "has no 'Nothing'"),
+        (("nothing:Mine",), "No module named 'nothing'"),
+        (("aebb",), "did you mean 'aeb'?"),
+        (("missing.toml",), "missing.toml"),
+        (("builtins:int",), "no study names 'builtins:int'"),
+        (("missing.fmu",), "there is no file"),
+        (("smoke", "--study", "smoke"), "is itself a study"),
+        (("mine:Mine", "--study", "nope"), "nope"),
+        (("broken:Mine",), "ZeroDivisionError: division by zero"),
+        (("cart:Mine",), "no study gives the characteristics of 'cart:Mine'"),
+    ],
+)
 def test_a_subject_that_cannot_be_loaded_is_refused(subject: tuple[str, ...], message: str, in_tmp: Path) -> None:
     (in_tmp / "mine.py").write_text(RIGHT["scalar ads"])
     (in_tmp / "cart.py").write_text(VEHICLE)
@@ -218,7 +311,9 @@ def test_the_command_prints_the_json_and_ends_with_its_exit_codes(in_tmp: Path) 
         assert list(report) == ["subject", "kind", "passed", "findings", "seconds"]
         assert (report["subject"], report["kind"], report["passed"]) == (subject, kind, False)
         assert list(report["findings"][0]) == ["check", "file", "line", "expected", "got", "advice"]
-    assert "mine.py:11: contract: returned brake = 100.0 from drive" in run("check", "mine:Mine", expect=1).stdout.replace("\n", "")
+    assert "mine.py:11: contract: returned brake = 100.0 from drive" in run(
+        "check", "mine:Mine", expect=1
+    ).stdout.replace("\n", "")
     (in_tmp / "mine.py").write_text(RIGHT["scalar ads"])
     assert json.loads(run("check", "mine:Mine", "--study", "mine.toml", "--json").stdout)["findings"] == []
 

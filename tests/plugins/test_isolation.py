@@ -42,13 +42,20 @@ def step(traci, vehicle_id):
 CONSTRAINED = '[[constraints]]\nfunction = "mine:mine"\nunit = "kg"\nat_most = 1e9\n'
 
 
-@pytest.mark.parametrize(("line", "message"), [
-    ("return mass + np.random.random(len(mass))", "the value is .* in a second run"),
-    ("return mass + len(calls)", "the value is .* in a second run"),
-    ("return mass - np.mean(mass)", "the value is .* in (another order|a smaller batch)"),
-    ("return mass + np.arange(len(mass))", "the value is .* in another order"),
-    ("mass[:] = 0; return mass", "read-only")], ids=["random", "counts", "mean", "place", "changes arguments"])
-def test_a_constraint_whose_function_is_none_of_the_setting_alone_is_refused(line: str, message: str, mine: Mine, folder: Path) -> None:
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("return mass + np.random.random(len(mass))", "the value is .* in a second run"),
+        ("return mass + len(calls)", "the value is .* in a second run"),
+        ("return mass - np.mean(mass)", "the value is .* in (another order|a smaller batch)"),
+        ("return mass + np.arange(len(mass))", "the value is .* in another order"),
+        ("mass[:] = 0; return mass", "read-only"),
+    ],
+    ids=["random", "counts", "mean", "place", "changes arguments"],
+)
+def test_a_constraint_whose_function_is_none_of_the_setting_alone_is_refused(
+    line: str, message: str, mine: Mine, folder: Path
+) -> None:
     with pytest.raises(UserCodeError, match=rf"'mine:mine' .*{message}"):
         checked(mine, CONSTRAINT.format(line=line), folder, CONSTRAINED)
 
@@ -58,7 +65,11 @@ def test_a_constraint_whose_function_is_none_of_the_setting_alone_is_refused(lin
 def test_a_random_constraint_is_refused_before_the_first_batch(command: str, mine: Mine, folder: Path) -> None:
     mine(CONSTRAINT.format(line="return mass + np.random.random(len(mass))"), CONSTRAINED)
     for _ in range(2):
-        refused(command, str(folder / "mine.toml"), message=("constraints.function = 'mine:mine'", "in a second run", "mine.py:"))
+        refused(
+            command,
+            str(folder / "mine.toml"),
+            message=("constraints.function = 'mine:mine'", "in a second run", "mine.py:"),
+        )
 
 
 SEARCH = """
@@ -77,7 +88,9 @@ class Mine:
 
 
 @pytest.mark.parametrize(("own", "shared"), [("Mine", True), ("self", False)])
-def test_an_algorithm_whose_runs_learn_from_each_other(own: str, shared: bool, mine: Mine, folder: Path, tmp_path: Path) -> None:
+def test_an_algorithm_whose_runs_learn_from_each_other(
+    own: str, shared: bool, mine: Mine, folder: Path, tmp_path: Path
+) -> None:
     system = mine(SEARCH.format(own=own), '[search]\nalgorithms = ["mine:Mine"]\nevaluations = 20\nruns = 3\n')
     study = load_study(str(folder / "mine.toml"))
 
@@ -117,7 +130,9 @@ def test_a_class_that_changes_after_three_hundred_vehicles(mine: Mine, folder: P
     system = mine(SAFER)
     study = load_study(str(folder / "mine.toml"), search={"algorithms": ["rs"], "evaluations": 450, "runs": 1})
     for _ in range(2):
-        with pytest.raises(UserCodeError, match=r"rs-00 and \S+ alone; to reproduce it: python -m safevar_sumo simulate") as caught:
+        with pytest.raises(
+            UserCodeError, match=r"rs-00 and \S+ alone; to reproduce it: python -m safevar_sumo simulate"
+        ) as caught:
             carry_out_runs(study, system, all_runs(study), tmp_path / "out", InlinePool(), SilentObserver(), 50)
         assert "ads.model = 'mine:Mine' a result depends on what else is simulated" in str(caught.value)
     assert not (tmp_path / "out/solutions.csv").exists()
@@ -159,13 +174,21 @@ class Mine:
 """
 
 
-@pytest.mark.parametrize(("module", "problem"), [
-    (GREEDY, "read-only"),
-    (IDLE.format(body="if problem.evaluations == 0:\n            yield"), "ended in search without yielding any setting"),
-    (IDLE.format(body="yield problem.characteristics.original[None][:0]"), "returned settings = .* from search"),
-], ids=["lower", "nothing", "empty"])
-def test_an_algorithm_that_changes_its_problem_or_asks_for_nothing(module: str, problem: str, mine: Mine, folder: Path,
-                                                                  tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("module", "problem"),
+    [
+        (GREEDY, "read-only"),
+        (
+            IDLE.format(body="if problem.evaluations == 0:\n            yield"),
+            "ended in search without yielding any setting",
+        ),
+        (IDLE.format(body="yield problem.characteristics.original[None][:0]"), "returned settings = .* from search"),
+    ],
+    ids=["lower", "nothing", "empty"],
+)
+def test_an_algorithm_that_changes_its_problem_or_asks_for_nothing(
+    module: str, problem: str, mine: Mine, folder: Path, tmp_path: Path
+) -> None:
     system = mine(module, '[search]\nalgorithms = ["mine:Mine"]\nevaluations = 10\nruns = 1\n')
     study = load_study(str(folder / "mine.toml"))
     with pytest.raises(UserCodeError, match=problem):

@@ -50,7 +50,9 @@ def test_a_module_that_was_edited_is_read_anew_and_so_is_what_it_imports(mine: M
     assert throttle(folder / "mine.toml") == 0.6
 
 
-def test_a_file_with_the_name_of_an_installed_module_is_refused_where_it_is_meant_and_ignored_where_not(mine: Mine, folder: Path) -> None:
+def test_a_file_with_the_name_of_an_installed_module_is_refused_where_it_is_meant_and_ignored_where_not(
+    mine: Mine, folder: Path
+) -> None:
     (folder / "scipy.py").write_text("raise RuntimeError('not scipy')")
     mine("import numpy, scipy\n" + CONSTANT.format(0.1))
     (folder / "numpy.py").write_text(CONSTANT.format(0.1))
@@ -58,22 +60,32 @@ def test_a_file_with_the_name_of_an_installed_module_is_refused_where_it_is_mean
         mine("", '[ads]\nmodel = "numpy:Mine"\n')
 
 
-@pytest.mark.parametrize(("model", "expected"), [
-    ("os:system", "is a function, not a class"),
-    ("os:path", "is a module, not a class"),
-    ("subprocess:Popen", "has no method start(n, nominal, step)"),
-    ("mine:Mine", "has no method drive(seen)"),
-    ("mine:NotEnough", "has a method drive that does not take (seen, memory)"),
-    ("mine:Scalar", "has a method drive that does not take (seen)"),
-    ("mine:Odd", "has drive = 3 instead of a method drive(seen, memory)"),
-    ("mine:nothing", "has no 'nothing'"),
-    ("__main__:Mine", "cannot import from __main__"),
-    ("mine:", "mine:"), (":Mine", ":Mine"), ("no where:Mine", "no where:Mine"), ("mine:Mine.Inner", "mine:Mine.Inner"),
-])
-def test_a_class_that_does_not_meet_the_contract_is_refused_before_a_call(model: str, expected: str, mine: Mine, folder: Path) -> None:
-    module = (SCALAR + "    pass\n\n\nclass Called:\n    def __init__(self):\n        open('called', 'w').close()\n\n"
-              "    def start(self, n, nominal, step): ...\n\n\nclass NotEnough(Called):\n    def drive(self, seen): ...\n\n\n"
-              "class Odd(Called):\n    drive = 3\n\n\nclass Scalar(ScalarAds):\n    def drive(self, seen, memory): ...\n")
+@pytest.mark.parametrize(
+    ("model", "expected"),
+    [
+        ("os:system", "is a function, not a class"),
+        ("os:path", "is a module, not a class"),
+        ("subprocess:Popen", "has no method start(n, nominal, step)"),
+        ("mine:Mine", "has no method drive(seen)"),
+        ("mine:NotEnough", "has a method drive that does not take (seen, memory)"),
+        ("mine:Scalar", "has a method drive that does not take (seen)"),
+        ("mine:Odd", "has drive = 3 instead of a method drive(seen, memory)"),
+        ("mine:nothing", "has no 'nothing'"),
+        ("__main__:Mine", "cannot import from __main__"),
+        ("mine:", "mine:"),
+        (":Mine", ":Mine"),
+        ("no where:Mine", "no where:Mine"),
+        ("mine:Mine.Inner", "mine:Mine.Inner"),
+    ],
+)
+def test_a_class_that_does_not_meet_the_contract_is_refused_before_a_call(
+    model: str, expected: str, mine: Mine, folder: Path
+) -> None:
+    module = (
+        SCALAR + "    pass\n\n\nclass Called:\n    def __init__(self):\n        open('called', 'w').close()\n\n"
+        "    def start(self, n, nominal, step): ...\n\n\nclass NotEnough(Called):\n    def drive(self, seen): ...\n\n\n"
+        "class Odd(Called):\n    drive = 3\n\n\nclass Scalar(ScalarAds):\n    def drive(self, seen, memory): ...\n"
+    )
     with pytest.raises(InputError) as caught:
         mine(module, f'[ads]\nmodel = "{model}"\nparameters = {{ command = "touch called" }}\n')
     assert expected in str(caught.value)
@@ -81,12 +93,18 @@ def test_a_class_that_does_not_meet_the_contract_is_refused_before_a_call(model:
     assert not Path("called").exists()
 
 
-@pytest.mark.parametrize(("module", "expected"), [
-    ("import nothing_of_that_name\n", "ModuleNotFoundError: No module named 'nothing_of_that_name' ({}:1)"),
-    ("\nraise SystemExit(3)\n", "SystemExit: 3 ({}:2)"), ("\n\n1 / 0\n", "ZeroDivisionError: division by zero ({}:3)"),
-    ("x = (\n", "SyntaxError: '(' was never closed"),
-])
-def test_a_module_that_fails_is_reported_with_its_line_and_can_be_corrected(module: str, expected: str, mine: Mine, folder: Path) -> None:
+@pytest.mark.parametrize(
+    ("module", "expected"),
+    [
+        ("import nothing_of_that_name\n", "ModuleNotFoundError: No module named 'nothing_of_that_name' ({}:1)"),
+        ("\nraise SystemExit(3)\n", "SystemExit: 3 ({}:2)"),
+        ("\n\n1 / 0\n", "ZeroDivisionError: division by zero ({}:3)"),
+        ("x = (\n", "SyntaxError: '(' was never closed"),
+    ],
+)
+def test_a_module_that_fails_is_reported_with_its_line_and_can_be_corrected(
+    module: str, expected: str, mine: Mine, folder: Path
+) -> None:
     with pytest.raises(InputError) as caught:
         mine(module)
     assert expected.format(folder / "mine.py") in str(caught.value)
@@ -98,15 +116,31 @@ def test_a_module_that_fails_is_reported_with_its_line_and_can_be_corrected(modu
 def test_a_numpy_py_in_the_working_directory_is_not_numpy(tmp_path: Path) -> None:
     for name in ("numpy", "random"):
         (tmp_path / f"{name}.py").write_text("raise RuntimeError('not this one')\n")
-    command = [sys.executable, "-m", "safevar_sumo", "study", "smoke", "--runs", "1", "--evaluations", "10", "--jobs", "1", "--quiet"]
+    command = [
+        sys.executable,
+        "-m",
+        "safevar_sumo",
+        "study",
+        "smoke",
+        "--runs",
+        "1",
+        "--evaluations",
+        "10",
+        "--jobs",
+        "1",
+        "--quiet",
+    ]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
 
 
 def test_a_script_in_the_folder_of_the_study_stays_the_main_module(tmp_path: Path) -> None:
-    (tmp_path / "mine.toml").write_text('extends = "native"\nname = "mine"\n[ads]\nkind = "traci"\nmodel = "mine:step"\n')
+    (tmp_path / "mine.toml").write_text(
+        'extends = "native"\nname = "mine"\n[ads]\nkind = "traci"\nmodel = "mine:step"\n'
+    )
     (tmp_path / "mine.py").write_text("def step(traci, vehicle_id):\n    traci.vehicle.setSpeed(vehicle_id, 5)\n")
     (tmp_path / "script.py").write_text(
-        "import safevar_sumo as sv\nsv.simulate('mine.toml')\nprint(len(sv.evaluate('mine.toml', [{'mass': 1600}])))\n")
+        "import safevar_sumo as sv\nsv.simulate('mine.toml')\nprint(len(sv.evaluate('mine.toml', [{'mass': 1600}])))\n"
+    )
     output = subprocess.run([sys.executable, "script.py"], cwd=tmp_path, capture_output=True, text=True, timeout=300)
     assert output.stdout.split() == ["1"], output.stderr

@@ -58,7 +58,10 @@ def systems(steps: int, speed: float) -> list[System]:
     """A shipped vehicle that diverges, and a user's."""
     shipped = Diverges(steps, speed)
     guarded = GuardedVehicle(Diverges(steps, speed), GUARD)
-    return [replace(NATIVE, ads=Brakes(), vehicle=vehicle) for vehicle in ([shipped, guarded] if np.isnan(speed) else [guarded])]
+    return [
+        replace(NATIVE, ads=Brakes(), vehicle=vehicle)
+        for vehicle in ([shipped, guarded] if np.isnan(speed) else [guarded])
+    ]
 
 
 def bits(evaluations: Evaluations) -> list[bytes]:

@@ -33,9 +33,17 @@ def block(sheet, frame, name: str) -> list[str]:
     top, left, n_rows, n_columns = extent["start_row"] + 2, extent["start_col"] + 1, extent["n_rows"], extent["n_cols"]
     headings = {sheet.cell(top - 2, column).value: column for column in range(2, left + 1)}
     test, _, light = name.partition(" ")
-    column_key = "impact_location" if "Impact location" in [sheet.cell(top - 2, c).value for c in range(1, left + 1)] else "target_speed"
+    column_key = (
+        "impact_location"
+        if "Impact location" in [sheet.cell(top - 2, c).value for c in range(1, left + 1)]
+        else "target_speed"
+    )
     columns = [sheet.cell(top - 1, left + k).value for k in range(n_columns)]
-    columns = [round(100 * value) for value in columns] if column_key == "impact_location" else [number(value) for value in columns]
+    columns = (
+        [round(100 * value) for value in columns]
+        if column_key == "impact_location"
+        else [number(value) for value in columns]
+    )
     points = {(p.row, p.col): p for p in matrix_processing.get_test_matrix(frame, name, KEY)}
     rows = []
     for k in range(n_rows):
@@ -47,22 +55,36 @@ def block(sheet, frame, name: str) -> list[str]:
         rows.append(f'  {{ {speeds}, ranges = "{mask}"{"" if function else ", choice = true"} }},')
     total = data_model.TOTAL_SCORES[name]
     return [
-        "", "[[blocks]]", f'test = "{test}"', *([f'light = "{light}"'] if light else []), f'criterion = "{criterion(name)}"',
-        f'sheet = "{sheet.title}"', f'label = "A{top - 2}"', f'first = "{sheet.cell(top, left).coordinate}"',
+        "",
+        "[[blocks]]",
+        f'test = "{test}"',
+        *([f'light = "{light}"'] if light else []),
+        f'criterion = "{criterion(name)}"',
+        f'sheet = "{sheet.title}"',
+        f'label = "A{top - 2}"',
+        f'first = "{sheet.cell(top, left).coordinate}"',
         *([f'function = "{sheet.cell(top, headings["Function"]).column_letter}"'] if "Function" in headings else []),
         f"points = [{', '.join(f'{total[kind] or 0:g}' for kind in ('Standard', 'Extended', 'Robustness'))}]",
-        f"{column_key}s = {quoted(columns)}", "rows = [", *rows, "]"]
+        f"{column_key}s = {quoted(columns)}",
+        "rows = [",
+        *rows,
+        "]",
+    ]
 
 
 def criterion(name: str) -> str:
-    return {"mitigation or avoidance": "mitigation", "avoidance": "avoidance"}[data_model.get_criteria_for_test(name).value]
+    return {"mitigation or avoidance": "mitigation", "avoidance": "avoidance"}[
+        data_model.get_criteria_for_test(name).value
+    ]
 
 
 def bands(test: str, attributes: dict[str, str], colours: list[str]) -> str:
     """Lower limits of the colours of a measured value, from the colours that the calculator gives at each hundredth."""
     limits = []
     for hundredth in range(6001):
-        point = matrix_processing.TestPoint(0, 0, common.PredictionColor.GREY, matrix_processing.TestRange.STANDARD, attributes)
+        point = matrix_processing.TestPoint(
+            0, 0, common.PredictionColor.GREY, matrix_processing.TestRange.STANDARD, attributes
+        )
         colour = matrix_processing.ComputedTestPoint(point, test, hundredth / 100).measured_color.value
         if not limits or limits[-1][0] != colour:
             limits.append((colour, hundredth / 100))
@@ -73,29 +95,48 @@ def bands(test: str, attributes: dict[str, str], colours: list[str]) -> str:
 def main() -> None:
     path = files("data").joinpath("ca_template.xlsx")
     book, frames = openpyxl.load_workbook(str(path)), common.read_excel_file_to_dfs(str(path))
-    print("# Euro NCAP's crash avoidance, frontal collisions, protocol v1.2 (July 2026): matrices, points and robustness layers.")
-    print(f"# Derived by tests/rating/derive.py from euroncap-rating-2026 {version('euroncap-rating-2026')} (PyPI, Apache-2.0):")
-    print("# its template ca_template.xlsx and its modules crash_avoidance.data_model, matrix_processing, robustness_layer. Do not edit.")
-    print("# ranges: a letter for each column, S standard, E extended, - no cell; choice: the manufacturer chooses AEB or FCW.")
+    print(
+        "# Euro NCAP's crash avoidance, frontal collisions, protocol v1.2 (July 2026): matrices, points and robustness layers."
+    )
+    print(
+        f"# Derived by tests/rating/derive.py from euroncap-rating-2026 {version('euroncap-rating-2026')} (PyPI, Apache-2.0):"
+    )
+    print(
+        "# its template ca_template.xlsx and its modules crash_avoidance.data_model, matrix_processing, robustness_layer. Do not edit."
+    )
+    print(
+        "# ranges: a letter for each column, S standard, E extended, - no cell; choice: the manufacturer chooses AEB or FCW."
+    )
     print(f'\ncalculator = "{version("euroncap-rating-2026")}"')
-    colours = {colour.value: "".join(f"{round(255 * part):02X}" for part in rgb) for colour, rgb in common.PREDICTION_COLOR_MAP.items()}
-    print("colours = { " + ", ".join(f'{name} = "{colours[name]}"' for name in ("green", "yellow", "orange", "brown", "red")) + " }")
+    colours = {
+        colour.value: "".join(f"{round(255 * part):02X}" for part in rgb)
+        for colour, rgb in common.PREDICTION_COLOR_MAP.items()
+    }
+    print(
+        "colours = { "
+        + ", ".join(f'{name} = "{colours[name]}"' for name in ("green", "yellow", "orange", "brown", "red"))
+        + " }"
+    )
     best_first = ["green", "yellow", "orange", "brown", "red"]
-    print("\n# From which relative speed at impact [km/h] a cell has a colour, by the speed of the vehicle under test [km/h], the last"
-          "\n# row for all faster ones; and from which time to collision at the warning [s]. Measured values have two decimals.")
+    print(
+        "\n# From which relative speed at impact [km/h] a cell has a colour, by the speed of the vehicle under test [km/h], the last"
+        "\n# row for all faster ones; and from which time to collision at the warning [s]. Measured values have two decimals."
+    )
     print("[mitigation]")
     for vut in (10, 20, 30, 40, 50):
-        print(f'{vut} = {bands("CCRs", {"VUT speed": f"{vut} km/h"}, best_first)}')
+        print(f"{vut} = {bands('CCRs', {'VUT speed': f'{vut} km/h'}, best_first)}")
     assert bands("CCRs", {"VUT speed": "130 km/h"}, best_first) == bands("CCRs", {"VUT speed": "50 km/h"}, best_first)
     print("[criteria]")
-    print(f'avoidance = {bands("CCCscp", {"VUT speed": "50 km/h"}, best_first)}')
-    print(f'warning = {bands("CBLA", {"VUT speed": "50 km/h", "Function": "FCW"}, best_first[::-1])}')
+    print(f"avoidance = {bands('CCCscp', {'VUT speed': '50 km/h'}, best_first)}")
+    print(f"warning = {bands('CBLA', {'VUT speed': '50 km/h', 'Function': 'FCW'}, best_first[::-1])}")
     lines = ["", "# Points of every test of the stage: standard, extended, robustness.", "[scenarios]"]
     scenario: dict[str, list[float]] = {}
     for row in book["Scenario Scores"].iter_rows(min_row=2, values_only=True):
         name = row[4] or name  # noqa: F821
         scenario.setdefault(name, []).append(row[7])
-    lines += [f'"{name}" = [{", ".join(f"{value:g}" for value in [*points, 0, 0][:3])}]' for name, points in scenario.items()]
+    lines += [
+        f'"{name}" = [{", ".join(f"{value:g}" for value in [*points, 0, 0][:3])}]' for name, points in scenario.items()
+    ]
     tests_by_part = data_model.STAGE_SUBELEMENT_TO_LOADCASES["FC"]
     simulated_tests = []
     for part, names in tests_by_part.items():
@@ -111,11 +152,20 @@ def main() -> None:
             cell, layer = sheet.cell(row, column), sheet.cell(row, 2).value
             if cell.fill.fill_type and cell.fill.fgColor.tint:
                 conditions_by_layer = robustness_layer.ROBUSTNESS_LAYER_TO_VERIFICATION_CONDITION
-                pairs = next((conditions_by_layer[key].get(test, []) for key in conditions_by_layer if key.value == layer), [])
+                pairs = next(
+                    (conditions_by_layer[key].get(test, []) for key in conditions_by_layer if key.value == layer), []
+                )
                 pairs = [pairs] if isinstance(pairs, tuple) else pairs
                 conditions = [f'{{ condition = "{text}", criterion = "{kind.value}" }}' for text, kind in pairs]
-                lines += ["", "[[layers]]", f'test = "{test}"', f'layer = "{layer}"', f'sheet = "{sheet.title}"',
-                          f'cell = "{cell.coordinate}"', f"conditions = [{', '.join(conditions)}]"]
+                lines += [
+                    "",
+                    "[[layers]]",
+                    f'test = "{test}"',
+                    f'layer = "{layer}"',
+                    f'sheet = "{sheet.title}"',
+                    f'cell = "{cell.coordinate}"',
+                    f"conditions = [{', '.join(conditions)}]",
+                ]
     print("\n".join(lines))
 
 

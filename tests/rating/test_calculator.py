@@ -54,7 +54,9 @@ def agrees(rated: RatedVehicle, calculator: Calculator, template: Path, place: P
     assert verified or rated.points == 0
     for row in verified:
         across, down = map(int, str(row["Test point"]).strip("()").split(","))
-        assert str(row["Colour"]).lower() == rated.colour(PROTOCOL.matrix_cell_numbers[str(row["Scenario"]), across, down]), row
+        assert str(row["Colour"]).lower() == rated.colour(
+            PROTOCOL.matrix_cell_numbers[str(row["Scenario"]), across, down]
+        ), row
 
 
 def test_the_protocols_data_is_what_the_calculator_has(calculator: Calculator) -> None:
@@ -63,31 +65,51 @@ def test_the_protocols_data_is_what_the_calculator_has(calculator: Calculator) -
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_vehicles_with_any_colours_score_alike(seed: int, calculator: Calculator, template: Path, tmp_path: Path) -> None:
+def test_vehicles_with_any_colours_score_alike(
+    seed: int, calculator: Calculator, template: Path, tmp_path: Path
+) -> None:
     """Colours at random, with speeds that round to a bound; layers as their cells or at random, some claimed."""
     rng = np.random.default_rng(seed)
     speeds = rng.choice([0.004, 5, 9.996, 10, 15, 20, 25, 30, 40], (1, N))
     impact = np.where(rng.random((1, N)) < rng.choice([0.1, 0.3, 0.7]), speeds, np.nan)
     if seed:
-        impact[:, [k for k, cell in enumerate(PROTOCOL.cells) if cell.matrix.test_name == "CCRs" and cell.vut_speed <= 20]] = np.nan
+        impact[
+            :, [k for k, cell in enumerate(PROTOCOL.cells) if cell.matrix.test_name == "CCRs" and cell.vut_speed <= 20]
+        ] = np.nan
     warning = np.where(rng.random((1, N)) < 0.7, 1.9, rng.choice([np.nan, 1.2, 1.696], (1, N)))
     nominal = list(range(N))
     if seed % 2:
         nominal = [PROTOCOL.matrix_cell_numbers[cell.matrix.name, cell.row, cell.column] for cell in PROTOCOL.cells]
-    cells, claims = CellResults(impact[:, nominal], warning[:, nominal], np.ones((1, N), dtype=bool)), CLAIMS if seed % 3 else {}
-    rated = RatedVehicle(name="any", setting={}, protocol=PROTOCOL, cells=cells, scores=points_of(PROTOCOL, cells, claims), claims=claims)
+    cells, claims = (
+        CellResults(impact[:, nominal], warning[:, nominal], np.ones((1, N), dtype=bool)),
+        CLAIMS if seed % 3 else {},
+    )
+    rated = RatedVehicle(
+        name="any", setting={}, protocol=PROTOCOL, cells=cells, scores=points_of(PROTOCOL, cells, claims), claims=claims
+    )
     assert rated.fails == (seed == 0)
     agrees(rated, calculator, template, tmp_path)
 
 
-def test_the_original_half_the_brakes_the_worst_wear_and_who_never_brakes(calculator: Calculator, template: Path, tmp_path: Path) -> None:
+def test_the_original_half_the_brakes_the_worst_wear_and_who_never_brakes(
+    calculator: Calculator, template: Path, tmp_path: Path
+) -> None:
     study = load_study("euro_ncap_rating")
     characteristics = CharacteristicSet.of(study.vehicle.characteristics)
-    worst = characteristics.setting({"treadDepth": 1.6, "brakeTorque": 0.5, "brakeResponse": 0.4, "payload": 525, "payloadCentre": 3.2,
-                                     "sensorRange": 15, "sensorLatency": 0.4}, "worst")
+    worst = characteristics.setting(
+        {
+            "treadDepth": 1.6,
+            "brakeTorque": 0.5,
+            "brakeResponse": 0.4,
+            "payload": 525,
+            "payloadCentre": 3.2,
+            "sensorRange": 15,
+            "sensorLatency": 0.4,
+        },
+        "worst",
+    )
     result = rate(study, {"half": characteristics.setting({"brakeTorque": 0.5}, "half"), "worst": worst})
-    idle = rate(load_study(
-        study, ads={"model": "aeb", "parameters": {"reach": 0.001}}), {})
+    idle = rate(load_study(study, ads={"model": "aeb", "parameters": {"reach": 0.001}}), {})
     for number, vehicle in enumerate([*result.vehicles, idle.original]):
         agrees(vehicle, calculator, template, tmp_path / str(number))
     assert result.original.points > result.vehicles[1].points > result.vehicles[2].points
@@ -96,8 +118,11 @@ def test_the_original_half_the_brakes_the_worst_wear_and_who_never_brakes(calcul
 
 def test_other_cells_and_sheets_are_refused_by_name(template: Path, tmp_path: Path) -> None:
     for sheet, cell, value, message in (
-            ("FC - Car & PTW pred.", "A3", "15 km/h", "A3"), ("FC - Ped & Cyc pred.", "A72", "CPNX day", "A72"),
-            ("FC - Ped & Cyc robust. pred.", "B3", "Velocity", "B3"), ("Version", "B1", "5.9.0", "Version")):
+        ("FC - Car & PTW pred.", "A3", "15 km/h", "A3"),
+        ("FC - Ped & Cyc pred.", "A72", "CPNX day", "A72"),
+        ("FC - Ped & Cyc robust. pred.", "B3", "Velocity", "B3"),
+        ("Version", "B1", "5.9.0", "Version"),
+    ):
         book = openpyxl.load_workbook(shutil.copy(template, tmp_path / "other.xlsx"))
         book[sheet][cell] = value
         book.save(tmp_path / "other.xlsx")
@@ -112,11 +137,14 @@ def test_other_cells_and_sheets_are_refused_by_name(template: Path, tmp_path: Pa
         PreprocessedFile(template, tmp_path / "out.xlsx")
 
 
-def test_the_pages_commands_run_as_typed(calculator: Calculator, tmp_path: Path,
-                                         monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_pages_commands_run_as_typed(
+    calculator: Calculator, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """All but the two that make the calculator's environment, which is there."""
     page = (Path(__file__).parents[2] / "docs/rating.md").read_text(encoding="utf-8")
-    (block,) = (block for block in page.split("```text\n") if block.startswith("python -m venv calculator\ncalculator/bin/pip"))
+    (block,) = (
+        block for block in page.split("```text\n") if block.startswith("python -m venv calculator\ncalculator/bin/pip")
+    )
     (tmp_path / "calculator").symlink_to(calculator.python.parents[1])
     monkeypatch.setenv("PATH", f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}")
     for line in block.split("\n```")[0].splitlines()[2:]:

@@ -19,7 +19,14 @@ STEPS = np.linspace(0, 1, 4)
 MATRIX = ("standard", "extended")
 VEHICLES = 3
 """The original one, and others of which each characteristic has up to 0.4 of its domain's wear."""
-GAIN = {"treadDepth": 4.2, "brakeTorque": 0.87, "brakeResponse": 0.16, "payload": 200.0, "sensorRange": 56.0, "sensorLatency": 0.16}
+GAIN = {
+    "treadDepth": 4.2,
+    "brakeTorque": 0.87,
+    "brakeResponse": 0.16,
+    "payload": 200.0,
+    "sensorRange": 56.0,
+    "sensorLatency": 0.16,
+}
 """The vehicle of docs/rating.md, which has gained a layer since its tread was 5.1 mm deep."""
 
 
@@ -44,9 +51,14 @@ def test_wear_never_gains_points_in_a_monotone_matrix() -> None:
             ladders += pairwise(names)
     rating = rate(STUDY, settings)
     rated = {one.name: one for one in rating.vehicles}
-    cells = {matrix.name: [number for number, cell in enumerate(rating.protocol.cells)
-                           if cell.matrix is matrix and cell.range_or_layer in MATRIX]
-             for matrix in rating.protocol.matrices}
+    cells = {
+        matrix.name: [
+            number
+            for number, cell in enumerate(rating.protocol.cells)
+            if cell.matrix is matrix and cell.range_or_layer in MATRIX
+        ]
+        for matrix in rating.protocol.matrices
+    }
     matrices, pairs, losses = 0, 0, 0
     for better, worse in ((rated[first], rated[then]) for first, then in ladders):
         for before, after in zip(better.tests, worse.tests, strict=True):

@@ -31,18 +31,33 @@ from safevar_sumo.sumo.system import assemble
 PROTOCOL = protocol_of(EURO_NCAP_2026)
 CELLS = PROTOCOL.cells
 N = len(CELLS)
-BANDS = {10: [0.01], 20: [0.01], 30: [None, None, 0.01, 10], 40: [None, 0.01, 10, 20], 50: [0.01, 10, 20, 30], 130: [0.01, 10, 20, 30]}
+BANDS = {
+    10: [0.01],
+    20: [0.01],
+    30: [None, None, 0.01, 10],
+    40: [None, 0.01, 10, 20],
+    50: [0.01, 10, 20, 30],
+    130: [0.01, 10, 20, 30],
+}
 """From which relative speed on a cell is yellow, orange, brown, red, by the speed of the vehicle (protocol 5.2); one number: red alone."""
 
 
 def results(impact: Any = np.nan, warning: Any = 2.0, vehicles: int = 1) -> CellResults:
-    return CellResults(np.broadcast_to(impact, (vehicles, N)).astype(float), np.broadcast_to(warning, (vehicles, N)).astype(float),
-                       np.ones((vehicles, N), dtype=bool))
+    return CellResults(
+        np.broadcast_to(impact, (vehicles, N)).astype(float),
+        np.broadcast_to(warning, (vehicles, N)).astype(float),
+        np.ones((vehicles, N), dtype=bool),
+    )
 
 
 def numbers(test: str, kind: str = "", light: str | None = None) -> list[int]:
-    return [number for number, cell in enumerate(CELLS) if cell.matrix.test_name == test and (not kind or cell.range_or_layer == kind)
-            and (light is None or cell.matrix.light == light)]
+    return [
+        number
+        for number, cell in enumerate(CELLS)
+        if cell.matrix.test_name == test
+        and (not kind or cell.range_or_layer == kind)
+        and (light is None or cell.matrix.light == light)
+    ]
 
 
 def rated(cells: CellResults, name: str = "original", claims: dict[str, list[str]] | None = None) -> RatedVehicle:
@@ -63,13 +78,21 @@ def test_a_bound_belongs_to_the_worse_colour(vut: int) -> None:
 def test_a_warning_is_green_from_1_7_s_and_measured_values_have_two_decimals() -> None:
     (row,) = {CELLS[k].row for k in numbers("CBLA") if CELLS[k].judged_by == "warning" and CELLS[k].vut_speed == 70}
     number = next(k for k in numbers("CBLA", "standard") if CELLS[k].row == row)
-    shown = [COLOURS[colours_of(PROTOCOL, results(50.0, warning))[0, number]] for warning in (1.7, 1.695, 1.694, np.nan)]
+    shown = [
+        COLOURS[colours_of(PROTOCOL, results(50.0, warning))[0, number]] for warning in (1.7, 1.695, 1.694, np.nan)
+    ]
     assert shown == ["green", "green", "red", "red"]
 
 
 def test_a_vehicle_that_avoids_every_impact_earns_all_simulated_points_and_one_that_never_brakes_none() -> None:
-    whole = points_of(PROTOCOL, results(vehicles=2), {test: [one.name for one in PROTOCOL.layers_of(test) if not one.simulated_conditions]
-                                                      for test in PROTOCOL.tests})
+    whole = points_of(
+        PROTOCOL,
+        results(vehicles=2),
+        {
+            test: [one.name for one in PROTOCOL.layers_of(test) if not one.simulated_conditions]
+            for test in PROTOCOL.tests
+        },
+    )
     assert whole.total.tolist() == [40.0, 40.0]
     assert sum(PROTOCOL.points_not_simulated.values()) + whole.total[0] == 100
     assert points_of(PROTOCOL, results(60.0, np.nan)).total.tolist() == [0.0]
@@ -91,7 +114,10 @@ def test_robustness_counts_from_half_of_the_standard_range_and_claims_count_as_h
         assert points[0] == pytest.approx(1 - red / 12)
         assert (points[2] > 0) == earned
     layers = PROTOCOL.layers_of("CBNA")
-    held, claim = sum(bool(one.simulated_conditions) for one in layers), next(one.name for one in layers if not one.simulated_conditions)
+    held, claim = (
+        sum(bool(one.simulated_conditions) for one in layers),
+        next(one.name for one in layers if not one.simulated_conditions),
+    )
     shares = [points_of(PROTOCOL, results(), claims).tests["CBNA"][0, 2] / 0.125 for claims in ({}, {"CBNA": [claim]})]
     assert shares == pytest.approx([held / len(layers), (held + 1) / len(layers)])
 
@@ -116,16 +142,24 @@ def test_remarks_name_the_required_cells_that_are_not_green() -> None:
     def remarks_on(cell_number: int) -> list[str]:
         impact = np.full(N, np.nan)
         impact[cell_number] = 1.0
-        return remarks(Rating(study=load_study("euro_ncap_rating", weather="clear"), protocol=PROTOCOL, vehicles=[rated(results(impact))]))
+        return remarks(
+            Rating(
+                study=load_study("euro_ncap_rating", weather="clear"),
+                protocol=PROTOCOL,
+                vehicles=[rated(results(impact))],
+            )
+        )
 
     assert remarks_on(numbers("CCRs", "standard")[0]) == [
-        "original: it earns nothing, because CCRs at 10 and 20 km/h is not green in the whole standard range."]
+        "original: it earns nothing, because CCRs at 10 and 20 km/h is not green in the whole standard range."
+    ]
     cpna = [number for number in numbers("CPNA") if CELLS[number].vut_speed == 10]
     unchecked = [number for number in cpna if remarks_on(number)]
     assert {(CELLS[number].impact_location, CELLS[number].range_or_layer) for number in unchecked} == {(75, "standard")}
     assert remarks_on(unchecked[0]) == [
         "original: CPNA at 10 km/h and 75 % is not green, which Euro NCAP requires; Euro NCAP's calculator 5.4.9 does not check this, "
-        "nor do these points."]
+        "nor do these points."
+    ]
 
 
 @settings(max_examples=40, deadline=None)
@@ -170,16 +204,26 @@ def test_a_rated_study_has_its_points_as_an_objective_and_another_one_has_not() 
     system = assemble(load_study("euro_ncap_rating"))
     few = replace(system, matrix=system.matrix[::930], rater=None)
     assert "rating_points" in system.measuring.metrics
-    assert [objective.name for objective in system.measuring.scoring.objectives] == ["rating_points", "f_diff", "f_num_diff"]
+    assert [objective.name for objective in system.measuring.scoring.objectives] == [
+        "rating_points",
+        "f_diff",
+        "f_num_diff",
+    ]
     assert len(evaluate(few, system.characteristics.original[np.newaxis])) == 1
     with pytest.raises(InputError, match="rating_points"):
         assemble(load_study("wear", search={"objectives": ["rating_points", "f_diff"]}))
 
 
-@pytest.mark.parametrize(("changes", "message"), [
-    ({"rating": {"claims": {"CCRx": ["Type"]}}}, "CCRx"), ({"rating": {"claims": {"CCRs": ["Typo"]}}}, "Typo"),
-    ({"rating": {"claims": {"CCRs": ["Trajectory/Heading"]}}}, "is simulated"), ({"matrix": {"protocol": "euro_ncap_2023"}}, "protocol"),
-    ({"matrix": {"protocol": ""}}, "tests, or a protocol")])
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"rating": {"claims": {"CCRx": ["Type"]}}}, "CCRx"),
+        ({"rating": {"claims": {"CCRs": ["Typo"]}}}, "Typo"),
+        ({"rating": {"claims": {"CCRs": ["Trajectory/Heading"]}}}, "is simulated"),
+        ({"matrix": {"protocol": "euro_ncap_2023"}}, "protocol"),
+        ({"matrix": {"protocol": ""}}, "tests, or a protocol"),
+    ],
+)
 def test_unknown_claims_and_protocols_are_refused_by_name(changes: dict[str, Any], message: str) -> None:
     with pytest.raises(InputError, match=message):
         assemble(load_study("euro_ncap_rating", **changes))
@@ -188,8 +232,14 @@ def test_unknown_claims_and_protocols_are_refused_by_name(changes: dict[str, Any
 def test_the_verdict_names_what_is_lost_and_where() -> None:
     impact = np.full(N, np.nan)
     impact[numbers("CPNCO", "standard", "night")] = 40.0
-    result = Rating(study=load_study("euro_ncap_rating"), protocol=PROTOCOL, vehicles=[rated(results()), rated(results(impact), "variant")])
-    result.vehicles[0].__dict__["setting"] = {name: row.original for name, row in result.study.vehicle.characteristics.items()}
+    result = Rating(
+        study=load_study("euro_ncap_rating"),
+        protocol=PROTOCOL,
+        vehicles=[rated(results()), rated(results(impact), "variant")],
+    )
+    result.vehicles[0].__dict__["setting"] = {
+        name: row.original for name, row in result.study.vehicle.characteristics.items()
+    }
     result.vehicles[1].__dict__["setting"] = {**result.vehicles[0].setting, "treadDepth": 3.0}
     assert rating_in_words(result).startswith("With tread depth of the tyres 3 mm the vehicle loses 1.")
     assert rating_in_words(result).endswith("all of them in CPNCO by night.")
@@ -201,9 +251,19 @@ def test_the_verdict_names_what_is_lost_and_where() -> None:
     record = json.loads(json.dumps(result.to_dict(), allow_nan=False))
     assert set(record) == {"study", "variants", "not_simulated"}
     assert set(record["variants"][0]) == {"name", "setting", "points", "possible", "tests"}
-    assert {(one["test"], one["light"]) for one in record["variants"][0]["tests"]} >= {("CCRs", None), ("CPNCO", "night")}
+    assert {(one["test"], one["light"]) for one in record["variants"][0]["tests"]} >= {
+        ("CCRs", None),
+        ("CPNCO", "night"),
+    }
     assert set(record["variants"][0]["tests"][0]["cells"][0]) == {
-        "range", "vut_speed", "target_speed", "impact_location", "colour", "relative_impact_speed", "warning_ttc"}
+        "range",
+        "vut_speed",
+        "target_speed",
+        "impact_location",
+        "colour",
+        "relative_impact_speed",
+        "warning_ttc",
+    }
 
 
 def _rate(*arguments: str) -> Any:
@@ -216,14 +276,20 @@ def test_what_a_command_cannot_write_or_read_is_refused_before_anything_is_simul
     (text := tmp_path / "text.xlsx").write_text("no spreadsheet")
     new = str(tmp_path / "new.xlsx")
     for arguments, message in (
-            (["--xlsx", new], "--template FILE"), (["--template", str(there)], "--xlsx FILE"),
-            (["--template", str(there), "--xlsx", str(there)], "--force"), (["--preprocessed", str(there)], "--force"),
-            (["--template", str(there), "--preprocessed", str(there), "--xlsx", new], "one of them"),
-            (["--template", "nothing.xlsx", "--xlsx", new], "nothing.xlsx: there is no such file"),
-            (["--template", str(tmp_path), "--xlsx", new], ": is a directory"),
-            (["--template", str(text), "--xlsx", new], "text.xlsx"), (["--template", str(there), "--xlsx", new], "has no sheet 'Version'"),
-            (["--set", "treadDepth=1.6..8:3"], "one value"), (["--solution", "nsga2:0:0"], "has no solutions"),
-            (["--set", "treadDepth=1"], "treadDepth"), (["--plot", str(there)], ".png")):
+        (["--xlsx", new], "--template FILE"),
+        (["--template", str(there)], "--xlsx FILE"),
+        (["--template", str(there), "--xlsx", str(there)], "--force"),
+        (["--preprocessed", str(there)], "--force"),
+        (["--template", str(there), "--preprocessed", str(there), "--xlsx", new], "one of them"),
+        (["--template", "nothing.xlsx", "--xlsx", new], "nothing.xlsx: there is no such file"),
+        (["--template", str(tmp_path), "--xlsx", new], ": is a directory"),
+        (["--template", str(text), "--xlsx", new], "text.xlsx"),
+        (["--template", str(there), "--xlsx", new], "has no sheet 'Version'"),
+        (["--set", "treadDepth=1.6..8:3"], "one value"),
+        (["--solution", "nsga2:0:0"], "has no solutions"),
+        (["--set", "treadDepth=1"], "treadDepth"),
+        (["--plot", str(there)], ".png"),
+    ):
         error = _rate(*arguments).exception
         assert isinstance(error, InputError), (arguments, error)
         assert message in str(error), (arguments, str(error))

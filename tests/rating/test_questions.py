@@ -61,14 +61,20 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
         rows = tuple(row for row in matrix.rows if row.vut_speed in speeds)
         if rows:
             matrices.append(msgspec.structs.replace(matrix, rows=rows))
-    layers = tuple(layer for layer in WHOLE.layers if layer.test_name in ("CCRs", "CPNA") and layer.name not in ("Trajectory/Heading",))
+    layers = tuple(
+        layer
+        for layer in WHOLE.layers
+        if layer.test_name in ("CCRs", "CPNA") and layer.name not in ("Trajectory/Heading",)
+    )
     protocol = msgspec.structs.replace(WHOLE, matrices=tuple(matrices), layers=layers)
     monkeypatch.setattr(rater, "protocol_of", lambda name: protocol)
 
 
 @pytest.mark.slow
 def test_brakes_cost_points_one_by_one_and_the_first_loss_is_named() -> None:
-    result = find_tolerances(STUDY, ToleranceOptions(characteristics=("brakeTorque",), unsafe="points=4.0"), pool=TwoWorkers())
+    result = find_tolerances(
+        STUDY, ToleranceOptions(characteristics=("brakeTorque",), unsafe="points=4.0"), pool=TwoWorkers()
+    )
     (scan,) = result.alone
     assert scan.points is not None
     points = scan.points
@@ -91,12 +97,21 @@ def test_explain_names_the_cells_of_a_worse_colour_and_the_summary_the_points_th
     members = evaluator.characteristics
     settings = np.array([members.setting({"brakeTorque": value, "payload": 200.0}, "it") for value in (0.5, 0.6)])
     original, evaluations = evaluator.evaluate_original(), evaluator.evaluate(settings, "it")
-    case: Any = type("Case", (), {"study": STUDY, "solutions": solutions_frame(members.names, [(("nsga2", 0), evaluations)]),
-                                  "characteristics": members})()
+    case: Any = type(
+        "Case",
+        (),
+        {
+            "study": STUDY,
+            "solutions": solutions_frame(members.names, [(("nsga2", 0), evaluations)]),
+            "characteristics": members,
+        },
+    )()
     points = float(original.column("rating_points")[0])
     lost = points - float(evaluations.column("rating_points")[1])
     assert lost > 0
-    result = explain_failures(case, ExplainOptions(solutions=("nsga2:0:0",), unsafe=f"points={points - 1e-3}"), pool=TwoWorkers())
+    result = explain_failures(
+        case, ExplainOptions(solutions=("nsga2:0:0",), unsafe=f"points={points - 1e-3}"), pool=TwoWorkers()
+    )
     (failure,) = result.explanations
     assert failure.points
     assert all(name.startswith(("CCRs", "CPNA")) for name in failure.points)
@@ -110,9 +125,13 @@ def test_explain_names_the_cells_of_a_worse_colour_and_the_summary_the_points_th
 
 
 def test_simulate_prints_the_command_that_rates_the_simulated_vehicle() -> None:
-    done = CliRunner(env={"COLUMNS": "300"}).invoke(commands, ["simulate", STUDY.name, "--set", "payload=200", "--set", "brakeTorque=0.6"])
+    done = CliRunner(env={"COLUMNS": "300"}).invoke(
+        commands, ["simulate", STUDY.name, "--set", "payload=200", "--set", "brakeTorque=0.6"]
+    )
     (words,) = re.findall(r"run `python -m safevar_sumo (rating .*)`", done.stdout)
-    assert sorted(words.split()) == sorted(["rating", "euro_ncap_rating", "--set", "payload=200.0", "--set", "brakeTorque=0.6", "--matrix"])
+    assert sorted(words.split()) == sorted(
+        ["rating", "euro_ncap_rating", "--set", "payload=200.0", "--set", "brakeTorque=0.6", "--matrix"]
+    )
     system = assemble(STUDY)
     solution = system.characteristics.setting({"payload": 200.0, "brakeTorque": 0.6}, "it")
     target = CommandTarget(STUDY, "my results", SolutionId("nsga2", 3, 0), solution)
@@ -162,13 +181,19 @@ def test_at_one_cell_a_collision_is_unsafe_and_points_are_no_column() -> None:
     evaluations = evaluator.evaluate(settings, "it")
     solutions = solutions_frame(evaluator.characteristics.names, [(("nsga2", 0), evaluations)])
     scoring = assemble(STUDY).measuring.scoring
-    case = build_case(STUDY, record(evaluator.evaluate_original(), 0), solutions, pd.DataFrame(), [("nsga2", 0)], scoring=scoring)
+    case = build_case(
+        STUDY, record(evaluator.evaluate_original(), 0), solutions, pd.DataFrame(), [("nsga2", 0)], scoring=scoring
+    )
     assert case.unsafe.points is not None
     here = at_point(case, "CCRs, 80 km/h, 100 %, wet")
     stated = RatingOptions(solution="nsga2:0:1", changes={"payload": 200.0})
     variant = compute.rate_variant(case, stated, pool=TwoWorkers()).variant
     assert variant is not None
-    assert (variant.name, variant.setting["brakeTorque"], variant.setting["payload"]) == ("nsga2:0:1 changed", 0.99, 200.0)
+    assert (variant.name, variant.setting["brakeTorque"], variant.setting["payload"]) == (
+        "nsga2:0:1 changed",
+        0.99,
+        200.0,
+    )
     assert stated.command_line("it").endswith("rating it --set payload=200.0 --solution nsga2:0:1")
     assert here.unsafe == Unsafe()
     assert here.unsafe.rows(here.solutions).tolist() == [True, False]

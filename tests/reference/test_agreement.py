@@ -20,8 +20,9 @@ ONE = CharacteristicSet((Characteristic(name="c", unit="kg", original=5.0, lower
 
 
 def study(published: dict[str, float], repeatability: float) -> Study:
-    return msgspec.structs.replace(load_study("smoke"), published=published,
-                                   repeatability={"safety_degree": repeatability})
+    return msgspec.structs.replace(
+        load_study("smoke"), published=published, repeatability={"safety_degree": repeatability}
+    )
 
 
 def reference(safety: list[float], tet: list[float]) -> ReferenceData:
@@ -34,15 +35,23 @@ def reference(safety: list[float], tet: list[float]) -> ReferenceData:
 def here(safety: list[float], tet: list[float]) -> Evaluations:
     data = reference(safety, tet)
     values, collided = data.metrics["safety_degree"], data.collided
-    return Evaluations(settings=data.settings, outcome=np.where(collided, "collision", "stopped"), f_diff=values * 0,
-                       collision_speed=np.where(collided, -values, np.nan), f_num_diff=values * 0,
-                       metrics={**data.metrics, "ave_dece": np.ones(len(values))})
+    return Evaluations(
+        settings=data.settings,
+        outcome=np.where(collided, "collision", "stopped"),
+        f_diff=values * 0,
+        collision_speed=np.where(collided, -values, np.nan),
+        f_num_diff=values * 0,
+        metrics={**data.metrics, "ave_dece": np.ones(len(values))},
+    )
 
 
 def test_every_number_is_what_it_says() -> None:
-    result = measure_agreement(reference([1.0, 2.0, 3.0, -1.0], [1.0, 1.2, 1.4, 0]),
-                               here([1.5, 2.0, 2.0, 1.0], [1.1, 1.2, 1.2, 9.0]),
-                               study({"safety_degree": 2.7}, 0.4), here([2.5], [1.0]))
+    result = measure_agreement(
+        reference([1.0, 2.0, 3.0, -1.0], [1.0, 1.2, 1.4, 0]),
+        here([1.5, 2.0, 2.0, 1.0], [1.1, 1.2, 1.2, 9.0]),
+        study({"safety_degree": 2.7}, 0.4),
+        here([2.5], [1.0]),
+    )
     assert result.rows == 4
     assert result.mean_absolute_error["safety_degree"] == pytest.approx((0.5 + 0 + 1 + 2) / 4)
     assert result.bias["safety_degree"] == pytest.approx((0.5 + 0 - 1 + 2) / 4)
@@ -60,9 +69,12 @@ def test_every_number_is_what_it_says() -> None:
 
 def test_collisions_are_counted_and_those_that_repeats_may_turn_are_told() -> None:
     """Four collide there and four here, three on both sides; of the two others one is 0.05 m from a collision."""
-    result = measure_agreement(reference([-1.0, -2.0, -3.0, -1.0, 0.5, 2.0], [1.0] * 6),
-                               here([-2.0, -2.0, -2.0, 0.05, -1.5, 2.0], [1.0] * 6), study({}, 0.03),
-                               here([2.5], [1.0]))
+    result = measure_agreement(
+        reference([-1.0, -2.0, -3.0, -1.0, 0.5, 2.0], [1.0] * 6),
+        here([-2.0, -2.0, -2.0, 0.05, -1.5, 2.0], [1.0] * 6),
+        study({}, 0.03),
+        here([2.5], [1.0]),
+    )
     assert (result.precision, result.recall) == (0.75, 0.75)
     assert result.collision_speed == {"reference": 2.0, "here": 2.0}
     assert result.undecided == {"differ": 2, "within_repeats": 1}
@@ -80,32 +92,64 @@ def test_rank_correlation_of_known_orders() -> None:
 def test_the_picture_is_drawn_whatever_the_data(tmp_path: Path) -> None:
     for rows in (1, 40):
         safety = np.linspace(-1, 3, rows).tolist()
-        plot_agreement(tmp_path / f"{rows}.png", "title", ONE, reference(safety, [1.0] * rows),
-                       here(safety, [1.0] * rows))
+        plot_agreement(
+            tmp_path / f"{rows}.png", "title", ONE, reference(safety, [1.0] * rows), here(safety, [1.0] * rows)
+        )
         assert (tmp_path / f"{rows}.png").stat().st_size > 10_000
 
 
 SUN = CharacteristicSet.of(load_study("sun").vehicle.characteristics)
 LGSVL = CharacteristicSet.of(load_study("lgsvl").vehicle.characteristics)
-SUN_COLUMNS = ["max_rpm", "dampRateFullT", "dampRateZero_CE", "dampRateZero_CD", "gearSwitchTime", "clutchStrength",
-               "mass", "dragCoeff",
-               "tireFric", "dampRate", "radius", "maxBrakeTorque"]
-LGSVL_COLUMNS = ["mass", "wheel_mass", "wheel_radius", "MaxRPM", "MinRPM", "MaxBrakeTorque", "MaxMotorTorque",
-                 "MaxSteeringAngle",
-                 "TireDragCoeff", "WheelDamping", "ShiftTime", "TractionControlSlipLimit"]
-METRICS = {"MaxPercentage": [0.5, 0.1, 0.2], "SaftyDegree": [2.5, -1.5, 3.0], "numbers": [3, 2, 1],
-           "TIT": [0.4, 0.0, 0.5],
-           "TET": [1.2, 0.0, 1.3], "Dece": [5.0, 3.0, 6.0]}
+SUN_COLUMNS = [
+    "max_rpm",
+    "dampRateFullT",
+    "dampRateZero_CE",
+    "dampRateZero_CD",
+    "gearSwitchTime",
+    "clutchStrength",
+    "mass",
+    "dragCoeff",
+    "tireFric",
+    "dampRate",
+    "radius",
+    "maxBrakeTorque",
+]
+LGSVL_COLUMNS = [
+    "mass",
+    "wheel_mass",
+    "wheel_radius",
+    "MaxRPM",
+    "MinRPM",
+    "MaxBrakeTorque",
+    "MaxMotorTorque",
+    "MaxSteeringAngle",
+    "TireDragCoeff",
+    "WheelDamping",
+    "ShiftTime",
+    "TractionControlSlipLimit",
+]
+METRICS = {
+    "MaxPercentage": [0.5, 0.1, 0.2],
+    "SaftyDegree": [2.5, -1.5, 3.0],
+    "numbers": [3, 2, 1],
+    "TIT": [0.4, 0.0, 0.5],
+    "TET": [1.2, 0.0, 1.3],
+    "Dece": [5.0, 3.0, 6.0],
+}
 
 
 def table(characteristics: CharacteristicSet, columns: list[str]) -> pd.DataFrame:
-    return pd.DataFrame(np.repeat(characteristics.original[np.newaxis], 3, axis=0),
-                        columns=columns).assign(**METRICS).astype(object)
+    return (
+        pd.DataFrame(np.repeat(characteristics.original[np.newaxis], 3, axis=0), columns=columns)
+        .assign(**METRICS)
+        .astype(object)
+    )
 
 
 @pytest.mark.parametrize(("characteristics", "columns"), [(SUN, SUN_COLUMNS), (LGSVL, LGSVL_COLUMNS)])
-def test_both_published_formats_are_read(tmp_path: Path, characteristics: CharacteristicSet,
-                                         columns: list[str]) -> None:
+def test_both_published_formats_are_read(
+    tmp_path: Path, characteristics: CharacteristicSet, columns: list[str]
+) -> None:
     """The lgsvl files have negative decelerations. A row outside the domains is counted and left out."""
     frame = table(characteristics, columns).assign(Dece=[-5.0, -3.0, -6.0])
     frame.loc[0, columns[0]] = characteristics.lower[0]
@@ -131,23 +175,36 @@ def test_the_packages_filter_compares_a_rounded_share_with_at_least() -> None:
     assert np.array_equal(reset, SUN.original)
 
 
-@pytest.mark.parametrize(("text", "expected"), [
-    ("", "is not CSV"),
-    (",".join([*SUN_COLUMNS, "SaftyDegree", "TET", "TIT"]) + "\n", "has no rows"),
-    ("mass,radius\n1,2\n", "lacks the columns max_rpm"),
-    (",".join(SUN_COLUMNS) + "\n" + ",".join(["1"] * 12) + "\n", "lacks the columns SaftyDegree, TET, TIT"),
-    ("mass,radius\n1,2,3\n", "more values than the header"), ("mass,radius\n1,2\n1,2,3\n", "is not CSV: .*line 3"),
-    ('a,b\n"1\n', "is not CSV"),
-])
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("", "is not CSV"),
+        (",".join([*SUN_COLUMNS, "SaftyDegree", "TET", "TIT"]) + "\n", "has no rows"),
+        ("mass,radius\n1,2\n", "lacks the columns max_rpm"),
+        (",".join(SUN_COLUMNS) + "\n" + ",".join(["1"] * 12) + "\n", "lacks the columns SaftyDegree, TET, TIT"),
+        ("mass,radius\n1,2,3\n", "more values than the header"),
+        ("mass,radius\n1,2\n1,2,3\n", "is not CSV: .*line 3"),
+        ('a,b\n"1\n', "is not CSV"),
+    ],
+)
 def test_a_file_in_another_format_is_refused(tmp_path: Path, text: str, expected: str) -> None:
     (tmp_path / "data.csv").write_text(text)
     with pytest.raises(InputError, match=expected):
         read_reference(tmp_path / "data.csv", SUN)
 
 
-@pytest.mark.parametrize(("column", "cell"), [
-    ("mass", "heavy"), ("mass", ""), ("mass", "nan"), ("mass", "inf"), ("TET", "-5"), ("SaftyDegree", "1e308"),
-    ("Dece", "1e9")])
+@pytest.mark.parametrize(
+    ("column", "cell"),
+    [
+        ("mass", "heavy"),
+        ("mass", ""),
+        ("mass", "nan"),
+        ("mass", "inf"),
+        ("TET", "-5"),
+        ("SaftyDegree", "1e308"),
+        ("Dece", "1e9"),
+    ],
+)
 def test_a_cell_that_cannot_be_used_is_told_with_row_and_column(tmp_path: Path, column: str, cell: str) -> None:
     """By its line in the file, though lines are blank."""
     frame = table(SUN, SUN_COLUMNS)

@@ -83,8 +83,10 @@ def test_studies_that_are_fitted_together_share_what_is_not_their_own(data: Refe
     fits, steps = [], list[float]()
     for gap in (0.4, 1.5) if from_scratch else (0.95,):
         sun = mine(gap, trials=100, starts=1, ensemble=10) if from_scratch else mine(gap, trials=49)
-        subjects = [FitSubject(sun, {"mine": data}), FitSubject(late(sun, 0.15),
-                                                                {"theirs": ReferenceData(data.settings, there, 0)})]
+        subjects = [
+            FitSubject(sun, {"mine": data}),
+            FitSubject(late(sun, 0.15), {"theirs": ReferenceData(data.settings, there, 0)}),
+        ]
         fits.append(calibrate(subjects, InlinePool(), lambda loss, best: steps.append(loss), from_scratch=from_scratch))
     dry, wet = fits[0]
     assert dry.values[GAP].value == wet.values[GAP].value == pytest.approx(TRUTH, rel=0.05)
@@ -103,8 +105,9 @@ def test_a_search_by_logarithm_has_the_geometric_mean_in_the_middle_and_stays_in
     bounds = FreeParameter(lower=0.3, upper=30.0, unit="m", meaning="gap", log=True)
     linear = msgspec.structs.replace(bounds, log=False)
     space = FitSpace([FittedParameter(GAP, (0,), bounds), FittedParameter(HESITATION, (0,), linear)], [])
-    assert space.values(np.array([[0.5, 0.5], [0.75, 0.0]])) == pytest.approx(np.array([[3.0, 15.15],
-                                                                                        [3 * 10**0.5, 0.3]]))
+    assert space.values(np.array([[0.5, 0.5], [0.75, 0.0]])) == pytest.approx(
+        np.array([[3.0, 15.15], [3 * 10**0.5, 0.3]])
+    )
     assert space.values(np.ones(2)).max() <= 30.0
     assert space.values(np.full(2, 1 / 7)).tolist() == [0.579209, 4.54286], "six digits, as in the study file"
 
@@ -118,10 +121,14 @@ def test_what_another_study_gives_another_value_is_not_shared() -> None:
 def evaluations(safety: Sequence[float], tet: Sequence[float] | None = None) -> Evaluations:
     values = np.array(safety)
     collided = values < 0
-    return Evaluations(settings=np.ones((len(values), 12)),
-                       outcome=np.where(collided, str(Outcome.COLLISION), str(Outcome.STOPPED)),
-                       collision_speed=np.where(collided, -values, np.nan), f_diff=0 * values, f_num_diff=0 * values,
-                       metrics={"safety_degree": values, **({} if tet is None else {"tet": np.array(tet)})})
+    return Evaluations(
+        settings=np.ones((len(values), 12)),
+        outcome=np.where(collided, str(Outcome.COLLISION), str(Outcome.STOPPED)),
+        collision_speed=np.where(collided, -values, np.nan),
+        f_diff=0 * values,
+        f_num_diff=0 * values,
+        metrics={"safety_degree": values, **({} if tet is None else {"tet": np.array(tet)})},
+    )
 
 
 def test_errors_count_in_repeats_and_each_collision_on_one_side_alone_its_share(data: ReferenceData) -> None:
@@ -139,8 +146,10 @@ def test_errors_count_in_repeats_and_each_collision_on_one_side_alone_its_share(
     assert loss == pytest.approx(6 * 2 / 6), "four there and four here, three of them the same: two rows of six differ"
 
 
-@pytest.mark.parametrize(("reference", "nearest", "too_far"), [
-    (1.0, 1.19, 1.21), (-1.0, -0.81, -0.79), (0.2, 0.29, 0.31), (0.0, -0.09, 0.11)])
+@pytest.mark.parametrize(
+    ("reference", "nearest", "too_far"),
+    [(1.0, 1.19, 1.21), (-1.0, -0.81, -0.79), (0.2, 0.29, 0.31), (0.0, -0.09, 0.11)],
+)
 def test_effects_agree_within_a_fifth_or_a_tenth_of_a_metre(reference: float, nearest: float, too_far: float) -> None:
     assert [Effect.of(reference, here).agrees for here in (nearest, too_far, None)] == [True, False, None]
 
@@ -157,22 +166,27 @@ def test_a_linear_response_has_the_effects_that_it_was_made_with() -> None:
 
 
 def test_a_miss_costs_nothing_within_the_tolerance_and_in_proportion_beyond() -> None:
-    published, fit = {"safety_degree": 2.0, "tet": 1.0}, FitTable(tolerance=0.05, original=0.5,
-                                                                  weights={"safety_degree": 1.0, "tet": 0.3})
+    published, fit = (
+        {"safety_degree": 2.0, "tet": 1.0},
+        FitTable(tolerance=0.05, original=0.5, weights={"safety_degree": 1.0, "tet": 0.3}),
+    )
 
     def loss(safety_degree: float, tet: float) -> float:
         return original_misfit(evaluations([safety_degree], [tet]), published, fit)[0]
 
     assert loss(2.0, 1.0) == loss(2.09, 0.96) == 0.0
-    assert loss(2.3, 1.0) == pytest.approx(0.5 * 2 * (3 - 1)
-                                           / 2), "three tolerances; the mean of two metrics counts half"
+    assert loss(2.3, 1.0) == pytest.approx(0.5 * 2 * (3 - 1) / 2), (
+        "three tolerances; the mean of two metrics counts half"
+    )
     assert loss(2.0, 0.85) == pytest.approx(0.5 * 0.3 * 2 * (3 - 1) / 2), "on the other side, with that metric's weight"
-    assert loss(20.0, 1.0) == loss(np.nan, 1.0) == pytest.approx(0.5 * 2 * (10 - 1)
-                                                                 / 2), "farther than ten is as far as that"
+    assert loss(20.0, 1.0) == loss(np.nan, 1.0) == pytest.approx(0.5 * 2 * (10 - 1) / 2), (
+        "farther than ten is as far as that"
+    )
     residuals = original_misfit(evaluations([2.3], [np.nan]), published, fit)[1]
     assert residuals == pytest.approx([3.0, 0.3**0.5 * MAX_DEVIATION])
-    assert original_misfit(evaluations([2.3], [1.0]), published,
-                           msgspec.structs.replace(fit, original=0.0))[1].size == 0
+    assert (
+        original_misfit(evaluations([2.3], [1.0]), published, msgspec.structs.replace(fit, original=0.0))[1].size == 0
+    )
 
 
 def test_residuals_count_in_deviations_of_the_noise_with_the_weight_of_their_metric(data: ReferenceData) -> None:
@@ -180,9 +194,10 @@ def test_residuals_count_in_deviations_of_the_noise_with_the_weight_of_their_met
     study = mine(0.8, weights={"safety_degree": 1.0, "tit": 0.25})
     here = evaluate(assemble(study), data.settings)
     there = data._replace(metrics={**data.metrics, "tit": np.where(np.arange(24) < 3, np.nan, data.metrics["tit"])})
-    expected = [(here.f_safe - there.metrics["safety_degree"]) / (ROW_NOISE * there.metrics["safety_degree"].std()),
-                0.5 * np.nan_to_num(here.metrics["tit"] - there.metrics["tit"])
-                / (ROW_NOISE * np.nanstd(there.metrics["tit"]))]
+    expected = [
+        (here.f_safe - there.metrics["safety_degree"]) / (ROW_NOISE * there.metrics["safety_degree"].std()),
+        0.5 * np.nan_to_num(here.metrics["tit"] - there.metrics["tit"]) / (ROW_NOISE * np.nanstd(there.metrics["tit"])),
+    ]
     loss = ReferenceLoss(there, study)
     assert loss.residuals(here) == pytest.approx(np.concatenate(expected))
     lost = here.outcome.copy()
@@ -224,8 +239,10 @@ class Bowl:
 
     def misfits_at(self, places: Sequence[FloatArray]) -> list[Misfit]:
         self.generations.append(len(places))
-        return [Misfit(float(((place - 0.2) ** 2).sum() + self.step * (place[0] > 0.5)) + self.bottom, place - 0.2)
-                for place in places]
+        return [
+            Misfit(float(((place - 0.2) ** 2).sum() + self.step * (place[0] > 0.5)) + self.bottom, place - 0.2)
+            for place in places
+        ]
 
 
 def race_in(bowl: Bowl, population: int, trials: int) -> tuple[SearchRace, list[float]]:
@@ -260,13 +277,17 @@ def test_a_search_around_known_values_has_smaller_generations() -> None:
 
 
 @pytest.mark.parametrize(("starts", "trials", "ensemble"), [(1, 1, 5), (3, 2, 5), (2, 9, 2), (2, 33, 4), (1, 25, 50)])
-def test_a_fit_from_scratch_has_as_many_trials_as_it_may(data: ReferenceData, starts: int, trials: int,
-                                                         ensemble: int) -> None:
+def test_a_fit_from_scratch_has_as_many_trials_as_it_may(
+    data: ReferenceData, starts: int, trials: int, ensemble: int
+) -> None:
     losses = list[float]()
     study = mine(0.9, trials=trials, starts=starts, ensemble=ensemble)
-    calibrate([FitSubject(study, {"mine": data.take(np.arange(24) < 6)})], InlinePool(), lambda loss,
-              best: losses.append(loss),
-              from_scratch=True)
+    calibrate(
+        [FitSubject(study, {"mine": data.take(np.arange(24) < 6)})],
+        InlinePool(),
+        lambda loss, best: losses.append(loss),
+        from_scratch=True,
+    )
     assert len(losses) == trials
 
 

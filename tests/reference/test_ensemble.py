@@ -32,8 +32,9 @@ class LinearModel:
         return [Misfit(float((values**2).sum()), values) for values in map(self.residuals, places)]
 
 
-def inversion_of(model: LinearModel, size: int, max_trials: int, seed: int = 1
-                 ) -> tuple[FloatArray, FloatArray, SearchRace]:
+def inversion_of(
+    model: LinearModel, size: int, max_trials: int, seed: int = 1
+) -> tuple[FloatArray, FloatArray, SearchRace]:
     race = SearchRace(model.misfits_at, 8, 10_000, lambda loss, best: None)
     return *invert(race, len(TRUTH), size, max_trials, np.random.default_rng(seed)), race
 

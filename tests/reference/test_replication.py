@@ -48,13 +48,14 @@ def rows(path: Path, changed: tuple[str, ...], safety: float, collisions: int, n
     settings = np.repeat(SUN.original[np.newaxis], number, axis=0)
     for place, name in enumerate(changed):
         i = SUN.names.index(name)
-        settings[::2 ** place, i] = SUN.lower[i] + 0.01 * np.arange(0, number, 2 ** place) / number
+        settings[:: 2**place, i] = SUN.lower[i] + 0.01 * np.arange(0, number, 2**place) / number
     frame = pd.DataFrame(settings, columns=list(SUN.names))
     values = safety + 0.001 * np.arange(number)
     values[:collisions] = -1.0
     crash = values <= 0
-    frame.assign(SaftyDegree=values, TET=np.where(crash, 0, 1.5), TIT=np.where(crash, 0, 0.7),
-                 Dece=5.0).to_csv(path, index=False)
+    frame.assign(SaftyDegree=values, TET=np.where(crash, 0, 1.5), TIT=np.where(crash, 0, 0.7), Dece=5.0).to_csv(
+        path, index=False
+    )
     return path
 
 
@@ -65,9 +66,13 @@ def sides(tmp_path_factory: pytest.TempPathFactory) -> Path:
     rs = rows(place / "rs.csv", ("mass", "radius"), 2.0, 0)
     here = rows(place / "here.csv", ("mass", "tireFric", "radius", "max_rpm"), 1.0, 20)
     there = rows(place / "there.csv", ("maxBrakeTorque", "dragCoeff", "dampRate"), 1.5, 0)
-    for name, study, nsga2 in (("one", "sun", here), ("same", "sun", here), ("other", "sun", there),
-                               ("rain", "rain", here),
-                               ("wet", "rain", there)):
+    for name, study, nsga2 in (
+        ("one", "sun", here),
+        ("same", "sun", here),
+        ("other", "sun", there),
+        ("rain", "rain", here),
+        ("wet", "rain", there),
+    ):
         assert typed("import", study, "--out", place / name, "--nsga2", nsga2, "--rs", rs).exit_code == 0
     return place
 
@@ -77,17 +82,22 @@ def verdicts_of(sides: Path, here: str, there: str) -> dict[tuple[str, str], str
     return {(one.question, one.statement.split(":")[0]): one.verdict for one in draw_conclusions(tables)}
 
 
-@pytest.mark.parametrize(("here", "published", "verdict"), [
-    ((0.00, 1e-9), (0.42, 1e-9), IN_DIRECTION),  # large here, small there: only the sign agrees
-    ((0.05, 1e-9), (0.20, 1e-9), HOLDS),
-    ((0.80, 1e-9), (0.20, 1e-9), DIFFERS),
-    ((0.53, 0.3), (0.48, 0.4), HOLDS),  # negligible on both sides, wherever they lie
-    ((0.53, 0.3), (0.60, 0.4), IN_DIRECTION),
-    ((0.40, 0.3), (0.60, 0.4), HOLDS),  # no difference on either side
-    ((0.60, 1e-9), (0.60, 0.4), IN_DIRECTION),
-    ((0.40, 1e-9), (0.60, 0.4), DIFFERS)])
+@pytest.mark.parametrize(
+    ("here", "published", "verdict"),
+    [
+        ((0.00, 1e-9), (0.42, 1e-9), IN_DIRECTION),  # large here, small there: only the sign agrees
+        ((0.05, 1e-9), (0.20, 1e-9), HOLDS),
+        ((0.80, 1e-9), (0.20, 1e-9), DIFFERS),
+        ((0.53, 0.3), (0.48, 0.4), HOLDS),  # negligible on both sides, wherever they lie
+        ((0.53, 0.3), (0.60, 0.4), IN_DIRECTION),
+        ((0.40, 0.3), (0.60, 0.4), HOLDS),  # no difference on either side
+        ((0.60, 1e-9), (0.60, 0.4), IN_DIRECTION),
+        ((0.40, 1e-9), (0.60, 0.4), DIFFERS),
+    ],
+)
 def test_a_test_holds_in_direction_magnitude_and_significance(
-        here: tuple[float, float], published: tuple[float, float], verdict: str) -> None:
+    here: tuple[float, float], published: tuple[float, float], verdict: str
+) -> None:
     assert judge_test(*here, *published) == verdict
 
 
@@ -104,37 +114,70 @@ def test_what_differs_is_marked_by_the_rules(sides: Path) -> None:
 
 
 def test_the_page_has_both_sides_and_says_what_is_missing(sides: Path) -> None:
-    done = typed("replicate", sides / "one", sides / "rain", "--published", sides / "other", "--out", sides / "page.md",
-                 "--reference", f"sun={sides / 'there.csv'}", f"sun={sides / 'rs.csv'}")
+    done = typed(
+        "replicate",
+        sides / "one",
+        sides / "rain",
+        "--published",
+        sides / "other",
+        "--out",
+        sides / "page.md",
+        "--reference",
+        f"sun={sides / 'there.csv'}",
+        f"sun={sides / 'rs.csv'}",
+    )
     assert done.exit_code == 0, done.output
     page = (sides / "page.md").read_text(encoding="utf-8")
     assert "rain: results here, none published given" in page
     assert "| sun | nsga2 | 0.5 / 0 |" in page.replace("40 / 40 | 20 / 0 | ", "")
-    for heading in ("RQ1", "RQ2", "RQ3.1", "RQ3.2", "RQ3.3", "Collisions", "Four changed together",
-                    "One weather against another"):
+    for heading in (
+        "RQ1",
+        "RQ2",
+        "RQ3.1",
+        "RQ3.2",
+        "RQ3.3",
+        "Collisions",
+        "Four changed together",
+        "One weather against another",
+    ):
         assert f"### {heading}" in page
-    assert typed("replicate", sides / "one", "--published", sides / "other").output == typed(
-        "replicate", "--published", sides / "other", "--reference", "--", sides / "one").output
+    assert (
+        typed("replicate", sides / "one", "--published", sides / "other").output
+        == typed("replicate", "--published", sides / "other", "--reference", "--", sides / "one").output
+    )
 
 
-@pytest.mark.parametrize(("arguments", "problem"), [
-    (("one", "--published", "rain"), "none of sun"),
-    (("one", "same", "--published", "other"), "two results of a study"),
-    (("one", "rain", "--published", "other", "wet", "--reference", "rs.csv"), "may belong to any of sun, rain"),
-    (("one", "--published", "other", "--reference", "nowhere.csv"), "cannot be read"),
-])
-def test_what_cannot_be_held_against_each_other_is_refused(sides: Path, arguments: tuple[str, ...], problem: str,
-                                                           monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("arguments", "problem"),
+    [
+        (("one", "--published", "rain"), "none of sun"),
+        (("one", "same", "--published", "other"), "two results of a study"),
+        (("one", "rain", "--published", "other", "wet", "--reference", "rs.csv"), "may belong to any of sun, rain"),
+        (("one", "--published", "other", "--reference", "nowhere.csv"), "cannot be read"),
+    ],
+)
+def test_what_cannot_be_held_against_each_other_is_refused(
+    sides: Path, arguments: tuple[str, ...], problem: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(sides)
     done = typed("replicate", *arguments)
     assert problem in str(done.exception)
 
 
 MADE_UP = Agreement(
-    rows=80, spearman={"safety_degree": 0.61234, "tet": None}, mean_absolute_error={"safety_degree": 0.25}, bias={},
-    collisions={"reference": 40, "here": 20, "both": 10}, original={}, precision=0.5, recall=0.25, collision_speed={},
+    rows=80,
+    spearman={"safety_degree": 0.61234, "tet": None},
+    mean_absolute_error={"safety_degree": 0.25},
+    bias={},
+    collisions={"reference": 40, "here": 20, "both": 10},
+    original={},
+    precision=0.5,
+    recall=0.25,
+    collision_speed={},
     in_repeats={},
-    undecided={}, by_predicted=[])
+    undecided={},
+    by_predicted=[],
+)
 
 
 @pytest.fixture
@@ -150,10 +193,15 @@ def test_the_page_says_how_well_the_study_agrees_with_every_file(totals: Path) -
     worse = Agreement(**{**MADE_UP.to_dict(), "rows": 90, "spearman": {"safety_degree": 0.1}})
     write_totals(totals, load_study("rain"), "worse.csv", worse)
     sentence, rows = describe_agreement(load_study("rain", title="Mine", search={"seed": 5, "evaluations": 100}))
-    for words in ("made_up.csv, 80 vehicles",
-                  "rank correlation of the safety degrees is 0.61 (1: the same order, 0: none)",
-                  "10 of the 40 published collisions", "recall 0.25", "precision 0.50", "worse.csv, 90 vehicles",
-                  "is 0.10"):
+    for words in (
+        "made_up.csv, 80 vehicles",
+        "rank correlation of the safety degrees is 0.61 (1: the same order, 0: none)",
+        "10 of the 40 published collisions",
+        "recall 0.25",
+        "precision 0.50",
+        "worse.csv, 90 vehicles",
+        "is 0.10",
+    ):
         assert words in sentence
     assert rows[0] == ["made_up.csv", "80", "0.61", "0.25", "40", "20", "10", "0.25", "0.50"]
 
@@ -162,8 +210,9 @@ def test_the_page_says_how_well_the_study_agrees_with_every_file(totals: Path) -
 def test_nobody_elses_agreement_is_claimed() -> None:
     """Another weather, or the same study with another parameter, simulates something else."""
     rain = load_study("rain")
-    other = msgspec.structs.replace(rain, ads=msgspec.structs.replace(rain.ads, parameters={**rain.ads.parameters,
-                                                                                            "margin": 9.0}))
+    other = msgspec.structs.replace(
+        rain, ads=msgspec.structs.replace(rain.ads, parameters={**rain.ads.parameters, "margin": 9.0})
+    )
     for study in (load_study("sun"), other):
         assert shipped_totals_of(study) == {}
         assert "was not compared with published data" in describe_agreement(study)[0]
@@ -181,23 +230,33 @@ def test_an_entry_is_replaced_and_others_stay(totals: Path) -> None:
 def test_what_ships_is_what_the_trust_page_says() -> None:
     lines = (Path(__file__).parents[2] / "docs/trust.md").read_text()
     shown = re.findall(r"^\| \w+, [\w\- ]+ \| (\d+) \| (\d+) \| (\d+) \| [\d.]+ \| [\d.]+ \|", lines, re.MULTILINE)
-    ships = [one.collisions.values() for name in ("sun", "rain")
-             for one in shipped_totals_of(load_study(name)).values()]
+    ships = [
+        one.collisions.values() for name in ("sun", "rain") for one in shipped_totals_of(load_study(name)).values()
+    ]
     assert len(shown) == 4
     assert set(shown) <= {tuple(map(str, counts)) for counts in ships}
 
 
-PUBLISHED_EFFECTS = {"tireFric": 1.2, "mass": -0.8, "maxBrakeTorque": 0.6, "dampRateZeroT_CE": 0.4, "radius": 0.4,
-                     "max_rpm": 0.2,
-                     "dampRateZeroT_CD": 0.2}
+PUBLISHED_EFFECTS = {
+    "tireFric": 1.2,
+    "mass": -0.8,
+    "maxBrakeTorque": 0.6,
+    "dampRateZeroT_CE": 0.4,
+    "radius": 0.4,
+    "max_rpm": 0.2,
+    "dampRateZeroT_CD": 0.2,
+}
 """Linear effect on the safety degree over a whole domain in the published random search in sun [m]."""
 
 
-@pytest.mark.parametrize(("study", "within"), [
-    ("sun", {"safety_degree": 0.05, "tet": 0.05, "tit": 0.05, "ave_dece": 0.05}),
-    ("lgsvl", {"safety_degree": 0.05, "tet": 0.05, "tit": 0.05, "ave_dece": 0.05}),
-    ("rain", {"safety_degree": 0.40 / 2.2, "tet": 0.05, "tit": 0.15, "ave_dece": 0.05}),
-])
+@pytest.mark.parametrize(
+    ("study", "within"),
+    [
+        ("sun", {"safety_degree": 0.05, "tet": 0.05, "tit": 0.05, "ave_dece": 0.05}),
+        ("lgsvl", {"safety_degree": 0.05, "tet": 0.05, "tit": 0.05, "ave_dece": 0.05}),
+        ("rain", {"safety_degree": 0.40 / 2.2, "tet": 0.05, "tit": 0.15, "ave_dece": 0.05}),
+    ],
+)
 def test_the_original_vehicle_is_as_near_to_the_published_one_as_is_said(study: str, within: dict[str, float]) -> None:
     """Rain's published vehicle is one simulation, 0.3 to 0.4 m above its own neighbours."""
     read = load_study(study)

@@ -26,7 +26,9 @@ from tests.in_process import refused
 @pytest.fixture(scope="module")
 def crash(slippery: Path) -> Comparison:
     (case,) = load_cases([slippery])
-    return compare_setting(case.study, assemble(case.study), case.solutions[list(case.characteristics.names)].to_numpy()[0])
+    return compare_setting(
+        case.study, assemble(case.study), case.solutions[list(case.characteristics.names)].to_numpy()[0]
+    )
 
 
 def frame(scene: FlatScene, sample: int) -> np.ndarray:
@@ -41,7 +43,7 @@ def frame(scene: FlatScene, sample: int) -> np.ndarray:
 def where(picture: np.ndarray, colour: str) -> tuple[np.ndarray, np.ndarray]:
     """Rows and columns of the pixels of a colour, below the words."""
     pixels = picture.astype(int)[PANEL_HEIGHT:]
-    wanted = [int(colour[i:i + 2], 16) for i in (1, 3, 5)]
+    wanted = [int(colour[i : i + 2], 16) for i in (1, 3, 5)]
     return np.nonzero(np.abs(pixels - wanted).max(axis=2) < 26)
 
 

@@ -54,7 +54,9 @@ def test_the_command_replays_every_solution_of_solutions_csv(slippery: Path) -> 
         assert [output[name] for name in METRICS] == [None if np.isnan(row[name]) else row[name] for name in METRICS]
 
 
-@pytest.mark.parametrize(("flag", "column"), [("--most-severe", "f_safe"), ("--smallest", "f_diff"), ("--fewest", "f_num_diff")])
+@pytest.mark.parametrize(
+    ("flag", "column"), [("--most-severe", "f_safe"), ("--smallest", "f_diff"), ("--fewest", "f_num_diff")]
+)
 def test_the_most_severe_the_smallest_and_the_fewest(flag: str, column: str, slippery: Path) -> None:
     frame = pd.read_csv(slippery / "solutions.csv")
     output = json.loads(simulated(str(slippery), flag, "--json").stdout)
@@ -64,15 +66,23 @@ def test_the_most_severe_the_smallest_and_the_fewest(flag: str, column: str, sli
 def test_a_replay_that_differs_from_its_row_is_reported(slippery: Path, case: Case) -> None:
     comparison = compare_setting(case.study, assemble(case.study), case.characteristics.original)
     result = list_differences(comparison.evaluations, {"safety_degree": 1.0, "tet": np.nan, "outcome": "collision"})
-    rated = dataclasses.replace(comparison.evaluations, metrics={**comparison.evaluations.metrics, "rating_points": np.array([np.nan])})
+    rated = dataclasses.replace(
+        comparison.evaluations, metrics={**comparison.evaluations.metrics, "rating_points": np.array([np.nan])}
+    )
     assert list_differences(rated, {"rating_points": 3.0, "outcome": "stopped"}) == [], "a single cell has no points"
     assert [one.split(" was ")[0] for one in result] == ["the outcome", "safety_degree", "tet"]
 
 
-@pytest.mark.parametrize(("arguments", "legal"), [
-    (["rain", "--fewest"], "a directory"), (["DIR", "--solution", "nsga2:0:99"], "N from 0 to"),
-    (["DIR", "--solution", "x"], "ALGORITHM:RUN:N"),
-    (["DIR", "--solution", "nsga2:0:0", "--fewest"], "one of them"), (["DIR", "--plot", "x.bmp"], ".png"),])
+@pytest.mark.parametrize(
+    ("arguments", "legal"),
+    [
+        (["rain", "--fewest"], "a directory"),
+        (["DIR", "--solution", "nsga2:0:99"], "N from 0 to"),
+        (["DIR", "--solution", "x"], "ALGORITHM:RUN:N"),
+        (["DIR", "--solution", "nsga2:0:0", "--fewest"], "one of them"),
+        (["DIR", "--plot", "x.bmp"], ".png"),
+    ],
+)
 def test_what_cannot_be_replayed_is_refused(arguments: list[str], legal: str, slippery: Path) -> None:
     done = simulated(*(str(slippery) if one == "DIR" else one for one in arguments))
     assert isinstance(done.exception, InputError)
@@ -92,7 +102,7 @@ def test_a_film_shows_what_is_simulated(study: str) -> None:
     assert not np.isnan(vut.y).any()
     for row, end in enumerate(result.last_samples):
         assert result.runs.trace.active[end, row]
-        assert not result.runs.trace.active[end + 1:, row].any()
+        assert not result.runs.trace.active[end + 1 :, row].any()
 
 
 def test_a_film_of_the_crossing_has_its_pedestrian_and_its_crossing(sun: System) -> None:
@@ -106,7 +116,9 @@ def test_a_film_of_the_crossing_has_its_pedestrian_and_its_crossing(sun: System)
 
 
 def test_moments_of_a_drive(case: Case) -> None:
-    comparison = compare_setting(case.study, assemble(case.study), case.solutions[list(case.characteristics.names)].to_numpy()[0])
+    comparison = compare_setting(
+        case.study, assemble(case.study), case.solutions[list(case.characteristics.names)].to_numpy()[0]
+    )
     runs = comparison.film.runs
     trace, original, hit = runs.trace, find_moments(runs, 0), find_moments(runs, 1)
     assert original.braking_start is not None
@@ -125,19 +137,27 @@ def test_moments_of_a_drive(case: Case) -> None:
 @pytest.fixture(scope="module")
 def comparison(slippery: Path) -> Comparison:
     (case,) = load_cases([slippery])
-    return compare_setting(case.study, assemble(case.study), case.solutions[list(case.characteristics.names)].to_numpy()[0])
+    return compare_setting(
+        case.study, assemble(case.study), case.solutions[list(case.characteristics.names)].to_numpy()[0]
+    )
 
 
 def test_the_figure_draws_both_drives_until_their_ends(comparison: Comparison) -> None:
     figure = draw_comparison(comparison)
     trace = comparison.film.runs.trace
     for axis, values in zip(figure.axes, (trace.speed, trace.gap, trace.throttle - trace.brake), strict=False):
-        for row, line in zip(comparison.rows, axis.lines[:1] + [one for one in axis.lines[1:] if len(one.get_xdata()) > 9], strict=False):
+        for row, line in zip(
+            comparison.rows, axis.lines[:1] + [one for one in axis.lines[1:] if len(one.get_xdata()) > 9], strict=False
+        ):
             end = comparison.film.last_samples[row] + 1
             assert list(line.get_xdata()) == list(trace.time[:end])
             assert list(line.get_ydata()) == list(values[:end, row])
     assert [axis.get_ylabel() for axis in figure.axes] == [
-        "speed [m/s]", "gap to the obstacle [m]", "brake     |     throttle", "time to collision [s]"]
+        "speed [m/s]",
+        "gap to the obstacle [m]",
+        "brake     |     throttle",
+        "time to collision [s]",
+    ]
     words = " ".join(text.get_text() for text in figure.legends[0].get_texts())
     assert comparison.verdict(0) in words
     assert comparison.verdict(1) in words
@@ -167,7 +187,9 @@ def test_the_figure_of_one_vehicle_has_no_line_or_entry_of_another() -> None:
     assert not any("diverge" in text.get_text() for text in figure.legends[0].get_texts())
     figure.canvas.draw()
     for text in figure.axes[1].texts:
-        assert text.get_bbox_patch().get_facecolor() == (1.0, 1.0, 1.0, 1.0), "the ground's line does not strike the number through"
+        assert text.get_bbox_patch().get_facecolor() == (1.0, 1.0, 1.0, 1.0), (
+            "the ground's line does not strike the number through"
+        )
 
 
 @pytest.mark.parametrize("friction", [1.1, 1.9])
@@ -178,7 +200,9 @@ def test_the_larger_gap_has_its_number_above(friction: float) -> None:
     setting[system.characteristics.names.index("tireFric")] = friction
     shown = compare_setting(study, system, setting)
     degrees = shown.evaluations.metrics["safety_degree"]
-    assert (degrees[1] > degrees[0]) == (friction == 1.9), "of the two one is safer than the original, or the test tells nothing"
+    assert (degrees[1] > degrees[0]) == (friction == 1.9), (
+        "of the two one is safer than the original, or the test tells nothing"
+    )
     heights = {text.get_text(): text.xyann[1] for text in draw_comparison(shown).axes[1].texts}
     assert heights[f"{degrees.max():.2f} m"] > 0 > heights[f"{degrees.min():.2f} m"]
 
@@ -212,8 +236,11 @@ def screen(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     if shutil.which("Xvfb") is None and not os.environ.get("SAFEVAR_BROWSER"):
         pytest.skip("Xvfb is not installed")
     reading, writing = os.pipe()
-    server = subprocess.Popen(["Xvfb", "-displayfd", str(writing), "-screen", "0", "1280x800x24", "-nolisten", "tcp"],
-                              pass_fds=[writing], stderr=subprocess.DEVNULL)
+    server = subprocess.Popen(
+        ["Xvfb", "-displayfd", str(writing), "-screen", "0", "1280x800x24", "-nolisten", "tcp"],
+        pass_fds=[writing],
+        stderr=subprocess.DEVNULL,
+    )
     os.close(writing)
     with os.fdopen(reading) as result:
         monkeypatch.setenv("DISPLAY", f":{result.readline().strip()}")
@@ -231,13 +258,17 @@ def of_colour(picture: np.ndarray, red: int, green: int, blue: int) -> np.ndarra
 @pytest.mark.usefixtures("screen")
 def test_both_vehicles_are_in_the_window_at_the_nearest_moment(slippery: Path, tmp_path: Path) -> None:
     (case,) = load_cases([slippery])
-    comparison = compare_setting(case.study, assemble(case.study), case.solutions[list(case.characteristics.names)].to_numpy()[0])
+    comparison = compare_setting(
+        case.study, assemble(case.study), case.solutions[list(case.characteristics.names)].to_numpy()[0]
+    )
     show_in_gui(comparison, slower=0.01, rest=0.0, pictures=tmp_path)
     first, second = (find_moments(comparison.film.runs, row) for row in comparison.rows)
-    assert {path.stem for path in tmp_path.iterdir()} == {f"{sample:04d}" for sample in (first.nearest, second.nearest, first.end)}
+    assert {path.stem for path in tmp_path.iterdir()} == {
+        f"{sample:04d}" for sample in (first.nearest, second.nearest, first.end)
+    }
     with Image.open(tmp_path / f"{second.nearest:04d}.png") as image:
         picture = np.asarray(image.convert("RGB"))
-    original, changed = of_colour(picture, 0x00, 0x72, 0xb2), of_colour(picture, 0xd5, 0x5e, 0x00)
+    original, changed = of_colour(picture, 0x00, 0x72, 0xB2), of_colour(picture, 0xD5, 0x5E, 0x00)
     assert len(original) > 100
     assert len(changed) > 100
     assert original[:, 0].max() < changed[:, 0].min(), "the original's road is above"
@@ -257,7 +288,9 @@ def test_without_a_display_it_is_refused(slippery: Path, monkeypatch: pytest.Mon
 def test_a_verdict_names_the_comfort_that_the_study_optimises() -> None:
     study = load_study("comfort")
     system = assemble(study)
-    comparison = compare_setting(study, system, system.characteristics.setting({"mass": 2105.0, "maxBrakeTorque": 1360.0}, "it"))
+    comparison = compare_setting(
+        study, system, system.characteristics.setting({"mass": 2105.0, "maxBrakeTorque": 1360.0}, "it")
+    )
     for row in comparison.rows:
         jerk = comparison.evaluations.metrics["max_jerk"][row]
         assert comparison.verdict(row).endswith(f" m to spare, jerk {jerk:.1f} m/s^3")

@@ -86,7 +86,9 @@ def try_player(browser: Chrome, player: object) -> None:
     button.click()
     assert button.text == "Play"
     assert 0.1 < shown_time(player) < 5
-    browser.execute_script("arguments[0].value = arguments[0].max; arguments[0].dispatchEvent(new Event('input'))", slider)
+    browser.execute_script(
+        "arguments[0].value = arguments[0].max; arguments[0].dispatchEvent(new Event('input'))", slider
+    )
     assert find(By.CSS_SELECTOR, "[data-body]:has(.changed)").get_attribute("transform") != start
     assert "collides at" in player.text  # type: ignore[attr-defined]
     find(By.CSS_SELECTOR, "[data-sample]").click()
@@ -135,14 +137,18 @@ def test_tables_sort_and_a_row_opens_its_replay(browser: Chrome, report: Path) -
     row.find_elements(By.TAG_NAME, "td")[1].click()
     time.sleep(0.6)
     assert replay.get_attribute("open") is not None
-    assert browser.execute_script("const box = arguments[0].getBoundingClientRect(); return box.top >= -1 && box.top < innerHeight", replay)
+    assert browser.execute_script(
+        "const box = arguments[0].getBoundingClientRect(); return box.top >= -1 && box.top < innerHeight", replay
+    )
     try_player(browser, replay.find_element(By.CSS_SELECTOR, ".player"))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("width", [390, 1400])
 @pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_it_fits_the_screen_and_everybody_can_read_it(width: int, scheme: str, browser: Chrome, report: Path, axe: str) -> None:
+def test_it_fits_the_screen_and_everybody_can_read_it(
+    width: int, scheme: str, browser: Chrome, report: Path, axe: str
+) -> None:
     resized(browser, width, scheme)
     try:
         opened(browser, report)
@@ -175,7 +181,9 @@ def test_it_prints_on_few_pages_with_all_values_and_nothing_to_press(browser: Ch
         stills = browser.execute_script(seen, ".player")
         assert stills == browser.execute_script(every, ".causes > div"), "one still for each cause"
         values = "details li, details td"
-        assert browser.execute_script(seen, values) == browser.execute_script(every, values) > 0, "closed details are printed too"
+        assert browser.execute_script(seen, values) == browser.execute_script(every, values) > 0, (
+            "closed details are printed too"
+        )
     finally:
         browser.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
         browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": ""})
@@ -204,7 +212,11 @@ def test_the_documentation_is_searched(browser: Chrome) -> None:
     with ThreadingHTTPServer(("127.0.0.1", 0), partial(SimpleHTTPRequestHandler, directory=str(site))) as server:
         Thread(target=server.serve_forever, daemon=True).start()
         try:
-            for words, page in (("repeatability", "/study_file/"), ("gearSwitchTime", "/glossary/"), ("cluster_pool_of_nobody", "")):
+            for words, page in (
+                ("repeatability", "/study_file/"),
+                ("gearSwitchTime", "/glossary/"),
+                ("cluster_pool_of_nobody", ""),
+            ):
                 browser.get(f"http://127.0.0.1:{server.server_port}/")
                 browser.find_element(By.CSS_SELECTOR, "[data-md-component=search-query]").send_keys(words)
                 WebDriverWait(browser, 20).until(lambda one: searched(one) is not None)
@@ -225,8 +237,17 @@ REQUIRED = "SAFEVAR_BROWSER"
 """Set where a missing browser is a failure and no reason to skip: in CI."""
 AXE = "axe-core@4.10.3"
 OPTIONS = (
-    "--headless=new", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking",
-    "--disable-component-update", "--disable-sync", "--disable-dev-shm-usage", "--window-size=1400,900")
+    "--headless=new",
+    "--no-sandbox",
+    "--disable-gpu",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+    "--disable-dev-shm-usage",
+    "--window-size=1400,900",
+)
 
 
 def program(*names: str) -> str:
@@ -250,15 +271,24 @@ def chromium(profile: Path) -> webdriver.Chrome:
 
 def resized(browser: webdriver.Chrome, width: int, scheme: str = "light") -> None:
     """Make it a screen of that width, in light or dark."""
-    browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": [{"name": "prefers-color-scheme", "value": scheme}]})
-    browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride",
-                            {"width": width, "height": 900, "deviceScaleFactor": 1, "mobile": width < 500})
+    browser.execute_cdp_cmd(
+        "Emulation.setEmulatedMedia", {"features": [{"name": "prefers-color-scheme", "value": scheme}]}
+    )
+    browser.execute_cdp_cmd(
+        "Emulation.setDeviceMetricsOverride",
+        {"width": width, "height": 900, "deviceScaleFactor": 1, "mobile": width < 500},
+    )
 
 
 def axe_core(folder: Path) -> str:
     """The script of axe-core, from npm's registry."""
-    done = subprocess.run([program("npm"), "pack", AXE, "--silent", "--pack-destination", str(folder)], capture_output=True, text=True,
-                          check=False, cwd=folder)
+    done = subprocess.run(
+        [program("npm"), "pack", AXE, "--silent", "--pack-destination", str(folder)],
+        capture_output=True,
+        text=True,
+        check=False,
+        cwd=folder,
+    )
     assert done.returncode == 0, done.stderr
     with tarfile.open(next(folder.glob("axe-core-*.tgz"))) as archive:
         member = archive.extractfile("package/axe.min.js")
@@ -269,6 +299,11 @@ def axe_core(folder: Path) -> str:
 def violations(browser: webdriver.Chrome, axe: str) -> list[dict[str, Any]]:
     """What axe-core finds in the page that is serious or critical."""
     browser.execute_script(axe)
-    result = browser.execute_async_script("const done = arguments[0]; axe.run(document).then((found) => done(found.violations));")
-    return [{"rule": one["id"], "where": [node["html"][:150] for node in one["nodes"][:3]]}
-            for one in result if one["impact"] in ("serious", "critical")]
+    result = browser.execute_async_script(
+        "const done = arguments[0]; axe.run(document).then((found) => done(found.violations));"
+    )
+    return [
+        {"rule": one["id"], "where": [node["html"][:150] for node in one["nodes"][:3]]}
+        for one in result
+        if one["impact"] in ("serious", "critical")
+    ]

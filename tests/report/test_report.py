@@ -120,12 +120,16 @@ def test_the_page_is_sound_html_and_whole_in_itself(page: str) -> None:
 
 
 @pytest.mark.slow
-def test_the_sections_stand_in_their_order_and_say_what_the_commands_say(page: str, slippery: Path, explained: Explained) -> None:
+def test_the_sections_stand_in_their_order_and_say_what_the_commands_say(
+    page: str, slippery: Path, explained: Explained
+) -> None:
     places = [page.index(f'<h2 id="{name}">') for name in SECTIONS]
     assert places == sorted(places)
     (case,) = load_cases([slippery])
     worst = case.solutions["f_safe"].min()
-    words = " ".join(html.unescape(re.sub("<(style|script).*?</(style|script)>|<[^>]*>", "", page, flags=re.DOTALL)).split())
+    words = " ".join(
+        html.unescape(re.sub("<(style|script).*?</(style|script)>|<[^>]*>", "", page, flags=re.DOTALL)).split()
+    )
     assert "^2" not in words
     for sentence in (*verdict_in_words(explained), counts_in_words(explained)):
         assert sentence.replace("^2", "²") in words
@@ -134,10 +138,18 @@ def test_the_sections_stand_in_their_order_and_say_what_the_commands_say(page: s
         assert failure.cause is not None
         assert f"{failure.robustness}" in words
     for expected in (
-            f"collision at {-worst:.1f} m/s", f"{-3.6 * worst:.0f} km/h", f"stops with {case.original['safety_degree']:.2f} m to spare",
-            "Unsafe: collision. With the weather 'wet leaves', the original vehicle stops 2.00 m short",
-            "Unsafe alone, all others as in the original: tireFric.", "the others anywhere: collides in ",
-            "not a probability in the field", "NSGA-II (1 run)", "RQ1: solutions", "RQ3.2", "from seed 1"):
+        f"collision at {-worst:.1f} m/s",
+        f"{-3.6 * worst:.0f} km/h",
+        f"stops with {case.original['safety_degree']:.2f} m to spare",
+        "Unsafe: collision. With the weather 'wet leaves', the original vehicle stops 2.00 m short",
+        "Unsafe alone, all others as in the original: tireFric.",
+        "the others anywhere: collides in ",
+        "not a probability in the field",
+        "NSGA-II (1 run)",
+        "RQ1: solutions",
+        "RQ3.2",
+        "from seed 1",
+    ):
         assert expected in words
     assert str(explained.explanations[0].cause.limit) in words  # type: ignore[union-attr]
     low, high = map(float, re.findall(r"confidence from ([\d.]+) to ([\d.]+)\.", words)[0])
@@ -152,8 +164,12 @@ def test_every_figure_has_its_values_beside_it(page: str, explained: Explained) 
     cells = [[re.sub("<.*?>", "", cell) for cell in re.findall("<td.*?>(.*?)</td>", table)] for table in tables]
     assert len(cells) == 3
     necessity = explained.necessity.iloc[0]
-    assert cells[0][:3] == [necessity["characteristic"], format_number(necessity["changed"]), format_number(necessity["necessary"])]
-    row = cells[1][cells[1].index("tireFric"):][:8]
+    assert cells[0][:3] == [
+        necessity["characteristic"],
+        format_number(necessity["changed"]),
+        format_number(necessity["necessary"]),
+    ]
+    row = cells[1][cells[1].index("tireFric") :][:8]
     assert row[:4] == ["tireFric", "-", "3.5", "1.5"]
     assert row[-1] == "1 to 1.5"
     assert page.count('<figure class="picture">') == 3
@@ -161,10 +177,13 @@ def test_every_figure_has_its_values_beside_it(page: str, explained: Explained) 
 
 @pytest.mark.slow
 def test_where_nothing_collides_the_page_says_so_first_and_calls_half_a_screening_limit(
-        slippery: Path, explained: Explained, monkeypatch: pytest.MonkeyPatch) -> None:
+    slippery: Path, explained: Explained, monkeypatch: pytest.MonkeyPatch
+) -> None:
     (data,) = read_inputs([slippery])
     nearest = Evaluations.concatenate([explained.original])
-    half = dataclasses.replace(explained, nearest=nearest, explanations=(), failures=0, unsafe=Unsafe(0.9, is_half=True))
+    half = dataclasses.replace(
+        explained, nearest=nearest, explanations=(), failures=0, unsafe=Unsafe(0.9, is_half=True)
+    )
     verdict = make_verdict(data, half, None)
     assert verdict["sentences"][0].startswith(f"No collision in {explained.looked_at} vehicles; the worst stops ")
     assert verdict["sentences"][-1].endswith("safety degree below 0.9 m (half of the original's, a screening limit).")
@@ -177,19 +196,28 @@ def test_the_key_figures_are_those_of_the_answers(slippery: Path, explained: Exp
     counts = {PreventableBy.COMPETENT_DRIVER: 9996, PreventableBy.NOBODY: 4}
     shares = dataclasses.replace(explained, preventability=Preventability(counts=counts, collisions=10_000, later=3900))
     box = SafeBox(0.42, 0.95, 1024, 0, 1, 0.003, ("mass",))
-    tolerated = Tolerance(study=explained.study, unsafe=explained.unsafe, original=explained.original, alone=[], pairs=None, joint=box)
+    tolerated = Tolerance(
+        study=explained.study, unsafe=explained.unsafe, original=explained.original, alone=[], pairs=None, joint=box
+    )
     figures = make_verdict(data, shares, tolerated)["key_figures"]
     robust = explained.by_reason["smallest robust"]
-    assert figures[0][1:] == (f"{len(robust.changed)} change{'s' if len(robust.changed) > 1 else ''}", str(robust.robustness))
+    assert figures[0][1:] == (
+        f"{len(robust.changed)} change{'s' if len(robust.changed) > 1 else ''}",
+        str(robust.robustness),
+    )
     assert figures[2][1] == "nearly all of the collisions"
-    assert figures[2][2].startswith("39 % if he needs 0.4 s longer, in the same vehicle (all 10000 collisions analysed)")
+    assert figures[2][2].startswith(
+        "39 % if he needs 0.4 s longer, in the same vehicle (all 10000 collisions analysed)"
+    )
     assert figures[3][1] == "42.0 % of the way"
 
 
 @pytest.mark.slow
 def test_every_replay_that_is_linked_is_there_and_hits_as_recorded(page: str, slippery: Path) -> None:
     (data,) = read_inputs([slippery])
-    players = re.findall(r'<details class="replay" id="(.*?)".*?<script type="application/json">(.*?)</script>', page, re.DOTALL)
+    players = re.findall(
+        r'<details class="replay" id="(.*?)".*?<script type="application/json">(.*?)</script>', page, re.DOTALL
+    )
     by_anchor = {data.anchor("replay", handle): row for handle, row in data.solutions.items()}
     assert len(players) >= 3
     for anchor, data in players:
@@ -207,7 +235,9 @@ def test_the_same_results_give_the_same_bytes(slippery: Path, few_samples: None)
 
 
 @pytest.mark.slow
-def test_what_is_not_as_the_results_say_any_more_is_told(page: str, slippery: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_is_not_as_the_results_say_any_more_is_told(
+    page: str, slippery: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Somebody's driving system was edited since: here another one drives."""
     assert "differs from the results" not in page
     monkeypatch.setattr(report_input, "assemble", lambda *study: replace(assemble(*study), ads=FullBraking()))
@@ -247,8 +277,12 @@ def test_studies_stand_side_by_side(slippery: Path, tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_results_without_a_solution_have_a_report(slippery: Path, tmp_path: Path) -> None:
-    shutil.copytree(slippery, tmp_path / "begun", ignore=shutil.ignore_patterns("answers", "nsga2*", "rs*", "solutions.csv"))
-    page = make_report([tmp_path / "begun"], only=["tested", "verdict", "causes", "questions", "trust", "reproduce"], jobs=1)
+    shutil.copytree(
+        slippery, tmp_path / "begun", ignore=shutil.ignore_patterns("answers", "nsga2*", "rs*", "solutions.csv")
+    )
+    page = make_report(
+        [tmp_path / "begun"], only=["tested", "verdict", "causes", "questions", "trust", "reproduce"], jobs=1
+    )
     assert "No solution was found" in page
     assert Outline(page).open == []
 
@@ -259,8 +293,12 @@ def test_the_command_writes_the_page_and_refuses_what_it_cannot(slippery: Path, 
 
     assert report(str(slippery), "--only", "tested", "--out", str(tmp_path / "it.html")) is None
     assert (tmp_path / "it.html").read_text().startswith("<!DOCTYPE html>")
-    for arguments in ([str(tmp_path)], [str(slippery), "--out", str(tmp_path / "it.pdf")], [str(slippery), str(slippery)],
-                      [str(slippery), "--only", "x", "--out", str(tmp_path / "x.html")]):
+    for arguments in (
+        [str(tmp_path)],
+        [str(slippery), "--out", str(tmp_path / "it.pdf")],
+        [str(slippery), str(slippery)],
+        [str(slippery), "--only", "x", "--out", str(tmp_path / "x.html")],
+    ):
         assert isinstance(report(*arguments), InputError)
 
 
@@ -274,19 +312,29 @@ def point(name: str, **place: Any) -> Point:
 
 
 def test_tests_and_weathers_stand_down_and_speeds_across() -> None:
-    matrix = [*(point(f"near {speed} {at}", test="near", speed=speed, impact_location=at, weather="night")
-                for speed in (10, 20, 30) for at in (25, 50)),
-              point("along 30", test="along", speed=30, weather="clear"), point("along 40", test="along", speed=40, weather="clear"),
-              point("safe 10", test="safe", speed=10, weather="clear")]
+    matrix = [
+        *(
+            point(f"near {speed} {at}", test="near", speed=speed, impact_location=at, weather="night")
+            for speed in (10, 20, 30)
+            for at in (25, 50)
+        ),
+        point("along 30", test="along", speed=30, weather="clear"),
+        point("along 40", test="along", speed=40, weather="clear"),
+        point("safe 10", test="safe", speed=10, weather="clear"),
+    ]
     result = tabulate_failing_points(matrix, ("near 20 50", "near 30 25", "near 30 50", "along 40"))
     assert result.summary == "Fails at 4 of 9 points. Percentages are impact locations."
     assert list(result.frame) == ["10 km/h", "20 km/h", "30 km/h", "40 km/h"]
     assert result.frame.T.to_dict("list") == {
-        "near, night": [AVOIDED_TEXT, "50 %", "25 %, 50 %", ""], "along, clear": ["", "", AVOIDED_TEXT, "fails"]}
+        "near, night": [AVOIDED_TEXT, "50 %", "25 %, 50 %", ""],
+        "along, clear": ["", "", AVOIDED_TEXT, "fails"],
+    }
 
 
 def test_a_matrix_of_something_else_than_speeds_has_a_table_too() -> None:
-    result = tabulate_failing_points([point("a", test="a", weather="fog", slope=0.1), point("b", test="b", weather="fog")], ["a"])
+    result = tabulate_failing_points(
+        [point("a", test="a", weather="fog", slope=0.1), point("b", test="b", weather="fog")], ["a"]
+    )
     assert result.frame.T.to_dict("list") == {"a, fog, slope 0.1": ["fails"]}
     assert tabulate_failing_points([point("b", test="b", weather="fog")], []).frame.empty
 
@@ -298,7 +346,9 @@ def test_a_study_that_cannot_be_simulated_has_its_page(slippery: Path, tmp_path:
     manifest["study"]["scenario"]["parameters"] = {"network": "/nowhere/gone"}
     write_manifest(tmp_path / "copy", manifest)
     with pytest.warns(UserWarning, match="copy: This study cannot be simulated here: .*gone"):
-        page = make_report([tmp_path / "copy"], only=["tested", "verdict", *COMMAND_OF_SECTION, "trust", "reproduce"], jobs=1)
+        page = make_report(
+            [tmp_path / "copy"], only=["tested", "verdict", *COMMAND_OF_SECTION, "trust", "reproduce"], jobs=1
+        )
     result = re.findall(r"slippery: This study cannot be simulated here: .*gone", page)
     assert len(result) == 1 + len(DOMAIN_QUESTIONS), "each section that would take simulations says so"
     assert '<details class="replay"' in page
@@ -306,12 +356,18 @@ def test_a_study_that_cannot_be_simulated_has_its_page(slippery: Path, tmp_path:
 
 @pytest.mark.slow
 def test_of_an_original_that_collides_no_change_is_called_the_cause(
-        slippery: Path, explained: Explained, monkeypatch: pytest.MonkeyPatch) -> None:
-    run = dataclasses.replace(explained.original, outcome=np.array(["collision"]), metrics={"safety_degree": np.array([-3.9])})
+    slippery: Path, explained: Explained, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = dataclasses.replace(
+        explained.original, outcome=np.array(["collision"]), metrics={"safety_degree": np.array([-3.9])}
+    )
     none = Cause(changes={}, boundary={}, fraction=0.0, alone={}, outcome="collision", safety_degree=-3.9)
     failures = tuple(dataclasses.replace(failure, causes=(none,)) for failure in explained.explanations)
-    monkeypatch.setattr(report_page, "explain_failures", lambda *_, **__: dataclasses.replace(
-        explained, original=run, nearest=run, explanations=failures))
+    monkeypatch.setattr(
+        report_page,
+        "explain_failures",
+        lambda *_, **__: dataclasses.replace(explained, original=run, nearest=run, explanations=failures),
+    )
     page = make_report([slippery], only=["verdict", "causes"], jobs=1)
     assert "the original vehicle itself collides, at 3.9 m/s, 14 km/h. No change is needed for it to be unsafe." in page
     assert "Cause 1" not in page
@@ -320,17 +376,26 @@ def test_of_an_original_that_collides_no_change_is_called_the_cause(
 def test_user_code_is_called_by_its_name_once(slippery: Path) -> None:
     (data,) = read_inputs([slippery])
     scenario = SimpleNamespace(pre_crash="", centre_to_centre=False, test_speed=None)
-    study = msgspec.structs.replace(data.case.study, ads=msgspec.structs.replace(data.case.study.ads, model="my_controller:Pilot"))
+    study = msgspec.structs.replace(
+        data.case.study, ads=msgspec.structs.replace(data.case.study.ads, model="my_controller:Pilot")
+    )
     points = [Point(scenario, data.case.weather)]  # type: ignore[arg-type]
-    others: Any = SimpleNamespace(case=dataclasses.replace(data.case, study=study), manifest=data.manifest, problem="", point="",
-                                  system=SimpleNamespace(points=points, matrix=(), vehicle=SimpleNamespace(FITTED_UP_TO=math.inf)))
+    others: Any = SimpleNamespace(
+        case=dataclasses.replace(data.case, study=study),
+        manifest=data.manifest,
+        problem="",
+        point="",
+        system=SimpleNamespace(points=points, matrix=(), vehicle=SimpleNamespace(FITTED_UP_TO=math.inf)),
+    )
     result = describe_tested_system(others)
     assert "Driving system: my_controller:Pilot. Scenario: pedestrian_crossing (" in result["subject"]
     assert "NSGA-II (1 run)" in result["search"]
     assert not result["tags"]
 
 
-@pytest.mark.parametrize(("weather", "has_effect"), [("carla_hard_rain", False), ("clear", True), ("hard_rain", True), ("night", True)])
+@pytest.mark.parametrize(
+    ("weather", "has_effect"), [("carla_hard_rain", False), ("clear", True), ("hard_rain", True), ("night", True)]
+)
 def test_a_weather_without_effect_is_called_so(weather: str, has_effect: bool) -> None:
     material: Any = SimpleNamespace(system=None, point="", case=SimpleNamespace(weather=weather_of(weather, "weather")))
     assert describe_conditions(material).startswith(f"weather: {weather}")

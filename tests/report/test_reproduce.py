@@ -27,8 +27,9 @@ from tests.in_process import searched
 
 
 def first_command(study: Study) -> list[str]:
-    one: Any = SimpleNamespace(directory=Path("its results"), point="", later_changes=(),
-                               case=SimpleNamespace(study=study, has_runs=True))
+    one: Any = SimpleNamespace(
+        directory=Path("its results"), point="", later_changes=(), case=SimpleNamespace(study=study, has_runs=True)
+    )
     return shlex.split(commands_to_reproduce([one], [])[0]["command"])
 
 
@@ -43,7 +44,8 @@ def test_of_a_shipped_study_the_command_asks_for_the_same() -> None:
 
 @pytest.mark.parametrize("changes", [{"name": "pilot"}, {"step_length": 0.02}])
 def test_any_other_study_is_carried_out_from_what_its_results_record(
-        changes: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
+    changes: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
     study = msgspec.structs.replace(load_study("smoke"), **changes)
     python, option, script = first_command(study)
     assert (python, option) == ("python", "-c")
@@ -57,7 +59,8 @@ def test_any_other_study_is_carried_out_from_what_its_results_record(
 
 @pytest.mark.slow
 def test_every_printed_command_gives_the_numbers_of_the_page(
-        slippery: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    slippery: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """What the printed commands print stands on the page, word for word; the tables' numbers are those of `tables`."""
     monkeypatch.setattr(report_input, "SAMPLED_VEHICLES", 300)
     place = tmp_path / "results"
@@ -67,17 +70,25 @@ def test_every_printed_command_gives_the_numbers_of_the_page(
     printed = {typed[3]: typed[3:] for typed in commands_of_page}
     assert {"explain", "tolerance", "risk", "rules", "simulate", "tables", "figures"} <= set(printed)
 
-    text = " ".join(html.unescape(re.sub("<(style|script).*?</(style|script)>|<[^>]*>", "", page, flags=re.DOTALL)).split())
+    text = " ".join(
+        html.unescape(re.sub("<(style|script).*?</(style|script)>|<[^>]*>", "", page, flags=re.DOTALL)).split()
+    )
     for question in ("explain", "tolerance", "risk", "rules"):
         lines = [line for line in output_of(printed[question]).splitlines() if re.match(r"[A-Z0-9-].*[.]$", line)]
         said = [line for line in lines if " ".join(line.replace("^2", "²").replace("^3", "³").split()) in text]
         assert len(said) >= 2, (question, lines)
-        if question in ("tolerance", "rules"):  # the page says the other lines in other words, beside what they belong to
+        if question in (
+            "tolerance",
+            "rules",
+        ):  # the page says the other lines in other words, beside what they belong to
             assert said == lines
-    assert " ".join(json.loads(output_of([*printed["explain"], "--json"]))[0]["because"].replace("^2", "²").split()) in text
+    assert (
+        " ".join(json.loads(output_of([*printed["explain"], "--json"]))[0]["because"].replace("^2", "²").split())
+        in text
+    )
 
     cells = {text.strip() for text in re.findall(r"[^|\n]+", output_of([*printed["tables"], "--format", "markdown"]))}
-    section = page[page.index('<h2 id="questions">'):page.index('<h2 id="trust">')]
+    section = page[page.index('<h2 id="questions">') : page.index('<h2 id="trust">')]
     shown = [re.sub("<.*?>", "", html.unescape(cell)) for cell in re.findall("<td.*?>(.*?)</td>", section)]
     assert len(shown) > 50
     result = {cell.replace("\\", "").strip("*") for cell in cells}
@@ -98,7 +109,9 @@ DAY, RAIN = "crossing, clear", "crossing, hard_rain"
 def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A crossing in the clear, where less collides, and in hard_rain."""
     matrix = {"aggregate": "worst", "tests": [{"name": "crossing", "weathers": ["clear", "hard_rain"]}]}
-    study = load_study("smoke", matrix=matrix, search={"runs": 1, "population": 10, "evaluations": 40, "algorithms": ["rs"]})
+    study = load_study(
+        "smoke", matrix=matrix, search={"runs": 1, "population": 10, "evaluations": 40, "algorithms": ["rs"]}
+    )
     return searched(study, tmp_path_factory.mktemp("matrix") / "results")
 
 
@@ -117,7 +130,9 @@ def test_all_of_it_is_of_the_point(results: Path) -> None:
 
 def test_its_commands_ask_about_the_point_and_a_wrong_one_is_refused(results: Path) -> None:
     page = make_report([results], ["reproduce"], jobs=1, point=DAY)
-    assert all("simulate" not in command and "tables" not in command for command in re.findall("<code>(.*?)</code>", page))
+    assert all(
+        "simulate" not in command and "tables" not in command for command in re.findall("<code>(.*?)</code>", page)
+    )
     with pytest.raises(InputError, match="point: 'crossing, snow'"):
         make_report([results], ["verdict"], jobs=1, point="crossing, snow")
     with pytest.raises(InputError, match="whole studies"):

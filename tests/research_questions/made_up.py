@@ -15,13 +15,17 @@ ORIGINAL = {"safety_degree": 2.0, "tet": 1.0, "tit": 0.5, "ave_dece": 6.0}
 CHARACTERISTICS = {
     "mass": CharacteristicTable(unit="kg", original=1000, lower=800, upper=1400),
     "grip": CharacteristicTable(unit="-", original=2, lower=1, upper=3),
-    "lag": CharacteristicTable(unit="s", original=0.1, lower=0.05, upper=0.5)}
+    "lag": CharacteristicTable(unit="s", original=0.1, lower=0.05, upper=0.5),
+}
 UNCHANGED = (1000.0, 2.0, 0.1)
 
 
-def made_up_study(algorithms: Sequence[str] = ("nsga2", "rs"), runs: int = 2,
-                  characteristics: Mapping[str, CharacteristicTable]
-                  = CHARACTERISTICS, **changes: Any) -> Study:
+def made_up_study(
+    algorithms: Sequence[str] = ("nsga2", "rs"),
+    runs: int = 2,
+    characteristics: Mapping[str, CharacteristicTable] = CHARACTERISTICS,
+    **changes: Any,
+) -> Study:
     smoke = load_study("smoke")
     vehicle = msgspec.structs.replace(smoke.vehicle, characteristics=dict(characteristics))
     search = msgspec.structs.replace(smoke.search, algorithms=list(algorithms), runs=runs, evaluations=100)
@@ -35,16 +39,32 @@ def only(frame: pd.DataFrame, **wanted: Any) -> dict[str, Any]:
     return dict(result.iloc[0])
 
 
-def row(algorithm: str = "nsga2", run: int = 0, values: Sequence[float] = UNCHANGED, sd: float = 1.0, tet: float
-        | None = 1.5,
-        tit: float | None = 0.75, ave_dece: float | None = 5.0, f_diff: float | None = None) -> dict[str, Any]:
+def row(
+    algorithm: str = "nsga2",
+    run: int = 0,
+    values: Sequence[float] = UNCHANGED,
+    sd: float = 1.0,
+    tet: float | None = 1.5,
+    tit: float | None = 0.75,
+    ave_dece: float | None = 5.0,
+    f_diff: float | None = None,
+) -> dict[str, Any]:
     """A solution; a safety degree of 0 or less is a collision, without TET and TIT."""
     crash = sd <= 0
     changes = [abs(value - original) / original for value, original in zip(values, UNCHANGED, strict=True)]
-    return {"algorithm": algorithm, "run": run, **dict(zip(CHARACTERISTICS, values, strict=True)), "f_safe": sd,
-            "f_diff": max(changes) if f_diff is None else f_diff, "f_num_diff": sum(change > 0 for change in changes),
-            "safety_degree": sd, "tet": None if crash else tet, "tit": None if crash else tit, "ave_dece": ave_dece,
-            "outcome": "collision" if crash else "stopped"}
+    return {
+        "algorithm": algorithm,
+        "run": run,
+        **dict(zip(CHARACTERISTICS, values, strict=True)),
+        "f_safe": sd,
+        "f_diff": max(changes) if f_diff is None else f_diff,
+        "f_num_diff": sum(change > 0 for change in changes),
+        "safety_degree": sd,
+        "tet": None if crash else tet,
+        "tit": None if crash else tit,
+        "ave_dece": ave_dece,
+        "outcome": "collision" if crash else "stopped",
+    }
 
 
 def frame(rows: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
@@ -52,9 +72,14 @@ def frame(rows: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=list(row())).astype(dict.fromkeys(numbers, float))
 
 
-def made_up(*rows: Mapping[str, Any], original: Mapping[str, Any] = ORIGINAL, study: Study | None = None,
-            evaluations: Sequence[Mapping[str, Any]] = (), finished: Sequence[tuple[str, int]] | None = None,
-            has_runs: bool = True) -> Case:
+def made_up(
+    *rows: Mapping[str, Any],
+    original: Mapping[str, Any] = ORIGINAL,
+    study: Study | None = None,
+    evaluations: Sequence[Mapping[str, Any]] = (),
+    finished: Sequence[tuple[str, int]] | None = None,
+    has_runs: bool = True,
+) -> Case:
     """A case with these solutions; unless `finished` is given, the finished runs are those with a solution."""
     done = list(dict.fromkeys((one["algorithm"], one["run"]) for one in rows)) if finished is None else finished
     seen = frame(evaluations)

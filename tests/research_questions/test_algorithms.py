@@ -38,8 +38,16 @@ def three_algorithms() -> Case:
     rng, rows = np.random.default_rng(1), []
     for (name, worse), run in itertools.product((("nsga2", 0.0), ("spea2", 1.0), ("mocell", 0.0)), range(RUNS)):
         if (name, run) != ("mocell", 3):
-            rows += [row(name, run, (900.0, 1.5, 0.1), sd=2 - worse - share - 0.2 * rng.random(),
-                         f_diff=0.3 * share + 0.05 * rng.random()) for share in (0.2, 0.5, 0.8)]
+            rows += [
+                row(
+                    name,
+                    run,
+                    (900.0, 1.5, 0.1),
+                    sd=2 - worse - share - 0.2 * rng.random(),
+                    f_diff=0.3 * share + 0.05 * rng.random(),
+                )
+                for share in (0.2, 0.5, 0.8)
+            ]
     return made_up(*rows, study=study, finished=list(itertools.product(("nsga2", "spea2", "mocell"), range(RUNS))))
 
 
@@ -52,8 +60,9 @@ def test_rq1_is_small_where_solutions_are_more_unsafe() -> None:
 
 
 def test_a_tet_that_stands_at_a_collision_is_not_counted() -> None:
-    case = made_up({**row(sd=-3), "tet": 0.0}, row(sd=1, tet=1.4), {**row("rs", sd=-3), "tet": 9.0},
-                   row("rs", sd=1, tet=1.3))
+    case = made_up(
+        {**row(sd=-3), "tet": 0.0}, row(sd=1, tet=1.4), {**row("rs", sd=-3), "tet": 9.0}, row("rs", sd=1, tet=1.3)
+    )
     assert only(rq1(case), algorithm="nsga2", metric="tet")["mean"] == 1.4
     assert only(rq2(case), metric="tet")["effect_size"] == 1
 
@@ -68,8 +77,10 @@ def test_rq1_says_which_values_are_undefined() -> None:
 
 
 def test_rq2_is_high_where_nsga2_is_better() -> None:
-    rows = [*(row(run=run, sd=0.5 - run / 10, tet=2, tit=1, ave_dece=3, f_diff=0.1) for run in (0, 1, 2)),
-            *(row("rs", run=run, sd=1.5 + run / 10, f_diff=0.6) for run in (0, 1, 2))]
+    rows = [
+        *(row(run=run, sd=0.5 - run / 10, tet=2, tit=1, ave_dece=3, f_diff=0.1) for run in (0, 1, 2)),
+        *(row("rs", run=run, sd=1.5 + run / 10, f_diff=0.6) for run in (0, 1, 2)),
+    ]
     frame = rq2(made_up(*rows))
     assert frame["metric"].tolist() == ["igd", "igd_plus", "hypervolume", "safety_degree", "tet", "tit", "ave_dece"]
     assert frame["effect_size"].tolist() == [1] * 7
@@ -87,8 +98,10 @@ def test_rq2_compares_runs_by_front_and_pooled_solutions_by_metric() -> None:
     assert any("need runs" in note for note in imported.notes)
 
 
-@pytest.mark.parametrize(("case", "expected"), [
-    (made_up(row("rs")), "no finished run of nsga2"), (made_up(row()), "only nsga2"), (made_up(), "no finished run")])
+@pytest.mark.parametrize(
+    ("case", "expected"),
+    [(made_up(row("rs")), "no finished run of nsga2"), (made_up(row()), "only nsga2"), (made_up(), "no finished run")],
+)
 def test_rq2_without_an_algorithm_is_refused(case: Case, expected: str) -> None:
     with pytest.raises(InputError, match=expected):
         answer_questions([case], "rq2")
@@ -125,18 +138,20 @@ def test_what_cannot_be_asked_says_why() -> None:
     """The largest difference of three mean ranks is 2; with two runs the critical difference is 2.9."""
     degrees = {"nsga2": 1.0, "rs": 1.5, "mocell": 2.0}
     two_runs = made_up(*(row(name, run, sd=sd) for name, sd in degrees.items() for run in (0, 1)))
-    for question, case, problem in ((rank_algorithms, made_up(row("nsga2"), row("rs")), "of 2 algorithms"),
-                                    (compare_pairs, made_up(row("nsga2")), "of 1 algorithm"),
-                                    (compare_pairs, made_up(row("nsga2"), row("rs"), has_runs=False), "imported"),
-                                    (draw_critical_differences, two_runs,
-                                     "2 runs are too few for a figure of critical diff")):
+    for question, case, problem in (
+        (rank_algorithms, made_up(row("nsga2"), row("rs")), "of 2 algorithms"),
+        (compare_pairs, made_up(row("nsga2")), "of 1 algorithm"),
+        (compare_pairs, made_up(row("nsga2"), row("rs"), has_runs=False), "imported"),
+        (draw_critical_differences, two_runs, "2 runs are too few for a figure of critical diff"),
+    ):
         with pytest.raises(UnanswerableError, match=problem):
             question(case)
 
 
 def test_the_brief_lines_and_notes_say_what_the_data_allows() -> None:
-    five = made_up(*(row(name, run=run, sd=sd + run / 10) for name, sd in (("nsga2", 1.0), ("rs", 2.5))
-                     for run in range(5)))
+    five = made_up(
+        *(row(name, run=run, sd=sd + run / 10) for name, sd in (("nsga2", 1.0), ("rs", 2.5)) for run in range(5))
+    )
     lines = "\n".join(summary_lines(five))
     few = re.escape("too few runs for a test (8 are needed)")
     assert re.search(rf"A12 of NSGA-II against the original vehicle: SD 0\.00, .*{few}", lines)
@@ -156,9 +171,14 @@ def test_solutions_of_one_run_are_not_taken_for_independent() -> None:
     there are.
     """
     ours, theirs = [1.0, 1.1, 1.2, 1.3, 1.4, 1.6, 1.7, 2.2], [1.5, 1.8, 1.9, 2.3, 2.4, 2.5, 2.6, 2.7]
-    case = made_up(*(row(name, run=run, sd=sd, values=(1100.0 + run, 2.0, 0.1))
-                     for name, degrees in (("nsga2", ours), ("rs", theirs)) for run, sd in enumerate(degrees)
-                     for _ in range(40)))
+    case = made_up(
+        *(
+            row(name, run=run, sd=sd, values=(1100.0 + run, 2.0, 0.1))
+            for name, degrees in (("nsga2", ours), ("rs", theirs))
+            for run, sd in enumerate(degrees)
+            for _ in range(40)
+        )
+    )
     paper, runs = (only(frame, metric="safety_degree") for frame in (rq2(case), rq2_runs(case)))
     assert paper["p_value"] < 1e-30
     assert (runs["n1"], runs["n2"], runs["effect_size"]) == (8, 8, 1 - (0 + 0 + 0 + 0 + 0 + 1 + 1 + 3) / 64)
@@ -174,9 +194,16 @@ def test_solutions_of_one_run_are_not_taken_for_independent() -> None:
 
 
 def test_a_question_with_too_few_runs_for_significance_loses_none() -> None:
-    line = significance_change_line(made_up(*(
-        row(name, run=run, sd=sd + run / 100, values=(1100.0 + run, 2.0, 0.1))
-        for name, sd in (("nsga2", 1.0), ("rs", 2.0)) for run in range(5) for _ in range(40))))
+    line = significance_change_line(
+        made_up(
+            *(
+                row(name, run=run, sd=sd + run / 100, values=(1100.0 + run, 2.0, 0.1))
+                for name, sd in (("nsga2", 1.0), ("rs", 2.0))
+                for run in range(5)
+                for _ in range(40)
+            )
+        )
+    )
     assert "RQ1" not in line, "5 runs are too few for its tests, not for RQ2's"
     assert "of 7 tests" in line
 

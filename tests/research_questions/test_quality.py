@@ -58,12 +58,20 @@ def test_hypervolume_of_boxes() -> None:
     assert hypervolume(np.full((1, 3), 1.2)) == 0
 
 
-@pytest.mark.parametrize("indicator", [
-    lambda front: igd(front, FRONT), lambda front: igd_plus(front, FRONT), hypervolume, nondominated_points,
-    lambda front: igd(FRONT, front)])
+@pytest.mark.parametrize(
+    "indicator",
+    [
+        lambda front: igd(front, FRONT),
+        lambda front: igd_plus(front, FRONT),
+        hypervolume,
+        nondominated_points,
+        lambda front: igd(FRONT, front),
+    ],
+)
 @pytest.mark.parametrize("front", [np.zeros((0, 3)), np.array([[math.nan, 0, 0]]), np.array([[math.inf, 0, 0]])])
-def test_no_indicator_of_an_empty_or_undefined_front(indicator: Callable[[np.ndarray], object],
-                                                     front: np.ndarray) -> None:
+def test_no_indicator_of_an_empty_or_undefined_front(
+    indicator: Callable[[np.ndarray], object], front: np.ndarray
+) -> None:
     with pytest.raises(InputError, match=r"empty|undefined"):
         indicator(front)
 
@@ -92,8 +100,11 @@ def test_indicators_are_those_of_each_runs_own_front_against_that_of_all_runs() 
 
 def test_convergence_grows_to_the_hypervolume_of_all() -> None:
     rng = np.random.default_rng(1)
-    evaluations = [{**row("nsga2", run, sd=sd, f_diff=diff), "evaluation": i}
-                   for run in (0, 1) for i, (sd, diff) in enumerate(rng.uniform(0.1, 1, size=(100 if run else 40, 2)))]
+    evaluations = [
+        {**row("nsga2", run, sd=sd, f_diff=diff), "evaluation": i}
+        for run in (0, 1)
+        for i, (sd, diff) in enumerate(rng.uniform(0.1, 1, size=(100 if run else 40, 2)))
+    ]
     case = made_up(row(sd=0.1, f_diff=1), row(run=1, sd=1, f_diff=0.1), evaluations=evaluations)
     grown = compute_convergence(case)
     assert set(grown["evaluations"]) >= {10, 100}
@@ -159,10 +170,25 @@ def test_signed_ranks_of_a_sample_without_a_difference_and_with_ties() -> None:
     assert tied.p_value == scipy.stats.wilcoxon([-1, -1, 1, 2], correction=True, method="approx").pvalue
 
 
-@pytest.mark.parametrize(("effect", "name"), [
-    (0.5, "negligible"), (0.444, "small"), (0.4441, "negligible"), (0.5559, "negligible"), (0.556, "small"),
-    (0.6379, "small"), (0.638, "medium"), (0.7139, "medium"), (0.714, "large"), (0.362, "medium"), (0.286, "large"),
-    (0.2861, "medium"), (0, "large"), (1 - 0.714, "large")])
+@pytest.mark.parametrize(
+    ("effect", "name"),
+    [
+        (0.5, "negligible"),
+        (0.444, "small"),
+        (0.4441, "negligible"),
+        (0.5559, "negligible"),
+        (0.556, "small"),
+        (0.6379, "small"),
+        (0.638, "medium"),
+        (0.7139, "medium"),
+        (0.714, "large"),
+        (0.362, "medium"),
+        (0.286, "large"),
+        (0.2861, "medium"),
+        (0, "large"),
+        (1 - 0.714, "large"),
+    ],
+)
 def test_magnitudes_are_kitchenhams(effect: float, name: str) -> None:
     assert magnitude_of(effect) == name
 

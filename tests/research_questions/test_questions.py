@@ -38,7 +38,13 @@ def test_critical_solutions_are_strictly_below_the_original() -> None:
 def test_rq31_counts_runs_without_any() -> None:
     case = made_up(row(values=HEAVY), row(values=GRIPLESS), row(values=BOTH), finished=[("nsga2", 0), ("nsga2", 1)])
     assert rq31(case)[["run", "j", "count"]].to_numpy().tolist() == [
-        [0, "1", 2], [0, "2", 1], [0, "3", 0], [1, "1", 0], [1, "2", 0], [1, "3", 0]]
+        [0, "1", 2],
+        [0, "2", 1],
+        [0, "3", 0],
+        [1, "1", 0],
+        [1, "2", 0],
+        [1, "3", 0],
+    ]
 
 
 def test_rq32_shares_and_ranks() -> None:
@@ -51,8 +57,10 @@ def test_rq32_shares_and_ranks() -> None:
 
 def test_rq33_tells_increases_from_decreases() -> None:
     frame = rq33(made_up(row(values=HEAVY), row(values=(1300, 2, 0.1)), row(values=(900, 2, 0.1)), row(values=BOTH)))
-    cells = {(one["characteristic"], one["direction"], one["j"]): (one["pc"], one["delta"], one["n"])
-             for one in frame.to_dict("records")}
+    cells = {
+        (one["characteristic"], one["direction"], one["j"]): (one["pc"], one["delta"], one["n"])
+        for one in frame.to_dict("records")
+    }
     assert cells["mass", "increase", "1"] == (pytest.approx(0.2), 200, 2)
     assert cells["mass", "decrease", "any"] == (pytest.approx(0.1), -100, 1)
     assert cells["mass", "increase", "any"][1] == 200
@@ -62,11 +70,18 @@ def test_rq33_tells_increases_from_decreases() -> None:
 
 def test_the_footer_of_rq33() -> None:
     """A TET that stands at a collision is not counted, and nothing is a share of an original value of zero."""
-    rows = [row(values=HEAVY, sd=1.5, tet=1.5, tit=0.6, ave_dece=5),
-            row(values=HEAVY, sd=0.5, tet=2, tit=1, ave_dece=4),
-            {**row(values=HEAVY, sd=-3, ave_dece=3), "tet": 0.0, "tit": 0.0}]
-    expected = {"avgSD_mD": (1, 50, 2), "avgSD_cS": (3, None, 1), "TET": (0.75, 75, 2), "TIT": (0.3, 60, 2),
-                "aveDece": (2, 100 / 3, 3)}
+    rows = [
+        row(values=HEAVY, sd=1.5, tet=1.5, tit=0.6, ave_dece=5),
+        row(values=HEAVY, sd=0.5, tet=2, tit=1, ave_dece=4),
+        {**row(values=HEAVY, sd=-3, ave_dece=3), "tet": 0.0, "tit": 0.0},
+    ]
+    expected = {
+        "avgSD_mD": (1, 50, 2),
+        "avgSD_cS": (3, None, 1),
+        "TET": (0.75, 75, 2),
+        "TIT": (0.3, 60, 2),
+        "aveDece": (2, 100 / 3, 3),
+    }
     frame = rq33_safety(made_up(*rows))
     for quantity, (value, percent, n) in expected.items():
         result = only(frame, quantity=quantity, j="1")
@@ -85,8 +100,12 @@ def test_collisions_and_their_share() -> None:
 def test_combinations_of_exactly_four() -> None:
     tables = {name: CharacteristicTable(unit="-", original=1, lower=0.5, upper=2) for name in "abcdef"}
     case = made_up(study=made_up_study(characteristics=tables), finished=[("nsga2", 0)])
-    solutions = pd.DataFrame([{**row(), **{name: 2.0 if name in changed else 1.0 for name in tables}}
-                              for changed in ("abcd", "bcde", "abcd", "cdef", "abcf", "abcde", "abc")])
+    solutions = pd.DataFrame(
+        [
+            {**row(), **{name: 2.0 if name in changed else 1.0 for name in tables}}
+            for changed in ("abcd", "bcde", "abcd", "cdef", "abcf", "abcde", "abc")
+        ]
+    )
     result = frequent_combinations(dataclasses.replace(case, solutions=solutions))
     assert result["characteristics"].tolist() == [list("abcd"), list("abcf"), list("bcde")]
     assert (result["percent"].tolist(), result["rank"].tolist()) == ([40, 20, 20], [1, 2, 2])
@@ -95,15 +114,17 @@ def test_combinations_of_exactly_four() -> None:
 def test_weather_compares_cases_that_differ_in_it_alone() -> None:
     clear = made_up(row(values=HEAVY), row(values=GRIPLESS))
     wet = made_up(row(values=BOTH), study=made_up_study(name="wet", weather="hard_rain"))
-    other = made_up(row(values=BOTH), study=made_up_study(name="other", weather="hard_rain",
-                                                          metrics=MetricsTable(ttc_threshold=9)))
+    other = made_up(
+        row(values=BOTH), study=made_up_study(name="other", weather="hard_rain", metrics=MetricsTable(ttc_threshold=9))
+    )
     assert [(one.name, two.name) for one, two in find_weather_pairs([wet, other, clear])] == [("made-up", "wet")]
     result = only(compare_weathers(clear, wet), characteristic="mass")
     assert (result["percent"], result["percent_other"], result["difference"]) == (50, 100, 50)
     assert (result["increase"], result["increase_other"], result["decrease"]) == (100, 200, None)
     assert (result["rank"], result["rank_other"]) == (1, 1)
-    with pytest.raises(InputError,
-                       match=r"differ in the weather alone; these two also differ in metrics\.ttc_threshold"):
+    with pytest.raises(
+        InputError, match=r"differ in the weather alone; these two also differ in metrics\.ttc_threshold"
+    ):
         answer_questions([clear, other], "weather")
     with pytest.raises(InputError, match="these two have equally clear weather"):
         find_weather_pairs([clear, clear])
@@ -111,8 +132,9 @@ def test_weather_compares_cases_that_differ_in_it_alone() -> None:
 
 @pytest.mark.parametrize(("clearer", "other"), [("clear", "hard_rain"), ("fog", "wet"), ("clear", "night")])
 def test_the_clearer_weather_comes_first(clearer: str, other: str) -> None:
-    (pair,) = find_weather_pairs([made_up(row(), study=made_up_study(name=name, weather=name))
-                                  for name in (other, clearer)])
+    (pair,) = find_weather_pairs(
+        [made_up(row(), study=made_up_study(name=name, weather=name)) for name in (other, clearer)]
+    )
     assert [one.name for one in pair] == [clearer, other]
 
 

@@ -47,25 +47,35 @@ from tests.research_questions.test_algorithms import three_algorithms
 def rich_case(**changes: Any) -> Case:
     """Two algorithms, two runs, changes of one to three characteristics, collisions; every run has evaluations."""
     values = [(1000 + 50 * i, 2 - 0.1 * (i % 3), 0.1 if i % 2 else 0.2) for i in range(8)]
-    rows = [row(algorithm, run, values=value, sd=1 - 0.3 * i + 0.1 * run + (0.5 if algorithm == "rs" else 0), tet=1 + i
-                / 10)
-            for algorithm in ("nsga2", "rs") for run in (0, 1) for i, value in enumerate(values)]
-    return made_up(*rows, study=made_up_study(**changes),
-                   evaluations=[{**one, "evaluation": i % 8} for i, one in enumerate(rows)])
+    rows = [
+        row(
+            algorithm, run, values=value, sd=1 - 0.3 * i + 0.1 * run + (0.5 if algorithm == "rs" else 0), tet=1 + i / 10
+        )
+        for algorithm in ("nsga2", "rs")
+        for run in (0, 1)
+        for i, value in enumerate(values)
+    ]
+    return made_up(
+        *rows, study=made_up_study(**changes), evaluations=[{**one, "evaluation": i % 8} for i, one in enumerate(rows)]
+    )
 
 
 def special_case() -> Case:
     """Names and units with the characters that LaTeX and Markdown read as commands."""
-    tables = {name: CharacteristicTable(unit=name, original=1, lower=0.5, upper=2)
-              for name in ("a&b", "50%_of $x$", "#1 {brace}", r"back\slash", "~tilde^2", "[option]", "*star|",
-                           "µ ° ² ä")}
+    tables = {
+        name: CharacteristicTable(unit=name, original=1, lower=0.5, upper=2)
+        for name in ("a&b", "50%_of $x$", "#1 {brace}", r"back\slash", "~tilde^2", "[option]", "*star|", "µ ° ² ä")
+    }
     case = made_up(row(), row("rs"), study=made_up_study(characteristics=tables))
     solutions = case.solutions.assign(**{name: 1.5 if i < 4 else 1.0 for i, name in enumerate(tables)})
     return dataclasses.replace(case, name="_".join(tables), solutions=solutions)
 
 
-CASES = {"one": [rich_case()], "two": [rich_case(), rich_case(name="wet", weather="hard_rain")],
-         "special": [special_case()]}
+CASES = {
+    "one": [rich_case()],
+    "two": [rich_case(), rich_case(name="wet", weather="hard_rain")],
+    "special": [special_case()],
+}
 DOCUMENT = r"""\documentclass{article}
 \usepackage[T1]{fontenc}
 \usepackage[utf8]{inputenc}
@@ -85,15 +95,32 @@ def test_latex_compiles(cases: list[Case], tmp_path: Path) -> None:
     answers = answer_questions(cases)
     document = DOCUMENT % (as_latex(answers) + as_latex(answers, PAPER_LAYOUTS).replace("tab:", "tab:paper-"))
     (tmp_path / "tables.tex").write_text(document, encoding="utf-8")
-    done = subprocess.run(["pdflatex", "-halt-on-error", "-interaction=nonstopmode", "tables.tex"], cwd=tmp_path,
-                          capture_output=True, text=True, errors="replace", check=False)
+    done = subprocess.run(
+        ["pdflatex", "-halt-on-error", "-interaction=nonstopmode", "tables.tex"],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        errors="replace",
+        check=False,
+    )
     assert done.returncode == 0, done.stdout[-2000:]
 
 
-@pytest.mark.parametrize(("plain", "latex_form"), [
-    ("a_b", r"a\_b"), ("50 %", r"50 \%"), ("m/s^2", r"m/s\textsuperscript{2}"), ("^", r"\textasciicircum{}"),
-    ("[x]", "{[}x{]}"), ("-0.5", r"\textminus{}0.5"), ("2-3", "2-3"), ("s^-1", r"s\textsuperscript{\textminus{}1}"),
-    ("NSGA-2", "NSGA-2"), ("\\", r"\textbackslash{}")])
+@pytest.mark.parametrize(
+    ("plain", "latex_form"),
+    [
+        ("a_b", r"a\_b"),
+        ("50 %", r"50 \%"),
+        ("m/s^2", r"m/s\textsuperscript{2}"),
+        ("^", r"\textasciicircum{}"),
+        ("[x]", "{[}x{]}"),
+        ("-0.5", r"\textminus{}0.5"),
+        ("2-3", "2-3"),
+        ("s^-1", r"s\textsuperscript{\textminus{}1}"),
+        ("NSGA-2", "NSGA-2"),
+        ("\\", r"\textbackslash{}"),
+    ],
+)
 def test_special_characters_are_escaped(plain: str, latex_form: str) -> None:
     assert escaped_for_latex(plain) == latex_form
 
@@ -105,17 +132,23 @@ def test_markdown_rows_are_as_wide_as_their_heads(cases: list[Case]) -> None:
         assert len({line.count("|") for line in lines}) <= 1
 
 
-@pytest.mark.parametrize(("question", "keys"), [
-    ("rq1", "setting algorithm metric p_value effect_size magnitude n1 n2 method mean original"),
-    ("rq2", "setting baseline metric p_value effect_size magnitude n1 n2 method"),
-    ("rq3.2", "setting characteristic j percent"), ("rq3.3", "setting characteristic direction j pc delta n"),
-    ("rq3.3-safety", "setting quantity j value percent n"),
-    ("collisions", "setting algorithm solutions collisions share")])
+@pytest.mark.parametrize(
+    ("question", "keys"),
+    [
+        ("rq1", "setting algorithm metric p_value effect_size magnitude n1 n2 method mean original"),
+        ("rq2", "setting baseline metric p_value effect_size magnitude n1 n2 method"),
+        ("rq3.2", "setting characteristic j percent"),
+        ("rq3.3", "setting characteristic direction j pc delta n"),
+        ("rq3.3-safety", "setting quantity j value percent n"),
+        ("collisions", "setting algorithm solutions collisions share"),
+    ],
+)
 def test_json_records_have_the_promised_keys(question: str, keys: str) -> None:
     for one in json.loads(as_json(answer_questions(CASES["one"], question)[:1])):
         assert list(one) == [*keys.split(), *(["rank"] if question == "rq3.2" and one["j"] == "any" else [])]
-        assert all(isinstance(one[name], int) for name in ("n1", "n2", "n", "rank", "solutions", "collisions")
-                   if name in one)
+        assert all(
+            isinstance(one[name], int) for name in ("n1", "n2", "n", "rank", "solutions", "collisions") if name in one
+        )
 
 
 def test_significant_and_notable_cells_stand_out() -> None:
@@ -133,16 +166,19 @@ def test_pooled_solutions_of_too_few_runs_do_not_stand_out_either(layouts: Layou
     """As at the end of a study: seven runs are too few for RQ1, five are enough for RQ2, whatever the number of
     solutions.
     """
-    case = made_up(*(row(name, run=i % 7, sd=sd - i / 100) for name, sd in (("nsga2", 0.5), ("rs", 1.5))
-                     for i in range(30)))
+    case = made_up(
+        *(row(name, run=i % 7, sd=sd - i / 100) for name, sd in (("nsga2", 0.5), ("rs", 1.5)) for i in range(30))
+    )
     options = {} if layouts is None else {"layouts": layouts}
     for question, stands_out in (("rq1", False), ("rq2", True)):
         (answer,) = answer_questions([case], question)
         lines = [line for line in as_text([answer], **options).splitlines() if "<0.001" in line]
         assert lines
         assert any("*" in line for line in lines) is stands_out
-        assert any("too few runs of NSGA-II, RS for a test (8 are needed)" in note
-                   for note in answer.notes) is not stands_out
+        assert (
+            any("too few runs of NSGA-II, RS for a test (8 are needed)" in note for note in answer.notes)
+            is not stands_out
+        )
     (imported,) = answer_questions([dataclasses.replace(case, has_runs=False)], "rq1")
     assert "*" in as_text([imported], **options).replace("(or *)", ""), "the runs of imported solutions are unknown"
 
@@ -170,10 +206,18 @@ def random_case(name: str) -> Case:
     """A shipped study's characteristics, some with long names, and three algorithms."""
     rng, study = np.random.default_rng(4), load_study(name)
     characteristics = CharacteristicSet.of(study.vehicle.characteristics)
-    rows = [row(algorithm, run, sd=rng.uniform(-5, 11)) for algorithm in study.search.algorithms for run in range(3)
-            for _ in range(100)]
-    base = made_up(*rows, original={"safety_degree": 10.1}, study=study,
-                   evaluations=[{**one, "evaluation": i % 100} for i, one in enumerate(rows)])
+    rows = [
+        row(algorithm, run, sd=rng.uniform(-5, 11))
+        for algorithm in study.search.algorithms
+        for run in range(3)
+        for _ in range(100)
+    ]
+    base = made_up(
+        *rows,
+        original={"safety_degree": 10.1},
+        study=study,
+        evaluations=[{**one, "evaluation": i % 100} for i, one in enumerate(rows)],
+    )
     drawn = rng.uniform(characteristics.lower, characteristics.upper, (len(rows), len(characteristics)))
     drawn = np.where(rng.random(drawn.shape) < 0.5, drawn, characteristics.original)
     values = {**dict(zip(characteristics.names, drawn.T, strict=True)), "f_diff": characteristics.largest_change(drawn)}
@@ -190,8 +234,11 @@ def test_axes_are_labelled_and_no_text_lies_on_another(name: str) -> None:
         if axis.axison and axis.get_label() != "<colorbar>":
             assert axis.get_xlabel()
             assert axis.get_ylabel() or figure.get_supylabel()
-    boxes = [(text.get_text(), text.get_window_extent()) for text in _texts(figure) if text.get_visible()
-             and text.get_text().strip()]
+    boxes = [
+        (text.get_text(), text.get_window_extent())
+        for text in _texts(figure)
+        if text.get_visible() and text.get_text().strip()
+    ]
     assert len(boxes) > 8
     for (first, box), (second, other) in combinations(boxes, 2):
         lower, upper = (one.padded(0, -0.1 * one.height) for one in (box, other))

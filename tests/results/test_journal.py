@@ -35,9 +35,18 @@ def batch(number: int) -> Evaluations:
     """Rows that their values identify; one is a collision, one failed."""
     values = np.arange(ROWS) + 10.0 * number
     outcome = np.array(["stopped", "collision", "simulator-error"])
-    metrics = {name: np.where(outcome == "simulator-error", np.nan, values + i / 7) for i, name in enumerate(("safety_degree", "tet"))}
-    return Evaluations(settings=np.stack([values, values + 0.1], axis=1), outcome=outcome, metrics=metrics, f_diff=values / 3,
-                       collision_speed=np.where(outcome == "collision", values, np.nan), f_num_diff=np.ones(ROWS))
+    metrics = {
+        name: np.where(outcome == "simulator-error", np.nan, values + i / 7)
+        for i, name in enumerate(("safety_degree", "tet"))
+    }
+    return Evaluations(
+        settings=np.stack([values, values + 0.1], axis=1),
+        outcome=outcome,
+        metrics=metrics,
+        f_diff=values / 3,
+        collision_speed=np.where(outcome == "collision", values, np.nan),
+        f_num_diff=np.ones(ROWS),
+    )
 
 
 def places(number: int) -> list[int]:
@@ -61,9 +70,13 @@ def write(path: Path, batches: int = BATCHES, finished: bool = True) -> list[int
 
 
 def same(one: Evaluations, other: Evaluations) -> bool:
-    numbers = [(getattr(one, name), getattr(other, name)) for name in ("settings", "collision_speed", "f_diff", "f_num_diff")]
+    numbers = [
+        (getattr(one, name), getattr(other, name)) for name in ("settings", "collision_speed", "f_diff", "f_num_diff")
+    ]
     numbers += [(one.metrics[name], other.metrics[name]) for name in other.metrics]
-    return bool(all(np.array_equal(a, b, equal_nan=True) for a, b in numbers) and np.array_equal(one.outcome, other.outcome))
+    return bool(
+        all(np.array_equal(a, b, equal_nan=True) for a, b in numbers) and np.array_equal(one.outcome, other.outcome)
+    )
 
 
 def holds_the_first(batches: int, content: JournalContent) -> bool:
@@ -98,7 +111,11 @@ def test_a_journal_is_a_table_that_pandas_reads(tmp_path: Path) -> None:
     frame = pd.concat([pd.DataFrame(line) for line in lines if "evaluation" in line])
     expected = Evaluations.concatenate([batch(number) for number in range(BATCHES)])
     assert frame["evaluation"].tolist() == list(range(ROWS * BATCHES))
-    for name, column in (("b", expected.settings[:, 1]), ("tet", expected.metrics["tet"]), ("collision_speed", expected.collision_speed)):
+    for name, column in (
+        ("b", expected.settings[:, 1]),
+        ("tet", expected.metrics["tet"]),
+        ("collision_speed", expected.collision_speed),
+    ):
         assert np.array_equal(frame[name].to_numpy(dtype=float), column, equal_nan=True)
     assert lines[0]["tet"][2] is None, "undefined"
 
@@ -108,8 +125,15 @@ def test_a_journal_is_a_table_that_pandas_reads(tmp_path: Path) -> None:
 def test_numbers_return_to_the_last_bit(tmp_path: Path, numbers: list[float]) -> None:
     (tmp_path / "a.jsonl").unlink(missing_ok=True)
     values = np.array(numbers)
-    evaluations = dataclasses.replace(batch(0), settings=np.stack([values, values], axis=1), outcome=np.full(len(values), "stopped"),
-                                      collision_speed=values, metrics={"tet": values}, f_diff=values, f_num_diff=values)
+    evaluations = dataclasses.replace(
+        batch(0),
+        settings=np.stack([values, values], axis=1),
+        outcome=np.full(len(values), "stopped"),
+        collision_speed=values,
+        metrics={"tet": values},
+        f_diff=values,
+        f_num_diff=values,
+    )
     journal = Journal(tmp_path / "a.jsonl", HEAD)
     journal.append(range(len(values)), evaluations)
     journal.close()
@@ -156,7 +180,9 @@ def test_a_damaged_line_is_cut_at_the_end_and_an_error_with_its_number_elsewhere
     assert path.read_bytes() == damaged, "a damaged file is left as it is"
 
 
-@pytest.mark.parametrize(("old", "new"), [('"tet"', '"tat"'), ("[10.0,", "["), ('"outcome"', '"income"'), ("[3,4,5]", "[3,4]")])
+@pytest.mark.parametrize(
+    ("old", "new"), [('"tet"', '"tat"'), ("[10.0,", "["), ('"outcome"', '"income"'), ("[3,4,5]", "[3,4]")]
+)
 def test_an_edited_journal_is_an_error(old: str, new: str, tmp_path: Path) -> None:
     path = tmp_path / "a.jsonl"
     write(path)
@@ -170,12 +196,17 @@ def test_an_edited_journal_is_an_error(old: str, new: str, tmp_path: Path) -> No
         read_journal(path, HEAD)
 
 
-@pytest.mark.parametrize(("study", "run", "reason"), [
-    ("other", "nsga2-00", "belongs to another study or version"),
-    ("study", "nsga2-01", "is the journal of run nsga2-00, not of nsga2-01: was it renamed or swapped?")])
+@pytest.mark.parametrize(
+    ("study", "run", "reason"),
+    [
+        ("other", "nsga2-00", "belongs to another study or version"),
+        ("study", "nsga2-01", "is the journal of run nsga2-00, not of nsga2-01: was it renamed or swapped?"),
+    ],
+)
 @pytest.mark.parametrize("opened", [Journal, read_journal])
-def test_a_journal_of_another_study_or_run_is_refused(tmp_path: Path, opened: Callable[..., object], study: str, run: str,
-                                                      reason: str) -> None:
+def test_a_journal_of_another_study_or_run_is_refused(
+    tmp_path: Path, opened: Callable[..., object], study: str, run: str, reason: str
+) -> None:
     write(tmp_path / "a.jsonl")
     with pytest.raises(InputError, match=re.escape(reason)):
         opened(tmp_path / "a.jsonl", Head(study, run, ("a", "b")))
@@ -197,7 +228,9 @@ def test_a_run_has_one_owner_and_the_lock_ends_with_the_process(tmp_path: Path) 
 
 
 @pytest.mark.parametrize("written", [0, 7, 40])
-def test_a_full_disk_leaves_an_intact_journal_that_continues(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, written: int) -> None:
+def test_a_full_disk_leaves_an_intact_journal_that_continues(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, written: int
+) -> None:
     path = tmp_path / "a.jsonl"
     end = write(path, batches=2, finished=False)[-1]
     journal = Journal(path, HEAD)
@@ -208,7 +241,7 @@ def test_a_full_disk_leaves_an_intact_journal_that_continues(tmp_path: Path, mon
         room = written
 
         def write(self, content: memoryview) -> int:
-            result = content[:self.room]
+            result = content[: self.room]
             if not len(result):
                 raise OSError(28, "No space left on device")
             self.room -= len(result)

@@ -41,11 +41,20 @@ NAMES = ("a", "b")
 def evaluations(*safety: float) -> Evaluations:
     values = np.array(safety)
     collided = values <= 0
-    metrics = {"safety_degree": values, "tet": np.where(collided, np.nan, 0.2), "tit": np.where(collided, np.nan, 0.1),
-               "ave_dece": np.full(len(values), 5.0)}
-    return Evaluations(settings=np.arange(2.0 * len(values)).reshape(-1, 2), outcome=np.where(collided, "collision", "stopped"),
-                       collision_speed=np.where(collided, -values, np.nan), metrics=metrics, f_diff=values * 0 + 0.5,
-                       f_num_diff=values * 0 + 2)
+    metrics = {
+        "safety_degree": values,
+        "tet": np.where(collided, np.nan, 0.2),
+        "tit": np.where(collided, np.nan, 0.1),
+        "ave_dece": np.full(len(values), 5.0),
+    }
+    return Evaluations(
+        settings=np.arange(2.0 * len(values)).reshape(-1, 2),
+        outcome=np.where(collided, "collision", "stopped"),
+        collision_speed=np.where(collided, -values, np.nan),
+        metrics=metrics,
+        f_diff=values * 0 + 0.5,
+        f_num_diff=values * 0 + 2,
+    )
 
 
 def written(path: Path, study: Study) -> ResultsDirectory:
@@ -73,8 +82,20 @@ def with_search(study: Study, **changes: int) -> Study:
 def test_solutions_have_the_promised_columns_in_a_fixed_order() -> None:
     result = {("nsga2", 1): evaluations(2.0, -1.0), ("nsga2", 0): evaluations(3.0)}
     frame = solutions_frame(NAMES, result.items())
-    assert list(frame.columns) == ["algorithm", "run", "a", "b", "f_safe", "f_diff", "f_num_diff", "safety_degree", "tet", "tit",
-                                   "ave_dece", "outcome"]
+    assert list(frame.columns) == [
+        "algorithm",
+        "run",
+        "a",
+        "b",
+        "f_safe",
+        "f_diff",
+        "f_num_diff",
+        "safety_degree",
+        "tet",
+        "tit",
+        "ave_dece",
+        "outcome",
+    ]
     assert frame["run"].tolist() == [0, 1, 1]
     assert frame["f_safe"].tolist() == [3.0, -1.0, 2.0]
     pd.testing.assert_frame_equal(frame, solutions_frame(NAMES, reversed(result.items())))
@@ -82,8 +103,17 @@ def test_solutions_have_the_promised_columns_in_a_fixed_order() -> None:
 
 def test_undefined_values_stay_undefined() -> None:
     assert record(evaluations(-1.5), 0) == {
-        "outcome": "collision", "collision": True, "collision_speed": 1.5, "safety_degree": -1.5, "tet": None, "tit": None,
-        "ave_dece": 5.0, "f_safe": -1.5, "f_diff": 0.5, "f_num_diff": 2}
+        "outcome": "collision",
+        "collision": True,
+        "collision_speed": 1.5,
+        "safety_degree": -1.5,
+        "tet": None,
+        "tit": None,
+        "ave_dece": 5.0,
+        "f_safe": -1.5,
+        "f_diff": 0.5,
+        "f_num_diff": 2,
+    }
     assert "nan" not in solutions_frame(NAMES, [(("nsga2", 0), evaluations(-1.5))]).to_csv()
 
 
@@ -122,15 +152,20 @@ def test_the_error_names_the_changed_file_and_both_remedies(tmp_path: Path, stud
 
 def test_a_change_without_effect_on_results_is_accepted(tmp_path: Path, study: Study) -> None:
     written(tmp_path, study)
-    for other in (msgspec.structs.replace(study, title="Another title", published={}, calibration={}),
-                  with_search(study, time_limit=7, runs=3, evaluations=900),
-                  msgspec.structs.replace(study, search=msgspec.structs.replace(study.search, algorithms=["rs"]))):
+    for other in (
+        msgspec.structs.replace(study, title="Another title", published={}, calibration={}),
+        with_search(study, time_limit=7, runs=3, evaluations=900),
+        msgspec.structs.replace(study, search=msgspec.structs.replace(study.search, algorithms=["rs"])),
+    ):
         directory = ResultsDirectory(tmp_path, other)
         assert identity_digest(directory.manifest) == identity_digest(ResultsDirectory(tmp_path, study).manifest)
 
 
 def test_a_whole_number_is_not_the_same_as_one_with_a_point(tmp_path: Path, study: Study) -> None:
-    one, other = (msgspec.structs.replace(study, ads=ModelTable(model="my_ads:Mine", parameters={"margin": margin})) for margin in (2, 2.0))
+    one, other = (
+        msgspec.structs.replace(study, ads=ModelTable(model="my_ads:Mine", parameters={"margin": margin}))
+        for margin in (2, 2.0)
+    )
     ResultsDirectory(tmp_path, one).begin(evaluations(2.5))
     with pytest.raises(InputError, match=r"ads\.parameters\.margin was 2 and is 2\.0 now"):
         ResultsDirectory(tmp_path, other)
@@ -157,14 +192,16 @@ def test_a_directory_belongs_to_its_first_study(tmp_path: Path, study: Study) ->
         second.journal("original")
 
 
-@pytest.mark.parametrize("text", ["", "{}", "[]", "null", "{\"study\": 3", "\x00"])
+@pytest.mark.parametrize("text", ["", "{}", "[]", "null", '{"study": 3', "\x00"])
 def test_a_file_that_is_no_manifest_is_refused(tmp_path: Path, study: Study, text: str) -> None:
     (tmp_path / "manifest.json").write_text(text)
     with pytest.raises(InputError, match=r"manifest\.json"):
         ResultsDirectory(tmp_path, study)
 
 
-def test_a_failed_write_leaves_the_file_unchanged(tmp_path: Path, study: Study, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_failed_write_leaves_the_file_unchanged(
+    tmp_path: Path, study: Study, monkeypatch: pytest.MonkeyPatch
+) -> None:
     directory = written(tmp_path, study)
     before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
 
@@ -180,21 +217,42 @@ def test_a_failed_write_leaves_the_file_unchanged(tmp_path: Path, study: Study, 
 
 
 def test_simulations_depend_on_files_and_the_number_of_results_but_not_on_new_keys() -> None:
-    stored = {"resolved": {"a": 1}, "network": {}, "sources": {"x.py": "0"}, "results": 1, "versions": {"numpy": "1", "libsumo": "1"}}
+    stored = {
+        "resolved": {"a": 1},
+        "network": {},
+        "sources": {"x.py": "0"},
+        "results": 1,
+        "versions": {"numpy": "1", "libsumo": "1"},
+    }
 
     def changed(**layers: object) -> list[tuple[str, bool]]:
-        return [(difference.text, difference.changes_simulations) for difference in differences(stored, {**stored, **layers})]
+        return [
+            (difference.text, difference.changes_simulations)
+            for difference in differences(stored, {**stored, **layers})
+        ]
 
     assert changed(resolved={"a": 1, "b": False}, versions={"numpy": "2", "libsumo": "1"}) == [
-        ("b was None and is False now", False), ("version of numpy was '1' and is '2' now", False)]
+        ("b was None and is False now", False),
+        ("version of numpy was '1' and is '2' now", False),
+    ]
     assert changed(resolved={"a": 2}, sources={}, results=2, versions={"numpy": "1", "libsumo": "2"}) == [
-        ("a was 1 and is 2 now", True), ("x.py no longer exists", True), ("the version of the package's results was 1 and is 2 now", True),
-        ("version of libsumo was '1' and is '2' now", True)]
+        ("a was 1 and is 2 now", True),
+        ("x.py no longer exists", True),
+        ("the version of the package's results was 1 and is 2 now", True),
+        ("version of libsumo was '1' and is '2' now", True),
+    ]
 
 
-FRAME = pd.DataFrame({
-    "algorithm": ["nsga2", "nsga2", "nsga2", "rs"], "run": [0, 0, 3, 0], "f_safe": [-3.0, -1.0, -2.0, 2.0], "f_diff": [0.3, 0.2, 0.1, 0.01],
-    "f_num_diff": [5, 2, 4, 1], "outcome": ["collision", "collision", "collision", "stopped"]})
+FRAME = pd.DataFrame(
+    {
+        "algorithm": ["nsga2", "nsga2", "nsga2", "rs"],
+        "run": [0, 0, 3, 0],
+        "f_safe": [-3.0, -1.0, -2.0, 2.0],
+        "f_diff": [0.3, 0.2, 0.1, 0.01],
+        "f_num_diff": [5, 2, 4, 1],
+        "outcome": ["collision", "collision", "collision", "stopped"],
+    }
+)
 
 
 def test_rows_count_within_their_run() -> None:
@@ -203,14 +261,18 @@ def test_rows_count_within_their_run() -> None:
         assert row_of_handle(FRAME, SolutionId.parse(str(handle))) == place
 
 
-@pytest.mark.parametrize("text", [
-    "", "nsga2", "nsga2:0", "nsga2:0:", ":0:0", "nsga2:-1:0", "nsga2:0:0:0", "nsga2:0:x", "nsga2:0:" + "9" * 30])
+@pytest.mark.parametrize(
+    "text",
+    ["", "nsga2", "nsga2:0", "nsga2:0:", ":0:0", "nsga2:-1:0", "nsga2:0:0:0", "nsga2:0:x", "nsga2:0:" + "9" * 30],
+)
 def test_a_text_that_is_no_handle_is_refused(text: str) -> None:
     with pytest.raises(InputError, match="ALGORITHM:RUN:N"):
         SolutionId.parse(text)
 
 
-@pytest.mark.parametrize(("handle", "legal"), [("nsga2:0:2", "0 to 1"), ("nsga2:1:0", "nsga2:0, nsga2:3, rs:0"), ("sf:0:0", "nsga2:0")])
+@pytest.mark.parametrize(
+    ("handle", "legal"), [("nsga2:0:2", "0 to 1"), ("nsga2:1:0", "nsga2:0, nsga2:3, rs:0"), ("sf:0:0", "nsga2:0")]
+)
 def test_the_error_for_a_missing_solution_names_the_present_ones(handle: str, legal: str) -> None:
     with pytest.raises(InputError) as refused:
         row_of_handle(FRAME, SolutionId.parse(handle))
@@ -244,18 +306,28 @@ def test_a_point_is_lost_to_six_decimals() -> None:
 def test_a_criterion_in_words_is_rounded_but_its_text_is_exact() -> None:
     half = Unsafe.default({"safety_degree": 1.694206}, FRAME["outcome"].head(0))
     assert (str(half), half.description, half.in_words) == (
-        "below=0.847103", "safety degree below 0.847 m (half of the original's, a screening limit)", "SD is below 0.847")
+        "below=0.847103",
+        "safety degree below 0.847 m (half of the original's, a screening limit)",
+        "SD is below 0.847",
+    )
     assert half == Unsafe(0.847103)
     assert [Unsafe.parse(text).description for text in ("collision", "below=0.847103", "below=-2", "points=3.5")] == [
-        "collision", "safety degree below 0.847 m", "safety degree below -2 m/s", "at most 3.5 points"]
+        "collision",
+        "safety degree below 0.847 m",
+        "safety degree below -2 m/s",
+        "at most 3.5 points",
+    ]
 
 
 @pytest.mark.parametrize(("number", "release"), [(None, "0.1.0"), (2, "0.2.0"), (3, "0.2.0"), (5, "9.0.0")])
 def test_results_in_another_format_are_refused_with_the_release_that_wrote_them(
-        number: int | None, release: str, slippery: Path, tmp_path: Path) -> None:
+    number: int | None, release: str, slippery: Path, tmp_path: Path
+) -> None:
     shutil.copytree(slippery, tmp_path / "it")
     manifest = json.loads((slippery / "manifest.json").read_text())
-    manifest = {key: value for key, value in manifest.items() if key != "format"} | ({} if number is None else {"format": number})
+    manifest = {key: value for key, value in manifest.items() if key != "format"} | (
+        {} if number is None else {"format": number}
+    )
     manifest["versions"]["safevar_sumo"] = release
     (tmp_path / "it" / "manifest.json").write_text(json.dumps(manifest))
     before = contents(tmp_path)
@@ -273,7 +345,9 @@ def test_a_torn_manifest_is_called_torn_and_written_again(tmp_path: Path, study:
     written(tmp_path, study)
     manifest = tmp_path / "manifest.json"
     manifest.write_text(text := manifest.read_text()[:300])
-    with pytest.raises(InputError, match=rf"manifest\.json: is torn or was edited, line {len(text.splitlines())} is no JSON"):
+    with pytest.raises(
+        InputError, match=rf"manifest\.json: is torn or was edited, line {len(text.splitlines())} is no JSON"
+    ):
         load_runs(tmp_path)
     manifest.unlink()
     (tmp_path / "runs").mkdir()
@@ -297,7 +371,9 @@ def test_a_file_that_was_read_later_is_an_input(tmp_path: Path, in_tmp: Path) ->
 
 
 def contents(place: Path) -> dict[str, tuple[bytes, int]]:
-    return {str(path): (path.read_bytes(), path.stat().st_mtime_ns) for path in sorted(place.rglob("*")) if path.is_file()}
+    return {
+        str(path): (path.read_bytes(), path.stat().st_mtime_ns) for path in sorted(place.rglob("*")) if path.is_file()
+    }
 
 
 def test_the_status_of_a_finished_study_agrees_with_its_journals(slippery: Path) -> None:
@@ -309,7 +385,9 @@ def test_the_status_of_a_finished_study_agrees_with_its_journals(slippery: Path)
     assert result.share == 1
     assert result.simulated == len(case.evaluations)
     for run in result.runs:
-        group = case.evaluations[(case.evaluations["algorithm"] == run.algorithm) & (case.evaluations["run"] == run.run)]
+        group = case.evaluations[
+            (case.evaluations["algorithm"] == run.algorithm) & (case.evaluations["run"] == run.run)
+        ]
         assert run.collisions == (group["outcome"] == "collision").sum()
         assert run.best == group["f_safe"].min()
     assert sorted(result.points[:, 0].tolist()) == sorted(case.evaluations["f_safe"].tolist())
@@ -320,7 +398,7 @@ def test_a_study_under_way(slippery: Path, tmp_path: Path) -> None:
     nsga2, rs = tmp_path / "it/runs/nsga2-00.jsonl", tmp_path / "it/runs/rs-00.jsonl"
     rs.unlink()
     (tmp_path / "it/solutions.csv").unlink()  # written after the last run
-    nsga2.write_bytes(nsga2.read_bytes()[:len(nsga2.read_bytes()) * 2 // 3])  # torn, as while somebody writes
+    nsga2.write_bytes(nsga2.read_bytes()[: len(nsga2.read_bytes()) * 2 // 3])  # torn, as while somebody writes
     result = status(tmp_path / "it")
     assert [run.state for run in result.runs] == ["begun", "waiting"]
     assert 0 < result.runs[0].simulated < 60
@@ -340,7 +418,9 @@ def test_reading_a_torn_run_warns(slippery: Path, tmp_path: Path) -> None:
     shutil.copytree(slippery, tmp_path / "it")
     journal = tmp_path / "it/runs/nsga2-00.jsonl"
     journal.write_bytes(journal.read_bytes()[:-7])
-    with pytest.warns(UserWarning, match=r"nsga2-00\.jsonl: the last \d+ bytes are torn, so the run counts as unfinished"):
+    with pytest.warns(
+        UserWarning, match=r"nsga2-00\.jsonl: the last \d+ bytes are torn, so the run counts as unfinished"
+    ):
         (case,) = load_cases([tmp_path / "it"])
     assert ("nsga2", 0) not in case.finished_runs
 
@@ -348,7 +428,9 @@ def test_reading_a_torn_run_warns(slippery: Path, tmp_path: Path) -> None:
 def test_a_lost_journal_of_a_finished_study_is_named_with_its_remedy(slippery: Path, tmp_path: Path) -> None:
     shutil.copytree(slippery, tmp_path / "it")
     (tmp_path / "it/runs/rs-00.jsonl").unlink()
-    with pytest.raises(InputError, match=r"rs-00\.jsonl: is missing, although solutions\.csv holds.*\nexpected: .*the same study again"):
+    with pytest.raises(
+        InputError, match=r"rs-00\.jsonl: is missing, although solutions\.csv holds.*\nexpected: .*the same study again"
+    ):
         load_runs(tmp_path / "it")
 
 
@@ -356,7 +438,10 @@ def test_every_command_about_solutions_says_which_runs_are_unfinished(slippery: 
     shutil.copytree(slippery, tmp_path / "it")
     (tmp_path / "it/runs/rs-00.jsonl").unlink()
     (tmp_path / "it/solutions.csv").unlink()
-    for command in (["explain", str(tmp_path / "it"), "--top", "1"], ["simulate", str(tmp_path / "it"), "--most-severe"]):
+    for command in (
+        ["explain", str(tmp_path / "it"), "--top", "1"],
+        ["simulate", str(tmp_path / "it"), "--most-severe"],
+    ):
         done = CliRunner().invoke(commands, command)
         assert done.exit_code == 0, done.output
         assert "unfinished, rs 0 of 1 runs" in done.stderr

@@ -33,7 +33,9 @@ class Hold(Ads):
         return Command(np.where(brakes, 0.0, throttle), np.where(brakes, 1.0, brake)), memory
 
 
-def driven(scenario: Scenario, ads: Any = None, settings: FloatArray | None = None, system: System = CARLA) -> SimulationRuns:
+def driven(
+    scenario: Scenario, ads: Any = None, settings: FloatArray | None = None, system: System = CARLA
+) -> SimulationRuns:
     """Simulates the original vehicle of a system, or settings, in a scenario; without an ADS, the vehicle keeps its speed."""
     system = replace(system, scenario=scenario, ads=ads or Hold())
     return simulate(system, system.characteristics.original[np.newaxis] if settings is None else settings)

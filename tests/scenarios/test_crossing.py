@@ -33,7 +33,9 @@ NUMBERS = {"CPFA": (8 / 3.6, 6.0, 1.5), "CPNA": (5 / 3.6, 4.0, 1.0), "CPNCO": (5
 
 @pytest.mark.parametrize(("test", "location"), [*STANDARD, ("CPFA", 0.0), ("CPNA", 100.0), ("CPNCO", 10.0)])
 @pytest.mark.parametrize("speed", [10.0, 30.0, 60.0])
-def test_a_vehicle_that_does_not_brake_hits_the_impact_location_at_the_time_to_impact(test: str, location: float, speed: float) -> None:
+def test_a_vehicle_that_does_not_brake_hits_the_impact_location_at_the_time_to_impact(
+    test: str, location: float, speed: float
+) -> None:
     run = driven(Crossing(test=test, speed=speed, impact_location=location))
     assert run.outcome[0] == Outcome.COLLISION
     assert run.collision_speed[0] == pytest.approx(speed / 3.6)
@@ -55,7 +57,9 @@ def test_the_pedestrian_moves_as_the_closed_form_says(test: str) -> None:
     acceleration = speed**2 / (2 * run_up)
     begin = 6.0 - (speed / acceleration + (start - run_up) / speed)
     since = np.maximum(trace.time - begin, 0.0)
-    way = np.where(since < speed / acceleration, acceleration * since**2 / 2, run_up + speed * (since - speed / acceleration))
+    way = np.where(
+        since < speed / acceleration, acceleration * since**2 / 2, run_up + speed * (since - speed / acceleration)
+    )
     assert trace.lateral[:, 0] == pytest.approx(-start + way, abs=1e-6)
     assert trace.lateral_speed[-1, 0] == pytest.approx(speed)
 
@@ -73,10 +77,17 @@ def test_a_target_arrives_in_time_with_any_speed_profile(speed: float, run_up: f
 def test_sumo_reports_a_crash_exactly_if_bodies_overlap() -> None:
     """Many braking times, targets from both sides: bodies overlap clearly or do not touch, and SUMO agrees."""
     half_width, seen = VUT_WIDTH / 2, set()
-    for test, location, (length, width) in (("CPFA", 20.0, (0.6, 0.5)), ("CPNA", 60.0, (0.6, 0.5)), ("CPNCO", 5.0, (0.711, 0.298))):
+    for test, location, (length, width) in (
+        ("CPFA", 20.0, (0.6, 0.5)),
+        ("CPNA", 60.0, (0.6, 0.5)),
+        ("CPNCO", 5.0, (0.711, 0.298)),
+    ):
         brakes_at = np.linspace(3.0, 6.2, 60)
-        run = driven(Crossing(test=test, speed=30.0, impact_location=location), Hold(brakes_at),
-                     np.repeat(CARLA.characteristics.original[np.newaxis], 60, axis=0))
+        run = driven(
+            Crossing(test=test, speed=30.0, impact_location=location),
+            Hold(brakes_at),
+            np.repeat(CARLA.characteristics.original[np.newaxis], 60, axis=0),
+        )
         trace, collided = run.trace, run.outcome == Outcome.COLLISION
         away, reach = np.abs(trace.lateral), half_width + length / 2
         behind = -width - trace.vehicle_length
@@ -126,19 +137,33 @@ def test_the_original_with_aeb_avoids_and_with_half_its_brakes_does_not(test: st
     half = CARLA.characteristics.original.copy()
     half[CARLA.characteristics.names.index("maxBrakeTorque")] /= 2
     both = np.stack([CARLA.characteristics.original, half])
-    outcomes = np.stack([driven(Crossing(test=test, speed=speed, impact_location=location), Aeb(), both).outcome
-                         for speed in (10.0, 20.0, 30.0, 40.0)]) == Outcome.COLLISION
+    outcomes = (
+        np.stack(
+            [
+                driven(Crossing(test=test, speed=speed, impact_location=location), Aeb(), both).outcome
+                for speed in (10.0, 20.0, 30.0, 40.0)
+            ]
+        )
+        == Outcome.COLLISION
+    )
     assert not outcomes[:, 0].any()
     assert outcomes[2, 1]
 
 
-@pytest.mark.parametrize(("parameters", "message"), [
-    ({"speed": -10}, "speed"), ({"speed": 0}, "speed"), ({"impact_location": 151}, "impact_location"), ({"test": "CPXX"}, "test"),
-    ({"time_to_impact": 2}, "needs 3.38 s to the impact"), ({"lateral_start": 2.0}, "lateral_start"),
-    ({"acceleration_distance": 9}, "acceleration_distance"),
-    ({"test": "CBNA", "acceleration_distance": 1}, "the target starts at its speed"),
-    ({"speed": 250, "time_to_impact": 20}, "is longer than the road"),
-])
+@pytest.mark.parametrize(
+    ("parameters", "message"),
+    [
+        ({"speed": -10}, "speed"),
+        ({"speed": 0}, "speed"),
+        ({"impact_location": 151}, "impact_location"),
+        ({"test": "CPXX"}, "test"),
+        ({"time_to_impact": 2}, "needs 3.38 s to the impact"),
+        ({"lateral_start": 2.0}, "lateral_start"),
+        ({"acceleration_distance": 9}, "acceleration_distance"),
+        ({"test": "CBNA", "acceleration_distance": 1}, "the target starts at its speed"),
+        ({"speed": 250, "time_to_impact": 20}, "is longer than the road"),
+    ],
+)
 def test_impossible_parameters_are_refused(parameters: dict[str, object], message: str) -> None:
     with pytest.raises((InputError, msgspec.ValidationError), match=message):
         driven(msgspec.convert(parameters, Crossing))
@@ -160,7 +185,10 @@ def test_the_braking_distance_is_v2_over_2_b_plus_g_sin(grade: float) -> None:
 
 
 def values() -> dict[str, np.ndarray]:
-    return {name: np.full(1, value) for name, value in zip(WORN.characteristics.names, WORN.characteristics.original, strict=True)}
+    return {
+        name: np.full(1, value)
+        for name, value in zip(WORN.characteristics.names, WORN.characteristics.original, strict=True)
+    }
 
 
 @pytest.mark.parametrize("grade", [6.0, -6.0])
@@ -177,7 +205,11 @@ def test_points_of_a_matrix_may_differ_in_grade_and_do_not_depend_on_each_other(
     tests = [{"name": "CPLA", "model": "along", "parameters": {"speed": 40}, "over": {"grade": [-8, 0, 8]}}]
     together = assemble(load_study("euro_ncap_pedestrian", matrix={"tests": tests}))
     original = together.characteristics.original[None]
-    assert [point.name for point in together.points] == ["CPLA, grade -8, clear", "CPLA, grade 0, clear", "CPLA, grade 8, clear"]
+    assert [point.name for point in together.points] == [
+        "CPLA, grade -8, clear",
+        "CPLA, grade 0, clear",
+        "CPLA, grade 8, clear",
+    ]
     degrees = [evaluate(together.at(point), original).f_safe[0] for point in together.points]
     assert evaluate(together, original).f_safe[0] == min(degrees)
     assert len(set(degrees)) == 3
@@ -188,14 +220,17 @@ def test_a_vehicle_model_without_slopes_is_refused_on_a_slope(tmp_path: Path, mo
     (tmp_path / "flat.py").write_text(
         "from safevar_sumo.vehicles.sumo import SumoVehicle\n\n\nclass Flat(SumoVehicle, frozen=True):\n"
         "    def prepare(self, characteristics, road_friction, step):\n"
-        "        return super().prepare(characteristics, road_friction, step)\n")
+        "        return super().prepare(characteristics, road_friction, step)\n"
+    )
     native = load_study("native")
     vehicle = msgspec.structs.replace(native.vehicle, model="flat:Flat")
     for grade in (0.0, 4.0):
         scenario = msgspec.structs.replace(native.scenario, parameters={"grade": grade})
         system = assemble(msgspec.structs.replace(native, vehicle=vehicle, scenario=scenario))
         if grade:
-            with pytest.raises(InputError, match=r"TypeError: .*prepare\(\) takes 4 positional arguments but 5 were.*flat\.py:5"):
+            with pytest.raises(
+                InputError, match=r"TypeError: .*prepare\(\) takes 4 positional arguments but 5 were.*flat\.py:5"
+            ):
                 simulate(system, system.characteristics.original[None])
         else:
             assert simulate(system, system.characteristics.original[None]).trace.speed.max() > 5
@@ -207,6 +242,7 @@ TURNS = {"north": (0.0, 1.0), "west": (-1.0, 0.0), "north-west": (-0.6, 0.8)}
 
 def moved(folder: Path, network: str, forth: tuple[float, float], skew: float = 0.0) -> str:
     """A rotated copy of a network, with its southern end shifted to the right by `skew` [m]."""
+
     def place(match: re.Match[str]) -> str:
         x, y = float(match[1]), float(match[2])
         x += skew if y < -10 else 0
@@ -235,7 +271,9 @@ def test_a_turned_road_changes_nothing(study: str, forth: tuple[float, float], t
 
 def test_a_skewed_crossing_is_refused(tmp_path: Path) -> None:
     network = moved(tmp_path, "crossing", (1.0, 0.0), skew=4.0)
-    system = assemble(load_study("rain", scenario={"model": "crossing", "parameters": {"network": network}}, title="", published={}))
+    system = assemble(
+        load_study("rain", scenario={"model": "crossing", "parameters": {"network": network}}, title="", published={})
+    )
     with pytest.raises(InputError, match=r"lane 'footpath_0' leads [\d.]+ m along the road"):
         simulate(system, system.characteristics.original[np.newaxis])
     crossings = Path(moved(tmp_path / "other", "pedestrian_crossing", (1.0, 0.0)), "network.con.xml")

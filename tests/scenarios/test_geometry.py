@@ -60,16 +60,22 @@ def test_the_gap_to_a_pedestrian_ends_at_the_strip_that_he_walks_on() -> None:
     assert scene.lateral_speed[0] == pytest.approx(1.8)
 
 
-@pytest.mark.parametrize(("front", "over"), [(PATH + WIDTH / 2 + LENGTH - 0.01, False), (PATH + WIDTH / 2 + LENGTH + 0.01, True)])
+@pytest.mark.parametrize(
+    ("front", "over"), [(PATH + WIDTH / 2 + LENGTH - 0.01, False), (PATH + WIDTH / 2 + LENGTH + 0.01, True)]
+)
 def test_the_vehicle_has_passed_once_its_rear_has_left_the_strip(front: float, over: bool) -> None:
     scenario, world = PedestrianCrossing(), ArtificialWorld(front, 0.0)
     scene, _ = scenario.observe(world, STEP, scenario.begin(world))
     assert scene.over[0] == over
 
 
-@pytest.mark.parametrize(("before", "now", "over"), [
-    (1.70, 1.79, True), (1.60, 1.74, False), (1.90, 1.81, False), (-1.90, -1.80, False), (-1.70, -1.79, True)])
-def test_the_pedestrian_has_left_the_lane_when_he_walks_away_beyond_its_edge(before: float, now: float, over: bool) -> None:
+@pytest.mark.parametrize(
+    ("before", "now", "over"),
+    [(1.70, 1.79, True), (1.60, 1.74, False), (1.90, 1.81, False), (-1.90, -1.80, False), (-1.70, -1.79, True)],
+)
+def test_the_pedestrian_has_left_the_lane_when_he_walks_away_beyond_its_edge(
+    before: float, now: float, over: bool
+) -> None:
     scenario, world = PedestrianCrossing(turns_after=None, lane_width=3.5), ArtificialWorld(0.0, before)
     memory = scenario.begin(world)
     world.lateral = now
@@ -91,32 +97,47 @@ def test_the_pedestrian_turns_in_the_last_step_that_keeps_him_within_the_distanc
 
 @pytest.mark.parametrize(("faster", "avoids"), [(0.4, False), (0.6, True)])
 def test_a_vehicle_has_avoided_a_target_ahead_once_it_has_approached_at_half_a_metre_a_second_and_is_no_longer_faster(
-        faster: float, avoids: bool) -> None:
+    faster: float, avoids: bool
+) -> None:
     target, approached, over = Target(np.array([30.0]), np.zeros(1), speed=5.0), np.zeros(1, dtype=bool), []
     for speed in (5.0, 5.0 + faster, 5.1, 5.0):
-        scene, approached = scene_of(EncounterConstants(follows=True), target, np.zeros(1), np.array([speed]), approached)
+        scene, approached = scene_of(
+            EncounterConstants(follows=True), target, np.zeros(1), np.array([speed]), approached
+        )
         over.append(bool(scene.over[0]))
     assert over == [False, False, False, avoids], "who keeps its distance from the start has not avoided anything"
 
 
 def trace(gap: np.ndarray, speed: np.ndarray, lateral: np.ndarray, lateral_speed: np.ndarray) -> Trace:
-    columns = {name: values[:, np.newaxis] for name, values in
-               {"gap": gap, "speed": speed, "lateral": lateral, "lateral_speed": lateral_speed}.items()}
+    columns = {
+        name: values[:, np.newaxis]
+        for name, values in {"gap": gap, "speed": speed, "lateral": lateral, "lateral_speed": lateral_speed}.items()
+    }
     nothing = np.zeros_like(columns["gap"])
-    unused = {name: nothing for name in Trace.__dataclass_fields__ if name not in (*columns, "step", "vehicle_length", "time", "active")}
-    return Trace(step=STEP, vehicle_length=LENGTH, time=STEP * np.arange(len(gap)), active=nothing == 0, **columns, **unused)
+    unused = {
+        name: nothing
+        for name in Trace.__dataclass_fields__
+        if name not in (*columns, "step", "vehicle_length", "time", "active")
+    }
+    return Trace(
+        step=STEP, vehicle_length=LENGTH, time=STEP * np.arange(len(gap)), active=nothing == 0, **columns, **unused
+    )
 
 
 def test_closing_speed_of_a_pedestrian_has_both_speeds_along_the_line_of_sight() -> None:
     """Vehicle's centre at (0, 0), pedestrian at (4, -3): distance 5, cos(theta) = 0.8; v cos + v_ped sin = 0.8 * 6 + 0.6 * 1.5."""
-    encounter = PedestrianCrossing().encounter(trace(np.array([4.0 - LENGTH / 2]), np.array([6.0]), np.array([-3.0]), np.array([1.5])))
+    encounter = PedestrianCrossing().encounter(
+        trace(np.array([4.0 - LENGTH / 2]), np.array([6.0]), np.array([-3.0]), np.array([1.5]))
+    )
     assert encounter.distance[0, 0] == pytest.approx(5.0 - LENGTH / 2)
     assert encounter.closing_speed[0, 0] == pytest.approx(0.8 * 6 + 0.6 * 1.5)
     assert encounter.separation[0, 0] == pytest.approx(4.0 - LENGTH / 2)
 
 
 def test_a_parked_vehicle_is_separated_by_centres_and_closed_in_on_by_bumpers() -> None:
-    encounter = LeadVehicleStopped().encounter(trace(np.array([3.0, -0.1]), np.array([2.0, 2.0]), np.zeros(2), np.zeros(2)))
+    encounter = LeadVehicleStopped().encounter(
+        trace(np.array([3.0, -0.1]), np.array([2.0, 2.0]), np.zeros(2), np.zeros(2))
+    )
     assert encounter.separation[:, 0].tolist() == [3.0 + LENGTH, -0.1 + LENGTH]
     assert encounter.distance[:, 0].tolist() == [3.0, -0.1]
     assert encounter.closing_speed[:, 0].tolist() == [2.0, 2.0]

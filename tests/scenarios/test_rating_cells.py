@@ -45,9 +45,12 @@ class Row(NamedTuple):
 
 
 CROSSING = {
-    "CPNA": Row(NEAR, 5, 4, 1, (-10, 20), (3, -2)), "CPFA": Row(FAR, 8, 6, 1.5, (-10, 20), (3, -2)),
-    "CPNCO": Row(NEAR, 5, 4, 1, (20,), (3, -2)), "CBNA": Row(NEAR, 15, None, 0, (20,), (5, -3)),
-    "CBFA": Row(FAR, 20, None, 0, (-20,), (5, -3)), "CBNAO": Row(NEAR, 10, None, 0, (-10, 20), (5, -3)),
+    "CPNA": Row(NEAR, 5, 4, 1, (-10, 20), (3, -2)),
+    "CPFA": Row(FAR, 8, 6, 1.5, (-10, 20), (3, -2)),
+    "CPNCO": Row(NEAR, 5, 4, 1, (20,), (3, -2)),
+    "CBNA": Row(NEAR, 15, None, 0, (20,), (5, -3)),
+    "CBFA": Row(FAR, 20, None, 0, (-20,), (5, -3)),
+    "CBNAO": Row(NEAR, 10, None, 0, (-10, 20), (5, -3)),
 }
 
 
@@ -55,8 +58,12 @@ def crossing(test: str, speed: float, location: float) -> Iterator[Cell]:
     """A cell and its layers; the target arrives after 6 s, or as soon as it can."""
     row = CROSSING[test]
     width = Crossing().vut_width
-    layers: list[dict[str, float]] = [{}, {"start_share": 0.75}, *({"heading": float(turn)} for turn in row.headings),
-                                      *({"target_speed": row.speed + increase} for increase in row.speed_changes)]
+    layers: list[dict[str, float]] = [
+        {},
+        {"start_share": 0.75},
+        *({"heading": float(turn)} for turn in row.headings),
+        *({"target_speed": row.speed + increase} for increase in row.speed_changes),
+    ]
     for layer in layers:
         share, target_speed_ms = layer.get("start_share", 1.0), layer.get("target_speed", row.speed) * KMH
         arrival = 6.0 * share
@@ -87,12 +94,18 @@ def behind_braking(test: str, speed: float, location: float) -> Iterator[Cell]:
         gap, speed_loss = headway * speed * KMH, (speed - 2) * KMH
         closing = min(math.sqrt(2 * deceleration * gap), speed_loss)
         braking_time = closing / deceleration + max(gap - closing**2 / (2 * deceleration), 0) / closing
-        scenario = CarToCar(test=test, speed=speed, impact_location=location, headway=headway, target_deceleration=deceleration)
+        scenario = CarToCar(
+            test=test, speed=speed, impact_location=location, headway=headway, target_deceleration=deceleration
+        )
         yield Cell(scenario, 3 + braking_time, closing)
 
 
 def along(test: str, speed: float, location: float, target_speed: float) -> Iterator[Cell]:
-    yield Cell(Along(test=test, speed=speed, impact_location=location, target_speed=target_speed), 6.0, (speed - target_speed) * KMH)
+    yield Cell(
+        Along(test=test, speed=speed, impact_location=location, target_speed=target_speed),
+        6.0,
+        (speed - target_speed) * KMH,
+    )
 
 
 def all_cells() -> Iterator[Cell]:
@@ -140,14 +153,18 @@ def edge_cells() -> Iterator[Cell]:
 def check(cells: list[Cell]) -> None:
     points = tuple(Point(cell.scenario, WEATHERS["clear"], str(k)) for k, cell in enumerate(cells))
     system = replace(CARLA, ads=Hold(), matrix=points)
-    for cell, there in zip(cells, simulate_all_points(system, system.characteristics.original[np.newaxis]), strict=True):
+    for cell, there in zip(
+        cells, simulate_all_points(system, system.characteristics.original[np.newaxis]), strict=True
+    ):
         run, scenario = there.runs, cell.scenario
         assert run.outcome[0] == Outcome.COLLISION, scenario
         assert set(run.contact.side) == {"front"}, scenario
         late = at_contact(run, run.trace.time) - cell.arrival
         assert abs(late) * scenario.speed * KMH < 0.05, (late, scenario)
         lateral = at_contact(run, run.trace.lateral[:, 0])
-        assert abs(lateral - (scenario.impact_location / 100 - 0.5) * scenario.vut_width) < 0.02 * scenario.vut_width, scenario
+        assert abs(lateral - (scenario.impact_location / 100 - 0.5) * scenario.vut_width) < 0.02 * scenario.vut_width, (
+            scenario
+        )
         assert run.contact.place == pytest.approx(min(max(scenario.impact_location, 0), 100), abs=2), scenario
         assert run.relative_speed[0] == pytest.approx(cell.relative, abs=0.1 * KMH), scenario
 
@@ -163,12 +180,20 @@ def test_cells_and_layers_of_all_tests_agree_with_the_closed_forms() -> None:
     check([*all_cells()][::7])
 
 
-@pytest.mark.parametrize("scenario", [
-    Crossing(test="CBNAO", impact_location=90, heading=-10), Crossing(test="CBFA", speed=60, impact_location=10, heading=-20),
-    Crossing(test="CPNCO", start_share=0.75), Crossing(test="CMCscp", speed=20, target_speed=80, impact_location=10),
-    CarToCar(test="CCRs", impact_location=125, heading=20), CarToCar(test="CMRs", impact_location=10, heading=-10),
-    CarToCar(test="CMRb", speed=90, impact_location=90), Along(test="CBLA", speed=80, target_speed=20),
-], ids=lambda scenario: scenario.test)
+@pytest.mark.parametrize(
+    "scenario",
+    [
+        Crossing(test="CBNAO", impact_location=90, heading=-10),
+        Crossing(test="CBFA", speed=60, impact_location=10, heading=-20),
+        Crossing(test="CPNCO", start_share=0.75),
+        Crossing(test="CMCscp", speed=20, target_speed=80, impact_location=10),
+        CarToCar(test="CCRs", impact_location=125, heading=20),
+        CarToCar(test="CMRs", impact_location=10, heading=-10),
+        CarToCar(test="CMRb", speed=90, impact_location=90),
+        Along(test="CBLA", speed=80, target_speed=20),
+    ],
+    ids=lambda scenario: scenario.test,
+)
 def test_other_targets_are_hit_in_a_recorded_scene_as_in_sumo_to_the_last_bit(scenario: Any) -> None:
     """Vehicles that never brake, or brake at any time up to the impact: impacts at the front and the corners, and passed targets."""
     n, arrival = 30, scenario.duration - scenario.time_after
@@ -187,11 +212,17 @@ def test_other_targets_are_hit_in_a_recorded_scene_as_in_sumo_to_the_last_bit(sc
 def test_a_scenario_of_ones_own_may_turn_lanes(in_tmp: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(in_tmp)
     Path("mine_at_an_angle.py").write_text(
-        "from safevar_sumo.scenarios import Crossing\n\n\nclass Mine(Crossing, frozen=True, kw_only=True):\n    pass\n")
+        "from safevar_sumo.scenarios import Crossing\n\n\nclass Mine(Crossing, frozen=True, kw_only=True):\n    pass\n"
+    )
     turned = {"test": "CBNA", "heading": 20}
-    studies = [load_study("euro_ncap_pedestrian", title="", matrix=None, scenario={"model": model, "parameters": turned})
-               for model in ("mine_at_an_angle:Mine", "crossing")]
-    mine, ours = (simulate(system, system.characteristics.original[np.newaxis], Engine.LIBSUMO) for system in map(assemble, studies))
+    studies = [
+        load_study("euro_ncap_pedestrian", title="", matrix=None, scenario={"model": model, "parameters": turned})
+        for model in ("mine_at_an_angle:Mine", "crossing")
+    ]
+    mine, ours = (
+        simulate(system, system.characteristics.original[np.newaxis], Engine.LIBSUMO)
+        for system in map(assemble, studies)
+    )
     np.testing.assert_array_equal(mine.trace.gap, ours.trace.gap)
 
 
@@ -210,7 +241,7 @@ def test_a_cyclist_behind_parked_cars_is_seen_past_the_corner_whatever_his_direc
         recorder = _GapRecorder()
         driven(scenario, recorder)
         seen = np.array(recorder.gaps)
-        assert np.isinf(seen).tolist() == hidden[:len(seen)].tolist()
+        assert np.isinf(seen).tolist() == hidden[: len(seen)].tolist()
         assert 0.5 < before[np.argmin(hidden)] < 3.0
 
 
@@ -226,18 +257,24 @@ class _GapRecorder(Hold):
         return super().drive(seen, memory)
 
 
-@pytest.mark.parametrize(("kind", "parameters", "message"), [
-    (CarToCar, {"test": "CCRm", "heading": 10}, "a moving target"),
-    (Crossing, {"test": "CBFA", "target_speed": 90, "time_to_impact": 13}, "has no lane"),
-    (Crossing, {"test": "CBNA", "acceleration_distance": 1.0}, "lateral_start"),
-])
+@pytest.mark.parametrize(
+    ("kind", "parameters", "message"),
+    [
+        (CarToCar, {"test": "CCRm", "heading": 10}, "a moving target"),
+        (Crossing, {"test": "CBFA", "target_speed": 90, "time_to_impact": 13}, "has no lane"),
+        (Crossing, {"test": "CBNA", "acceleration_distance": 1.0}, "lateral_start"),
+    ],
+)
 def test_impossible_targets_are_refused(kind: type, parameters: dict[str, Any], message: str) -> None:
     with pytest.raises(InputError, match=message):
         driven(kind(**parameters), system=NATIVE)
 
 
 def test_a_speed_outside_the_protocol_is_allowed_with_a_remark() -> None:
-    assert Crossing(test="CMCscp", speed=90).remarks() == ["CMCscp: speed = 90 km/h is outside the protocol's 20 to 80 km/h"]
+    assert Crossing(test="CMCscp", speed=90).remarks() == [
+        "CMCscp: speed = 90 km/h is outside the protocol's 20 to 80 km/h"
+    ]
     assert CarToCar(test="CMRs", speed=10, impact_location=125).remarks() == [
-        "CMRs: impact_location = 125 % is none of the protocol's 50, 10, 25, 75, 90 %"]
+        "CMRs: impact_location = 125 % is none of the protocol's 50, 10, 25, 75, 90 %"
+    ]
     assert not Along(test="CBLA", speed=80, target_speed=20).remarks()

@@ -52,7 +52,9 @@ def test_a_vehicle_that_does_not_brake_hits_the_protocols_impact_location_at_eve
         error = np.where(run.trace.active, run.trace.speed * 3.6 - scenario.speed, 0.0)
         assert error.min() > -0.5, there.point.name
         assert error.max() < 1.0, there.point.name
-        assert struck(run, scenario.vut_width) == pytest.approx(scenario.impact_location / 100, abs=0.02), there.point.name
+        assert struck(run, scenario.vut_width) == pytest.approx(scenario.impact_location / 100, abs=0.02), (
+            there.point.name
+        )
         if isinstance(scenario, Crossing | Along):
             late = abs(at_contact(run, run.trace.time) - 6.0)
             assert late * scenario.speed / 3.6 < 0.05, there.point.name
@@ -66,7 +68,9 @@ def struck(run: SimulationRuns, width: float) -> float:
 @pytest.mark.parametrize("study", BRAKE)
 def test_the_originals_avoid_every_shipped_point_and_with_half_their_brakes_some_fail(study: str) -> None:
     system = assemble(load_study(study))
-    collided = np.stack([one.evaluations.collided for one in simulate_all_points(system, original_and_half_its_brakes(study, system))])
+    collided = np.stack(
+        [one.evaluations.collided for one in simulate_all_points(system, original_and_half_its_brakes(study, system))]
+    )
     assert not collided[:, 0].any()
     assert collided[:, 1].any()
 
@@ -75,18 +79,29 @@ def test_the_worn_cars_matrix_at_its_edges() -> None:
     system = assemble(load_study("wear"))
     edges = tuple(point for point in system.points if point.name in ("CPNCO, speed 40, wet", "CPLA, speed 60, wet"))
     system = replace(system, matrix=edges)
-    collided = [one.evaluations.collided.tolist() for one in simulate_all_points(system, original_and_half_its_brakes("wear", system))]
+    collided = [
+        one.evaluations.collided.tolist()
+        for one in simulate_all_points(system, original_and_half_its_brakes("wear", system))
+    ]
     assert collided == [[False, False], [False, True]]
 
 
 PEDESTRIAN = "pedestrian crash without prior vehicle manoeuvre"
 
 
-@pytest.mark.parametrize(("study", "types"), [
-    ("sun", "pedestrian crash with prior vehicle manoeuvre; by day"), ("lgsvl", "lead vehicle stopped; by day"),
-    ("euro_ncap_pedestrian", f"{PEDESTRIAN}; by day and by night"), ("wear", f"{PEDESTRIAN}; by day"),
-    ("euro_ncap_car_to_car", "lead vehicle stopped; lead vehicle moving at lower constant speed; lead vehicle decelerating; by day"),
-])
+@pytest.mark.parametrize(
+    ("study", "types"),
+    [
+        ("sun", "pedestrian crash with prior vehicle manoeuvre; by day"),
+        ("lgsvl", "lead vehicle stopped; by day"),
+        ("euro_ncap_pedestrian", f"{PEDESTRIAN}; by day and by night"),
+        ("wear", f"{PEDESTRIAN}; by day"),
+        (
+            "euro_ncap_car_to_car",
+            "lead vehicle stopped; lead vehicle moving at lower constant speed; lead vehicle decelerating; by day",
+        ),
+    ],
+)
 def test_the_tags_of_the_shipped_studies(study: str, types: str) -> None:
     assert pre_crash_sentence(assemble(load_study(study)).points) == f"NHTSA's pre-crash types: {types}."
 
@@ -105,9 +120,13 @@ def closed_in(test: str, speed: float) -> float:
     return 3 + np.sqrt(gap / 2) if gap < 2 * stops**2 else 3 + stops + (gap - 2 * stops**2) / (4 * stops)
 
 
-@pytest.mark.parametrize(("test", "speed"), [("CCRs", 10), ("CCRs", 50), ("CCRm", 30), ("CCRm", 80), ("CCRb", 30), ("CCRb", 80)])
+@pytest.mark.parametrize(
+    ("test", "speed"), [("CCRs", 10), ("CCRs", 50), ("CCRm", 30), ("CCRm", 80), ("CCRb", 30), ("CCRb", 80)]
+)
 @pytest.mark.parametrize("location", [0.0, 75.0])
-def test_a_vehicle_that_does_not_brake_hits_the_car_when_and_where_the_closed_form_says(test: str, speed: float, location: float) -> None:
+def test_a_vehicle_that_does_not_brake_hits_the_car_when_and_where_the_closed_form_says(
+    test: str, speed: float, location: float
+) -> None:
     run = driven(CarToCar(test=test, speed=speed, impact_location=location), system=NATIVE)
     assert run.outcome[0] == Outcome.COLLISION
     assert at_contact(run, run.trace.time) == pytest.approx(closed_in(test, speed), abs=2e-3)
@@ -122,7 +141,9 @@ def test_the_braking_car_moves_as_the_closed_form_says() -> None:
     after = np.maximum(trace.time - 3 - (first - last) / 4, 0)
     place = first * np.minimum(trace.time, 3) + first * since - 2 * since**2 + last * after
     assert trace.gap[:, 0] + trace.position[:, 0] - trace.position[0, 0] == pytest.approx(first + place, abs=0.05)
-    assert trace.obstacle_speed[:, 0] == pytest.approx(np.where(trace.time < 3, first, np.maximum(first - 4 * (trace.time - 3), last)))
+    assert trace.obstacle_speed[:, 0] == pytest.approx(
+        np.where(trace.time < 3, first, np.maximum(first - 4 * (trace.time - 3), last))
+    )
 
 
 def test_the_pedestrian_ahead_moves_as_the_closed_form_says() -> None:
@@ -136,11 +157,17 @@ def test_the_pedestrian_ahead_moves_as_the_closed_form_says() -> None:
     assert run.relative_speed[0] == pytest.approx(25 * KMH)
 
 
-@pytest.mark.parametrize("scenario", [CarToCar(test="CCRm", speed=40), CarToCar(test="CCRb", speed=40), Along(speed=40)])
+@pytest.mark.parametrize(
+    "scenario", [CarToCar(test="CCRm", speed=40), CarToCar(test="CCRb", speed=40), Along(speed=40)]
+)
 def test_sumo_reports_a_collision_exactly_when_the_gap_is_closed(scenario: CarToCar | Along) -> None:
     n = 40
-    run = driven(scenario, Hold(np.linspace(1.0, scenario.duration, n)), np.repeat(NATIVE.characteristics.original[np.newaxis], n, axis=0),
-                 NATIVE)
+    run = driven(
+        scenario,
+        Hold(np.linspace(1.0, scenario.duration, n)),
+        np.repeat(NATIVE.characteristics.original[np.newaxis], n, axis=0),
+        NATIVE,
+    )
     least = np.min(np.where(run.trace.active, run.trace.gap, np.inf), axis=0)
     collided = run.outcome == Outcome.COLLISION
     assert np.all(collided[least < -1e-3])
@@ -148,10 +175,16 @@ def test_sumo_reports_a_collision_exactly_when_the_gap_is_closed(scenario: CarTo
     assert 0 < np.count_nonzero(collided) < n
 
 
-@pytest.mark.parametrize(("kind", "parameters", "message"), [
-    (CarToCar, {"speed": -5}, "speed"), (CarToCar, {"test": "CCRm", "speed": 15}, "never reaches"), (CarToCar, {"headway": 0}, "headway"),
-    (Along, {"speed": 4}, "inside the vehicle"), (Along, {"target_speed": -1}, "target_speed"),
-])
+@pytest.mark.parametrize(
+    ("kind", "parameters", "message"),
+    [
+        (CarToCar, {"speed": -5}, "speed"),
+        (CarToCar, {"test": "CCRm", "speed": 15}, "never reaches"),
+        (CarToCar, {"headway": 0}, "headway"),
+        (Along, {"speed": 4}, "inside the vehicle"),
+        (Along, {"target_speed": -1}, "target_speed"),
+    ],
+)
 def test_impossible_parameters_are_refused(kind: type, parameters: dict[str, object], message: str) -> None:
     with pytest.raises((InputError, msgspec.ValidationError), match=message):
         driven(msgspec.convert(parameters, kind), system=NATIVE)

@@ -19,9 +19,13 @@ Evaluate = Callable[[CharacteristicSet, np.ndarray], Evaluations]
 def evaluated(characteristics: CharacteristicSet, settings: np.ndarray, safety: np.ndarray) -> Evaluations:
     undefined = np.full(len(settings), np.nan)
     return Evaluations(
-        settings=settings, outcome=np.full(len(settings), Outcome.STOPPED.value, dtype="U16"), collision_speed=undefined,
-        metrics={"safety_degree": safety}, f_diff=characteristics.largest_change(settings),
-        f_num_diff=characteristics.number_changed(settings))
+        settings=settings,
+        outcome=np.full(len(settings), Outcome.STOPPED.value, dtype="U16"),
+        collision_speed=undefined,
+        metrics={"safety_degree": safety},
+        f_diff=characteristics.largest_change(settings),
+        f_num_diff=characteristics.number_changed(settings),
+    )
 
 
 def sphere(characteristics: CharacteristicSet, settings: np.ndarray) -> Evaluations:
@@ -30,15 +34,24 @@ def sphere(characteristics: CharacteristicSet, settings: np.ndarray) -> Evaluati
     return evaluated(characteristics, settings, np.add.accumulate(share**2, axis=1)[:, -1])
 
 
-def begun(name: str, seed: int, evaluations: int, characteristics: CharacteristicSet = SUN,
-          algorithm: Algorithm | None = None) -> Search:
+def begun(
+    name: str, seed: int, evaluations: int, characteristics: CharacteristicSet = SUN, algorithm: Algorithm | None = None
+) -> Search:
     original = sphere(characteristics, characteristics.original[np.newaxis])
-    problem = Problem(characteristics=characteristics, original=original, evaluations=evaluations, population=POPULATION)
+    problem = Problem(
+        characteristics=characteristics, original=original, evaluations=evaluations, population=POPULATION
+    )
     return (algorithm or ALGORITHMS[name]()).search(problem, np.random.default_rng(seed))
 
 
-def searched(name: str, seed: int, evaluations: int, characteristics: CharacteristicSet = SUN,
-             evaluate: Evaluate = sphere, algorithm: Algorithm | None = None) -> tuple[Evaluations, list[np.ndarray]]:
+def searched(
+    name: str,
+    seed: int,
+    evaluations: int,
+    characteristics: CharacteristicSet = SUN,
+    evaluate: Evaluate = sphere,
+    algorithm: Algorithm | None = None,
+) -> tuple[Evaluations, list[np.ndarray]]:
     """Run an algorithm to its end; returns its result and all populations that it requested."""
     search = begun(name, seed, evaluations, characteristics, algorithm)
     populations = [next(search)]

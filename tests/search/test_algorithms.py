@@ -84,8 +84,14 @@ def test_a_setting_that_failed_never_gets_into_the_result(name: str) -> None:
         fails = settings[:, 0] < 5800
         outcome = np.where(fails, Outcome.SIMULATOR_ERROR.value, good.outcome).astype("U16")
         safety = np.where(fails, np.nan, good.f_safe)
-        return Evaluations(settings=settings, outcome=outcome, collision_speed=good.collision_speed,
-                           metrics={"safety_degree": safety}, f_diff=good.f_diff, f_num_diff=good.f_num_diff)
+        return Evaluations(
+            settings=settings,
+            outcome=outcome,
+            collision_speed=good.collision_speed,
+            metrics={"safety_degree": safety},
+            f_diff=good.f_diff,
+            f_num_diff=good.f_num_diff,
+        )
 
     solutions = searched(name, 1, 400, evaluate=failing)[0]
     assert len(solutions) > 0
@@ -120,8 +126,14 @@ class _Dtlz2(Evaluations):
         x, rest = self.settings[:, :2] - 1, self.settings[:, 2:] - 1
         g = 1 + ((rest - 0.5) ** 2).sum(axis=1)
         angles = x * np.pi / 2
-        return np.stack([g * np.cos(angles[:, 0]) * np.cos(angles[:, 1]), g * np.cos(angles[:, 0]) * np.sin(angles[:, 1]),
-                         g * np.sin(angles[:, 0])], axis=1)
+        return np.stack(
+            [
+                g * np.cos(angles[:, 0]) * np.cos(angles[:, 1]),
+                g * np.cos(angles[:, 0]) * np.sin(angles[:, 1]),
+                g * np.sin(angles[:, 0]),
+            ],
+            axis=1,
+        )
 
     def column(self, name: str) -> np.ndarray:
         return self.objectives[:, ["f_safe", "f_diff", "f_num_diff"].index(name)]
@@ -143,7 +155,9 @@ def test_hypervolumes_are_those_of_jmetalpy_on_dtlz2() -> None:
         def filter(self, settings: np.ndarray) -> np.ndarray:
             return settings
 
-    unit = Unfiltered(tuple(Characteristic(name=f"x{i}", unit="-", original=1.5, lower=1.0, upper=2.0) for i in range(variables)))
+    unit = Unfiltered(
+        tuple(Characteristic(name=f"x{i}", unit="-", original=1.5, lower=1.0, upper=2.0) for i in range(variables))
+    )
     reference = np.full(3, 2.0)
     ours, theirs = [], []
     for seed in range(10):
@@ -152,10 +166,14 @@ def test_hypervolumes_are_those_of_jmetalpy_on_dtlz2() -> None:
         random.seed(seed)
         np.random.seed(seed)
         problem = DTLZ2(number_of_variables=variables)
-        algorithm = NSGAII(problem=problem, population_size=POPULATION, offspring_population_size=POPULATION,
-                           mutation=PolynomialMutation(probability=1 / variables, distribution_index=20),
-                           crossover=SBXCrossover(probability=0.9, distribution_index=20),
-                           termination_criterion=StoppingByEvaluations(max_evaluations=evaluations))
+        algorithm = NSGAII(
+            problem=problem,
+            population_size=POPULATION,
+            offspring_population_size=POPULATION,
+            mutation=PolynomialMutation(probability=1 / variables, distribution_index=20),
+            crossover=SBXCrossover(probability=0.9, distribution_index=20),
+            termination_criterion=StoppingByEvaluations(max_evaluations=evaluations),
+        )
         algorithm.run()
         front = np.array([solution.objectives for solution in algorithm.result()])
         theirs.append(moocore.hypervolume(front[moocore.is_nondominated(front)], ref=reference))
@@ -209,8 +227,12 @@ def test_the_result_is_the_fifty_best_scores() -> None:
     assert np.array_equal(solutions.settings, everything.settings[np.argsort(scores, kind="stable")[:50]])
 
 
-TWO = CharacteristicSet((Characteristic(name="a", unit="-", original=50.0, lower=0.0, upper=100.0),
-                         Characteristic(name="b", unit="-", original=50.0, lower=0.0, upper=100.0)))
+TWO = CharacteristicSet(
+    (
+        Characteristic(name="a", unit="-", original=50.0, lower=0.0, upper=100.0),
+        Characteristic(name="b", unit="-", original=50.0, lower=0.0, upper=100.0),
+    )
+)
 
 
 def individuals(*objectives: tuple[float, float, float]) -> list[Individual]:
@@ -257,14 +279,22 @@ def test_nsga2_returns_the_non_dominated_part_of_its_population(seed: int) -> No
 def test_random_search_keeps_all_solutions_with_equal_objectives() -> None:
     def equal(characteristics: CharacteristicSet, settings: np.ndarray) -> Evaluations:
         one = np.ones(len(settings))
-        return Evaluations(settings=settings, outcome=np.full(len(settings), Outcome.STOPPED.value, dtype="U16"),
-                           collision_speed=one * np.nan, metrics={"safety_degree": one}, f_diff=one, f_num_diff=one)
+        return Evaluations(
+            settings=settings,
+            outcome=np.full(len(settings), Outcome.STOPPED.value, dtype="U16"),
+            collision_speed=one * np.nan,
+            metrics={"safety_degree": one},
+            f_diff=one,
+            f_num_diff=one,
+        )
 
     assert len(searched("rs", 1, 45, evaluate=equal)[0]) == 45
 
 
 def problem() -> Problem:
-    return Problem(characteristics=TWO, original=evaluated(TWO, TWO.original[np.newaxis], np.array([5.0])), evaluations=1000)
+    return Problem(
+        characteristics=TWO, original=evaluated(TWO, TWO.original[np.newaxis], np.array([5.0])), evaluations=1000
+    )
 
 
 def window(settings: list[list[float]], safety: list[float]) -> Evaluations:
@@ -278,7 +308,9 @@ def test_ranges_narrow_to_means_of_the_unsafe_alone_and_never_across_the_origina
     assert ranges.lower.tolist() == [0, 40]
 
 
-@pytest.mark.parametrize(("settings", "most"), [([[60, 50], [60, 40]], 2), ([[60, 50], [60, 50], [60, 40]], 1), ([[60, 50]], 1)])
+@pytest.mark.parametrize(
+    ("settings", "most"), [([[60, 50], [60, 40]], 2), ([[60, 50], [60, 50], [60, 40]], 1), ([[60, 50]], 1)]
+)
 def test_the_number_of_changes_is_rounded_half_up(settings: list[list[float]], most: int) -> None:
     ranges = _Ranges(problem())
     ranges.narrow(window(settings, [1.0] * len(settings)))
@@ -318,23 +350,38 @@ def test_a_child_that_neither_dominates_nor_is_dominated_enters_only_if_a_neighb
     assert choose_survivor(cell, child, [cell, worst]) is child
 
 
-@pytest.mark.parametrize(("search", "problem"), [
-    ({"mocell": {"grid": [3, 4]}}, "search.mocell.grid = [3, 4] has 12 cells\nexpected: two sides whose product is search.population = 10"),
-    ({"mocell": {"neighbourhood": "hexagonal"}}, "search.mocell.neighbourhood = 'hexagonal'"),
-    ({"spea2": {"archive": 0}}, "search.spea2.archive = 0"),
-    ({"spea2": {"archives": 7}}, "did you mean 'archive'?"),
-    ({"spea": {"archive": 7}}, "did you mean 'spea2'?"),
-])
+@pytest.mark.parametrize(
+    ("search", "problem"),
+    [
+        (
+            {"mocell": {"grid": [3, 4]}},
+            "search.mocell.grid = [3, 4] has 12 cells\nexpected: two sides whose product is search.population = 10",
+        ),
+        ({"mocell": {"neighbourhood": "hexagonal"}}, "search.mocell.neighbourhood = 'hexagonal'"),
+        ({"spea2": {"archive": 0}}, "search.spea2.archive = 0"),
+        ({"spea2": {"archives": 7}}, "did you mean 'archive'?"),
+        ({"spea": {"archive": 7}}, "did you mean 'spea2'?"),
+    ],
+)
 def test_options_that_cannot_be_used_are_refused(search: dict[str, object], problem: str) -> None:
     with pytest.raises(InputError) as refused:
         load_for_search(load_study("smoke", search={"algorithms": ["spea2", "mocell"], **search}))
     assert problem in str(refused.value)
 
 
-@pytest.mark.parametrize(("name", "options"), [
-    ("spea2", {"archive": 5}), ("spea2", {"normalised": False}), ("mocell", {"archive": 5}), ("mocell", {"grid": [2, 10]}),
-    ("mocell", {"neighbourhood": "von_neumann"}), ("nsga2", {"tournament_size": 3}), ("mocell", {"mutation_probability": 1.0}),
-    ("map_elites", {"behaviour": "speed"})])
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [
+        ("spea2", {"archive": 5}),
+        ("spea2", {"normalised": False}),
+        ("mocell", {"archive": 5}),
+        ("mocell", {"grid": [2, 10]}),
+        ("mocell", {"neighbourhood": "von_neumann"}),
+        ("nsga2", {"tournament_size": 3}),
+        ("mocell", {"mutation_probability": 1.0}),
+        ("map_elites", {"behaviour": "speed"}),
+    ],
+)
 def test_options_change_what_a_search_asks_for(name: str, options: dict[str, object]) -> None:
     algorithm = msgspec.convert(options, ALGORITHMS[name])
     solutions, asked = searched(name, 1, 200, algorithm=algorithm)
@@ -344,6 +391,7 @@ def test_options_change_what_a_search_asks_for(name: str, options: dict[str, obj
 
 def test_an_atlas_has_the_smallest_collision_of_every_set_of_changes() -> None:
     """Every setting with more than three changes collides."""
+
     def colliding(characteristics: CharacteristicSet, settings: np.ndarray) -> Evaluations:
         good = sphere(characteristics, settings)
         outcome = np.where(good.f_num_diff > 3, Outcome.COLLISION.value, good.outcome).astype("U16")
@@ -352,15 +400,22 @@ def test_an_atlas_has_the_smallest_collision_of_every_set_of_changes() -> None:
     solutions, asked = searched("map_elites", 1, 400, evaluate=colliding)
     everything = colliding(SUN, np.concatenate(asked))
     smallest: dict[bytes, float] = {}
-    for changed, size in zip(SUN.changed(everything.settings)[everything.collided], everything.f_diff[everything.collided], strict=True):
+    for changed, size in zip(
+        SUN.changed(everything.settings)[everything.collided], everything.f_diff[everything.collided], strict=True
+    ):
         smallest[changed.tobytes()] = min(size, smallest.get(changed.tobytes(), np.inf))
-    assert {changed.tobytes(): size for changed, size in zip(SUN.changed(solutions.settings), solutions.f_diff, strict=True)} == smallest
+    assert {
+        changed.tobytes(): size for changed, size in zip(SUN.changed(solutions.settings), solutions.f_diff, strict=True)
+    } == smallest
 
 
 def test_cells_of_an_atlas_over_the_speed_are_a_metre_a_second_wide_and_the_last_one_is_open() -> None:
     """For each number of changes, 20 cells of collisions and one cell without a collision."""
     speeds = [np.nan, 0.0, 0.9, 1.0, 18.9, 19.0, 25.0]
-    one, two = (dataclasses.replace(window([setting] * 7, [1.0] * 7), collision_speed=np.array(speeds)) for setting in ([60, 50], [60, 60]))
+    one, two = (
+        dataclasses.replace(window([setting] * 7, [1.0] * 7), collision_speed=np.array(speeds))
+        for setting in ([60, 50], [60, 60])
+    )
     atlas = MapElites(behaviour="speed")
     assert atlas._cell_numbers(one, problem()).tolist() == [0, 1, 1, 2, 19, 20, 20]
     assert atlas._cell_numbers(two, problem()).tolist() == [21, 22, 22, 23, 40, 41, 41]

@@ -39,13 +39,20 @@ def zdt(shape: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> Callable[[np.n
     def objectives(x: np.ndarray) -> np.ndarray:
         first, g = x[:, 0], 1 + 9 * x[:, 1:].mean(axis=1)
         return np.stack([first, g * shape(first, g)], axis=1)
+
     return objectives
 
 
 def dtlz2(x: np.ndarray) -> np.ndarray:
     g, angles = 1 + ((x[:, 2:] - 0.5) ** 2).sum(axis=1), x[:, :2] * np.pi / 2
-    return np.stack([g * np.cos(angles[:, 0]) * np.cos(angles[:, 1]), g * np.cos(angles[:, 0]) * np.sin(angles[:, 1]),
-                     g * np.sin(angles[:, 0])], axis=1)
+    return np.stack(
+        [
+            g * np.cos(angles[:, 0]) * np.cos(angles[:, 1]),
+            g * np.cos(angles[:, 0]) * np.sin(angles[:, 1]),
+            g * np.sin(angles[:, 0]),
+        ],
+        axis=1,
+    )
 
 
 class StandardProblem(NamedTuple):
@@ -59,7 +66,9 @@ class StandardProblem(NamedTuple):
 PROBLEMS = {
     "zdt1": StandardProblem(30, zdt(lambda first, g: 1 - np.sqrt(first / g)), (11.0, 11.0)),
     "zdt2": StandardProblem(30, zdt(lambda first, g: 1 - (first / g) ** 2), (11.0, 11.0)),
-    "zdt3": StandardProblem(30, zdt(lambda first, g: 1 - np.sqrt(first / g) - first / g * np.sin(10 * np.pi * first)), (11.0, 11.0)),
+    "zdt3": StandardProblem(
+        30, zdt(lambda first, g: 1 - np.sqrt(first / g) - first / g * np.sin(10 * np.pi * first)), (11.0, 11.0)
+    ),
     "dtlz2": StandardProblem(12, dtlz2, (2.0, 2.0, 2.0)),
 }
 
@@ -88,10 +97,20 @@ class StandardScoring:
 
 
 def front_of_ours(name: str, standard: StandardProblem, seed: int) -> np.ndarray:
-    unit = Unfiltered(tuple(Characteristic(name=f"x{i}", unit="-", original=1.5, lower=1.0, upper=2.0) for i in range(standard.variables)))
+    unit = Unfiltered(
+        tuple(
+            Characteristic(name=f"x{i}", unit="-", original=1.5, lower=1.0, upper=2.0)
+            for i in range(standard.variables)
+        )
+    )
     scoring: Any = StandardScoring(standard)
-    problem = Problem(characteristics=unit, original=evaluated(unit, unit.original[np.newaxis], np.zeros(1)), evaluations=EVALUATIONS,
-                      population=POPULATION, scoring=scoring)
+    problem = Problem(
+        characteristics=unit,
+        original=evaluated(unit, unit.original[np.newaxis], np.zeros(1)),
+        evaluations=EVALUATIONS,
+        population=POPULATION,
+        scoring=scoring,
+    )
     search = ALGORITHMS[name]().search(problem, np.random.default_rng(seed))
     asked = next(search)
     while True:
@@ -135,11 +154,15 @@ def front_of_jmetal(standard: StandardProblem, seed: int) -> np.ndarray:
 
     random.seed(seed)
     np.random.seed(seed)
-    algorithm = MOCell(problem=Theirs(), population_size=POPULATION, neighborhood=C9(10, POPULATION // 10),
-                       archive=CrowdingDistanceArchive(POPULATION),
-                       mutation=PolynomialMutation(probability=1 / standard.variables, distribution_index=20),
-                       crossover=SBXCrossover(probability=0.9, distribution_index=20),
-                       termination_criterion=StoppingByEvaluations(max_evaluations=EVALUATIONS))
+    algorithm = MOCell(
+        problem=Theirs(),
+        population_size=POPULATION,
+        neighborhood=C9(10, POPULATION // 10),
+        archive=CrowdingDistanceArchive(POPULATION),
+        mutation=PolynomialMutation(probability=1 / standard.variables, distribution_index=20),
+        crossover=SBXCrossover(probability=0.9, distribution_index=20),
+        termination_criterion=StoppingByEvaluations(max_evaluations=EVALUATIONS),
+    )
     algorithm.run()
     return np.array([solution.objectives for solution in algorithm.result()])
 
@@ -147,11 +170,17 @@ def front_of_jmetal(standard: StandardProblem, seed: int) -> np.ndarray:
 @pytest.mark.slow
 @pytest.mark.parametrize("problem", sorted(PROBLEMS))
 @pytest.mark.parametrize(("name", "theirs"), [("spea2", front_of_pymoo), ("mocell", front_of_jmetal)])
-def test_hypervolumes_reach_those_of_the_second_implementation(problem: str, name: str,
-                                                               theirs: Callable[[StandardProblem, int], np.ndarray]) -> None:
+def test_hypervolumes_reach_those_of_the_second_implementation(
+    problem: str, name: str, theirs: Callable[[StandardProblem, int], np.ndarray]
+) -> None:
     standard = PROBLEMS[problem]
-    ours, others = ([moocore.hypervolume(front, ref=standard.reference) for front in fronts] for fronts in (
-        [front_of_ours(name, standard, seed) for seed in SEEDS], [theirs(standard, seed) for seed in SEEDS]))
+    ours, others = (
+        [moocore.hypervolume(front, ref=standard.reference) for front in fronts]
+        for fronts in (
+            [front_of_ours(name, standard, seed) for seed in SEEDS],
+            [theirs(standard, seed) for seed in SEEDS],
+        )
+    )
     assert np.mean(ours) >= 0.98 * np.mean(others), (np.mean(ours), np.mean(others))
 
 
@@ -196,6 +225,8 @@ def test_survivors_of_spea2_are_those_of_pymoo_on_random_fronts(hundred: int) ->
         others = SPEA2Survival().do(PymooProblem(n_obj=objectives.shape[1]), population, n_survive=number)
         assert [one.standing[0] for one in ours] == population.get("SPEA_F").tolist(), seed
         last = others.get("SPEA_F").max()
-        if last < 1 or np.count_nonzero(population.get("SPEA_F") == last) == np.count_nonzero(others.get("SPEA_F") == last):
+        if last < 1 or np.count_nonzero(population.get("SPEA_F") == last) == np.count_nonzero(
+            others.get("SPEA_F") == last
+        ):
             assert mine == sorted(map(tuple, others.get("F").tolist())), seed
         assert len(mine) == len(others)

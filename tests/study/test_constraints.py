@@ -50,8 +50,11 @@ at_most = 0.7
 def is_feasible(values: Mapping[str, float]) -> bool:
     """The region of `BOUND`, written once more; what is not there is the original's."""
     by = {**dict(zip(SUN.names, SUN.original.tolist(), strict=True)), **values}
-    return (700 - 1e-6 <= by["mass"] - by["maxBrakeTorque"] <= 1100 + 1e-6 and by["tireFric"] - 0.5 * by["radius"] >= -16.4 - 1e-6
-            and ((by["tireFric"] - 3.5) / 2.9) ** 2 + ((by["mass"] - 2404) / 660) ** 2 <= 0.7 + 1e-6)
+    return (
+        700 - 1e-6 <= by["mass"] - by["maxBrakeTorque"] <= 1100 + 1e-6
+        and by["tireFric"] - 0.5 * by["radius"] >= -16.4 - 1e-6
+        and ((by["tireFric"] - 3.5) / 2.9) ** 2 + ((by["mass"] - 2404) / 660) ** 2 <= 0.7 + 1e-6
+    )
 
 
 def settings_in(answer: Any) -> Iterator[dict[str, float]]:
@@ -83,20 +86,34 @@ def test_every_setting_that_a_command_reports_is_feasible(bound: Path) -> None:
     assert all(is_feasible(row) for row in frame[list(SUN.names)].to_dict("records"))
     below = ("--unsafe", "below=2.5")
     explained = json.loads(run("explain", "out", *below, "--top", "4", "--json").stdout)
-    tolerance = json.loads(run("tolerance", "bound.toml", *below, "--pairs", "--json", "--characteristics",
-                               "tireFric,mass,maxBrakeTorque").stdout)
+    tolerance = json.loads(
+        run(
+            "tolerance", "bound.toml", *below, "--pairs", "--json", "--characteristics", "tireFric,mass,maxBrakeTorque"
+        ).stdout
+    )
     boundaries = [cause["boundary"] for one in explained[:-1] for cause in one["minimal_causes"]]
     nearest = [pair["nearest"] for pair in tolerance["pairs"] if pair["nearest"]]
-    alone = [{scan["characteristic"]: value} for scan in tolerance["alone"] for ends in [scan["safe"], *scan["unsafe"]] for value in ends]
+    alone = [
+        {scan["characteristic"]: value}
+        for scan in tolerance["alone"]
+        for ends in [scan["safe"], *scan["unsafe"]]
+        for value in ends
+    ]
     assert boundaries
     assert nearest
     assert len(alone) >= 6
     reported = [*settings_in([one for one in explained if "summary" not in one]), *nearest, *alone]
     assert [values for values in reported if not is_feasible(values)] == []
     assert any(scan["infeasible"] for scan in tolerance["alone"] if scan["characteristic"] == "mass")
-    for question in ("explain out --unsafe below=2.5", "tolerance bound.toml --unsafe below=2.5 --characteristics mass",
-                     "risk bound.toml --samples 200 --unsafe below=2.5", "rules bound.toml --samples 200 --unsafe below=2.5"):
-        assert "satisfy the study's constraints: mass - maxBrakeTorque at least 700 kg" in run(*question.split()).stdout, question
+    for question in (
+        "explain out --unsafe below=2.5",
+        "tolerance bound.toml --unsafe below=2.5 --characteristics mass",
+        "risk bound.toml --samples 200 --unsafe below=2.5",
+        "rules bound.toml --samples 200 --unsafe below=2.5",
+    ):
+        assert (
+            "satisfy the study's constraints: mass - maxBrakeTorque at least 700 kg" in run(*question.split()).stdout
+        ), question
 
 
 @pytest.mark.slow
@@ -105,13 +122,23 @@ def test_every_setting_that_a_command_reports_is_feasible(bound: Path) -> None:
 def test_searches_and_designs_stay_in_any_linear_region_around_the_original(data: st.DataObject) -> None:
     names = data.draw(st.lists(st.sampled_from(SUN.names), min_size=1, max_size=4, unique=True))
     widths, units = (SUN.upper - SUN.lower).tolist(), {member.unit for member in SUN if member.name in names}
-    weights = {name: data.draw(st.sampled_from([-2.0, -1.0, 0.5, 1.0])) / widths[SUN.names.index(name)] for name in names}
+    weights = {
+        name: data.draw(st.sampled_from([-2.0, -1.0, 0.5, 1.0])) / widths[SUN.names.index(name)] for name in names
+    }
     middle = sum(weight * float(SUN.original[SUN.names.index(name)]) for name, weight in weights.items())
     room = data.draw(st.tuples(st.floats(0.1, 1), st.floats(0.1, 1)))
     unit = units.pop() if len(units) == 1 else "-"
-    study = load_study("smoke", constraints=[{"sum": weights, "unit": unit, "at_least": middle - room[0], "at_most": middle + room[1]}])
+    study = load_study(
+        "smoke", constraints=[{"sum": weights, "unit": unit, "at_least": middle - room[0], "at_most": middle + room[1]}]
+    )
     region = region_of(study)
-    problem = Problem(characteristics=SUN, original=sphere(SUN, SUN.original[np.newaxis]), evaluations=60, population=12, region=region)
+    problem = Problem(
+        characteristics=SUN,
+        original=sphere(SUN, SUN.original[np.newaxis]),
+        evaluations=60,
+        population=12,
+        region=region,
+    )
     for name, algorithm in ALGORITHMS.items():
         search = algorithm().search(problem, np.random.default_rng(data.draw(st.integers(0, 9))))
         asked, total = next(search), 0
@@ -129,7 +156,10 @@ def test_searches_and_designs_stay_in_any_linear_region_around_the_original(data
 
 def test_tolerance_refuses_characteristics_that_an_equality_ties_and_answers_for_the_others() -> None:
     tied = constrained({"sum": {"mass": 1.0, "maxBrakeTorque": -1.0}, "unit": "-", "at_least": 904.0, "at_most": 904.0})
-    with pytest.raises(InputError, match="fewer than 1 in 1000 random settings satisfy the constraints, which leaves no box to test: mass"):
+    with pytest.raises(
+        InputError,
+        match="fewer than 1 in 1000 random settings satisfy the constraints, which leaves no box to test: mass",
+    ):
         sv.tolerance(tied, characteristics=["mass", "radius"], unsafe="collision", jobs=1)
     free = sv.tolerance(tied, characteristics=["radius"], unsafe="collision", jobs=1)
     assert free.joint.samples > 0
@@ -142,24 +172,50 @@ def constrained(*constraints: Mapping[str, Any]) -> Study:
 MASS = {"sum": {"mass": 1.0}}
 
 
-@pytest.mark.parametrize(("constraints", "problem"), [
-    ([{**MASS, "at_least": 2500.0}], "the original vehicle: violates a constraint: mass = 2404 kg (mass = 2404 kg)"),
-    ([{"sum": {"mass": 1.0, "maxBrakeTorque": -1.0}, "unit": "kg", "at_most": 900.0}],
-     "mass - maxBrakeTorque = 904 kg (mass = 2404 kg, maxBrakeTorque = 1500 N m)\nexpected: at most 900 kg"),
-    ([{**MASS, "at_least": 3000.0}], "mass is between 2040 and 2700 in the domains\nexpected: at least 3000 kg"),
-    ([{**MASS, "at_least": 2404.0}, {"sum": {"mass": 2.0, "tireFric": 1.0}, "unit": "kg", "at_most": 4800.0}],
-     "no setting in the domains satisfies all of them: mass at least 2404 kg; 2 mass + tireFric at most 4800 kg"),
-    ([{"sum": {name: 1.0}, "at_least": float(value), "at_most": float(value)} for name, value in zip(SUN.names, SUN.original, strict=True)],
-     "leave only the original vehicle"),
-    ([{"sum": {"mass": 1.0}, "upper": 1.0}], "constraints[0].upper: there is no such key\nexpected: one of at_least"),
-    ([{"sum": {"mass": 1.0}, "name": "x"}], "constraints[0].name: there is no such key\nexpected: one of at_least"),
-    ([{"sum": {"mas": 1.0}, "at_least": 1.0}], "constraints[0].sum.mas: there is no such characteristic; did you mean 'mass'?"),
-    ([{**MASS, "at_least": 1.0, "unit": "t"}], "constraints[0].unit = 't'\nexpected: 'kg', the unit of mass, or '-'"),
-    ([{"sum": {"mass": 1.0, "radius": 1.0}, "at_least": 1.0}], "constraints[0].sum adds mass [kg], radius [cm]"),
-    ([{**MASS}], "neither at_least nor at_most"), ([{**MASS, "at_least": 2.0, "at_most": 1.0}], "at_least = 2 and at_most = 1"),
-    ([{"at_least": 2.0}], "neither sum nor function"), ([{**MASS, "function": "a:b", "at_most": 2.0}], "both sum and function"),
-    ([{"function": "no_such_module:f", "at_most": 2.0}], "constraints[0].function = 'no_such_module:f'"),
-])
+@pytest.mark.parametrize(
+    ("constraints", "problem"),
+    [
+        (
+            [{**MASS, "at_least": 2500.0}],
+            "the original vehicle: violates a constraint: mass = 2404 kg (mass = 2404 kg)",
+        ),
+        (
+            [{"sum": {"mass": 1.0, "maxBrakeTorque": -1.0}, "unit": "kg", "at_most": 900.0}],
+            "mass - maxBrakeTorque = 904 kg (mass = 2404 kg, maxBrakeTorque = 1500 N m)\nexpected: at most 900 kg",
+        ),
+        ([{**MASS, "at_least": 3000.0}], "mass is between 2040 and 2700 in the domains\nexpected: at least 3000 kg"),
+        (
+            [{**MASS, "at_least": 2404.0}, {"sum": {"mass": 2.0, "tireFric": 1.0}, "unit": "kg", "at_most": 4800.0}],
+            "no setting in the domains satisfies all of them: mass at least 2404 kg; 2 mass + tireFric at most 4800 kg",
+        ),
+        (
+            [
+                {"sum": {name: 1.0}, "at_least": float(value), "at_most": float(value)}
+                for name, value in zip(SUN.names, SUN.original, strict=True)
+            ],
+            "leave only the original vehicle",
+        ),
+        (
+            [{"sum": {"mass": 1.0}, "upper": 1.0}],
+            "constraints[0].upper: there is no such key\nexpected: one of at_least",
+        ),
+        ([{"sum": {"mass": 1.0}, "name": "x"}], "constraints[0].name: there is no such key\nexpected: one of at_least"),
+        (
+            [{"sum": {"mas": 1.0}, "at_least": 1.0}],
+            "constraints[0].sum.mas: there is no such characteristic; did you mean 'mass'?",
+        ),
+        (
+            [{**MASS, "at_least": 1.0, "unit": "t"}],
+            "constraints[0].unit = 't'\nexpected: 'kg', the unit of mass, or '-'",
+        ),
+        ([{"sum": {"mass": 1.0, "radius": 1.0}, "at_least": 1.0}], "constraints[0].sum adds mass [kg], radius [cm]"),
+        ([{**MASS}], "neither at_least nor at_most"),
+        ([{**MASS, "at_least": 2.0, "at_most": 1.0}], "at_least = 2 and at_most = 1"),
+        ([{"at_least": 2.0}], "neither sum nor function"),
+        ([{**MASS, "function": "a:b", "at_most": 2.0}], "both sum and function"),
+        ([{"function": "no_such_module:f", "at_most": 2.0}], "constraints[0].function = 'no_such_module:f'"),
+    ],
+)
 def test_constraints_that_cannot_be_used_are_refused(constraints: list[dict[str, Any]], problem: str) -> None:
     with pytest.raises(InputError) as refused:
         region_of(constrained(*constraints))
@@ -171,15 +227,21 @@ def test_an_infeasible_original_ends_the_command_with_two_lines(in_tmp: Path) ->
     for command in ("study", "tolerance"):
         output = run(command, "heavy.toml", expect=2)
         assert len(output.stderr.splitlines()) == 2
-        assert output.stderr.startswith("safevar-sumo: heavy.toml: the original vehicle: violates a constraint: mass = 2404 kg")
+        assert output.stderr.startswith(
+            "safevar-sumo: heavy.toml: the original vehicle: violates a constraint: mass = 2404 kg"
+        )
 
 
 def test_an_equation_leaves_what_satisfies_it() -> None:
     """Nothing drawn uniformly does: mixtures of the region's vertices do."""
-    study = constrained({"sum": {"mass": 1.0, "maxBrakeTorque": -2.0}, "unit": "kg", "at_least": -596.0, "at_most": -596.0})
+    study = constrained(
+        {"sum": {"mass": 1.0, "maxBrakeTorque": -2.0}, "unit": "kg", "at_least": -596.0, "at_most": -596.0}
+    )
     rng = np.random.default_rng(1)
     region = region_of(study)
-    drawn = region.draw_feasible(lambda some: rng.uniform(SUN.lower, SUN.upper, (some, len(SUN))), 40, rng, filtered=True, rejections=2)
+    drawn = region.draw_feasible(
+        lambda some: rng.uniform(SUN.lower, SUN.upper, (some, len(SUN))), 40, rng, filtered=True, rejections=2
+    )
     filtered = SUN.filter(drawn)
     mass, torque = (filtered[:, SUN.names.index(name)] for name in ("mass", "maxBrakeTorque"))
     assert np.abs(mass - 2 * torque + 596).max() < 1e-5
@@ -197,7 +259,8 @@ def test_an_unfeasible_setting_is_simulated_only_where_that_is_asked_for(bound: 
 
 def test_a_rating_refuses_a_variant_that_violates_a_constraint(in_tmp: Path) -> None:
     Path("light.toml").write_text(
-        'extends = "euro_ncap_rating"\n[[constraints]]\nsum = { payload = 1.0 }\nunit = "kg"\nat_most = 100\n')
+        'extends = "euro_ncap_rating"\n[[constraints]]\nsum = { payload = 1.0 }\nunit = "kg"\nat_most = 100\n'
+    )
     problem = "violates a constraint: payload = 400 kg (payload = 400 kg)\nexpected: at most 100 kg"
     assert run("rating", "light.toml", "--set", "payload=400", expect=2).stderr == f"safevar-sumo: --set: {problem}\n"
     with pytest.raises(InputError) as refused:
@@ -209,7 +272,11 @@ def test_a_rating_refuses_a_variant_that_violates_a_constraint(in_tmp: Path) -> 
 def test_shipped_constraints_say_why_and_leave_a_good_part_of_the_domain(name: str) -> None:
     study = load_study(name)
     members = CharacteristicSet.of(study.vehicle.characteristics)
-    share = np.mean(region_of(study).feasible(np.random.default_rng(1).uniform(members.lower, members.upper, (20_000, len(members)))))
+    share = np.mean(
+        region_of(study).feasible(
+            np.random.default_rng(1).uniform(members.lower, members.upper, (20_000, len(members)))
+        )
+    )
     assert 0.002 < share < 0.9
     assert all(len(one.meaning) > 40 for one in study.constraints)
 

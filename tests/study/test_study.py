@@ -15,7 +15,11 @@ from safevar_sumo.sumo.system import assemble
 
 
 def test_the_published_settings_are_searched_as_published() -> None:
-    for name, population, evaluations, threshold in (("sun", 50, 5000, 1.5), ("rain", 50, 5000, 1.5), ("lgsvl", 30, 3000, 3.0)):
+    for name, population, evaluations, threshold in (
+        ("sun", 50, 5000, 1.5),
+        ("rain", 50, 5000, 1.5),
+        ("lgsvl", 30, 3000, 3.0),
+    ):
         study = load_study(name)
         assert (study.search.population, study.search.evaluations, study.search.runs) == (population, evaluations, 30)
         assert study.metrics.ttc_threshold == threshold
@@ -28,11 +32,20 @@ REACTS = {"hesitation", "brake_place"}
 def test_rain_differs_from_sun_only_in_weather_and_reaction_of_its_driver() -> None:
     sun, rain = load_study("sun"), load_study("rain")
     assert rain.weather != sun.weather
-    assert {name: value for name, value in rain.ads.parameters.items() if sun.ads.parameters.get(name) != value}.keys() == REACTS
+    assert {
+        name: value for name, value in rain.ads.parameters.items() if sun.ads.parameters.get(name) != value
+    }.keys() == REACTS
     assert msgspec.structs.replace(rain.ads, parameters=sun.ads.parameters) == sun.ads
-    same = {"name": sun.name, "title": sun.title, "published": sun.published, "calibration": sun.calibration,
-            "repeatability": sun.repeatability, "fit": sun.fit, "spread": sun.spread,
-            "model_error": sun.model_error}
+    same = {
+        "name": sun.name,
+        "title": sun.title,
+        "published": sun.published,
+        "calibration": sun.calibration,
+        "repeatability": sun.repeatability,
+        "fit": sun.fit,
+        "spread": sun.spread,
+        "model_error": sun.model_error,
+    }
     assert msgspec.structs.replace(rain, weather=sun.weather, ads=sun.ads, **same) == sun
     assert set(rain.calibration) == {f"ads.parameters.{name}" for name in REACTS}
     assert all(row.own for row in rain.calibration.values())
@@ -46,26 +59,45 @@ def variant(tmp_path: Path, old: str, new: str) -> str:
     return str(path)
 
 
-@pytest.mark.parametrize(("old", "new", "expected"), [
-    ("runs = 30", "runs = 30\ntime_limit = inf", "search.time_limit = inf"),
-    ("runs = 30", "runs = 30\ntime_limit = 0", "search.time_limit = 0"),
-    ("ttc_threshold = 1.5", "ttc_threshold = 1.5\nttc = 2", "metrics.ttc: there is no such key"),
-    ("ttc_threshold = 1.5", "ttc_threshold = '1.5'", "metrics.ttc_threshold = '1.5'"),
-    ("ttc_threshold = 1.5", "ttc_threshold = nan", "metrics.ttc_threshold = nan"),
-    ("ttc_threshold = 1.5", "ttc_threshold = -1", "metrics.ttc_threshold = -1"),
-    ("population = 50", "population = 1", "search.population = 1"),
-    ("population = 50", "population = 50.5", "search.population = 50.5"),
-    ("runs = 30", "", "search.runs is missing"),
-    ("lower = 4200, upper = 7000", "lower = 7000, upper = 4200", "vehicle.characteristics.max_rpm: lower = 7000.0 and upper = 4200.0"),
-    ("lower = 4200, upper = 7000", "lower = 5800, upper = 5800", "vehicle.characteristics.max_rpm: lower = 5800.0 and upper = 5800.0"),
-    ("lower = 4200, upper = 7000", "lower = 5900, upper = 7000", "vehicle.characteristics.max_rpm.original = 5800.0"),
-    ("original = 5800", "original = nan", "vehicle.characteristics.max_rpm.original = nan"),
-    ("original = 5800", "original = 'many'", "vehicle.characteristics.max_rpm.original = 'many'"),
-    ("original = 0.15, lower = 0.1", "original = 0, lower = -1", "vehicle.characteristics.dampRateFullT.original = 0"),
-    ("[ads]", "[ads", "is not TOML"),
-    ('name = "sun"', 'name = "../sun"', "name = '../sun'\nexpected: letters, digits, _, . and -"),
-    ('name = "sun"', 'name = "sun"\nextends = "nothing"', "nothing"),
-])
+@pytest.mark.parametrize(
+    ("old", "new", "expected"),
+    [
+        ("runs = 30", "runs = 30\ntime_limit = inf", "search.time_limit = inf"),
+        ("runs = 30", "runs = 30\ntime_limit = 0", "search.time_limit = 0"),
+        ("ttc_threshold = 1.5", "ttc_threshold = 1.5\nttc = 2", "metrics.ttc: there is no such key"),
+        ("ttc_threshold = 1.5", "ttc_threshold = '1.5'", "metrics.ttc_threshold = '1.5'"),
+        ("ttc_threshold = 1.5", "ttc_threshold = nan", "metrics.ttc_threshold = nan"),
+        ("ttc_threshold = 1.5", "ttc_threshold = -1", "metrics.ttc_threshold = -1"),
+        ("population = 50", "population = 1", "search.population = 1"),
+        ("population = 50", "population = 50.5", "search.population = 50.5"),
+        ("runs = 30", "", "search.runs is missing"),
+        (
+            "lower = 4200, upper = 7000",
+            "lower = 7000, upper = 4200",
+            "vehicle.characteristics.max_rpm: lower = 7000.0 and upper = 4200.0",
+        ),
+        (
+            "lower = 4200, upper = 7000",
+            "lower = 5800, upper = 5800",
+            "vehicle.characteristics.max_rpm: lower = 5800.0 and upper = 5800.0",
+        ),
+        (
+            "lower = 4200, upper = 7000",
+            "lower = 5900, upper = 7000",
+            "vehicle.characteristics.max_rpm.original = 5800.0",
+        ),
+        ("original = 5800", "original = nan", "vehicle.characteristics.max_rpm.original = nan"),
+        ("original = 5800", "original = 'many'", "vehicle.characteristics.max_rpm.original = 'many'"),
+        (
+            "original = 0.15, lower = 0.1",
+            "original = 0, lower = -1",
+            "vehicle.characteristics.dampRateFullT.original = 0",
+        ),
+        ("[ads]", "[ads", "is not TOML"),
+        ('name = "sun"', 'name = "../sun"', "name = '../sun'\nexpected: letters, digits, _, . and -"),
+        ('name = "sun"', 'name = "sun"\nextends = "nothing"', "nothing"),
+    ],
+)
 def test_a_bad_study_is_refused_with_file_key_and_value(tmp_path: Path, old: str, new: str, expected: str) -> None:
     path = variant(tmp_path, old, new)
     with pytest.raises(InputError) as caught:
@@ -76,42 +108,71 @@ def test_a_bad_study_is_refused_with_file_key_and_value(tmp_path: Path, old: str
     assert len(message.splitlines()) <= 2
 
 
-@pytest.mark.parametrize(("text", "expected"), [
-    ("[search]\nruns = 1_000_000", "search.runs = 1000000"),
-    ("[search]\nevaluations = 9223372036854775807", "search.evaluations"),
-    ("[variation.mass]\ndistribution = 'normal'\ndeviation = 1e300", "variation.mass.deviation = 1e+300\nexpected: at most 66000"),
-    ("[variation.mass]\ndistribution = 'uniform'\nlower = 9999", "variation.mass.lower = 9999"),
-    ('[calibration."ads.parameters.brake_gap"]\nlower = "a"', "calibration.'ads.parameters.brake_gap'.lower = 'a'"),
-    ('[calibration."ads.parameters.brake_gap"]\nlow = 1', "calibration.'ads.parameters.brake_gap'.low: there is no such key"),
-    ('[published]\ntet = "much"', "published.tet = 'much'"),
-    ("seed = 3", "seed: there is no such key; did you mean search.seed or fit.seed?"),
-    ("[search]\nttc_threshold = 3", "search.ttc_threshold: there is no such key; did you mean metrics.ttc_threshold?"),
-    ("[vehicle.characteristics.masss]\noriginal = 9", "vehicle.characteristics.masss lacks unit, lower, upper; did you mean 'mass'?"),
-    ("evaluatons = 5", "evaluatons: there is no such key; did you mean search.evaluations?"),
-    ("\n".join(f"x{i} = 1" for i in range(20_000)), "more than 8 mistakes: x0: there is no such key"),
-    ('[weather]\nname = "x"\nroad_friction = 0\nvisibility = 1', "weather.road_friction = 0\nexpected: a number above 0 to 1.5"),
-    ("zzz = 1", "zzz: there is no such key\nexpected: one of ads, calibration"),
-    ("[origin]\nplaces = []", "origin"),
-    ("[vehicle]\ncharacteristics = 3", "vehicle.characteristics = 3\nexpected: a table"),
-    ('[ads]\nkind = "fmuu"', "ads.kind = 'fmuu'; did you mean 'fmu'?\nexpected: one of fmu, traci, or no such key"),
-    ('[variation.mass]\ndistribution = "norml"', "mass.distribution = 'norml'; did you mean 'normal'?\nexpected: one of fixed, lognormal"),
-    ('[metrics]\nalso = ["max_jerk", "max_jerk"]', "'max_jerk' is listed 2 times\nexpected: each metric once"),
-    ("[[constraints]]\nsum = { mass = 'a' }", "constraints[0].sum.mass = 'a'\nexpected: a number"),
-    ('extends = "euro_ncap_rating"\n[rating.claims]\nCCRs = [3]', "rating.claims.CCRs[0] = 3\nexpected: a text"),
-    ('[rating.claims]\nCCRs = ["glare"]', "rating.claims: the study is not rated\nexpected: matrix.protocol"),
-    ("search = 3", "search = 3"),
-    ('[vehicle]\nmodel = "tesla"', "vehicle.characteristics is missing, for model = 'tesla'"),
-    ('extends = "mine.toml"\n', "extends = 'mine.toml' leads back to this file\nexpected: a study that does not extend"),
-    ("[vehicle]\nstep = 0.001", "vehicle.step: 'carla' is no FMU\nexpected: no such key, or vehicle.kind = \"fmu\""),
-    ('[vehicle.inputs]\nfoo = "bar"', "vehicle.inputs: 'carla' is no FMU"),
-    ("[vehicle.sensors]\nmount = 1", "vehicle.sensors: 'carla' is no FMU"),
-    ("[ads]\nstep = 0.2", "ads.step: 'world_on_rails' is no FMU"),
-    ('[ads.outputs]\nfoo = "bar"', "ads.outputs: 'world_on_rails' is no FMU"),
-    ('[scenario]\nkind = "fmu"', "scenario.kind: 'pedestrian_crossing' is no FMU\nexpected: no such key"),
-    ('[calibration."ads.parameters.brake_gapp"]\nlower = 1\nupper = 2\nunit = "m"\nmeaning = "x"',
-     "calibration.'ads.parameters.brake_gapp' is no parameter of the study"),
-    ("extends = 3\n", "extends"),
-])
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("[search]\nruns = 1_000_000", "search.runs = 1000000"),
+        ("[search]\nevaluations = 9223372036854775807", "search.evaluations"),
+        (
+            "[variation.mass]\ndistribution = 'normal'\ndeviation = 1e300",
+            "variation.mass.deviation = 1e+300\nexpected: at most 66000",
+        ),
+        ("[variation.mass]\ndistribution = 'uniform'\nlower = 9999", "variation.mass.lower = 9999"),
+        ('[calibration."ads.parameters.brake_gap"]\nlower = "a"', "calibration.'ads.parameters.brake_gap'.lower = 'a'"),
+        (
+            '[calibration."ads.parameters.brake_gap"]\nlow = 1',
+            "calibration.'ads.parameters.brake_gap'.low: there is no such key",
+        ),
+        ('[published]\ntet = "much"', "published.tet = 'much'"),
+        ("seed = 3", "seed: there is no such key; did you mean search.seed or fit.seed?"),
+        (
+            "[search]\nttc_threshold = 3",
+            "search.ttc_threshold: there is no such key; did you mean metrics.ttc_threshold?",
+        ),
+        (
+            "[vehicle.characteristics.masss]\noriginal = 9",
+            "vehicle.characteristics.masss lacks unit, lower, upper; did you mean 'mass'?",
+        ),
+        ("evaluatons = 5", "evaluatons: there is no such key; did you mean search.evaluations?"),
+        ("\n".join(f"x{i} = 1" for i in range(20_000)), "more than 8 mistakes: x0: there is no such key"),
+        (
+            '[weather]\nname = "x"\nroad_friction = 0\nvisibility = 1',
+            "weather.road_friction = 0\nexpected: a number above 0 to 1.5",
+        ),
+        ("zzz = 1", "zzz: there is no such key\nexpected: one of ads, calibration"),
+        ("[origin]\nplaces = []", "origin"),
+        ("[vehicle]\ncharacteristics = 3", "vehicle.characteristics = 3\nexpected: a table"),
+        ('[ads]\nkind = "fmuu"', "ads.kind = 'fmuu'; did you mean 'fmu'?\nexpected: one of fmu, traci, or no such key"),
+        (
+            '[variation.mass]\ndistribution = "norml"',
+            "mass.distribution = 'norml'; did you mean 'normal'?\nexpected: one of fixed, lognormal",
+        ),
+        ('[metrics]\nalso = ["max_jerk", "max_jerk"]', "'max_jerk' is listed 2 times\nexpected: each metric once"),
+        ("[[constraints]]\nsum = { mass = 'a' }", "constraints[0].sum.mass = 'a'\nexpected: a number"),
+        ('extends = "euro_ncap_rating"\n[rating.claims]\nCCRs = [3]', "rating.claims.CCRs[0] = 3\nexpected: a text"),
+        ('[rating.claims]\nCCRs = ["glare"]', "rating.claims: the study is not rated\nexpected: matrix.protocol"),
+        ("search = 3", "search = 3"),
+        ('[vehicle]\nmodel = "tesla"', "vehicle.characteristics is missing, for model = 'tesla'"),
+        (
+            'extends = "mine.toml"\n',
+            "extends = 'mine.toml' leads back to this file\nexpected: a study that does not extend",
+        ),
+        (
+            "[vehicle]\nstep = 0.001",
+            "vehicle.step: 'carla' is no FMU\nexpected: no such key, or vehicle.kind = \"fmu\"",
+        ),
+        ('[vehicle.inputs]\nfoo = "bar"', "vehicle.inputs: 'carla' is no FMU"),
+        ("[vehicle.sensors]\nmount = 1", "vehicle.sensors: 'carla' is no FMU"),
+        ("[ads]\nstep = 0.2", "ads.step: 'world_on_rails' is no FMU"),
+        ('[ads.outputs]\nfoo = "bar"', "ads.outputs: 'world_on_rails' is no FMU"),
+        ('[scenario]\nkind = "fmu"', "scenario.kind: 'pedestrian_crossing' is no FMU\nexpected: no such key"),
+        (
+            '[calibration."ads.parameters.brake_gapp"]\nlower = 1\nupper = 2\nunit = "m"\nmeaning = "x"',
+            "calibration.'ads.parameters.brake_gapp' is no parameter of the study",
+        ),
+        ("extends = 3\n", "extends"),
+    ],
+)
 def test_an_unusable_value_is_refused_by_its_key(text: str, expected: str, tmp_path: Path) -> None:
     path = tmp_path / "mine.toml"
     path.write_text(text if text.startswith("extends") else f'extends = "smoke"\nname = "mine"\n{text}\n')
@@ -122,14 +183,23 @@ def test_an_unusable_value_is_refused_by_its_key(text: str, expected: str, tmp_p
     assert len(str(caught.value)) < 1000
 
 
-@pytest.mark.parametrize(("text", "expected"), [
-    ("[model_error]\nsafety_degre = 1", "model_error.safety_degre is no metric; did you mean 'safety_degree'?"),
-    ("[repeatability]\nfoo = 1", "repeatability.foo is no metric\nexpected: one of ave_dece"),
-    ("[fit.weights]\ntett = 1", "fit.weights.tett is no metric; did you mean 'tet'?"),
-    ("[ads.parameters]\nthrottle = [true, 0.2, 0.3]", "ads.parameters.throttle[0] = True\nexpected: a number"),
-    ('[scenario.parameters]\nnetwork = "nope"', "mine.toml: scenario.parameters.network: there is no network 'nope'"),
-    ('[metrics]\nalso = ["tet"]', "metrics.also = ['tet']: every study has 'tet'\nexpected: one of brake_harshness"),
-])
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("[model_error]\nsafety_degre = 1", "model_error.safety_degre is no metric; did you mean 'safety_degree'?"),
+        ("[repeatability]\nfoo = 1", "repeatability.foo is no metric\nexpected: one of ave_dece"),
+        ("[fit.weights]\ntett = 1", "fit.weights.tett is no metric; did you mean 'tet'?"),
+        ("[ads.parameters]\nthrottle = [true, 0.2, 0.3]", "ads.parameters.throttle[0] = True\nexpected: a number"),
+        (
+            '[scenario.parameters]\nnetwork = "nope"',
+            "mine.toml: scenario.parameters.network: there is no network 'nope'",
+        ),
+        (
+            '[metrics]\nalso = ["tet"]',
+            "metrics.also = ['tet']: every study has 'tet'\nexpected: one of brake_harshness",
+        ),
+    ],
+)
 def test_a_value_that_a_model_refuses_is_named(text: str, expected: str, tmp_path: Path) -> None:
     (tmp_path / "mine.toml").write_text(f'extends = "smoke"\n{text}\n')
     with pytest.raises(InputError) as caught:
@@ -140,19 +210,29 @@ def test_a_value_that_a_model_refuses_is_named(text: str, expected: str, tmp_pat
 
 def test_all_mistakes_of_a_file_are_reported_at_once(tmp_path: Path) -> None:
     path = tmp_path / "mine.toml"
-    path.write_text('extends = "smoke"\nname = "mine"\n[search]\nruns = 0\npopulation = "x"\nseeds = 1\n'
-                    "[vehicle.characteristics.mass]\nunit = 3\n")
+    path.write_text(
+        'extends = "smoke"\nname = "mine"\n[search]\nruns = 0\npopulation = "x"\nseeds = 1\n'
+        "[vehicle.characteristics.mass]\nunit = 3\n"
+    )
     with pytest.raises(InputError, match="4 mistakes") as caught:
         load_study(str(path))
     for key in ("search.runs = 0", "search.population = 'x'", "search.seeds", "vehicle.characteristics.mass.unit = 3"):
         assert key in str(caught.value)
 
 
-@pytest.mark.parametrize(("text", "inherits"), [
-    ('weather = "fog"', False), ('[ads]\nmodel = "krauss"', False), ("[ads.parameters]\nlatency = 0.1", True),
-    ('[scenario.parameters]\nnetwork = "my_town"', False), ('[[matrix.tests]]\nname = "late"\n', False),
-    ("[scenario.parameters]\nduration = 5.0", True), ("[search]\nruns = 3", True), ('[ads]\nmodel = "world_on_rails"', True),
-])
+@pytest.mark.parametrize(
+    ("text", "inherits"),
+    [
+        ('weather = "fog"', False),
+        ('[ads]\nmodel = "krauss"', False),
+        ("[ads.parameters]\nlatency = 0.1", True),
+        ('[scenario.parameters]\nnetwork = "my_town"', False),
+        ('[[matrix.tests]]\nname = "late"\n', False),
+        ("[scenario.parameters]\nduration = 5.0", True),
+        ("[search]\nruns = 3", True),
+        ('[ads]\nmodel = "world_on_rails"', True),
+    ],
+)
 def test_another_system_inherits_neither_title_nor_published_values(text: str, inherits: bool, tmp_path: Path) -> None:
     (tmp_path / "mine.toml").write_text(f'extends = "sun"\n{text}\n')
     study, sun = load_study(str(tmp_path / "mine.toml")), load_study("sun")
@@ -175,10 +255,14 @@ def test_a_written_study_is_called_as_its_file(tmp_path: Path) -> None:
     assert output.published == load_study("sun").published
 
 
-@pytest.mark.parametrize(("base", "reason"), [
-    ("nope.toml", "there is no study or file 'nope.toml'"), (".", "is no regular file but a directory"),
-    ("LOOP", "cannot be read: Too many levels of symbolic links"),
-])
+@pytest.mark.parametrize(
+    ("base", "reason"),
+    [
+        ("nope.toml", "there is no study or file 'nope.toml'"),
+        (".", "is no regular file but a directory"),
+        ("LOOP", "cannot be read: Too many levels of symbolic links"),
+    ],
+)
 def test_an_unreadable_base_is_named_with_file_and_key(tmp_path: Path, base: str, reason: str) -> None:
     loop = tmp_path / "loop.toml"
     loop.symlink_to(loop)

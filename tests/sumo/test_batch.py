@@ -29,7 +29,10 @@ def drawn(system: System, n: int, seed: int) -> np.ndarray:
 
 
 def same_bits(one: Evaluations, other: Evaluations) -> bool:
-    numbers = [(one.collision_speed, other.collision_speed), *((one.metrics[name], other.metrics[name]) for name in one.metrics)]
+    numbers = [
+        (one.collision_speed, other.collision_speed),
+        *((one.metrics[name], other.metrics[name]) for name in one.metrics),
+    ]
     return bool(np.array_equal(one.outcome, other.outcome)) and all(a.tobytes() == b.tobytes() for a, b in numbers)
 
 
@@ -37,7 +40,9 @@ def same_bits(one: Evaluations, other: Evaluations) -> bool:
 @pytest.mark.parametrize("study", ["rain", "lgsvl", "native"])
 @settings(max_examples=6, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(seed=st.integers(0, 2**32 - 1), n=st.integers(2, 23), data=st.data())
-def test_a_result_depends_neither_on_the_batch_nor_on_its_size(study: str, seed: int, n: int, data: st.DataObject) -> None:
+def test_a_result_depends_neither_on_the_batch_nor_on_its_size(
+    study: str, seed: int, n: int, data: st.DataObject
+) -> None:
     system = assemble(load_study(study))
     population = drawn(system, n, seed)
     together = evaluate(system, population)
@@ -83,15 +88,21 @@ def judged(*samples: tuple[float, bool, float | None]) -> tuple[str, list[bool],
     return str(outcomes.classify()[0]), active, float(outcomes.collision_speed[0])
 
 
-@pytest.mark.parametrize(("samples", "outcome"), [
-    (((0, False, None), (2, False, None), (2, False, None)), Outcome.TIMEOUT),
-    (((0, False, None), (0, False, None), (0, False, None)), Outcome.NEVER_MOVED),
-    (((0, False, None), (0, False, None), (0, True, None)), Outcome.NEVER_MOVED),
-    (((0, False, None), (2, False, None), (0, False, None)), Outcome.STOPPED),
-    (((0, False, None), (2, False, None), (2, True, None), (2, False, None)), Outcome.PASSED),
-    (((0, False, None), (2, False, None), (2, False, 1.5), (0, False, None)), Outcome.COLLISION),
-    (((0, False, None), (0, False, 0.0), (0, False, None)), Outcome.COLLISION)])
-def test_the_last_samples_determine_the_outcome(samples: tuple[tuple[float, bool, float | None], ...], outcome: Outcome) -> None:
+@pytest.mark.parametrize(
+    ("samples", "outcome"),
+    [
+        (((0, False, None), (2, False, None), (2, False, None)), Outcome.TIMEOUT),
+        (((0, False, None), (0, False, None), (0, False, None)), Outcome.NEVER_MOVED),
+        (((0, False, None), (0, False, None), (0, True, None)), Outcome.NEVER_MOVED),
+        (((0, False, None), (2, False, None), (0, False, None)), Outcome.STOPPED),
+        (((0, False, None), (2, False, None), (2, True, None), (2, False, None)), Outcome.PASSED),
+        (((0, False, None), (2, False, None), (2, False, 1.5), (0, False, None)), Outcome.COLLISION),
+        (((0, False, None), (0, False, 0.0), (0, False, None)), Outcome.COLLISION),
+    ],
+)
+def test_the_last_samples_determine_the_outcome(
+    samples: tuple[tuple[float, bool, float | None], ...], outcome: Outcome
+) -> None:
     assert judged(*samples)[0] == outcome
 
 
@@ -176,11 +187,17 @@ def observed(delay: float) -> tuple[np.ndarray, np.ndarray]:
     perception = Perception(Weather(name="any", road_friction=1.0, visibility=0.7, recognition_delay=delay), STEP)
     seen = []
     for time in TIMES:
-        scene = Scene(np.array([20 - 5 * time]), np.array([-3 + 2 * time]), np.array([2 + time]), np.zeros(1, dtype=bool))
+        scene = Scene(
+            np.array([20 - 5 * time]), np.array([-3 + 2 * time]), np.array([2 + time]), np.zeros(1, dtype=bool)
+        )
         seen.append(perception.observe(float(time), np.array([5 + time]), scene))
     assert all(one.visibility == 0.7 for one in seen)
-    return (np.array([one.speed[0] for one in seen]),
-            np.array([[values[0] for values in (one.gap, one.closing_speed, one.lateral, one.lateral_speed)] for one in seen]))
+    return (
+        np.array([one.speed[0] for one in seen]),
+        np.array(
+            [[values[0] for values in (one.gap, one.closing_speed, one.lateral, one.lateral_speed)] for one in seen]
+        ),
+    )
 
 
 @pytest.mark.parametrize("delay", [0.0, 0.05, 0.0863, 0.1, 0.15])
@@ -189,15 +206,19 @@ def test_the_scene_is_observed_with_delay_and_the_own_speed_without(delay: float
     then = np.maximum(TIMES - delay, 0.0)
     assert speed == pytest.approx(5 + TIMES)
     if delay in (0.05, 0.15):
-        assert np.array_equal(scene[4:], observed(0.0)[1][4 - round(delay / STEP):-round(delay / STEP)]), "whole steps are exact"
+        assert np.array_equal(scene[4:], observed(0.0)[1][4 - round(delay / STEP) : -round(delay / STEP)]), (
+            "whole steps are exact"
+        )
     assert scene == pytest.approx(np.stack([20 - 5 * then, 5 + then, -3 + 2 * then, 2 + then], axis=1))
 
 
 def test_an_obstacle_that_appears_is_not_interpolated_from_infinity() -> None:
     perception = Perception(Weather(name="any", road_friction=1.0, visibility=1.0, recognition_delay=0.03), STEP)
     nothing = np.zeros(1)
-    gaps = [perception.observe(time, nothing, Scene(np.array([gap]), nothing, nothing, nothing > 0)).gap[0]
-            for time, gap in zip(TIMES.tolist(), [np.inf, np.inf, 5.0, 4.0], strict=False)]
+    gaps = [
+        perception.observe(time, nothing, Scene(np.array([gap]), nothing, nothing, nothing > 0)).gap[0]
+        for time, gap in zip(TIMES.tolist(), [np.inf, np.inf, 5.0, 4.0], strict=False)
+    ]
     assert gaps == pytest.approx([np.inf, np.inf, np.inf, 4.6])
 
 

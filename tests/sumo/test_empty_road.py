@@ -39,20 +39,30 @@ def reason(study: str | Study, pedals: Callable[[Observation], tuple[object, obj
     return why_no_verdict(replace(assemble(load_study(study)), ads=Pedals(pedals)))
 
 
-@pytest.mark.parametrize("name", [
-    name if name in SIMPLE_STUDIES else pytest.param(name, marks=pytest.mark.slow) for name in study_names()])
+@pytest.mark.parametrize(
+    "name", [name if name in SIMPLE_STUDIES else pytest.param(name, marks=pytest.mark.slow) for name in study_names()]
+)
 def test_the_original_vehicle_of_every_shipped_study_drives_to_the_encounter(name: str) -> None:
     assert why_no_verdict(assemble(load_study(name))) == ""
 
 
-@pytest.mark.parametrize(("pedals", "expected"), [
-    (lambda seen: (0, 1), STANDS), (lambda seen: (0, 0), STANDS),
-    (lambda seen: (0.02, seen.gap < 5), STANDS.replace("0.0 of", "0.4 of")),
-    (lambda seen: (0.9 * (seen.time < 1.5), seen.time > 1.5), "The original vehicle brakes without an obstacle: no verdict."),
-    (lambda seen: (seen.speed < 5, seen.speed > 5), ""),  # a cruise control with the pedals' full strokes
-    (lambda seen: (0.9, np.isfinite(seen.gap)), "")])  # stands on its brake, but only because of the pedestrian
+@pytest.mark.parametrize(
+    ("pedals", "expected"),
+    [
+        (lambda seen: (0, 1), STANDS),
+        (lambda seen: (0, 0), STANDS),
+        (lambda seen: (0.02, seen.gap < 5), STANDS.replace("0.0 of", "0.4 of")),
+        (
+            lambda seen: (0.9 * (seen.time < 1.5), seen.time > 1.5),
+            "The original vehicle brakes without an obstacle: no verdict.",
+        ),
+        (lambda seen: (seen.speed < 5, seen.speed > 5), ""),  # a cruise control with the pedals' full strokes
+        (lambda seen: (0.9, np.isfinite(seen.gap)), ""),
+    ],
+)  # stands on its brake, but only because of the pedestrian
 def test_who_stands_creeps_or_brakes_for_nobody_gets_no_verdict(
-        pedals: Callable[[Observation], tuple[FloatArray, FloatArray]], expected: str) -> None:
+    pedals: Callable[[Observation], tuple[FloatArray, FloatArray]], expected: str
+) -> None:
     assert reason("smoke", pedals) == expected
 
 
@@ -60,22 +70,34 @@ def test_a_robot_drives_who_does_nothing_to_the_target_but_braking_for_nobody_is
     test = study_at(load_study("euro_ncap_car_to_car"), "CCRm, speed 50, impact_location 50, clear", "test")
     assert reason(test, lambda seen: (0, 0)) == ""
     assert reason(test, lambda seen: (0, 1)) == "The original vehicle brakes without an obstacle: no verdict."
-    assert reason(test, lambda seen: (0, 0.1 * (seen.time == 0))).startswith("The original vehicle never reaches the encounter (it gets ")
+    assert reason(test, lambda seen: (0, 0.1 * (seen.time == 0))).startswith(
+        "The original vehicle never reaches the encounter (it gets "
+    )
 
 
 @pytest.mark.slow
 def test_the_reason_counts_the_points_and_names_one() -> None:
     said = reason("euro_ncap_car_to_car", lambda seen: (0, seen.speed > 3))  # not at 10 km/h
-    assert said.startswith("The original vehicle brakes without an obstacle at 24 of 27 points, such as CCRs, speed 20, ")
+    assert said.startswith(
+        "The original vehicle brakes without an obstacle at 24 of 27 points, such as CCRs, speed 20, "
+    )
 
 
-@pytest.mark.parametrize(("step", "expected"), [
-    ("traci.vehicle.setSpeed(vehicle_id, 0)", "it gets 0.0 of 60.3 m"),
-    ("traci.vehicle.setSpeed(vehicle_id, 0 if traci.vehicle.getLeader(vehicle_id, 100) else 12)", "")])
-def test_a_traci_controller_sees_nobody(step: str, expected: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("step", "expected"),
+    [
+        ("traci.vehicle.setSpeed(vehicle_id, 0)", "it gets 0.0 of 60.3 m"),
+        ("traci.vehicle.setSpeed(vehicle_id, 0 if traci.vehicle.getLeader(vehicle_id, 100) else 12)", ""),
+    ],
+)
+def test_a_traci_controller_sees_nobody(
+    step: str, expected: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     Path("controller.py").write_text(f"def step(traci, vehicle_id):\n    {step}\n")
-    Path("mine.toml").write_text('extends = "native"\nname = "mine"\n[ads]\nkind = "traci"\nmodel = "controller:step"\n')
+    Path("mine.toml").write_text(
+        'extends = "native"\nname = "mine"\n[ads]\nkind = "traci"\nmodel = "controller:step"\n'
+    )
     said = why_no_verdict(assemble(load_study("mine.toml")))
     assert expected in said
     assert bool(said) == bool(expected)
@@ -85,8 +107,10 @@ def test_a_traci_controller_sees_nobody(step: str, expected: str, tmp_path: Path
 def still(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
     """A study file whose driving system always returns the same pedals."""
     monkeypatch.chdir(tmp_path)
-    Path("still.py").write_text("from safevar_sumo.ads import ScalarAds\n\n\nclass Still(ScalarAds):\n    def drive(self, seen):\n"
-                                f"        return {request.param}\n")
+    Path("still.py").write_text(
+        "from safevar_sumo.ads import ScalarAds\n\n\nclass Still(ScalarAds):\n    def drive(self, seen):\n"
+        f"        return {request.param}\n"
+    )
     Path("still.toml").write_text('extends = "smoke"\nname = "still"\n[ads]\nmodel = "still:Still"\nparameters = {}\n')
     return "still.toml"
 
@@ -105,10 +129,16 @@ def test_an_answer_begins_with_the_reason(still: str) -> None:
 @pytest.mark.slow
 @pytest.mark.usefixtures("worker_processes")
 def test_every_command_begins_with_the_reason(still: str) -> None:
-    for command in (("tolerance", still), ("risk", still, "--samples", "100"), ("explain", still),
-                    ("simulate", still, "--set", "mass=2400..2600")):
+    for command in (
+        ("tolerance", still),
+        ("risk", still, "--samples", "100"),
+        ("explain", still),
+        ("simulate", still, "--set", "mass=2400..2600"),
+    ):
         begins_with_the_reason(*command)
-    assert run("study", still, "--runs", "1", "--evaluations", "20", "--out", "results").stdout.splitlines()[0] == STANDS
+    assert (
+        run("study", still, "--runs", "1", "--evaluations", "20", "--out", "results").stdout.splitlines()[0] == STANDS
+    )
     begins_with_the_reason("opinion", "results")
     run("check", still, expect=1)
     run("report", "results", "--out", "page.html")

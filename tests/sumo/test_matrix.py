@@ -25,8 +25,12 @@ from safevar_sumo.sumo.world import Body
 
 BASE = load_study("euro_ncap_pedestrian")
 TESTS = [
-    MatrixTest(name="CPNA", parameters={"test": "CPNA"}, over={"speed": [20, 50], "impact_location": [25, 75]},
-               weathers=["clear", "carla_hard_rain"]),
+    MatrixTest(
+        name="CPNA",
+        parameters={"test": "CPNA"},
+        over={"speed": [20, 50], "impact_location": [25, 75]},
+        weathers=["clear", "carla_hard_rain"],
+    ),
     MatrixTest(name="CPNCO", parameters={"test": "CPNCO"}, over={"speed": [40]}),
     MatrixTest(name="CPLA", model="along", over={"speed": [30]}),
 ]
@@ -46,7 +50,8 @@ def drawn(system: System, n: int) -> np.ndarray:
 
 def same(one: Evaluations, other: Evaluations) -> bool:
     return bool((one.outcome == other.outcome).all()) and all(
-        one.metrics[name].tobytes() == other.metrics[name].tobytes() for name in one.metrics)
+        one.metrics[name].tobytes() == other.metrics[name].tobytes() for name in one.metrics
+    )
 
 
 @pytest.mark.slow
@@ -54,8 +59,10 @@ def test_the_worst_point_decides_a_settings_result_and_points_do_not_affect_each
     population = drawn(SYSTEM, 3)
     points = simulate_all_points(SYSTEM, population)
     assert [one.point.name for one in points][:3] == [
-        "CPNA, speed 20, impact_location 25, clear", "CPNA, speed 20, impact_location 25, carla_hard_rain",
-        "CPNA, speed 20, impact_location 75, clear"]
+        "CPNA, speed 20, impact_location 25, clear",
+        "CPNA, speed 20, impact_location 25, carla_hard_rain",
+        "CPNA, speed 20, impact_location 75, clear",
+    ]
     assert len(points) == 10
     for one in points[::3]:
         alone = evaluate(SYSTEM.at(one.point), population)
@@ -68,7 +75,9 @@ def test_the_worst_point_decides_a_settings_result_and_points_do_not_affect_each
 
 
 @pytest.mark.slow
-def test_results_do_not_depend_on_the_batch_the_order_of_points_or_the_size_of_simulations(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_results_do_not_depend_on_the_batch_the_order_of_points_or_the_size_of_simulations(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     population = drawn(SYSTEM, 3)
     whole = evaluate(SYSTEM, population)
     assert same(evaluate(SYSTEM, population[1:3]), whole.take([1, 2]))
@@ -83,13 +92,16 @@ def test_named_point_finds_a_point_and_suggests_similar_names() -> None:
         system_at_point(SYSTEM, "CPNCO", "--point")
 
 
-@pytest.mark.parametrize(("tests", "message"), [
-    ([TESTS[2], TESTS[2]], "2 points are 'CPLA"),
-    ([MatrixTest(name="x", over={"spede": [1]})], "spede"),
-    ([MatrixTest(name="x", over={"speed": [-1]})], "speed"),
-    ([MatrixTest(name="x", weathers=["sunny"])], "sunny"),
-    ([MatrixTest(name="x", model="nothing")], "nothing"),
-])
+@pytest.mark.parametrize(
+    ("tests", "message"),
+    [
+        ([TESTS[2], TESTS[2]], "2 points are 'CPLA"),
+        ([MatrixTest(name="x", over={"spede": [1]})], "spede"),
+        ([MatrixTest(name="x", over={"speed": [-1]})], "speed"),
+        ([MatrixTest(name="x", weathers=["sunny"])], "sunny"),
+        ([MatrixTest(name="x", model="nothing")], "nothing"),
+    ],
+)
 def test_the_error_names_the_wrong_value_in_a_matrix(tests: list[MatrixTest], message: str) -> None:
     with pytest.raises(InputError, match=message):
         assemble(study(tests))
@@ -104,7 +116,9 @@ EAST = np.array([1.0, 0.0])
 class Pedals(Ads):
     """Throttle and brake over time [s]."""
 
-    def __init__(self, throttle: float = 0.5, *, brakes: tuple[float, float] = (99.0, 99.0), lets_go: float = 99.0) -> None:
+    def __init__(
+        self, throttle: float = 0.5, *, brakes: tuple[float, float] = (99.0, 99.0), lets_go: float = 99.0
+    ) -> None:
         self._throttle, self._brakes, self._lets_go = throttle, brakes, lets_go
 
     def start(self, n: int, nominal: Nominal, step: float) -> Any:
@@ -116,7 +130,9 @@ class Pedals(Ads):
         return Command(nothing + throttle, nothing + (0.5 if brakes else 0.0)), memory
 
 
-def run(scenario: Scenario, ads: Any = None, settings: FloatArray | None = None, system: System = SUN) -> SimulationRuns:
+def run(
+    scenario: Scenario, ads: Any = None, settings: FloatArray | None = None, system: System = SUN
+) -> SimulationRuns:
     system = replace(system, scenario=scenario, ads=ads or Pedals())
     return simulate(system, system.characteristics.original[np.newaxis] if settings is None else settings)
 
@@ -127,10 +143,16 @@ def with_max_rpm(*values: float) -> FloatArray:
     return settings
 
 
-@pytest.mark.parametrize(("scenario", "settings"), [
-    (Crossing(test="CPFA", speed=50.0), with_max_rpm(5800, 6567, 6570, 6575)),
-    (CarToCar(test="CCRm", speed=70.0), with_max_rpm(4200, 5800, 7000))])
-def test_unbraked_a_vehicle_holds_the_tests_speed_in_one_gear_and_hits_with_its_front(scenario: Any, settings: FloatArray) -> None:
+@pytest.mark.parametrize(
+    ("scenario", "settings"),
+    [
+        (Crossing(test="CPFA", speed=50.0), with_max_rpm(5800, 6567, 6570, 6575)),
+        (CarToCar(test="CCRm", speed=70.0), with_max_rpm(4200, 5800, 7000)),
+    ],
+)
+def test_unbraked_a_vehicle_holds_the_tests_speed_in_one_gear_and_hits_with_its_front(
+    scenario: Any, settings: FloatArray
+) -> None:
     runs = run(scenario, settings=settings)
     speed = np.where(runs.trace.active, runs.trace.speed * 3.6, scenario.speed)
     assert speed.max() < scenario.speed + 1.0
@@ -142,8 +164,11 @@ def test_unbraked_a_vehicle_holds_the_tests_speed_in_one_gear_and_hits_with_its_
 
 @pytest.mark.parametrize("location", [0.0, 25.0, 75.0])
 def test_an_unbraked_vehicle_hits_at_the_tests_impact_location(location: float) -> None:
-    scenarios = (Crossing(test="CPNA", speed=40.0, impact_location=location), Crossing(test="CPFA", speed=40.0, impact_location=location),
-                 CarToCar(test="CCRs", speed=40.0, impact_location=location))
+    scenarios = (
+        Crossing(test="CPNA", speed=40.0, impact_location=location),
+        Crossing(test="CPFA", speed=40.0, impact_location=location),
+        CarToCar(test="CCRs", speed=40.0, impact_location=location),
+    )
     for scenario in scenarios:
         contact = run(scenario).contact
         assert contact.side[0] == "front"
@@ -176,13 +201,18 @@ def test_a_setting_with_an_invalid_test_is_neither_safe_nor_unsafe_unless_it_col
     steep = assemble(msgspec.structs.replace(load_study("euro_ncap_car_to_car"), matrix=MatrixTable(tests=tests)))
     steep = replace(steep, vehicle=WEAK.vehicle)
     original = SUN.characteristics.original[np.newaxis]
-    assert [str(one.evaluations.outcome[0]) for one in simulate_all_points(steep, original)] == ["stopped", "invalid-test"]
+    assert [str(one.evaluations.outcome[0]) for one in simulate_all_points(steep, original)] == [
+        "stopped",
+        "invalid-test",
+    ]
     evaluations = evaluate(steep, original)
     assert evaluations.outcome[0] == Outcome.INVALID_TEST
     assert not evaluations.valid[0]
     assert not evaluations.failed[0]
     assert np.isnan(evaluations.f_safe[0])
-    assert evaluate(replace(steep, ads=Pedals()), original).outcome[0] == Outcome.COLLISION, "at 10 km/h, where the speed is held"
+    assert evaluate(replace(steep, ads=Pedals()), original).outcome[0] == Outcome.COLLISION, (
+        "at 10 km/h, where the speed is held"
+    )
 
 
 def test_an_ads_that_releases_the_accelerator_or_brakes_takes_control_of_the_vehicle() -> None:
@@ -195,16 +225,20 @@ def test_an_ads_that_releases_the_accelerator_or_brakes_takes_control_of_the_veh
     assert faster.trace.speed.max() * 3.6 > 60
 
 
-@pytest.mark.parametrize(("middle", "along", "speed", "contact"), [
-    # own: 4 m by 2 m at the origin, east at 10 m/s; the other: 0.6 m by 0.4 m
-    ((2.1, 0.0), (0.0, 1.0), 0.0, ("front", 0.01, 0.0)),  # reach 2 + 0.2; overlaps by 0.1
-    ((2.1, -1.2), (0.0, 1.0), 1.0, ("front", 0.01, 0.0)),  # across since 0.1 s, along since 0.01 s
-    ((1.0, -1.25), (0.0, 1.0), 1.0, ("right", 0.05, None)),  # along since 0.12 s, across by 0.05 m at 1 m/s
-    ((-1.0, 1.25), (0.0, -1.0), 1.0, ("left", 0.05, None)),
-    ((-2.2, 0.0), (1.0, 0.0), 12.0, ("rear", 0.05, None)),  # 2 m/s faster, reach 2 + 0.3
-])
+@pytest.mark.parametrize(
+    ("middle", "along", "speed", "contact"),
+    [
+        # own: 4 m by 2 m at the origin, east at 10 m/s; the other: 0.6 m by 0.4 m
+        ((2.1, 0.0), (0.0, 1.0), 0.0, ("front", 0.01, 0.0)),  # reach 2 + 0.2; overlaps by 0.1
+        ((2.1, -1.2), (0.0, 1.0), 1.0, ("front", 0.01, 0.0)),  # across since 0.1 s, along since 0.01 s
+        ((1.0, -1.25), (0.0, 1.0), 1.0, ("right", 0.05, None)),  # along since 0.12 s, across by 0.05 m at 1 m/s
+        ((-1.0, 1.25), (0.0, -1.0), 1.0, ("left", 0.05, None)),
+        ((-2.2, 0.0), (1.0, 0.0), 12.0, ("rear", 0.05, None)),  # 2 m/s faster, reach 2 + 0.3
+    ],
+)
 def test_bodies_touch_at_the_side_where_the_overlap_began_last(
-        middle: tuple[float, float], along: tuple[float, float], speed: float, contact: tuple[str, float, float | None]) -> None:
+    middle: tuple[float, float], along: tuple[float, float], speed: float, contact: tuple[str, float, float | None]
+) -> None:
     own, other = Body(np.zeros(2), EAST, 4.0, 2.0, 10.0), Body(np.array(middle), np.array(along), 0.6, 0.4, speed)
     touch = find_touches(Body.columns([own]), Body.columns([other]))
     assert touch.side == contact[0]

@@ -29,28 +29,45 @@ BINARIES = Path(sumo.SUMO_HOME) / "bin"
 @pytest.mark.parametrize("folder", FOLDERS)
 def test_the_recipe_builds_the_network_that_is_kept(folder: str, tmp_path: Path) -> None:
     shutil.copytree(NETWORKS / folder, tmp_path / folder)
-    subprocess.run([str(BINARIES / "netconvert"), "-c", "network.netccfg"], cwd=tmp_path / folder, check=True, capture_output=True)
+    subprocess.run(
+        [str(BINARIES / "netconvert"), "-c", "network.netccfg"], cwd=tmp_path / folder, check=True, capture_output=True
+    )
 
     def without_head(path: Path) -> list[str]:
         lines = path.read_text().splitlines()
-        return lines[next(i for i, line in enumerate(lines) if line.startswith("<net ")):]
+        return lines[next(i for i, line in enumerate(lines) if line.startswith("<net ")) :]
 
     assert without_head(tmp_path / folder / "network.net.xml") == without_head(NETWORKS / folder / "network.net.xml")
 
 
 def test_copies_share_coordinates_and_nothing_else() -> None:
     text = copied_network(open_network("pedestrian_crossing"), 2).network.read_text()
-    shapes = {copy: [line.split('shape="')[1].split('"')[0] for line in text.splitlines() if f'lane id="{copy}.approach_0"' in line]
-              for copy in (0, 1)}
+    shapes = {
+        copy: [
+            line.split('shape="')[1].split('"')[0]
+            for line in text.splitlines()
+            if f'lane id="{copy}.approach_0"' in line
+        ]
+        for copy in (0, 1)
+    }
     assert shapes[0] == shapes[1] != []
-    connections = [dict(re.findall(r'(from|to)=":?(\d+)\.', line)) for line in text.splitlines() if "<connection " in line]
+    connections = [
+        dict(re.findall(r'(from|to)=":?(\d+)\.', line)) for line in text.splitlines() if "<connection " in line
+    ]
     assert {one["from"] for one in connections} == {"0", "1"}
     assert all(one["from"] == one["to"] for one in connections)
 
 
-@pytest.mark.parametrize("spoil", [
-    lambda path: path.write_text(path.read_text().replace('id="0', 'id="00')), lambda path: path.write_text("<net><edge id='x'/></net>"),
-    lambda path: path.write_bytes(path.read_bytes()[:-500]), lambda path: path.write_bytes(b""), Path.unlink])
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        lambda path: path.write_text(path.read_text().replace('id="0', 'id="00')),
+        lambda path: path.write_text("<net><edge id='x'/></net>"),
+        lambda path: path.write_bytes(path.read_bytes()[:-500]),
+        lambda path: path.write_bytes(b""),
+        Path.unlink,
+    ],
+)
 @pytest.mark.parametrize("which", ["network", "traffic"])
 def test_a_damaged_file_in_the_cache_is_built_again(spoil: Callable[[Path], None], which: str) -> None:
     file: Path = getattr(copied_network(open_network("lead_vehicle_stopped"), 2), which)
@@ -101,8 +118,9 @@ def test_two_processes_may_build_the_same_folder_of_the_cache(tmp_path: Path, mo
 
 
 @pytest.mark.parametrize(("loss", "n"), [("half", 12), ("nothing", 25), ("error", 60)])
-def test_a_full_disk_during_a_build_leaves_no_files(loss: str, n: int, tmp_path: Path,
-                                                                              monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_full_disk_during_a_build_leaves_no_files(
+    loss: str, n: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """In an empty cache, because other tests may have built as many copies already."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     ran = subprocess.run
@@ -112,8 +130,10 @@ def test_a_full_disk_during_a_build_leaves_no_files(loss: str, n: int, tmp_path:
         target = Path(command[command.index("-o") + 1])
         if loss == "error":
             target.unlink()
-            return subprocess.CompletedProcess(command, 1, "", f"Error: Could not build output file '{target}' (No space left)")
-        target.write_bytes(target.read_bytes()[:len(target.read_bytes()) // 2 if loss == "half" else 0])
+            return subprocess.CompletedProcess(
+                command, 1, "", f"Error: Could not build output file '{target}' (No space left)"
+            )
+        target.write_bytes(target.read_bytes()[: len(target.read_bytes()) // 2 if loss == "half" else 0])
         return done
 
     monkeypatch.setattr(subprocess, "run", full)
@@ -127,7 +147,9 @@ def test_sources_that_netconvert_refuses_are_an_error(tmp_path: Path) -> None:
     mine = tmp_path / "mine"
     shutil.copytree(NETWORKS / "lead_vehicle_stopped", mine)
     (mine / "network.edg.xml").write_text('<edges><edge id="road" from="west" to="nowhere"/></edges>')
-    with pytest.raises(InputError, match="netconvert refuses the network: Edge's 'road' to-node 'nowhere' is not known"):
+    with pytest.raises(
+        InputError, match="netconvert refuses the network: Edge's 'road' to-node 'nowhere' is not known"
+    ):
         copied_network(open_network(str(mine)), 1)
     (mine / "network.edg.xml").write_text("<edges>")
     with pytest.raises(InputError, match="tags were ended"):
@@ -156,8 +178,7 @@ GOOD = {
     "a trip by a via": '<trip id="t" type="car" depart="0" from="oncoming" via="oncoming" to="oncoming_on"/>',
     "a late vehicle": '<vehicle id="t" type="car" depart="0:0:2"><route edges="oncoming"/><stop edge="oncoming" duration="1"/></vehicle>',
     "a person's trip": '<person id="w" type="walker" depart="0"><personTrip from="footpath" to="footpath_on"/></person>',
-    "a flow of persons":
-        '<personFlow id="w" type="walker" begin="0" end="4" period="2"><walk from="footpath" to="footpath_on"/></personFlow>',
+    "a flow of persons": '<personFlow id="w" type="walker" begin="0" end="4" period="2"><walk from="footpath" to="footpath_on"/></personFlow>',
     "stop and walk": '<person id="w" type="walker" depart="0"><stop lane="footpath_0" duration="2"/><walk edges="footpath"/></person>',
     "parameters": '<vehicle id="v" type="car" depart="0"><route edges="oncoming"/><param key="note" value="approach"/></vehicle>',
 }
@@ -173,28 +194,52 @@ def test_legal_traffic_moves_equally_in_every_copy(mine: Path, what: str) -> Non
         for _ in range(60):
             world.api.simulationStep()
             there = world.actor_poses()
-            first, second = ({name[2:]: place for name, place in there.items() if name.startswith(copy)} for copy in ("0.", "1."))
+            first, second = (
+                {name[2:]: place for name, place in there.items() if name.startswith(copy)} for copy in ("0.", "1.")
+            )
             assert first == second
             seen |= set(first)
         assert seen > {"vut", "pedestrian"}
 
 
 BAD = {
-    "random kinds": ('<vTypeDistribution id="d"><vType id="x"/></vTypeDistribution>', "has a 'vTypeDistribution', which"),
-    "a random flow": ('<flow id="f" type="car" from="oncoming" begin="0" end="9" probability="0.5"/>', "'f.0' moves at random"),
-    "a Poisson flow": ('<flow id="f" type="car" from="oncoming" begin="0" end="9" period="exp(0.5)"/>', "'f.0' moves at random"),
-    "a random place": ('<trip id="t" type="car" from="oncoming" depart="0" departPos="random"/>', "'t' moves at random"),
+    "random kinds": (
+        '<vTypeDistribution id="d"><vType id="x"/></vTypeDistribution>',
+        "has a 'vTypeDistribution', which",
+    ),
+    "a random flow": (
+        '<flow id="f" type="car" from="oncoming" begin="0" end="9" probability="0.5"/>',
+        "'f.0' moves at random",
+    ),
+    "a Poisson flow": (
+        '<flow id="f" type="car" from="oncoming" begin="0" end="9" period="exp(0.5)"/>',
+        "'f.0' moves at random",
+    ),
+    "a random place": (
+        '<trip id="t" type="car" from="oncoming" depart="0" departPos="random"/>',
+        "'t' moves at random",
+    ),
     "SUMO's default type": ('<trip id="t" from="oncoming" depart="0"/>', "'t' moves at random"),
     "random speeds": (
-        '<vType id="r" sigma="0"/><trip id="t" type="r" from="oncoming" depart="0"/>', "vType 'r' drives at random: speedDev = 0.1"),
-    "random driving": ('<vType id="r" speedDev="0"/><trip id="t" type="r" from="oncoming" depart="0"/>', "drives at random: sigma = 0.5"),
+        '<vType id="r" sigma="0"/><trip id="t" type="r" from="oncoming" depart="0"/>',
+        "vType 'r' drives at random: speedDev = 0.1",
+    ),
+    "random driving": (
+        '<vType id="r" speedDev="0"/><trip id="t" type="r" from="oncoming" depart="0"/>',
+        "drives at random: sigma = 0.5",
+    ),
     "a random model": (
-        '<vType id="r" speedDev="0" carFollowModel="EIDM"/><trip id="t" type="r" from="oncoming" depart="0"/>', "carFollowModel = EIDM"),
+        '<vType id="r" speedDev="0" carFollowModel="EIDM"/><trip id="t" type="r" from="oncoming" depart="0"/>',
+        "carFollowModel = EIDM",
+    ),
     "no such edge": ('<trip id="t" type="car" from="nowhere" depart="0"/>', "The edge 'nowhere' within the route"),
     "an id twice": ('<trip id="vut" type="car" from="oncoming" depart="0"/>', "A vehicle with id 'vut' already exists"),
     "the tested type for others": ('<trip id="t" type="vut" from="oncoming" depart="0"/>', "'vut', a vType of its own"),
     "an impossible length": ('<vType id="x" length="-1"/>', "length must be greater than 0"),
-    "a ride": ('<person id="w" type="walker" depart="0"><ride from="approach" to="departure" lines="vut"/></person>', "has a 'ride'"),
+    "a ride": (
+        '<person id="w" type="walker" depart="0"><ride from="approach" to="departure" lines="vut"/></person>',
+        "has a 'ride'",
+    ),
 }
 
 
@@ -217,15 +262,25 @@ def test_a_configuration_that_waits_for_a_client_is_refused(mine: Path) -> None:
 def test_persons_who_dawdle_are_refused(mine: Path) -> None:
     file = mine / "scenario.sumocfg"
     file.write_text(file.read_text().replace('dawdling value="0"', 'dawdling value="0.2"'))
-    with pytest.raises(InputError, match=r"traffic\.rou\.xml: 'pedestrian' moves at random: two copies of it differ at \d"):
+    with pytest.raises(
+        InputError, match=r"traffic\.rou\.xml: 'pedestrian' moves at random: two copies of it differ at \d"
+    ):
         check_network(str(mine), "study")
 
 
-@pytest.mark.parametrize(("old", "new", "message"), [
-    ('<vehicle id="vut"', '<vehicle id="ego"', "has no vehicle 'vut'"),
-    ('id="vut" type="vut" depart="0"', 'id="vut" type="vut" depart="3"', "depart = '3'"),
-    ('id="vut" type="vut" depart', 'id="vut" type="pedestrian" depart', "type = 'pedestrian'"),
-    ('<route edges="approach departure"/>', '<route edges="approach departure"/><stop lane="departure_0" duration="9"/>', "has a stop")])
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ('<vehicle id="vut"', '<vehicle id="ego"', "has no vehicle 'vut'"),
+        ('id="vut" type="vut" depart="0"', 'id="vut" type="vut" depart="3"', "depart = '3'"),
+        ('id="vut" type="vut" depart', 'id="vut" type="pedestrian" depart', "type = 'pedestrian'"),
+        (
+            '<route edges="approach departure"/>',
+            '<route edges="approach departure"/><stop lane="departure_0" duration="9"/>',
+            "has a stop",
+        ),
+    ],
+)
 def test_the_vehicle_under_test_must_depart_at_time_0(mine: Path, old: str, new: str, message: str) -> None:
     file = mine / "traffic.rou.xml"
     assert old in file.read_text()

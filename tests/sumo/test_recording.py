@@ -37,7 +37,9 @@ class Claims(PedestrianCrossing, frozen=True, kw_only=True):
 def assert_same(system: System, number: int, seed: int) -> list[str]:
     """Assert that recorded scenes and SUMO give the same bits; returns all outcomes."""
     characteristics, rng = system.characteristics, np.random.default_rng(seed)
-    settings = characteristics.filter(rng.uniform(characteristics.lower, characteristics.upper, (number, len(characteristics))))
+    settings = characteristics.filter(
+        rng.uniform(characteristics.lower, characteristics.upper, (number, len(characteristics)))
+    )
     settings[0] = characteristics.original
     outcomes = []
     results = (simulate_all_points(system, settings, engine) for engine in (Engine.RECORDED, Engine.LIBSUMO))
@@ -81,7 +83,9 @@ def test_a_vehicle_at_full_throttle_collides_as_in_sumo(study: str) -> None:
     assert Outcome.COLLISION in outcomes
 
 
-def test_a_scene_from_the_cache_equals_the_scene_that_sumo_played(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_a_scene_from_the_cache_equals_the_scene_that_sumo_played(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     """In an empty cache: SUMO plays the scene, the next process reads the file, and a truncated file is written again."""
     monkeypatch.setattr(platformdirs, "user_cache_path", lambda name: tmp_path)
     scenario = assemble(load_study("sun")).scenario
@@ -103,8 +107,15 @@ def test_contacts_are_those_that_sumo_finds() -> None:
     """Vehicles that brake at various gaps: they hit with the front, a corner or the side, or miss."""
     study, rng, outcomes = load_study("sun"), np.random.default_rng(6), []
     for gap in rng.uniform(3.0, 9.0, 6):
-        ads = {**study.ads.parameters, "brake_gap": float(gap), "brake_gap_before": 1.0, "first_command": float(rng.uniform(0, 1.5))}
-        outcomes += assert_same(assemble(msgspec.structs.replace(study, ads=msgspec.structs.replace(study.ads, parameters=ads))), 40, 6)
+        ads = {
+            **study.ads.parameters,
+            "brake_gap": float(gap),
+            "brake_gap_before": 1.0,
+            "first_command": float(rng.uniform(0, 1.5)),
+        }
+        outcomes += assert_same(
+            assemble(msgspec.structs.replace(study, ads=msgspec.structs.replace(study.ads, parameters=ads))), 40, 6
+        )
     assert 40 < outcomes.count(Outcome.COLLISION) < 220
 
 
@@ -133,9 +144,13 @@ def reacting(in_tmp: Path) -> Path:
 
 
 def test_a_scenario_whose_pedestrian_reacts_is_simulated_in_sumo_by_default(reacting: Path) -> None:
-    study = load_study("smoke", scenario={"parameters": {"network": "reacting"}},
-                       search={"runs": 1, "algorithms": ["rs"], "evaluations": 20},
-                       title="", published={})
+    study = load_study(
+        "smoke",
+        scenario={"parameters": {"network": "reacting"}},
+        search={"runs": 1, "algorithms": ["rs"], "evaluations": 20},
+        title="",
+        published={},
+    )
     sv.run(study, out="results/it", jobs=1)
     engine = json.loads(Path("results/it/manifest.json").read_text())["engine"]
     assert engine["name"] == "sumo"
@@ -146,7 +161,15 @@ def test_a_scenario_whose_pedestrian_reacts_is_simulated_in_sumo_by_default(reac
 def test_a_false_claim_that_no_actor_reacts_is_detected(reacting: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(reacting)
     Path("claims.py").write_text(CLAIM)
-    study = load_study("native", scenario={"model": "claims:Claims", "parameters": {"network": "reacting"}}, name="mine", title="",
-                       search={"runs": 1, "algorithms": ["rs"], "evaluations": 60}, published={})
-    with pytest.raises(InputError, match=r"outcome is \w+ instead of \w+ in SUMO and in the recorded scene, with mass = "):
+    study = load_study(
+        "native",
+        scenario={"model": "claims:Claims", "parameters": {"network": "reacting"}},
+        name="mine",
+        title="",
+        search={"runs": 1, "algorithms": ["rs"], "evaluations": 60},
+        published={},
+    )
+    with pytest.raises(
+        InputError, match=r"outcome is \w+ instead of \w+ in SUMO and in the recorded scene, with mass = "
+    ):
         sv.run(study, out="results/it", jobs=1)

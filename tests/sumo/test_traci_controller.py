@@ -18,7 +18,7 @@ from safevar_sumo.sumo.matrix import evaluate, simulate
 from safevar_sumo.sumo.system import System, assemble
 from tests.in_process import run
 
-SCRIPT = '''
+SCRIPT = """
 def step(traci, vehicle_id):
     traci.vehicle.setSpeedMode(vehicle_id, 0)
     speed = traci.vehicle.getSpeed(vehicle_id)
@@ -46,7 +46,7 @@ class Harsh:
     def step(self, traci, vehicle_id):
         time = traci.simulation.getTime()
         traci.vehicle.setAcceleration(vehicle_id, 2.0 if time < 3 else -100.0, 1.0)
-'''
+"""
 
 HELPER = """
 import libsumo as ls
@@ -92,7 +92,9 @@ def test_a_module_that_imports_traci_reads_the_simulation(tmp_path: Path, monkey
     runs = system("step", tmp_path, monkeypatch, USES_HELPER)
     run = simulate(runs, changed(runs))
     assert run.trace.speed.max() == pytest.approx(5, abs=0.7)
-    assert {type(sys.modules[name]) for name in ("traci", "libsumo")} == {ModuleType}, "the import is for controllers alone"
+    assert {type(sys.modules[name]) for name in ("traci", "libsumo")} == {ModuleType}, (
+        "the import is for controllers alone"
+    )
 
 
 LOOKS = """
@@ -115,9 +117,9 @@ def test_a_controller_reads_other_actors_through_the_sensors(tmp_path: Path, mon
     weather = {"name": "haze", "road_friction": 1.0, "visibility": 0.5, "recognition_delay": 0.1, "light": "day"}
     runs = system("step", tmp_path, monkeypatch, LOOKS, weather=weather)
     trace = simulate(runs, changed(runs, reactionTime=0.25, sensorRange=80)).trace
-    leader, x, number, listed = np.loadtxt(tmp_path / "looks.csv", delimiter=",")[:len(trace.time)].T
+    leader, x, number, listed = np.loadtxt(tmp_path / "looks.csv", delimiter=",")[: len(trace.time)].T
     gap = np.concatenate([np.repeat(trace.gap[0, :], 4), trace.gap[:, 0]])
-    late = (gap[1:len(leader) + 1] + gap[:len(leader)]) / 2  # 3.5 steps
+    late = (gap[1 : len(leader) + 1] + gap[: len(leader)]) / 2  # 3.5 steps
     near = late <= 40
     assert 0 < near.sum() < len(near)
     assert leader[near] == pytest.approx(late[near], abs=1e-6)
@@ -175,7 +177,10 @@ REFUSED = [
     ("traci.simulation.executeMove()", "safevar_sumo itself starts, advances and ends the simulation"),
     ("traci.executeMove()", "safevar_sumo itself starts, advances and ends the simulation"),
     ("traci.close()", "traci.close: safevar_sumo itself starts, advances and ends the simulation"),
-    ("traci.vehicle.setSpeed('parked_ahead', 3)", "traci.vehicle.setSpeed: vehID = 'parked_ahead' is not the vehicle under test"),
+    (
+        "traci.vehicle.setSpeed('parked_ahead', 3)",
+        "traci.vehicle.setSpeed: vehID = 'parked_ahead' is not the vehicle under test",
+    ),
     ("traci.vehicle.setSpeed(v, speed=float('nan'))", "traci.vehicle.setSpeed: speed = nan"),
     ("traci.vehicle.setSpeed(v, -0.5)", "traci.vehicle.setSpeed: speed = -0.5"),
     ("traci.vehicle.setMaxSpeed(v, float('inf'))", "traci.vehicle.setMaxSpeed: speed = inf"),
@@ -184,7 +189,10 @@ REFUSED = [
     ("traci.vehicle.setAcceleration(v, float('-inf'), 1)", "traci.vehicle.setAcceleration: acceleration = -inf"),
     ("traci.vehicle.setSpeedMode(v, 1.5)", "traci.vehicle.setSpeedMode: mode = 1.5"),
     ("traci.vehicle.getNeighbors(v, 1)", "traci.vehicle.getNeighbors: is not for a controller of 'vut'"),
-    ("traci.vehicle.getRoute('parked_ahead')", "traci.vehicle.getRoute: returns a value of 'parked_ahead' that no sensor"),
+    (
+        "traci.vehicle.getRoute('parked_ahead')",
+        "traci.vehicle.getRoute: returns a value of 'parked_ahead' that no sensor",
+    ),
     ("traci.inductionloop.getIDList()", "traci.inductionloop.getIDList: is not for a controller of 'vut'"),
     ("traci.vehicle.moveTo(v, 'road_0', 50)", "traci.vehicle.moveTo: is not for a controller of 'vut'"),
 ]
@@ -192,8 +200,9 @@ REFUSED = [
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("line", "problem"), REFUSED)
-def test_illegal_calls_are_refused_even_if_the_controller_catches_the_error(line: str, problem: str, tmp_path: Path,
-                                                                      monkeypatch: pytest.MonkeyPatch) -> None:
+def test_illegal_calls_are_refused_even_if_the_controller_catches_the_error(
+    line: str, problem: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     script = f"def step(traci, v):\n    try:\n        {line}\n    except Exception:\n        pass\n"
     runs = system("step", tmp_path, monkeypatch, script)
     with pytest.raises(InputError) as caught:
@@ -221,12 +230,18 @@ def main(traci, v):
 """
 
 
-@pytest.mark.parametrize(("model", "problem"), [
-    ("my_script:step", "raised in step: traci.simulationStep: safevar_sumo itself starts, advances and ends the simulation"),
-    ("my_script:main", "raised in step: traci.start: safevar_sumo itself starts"),
-    ("my_script:run", "cannot be called as step(traci, vehicle_id)"),
-    ("my_loop:run", "cannot be imported: traci.start: safevar_sumo itself starts"),
-])
+@pytest.mark.parametrize(
+    ("model", "problem"),
+    [
+        (
+            "my_script:step",
+            "raised in step: traci.simulationStep: safevar_sumo itself starts, advances and ends the simulation",
+        ),
+        ("my_script:main", "raised in step: traci.start: safevar_sumo itself starts"),
+        ("my_script:run", "cannot be called as step(traci, vehicle_id)"),
+        ("my_loop:run", "cannot be imported: traci.start: safevar_sumo itself starts"),
+    ],
+)
 def test_a_script_with_a_loop_of_its_own_is_told_once_what_to_change(model: str, problem: str, in_tmp: Path) -> None:
     Path("my_script.py").write_text(OWN_LOOP)
     Path("my_loop.py").write_text(f"{OWN_LOOP}\n\nmain(traci, 'vut')\n")
@@ -235,10 +250,14 @@ def test_a_script_with_a_loop_of_its_own_is_told_once_what_to_change(model: str,
     assert problem in error
     assert len(error.splitlines()) == 2
     assert error.count("expected: ") == 1
-    assert "as a function step(traci, vehicle_id)" in error or "a function step(traci, vehicle_id) with the body" in error
+    assert (
+        "as a function step(traci, vehicle_id)" in error or "a function step(traci, vehicle_id) with the body" in error
+    )
 
 
-def test_a_script_stops_the_original_but_not_a_vehicle_with_weak_brakes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_script_stops_the_original_but_not_a_vehicle_with_weak_brakes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     runs = system("step", tmp_path, monkeypatch)
     weak = runs.characteristics.original.copy()
     weak[runs.characteristics.names.index("decel")] = 4.5
@@ -260,14 +279,24 @@ def test_the_vehicle_model_limits_a_commanded_acceleration(tmp_path: Path, monke
     assert run.outcome[0] == Outcome.STOPPED
 
 
-@pytest.mark.parametrize(("table", "message"), [
-    ({"model": "my_controller:Hrash", "kind": "traci"}, r"has no 'Hrash'\nexpected: package.module:Name$"),
-    ({"model": "my_controller:Harsh", "kind": "traci", "parameters": {"margin": 2}}, r"^mine: ads.model = .* does not take ads.parameters"),
-    ({"model": "my_controller:step", "kind": "traci", "parameters": {"margin": 2}}, r"^mine: ads.model = .* does not take ads.parameters"),
-    ({"model": "my_controller:step"}, r'not a class\nexpected: .*; or with ads.kind = "traci" a function step\('),
-])
+@pytest.mark.parametrize(
+    ("table", "message"),
+    [
+        ({"model": "my_controller:Hrash", "kind": "traci"}, r"has no 'Hrash'\nexpected: package.module:Name$"),
+        (
+            {"model": "my_controller:Harsh", "kind": "traci", "parameters": {"margin": 2}},
+            r"^mine: ads.model = .* does not take ads.parameters",
+        ),
+        (
+            {"model": "my_controller:step", "kind": "traci", "parameters": {"margin": 2}},
+            r"^mine: ads.model = .* does not take ads.parameters",
+        ),
+        ({"model": "my_controller:step"}, r'not a class\nexpected: .*; or with ads.kind = "traci" a function step\('),
+    ],
+)
 def test_a_wrong_ads_table_raises_an_error_before_the_simulation(
-        table: dict[str, object], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    table: dict[str, object], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     (tmp_path / "my_controller.py").write_text(SCRIPT)
     monkeypatch.chdir(tmp_path)
     with pytest.raises(InputError, match=message):

@@ -32,14 +32,25 @@ class Drive(NamedTuple):
     @property
     def distance(self) -> np.ndarray:
         speed = self.speed
-        return np.concatenate([np.zeros((1, speed.shape[1])), np.cumsum((speed[1:] + speed[:-1]) / 2 * self.step, axis=0)])
+        return np.concatenate(
+            [np.zeros((1, speed.shape[1])), np.cumsum((speed[1:] + speed[:-1]) / 2 * self.step, axis=0)]
+        )
 
     def at(self, time: float) -> int:
         return round(time / self.step)
 
 
-def drive(model: str, settings: np.ndarray, pedals: Pedals, duration: float, step: float = STEP, road: float = 1.0,
-          rolling: float = 0.0, grade: float = 0.0, wet: bool = False) -> Drive:
+def drive(
+    model: str,
+    settings: np.ndarray,
+    pedals: Pedals,
+    duration: float,
+    step: float = STEP,
+    road: float = 1.0,
+    rolling: float = 0.0,
+    grade: float = 0.0,
+    wet: bool = False,
+) -> Drive:
     """Drive settings, shape (N, n); pedals(t) -> (throttle, brake), for all vehicles or one each. `rolling` is the initial speed [m/s]."""
     system = SYSTEMS[model]
     values = dict(zip(system.characteristics.names, np.ascontiguousarray(settings.T), strict=True))

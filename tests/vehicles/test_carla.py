@@ -13,7 +13,16 @@ from safevar_sumo.records import GRAVITY, Command, Observation
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.matrix import simulate
 from safevar_sumo.sumo.system import assemble
-from safevar_sumo.vehicles.carla import AIR_DENSITY, ENGINE_INERTIA, FINAL_RATIO, FRONTAL_AREA, GEAR_RATIOS, RPM, WHEELS, Carla
+from safevar_sumo.vehicles.carla import (
+    AIR_DENSITY,
+    ENGINE_INERTIA,
+    FINAL_RATIO,
+    FRONTAL_AREA,
+    GEAR_RATIOS,
+    RPM,
+    WHEELS,
+    Carla,
+)
 from tests.vehicles.runs import STEP, SYSTEMS, braking_after, drawn, drive, ends, original
 
 
@@ -45,26 +54,49 @@ def test_driving_and_braking_follow_the_differential_equations() -> None:
         radius, mass, limit = values["radius"] / 100, values["mass"], values["max_rpm"] * RPM
         ratio, friction = GEAR_RATIOS[1] * FINAL_RATIO, vehicle.tyre_friction * values["tireFric"]
 
-        def changes(time: float, state: np.ndarray, values: dict[str, float] = values, ratio: float = ratio, mass: float = mass,
-                    radius: float = radius, limit: float = limit, friction: float = friction) -> list[float]:
+        def changes(
+            time: float,
+            state: np.ndarray,
+            values: dict[str, float] = values,
+            ratio: float = ratio,
+            mass: float = mass,
+            radius: float = radius,
+            limit: float = limit,
+            friction: float = friction,
+        ) -> list[float]:
             speed, wheel, engine = state
             throttle = max(1 - vehicle.throttle_fall * max(time - 1.4, 0), 0.0)
             brake = min(vehicle.brake_rise * max(time - 1.4, 0), 1.0)
             x = engine / limit
-            torque = vehicle.engine_torque * min(400 + 100 * x * 5800 / 1890, 500 - 100 * (x * 5800 - 1890) / (5730 - 1890)) * (x <= 1)
+            torque = (
+                vehicle.engine_torque
+                * min(400 + 100 * x * 5800 / 1890, 500 - 100 * (x * 5800 - 1890) / (5730 - 1890))
+                * (x <= 1)
+            )
             damping = values["dampRateZeroT_CE"] + (values["dampRateFullT"] - values["dampRateZeroT_CE"]) * throttle
             clutch = values["clutchStrength"] * (engine - ratio * wheel)
             force = tyre_force(vehicle, friction, mass * GRAVITY, speed, radius * wheel)
             braking = brake * 4 * values["maxBrakeTorque"] * np.tanh(wheel / 0.01)
-            return [(force - 0.5 * AIR_DENSITY * FRONTAL_AREA * values["dragCoeff"] * speed * speed) / mass,
-                    (ratio * clutch - 4 * values["dampRate"] * wheel - braking - radius * force) / (4 * 0.5 * 20 * radius * radius),
-                    (throttle * torque - damping * engine - clutch) / ENGINE_INERTIA]
+            return [
+                (force - 0.5 * AIR_DENSITY * FRONTAL_AREA * values["dragCoeff"] * speed * speed) / mass,
+                (ratio * clutch - 4 * values["dampRate"] * wheel - braking - radius * force)
+                / (4 * 0.5 * 20 * radius * radius),
+                (throttle * torque - damping * engine - clutch) / ENGINE_INERTIA,
+            ]
 
         begin = next(k for k, state in enumerate(run.states) if state.gear[0] > 0 and k * STEP >= 0.8)
         first = run.states[begin]
         times = np.arange(begin, len(run.states)) * STEP
-        exact = solve_ivp(changes, (times[0], times[-1]), [first.speed[0], first.wheel_speed[0], first.engine_speed[0]],
-                          t_eval=times, method="LSODA", rtol=1e-8, atol=1e-8, max_step=0.01).y[0]
+        exact = solve_ivp(
+            changes,
+            (times[0], times[-1]),
+            [first.speed[0], first.wheel_speed[0], first.engine_speed[0]],
+            t_eval=times,
+            method="LSODA",
+            rtol=1e-8,
+            atol=1e-8,
+            max_step=0.01,
+        ).y[0]
         simulated = run.speed[begin:, 0]
         moving = exact > 0.5
         assert np.count_nonzero(moving & (times > 1.7)) > 5, "the vehicle brakes for some time"
@@ -76,7 +108,9 @@ def test_a_camera_on_smaller_wheels_overestimates_the_gap() -> None:
     values = dict(zip(SYSTEMS["carla"].characteristics.names, np.ascontiguousarray(population.T), strict=True))
     prepared = vehicle.prepare(values, 1.0, STEP)
     nothing = np.zeros(5)
-    seen, _ = vehicle.sense(prepared, vehicle.at_rest(prepared), Observation(0.0, nothing, nothing + 8, nothing, nothing, nothing, 1.0))
+    seen, _ = vehicle.sense(
+        prepared, vehicle.at_rest(prepared), Observation(0.0, nothing, nothing + 8, nothing, nothing, nothing, 1.0)
+    )
     assert np.all(np.diff(seen.gap) < 0)
     assert np.interp(35.5, population[:, 10], seen.gap) == pytest.approx(8.0, rel=1e-3)
 
@@ -117,8 +151,14 @@ def multi_body(deceleration: float, **changed: float) -> float:
         return x[3] - UNTIL
 
     slow.terminal = True  # type: ignore[attr-defined]
-    result = solve_ivp(lambda _, x: vehicle_dynamics_mb(list(x), [0.0, torque], vehicle), (0, 12),
-                      init_mb([0, 0, 0, SPEED, 0, 0, 0], vehicle), events=slow, max_step=0.01, rtol=1e-4)
+    result = solve_ivp(
+        lambda _, x: vehicle_dynamics_mb(list(x), [0.0, torque], vehicle),
+        (0, 12),
+        init_mb([0, 0, 0, SPEED, 0, 0, 0], vehicle),
+        events=slow,
+        max_step=0.01,
+        rtol=1e-4,
+    )
     return float((SPEED - result.y[3, -1]) / result.t[-1])
 
 
@@ -132,11 +172,28 @@ def carla_deceleration(deceleration: float, **changed: float) -> float:
     """Mean deceleration of the vehicle of CARLA for the same brake torque [m/s^2]."""
     reference = parameters()
     mass, radius = changed.get("m", reference.m), changed.get("R_w", reference.R_w)
-    vehicle = Carla(tyre_friction=1.0, longitudinal_stiffness=reference.tire.p_kx1 * mass / WHEELS, slip_offset=0.1, engine_torque=1.0,
-                    brake_rise=1e3, camera_height=1.0)
-    values = {"max_rpm": 5800.0, "dampRateFullT": 0.15, "dampRateZeroT_CE": 2.0, "dampRateZeroT_CD": 0.35, "gearSwitchTime": 0.5,
-              "clutchStrength": 10.0, "mass": mass, "dragCoeff": 0.0, "tireFric": changed.get("p_dx1", reference.tire.p_dx1),
-              "dampRate": 0.0, "radius": 100 * radius, "maxBrakeTorque": deceleration * reference.m * reference.R_w / WHEELS}
+    vehicle = Carla(
+        tyre_friction=1.0,
+        longitudinal_stiffness=reference.tire.p_kx1 * mass / WHEELS,
+        slip_offset=0.1,
+        engine_torque=1.0,
+        brake_rise=1e3,
+        camera_height=1.0,
+    )
+    values = {
+        "max_rpm": 5800.0,
+        "dampRateFullT": 0.15,
+        "dampRateZeroT_CE": 2.0,
+        "dampRateZeroT_CD": 0.35,
+        "gearSwitchTime": 0.5,
+        "clutchStrength": 10.0,
+        "mass": mass,
+        "dragCoeff": 0.0,
+        "tireFric": changed.get("p_dx1", reference.tire.p_dx1),
+        "dampRate": 0.0,
+        "radius": 100 * radius,
+        "maxBrakeTorque": deceleration * reference.m * reference.R_w / WHEELS,
+    }
     step = 0.005
     prepared = vehicle.prepare({name: np.full(1, value) for name, value in values.items()}, 1.0, step)
     neutral = np.zeros(1)
@@ -166,7 +223,9 @@ def test_mass_and_radius_act_alike(name: str, factor: float) -> None:
 
 @SLOW
 @pytest.mark.parametrize(("friction", "least_share"), [(0.8, 0.6), (0.5, 0.55)])
-def test_beyond_the_limit_carla_keeps_the_friction_that_the_multi_body_model_loses(friction: float, least_share: float) -> None:
+def test_beyond_the_limit_carla_keeps_the_friction_that_the_multi_body_model_loses(
+    friction: float, least_share: float
+) -> None:
     """Friction limits both models. PhysX's tyre keeps its friction when the wheels lock; Pacejka's tyre loses up to a half."""
     limit = friction * GRAVITY
     assert carla_deceleration(9.5, p_dx1=friction) == pytest.approx(limit, rel=0.03)

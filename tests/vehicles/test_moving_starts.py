@@ -47,7 +47,10 @@ def test_whoever_stands_and_whoever_rolls_start_together_and_each_as_if_alone() 
         values = dict(zip(system.characteristics.names, np.ascontiguousarray(settings.T), strict=True))
         prepared = system.vehicle.prepare(values, 1.0, STEP)
         mixed = system.vehicle.at_start(prepared, np.array([0.0, 8.0, 0.0, 12.0]))
-        rest, rolling = system.vehicle.at_rest(prepared), system.vehicle.at_start(prepared, np.array([3.0, 8.0, 4.0, 12.0]))
+        rest, rolling = (
+            system.vehicle.at_rest(prepared),
+            system.vehicle.at_start(prepared, np.array([3.0, 8.0, 4.0, 12.0])),
+        )
         for one, stands, rolls in zip(mixed, rest, rolling, strict=True):
             if one is not None:
                 assert one[..., [0, 2]].tolist() == stands[..., [0, 2]].tolist()
@@ -62,12 +65,16 @@ def test_the_depart_speed_of_the_traffic_is_honoured(study: str, tmp_path: Path)
     traffic = folder / "traffic.rou.xml"
     head, vut, tail = traffic.read_text().partition('<vehicle id="vut"')
     traffic.write_text(head + vut + tail.replace('departSpeed="0"', 'departSpeed="5"', 1))
-    scenario = msgspec.structs.replace(chosen.scenario, parameters={**chosen.scenario.parameters, "network": str(folder)})
+    scenario = msgspec.structs.replace(
+        chosen.scenario, parameters={**chosen.scenario.parameters, "network": str(folder)}
+    )
     system = assemble(msgspec.structs.replace(chosen, scenario=scenario))
     trace = simulate(system, system.characteristics.original[np.newaxis]).trace
     assert trace.speed[0, 0] == 5
     assert abs(trace.speed[1, 0] - 5) < 0.3, "no jump in the first step, whatever the system commands"
-    assert trace.position[1, 0] - trace.position[0, 0] == pytest.approx((trace.speed[0, 0] + trace.speed[1, 0]) / 2 * trace.step)
+    assert trace.position[1, 0] - trace.position[0, 0] == pytest.approx(
+        (trace.speed[0, 0] + trace.speed[1, 0]) / 2 * trace.step
+    )
 
 
 G = 9.81
@@ -91,7 +98,10 @@ def test_who_coasts_loses_or_gains_g_sin(model: str, grade: float, gained: float
 @pytest.mark.parametrize(("model", "wheels"), [("carla", 4 * 0.5 * 20.0), ("lgsvl", 4 * 0.5 * 30.0)])
 def test_wheels_have_inertia_and_no_weight_of_their_own_to_pull_them(model: str, wheels: float) -> None:
     """Out of gear, the slope changes the speed by m g sin / (m + I / r^2) per second, compared with a level road."""
-    speeds = [drive(model, original(model), lambda time: (0.0, 0.0), 1.0, rolling=12.0, grade=grade).speed[-1, 0] for grade in (0.0, 8.0)]
+    speeds = [
+        drive(model, original(model), lambda time: (0.0, 0.0), 1.0, rolling=12.0, grade=grade).speed[-1, 0]
+        for grade in (0.0, 8.0)
+    ]
     characteristics = SYSTEMS[model].characteristics
     mass = characteristics.original[characteristics.names.index("mass")]
     assert speeds[0] - speeds[1] == pytest.approx(G * math.sin(ANGLE) * mass / (mass + wheels), rel=0.02)
@@ -101,9 +111,13 @@ def test_wheels_have_inertia_and_no_weight_of_their_own_to_pull_them(model: str,
 @pytest.mark.parametrize("grade", [8.0, -8.0])
 def test_the_way_to_stop_is_v2_over_twice_what_the_tyres_hold_and_the_slope_adds(model: str, grade: float) -> None:
     """On ice, where the tyres limit the deceleration to mu g cos; between 10 and 4 m/s, after the brake has built up."""
+
     def distance(grade: float) -> float:
         run = drive(model, original(model), lambda time: (0.0, 1.0), 25.0, rolling=12.0, road=0.25, grade=grade)
-        return float(np.interp(-4.0, -run.speed[:, 0], run.distance[:, 0]) - np.interp(-10.0, -run.speed[:, 0], run.distance[:, 0]))
+        return float(
+            np.interp(-4.0, -run.speed[:, 0], run.distance[:, 0])
+            - np.interp(-10.0, -run.speed[:, 0], run.distance[:, 0])
+        )
 
     level = (10**2 - 4**2) / (2 * distance(0.0))
     expected = level * math.cos(ANGLE) + math.copysign(G * math.sin(ANGLE), grade)
@@ -122,10 +136,16 @@ def test_whoever_stands_with_the_brake_on_stays_and_nobody_rolls_back(model: str
 @pytest.mark.parametrize("model", sorted(SYSTEMS))
 def test_each_vehicle_is_on_a_slope_of_its_own(model: str) -> None:
     system, n = SYSTEMS[model], 3
-    values = {name: np.full(n, value) for name, value in zip(system.characteristics.names, system.characteristics.original, strict=True)}
+    values = {
+        name: np.full(n, value)
+        for name, value in zip(system.characteristics.names, system.characteristics.original, strict=True)
+    }
     prepared = system.vehicle.prepare(values, 1.0, STEP, slope_of(np.array([0.0, 5.0, -5.0])))
     state = system.vehicle.at_rest(prepared)
-    alone = [drive(model, original(model), lambda time: (0.4, 0.0), 2.0, grade=grade).speed[-1, 0] for grade in (0.0, 5.0, -5.0)]
+    alone = [
+        drive(model, original(model), lambda time: (0.4, 0.0), 2.0, grade=grade).speed[-1, 0]
+        for grade in (0.0, 5.0, -5.0)
+    ]
     for _ in range(round(2.0 / STEP)):
         state = system.vehicle.advance(prepared, state, Command(np.full(n, 0.4), np.zeros(n)))
     assert state.speed.tolist() == alone

@@ -36,28 +36,44 @@ def test_air_slows_carlas_vehicle_by_half_rho_cd_a_v_squared() -> None:
 
 
 def test_carlas_gearbox_shifts_up_at_065_and_down_at_050_of_the_engines_maximum_and_waits_two_seconds() -> None:
-    vehicle = replace(SYSTEMS["carla"].vehicle, shift_up=0.65, shift_down=0.5, shift_latency=2.0)  # the values of sun are fitted
-    p = vehicle.prepare({member.name: np.full(1, float(member.original)) for member in SYSTEMS["carla"].characteristics}, 1.0, STEP)
+    vehicle = replace(
+        SYSTEMS["carla"].vehicle, shift_up=0.65, shift_down=0.5, shift_latency=2.0
+    )  # the values of sun are fitted
+    p = vehicle.prepare(
+        {member.name: np.full(1, float(member.original)) for member in SYSTEMS["carla"].characteristics}, 1.0, STEP
+    )
     limit = 5800 * 2 * np.pi / 60
 
     def target(gear: int, share: float, since: float = 2.0) -> float:
         from safevar_sumo.vehicles.carla import _shift
 
         one = np.ones(1)
-        state = vehicle.at_rest(p)._replace(gear=gear * one, target_gear=gear * one, since_shift=since * one, throttle=one,
-                                            engine_speed=share * limit * one)
+        state = vehicle.at_rest(p)._replace(
+            gear=gear * one,
+            target_gear=gear * one,
+            since_shift=since * one,
+            throttle=one,
+            engine_speed=share * limit * one,
+        )
         return float(_shift(p, state, state.throttle)[1][0])
 
     assert [target(1, 0.649), target(1, 0.651), target(1, 0.651, 1.9)] == [1, 2, 1]
-    assert [target(2, 0.501), target(2, 0.499), target(2, 0.499, 1.9), target(1, 0.1), target(4, 0.9)] == [2, 1, 2, 1, 4]
+    assert [target(2, 0.501), target(2, 0.499), target(2, 0.499, 1.9), target(1, 0.1), target(4, 0.9)] == [
+        2,
+        1,
+        2,
+        1,
+        4,
+    ]
 
 
 def test_carlas_gearbox_shifts_as_soon_as_the_selector_lets_go_of_the_gear() -> None:
     """In first gear at 90 % of the engine's maximum: the gearbox waits while the selector holds the gear, and has no latency afterwards."""
     vehicle, p, one = SYSTEMS["carla"].vehicle, prepared("carla"), np.ones(1)
     rim = 0.9 * 5800 * 2 * np.pi / 60 / (2.85 * 4)
-    state = vehicle.at_rest(p)._replace(gear=one, target_gear=one, speed=rim * 0.355 * one, wheel_speed=rim * one,
-                                        engine_speed=rim * 2.85 * 4 * one)
+    state = vehicle.at_rest(p)._replace(
+        gear=one, target_gear=one, speed=rim * 0.355 * one, wheel_speed=rim * one, engine_speed=rim * 2.85 * 4 * one
+    )
     for _ in range(100):
         state = step("carla", vehicle.hold_gear(p, state, one > 0), throttle=1.0)  # type: ignore[attr-defined]
         assert state.target_gear[0] == 1
@@ -80,12 +96,16 @@ def test_sumo_is_told_what_carlas_vehicle_can_do() -> None:
     vehicle = SYSTEMS["carla"].vehicle
     result = vehicle.sumo_type(prepared("carla"))
     grip = vehicle.tyre_friction * 3.5 * GRAVITY
-    assert result.max_speed[0] == pytest.approx(5800 * 2 * np.pi / 60 / 4.0 * 0.355), "the highest gear is 1.0, the final drive 4.0"
+    assert result.max_speed[0] == pytest.approx(5800 * 2 * np.pi / 60 / 4.0 * 0.355), (
+        "the highest gear is 1.0, the final drive 4.0"
+    )
     assert result.accel[0] == pytest.approx(min(vehicle.engine_torque * 500 * 2.85 * 4 / 0.355 / 2404, grip))
     assert result.decel[0] == pytest.approx(min(4 * 1500 / 0.355 / 2404, grip))
     assert result.tau[0] == pytest.approx(STEP + 1 / vehicle.brake_rise)
     assert result.mass[0] == 2404
-    icy = vehicle.sumo_type(vehicle.prepare({m.name: np.full(1, float(m.original)) for m in SYSTEMS["carla"].characteristics}, 0.01, STEP))
+    icy = vehicle.sumo_type(
+        vehicle.prepare({m.name: np.full(1, float(m.original)) for m in SYSTEMS["carla"].characteristics}, 0.01, STEP)
+    )
     assert icy.accel[0] == pytest.approx(0.01 * grip)
     assert icy.decel[0] == pytest.approx(0.01 * grip)
 
@@ -112,9 +132,18 @@ def test_lgsvls_gearbox_and_traction_control_have_their_numbers() -> None:
 def test_lgsvls_gearbox_shifts_up_at_033_and_down_at_013_of_the_engines_maximum(share: float, gear: int) -> None:
     """From third gear, 8299 r/min at most."""
     one = np.ones(1)
-    state = SYSTEMS["lgsvl"].vehicle.at_rest(prepared("lgsvl"))._replace(speed=5 * one, wheel_speed=5 / 0.35 * one, gear=3 * one,
-                                                                         old_ratio=2.11 * one, new_ratio=2.11 * one,
-                                                                         engine_rpm=share * 8299 * one)
+    state = (
+        SYSTEMS["lgsvl"]
+        .vehicle.at_rest(prepared("lgsvl"))
+        ._replace(
+            speed=5 * one,
+            wheel_speed=5 / 0.35 * one,
+            gear=3 * one,
+            old_ratio=2.11 * one,
+            new_ratio=2.11 * one,
+            engine_rpm=share * 8299 * one,
+        )
+    )
     assert step("lgsvl", state).gear[0] == gear
 
 

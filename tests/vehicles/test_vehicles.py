@@ -61,12 +61,18 @@ def test_energy_is_never_created(model: str) -> None:
     gained = np.diff(energy, axis=0)
     throttle = np.stack([state.throttle for state in run.states])
     closed = (throttle[1:] == 0) & (throttle[:-1] == 0)
-    if model == "sumo":  # its acceleration lags behind the throttle, which counts as closed when the acceleration has died away
+    if (
+        model == "sumo"
+    ):  # its acceleration lags behind the throttle, which counts as closed when the acceleration has died away
         closed &= np.stack([state.acceleration for state in run.states[1:]]) <= 0
     assert np.count_nonzero(closed) > 1000
     assert np.all(gained[closed] <= 1e-9 * (1 + energy[:-1][closed]))
-    strongest = {"carla": 2 * 500 * 7000 * np.pi / 30, "lgsvl": 550 * 13000 * np.pi / 30, "sumo": 3.2 * 2100 * 60,
-                 "worn": 3900.0 * 60}[model]
+    strongest = {
+        "carla": 2 * 500 * 7000 * np.pi / 30,
+        "lgsvl": 550 * 13000 * np.pi / 30,
+        "sumo": 3.2 * 2100 * 60,
+        "worn": 3900.0 * 60,
+    }[model]
     assert np.all(gained <= strongest * STEP)
 
 
@@ -88,14 +94,17 @@ def test_braking_never_raises_speed(model: str) -> None:
         states = braking.states[since:-1]
         ratio = np.stack([GEAR_RATIOS[state.gear.astype(int)] * FINAL_RATIO for state in states])
         shifting = np.stack([state.gear != state.target_gear for state in braking.states])
-        shifting = shifting[since:-1] | shifting[since + 1:]
-        slows |= shifting | (np.stack([s.engine_speed for s in states]) > ratio * np.stack([s.wheel_speed for s in states]))
+        shifting = shifting[since:-1] | shifting[since + 1 :]
+        slows |= shifting | (
+            np.stack([s.engine_speed for s in states]) > ratio * np.stack([s.wheel_speed for s in states])
+        )
     assert np.all(slows)
 
 
 @pytest.mark.parametrize("model", MODELS)
 def test_halving_the_time_step_changes_a_trajectory_by_little(model: str) -> None:
     """Stated bound: 2 % of the distance and 0.3 m/s while driving up, coasting and braking to a stop."""
+
     def pedals(time: float) -> tuple[float, float]:
         return (0.8, 0.0) if time < 3 else (0.0, 0.0) if time < 4 else (0.0, 0.6)
 
@@ -113,12 +122,16 @@ def test_no_vehicle_knows_of_another(model: str) -> None:
 
 
 # Measurements in which a characteristic acts, over a grid of its domain.
-def speed_at(time: float, pedals: Callable[[float], tuple[float, float]] = full_throttle, road: float = 1.0) -> Callable[..., np.ndarray]:
+def speed_at(
+    time: float, pedals: Callable[[float], tuple[float, float]] = full_throttle, road: float = 1.0
+) -> Callable[..., np.ndarray]:
     return lambda model, population: drive(model, population, pedals, time, road=road).speed[-1]
 
 
 def stopping_distance(brake: float, road: float = 1.0, wet: bool = False) -> Callable[..., np.ndarray]:
-    return lambda model, population: drive(model, population, lambda time: (0.0, brake), 15, rolling=8.0, road=road, wet=wet).distance[-1]
+    return lambda model, population: drive(
+        model, population, lambda time: (0.0, brake), 15, rolling=8.0, road=road, wet=wet
+    ).distance[-1]
 
 
 def coasting_loss(start: float, duration: float) -> Callable[..., np.ndarray]:
@@ -136,25 +149,47 @@ def lateral_error(model: str, population: np.ndarray) -> np.ndarray:
 
 ACTS = {
     "carla": {
-        "max_rpm": (speed_at(30), +1), "dampRateFullT": (speed_at(1), -1), "dampRateZeroT_CE": (coasting_loss(3, 2), +1),
-        "dampRateZeroT_CD": (speed_at(0.8, half_throttle), -1), "gearSwitchTime": (speed_at(0.8), -1),
-        "clutchStrength": (speed_at(0.65), +1), "mass": (speed_at(3), -1), "dragCoeff": (speed_at(1.5), -1),
-        "tireFric": (stopping_distance(1.0), -1), "dampRate": (coasting_loss(3, 2), +1), "radius": (stopping_distance(1.0), +1),
+        "max_rpm": (speed_at(30), +1),
+        "dampRateFullT": (speed_at(1), -1),
+        "dampRateZeroT_CE": (coasting_loss(3, 2), +1),
+        "dampRateZeroT_CD": (speed_at(0.8, half_throttle), -1),
+        "gearSwitchTime": (speed_at(0.8), -1),
+        "clutchStrength": (speed_at(0.65), +1),
+        "mass": (speed_at(3), -1),
+        "dragCoeff": (speed_at(1.5), -1),
+        "tireFric": (stopping_distance(1.0), -1),
+        "dampRate": (coasting_loss(3, 2), +1),
+        "radius": (stopping_distance(1.0), +1),
         "maxBrakeTorque": (stopping_distance(1.0), -1),
     },
     "lgsvl": {
-        "mass": (speed_at(3), -1), "wheelMass": (speed_at(3), -1), "radius": (speed_at(2), -1), "maxRpm": (speed_at(60), +1),
-        "minRpm": (speed_at(0.5), +1), "maxBrakeTorque": (stopping_distance(0.2), -1), "maxMotorTorque": (speed_at(3), +1),
-        "maxSteeringAngle": (lateral_error, -1), "tireDragCoeff": (coasting_loss(3, 5), +1), "wheelDamping": (coasting_loss(3, 5), +1),
-        "shiftTime": (speed_at(5), +1), "tractionControlSlipLimit": (speed_at(6, road=0.1), -1),
+        "mass": (speed_at(3), -1),
+        "wheelMass": (speed_at(3), -1),
+        "radius": (speed_at(2), -1),
+        "maxRpm": (speed_at(60), +1),
+        "minRpm": (speed_at(0.5), +1),
+        "maxBrakeTorque": (stopping_distance(0.2), -1),
+        "maxMotorTorque": (speed_at(3), +1),
+        "maxSteeringAngle": (lateral_error, -1),
+        "tireDragCoeff": (coasting_loss(3, 5), +1),
+        "wheelDamping": (coasting_loss(3, 5), +1),
+        "shiftTime": (speed_at(5), +1),
+        "tractionControlSlipLimit": (speed_at(6, road=0.1), -1),
     },
     "sumo": {
-        "mass": (speed_at(3), -1), "accel": (speed_at(3), +1), "decel": (stopping_distance(0.6), -1), "maxSpeed": (speed_at(60), +1),
-        "tau": (speed_at(1), -1), "brakeDelay": (stopping_distance(0.6), +1), "brakeGain": (stopping_distance(0.6), -1),
+        "mass": (speed_at(3), -1),
+        "accel": (speed_at(3), +1),
+        "decel": (stopping_distance(0.6), -1),
+        "maxSpeed": (speed_at(60), +1),
+        "tau": (speed_at(1), -1),
+        "brakeDelay": (stopping_distance(0.6), +1),
+        "brakeGain": (stopping_distance(0.6), -1),
     },
     "worn": {
-        "treadDepth": (stopping_distance(1.0, road=0.85, wet=True), -1), "brakeTorque": (stopping_distance(0.6), -1),
-        "brakeResponse": (stopping_distance(0.6), +1), "payload": (stopping_distance(0.6), +1),
+        "treadDepth": (stopping_distance(1.0, road=0.85, wet=True), -1),
+        "brakeTorque": (stopping_distance(0.6), -1),
+        "brakeResponse": (stopping_distance(0.6), +1),
+        "payload": (stopping_distance(0.6), +1),
     },
 }
 SENSED = {"sumo": {"sensorRange", "reactionTime"}, "worn": {"sensorRange", "sensorLatency", "payloadCentre"}}
@@ -182,7 +217,9 @@ def sensed_gaps(name: str) -> np.ndarray:
     state, gaps, nothing = vehicle.at_rest(prepared), [], np.zeros(5)
     for k in range(240):
         gap = np.full(5, 130.0 - 10 * k * STEP)
-        seen, state = vehicle.sense(prepared, state, Observation(k * STEP, nothing, gap, nothing, nothing, nothing, 1.0))
+        seen, state = vehicle.sense(
+            prepared, state, Observation(k * STEP, nothing, gap, nothing, nothing, nothing, 1.0)
+        )
         gaps.append(seen.gap)
     return np.stack(gaps)
 

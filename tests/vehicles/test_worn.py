@@ -18,12 +18,21 @@ from safevar_sumo.vehicles.base import LEVEL
 from safevar_sumo.vehicles.worn import WornVehicle
 
 CAR = WornVehicle()
-HEALTHY = {"treadDepth": 8.0, "brakeTorque": 1.0, "brakeResponse": 0.1, "payload": 75.0, "payloadCentre": 1.4, "sensorRange": 80.0,
-           "sensorLatency": 0.05}
+HEALTHY = {
+    "treadDepth": 8.0,
+    "brakeTorque": 1.0,
+    "brakeResponse": 0.1,
+    "payload": 75.0,
+    "payloadCentre": 1.4,
+    "sensorRange": 80.0,
+    "sensorLatency": 0.05,
+}
 
 
 def prepared(road: float, wet: bool = False, step: float = 0.05, **changes: float):  # type: ignore[no-untyped-def]
-    return CAR.prepare({name: np.array([value]) for name, value in {**HEALTHY, **changes}.items()}, road, step, LEVEL, wet)
+    return CAR.prepare(
+        {name: np.array([value]) for name, value in {**HEALTHY, **changes}.items()}, road, step, LEVEL, wet
+    )
 
 
 def stopping_distance(tread: float, wet: bool = True) -> float:
@@ -37,9 +46,13 @@ def stopping_distance(tread: float, wet: bool = True) -> float:
 
 
 @pytest.mark.parametrize("road", [1.0, 0.85, 0.5, 0.2])
-@pytest.mark.parametrize("changes", [
-    {}, {"payload": 525.0, "payloadCentre": 3.2}, {"payload": 525.0, "payloadCentre": 1.2}, {"brakeTorque": 0.5}])
-def test_two_axles_brake_together_and_none_beyond_the_friction_of_its_load(road: float, changes: dict[str, float]) -> None:
+@pytest.mark.parametrize(
+    "changes",
+    [{}, {"payload": 525.0, "payloadCentre": 3.2}, {"payload": 525.0, "payloadCentre": 1.2}, {"brakeTorque": 0.5}],
+)
+def test_two_axles_brake_together_and_none_beyond_the_friction_of_its_load(
+    road: float, changes: dict[str, float]
+) -> None:
     """Expected: the bisection of m a = sum of min(share F, mu N(a)); the load N moves forward with the deceleration a."""
     p = prepared(road, **changes)
     mass, mu, force = float(p.mass[0]), float(p.grip[0]), float(p.brake[0] * p.mass[0])
@@ -48,7 +61,11 @@ def test_two_axles_brake_together_and_none_beyond_the_friction_of_its_load(road:
 
     def excess_force(a: float) -> float:
         front = mass * (GRAVITY * (CAR.wheelbase - centre) + a * CAR.centre_height) / CAR.wheelbase
-        return min(CAR.front_share * force, mu * front) + min((1 - CAR.front_share) * force, mu * (mass * GRAVITY - front)) - mass * a
+        return (
+            min(CAR.front_share * force, mu * front)
+            + min((1 - CAR.front_share) * force, mu * (mass * GRAVITY - front))
+            - mass * a
+        )
 
     low, high = 0.0, 20.0
     for _ in range(80):
@@ -78,14 +95,31 @@ def test_stopping_distances_of_worn_tyres_are_in_the_published_ratios_on_a_wet_r
     assert depths[0] > 0
 
 
-@pytest.mark.parametrize(("weather", "is_wet"), [
-    ("clear", False), ("wet", True), ("soft_rain", True), ("hard_rain", True), ("fog", False), ("night", False),
-    ({"name": "polished", "road_friction": 0.6, "visibility": 1.0}, False),
-    ({"name": "puddles", "road_friction": 1.0, "visibility": 1.0, "wet": True}, True)])
+@pytest.mark.parametrize(
+    ("weather", "is_wet"),
+    [
+        ("clear", False),
+        ("wet", True),
+        ("soft_rain", True),
+        ("hard_rain", True),
+        ("fog", False),
+        ("night", False),
+        ({"name": "polished", "road_friction": 0.6, "visibility": 1.0}, False),
+        ({"name": "puddles", "road_friction": 1.0, "visibility": 1.0, "wet": True}, True),
+    ],
+)
 def test_tread_counts_where_the_weather_is_wet_and_not_where_friction_is_low(weather: object, is_wet: bool) -> None:
-    study = load_study({"extends": "wear", "name": "one", "weather": weather,
-                        "matrix": {"tests": [{"name": "CPNA", "parameters": {"test": "CPNA", "speed": 40}}]}})
-    new, worn = evaluate(assemble(study), np.array([[8, 1, 0.1, 75, 1.4, 80, 0.05], [1.6, 1, 0.1, 75, 1.4, 80, 0.05]])).metrics["ave_dece"]
+    study = load_study(
+        {
+            "extends": "wear",
+            "name": "one",
+            "weather": weather,
+            "matrix": {"tests": [{"name": "CPNA", "parameters": {"test": "CPNA", "speed": 40}}]},
+        }
+    )
+    new, worn = evaluate(
+        assemble(study), np.array([[8, 1, 0.1, 75, 1.4, 80, 0.05], [1.6, 1, 0.1, 75, 1.4, 80, 0.05]])
+    ).metrics["ave_dece"]
     assert (worn < 0.9 * new) == is_wet
 
 
@@ -93,7 +127,9 @@ def test_dirty_sensors_see_late_and_not_far() -> None:
     p, seen = prepared(1.0, sensorRange=30.0, sensorLatency=0.2), []
     state, one = CAR.at_rest(p), np.ones(1)
     for k in range(200):
-        result, state = CAR.sense(p, state, Observation(k * 0.05, one, (60 - 0.5 * k) * one, 10 * one, 0 * one, 0 * one, 1.0))
+        result, state = CAR.sense(
+            p, state, Observation(k * 0.05, one, (60 - 0.5 * k) * one, 10 * one, 0 * one, 0 * one, 1.0)
+        )
         seen.append(float(result.gap[0]))
     assert np.isinf(seen[:64]).all()
     assert seen[64] == pytest.approx(60 - 0.5 * 60)
@@ -107,15 +143,25 @@ def one(lower: float, original: float, upper: float) -> Characteristic:
     return Characteristic(name="c", unit="-", original=original, lower=lower, upper=upper)
 
 
-@pytest.mark.parametrize(("lower", "upper", "threshold"), [
-    (2040, 2700, 13.2),  # the worked example of the paper: mass
-    (0, 1000, 10), (0, 999, 0.02 * 999), (0, 100, 2), (0, 99, 0.04 * 99), (0, 1, 0.04), (0, 0.5, 0.04),
-])
+@pytest.mark.parametrize(
+    ("lower", "upper", "threshold"),
+    [
+        (2040, 2700, 13.2),  # the worked example of the paper: mass
+        (0, 1000, 10),
+        (0, 999, 0.02 * 999),
+        (0, 100, 2),
+        (0, 99, 0.04 * 99),
+        (0, 1, 0.04),
+        (0, 0.5, 0.04),
+    ],
+)
 def test_threshold_is_a_share_of_the_domains_width(lower: float, upper: float, threshold: float) -> None:
     assert one(lower, upper, upper).threshold == pytest.approx(threshold)
 
 
-settings_in_domain = arrays(float, (5, 12), elements=st.floats(0, 1)).map(lambda share: SUN.lower + share * (SUN.upper - SUN.lower))
+settings_in_domain = arrays(float, (5, 12), elements=st.floats(0, 1)).map(
+    lambda share: SUN.lower + share * (SUN.upper - SUN.lower)
+)
 
 
 @given(settings_in_domain)

@@ -26,21 +26,40 @@ class ExplainOptions(Options):
 
     question: ClassVar[str] = "explain"
     solutions: tuple[str, ...] = option(
-        (), "Explain the N-th solution of a run, from 0; may be repeated.  [default: the failures that matter]",
-        flag="--solution", metavar="ALG:RUN:N", form="repeated",
+        (),
+        "Explain the N-th solution of a run, from 0; may be repeated.  [default: the failures that matter]",
+        flag="--solution",
+        metavar="ALG:RUN:N",
+        form="repeated",
         python='Handles of solutions, such as "nsga2:3:0". By default the robust failure with the fewest changes, the failures with the '
-               "fewest changes and with the smallest largest change, the most severe failure, and one failure of each distinct cause, the "
-               "most frequent first.")
+        "fewest changes and with the smallest largest change, the most severe failure, and one failure of each distinct cause, the "
+        "most frequent first.",
+    )
     unsafe: str | None = unsafe_option()
     top: int = option(8, "Maximum number of failures explained in full.", kind=int, low=1, high=1000)
-    limit: int = option(40_000, "Approximate number of simulations for the minimal causes of all failures; if all failures would take "
-                                 "more, a random sample is analysed.", kind=int, low=1, metavar="N")
+    limit: int = option(
+        40_000,
+        "Approximate number of simulations for the minimal causes of all failures; if all failures would take "
+        "more, a random sample is analysed.",
+        kind=int,
+        low=1,
+        metavar="N",
+    )
 
 
 @document_options(ExplainOptions)
-def explain(source: StudyLike | Results, *, solutions: Sequence[str] = ExplainOptions.solutions, unsafe: Criterion | None = None,
-            top: int = ExplainOptions.top, limit: int = ExplainOptions.limit, pool: Pool | None = None, jobs: int | None = None,
-            progress: bool | Progress = False, as_it_is_now: bool = False) -> Explained:
+def explain(
+    source: StudyLike | Results,
+    *,
+    solutions: Sequence[str] = ExplainOptions.solutions,
+    unsafe: Criterion | None = None,
+    top: int = ExplainOptions.top,
+    limit: int = ExplainOptions.limit,
+    pool: Pool | None = None,
+    jobs: int | None = None,
+    progress: bool | Progress = False,
+    as_it_is_now: bool = False,
+) -> Explained:
     """Explain failures: their minimal causes with boundaries, the reason in words, and the robustness.
 
     Parameters

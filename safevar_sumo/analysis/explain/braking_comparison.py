@@ -127,9 +127,9 @@ def brake_onset(runs: SimulationRuns, column: int) -> int | None:
     3. otherwise none if the vehicle collides, and its last one if it does not.
     """
     trace, nearest = runs.trace, runs.nearest(column)
-    active = trace.active[:None if nearest is None else nearest + 1, column]
-    speed = np.where(active, trace.speed[:len(active), column], 0.0)
-    brake = np.where(speed > STANDSTILL, trace.brake[:len(active), column], 0.0)
+    active = trace.active[: None if nearest is None else nearest + 1, column]
+    speed = np.where(active, trace.speed[: len(active), column], 0.0)
+    brake = np.where(speed > STANDSTILL, trace.brake[: len(active), column], 0.0)
     is_braking = (brake > 0) & (brake >= REGULATION_SHARE * brake.max())
     braking_samples, last_cruise = np.flatnonzero(is_braking), np.flatnonzero(speed >= CRUISE_SHARE * speed.max())[-1]
     later_samples = braking_samples[braking_samples >= last_cruise]
@@ -145,7 +145,11 @@ def brake_onset(runs: SimulationRuns, column: int) -> int | None:
 
 def summarise_run(runs: SimulationRuns, column: int, safety_degree: float) -> RunSummary:
     """Summary of the run of vehicle `column`."""
-    collision_speed, nearest, onset = float(runs.collision_speed[column]), runs.nearest(column), brake_onset(runs, column)
+    collision_speed, nearest, onset = (
+        float(runs.collision_speed[column]),
+        runs.nearest(column),
+        brake_onset(runs, column),
+    )
     least_gap, braking = np.nan, None
     if nearest is not None and np.isnan(collision_speed):
         least_gap = float(runs.trace.gap[nearest, column])
@@ -158,25 +162,31 @@ def summarise_run(runs: SimulationRuns, column: int, safety_degree: float) -> Ru
 def _measure_braking(runs: SimulationRuns, column: int, first: int, last: int) -> Braking | None:
     """The braking from sample `first` to `last`; None if the vehicle only coasts after the pedal has followed."""
     trace = runs.trace
-    speed, position = trace.speed[:last + 1, column], trace.position[:last + 1, column]
+    speed, position = trace.speed[: last + 1, column], trace.position[: last + 1, column]
     elapsed = trace.time[last] - trace.time[first]
     shift = position[last] + trace.gap[last, column] - position[first] - trace.gap[first, column]  # of the obstacle
     obstacle_speed = round(float(shift / elapsed), OBSTACLE_DECIMALS) if last > first and np.isfinite(shift) else 0.0
-    speed, position = speed - obstacle_speed, position - obstacle_speed * trace.time[:last + 1]  # relative to it
-    has_followed = trace.pedal[first:last + 1, column] >= PEDAL_SHARE * trace.brake[first:last + 1, column]
+    speed, position = speed - obstacle_speed, position - obstacle_speed * trace.time[: last + 1]  # relative to it
+    has_followed = trace.pedal[first : last + 1, column] >= PEDAL_SHARE * trace.brake[first : last + 1, column]
     end_of_delay = first + int(np.argmax(has_followed))
     distance = float(position[last] - position[end_of_delay])
-    specific_energy = float(speed[end_of_delay]**2 - speed[last]**2) / 2  # energy that the brake takes, per mass
+    specific_energy = float(speed[end_of_delay] ** 2 - speed[last] ** 2) / 2  # energy that the brake takes, per mass
     if not has_followed.any() or distance <= 0 or specific_energy <= COAST_DECELERATION * distance:
         return None
     initial_speed, delay = float(speed[first]), (end_of_delay - first) * trace.step
     return Braking(
-        time=float(trace.time[first]), gap=float(trace.gap[first, column]), speed=initial_speed + obstacle_speed,
+        time=float(trace.time[first]),
+        gap=float(trace.gap[first, column]),
+        speed=initial_speed + obstacle_speed,
         delay=delay,
-        speed_deficit=initial_speed - float(position[end_of_delay] - position[first]) / delay if end_of_delay > first else 0.0,
-        speed_lost=initial_speed - float(speed[end_of_delay]), deceleration=specific_energy / distance,
+        speed_deficit=initial_speed - float(position[end_of_delay] - position[first]) / delay
+        if end_of_delay > first
+        else 0.0,
+        speed_lost=initial_speed - float(speed[end_of_delay]),
+        deceleration=specific_energy / distance,
         gears=(float(trace.gear[first, column]), float(trace.gear[end_of_delay, column])),
-        obstacle_speed=obstacle_speed)
+        obstacle_speed=obstacle_speed,
+    )
 
 
 def compare_braking(original: RunSummary, changed: RunSummary, point: str = "") -> BrakingComparison:
@@ -204,29 +214,42 @@ def _split_lost_margin(original: Braking, changed: Braking) -> dict[str, float]:
 
     With the two runs' means of t, of v - d and of 1 / a, a vehicle saves e t + d (v - d) / a.
     """
-    mean_delay, mean_inverse_deceleration = (original.delay + changed.delay) / 2, (1 / original.deceleration + 1 / changed.deceleration) / 2
+    mean_delay, mean_inverse_deceleration = (
+        (original.delay + changed.delay) / 2,
+        (1 / original.deceleration + 1 / changed.deceleration) / 2,
+    )
     speeds_after_delay = [braking.closing_speed - braking.speed_lost for braking in (original, changed)]
     mean_speed_after_delay = sum(speeds_after_delay) / 2
     mean_delay_speeds = [braking.closing_speed - braking.speed_deficit for braking in (original, changed)]
-    savings = [braking.speed_deficit * mean_delay + braking.speed_lost * mean_speed_after_delay * mean_inverse_deceleration
-               for braking in (original, changed)]
+    savings = [
+        braking.speed_deficit * mean_delay + braking.speed_lost * mean_speed_after_delay * mean_inverse_deceleration
+        for braking in (original, changed)
+    ]
     return {
         "gap": original.gap - changed.gap,
-        "speed": ((changed.closing_speed - original.closing_speed)
-                  * (mean_delay + mean_speed_after_delay * mean_inverse_deceleration)),
+        "speed": (
+            (changed.closing_speed - original.closing_speed)
+            * (mean_delay + mean_speed_after_delay * mean_inverse_deceleration)
+        ),
         "delay": (changed.delay - original.delay) * sum(mean_delay_speeds) / 2,
         "slowing": savings[0] - savings[1],
-        "deceleration": ((1 / changed.deceleration - 1 / original.deceleration)
-                         * (speeds_after_delay[0]**2 + speeds_after_delay[1]**2) / 4)}
+        "deceleration": (
+            (1 / changed.deceleration - 1 / original.deceleration)
+            * (speeds_after_delay[0] ** 2 + speeds_after_delay[1] ** 2)
+            / 4
+        ),
+    }
 
 
 MIN_PART = 0.005
 """Smallest part of a distance that a sentence mentions [m]: half a centimetre."""
 PART_PHRASES = {
-    "gap": ("it begins to brake at a smaller gap", "it begins to brake at a larger gap"), "speed": ("it is faster", "it is slower"),
+    "gap": ("it begins to brake at a smaller gap", "it begins to brake at a larger gap"),
+    "speed": ("it is faster", "it is slower"),
     "delay": ("its brake pedal follows later", "its brake pedal follows sooner"),
     "slowing": ("it slows less while the pedal moves", "it slows more while the pedal moves"),
-    "deceleration": ("it decelerates less with the pedal down", "it decelerates more with the pedal down")}
+    "deceleration": ("it decelerates less with the pedal down", "it decelerates more with the pedal down"),
+}
 """Phrases for each part: if it costs distance, and if it gains distance."""
 
 
@@ -241,7 +264,9 @@ def ending_in_words(run: RunSummary) -> str:
 def sentence(comparison: BrakingComparison, *, full: bool = False) -> str:
     """Why the changed vehicle is less safe than the original, in one sentence or two; `full` explains what the lost margin is."""
     subject = f"At {comparison.point}: the" if comparison.point else "The"
-    endings = f"{subject} original {ending_in_words(comparison.original)}; this one {ending_in_words(comparison.changed)}."
+    endings = (
+        f"{subject} original {ending_in_words(comparison.original)}; this one {ending_in_words(comparison.changed)}."
+    )
     original_braking, changed_braking = comparison.original.braking, comparison.changed.braking
     if original_braking is None and changed_braking is None:
         return f"{endings} Neither of them brakes."
@@ -250,23 +275,36 @@ def sentence(comparison: BrakingComparison, *, full: bool = False) -> str:
     no_effect = "" if changed_braking is not None else " Its brake has no effect."
     parts, is_lost = comparison.parts, comparison.lost_margin >= 0
     loss_prefix, gain_prefix = ("", "gained ") if is_lost else ("lost ", "")
-    phrases = [f"{abs(parts[name]):.2f} m {loss_prefix if parts[name] > 0 else gain_prefix}because {_phrase_of(comparison, name)}"
-               f"{_quantities_in_words(comparison, name)}"
-               for name in sorted(PART_PHRASES, key=lambda name: -parts[name]) if abs(parts[name]) >= MIN_PART]
+    phrases = [
+        f"{abs(parts[name]):.2f} m {loss_prefix if parts[name] > 0 else gain_prefix}because {_phrase_of(comparison, name)}"
+        f"{_quantities_in_words(comparison, name)}"
+        for name in sorted(PART_PHRASES, key=lambda name: -parts[name])
+        if abs(parts[name]) >= MIN_PART
+    ]
     if abs(parts["remainder"]) > MAX_OMITTED_REMAINDER:
         phrases.append(f"{parts['remainder']:+.2f} m unexplained")
     if not phrases:
         return f"{endings} They brake alike."
     margin = f"{abs(comparison.lost_margin):.2f} m"
-    introduction = f"Of the {margin} {'lost' if is_lost else 'gained'}" if not full else (
-        f"Its margin, the gap at the brake command less the distance needed to stop, is {margin} {'smaller' if is_lost else 'larger'}")
+    introduction = (
+        f"Of the {margin} {'lost' if is_lost else 'gained'}"
+        if not full
+        else (
+            f"Its margin, the gap at the brake command less the distance needed to stop, is {margin} {'smaller' if is_lost else 'larger'}"
+        )
+    )
     return f"{endings}{no_effect} {introduction}: {join_phrases(phrases)}."
 
 
 def _phrase_of(comparison: BrakingComparison, part: str) -> str:
     """The phrase for a part; a vehicle that speeds up while its pedal moves does not slow less."""
     gains, changed, original = comparison.parts[part] < 0, comparison.changed.braking, comparison.original.braking
-    if part == "slowing" and changed is not None and original is not None and min(changed.speed_lost, original.speed_lost) < 0:
+    if (
+        part == "slowing"
+        and changed is not None
+        and original is not None
+        and min(changed.speed_lost, original.speed_lost) < 0
+    ):
         if changed.speed_lost >= 0:
             return "it does not speed up while the pedal moves"
         before, after = changed.gears
@@ -281,12 +319,16 @@ def _quantities_in_words(comparison: BrakingComparison, part: str) -> str:
     if original_braking is None or changed_braking is None:
         return ""
     if part == "slowing":
-        changes = [f"from {one.speed:.2f} to {one.speed - one.speed_lost:.2f}" for one in (changed_braking, original_braking)]
+        changes = [
+            f"from {one.speed:.2f} to {one.speed - one.speed_lost:.2f}" for one in (changed_braking, original_braking)
+        ]
         return f" ({' instead of '.join(changes)} m/s)"
-    quantities = {"gap": (changed_braking.gap, original_braking.gap, "m"),
-                  "speed": (changed_braking.speed, original_braking.speed, "m/s at the command"),
-                  "delay": (changed_braking.delay, original_braking.delay, "s after the command"),
-                  "deceleration": (changed_braking.deceleration, original_braking.deceleration, "m/s^2")}
+    quantities = {
+        "gap": (changed_braking.gap, original_braking.gap, "m"),
+        "speed": (changed_braking.speed, original_braking.speed, "m/s at the command"),
+        "delay": (changed_braking.delay, original_braking.delay, "s after the command"),
+        "deceleration": (changed_braking.deceleration, original_braking.deceleration, "m/s^2"),
+    }
     changed, original, unit = quantities[part]
     decimals = next((digits for digits in range(2, 9) if f"{changed:.{digits}f}" != f"{original:.{digits}f}"), 2)
     return f" ({changed:.{decimals}f} instead of {original:.{decimals}f} {unit})"

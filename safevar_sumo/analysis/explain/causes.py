@@ -133,9 +133,11 @@ def find_boundaries(evaluator: Evaluator, causes: list[MinimalCause], unsafe: Un
     single_changes = [(cause, (column,)) for cause in causes for column in cause.columns]
     lines = [Line.from_original(evaluator, cause, columns) for cause, columns in [*all_changes, *single_changes]]
     fractions, states = find_boundary_shares(evaluator, lines, unsafe)
-    single_shares = iter(zip(lines[len(causes):], fractions[len(causes):], strict=True))
+    single_shares = iter(zip(lines[len(causes) :], fractions[len(causes) :], strict=True))
     boundaries = []
-    for cause, line, fraction, state in zip(causes, lines, fractions, states, strict=False):  # the lines of single changes follow
+    for cause, line, fraction, state in zip(
+        causes, lines, fractions, states, strict=False
+    ):  # the lines of single changes follow
         if not cause.columns:
             boundaries.append(Boundary(0.0, cause.setting, {}))
             continue
@@ -144,7 +146,9 @@ def find_boundaries(evaluator: Evaluator, causes: list[MinimalCause], unsafe: Un
             single_line, single_fraction = next(single_shares)
             single_limits[column] = float(single_line.settings_at(np.array([single_fraction]))[0, column])
         setting = line.settings_at(np.array([fraction]))[0]
-        filtered_column = line.first_filtered(evaluator.characteristics.threshold) if state == BoundaryState.FILTER else None
+        filtered_column = (
+            line.first_filtered(evaluator.characteristics.threshold) if state == BoundaryState.FILTER else None
+        )
         boundaries.append(Boundary(float(fraction), setting, single_limits, state, filtered_column))
     return boundaries
 
@@ -152,13 +156,28 @@ def find_boundaries(evaluator: Evaluator, causes: list[MinimalCause], unsafe: Un
 def shorten(evaluator: Evaluator, settings: FloatArray, unsafe: Unsafe) -> FloatArray:
     """K unsafe settings, shape (K, n), in as few digits as they need to stay unsafe with the same safety degree to 1 cm."""
     characteristics = evaluator.characteristics
-    rounded = [np.array([[float(f"{value:.{digits}g}") for value in setting] for setting in settings.tolist()])
-               for digits in SHORT_DIGITS]
-    candidates = np.array([*(np.where(settings == characteristics.original, settings, characteristics.filter(
-        np.clip(values, characteristics.lower, characteristics.upper))) for values in rounded), settings])
+    rounded = [
+        np.array([[float(f"{value:.{digits}g}") for value in setting] for setting in settings.tolist()])
+        for digits in SHORT_DIGITS
+    ]
+    candidates = np.array(
+        [
+            *(
+                np.where(
+                    settings == characteristics.original,
+                    settings,
+                    characteristics.filter(np.clip(values, characteristics.lower, characteristics.upper)),
+                )
+                for values in rounded
+            ),
+            settings,
+        ]
+    )
     evaluations = evaluator.evaluate(candidates.reshape(-1, settings.shape[1]), "digits of commands")
-    outcome, degree, is_unsafe = (values.reshape(len(candidates), -1) for values in (
-        evaluations.outcome, evaluations.f_safe, unsafe.of(evaluations)))
+    outcome, degree, is_unsafe = (
+        values.reshape(len(candidates), -1)
+        for values in (evaluations.outcome, evaluations.f_safe, unsafe.of(evaluations))
+    )
     changes_alike = (characteristics.changed(candidates) == characteristics.changed(settings)).all(axis=2)
     ends_alike = changes_alike & is_unsafe & (outcome == outcome[-1]) & (np.abs(degree - degree[-1]) < SHORT_DEGREE)
     ends_alike[-1] = True
@@ -193,13 +212,16 @@ class Line(NamedTuple):
         return np.where(factors >= 1, self.end, self.start + factors * (self.end - self.start))
 
 
-def find_first_unsafe_shares(evaluator: Evaluator, lines: list[Line], unsafe: Unsafe, stage: str = "boundaries") -> FloatArray:
+def find_first_unsafe_shares(
+    evaluator: Evaluator, lines: list[Line], unsafe: Unsafe, stage: str = "boundaries"
+) -> FloatArray:
     """The first unsafe share of every line; its end must be unsafe. The error is at most `RESOLUTION` times the line above `lowest`."""
     return find_boundary_shares(evaluator, lines, unsafe, stage)[0]
 
 
-def find_boundary_shares(evaluator: Evaluator, lines: list[Line], unsafe: Unsafe,
-                         stage: str = "boundaries") -> tuple[FloatArray, list[BoundaryState]]:
+def find_boundary_shares(
+    evaluator: Evaluator, lines: list[Line], unsafe: Unsafe, stage: str = "boundaries"
+) -> tuple[FloatArray, list[BoundaryState]]:
     """The first unsafe share of every line, as `find_first_unsafe_shares`, and what lies just below this share.
 
     A setting that cannot be simulated is neither safe nor unsafe; just below the share, it gives the state `NOT_SIMULATED`.
@@ -220,4 +242,6 @@ def find_boundary_shares(evaluator: Evaluator, lines: list[Line], unsafe: Unsafe
         low_is_valid = np.where(index > 0, is_valid[rows, np.maximum(index - 1, 0)], low_is_valid)
         low, high = np.where(index > 0, shares[rows, np.maximum(index - 1, 0)], low), shares[rows, index]
     states = np.where(low_is_valid, BoundaryState.SAFE, BoundaryState.NOT_SIMULATED)
-    return high, [BoundaryState(state) for state in np.where((low == lowest) & (lowest > 0), BoundaryState.FILTER, states)]
+    return high, [
+        BoundaryState(state) for state in np.where((low == lowest) & (lowest > 0), BoundaryState.FILTER, states)
+    ]

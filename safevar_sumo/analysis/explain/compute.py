@@ -51,8 +51,15 @@ SAMPLED_SETTINGS, RATED_SAMPLED_SETTINGS = 4096, 64
 """Number of settings drawn from the whole domain if there are no results, in an unrated and in a rated study."""
 
 
-def explain_failures(source: Study | Case, options: ExplainOptions, *, pool: Pool | None = None, jobs: int | None = None,
-                     progress: Progress = show_no_progress, statistics: bool = True) -> Explained:
+def explain_failures(
+    source: Study | Case,
+    options: ExplainOptions,
+    *,
+    pool: Pool | None = None,
+    jobs: int | None = None,
+    progress: Progress = show_no_progress,
+    statistics: bool = True,
+) -> Explained:
     """Explain the failures that matter among the solutions of results, or among settings drawn from a study's whole domain.
 
     Without `statistics`, only the failures that matter by their size or severity, and nothing of all the others.
@@ -69,8 +76,13 @@ def explain_failures(source: Study | Case, options: ExplainOptions, *, pool: Poo
         found = _evaluate(source, options, evaluator, original, unsafe)
         limit = options.limit // len(assemble(study).points)  # an evaluation simulates a setting at every point
         settings, characteristics = found.evaluations.settings, evaluator.characteristics
-        sample = found.rows if options.solutions else [] if not statistics else [
-            found.rows[index] for index in select_affordable_rows(settings[found.rows], evaluator, limit)]
+        sample = (
+            found.rows
+            if options.solutions
+            else []
+            if not statistics
+            else [found.rows[index] for index in select_affordable_rows(settings[found.rows], evaluator, limit)]
+        )
         requested: Reasons = {row: ("requested",) for row in found.rows}
         reasons = requested if options.solutions else _choose_rows(found, evaluator, original, limit)
         analysed = sorted({*sample, *reasons})
@@ -83,11 +95,20 @@ def explain_failures(source: Study | Case, options: ExplainOptions, *, pool: Poo
     sample_causes, changed = [causes[row] for row in sample], characteristics.changed(settings[sample])
     nearest = np.argsort(found.evaluations.f_safe, kind="stable")[:1]
     return Explained(
-        study=study, unsafe=found.unsafe, original=original, nearest=found.evaluations.take(nearest), explanations=explanations,
+        study=study,
+        unsafe=found.unsafe,
+        original=original,
+        nearest=found.evaluations.take(nearest),
+        explanations=explanations,
         necessity=necessity_frame(characteristics, changed, sample_causes, len(found.rows)),
-        distinct=count_distinct_causes(characteristics, sample_causes), looked_at=len(found.evaluations),
-        failures=len(found.rows), analysed=len(sample), otherwise=found.deviations, preventability=preventable,
-        no_verdict=no_verdict)
+        distinct=count_distinct_causes(characteristics, sample_causes),
+        looked_at=len(found.evaluations),
+        failures=len(found.rows),
+        analysed=len(sample),
+        otherwise=found.deviations,
+        preventability=preventable,
+        no_verdict=no_verdict,
+    )
 
 
 class _Found(NamedTuple):
@@ -104,8 +125,9 @@ class _Found(NamedTuple):
     deviations: int
 
 
-def _evaluate(source: Study | Case, options: ExplainOptions, evaluator: Evaluator, original: Evaluations,
-              unsafe: Unsafe | None) -> _Found:
+def _evaluate(
+    source: Study | Case, options: ExplainOptions, evaluator: Evaluator, original: Evaluations, unsafe: Unsafe | None
+) -> _Found:
     """Evaluate all solutions of results, or settings drawn from a study's whole domain."""
     named = [SolutionId.parse(text, "solutions") for text in options.solutions]
     handles: list[SolutionId | None]
@@ -114,7 +136,8 @@ def _evaluate(source: Study | Case, options: ExplainOptions, evaluator: Evaluato
             raise InputError("solutions", f"{source.name!r} is a study and has no solutions", "a results directory")
         number = RATED_SAMPLED_SETTINGS if is_rated(source) else SAMPLED_SETTINGS
         settings = evaluator.characteristics.filter(
-            evaluator.feasible_settings(number, source.search.seed, feasible_after_filter=True))
+            evaluator.feasible_settings(number, source.search.seed, feasible_after_filter=True)
+        )
         handles, recorded = [None] * len(settings), np.full(len(settings), UNKNOWN)
     else:
         solutions, names = source.solutions, list(evaluator.characteristics.names)
@@ -150,23 +173,29 @@ def _choose_rows(found: _Found, evaluator: Evaluator, original: Evaluations, lim
     return reasons
 
 
-def _add_distinct_causes(found: _Found, evaluator: Evaluator, sample: Sequence[int], reasons: Reasons, causes: CausesByRow,
-                         top: int) -> Reasons:
+def _add_distinct_causes(
+    found: _Found, evaluator: Evaluator, sample: Sequence[int], reasons: Reasons, causes: CausesByRow, top: int
+) -> Reasons:
     """Add the simplest failure of every minimal cause that no chosen failure has, until `top` failures are chosen."""
     chosen = dict(list(reasons.items())[:top])
-    keys = {row: {cause_key(evaluator.characteristics, cause) for cause in row_causes} for row, row_causes in causes.items()}
+    keys = {
+        row: {cause_key(evaluator.characteristics, cause) for cause in row_causes} for row, row_causes in causes.items()
+    }
     for key in count_distinct_causes(evaluator.characteristics, [causes[row] for row in sample])["cause"]:
         if len(chosen) >= top:
             break
         if not any(key in keys[row] for row in chosen):
             sizes = found.evaluations.f_num_diff, found.evaluations.f_diff
-            simplest = min((row for row in sample if key in keys[row]), key=lambda row: (*(size[row] for size in sizes), row))
+            simplest = min(
+                (row for row in sample if key in keys[row]), key=lambda row: (*(size[row] for size in sizes), row)
+            )
             chosen[simplest] = (DISTINCT_CAUSE,)
     return chosen
 
 
-def _explain_rows(found: _Found, evaluator: Evaluator, original: Evaluations, causes: CausesByRow,
-                  reasons: Reasons) -> tuple[Explanation, ...]:
+def _explain_rows(
+    found: _Found, evaluator: Evaluator, original: Evaluations, causes: CausesByRow, reasons: Reasons
+) -> tuple[Explanation, ...]:
     """Explanations of the chosen failures."""
     rows, unsafe, system = list(reasons), found.unsafe, assemble(evaluator.study)
     if not rows:
@@ -183,39 +212,67 @@ def _explain_rows(found: _Found, evaluator: Evaluator, original: Evaluations, ca
     boundaries = find_boundaries(evaluator, all_causes, unsafe)
     exact = np.array([one.setting for ones in (all_causes, boundaries) for one in ones]).reshape(-1, len(names))
     short = exact if is_rated(evaluator.study) or not len(exact) else shorten(evaluator, exact, unsafe)
-    described = iter([_describe_cause(names, *parts) for parts in zip_longest(
-        all_causes, boundaries, *np.split(short, 2), robustnesses[len(rows):])])
+    described = iter(
+        [
+            _describe_cause(names, *parts)
+            for parts in zip_longest(all_causes, boundaries, *np.split(short, 2), robustnesses[len(rows) :])
+        ]
+    )
     collisions = _collisions(evaluator.study, chosen)
     avoidances = dict(zip(map(bytes, collisions.settings), classify_collisions(evaluator, collisions), strict=True))
     explanations = list[Explanation]()
     for row, setting, comparison, robustness in zip(rows, chosen.settings, comparisons, robustnesses, strict=False):
         avoidance, index = avoidances.get(bytes(setting)), len(explanations)
         changed = evaluator.characteristics.changed(setting)
-        explanations.append(Explanation(
-            handle=found.handles[row], reasons=reasons[row], setting=dict(zip(names, setting.tolist(), strict=True)),
-            outcome=str(chosen.outcome[index]), safety_degree=finite_or_none(chosen.f_safe[index]),
-            changed=tuple(name for name, is_changed in zip(names, changed, strict=True) if is_changed),
-            causes=tuple(next(described) for _ in causes[row]), robustness=robustness, because=comparison.braking,
-            points=comparison.failing_points, preventable=str(avoidance.by) if avoidance else ""))
+        explanations.append(
+            Explanation(
+                handle=found.handles[row],
+                reasons=reasons[row],
+                setting=dict(zip(names, setting.tolist(), strict=True)),
+                outcome=str(chosen.outcome[index]),
+                safety_degree=finite_or_none(chosen.f_safe[index]),
+                changed=tuple(name for name, is_changed in zip(names, changed, strict=True) if is_changed),
+                causes=tuple(next(described) for _ in causes[row]),
+                robustness=robustness,
+                because=comparison.braking,
+                points=comparison.failing_points,
+                preventable=str(avoidance.by) if avoidance else "",
+            )
+        )
     return tuple(explanations)
 
 
-def _describe_cause(names: Sequence[str], cause: MinimalCause, boundary: Boundary, short_changes: FloatArray,
-                    short_boundary: FloatArray, robustness: Robustness | None) -> Cause:
+def _describe_cause(
+    names: Sequence[str],
+    cause: MinimalCause,
+    boundary: Boundary,
+    short_changes: FloatArray,
+    short_boundary: FloatArray,
+    robustness: Robustness | None,
+) -> Cause:
     def values(setting: FloatArray) -> dict[str, float]:
         return {names[column]: float(setting[column]) for column in cause.columns}
 
     return Cause(
-        changes=values(cause.setting), boundary=values(boundary.setting), fraction=boundary.fraction,
-        short_changes=values(short_changes), short_boundary=values(short_boundary),
-        alone={names[column]: value for column, value in boundary.single_limits.items()}, outcome=cause.outcome,
-        safety_degree=cause.safety_degree, end=boundary.state_below, neighbours=robustness,
-        at_threshold=None if boundary.at_threshold is None else names[boundary.at_threshold])
+        changes=values(cause.setting),
+        boundary=values(boundary.setting),
+        fraction=boundary.fraction,
+        short_changes=values(short_changes),
+        short_boundary=values(short_boundary),
+        alone={names[column]: value for column, value in boundary.single_limits.items()},
+        outcome=cause.outcome,
+        safety_degree=cause.safety_degree,
+        end=boundary.state_below,
+        neighbours=robustness,
+        at_threshold=None if boundary.at_threshold is None else names[boundary.at_threshold],
+    )
 
 
 def _time_step(system: System) -> float:
     """The time step of the simulations [s]."""
-    return simulate(system.at(system.points[0]) if system.matrix else system, system.characteristics.original[np.newaxis]).trace.step
+    return simulate(
+        system.at(system.points[0]) if system.matrix else system, system.characteristics.original[np.newaxis]
+    ).trace.step
 
 
 class PointComparison(NamedTuple):
@@ -234,12 +291,16 @@ class PointComparison(NamedTuple):
     failing_points: tuple[str, ...]
 
 
-def compare_at_points(system: System, original: FloatArray, settings: FloatArray, unsafe: Unsafe) -> list[PointComparison]:
+def compare_at_points(
+    system: System, original: FloatArray, settings: FloatArray, unsafe: Unsafe
+) -> list[PointComparison]:
     """Compare settings, shape (M, n), with the original, shape (1, n)."""
     point_results = simulate_all_points(system, np.concatenate([original, settings]))
     failing_points, worst = unsafe_points_of(system, point_results, unsafe)[1:], worst_points(point_results)[1:]
-    return [PointComparison(_compare_runs(point_results[index], row, point_results[index].point.name), names)
-            for row, (names, index) in enumerate(zip(failing_points, worst.tolist(), strict=True), 1)]
+    return [
+        PointComparison(_compare_runs(point_results[index], row, point_results[index].point.name), names)
+        for row, (names, index) in enumerate(zip(failing_points, worst.tolist(), strict=True), 1)
+    ]
 
 
 def compare_at_cells(evaluator: Evaluator, original: FloatArray, settings: FloatArray) -> list[PointComparison]:
@@ -250,7 +311,9 @@ def compare_at_cells(evaluator: Evaluator, original: FloatArray, settings: Float
     system = assemble(evaluator.study)
     assert system.rater is not None
     stage = "cells whose colour is worse"
-    colours = system.rater.points(evaluator.simulate_cells(np.concatenate([original, settings]), stage)).colours.astype(int)
+    colours = system.rater.points(evaluator.simulate_cells(np.concatenate([original, settings]), stage)).colours.astype(
+        int
+    )
     losses = np.where(colours[0] == UNKNOWN_COLOUR, 0, np.maximum(colours[1:] - colours[0], 0))
     comparisons = []
     for setting, loss in zip(settings, losses, strict=True):
@@ -272,5 +335,7 @@ def unsafe_points_of(system: System, point_results: list[PointResult], unsafe: U
     if not system.matrix:
         return [() for _ in point_results[0].evaluations.settings]
     unsafe_by_point = np.stack([unsafe.of(result.evaluations) for result in point_results])
-    return [tuple(result.point.name for result, is_unsafe in zip(point_results, flags, strict=True) if is_unsafe)
-            for flags in unsafe_by_point.T]
+    return [
+        tuple(result.point.name for result, is_unsafe in zip(point_results, flags, strict=True) if is_unsafe)
+        for flags in unsafe_by_point.T
+    ]

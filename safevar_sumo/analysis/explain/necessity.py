@@ -19,11 +19,14 @@ CauseKey = tuple[str, ...]
 
 
 def cause_key(characteristics: CharacteristicSet, cause: MinimalCause) -> CauseKey:
-    return tuple(direction_in_words(characteristics.members[column], float(cause.setting[column])) for column in cause.columns)
+    return tuple(
+        direction_in_words(characteristics.members[column], float(cause.setting[column])) for column in cause.columns
+    )
 
 
-def necessity_frame(characteristics: CharacteristicSet, changed: BoolArray, causes: Sequence[Sequence[MinimalCause]],
-                    failures: int) -> pd.DataFrame:
+def necessity_frame(
+    characteristics: CharacteristicSet, changed: BoolArray, causes: Sequence[Sequence[MinimalCause]], failures: int
+) -> pd.DataFrame:
     """How often each characteristic is changed, and how often it is needed.
 
     Parameters
@@ -45,17 +48,29 @@ def necessity_frame(characteristics: CharacteristicSet, changed: BoolArray, caus
         changed; no rows if there is no failure.
     """
     columns = range(len(characteristics) if len(changed) else 0)
-    counts = {"changed": Counter(np.nonzero(changed)[1].tolist()),
-              "necessary": Counter(column for failure_causes in causes for column in necessary_columns(failure_causes)),
-              "involved": Counter(column for failure_causes in causes for column in involved_columns(failure_causes))}
+    counts = {
+        "changed": Counter(np.nonzero(changed)[1].tolist()),
+        "necessary": Counter(column for failure_causes in causes for column in necessary_columns(failure_causes)),
+        "involved": Counter(column for failure_causes in causes for column in involved_columns(failure_causes)),
+    }
     is_sample = len(changed) < failures
-    intervals = [clopper_pearson(counts["necessary"][column], len(changed)) if is_sample
-                 else (counts["necessary"][column] / len(changed),) * 2 for column in columns]
-    frame = pd.DataFrame({
-        "characteristic": pd.Series([characteristics.names[column] for column in columns], dtype=object),
-        **{name: pd.Series([count[column] / len(changed) for column in columns], dtype=float) for name, count in counts.items()},
-        "necessary_lower": pd.Series([low for low, _ in intervals], dtype=float),
-        "necessary_upper": pd.Series([high for _, high in intervals], dtype=float)})
+    intervals = [
+        clopper_pearson(counts["necessary"][column], len(changed))
+        if is_sample
+        else (counts["necessary"][column] / len(changed),) * 2
+        for column in columns
+    ]
+    frame = pd.DataFrame(
+        {
+            "characteristic": pd.Series([characteristics.names[column] for column in columns], dtype=object),
+            **{
+                name: pd.Series([count[column] / len(changed) for column in columns], dtype=float)
+                for name, count in counts.items()
+            },
+            "necessary_lower": pd.Series([low for low, _ in intervals], dtype=float),
+            "necessary_upper": pd.Series([high for _, high in intervals], dtype=float),
+        }
+    )
     return frame.sort_values(["necessary", "involved", "changed"], ascending=False, kind="stable", ignore_index=True)
 
 
@@ -68,8 +83,14 @@ def count_distinct_causes(characteristics: CharacteristicSet, causes: Sequence[S
         Columns `cause`, a tuple of changes with their directions; `failures`, the number of failures with this cause; and `share`, their
         share of all failures.
     """
-    counts = Counter(key for failure_causes in causes for key in {cause_key(characteristics, cause) for cause in failure_causes})
+    counts = Counter(
+        key for failure_causes in causes for key in {cause_key(characteristics, cause) for cause in failure_causes}
+    )
     order = sorted(counts, key=lambda key: (-counts[key], len(key), key))
-    return pd.DataFrame({
-        "cause": pd.Series(order, dtype=object), "failures": pd.Series([counts[key] for key in order], dtype=int),
-        "share": pd.Series([counts[key] / len(causes) for key in order], dtype=float)})
+    return pd.DataFrame(
+        {
+            "cause": pd.Series(order, dtype=object),
+            "failures": pd.Series([counts[key] for key in order], dtype=int),
+            "share": pd.Series([counts[key] / len(causes) for key in order], dtype=float),
+        }
+    )

@@ -25,6 +25,7 @@ from safevar_sumo.vehicles import CharacteristicSet
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+
 @dataclass(frozen=True, kw_only=True)
 class Cause:
     """A smallest subset of a failure's changes that is unsafe by itself, all else as in the original vehicle.
@@ -69,16 +70,25 @@ class Cause:
     @property
     def limit(self) -> str:
         """A sentence on the smallest unsafe share of the changes, and on what lies just below this share."""
-        below = {BoundaryState.SAFE: "slightly less is safe",
-                 BoundaryState.FILTER: f"with less, the change of {self.at_threshold} falls below the filter's threshold "
-                                       "and counts as none",
-                 BoundaryState.NOT_SIMULATED: "slightly less could not be simulated"}[self.end]
+        below = {
+            BoundaryState.SAFE: "slightly less is safe",
+            BoundaryState.FILTER: f"with less, the change of {self.at_threshold} falls below the filter's threshold "
+            "and counts as none",
+            BoundaryState.NOT_SIMULATED: "slightly less could not be simulated",
+        }[self.end]
         return f"Scaling all changes to {100 * self.fraction:.1f} % is still unsafe; {below}."
 
     def to_dict(self) -> dict[str, Any]:
         """An entry of `minimal_causes` in `explain --json`."""
-        return {"changes": self.changes, "boundary": self.boundary, "fraction": self.fraction, "outcome": self.outcome,
-                "safety_degree": self.safety_degree, "end": str(self.end), "robustness": self.robustness}
+        return {
+            "changes": self.changes,
+            "boundary": self.boundary,
+            "fraction": self.fraction,
+            "outcome": self.outcome,
+            "safety_degree": self.safety_degree,
+            "end": str(self.end),
+            "robustness": self.robustness,
+        }
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -125,16 +135,27 @@ class Explanation:
     @property
     def necessary(self) -> tuple[str, ...]:
         """The changed characteristics that every minimal cause contains."""
-        return tuple(name for name in self.changed if self.causes and all(name in cause.changes for cause in self.causes))
+        return tuple(
+            name for name in self.changed if self.causes and all(name in cause.changes for cause in self.causes)
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """An entry of `explain --json`."""
         algorithm, run, index = self.handle or (None, None, None)
-        return {"algorithm": algorithm, "run": run, "index": index, "setting": self.setting, "outcome": self.outcome,
-                "safety_degree": self.safety_degree, "changed": list(self.changed),
-                "minimal_causes": [cause.to_dict() for cause in self.causes], "robustness": self.robustness.share,
-                "because": sentence(self.because), "reasons": list(self.reasons),
-                **({"points": list(self.points)} if self.points else {})}
+        return {
+            "algorithm": algorithm,
+            "run": run,
+            "index": index,
+            "setting": self.setting,
+            "outcome": self.outcome,
+            "safety_degree": self.safety_degree,
+            "changed": list(self.changed),
+            "minimal_causes": [cause.to_dict() for cause in self.causes],
+            "robustness": self.robustness.share,
+            "because": sentence(self.because),
+            "reasons": list(self.reasons),
+            **({"points": list(self.points)} if self.points else {}),
+        }
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -197,14 +218,21 @@ class Explained:
 
     def to_dict(self) -> list[dict[str, Any]]:
         """The JSON of `explain`: a list with an entry for each explained failure, and a summary."""
+
         def columns(*names: str) -> dict[str, Any]:
             rows = self.necessity[["characteristic", *names]].itertuples(index=False)
             return {name: values[0] if len(values) == 1 else values for name, *values in rows}
 
-        summary = {"necessary": columns("necessary"), "changed": columns("changed"),
-                   "necessary_interval": columns("necessary_lower", "necessary_upper"),
-                   "preventable": msgspec.to_builtins(self.preventability.shares)}
-        return [*(failure.to_dict() for failure in self.explanations), {"summary": summary | driven_entry(self.no_verdict)}]
+        summary = {
+            "necessary": columns("necessary"),
+            "changed": columns("changed"),
+            "necessary_interval": columns("necessary_lower", "necessary_upper"),
+            "preventable": msgspec.to_builtins(self.preventability.shares),
+        }
+        return [
+            *(failure.to_dict() for failure in self.explanations),
+            {"summary": summary | driven_entry(self.no_verdict)},
+        ]
 
     def __repr__(self) -> str:
         counts = f"{self.failures} of {self.looked_at}, {len(self.explanations)} in full"
@@ -217,14 +245,51 @@ class Explained:
         `original`, `value`, `boundary`, `alone` [unit], `fraction`, `outcome`, `safety_degree` [m or -m/s], `robustness`,
         `whose`, the class `preventable` of the failure, and `points`, separated by semicolons.
         """
-        rows = [(failure_index, *(failure.handle or (None, None, None)), cause_index, item.name, item.unit, item.original,
-                 cause.changes[item.name], cause.boundary[item.name], cause.alone[item.name], cause.fraction, cause.outcome,
-                 cause.safety_degree, failure.robustness.share, failure.preventable, "; ".join(failure.points))
-                for failure_index, failure in enumerate(self.explanations) for cause_index, cause in enumerate(failure.causes)
-                for item in CharacteristicSet.of(self.study.vehicle.characteristics) if item.name in cause.changes]
-        return pd.DataFrame(rows, columns=[
-            "failure", "algorithm", "run", "index", "cause", "characteristic", "unit", "original", "value", "boundary", "alone",
-            "fraction", "outcome", SAFETY_DEGREE, "robustness", "whose", "points"])
+        rows = [
+            (
+                failure_index,
+                *(failure.handle or (None, None, None)),
+                cause_index,
+                item.name,
+                item.unit,
+                item.original,
+                cause.changes[item.name],
+                cause.boundary[item.name],
+                cause.alone[item.name],
+                cause.fraction,
+                cause.outcome,
+                cause.safety_degree,
+                failure.robustness.share,
+                failure.preventable,
+                "; ".join(failure.points),
+            )
+            for failure_index, failure in enumerate(self.explanations)
+            for cause_index, cause in enumerate(failure.causes)
+            for item in CharacteristicSet.of(self.study.vehicle.characteristics)
+            if item.name in cause.changes
+        ]
+        return pd.DataFrame(
+            rows,
+            columns=[
+                "failure",
+                "algorithm",
+                "run",
+                "index",
+                "cause",
+                "characteristic",
+                "unit",
+                "original",
+                "value",
+                "boundary",
+                "alone",
+                "fraction",
+                "outcome",
+                SAFETY_DEGREE,
+                "robustness",
+                "whose",
+                "points",
+            ],
+        )
 
     def figure(self) -> Figure:
         """How often each characteristic is necessary, beside how often it is changed (as RQ3.2 counts)."""
@@ -232,11 +297,15 @@ class Explained:
         figure, ((axis,),) = new_figure(f"{self.study.name}: changed vs. necessary", 1, 1, size)
         names = [escape_dollars(name) for name in frame["characteristic"]]
         for column, label, colour, height in (
-                ("changed", "changed", GREY, 0.8), ("involved", "in some minimal cause", SKY_BLUE, 0.5),
-                ("necessary", "necessary: in every minimal cause", BLUE, 0.24)):
+            ("changed", "changed", GREY, 0.8),
+            ("involved", "in some minimal cause", SKY_BLUE, 0.5),
+            ("necessary", "necessary: in every minimal cause", BLUE, 0.24),
+        ):
             axis.barh(names, 100 * frame[column], height=height, color=colour, label=label)
         axis.set_xlim(0, 100)
         axis.set_xlabel(f"share of {self.analysed} failures [%]")
         axis.grid(visible=False, axis="y")
-        figure.legend(*axis.get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False, fontsize=FONT)
+        figure.legend(
+            *axis.get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False, fontsize=FONT
+        )
         return figure

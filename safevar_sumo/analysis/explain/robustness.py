@@ -39,7 +39,9 @@ class Robustness(NamedTuple):
         """A phrase such as `robust: 84 % of the neighbours are unsafe too, but only 53 % with a step of 0.1 s`."""
         step, least_share = min(self.shares_by_step.items(), key=lambda item: item[1])
         disagrees = is_borderline(least_share) and not self.borderline
-        return robustness_in_words(self.share) + (f", but only {100 * least_share:.0f} % with a step of {step:g} s" if disagrees else "")
+        return robustness_in_words(self.share) + (
+            f", but only {100 * least_share:.0f} % with a step of {step:g} s" if disagrees else ""
+        )
 
 
 def is_borderline(share: float) -> bool:
@@ -54,12 +56,17 @@ def robustness_in_words(share: float) -> str:
 
 def draw_neighbours(characteristics: CharacteristicSet, settings: FloatArray, seed: int) -> FloatArray:
     """The neighbours of M settings, shape (M, n), one setting after the other; they differ from it by at most the filter's threshold."""
-    offsets = np.random.default_rng(seed).uniform(-1, 1, (NEIGHBOUR_COUNT, len(characteristics))) * characteristics.threshold
-    return np.clip(settings[:, np.newaxis] + offsets, characteristics.lower, characteristics.upper).reshape(-1, len(characteristics))
+    offsets = (
+        np.random.default_rng(seed).uniform(-1, 1, (NEIGHBOUR_COUNT, len(characteristics))) * characteristics.threshold
+    )
+    return np.clip(settings[:, np.newaxis] + offsets, characteristics.lower, characteristics.upper).reshape(
+        -1, len(characteristics)
+    )
 
 
-def estimate_robustness(evaluator: Evaluator, settings: FloatArray, step: float, unsafe: Unsafe,
-                        factors: Sequence[float] = STEP_FACTORS) -> list[Robustness]:
+def estimate_robustness(
+    evaluator: Evaluator, settings: FloatArray, step: float, unsafe: Unsafe, factors: Sequence[float] = STEP_FACTORS
+) -> list[Robustness]:
     """The robustness of each of M settings, shape (M, n).
 
     A setting's neighbours differ from it in each characteristic by at most the filter's threshold. They are simulated without the filter,
@@ -69,28 +76,44 @@ def estimate_robustness(evaluator: Evaluator, settings: FloatArray, step: float,
     for factor in factors:
         step_evaluator = evaluator if factor == 1 else evaluator.with_step(step * factor)
         evaluations = step_evaluator.evaluate(neighbours, f"neighbours at {step * factor:g} s a step")
-        is_unsafe, is_valid = (flags.reshape(len(settings), NEIGHBOUR_COUNT) for flags in (unsafe.of(evaluations), evaluations.valid))
+        is_unsafe, is_valid = (
+            flags.reshape(len(settings), NEIGHBOUR_COUNT) for flags in (unsafe.of(evaluations), evaluations.valid)
+        )
         shares[step * factor] = (is_unsafe & is_valid).sum(axis=1) / np.maximum(is_valid.sum(axis=1), 1)
-    return [Robustness({step: float(step_shares[row]) for step, step_shares in shares.items()}) for row in range(len(settings))]
+    return [
+        Robustness({step: float(step_shares[row]) for step, step_shares in shares.items()})
+        for row in range(len(settings))
+    ]
 
 
-def find_smallest_robust_failure(evaluator: Evaluator, failures: Evaluations, step: float, unsafe: Unsafe,
-                                 max_evaluations: int) -> int | None:
+def find_smallest_robust_failure(
+    evaluator: Evaluator, failures: Evaluations, step: float, unsafe: Unsafe, max_evaluations: int
+) -> int | None:
     """The row of the robust failure with the fewest changes; of several, the one whose largest change is smallest.
 
     Failures are tried in this order until one is robust, or about `max_evaluations` settings are evaluated; None if no tried failure is
     robust. Other time steps than the study's are left out where they could not make a failure robust.
     """
     order = np.lexsort([failures.f_safe, failures.f_diff, failures.f_num_diff])
-    least_share = len(STEP_FACTORS) * MIN_ROBUST_SHARE - len(STEP_FACTORS[1:])  # with it, the mean is just robust if all others are 1
+    least_share = len(STEP_FACTORS) * MIN_ROBUST_SHARE - len(
+        STEP_FACTORS[1:]
+    )  # with it, the mean is just robust if all others are 1
     neighbour_sets = 0
     for start in range(0, len(order), FAILURES_PER_BATCH):
-        rows = order[start:start + FAILURES_PER_BATCH]
-        candidates = [(row, estimate) for row, estimate in zip(
-            rows.tolist(), estimate_robustness(evaluator, failures.settings[rows], step, unsafe, STEP_FACTORS[:1]), strict=True)
-            if estimate.share >= least_share]
+        rows = order[start : start + FAILURES_PER_BATCH]
+        candidates = [
+            (row, estimate)
+            for row, estimate in zip(
+                rows.tolist(),
+                estimate_robustness(evaluator, failures.settings[rows], step, unsafe, STEP_FACTORS[:1]),
+                strict=True,
+            )
+            if estimate.share >= least_share
+        ]
         if candidates:
-            other_steps = estimate_robustness(evaluator, failures.settings[[row for row, _ in candidates]], step, unsafe, STEP_FACTORS[1:])
+            other_steps = estimate_robustness(
+                evaluator, failures.settings[[row for row, _ in candidates]], step, unsafe, STEP_FACTORS[1:]
+            )
             for (row, estimate), others in zip(candidates, other_steps, strict=True):
                 if not Robustness(estimate.shares_by_step | others.shares_by_step).borderline:
                     return int(row)

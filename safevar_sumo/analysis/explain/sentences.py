@@ -25,9 +25,13 @@ REASONS = {"fewest": "fewest changes", "smallest": "smallest changes", "most_sev
 """The other reasons for choosing a failure, by the name of the choice in `CHOICES`; the JSON contains these texts."""
 DISTINCT_CAUSE = "a cause of its own"
 """The reason for choosing the simplest failure with a cause that no other chosen failure has."""
-LABELS = {ROBUST: "robust with the fewest changes", REASONS["fewest"]: "fewest changes",
-          REASONS["smallest"]: "smallest largest change", REASONS["most_severe"]: "most severe",
-          DISTINCT_CAUSE: "distinct cause"}
+LABELS = {
+    ROBUST: "robust with the fewest changes",
+    REASONS["fewest"]: "fewest changes",
+    REASONS["smallest"]: "smallest largest change",
+    REASONS["most_severe"]: "most severe",
+    DISTINCT_CAUSE: "distinct cause",
+}
 """Titles of failures by the reason for their choice, in the order in which they are shown."""
 NUMBER_WORDS = ("no", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten", "eleven", "twelve")
 MAX_CHANGES_LISTED = 4
@@ -51,7 +55,8 @@ def answer_in_words(result: Explained) -> list[str]:
         sentences += [
             f"In every cause of a failure most often ({result.sample}): {_most_necessary_in_words(result)}.",
             f"{number_of(len(result.distinct), 'distinct minimal cause')}; the most frequent: "
-            f"{', '.join(common['cause']) or 'none'} ({100 * common['share']:.0f} % of the failures)."]
+            f"{', '.join(common['cause']) or 'none'} ({100 * common['share']:.0f} % of the failures).",
+        ]
     return sentences
 
 
@@ -79,21 +84,39 @@ def verdict_in_words(result: Explained) -> list[str]:
         first = robust
     parts.append(finding_in_words(system.characteristics, first))
     if first.robustness.borderline:
-        parts.append("No failure tested is robust." if robust is None else
-                     f"The robust failure with the fewest changes: {finding_in_words(system.characteristics, robust)}")
+        parts.append(
+            "No failure tested is robust."
+            if robust is None
+            else f"The robust failure with the fewest changes: {finding_in_words(system.characteristics, robust)}"
+        )
     return [part[0].upper() + part[1:] for part in [*parts, str(result.preventability)] if part]
 
 
-def situation_in_words(system: System, original: Evaluations, nearest: Evaluations | None = None, number: int = 0) -> str:
+def situation_in_words(
+    system: System, original: Evaluations, nearest: Evaluations | None = None, number: int = 0
+) -> str:
     """The conditions and how the original vehicle's run ends; first that nothing collides, if so of `number` vehicles.
 
     `nearest` is the evaluation of the least safe of these vehicles.
     """
     points, weather = system.points, system.points[0].weather
-    where = f"at the worst of {len(points)} test points" if len(points) > 1 else f"at {points[0].name}" if system.matrix else (
-        f"{weather_in_words(weather)}{' (which changes neither road nor sensors)' if equals_clear(weather) else ''}")
+    where = (
+        f"at the worst of {len(points)} test points"
+        if len(points) > 1
+        else f"at {points[0].name}"
+        if system.matrix
+        else (
+            f"{weather_in_words(weather)}{' (which changes neither road nor sensors)' if equals_clear(weather) else ''}"
+        )
+    )
     own_ending = _ending_in_words(system, original)
-    if nearest is None or not len(nearest) or nearest.collided[0] or original.collided[0] or RATING_POINTS.name in original.metrics:
+    if (
+        nearest is None
+        or not len(nearest)
+        or nearest.collided[0]
+        or original.collided[0]
+        or RATING_POINTS.name in original.metrics
+    ):
         return f"{where[0].upper()}{where[1:]}, the original vehicle {own_ending}."
     other = f"{original.f_safe[0]:.2f} m" if nearest.outcome[0] == original.outcome[0] else own_ending
     ending = _ending_in_words(system, nearest)
@@ -109,7 +132,9 @@ def _ending_in_words(system: System, run: Evaluations) -> str:
         return f"itself collides, at {_speed_in_words(degree)}"
     if outcome == Outcome.STOPPED and all(point.scenario.pre_crash.startswith("pedestrian") for point in system.points):
         return f"stops {degree:.2f} m short of the pedestrian"
-    distance = "" if np.isnan(degree) else f" with a safety degree of {distance_in_words(system.points[0].scenario, degree)}"
+    distance = (
+        "" if np.isnan(degree) else f" with a safety degree of {distance_in_words(system.points[0].scenario, degree)}"
+    )
     return f"{OUTCOME_VERBS.get(outcome, outcome)}{distance}"
 
 
@@ -117,7 +142,9 @@ def finding_in_words(characteristics: CharacteristicSet, failure: Explanation) -
     """A sentence such as `a collision at 1.5 m/s, 5 km/h (rs:0:4, robust: ...) was found with ten changes: ...; three of them suffice`."""
     number, cause = len(failure.changed), failure.cause
     effect = f"{effect_in_words(failure)} ({failure.name}, {failure.robustness})"
-    shares = [(_share_of_change(failure, item), item.short_name) for item in characteristics if item.name in failure.changed]
+    shares = [
+        (_share_of_change(failure, item), item.short_name) for item in characteristics if item.name in failure.changed
+    ]
     largest = sorted(shares, key=lambda share: -abs(share[0]))
     changes = ", ".join(f"{name} {100 * share:+.0f} %" for share, name in largest[:MAX_CHANGES_LISTED])
     changes += f" and {number - MAX_CHANGES_LISTED} more" if number > MAX_CHANGES_LISTED else ""
@@ -159,23 +186,32 @@ def choices_in_words(result: Explained) -> list[str]:
         size = f"{number_of(len(failure.changed), 'change')} of up to {100 * largest:.0f} %"
         others = number_of(len(failure.causes) - 1, "alternative set")
         more = f" ({others} of the same size; see explain)" if len(failure.causes) > 1 else ""
-        cause = "Simulated again, it is not unsafe." if failure.cause is None else (
-            f"These changes alone cause it: {list_of_changes(characteristics, failure.cause.changes)}{more}.")
+        cause = (
+            "Simulated again, it is not unsafe."
+            if failure.cause is None
+            else (f"These changes alone cause it: {list_of_changes(characteristics, failure.cause.changes)}{more}.")
+        )
         degree = "-" if failure.safety_degree is None else f"{failure.safety_degree:.2f}"
-        sentences.append(f"{failure.title.capitalize()}: {failure.name}, {failure.outcome}, SD {degree}, {size}. {cause}")
+        sentences.append(
+            f"{failure.title.capitalize()}: {failure.name}, {failure.outcome}, SD {degree}, {size}. {cause}"
+        )
     return sentences
 
 
 def _limits_in_words(result: Explained, boundary: Mapping[str, float]) -> str:
-    return ", ".join(f"{full_name(item)} {item.original:g} -> {item.text(boundary[item.name])}{item.suffix}"
-                     for item in CharacteristicSet.of(result.study.vehicle.characteristics) if item.name in boundary)
+    return ", ".join(
+        f"{full_name(item)} {item.original:g} -> {item.text(boundary[item.name])}{item.suffix}"
+        for item in CharacteristicSet.of(result.study.vehicle.characteristics)
+        if item.name in boundary
+    )
 
 
 def _most_necessary_in_words(result: Explained) -> str:
     full_names = {item.name: full_name(item) for item in CharacteristicSet.of(result.study.vehicle.characteristics)}
     rows = result.necessity[result.necessity["necessary"] > 0].head(MAX_NECESSARY).to_dict("records")
     return ", ".join(f"{full_names[row['characteristic']]} {necessary_share(row)}" for row in rows) or (
-        "none; no change is common to all causes")
+        "none; no change is common to all causes"
+    )
 
 
 def necessary_share(row: Mapping[Any, Any] | pd.Series[Any]) -> str:

@@ -26,8 +26,9 @@ from safevar_sumo.sumo.matrix import simulate_all_points
 from safevar_sumo.sumo.system import assemble
 
 
-def summarise_failures(case: Case, original: Evaluations, pool: Pool, directory: str,
-                       progress: Progress = show_no_progress) -> list[str]:
+def summarise_failures(
+    case: Case, original: Evaluations, pool: Pool, directory: str, progress: Progress = show_no_progress
+) -> list[str]:
     """Summarise results in lines: the verdict first, the command for the next step last; no line without a solution.
 
     Of a matrix, the failures are those at the worst point of the failure with the fewest changes.
@@ -49,11 +50,17 @@ def summarise_failures(case: Case, original: Evaluations, pool: Pool, directory:
     lines, point, unsafe, system = list[str](), "", case.unsafe, assemble(study)
     if system.matrix:
         distinct = solutions.drop_duplicates(names)
-        rows = solutions.iloc[[row_of_handle(solutions, choose_handle(solutions, unsafe, choice, study.name))
-                               for choice in ("most_severe", *(["fewest"] if unsafe.rows(solutions).any() else []))]]
+        rows = solutions.iloc[
+            [
+                row_of_handle(solutions, choose_handle(solutions, unsafe, choice, study.name))
+                for choice in ("most_severe", *(["fewest"] if unsafe.rows(solutions).any() else []))
+            ]
+        ]
         evaluations = Evaluator(study, pool, progress).evaluate(rows[names].to_numpy(float), "worst points")
-        lines = [situation_in_words(system, original, evaluations.take([0]), len(distinct)),
-                 f"{int(unsafe.rows(distinct).sum())} of {len(distinct)} different vehicles are unsafe: {unsafe.description}."]
+        lines = [
+            situation_in_words(system, original, evaluations.take([0]), len(distinct)),
+            f"{int(unsafe.rows(distinct).sum())} of {len(distinct)} different vehicles are unsafe: {unsafe.description}.",
+        ]
         if len(rows) > 1 and evaluations.worst_points is not None:
             point = system.points[evaluations.worst_points[1]].name
             case = at_point(case, point)
@@ -63,9 +70,15 @@ def summarise_failures(case: Case, original: Evaluations, pool: Pool, directory:
         if point:
             settings = np.array([list(failure.setting.values()) for failure in explained.explanations])
             fails_at = unsafe_points_of(system, simulate_all_points(system, settings), unsafe) if len(settings) else []
-            failures = [f"{line} {points_in_words(points, len(system.matrix), limit=3)}"
-                        for line, points in zip(failures, fails_at, strict=True)]
-        lines += [" ".join(verdict_in_words(explained)), f"{'There, ' if point else ''}{counts_in_words(explained)}", *failures]
+            failures = [
+                f"{line} {points_in_words(points, len(system.matrix), limit=3)}"
+                for line, points in zip(failures, fails_at, strict=True)
+            ]
+        lines += [
+            " ".join(verdict_in_words(explained)),
+            f"{'There, ' if point else ''}{counts_in_words(explained)}",
+            *failures,
+        ]
     if not unsafe.rows(solutions).any():
         return [*lines, f"How far each characteristic may go: {question_command('tolerance', directory)}"]
     at_worst = f", at the worst point of the first (without --point: at all {len(system.points)}, which takes long)"

@@ -26,16 +26,27 @@ class OpinionOptions(Options):
 
     question: ClassVar[str] = "opinion"
     solutions: tuple[str, ...] = option(
-        (), "Drive the N-th solution of a run, from 0; may be repeated.  [default: the failures a report explains]",
-        flag="--solution", metavar="ALG:RUN:N", form="repeated",
-        python='Handles of solutions, such as "nsga2:3:0". By default the failures that a report explains.')
+        (),
+        "Drive the N-th solution of a run, from 0; may be repeated.  [default: the failures a report explains]",
+        flag="--solution",
+        metavar="ALG:RUN:N",
+        form="repeated",
+        python='Handles of solutions, such as "nsga2:3:0". By default the failures that a report explains.',
+    )
     unsafe: str | None = unsafe_option()
 
 
 @document_options(OpinionOptions)
-def opinion(source: str | Path | Results, *, solutions: Sequence[str] = OpinionOptions.solutions,
-            unsafe: Criterion | None = None, pool: Pool | None = None, jobs: int | None = None,
-            progress: bool | Progress = False, as_it_is_now: bool = False) -> Opinions:
+def opinion(
+    source: str | Path | Results,
+    *,
+    solutions: Sequence[str] = OpinionOptions.solutions,
+    unsafe: Criterion | None = None,
+    pool: Pool | None = None,
+    jobs: int | None = None,
+    progress: bool | Progress = False,
+    as_it_is_now: bool = False,
+) -> Opinions:
     """Drive minimal causes of failures again with CommonRoad's multi-body vehicle with Pacejka's tyres.
 
     Parameters

@@ -55,8 +55,14 @@ def assemble_both_systems(study: Study) -> tuple[System, SecondVehicle]:
     return system, SecondVehicle(system.vehicle, study)
 
 
-def ask_for_opinions(source: Study | Case, options: OpinionOptions, *, pool: Pool | None = None,
-                     jobs: int | None = None, progress: Progress = show_no_progress) -> Opinions:
+def ask_for_opinions(
+    source: Study | Case,
+    options: OpinionOptions,
+    *,
+    pool: Pool | None = None,
+    jobs: int | None = None,
+    progress: Progress = show_no_progress,
+) -> Opinions:
     """Find the minimal causes of the failures that a report explains, or of named solutions, and judge them.
 
     Raises
@@ -65,20 +71,29 @@ def ask_for_opinions(source: Study | Case, options: OpinionOptions, *, pool: Poo
         If `assemble_both_systems` or `explain_failures` raises it, or `source` is a study, which has no failures yet.
     """
     if isinstance(source, Study):
-        raise InputError(source.origin.called or source.name, "is a study and has no solutions",
-                         "a directory that the command `study` has written")
+        raise InputError(
+            source.origin.called or source.name,
+            "is a study and has no solutions",
+            "a directory that the command `study` has written",
+        )
     assemble_both_systems(source.study)
     explain_options = ExplainOptions(solutions=options.solutions, unsafe=options.unsafe, limit=SIMULATION_LIMIT)
     explained = explain_failures(source, explain_options, pool=pool, jobs=jobs, progress=progress)
-    causes = [CauseToJudge(str(failure.handle), cause.changes, cause.fraction, cause.robustness)
-              for failure in explained.explanations for cause in failure.causes]
+    causes = [
+        CauseToJudge(str(failure.handle), cause.changes, cause.fraction, cause.robustness)
+        for failure in explained.explanations
+        for cause in failure.causes
+    ]
     return replace(
-        judge_causes(source.study, causes, explained.unsafe, progress), no_verdict=explained.no_verdict,
-        without_cause=tuple(str(failure.handle) for failure in explained.explanations if not failure.causes))
+        judge_causes(source.study, causes, explained.unsafe, progress),
+        no_verdict=explained.no_verdict,
+        without_cause=tuple(str(failure.handle) for failure in explained.explanations if not failure.causes),
+    )
 
 
-def judge_causes(study: Study, causes: Sequence[CauseToJudge], unsafe: Unsafe,
-                 progress: Progress = show_no_progress) -> Opinions:
+def judge_causes(
+    study: Study, causes: Sequence[CauseToJudge], unsafe: Unsafe, progress: Progress = show_no_progress
+) -> Opinions:
     """Simulate minimal causes with both models and judge them; raises the errors of `assemble_both_systems`."""
     system, vehicle = assemble_both_systems(study)
     second, original, stage = replace(system, vehicle=vehicle), system.characteristics.original, "second vehicle model"
@@ -88,7 +103,7 @@ def judge_causes(study: Study, causes: Sequence[CauseToJudge], unsafe: Unsafe,
     scaled = (original + CHANGE_SHARES[:, np.newaxis] * (settings - original)[:, np.newaxis]).reshape(-1, len(original))
     ours, theirs = evaluate(system, settings), evaluate(second, np.concatenate([settings, scaled]))
     fails_here, fails_there = unsafe.of(ours), unsafe.of(theirs)
-    fails_scaled = fails_there[len(settings):].reshape(len(settings), -1)
+    fails_scaled = fails_there[len(settings) :].reshape(len(settings), -1)
     (original_here, *ends_here), (original_there, *ends_there) = _run_ends(ours), _run_ends(theirs)
     opinions = []
     for row, (cause, here, there) in enumerate(zip(causes, ends_here, ends_there, strict=False), 1):
@@ -107,21 +122,35 @@ def judge_causes(study: Study, causes: Sequence[CauseToJudge], unsafe: Unsafe,
             verdict = "contradicted"
             because = f"safe with the second model: {there}; the original vehicle: {original_there}"
             if fails_there[row]:
-                verdict, because = "confirmed", (
-                    f"also unsafe with the second model: {there}; the original vehicle is safe: {original_there}. "
-                    f"{_failing_shares(fails_scaled[row])} of the changes are enough with the second model, "
-                    f"{cause.fraction:.1%} with ours")
+                verdict, because = (
+                    "confirmed",
+                    (
+                        f"also unsafe with the second model: {there}; the original vehicle is safe: {original_there}. "
+                        f"{_failing_shares(fails_scaled[row])} of the changes are enough with the second model, "
+                        f"{cause.fraction:.1%} with ours"
+                    ),
+                )
             if doubt := _doubt(second, settings[row], cause.robustness, fails_there[row], unsafe, study.search.seed):
                 verdict, because = "borderline", f"{doubt}; {because}"
-        opinions.append(Opinion(solution=cause.solution, changes=dict(cause.changes), here=here, there=there,
-                                opinion=verdict, because=because))
+        opinions.append(
+            Opinion(
+                solution=cause.solution,
+                changes=dict(cause.changes),
+                here=here,
+                there=there,
+                opinion=verdict,
+                because=because,
+            )
+        )
         progress(stage, row + 1, len(settings))
-    return Opinions(study=study, unsafe=unsafe, opinions=tuple(opinions), original_here=original_here,
-                    original_there=original_there)
+    return Opinions(
+        study=study, unsafe=unsafe, opinions=tuple(opinions), original_here=original_here, original_there=original_there
+    )
 
 
-def _doubt(second: System, setting: FloatArray, our_robustness: float | None, is_unsafe: bool, unsafe: Unsafe,
-           seed: int) -> str:
+def _doubt(
+    second: System, setting: FloatArray, our_robustness: float | None, is_unsafe: bool, unsafe: Unsafe, seed: int
+) -> str:
     """In which model a cause is borderline; empty if in none, or in a rated study, whose neighbours take too long."""
     if our_robustness is None:
         return ""

@@ -49,8 +49,11 @@ def load_bmw_parameters() -> Any:
     try:
         from vehiclemodels.parameters_vehicle2 import parameters_vehicle2
     except ImportError:
-        raise InputError("opinion", "commonroad-vehicle-models, the second vehicle model, is not installed",
-                         "in the checkout: pip install '.[opinion]'") from None
+        raise InputError(
+            "opinion",
+            "commonroad-vehicle-models, the second vehicle model, is not installed",
+            "in the checkout: pip install '.[opinion]'",
+        ) from None
     return parameters_vehicle2()
 
 
@@ -100,9 +103,18 @@ class Plant(NamedTuple):
     drive_ratio: FloatArray = ONE
 
 
-def build_plant(mass: FloatArray, unladen_mass: float, slope: Slope, *, front_brake_share: float = 0.5,
-                front_drive_share: float = 0.5, centre: FloatArray | None = None, wheelbase: float | None = None,
-                height: float | None = None, **constants: Any) -> Plant:
+def build_plant(
+    mass: FloatArray,
+    unladen_mass: float,
+    slope: Slope,
+    *,
+    front_brake_share: float = 0.5,
+    front_drive_share: float = 0.5,
+    centre: FloatArray | None = None,
+    wheelbase: float | None = None,
+    height: float | None = None,
+    **constants: Any,
+) -> Plant:
     """Vehicles with masses [kg] that differ from the package's vehicle.
 
     Unsprung masses, springs, dampers, tyres and inertia grow with `unladen_mass` [kg], so that all frequencies stay the
@@ -121,12 +133,22 @@ def build_plant(mass: FloatArray, unladen_mass: float, slope: Slope, *, front_br
         return np.array([[front], [rear]])
 
     plant = Plant(
-        mass=mass, sprung_mass=sprung_mass, unsprung_mass=unsprung_mass, arms=np.stack([front_arm, front_arm - length]),
-        static_shares=np.stack([length - front_arm, front_arm]) / length, height=height or bmw.h_s,
-        pitch_inertia=scale * bmw.I_y_s * (length / package_length) ** 2, tyre_spring=scale * bmw.K_zt,
-        springs=scale * axles(bmw.K_sf, bmw.K_sr), dampers=scale * axles(bmw.K_sdf, bmw.K_sdr),
-        brake_shares=axles(front_brake_share, 1 - front_brake_share), back=slope.back, down=slope.down,
-        drive_shares=axles(front_drive_share, 1 - front_drive_share), **constants)
+        mass=mass,
+        sprung_mass=sprung_mass,
+        unsprung_mass=unsprung_mass,
+        arms=np.stack([front_arm, front_arm - length]),
+        static_shares=np.stack([length - front_arm, front_arm]) / length,
+        height=height or bmw.h_s,
+        pitch_inertia=scale * bmw.I_y_s * (length / package_length) ** 2,
+        tyre_spring=scale * bmw.K_zt,
+        springs=scale * axles(bmw.K_sf, bmw.K_sr),
+        dampers=scale * axles(bmw.K_sdf, bmw.K_sdr),
+        brake_shares=axles(front_brake_share, 1 - front_brake_share),
+        back=slope.back,
+        down=slope.down,
+        drive_shares=axles(front_drive_share, 1 - front_drive_share),
+        **constants,
+    )
     # Heights of the state count from unloaded tyres.
     return plant._replace(height=plant.height + balanced_state(plant, mass).heights[0])
 
@@ -181,8 +203,9 @@ def tyre_forces(plant: Plant, body: MultiBodyState) -> TyreForces:
     return TyreForces(peak * np.sin(angle), peak, slip, slope * (stiffness * plant.radius / slip_speed))
 
 
-def derivatives(plant: Plant, body: MultiBodyState, torques: FloatArray, force: FloatArray
-                ) -> tuple[FloatArray, FloatArray, FloatArray]:
+def derivatives(
+    plant: Plant, body: MultiBodyState, torques: FloatArray, force: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     """The right-hand side of the package's equations: the derivatives of speed, rates and wheel speeds.
 
     `torques`, shape (2, N), turn both wheels of an axle forward [N m]; `force` is that of one tyre of each axle [N].
@@ -195,12 +218,16 @@ def derivatives(plant: Plant, body: MultiBodyState, torques: FloatArray, force: 
     heave = plant.down - 2 * (springs[0] + springs[1]) / plant.sprung_mass
     pitch = (2 * (moments[0] + moments[1]) + traction * (plant.height - body.heights[0])) / plant.pitch_inertia
     axles = plant.down - 2 * (body.heights[2:] * plant.tyre_spring - springs) / plant.unsprung_mass
-    return (traction / plant.mass - plant.back, np.stack([heave, pitch, *axles]),
-            (torques / 2 - plant.radius * force) / plant.wheel_inertia)
+    return (
+        traction / plant.mass - plant.back,
+        np.stack([heave, pitch, *axles]),
+        (torques / 2 - plant.radius * force) / plant.wheel_inertia,
+    )
 
 
-def advance(plant: Plant, body: MultiBodyState, pedal: FloatArray, drive_torque: FloatArray, step: float
-            ) -> MultiBodyState:
+def advance(
+    plant: Plant, body: MultiBodyState, pedal: FloatArray, drive_torque: FloatArray, step: float
+) -> MultiBodyState:
     """One integration step under a brake pedal (0 to 1) and a torque of engine and drags on all wheels [N m].
 
     Wheel speeds, which are stiff, are integrated implicitly (linearised), others explicitly, rates before heights.

@@ -90,10 +90,32 @@ class Opinions:
 
     def to_frame(self) -> pd.DataFrame:
         """One row for each cause: the keys of `to_dict`, with outcome and safety degree of `here` and `there`."""
-        rows = [(one.solution, one.changes, one.here.outcome, one.here.safety_degree, one.there.outcome,
-                 one.there.safety_degree, one.opinion, one.because) for one in self.opinions]
-        return pd.DataFrame(rows, columns=["solution", "changes", "outcome_here", "safety_degree_here", "outcome_there",
-                                           "safety_degree_there", "opinion", "because"])
+        rows = [
+            (
+                one.solution,
+                one.changes,
+                one.here.outcome,
+                one.here.safety_degree,
+                one.there.outcome,
+                one.there.safety_degree,
+                one.opinion,
+                one.because,
+            )
+            for one in self.opinions
+        ]
+        return pd.DataFrame(
+            rows,
+            columns=[
+                "solution",
+                "changes",
+                "outcome_here",
+                "safety_degree_here",
+                "outcome_there",
+                "safety_degree_there",
+                "opinion",
+                "because",
+            ],
+        )
 
     @property
     def notes(self) -> list[str]:
@@ -101,20 +123,26 @@ class Opinions:
         words, numbers = {"outside": "outside (no answer)"}, Counter(one.opinion for one in self.opinions)
         counts = [f"{numbers[one]} {words.get(one, one)}" for one in get_args(Verdict) if one in numbers]
         total = number_of(len(self.opinions), "minimal cause")
-        return [*(f"{handle} is not unsafe: it has no cause" for handle in self.without_cause),
-                f"of {total} {join_phrases(counts)}" if counts else "there is no cause to judge"]
+        return [
+            *(f"{handle} is not unsafe: it has no cause" for handle in self.without_cause),
+            f"of {total} {join_phrases(counts)}" if counts else "there is no cause to judge",
+        ]
 
     def sentences(self) -> list[str]:
         """The answer as lines: how many causes are confirmed, then every cause with the reason."""
         characteristics = CharacteristicSet.of(self.study.vehicle.characteristics)
         *notes, counts = self.notes
-        lines = [f"Unsafe: {self.unsafe.description}. {MODEL_IN_WORDS}: {counts}.",
-                 f"The original vehicle with our model: {self.original_here}; with the second: {self.original_there}.",
-                 *(f"note: {note}" for note in notes)]
+        lines = [
+            f"Unsafe: {self.unsafe.description}. {MODEL_IN_WORDS}: {counts}.",
+            f"The original vehicle with our model: {self.original_here}; with the second: {self.original_there}.",
+            *(f"note: {note}" for note in notes),
+        ]
         for one in self.opinions:
             handle = f"{one.solution}: " if one.solution else ""
-            lines += [f"{handle}{one.opinion}: {list_of_changes(characteristics, one.changes)}",
-                      f"  with our model {one.here}; {one.because}"]
+            lines += [
+                f"{handle}{one.opinion}: {list_of_changes(characteristics, one.changes)}",
+                f"  with our model {one.here}; {one.because}",
+            ]
         return lines
 
     def __repr__(self) -> str:

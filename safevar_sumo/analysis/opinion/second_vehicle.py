@@ -92,9 +92,12 @@ class SecondVehicle(Vehicle):
                 break
         else:
             raise InputError(
-                study.source, f"vehicle.model = {study.vehicle.model!r} with {', '.join(rows)} is no vehicle that the "
-                "second model can represent", f"one of {', '.join(MAPPING_TABLES)}, a class derived from one, or one "
-                "with the same characteristics in the same units")
+                study.source,
+                f"vehicle.model = {study.vehicle.model!r} with {', '.join(rows)} is no vehicle that the "
+                "second model can represent",
+                f"one of {', '.join(MAPPING_TABLES)}, a class derived from one, or one "
+                "with the same characteristics in the same units",
+            )
         shipped = load_study(self.table.study).vehicle
         given = {**shipped.parameters, **study.vehicle.parameters}
         parameters = {key: getattr(model, key, given.get(key)) for key in cls.__struct_fields__}
@@ -104,20 +107,34 @@ class SecondVehicle(Vehicle):
     def reasons_to_omit(self, changes: Mapping[str, float]) -> list[str]:
         """The reason for each changed characteristic that cannot be represented; empty if all can."""
         unknown = "no parameter of the second model is known for it"
-        return [f"{name}: {self.table.outside.get(name, unknown)}" for name in changes
-                if name in self.table.outside or name not in self._matching]
+        return [
+            f"{name}: {self.table.outside.get(name, unknown)}"
+            for name in changes
+            if name in self.table.outside or name not in self._matching
+        ]
 
-    def prepare(self, characteristics: Characteristics, road_friction: Any, step: float,
-                slope: Slope = LEVEL, wet: bool | BoolArray = False) -> Prepared:
+    def prepare(
+        self,
+        characteristics: Characteristics,
+        road_friction: Any,
+        step: float,
+        slope: Slope = LEVEL,
+        wet: bool | BoolArray = False,
+    ) -> Prepared:
         road, settings = Road(road_friction, slope, wet), np.stack([*characteristics.values()], axis=1)
         original = {name: np.full(len(settings), value) for name, value in self._original.items()}
         represented = original | {name: characteristics[name] for name in self._matching}
         plant, own = (self.table.represent(self._engine, c, self._original, road) for c in (represented, original))
         return Prepared(
             vehicle=self._vehicle.prepare(characteristics, road_friction, step, slope, wet),
-            original=self._engine.prepare(original, road_friction, step, slope, wet), plant=plant,
-            engine_mass=own.mass + WHEEL_COUNT * own.wheel_inertia / own.radius**2, engine_radius=own.radius,
-            settings=settings, slope=slope, step=step)
+            original=self._engine.prepare(original, road_friction, step, slope, wet),
+            plant=plant,
+            engine_mass=own.mass + WHEEL_COUNT * own.wheel_inertia / own.radius**2,
+            engine_radius=own.radius,
+            settings=settings,
+            slope=slope,
+            step=step,
+        )
 
     def sumo_type(self, prepared: Prepared) -> SumoType:
         return self._vehicle.sumo_type(prepared.vehicle)

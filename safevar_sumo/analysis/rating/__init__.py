@@ -25,17 +25,29 @@ class RatingOptions(Options):
 
     question: ClassVar[str] = "rating"
     changes: Mapping[str, float] | None = option(
-        None, "A characteristic of the variant, in its unit or as +10% of the original.", flag="--set", metavar="NAME=VALUE",
+        None,
+        "A characteristic of the variant, in its unit or as +10% of the original.",
+        flag="--set",
+        metavar="NAME=VALUE",
         form="repeated",
-        python="Values of characteristics of the variant, in their units; the others are the original's, or the solution's.")
-    solution: str | None = option(None, "The variant is the N-th solution of a run, from 0, of a results directory.",
-                                  metavar="ALG:RUN:N")
+        python="Values of characteristics of the variant, in their units; the others are the original's, or the solution's.",
+    )
+    solution: str | None = option(
+        None, "The variant is the N-th solution of a run, from 0, of a results directory.", metavar="ALG:RUN:N"
+    )
 
 
 @document_options(RatingOptions)
-def rating(study: StudyLike | Results, changes: Mapping[str, float] | None = RatingOptions.changes, *,
-           solution: str | None = RatingOptions.solution, pool: Pool | None = None, jobs: int | None = None,
-           progress: bool | Progress = False, as_it_is_now: bool = False) -> Rating:
+def rating(
+    study: StudyLike | Results,
+    changes: Mapping[str, float] | None = RatingOptions.changes,
+    *,
+    solution: str | None = RatingOptions.solution,
+    pool: Pool | None = None,
+    jobs: int | None = None,
+    progress: bool | Progress = False,
+    as_it_is_now: bool = False,
+) -> Rating:
     """Rate the crash avoidance (frontal collisions) of a vehicle and of one variant as Euro NCAP does in 2026.
 
     Parameters

@@ -83,14 +83,24 @@ class RatedVehicle:
     def tests(self) -> list[RatedTest]:
         tests = []
         for matrix in self.protocol.matrices:
-            standard, extended, robustness = (round(float(value), DECIMALS) for value in self.scores.tests[matrix.name][0])
-            tests.append(RatedTest(matrix=matrix, points=(standard, extended, robustness), layers=self._held_layers(matrix)))
+            standard, extended, robustness = (
+                round(float(value), DECIMALS) for value in self.scores.tests[matrix.name][0]
+            )
+            tests.append(
+                RatedTest(matrix=matrix, points=(standard, extended, robustness), layers=self._held_layers(matrix))
+            )
         return tests
 
     def _held_layers(self, matrix: CellMatrix) -> dict[str, bool | None]:
         claimed = self.claims.get(matrix.test_name, ())
-        return {layer.name: bool(self.scores.layers[matrix.test_name, layer.name][0]) if layer.simulated_conditions
-                else True if layer.name in claimed else None for layer in self.protocol.layers_of(matrix.test_name)}
+        return {
+            layer.name: bool(self.scores.layers[matrix.test_name, layer.name][0])
+            if layer.simulated_conditions
+            else True
+            if layer.name in claimed
+            else None
+            for layer in self.protocol.layers_of(matrix.test_name)
+        }
 
     def colour(self, cell_number: int) -> str | None:
         """Colour of a cell; None if the vehicle could not drive the test."""
@@ -100,7 +110,10 @@ class RatedVehicle:
     def passes(self, cell_number: int) -> bool:
         """Whether a robustness cell meets its criterion."""
         colour, nominal = self.scores.colours[0, [cell_number, self.matrix_cell_number(cell_number)]].tolist()
-        return bool(colour >= 0 and (colour < RED if self.protocol.cells[cell_number].criterion == NOT_RED else colour <= nominal))
+        return bool(
+            colour >= 0
+            and (colour < RED if self.protocol.cells[cell_number].criterion == NOT_RED else colour <= nominal)
+        )
 
     def matrix_cell_number(self, cell_number: int) -> int:
         """Number of the matrix cell that a robustness cell varies; of a matrix cell its own number."""
@@ -111,21 +124,38 @@ class RatedVehicle:
         """A cell as `rating --json` prints it."""
         cell, impact = self.protocol.cells[cell_number], finite_or_none(self.cells.impact[0, cell_number])
         warning = finite_or_none(self.cells.warning[0, cell_number])
-        return {"range": cell.range_or_layer, "vut_speed": cell.vut_speed, "target_speed": cell.target_speed,
-                "impact_location": cell.impact_location, "colour": self.colour(cell_number),
-                "relative_impact_speed": None if impact is None else round(impact, DECIMALS), "warning_ttc":
-                None if warning is None else round(warning, DECIMALS)}
+        return {
+            "range": cell.range_or_layer,
+            "vut_speed": cell.vut_speed,
+            "target_speed": cell.target_speed,
+            "impact_location": cell.impact_location,
+            "colour": self.colour(cell_number),
+            "relative_impact_speed": None if impact is None else round(impact, DECIMALS),
+            "warning_ttc": None if warning is None else round(warning, DECIMALS),
+        }
 
     def to_dict(self) -> dict[str, Any]:
         cell_numbers: dict[str, list[int]] = {}
         for cell_number, cell in enumerate(self.protocol.cells):
             cell_numbers.setdefault(cell.matrix.name, []).append(cell_number)
-        tests = [{"test": test.matrix.test_name, "light": test.matrix.light, **dict(zip(POINT_KINDS, test.points, strict=True)),
-                  "possible": dict(zip(POINT_KINDS, test.matrix.points, strict=True)),
-                  "cells": [self.cell_to_dict(cell_number) for cell_number in cell_numbers[test.matrix.name]], "layers": dict(test.layers)}
-                 for test in self.tests]
-        return {"name": self.name, "setting": dict(self.setting), "points": round(self.points, DECIMALS),
-                "possible": max_points(self.protocol), "tests": tests}
+        tests = [
+            {
+                "test": test.matrix.test_name,
+                "light": test.matrix.light,
+                **dict(zip(POINT_KINDS, test.points, strict=True)),
+                "possible": dict(zip(POINT_KINDS, test.matrix.points, strict=True)),
+                "cells": [self.cell_to_dict(cell_number) for cell_number in cell_numbers[test.matrix.name]],
+                "layers": dict(test.layers),
+            }
+            for test in self.tests
+        ]
+        return {
+            "name": self.name,
+            "setting": dict(self.setting),
+            "points": round(self.points, DECIMALS),
+            "possible": max_points(self.protocol),
+            "tests": tests,
+        }
 
 
 def max_points(protocol: Protocol) -> float:
@@ -162,7 +192,9 @@ class Rating:
         claims, open_points = self.original.claims, 0.0
         for test, matrices in self.protocol.tests.items():
             layers = self.protocol.layers_of(test)
-            open_layers = [layer for layer in layers if not layer.simulated_conditions and layer.name not in claims.get(test, ())]
+            open_layers = [
+                layer for layer in layers if not layer.simulated_conditions and layer.name not in claims.get(test, ())
+            ]
             open_points += sum(matrix.points[2] for matrix in matrices) * len(open_layers) / len(layers)
         return round(open_points, DECIMALS)
 
@@ -172,31 +204,55 @@ class Rating:
         if variant is None:
             return []
         cell_numbers = np.flatnonzero(self.original.scores.colours[0] != variant.scores.colours[0]).tolist()
-        return [(self.protocol.cells[cell_number], self.original.colour(cell_number), variant.colour(cell_number))
-                for cell_number in cell_numbers]
+        return [
+            (self.protocol.cells[cell_number], self.original.colour(cell_number), variant.colour(cell_number))
+            for cell_number in cell_numbers
+        ]
 
     def to_frame(self) -> pd.DataFrame:
         """One row for each vehicle and test.
 
         Columns: `vehicle`, `test`, `light`, `standard`, `extended`, `robustness`, `total`, `possible` [points].
         """
-        return pd.DataFrame([{
-            "vehicle": vehicle.name, "test": test.matrix.test_name, "light": test.matrix.light,
-            **dict(zip(POINT_KINDS, test.points, strict=True)), "total": test.total,
-            "possible": sum(test.matrix.points)} for vehicle in self.vehicles for test in vehicle.tests])
+        return pd.DataFrame(
+            [
+                {
+                    "vehicle": vehicle.name,
+                    "test": test.matrix.test_name,
+                    "light": test.matrix.light,
+                    **dict(zip(POINT_KINDS, test.points, strict=True)),
+                    "total": test.total,
+                    "possible": sum(test.matrix.points),
+                }
+                for vehicle in self.vehicles
+                for test in vehicle.tests
+            ]
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """The JSON of `rating`."""
-        return {"study": self.study.name, **driven_entry(self.no_verdict), "variants": [vehicle.to_dict() for vehicle in self.vehicles],
-                "not_simulated": [{"test": test, "points": points} for test, points in self.protocol.points_not_simulated.items()]}
+        return {
+            "study": self.study.name,
+            **driven_entry(self.no_verdict),
+            "variants": [vehicle.to_dict() for vehicle in self.vehicles],
+            "not_simulated": [
+                {"test": test, "points": points} for test, points in self.protocol.points_not_simulated.items()
+            ],
+        }
 
     def __repr__(self) -> str:
         vehicles = "; ".join(f"{vehicle.name} {vehicle.points:.2f}" for vehicle in self.vehicles)
         return f"<Rating of {self.study.name}, points of {max_points(self.protocol):g}: {vehicles}>"
 
 
-def rate_variant(subject: Study | Case, options: RatingOptions, *, pool: Pool | None = None, jobs: int | None = None,
-                 progress: Progress = show_no_progress) -> Rating:
+def rate_variant(
+    subject: Study | Case,
+    options: RatingOptions,
+    *,
+    pool: Pool | None = None,
+    jobs: int | None = None,
+    progress: Progress = show_no_progress,
+) -> Rating:
     """Rate the original vehicle, and the variant if the options describe one.
 
     Raises
@@ -214,7 +270,10 @@ def rate_variant(subject: Study | Case, options: RatingOptions, *, pool: Pool | 
         if isinstance(subject, Study):
             raise InputError("solution", f"{study.name!r} is a study and has no solutions", "a results directory")
         row = subject.solutions.iloc[row_of_handle(subject.solutions, SolutionId.parse(options.solution))]
-        setting_values, name = {characteristic: float(row[characteristic]) for characteristic in characteristics.names}, options.solution
+        setting_values, name = (
+            {characteristic: float(row[characteristic]) for characteristic in characteristics.names},
+            options.solution,
+        )
     if options.changes:
         characteristics.setting(options.changes, "changes", switch="")  # refuses unknown names
         setting_values, name = {**setting_values, **options.changes}, f"{name} changed" if setting_values else name
@@ -224,8 +283,14 @@ def rate_variant(subject: Study | Case, options: RatingOptions, *, pool: Pool | 
     return rate(study, variants, pool=pool, jobs=jobs, progress=progress)
 
 
-def rate(study: Study, settings: Mapping[str, FloatArray], *, pool: Pool | None = None, jobs: int | None = None,
-         progress: Progress = show_no_progress) -> Rating:
+def rate(
+    study: Study,
+    settings: Mapping[str, FloatArray],
+    *,
+    pool: Pool | None = None,
+    jobs: int | None = None,
+    progress: Progress = show_no_progress,
+) -> Rating:
     """Rate a study's original vehicle and variants, given as settings of shape (n,) by name; the filter is not applied.
 
     Raises
@@ -246,10 +311,17 @@ def rate_on(evaluator: Evaluator, settings: Mapping[str, FloatArray]) -> Rating:
     names = CharacteristicSet.of(evaluator.study.vehicle.characteristics).names
     settings_by_name = {"original": evaluator.characteristics.original, **settings}
     cells = evaluator.simulate_cells(np.stack(list(settings_by_name.values())), "cells and robustness layers")
-    vehicles = [RatedVehicle(name=name, setting=dict(zip(names, setting.tolist(), strict=True)), protocol=rater.protocol,
-                             cells=cells.of([index]), scores=points_of(rater.protocol, cells.of([index]), rater.claims),
-                             claims=rater.claims)
-                for index, (name, setting) in enumerate(settings_by_name.items())]
+    vehicles = [
+        RatedVehicle(
+            name=name,
+            setting=dict(zip(names, setting.tolist(), strict=True)),
+            protocol=rater.protocol,
+            cells=cells.of([index]),
+            scores=points_of(rater.protocol, cells.of([index]), rater.claims),
+            claims=rater.claims,
+        )
+        for index, (name, setting) in enumerate(settings_by_name.items())
+    ]
     return Rating(study=evaluator.study, protocol=rater.protocol, vehicles=vehicles, no_verdict=evaluator.no_verdict)
 
 
@@ -258,17 +330,25 @@ def remarks(rating: Rating) -> list[str]:
     weather = weather_of(rating.study.weather, f"study {rating.study.name!r}")
     lines = []
     if weather.wet or weather.road_friction != 1:
-        lines.append(f"Euro NCAP tests on a dry road; this rating has the weather {weather.name!r}, by night {darken(weather).name!r}.")
+        lines.append(
+            f"Euro NCAP tests on a dry road; this rating has the weather {weather.name!r}, by night {darken(weather).name!r}."
+        )
     for vehicle in rating.vehicles:
         if vehicle.fails:
-            lines.append(f"{vehicle.name}: it earns nothing, because {_describe_cells(REQUIRED_CELLS, vehicle.protocol)} is not green in "
-                         "the whole standard range.")
+            lines.append(
+                f"{vehicle.name}: it earns nothing, because {_describe_cells(REQUIRED_CELLS, vehicle.protocol)} is not green in "
+                "the whole standard range."
+            )
         elif any(vehicle.colour(cell_number) != "green" for cell_number in UNCHECKED_CELLS.numbers(vehicle.protocol)):
-            lines.append(f"{vehicle.name}: {_describe_cells(UNCHECKED_CELLS, vehicle.protocol)} is not green, which Euro NCAP requires; "
-                         f"Euro NCAP's calculator {vehicle.protocol.calculator_version} does not check this, nor do these points.")
+            lines.append(
+                f"{vehicle.name}: {_describe_cells(UNCHECKED_CELLS, vehicle.protocol)} is not green, which Euro NCAP requires; "
+                f"Euro NCAP's calculator {vehicle.protocol.calculator_version} does not check this, nor do these points."
+            )
         invalid_cells = int(np.count_nonzero(~vehicle.cells.valid))
         if invalid_cells:
-            lines.append(f"{vehicle.name}: {invalid_cells} cells are no valid tests and earn nothing: the vehicle cannot hold the speed.")
+            lines.append(
+                f"{vehicle.name}: {invalid_cells} cells are no valid tests and earn nothing: the vehicle cannot hold the speed."
+            )
     if all(np.isnan(vehicle.cells.warning).all() for vehicle in rating.vehicles):
         lines.append("The driving system never warns: rows with FCW are red.")
     return lines

@@ -22,8 +22,13 @@ if TYPE_CHECKING:
 
 COLOUR_LETTERS = {colour: colour[0].upper() for colour in COLOURS}
 LEGEND = ", ".join(f"{letter} {colour}" for colour, letter in COLOUR_LETTERS.items())
-TERMINAL_STYLES = {"green": "black on green", "yellow": "black on bright_yellow", "orange": "black on dark_orange",
-               "brown": "white on dark_red", "red": "white on red"}
+TERMINAL_STYLES = {
+    "green": "black on green",
+    "yellow": "black on bright_yellow",
+    "orange": "black on dark_orange",
+    "brown": "white on dark_red",
+    "red": "white on red",
+}
 DARK_COLOURS = ("green", "brown", "red")
 """Colours of cells whose text is white."""
 LIGHT_WORDS = {"day": " by day", "night": " by night", None: ""}
@@ -45,14 +50,18 @@ def rating_in_words(rating: Rating) -> str:
     if variant is None:
         return f"The original vehicle earns {rating.original.points:.2f} of the {maximum:g} points of the tests that are simulated."
     changes = _changes_in_words(rating, variant)
-    of_original_points = f"of the {rating.original.points:.2f} points that the original earns (of {maximum:g} that are simulated)"
+    of_original_points = (
+        f"of the {rating.original.points:.2f} points that the original earns (of {maximum:g} that are simulated)"
+    )
     if not rating.lost:
         return f"With {changes} the vehicle keeps all {of_original_points}."
     if rating.lost < 0:
         return f"With {changes} the vehicle earns {-rating.lost:.2f} points more, {variant.points:.2f} instead {of_original_points}."
     losses = lost_by_test(rating)
     test, loss = losses[0]
-    share = "all" if math.isclose(loss, rating.lost, abs_tol=1e-6) else "most" if loss > rating.lost / 2 else f"{loss:.2f}"
+    share = (
+        "all" if math.isclose(loss, rating.lost, abs_tol=1e-6) else "most" if loss > rating.lost / 2 else f"{loss:.2f}"
+    )
     return f"With {changes} the vehicle loses {rating.lost:.2f} {of_original_points}, {share} of them in {test_in_words(test)}."
 
 
@@ -72,8 +81,16 @@ def colour_changes_in_words(rating: Rating) -> list[tuple[str, str]]:
         if not cell.is_robustness_cell:
             colours = before or "unknown", after or "unknown"
             tests.setdefault(cell.matrix.name, {}).setdefault(colours, []).append(f"{cell.vut_speed:g}")
-    return [(test, "; ".join(f"{before} to {after} at {join_phrases(dict.fromkeys(speeds))} km/h ({number_of(len(speeds), 'cell')})"
-                             for (before, after), speeds in groups.items())) for test, groups in tests.items()]
+    return [
+        (
+            test,
+            "; ".join(
+                f"{before} to {after} at {join_phrases(dict.fromkeys(speeds))} km/h ({number_of(len(speeds), 'cell')})"
+                for (before, after), speeds in groups.items()
+            ),
+        )
+        for test, groups in tests.items()
+    ]
 
 
 def not_simulated(rating: Rating) -> str:
@@ -92,24 +109,38 @@ def test_in_words(test: RatedTest) -> str:
 
 def _changes_in_words(rating: Rating, variant: RatedVehicle) -> str:
     characteristics = CharacteristicSet.of(rating.study.vehicle.characteristics)
-    changes = [f"{characteristic.short_name} {float(characteristic.text(variant.setting[characteristic.name])):g}{characteristic.suffix}"
-               for characteristic in characteristics if variant.setting[characteristic.name] != characteristic.original]
+    changes = [
+        f"{characteristic.short_name} {float(characteristic.text(variant.setting[characteristic.name])):g}{characteristic.suffix}"
+        for characteristic in characteristics
+        if variant.setting[characteristic.name] != characteristic.original
+    ]
     return join_phrases(changes) if changes else "no change at all"
 
 
 def _build_points_table(rating: Rating) -> WholeTable:
     """Points of every test as standard + extended + robustness = total."""
     names = [vehicle.name for vehicle in rating.vehicles]
-    table = WholeTable("test", right=[*names, *(["lost"] if rating.variant else []), "of"],
-                       title="Points: standard + extended + robustness = total")
+    table = WholeTable(
+        "test",
+        right=[*names, *(["lost"] if rating.variant else []), "of"],
+        title="Points: standard + extended + robustness = total",
+    )
     for test_of_each in zip(*(vehicle.tests for vehicle in rating.vehicles), strict=True):
         original_test, lost = test_of_each[0], round(test_of_each[0].total - test_of_each[-1].total, 2)
-        table.add_row(original_test.matrix.name, *(_format_sum(test.points) for test in test_of_each),
-                      *([f"{lost:.2f}" if lost else ""] if rating.variant else []), f"{sum(original_test.matrix.points):.2f}")
+        table.add_row(
+            original_test.matrix.name,
+            *(_format_sum(test.points) for test in test_of_each),
+            *([f"{lost:.2f}" if lost else ""] if rating.variant else []),
+            f"{sum(original_test.matrix.points):.2f}",
+        )
     table.add_section()
     totals = [[sum(test.points[kind] for test in vehicle.tests) for kind in range(3)] for vehicle in rating.vehicles]
-    table.add_row("all", *map(_format_sum, totals), *([f"{rating.lost:.2f}"] if rating.variant else []),
-                  f"{max_points(rating.protocol):g}")
+    table.add_row(
+        "all",
+        *map(_format_sum, totals),
+        *([f"{rating.lost:.2f}"] if rating.variant else []),
+        f"{max_points(rating.protocol):g}",
+    )
     return table
 
 
@@ -119,32 +150,53 @@ def _format_sum(points: Sequence[float]) -> str:
 
 def _build_layers_table(rating: Rating) -> WholeTable:
     """The layers that are simulated or claimed, the same by day and night; a variant has a row only where it differs from the original."""
-    table = WholeTable("test", "vehicle", "layers that hold", "layers that fail", "claimed layers", title="Robustness layers")
+    table = WholeTable(
+        "test", "vehicle", "layers that hold", "layers that fail", "claimed layers", title="Robustness layers"
+    )
     for test_of_each in zip(*(vehicle.tests for vehicle in rating.vehicles), strict=True):
         claimed = rating.original.claims.get(test_of_each[0].matrix.test_name, ())
         for vehicle, test in zip(rating.vehicles, test_of_each, strict=True):
             if test.matrix.light != "night" and (vehicle is rating.original or test.layers != test_of_each[0].layers):
-                held_layers, failed_layers = ([layer for layer, holds in test.layers.items() if holds is expected and layer not in claimed]
-                                              for expected in (True, False))
-                table.add_row(test.matrix.test_name, vehicle.name, ", ".join(held_layers), ", ".join(failed_layers), ", ".join(claimed))
+                held_layers, failed_layers = (
+                    [layer for layer, holds in test.layers.items() if holds is expected and layer not in claimed]
+                    for expected in (True, False)
+                )
+                table.add_row(
+                    test.matrix.test_name,
+                    vehicle.name,
+                    ", ".join(held_layers),
+                    ", ".join(failed_layers),
+                    ", ".join(claimed),
+                )
     return table
 
 
 def print_matrices(console: Console, rating: Rating) -> None:
     """Print every matrix: for each cell a letter, a colour, and the impact speed [km/h] or the time to collision at the warning [s]."""
     for matrix in rating.protocol.matrices:
-        columns = [f"{location:g} %" for location in matrix.impact_locations] or [f"{speed:g}" for speed in matrix.target_speeds]
+        columns = [f"{location:g} %" for location in matrix.impact_locations] or [
+            f"{speed:g}" for speed in matrix.target_speeds
+        ]
         column_meaning = "impact location" if matrix.impact_locations else "speed of the target"
         headings = ["VUT", *(["target"] if matrix.impact_locations else [])]
         table = WholeTable(*headings, right=columns, title=f"{matrix.name}: speeds [km/h], {column_meaning}")
         for row_number, row in enumerate(matrix.rows):
-            cells = [_format_cell(rating, matrix, row_number, column) if row.has_cell(column) else Text("")
-                     for column in range(len(row.range_letters))]
-            table.add_row(_format_vut_speed(matrix, row_number), *([] if row.target_speed is None else [f"{row.target_speed:g}"]), *cells)
+            cells = [
+                _format_cell(rating, matrix, row_number, column) if row.has_cell(column) else Text("")
+                for column in range(len(row.range_letters))
+            ]
+            table.add_row(
+                _format_vut_speed(matrix, row_number),
+                *([] if row.target_speed is None else [f"{row.target_speed:g}"]),
+                *cells,
+            )
         console.print(table)
     compared = "; original>variant where they differ" if rating.variant else ""
-    print_text(console, f"{LEGEND}; small letters: extended range. The number is the relative speed of the impact [km/h]; in rows with "
-                        f"FCW it is the time to collision at the warning [s]{compared}.")
+    print_text(
+        console,
+        f"{LEGEND}; small letters: extended range. The number is the relative speed of the impact [km/h]; in rows with "
+        f"FCW it is the time to collision at the warning [s]{compared}.",
+    )
 
 
 def _format_vut_speed(matrix: CellMatrix, row_number: int) -> str:
@@ -178,12 +230,15 @@ def matrices_figure(rating: Rating) -> Figure:
     matrices = rating.protocol.matrices
     rows = math.ceil(len(matrices) / FIGURE_COLUMNS)
     figure, axes = new_figure(points_title(rating), rows, FIGURE_COLUMNS, (15, 2.6 * rows))
-    for axis in axes.flat[len(matrices):]:
+    for axis in axes.flat[len(matrices) :]:
         axis.set_axis_off()
     for axis, matrix in zip(axes.flat, matrices, strict=False):
         _draw_matrices(axis, rating, matrix)
-    figure.supxlabel(f"impact location [% of the width], or speed of the target [km/h] in CCCscp and CMCscp; {LEGEND}; hatched: extended "
-                     "range; thick frame: colour differs from the original's", fontsize=FONT)
+    figure.supxlabel(
+        f"impact location [% of the width], or speed of the target [km/h] in CCCscp and CMCscp; {LEGEND}; hatched: extended "
+        "range; thick frame: colour differs from the original's",
+        fontsize=FONT,
+    )
     figure.supylabel("speed of the vehicle under test [km/h]", fontsize=FONT)
     return figure
 
@@ -211,18 +266,45 @@ def _draw_matrices(axis: Axes, rating: Rating, matrix: CellMatrix) -> None:
             differs = index > 0 and colour != rating.original.colour(cell_number)
             fill_colour = f"#{rating.protocol.colours[colour]}" if colour else "#808080"
             text_colour = "white" if colour in DARK_COLOURS or colour is None else "black"
-            axis.add_patch(Rectangle((offset + cell.column, cell.row), width=1, height=1, facecolor=fill_colour, edgecolor="white",
-                                     linewidth=0.6, hatch="///" if is_extended else None))
+            axis.add_patch(
+                Rectangle(
+                    (offset + cell.column, cell.row),
+                    width=1,
+                    height=1,
+                    facecolor=fill_colour,
+                    edgecolor="white",
+                    linewidth=0.6,
+                    hatch="///" if is_extended else None,
+                )
+            )
             if differs:
-                axis.add_patch(Rectangle((offset + cell.column + 0.08, cell.row + 0.08), width=0.84, height=0.84, fill=False,
-                                         edgecolor="black", linewidth=1.8))
-            axis.text(offset + cell.column + 0.5, cell.row + 0.5, COLOUR_LETTERS.get(colour or "", "?"), ha="center", va="center",
-                      fontsize=FONT - 2, color=text_colour, bbox={"facecolor": fill_colour, "edgecolor": "none", "pad": 0.8})
+                axis.add_patch(
+                    Rectangle(
+                        (offset + cell.column + 0.08, cell.row + 0.08),
+                        width=0.84,
+                        height=0.84,
+                        fill=False,
+                        edgecolor="black",
+                        linewidth=1.8,
+                    )
+                )
+            axis.text(
+                offset + cell.column + 0.5,
+                cell.row + 0.5,
+                COLOUR_LETTERS.get(colour or "", "?"),
+                ha="center",
+                va="center",
+                fontsize=FONT - 2,
+                color=text_colour,
+                bbox={"facecolor": fill_colour, "edgecolor": "none", "pad": 0.8},
+            )
     axis.set_xlim(0, len(rating.vehicles) * (columns + 0.6) - 0.6)
     axis.set_ylim(len(matrix.rows), 0)
     axis.set_xticks([position for position, _ in ticks], [text for _, text in ticks], fontsize=FONT - 3)
     row_names = [_format_vut_speed(matrix, row_number) for row_number in range(len(matrix.rows))]
     axis.set_yticks([k + 0.5 for k in range(len(row_names))], row_names, fontsize=FONT - 2)
     axis.grid(visible=False)
-    totals = " / ".join(f"{test.total:.2f}" for vehicle in rating.vehicles for test in vehicle.tests if test.matrix is matrix)
+    totals = " / ".join(
+        f"{test.total:.2f}" for vehicle in rating.vehicles for test in vehicle.tests if test.matrix is matrix
+    )
     axis.set_title(escape_dollars(f"{matrix.name}: {totals} of {sum(matrix.points):g}"), fontsize=FONT)

@@ -35,7 +35,9 @@ class _Spreadsheet:
     def __init__(self, source: Path, output: Path) -> None:
         self.source, self.output, self.protocol = source, output, protocol_of(EURO_NCAP_2026)
         if not source.is_file():
-            raise InputError(source, "is a directory" if source.is_dir() else "there is no such file", self._expected_file)
+            raise InputError(
+                source, "is a directory" if source.is_dir() else "there is no such file", self._expected_file
+            )
         try:
             self._workbook = openpyxl.load_workbook(source)
         except (OSError, InvalidFileException, zipfile.BadZipFile, KeyError, ValueError) as error:
@@ -44,8 +46,10 @@ class _Spreadsheet:
 
     @property
     def _expected_file(self) -> str:
-        return (f"the file written by `euroncap_rating_2026 crash_avoidance {self.command}` "
-                f"(to install it: `pip install euroncap-rating-2026=={self.protocol.calculator_version}`)")
+        return (
+            f"the file written by `euroncap_rating_2026 crash_avoidance {self.command}` "
+            f"(to install it: `pip install euroncap-rating-2026=={self.protocol.calculator_version}`)"
+        )
 
     def _sheet(self, name: str) -> Any:
         if name not in self._workbook.sheetnames:
@@ -54,7 +58,11 @@ class _Spreadsheet:
 
     def _check_cell(self, sheet: str, address: str, value: object, expected: object) -> None:
         if str(value).strip() != str(expected):
-            raise InputError(self.source, f"sheet {sheet!r}, cell {address}: {value!r} in place of {str(expected)!r}", self._expected_file)
+            raise InputError(
+                self.source,
+                f"sheet {sheet!r}, cell {address}: {value!r} in place of {str(expected)!r}",
+                self._expected_file,
+            )
 
     def _check_version(self) -> None:
         version = str(self._sheet(VERSION)["B1"].value)
@@ -77,7 +85,9 @@ class Template(_Spreadsheet):
             self._check_matrix(matrix)
         for layer in self.protocol.layers:
             sheet, (row, column) = self._sheet(layer.sheet), coordinate_to_tuple(layer.claim_cell)
-            self._check_cell(layer.sheet, sheet.cell(1, column).coordinate, sheet.cell(1, column).value, expected=layer.test_name)
+            self._check_cell(
+                layer.sheet, sheet.cell(1, column).coordinate, sheet.cell(1, column).value, expected=layer.test_name
+            )
             self._check_cell(layer.sheet, f"B{row}", sheet.cell(row, 2).value, expected=layer.name)
         tests = {test for test, _, _ in self._iterate_parameters()}
         for test in self.protocol.tests:
@@ -95,7 +105,9 @@ class Template(_Spreadsheet):
             heading = sheet.cell(top - 1, left + k)
             self._check_cell(matrix.sheet, heading.coordinate, heading.value, expected=f"{speed:g} km/h")
         for k, row in enumerate(matrix.rows):
-            self._check_cell(matrix.sheet, f"A{top + k}", sheet.cell(top + k, 1).value, expected=f"{row.vut_speed:g} km/h")
+            self._check_cell(
+                matrix.sheet, f"A{top + k}", sheet.cell(top + k, 1).value, expected=f"{row.vut_speed:g} km/h"
+            )
 
     def _iterate_parameters(self) -> Iterator[tuple[str, str, Any]]:
         """Test (in the sheet's words "Scenario"), name, and cell for the value, of every input parameter."""
@@ -120,7 +132,11 @@ class Template(_Spreadsheet):
                 if row.has_function_choice:
                     function = "FCW" if matrix.is_rated_by_warning(row_number) else "AEB"
                     self._sheet(matrix.sheet)[f"{matrix.function_column}{top + row_number}"].value = function
-        holds = {(test.matrix.test_name, layer): does_hold for test in vehicle.tests for layer, does_hold in test.layers.items()}
+        holds = {
+            (test.matrix.test_name, layer): does_hold
+            for test in vehicle.tests
+            for layer, does_hold in test.layers.items()
+        }
         for layer in self.protocol.layers:
             self._sheet(layer.sheet)[layer.claim_cell].value = "YES" if holds[layer.test_name, layer.name] else "NO"
         for test, parameter, value_cell in self._iterate_parameters():
@@ -137,8 +153,11 @@ class PreprocessedFile(_Spreadsheet):
     def __init__(self, source: Path, output: Path) -> None:
         super().__init__(source, output)
         prediction_sheets = dict.fromkeys(matrix.sheet for matrix in self.protocol.matrices)
-        self._drawn_cells = [drawn_cell for sheet in prediction_sheets
-                             for drawn_cell in self._read_drawn_cells(f"{sheet.removesuffix('pred.')}verif.")]
+        self._drawn_cells = [
+            drawn_cell
+            for sheet in prediction_sheets
+            for drawn_cell in self._read_drawn_cells(f"{sheet.removesuffix('pred.')}verif.")
+        ]
 
     def _read_drawn_cells(self, name: str) -> list[tuple[Any, dict[str, int], int, int]]:
         """Sheet, columns by heading, row, and cell number of every drawn cell."""
@@ -150,7 +169,11 @@ class PreprocessedFile(_Spreadsheet):
                 columns = {value: k + 1 for k, value in enumerate(values) if value}
                 for heading in VERIFICATION_HEADINGS:
                     if heading not in columns:
-                        raise InputError(self.source, f"sheet {name!r}, row {row}: there is no column {heading!r}", self._expected_file)
+                        raise InputError(
+                            self.source,
+                            f"sheet {name!r}, row {row}: there is no column {heading!r}",
+                            self._expected_file,
+                        )
                 continue
             test_point = values[columns["Test point"] - 1] if columns else ""
             if not test_point:
@@ -159,26 +182,36 @@ class PreprocessedFile(_Spreadsheet):
             if matrix_name not in {matrix.name for matrix in self.protocol.matrices}:
                 continue  # the test is not simulated
             indices = test_point.strip("()").split(",")
-            cell_number = self.protocol.matrix_cell_numbers.get((matrix_name, int(indices[0]), int(indices[1]))) if all(
-                part.strip().isdigit() for part in indices) and len(indices) == 2 else None
+            cell_number = (
+                self.protocol.matrix_cell_numbers.get((matrix_name, int(indices[0]), int(indices[1])))
+                if all(part.strip().isdigit() for part in indices) and len(indices) == 2
+                else None
+            )
             if cell_number is None:
                 problem = f"sheet {name!r}, row {row}: {matrix_name} has no test point {test_point!r}"
                 raise InputError(self.source, problem, self._expected_file)
             drawn_cells.append((sheet, columns, row, cell_number))
-        if not columns and sheet["A2"].value != "General requirements":  # in A2 of a sheet without drawn cells: all its predictions are red
+        if (
+            not columns and sheet["A2"].value != "General requirements"
+        ):  # in A2 of a sheet without drawn cells: all its predictions are red
             raise InputError(self.source, f"sheet {name!r} has no column 'Test point'", self._expected_file)
         return drawn_cells
 
     def fill(self, vehicle: RatedVehicle) -> None:
         """Fill in each drawn cell's simulated value and, if a variation is drawn with the cell, whether the robustness cell passes."""
-        robustness_cells = {(cell.matrix.name, cell.row, cell.column, cell.range_or_layer, cell.condition): cell_number
-                            for cell_number, cell in enumerate(self.protocol.cells) if cell.is_robustness_cell}
+        robustness_cells = {
+            (cell.matrix.name, cell.row, cell.column, cell.range_or_layer, cell.condition): cell_number
+            for cell_number, cell in enumerate(self.protocol.cells)
+            if cell.is_robustness_cell
+        }
         for sheet, columns, row, cell_number in self._drawn_cells:
             cell = self.protocol.cells[cell_number]
             sheet.cell(row, columns["Value"]).value = _measurement(vehicle, cell_number)
             if "Verification condition" in columns and "Robustness" in columns:
-                layer, condition = (str(sheet.cell(row, columns[heading]).value or "")
-                                    for heading in ("Robustness layer", "Verification condition"))
+                layer, condition = (
+                    str(sheet.cell(row, columns[heading]).value or "")
+                    for heading in ("Robustness layer", "Verification condition")
+                )
                 robustness_cell = robustness_cells.get((cell.matrix.name, cell.row, cell.column, layer, condition))
                 if robustness_cell is not None:
                     sheet.cell(row, columns["Robustness"]).value = "PASS" if vehicle.passes(robustness_cell) else "FAIL"

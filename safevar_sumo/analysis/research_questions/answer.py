@@ -49,10 +49,19 @@ The question rq3.3 is answered by both tables.
 """
 WEATHER = "weather"
 FRAMES_OF_ONE_CASE: Mapping[str, Callable[[Case], pd.DataFrame]] = {
-    "rq1": rq1, "rq2": rq2, "rq1-runs": rq1_runs, "rq2-runs": rq2_runs, "rq2-pairs": compare_pairs,
+    "rq1": rq1,
+    "rq2": rq2,
+    "rq1-runs": rq1_runs,
+    "rq2-runs": rq2_runs,
+    "rq2-pairs": compare_pairs,
     "rq2-ranks": rank_algorithms,
-    "rq3.1": rq31, "rq3.2": rq32, "rq3.3": rq33, SAFETY_TABLE: rq33_safety, "collisions": count_collisions,
-    "combinations": frequent_combinations}
+    "rq3.1": rq31,
+    "rq3.2": rq32,
+    "rq3.3": rq33,
+    SAFETY_TABLE: rq33_safety,
+    "collisions": count_collisions,
+    "combinations": frequent_combinations,
+}
 POOLED_QUESTIONS = ("rq1", "rq2")
 """The questions whose tests pool the solutions of all runs."""
 QUESTIONS = (*FRAMES_OF_ONE_CASE, WEATHER)
@@ -94,10 +103,15 @@ def answer_questions(cases: Sequence[Case], question: str | None = None) -> list
         else:
             answered = {case.name for case in cases} - {error.source for error in errors}
         notes = [f"{error.source}: {error.problem}." for error in errors]
-        notes += [note for case in cases if case.name in answered
-                  for note in _notes(name, case, alone=question is not None)]
-        untested = frozenset((case.name, algorithm) for case in cases if name in POOLED_QUESTIONS
-                             for algorithm in algorithms_with_few_runs(case, name.upper()))
+        notes += [
+            note for case in cases if case.name in answered for note in _notes(name, case, alone=question is not None)
+        ]
+        untested = frozenset(
+            (case.name, algorithm)
+            for case in cases
+            if name in POOLED_QUESTIONS
+            for algorithm in algorithms_with_few_runs(case, name.upper())
+        )
         answers.append(Answer(name, frame, tuple(dict.fromkeys(notes)), metrics, untested))
     if all_errors and all(answer.frame.empty for answer in answers):
         raise all_errors[0]
@@ -111,8 +125,11 @@ def _collect_frames(name: str, cases: Sequence[Case]) -> tuple[list[pd.DataFrame
     frames, errors = [], []
     for group in [cases] if name == WEATHER else [[case] for case in cases]:
         try:
-            frames += ([compare_weathers(*pair) for pair in find_weather_pairs(group)] if name == WEATHER
-                       else [FRAMES_OF_ONE_CASE[name](*group)])
+            frames += (
+                [compare_weathers(*pair) for pair in find_weather_pairs(group)]
+                if name == WEATHER
+                else [FRAMES_OF_ONE_CASE[name](*group)]
+            )
         except UnanswerableError as error:
             errors.append(error)
     return frames, errors
@@ -123,14 +140,17 @@ def _notes(question: str, case: Case, *, alone: bool) -> list[str]:
     notes = []
     if question in POOLED_QUESTIONS:
         if few := [ALGORITHM_TITLES.get(name, name) for name in algorithms_with_few_runs(case, question.upper())]:
-            notes.append(f"too few runs of {', '.join(few)} for a test ({fewest_runs(question.upper())} are needed): "
-                         "no p-value of pooled solutions stands out.")
+            notes.append(
+                f"too few runs of {', '.join(few)} for a test ({fewest_runs(question.upper())} are needed): "
+                "no p-value of pooled solutions stands out."
+            )
         for metric in case.scoring.metrics:
             rows = solutions_for_metric(case.solutions, metric)
             undefined_values = int(rows[metric.name].isna().sum())
             if undefined_values:
-                notes.append(f"{metric.name} is undefined in {undefined_values} of {len(rows)} solutions, "
-                             "which the tests omit.")
+                notes.append(
+                    f"{metric.name} is undefined in {undefined_values} of {len(rows)} solutions, which the tests omit."
+                )
     if question == "rq1":
         undefined_metrics = [name for name, value in case.original.items() if pd.isna(value)]
         if undefined_metrics:
@@ -145,11 +165,19 @@ def _notes(question: str, case: Case, *, alone: bool) -> list[str]:
         if empty_runs:
             notes.append(f"{empty_runs} finished runs found no solution; they have no igd, igd_plus or hypervolume.")
     if question.startswith("rq3") or question in ("combinations", WEATHER):
-        notes.append(f"{len(critical_solutions(case))} of {ALGORITHM_TITLES[NSGA2]}'s {len(case.solutions_of(NSGA2))} "
-                     "solutions are critical.")
+        notes.append(
+            f"{len(critical_solutions(case))} of {ALGORITHM_TITLES[NSGA2]}'s {len(case.solutions_of(NSGA2))} "
+            "solutions are critical."
+        )
     if question == "combinations" and frequent_combinations(case).empty:
         notes.append("no critical solution has exactly four characteristics changed.")
-    units = [f"{characteristic.name} {characteristic.unit}" for characteristic in case.characteristics
-             if characteristic.unit != "-"]
-    return [*case.remarks, *(f"{case.name}: {note}" for note in notes),
-            *([f"Units of delta: {', '.join(units)}."] if question == "rq3.3" else [])]
+    units = [
+        f"{characteristic.name} {characteristic.unit}"
+        for characteristic in case.characteristics
+        if characteristic.unit != "-"
+    ]
+    return [
+        *case.remarks,
+        *(f"{case.name}: {note}" for note in notes),
+        *([f"Units of delta: {', '.join(units)}."] if question == "rq3.3" else []),
+    ]

@@ -25,8 +25,13 @@ from safevar_sumo.vehicles import CharacteristicSet
 NSGA2 = "nsga2"
 """The algorithm that RQ2 compares with the others, and whose solutions RQ3 analyses."""
 ALGORITHM_TITLES = {
-    "nsga2": "NSGA-II", "spea2": "SPEA2", "mocell": "MOCell", "map_elites": "MAP-Elites", "rs": "RS",
-    "safe_fuzzer": "SafeFuzzer"}
+    "nsga2": "NSGA-II",
+    "spea2": "SPEA2",
+    "mocell": "MOCell",
+    "map_elites": "MAP-Elites",
+    "rs": "RS",
+    "safe_fuzzer": "SafeFuzzer",
+}
 
 
 class UnanswerableError(InputError):
@@ -101,8 +106,9 @@ class Case:
         """
         if algorithm not in self.algorithms:
             names = ", ".join(self.algorithms) or "no algorithm"
-            raise UnanswerableError(self.name, f"has no finished run of {algorithm}",
-                                    f"results of {algorithm} (it has results of {names})")
+            raise UnanswerableError(
+                self.name, f"has no finished run of {algorithm}", f"results of {algorithm} (it has results of {names})"
+            )
         return self.solutions[self.solutions["algorithm"] == algorithm]
 
     def runs_of(self, algorithm: str) -> list[int]:
@@ -114,16 +120,18 @@ class Case:
             If the solutions are imported and belong to no run.
         """
         if not self.has_runs:
-            raise UnanswerableError(self.name, "is imported: the runs of its solutions are unknown",
-                                    "results of the command `study`")
+            raise UnanswerableError(
+                self.name, "is imported: the runs of its solutions are unknown", "results of the command `study`"
+            )
         return sorted(run for name, run in self.finished_runs if name == algorithm)
 
     @property
     def shortfall(self) -> str:
         """Note on unfinished runs, for the readers of every answer about the solutions; empty if there are none."""
         done, planned = Counter(algorithm for algorithm, _ in self.finished_runs), self.study.search.runs
-        shortfalls = [f"{name} {done[name]} of {planned} runs" for name in self.study.search.labels if done[name]
-                      < planned]
+        shortfalls = [
+            f"{name} {done[name]} of {planned} runs" for name in self.study.search.labels if done[name] < planned
+        ]
         if not self.has_runs or not shortfalls:
             return ""
         return f"{self.name}: unfinished, {', '.join(shortfalls)}; only solutions of finished runs count."
@@ -133,12 +141,16 @@ class Case:
         """Notes for the readers of every table of this case."""
         lines = [self.shortfall] if self.shortfall else []
         if not self.has_runs:
-            lines.append(f"{self.name}: imported solutions, without runs; "
-                         "the original vehicle's metrics are published or supplied.")
+            lines.append(
+                f"{self.name}: imported solutions, without runs; "
+                "the original vehicle's metrics are published or supplied."
+            )
         if self.failures:
-            lines.append(f"{self.name}: {len(self.failures)} settings could not be simulated (simulator-error) "
-                         "and are in no result: "
-                        f"{'; '.join(failure_lines(self.failures))}. `study --retry-failed` simulates them again.")
+            lines.append(
+                f"{self.name}: {len(self.failures)} settings could not be simulated (simulator-error) "
+                "and are in no result: "
+                f"{'; '.join(failure_lines(self.failures))}. `study --retry-failed` simulates them again."
+            )
         return lines
 
 
@@ -176,11 +188,14 @@ def load_cases(directories: Iterable[str | Path]) -> list[Case]:
         try:
             cases.append(_load_case(path))
         except (TypeError, ValueError, KeyError, ArithmeticError) as error:
-            raise InputError(path, f"is damaged: {describe_error(error)}",
-                             "an unchanged directory of the command `study`") from error
+            raise InputError(
+                path, f"is damaged: {describe_error(error)}", "an unchanged directory of the command `study`"
+            ) from error
     names = Counter(case.name for case in cases)
-    return [replace(case, name=f"{case.name} ({path})") if names[case.name] > 1 else case for case,
-            path in zip(cases, paths, strict=True)]
+    return [
+        replace(case, name=f"{case.name} ({path})") if names[case.name] > 1 else case
+        for case, path in zip(cases, paths, strict=True)
+    ]
 
 
 def _load_case(directory: Path) -> Case:
@@ -191,18 +206,43 @@ def _load_case(directory: Path) -> Case:
         raise error_with_key(directory / MANIFEST, manifest["study"], error, "study") from None
     scoring = msgspec.convert(manifest["scoring"], Scoring) if "scoring" in manifest else PUBLISHED_SCORING
     study = msgspec.structs.replace(study, origin=Origin(places=folders_of(directory, manifest)))
-    return build_case(study, manifest["original"], solutions, evaluations, finished,
-                      has_runs="imported" not in manifest, failures=failures, scoring=scoring)
+    return build_case(
+        study,
+        manifest["original"],
+        solutions,
+        evaluations,
+        finished,
+        has_runs="imported" not in manifest,
+        failures=failures,
+        scoring=scoring,
+    )
 
 
-def build_case(study: Study, original: Mapping[str, Any], solutions: pd.DataFrame, evaluations: pd.DataFrame,
-               finished: Sequence[tuple[str, int]], has_runs: bool = True, failures: Sequence[Failure] = (),
-               scoring: Scoring = PUBLISHED_SCORING) -> Case:
+def build_case(
+    study: Study,
+    original: Mapping[str, Any],
+    solutions: pd.DataFrame,
+    evaluations: pd.DataFrame,
+    finished: Sequence[tuple[str, int]],
+    has_runs: bool = True,
+    failures: Sequence[Failure] = (),
+    scoring: Scoring = PUBLISHED_SCORING,
+) -> Case:
     """Put a case together; in `original` an undefined metric is None or missing."""
     names = [metric.name for metric in scoring.metrics]
     columns = [*names, *(objective.name for objective in scoring.objectives)]
     metrics = {name: np.nan if original.get(name) is None else float(original[name]) for name in names}
-    solutions, evaluations = (frame.assign(**{name: np.nan for name in columns if name not in frame})
-                              for frame in (solutions, evaluations))
-    return Case(name=study.name, study=study, original=metrics, solutions=solutions, evaluations=evaluations,
-                finished_runs=tuple(finished), has_runs=has_runs, failures=tuple(failures), scoring=scoring)
+    solutions, evaluations = (
+        frame.assign(**{name: np.nan for name in columns if name not in frame}) for frame in (solutions, evaluations)
+    )
+    return Case(
+        name=study.name,
+        study=study,
+        original=metrics,
+        solutions=solutions,
+        evaluations=evaluations,
+        finished_runs=tuple(finished),
+        has_runs=has_runs,
+        failures=tuple(failures),
+        scoring=scoring,
+    )

@@ -45,12 +45,19 @@ def draw_change_counts(cases: Sequence[Case]) -> Figure:
     for axis, case in zip(axes, cases, strict=True):
         counts = rq31(case)
         counts_by_number = {str(j): rows["count"].to_numpy() for j, rows in counts.groupby("j", sort=False)}
-        axis.boxplot(list(counts_by_number.values()), tick_labels=list(counts_by_number), widths=0.8, patch_artist=True,
-                     boxprops={"facecolor": SKY_BLUE, "linewidth": 0.8}, medianprops={"color": "black"},
-                     flierprops={"markersize": 3})
+        axis.boxplot(
+            list(counts_by_number.values()),
+            tick_labels=list(counts_by_number),
+            widths=0.8,
+            patch_artist=True,
+            boxprops={"facecolor": SKY_BLUE, "linewidth": 0.8},
+            medianprops={"color": "black"},
+            flierprops={"markersize": 3},
+        )
         axis.grid(visible=False, axis="x")
-        axis.set(xlabel="characteristics changed",
-                 ylabel=f"critical solutions per run\n({counts['run'].nunique()} runs)")
+        axis.set(
+            xlabel="characteristics changed", ylabel=f"critical solutions per run\n({counts['run'].nunique()} runs)"
+        )
         axis.set_title(escape_dollars(case.name) if len(cases) > 1 else "", fontsize=FONT)
         axis.yaxis.set_major_locator(MaxNLocator(6, integer=True, min_n_ticks=1))
     return figure
@@ -69,15 +76,26 @@ def draw_changed_characteristics(case: Case) -> Figure:
     shares_by_number = shares_by_number.loc[order, list(dict.fromkeys(shares["j"]))].rename(index=escape_dollars)
     title = f"{case.name}: characteristics changed in critical solutions"
     figure, ((axis,),) = new_figure(title, rows=1, columns=1, size=(7.6, 1.4 + 0.3 * len(shares_by_number)))
-    sns.heatmap(shares_by_number, ax=axis, cmap="cividis", vmin=0, vmax=100, annot=True, fmt=".0f",
-                annot_kws={"fontsize": 7},
-                linewidths=0.5, cbar_kws={"label": "critical solutions\nin which it is changed [%]"})
+    sns.heatmap(
+        shares_by_number,
+        ax=axis,
+        cmap="cividis",
+        vmin=0,
+        vmax=100,
+        annot=True,
+        fmt=".0f",
+        annot_kws={"fontsize": 7},
+        linewidths=0.5,
+        cbar_kws={"label": "critical solutions\nin which it is changed [%]"},
+    )
     axis.grid(visible=False)
     colour_bar = axis.collections[0].colorbar.ax
     colour_bar.tick_params(labelsize=FONT)
     colour_bar.yaxis.label.set_size(FONT)
-    axis.set(xlabel="number of characteristics changed (empty: no such solution)",
-             ylabel="characteristic, most frequent first")
+    axis.set(
+        xlabel="number of characteristics changed (empty: no such solution)",
+        ylabel="characteristic, most frequent first",
+    )
     axis.tick_params(axis="both", length=0, rotation=0)
     return figure
 
@@ -89,20 +107,26 @@ def draw_change_sizes(case: Case) -> Figure:
     figure, axes = new_panels(title, len(case.characteristics), 4, (2.25, 1.85), min_width=9.0, title_height=1.0)
     changes_by_characteristic = changes_of(case, critical_solutions(case)).T
     for axis, characteristic, changes in zip(axes, case.characteristics, changes_by_characteristic, strict=True):
-        low, high = (float(f"{end - characteristic.original:.9g}")
-                     for end in (characteristic.lower, characteristic.upper))
+        low, high = (
+            float(f"{end - characteristic.original:.9g}") for end in (characteristic.lower, characteristic.upper)
+        )
         increases, decreases = changes[changes > 0], changes[changes < 0]
         axis.hist([increases, decreases], bins=BIN_COUNT, range=(low, high), color=[VERMILION, BLUE], stacked=True)
         axis.axvline(0, color="black", linewidth=0.8)
         axis.set_xlim(low, high)
-        axis.set_title(f"{escape_dollars(characteristic.name)}\n+{len(increases)}, -{len(decreases)}",
-                       fontsize=min(FONT, FONT * LONGEST_NAME / len(characteristic.name)))
+        axis.set_title(
+            f"{escape_dollars(characteristic.name)}\n+{len(increases)}, -{len(decreases)}",
+            fontsize=min(FONT, FONT * LONGEST_NAME / len(characteristic.name)),
+        )
         axis.set_xlabel(f"change [{as_formula(characteristic.unit)}]", fontsize=FONT)
         axis.locator_params(axis="x", nbins=3, steps=[1, 2, 5, 10])
         axis.yaxis.set_major_locator(MaxNLocator(4, integer=True, min_n_ticks=1))
     figure.supylabel(f"number of critical solutions (of {solution_count})", fontsize=9)
-    figure.supxlabel("orange, right of 0: increases; blue, left of 0: decreases; titles count them;\n"
-                     "each axis spans the characteristic's domain", fontsize=FONT)
+    figure.supxlabel(
+        "orange, right of 0: increases; blue, left of 0: decreases; titles count them;\n"
+        "each axis spans the characteristic's domain",
+        fontsize=FONT,
+    )
     return figure
 
 
@@ -110,6 +134,7 @@ def _count_critical_solutions(case: Case) -> int:
     """Number of critical solutions; raises UnanswerableError if there are none."""
     count = len(critical_solutions(case))
     if not count:
-        raise UnanswerableError(case.name, "has no critical solution",
-                                "results with solutions that are more unsafe than the original")
+        raise UnanswerableError(
+            case.name, "has no critical solution", "results with solutions that are more unsafe than the original"
+        )
     return count

@@ -52,8 +52,10 @@ def changes_of(case: Case, solutions: pd.DataFrame) -> FloatArray:
 def masks_by_change_count(case: Case, changes: FloatArray) -> dict[str, BoolArray]:
     """For j = "1".."n" and "any": whether each solution has j characteristics changed, shape (M,)."""
     change_counts = np.count_nonzero(changes, axis=1)
-    return {**{str(j): change_counts == j for j in range(1, len(case.characteristics) + 1)},
-            ANY: np.ones(len(changes), dtype=bool)}
+    return {
+        **{str(j): change_counts == j for j in range(1, len(case.characteristics) + 1)},
+        ANY: np.ones(len(changes), dtype=bool),
+    }
 
 
 def _means_by_change_count(case: Case, values: Mapping[tuple[str, ...], FloatArray]) -> list[tuple[Any, ...]]:
@@ -74,8 +76,12 @@ def rq31(case: Case) -> pd.DataFrame:
     """
     solutions, runs = critical_solutions(case), case.runs_of(NSGA2)
     masks = masks_by_change_count(case, changes_of(case, solutions))
-    rows = [(case.name, run, j, int(np.count_nonzero((solutions["run"] == run) & mask)))
-            for run in runs for j, mask in masks.items() if j != ANY]
+    rows = [
+        (case.name, run, j, int(np.count_nonzero((solutions["run"] == run) & mask)))
+        for run in runs
+        for j, mask in masks.items()
+        if j != ANY
+    ]
     return pd.DataFrame(rows, columns=["setting", "run", "j", "count"])
 
 
@@ -88,13 +94,17 @@ def rq32(case: Case) -> pd.DataFrame:
     """
     changed = changes_of(case, critical_solutions(case)) != 0
     counts = changed.sum(axis=0)  # solutions that change each characteristic
-    ranks = {name: 1 + int(np.count_nonzero(counts > count)) for name,
-             count in zip(case.characteristics.names, counts, strict=True)}
-    shares = _means_by_change_count(case, {(name,): column for name,
-                                           column in zip(ranks, changed.T.astype(float), strict=True)})
-    rows = [(case.name, name, j, None if share is None else 100 * share, ranks[name] if j == ANY and len(changed)
-             else None)
-            for name, j, share, _ in shares]
+    ranks = {
+        name: 1 + int(np.count_nonzero(counts > count))
+        for name, count in zip(case.characteristics.names, counts, strict=True)
+    }
+    shares = _means_by_change_count(
+        case, {(name,): column for name, column in zip(ranks, changed.T.astype(float), strict=True)}
+    )
+    rows = [
+        (case.name, name, j, None if share is None else 100 * share, ranks[name] if j == ANY and len(changed) else None)
+        for name, j, share, _ in shares
+    ]
     return pd.DataFrame(rows, columns=["setting", "characteristic", "j", "percent", "rank"], dtype=object)
 
 
@@ -107,12 +117,18 @@ def rq33(case: Case) -> pd.DataFrame:
     """
     changes = changes_of(case, critical_solutions(case))
     originals = dict(zip(case.characteristics.names, case.characteristics.original, strict=True))
-    means = _means_by_change_count(case, {
-        (name, direction): np.where(np.sign(column) == sign, column, np.nan)
-        for name, column in zip(originals, changes.T, strict=True) for direction,
-        sign in (("increase", 1), ("decrease", -1))})
-    rows = [(case.name, name, direction, j, None if mean is None else abs(mean / originals[name]), mean, n)
-            for name, direction, j, mean, n in means]
+    means = _means_by_change_count(
+        case,
+        {
+            (name, direction): np.where(np.sign(column) == sign, column, np.nan)
+            for name, column in zip(originals, changes.T, strict=True)
+            for direction, sign in (("increase", 1), ("decrease", -1))
+        },
+    )
+    rows = [
+        (case.name, name, direction, j, None if mean is None else abs(mean / originals[name]), mean, n)
+        for name, direction, j, mean, n in means
+    ]
     return pd.DataFrame(rows, columns=["setting", "characteristic", "direction", "j", "pc", "delta", "n"], dtype=object)
 
 
@@ -131,18 +147,34 @@ def rq33_safety(case: Case) -> pd.DataFrame:
     has_collided = are_collisions(solutions).to_numpy()
     sd, tet, tit, dece = (solutions[name].to_numpy(dtype=float) for name in (SAFETY_DEGREE, "tet", "tit", "ave_dece"))
     original = case.original
-    originals = {"avgSD_mD": original[SAFETY_DEGREE], "avgSD_cS": np.nan, "TET": original["tet"],
-                 "TIT": original["tit"],
-                 "aveDece": original["ave_dece"]}
-    means = _means_by_change_count(case, {
-        ("avgSD_mD",): np.where(has_collided, np.nan, original[SAFETY_DEGREE] - sd),
-        ("avgSD_cS",): np.where(has_collided, -sd, np.nan),
-        ("TET",): np.where(has_collided, np.nan, tet - original["tet"]),
-        ("TIT",): np.where(has_collided, np.nan, tit - original["tit"]),
-        ("aveDece",): original["ave_dece"] - dece})
-    rows = [(case.name, quantity, j, mean, None if mean is None or not (scale := abs(originals[quantity])) > 0 else 100
-             * mean / scale, n)
-            for quantity, j, mean, n in means]
+    originals = {
+        "avgSD_mD": original[SAFETY_DEGREE],
+        "avgSD_cS": np.nan,
+        "TET": original["tet"],
+        "TIT": original["tit"],
+        "aveDece": original["ave_dece"],
+    }
+    means = _means_by_change_count(
+        case,
+        {
+            ("avgSD_mD",): np.where(has_collided, np.nan, original[SAFETY_DEGREE] - sd),
+            ("avgSD_cS",): np.where(has_collided, -sd, np.nan),
+            ("TET",): np.where(has_collided, np.nan, tet - original["tet"]),
+            ("TIT",): np.where(has_collided, np.nan, tit - original["tit"]),
+            ("aveDece",): original["ave_dece"] - dece,
+        },
+    )
+    rows = [
+        (
+            case.name,
+            quantity,
+            j,
+            mean,
+            None if mean is None or not (scale := abs(originals[quantity])) > 0 else 100 * mean / scale,
+            n,
+        )
+        for quantity, j, mean, n in means
+    ]
     return pd.DataFrame(rows, columns=["setting", "quantity", "j", "value", "percent", "n"], dtype=object)
 
 
@@ -160,8 +192,15 @@ def count_collisions(case: Case) -> pd.DataFrame:
     for algorithm in case.algorithms:
         solutions = case.solutions_of(algorithm)
         collision_count = int(are_collisions(solutions).sum())
-        rows.append((case.name, algorithm, len(solutions), collision_count, collision_count / len(solutions)
-                     if len(solutions) else None))
+        rows.append(
+            (
+                case.name,
+                algorithm,
+                len(solutions),
+                collision_count,
+                collision_count / len(solutions) if len(solutions) else None,
+            )
+        )
     return pd.DataFrame(rows, columns=["setting", "algorithm", "solutions", "collisions", "share"], dtype=object)
 
 
@@ -177,9 +216,15 @@ def frequent_combinations(case: Case) -> pd.DataFrame:
     counts = Counter(tuple(np.flatnonzero(mask).tolist()) for mask in masks)
     ranking = sorted(counts.items(), key=lambda item: (-item[1], item[0]))[:COMBINATIONS_SHOWN]
     names = case.characteristics.names
-    rows = [(case.name, 1 + sum(other > count for other in counts.values()), [names[i] for i in columns], 100 * count
-             / len(masks))
-            for columns, count in ranking]
+    rows = [
+        (
+            case.name,
+            1 + sum(other > count for other in counts.values()),
+            [names[i] for i in columns],
+            100 * count / len(masks),
+        )
+        for columns, count in ranking
+    ]
     return pd.DataFrame(rows, columns=["setting", "rank", "characteristics", "percent"])
 
 
@@ -194,15 +239,19 @@ def find_weather_pairs(cases: Sequence[Case]) -> list[tuple[Case, Case]]:
     UnanswerableError
         If there is no such pair.
     """
-    pairs = [(clearer, other) for clearer, other in permutations(cases, 2)
-             if not _differences(clearer, other) and _clearness(clearer) > _clearness(other)]
+    pairs = [
+        (clearer, other)
+        for clearer, other in permutations(cases, 2)
+        if not _differences(clearer, other) and _clearness(clearer) > _clearness(other)
+    ]
     if not pairs:
         problem = "two cases are needed that differ in the weather alone"
         if len(cases) == 2:
             differences = ", ".join(_differences(*cases))
             problem += f"; these two {f'also differ in {differences}' if differences else 'have equally clear weather'}"
-        raise UnanswerableError(", ".join(case.name for case in cases), problem,
-                                "results such as those of sun and rain")
+        raise UnanswerableError(
+            ", ".join(case.name for case in cases), problem, "results such as those of sun and rain"
+        )
     return pairs
 
 
@@ -219,11 +268,29 @@ def compare_weathers(clearer: Case, other: Case) -> pd.DataFrame:
         shares, sizes = rq32(case), rq33(case)
         deltas = sizes[sizes["j"] == ANY].pivot(index="characteristic", columns="direction", values="delta")
         tables.append(shares[shares["j"] == ANY].set_index("characteristic")[["percent", "rank"]].join(deltas))
-    table = tables[0].join(tables[1].add_suffix("_other")).assign(
-        setting=clearer.name, other=other.name,
-        difference=lambda rows: rows["percent_other"].astype(float) - rows["percent"].astype(float))
-    columns = ["setting", "other", "characteristic", "percent", "percent_other", "difference", "rank", "rank_other",
-               "increase", "increase_other", "decrease", "decrease_other"]
+    table = (
+        tables[0]
+        .join(tables[1].add_suffix("_other"))
+        .assign(
+            setting=clearer.name,
+            other=other.name,
+            difference=lambda rows: rows["percent_other"].astype(float) - rows["percent"].astype(float),
+        )
+    )
+    columns = [
+        "setting",
+        "other",
+        "characteristic",
+        "percent",
+        "percent_other",
+        "difference",
+        "rank",
+        "rank_other",
+        "increase",
+        "increase_other",
+        "decrease",
+        "decrease_other",
+    ]
     return table.reset_index()[columns]
 
 
@@ -242,6 +309,9 @@ def _differences(one: Case, other: Case) -> list[str]:
     for study in studies:
         for name in (*REACTION_PARAMETERS, *(key.removeprefix("ads.parameters.") for key in own_keys)):
             study["ads"]["parameters"].pop(name, None)
-    return [f"{table}.{key}" for table in ("scenario", "vehicle", "ads", "metrics") for key in studies[0][table]
-            | studies[1][table]
-            if studies[0][table].get(key) != studies[1][table].get(key)]
+    return [
+        f"{table}.{key}"
+        for table in ("scenario", "vehicle", "ads", "metrics")
+        for key in studies[0][table] | studies[1][table]
+        if studies[0][table].get(key) != studies[1][table].get(key)
+    ]

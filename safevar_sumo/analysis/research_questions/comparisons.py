@@ -39,17 +39,70 @@ from safevar_sumo.analysis.research_questions.statistics import (
 from safevar_sumo.analysis.words import number_of
 from safevar_sumo.metrics import MetricFacts
 
-RQ1_COLUMNS = ["setting", "algorithm", "metric", "p_value", "effect_size", "magnitude", "n1", "n2", "method", "mean",
-               "original"]
+RQ1_COLUMNS = [
+    "setting",
+    "algorithm",
+    "metric",
+    "p_value",
+    "effect_size",
+    "magnitude",
+    "n1",
+    "n2",
+    "method",
+    "mean",
+    "original",
+]
 RQ2_COLUMNS = ["setting", "baseline", "metric", "p_value", "effect_size", "magnitude", "n1", "n2", "method"]
-RQ1_RUNS_COLUMNS = ["setting", "algorithm", "metric", "p_value", "p_holm", "effect_size", "magnitude", "runs", "method",
-                    "mean", "original"]
-RQ2_RUNS_COLUMNS = ["setting", "baseline", "metric", "p_value", "p_holm", "effect_size", "magnitude", "n1", "n2",
-                    "method"]
-PAIR_COLUMNS = ["setting", "algorithm", "other", "metric", "p_value", "p_holm", "effect_size", "magnitude", "n1", "n2",
-                "method"]
-RANK_COLUMNS = ["setting", "metric", "algorithm", "mean_rank", "median", "runs", "statistic", "p_value", "p_holm",
-                "critical_difference"]
+RQ1_RUNS_COLUMNS = [
+    "setting",
+    "algorithm",
+    "metric",
+    "p_value",
+    "p_holm",
+    "effect_size",
+    "magnitude",
+    "runs",
+    "method",
+    "mean",
+    "original",
+]
+RQ2_RUNS_COLUMNS = [
+    "setting",
+    "baseline",
+    "metric",
+    "p_value",
+    "p_holm",
+    "effect_size",
+    "magnitude",
+    "n1",
+    "n2",
+    "method",
+]
+PAIR_COLUMNS = [
+    "setting",
+    "algorithm",
+    "other",
+    "metric",
+    "p_value",
+    "p_holm",
+    "effect_size",
+    "magnitude",
+    "n1",
+    "n2",
+    "method",
+]
+RANK_COLUMNS = [
+    "setting",
+    "metric",
+    "algorithm",
+    "mean_rank",
+    "median",
+    "runs",
+    "statistic",
+    "p_value",
+    "p_holm",
+    "critical_difference",
+]
 
 SampleFunction = Callable[[Case, str, MetricFacts], "pd.Series[float]"]
 """Returns an algorithm's values of a metric."""
@@ -65,8 +118,10 @@ def pooled_values(case: Case, algorithm: str, metric: MetricFacts) -> pd.Series[
 def run_means(case: Case, algorithm: str, metric: MetricFacts) -> pd.Series[float]:
     """The mean of a metric's defined values in each finished run that has some, by the run's number."""
     solutions = defined_solutions(case.solutions_of(algorithm), metric)
-    samples = {run: solutions.loc[solutions["run"] == run, metric.name].to_numpy(dtype=float)
-               for run in case.runs_of(algorithm)}
+    samples = {
+        run: solutions.loc[solutions["run"] == run, metric.name].to_numpy(dtype=float)
+        for run in case.runs_of(algorithm)
+    }
     return pd.Series({run: float(np.mean(sample)) for run, sample in samples.items() if sample.size}, dtype=float)
 
 
@@ -81,24 +136,34 @@ def rq1(case: Case) -> pd.DataFrame:
     UnanswerableError
         If no run is finished.
     """
-    rows = _rows_against_original(case, pooled_values, lambda sample, original: compare_samples(
-        sample, np.full(0 if np.isnan(original) else len(sample), original)))
+    rows = _rows_against_original(
+        case,
+        pooled_values,
+        lambda sample, original: compare_samples(sample, np.full(0 if np.isnan(original) else len(sample), original)),
+    )
     return pd.DataFrame(rows, columns=RQ1_COLUMNS, dtype=object)
 
 
-def _rows_against_original(case: Case, sample_of: SampleFunction,
-                           test: Callable[[pd.Series[float], float], TwoSampleTest]
-                           ) -> list[dict[str, Any]]:
+def _rows_against_original(
+    case: Case, sample_of: SampleFunction, test: Callable[[pd.Series[float], float], TwoSampleTest]
+) -> list[dict[str, Any]]:
     case.require_solutions()
     rows = []
     for algorithm in case.algorithms:
         for metric in case.scoring.metrics:
             sample, original = sample_of(case, algorithm, metric), case.original[metric.name]
             result = test(sample, original).reversed_if(metric.more_is_unsafe)
-            rows.append({"setting": case.name, "algorithm": algorithm, "metric": metric.name, **result._asdict(),
-                         "runs": result.n1,
-                         "mean": float(np.mean(sample.to_numpy())) if sample.size else None,
-                         "original": None if np.isnan(original) else original})
+            rows.append(
+                {
+                    "setting": case.name,
+                    "algorithm": algorithm,
+                    "metric": metric.name,
+                    **result._asdict(),
+                    "runs": result.n1,
+                    "mean": float(np.mean(sample.to_numpy())) if sample.size else None,
+                    "original": None if np.isnan(original) else original,
+                }
+            )
     return rows
 
 
@@ -125,8 +190,9 @@ def _nsga2_pairs(case: Case) -> list[tuple[str, str]]:
     case.solutions_of(NSGA2)  # raises if there are none
     pairs = [(NSGA2, name) for name in case.algorithms if name != NSGA2]
     if not pairs:
-        raise UnanswerableError(case.name, f"only {NSGA2} has finished runs",
-                                "results of another algorithm to compare with, such as rs")
+        raise UnanswerableError(
+            case.name, f"only {NSGA2} has finished runs", "results of another algorithm to compare with, such as rs"
+        )
     return pairs
 
 
@@ -134,21 +200,39 @@ def _samples(case: Case, sample_of: SampleFunction) -> Samples:
     samples: dict[str, tuple[bool, dict[str, pd.Series[float]]]] = {}
     indicators = compute_indicators(case) if case.has_runs and len(case.solutions) else None
     for name, more_is_better in MORE_IS_BETTER.items():
-        samples[name] = more_is_better, {
-            algorithm: pd.Series(dtype=float) if indicators is None else
-            indicators.loc[indicators.index.get_level_values("algorithm") == algorithm, name].droplevel("algorithm")
-            for algorithm in case.algorithms}
+        samples[name] = (
+            more_is_better,
+            {
+                algorithm: pd.Series(dtype=float)
+                if indicators is None
+                else indicators.loc[indicators.index.get_level_values("algorithm") == algorithm, name].droplevel(
+                    "algorithm"
+                )
+                for algorithm in case.algorithms
+            },
+        )
     for metric in case.scoring.metrics:
-        samples[metric.name] = metric.more_is_unsafe, {algorithm: sample_of(case, algorithm, metric)
-                                                       for algorithm in case.algorithms}
+        samples[metric.name] = (
+            metric.more_is_unsafe,
+            {algorithm: sample_of(case, algorithm, metric) for algorithm in case.algorithms},
+        )
     return samples
 
 
 def _rows_of_pairs(case: Case, pairs: Iterable[tuple[str, str]], samples: Samples) -> list[dict[str, Any]]:
     """A row for each pair and metric; the second algorithm is both its `other` and its `baseline`."""
-    return [{"setting": case.name, "algorithm": first, "other": second, "baseline": second, "metric": metric,
-             **compare_samples(values[first], values[second]).reversed_if(not more_is_better)._asdict()}
-            for first, second in pairs for metric, (more_is_better, values) in samples.items()]
+    return [
+        {
+            "setting": case.name,
+            "algorithm": first,
+            "other": second,
+            "baseline": second,
+            "metric": metric,
+            **compare_samples(values[first], values[second]).reversed_if(not more_is_better)._asdict(),
+        }
+        for first, second in pairs
+        for metric, (more_is_better, values) in samples.items()
+    ]
 
 
 def compare_over_runs(case: Case) -> dict[str, pd.DataFrame]:
@@ -163,8 +247,11 @@ def compare_over_runs(case: Case) -> dict[str, pd.DataFrame]:
     if NSGA2 in case.algorithms and len(case.algorithms) > 1:
         rows["RQ2"] = _rows_of_pairs(case, _nsga2_pairs(case), _samples(case, run_means))
     _add_holm([row for rows_of_question in rows.values() for row in rows_of_question])
-    return {question: pd.DataFrame(rows[question], columns=columns, dtype=object)
-            for question, columns in (("RQ1", RQ1_RUNS_COLUMNS), ("RQ2", RQ2_RUNS_COLUMNS)) if question in rows}
+    return {
+        question: pd.DataFrame(rows[question], columns=columns, dtype=object)
+        for question, columns in (("RQ1", RQ1_RUNS_COLUMNS), ("RQ2", RQ2_RUNS_COLUMNS))
+        if question in rows
+    }
 
 
 def _add_holm(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -220,8 +307,9 @@ def compare_pairs(case: Case) -> pd.DataFrame:
         If there are no runs, or runs of only one algorithm.
     """
     samples = _samples_of_several(case, 2)
-    return pd.DataFrame(_add_holm(_rows_of_pairs(case, combinations(case.algorithms, 2), samples)),
-                        columns=PAIR_COLUMNS, dtype=object)
+    return pd.DataFrame(
+        _add_holm(_rows_of_pairs(case, combinations(case.algorithms, 2), samples)), columns=PAIR_COLUMNS, dtype=object
+    )
 
 
 def rank_algorithms(case: Case) -> pd.DataFrame:
@@ -244,11 +332,18 @@ def rank_algorithms(case: Case) -> pd.DataFrame:
         ranks = scipy.stats.rankdata(-values if more_is_better else values, axis=1)
         statistic, p = friedman_test(values)
         tests.append({"metric": metric, "statistic": statistic, "p_value": p})
-        rows += [{"setting": case.name, "metric": metric, "algorithm": name, "runs": len(blocks),
-                  "mean_rank": float(ranks[:, i].mean()) if len(blocks) else None,
-                  "median": float(np.median(values[:, i])) if len(blocks) else None,
-                  "critical_difference": critical_difference(len(blocks.columns), len(blocks)) if len(blocks) else None}
-                 for i, name in enumerate(blocks.columns)]
+        rows += [
+            {
+                "setting": case.name,
+                "metric": metric,
+                "algorithm": name,
+                "runs": len(blocks),
+                "mean_rank": float(ranks[:, i].mean()) if len(blocks) else None,
+                "median": float(np.median(values[:, i])) if len(blocks) else None,
+                "critical_difference": critical_difference(len(blocks.columns), len(blocks)) if len(blocks) else None,
+            }
+            for i, name in enumerate(blocks.columns)
+        ]
     tests_by_metric = {test["metric"]: test for test in _add_holm(tests)}
     return pd.DataFrame([{**row, **tests_by_metric[row["metric"]]} for row in rows], columns=RANK_COLUMNS, dtype=object)
 
@@ -257,9 +352,11 @@ def _samples_of_several(case: Case, min_algorithms: int) -> Samples:
     """The samples over runs of at least so many algorithms."""
     if case.has_runs and len(case.algorithms) < min_algorithms:
         names = ", ".join(case.algorithms) or "none"
-        raise UnanswerableError(case.name,
-                                f"has finished runs of {number_of(len(case.algorithms), 'algorithm')} ({names})",
-                                f"results of {min_algorithms} algorithms or more")
+        raise UnanswerableError(
+            case.name,
+            f"has finished runs of {number_of(len(case.algorithms), 'algorithm')} ({names})",
+            f"results of {min_algorithms} algorithms or more",
+        )
     return _samples(case, run_means)
 
 
@@ -293,12 +390,18 @@ def _tests_over_runs(case: Case) -> pd.DataFrame:
     """
     frames, titles = [], titles_of(case.scoring.metrics)
     for question, frame in compare_over_runs(case).items():
-        pooled_frame, group, counts = ((rq1(case), "algorithm", ["runs"]) if question == "RQ1"
-                                       else (rq2(case), "baseline", ["n1", "n2"]))
-        frames.append(frame.assign(
-            question=question, algorithm=frame[group].map(lambda name: ALGORITHM_TITLES.get(name, name)),
-            metric=frame["metric"].map(titles), pooled_p=pooled_frame["p_value"],
-            enough=frame[counts].min(axis=1) >= fewest_runs(question)))
+        pooled_frame, group, counts = (
+            (rq1(case), "algorithm", ["runs"]) if question == "RQ1" else (rq2(case), "baseline", ["n1", "n2"])
+        )
+        frames.append(
+            frame.assign(
+                question=question,
+                algorithm=frame[group].map(lambda name: ALGORITHM_TITLES.get(name, name)),
+                metric=frame["metric"].map(titles),
+                pooled_p=pooled_frame["p_value"],
+                enough=frame[counts].min(axis=1) >= fewest_runs(question),
+            )
+        )
     return pd.concat(frames, ignore_index=True)
 
 
@@ -311,8 +414,10 @@ def notes_over_runs(case: Case, question: str, *, pooling: bool) -> list[str]:
     enough = tests.loc[tests["question"] == question, "enough"]
     share = f"{(~enough).sum()} of the" if enough.any() else "all"
     too_few = f"too few runs for {share} {len(enough)} tests of {question} ({fewest_runs(question)} are needed)."
-    return [*([] if enough.all() else [too_few]),
-            *([significance_change_line(case)] if pooling and tests["enough"].any() else [])]
+    return [
+        *([] if enough.all() else [too_few]),
+        *([significance_change_line(case)] if pooling and tests["enough"].any() else []),
+    ]
 
 
 def significance_change_line(case: Case) -> str:
@@ -324,15 +429,19 @@ def significance_change_line(case: Case) -> str:
     tests, texts = _tests_over_runs(case), []
     tests = tests[tests["enough"]].dropna(subset="p_holm")
     was_significant, is_significant = (tests[column].astype(float) < ALPHA for column in ("pooled_p", "p_holm"))
-    for word, changes in (("no longer", tests[was_significant & ~is_significant]),
-                          ("now", tests[~was_significant & is_significant])):
+    for word, changes in (
+        ("no longer", tests[was_significant & ~is_significant]),
+        ("now", tests[~was_significant & is_significant]),
+    ):
         groups = changes.dropna(subset="pooled_p").groupby(["question", "algorithm"], sort=False)["metric"]
         named = "; ".join(f"{question} {name} {', '.join(metrics)}" for (question, name), metrics in groups)
         count = groups.size().sum()
         if count:
             texts.append(f"{count} of {len(tests)} tests {'is' if count == 1 else 'are'} {word} significant: {named}")
-    return ("With one value for each run and Holm's correction for the number of tests, instead of the paper's pooled "
-            f"solutions, {'. '.join(texts) or 'the same tests are significant'}.")
+    return (
+        "With one value for each run and Holm's correction for the number of tests, instead of the paper's pooled "
+        f"solutions, {'. '.join(texts) or 'the same tests are significant'}."
+    )
 
 
 def summary_lines(case: Case) -> list[str]:
@@ -341,9 +450,15 @@ def summary_lines(case: Case) -> list[str]:
     A line says so if there are too few runs for a significant difference. The last line is `significance_change_line`.
     """
     lines, any_testable = list[str](), False
-    questions = (("RQ1", compare_over_runs, "A12 below 0.5: the runs are more unsafe than the original vehicle",
-                  "A12 of {} against the original vehicle"),
-                 ("RQ2", _nsga2_pairs, "A12 above 0.5: NSGA-II is better", "A12 of NSGA-II against {}"))
+    questions = (
+        (
+            "RQ1",
+            compare_over_runs,
+            "A12 below 0.5: the runs are more unsafe than the original vehicle",
+            "A12 of {} against the original vehicle",
+        ),
+        ("RQ2", _nsga2_pairs, "A12 above 0.5: NSGA-II is better", "A12 of NSGA-II against {}"),
+    )
     for question, check, meaning, heading in questions:
         try:
             check(case)
@@ -358,9 +473,12 @@ def summary_lines(case: Case) -> list[str]:
             is_any_testable = bool(defined_tests["enough"].any())
             named_metrics = f"{', '.join(untestable)}: " if is_any_testable else ""
             too_few = f"; {named_metrics}too few runs for a test ({fewest_runs(question)} are needed)"
-            effects = [f"{test['metric']} -" if test["p_holm"] is None else
-                       f"{test['metric']} {test['effect_size']:.2f}{'*' if test['p_holm'] < ALPHA else ''}"
-                       for test in group.to_dict("records")]
+            effects = [
+                f"{test['metric']} -"
+                if test["p_holm"] is None
+                else f"{test['metric']} {test['effect_size']:.2f}{'*' if test['p_holm'] < ALPHA else ''}"
+                for test in group.to_dict("records")
+            ]
             lines.append(f"  {heading.format(name)}: {', '.join(effects)}{too_few if len(untestable) else ''}")
             any_testable = any_testable or is_any_testable
     return [*lines, significance_change_line(case)] if any_testable else lines

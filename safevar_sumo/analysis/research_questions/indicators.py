@@ -27,8 +27,9 @@ def _check_points(points: FloatArray) -> FloatArray:
     """Refuse empty sets and undefined points, for which indicators would return their best value."""
     array = np.asarray(points, dtype=float)
     if array.ndim != 2 or not array.size or not np.isfinite(array).all():
-        raise InputError("a set of points", "is empty or holds an undefined value",
-                         "at least one point, shape (points, objectives)")
+        raise InputError(
+            "a set of points", "is empty or holds an undefined value", "at least one point, shape (points, objectives)"
+        )
     return array
 
 
@@ -122,8 +123,9 @@ def compute_convergence(case: Case) -> pd.DataFrame:
     """
     runs = [(algorithm, run) for algorithm in case.algorithms for run in case.runs_of(algorithm)]
     reference, budget = reference_front(case), case.study.search.evaluations
-    evaluation_counts = np.unique(np.linspace(min(case.study.search.population, budget), budget,
-                                              CURVE_POINTS).astype(int))
+    evaluation_counts = np.unique(
+        np.linspace(min(case.study.search.population, budget), budget, CURVE_POINTS).astype(int)
+    )
     by_run = dict(list(case.evaluations.groupby(["algorithm", "run"])))
     frames = []
     for algorithm, run in (run for run in runs if run in by_run):
@@ -136,8 +138,9 @@ def compute_convergence(case: Case) -> pd.DataFrame:
             front = np.concatenate([front, new_points])
             front = nondominated_points(front) if len(front) else front
             volumes.append(hypervolume(front) if len(front) else 0.0)
-        frames.append(pd.DataFrame({"algorithm": algorithm, "run": run, "evaluations": evaluation_counts,
-                                    "hypervolume": volumes}))
+        frames.append(
+            pd.DataFrame({"algorithm": algorithm, "run": run, "evaluations": evaluation_counts, "hypervolume": volumes})
+        )
     if not frames:
         raise UnanswerableError(case.name, "has no evaluations", "results with the journals of their runs")
     return pd.concat(frames, ignore_index=True)
@@ -159,17 +162,21 @@ def compute_attainment(case: Case) -> dict[str, dict[float, FloatArray]]:
     signs = np.array([objective.sign for objective in case.scoring.objectives[:2]])
     for algorithm in case.algorithms:
         solutions = case.solutions_of(algorithm)
-        fronts = [defined_minimised_values(case, solutions[solutions["run"] == run])[:, :2]
-                  for run in case.runs_of(algorithm)]
+        fronts = [
+            defined_minimised_values(case, solutions[solutions["run"] == run])[:, :2] for run in case.runs_of(algorithm)
+        ]
         fronts = [front for front in fronts if len(front)]
         if fronts:
             run_indices = np.repeat(np.arange(len(fronts)), [len(front) for front in fronts])
             percentages = sorted({100 / len(fronts), *SURFACE_PERCENTAGES})
             points = moocore.eaf(np.concatenate(fronts), run_indices, percentiles=percentages)
             surfaces[algorithm] = {
-                percentage: (minimised := points[points[:, 2] == percentage, :2])[np.argsort(minimised[:, 0],
-                                                                                             kind="stable")] * signs
-                for percentage in np.unique(points[:, 2]).tolist()}
+                percentage: (minimised := points[points[:, 2] == percentage, :2])[
+                    np.argsort(minimised[:, 0], kind="stable")
+                ]
+                * signs
+                for percentage in np.unique(points[:, 2]).tolist()
+            }
     if not surfaces:
         raise UnanswerableError(case.name, "has no solution", "results with at least one finished run")
     return surfaces

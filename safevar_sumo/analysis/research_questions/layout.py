@@ -20,22 +20,46 @@ from safevar_sumo.analysis.words import join_phrases
 from safevar_sumo.metrics import MetricFacts
 
 UNDEFINED = "-"
-SAFETY_UNITS = {"avgSD_mD": "avgSD_mD [m]", "avgSD_cS": "avgSD_cS [m/s]", "TET": "TET [s]", "TIT": "TIT [s^2]",
-                "aveDece": "aveDece [m/s^2]"}
+SAFETY_UNITS = {
+    "avgSD_mD": "avgSD_mD [m]",
+    "avgSD_cS": "avgSD_cS [m/s]",
+    "TET": "TET [s]",
+    "TIT": "TIT [s^2]",
+    "aveDece": "aveDece [m/s^2]",
+}
 PAPER_CHANGE_COUNTS = ("2", "3", "4", "5", "6")
 """The numbers of changed characteristics in the paper's table of RQ3.3."""
-FORMATS = {"mean": ".2f", "original": ".2f", "mean_rank": ".2f", "critical_difference": ".2f", "share": ".1%",
-           "pc": ".1%",
-           "value": ".2f", "percent": ".1f", "percent_other": ".1f", "difference": "+.1f", "effect_size": ".3f",
-           **dict.fromkeys(("rank", "rank_other", "n1", "n2", "runs", "solutions", "collisions"), "d"),
-           **dict.fromkeys(("delta", "increase", "increase_other", "decrease", "decrease_other"), "+.3g"),
-           **dict.fromkeys(("min", "Q1", "median", "Q3", "max"), "g")}
+FORMATS = {
+    "mean": ".2f",
+    "original": ".2f",
+    "mean_rank": ".2f",
+    "critical_difference": ".2f",
+    "share": ".1%",
+    "pc": ".1%",
+    "value": ".2f",
+    "percent": ".1f",
+    "percent_other": ".1f",
+    "difference": "+.1f",
+    "effect_size": ".3f",
+    **dict.fromkeys(("rank", "rank_other", "n1", "n2", "runs", "solutions", "collisions"), "d"),
+    **dict.fromkeys(("delta", "increase", "increase_other", "decrease", "decrease_other"), "+.3g"),
+    **dict.fromkeys(("min", "Q1", "median", "Q3", "max"), "g"),
+}
 """Format specifications of the frames' columns."""
-HEADINGS = {"setting": "case", "p_value": "p", "p_holm": "p Holm", "effect_size": "A12",
-            "critical_difference": "critical difference",
-            "pc": "PC", "percent": "%", "percent_other": "% in the other", "difference": "difference",
-            "rank_other": "rank in the other",
-            "increase_other": "increase in the other", "decrease_other": "decrease in the other"}
+HEADINGS = {
+    "setting": "case",
+    "p_value": "p",
+    "p_holm": "p Holm",
+    "effect_size": "A12",
+    "critical_difference": "critical difference",
+    "pc": "PC",
+    "percent": "%",
+    "percent_other": "% in the other",
+    "difference": "difference",
+    "rank_other": "rank in the other",
+    "increase_other": "increase in the other",
+    "decrease_other": "decrease in the other",
+}
 
 
 class BoldText(str):
@@ -78,30 +102,55 @@ Layouts = Mapping[str, Sequence[Layout]]
 TESTS = ["p_value", "effect_size", "magnitude", "n1", "n2"]
 HOLM_TESTS = ["p_value", "p_holm", "effect_size", "magnitude"]
 LAYOUTS: Layouts = {
-    "rq1": [Layout(["algorithm", "metric"], TESTS), Layout(["metric", "original"], "mean", "algorithm", ["setting"],
-                                                           ", mean metrics")],
+    "rq1": [
+        Layout(["algorithm", "metric"], TESTS),
+        Layout(["metric", "original"], "mean", "algorithm", ["setting"], ", mean metrics"),
+    ],
     "rq2": [Layout(["baseline", "metric"], TESTS)],
     "rq1-runs": [Layout(["algorithm", "metric"], [*HOLM_TESTS, "runs"])],
     "rq2-runs": [Layout(["baseline", "metric"], [*HOLM_TESTS, "n1", "n2"])],
     "rq2-pairs": [Layout(["algorithm", "other", "metric"], HOLM_TESTS)],
-    "rq2-ranks": [Layout(["metric", "runs", "p_value", "p_holm", "critical_difference"],
-                         "mean_rank", "algorithm", ["setting"])],
+    "rq2-ranks": [
+        Layout(["metric", "runs", "p_value", "p_holm", "critical_difference"], "mean_rank", "algorithm", ["setting"])
+    ],
     "rq3.1": [Layout(["j"], ["min", "Q1", "median", "Q3", "max"])],
     "rq3.2": [Layout(["characteristic", "rank"], "percent", "j", ["setting"])],
-    "rq3.3": [Layout(["characteristic", "direction"], "pc", "j", ["setting"], ", PC"),
-              Layout(["characteristic", "direction"], "delta", "j", ["setting"], ", delta")],
-    SAFETY_TABLE: [Layout(["quantity"], "value", "j", ["setting"], ", mean"),
-                   Layout(["quantity"], "percent", "j", ["setting"], ", % of the original")],
+    "rq3.3": [
+        Layout(["characteristic", "direction"], "pc", "j", ["setting"], ", PC"),
+        Layout(["characteristic", "direction"], "delta", "j", ["setting"], ", delta"),
+    ],
+    SAFETY_TABLE: [
+        Layout(["quantity"], "value", "j", ["setting"], ", mean"),
+        Layout(["quantity"], "percent", "j", ["setting"], ", % of the original"),
+    ],
     "collisions": [Layout(["algorithm"], ["solutions", "collisions", "share"])],
     "combinations": [Layout(["setting", "rank", "characteristics"], ["percent"], None)],
-    "weather": [Layout(["characteristic"], ["percent", "percent_other", "difference", "rank", "rank_other",
-                                            "increase", "increase_other", "decrease", "decrease_other"],
-                       None, ["setting", "other"])]}
+    "weather": [
+        Layout(
+            ["characteristic"],
+            [
+                "percent",
+                "percent_other",
+                "difference",
+                "rank",
+                "rank_other",
+                "increase",
+                "increase_other",
+                "decrease",
+                "decrease_other",
+            ],
+            None,
+            ["setting", "other"],
+        )
+    ],
+}
 PAPER_LAYOUTS: Layouts = {
-    **LAYOUTS, "rq1": [Layout(["setting", "algorithm"], "p / A12", "metric")],
+    **LAYOUTS,
+    "rq1": [Layout(["setting", "algorithm"], "p / A12", "metric")],
     "rq2": [Layout(["setting", "baseline"], "p / A12", "metric")],
     "rq3.3": [Layout(["characteristic", "direction"], ["pc", "delta"], "j of the paper", ["setting"])],
-    "combinations": [Layout(["characteristic"], "contained", "place")]}
+    "combinations": [Layout(["characteristic"], "contained", "place")],
+}
 LAYOUTS_BY_NAME = {"full": LAYOUTS, "paper": PAPER_LAYOUTS}
 
 HOLM_LEGEND = f"bold or *: p < {ALPHA:g} after Holm"
@@ -123,28 +172,48 @@ TITLES = {
 BOLD_NOTE = f"Bold (or *): p < {ALPHA:g}; A12 also of medium or large magnitude."
 HOLM_NOTE = f"Bold (or *): p < {ALPHA:g} after Holm's correction for all tests of a case's RQ1 and RQ2."
 NOTES: Mapping[str, Sequence[str]] = {
-    "rq1": ["A12 below 0.5: the algorithm's solutions are more unsafe than the original vehicle.",
-            "The original vehicle's value is repeated to the sample's size.", BOLD_NOTE],
-    "rq2": ["A12 above 0.5: NSGA-II is better. IGD, IGD+ and HV compare runs;",
-            "the other metrics compare pooled solutions.",
-            "IGD on the objectives as they are, IGD+ and hypervolume (HV) on normalised ones.", BOLD_NOTE],
-    "rq1-runs": ["One mean for each run against the original vehicle's value; A12 below 0.5: the runs are more unsafe.",
-                 HOLM_NOTE],
-    "rq2-runs": ["One value for each run (for safety metrics, the mean over its solutions).",
-                 "A12 above 0.5: NSGA-II is better.", HOLM_NOTE],
-    "rq2-pairs": ["One value for each run; A12 above 0.5: the first is better (a better front, more unsafe solutions).",
-                  "Holm's correction is for all pairs and metrics of a case."],
-    "rq2-ranks": ["p: Friedman's test; runs with the same number form a block.",
-                  "Holm's correction is for all metrics of a case.",
-                  f"Ranks closer than the critical difference are not distinguished (Nemenyi, {ALPHA:g})."],
+    "rq1": [
+        "A12 below 0.5: the algorithm's solutions are more unsafe than the original vehicle.",
+        "The original vehicle's value is repeated to the sample's size.",
+        BOLD_NOTE,
+    ],
+    "rq2": [
+        "A12 above 0.5: NSGA-II is better. IGD, IGD+ and HV compare runs;",
+        "the other metrics compare pooled solutions.",
+        "IGD on the objectives as they are, IGD+ and hypervolume (HV) on normalised ones.",
+        BOLD_NOTE,
+    ],
+    "rq1-runs": [
+        "One mean for each run against the original vehicle's value; A12 below 0.5: the runs are more unsafe.",
+        HOLM_NOTE,
+    ],
+    "rq2-runs": [
+        "One value for each run (for safety metrics, the mean over its solutions).",
+        "A12 above 0.5: NSGA-II is better.",
+        HOLM_NOTE,
+    ],
+    "rq2-pairs": [
+        "One value for each run; A12 above 0.5: the first is better (a better front, more unsafe solutions).",
+        "Holm's correction is for all pairs and metrics of a case.",
+    ],
+    "rq2-ranks": [
+        "p: Friedman's test; runs with the same number form a block.",
+        "Holm's correction is for all metrics of a case.",
+        f"Ranks closer than the critical difference are not distinguished (Nemenyi, {ALPHA:g}).",
+    ],
     "rq3.1": ["Critical solutions of a run with exactly j characteristics changed, over the runs."],
     "rq3.2": ["Columns: number of characteristics changed; ranked by 'any'."],
-    "rq3.3": ["PC: mean of |v - v''| / v (v'': filtered, v: original value).",
-              "delta: mean signed change in the characteristic's unit."],
-    SAFETY_TABLE: ["Without collisions: avgSD_mD is the reduction of the distance, TET and TIT are increases.",
-                   "avgSD_cS is the speed of the collisions. aveDece is the decrease over all solutions."],
+    "rq3.3": [
+        "PC: mean of |v - v''| / v (v'': filtered, v: original value).",
+        "delta: mean signed change in the characteristic's unit.",
+    ],
+    SAFETY_TABLE: [
+        "Without collisions: avgSD_mD is the reduction of the distance, TET and TIT are increases.",
+        "avgSD_cS is the speed of the collisions. aveDece is the decrease over all solutions.",
+    ],
     "combinations": ["Percent of the critical solutions with exactly four characteristics changed."],
-    "weather": ["Over the critical solutions; increase and decrease: mean, in the characteristic's unit."]}
+    "weather": ["Over the critical solutions; increase and decrease: mean, in the characteristic's unit."],
+}
 
 
 def lay_out(answer: Answer, layouts: Layouts = LAYOUTS) -> list[Table]:
@@ -156,8 +225,10 @@ def lay_out(answer: Answer, layouts: Layouts = LAYOUTS) -> list[Table]:
         for key, group in frame.groupby(list(layout.separate), sort=False) if layout.separate else [((), frame)]:
             title = f"{TITLES[answer.name]}{layout.title}" + (f": {' against '.join(map(str, key))}" if key else "")
             tables.append(Table(title, _arrange(group, layout)))
-    methods = [f"p{' with e' if method == EXACT_TEST and 'p_holm' not in frame else ''}: {method}."
-               for method in (answer.frame["method"].dropna().unique() if "method" in answer.frame else ())]
+    methods = [
+        f"p{' with e' if method == EXACT_TEST and 'p_holm' not in frame else ''}: {method}."
+        for method in (answer.frame["method"].dropna().unique() if "method" in answer.frame else ())
+    ]
     metric_notes = [_note_on_metrics(answer.metrics)] if "metric" in answer.frame else []
     notes = (*methods, *NOTES.get(answer.name, ()), *metric_notes, *answer.notes)
     return [*tables[:-1], tables[-1]._replace(notes=notes)]
@@ -167,8 +238,10 @@ def _arrange(frame: pd.DataFrame, layout: Layout) -> pd.DataFrame:
     cells = frame.explode(layout.labels[0])  # a cell with several labels is in the row of each
     if layout.over is None:
         return _with_headings(cells.set_index(list(layout.labels))[layout.columns])
-    blocks = {block: _with_headings(group.set_index(list(layout.labels))[layout.columns])
-              for block, group in cells.groupby(layout.over, sort=False)}
+    blocks = {
+        block: _with_headings(group.set_index(list(layout.labels))[layout.columns])
+        for block, group in cells.groupby(layout.over, sort=False)
+    }
     return pd.concat(blocks, axis=1).fillna(UNDEFINED)
 
 
@@ -187,8 +260,13 @@ def _readable_frame(answer: Answer) -> pd.DataFrame:
         frame = pd.DataFrame({quartile: counts.quantile(k / 4) for k, quartile in enumerate(quartiles)}).reset_index()
     if name == "rq3.2":
         frame = frame.assign(rank=frame.groupby(["setting", "characteristic"], sort=False)["rank"].transform("max"))
-    cells = frame.assign(**{column: [_format(value, spec) for value in frame[column]]
-                            for column, spec in FORMATS.items() if column in frame})
+    cells = frame.assign(
+        **{
+            column: [_format(value, spec) for value in frame[column]]
+            for column, spec in FORMATS.items()
+            if column in frame
+        }
+    )
     titles = {**ALGORITHM_TITLES, **SAFETY_UNITS, **titles_of(answer.metrics)}
     for column in ("algorithm", "baseline", "metric", "quantity", *(["other"] if name == "rq2-pairs" else [])):
         if column in frame:
@@ -197,9 +275,12 @@ def _readable_frame(answer: Answer) -> pd.DataFrame:
         cells["j of the paper"] = ("j = " + frame["j"]).where(frame["j"].isin(PAPER_CHANGE_COUNTS))
     if name == "combinations":
         places = (frame.groupby("setting").cumcount() + 1).astype(str)
-        cells = cells.assign(characteristics=frame["characteristics"].map(", ".join),
-                             characteristic=frame["characteristics"],
-                             contained="x", place=frame["setting"] + " #" + places + " (" + cells["percent"] + " %)")
+        cells = cells.assign(
+            characteristics=frame["characteristics"].map(", ".join),
+            characteristic=frame["characteristics"],
+            contained="x",
+            place=frame["setting"] + " #" + places + " (" + cells["percent"] + " %)",
+        )
     return cells.assign(**_test_cells(answer)) if "p_value" in frame else cells
 
 
@@ -220,10 +301,14 @@ def _test_cells(answer: Answer) -> dict[str, list[str]]:
     is_significant = (frame["p_value"].astype(float) < ALPHA) & is_tested
     is_notable = is_significant & frame["magnitude"].isin(NOTABLE_MAGNITUDES)
     marked = [value + ("e" if method == EXACT_TEST else "") for value, method in zip(p, frame["method"], strict=True)]
-    both = [value if value == UNDEFINED else f"{value} / {effect}" for value,
-            effect in zip(p, _effects(frame), strict=True)]
-    return {"p_value": _bold_where(marked, is_significant), "effect_size": _bold_where(_effects(frame), is_notable),
-            "p / A12": _bold_where(both, is_notable)}
+    both = [
+        value if value == UNDEFINED else f"{value} / {effect}" for value, effect in zip(p, _effects(frame), strict=True)
+    ]
+    return {
+        "p_value": _bold_where(marked, is_significant),
+        "effect_size": _bold_where(_effects(frame), is_notable),
+        "p / A12": _bold_where(both, is_notable),
+    }
 
 
 def _effects(frame: pd.DataFrame) -> list[str]:
@@ -247,6 +332,9 @@ def _note_on_metrics(metrics: Iterable[MetricFacts]) -> str:
     titles: dict[bool, list[str]] = {False: [], True: []}
     for metric in metrics:
         titles[metric.over_collisions].append(metric.title + (f" [{metric.unit}]" if metric.unit != "-" else ""))
-    parts = [f"{join_phrases(names)} over {which}" for names, which in (
-        (titles[False], "solutions without collision"), (titles[True], "all solutions")) if names]
+    parts = [
+        f"{join_phrases(names)} over {which}"
+        for names, which in ((titles[False], "solutions without collision"), (titles[True], "all solutions"))
+        if names
+    ]
     return f"{'; '.join(parts)}."

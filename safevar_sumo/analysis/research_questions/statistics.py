@@ -67,11 +67,13 @@ def compare_samples(x: ArrayLike, y: ArrayLike) -> TwoSampleTest:
     if not first.size or not second.size:
         return TwoSampleTest(None, None, None, first.size, second.size, None)
     is_exact = min(first.size, second.size) <= EXACT_SAMPLE_SIZE and np.unique(pooled).size == pooled.size
-    test = scipy.stats.mannwhitneyu(first, second, alternative="two-sided", method="exact" if is_exact
-                                    else "asymptotic")
+    test = scipy.stats.mannwhitneyu(
+        first, second, alternative="two-sided", method="exact" if is_exact else "asymptotic"
+    )
     a12 = float(test.statistic) / (first.size * second.size)
-    return TwoSampleTest(float(test.pvalue), a12, magnitude_of(a12), first.size, second.size, EXACT_TEST if is_exact
-                         else ASYMPTOTIC_TEST)
+    return TwoSampleTest(
+        float(test.pvalue), a12, magnitude_of(a12), first.size, second.size, EXACT_TEST if is_exact else ASYMPTOTIC_TEST
+    )
 
 
 def magnitude_of(effect_size: float) -> str:
@@ -91,10 +93,18 @@ def signed_rank_test(sample: ArrayLike, value: float) -> TwoSampleTest:
     distances = np.abs(differences[differences != 0])
     effect = float(np.mean(differences > 0) + np.mean(differences == 0) / 2)
     is_exact = not distances.size or (np.unique(distances).size == differences.size <= MAX_EXACT_RUNS)
-    p = float(scipy.stats.wilcoxon(differences, alternative="two-sided", correction=not is_exact,
-                                   method="exact" if is_exact else "approx").pvalue) if distances.size else 1.0
-    return TwoSampleTest(p, effect, magnitude_of(effect), differences.size, 1, EXACT_SIGNED_TEST if is_exact
-                         else ASYMPTOTIC_SIGNED_TEST)
+    p = (
+        float(
+            scipy.stats.wilcoxon(
+                differences, alternative="two-sided", correction=not is_exact, method="exact" if is_exact else "approx"
+            ).pvalue
+        )
+        if distances.size
+        else 1.0
+    )
+    return TwoSampleTest(
+        p, effect, magnitude_of(effect), differences.size, 1, EXACT_SIGNED_TEST if is_exact else ASYMPTOTIC_SIGNED_TEST
+    )
 
 
 def fewest_runs(question: str) -> int:

@@ -11,11 +11,17 @@ from safevar_sumo.analysis.research_questions.answer import Answer
 from safevar_sumo.analysis.research_questions.layout import LAYOUTS, BoldText, Layouts, Table, lay_out
 
 LATEX_NEEDS = "% In the preamble: " + " ".join(
-    rf"\usepackage{name}" for name in ("[T1]{fontenc}", "{textcomp}", "{booktabs}", "{graphicx}"))
-_LATEX_CODES = str.maketrans({
-    **{character: "\\" + character for character in "{}$&#%_"},
-    **{character: f"{{{character}}}" for character in "[]*"},  # LaTeX reads these as arguments of the line before
-    "\\": r"\textbackslash{}", "^": r"\textasciicircum{}", "~": r"\textasciitilde{}"})
+    rf"\usepackage{name}" for name in ("[T1]{fontenc}", "{textcomp}", "{booktabs}", "{graphicx}")
+)
+_LATEX_CODES = str.maketrans(
+    {
+        **{character: "\\" + character for character in "{}$&#%_"},
+        **{character: f"{{{character}}}" for character in "[]*"},  # LaTeX reads these as arguments of the line before
+        "\\": r"\textbackslash{}",
+        "^": r"\textasciicircum{}",
+        "~": r"\textasciitilde{}",
+    }
+)
 
 
 def as_text(answers: Sequence[Answer], layouts: Layouts = LAYOUTS) -> str:
@@ -32,20 +38,33 @@ def as_markdown(answers: Sequence[Answer], layouts: Layouts = LAYOUTS) -> str:
     """Markdown tables; a heading over several columns is repeated in each column's heading."""
     texts = []
     for table in (table for answer in answers for table in lay_out(answer, layouts)):
-        body = [] if table.frame.empty else [markdown_table(table.headings(),
-                                                            table.frame.reset_index().to_numpy().tolist(),
-                                                            table.frame.index.nlevels), ""]
-        texts.append("\n".join([f"**{_markdown(table.title)}**", "", *body,
-                                *(f"{_markdown(note)}  " for note in table.notes), ""]))
+        body = (
+            []
+            if table.frame.empty
+            else [
+                markdown_table(
+                    table.headings(), table.frame.reset_index().to_numpy().tolist(), table.frame.index.nlevels
+                ),
+                "",
+            ]
+        )
+        texts.append(
+            "\n".join(
+                [f"**{_markdown(table.title)}**", "", *body, *(f"{_markdown(note)}  " for note in table.notes), ""]
+            )
+        )
     return "\n".join(texts)
 
 
 def markdown_table(headings: Sequence[str], rows: Iterable[Sequence[str]], label_count: int) -> str:
     """A Markdown table of texts; all columns but the first `label_count` are aligned to the right."""
     rule = [":---" if i < label_count else "---:" for i in range(len(headings))]
-    lines = [rule if cells is rule else [f"**{_markdown(cell)}**" if isinstance(cell, BoldText) else _markdown(cell)
-                                         for cell in cells]
-             for cells in (headings, rule, *rows)]
+    lines = [
+        rule
+        if cells is rule
+        else [f"**{_markdown(cell)}**" if isinstance(cell, BoldText) else _markdown(cell) for cell in cells]
+        for cells in (headings, rule, *rows)
+    ]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
@@ -55,21 +74,30 @@ def _markdown(source: str) -> str:
 
 def as_latex(answers: Sequence[Answer], layouts: Layouts = LAYOUTS) -> str:
     r"""Booktabs tables for `\input`, each with a label: `tab:rq1`, and `tab:rq1-2` for an answer's second table."""
-    tables = [_render_latex(table, f"{answer.name}-{i}" if i > 1 else answer.name)
-              for answer in answers for i, table in enumerate(lay_out(answer, layouts), 1)]
+    tables = [
+        _render_latex(table, f"{answer.name}-{i}" if i > 1 else answer.name)
+        for answer in answers
+        for i, table in enumerate(lay_out(answer, layouts), 1)
+    ]
     return "\n".join([LATEX_NEEDS, *tables])
 
 
 def _render_latex(table: Table, label: str) -> str:
-    lines = [r"\begin{table}[htbp]", r"\centering", rf"\caption{{{escaped_for_latex(table.title)}}}",
-             rf"\label{{tab:{label}}}"]
+    lines = [
+        r"\begin{table}[htbp]",
+        r"\centering",
+        rf"\caption{{{escaped_for_latex(table.title)}}}",
+        rf"\label{{tab:{label}}}",
+    ]
     if not table.frame.empty:
         style = table.frame.style.format(_latex_cell)
         style = style.format_index(_latex_cell, axis=0).format_index(_latex_cell, axis=1)
         alignment = "l" * table.frame.index.nlevels + "r" * len(table.frame.columns)
-        lines += [r"\resizebox{\ifdim\width>\linewidth\linewidth\else\width\fi}{!}{%",
-                  style.to_latex(hrules=True, sparse_index=False, multicol_align="c", column_format=alignment).rstrip()
-                  + "%", "}"]
+        lines += [
+            r"\resizebox{\ifdim\width>\linewidth\linewidth\else\width\fi}{!}{%",
+            style.to_latex(hrules=True, sparse_index=False, multicol_align="c", column_format=alignment).rstrip() + "%",
+            "}",
+        ]
     notes = " ".join(map(escaped_for_latex, table.notes))
     lines += [rf"\par\smallskip{{\footnotesize {notes}\par}}"] if notes else []
     return "\n".join([*lines, r"\end{table}", ""])
@@ -105,8 +133,10 @@ def as_json(answers: Sequence[Answer]) -> str:
     for answer in answers:
         frame = answer.frame.astype(object).where(answer.frame.notna(), None)
         table_key = {"table": answer.name} if len(answers) > 1 else {}
-        rows += [table_key | {name: value for name, value in row.items() if name != "rank" or value is not None}
-                 for row in frame.to_dict("records")]
+        rows += [
+            table_key | {name: value for name, value in row.items() if name != "rank" or value is not None}
+            for row in frame.to_dict("records")
+        ]
     return json.dumps(rows, indent=2, allow_nan=False) + "\n"
 
 

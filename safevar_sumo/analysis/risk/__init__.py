@@ -34,18 +34,37 @@ class RiskOptions(Options):
     """Options for the estimate of a risk."""
 
     question: ClassVar[str] = "risk"
-    samples: int = option(10_000, "Maximum number of vehicles that plain Monte Carlo samples.", kind=int, low=1, high=100_000_000,
-                          metavar="N")
+    samples: int = option(
+        10_000,
+        "Maximum number of vehicles that plain Monte Carlo samples.",
+        kind=int,
+        low=1,
+        high=100_000_000,
+        metavar="N",
+    )
     confidence: float = option(0.95, "Confidence of the intervals.", kind=float, low=0, high=1, is_open=(True, True))
     width: float | None = option(
-        None, "Stop as soon as the confidence interval of the probability is at most this wide.", kind=float, low=0, high=1,
-        is_open=(True, False))
+        None,
+        "Stop as soon as the confidence interval of the probability is at most this wide.",
+        kind=float,
+        low=0,
+        high=1,
+        is_open=(True, False),
+    )
     unsafe: str | None = unsafe_option()
-    method: str = option("auto", "Method: monte_carlo, subset_simulation, cross_entropy, or auto, which for a study with [variation] draws "
-                                 f"{PILOT_VEHICLES:,} vehicles and takes subset_simulation if OpenTURNS is installed, the probability is "
-                                 f"below {RARE_BELOW:g} and --samples vehicles would have fewer than {ENOUGH_FAILURES} failures.",
-                         metavar="METHOD", kind=str)
-    rare: bool = option(False, "For rare failures, 1e-3 to 1e-8: as auto, but requires OpenTURNS and computes no sensitivities.", kind=bool)
+    method: str = option(
+        "auto",
+        "Method: monte_carlo, subset_simulation, cross_entropy, or auto, which for a study with [variation] draws "
+        f"{PILOT_VEHICLES:,} vehicles and takes subset_simulation if OpenTURNS is installed, the probability is "
+        f"below {RARE_BELOW:g} and --samples vehicles would have fewer than {ENOUGH_FAILURES} failures.",
+        metavar="METHOD",
+        kind=str,
+    )
+    rare: bool = option(
+        False,
+        "For rare failures, 1e-3 to 1e-8: as auto, but requires OpenTURNS and computes no sensitivities.",
+        kind=bool,
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -61,10 +80,20 @@ class RiskOptions(Options):
 
 
 @document_options(RiskOptions)
-def risk(study: StudyLike | Results, *, samples: int = RiskOptions.samples, confidence: float = RiskOptions.confidence,
-         width: float | None = RiskOptions.width, unsafe: Criterion | None = None, method: str = RiskOptions.method,
-         rare: bool = RiskOptions.rare, pool: Pool | None = None, jobs: int | None = None, progress: bool | Progress = False,
-         as_it_is_now: bool = False) -> Risk:
+def risk(
+    study: StudyLike | Results,
+    *,
+    samples: int = RiskOptions.samples,
+    confidence: float = RiskOptions.confidence,
+    width: float | None = RiskOptions.width,
+    unsafe: Criterion | None = None,
+    method: str = RiskOptions.method,
+    rare: bool = RiskOptions.rare,
+    pool: Pool | None = None,
+    jobs: int | None = None,
+    progress: bool | Progress = False,
+    as_it_is_now: bool = False,
+) -> Risk:
     """Estimate how likely an unsafe outcome is when vehicles vary as the study says, and which characteristic decides whether one occurs.
 
     Parameters
@@ -74,4 +103,6 @@ def risk(study: StudyLike | Results, *, samples: int = RiskOptions.samples, conf
     """
     from safevar_sumo.analysis.risk.compute import estimate_risk
 
-    return answer_question(estimate_risk, study_or_case(study, as_it_is_now=as_it_is_now), RiskOptions, locals())  # the arguments
+    return answer_question(
+        estimate_risk, study_or_case(study, as_it_is_now=as_it_is_now), RiskOptions, locals()
+    )  # the arguments

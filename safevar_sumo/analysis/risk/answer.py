@@ -101,16 +101,31 @@ class Risk(Estimate):
         """The JSON of `risk`."""
         rows = [] if self.sensitivity is None else self.sensitivity.to_dict("records")
         return {
-            "study": self.study.name, **driven_entry(self.no_verdict), "unsafe": str(self.unsafe),
-            "samples": self.samples, "failures": self.failures,
-            "probability": self.probability, "interval": list(self.interval), "confidence": self.confidence,
-            "sensitivity": [{
-                "characteristic": row["characteristic"], **{name: finite_or_none(row[name]) for name in INDICES},
-                **{f"{name}_interval": [finite_or_none(row[f"{name}_{end}"]) for end in ("lower", "upper")]
-                   for name in INDICES}} for row in rows],
-            "method": self.method, "simulations": self.simulations,
+            "study": self.study.name,
+            **driven_entry(self.no_verdict),
+            "unsafe": str(self.unsafe),
+            "samples": self.samples,
+            "failures": self.failures,
+            "probability": self.probability,
+            "interval": list(self.interval),
+            "confidence": self.confidence,
+            "sensitivity": [
+                {
+                    "characteristic": row["characteristic"],
+                    **{name: finite_or_none(row[name]) for name in INDICES},
+                    **{
+                        f"{name}_interval": [finite_or_none(row[f"{name}_{end}"]) for end in ("lower", "upper")]
+                        for name in INDICES
+                    },
+                }
+                for row in rows
+            ],
+            "method": self.method,
+            "simulations": self.simulations,
             "coefficient_of_variation": finite_or_none(self.coefficient_of_variation),
-            "design_point": self.design_point, "remark": self.remark}
+            "design_point": self.design_point,
+            "remark": self.remark,
+        }
 
     def to_frame(self) -> pd.DataFrame:
         """Sensitivity of the safety degree and of the unsafe outcome, one row per output and characteristic; empty if correlated.
@@ -118,7 +133,11 @@ class Risk(Estimate):
         Columns: `output` (safety_degree or unsafe), and the columns of `compute_sensitivities`.
         """
         frames = {SAFETY_DEGREE: self.sensitivity, "unsafe": self.sensitivity_of_unsafe}
-        columns = ["output", "characteristic", *(f"{name}{end}" for name in INDICES for end in ("", "_lower", "_upper"))]
+        columns = [
+            "output",
+            "characteristic",
+            *(f"{name}{end}" for name in INDICES for end in ("", "_lower", "_upper")),
+        ]
         tables = [frame.assign(output=name) for name, frame in frames.items() if frame is not None]
         return pd.concat(tables, ignore_index=True)[columns] if tables else pd.DataFrame(columns=columns)
 
@@ -137,32 +156,51 @@ class Risk(Estimate):
         if self.remark:
             yield f"note: {self.remark}."
         if self.design_point is not None:
-            values = ", ".join(f"{one.name} = {one.text(self.design_point[one.name])}{one.suffix}" for one in characteristics)
+            values = ", ".join(
+                f"{one.name} = {one.text(self.design_point[one.name])}{one.suffix}" for one in characteristics
+            )
             yield f"The most probable failure: {values}."
         if self.is_share_of_domain:
-            yield ("warning: this is not a probability in the field: the study has no [variation] table for how real vehicles "
-                   "vary.")
+            yield (
+                "warning: this is not a probability in the field: the study has no [variation] table for how real vehicles "
+                "vary."
+            )
         elif 0 < self.probability < RARE_BELOW:
-            yield (f"Of {FLEET_VEHICLES:,} vehicles that vary independently at least one is unsafe with probability "
-                   f"{self.of_fleet_in_words(FLEET_VEHICLES)}.")
+            yield (
+                f"Of {FLEET_VEHICLES:,} vehicles that vary independently at least one is unsafe with probability "
+                f"{self.of_fleet_in_words(FLEET_VEHICLES)}."
+            )
         yield _how_vehicles_vary(self.study)
         yield from constraints_in_words(self.study)
         if self.sensitivity is None or self.sensitivity_of_unsafe is None:
             return
-        table = WholeTable("characteristic", right=("SD alone", "SD in all", "unsafe alone", "unsafe in all"),
-                           title="What decides: share of the variance")
+        table = WholeTable(
+            "characteristic",
+            right=("SD alone", "SD in all", "unsafe alone", "unsafe in all"),
+            title="What decides: share of the variance",
+        )
         indices = self.sensitivity.merge(self.sensitivity_of_unsafe, on="characteristic", suffixes=("", "_of_unsafe"))
         for row in indices.sort_values("total", ascending=False, kind="stable").to_dict("records"):
-            shares = ([row[f"{name}{end}{output}"] for end in ("", "_lower", "_upper")]
-                      for output in ("", "_of_unsafe") for name in INDICES)
-            table.add_row(row["characteristic"], *("-" if math.isnan(share) else f"{share:.2f} ±{(upper - lower) / 2:.2f}"
-                                                   for share, lower, upper in shares))
+            shares = (
+                [row[f"{name}{end}{output}"] for end in ("", "_lower", "_upper")]
+                for output in ("", "_of_unsafe")
+                for name in INDICES
+            )
+            table.add_row(
+                row["characteristic"],
+                *(
+                    "-" if math.isnan(share) else f"{share:.2f} ±{(upper - lower) / 2:.2f}"
+                    for share, lower, upper in shares
+                ),
+            )
         yield table
         if self.sensitivity_of_unsafe["total"].isna().all():
             yield "There are no indices of the unsafe outcome, because too few settings are unsafe or too few are safe."
         yield meanings(characteristics)
-        yield (f"Sobol indices, first order and total, with half of their {100 * self.confidence:g} % intervals: estimates, "
-               "which may exceed 1 or fall below 0 by their error.")
+        yield (
+            f"Sobol indices, first order and total, with half of their {100 * self.confidence:g} % intervals: estimates, "
+            "which may exceed 1 or fall below 0 by their error."
+        )
 
     def figure(self) -> Figure:
         """Sobol indices of every characteristic with intervals, for the safety degree and for unsafe outcomes.
@@ -173,35 +211,57 @@ class Risk(Estimate):
             If characteristics are correlated or bound by constraints, so that indices are undefined.
         """
         if self.sensitivity is None or self.sensitivity_of_unsafe is None:
-            raise InputError("correlations", "there are no sensitivity indices of characteristics that are correlated or bound by "
-                             "constraints", "a study without correlations and constraints")
+            raise InputError(
+                "correlations",
+                "there are no sensitivity indices of characteristics that are correlated or bound by constraints",
+                "a study without correlations and constraints",
+            )
         names = self.sensitivity.sort_values("total", kind="stable")["characteristic"].to_list()
         title = f"{self.study.name}: what decides ({100 * self.confidence:g} % intervals)"
         figure, (axes,) = new_figure(title, rows=1, columns=2, size=(7.2, 1.5 + 0.28 * max(len(names), 4)))
         frames = {"safety degree": self.sensitivity, f"unsafe ({self.unsafe})": self.sensitivity_of_unsafe}
         for axis, (output, frame) in zip(axes, frames.items(), strict=True):
             rows = frame.set_index("characteristic").loc[names]
-            for column, label, colour, shift in (("total", "total: with all others", GREY, 0.2),
-                                                 ("first_order", "alone", BLUE, -0.2)):
-                axis.barh(np.arange(len(names)) + shift, rows[column], height=0.36, color=colour, label=label,
-                          xerr=(rows[f"{column}_upper"] - rows[column]).clip(lower=0),
-                          error_kw={"elinewidth": 0.8, "ecolor": "black"})
+            for column, label, colour, shift in (
+                ("total", "total: with all others", GREY, 0.2),
+                ("first_order", "alone", BLUE, -0.2),
+            ):
+                axis.barh(
+                    np.arange(len(names)) + shift,
+                    rows[column],
+                    height=0.36,
+                    color=colour,
+                    label=label,
+                    xerr=(rows[f"{column}_upper"] - rows[column]).clip(lower=0),
+                    error_kw={"elinewidth": 0.8, "ecolor": "black"},
+                )
             axis.set_yticks(np.arange(len(names)), [escape_dollars(name) for name in names])
             axis.set_title(escape_dollars(output), fontsize=FONT)
             axis.set(xlabel="share of the variance [-]", xlim=(0, 1))
             if rows["total"].isna().all():
-                axis.text(0.5, 0.5, "too few settings are unsafe,\nor safe, for indices", transform=axis.transAxes,
-                          ha="center", fontsize=FONT)
+                axis.text(
+                    0.5,
+                    0.5,
+                    "too few settings are unsafe,\nor safe, for indices",
+                    transform=axis.transAxes,
+                    ha="center",
+                    fontsize=FONT,
+                )
             axis.grid(visible=False, axis="y")
         axes[1].set_yticklabels([])
-        figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=2, frameon=False, fontsize=FONT)
+        figure.legend(
+            *axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=2, frameon=False, fontsize=FONT
+        )
         return figure
 
 
 def _how_vehicles_vary(study: Study) -> str:
     """How vehicles vary, in a sentence."""
-    not_uniform = [f"{name} {distribution.__struct_config__.tag}"
-                   for name, distribution in study.variation.items() if distribution != Uniform()]
+    not_uniform = [
+        f"{name} {distribution.__struct_config__.tag}"
+        for name, distribution in study.variation.items()
+        if distribution != Uniform()
+    ]
     pairs = ", ".join(f"{' with '.join(pair.between)} {pair.value:g}" for pair in study.correlations)
     others = "" if len(not_uniform) == len(study.vehicle.characteristics) else "; the others uniformly"
     specified = f"as the study specifies: {'; '.join(not_uniform)}{others}"

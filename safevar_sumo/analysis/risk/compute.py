@@ -29,8 +29,14 @@ MAX_VEHICLES_PER_CALL = 50_000
 """Maximum number of vehicles evaluated in one call if no `width` is requested; bounds the memory of a process."""
 
 
-def estimate_risk(source: Study | Case, options: RiskOptions, *, pool: Pool | None = None, jobs: int | None = None,
-                  progress: Progress = show_no_progress) -> Risk:
+def estimate_risk(
+    source: Study | Case,
+    options: RiskOptions,
+    *,
+    pool: Pool | None = None,
+    jobs: int | None = None,
+    progress: Progress = show_no_progress,
+) -> Risk:
     """Estimate the probability of an unsafe outcome. The filter of small changes is not applied, as no search changes vehicles.
 
     Raises
@@ -48,11 +54,21 @@ def estimate_risk(source: Study | Case, options: RiskOptions, *, pool: Pool | No
         estimate = vars(_draw_vehicles(evaluator, model, unsafe, options))
         has_indices = not (model.is_correlated or evaluator.region or options.requires_rare_method)
         sensitivity, sensitivity_of_unsafe = (
-            compute_sensitivities(evaluator, model, unsafe, options.confidence) if has_indices else (None, None))
+            compute_sensitivities(evaluator, model, unsafe, options.confidence) if has_indices else (None, None)
+        )
         no_verdict = evaluator.no_verdict
     samples, simulations = estimate["simulations"] - estimate["errors"], simulated_before + estimate.pop("simulations")
-    return Risk(study=study, unsafe=unsafe, confidence=options.confidence, sensitivity=sensitivity, no_verdict=no_verdict,
-                sensitivity_of_unsafe=sensitivity_of_unsafe, samples=samples, simulations=simulations, **estimate)
+    return Risk(
+        study=study,
+        unsafe=unsafe,
+        confidence=options.confidence,
+        sensitivity=sensitivity,
+        no_verdict=no_verdict,
+        sensitivity_of_unsafe=sensitivity_of_unsafe,
+        samples=samples,
+        simulations=simulations,
+        **estimate,
+    )
 
 
 def _draw_vehicles(evaluator: Evaluator, model: VariationModel, unsafe: Unsafe, options: RiskOptions) -> Estimate:
@@ -64,12 +80,19 @@ def _draw_vehicles(evaluator: Evaluator, model: VariationModel, unsafe: Unsafe, 
         requested = max(requested, PILOT_VEHICLES)
         remark = "the study has constraints, which only plain Monte Carlo supports" if evaluator.region else ""
     interval = 0.0, 1.0
-    while vehicles + errors < requested and not (options.width is not None and interval[1] - interval[0] <= options.width):
-        largest_number = PILOT_VEHICLES if is_pilot else (
-            MAX_VEHICLES_PER_CALL if options.width is None else VEHICLES_PER_CHECK)
+    while vehicles + errors < requested and not (
+        options.width is not None and interval[1] - interval[0] <= options.width
+    ):
+        largest_number = (
+            PILOT_VEHICLES if is_pilot else (MAX_VEHICLES_PER_CALL if options.width is None else VEHICLES_PER_CHECK)
+        )
         number = min(largest_number, requested - vehicles - errors)
         probabilities = rng.random((number, len(evaluator.characteristics))) if is_pilot else None
-        settings = _draw_feasible_vehicles(evaluator, model, number, rng) if probabilities is None else model.settings(probabilities)
+        settings = (
+            _draw_feasible_vehicles(evaluator, model, number, rng)
+            if probabilities is None
+            else model.settings(probabilities)
+        )
         evaluations = evaluator.evaluate(settings, "sampling vehicles", done_before=vehicles + errors, total=requested)
         valid = int(np.count_nonzero(evaluations.valid))
         vehicles, errors = vehicles + valid, errors + number - valid
@@ -85,8 +108,11 @@ def _draw_vehicles(evaluator: Evaluator, model: VariationModel, unsafe: Unsafe, 
                     return estimate
                 remark = estimate
             elif options.requires_rare_method:
-                pilot = f"at least {100 * RARE_BELOW:g} % of {valid} vehicles are unsafe" if valid else (
-                    f"none of the first {number} vehicles could be simulated")
+                pilot = (
+                    f"at least {100 * RARE_BELOW:g} % of {valid} vehicles are unsafe"
+                    if valid
+                    else (f"none of the first {number} vehicles could be simulated")
+                )
                 remark = f"{pilot}: plain Monte Carlo is used"
         if vehicles:
             interval = clopper_pearson(failures, vehicles, options.confidence)
@@ -94,8 +120,16 @@ def _draw_vehicles(evaluator: Evaluator, model: VariationModel, unsafe: Unsafe, 
         raise SimulationError(f"study {evaluator.study.name!r}: none of {errors} vehicles could be simulated")
     share = failures / vehicles
     variation = float(np.sqrt((1 - share) / failures)) if failures else math.nan
-    return Estimate(probability=share, coefficient_of_variation=variation, interval=interval, failures=failures,
-                    errors=errors, simulations=vehicles + errors, method="monte_carlo", remark=remark)
+    return Estimate(
+        probability=share,
+        coefficient_of_variation=variation,
+        interval=interval,
+        failures=failures,
+        errors=errors,
+        simulations=vehicles + errors,
+        method="monte_carlo",
+        remark=remark,
+    )
 
 
 def _needs_pilot(options: RiskOptions, study: Study) -> bool:
@@ -107,11 +141,15 @@ def _needs_pilot(options: RiskOptions, study: Study) -> bool:
 def _try_rare_method(response: Response, responses: FloatArray, options: RiskOptions, seed: int) -> Estimate | str:
     """The estimate by a method for rare failures; why plain Monte Carlo has to continue if there is none."""
     if is_plateau(responses):
-        return ("the response is a plateau: most vehicles nearest to failure have the same safety degree, so that methods for "
-                "rare failures cannot approach failures; plain Monte Carlo is used")
+        return (
+            "the response is a plateau: most vehicles nearest to failure have the same safety degree, so that methods for "
+            "rare failures cannot approach failures; plain Monte Carlo is used"
+        )
     if not options.requires_rare_method and find_spec("openturns") is None:
-        return (f"fewer than {100 * RARE_BELOW:g} % of the first vehicles are unsafe; for a method that needs fewer vehicles "
-                "for rare failures, in the checkout: pip install '.[rare]'")
+        return (
+            f"fewer than {100 * RARE_BELOW:g} % of the first vehicles are unsafe; for a method that needs fewer vehicles "
+            "for rare failures, in the checkout: pip install '.[rare]'"
+        )
     method = "cross_entropy" if options.method == "cross_entropy" else "subset_simulation"
     try:
         return estimate_rare(response, method, options.confidence, seed)
@@ -119,10 +157,17 @@ def _try_rare_method(response: Response, responses: FloatArray, options: RiskOpt
         return f"{error}; plain Monte Carlo is used"
 
 
-def _draw_feasible_vehicles(evaluator: Evaluator, model: VariationModel, number: int, rng: np.random.Generator) -> FloatArray:
+def _draw_feasible_vehicles(
+    evaluator: Evaluator, model: VariationModel, number: int, rng: np.random.Generator
+) -> FloatArray:
     """Random vehicles that satisfy the constraints, shape (number, n)."""
-    settings = evaluator.region.draw_feasible(lambda count: model.settings(rng.random((count, len(evaluator.characteristics)))), number)
+    settings = evaluator.region.draw_feasible(
+        lambda count: model.settings(rng.random((count, len(evaluator.characteristics)))), number
+    )
     if len(settings) < number:
-        raise InputError(evaluator.study.source, f"fewer than 1 in {REJECTIONS} random vehicles satisfy the constraints: "
-                         f"{evaluator.region}", "a [variation] and [[constraints]] that agree")
+        raise InputError(
+            evaluator.study.source,
+            f"fewer than 1 in {REJECTIONS} random vehicles satisfy the constraints: {evaluator.region}",
+            "a [variation] and [[constraints]] that agree",
+        )
     return settings

@@ -120,10 +120,12 @@ def load_openturns() -> Any:
 
 def is_plateau(responses: FloatArray) -> bool:
     """Whether most of the responses nearest to failure (a share p0 of all) equal each other."""
-    nearest = np.sort(responses[responses > 0])[:max(int(LEVEL_SHARE * len(responses)), 2)]
+    nearest = np.sort(responses[responses > 0])[: max(int(LEVEL_SHARE * len(responses)), 2)]
     if not len(nearest):
         return False
-    return bool(np.count_nonzero(nearest == nearest[-1]) >= PLATEAU_SHARE * len(nearest) or nearest[-1] >= SAFE_RESPONSE)
+    return bool(
+        np.count_nonzero(nearest == nearest[-1]) >= PLATEAU_SHARE * len(nearest) or nearest[-1] >= SAFE_RESPONSE
+    )
 
 
 def estimate_rare(response: Response, method: str, confidence: float, seed: int) -> Estimate:
@@ -166,9 +168,17 @@ def estimate_rare(response: Response, method: str, confidence: float, seed: int)
     failures, errors = response.failure_count, response.errors  # without those around the design point
     if mean > 0:
         design_point = response.values_at(_find_design_point(response, rng))
-    return Estimate(probability=max(mean, 0.0), coefficient_of_variation=variation, interval=interval,
-                    failures=failures, errors=errors, simulations=response.simulations,
-                    method=method, design_point=design_point, remark=remark)
+    return Estimate(
+        probability=max(mean, 0.0),
+        coefficient_of_variation=variation,
+        interval=interval,
+        failures=failures,
+        errors=errors,
+        simulations=response.simulations,
+        method=method,
+        design_point=design_point,
+        remark=remark,
+    )
 
 
 def _failure_event(ot: Any, response: Callable[[Any], FloatArray], dimensions: int) -> Any:
@@ -226,7 +236,9 @@ def _run_subset_simulation(response: Response, seed: int) -> tuple[float, float,
 def _run_cross_entropy(response: Response, seed: int) -> tuple[float, float, list[float]]:
     """Probability and coefficient of variation by cross-entropy importance sampling with independent normal variables; no thresholds."""
     ot = load_openturns()
-    algorithm = ot.StandardSpaceCrossEntropyImportanceSampling(_failure_event(ot, response, response.dimensions), 2 * LEVEL_SHARE)
+    algorithm = ot.StandardSpaceCrossEntropyImportanceSampling(
+        _failure_event(ot, response, response.dimensions), 2 * LEVEL_SHARE
+    )
     algorithm.setBlockSize(LEVEL_SIZE)
     algorithm.setMaximumOuterSampling(1)
     algorithm.setMaximumCoefficientOfVariation(-1.0)
@@ -260,8 +272,10 @@ def _remark_on_islands(response: Response, thresholds: list[float], rng: np.rand
     island_count, _ = scipy.sparse.csgraph.connected_components(links)
     if island_count < 2:
         return ""
-    return (f"failures lie on {island_count} islands with safe settings between them, and this method may have missed others; "
-            "plain Monte Carlo misses none, with many samples")
+    return (
+        f"failures lie on {island_count} islands with safe settings between them, and this method may have missed others; "
+        "plain Monte Carlo misses none, with many samples"
+    )
 
 
 def _select_distant_points(points: FloatArray) -> FloatArray:
@@ -281,8 +295,10 @@ def _find_design_point(response: Response, rng: np.random.Generator) -> FloatArr
     nearest, response.stage = _nearest_point(response.failure_points), "most probable failure"
     for search_round in range(SEARCH_ROUNDS):
         inner_points = nearest * np.linspace(0.5, 1.0, SEARCH_SETTINGS)[:, np.newaxis]
-        random_points = (nearest * (1 - 0.05 * rng.random((SEARCH_SETTINGS, 1)))
-                         + rng.normal(size=(SEARCH_SETTINGS, response.dimensions)) * 0.4 / 2**search_round)
+        random_points = (
+            nearest * (1 - 0.05 * rng.random((SEARCH_SETTINGS, 1)))
+            + rng.normal(size=(SEARCH_SETTINGS, response.dimensions)) * 0.4 / 2**search_round
+        )
         for points in (inner_points, random_points):
             is_unsafe: BoolArray = response(points) < 0
             nearest = _nearest_point(np.vstack([nearest, points[is_unsafe]]))

@@ -44,8 +44,10 @@ class VariationModel:
     def __init__(self, study: Study) -> None:
         self._characteristics = CharacteristicSet.of(study.vehicle.characteristics)
         self._source = study.source
-        self._quantiles = [self._quantile_function(characteristic, study.variation.get(characteristic.name, Uniform()))
-                           for characteristic in self._characteristics]
+        self._quantiles = [
+            self._quantile_function(characteristic, study.variation.get(characteristic.name, Uniform()))
+            for characteristic in self._characteristics
+        ]
         self._factor = self._correlating_factor(study.correlations)
 
     @property
@@ -100,8 +102,12 @@ class VariationModel:
         try:
             return np.asarray(np.linalg.cholesky(matrix), dtype=float)
         except np.linalg.LinAlgError:
-            pairs = ", ".join(f"{' and '.join(correlation.between)} {correlation.value:g}" for correlation in correlations)
-            raise InputError(self._source, f"correlations contradict each other: {pairs}", "a positive definite matrix") from None
+            pairs = ", ".join(
+                f"{' and '.join(correlation.between)} {correlation.value:g}" for correlation in correlations
+            )
+            raise InputError(
+                self._source, f"correlations contradict each other: {pairs}", "a positive definite matrix"
+            ) from None
 
 
 def _truncated_normal(low: float, high: float, mean: float, deviation: float) -> Any:
@@ -112,8 +118,9 @@ def _or_default(value: float | None, default: float) -> float:
     return default if value is None else value
 
 
-def compute_sensitivities(evaluator: Evaluator, model: VariationModel, unsafe: Unsafe,
-                          confidence: float) -> tuple[pd.DataFrame, pd.DataFrame]:
+def compute_sensitivities(
+    evaluator: Evaluator, model: VariationModel, unsafe: Unsafe, confidence: float
+) -> tuple[pd.DataFrame, pd.DataFrame]:
     """Sensitivity of the safety degree, and of the unsafe outcome.
 
     Returns
@@ -146,8 +153,9 @@ def _sobol_indices(problem: dict[str, Any], output: FloatArray, confidence: floa
     if not outputs.size or np.ptp(outputs) == 0:
         indices = {name: np.full(len(names), np.nan) for name in ("S1", "ST", "S1_conf", "ST_conf")}
     else:
-        indices = sobol.analyze(problem, outputs, calc_second_order=False, num_resamples=BOOTSTRAP_SAMPLES, conf_level=confidence,
-                                seed=seed)
+        indices = sobol.analyze(
+            problem, outputs, calc_second_order=False, num_resamples=BOOTSTRAP_SAMPLES, conf_level=confidence, seed=seed
+        )
     frame = pd.DataFrame({"characteristic": names, "first_order": indices["S1"], "total": indices["ST"]})
     for name, key in (("first_order", "S1"), ("total", "ST")):
         for end, sign in (("lower", -1), ("upper", 1)):

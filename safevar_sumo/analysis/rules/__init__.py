@@ -24,14 +24,28 @@ class RulesOptions(Options):
     """Options of the search for rules."""
 
     question: ClassVar[str] = "rules"
-    samples: int = option(16_384, "Number of settings over the whole domain; one half yields the rules, the other half tests them.",
-                           kind=int, low=2, high=10_000_000, metavar="N")
+    samples: int = option(
+        16_384,
+        "Number of settings over the whole domain; one half yields the rules, the other half tests them.",
+        kind=int,
+        low=2,
+        high=10_000_000,
+        metavar="N",
+    )
     unsafe: str | None = unsafe_option()
 
 
 @document_options(RulesOptions)
-def rules(study: StudyLike | Results, *, samples: int = RulesOptions.samples, unsafe: Criterion | None = None, pool: Pool | None = None,
-          jobs: int | None = None, progress: bool | Progress = False, as_it_is_now: bool = False) -> Rules:
+def rules(
+    study: StudyLike | Results,
+    *,
+    samples: int = RulesOptions.samples,
+    unsafe: Criterion | None = None,
+    pool: Pool | None = None,
+    jobs: int | None = None,
+    progress: bool | Progress = False,
+    as_it_is_now: bool = False,
+) -> Rules:
     """Find rules in physical units that say where a study is unsafe.
 
     Parameters
@@ -41,4 +55,6 @@ def rules(study: StudyLike | Results, *, samples: int = RulesOptions.samples, un
     """
     from safevar_sumo.analysis.rules.compute import find_rules
 
-    return answer_question(find_rules, study_or_case(study, as_it_is_now=as_it_is_now), RulesOptions, locals())  # the arguments
+    return answer_question(
+        find_rules, study_or_case(study, as_it_is_now=as_it_is_now), RulesOptions, locals()
+    )  # the arguments

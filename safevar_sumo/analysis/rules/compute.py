@@ -36,8 +36,10 @@ FOLDS, MAX_DEPTH, MAX_PRUNINGS = 5, 6, 24
 """Number of folds of the cross-validation; maximum depth of the tree; maximum number of prunings compared."""
 MIN_ADDED_SHARE = 0.01
 """Share of the unsafe settings that a rule must cover in addition to the rules before it."""
-RULES_NOTE = ("Shares of vehicles that did not form the rules. In a rule all characteristics vary together over the whole domain; how far "
-              "one may go while all others stay as in the original says `tolerance`.")
+RULES_NOTE = (
+    "Shares of vehicles that did not form the rules. In a rule all characteristics vary together over the whole domain; how far "
+    "one may go while all others stay as in the original says `tolerance`."
+)
 """What the shares of rules are shares of."""
 LIMIT_DIGITS = 3
 """Limits are rounded to this many digits of the domain's width."""
@@ -77,7 +79,11 @@ class Rule:
 
     @property
     def coverage_interval(self) -> tuple[float, float] | None:
-        return clopper_pearson(self.unsafe_inside, self.unsafe_everywhere, self.confidence) if self.unsafe_everywhere else None
+        return (
+            clopper_pearson(self.unsafe_inside, self.unsafe_everywhere, self.confidence)
+            if self.unsafe_everywhere
+            else None
+        )
 
     def is_denser_than(self, share: float) -> bool:
         """Whether the density is significantly above a share; always true of a rule without limits."""
@@ -86,21 +92,33 @@ class Rule:
     def in_words(self, characteristics: CharacteristicSet, unsafe: Unsafe) -> str:
         """Itself with its shares: `mass above 2500 kg, the others anywhere: collides in 92 % (..), covers 61 % (..)`."""
         others = ", the others anywhere" if 0 < len(self.limits) < len(characteristics) else ""
-        conditions = [_condition_in_words(characteristic, *self.limits[characteristic.name])
-                      for characteristic in characteristics if characteristic.name in self.limits]
-        shares = [f"{word} -" if share is None or interval is None else
-                  f"{word} {100 * share:.0f} % ({100 * interval[0]:.0f} % to {100 * interval[1]:.0f} %)"
-                  for word, share, interval in ((f"{unsafe.in_words} in", self.density, self.density_interval),
-                                                ("covers", self.coverage, self.coverage_interval))]
+        conditions = [
+            _condition_in_words(characteristic, *self.limits[characteristic.name])
+            for characteristic in characteristics
+            if characteristic.name in self.limits
+        ]
+        shares = [
+            f"{word} -"
+            if share is None or interval is None
+            else f"{word} {100 * share:.0f} % ({100 * interval[0]:.0f} % to {100 * interval[1]:.0f} %)"
+            for word, share, interval in (
+                (f"{unsafe.in_words} in", self.density, self.density_interval),
+                ("covers", self.coverage, self.coverage_interval),
+            )
+        ]
         return f"{join_phrases(conditions) if conditions else 'everywhere'}{others}: {', '.join(shares)}"
 
     def to_dict(self) -> dict[str, Any]:
         """An entry of `rules --json`."""
         return {
-            "conditions": [{"characteristic": name, "at_least": low, "at_most": high} for name, (low, high) in self.limits.items()],
-            "density": self.density, "coverage": self.coverage,
+            "conditions": [
+                {"characteristic": name, "at_least": low, "at_most": high} for name, (low, high) in self.limits.items()
+            ],
+            "density": self.density,
+            "coverage": self.coverage,
             "density_interval": None if self.density_interval is None else list(self.density_interval),
-            "coverage_interval": None if self.coverage_interval is None else list(self.coverage_interval)}
+            "coverage_interval": None if self.coverage_interval is None else list(self.coverage_interval),
+        }
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -126,9 +144,13 @@ class Rules:
         Columns: `rule`, counted from 0, `characteristic`, `at_least`, `at_most` [unit], `density`, `coverage` [fraction].
         """
         return pd.DataFrame(
-            [(number, name, low, high, rule.density, rule.coverage) for number, rule in enumerate(self.rules)
-             for name, (low, high) in rule.limits.items() or [(None, (None, None))]],
-            columns=["rule", "characteristic", "at_least", "at_most", "density", "coverage"])
+            [
+                (number, name, low, high, rule.density, rule.coverage)
+                for number, rule in enumerate(self.rules)
+                for name, (low, high) in rule.limits.items() or [(None, (None, None))]
+            ],
+            columns=["rule", "characteristic", "at_least", "at_most", "density", "coverage"],
+        )
 
     def __repr__(self) -> str:
         share = f"{self.unsafe_share:.2%} of {self.samples}"
@@ -137,8 +159,10 @@ class Rules:
     def sentences(self) -> Iterator[str | Table]:
         """Every rule with its density and coverage."""
         characteristics, (low, high) = CharacteristicSet.of(self.study.vehicle.characteristics), self.unsafe_interval
-        yield (f"Unsafe: {self.unsafe.description}; {100 * self.unsafe_share:.2f} % of {self.samples} vehicles drawn evenly over "
-               f"the whole domain ({100 * low:.2f} % to {100 * high:.2f} %).")
+        yield (
+            f"Unsafe: {self.unsafe.description}; {100 * self.unsafe_share:.2f} % of {self.samples} vehicles drawn evenly over "
+            f"the whole domain ({100 * low:.2f} % to {100 * high:.2f} %)."
+        )
         yield from constraints_in_words(self.study)
         if self.remark:
             yield f"No rule: {self.remark}."
@@ -161,8 +185,14 @@ def _condition_in_words(characteristic: Characteristic, low: float | None, high:
     return f"{characteristic.name} {f'below {high:g}' if low is None else f'above {low:g}'}{characteristic.suffix}"
 
 
-def find_rules(source: Study | Case, options: RulesOptions, *, pool: Pool | None = None, jobs: int | None = None,
-               progress: Progress = show_no_progress) -> Rules:
+def find_rules(
+    source: Study | Case,
+    options: RulesOptions,
+    *,
+    pool: Pool | None = None,
+    jobs: int | None = None,
+    progress: Progress = show_no_progress,
+) -> Rules:
     """Find rules that say where a study is unsafe, from random settings of the whole domain.
 
     Raises
@@ -185,14 +215,23 @@ def find_rules(source: Study | Case, options: RulesOptions, *, pool: Pool | None
     if unsafe_count == len(is_unsafe) > 0:
         boxes = [np.repeat([[-np.inf], [np.inf]], len(characteristics), axis=1)]
     elif min(unsafe_count, len(is_unsafe) - unsafe_count) < MIN_SETTINGS:
-        remark = (f"{unsafe_count} of {len(is_unsafe)} settings are unsafe: rules need at least {MIN_SETTINGS} unsafe and as many safe "
-                  "settings (the command rules --samples N simulates more)")
+        remark = (
+            f"{unsafe_count} of {len(is_unsafe)} settings are unsafe: rules need at least {MIN_SETTINGS} unsafe and as many safe "
+            "settings (the command rules --samples N simulates more)"
+        )
     else:
         boxes = _find_boxes(training.settings, is_unsafe, characteristics)
     rules = [_validate_rule(box, validation.settings, is_unsafe_validation, characteristics.names) for box in boxes]
-    return Rules(study=study, unsafe=unsafe, rules=sorted(rules, key=lambda rule: -rule.unsafe_inside), remark=remark,
-                 no_verdict=no_verdict, samples=samples, unsafe_share=all_unsafe / samples,
-                 unsafe_interval=clopper_pearson(all_unsafe, samples))
+    return Rules(
+        study=study,
+        unsafe=unsafe,
+        rules=sorted(rules, key=lambda rule: -rule.unsafe_inside),
+        remark=remark,
+        no_verdict=no_verdict,
+        samples=samples,
+        unsafe_share=all_unsafe / samples,
+        unsafe_interval=clopper_pearson(all_unsafe, samples),
+    )
 
 
 def _find_boxes(settings: FloatArray, is_unsafe: BoolArray, characteristics: CharacteristicSet) -> list[FloatArray]:
@@ -220,19 +259,29 @@ def _fit_pruned_tree(inputs: FloatArray, is_unsafe: BoolArray) -> Any:
     from sklearn.tree import DecisionTreeClassifier
 
     def new_tree(pruning: float) -> Any:
-        return DecisionTreeClassifier(max_depth=MAX_DEPTH, min_samples_leaf=MIN_SETTINGS // 2, ccp_alpha=pruning, random_state=0)
+        return DecisionTreeClassifier(
+            max_depth=MAX_DEPTH, min_samples_leaf=MIN_SETTINGS // 2, ccp_alpha=pruning, random_state=0
+        )
 
     path = np.unique(np.maximum(new_tree(0.0).cost_complexity_pruning_path(inputs, is_unsafe).ccp_alphas, 0.0))[:-1]
-    prunings = path[np.unique(np.linspace(0, len(path) - 1, MAX_PRUNINGS).round().astype(int))] if len(path) else np.zeros(1)
+    prunings = (
+        path[np.unique(np.linspace(0, len(path) - 1, MAX_PRUNINGS).round().astype(int))] if len(path) else np.zeros(1)
+    )
     folds = StratifiedKFold(FOLDS, shuffle=True, random_state=0)
-    scores = np.array([cross_val_score(new_tree(pruning), inputs, is_unsafe, cv=folds, scoring="neg_brier_score") for pruning in prunings])
+    scores = np.array(
+        [
+            cross_val_score(new_tree(pruning), inputs, is_unsafe, cv=folds, scoring="neg_brier_score")
+            for pruning in prunings
+        ]
+    )
     means, errors = scores.mean(axis=1), scores.std(axis=1, ddof=1) / math.sqrt(FOLDS)
     best = int(np.argmax(means))
     return new_tree(prunings[np.flatnonzero(means >= means[best] - errors[best])[-1]]).fit(inputs, is_unsafe)
 
 
-def _boxes_of_leaves(tree: Any, node: int, box: FloatArray, lower: FloatArray, width: FloatArray
-                     ) -> Iterator[tuple[FloatArray, float]]:
+def _boxes_of_leaves(
+    tree: Any, node: int, box: FloatArray, lower: FloatArray, width: FloatArray
+) -> Iterator[tuple[FloatArray, float]]:
     """The boxes of a tree below a node, each with its share of unsafe settings."""
     if tree.children_left[node] < 0:
         counts = tree.value[node][0]
@@ -247,6 +296,7 @@ def _boxes_of_leaves(tree: Any, node: int, box: FloatArray, lower: FloatArray, w
 
 def _drop_useless_conditions(box: FloatArray, settings: FloatArray, is_unsafe: BoolArray) -> FloatArray:
     """Drop conditions while the lower bound of the density does not fall."""
+
     def least_density(box: FloatArray) -> float:
         is_inside = is_within(box, settings)
         count = int(np.count_nonzero(is_inside))
@@ -270,7 +320,15 @@ def is_within(box: FloatArray, settings: FloatArray) -> BoolArray:
 def _validate_rule(box: FloatArray, settings: FloatArray, is_unsafe: BoolArray, names: Sequence[str]) -> Rule:
     """The rule of a box, with the numbers of validation settings."""
     is_inside = is_within(box, settings)
-    limits = {name: (None if low == -np.inf else low, None if high == np.inf else high)
-              for name, low, high in zip(names, *box.tolist(), strict=True) if np.isfinite([low, high]).any()}
-    return Rule(limits=limits, inside=int(np.count_nonzero(is_inside)), confidence=CONFIDENCE,
-                unsafe_inside=int(np.count_nonzero(is_inside & is_unsafe)), unsafe_everywhere=int(np.count_nonzero(is_unsafe)))
+    limits = {
+        name: (None if low == -np.inf else low, None if high == np.inf else high)
+        for name, low, high in zip(names, *box.tolist(), strict=True)
+        if np.isfinite([low, high]).any()
+    }
+    return Rule(
+        limits=limits,
+        inside=int(np.count_nonzero(is_inside)),
+        confidence=CONFIDENCE,
+        unsafe_inside=int(np.count_nonzero(is_inside & is_unsafe)),
+        unsafe_everywhere=int(np.count_nonzero(is_unsafe)),
+    )

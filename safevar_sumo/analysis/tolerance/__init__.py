@@ -27,15 +27,27 @@ class ToleranceOptions(Options):
     question: ClassVar[str] = "tolerance"
     unsafe: str | None = unsafe_option()
     characteristics: tuple[str, ...] | None = option(
-        None, "Only these characteristics, separated by commas.  [default: all]", metavar="A,B", form="commas",
-        python="Characteristics that vary alone, in pairs, and together in the joint box; the others keep their values. By default all.")
+        None,
+        "Only these characteristics, separated by commas.  [default: all]",
+        metavar="A,B",
+        form="commas",
+        python="Characteristics that vary alone, in pairs, and together in the joint box; the others keep their values. By default all.",
+    )
     pairs: bool = option(False, "Evaluate every pair too.", kind=bool)
 
 
 @document_options(ToleranceOptions)
-def tolerance(study: StudyLike | Results, *, unsafe: Criterion | None = None, characteristics: Sequence[str] | None = None,
-              pairs: bool = ToleranceOptions.pairs, pool: Pool | None = None, jobs: int | None = None, progress: bool | Progress = False,
-              as_it_is_now: bool = False) -> Tolerance:
+def tolerance(
+    study: StudyLike | Results,
+    *,
+    unsafe: Criterion | None = None,
+    characteristics: Sequence[str] | None = None,
+    pairs: bool = ToleranceOptions.pairs,
+    pool: Pool | None = None,
+    jobs: int | None = None,
+    progress: bool | Progress = False,
+    as_it_is_now: bool = False,
+) -> Tolerance:
     """Find how far characteristics may go: each by itself, with `pairs` also two together, and all together.
 
     Parameters

@@ -61,8 +61,10 @@ class Tolerance:
             return f"Unsafe alone, all others as in the original: {', '.join(names)}."
         if self.unsafe_pairs:
             pairs = ", ".join(" with ".join(pair.names) for pair in self.unsafe_pairs)
-            return (f"No single characteristic makes it unsafe, but {len(self.unsafe_pairs)} of {len(self.pairs or [])} pairs: "
-                    f"{pairs}.")
+            return (
+                f"No single characteristic makes it unsafe, but {len(self.unsafe_pairs)} of {len(self.pairs or [])} pairs: "
+                f"{pairs}."
+            )
         return f"No single characteristic {'makes' if self.pairs is None else 'and no pair makes'} it unsafe."
 
     def to_frame(self) -> pd.DataFrame:
@@ -71,17 +73,48 @@ class Tolerance:
         Columns: `characteristic`, `unit`, `original`, `lower` and `upper` of the domain, `safe_from`, `safe_to` [unit],
         `margin_from`, `margin_to`, the safety degrees there [m], and `unsafe` and `not_simulated`, lists of intervals.
         """
-        columns = ["characteristic", "unit", "original", "lower", "upper", "safe_from", "safe_to", "margin_from", "margin_to",
-                   "unsafe", "not_simulated"]
+        columns = [
+            "characteristic",
+            "unit",
+            "original",
+            "lower",
+            "upper",
+            "safe_from",
+            "safe_to",
+            "margin_from",
+            "margin_to",
+            "unsafe",
+            "not_simulated",
+        ]
         members = [(scan, scan.characteristic) for scan in self.alone]
-        return pd.DataFrame([(one.name, one.unit, one.original, one.lower, one.upper, *(scan.safe or (None, None)),
-                              *scan.margins, scan.unsafe, scan.not_simulated) for scan, one in members], columns=columns)
+        return pd.DataFrame(
+            [
+                (
+                    one.name,
+                    one.unit,
+                    one.original,
+                    one.lower,
+                    one.upper,
+                    *(scan.safe or (None, None)),
+                    *scan.margins,
+                    scan.unsafe,
+                    scan.not_simulated,
+                )
+                for scan, one in members
+            ],
+            columns=columns,
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """The JSON of `tolerance`."""
-        return {"study": self.study.name, **driven_entry(self.no_verdict), "unsafe": str(self.unsafe),
-                "alone": [scan.to_dict() for scan in self.alone],
-                "pairs": [pair.to_dict() for pair in self.pairs or []], "joint": self.joint._asdict()}
+        return {
+            "study": self.study.name,
+            **driven_entry(self.no_verdict),
+            "unsafe": str(self.unsafe),
+            "alone": [scan.to_dict() for scan in self.alone],
+            "pairs": [pair.to_dict() for pair in self.pairs or []],
+            "joint": self.joint._asdict(),
+        }
 
     def __repr__(self) -> str:
         return f"<Tolerance of {self.study.name}, unsafe {self.unsafe}: {self.verdict}>"
@@ -96,10 +129,15 @@ class Tolerance:
         yield "* the end of the domain: values beyond it were not simulated."
         yield meanings(scan.characteristic for scan in self.alone)
         worst = sorted(self.unsafe_pairs, key=lambda pair: -pair.unsafe_share)
-        table = WholeTable("pair", right=("unsafe share", "nearest unsafe setting"),
-                           title=f"Pairs with unsafe settings: {len(worst)} of {len(self.pairs or [])}")
+        table = WholeTable(
+            "pair",
+            right=("unsafe share", "nearest unsafe setting"),
+            title=f"Pairs with unsafe settings: {len(worst)} of {len(self.pairs or [])}",
+        )
         for pair in worst[:MAX_PAIRS]:
-            nearest = ", ".join(f"{name} {value:.5g}" for name, value in zip(pair.names, pair.nearest or (), strict=True))
+            nearest = ", ".join(
+                f"{name} {value:.5g}" for name, value in zip(pair.names, pair.nearest or (), strict=True)
+            )
             lost = pair.not_simulated_share
             failed = f" ({100 * lost:.1f} % could not be simulated)" if lost else ""
             table.add_row(" with ".join(pair.names), f"{100 * pair.unsafe_share:.1f} %{failed}", nearest)
@@ -111,15 +149,21 @@ class Tolerance:
     def _box_in_words(self) -> str:
         box = self.joint
         subset = len(box.characteristics) < len(self.study.vehicle.characteristics)
-        subject = f"{', '.join(box.characteristics)} together, the others as in the original" if subset else "All together"
+        subject = (
+            f"{', '.join(box.characteristics)} together, the others as in the original" if subset else "All together"
+        )
         if not box.factor:
             return f"{subject}: no box around the original is safe."
-        failed = f"; {box.failed} of them could not be simulated and count as unsafe in what follows" if box.failed else ""
+        failed = (
+            f"; {box.failed} of them could not be simulated and count as unsafe in what follows" if box.failed else ""
+        )
         which = f"all settings in the box{' that satisfy the constraints' if self.study.constraints else ''}"
-        return (f"{subject}: each may go {100 * box.factor:.1f} % of the way from its original value to either end of its "
-                f"domain. None of {box.samples} settings drawn at random in this box is unsafe{failed}. With "
-                f"{100 * box.confidence:.0f} % confidence at most {100 * box.unsafe_at_most:.2f} % of {which} are unsafe"
-                f"{' or cannot be simulated' if box.failed else ''}.")
+        return (
+            f"{subject}: each may go {100 * box.factor:.1f} % of the way from its original value to either end of its "
+            f"domain. None of {box.samples} settings drawn at random in this box is unsafe{failed}. With "
+            f"{100 * box.confidence:.0f} % confidence at most {100 * box.unsafe_at_most:.2f} % of {which} are unsafe"
+            f"{' or cannot be simulated' if box.failed else ''}."
+        )
 
     def figure(self) -> Figure:
         """The safety degree, or points, over each domain; the original is marked, unsafe intervals are shaded."""
@@ -133,8 +177,11 @@ class Tolerance:
             if degrees.size:  # equal for all panels, so that steep profiles stand out
                 axis.set_ylim(degrees.min() - margin, degrees.max() + margin)
         figure.supylabel(DEGREE_LABEL if column == SAFETY_DEGREE else RATING_POINTS.title, fontsize=FONT)
-        notes = {"dot: the original vehicle": True, "hatched: unsafe": any(scan.unsafe for scan in self.alone),
-                 "below the dashed line: collisions": column == SAFETY_DEGREE and bool(degrees.size) and degrees.min() <= 0}
+        notes = {
+            "dot: the original vehicle": True,
+            "hatched: unsafe": any(scan.unsafe for scan in self.alone),
+            "below the dashed line: collisions": column == SAFETY_DEGREE and bool(degrees.size) and degrees.min() <= 0,
+        }
         figure.supxlabel(";\n".join(words for words, is_drawn in notes.items() if is_drawn), fontsize=FONT)
         return figure
 
@@ -148,7 +195,9 @@ class Tolerance:
         """
         if not self.pairs:
             raise InputError("pairs", "there is no pair to draw", "at least two characteristics, evaluated in pairs")
-        worst = sorted(self.pairs, key=lambda pair: (-pair.unsafe_share, np.nanmin(pair.safety_degree)))[:MAX_PAIRS_DRAWN]
+        worst = sorted(self.pairs, key=lambda pair: (-pair.unsafe_share, np.nanmin(pair.safety_degree)))[
+            :MAX_PAIRS_DRAWN
+        ]
         degrees = np.stack([pair.safety_degree for pair in worst])
         title = f"{self.study.name}: the worst pairs (unsafe: {self.unsafe})"
         figure, axes = new_panels(title, len(worst), 3, (3.0, 2.4), min_width=4.6, title_height=1.1)
@@ -157,23 +206,33 @@ class Tolerance:
         bar = figure.colorbar(colours[-1], ax=figure.axes, shrink=0.9)
         bar.set_label(DEGREE_LABEL, fontsize=FONT)
         bar.ax.tick_params(labelsize=FONT)
-        figure.supxlabel("dot: the original vehicle; hatched: unsafe;\ncross: the unsafe setting nearest to the original",
-                         fontsize=FONT)
+        figure.supxlabel(
+            "dot: the original vehicle; hatched: unsafe;\ncross: the unsafe setting nearest to the original",
+            fontsize=FONT,
+        )
         return figure
 
 
 def _scan_table(scans: list[OneAtATimeScan]) -> WholeTable:
     states = {"unsafe": "unsafe", "not_simulated": "could not be simulated", "infeasible": "violates a constraint"}
     shown = [state for state in states if state == "unsafe" or any(scan.intervals(state) for scan in scans)]
-    table = WholeTable("characteristic", title="Each alone, all others as in the original",
-                       right=("original", "safe from", "to", "SD at the ends", *map(states.__getitem__, shown)))
+    table = WholeTable(
+        "characteristic",
+        title="Each alone, all others as in the original",
+        right=("original", "safe from", "to", "SD at the ends", *map(states.__getitem__, shown)),
+    )
     for scan in scans:
         one = scan.characteristic
         limits = ["nowhere"] * 2 if scan.safe is None else [_limit_in_words(one, value) for value in scan.safe]
         margins = "-" if scan.safe is None else " / ".join(map(two_decimals, scan.margins))
         intervals = (", ".join(f"{low:.5g} to {high:.5g}" for low, high in scan.intervals(state)) for state in shown)
-        table.add_row(f"{one.name} [{one.unit}]", f"{one.original:g}", *limits, margins,
-                      *(text or "nowhere" for text in intervals))
+        table.add_row(
+            f"{one.name} [{one.unit}]",
+            f"{one.original:g}",
+            *limits,
+            margins,
+            *(text or "nowhere" for text in intervals),
+        )
     return table
 
 
@@ -188,10 +247,15 @@ def _losses_in_words(scan: OneAtATimeScan) -> str:
     characteristic, any_loss, whole_point = scan.characteristic, scan.first_loss(), scan.first_loss(WHOLE_POINT_LOSS)
     if any_loss is None:
         return f"{characteristic.name}: costs no points anywhere in its domain."
-    first = ("it never costs a whole point" if whole_point is None else
-             f"the first point is lost at {whole_point:.5g}{characteristic.suffix}")
-    return (f"{characteristic.name}: points are lost from {any_loss:.5g}{characteristic.suffix} on; {first}; the minimum is "
-            f"{min((scan.points or {}).values()):.2f} points.")
+    first = (
+        "it never costs a whole point"
+        if whole_point is None
+        else f"the first point is lost at {whole_point:.5g}{characteristic.suffix}"
+    )
+    return (
+        f"{characteristic.name}: points are lost from {any_loss:.5g}{characteristic.suffix} on; {first}; the minimum is "
+        f"{min((scan.points or {}).values()):.2f} points."
+    )
 
 
 def _draw_profile(axis: Axes, scan: OneAtATimeScan, column: str) -> None:
@@ -210,7 +274,9 @@ def _draw_profile(axis: Axes, scan: OneAtATimeScan, column: str) -> None:
 
 def _draw_plane(axis: Axes, pair: Pair, limits: tuple[float, float]) -> QuadMesh:
     """Draw one plane, with the first characteristic on the horizontal axis."""
-    colours = axis.pcolormesh(*pair.values, pair.safety_degree.T, cmap="cividis", vmin=limits[0], vmax=limits[1], shading="nearest")
+    colours = axis.pcolormesh(
+        *pair.values, pair.safety_degree.T, cmap="cividis", vmin=limits[0], vmax=limits[1], shading="nearest"
+    )
     if pair.unsafe.any():
         axis.contourf(*pair.values, pair.unsafe.T.astype(float), levels=[0.5, 1.5], colors="none", hatches=["////"])
         axis.contour(*pair.values, pair.unsafe.T.astype(float), levels=[0.5], colors=VERMILION, linewidths=1.2)

@@ -21,8 +21,14 @@ from safevar_sumo.records import FloatArray
 from safevar_sumo.study import Study
 
 
-def find_tolerances(source: Study | Case, options: ToleranceOptions, *, pool: Pool | None = None, jobs: int | None = None,
-                    progress: Progress = show_no_progress) -> Tolerance:
+def find_tolerances(
+    source: Study | Case,
+    options: ToleranceOptions,
+    *,
+    pool: Pool | None = None,
+    jobs: int | None = None,
+    progress: Progress = show_no_progress,
+) -> Tolerance:
     """Find how far the characteristics of a study may go. The filter is not applied, as the question is about the vehicle.
 
     The joint box holds none of the unsafe solutions of results.
@@ -49,8 +55,15 @@ def find_tolerances(source: Study | Case, options: ToleranceOptions, *, pool: Po
         box = SafeBox(characteristics=names_of(evaluator, columns))
         if needs_box:
             box = find_safe_box(evaluator, columns, unsafe, _unsafe_settings(evaluator, scans, pairs or []), solutions)
-        return Tolerance(study=study, unsafe=unsafe, original=original, alone=scans, pairs=pairs, joint=box,
-                         no_verdict=evaluator.no_verdict)
+        return Tolerance(
+            study=study,
+            unsafe=unsafe,
+            original=original,
+            alone=scans,
+            pairs=pairs,
+            joint=box,
+            no_verdict=evaluator.no_verdict,
+        )
 
 
 def _columns_of(study: Study, characteristics: Sequence[str] | None) -> list[int]:
@@ -59,7 +72,9 @@ def _columns_of(study: Study, characteristics: Sequence[str] | None) -> list[int
         if name not in names:
             raise unknown_name("characteristics", f"there is no characteristic {name!r}", name, names)
     if len(set(chosen)) < len(chosen):
-        raise InputError("characteristics", f"{','.join(chosen)}: a characteristic is named twice", "each characteristic once")
+        raise InputError(
+            "characteristics", f"{','.join(chosen)}: a characteristic is named twice", "each characteristic once"
+        )
     return [column for column, name in enumerate(names) if characteristics is None or name in characteristics]
 
 

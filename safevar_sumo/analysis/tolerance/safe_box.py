@@ -51,8 +51,13 @@ def names_of(evaluator: Evaluator, columns: Sequence[int]) -> tuple[str, ...]:
     return tuple(evaluator.characteristics.names[column] for column in columns)
 
 
-def find_safe_box(evaluator: Evaluator, columns: Sequence[int], unsafe: Unsafe, unsafe_settings: FloatArray,
-                  solutions: pd.DataFrame | None = None) -> SafeBox:
+def find_safe_box(
+    evaluator: Evaluator,
+    columns: Sequence[int],
+    unsafe: Unsafe,
+    unsafe_settings: FloatArray,
+    solutions: pd.DataFrame | None = None,
+) -> SafeBox:
     """The largest safe box around an original vehicle that is safe itself.
 
     Parameters
@@ -77,6 +82,7 @@ def find_safe_box(evaluator: Evaluator, columns: Sequence[int], unsafe: Unsafe, 
     at most alpha_k; all tests together fail with probability sum alpha_k <= alpha, whichever of them accepts. Later tests draw more
     settings, so that the bound stays `MAX_UNSAFE_SHARE` if all of them can be simulated.
     """
+
     def shrunk(factor: float, unsafe_found: FloatArray) -> float:
         """The factor of a box that ends before all unsafe settings found on the straight ways from the original to some of these."""
         nearest = unsafe_found[np.argsort(_box_factors(evaluator, unsafe_found), kind="stable")[:MAX_LINES]]
@@ -96,7 +102,9 @@ def find_safe_box(evaluator: Evaluator, columns: Sequence[int], unsafe: Unsafe, 
         for point_count in (FIRST_SEARCH_POINTS, SECOND_SEARCH_POINTS):
             sobol = sobol_points(point_count, len(columns), evaluator.study.search.seed + search)
             points = np.concatenate([sobol, np.round(sobol)])  # and corners
-            unsafe_found, _ = _unsafe_in_box(evaluator, factor, _settings_in_box(evaluator, columns, factor, points), unsafe)
+            unsafe_found, _ = _unsafe_in_box(
+                evaluator, factor, _settings_in_box(evaluator, columns, factor, points), unsafe
+            )
             if len(unsafe_found):
                 break
         else:
@@ -108,7 +116,11 @@ def find_safe_box(evaluator: Evaluator, columns: Sequence[int], unsafe: Unsafe, 
             samples = len(settings)
             unsafe_found, failed = _unsafe_in_box(evaluator, factor, settings, unsafe)
             if not len(unsafe_found):
-                bound = scipy.stats.beta.ppf(1 - error_probability, failed + 1, samples - failed) if failed < samples else 1.0
+                bound = (
+                    scipy.stats.beta.ppf(1 - error_probability, failed + 1, samples - failed)
+                    if failed < samples
+                    else 1.0
+                )
                 return SafeBox(factor, CONFIDENCE, samples, failed, attempt, float(bound), names_of(evaluator, columns))
         factor = shrunk(factor, unsafe_found)
     return SafeBox(attempts=attempt, characteristics=names_of(evaluator, columns))
@@ -134,13 +146,20 @@ def _settings_in_box(evaluator: Evaluator, columns: Sequence[int], factor: float
     return settings
 
 
-def _random_settings(evaluator: Evaluator, columns: Sequence[int], factor: float, number: int, rng: np.random.Generator) -> FloatArray:
+def _random_settings(
+    evaluator: Evaluator, columns: Sequence[int], factor: float, number: int, rng: np.random.Generator
+) -> FloatArray:
     """Feasible settings drawn uniformly in a box; fewer than `number` where few are feasible, an error where none is."""
     settings = evaluator.region.draw_feasible(
-        lambda count: _settings_in_box(evaluator, columns, factor, rng.random((count, len(columns)))), number)
+        lambda count: _settings_in_box(evaluator, columns, factor, rng.random((count, len(columns)))), number
+    )
     if not len(settings):
-        raise InputError(evaluator.study.source, f"fewer than 1 in {REJECTIONS} random settings satisfy the constraints, which leaves "
-                         f"no box to test: {evaluator.region}", "characteristics that the constraints do not tie to each other")
+        raise InputError(
+            evaluator.study.source,
+            f"fewer than 1 in {REJECTIONS} random settings satisfy the constraints, which leaves "
+            f"no box to test: {evaluator.region}",
+            "characteristics that the constraints do not tie to each other",
+        )
     return settings
 
 
@@ -159,5 +178,9 @@ def _box_factors(evaluator: Evaluator, settings: FloatArray) -> FloatArray:
     """Factors of the boxes on whose surfaces K settings lie, shape (K,)."""
     characteristics = evaluator.characteristics
     change = settings - characteristics.original
-    room = np.where(change < 0, characteristics.original - characteristics.lower, characteristics.upper - characteristics.original)
-    return np.asarray(np.max(np.divide(np.abs(change), room, out=np.zeros_like(change), where=room > 0), axis=1, initial=0.0))
+    room = np.where(
+        change < 0, characteristics.original - characteristics.lower, characteristics.upper - characteristics.original
+    )
+    return np.asarray(
+        np.max(np.divide(np.abs(change), room, out=np.zeros_like(change), where=room > 0), axis=1, initial=0.0)
+    )

@@ -88,17 +88,32 @@ class OneAtATimeScan:
         """The value nearest to the original that loses more than `points` rating points; None if no value does."""
         kept, original = self.points or {}, self.characteristic.original
         limit = kept.get(original, math.nan) - points - POINT_ROUNDING
-        return min((value for value in kept if kept[value] < limit), key=lambda value: abs(value - original), default=None)
+        return min(
+            (value for value in kept if kept[value] < limit), key=lambda value: abs(value - original), default=None
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """An entry of `alone` in `tolerance --json`; in a rated study with points, and where points are first lost."""
-        rating_entries = {} if self.points is None else {
-            "points": [list(pair) for pair in self.points.items()], "any_lost": self.first_loss(),
-            "first_point_lost": self.first_loss(WHOLE_POINT_LOSS)}
+        rating_entries = (
+            {}
+            if self.points is None
+            else {
+                "points": [list(pair) for pair in self.points.items()],
+                "any_lost": self.first_loss(),
+                "first_point_lost": self.first_loss(WHOLE_POINT_LOSS),
+            }
+        )
         infeasible = self.intervals("infeasible")
-        return {**rating_entries, "characteristic": self.characteristic.name, "unit": self.characteristic.unit,
-                "original": self.characteristic.original, "safe": self.safe, "unsafe": self.unsafe,
-                "not_simulated": self.not_simulated, **({"infeasible": infeasible} if infeasible else {})}
+        return {
+            **rating_entries,
+            "characteristic": self.characteristic.name,
+            "unit": self.characteristic.unit,
+            "original": self.characteristic.original,
+            "safe": self.safe,
+            "unsafe": self.unsafe,
+            "not_simulated": self.not_simulated,
+            **({"infeasible": infeasible} if infeasible else {}),
+        }
 
 
 def scan(evaluator: Evaluator, columns: Sequence[int], unsafe: Unsafe) -> list[OneAtATimeScan]:
@@ -112,8 +127,10 @@ def scan(evaluator: Evaluator, columns: Sequence[int], unsafe: Unsafe) -> list[O
         if not any(map(len, values)):
             break
         finer_profiles = _evaluate_profiles(evaluator, columns, values, unsafe)
-        profiles = [pd.concat(both, ignore_index=True).sort_values("value", ignore_index=True)
-                    for both in zip(profiles, finer_profiles, strict=True)]
+        profiles = [
+            pd.concat(both, ignore_index=True).sort_values("value", ignore_index=True)
+            for both in zip(profiles, finer_profiles, strict=True)
+        ]
     return [OneAtATimeScan(characteristic=one, profile=profile) for one, profile in zip(scanned, profiles, strict=True)]
 
 
@@ -125,15 +142,23 @@ def _values_between_states(profile: pd.DataFrame) -> FloatArray:
     return np.setdiff1d(inner, values)
 
 
-def _evaluate_profiles(evaluator: Evaluator, columns: Sequence[int], values: Sequence[FloatArray],
-                       unsafe: Unsafe) -> list[pd.DataFrame]:
+def _evaluate_profiles(
+    evaluator: Evaluator, columns: Sequence[int], values: Sequence[FloatArray], unsafe: Unsafe
+) -> list[pd.DataFrame]:
     """The profile of each characteristic at its `values`."""
     original, ends = evaluator.characteristics.original, np.cumsum([len(its_values) for its_values in values])[:-1]
-    settings = np.concatenate([_settings_with(original, [column], its_values[:, np.newaxis])
-                               for column, its_values in zip(columns, values, strict=True)])
+    settings = np.concatenate(
+        [
+            _settings_with(original, [column], its_values[:, np.newaxis])
+            for column, its_values in zip(columns, values, strict=True)
+        ]
+    )
     evaluations = evaluator.evaluate(settings, "one characteristic at a time")
-    state = np.select([evaluations.infeasible, ~evaluations.valid, unsafe.of(evaluations)],
-                      ["infeasible", "not_simulated", "unsafe"], "safe")
+    state = np.select(
+        [evaluations.infeasible, ~evaluations.valid, unsafe.of(evaluations)],
+        ["infeasible", "not_simulated", "unsafe"],
+        "safe",
+    )
     points = {name: degrees for name, degrees in evaluations.metrics.items() if name == RATING_POINTS.name}
     frame = pd.DataFrame({"value": np.concatenate(values), SAFETY_DEGREE: evaluations.f_safe, "state": state, **points})
     return [frame.iloc[rows].reset_index(drop=True) for rows in np.split(np.arange(len(frame)), ends)]
@@ -190,9 +215,12 @@ class Pair:
 
     def to_dict(self) -> dict[str, Any]:
         """The entry of `pairs` in `tolerance --json`."""
-        return {"characteristics": self.names, "unsafe_share": self.unsafe_share,
-                "not_simulated_share": self.not_simulated_share,
-                "nearest": None if self.nearest is None else dict(zip(self.names, self.nearest, strict=True))}
+        return {
+            "characteristics": self.names,
+            "unsafe_share": self.unsafe_share,
+            "not_simulated_share": self.not_simulated_share,
+            "nearest": None if self.nearest is None else dict(zip(self.names, self.nearest, strict=True)),
+        }
 
 
 def scan_pairs(evaluator: Evaluator, columns: Sequence[int], unsafe: Unsafe) -> list[Pair]:
@@ -200,13 +228,17 @@ def scan_pairs(evaluator: Evaluator, columns: Sequence[int], unsafe: Unsafe) -> 
     characteristics, planes = evaluator.characteristics, [list(plane) for plane in combinations(columns, 2)]
     axes = np.linspace(characteristics.lower, characteristics.upper, GRID_VALUES).T
     grids = [np.stack(np.meshgrid(*axes[plane], indexing="ij"), axis=-1).reshape(-1, 2) for plane in planes]
-    settings = [_settings_with(characteristics.original, plane, grid) for plane, grid in zip(planes, grids, strict=True)]
+    settings = [
+        _settings_with(characteristics.original, plane, grid) for plane, grid in zip(planes, grids, strict=True)
+    ]
     evaluations = evaluator.evaluate(np.concatenate(settings), "two characteristics at a time")
     shape = len(planes), GRID_VALUES, GRID_VALUES
     degrees, is_unsafe = evaluations.f_safe.reshape(shape), unsafe.of(evaluations).reshape(shape)
     valid, infeasible = evaluations.valid.reshape(shape), evaluations.infeasible.reshape(shape)
-    ends = [[values[plane] for values in (characteristics.original, characteristics.lower, characteristics.upper)]
-            for plane in planes]
+    ends = [
+        [values[plane] for values in (characteristics.original, characteristics.lower, characteristics.upper)]
+        for plane in planes
+    ]
     searches = [_search_nearest(grid, *its_ends) for grid, its_ends in zip(is_unsafe, ends, strict=True)]
     answers: dict[int, BoolArray | None] = dict.fromkeys(range(len(planes)))
     nearest: list[tuple[float, float] | None] = [None] * len(planes)
@@ -222,19 +254,30 @@ def scan_pairs(evaluator: Evaluator, columns: Sequence[int], unsafe: Unsafe) -> 
             settings = [_settings_with(characteristics.original, planes[k], values) for k, values in requests.items()]
             found = unsafe.of(evaluator.evaluate(np.concatenate(settings), "nearest unsafe settings"))
             answers = dict(zip(requests, np.split(found, np.cumsum(list(map(len, settings)))[:-1]), strict=True))
-    return [Pair(characteristics=tuple(characteristics.members[column] for column in plane), values=axes[plane],
-                 safety_degree=degrees[k], unsafe=is_unsafe[k], valid=valid[k], infeasible=infeasible[k], nearest=nearest[k])
-            for k, plane in enumerate(planes)]
+    return [
+        Pair(
+            characteristics=tuple(characteristics.members[column] for column in plane),
+            values=axes[plane],
+            safety_degree=degrees[k],
+            unsafe=is_unsafe[k],
+            valid=valid[k],
+            infeasible=infeasible[k],
+            nearest=nearest[k],
+        )
+        for k, plane in enumerate(planes)
+    ]
 
 
-def _search_nearest(grid: BoolArray, original: FloatArray, lower: FloatArray, upper: FloatArray
-                    ) -> Generator[FloatArray, BoolArray | None, tuple[float, float] | None]:
+def _search_nearest(
+    grid: BoolArray, original: FloatArray, lower: FloatArray, upper: FloatArray
+) -> Generator[FloatArray, BoolArray | None, tuple[float, float] | None]:
     """Find the unsafe setting of a plane nearest to the original, from where its grid is unsafe; distances are in domain widths.
 
     Yields values of the two characteristics, shape (K, 2), and is sent which are unsafe. A branch and bound search: a square
     with an unsafe corner is divided into smaller squares if it comes nearer to the original than the nearest unsafe setting
     so far; each round divides the `MAX_SQUARES` nearest squares.
     """
+
     def distances(offset: FloatArray) -> FloatArray:
         return np.asarray(np.sqrt(np.sum((offset / width) ** 2, axis=-1)))
 

@@ -3,4 +3,14 @@
 from safevar_sumo.plugins.check.subject import KINDS, Subject, find_subject
 from safevar_sumo.plugins.check.suite import CHECKS, Finding, Report, check, check_subject, refuse_defects
 
-__all__ = ["CHECKS", "KINDS", "Finding", "Report", "Subject", "check", "check_subject", "find_subject", "refuse_defects"]
+__all__ = [
+    "CHECKS",
+    "KINDS",
+    "Finding",
+    "Report",
+    "Subject",
+    "check",
+    "check_subject",
+    "find_subject",
+    "refuse_defects",
+]

@@ -22,12 +22,23 @@ from safevar_sumo.sumo.traci_module import substitute_traci
 from safevar_sumo.vehicles import CHANGES, VEHICLES, Change
 
 KINDS: Mapping[str, Mapping[str, Any]] = {
-    "ads": ADS, "vehicle": VEHICLES, "scenario": SCENARIOS, "metric": {**METRICS, **OPTIONAL_METRICS}, "objective": CHANGES,
-    "algorithm": ALGORITHMS, "traci": {}, "constraint": {}}
+    "ads": ADS,
+    "vehicle": VEHICLES,
+    "scenario": SCENARIOS,
+    "metric": {**METRICS, **OPTIONAL_METRICS},
+    "objective": CHANGES,
+    "algorithm": ALGORITHMS,
+    "traci": {},
+    "constraint": {},
+}
 """Kinds of subjects, each with its shipped subjects by name."""
 METHODS: Mapping[str, tuple[str, ...]] = {
-    "ads": ("start", "drive"), "vehicle": ("prepare", "sumo_type", "at_rest", "sense", "advance"),
-    "scenario": ("begin", "observe", "encounter"), "algorithm": ("search",), "traci": ("step",)}
+    "ads": ("start", "drive"),
+    "vehicle": ("prepare", "sumo_type", "at_rest", "sense", "advance"),
+    "scenario": ("begin", "observe", "encounter"),
+    "algorithm": ("search",),
+    "traci": ("step",),
+}
 """Methods by which a class is recognised, by kind."""
 DEFAULT_STUDIES = {"traci": "native"}
 """Study to try a subject of a kind in if no study names it; `smoke` for all other kinds."""
@@ -37,12 +48,18 @@ NAMES: Mapping[str, tuple[str, Callable[[Study], list[str]]]] = {
     "traci": ("ads.model", lambda study: [study.ads.model] if study.ads.kind == "traci" else []),
     "ads": ("ads.model", lambda study: [study.ads.model] if study.ads.kind != "traci" else []),
     "vehicle": ("vehicle.model", lambda study: [study.vehicle.model]),
-    "scenario": ("scenario.model", lambda study: [study.scenario.model, *filter(None, (
-        test.model for test in (study.matrix.tests if study.matrix else ())))]),
+    "scenario": (
+        "scenario.model",
+        lambda study: [
+            study.scenario.model,
+            *filter(None, (test.model for test in (study.matrix.tests if study.matrix else ()))),
+        ],
+    ),
     "metric": ("metrics.also", lambda study: study.metrics.also),
     "objective": ("search.objectives", lambda study: study.search.objectives),
     "algorithm": ("search.algorithms", lambda study: study.search.algorithms),
-    "constraint": ("constraints.function", lambda study: [one.function for one in study.constraints if one.function])}
+    "constraint": ("constraints.function", lambda study: [one.function for one in study.constraints if one.function]),
+}
 """The key that names subjects of a kind, and the names that a study gives there."""
 
 
@@ -73,7 +90,9 @@ class Subject(NamedTuple):
 
 def subjects_of(study: Study) -> list[Subject]:
     """Every subject that a study names."""
-    return [Subject(name, kind, study) for kind, (_, names_of) in NAMES.items() for name in dict.fromkeys(names_of(study))]
+    return [
+        Subject(name, kind, study) for kind, (_, names_of) in NAMES.items() for name in dict.fromkeys(names_of(study))
+    ]
 
 
 def find_subject(name: str, study: str | None = None) -> Subject:
@@ -99,19 +118,39 @@ def find_subject(name: str, study: str | None = None) -> Subject:
     elif ":" in name or name.endswith(".fmu"):
         member = _look_up(name, given_study) if ":" in name else Member(None)
         kind, folder = _kind_of(member.target), Path(member.guard.folder if member.guard else name).absolute()
-        candidates = iter([given_study]) if given_study else _studies_beside(Path(name).name, folder if member.guard else folder.parent)
+        candidates = (
+            iter([given_study])
+            if given_study
+            else _studies_beside(Path(name).name, folder if member.guard else folder.parent)
+        )
     else:
         names = [*study_names(), *METRIC_OF_OBJECTIVE, *(member for members in KINDS.values() for member in members)]
-        raise unknown_name("check", f"there is nothing called {name!r}", name, names, ", package.module:Name, or the path of a study file")
+        raise unknown_name(
+            "check",
+            f"there is nothing called {name!r}",
+            name,
+            names,
+            ", package.module:Name, or the path of a study file",
+        )
     for candidate in candidates:
         for subject in subjects_of(candidate):
             if subject.name == name or (name.endswith(".fmu") and Path(subject.name).name == Path(name).name):
-                remark = "" if given_study or name in KINDS[subject.kind] else f"tried in {candidate.origin.called}, which names it"
+                remark = (
+                    ""
+                    if given_study or name in KINDS[subject.kind]
+                    else f"tried in {candidate.origin.called}, which names it"
+                )
                 return subject._replace(kind=kind if subject.kind == "objective" else subject.kind, remark=remark)
     if not kind:
         problem = f"no study names {name!r}" if ":" in name or Path(name).exists() else f"there is no file {name!r}"
-        raise InputError("check", problem, "a model, metric, algorithm or controller that a study can name, or `study=STUDY` that names it")
-    return Subject(name, kind, _put_in(given_study or load_study(DEFAULT_STUDIES.get(kind, "smoke")), kind, name), is_guest=True)
+        raise InputError(
+            "check",
+            problem,
+            "a model, metric, algorithm or controller that a study can name, or `study=STUDY` that names it",
+        )
+    return Subject(
+        name, kind, _put_in(given_study or load_study(DEFAULT_STUDIES.get(kind, "smoke")), kind, name), is_guest=True
+    )
 
 
 def _look_up(name: str, study: Study | None) -> Member:
@@ -145,7 +184,11 @@ def _put_in(study: Study, kind: str, name: str) -> Study:
         return replace(study, metrics=replace(study.metrics, also=[] if name in METRICS else [name]))
     if kind == "objective":
         return replace(study, search=replace(study.search, objectives=["safety_degree", name]))
-    raise InputError("check", f"no study gives the characteristics of {name!r}", "`study=STUDY`, or a study file beside it that names it")
+    raise InputError(
+        "check",
+        f"no study gives the characteristics of {name!r}",
+        "`study=STUDY`, or a study file beside it that names it",
+    )
 
 
 def _studies_beside(name: str, folder: Path) -> Iterator[Study]:

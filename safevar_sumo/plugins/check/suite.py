@@ -22,8 +22,9 @@ CHECKS: Mapping[str, str] = {
     "repetition": "draw nothing at random (an algorithm: from `rng` alone), read no clock, and keep nothing in a class or a module",
     "order": "compute element i of a result from element i of the arguments alone, whatever its place",
     "alone": "compute element i of a result from element i of the arguments alone: no mean, sum or maximum over the vehicles; keep what a "
-             "vehicle remembers in the memory that is handed on or in its own instance, not in a class or a module",
-    "reaction": "check that the code reads the quantity that it should react to, with the right sign and unit"}
+    "vehicle remembers in the memory that is handed on or in its own instance, not in a class or a module",
+    "reaction": "check that the code reads the quantity that it should react to, with the right sign and unit",
+}
 """The checks, with advice on a failure. All but `reaction`, of which every answer itself warns, also keep a study from starting."""
 
 
@@ -58,8 +59,13 @@ class Report:
 
     def to_dict(self) -> dict[str, str | bool | float | list[dict[str, str | int]]]:
         """The JSON output of the command `check`."""
-        return {"subject": self.subject, "kind": self.kind, "passed": self.passed, "findings": list(map(asdict, self.findings)),
-                "seconds": round(self.seconds, 3)}
+        return {
+            "subject": self.subject,
+            "kind": self.kind,
+            "passed": self.passed,
+            "findings": list(map(asdict, self.findings)),
+            "seconds": round(self.seconds, 3),
+        }
 
 
 def check(name: str, study: str | None = None) -> Report:
@@ -82,7 +88,9 @@ def check(name: str, study: str | None = None) -> Report:
     if study is not None:
         raise InputError("study", f"{study!r} is given, and {name!r} is itself a study", "one of them")
     start, loaded = time.perf_counter(), load_study(name)
-    findings = [finding for _, finding in _findings_in(loaded, subjects_of(loaded))] or _reaction(subjects_of(loaded)[0])
+    findings = [finding for _, finding in _findings_in(loaded, subjects_of(loaded))] or _reaction(
+        subjects_of(loaded)[0]
+    )
     return Report(subject=name, kind="study", findings=findings, seconds=time.perf_counter() - start)
 
 
@@ -92,7 +100,13 @@ def check_subject(subject: Subject) -> Report:
     findings = [finding for _, finding in _findings_in(subject.study, [subject])]
     if subject.kind in ("ads", "traci") and not subject.is_guest:
         findings = findings or _reaction(subject)
-    return Report(subject=subject.name, kind=subject.kind, findings=findings, remark=subject.remark, seconds=time.perf_counter() - start)
+    return Report(
+        subject=subject.name,
+        kind=subject.kind,
+        findings=findings,
+        remark=subject.remark,
+        seconds=time.perf_counter() - start,
+    )
 
 
 def refuse_defects(study: Study) -> list[str]:
@@ -104,7 +118,10 @@ def refuse_defects(study: Study) -> list[str]:
         With the first defect, the input that shows it, file and line, and advice.
     """
     for names, finding in _findings_in(study, [subject for subject in subjects_of(study) if subject.is_user_code]):
-        place, command = f"{finding.file}:{finding.line}", f"{PROGRAM_COMMAND} check {shlex.quote(study.origin.called or study.name)}"
+        place, command = (
+            f"{finding.file}:{finding.line}",
+            f"{PROGRAM_COMMAND} check {shlex.quote(study.origin.called or study.name)}",
+        )
         problem = f"{names} {finding.got}{'' if place in finding.got else f' ({place})'}; to reproduce it: {command}"
         raise UserCodeError(study.source, problem, f"{finding.expected}; {finding.advice}", place)
     return []
@@ -119,7 +136,10 @@ def _findings_in(study: Study, subjects: list[Subject]) -> Iterator[tuple[str, F
             with np.errstate(all="ignore"):
                 failure, place = next(_failures(study, trial[0]), None), ""
         except UserCodeError as error:
-            problem = next((error.problem.removeprefix(f"{one.key} ") for one in code if error.problem.startswith(one.key)), error.problem)
+            problem = next(
+                (error.problem.removeprefix(f"{one.key} ") for one in code if error.problem.startswith(one.key)),
+                error.problem,
+            )
             failure, place = Failure("contract", error.legal or "no exception", problem), error.place
         if failure is not None:
             yield " and ".join(subject.key for subject in code), _finding(code[0], failure, place)
@@ -134,8 +154,14 @@ def _reaction(driver: Subject) -> list[Finding]:
 
 def _finding(subject: Subject, failure: Failure, place: str = "") -> Finding:
     file, _, line = (place or subject.definition).rpartition(":")
-    return Finding(check=failure.check, file=file or subject.name, line=int(line or 1), expected=failure.expected, got=failure.got,
-                   advice=CHECKS[failure.check])
+    return Finding(
+        check=failure.check,
+        file=file or subject.name,
+        line=int(line or 1),
+        expected=failure.expected,
+        got=failure.got,
+        advice=CHECKS[failure.check],
+    )
 
 
 def _failures(study: Study, subject: Subject) -> Iterator[Failure]:

@@ -44,8 +44,11 @@ class Failure(NamedTuple):
 def try_simulations(study: Study) -> Iterator[Failure]:
     """Simulate a study with the original vehicle, the corners of the domains and random settings."""
     region = region_of(study)
-    settings = region.repaired(region.characteristics.filter(_settings(
-        region.characteristics, SIMULATED_BY_TRACI if study.ads.kind == "traci" else SIMULATED)))
+    settings = region.repaired(
+        region.characteristics.filter(
+            _settings(region.characteristics, SIMULATED_BY_TRACI if study.ads.kind == "traci" else SIMULATED)
+        )
+    )
 
     def load() -> Callable[[Rows], Outputs]:
         system = _system(study)
@@ -54,10 +57,15 @@ def try_simulations(study: Study) -> Iterator[Failure]:
     yield from _try(load, region.characteristics, settings)
     system = _system(study)
     if ":" in study.scenario.model and not reason_for_sumo(system):
-        recorded, in_sumo = (_results(evaluate(system, settings, engine)) for engine in (Engine.RECORDED, Engine.LIBSUMO))
+        recorded, in_sumo = (
+            _results(evaluate(system, settings, engine)) for engine in (Engine.RECORDED, Engine.LIBSUMO)
+        )
         for row, difference in _differences(recorded, in_sumo, ROUNDING):
-            yield Failure("contract", "reactive_actors = True where somebody reacts to the vehicle under test",
-                          f"{difference} in SUMO and in the recorded scene{_inputs(region.characteristics, settings[row])}")
+            yield Failure(
+                "contract",
+                "reactive_actors = True where somebody reacts to the vehicle under test",
+                f"{difference} in SUMO and in the recorded scene{_inputs(region.characteristics, settings[row])}",
+            )
 
 
 def try_constraint(study: Study, function: str) -> Iterator[Failure]:
@@ -77,23 +85,37 @@ def try_algorithm(study: Study, name: str) -> Iterator[Failure]:
     """Let an algorithm minimise a smooth function in place of simulations, twice, the second time after another run."""
     outputs, others = _search(study, name, seeds=(1,)), _search(study, name, seeds=(2, 1))
     if len(outputs) != len(others):
-        yield Failure("repetition", "the same in every run", f"{len(others)} settings instead of {len(outputs)} in another run")
+        yield Failure(
+            "repetition", "the same in every run", f"{len(others)} settings instead of {len(outputs)} in another run"
+        )
     for row in np.flatnonzero((outputs != others).any(axis=1))[:1] if len(outputs) == len(others) else ():
-        yield Failure("repetition", "the same in every run with the same random numbers, to the bit",
-                      f"setting {row} is {others[row].tolist()} instead of {outputs[row].tolist()} in another run")
+        yield Failure(
+            "repetition",
+            "the same in every run with the same random numbers, to the bit",
+            f"setting {row} is {others[row].tolist()} instead of {outputs[row].tolist()} in another run",
+        )
 
 
-def _try(load: Callable[[], Callable[[Rows], Outputs]], characteristics: CharacteristicSet, settings: FloatArray) -> Iterator[Failure]:
+def _try(
+    load: Callable[[], Callable[[Rows], Outputs]], characteristics: CharacteristicSet, settings: FloatArray
+) -> Iterator[Failure]:
     """Compare a run of all settings with other runs; `load` loads all user code again."""
     run, everything = load(), np.arange(len(settings))
     outputs, run_anew = run(everything), load()
-    others = [("repetition", "in a second run", everything), ("order", "in another order", everything[::-1]),
-              *(("alone", "in a smaller batch", rows) for rows in np.array_split(everything, SMALLER_BATCHES)),
-              *(("alone", "alone", everything[i:i + 1]) for i in (0, len(settings) - 1))]
+    others = [
+        ("repetition", "in a second run", everything),
+        ("order", "in another order", everything[::-1]),
+        *(("alone", "in a smaller batch", rows) for rows in np.array_split(everything, SMALLER_BATCHES)),
+        *(("alone", "alone", everything[i : i + 1]) for i in (0, len(settings) - 1)),
+    ]
     for check, circumstance, rows in others:
         other_outputs = (run if check == "repetition" else run_anew)(rows)
         for row, difference in _differences({name: values[rows] for name, values in outputs.items()}, other_outputs):
-            yield Failure(check, "the same, to the bit", f"{difference} {circumstance}{_inputs(characteristics, settings[rows[row]])}")
+            yield Failure(
+                check,
+                "the same, to the bit",
+                f"{difference} {circumstance}{_inputs(characteristics, settings[rows[row]])}",
+            )
 
 
 def _differences(outputs: Outputs, others: Outputs, tolerance: float = 0.0) -> Iterator[tuple[int, str]]:
@@ -107,8 +129,11 @@ def _differences(outputs: Outputs, others: Outputs, tolerance: float = 0.0) -> I
 
 
 def _inputs(characteristics: CharacteristicSet, setting: FloatArray) -> str:
-    changes = [f"{characteristic.name} = {value:g}" for characteristic, value in zip(characteristics, setting, strict=True)
-               if value != characteristic.original]
+    changes = [
+        f"{characteristic.name} = {value:g}"
+        for characteristic, value in zip(characteristics, setting, strict=True)
+        if value != characteristic.original
+    ]
     return f", with {', '.join(changes) or 'the original vehicle'}"
 
 
@@ -122,7 +147,7 @@ def _settings(characteristics: CharacteristicSet, count: int) -> FloatArray:
 def _system(study: Study) -> System:
     """The system of a study, with only a few points of its matrix; `assemble` loads all user code again."""
     system = assemble(study)
-    return replace(system, matrix=system.matrix[::max(len(system.matrix) // MATRIX_POINTS, 1)], rater=None)
+    return replace(system, matrix=system.matrix[:: max(len(system.matrix) // MATRIX_POINTS, 1)], rater=None)
 
 
 def _results(evaluations: Evaluations) -> Outputs:
@@ -135,11 +160,19 @@ def _search(study: Study, name: str, seeds: tuple[int, ...]) -> FloatArray:
     member = lookup.find(ALGORITHMS, name, "search.algorithms")
     parameters = lookup.with_paths(member, study.search.parameters.get(label, {}), f"search.{label}")
     original = _smooth_evaluations(system, system.characteristics.original[np.newaxis])
-    problem = Problem(characteristics=system.characteristics, original=original, population=min(study.search.population, MAX_POPULATION),
-                      evaluations=min(study.search.evaluations, MAX_EVALUATIONS), scoring=system.measuring.scoring, region=system.region)
+    problem = Problem(
+        characteristics=system.characteristics,
+        original=original,
+        population=min(study.search.population, MAX_POPULATION),
+        evaluations=min(study.search.evaluations, MAX_EVALUATIONS),
+        scoring=system.measuring.scoring,
+        region=system.region,
+    )
     for seed in seeds:
         algorithm = instance_of(member, parameters, f"search.algorithms = {name!r}", f"search.{label}", study.source)
-        search = (GuardedAlgorithm(algorithm, member.guard) if member.guard else algorithm).search(problem, np.random.default_rng(seed))
+        search = (GuardedAlgorithm(algorithm, member.guard) if member.guard else algorithm).search(
+            problem, np.random.default_rng(seed)
+        )
         settings = [next(search)]
         try:
             while True:
@@ -154,11 +187,21 @@ def _smooth_evaluations(system: System, settings: FloatArray) -> Evaluations:
     characteristics, scoring = system.characteristics, system.measuring.scoring
     share = (settings - characteristics.lower) / (characteristics.upper - characteristics.lower)
     safety_degree = 1.0 - np.add.accumulate(share, axis=1)[:, -1] / len(characteristics) * 1.5
-    names = {name for name in (*(metric.name for metric in scoring.metrics), *(objective.name for objective in scoring.objectives))
-             if not name.startswith("f_")}
+    names = {
+        name
+        for name in (
+            *(metric.name for metric in scoring.metrics),
+            *(objective.name for objective in scoring.objectives),
+        )
+        if not name.startswith("f_")
+    }
     metrics = {name: np.abs(safety_degree) for name in sorted(names)} | {"safety_degree": safety_degree}
     collided = safety_degree < 0
     return Evaluations(
-        settings=settings, outcome=np.where(collided, "collision", "stopped").astype("U16"), metrics=metrics,
-        collision_speed=np.where(collided, -safety_degree, np.nan), f_diff=characteristics.largest_change(settings),
-        f_num_diff=characteristics.number_changed(settings))
+        settings=settings,
+        outcome=np.where(collided, "collision", "stopped").astype("U16"),
+        metrics=metrics,
+        collision_speed=np.where(collided, -safety_degree, np.nan),
+        f_diff=characteristics.largest_change(settings),
+        f_num_diff=characteristics.number_changed(settings),
+    )

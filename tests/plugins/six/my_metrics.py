@@ -11,5 +11,11 @@ def largest_jerk(runs, thresholds):
     return np.max(np.where(trace.active[2:], jerk, 0.0), axis=0)
 
 
-JERK = Metric(name="jerk", title="jerk", unit="m/s^3", more_is_unsafe=True, function=largest_jerk,
-              description="Largest change of acceleration.")
+JERK = Metric(
+    name="jerk",
+    title="jerk",
+    unit="m/s^3",
+    more_is_unsafe=True,
+    function=largest_jerk,
+    description="Largest change of acceleration.",
+)
