@@ -2,10 +2,10 @@
 
     python benchmarks/campaign.py [STUDY] [--runs N] [--evaluations N] [--turns N] [--json]
 
-Time outside the simulation is search, journal and progress of a share that this process carries out by itself. Workers start, and load
-the network, before the clock does. The floor is bare libsumo for one population. What two workers bring is told by the clock: only an idle
-machine tells the truth. `ceiling` is what two processes bring on this machine that only compute the same batches, and
-`two_workers_of_ceiling` the share of it that two workers reach.
+Time outside the simulation is search, journal and progress of a share that this process carries out by itself. Workers
+start, and load the network, before the clock does. The floor is bare libsumo for one population. What two workers bring
+is told by the clock: only an idle machine tells the truth. `ceiling` is what two processes bring on this machine that
+only compute the same batches, and `two_workers_of_ceiling` the share of it that two workers reach.
 """
 
 from __future__ import annotations

@@ -50,7 +50,8 @@ class Coasting(ScalarAds):
 
 
 class Replayed:
-    """A vehicle or an ADS that computes in its first run alone, and returns the same in every later one of the same settings.
+    """A vehicle or an ADS that computes in its first run alone, and returns the same in every later one of the same
+    settings.
 
     `begins` is the method that a run begins with, `goes_on` the one of every step.
     """
@@ -83,7 +84,9 @@ def settings_of(system: System, n: int) -> FloatArray:
 
 
 def bare(network: str, n: int, steps: int) -> tuple[float, float]:
-    """Processor seconds of loading n copies, stepping and closing them with SUMO's own model at the wheel; and of the steps alone."""
+    """Processor seconds of loading n copies, stepping and closing them with SUMO's own model at the wheel; and of the
+    steps alone.
+    """
     stepping = 0.0
 
     def whole() -> None:

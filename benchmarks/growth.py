@@ -2,7 +2,8 @@
 
     python benchmarks/growth.py [STUDY] [--evaluations N] [--json]
 
-A worker answers batches of settings drawn at random; its processor time and its resident memory are those of its process.
+A worker answers batches of settings drawn at random; its processor time and its resident memory are those of its
+process.
 """
 
 from __future__ import annotations

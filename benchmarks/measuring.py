@@ -15,8 +15,12 @@ MEANINGS = {
     "stepping_alone": "an evaluation takes so many times what bare libsumo takes to step it",
     "replayed": "the same with a vehicle and an ADS that compute nothing: what no model can go below",
     "batches_of_1": "so many times as fast as one setting after the other",
-    "traci_socket": "so many times as fast as one setting after the other through a TraCI socket, the network reloaded for each",
-    "scalar_ads": "an evaluation with a ScalarAds that does next to nothing takes so many times one with the study's own ADS",
+    "traci_socket": (
+        "so many times as fast as one setting after the other through a TraCI socket, the network reloaded for each"
+    ),
+    "scalar_ads": (
+        "an evaluation with a ScalarAds that does next to nothing takes so many times one with the study's own ADS"
+    ),
     "campaign": "an evaluation of a campaign takes so many times a core's time of bare libsumo",
     "two_workers": "two workers are so many times as fast as one",
     "ceiling": "two processes that only compute are so many times as fast as one",
@@ -45,7 +49,10 @@ def print_records(records: Iterable[Record], *, as_json: bool) -> None:
         return
     for record in records:
         print(
-            f"{record.study:8} {record.population:6d}  {record.measure:18} {record.ratio:7.2f}  {MEANINGS[record.measure]}",
+            (
+                f"{record.study:8} {record.population:6d}  {record.measure:18} {record.ratio:7.2f}  "
+                f"{MEANINGS[record.measure]}"
+            ),
             flush=True,
         )
 

@@ -1,4 +1,6 @@
-"""Extension of mkdocstrings, which reads the code without running it: docstrings that are whole only once they are imported."""
+"""Extension of mkdocstrings, which reads the code without running it: docstrings that are whole only once they are
+imported.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +11,9 @@ from griffe import Extension, dynamic_import
 
 
 class WholeDocstrings(Extension):
-    """Documents functions by the docstrings that they have once imported: questions complete theirs with their options."""
+    """Documents functions by the docstrings that they have once imported: questions complete theirs with their
+    options.
+    """
 
     def on_function(self, *, func: Any, **_: Any) -> None:
         if func.docstring and any("document_options(" in str(one.value) for one in func.decorators):

@@ -1,4 +1,6 @@
-"""MkDocs hook: fills `<!-- generated: NAME -->` in a page with tables made from the code, so that they cannot differ from it."""
+"""MkDocs hook: fills `<!-- generated: NAME -->` in a page with tables made from the code, so that they cannot differ
+from it.
+"""
 
 from __future__ import annotations
 

@@ -15,7 +15,9 @@ def main() -> None:
 
 
 def _put_installed_modules_first() -> None:
-    """Move the working directory, which `python -m` puts first, to the end of the path: a `numpy.py` there must not replace numpy."""
+    """Move the working directory, which `python -m` puts first, to the end of the path: a `numpy.py` there must not
+    replace numpy.
+    """
     if sys.path[0] in ("", os.getcwd()):
         sys.path.append(sys.path.pop(0))
     os.environ.setdefault("PYTHONSAFEPATH", "1")

@@ -43,7 +43,9 @@ class InputError(SafevarError):
 
 
 class UserCodeError(InputError):
-    """User code that a study names failed or returned an illegal value; `place` is its file and line, "" if they are unknown."""
+    """User code that a study names failed or returned an illegal value; `place` is its file and line, "" if they are
+    unknown.
+    """
 
     def __init__(self, source: object, problem: str, legal: str = "", place: str = "") -> None:
         super().__init__(source, problem, legal)
@@ -99,7 +101,9 @@ def unknown_name(source: object, problem: str, name: object, names: Iterable[str
 
 
 def did_you_mean(name: object, names: Iterable[str]) -> str:
-    """The text `; did you mean 'rain'?` with the name nearest in spelling, ignoring case; empty if no name is similar."""
+    """The text `; did you mean 'rain'?` with the name nearest in spelling, ignoring case; empty if no name is
+    similar.
+    """
     names_in_lower_case = {known_name.lower(): known_name for known_name in names}
     matches = get_close_matches(str(name).lower(), names_in_lower_case, n=1)
     return f"; did you mean {names_in_lower_case[matches[0]]!r}?" if matches else ""

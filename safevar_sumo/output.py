@@ -19,8 +19,8 @@ WRITABLE = "a file in a directory that can be written, with space for it"
 def whole_file(path: Path, source: str = "") -> Iterator[Path]:
     """Give the path of a temporary file to write, which then replaces `path`; after an error `path` is as it was.
 
-    The temporary file lies beside `path` and has the same ending. A stream such as `/dev/stdout` is given itself. An OSError becomes
-    an InputError that names `source`, if it is given.
+    The temporary file lies beside `path` and has the same ending. A stream such as `/dev/stdout` is given itself. An
+    OSError becomes an InputError that names `source`, if it is given.
     """
     target = Path(os.path.realpath(path))  # a link stays a link
     is_new = target.is_file() or not target.exists()

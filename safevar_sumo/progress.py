@@ -14,7 +14,8 @@ from rich.progress import Progress as Bar
 from rich.text import Text
 
 Progress = Callable[[str, int, int], None]
-"""A function that shows progress, called with the stage, the amount done in it, and its total; first with nothing done."""
+"""A function that shows progress, called with the stage, the amount done in it, and its total; first with nothing done.
+"""
 SECONDS_BETWEEN_LINES = 30.0
 """Interval of the lines that show progress without a terminal [s]."""
 SETTLING_TIME = 2.0

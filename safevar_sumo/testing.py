@@ -8,8 +8,9 @@ class TestCareful(AdsChecks):
     subject = "my_ads:Careful"
 ```
 
-Each check is a separate test. `subject` names your code as `package.module:Name`, as a study file does, or is the class or record
-itself. `study` is the study in which the subject is tried, by default a study file beside your code that names the subject.
+Each check is a separate test. `subject` names your code as `package.module:Name`, as a study file does, or is the class
+or record itself. `study` is the study in which the subject is tried, by default a study file beside your code that
+names the subject.
 """
 
 from __future__ import annotations

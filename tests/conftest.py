@@ -1,4 +1,6 @@
-"""Fixtures for many tests: systems, results, an own cache folder and working directory, and pools that compute in this process."""
+"""Fixtures for many tests: systems, results, an own cache folder and working directory, and pools that compute in this
+process.
+"""
 
 from __future__ import annotations
 
@@ -48,7 +50,9 @@ runs = 1
 
 @pytest.fixture(scope="session", autouse=True)
 def _own_cache_and_pools_of_this_process(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """Each session of tests builds its own networks, once for all of its processes; commands start no worker processes."""
+    """Each session of tests builds its own networks, once for all of its processes; commands start no worker
+    processes.
+    """
     session = tmp_path_factory.getbasetemp()
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv(

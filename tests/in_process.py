@@ -1,4 +1,6 @@
-"""Campaigns and commands in this process: a pool that computes at once, an observer without output, commands as users type them."""
+"""Campaigns and commands in this process: a pool that computes at once, an observer without output, commands as users
+type them.
+"""
 
 from __future__ import annotations
 
@@ -78,7 +80,9 @@ class CommandOutput(NamedTuple):
 
 
 def run(*arguments: str, expect: int = 0) -> CommandOutput:
-    """Run a command as a user types it; its exit code must be `expect`. Afterwards, unload modules that it took from the test's folder."""
+    """Run a command as a user types it; its exit code must be `expect`. Afterwards, unload modules that it took from
+    the test's folder.
+    """
     out, err, code = io.StringIO(), io.StringIO(), None
     loaded_modules = set(sys.modules)
     with redirect_stdout(out), redirect_stderr(err), pytest.MonkeyPatch.context() as patch:
@@ -97,7 +101,9 @@ def run(*arguments: str, expect: int = 0) -> CommandOutput:
 
 
 def refused(*arguments: str, message: tuple[str, ...]) -> None:
-    """The command must end with exit code 2 and print, warnings apart, all of `message` in one or two lines, or a line for each mistake."""
+    """The command must end with exit code 2 and print, warnings apart, all of `message` in one or two lines, or a line
+    for each mistake.
+    """
     output = run(*arguments, expect=2)
     for part in message:
         assert part in output.stderr, output.stderr

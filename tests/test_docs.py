@@ -1,4 +1,6 @@
-"""README and tutorials true to the letter: every block of every page is put where it says, and run in the order of the page."""
+"""README and tutorials true to the letter: every block of every page is put where it says, and run in the order of the
+page.
+"""
 
 from __future__ import annotations
 
@@ -223,7 +225,9 @@ def test_every_generated_table_of_a_page_is_made_from_the_code() -> None:
 
 
 class Numbers(NamedTuple):
-    """A comment of a page: commands, and of the last one's JSON the values at some paths, as the page's next paragraph has them."""
+    """A comment of a page: commands, and of the last one's JSON the values at some paths, as the page's next paragraph
+    has them.
+    """
 
     page: str
     commands: list[str]

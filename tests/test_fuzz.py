@@ -1,4 +1,6 @@
-"""Whatever is in a study file, a flag, a CSV file or an ADS: an answer or an error of one kind, never a traceback, and soon."""
+"""Whatever is in a study file, a flag, a CSV file or an ADS: an answer or an error of one kind, never a traceback, and
+soon.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Adaptive cruise control (Milanes and Shladover 2014; Xiao, Wang, van Arem 2017), as SUMO's `MSCFModel_ACC` computes it."""
+"""Adaptive cruise control (Milanes and Shladover 2014; Xiao, Wang, van Arem 2017), as SUMO's `MSCFModel_ACC` computes
+it.
+"""
 
 from __future__ import annotations
 
@@ -53,7 +55,9 @@ class Acc(CarFollowing, frozen=True, kw_only=True):
 
 
 def _standing_distance(speed: FloatArray) -> FloatArray:
-    """Distance to keep in addition to the headway [m] (Xiao et al. 2017): 2 m below 10.8 m/s, 75 / v - 5 up to 15 m/s, none above."""
+    """Distance to keep in addition to the headway [m] (Xiao et al. 2017): 2 m below 10.8 m/s, 75 / v - 5 up to 15 m/s,
+    none above.
+    """
     return np.minimum(np.maximum(75 / np.maximum(speed, 1.0) - 5, 0.0), 2.0)
 
 

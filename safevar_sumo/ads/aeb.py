@@ -1,4 +1,6 @@
-"""Automatic emergency braking by braking distance, as in production systems and Autoware, on top of a cruise control."""
+"""Automatic emergency braking by braking distance, as in production systems and Autoware, on top of a cruise
+control.
+"""
 
 from __future__ import annotations
 
@@ -16,8 +18,8 @@ LEAST_DECELERATION = 0.5
 
 
 class _Memory(NamedTuple):
-    """The original vehicle; time between calls [s]; initial speed and the pedals that hold it; braking stage 0 to 2; whether it has ever
-    braked; the obstacle's speed at the last call [m/s]; whether it warns now.
+    """The original vehicle; time between calls [s]; initial speed and the pedals that hold it; braking stage 0 to 2;
+    whether it has ever braked; the obstacle's speed at the last call [m/s]; whether it warns now.
     """
 
     nominal: Nominal
@@ -30,14 +32,15 @@ class _Memory(NamedTuple):
 
 
 class Aeb(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Holds its speed; brakes in part, then fully, when the gap to an obstacle in its way falls below its braking distances.
+    """Holds its speed; brakes in part, then fully, when the gap to an obstacle in its way falls below its braking
+    distances.
 
     distance = v rt + max(v_rel^2 / (2 b), v^2 / (2 b) - u^2 / (2 b_u)) + margin, with
-    speed v and deceleration b of the vehicle, u and b_u of the obstacle, their closing speed v_rel, and `response_time` rt; b is
-    `braking_share` of the original vehicle's greatest deceleration. After braking it never accelerates again.
+    speed v and deceleration b of the vehicle, u and b_u of the obstacle, their closing speed v_rel, and `response_time`
+    rt; b is `braking_share` of the original vehicle's greatest deceleration. After braking it never accelerates again.
 
-    It warns its driver while gap / closing speed of an obstacle in its way is below `warning_time`, and while it brakes. The simulated
-    driver does not react to warnings.
+    It warns its driver while gap / closing speed of an obstacle in its way is below `warning_time`, and while it
+    brakes. The simulated driver does not react to warnings.
 
     Parameters
     ----------
@@ -56,13 +59,13 @@ class Aeb(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     reach
         Range of its sensors in clear weather [m].
     warning_time
-        Time to collision at which it warns [s]; with 0 it warns only while it brakes. The default is an assumption: Euro NCAP requires
-        a warning by 1.7 s, and 0.3 s allow for late sensors.
+        Time to collision at which it warns [s]; with 0 it warns only while it brakes. The default is an assumption:
+        Euro NCAP requires a warning by 1.7 s, and 0.3 s allow for late sensors.
 
     Notes
     -----
-    The defaults are assumptions, not measurements: with them the original vehicle of `carla` just avoids a collision at the standard
-    points of Euro NCAP's pedestrian and car-to-car tests. docs/scenarios.md lists the exceptions.
+    The defaults are assumptions, not measurements: with them the original vehicle of `carla` just avoids a collision at
+    the standard points of Euro NCAP's pedestrian and car-to-car tests. docs/scenarios.md lists the exceptions.
     """
 
     cruise_speed: PositiveParameter | None = None

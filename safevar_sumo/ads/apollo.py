@@ -20,7 +20,9 @@ FIRST_COMMAND_ROUNDING = 1e-9  # s
 
 
 class _Memory(NamedTuple):
-    """The original vehicle; time between calls; whether it stops; planned deceleration, commanded acceleration, creeping time [SI]."""
+    """The original vehicle; time between calls; whether it stops; planned deceleration, commanded acceleration,
+    creeping time [SI].
+    """
 
     nominal: Nominal
     step: float
@@ -91,19 +93,23 @@ class Apollo(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
         )
 
     def _plan(self, seen: Observation, memory: _Memory) -> _Memory:
-        """Plan an acceleration: cruise, or brake with v^2 / (2 d) to stop within the distance d; then creep and hold."""
+        """Plan an acceleration: cruise, or brake with v^2 / (2 d) to stop within the distance d; then creep and
+        hold.
+        """
         speed = seen.speed
         is_detected = seen.gap <= self.perception_range * seen.visibility
         distance = np.where(is_detected, np.minimum(seen.gap, self.perception_range) - self.stop_gap, np.inf)
         needed_deceleration = speed * speed / (2 * np.maximum(distance, LEAST_DISTANCE))
-        # The onset allows for the distance lost by the lag of the pedals and while the deceleration rises at the jerk limit.
+        # The onset allows for the distance lost by the lag of the pedals and while the deceleration rises at the jerk
+        # limit.
         lost_distance = speed * (self.pedal_lag + 0.5 * self.comfortable_deceleration / self.jerk)
         planned_deceleration = speed * speed / (2 * np.maximum(distance - lost_distance, LEAST_DISTANCE))
         begins_braking = (planned_deceleration > self.comfortable_deceleration) & ~memory.stops
         stops = memory.stops | begins_braking
         last_acceleration, largest_change = memory.commanded_acceleration, np.array(self.jerk * memory.step)
         if np.count_nonzero(begins_braking):
-            # Planning is continuous in time: braking began within the last step, when the needed deceleration passed the limit.
+            # Planning is continuous in time: braking began within the last step, when the needed deceleration passed
+            # the limit.
             rise = np.maximum(planned_deceleration - memory.planned_deceleration, 1e-9)
             share = np.where(
                 begins_braking, np.minimum((planned_deceleration - self.comfortable_deceleration) / rise, 1.0), 1.0

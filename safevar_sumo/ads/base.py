@@ -1,4 +1,6 @@
-"""The contract of an automated driving system (ADS), the base of an ADS for a single vehicle, and checks of an ADS that is user code."""
+"""The contract of an automated driving system (ADS), the base of an ADS for a single vehicle, and checks of an ADS that
+is user code.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +29,8 @@ class Ads:
     """An ADS that drives N vehicles at once. The study's table `ads.parameters` fills its fields.
 
     It gets an `Observation` and knows the original vehicle (`Nominal`), never the setting.
-    Element i of a command depends only on element i of the observations, bit for bit: neither on N nor on other vehicles.
+    Element i of a command depends only on element i of the observations, bit for bit: neither on N nor on other
+    vehicles.
 
     Attributes
     ----------

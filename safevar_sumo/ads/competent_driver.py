@@ -22,8 +22,8 @@ from safevar_sumo.records import TIME_ROUNDING, BoolArray, Command, FloatArray, 
 
 
 class _Memory(NamedTuple):
-    """The reaction; the lateral position of the obstacle when it was first sensed [m], infinite until then; whether it was in the way
-    there; the time since it strayed from there [s], negative until it does.
+    """The reaction; the lateral position of the obstacle when it was first sensed [m], infinite until then; whether it
+    was in the way there; the time since it strayed from there [s], negative until it does.
     """
 
     reaction: Reaction
@@ -33,7 +33,8 @@ class _Memory(NamedTuple):
 
 
 class CompetentDriver(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Holds its speed or a headway; perceives obstacles that move into its way, reacts to a TTC below 2 s, and brakes with up to 0.774 g.
+    """Holds its speed or a headway; perceives obstacles that move into its way, reacts to a TTC below 2 s, and brakes
+    with up to 0.774 g.
 
     UN R157 means this driver for cars that cut in, cut out or brake on motorways; its use for pedestrians is ours.
 
@@ -49,7 +50,8 @@ class CompetentDriver(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fie
     critical_ttc, reaction_time
         Time to collision that counts as a danger, and reaction time before braking [s].
     stray, perception_time
-        An obstacle that enters the way is perceived `perception_time` after it has moved `stray` from its first lateral position [m, s].
+        An obstacle that enters the way is perceived `perception_time` after it has moved `stray` from its first lateral
+        position [m, s].
     lets_go
         Largest deceleration while it increases its gap [m/s^2].
     headway
@@ -103,7 +105,9 @@ class CompetentDriver(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fie
         return np.where(is_in_way & (seen.obstacle_speed > 0), np.maximum(gap_control, -self.lets_go), np.inf)
 
     def _perceive(self, seen: Observation, memory: _Memory) -> tuple[BoolArray, _Memory]:
-        """Whether the obstacle is perceived: it was in the way at first, or strayed from its first position `perception_time` ago."""
+        """Whether the obstacle is perceived: it was in the way at first, or strayed from its first position
+        `perception_time` ago.
+        """
         is_sighted = np.isfinite(seen.gap) & np.isfinite(seen.lateral)
         lateral = np.where(is_sighted, seen.lateral, 0.0)
         appears = is_sighted & ~np.isfinite(memory.first_lateral)

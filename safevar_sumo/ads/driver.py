@@ -1,4 +1,6 @@
-"""Functions that drivers share: pedals for an acceleration, perception of an obstacle in the way, reaction to a danger, car following."""
+"""Functions that drivers share: pedals for an acceleration, perception of an obstacle in the way, reaction to a danger,
+car following.
+"""
 
 from __future__ import annotations
 
@@ -38,7 +40,9 @@ class DelayLine(NamedTuple):
         return cls(int(steps), fraction)
 
     def delayed(self, values: FloatArray) -> tuple[FloatArray, DelayLine]:
-        """The values one delay ago, linear between two steps, and the next delay line; before the first step the first values hold."""
+        """The values one delay ago, linear between two steps, and the next delay line; before the first step the first
+        values hold.
+        """
         past = (*(self.past[1:] or (values,) * (self.steps + 1)), values)
         older, newer = past[0], past[1]
         if self.fraction:
@@ -55,7 +59,9 @@ class DelayLine(NamedTuple):
 
 
 class Trim(NamedTuple):
-    """Pedal positions of a rolling vehicle minus the positions that hold the original vehicle's speed on a level road [-]."""
+    """Pedal positions of a rolling vehicle minus the positions that hold the original vehicle's speed on a level road
+    [-].
+    """
 
     throttle: FloatArray
     brake: FloatArray
@@ -96,7 +102,8 @@ def time_to_reach(seen: Observation) -> FloatArray:
 
 
 def is_in_the_way(seen: Observation, corridor: float, reach: float = np.inf) -> BoolArray:
-    """Whether a detected obstacle ahead is within `corridor` of the lane's middle [m], or will be when the vehicle reaches it.
+    """Whether a detected obstacle ahead is within `corridor` of the lane's middle [m], or will be when the vehicle
+    reaches it.
 
     `reach` is the sensors' range in clear weather [m].
     """
@@ -107,7 +114,9 @@ def is_in_the_way(seen: Observation, corridor: float, reach: float = np.inf) -> 
 
 
 def blocks_the_way(seen: Observation, corridor: float) -> BoolArray:
-    """Whether a detected obstacle ahead that does not move away is within `corridor` of the lane's middle [m] or on its way there."""
+    """Whether a detected obstacle ahead that does not move away is within `corridor` of the lane's middle [m] or on its
+    way there.
+    """
     is_ahead = np.isfinite(seen.gap) & (seen.gap > 0) & (seen.closing_speed >= 0)
     return np.asarray(
         is_ahead & ((np.abs(seen.lateral) <= corridor) | (np.sign(seen.lateral) * seen.lateral_speed < 0))

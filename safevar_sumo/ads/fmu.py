@@ -43,7 +43,9 @@ OUTPUT_UNITS: Mapping[str, str] = {"throttle": "-", "brake": "-", "acceleration"
 
 
 class _Memory(NamedTuple):
-    """Instances and their history; constant inputs; the original vehicle; trim at the initial speed; whether drivers are warned."""
+    """Instances and their history; constant inputs; the original vehicle; trim at the initial speed; whether drivers
+    are warned.
+    """
 
     fleet: Fleet
     constants: Mapping[str, float]

@@ -17,7 +17,8 @@ LEAST_DIVISOR = 1e-9
 
 
 class FuzzySafety(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Holds its speed; brakes according to two fuzzy metrics: PFS rises as the gap falls below the safe distance, CFS as a collision nears.
+    """Holds its speed; brakes according to two fuzzy metrics: PFS rises as the gap falls below the safe distance, CFS
+    as a collision nears.
 
     Parameters
     ----------
@@ -63,14 +64,18 @@ class FuzzySafety(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=
         )
 
     def proactive_metric(self, gap: FloatArray, v: FloatArray, u: FloatArray) -> FloatArray:
-        """PFS in [0, 1] at a gap [m] and speeds v and u (leader) [m/s], shape (N,): 0 above the safe distance, 1 below the unsafe one."""
+        """PFS in [0, 1] at a gap [m] and speeds v and u (leader) [m/s], shape (N,): 0 above the safe distance, 1 below
+        the unsafe one.
+        """
         leader_stop = u * u / (2 * self.leader_deceleration)
         safe_distance = v * self.reaction_time + v * v / (2 * self.comfortable) - leader_stop + self.margin
         unsafe_distance = v * self.reaction_time + v * v / (2 * self.hardest) - leader_stop
         return _falling_ramp(gap - self.margin, unsafe_distance, safe_distance)
 
     def critical_metric(self, gap: FloatArray, v: FloatArray, u: FloatArray, a: FloatArray) -> FloatArray:
-        """CFS in [0, 1] at a gap [m], speeds v and u [m/s] and the acceleration a of the vehicle [m/s^2], shape (N,)."""
+        """CFS in [0, 1] at a gap [m], speeds v and u [m/s] and the acceleration a of the vehicle [m/s^2], shape
+        (N,).
+        """
         acceleration = np.maximum(a, -self.comfortable)
         next_speed = v + self.reaction_time * acceleration
         approach = (v + acceleration * self.reaction_time / 2 - u) * self.reaction_time

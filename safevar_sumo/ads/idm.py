@@ -16,7 +16,8 @@ LEAST_GAP = 0.001  # m; NUMERICAL_EPS of SUMO
 
 
 class Idm(CarFollowing, frozen=True, kw_only=True):
-    """dv/dt = a (1 - (v / v0)^4 - (s* / s)^2), s* = s0 + max(0, v T + v (v - u) / (2 sqrt(a b))) at speed v, gap s, leader speed u.
+    """dv/dt = a (1 - (v / v0)^4 - (s* / s)^2), s* = s0 + max(0, v T + v (v - u) / (2 sqrt(a b))) at speed v, gap s,
+    leader speed u.
 
     Parameters
     ----------

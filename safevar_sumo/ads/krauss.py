@@ -20,7 +20,8 @@ class _Memory(NamedTuple):
 
 
 class Krauss(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Never drives faster than a speed from which the original vehicle can stop behind the obstacle after a reaction time.
+    """Never drives faster than a speed from which the original vehicle can stop behind the obstacle after a reaction
+    time.
 
     Parameters
     ----------

@@ -13,7 +13,8 @@ from safevar_sumo.records import Command, FloatArray, Nominal, Observation
 class Rss(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Holds its speed; a gap below the safe distance is a danger, to which it reacts and brakes with up to 0.774 g.
 
-    safe distance = v rt + a rt^2 / 2 + (v + rt a)^2 / (2 b) - u^2 / (2 b_u), with the speeds v and u of vehicle and leader.
+    safe distance = v rt + a rt^2 / 2 + (v + rt a)^2 / (2 b) - u^2 / (2 b_u), with the speeds v and u of vehicle and
+    leader.
 
     Parameters
     ----------

@@ -17,7 +17,9 @@ Delay = Annotated[float, Meta(ge=0, le=5)]
 SPEED_LIMIT = 20 / KMH_PER_MS
 """Speed above which the agent releases the throttle [m/s] (20 km/h in its source code)."""
 SPEED_LEVELS = (0.0, 8 / 3, 16 / 3)
-"""The first three of the four speed levels in the policy's source code, 0 to 8 m/s; between them the throttle is linear in speed."""
+"""The first three of the four speed levels in the policy's source code, 0 to 8 m/s; between them the throttle is linear
+in speed.
+"""
 PASSED_GAP = -0.5
 """Gap at which an obstacle is beside the vehicle rather than ahead [m]; the policy does not begin to brake for it."""
 RELEASE_GAP = -1.0
@@ -46,22 +48,25 @@ class WorldOnRails(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields
     latency
         Time from an image to its command [s], rounded to whole steps.
     corridor
-        Half the width of the corridor in which the policy brakes for obstacles; it releases the brake when they leave the corridor [m].
+        Half the width of the corridor in which the policy brakes for obstacles; it releases the brake when they leave
+        the corridor [m].
     brake_gap, brake_gap_per_speed
-        The policy brakes at gaps up to `brake_gap` + `brake_gap_per_speed` * speed [m, s] for an obstacle at the lateral position
-        `brake_place`.
+        The policy brakes at gaps up to `brake_gap` + `brake_gap_per_speed` * speed [m, s] for an obstacle at the
+        lateral position `brake_place`.
     brake_place
-        Lateral position of an obstacle for which the policy brakes earliest [m], negative on the side that it comes from.
+        Lateral position of an obstacle for which the policy brakes earliest [m], negative on the side that it comes
+        from.
     brake_gap_before, brake_gap_past
-        Slopes [-]: the braking gap shrinks by `brake_gap_before` for each metre that the obstacle is short of `brake_place`, and by
-        `brake_gap_past` for each metre past it, so that the policy brakes later for obstacles that enter or leave its path. The
-        visibility multiplies the remaining gap.
+        Slopes [-]: the braking gap shrinks by `brake_gap_before` for each metre that the obstacle is short of
+        `brake_place`, and by `brake_gap_past` for each metre past it, so that the policy brakes later for obstacles
+        that enter or leave its path. The visibility multiplies the remaining gap.
     throttle
         Throttle at the policy's speed levels 0, 2.7 and 5.3 m/s.
     recognition_delay
         Additional time to recognise an obstacle, compared with clear weather [s].
     hesitation
-        Time between releasing the accelerator and braking, while the policy is not yet sure [s]. It releases the brake at once.
+        Time between releasing the accelerator and braking, while the policy is not yet sure [s]. It releases the brake
+        at once.
     """
 
     first_command: UpTo60
@@ -98,7 +103,9 @@ class WorldOnRails(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields
     def _decide_to_brake(
         self, seen: Observation, gap: FloatArray, lateral: FloatArray, was_braking: BoolArray
     ) -> BoolArray:
-        """Whether the recognised obstacle is near and in the corridor; then the policy's probability of braking exceeds one half."""
+        """Whether the recognised obstacle is near and in the corridor; then the policy's probability of braking exceeds
+        one half.
+        """
         offset = lateral - self.brake_place
         reduction = self.brake_gap_past * np.maximum(offset, 0.0) + self.brake_gap_before * np.maximum(-offset, 0.0)
         braking_gap = seen.visibility * (self.brake_gap + self.brake_gap_per_speed * seen.speed - reduction)

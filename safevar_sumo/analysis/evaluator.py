@@ -32,9 +32,12 @@ PARTS_PER_WORKER = 2
 CONFIDENCE = 0.95
 """Confidence level of the intervals of shares, unless an option sets another level."""
 CRITERION_SETTINGS = 1024
-"""Number of settings over the whole domain that decide the default criterion: a collision if any setting collides, else a safety degree."""
+"""Number of settings over the whole domain that decide the default criterion: a collision if any setting collides, else
+a safety degree.
+"""
 MAX_REJECTIONS = 64
-"""If fewer than 1 in this many Sobol points is feasible, mixtures of the feasible region's vertices replace the points."""
+"""If fewer than 1 in this many Sobol points is feasible, mixtures of the feasible region's vertices replace the points.
+"""
 
 
 class Evaluator:
@@ -61,10 +64,11 @@ class Evaluator:
         *,
         ignore_constraints: bool = False,
     ) -> Evaluations:
-        """Evaluate M settings, shape (M, n). Progress is shown for `stage`; `done_before` of its `total` settings are already done.
+        """Evaluate M settings, shape (M, n). Progress is shown for `stage`; `done_before` of its `total` settings are
+        already done.
 
-        Settings that violate a constraint of the study are not simulated and get the outcome `infeasible`, unless `ignore_constraints`
-        is true.
+        Settings that violate a constraint of the study are not simulated and get the outcome `infeasible`, unless
+        `ignore_constraints` is true.
         """
         if self.region and not ignore_constraints:
             feasible = self.region.feasible(settings)
@@ -102,7 +106,9 @@ class Evaluator:
         )
 
     def feasible_settings(self, number: int, seed: int = 0, *, feasible_after_filter: bool = False) -> FloatArray:
-        """`number` settings that cover the feasible part of the domain evenly; optionally, they also stay feasible when filtered."""
+        """`number` settings that cover the feasible part of the domain evenly; optionally, they also stay feasible when
+        filtered.
+        """
         if not self.region:
             return sobol_settings(self.characteristics, number, seed)
         rng, drawn = np.random.default_rng(seed), 0
@@ -118,7 +124,9 @@ class Evaluator:
         )
 
     def random_settings(self, number: int) -> FloatArray:
-        """The first `number` random vehicles of the study, uniform over the domain's feasible part: those that `risk` draws, too."""
+        """The first `number` random vehicles of the study, uniform over the domain's feasible part: those that `risk`
+        draws, too.
+        """
         rng, bounds = np.random.default_rng(self.study.search.seed), self.characteristics
 
         def draw_next(count: int) -> FloatArray:
@@ -181,7 +189,8 @@ class Evaluator:
         return ask_why_no_verdict(self.study, self._pool)
 
     def choose_criterion(self, text: str | None, source: Study | Case, original: Evaluations | None = None) -> Unsafe:
-        """The criterion that an option states, or the default: that of the solutions, or of a study without results, of its whole domain.
+        """The criterion that an option states, or the default: that of the solutions, or of a study without results, of
+        its whole domain.
 
         Raises what `parse_criterion` and `Unsafe.default_among` raise.
         """
@@ -197,7 +206,9 @@ class Evaluator:
         )
 
     def parse_criterion(self, text: str) -> Unsafe:
-        """Parse the criterion that an option states; raises what `Unsafe.parse` raises, and an error for points without a rating."""
+        """Parse the criterion that an option states; raises what `Unsafe.parse` raises, and an error for points without
+        a rating.
+        """
         criterion = Unsafe.parse(text)
         if criterion.points is not None and not is_rated(self.study):
             raise InputError(
@@ -221,7 +232,8 @@ class Evaluator:
 def open_evaluator(
     study: Study, pool: Pool | None = None, jobs: int | None = None, progress: Progress = show_no_progress
 ) -> Iterator[Evaluator]:
-    """An evaluator that simulates on `pool`; without a pool, on `jobs` new worker processes, by default one for each core.
+    """An evaluator that simulates on `pool`; without a pool, on `jobs` new worker processes, by default one for each
+    core.
 
     Raises
     ------
@@ -237,7 +249,9 @@ def open_evaluator(
 
 
 def sobol_points(number: int, dimensions: int, seed: int) -> FloatArray:
-    """Scrambled Sobol points in the unit cube, shape (number, dimensions); they spread evenly if `number` is a power of two."""
+    """Scrambled Sobol points in the unit cube, shape (number, dimensions); they spread evenly if `number` is a power of
+    two.
+    """
     import scipy  # takes longer to load than a simulation
 
     points = scipy.stats.qmc.Sobol(dimensions, rng=np.random.default_rng(seed)).random_base2(

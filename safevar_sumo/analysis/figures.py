@@ -22,13 +22,17 @@ PICTURE_METADATA: Mapping[str, dict[str, Any]] = {".pdf": {"CreationDate": None}
 FONT = 8
 DEGREE_LABEL = "safety degree [m]\n(below 0: minus the collision's speed [m/s])"
 GREY, SKY_BLUE, BLUE, VERMILION = "#bbbbbb", "#56b4e9", "#0072b2", "#d55e00"
-"""Grey and colours of Okabe and Ito. Grey and the two blues differ in lightness, so that they differ in a print without colours too."""
+"""Grey and colours of Okabe and Ito. Grey and the two blues differ in lightness, so that they differ in a print without
+colours too.
+"""
 
 
 def new_figure(
     title: str, rows: int, columns: int, size: tuple[float, float], **options: Any
 ) -> tuple[Figure, np.ndarray]:
-    """A figure outside pyplot's state, and its axes, shape (rows, columns). `size` is in inches; `options` go to `Figure.subplots`."""
+    """A figure outside pyplot's state, and its axes, shape (rows, columns). `size` is in inches; `options` go to
+    `Figure.subplots`.
+    """
     import matplotlib.style
     from matplotlib.figure import Figure
 
@@ -53,7 +57,9 @@ def new_figure(
 def new_panels(
     title: str, number: int, max_columns: int, panel_size: tuple[float, float], min_width: float, title_height: float
 ) -> tuple[Figure, list[Axes]]:
-    """A figure with `number` panels, at most `max_columns` of them side by side, and the axes of the panels; all sizes are in inches."""
+    """A figure with `number` panels, at most `max_columns` of them side by side, and the axes of the panels; all sizes
+    are in inches.
+    """
     columns = min(max_columns, number)
     rows = -(-number // columns)
     figure, axes = new_figure(

@@ -1,4 +1,6 @@
-"""Uncertainty of the vehicle model: predictions for one setting by all parameter sets that fit the published data equally well."""
+"""Uncertainty of the vehicle model: predictions for one setting by all parameter sets that fit the published data
+equally well.
+"""
 
 from __future__ import annotations
 
@@ -21,9 +23,13 @@ BAND_SHARE = 0.9
 HALF_WIDTH = 1.645
 """Half width [standard deviations] of the interval around the mean that holds `BAND_SHARE` of a normal distribution."""
 ROUNDING_TOLERANCE = 1e-5
-"""Relative tolerance within which a parameter's value in the study equals its (rounded) value in the first set of [spread]."""
+"""Relative tolerance within which a parameter's value in the study equals its (rounded) value in the first set of
+[spread].
+"""
 LEAST_DISTANCE = 0.3
-"""Distance [domain widths] that the model's error assumes of nearer vehicles: near the original too, a decision may fall a frame off."""
+"""Distance [domain widths] that the model's error assumes of nearer vehicles: near the original too, a decision may
+fall a frame off.
+"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,8 +41,8 @@ class ModelSpread:
     sets
         Number of parameter sets.
     lower, upper
-        Ends of the band that holds 90 % of the sets' safety degrees and of repeats of a simulation [m, or -m/s]. The model's error
-        widens the band if the study states this error. None if no set has a safety degree.
+        Ends of the band that holds 90 % of the sets' safety degrees and of repeats of a simulation [m, or -m/s]. The
+        model's error widens the band if the study states this error. None if no set has a safety degree.
     collisions
         Number of parameter sets with which the vehicle collides.
     """
@@ -56,7 +62,8 @@ class ModelSpread:
             return f"no safety degree with any of {self.sets} parameter sets that fit the published data equally well"
         collisions = "none of them" if not self.collisions else f"{self.collisions} of them"
         return (
-            f"safety degree {self.lower:.2f} to {self.upper:.2f} ({BAND_SHARE:.0%} band of {self.sets} parameter sets that fit the "
+            f"safety degree {self.lower:.2f} to {self.upper:.2f} ({BAND_SHARE:.0%} band of {self.sets} "
+            "parameter sets that fit the "
             f"published data equally well, of repeats and of the model's error); a collision with {collisions}"
         )
 
@@ -81,7 +88,9 @@ def compute_model_spreads(study: Study, settings: FloatArray, point: str = "") -
 
 
 def band_of(study: Study, evaluations: Sequence[Evaluations]) -> tuple[FloatArray, FloatArray]:
-    """Lower and upper ends, shape (M,) each, of the sets' predictions for M settings, widened by repeats and the model's error."""
+    """Lower and upper ends, shape (M,) each, of the sets' predictions for M settings, widened by repeats and the
+    model's error.
+    """
     error = study.model_error.get(SAFETY_DEGREE, 0.0) * error_distance(study, evaluations[0].settings)
     return prediction_band(
         np.stack([prediction.f_safe for prediction in evaluations]), study.repeatability.get(SAFETY_DEGREE, 0.0), error
@@ -89,7 +98,8 @@ def band_of(study: Study, evaluations: Sequence[Evaluations]) -> tuple[FloatArra
 
 
 def error_distance(study: Study, settings: FloatArray) -> FloatArray:
-    """Distance of settings from the original vehicle to which the model's error is proportional [domain widths]; shape (M,).
+    """Distance of settings from the original vehicle to which the model's error is proportional [domain widths]; shape
+    (M,).
 
     It is the Euclidean distance, each characteristic in widths of its domain, but at least `LEAST_DISTANCE`.
     """
@@ -101,7 +111,9 @@ def error_distance(study: Study, settings: FloatArray) -> FloatArray:
 def prediction_band(
     safety_degrees: FloatArray, repeatability: float, error: FloatArray | float = 0.0
 ) -> tuple[FloatArray, FloatArray]:
-    """Ends, shape (M,) each, of the band of predictions, shape (sets, M); repeats of a simulation and `error` widen it on each side."""
+    """Ends, shape (M,) each, of the band of predictions, shape (sets, M); repeats of a simulation and `error` widen it
+    on each side.
+    """
     lower, upper = np.full(safety_degrees.shape[1], np.nan), np.full(safety_degrees.shape[1], np.nan)
     defined = np.isfinite(safety_degrees).any(axis=0)
     lower[defined], upper[defined] = np.nanquantile(
@@ -146,7 +158,9 @@ def studies_of_sets(study: Study) -> list[Study]:
 
 
 def parameters_outside_sets(study: Study) -> list[str]:
-    """The parameters under [spread] whose value in `study` is not that of the first set: the sets say nothing on other values."""
+    """The parameters under [spread] whose value in `study` is not that of the first set: the sets say nothing on other
+    values.
+    """
     return [
         key
         for key, values in study.spread.items()

@@ -1,8 +1,8 @@
 """Options of a question: one record with defaults, legal ranges and help texts.
 
-The record defines the flags of the command, the defaults and the documentation of the Python function, the report's call of this
-function, and the command that the report prints. It stands in the `__init__.py` of the question's package. Because the help of a
-command needs this module, the module imports nothing that loads slowly.
+The record defines the flags of the command, the defaults and the documentation of the Python function, the report's
+call of this function, and the command that the report prints. It stands in the `__init__.py` of the question's package.
+Because the help of a command needs this module, the module imports nothing that loads slowly.
 """
 
 from __future__ import annotations
@@ -25,7 +25,8 @@ class Option(NamedTuple):
 
     - `kind` is the type of one value.
     - `low` and `high` are the ends of the range; an end belongs to the range unless its entry in `is_open` is true.
-    - `form` is "one" for a single value, "commas" for several values separated by commas, or "repeated" for one flag per value.
+    - `form` is "one" for a single value, "commas" for several values separated by commas, or "repeated" for one flag
+      per value.
     - `python` is the help text of the Python function's argument, if this argument differs from the flag.
     """
 
@@ -61,12 +62,16 @@ def option(default: Any, text: str, **properties: Any) -> Any:
 
 
 def unsafe_option() -> Any:
-    default = "a collision if any evaluated setting collides, else half of the original's safety degree; of a rated study, any point lost"
+    default = (
+        "a collision if any evaluated setting collides, else half of the original's safety degree; of a rated "
+        "study, any point lost"
+    )
     return option(
         None,
         f"What is unsafe: a collision, a safety degree below X, or at most X points of a rating.  [default: {default}]",
         metavar="collision|below=X|points=X",
-        python='What is unsafe: `"collision"`, or a number X for a safety degree below X [m, or minus a collision\'s speed in '
+        python='What is unsafe: `"collision"`, or a number X for a safety degree below X [m, or minus a '
+        "collision's speed in "
         f"m/s], or an `Unsafe`. By default {default}.",
     )
 
@@ -106,7 +111,9 @@ class Options:
         return {name: option.flag or f"--{name.replace('_', '-')}" for name, option in cls.definitions().items()}
 
     def command_line(self, subject: str, point: str = "") -> str:
-        """The command that asks this question about a study or results directory; it has a flag for each option not at its default."""
+        """The command that asks this question about a study or results directory; it has a flag for each option not at
+        its default.
+        """
         parts = [PROGRAM_COMMAND, self.question, quote(subject)]
         for option_field in fields(self):
             value, flag, definition = (
@@ -132,9 +139,11 @@ COMMON_ARGUMENTS = """pool
 jobs
     Number of worker processes, by default one for each core.
 progress
-    True for a bar on the terminal, or a function called with the stage, the number of its settings done, and their total.
+    True for a bar on the terminal, or a function called with the stage, the number of its settings done, and their
+    total.
 as_it_is_now
-    If inputs have changed since results were computed, simulate with the present inputs and warn; by default an error is raised.
+    If inputs have changed since results were computed, simulate with the present inputs and warn; by default an error
+    is raised.
 
 Raises
 ------
@@ -146,7 +155,9 @@ QuestionFunction = TypeVar("QuestionFunction", bound=Callable[..., Any])
 
 
 def document_options(options: type[Options]) -> Callable[[QuestionFunction], QuestionFunction]:
-    """Decorator: appends the options and the arguments common to all questions to a docstring, which must end with the first argument."""
+    """Decorator: appends the options and the arguments common to all questions to a docstring, which must end with the
+    first argument.
+    """
 
     def append_arguments(function: QuestionFunction) -> QuestionFunction:
         arguments = [

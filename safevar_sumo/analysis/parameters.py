@@ -1,4 +1,6 @@
-"""Parameters of a study, named by their keys in the study file, such as `ads.parameters.brake_gap` or `ads.parameters.throttle.0`."""
+"""Parameters of a study, named by their keys in the study file, such as `ads.parameters.brake_gap` or
+`ads.parameters.throttle.0`.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +14,8 @@ from safevar_sumo.study import Study, error_with_key, locate_parameter, missing_
 
 
 def with_values(study: Study, values: Mapping[str, float], stated_in: str = "calibration") -> Study:
-    """A study with other values of some parameters, named by their keys in the study file; errors name the table `stated_in`.
+    """A study with other values of some parameters, named by their keys in the study file; errors name the table
+    `stated_in`.
 
     Raises
     ------

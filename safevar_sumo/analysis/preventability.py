@@ -1,8 +1,9 @@
 """Preventability of collisions (ISO 34502, UN R157): would a reference driver have avoided them in the same vehicle?
 
-If a competent driver avoids a collision, the driving system failed. If not even full braking at the first possible moment
-avoids it, the vehicle is the cause. UN R157 means its driver for cars that cut in, cut out or brake on motorways; its
-use for pedestrians is ours. So the share that he avoids is a range: it is computed for a later reaction, too.
+If a competent driver avoids a collision, the driving system failed. If not even full braking at the first possible
+moment avoids it, the vehicle is the cause. UN R157 means its driver for cars that cut in, cut out or brake on
+motorways; its use for pedestrians is ours. So the share that he avoids is a range: it is computed for a later reaction,
+too.
 """
 
 from __future__ import annotations
@@ -26,7 +27,8 @@ from safevar_sumo.sumo.matrix import simulate, study_at
 from safevar_sumo.sumo.system import System, assemble
 
 MAX_SIMULATIONS = 20_000
-"""Approximate maximum number of simulations; if all given collisions need more, a random sample of them is simulated."""
+"""Approximate maximum number of simulations; if all given collisions need more, a random sample of them is simulated.
+"""
 
 DELAY = 0.4
 """Time by which the competent driver reacts later in the second of the two computations [s]."""
@@ -63,7 +65,8 @@ class LaterReaction(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class PreventedShares(msgspec.Struct, frozen=True, kw_only=True):
-    """Shares of the simulated collisions (see `Preventability`) by category in the JSON of `explain`, None without a collision.
+    """Shares of the simulated collisions (see `Preventability`) by category in the JSON of `explain`, None without a
+    collision.
 
     `looked_at` is the number of simulated collisions; `interval_competent_driver` the 95 % interval of the share
     `competent_driver`; `later` the share with a later reaction.
@@ -81,7 +84,8 @@ class PreventedShares(msgspec.Struct, frozen=True, kw_only=True):
 class Preventability:
     """Counts of collisions, or of a random sample of them, by category: the weakest driver that avoids each collision.
 
-    The collisions are the distinct solutions that collide, or of a study without results the drawn settings that collide.
+    The collisions are the distinct solutions that collide, or of a study without results the drawn settings that
+    collide.
 
     Attributes
     ----------
@@ -109,8 +113,9 @@ class Preventability:
     def interval(self, category: PreventableBy) -> tuple[float, float] | None:
         """95 % confidence interval of a category's share in all `collisions`; None if no collision was simulated.
 
-        If all collisions were simulated, the share has no sampling error and the interval is the share itself. For a sample the
-        interval is Clopper and Pearson's. It is slightly too wide, as it has no correction for a finite population.
+        If all collisions were simulated, the share has no sampling error and the interval is the share itself. For a
+        sample the interval is Clopper and Pearson's. It is slightly too wide, as it has no correction for a finite
+        population.
         """
         share = self.share(category)
         if share is None:
@@ -153,8 +158,8 @@ def assess_preventability(
 ) -> Preventability:
     """Classify M evaluated collisions by the weakest driver that avoids them; equal settings count once.
 
-    If that takes more than about `max_simulations` simulations, only a random sample is simulated, drawn with the study's seed.
-    A setting that cannot be simulated with a reference driver is not counted.
+    If that takes more than about `max_simulations` simulations, only a random sample is simulated, drawn with the
+    study's seed. A setting that cannot be simulated with a reference driver is not counted.
     """
     distinct = np.unique(collisions.settings, axis=0, return_index=True)[1]
     shuffled = np.random.default_rng(evaluator.study.search.seed).permutation(distinct)
@@ -203,10 +208,12 @@ def _classify_at_point(evaluator: Evaluator, system: System, settings: FloatArra
 
 
 def approach_parameters(system: System) -> dict[str, Any]:
-    """Parameters with which a reference driver approaches from rest as the driving system does with the original vehicle.
+    """Parameters with which a reference driver approaches from rest as the driving system does with the original
+    vehicle.
 
-    The driver replays the throttle until the driving system first brakes or reaches its peak speed, and holds that speed, so that
-    both are at the same position when the danger begins. If the run begins at speed, the driver keeps that speed.
+    The driver replays the throttle until the driving system first brakes or reaches its peak speed, and holds that
+    speed, so that both are at the same position when the danger begins. If the run begins at speed, the driver keeps
+    that speed.
     """
     trace = simulate(system, system.characteristics.original[np.newaxis]).trace
     speed, is_braking = trace.speed[:, 0], trace.brake[:, 0] > 0

@@ -53,14 +53,16 @@ class Results:
     def solutions(self) -> pd.DataFrame:
         """One row per solution of every finished run.
 
-        Columns: algorithm, run (absent from imported results), the characteristics in their table units, f_safe [m or -m/s],
-        f_diff [fraction], f_num_diff, the metrics in their units (NaN where undefined), outcome.
+        Columns: algorithm, run (absent from imported results), the characteristics in their table units, f_safe [m or
+        -m/s], f_diff [fraction], f_num_diff, the metrics in their units (NaN where undefined), outcome.
         """
         return self.case.solutions
 
     @property
     def evaluations(self) -> pd.DataFrame:
-        """One row per simulated setting of every run, in the order of the run's requests; same columns as `solutions`."""
+        """One row per simulated setting of every run, in the order of the run's requests; same columns as
+        `solutions`.
+        """
         return self.case.evaluations
 
     @property
@@ -69,7 +71,10 @@ class Results:
         return self.case.finished_runs
 
     def __repr__(self) -> str:
-        return f"<Results of {self.case.name} in {self.directory}: {len(self.finished)} runs, {len(self.solutions)} solutions>"
+        return (
+            f"<Results of {self.case.name} in {self.directory}: {len(self.finished)} runs, {len(self.solutions)} "
+            "solutions>"
+        )
 
 
 def load(directory: str | Path) -> Results:
@@ -105,7 +110,8 @@ def study_or_case(
     Raises
     ------
     InputError
-        If `source` is no study and no results, if an input of the results has changed, or if `as_it_is_now` is set for a study.
+        If `source` is no study and no results, if an input of the results has changed, or if `as_it_is_now` is set for
+        a study.
     """
     if isinstance(source, str | Path):
         is_directory, is_study = (
@@ -119,7 +125,10 @@ def study_or_case(
         if results_only or (is_directory and not is_study):
             source = load(source)
         elif not (is_study or os.path.lexists(source)):
-            expected = f"a directory that the command `study` has written, {one_of(study_names())}, or the path of a study file (TOML)"
+            expected = (
+                f"a directory that the command `study` has written, {one_of(study_names())}, or the path of a "
+                "study file (TOML)"
+            )
             problem = f"is neither a results directory, a study nor a file{did_you_mean(source, study_names())}"
             raise InputError(source, problem, expected)
     if isinstance(source, Results):

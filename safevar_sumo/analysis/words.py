@@ -23,7 +23,9 @@ OUTCOME_VERBS = {
 
 
 def change_texts(characteristics: CharacteristicSet, values: Mapping[str, float]) -> list[str]:
-    """The values that differ from the original values, in the order of the study, such as `mass 2404 -> 2600 kg (+8.2 %)`."""
+    """The values that differ from the original values, in the order of the study, such as `mass 2404 -> 2600 kg (+8.2
+    %)`.
+    """
     texts = []
     for characteristic in characteristics:
         original, value = characteristic.original, values.get(characteristic.name, characteristic.original)
@@ -72,7 +74,9 @@ MAX_POINTS_NAMED = 6
 
 
 def points_in_words(failing_points: Sequence[str], point_count: int, limit: int = MAX_POINTS_NAMED) -> str:
-    """A sentence such as `Fails at 2 of 72 points: CPNA, speed 40, impact_location 25, night; CPLA, speed 60, clear.`"""
+    """A sentence such as `Fails at 2 of 72 points: CPNA, speed 40, impact_location 25, night; CPLA, speed 60,
+    clear.`
+    """
     names, rest = "; ".join(failing_points[:limit]), len(failing_points) - limit
     others = f" and {rest} more" if rest > 0 else ""
     return f"Fails at {len(failing_points)} of {point_count} points{': ' + names if failing_points else ''}{others}."

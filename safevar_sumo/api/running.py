@@ -71,8 +71,8 @@ def run(
     batch
         Maximum number of settings per batch, gathered from several runs; never changes a result.
     engine
-        "recorded": simulate in a recorded scene if no actor reacts to the vehicle under test, else in SUMO; "sumo": always in SUMO.
-        Never changes a result.
+        "recorded": simulate in a recorded scene if no actor reacts to the vehicle under test, else in SUMO; "sumo":
+        always in SUMO. Never changes a result.
     retry_failed
         Whether to simulate again the settings that failed before (simulator-error).
 
@@ -120,7 +120,8 @@ def carry_out_runs(
     *,
     retry_failed: bool = False,
 ) -> Campaign:
-    """Carry out runs of a study in a directory with `run_campaign`; write the solutions once all of the study's runs are finished.
+    """Carry out runs of a study in a directory with `run_campaign`; write the solutions once all of the study's runs
+    are finished.
 
     Raises
     ------
@@ -172,7 +173,8 @@ def _extent_remarks(results: ResultsDirectory, study: Study) -> list[str]:
     names = stored_runs(results.path) - set(map(str, all_runs(study)))
     if names:
         remarks.append(
-            f"{results.path}: {number_of(len(names), 'earlier run')} left out of the results: {', '.join(sorted(names))}"
+            f"{results.path}: {number_of(len(names), 'earlier run')} left out of the results: "
+            f"{', '.join(sorted(names))}"
         )
     return remarks
 

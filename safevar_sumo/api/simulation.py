@@ -53,9 +53,9 @@ OBSERVATION_HEADS = {
 def trace_frame(runs: SimulationRuns, observations: Sequence[Observation]) -> pd.DataFrame:
     """One row per step of the only vehicle while its simulation counts.
 
-    The columns `gap` (along the vehicle's path) and `lateral` (from the middle of its lane) hold the obstacle's true position; the columns
-    that begin with "seen" hold what the ADS observed. `ttc` is empty while no gap closes or the vehicle stands, `gap` while no
-    obstacle is ahead.
+    The columns `gap` (along the vehicle's path) and `lateral` (from the middle of its lane) hold the obstacle's true
+    position; the columns that begin with "seen" hold what the ADS observed. `ttc` is empty while no gap closes or the
+    vehicle stands, `gap` while no obstacle is ahead.
     """
     import pandas as pd  # takes longer to load than the simulation
 
@@ -229,7 +229,9 @@ def simulate(
 
 
 def changed_setting(system: System, changes: Mapping[str, float] | None, filtered: bool, beyond: bool) -> FloatArray:
-    """The unfiltered setting with these changes, shape (n,); raises InputError if it is illegal or, once filtered, infeasible."""
+    """The unfiltered setting with these changes, shape (n,); raises InputError if it is illegal or, once filtered,
+    infeasible.
+    """
     setting = system.characteristics.setting(changes or {}, "changes", beyond=beyond)
     if not beyond:
         system.check_feasible(setting[np.newaxis], "changes", filtered=filtered)
@@ -280,7 +282,8 @@ def _simulate_one(study: Study, system: System, setting: FloatArray, no_verdict:
 
 
 SETTINGS_FORMAT = (
-    "a list of mappings such as [{'mass': 2500}], a pandas.DataFrame with a column for each characteristic that is changed, "
+    "a list of mappings such as [{'mass': 2500}], a pandas.DataFrame with a column for each characteristic "
+    "that is changed, "
     "or an array of numbers, shape (M, n)"
 )
 
@@ -304,8 +307,8 @@ def evaluate(
     settings
         M settings, with values in the characteristics' table units, in one of these forms:
 
-        - a list with a mapping for each setting, or a frame with a row for each setting, of the characteristics that are changed; a
-          missing value (no key, None or NaN) means the original's value;
+        - a list with a mapping for each setting, or a frame with a row for each setting, of the characteristics that
+          are changed; a missing value (no key, None or NaN) means the original's value;
         - an array of shape (M, n) without missing values, with the n characteristics in the study's order.
     filtered
         Put changes that are smaller than their thresholds back to the original, as every search does.
@@ -316,15 +319,17 @@ def evaluate(
     jobs
         Worker processes, by default one for each core.
     progress
-        True for a bar on the terminal, or a function called with the stage, the number of settings done, and their total.
+        True for a bar on the terminal, or a function called with the stage, the number of settings done, and their
+        total.
 
     Returns
     -------
     pandas.DataFrame
-        One row per setting, in the order of `settings` and with the index of a frame: the characteristics as simulated, f_safe [m or -m/s],
-        f_diff [fraction], f_num_diff, the metrics in their units (NaN where undefined), collision_speed [m/s], outcome.
-        A setting that cannot be simulated has the outcome simulator-error, a setting that leaves a test's speed before the driving
-        system acts has the outcome invalid-test. Both have no metrics, and count neither as failures nor as successes.
+        One row per setting, in the order of `settings` and with the index of a frame: the characteristics as simulated,
+        f_safe [m or -m/s], f_diff [fraction], f_num_diff, the metrics in their units (NaN where undefined),
+        collision_speed [m/s], outcome. A setting that cannot be simulated has the outcome simulator-error, a setting
+        that leaves a test's speed before the driving system acts has the outcome invalid-test. Both have no metrics,
+        and count neither as failures nor as successes.
 
     Raises
     ------

@@ -1,9 +1,10 @@
 """Carries out a study: its runs, dealt out in shares to the workers of a pool.
 
-A search is a generator that requests evaluations of settings. The run of the search looks each setting up in its journal and memory,
-has new settings evaluated, journals the evaluations and sends them to the search; a resumed run replays its journal. A worker carries a
-share of the runs: its batches gather new settings of all of them. A worker that dies is replaced, and the next one continues from the
-journals; no result depends on the worker or on other settings in the batch. Questions ask the same pool for single batches.
+A search is a generator that requests evaluations of settings. The run of the search looks each setting up in its
+journal and memory, has new settings evaluated, journals the evaluations and sends them to the search; a resumed run
+replays its journal. A worker carries a share of the runs: its batches gather new settings of all of them. A worker that
+dies is replaced, and the next one continues from the journals; no result depends on the worker or on other settings in
+the batch. Questions ask the same pool for single batches.
 """
 
 from safevar_sumo.campaign.campaign import Campaign, Observer, run_campaign

@@ -35,7 +35,9 @@ _files_read: dict[tuple[bytes, str], Files] = {}
 
 
 def choose_batch_size(study: Study) -> tuple[int, bool]:
-    """Choose the most economical number of settings in a batch; also returns whether a recorded scene can replace SUMO."""
+    """Choose the most economical number of settings in a batch; also returns whether a recorded scene can replace
+    SUMO.
+    """
     system = assemble(study, study.source)
     return settings_per_batch(system, Engine.RECORDED), not reason_for_sumo(system)
 
@@ -97,7 +99,8 @@ def inputs_of(study: Study, pool: Pool) -> Inputs:
 
 
 def source_digests(study: Study, pool: Pool) -> Files:
-    """Digests, by name, of files that parameters name, and of files that user code reads while a worker simulates the original vehicle.
+    """Digests, by name, of files that parameters name, and of files that user code reads while a worker simulates the
+    original vehicle.
 
     The worker reloads all user code first.
 

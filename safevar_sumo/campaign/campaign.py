@@ -61,9 +61,10 @@ class Observer(Protocol):
 class Campaign(NamedTuple):
     """Results of the runs of a study: the evaluation of the original vehicle, and the solutions of each finished run.
 
-    `failures` are settings that could not be simulated. `busy` are runs that another process carries out. `collisions` and
-    `invalid_tests` are numbers of distinct settings of each finished run: those that collided, and those that left the speed tolerance
-    of a test. `scoring` holds the metrics and objectives. `no_verdict` says why the runs tell nothing about the ADS.
+    `failures` are settings that could not be simulated. `busy` are runs that another process carries out. `collisions`
+    and `invalid_tests` are numbers of distinct settings of each finished run: those that collided, and those that left
+    the speed tolerance of a test. `scoring` holds the metrics and objectives. `no_verdict` says why the runs tell
+    nothing about the ADS.
     """
 
     original: Evaluations
@@ -168,7 +169,8 @@ def run_campaign(
 
 
 def deal(keys: Sequence[RunKey], workers: int, runs_at_once: int) -> list[Sequence[RunKey]]:
-    """Deal runs out in shares of equal size and with equally many runs of each algorithm, a multiple of the number of workers.
+    """Deal runs out in shares of equal size and with equally many runs of each algorithm, a multiple of the number of
+    workers.
 
     All runs of a share are under way at the same time: they fill large batches, which cost least for each setting.
     """
@@ -185,7 +187,9 @@ class _ShareUnderWay:
         self._other_deaths = 0
 
     def note(self, message: Message) -> None:
-        """Note what a worker reports: the next worker does not carry out finished runs, and knows of deaths in the present round only."""
+        """Note what a worker reports: the next worker does not carry out finished runs, and knows of deaths in the
+        present round only.
+        """
         if isinstance(message, Attempt):
             self._attempt = message
         elif isinstance(message, list):
@@ -207,7 +211,9 @@ class _ShareUnderWay:
 
 
 def _carry_out(shares: Iterable[Share], pool: Pool) -> Generator[Message]:
-    """Carry out shares on a pool, again from their journals after the death of a worker; yields the workers' messages."""
+    """Carry out shares on a pool, again from their journals after the death of a worker; yields the workers'
+    messages.
+    """
     events: SimpleQueue[tuple[_ShareUnderWay, Message | Future[None]]] = SimpleQueue()
     waiting, under_way, is_over = deque(map(_ShareUnderWay, shares)), set[_ShareUnderWay](), False
 
@@ -258,7 +264,8 @@ def _evaluate_original(
     try:
         if journal.content.tail_size:
             observer.warned(
-                f"{journal.path}: the last {journal.content.tail_size} bytes were torn; what they held is simulated again"
+                f"{journal.path}: the last {journal.content.tail_size} bytes were torn; what they held is "
+                "simulated again"
             )
         if journal.content.evaluations is not None:
             return journal.content.evaluations

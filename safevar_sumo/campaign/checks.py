@@ -24,19 +24,23 @@ from safevar_sumo.sumo import Engine, assemble
 from safevar_sumo.vehicles import CharacteristicSet
 
 VERIFIED_SETTINGS = 50
-"""Number of settings to verify in SUMO: of a study in questions; and of each run of a campaign, besides the solutions."""
+"""Number of settings to verify in SUMO: of a study in questions; and of each run of a campaign, besides the solutions.
+"""
 ROUNDING = 1e-9
 """Largest accepted difference between a metric in a recorded scene and in SUMO."""
 EXPECTED_RESULTS = (
-    "results of a vehicle that depend on this vehicle alone: nothing kept in a class, a module or the model itself from one call or "
+    "results of a vehicle that depend on this vehicle alone: nothing kept in a class, a module or the model "
+    "itself from one call or "
     "setting to another, no mean or sum over the batch, nothing random"
 )
 _passed_checks: dict[str, list[str]] = {}
-"""Warnings by identity of the studies whose code has passed in this process, in case the cache folder is not writable."""
+"""Warnings by identity of the studies whose code has passed in this process, in case the cache folder is not writable.
+"""
 
 
 def check_code(study: Study, inputs: Inputs, pool: RetryingPool) -> list[str]:
-    """Check the user code of a study in a worker, unless it has passed before with the same files; returns the warnings, kept or new.
+    """Check the user code of a study in a worker, unless it has passed before with the same files; returns the
+    warnings, kept or new.
 
     Raises
     ------
@@ -89,7 +93,9 @@ def refuse_difference(
 def find_difference(
     evaluations: Evaluations, other_evaluations: Evaluations, tolerance: float = 0.0
 ) -> tuple[str, object, object] | None:
-    """Name and both values of the first quantity that differs by more than `tolerance`; None if all agree or a simulation failed."""
+    """Name and both values of the first quantity that differs by more than `tolerance`; None if all agree or a
+    simulation failed.
+    """
     if evaluations.failed[0] or other_evaluations.failed[0]:
         return None
     if evaluations.outcome[0] != other_evaluations.outcome[0]:
@@ -107,7 +113,8 @@ def find_difference(
 
 
 def works_for_sumo(study: Study, inputs: Inputs) -> tuple[bytes, bytes]:
-    """The packed study with which SUMO verifies results, and a packed study with comparable results from recorded scenes.
+    """The packed study with which SUMO verifies results, and a packed study with comparable results from recorded
+    scenes.
 
     SUMO repeats only a few cells of a rating; the second study then has the same cells. Otherwise it is empty.
     """
@@ -119,7 +126,8 @@ def works_for_sumo(study: Study, inputs: Inputs) -> tuple[bytes, bytes]:
 
 
 def refuse_unlike_sumo(study: Study, recorded: Evaluations, in_sumo: Evaluations) -> None:
-    """Refuse settings with different results in a recorded scene and in SUMO; skip settings that SUMO could not simulate.
+    """Refuse settings with different results in a recorded scene and in SUMO; skip settings that SUMO could not
+    simulate.
 
     Raises
     ------

@@ -158,7 +158,9 @@ def _carry(time_limit: float, versions: dict[str, str], share: Share, queue: str
 
 @contextmanager
 def _evaluator(time_limit: float, versions: dict[str, str]) -> Iterator[Evaluate]:
-    """The function that evaluates batches in a worker, one at a time because a process has one libsumo; a worker that hangs ends."""
+    """The function that evaluates batches in a worker, one at a time because a process has one libsumo; a worker that
+    hangs ends.
+    """
     if _versions() != versions:
         raise PoolLostError(f"a worker of the cluster has other versions: {_versions()} there, {versions} here")
     with _libsumo_lock, open(os.devnull, "w") as null_file:

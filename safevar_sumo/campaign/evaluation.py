@@ -56,8 +56,8 @@ def pack_study(
     Parameters
     ----------
     inputs
-        Digests of files by layer and name; by default those of the present networks. A worker refuses to compute with other files, and
-        reports files that user code reads and `sources` lacks.
+        Digests of files by layer and name; by default those of the present networks. A worker refuses to compute with
+        other files, and reports files that user code reads and `sources` lacks.
     engine
         What moves the vehicles.
     afresh
@@ -67,7 +67,8 @@ def pack_study(
     cells
         (k, n): for a rated study, results in part k of n parts of the cells, instead of points for all cells.
     empty_road
-        Whether the worker only applies `why_no_verdict`; the sentence, if any, is the only one of the result's `reasons`.
+        Whether the worker only applies `why_no_verdict`; the sentence, if any, is the only one of the result's
+        `reasons`.
     """
     if inputs is None:
         inputs = {"network": network_digests(assemble(study))}
@@ -115,7 +116,9 @@ def evaluate_batch(work: bytes, settings: FloatArray) -> Evaluations:
 
 
 def evaluate_in_time(work: bytes, settings: FloatArray, time_limit: float, last_words: IO[str]) -> Evaluations:
-    """Evaluate a batch; a process that takes longer than the time limit [s] writes to a file what it is doing, and ends."""
+    """Evaluate a batch; a process that takes longer than the time limit [s] writes to a file what it is doing, and
+    ends.
+    """
     faulthandler.dump_traceback_later(time_limit, exit=True, file=last_words)
     try:
         return evaluate_batch(work, settings)

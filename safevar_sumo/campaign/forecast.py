@@ -35,7 +35,9 @@ NUMBERS_BESIDE_METRICS = 5
 
 
 class Forecast(NamedTuple):
-    """Upper limits for a campaign: evaluations, `seconds`, and `size` of the results [bytes]; `rate` is in evaluations per second."""
+    """Upper limits for a campaign: evaluations, `seconds`, and `size` of the results [bytes]; `rate` is in evaluations
+    per second.
+    """
 
     evaluations: int
     rate: float

@@ -24,8 +24,9 @@ Inputs = dict[str, dict[str, str]]
 def identity_of(study: Study, system: System, sources: Mapping[str, str] = MappingProxyType({})) -> dict[str, Any]:
     """The layers of a manifest except the study: plain values that are the same in every process.
 
-    `resolved` are the tables of the study with all defaults of models and all numbers of the weather; `network` and `sources` are digests
-    by file; `results` is the version of the results; `platform` are properties of the machine that may affect the last bit of a result.
+    `resolved` are the tables of the study with all defaults of models and all numbers of the weather; `network` and
+    `sources` are digests by file; `results` is the version of the results; `platform` are properties of the machine
+    that may affect the last bit of a result.
 
     Parameters
     ----------
@@ -54,7 +55,9 @@ def identity_of(study: Study, system: System, sources: Mapping[str, str] = Mappi
 
 
 def input_files(study: Study, system: System) -> list[Path]:
-    """The files that a study is made of: its own file and those that it extends, networks, loaded modules, and files that it names."""
+    """The files that a study is made of: its own file and those that it extends, networks, loaded modules, and files
+    that it names.
+    """
     networks = [open_network(folder) for folder in dict.fromkeys(point.scenario.network for point in system.points)]
     return [
         *(Path(file) for file in study.origin.files),

@@ -1,7 +1,7 @@
 """Ctrl-C while a pool works: noted at once, but raised only where the main thread waits for a result and holds no lock.
 
-An interrupt inside `concurrent.futures` may leave a lock behind for which the thread of a worker waits for ever. An interrupt while a
-pool closes would leave worker processes behind.
+An interrupt inside `concurrent.futures` may leave a lock behind for which the thread of a worker waits for ever. An
+interrupt while a pool closes would leave worker processes behind.
 """
 
 from __future__ import annotations

@@ -63,7 +63,8 @@ def local_pool(jobs: int, time_limit: float) -> Iterator[LocalPool]:
 
 
 class LocalPool:
-    """Computes batches and carries shares in processes. For each process, a thread of this process waits for its messages.
+    """Computes batches and carries shares in processes. For each process, a thread of this process waits for its
+    messages.
 
     Workers share no queue and no lock: a worker may die at any moment without harm to the others.
     """
@@ -191,7 +192,9 @@ class _Worker:
 
 @contextmanager
 def _hide_main() -> Iterator[None]:
-    """Hide the main module, which a spawned process would run again; scripts then need no `if __name__ == "__main__"`."""
+    """Hide the main module, which a spawned process would run again; scripts then need no `if __name__ ==
+    "__main__"`.
+    """
     with _start_lock:
         main = sys.modules["__main__"]
         sys.modules["__main__"] = ModuleType("__main__")

@@ -29,8 +29,8 @@ class Share(NamedTuple):
     work
         The packed study, whose batches have at most `batch` settings of several runs.
     sumo_work, recorded_work
-        Packed studies that verify results in SUMO; `sumo_work` is empty if SUMO simulates everything anyway, `recorded_work` if the results
-        of the runs are comparable themselves.
+        Packed studies that verify results in SUMO; `sumo_work` is empty if SUMO simulates everything anyway,
+        `recorded_work` if the results of the runs are comparable themselves.
     keys
         The runs.
     directory, identity
@@ -40,8 +40,8 @@ class Share(NamedTuple):
     retry_failed
         Whether settings are simulated again that failed before.
     deaths
-        Why a worker died, for each attempt in the round of batches in which an earlier worker died with this share; by setting, or b"" for
-        a batch of several settings.
+        Why a worker died, for each attempt in the round of batches in which an earlier worker died with this share; by
+        setting, or b"" for a batch of several settings.
     """
 
     work: bytes
@@ -79,7 +79,9 @@ class RunProgress(NamedTuple):
 
 
 class RunResult(NamedTuple):
-    """A finished run: its state, its solutions, settings that could not be simulated, and the number of invalid tests."""
+    """A finished run: its state, its solutions, settings that could not be simulated, and the number of invalid
+    tests.
+    """
 
     progress: RunProgress
     solutions: Evaluations
@@ -100,7 +102,9 @@ class Busy(NamedTuple):
 
 
 Message = Attempt | list[RunProgress] | RunResult | Busy | str
-"""What a worker reports of its share: an attempt; the state of all runs after a round of batches; a result; or a warning."""
+"""What a worker reports of its share: an attempt; the state of all runs after a round of batches; a result; or a
+warning.
+"""
 Report = Callable[[Message], None]
 
 
@@ -115,4 +119,6 @@ class Pool(Protocol):
         """Evaluate k filtered settings of n characteristics, shape (k, n), of a packed study."""
 
     def carry(self, share: Share, report: Report) -> Future[None]:
-        """Carry out a share of a study's runs; `report` is called with every message, and ends the share by an exception."""
+        """Carry out a share of a study's runs; `report` is called with every message, and ends the share by an
+        exception.
+        """

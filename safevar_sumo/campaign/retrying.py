@@ -1,7 +1,8 @@
 """Batches that fail are tried once more, then row by row, which finds the setting that fails.
 
-A setting that fails again by itself, while the original vehicle can be simulated, gets the outcome `simulator-error`. Faults of the
-environment (disk, network files, memory) and of user code end the study, which the same command resumes later.
+A setting that fails again by itself, while the original vehicle can be simulated, gets the outcome `simulator-error`.
+Faults of the environment (disk, network files, memory) and of user code end the study, which the same command resumes
+later.
 """
 
 from __future__ import annotations
@@ -42,7 +43,8 @@ class Retries:
         )
 
     def evaluate(self, compute: Compute, settings: FloatArray, *, must_succeed: bool = False) -> Iterator[Evaluations]:
-        """Yield the evaluations of k filtered settings, shape (k, n), in their order: of all together or, after failures, row by row.
+        """Yield the evaluations of k filtered settings, shape (k, n), in their order: of all together or, after
+        failures, row by row.
 
         With `must_succeed` a failure is an error, not an outcome.
         """
@@ -138,7 +140,9 @@ class RetryingPool:
         return self._pool.workers
 
     def submit(self, work: bytes, settings: FloatArray, *, must_succeed: bool = False) -> Future[Evaluations]:
-        """Evaluate k filtered settings of n characteristics, shape (k, n); with `must_succeed` a failure is an error, not an outcome."""
+        """Evaluate k filtered settings of n characteristics, shape (k, n); with `must_succeed` a failure is an error,
+        not an outcome.
+        """
 
         def compute(batch: FloatArray) -> Evaluations:
             try:
@@ -153,7 +157,9 @@ class RetryingPool:
 
 
 def reproduction_command(study: Study, setting: FloatArray) -> str:
-    """The command that simulates a setting of n characteristics, shape (n,), in a study or at the point to which it was reduced."""
+    """The command that simulates a setting of n characteristics, shape (n,), in a study or at the point to which it was
+    reduced.
+    """
     characteristics = CharacteristicSet.of(study.vehicle.characteristics)
     point = ["--point", shlex.quote(study.origin.point)] if study.origin.point else []
     changes = [

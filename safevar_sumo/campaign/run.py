@@ -17,15 +17,18 @@ from safevar_sumo.results import SPARE_POSITION, Failure, Journal
 from safevar_sumo.search import Search
 
 RANDOM_SAMPLES = 10
-"""Number of random evaluations of a run that are simulated again. 30 runs then reveal an error in 1 % of the evaluations with a
-probability of 1 - 0.99^300 = 95 %."""
+"""Number of random evaluations of a run that are simulated again. 30 runs then reveal an error in 1 % of the
+evaluations with a probability of 1 - 0.99^300 = 95 %.
+"""
 SIMULATOR_ERROR, COLLISION, INVALID_TEST = (
     outcome.value for outcome in (Outcome.SIMULATOR_ERROR, Outcome.COLLISION, Outcome.INVALID_TEST)
 )  # numpy compares enums slowly
 
 
 class _EvaluatedSetting(NamedTuple):
-    """The `position` of a setting in the run (`SPARE_POSITION` until the search requests it), and its `row` in `evaluations`."""
+    """The `position` of a setting in the run (`SPARE_POSITION` until the search requests it), and its `row` in
+    `evaluations`.
+    """
 
     position: int
     evaluations: Evaluations
@@ -109,12 +112,16 @@ class Run:
         return False
 
     def receive(self, evaluations: Evaluations, files: Mapping[str, str]) -> None:
-        """Journal and remember new evaluations of requested settings, and files that user code has read for the first time."""
+        """Journal and remember new evaluations of requested settings, and files that user code has read for the first
+        time.
+        """
         self._store(evaluations, files)
         self._has_simulated = True
 
     def sample_evaluations(self, rng: np.random.Generator) -> list[Evaluations]:
-        """Sample the worst evaluation, at which users look; the last one, where leaked state accumulates; and random ones."""
+        """Sample the worst evaluation, at which users look; the last one, where leaked state accumulates; and random
+        ones.
+        """
         entries = [entry for entry in self._requested_entries() if entry.evaluations.valid[entry.row]]
         if not entries:
             return []

@@ -1,7 +1,8 @@
-"""What a worker does with a share of a study's runs: search, simulate in batches over its runs, write their journals, verify their results.
+"""What a worker does with a share of a study's runs: search, simulate in batches over its runs, write their journals,
+verify their results.
 
-The worker may die at any moment: the next one continues from the journals. It meets again what killed the first one, and so it is told
-why the first one died: the attempts of that round count as failed without a repetition.
+The worker may die at any moment: the next one continues from the journals. It meets again what killed the first one,
+and so it is told why the first one died: the attempts of that round count as failed without a repetition.
 """
 
 from __future__ import annotations
@@ -93,7 +94,8 @@ class _Carrier:
                     continue
                 if journal.content.tail_size:
                     self._report(
-                        f"{path}: the last {journal.content.tail_size} bytes were torn; what they held is simulated again"
+                        f"{path}: the last {journal.content.tail_size} bytes were torn; what they held is "
+                        "simulated again"
                     )
                 search = make_search(key, self._study, self._problem, self._note_files)
                 runs.append(Run(key, search, journal, self._problem.evaluations, retry=self._share.retry_failed))
@@ -104,7 +106,9 @@ class _Carrier:
         return runs
 
     def _note_files(self, files: Mapping[str, str]) -> None:
-        """Note files that user code has read, which the next line of a journal then names; refuses files that have changed."""
+        """Note files that user code has read, which the next line of a journal then names; refuses files that have
+        changed.
+        """
         refuse_changed_files([name for name, digest in files.items() if self._files.get(name, digest) != digest])
         new_files = {name: digest for name, digest in files.items() if name not in self._files}
         self._files |= new_files
@@ -139,7 +143,9 @@ class _Carrier:
         return self._evaluate(work, settings)
 
     def _verify(self, runs: Sequence[Run]) -> None:
-        """Simulate settings of ended runs again: one by one with user code loaded afresh, and in SUMO if the runs used recorded scenes."""
+        """Simulate settings of ended runs again: one by one with user code loaded afresh, and in SUMO if the runs used
+        recorded scenes.
+        """
         runs = [run for run in runs if not run.is_finished]
         if user_code_names(self._study):
             for run in runs:

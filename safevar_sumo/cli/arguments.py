@@ -1,4 +1,6 @@
-"""Check what users type (output files, changes of characteristics, numbers in a range), and complete it in the shell."""
+"""Check what users type (output files, changes of characteristics, numbers in a range), and complete it in the
+shell.
+"""
 
 from __future__ import annotations
 
@@ -123,7 +125,9 @@ def complete_study(ctx: click.Context, param: click.Parameter, incomplete: str) 
 
 
 def complete_changes(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:
-    """Complete `NAME=` for each characteristic of the study named earlier in the command line, with its domain as help."""
+    """Complete `NAME=` for each characteristic of the study named earlier in the command line, with its domain as
+    help.
+    """
     study = str(
         ctx.params.get("study") or next(iter(ctx.args), "")
     )  # while --set is incomplete, click has not parsed the rest

@@ -27,7 +27,9 @@ SECTIONS = ("studies", "vehicles", "ads", "scenarios", "weathers", "algorithms",
 @click.argument("section", required=False, type=click.Choice(SECTIONS), metavar="[SECTION]")
 @json_option
 def list_command(section: str | None, as_json: bool) -> None:
-    """List studies, vehicles, ADSs, scenarios, weathers, algorithms, metrics and objectives; with SECTION, such as weathers, only these."""
+    """List studies, vehicles, ADSs, scenarios, weathers, algorithms, metrics and objectives; with SECTION, such as
+    weathers, only these.
+    """
     studies = [load_study(name) for name in study_names()]
     if as_json:
         catalogue = _catalogue(studies)

@@ -21,10 +21,11 @@ from safevar_sumo.terminal import print_text
 )
 @json_option
 def check_command(subject: str, study: str | None, as_json: bool) -> int:
-    """Check whether your driving system, vehicle, scenario, metric, objective, algorithm or TraCI controller works with this package.
+    """Check whether your driving system, vehicle, scenario, metric, objective, algorithm or TraCI controller works with
+    this package.
 
-    SUBJECT is package.module:Name, the name of a shipped model, or the name or path of a study to check everything that it names.
-    The exit code is 0 if SUBJECT passes, 1 with findings, 2 if it cannot be loaded.
+    SUBJECT is package.module:Name, the name of a shipped model, or the name or path of a study to check everything that
+    it names. The exit code is 0 if SUBJECT passes, 1 with findings, 2 if it cannot be loaded.
     """
     from safevar_sumo.plugins.check import check
 

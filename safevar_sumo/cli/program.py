@@ -159,7 +159,9 @@ def _show_warning(
 
 @contextmanager
 def _exit_on_interrupt() -> Iterator[None]:
-    """End the program on Ctrl-C while modules load: compiled modules would swallow the exception. Later, Ctrl-C raises it."""
+    """End the program on Ctrl-C while modules load: compiled modules would swallow the exception. Later, Ctrl-C raises
+    it.
+    """
 
     def exit_at_once(*_: object) -> None:
         os.write(2, f"{PROGRAM}: interrupted\n".encode())

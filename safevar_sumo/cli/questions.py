@@ -91,7 +91,9 @@ def _plot_option(help_text: str) -> Callable[[CommandFunction], CommandFunction]
 def explain(
     source: str, full: bool, point: str | None, jobs: int | None, as_json: bool, out: Path | None, **values: Any
 ) -> None:
-    """Explain failures of results in DIR, or across the domain of STUDY: which changes cause them, how small a change is enough, why."""
+    """Explain failures of results in DIR, or across the domain of STUDY: which changes cause them, how small a change
+    is enough, why.
+    """
     from safevar_sumo.analysis.explain.compute import explain_failures
     from safevar_sumo.analysis.explain.render import print_explained
     from safevar_sumo.analysis.figures import save
@@ -167,7 +169,9 @@ def tolerance(
 
 @add_question(RiskOptions, "STUDY|DIR", _plot_option("Draw the sensitivity indices to this file: png, pdf or svg."))
 def risk(source: str, point: str | None, jobs: int | None, as_json: bool, plot: Path | None, **values: Any) -> None:
-    """Estimate how likely an unsafe outcome is if vehicles vary as defined in STUDY's [variation], and which characteristics decide it."""
+    """Estimate how likely an unsafe outcome is if vehicles vary as defined in STUDY's [variation], and which
+    characteristics decide it.
+    """
     from safevar_sumo.analysis.figures import save
     from safevar_sumo.analysis.risk.compute import estimate_risk
 
@@ -197,7 +201,9 @@ def risk(source: str, point: str | None, jobs: int | None, as_json: bool, plot: 
 
 @add_question(RulesOptions, "STUDY|DIR")
 def rules(source: str, point: str | None, jobs: int | None, as_json: bool, **values: Any) -> None:
-    """Find rules, in physical units, that describe the unsafe settings of STUDY, from evenly spread settings instead of a search."""
+    """Find rules, in physical units, that describe the unsafe settings of STUDY, from evenly spread settings instead of
+    a search.
+    """
     from safevar_sumo.analysis.rules.compute import find_rules
 
     result = _compute_with_bar(find_rules, load_results_or_study(source, point), RulesOptions(**values), jobs)

@@ -1,4 +1,6 @@
-"""The command `rating`: Euro NCAP points of a vehicle and of a variant, as tables, JSON, a picture and the official spreadsheet."""
+"""The command `rating`: Euro NCAP points of a vehicle and of a variant, as tables, JSON, a picture and the official
+spreadsheet.
+"""
 
 from __future__ import annotations
 

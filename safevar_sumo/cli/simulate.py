@@ -165,7 +165,9 @@ def _check_outputs(trace: Path | None, plot: Path | None, animation: Path | None
 def _show(
     study: Study, system: System, setting: FloatArray, plot: Path | None, animation: Path | None, slower: float | None
 ) -> None:
-    """Simulate a filtered setting, shape (n,), beside the original vehicle, and show both: as files, and `slower` in sumo-gui."""
+    """Simulate a filtered setting, shape (n,), beside the original vehicle, and show both: as files, and `slower` in
+    sumo-gui.
+    """
     from safevar_sumo.analysis.figures import save
     from safevar_sumo.replay.animation import animate
     from safevar_sumo.replay.comparison import compare_setting
@@ -210,7 +212,10 @@ def _simulate_sweep(
     reset_count = int(np.count_nonzero((settings != requested_settings).any(axis=1)))
     if reset_count:
         click.echo(
-            f"note: in {reset_count} of {len(requested_settings)} settings the filter reset small changes; --no-filter keeps them",
+            (
+                f"note: in {reset_count} of {len(requested_settings)} settings the filter reset small changes; "
+                "--no-filter keeps them"
+            ),
             err=True,
         )
 
@@ -250,7 +255,9 @@ def _print_results(
 
 
 def _rating_command(target: CommandTarget, system: System, simulation: Simulation) -> str:
-    """The command that rates the simulated vehicle: a solution, and the values that differ from it or from the original."""
+    """The command that rates the simulated vehicle: a solution, and the values that differ from it or from the
+    original.
+    """
     base = system.characteristics.original if target.setting is None else target.setting
     changes = {
         name: simulation.setting[name]
@@ -268,7 +275,10 @@ def _warn_of_differences(target: CommandTarget, simulation: Simulation) -> None:
     assert target.row is not None
     for difference in list_differences(simulation.evaluation, target.row):
         click.echo(
-            f"warning: {target.handle} of {target.source}: {difference}; have versions or code changed since the study?",
+            (
+                f"warning: {target.handle} of {target.source}: {difference}; have versions or code changed since "
+                "the study?"
+            ),
             err=True,
         )
 
@@ -315,7 +325,9 @@ def _safety_comparison(simulation: Simulation) -> str:
 def print_sweep(
     console: Console, characteristics: CharacteristicSet, names: Sequence[str], evaluations: Evaluations
 ) -> None:
-    """Print a row for each setting, of which the first is the original: the named characteristics, outcome and metrics."""
+    """Print a row for each setting, of which the first is the original: the named characteristics, outcome and
+    metrics.
+    """
     columns = [characteristics.names.index(name) for name in names]
     units = [characteristics.members[column].unit for column in columns]
     table = WholeTable(right=(name + unit_text(unit, ", {}") for name, unit in zip(names, units, strict=True)))
@@ -337,7 +349,9 @@ def print_sweep(
 
 
 COLOUR_BANDS = ((5.0, "green"), (15.0, "yellow"), (25.0, "dark_orange"), (35.0, "orange4"))
-"""Upper limits of the relative impact speed [km/h] and their colours, from Euro NCAP's car-to-car AEB tests; above them: red."""
+"""Upper limits of the relative impact speed [km/h] and their colours, from Euro NCAP's car-to-car AEB tests; above
+them: red.
+"""
 
 
 def print_matrix(console: Console, results: Sequence[PointResult]) -> None:

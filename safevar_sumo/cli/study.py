@@ -53,7 +53,8 @@ from safevar_sumo.vehicles import CharacteristicSet
     type=click.Choice(ENGINES),
     default=ENGINES[0],
     show_default=True,
-    help="What moves the vehicles. recorded: numpy, in a scene that SUMO has played once, if no actor reacts to the vehicles; "
+    help="What moves the vehicles. recorded: numpy, in a scene that SUMO has played once, if no actor reacts to "
+    "the vehicles; "
     "results are verified in SUMO. sumo: always SUMO.",
 )
 @click.option("--out", type=click.Path(path_type=Path), help="Directory of the results.  [default: results/STUDY]")
@@ -196,7 +197,9 @@ def print_forecast(console: Console, study: Study, runs: int, cost: Forecast, en
 
 
 def print_summary(console: Console, study: Study, campaign: Campaign, directory: Path, pool: Pool) -> None:
-    """Print the answer, a table of the original and of each algorithm's solutions, the most critical setting, and RQ1 and RQ2 in brief."""
+    """Print the answer, a table of the original and of each algorithm's solutions, the most critical setting, and RQ1
+    and RQ2 in brief.
+    """
     from safevar_sumo.analysis.explain.summary import summarise_failures
     from safevar_sumo.analysis.research_questions.case import build_case
     from safevar_sumo.analysis.research_questions.comparisons import (
@@ -273,7 +276,9 @@ MAX_RUNS_NAMED = 12
 
 
 def status_view(progress: Status, rate: float | None) -> RenderableType:
-    """The study's runs by algorithm and its front so far; `rate` is the share of all work that is done per second, None if unknown."""
+    """The study's runs by algorithm and its front so far; `rate` is the share of all work that is done per second, None
+    if unknown.
+    """
     table = WholeTable(
         "algorithm",
         right=("runs", "under\nway", "simulated", "collisions", "simulator\nerrors", "best\nSD"),

@@ -157,7 +157,8 @@ def _split_names(text: str | None) -> tuple[str, ...] | None:
 
 
 def load_results_or_study(source: str, point: str | None = None, *, results_only: bool = False) -> Study | Case:
-    """Load a results directory or, unless `results_only`, a study by name or path; `point` restricts it to a point of its matrix.
+    """Load a results directory or, unless `results_only`, a study by name or path; `point` restricts it to a point of
+    its matrix.
 
     A note says which runs of a results directory are unfinished.
 

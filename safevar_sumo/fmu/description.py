@@ -46,7 +46,9 @@ MIN_STEP, MAX_STEP = 1e-6, 10.0
 
 @dataclass(frozen=True)
 class Description:
-    """An FMU: its file, the digest of the file, FMPy's model description, the units that it defines, and its scalar variables by name."""
+    """An FMU: its file, the digest of the file, FMPy's model description, the units that it defines, and its scalar
+    variables by name.
+    """
 
     path: str
     digest: str
@@ -113,7 +115,8 @@ class Description:
         return unit._replace(offset=0.0) if unit is not None and declared(variable, "relativeQuantity") else unit
 
     def unit_for(self, variable: ModelVariable, unit: Unit, unit_name: str, source: str, key: str) -> Unit:
-        """The unit of a variable that is to hold a quantity given in `unit`; `unit` itself if the variable declares no unit.
+        """The unit of a variable that is to hold a quantity given in `unit`; `unit` itself if the variable declares no
+        unit.
 
         Raises
         ------
@@ -134,7 +137,9 @@ class Description:
         return variable_unit
 
     def table_rows(self, fixed_names: Collection[str]) -> dict[str, dict[str, str | float]]:
-        """Rows of the characteristics' table for all real parameters with start, min and max, except those of `fixed_names`."""
+        """Rows of the characteristics' table for all real parameters with start, min and max, except those of
+        `fixed_names`.
+        """
         rows = {
             name: self.table_row(name)
             for name, variable in self.variables.items()
@@ -147,7 +152,9 @@ class Description:
         }
 
     def table_row(self, name: str, unit: str = "") -> dict[str, str | float]:
-        """The table row that a parameter declares, converted to `unit` if a unit is given; empty if the variable is no parameter."""
+        """The table row that a parameter declares, converted to `unit` if a unit is given; empty if the variable is no
+        parameter.
+        """
         variable = self.variables.get(name)
         if variable is None or causality_of(variable) != "parameter":
             return {}
@@ -189,7 +196,9 @@ def number_of(variable: ModelVariable, name: str) -> float | None:
 
 
 def file_of(model: str, folders: Sequence[str]) -> str:
-    """The path of the FMU that a study names: relative to the folders of the study's files, else to the working directory."""
+    """The path of the FMU that a study names: relative to the folders of the study's files, else to the working
+    directory.
+    """
     try:
         return next(
             (
@@ -209,8 +218,8 @@ def description_of(model: str, folders: Sequence[str], source: str, key: str) ->
     Raises
     ------
     InputError
-        If there is no such file, it is not an FMU, its version or kind is not supported, it has no binary for this machine, or FMPy
-        is not installed.
+        If there is no such file, it is not an FMU, its version or kind is not supported, it has no binary for this
+        machine, or FMPy is not installed.
     """
     path = file_of(model, folders)
     if not path:

@@ -36,7 +36,9 @@ class FmuError(Exception):
 
 
 class History(NamedTuple):
-    """All inputs so far, as a chain: `inputs` of step `step_number` after the steps of `previous`; the initialisation is the first link."""
+    """All inputs so far, as a chain: `inputs` of step `step_number` after the steps of `previous`; the initialisation
+    is the first link.
+    """
 
     previous: History | None
     inputs: FloatArray
@@ -44,7 +46,8 @@ class History(NamedTuple):
 
 
 class Instances:
-    """The instances of one FMU with the same inputs and outputs: created when needed, and returned for reuse after a reset.
+    """The instances of one FMU with the same inputs and outputs: created when needed, and returned for reuse after a
+    reset.
 
     Parameters
     ----------
@@ -81,7 +84,9 @@ class Instances:
             self._free += slaves
 
     def start(self, slaves: Sequence[FMU2Slave], values: FloatArray) -> FloatArray:
-        """Initialise N instances, new or used, with values of the k inputs, shape (k, N); returns the m outputs, shape (m, N)."""
+        """Initialise N instances, new or used, with values of the k inputs, shape (k, N); returns the m outputs, shape
+        (m, N).
+        """
         return self._on_each("is initialised", slaves, values, self._start)
 
     def step(self, slaves: Sequence[FMU2Slave], time: float, length: float, values: FloatArray) -> FloatArray:
@@ -200,7 +205,8 @@ def _forget_other_modules(folder: str) -> None:
 
 
 class Fleet:
-    """N vehicles with one instance each. They can continue from any earlier step: the fleet simulates again up to that step.
+    """N vehicles with one instance each. They can continue from any earlier step: the fleet simulates again up to that
+    step.
 
     Parameters
     ----------
@@ -231,7 +237,8 @@ class Fleet:
         return outputs, self._history
 
     def advance(self, history: History, inputs: FloatArray) -> tuple[FloatArray, History]:
-        """Advance by one step after `history` with inputs of shape (k, N); returns outputs of shape (2, m, N), and the new history.
+        """Advance by one step after `history` with inputs of shape (k, N); returns outputs of shape (2, m, N), and the
+        new history.
 
         First come the outputs at the last communication point, then the outputs interpolated to the end of the step.
         """

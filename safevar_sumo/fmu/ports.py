@@ -1,4 +1,6 @@
-"""Ports: the variables of an FMU that a study maps, each with its unit in the FMU and the unit of its values outside the FMU."""
+"""Ports: the variables of an FMU that a study maps, each with its unit in the FMU and the unit of its values outside
+the FMU.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +30,9 @@ PYTHON_TYPES: Mapping[str, tuple[type, ...]] = {
 
 
 class Port(NamedTuple):
-    """A variable of an FMU, its unit, the unit of its values outside the FMU, and the bounds to which these are clipped (FMU's unit)."""
+    """A variable of an FMU, its unit, the unit of its values outside the FMU, and the bounds to which these are clipped
+    (FMU's unit).
+    """
 
     variable: ModelVariable
     fmu_unit: Unit

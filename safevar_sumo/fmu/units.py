@@ -1,4 +1,6 @@
-"""Units of quantities: by factor and offset to SI base units, as a model description defines them, or by their common names."""
+"""Units of quantities: by factor and offset to SI base units, as a model description defines them, or by their common
+names.
+"""
 
 from __future__ import annotations
 

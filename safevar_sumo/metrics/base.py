@@ -43,7 +43,9 @@ def sampling_stride(step: float, interval: float | None) -> int:
 
 
 def sum_in_order(samples: FloatArray) -> FloatArray:
-    """Sum over the first axis, in order; in numpy's own sum the order depends on the shape, and results would depend on N."""
+    """Sum over the first axis, in order; in numpy's own sum the order depends on the shape, and results would depend on
+    N.
+    """
     return np.asarray(np.add.accumulate(samples, axis=0)[-1]) if len(samples) else np.zeros(samples.shape[1:])
 
 
@@ -86,7 +88,8 @@ class MetricFacts(Struct, frozen=True, kw_only=True):
 
 
 class Metric(MetricFacts, frozen=True, kw_only=True):
-    """A metric: `function` takes N simulation runs and thresholds and returns an array of shape (N,), NaN where it is undefined.
+    """A metric: `function` takes N simulation runs and thresholds and returns an array of shape (N,), NaN where it is
+    undefined.
 
     Element i depends only on run i, bit for bit.
     """

@@ -1,4 +1,6 @@
-"""Metrics of longitudinal comfort: jerk, weighted acceleration, harsh braking. A study has these metrics only if it names them."""
+"""Metrics of longitudinal comfort: jerk, weighted acceleration, harsh braking. A study has these metrics only if it
+names them.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +13,8 @@ from safevar_sumo.records import BoolArray, FloatArray, SimulationRuns
 from safevar_sumo.study import MetricsTable
 
 JERK_TIME = 1.0
-"""Time over which jerk is averaged [s], as in ISO 15622 (adaptive cruise control), which allows 2.5 m/s^3 above 20 m/s."""
+"""Time over which jerk is averaged [s], as in ISO 15622 (adaptive cruise control), which allows 2.5 m/s^3 above 20 m/s.
+"""
 BRAKING_TIME = 0.5
 """Time over which a deceleration is averaged [s], as for accelerations in UN R79."""
 HIGH_PASS, TRANSITION, TRANSITION_QUALITY = 0.4, 2.0, 0.63
@@ -19,7 +22,9 @@ HIGH_PASS, TRANSITION, TRANSITION_QUALITY = 0.4, 2.0, 0.63
 
 
 class _BiquadFilter(NamedTuple):
-    """A second-order filter; coefficients from the latest sample to the oldest; the output's first coefficient is 1 and not stored."""
+    """A second-order filter; coefficients from the latest sample to the oldest; the output's first coefficient is 1 and
+    not stored.
+    """
 
     input_coefficients: tuple[float, float, float]
     output_coefficients: tuple[float, float]
@@ -28,7 +33,9 @@ class _BiquadFilter(NamedTuple):
     def bilinear(
         cls, numerator: tuple[float, float, float], denominator: tuple[float, float, float], step: float
     ) -> _BiquadFilter:
-        """The filter with a transfer function in s, by Tustin's rule; coefficients of polynomials from the highest power."""
+        """The filter with a transfer function in s, by Tustin's rule; coefficients of polynomials from the highest
+        power.
+        """
         k = 2 / step
 
         def in_z(polynomial: tuple[float, float, float]) -> tuple[float, float, float]:
@@ -56,7 +63,8 @@ class _BiquadFilter(NamedTuple):
 def weight_acceleration(acceleration: FloatArray, step: float) -> FloatArray:
     """Acceleration along the vehicle, weighted with W_d of ISO 2631-1 [m/s^2], shape (T, N).
 
-    The low pass at 100 Hz is omitted, since the samples of a simulation contain no frequencies above half the sampling rate.
+    The low pass at 100 Hz is omitted, since the samples of a simulation contain no frequencies above half the sampling
+    rate.
     """
     high_pass_rate, transition = 2 * np.pi * HIGH_PASS, 2 * np.pi * TRANSITION
     high_pass = _BiquadFilter.bilinear(
@@ -121,7 +129,9 @@ RMS_ACCELERATION = Metric(
     more_is_unsafe=True,
     over_collisions=False,
     function=rms_acceleration,
-    description="Root mean square of the acceleration along the vehicle, weighted with W_d of ISO 2631-1; without a collision.",
+    description=(
+        "Root mean square of the acceleration along the vehicle, weighted with W_d of ISO 2631-1; without a collision."
+    ),
 )
 BRAKE_HARSHNESS = Metric(
     name="brake_harshness",

@@ -18,17 +18,23 @@ from safevar_sumo.study import SAFETY_DEGREE
 if TYPE_CHECKING:
     import pandas as pd
 
-CRITERIA = "collision, points=X with X points of a rating, or below=X with a safety degree X [m, or minus a collision's speed in m/s]"
+CRITERIA = (
+    "collision, points=X with X points of a rating, or below=X with a safety degree X [m, or minus a collision's "
+    "speed in m/s]"
+)
 COLLISION = str(Outcome.COLLISION)
 DEGREE_SHARE, LIMIT_DIGITS = 0.5, 6
-"""The default limit if nothing collides: this share of the original's safety degree, to this many significant digits."""
+"""The default limit if nothing collides: this share of the original's safety degree, to this many significant digits.
+"""
 POINT_LOSS, POINT_DECIMALS = 1.0, 6
 """The default limit in a rated study: the original's points minus this loss, to this many decimals."""
 
 
 @dataclass(frozen=True)
 class Unsafe:
-    """A criterion: a collision; with `below`, a safety degree below this limit [m, or -m/s]; with `points`, at most that many points."""
+    """A criterion: a collision; with `below`, a safety degree below this limit [m, or -m/s]; with `points`, at most
+    that many points.
+    """
 
     below: float | None = None
     points: float | None = None
@@ -42,7 +48,9 @@ class Unsafe:
 
     @property
     def description(self) -> str:
-        """The criterion in words, rounded: `collision`, `safety degree below 0.847 m (half of the original's, a screening limit)`."""
+        """The criterion in words, rounded: `collision`, `safety degree below 0.847 m (half of the original's, a
+        screening limit)`.
+        """
         if self.points is not None:
             return f"at most {self.points:g} points"
         if self.below is None:
@@ -71,7 +79,9 @@ class Unsafe:
         return outcome == COLLISION if self.below is None else column(F_SAFE.name) < self.below
 
     def margin(self, evaluations: Evaluations) -> FloatArray:
-        """Margin of evaluations above the limit, in the limit's unit; shape (M,). For collisions the limit is a safety degree of 0."""
+        """Margin of evaluations above the limit, in the limit's unit; shape (M,). For collisions the limit is a safety
+        degree of 0.
+        """
         if self.points is not None:
             return evaluations.column(RATING_POINTS.name) - self.points
         return evaluations.f_safe - (self.below or 0.0)
@@ -102,9 +112,9 @@ class Unsafe:
     def default(cls, original: Mapping[str, Any], outcomes: Any) -> Unsafe:
         """The criterion if none is stated.
 
-        In a rated study, a vehicle is unsafe if it has lost at least one of the original's points. In other studies the criterion is a
-        collision if any vehicle collides or the original has no safety degree to halve; otherwise, a safety degree below half of the
-        original's safety degree.
+        In a rated study, a vehicle is unsafe if it has lost at least one of the original's points. In other studies the
+        criterion is a collision if any vehicle collides or the original has no safety degree to halve; otherwise, a
+        safety degree below half of the original's safety degree.
 
         Parameters
         ----------
@@ -145,4 +155,6 @@ class Unsafe:
 
 
 Criterion = Unsafe | float | str
-"""Values of an argument `unsafe`: `Unsafe`, a number X for a safety degree below X, "collision", "below=X" or "points=X"."""
+"""Values of an argument `unsafe`: `Unsafe`, a number X for a safety degree below X, "collision", "below=X" or
+"points=X".
+"""

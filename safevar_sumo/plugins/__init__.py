@@ -1,6 +1,7 @@
 """User code: looked up by name, checked against a contract, called through a guard; `plugins.check` tries it.
 
-`plugins.check` stands above `sumo` and `search`, which it uses; the rest of this room stands below the models, which use it.
+`plugins.check` stands above `sumo` and `search`, which it uses; the rest of this room stands below the models, which
+use it.
 """
 
 from safevar_sumo.plugins.files import (

@@ -1,7 +1,7 @@
 """Files that results depend on: finds the files that user code reads, and names them alike on every machine.
 
-The interpreter raises an audit event for every file that Python code opens and for every module that it loads. Compiled code
-raises no event, so all files that a study's parameters name count as read.
+The interpreter raises an audit event for every file that Python code opens and for every module that it loads. Compiled
+code raises no event, so all files that a study's parameters name count as read.
 """
 
 from __future__ import annotations
@@ -59,7 +59,9 @@ class InputFiles:
         self.paths: set[str] = set()
 
     def files(self, packages: Sequence[str] = ()) -> set[str]:
-        """Every input file: sources in place of Python's caches, and of installed packages only the files of `packages`."""
+        """Every input file: sources in place of Python's caches, and of installed packages only the files of
+        `packages`.
+        """
         modules = {file_of_module(name) for name in list(sys.modules) if name.partition(".")[0] in packages}
         return {path for path in map(_source_of, self.paths | modules) if _is_input(path, packages)}
 
@@ -67,8 +69,8 @@ class InputFiles:
 class _AuditHook:
     """The process's only audit hook, which cannot be removed.
 
-    `call_depth` is the number of calls of user code under way, `modules` the names of all modules that it has loaded, `written` the files
-    that it wrote, which are no inputs; `recordings` are those of `note_inputs` that are not over.
+    `call_depth` is the number of calls of user code under way, `modules` the names of all modules that it has loaded,
+    `written` the files that it wrote, which are no inputs; `recordings` are those of `note_inputs` that are not over.
     """
 
     def __init__(self) -> None:
@@ -115,13 +117,17 @@ def unload_user_modules() -> None:
 
 
 def file_of_module(name: str) -> str:
-    """The file of a loaded module, or the folder of a package without __init__.py; "" for a module of the interpreter."""
+    """The file of a loaded module, or the folder of a package without __init__.py; "" for a module of the
+    interpreter.
+    """
     module = sys.modules.get(name)
     return str(getattr(module, "__file__", None) or next(iter(getattr(module, "__path__", ())), ""))
 
 
 def is_user_file(path: str) -> bool:
-    """Whether a file belongs neither to the interpreter or an installed library nor to this package or the operating system."""
+    """Whether a file belongs neither to the interpreter or an installed library nor to this package or the operating
+    system.
+    """
     return not path.startswith(KNOWN_FOLDERS) and not any(name in Path(path).parts for name in LIBRARY_FOLDERS)
 
 
@@ -167,7 +173,9 @@ def digests(paths: Iterable[str], folders: Sequence[str]) -> Files:
 
 
 def _name_of(path: str, folders: Sequence[str], extra_parts: int = 0) -> str:
-    """A file's path relative to the first of `folders` that contains the file; if none does, the path's last 2 + `extra_parts` parts."""
+    """A file's path relative to the first of `folders` that contains the file; if none does, the path's last 2 +
+    `extra_parts` parts.
+    """
     for folder in (*folders, *_import_folders()):
         if not extra_parts and Path(path).is_relative_to(folder):
             return Path(path).relative_to(folder).as_posix()
@@ -194,7 +202,9 @@ def files_named_in(value: Any, folders: Sequence[str]) -> Iterator[str]:
 
 
 def file_beside(text: str, folders: Sequence[str]) -> str:
-    """The file that a text names, relative to the folder of the study's file or of a file that it extends; "" if there is none."""
+    """The file that a text names, relative to the folder of the study's file or of a file that it extends; "" if there
+    is none.
+    """
     try:
         return next((os.path.abspath(path) for folder in folders if (path := Path(folder, text)).is_file()), "")
     except (OSError, ValueError):  # the text is no path

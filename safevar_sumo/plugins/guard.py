@@ -33,12 +33,15 @@ _open_runs: ContextVar[BoolArray | None] = ContextVar("open_runs", default=None)
 def violation(candidate: Any, base: type) -> str:
     """The reason why a class does not meet the contract of a base class, found by inspection only; "" if it does.
 
-    The abstract methods of the base must exist, and every method of the base must take the parameters that it takes there. The class need
-    not derive from the base: see `completed`.
+    The abstract methods of the base must exist, and every method of the base must take the parameters that it takes
+    there. The class need not derive from the base: see `completed`.
     """
     if not inspect.isclass(candidate):
         value = f"value of type {type(candidate).__name__}"
-        return f"is a {'module' if inspect.ismodule(candidate) else 'function' if callable(candidate) else value}, not a class"
+        return (
+            f"is a {'module' if inspect.ismodule(candidate) else 'function' if callable(candidate) else value}, "
+            "not a class"
+        )
     for name, parameters in _methods(base).items():
         attribute, signature = getattr(candidate, name, getattr(base, name)), ", ".join(parameters)
         if getattr(attribute, "__isabstractmethod__", False):
@@ -110,7 +113,8 @@ def read_only_copy(value: Any) -> Any:
 
 @contextmanager
 def check_open_runs(are_open: BoolArray) -> Iterator[None]:
-    """Within the block, ignore wrong values of runs that have ended: a vehicle still moves while others in its batch drive.
+    """Within the block, ignore wrong values of runs that have ended: a vehicle still moves while others in its batch
+    drive.
 
     `are_open`, shape (N,), may change during the block.
     """
@@ -278,7 +282,9 @@ class Guard(NamedTuple):
         return np.broadcast_to(array, shape)
 
     def _place(self, error: BaseException) -> str:
-        """File and line of the innermost frame in the user code's folder, else outside libraries and this package; "" if there is none."""
+        """File and line of the innermost frame in the user code's folder, else outside libraries and this package; ""
+        if there is none.
+        """
         frames = [(frame.filename, frame.lineno) for frame in traceback.extract_tb(error.__traceback__)]
         if isinstance(error, SyntaxError) and error.filename:
             frames.append((error.filename, error.lineno))

@@ -1,6 +1,7 @@
 """Turns a name in a study into a class, function or record.
 
-The name belongs to this package, or is `package.module:Name` of a module beside the study, in the working directory or installed.
+The name belongs to this package, or is `package.module:Name` of a module beside the study, in the working directory or
+installed.
 """
 
 from __future__ import annotations
@@ -38,7 +39,8 @@ _added_folders: list[str] = []
 class Lookup(NamedTuple):
     """Looks up the names of a study.
 
-    `source` is the study, as errors name it; `folders`, searched first, are those of the study's file and of the files that it extends.
+    `source` is the study, as errors name it; `folders`, searched first, are those of the study's file and of the files
+    that it extends.
     """
 
     source: str
@@ -65,12 +67,16 @@ class Lookup(NamedTuple):
         guard = guard._replace(folder=os.path.dirname(file_of_module(module_name.partition(".")[0])))
         target = guard.call("import", getattr, module, attribute, _NO_ATTRIBUTE)
         if target is _NO_ATTRIBUTE:
-            problem = f"{guard.name} cannot be imported: AttributeError: {file_of_module(module_name) or module_name} has no {attribute!r}"
+            problem = (
+                f"{guard.name} cannot be imported: AttributeError: {file_of_module(module_name) or module_name} "
+                f"has no {attribute!r}"
+            )
             raise InputError(self.source, problem, expected)
         return Member(target, guard._replace(target=target))
 
     def class_of(self, shipped: Mapping[str, Any], name: str, key: str, *bases: type, otherwise: str = "") -> Member:
-        """A class by name; a user's class must meet the contract of the first base that it derives from, else of the last one.
+        """A class by name; a user's class must meet the contract of the first base that it derives from, else of the
+        last one.
 
         `otherwise` is what the study may give in place of a class, for the error.
         """
@@ -86,7 +92,8 @@ class Lookup(NamedTuple):
         return member._replace(target=completed(member.target, base))
 
     def with_paths(self, member: Member, parameters: Mapping[str, Any], key: str) -> dict[str, Any]:
-        """Parameters for a member that is user code, in which names of files beside the study's file are absolute paths.
+        """Parameters for a member that is user code, in which names of files beside the study's file are absolute
+        paths.
 
         Raises
         ------
@@ -139,7 +146,9 @@ class Lookup(NamedTuple):
 
 
 def add_import_folders(folders: Iterable[str]) -> None:
-    """Let modules import from `folders` and the working directory; folders that Python's path lists before the latter keep precedence."""
+    """Let modules import from `folders` and the working directory; folders that Python's path lists before the latter
+    keep precedence.
+    """
     sys.path[:] = [folder for folder in sys.path if folder not in _added_folders]
     _added_folders[:] = [folder for folder in dict.fromkeys((*folders, os.getcwd())) if folder not in sys.path]
     indices = [i for i, folder in enumerate(sys.path) if folder in ("", os.getcwd())]

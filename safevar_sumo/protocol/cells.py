@@ -1,4 +1,6 @@
-"""The cells of a rating, with their scenario parameters: all matrices of the protocol and all robustness layers that can be simulated."""
+"""The cells of a rating, with their scenario parameters: all matrices of the protocol and all robustness layers that
+can be simulated.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +23,9 @@ NIGHT = "Illumination (Night)"
 SPEED, ACCELERATION, OFFSET, HEADING = "Speed", "Acceleration", "Initial position offset", "Trajectory/Heading"
 IN_DARKNESS = "Performance in darkness (1 lux)"
 WARNING_TESTS = ("CPLA", "CBLA")
-"""Tests in which a row with a choice of AEB or FCW is rated by the warning; in other tests the calculator always rates the impact."""
+"""Tests in which a row with a choice of AEB or FCW is rated by the warning; in other tests the calculator always rates
+the impact.
+"""
 MODELS = {"CCR": "car_to_car", "CMR": "car_to_car", "CPLA": "along", "CBLA": "along"}
 """Scenario models by the prefix of a test's name; the model of all other tests is `crossing`."""
 TARGET_DECELERATION, TARGET_HEADWAY = 4.0, 1.0
@@ -36,7 +40,8 @@ class CellRow(
 ):
     """A row of a matrix: speeds of the vehicle under test (VUT) and of the target [km/h].
 
-    Letters of columns: S (standard range), E (extended range), - (no cell); `has_function_choice`: the manufacturer chooses AEB or FCW.
+    Letters of columns: S (standard range), E (extended range), - (no cell); `has_function_choice`: the manufacturer
+    chooses AEB or FCW.
     """
 
     vut_speed: float
@@ -56,8 +61,9 @@ class CellMatrix(
 ):
     """A matrix of a test; a test that is driven by day and by night has one matrix for each `light`.
 
-    In the official template the matrix is on `sheet`, its name in `name_cell`, its first colour in `first_cell`, and the function of each
-    row (AEB or FCW) in the column with the letter `function_column`. `points`: of the standard range, the extended range and robustness.
+    In the official template the matrix is on `sheet`, its name in `name_cell`, its first colour in `first_cell`, and
+    the function of each row (AEB or FCW) in the column with the letter `function_column`. `points`: of the standard
+    range, the extended range and robustness.
     """
 
     test_name: str
@@ -91,7 +97,9 @@ class Condition(Struct, frozen=True, forbid_unknown_fields=True, rename={"text":
 class Layer(
     Struct, frozen=True, forbid_unknown_fields=True, rename={"test_name": "test", "name": "layer", "claim_cell": "cell"}
 ):
-    """A robustness layer that counts for a test; in the official template, `claim_cell` on `sheet` states whether the layer holds."""
+    """A robustness layer that counts for a test; in the official template, `claim_cell` on `sheet` states whether the
+    layer holds.
+    """
 
     test_name: str
     name: str
@@ -199,7 +207,8 @@ class Protocol(
 ):
     """A protocol; `points_by_test` holds the points of every test, simulated or not, as in `CellMatrix.points`.
 
-    Measured values at which colours begin: for `mitigation` in `starts_by_vut_speed`, for other measures in `starts_by_measure`.
+    Measured values at which colours begin: for `mitigation` in `starts_by_vut_speed`, for other measures in
+    `starts_by_measure`.
     """
 
     calculator_version: str
@@ -212,7 +221,9 @@ class Protocol(
 
     @cached_property
     def cells(self) -> tuple[Cell, ...]:
-        """All simulations: the cells of the matrices, then the robustness cells, which vary cells of the standard range only."""
+        """All simulations: the cells of the matrices, then the robustness cells, which vary cells of the standard range
+        only.
+        """
         return (*self._iterate_matrix_cells(), *self._iterate_robustness_cells())
 
     @cached_property

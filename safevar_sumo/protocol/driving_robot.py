@@ -13,25 +13,33 @@ from safevar_sumo.scenarios.euro_ncap import KMH
 from safevar_sumo.vehicles import Vehicle, VehicleState
 
 MAX_ERROR, MIN_ERROR = 1.0 * KMH, -0.5 * KMH
-"""Tolerance of the test speed until the system brakes [m/s]: +1.0 and -0.5 km/h (Euro NCAP, AEB test protocols, "test execution")."""
+"""Tolerance of the test speed until the system brakes [m/s]: +1.0 and -0.5 km/h (Euro NCAP, AEB test protocols, "test
+execution").
+"""
 PROPORTIONAL_GAIN, INTEGRAL_GAIN = 1.0, 1.0
-"""Gains of the robot [pedal per m/s, pedal per m], chosen so that `carla` is within 0.1 km/h 3 s after a pedal error of 0.15."""
+"""Gains of the robot [pedal per m/s, pedal per m], chosen so that `carla` is within 0.1 km/h 3 s after a pedal error of
+0.15.
+"""
 ACTION_THRESHOLD = 0.03
-"""Change of the pedal towards braking from which on the system acts [-]: about 0.3 m/s^2, the onset of an AEB by Euro NCAP."""
+"""Change of the pedal towards braking from which on the system acts [-]: about 0.3 m/s^2, the onset of an AEB by Euro
+NCAP.
+"""
 
 
 class DrivingRobot:
     """Holds N vehicles at the speeds of their tests, by accelerator and brake and in their initial gear.
 
-    The robot drives as long as the system under test neither brakes nor eases off an accelerator that the system had pressed. Once the
-    system has braked, it controls the vehicle and its automatic gearbox. Euro NCAP (AEB car-to-car, "test execution") requires a steady
-    speed and allows a cruise control; an automatic gearbox is in D, a manual one in the highest gear of at least 1,500 r/min. The robot
-    holds the gear, since a gearbox that hunts between two gears would not keep the speed steady.
+    The robot drives as long as the system under test neither brakes nor eases off an accelerator that the system had
+    pressed. Once the system has braked, it controls the vehicle and its automatic gearbox. Euro NCAP (AEB car-to-car,
+    "test execution") requires a steady speed and allows a cruise control; an automatic gearbox is in D, a manual one in
+    the highest gear of at least 1,500 r/min. The robot holds the gear, since a gearbox that hunts between two gears
+    would not keep the speed steady.
 
     Parameters
     ----------
     points
-        Scenario points, each with an equal part of the vehicles; the robot drives only where the scenario has a `test_speed`.
+        Scenario points, each with an equal part of the vehicles; the robot drives only where the scenario has a
+        `test_speed`.
     vehicle, prepared, state
         The vehicle model, its prepared settings, and the state at the start; the pedals in this state hold the speed.
     step
@@ -53,10 +61,13 @@ class DrivingRobot:
         self._step, self._integral = step, np.zeros(n)
         self._has_braked, self._max_system_pedal = ~self.has_test_speed, np.full(n, -np.inf)
         self.error = np.where(self.has_test_speed, 0.0, np.nan)
-        """Deviation from the test speed [m/s] that was largest relative to the tolerance while the robot drove; NaN without a test."""
+        """Deviation from the test speed [m/s] that was largest relative to the tolerance while the robot drove; NaN
+        without a test.
+        """
 
     def drive(self, command: Command, state: Any, is_open: BoolArray) -> tuple[Command, Any]:
-        """The command of the robot while it drives, otherwise of the system; and the state, with the gear held while the robot drives.
+        """The command of the robot while it drives, otherwise of the system; and the state, with the gear held while
+        the robot drives.
 
         `is_open` marks the runs that are not over; the speeds of other runs are not compared with the tolerance.
         """

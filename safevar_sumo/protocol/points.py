@@ -31,7 +31,9 @@ UNKNOWN = -1
 WEIGHTS = np.array([1.0, 0.75, 0.5, 0.25, 0.0, 0.0])
 """Weight of a standard-range cell by its colour's index (protocol 5.2); UNKNOWN is -1 and so takes the last one."""
 EXTENDED_STEPS = ((1.0, 1.0), (0.75, 0.75), (0.5, 0.5))
-"""Minimum share of extended-range cells that are not red, and the share of the range's points earned from it on; below 0.5, none."""
+"""Minimum share of extended-range cells that are not red, and the share of the range's points earned from it on; below
+0.5, none.
+"""
 ROBUSTNESS_SHARE = 0.5
 """Share of the standard range's points from which on robustness earns points."""
 DECIMALS = 2
@@ -41,7 +43,9 @@ SHARE_DECIMALS = 6
 
 
 class RequiredCells(NamedTuple):
-    """Standard-range cells that must be green: of a test up to a speed [km/h], at one impact location [%] or, if it is None, at all."""
+    """Standard-range cells that must be green: of a test up to a speed [km/h], at one impact location [%] or, if it is
+    None, at all.
+    """
 
     test_name: str
     max_speed: float
@@ -99,7 +103,8 @@ def round_half_up(values: FloatArray, decimals: int) -> FloatArray:
 class _Columns(NamedTuple):
     """Columns of the arrays of cells, grouped by the rules that apply to the cells.
 
-    - `bands`: columns whose colours begin at the same values, with each colour's index and start, and whether the warning is rated.
+    - `bands`: columns whose colours begin at the same values, with each colour's index and start, and whether the
+      warning is rated.
     - `nominal_cells`: for every cell the matrix cell that it varies, or itself. `ranges`: by matrix name and range.
     """
 
@@ -152,7 +157,9 @@ def _columns_of(protocol: Protocol) -> _Columns:
 
 
 def colours_of(protocol: Protocol, results: CellResults) -> npt.NDArray[np.int8]:
-    """The colour of every cell, shape (M, cells); a value at which two colours meet makes an impact the worse one, a warning the better."""
+    """The colour of every cell, shape (M, cells); a value at which two colours meet makes an impact the worse one, a
+    warning the better.
+    """
     colours = np.full(results.impact.shape, UNKNOWN, dtype=np.int8)
     impact = round_half_up(np.maximum(np.nan_to_num(results.impact, nan=0.0), 0.0), DECIMALS)
     warning = round_half_up(np.nan_to_num(results.warning, nan=-1.0), DECIMALS)
@@ -204,7 +211,9 @@ def _range_points(
 
 
 def _which_layers_hold(protocol: Protocol, colours: npt.NDArray[np.int8]) -> dict[tuple[str, str], BoolArray]:
-    """Whether simulated layers hold, shape (M,) each: some standard-range cell is not red, and every such cell passes in all variations."""
+    """Whether simulated layers hold, shape (M,) each: some standard-range cell is not red, and every such cell passes
+    in all variations.
+    """
     columns = _columns_of(protocol)
     holds: dict[tuple[str, str], BoolArray] = {}
     for layer, criterion, numbers in columns.variations:

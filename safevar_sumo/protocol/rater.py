@@ -23,7 +23,9 @@ SUMO_CELLS = 8
 
 @dataclass(frozen=True, kw_only=True)
 class Rater:
-    """Rates vehicles that were simulated in all cells of a protocol, in the order of the cells; `claims` are claimed layers by test."""
+    """Rates vehicles that were simulated in all cells of a protocol, in the order of the cells; `claims` are claimed
+    layers by test.
+    """
 
     protocol: Protocol
     claims: dict[str, list[str]]
@@ -33,7 +35,9 @@ class Rater:
 
 
 def rated_quantities(runs: SimulationRuns) -> tuple[FloatArray, FloatArray, Any]:
-    """Rated quantities of N simulations of a cell: impact [km/h], warning [s], validity; shape (N,) each; see `CellResults`."""
+    """Rated quantities of N simulations of a cell: impact [km/h], warning [s], validity; shape (N,) each; see
+    `CellResults`.
+    """
     warning = np.broadcast_to(runs.warning_ttc, runs.relative_speed.shape)
     return (
         runs.relative_speed * KMH_PER_MS,

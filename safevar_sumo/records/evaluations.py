@@ -17,8 +17,8 @@ from safevar_sumo.study import SAFETY_DEGREE
 class CellResults(NamedTuple):
     """Results of M vehicles in every cell of a rating, shape (M, number of cells).
 
-    `impact` is the relative speed of the collision [km/h], NaN without one; `warning` the true time to collision at the warning [s],
-    NaN without one; `valid` is false where the test could not be driven.
+    `impact` is the relative speed of the collision [km/h], NaN without one; `warning` the true time to collision at the
+    warning [s], NaN without one; `valid` is false where the test could not be driven.
     """
 
     impact: FloatArray
@@ -37,8 +37,9 @@ class Evaluations:
     `metrics` holds `safevar_sumo.metrics.METRICS` and the study's further metrics; an undefined value is NaN.
     `collision_speed` is in m/s, `f_diff` a fraction, `f_num_diff` a count. `reasons` says, by the bytes of a
     setting, why the setting could not be simulated. `files` are digests, by name, of files that user code
-    read for the first time in a batch; they belong to the batch, not to its rows. `cells` are a rating's results, None without a rating.
-    `worst_points` are the numbers of the points at which the settings were worst, None without a matrix.
+    read for the first time in a batch; they belong to the batch, not to its rows. `cells` are a rating's results, None
+    without a rating. `worst_points` are the numbers of the points at which the settings were worst, None without a
+    matrix.
     """
 
     settings: FloatArray

@@ -42,7 +42,8 @@ class Encounter(NamedTuple):
 class Trace:
     """T samples of N vehicles, `step` seconds apart; arrays of shape (T, N), `time` (T,).
 
-    A vehicle's samples count while `active`; later samples are meaningless, as SUMO continues with the rest of the batch.
+    A vehicle's samples count while `active`; later samples are meaningless, as SUMO continues with the rest of the
+    batch.
 
     - `vehicle_length`, `position` along the path, `gap` and `lateral` are in m, all speeds in m/s.
     - `throttle` and `brake` are the pedals as commanded, `pedal` is the brake pedal's position.
@@ -73,9 +74,9 @@ class Trace:
 class Contact(NamedTuple):
     """The position of the first contact on the outline of each of N vehicles, shape (N,).
 
-    `side` is front, left, right or rear; empty without a contact. `place` is the position of the obstacle's middle, 0 to 100; NaN without a
-    contact. At the front or rear it is in % of the vehicle's width, from the side on which `lateral` is negative; at the left or right in %
-    of its length, from the front.
+    `side` is front, left, right or rear; empty without a contact. `place` is the position of the obstacle's middle, 0
+    to 100; NaN without a contact. At the front or rear it is in % of the vehicle's width, from the side on which
+    `lateral` is negative; at the left or right in % of its length, from the front.
     """
 
     side: npt.NDArray[np.str_]
@@ -90,10 +91,12 @@ for _array in NO_CONTACT:
 
 @dataclass(frozen=True, kw_only=True)
 class SimulationRuns:
-    """Trajectories and outcomes of N simulations; `outcome` holds values of `Outcome`, `collision_speed` is NaN without a collision [m/s].
+    """Trajectories and outcomes of N simulations; `outcome` holds values of `Outcome`, `collision_speed` is NaN without
+    a collision [m/s].
 
-    `test_speed_error` is the largest deviation from the test's speed before the driving system acted, NaN if no speed is prescribed
-    [m/s]; `warning_ttc` the time to collision at which the system first warned its driver, NaN if it never did [s].
+    `test_speed_error` is the largest deviation from the test's speed before the driving system acted, NaN if no speed
+    is prescribed [m/s]; `warning_ttc` the time to collision at which the system first warned its driver, NaN if it
+    never did [s].
     """
 
     trace: Trace
@@ -121,7 +124,9 @@ class SimulationRuns:
         )
 
     def nearest(self, vehicle: int) -> int | None:
-        """The sample of the impact or, without a collision, of the smallest separation in conflict; None if never in conflict."""
+        """The sample of the impact or, without a collision, of the smallest separation in conflict; None if never in
+        conflict.
+        """
         active = self.trace.active[:, vehicle]
         if np.isfinite(self.collision_speed[vehicle]):
             return int(np.flatnonzero(active)[-1])
@@ -134,10 +139,12 @@ class SimulationRuns:
 
     @property
     def relative_speed(self) -> FloatArray:
-        """Speed of a collision relative to the obstacle along the vehicle's path [m/s], shape (N,); NaN without a collision.
+        """Speed of a collision relative to the obstacle along the vehicle's path [m/s], shape (N,); NaN without a
+        collision.
 
-        A gap d that closes within a time step, from the relative speed v at the relative acceleration a, closes at sqrt(v^2 + 2 a d);
-        where no gap closes, the speed at the end of the step counts: `collision_speed` minus the obstacle's speed.
+        A gap d that closes within a time step, from the relative speed v at the relative acceleration a, closes at
+        sqrt(v^2 + 2 a d); where no gap closes, the speed at the end of the step counts: `collision_speed` minus the
+        obstacle's speed.
         """
         trace, vehicles = self.trace, np.arange(len(self.collision_speed))
         last_sample = len(trace.time) - 1 - np.argmax(trace.active[::-1], axis=0)

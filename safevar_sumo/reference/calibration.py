@@ -210,7 +210,9 @@ def _measure_agreements(study: Study, references: Mapping[str, ReferenceData], p
 
 
 def describe_fit(subject: FitSubject, result: Calibration, studies: Sequence[Study], *, from_scratch: bool) -> str:
-    """The fit of one of `studies` in words: search, loss, data with fingerprints, order, parameters of its own, bounds."""
+    """The fit of one of `studies` in words: search, loss, data with fingerprints, order, parameters of its own,
+    bounds.
+    """
     (study, references), fit, values = subject, studies[0].fit, result.values.items()
     together = "".join(f", together with {other.name!r}" for other in studies if other is not study)
     start = "random places only" if from_scratch else f"its own values and {fit.starts} random places"

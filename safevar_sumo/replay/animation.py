@@ -208,7 +208,9 @@ def _draw_road(axis: Axes, scene: FlatScene) -> None:
 
 
 def _draw_body(axis: Axes, body: FlatBody, scene: FlatScene) -> tuple[list[Patch], list[Patch]]:
-    """Draw an actor with its front bumper, or a person's middle, at the origin, heading along x; brake lights come second."""
+    """Draw an actor with its front bumper, or a person's middle, at the origin, heading along x; brake lights come
+    second.
+    """
     from matplotlib.patches import Circle, Rectangle
 
     length, width = body.length, body.width

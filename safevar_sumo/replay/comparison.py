@@ -1,4 +1,6 @@
-"""A changed vehicle beside the original: when each begins to brake, is nearest and ends, and when their speeds diverge."""
+"""A changed vehicle beside the original: when each begins to brake, is nearest and ends, and when their speeds
+diverge.
+"""
 
 from __future__ import annotations
 
@@ -57,7 +59,9 @@ COLOURS = {ORIGINAL: "#0072b2", CHANGED: "#d55e00"}
 
 
 def find_divergence(runs: SimulationRuns) -> int | None:
-    """Find the first sample at which the speeds of the original and the changed vehicle have diverged; None if they never do."""
+    """Find the first sample at which the speeds of the original and the changed vehicle have diverged; None if they
+    never do.
+    """
     trace = runs.trace
     is_active = trace.active[:, ORIGINAL] & trace.active[:, CHANGED]
     samples = np.flatnonzero(is_active & (np.abs(trace.speed[:, ORIGINAL] - trace.speed[:, CHANGED]) > MIN_DIVERGENCE))
@@ -69,8 +73,8 @@ class Comparison:
     """Runs of the original vehicle (row 0) and of a changed one (row 1; missing if nothing is changed).
 
     `title` is the study's title and the `point` of its matrix, `network` the scenario's network with the lanes that the
-    scenario's parameters define; `evaluations` and `film` have one row for each vehicle. `objectives` are metrics that the study
-    optimises besides the paper's metrics.
+    scenario's parameters define; `evaluations` and `film` have one row for each vehicle. `objectives` are metrics that
+    the study optimises besides the paper's metrics.
     """
 
     title: str
@@ -198,7 +202,9 @@ def compare_setting(study: Study, system: System, setting: FloatArray) -> Compar
 
 
 def _further_objectives(measuring: Measuring) -> tuple[MetricFacts, ...]:
-    """Objectives of one run besides the paper's; the points of a rating are none, as they belong to all cells together."""
+    """Objectives of one run besides the paper's; the points of a rating are none, as they belong to all cells
+    together.
+    """
     objectives = {objective.name for objective in measuring.scoring.objectives}
     return tuple(
         metric for metric in measuring.scoring.metrics if metric.name in objectives - {*METRICS, RATING_POINTS.name}
@@ -206,7 +212,9 @@ def _further_objectives(measuring: Measuring) -> tuple[MetricFacts, ...]:
 
 
 def _with_pedals_before_impacts(runs: SimulationRuns) -> SimulationRuns:
-    """Runs with the pedals of the sample before an impact also at the impact, where a command has no effect any more."""
+    """Runs with the pedals of the sample before an impact also at the impact, where a command has no effect any
+    more.
+    """
     trace = runs.trace
     throttle, brake = trace.throttle.copy(), trace.brake.copy()
     for row in np.flatnonzero(~np.isnan(runs.collision_speed)).tolist():
@@ -217,7 +225,9 @@ def _with_pedals_before_impacts(runs: SimulationRuns) -> SimulationRuns:
 
 
 def list_differences(replayed: Evaluations, recorded: Mapping[str, Any]) -> list[str]:
-    """List where the replay of a solution differs from its row of solutions.csv, with both values; one cell has no rating points."""
+    """List where the replay of a solution differs from its row of solutions.csv, with both values; one cell has no
+    rating points.
+    """
     differing_metrics = [
         f"{name} was {recorded[name]:.6g} and is {values[0]:.6g} now"
         for name, values in replayed.metrics.items()

@@ -173,7 +173,9 @@ def _draw_legend(figure: Figure, comparison: Comparison, divergence_time: float 
 
 
 def _divergence_time(comparison: Comparison) -> float | None:
-    """The time at which the speeds of two vehicles diverge [s]; None for a single vehicle or speeds that stay together."""
+    """The time at which the speeds of two vehicles diverge [s]; None for a single vehicle or speeds that stay
+    together.
+    """
     sample = find_divergence(comparison.film.runs) if len(comparison.rows) > 1 else None
     return None if sample is None else float(comparison.film.runs.trace.time[sample])
 

@@ -19,7 +19,8 @@ from safevar_sumo.sumo.world import SumoWorld
 
 
 class LaneLine(NamedTuple):
-    """A lane of SUMO: its middle line of P points, shape (P, 2), and width [m]; an area has its outline as `line` and the width 0.
+    """A lane of SUMO: its middle line of P points, shape (P, 2), and width [m]; an area has its outline as `line` and
+    the width 0.
 
     `kind` is road, path (only for persons), crossing or area (for persons, between paths).
     """
@@ -30,7 +31,8 @@ class LaneLine(NamedTuple):
 
 
 class ActorTrack(NamedTuple):
-    """The track of one actor: front bumper of a vehicle or middle of a person [m], heading clockwise from north [degrees].
+    """The track of one actor: front bumper of a vehicle or middle of a person [m], heading clockwise from north
+    [degrees].
 
     Arrays of shape (T, N) for T samples of N simulations, NaN while the actor was absent; `length` and `width` in m.
     """
@@ -47,8 +49,8 @@ class ActorTrack(NamedTuple):
 class Film:
     """N simulations seen from above.
 
-    `tracks` holds the tracks of actors by name; `last_samples` holds the last sample of every simulation, shape (N,): later samples are
-    meaningless, as SUMO continues with the rest of the batch.
+    `tracks` holds the tracks of actors by name; `last_samples` holds the last sample of every simulation, shape (N,):
+    later samples are meaningless, as SUMO continues with the rest of the batch.
     """
 
     runs: SimulationRuns

@@ -1,4 +1,6 @@
-"""A comparison in sumo-gui, which draws actors at their recorded positions: the original's road above the changed one's."""
+"""A comparison in sumo-gui, which draws actors at their recorded positions: the original's road above the changed
+one's.
+"""
 
 from __future__ import annotations
 

@@ -53,7 +53,9 @@ def animation_page(scene: FlatScene) -> str:
 
 
 def player_data(scene: FlatScene) -> dict[str, Any]:
-    """The data of the template `player`: the still picture, and under `played` the data of the script. y points down."""
+    """The data of the template `player`: the still picture, and under `played` the data of the script. y points
+    down.
+    """
     view, key_sample = scene.view, scene.key_sample
     drives = [_drive_data(scene, row) for row in scene.comparison.rows]
     bodies = sorted(scene.bodies, key=lambda body: (body.is_vut, body.row))

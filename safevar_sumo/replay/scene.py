@@ -34,7 +34,9 @@ MAX_OFFSET = 0.05
 
 
 class FlatBody(NamedTuple):
-    """An actor of one simulation: front bumper or person's middle, x to the right and y up [m], heading [rad from x]; shape (T,)."""
+    """An actor of one simulation: front bumper or person's middle, x to the right and y up [m], heading [rad from x];
+    shape (T,).
+    """
 
     name: str
     row: int
@@ -70,7 +72,9 @@ class FlatScene:
 
     @property
     def key_sample(self) -> int:
-        """The sample that a still picture shows: the moment at which the changed vehicle, or else the original, is nearest."""
+        """The sample that a still picture shows: the moment at which the changed vehicle, or else the original, is
+        nearest.
+        """
         last = self.moments[-1]
         return last.nearest if last.nearest is not None else last.end
 
@@ -142,7 +146,9 @@ def _is_near(film: Film, name: str, row: int) -> bool:
 
 
 def _is_duplicate(comparison: Comparison, name: str, row: int) -> bool:
-    """Whether the changed vehicle's copy of an actor is always at the same position, so that only this copy is drawn."""
+    """Whether the changed vehicle's copy of an actor is always at the same position, so that only this copy is
+    drawn.
+    """
     if row == CHANGED or len(comparison.rows) == 1:
         return False
     track, end = comparison.film.tracks[name], int(comparison.film.last_samples.min()) + 1

@@ -26,7 +26,8 @@ def report(
     progress: bool | Progress = False,
     as_it_is_now: bool = False,
 ) -> str:
-    """Make one self-contained HTML page about the results of one or several studies; the same results give the same page.
+    """Make one self-contained HTML page about the results of one or several studies; the same results give the same
+    page.
 
     Parameters
     ----------
@@ -37,7 +38,8 @@ def report(
     only
         Names of sections from `SECTIONS`, such as "verdict"; all sections by default.
     point
-        Name of a point of the study's matrix: the page is about this point only, without the research questions, which need whole studies.
+        Name of a point of the study's matrix: the page is about this point only, without the research questions, which
+        need whole studies.
     jobs
         Worker processes for simulations, by default one for each core.
     progress
@@ -53,7 +55,8 @@ def report(
     Warns
     -----
     UserWarning
-        If a new simulation of a solution differs from the results; with `as_it_is_now`, for each change of a file or version.
+        If a new simulation of a solution differs from the results; with `as_it_is_now`, for each change of a file or
+        version.
 
     Raises
     ------

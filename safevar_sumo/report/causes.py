@@ -238,7 +238,9 @@ def replay_solutions(data: ReportInput, explained: Explained | None, progress: P
 
 
 def nondominated_rows(rows: list[Section]) -> list[Section]:
-    """The solutions that no other solution dominates in the three objectives; one of solutions with equal objectives."""
+    """The solutions that no other solution dominates in the three objectives; one of solutions with equal
+    objectives.
+    """
     if not rows:
         return []
     objectives = np.array([[row[name] for name in OBJECTIVES] for row in rows], dtype=float)

@@ -1,4 +1,6 @@
-"""The input of a report: results, simulations of their settings, and the table of the points at which a setting fails."""
+"""The input of a report: results, simulations of their settings, and the table of the points at which a setting
+fails.
+"""
 
 from __future__ import annotations
 
@@ -81,9 +83,9 @@ def tabulate_failing_points(matrix: Sequence[Point], failing: Collection[str]) -
 class ReportInput:
     """One study of a report.
 
-    `study_number` counts from 1, `directory` holds the results. `system` is None if the study cannot be simulated here; `problem`
-    says why. `point` names the only point of the matrix that the page is about; it is empty for the whole study. `later_changes`
-    names the files and versions that have changed since the results were computed.
+    `study_number` counts from 1, `directory` holds the results. `system` is None if the study cannot be simulated here;
+    `problem` says why. `point` names the only point of the matrix that the page is about; it is empty for the whole
+    study. `later_changes` names the files and versions that have changed since the results were computed.
     """
 
     study_number: int
@@ -126,7 +128,9 @@ class ReportInput:
         return np.array([self.solutions[handle][name] for name in self.case.characteristics.names], dtype=float)
 
     def list_changes(self, setting: FloatArray) -> list[tuple[str, str, str]]:
-        """A setting's changes from the original: both values in a text, the characteristic's short name and its description."""
+        """A setting's changes from the original: both values in a text, the characteristic's short name and its
+        description.
+        """
         changed = [
             item
             for item, value in zip(self.case.characteristics, setting.tolist(), strict=True)
@@ -144,12 +148,16 @@ class ReportInput:
         return self._comparisons[key]
 
     def player_data_of(self, setting: FloatArray) -> dict[str, Any]:
-        """A setting's animation, in the form that the template `player` takes, with the point of the matrix that it shows."""
+        """A setting's animation, in the form that the template `player` takes, with the point of the matrix that it
+        shows.
+        """
         comparison = self.compare_with_original(setting)
         return {**player_data(lay_out_scene(comparison)), "point": comparison.point}
 
     def failing_points(self, setting: FloatArray) -> FailingPoints | None:
-        """The points of the matrix at which a setting fails; None without a matrix, or if the page is about one point."""
+        """The points of the matrix at which a setting fails; None without a matrix, or if the page is about one
+        point.
+        """
         if self.system is None or not self.system.matrix or self.point:
             return None
         key = setting.tobytes()
@@ -162,7 +170,9 @@ class ReportInput:
 
     @cached_property
     def no_verdict(self) -> str:
-        """Why simulations tell nothing about the ADS, in a sentence; "" if they do, or if the study cannot be simulated."""
+        """Why simulations tell nothing about the ADS, in a sentence; "" if they do, or if the study cannot be
+        simulated.
+        """
         return "" if self.system is None else why_no_verdict(self.system)
 
     @property
@@ -202,8 +212,8 @@ def read_inputs(
     Raises
     ------
     InputError
-        If a directory holds no results, is damaged or is given twice, a study has no such point, or files or versions have changed
-        since the results were computed and `as_it_is_now` is false.
+        If a directory holds no results, is damaged or is given twice, a study has no such point, or files or versions
+        have changed since the results were computed and `as_it_is_now` is false.
     """
     paths = [Path(directory) for directory in directories]
     inputs = []

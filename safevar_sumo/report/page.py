@@ -1,4 +1,6 @@
-"""The page of a report: its sections, from the answers to the questions, and the commands that reproduce its numbers."""
+"""The page of a report: its sections, from the answers to the questions, and the commands that reproduce its
+numbers.
+"""
 
 from __future__ import annotations
 
@@ -65,7 +67,9 @@ def list_tables(cases: Sequence[Case]) -> list[dict[str, Any]]:
 
 
 def table_data(frame: pd.DataFrame, title: str, notes: Iterable[str] = ()) -> dict[str, Any]:
-    """A frame as the template's table: the index as labels, the outer level of columns as headings over several columns."""
+    """A frame as the template's table: the index as labels, the outer level of columns as headings over several
+    columns.
+    """
     columns, labels = frame.columns, frame.index.nlevels
     blocks = Counter(columns.get_level_values(0)) if columns.nlevels > 1 else {}
     rows = [
@@ -151,7 +155,8 @@ def commands_to_reproduce(inputs: Sequence[ReportInput], questions: Sequence[str
         commands.append(
             {
                 "what": "A replay, with figure and animation",
-                "command": f"{PROGRAM_COMMAND} simulate {directory} --most-severe --plot it.png --animate it.html{flag}",
+                "command": f"{PROGRAM_COMMAND} simulate {directory} --most-severe --plot it.png "
+                f"--animate it.html{flag}",
             }
         )
     if any(data.point for data in inputs):
@@ -162,7 +167,9 @@ def commands_to_reproduce(inputs: Sequence[ReportInput], questions: Sequence[str
 
 
 def _rerun_command(study: Study, out: str, directory: Path) -> str:
-    """The command that runs a study again: `study` with options for a shipped study, else Python's `run` with the recorded study."""
+    """The command that runs a study again: `study` with options for a shipped study, else Python's `run` with the
+    recorded study.
+    """
     search = study.search
     if study.name in study_names():
         options = {name: getattr(search, name) for name in ("seed", "runs", "evaluations", "algorithms")}
@@ -177,7 +184,10 @@ def _rerun_command(study: Study, out: str, directory: Path) -> str:
             return " ".join(
                 [f"{PROGRAM_COMMAND} study {study.name}", *(f"--{name} {value}" for name, value in flags.items())]
             )
-    script = f"import safevar_sumo as sv; sv.run(sv.load({json.dumps(str(directory))}).study, out={json.dumps(out)}, progress=True)"
+    script = (
+        f"import safevar_sumo as sv; sv.run(sv.load({json.dumps(str(directory))}).study, out={json.dumps(out)}, "
+        "progress=True)"
+    )
     return f"python -c {shlex.quote(script)}"
 
 
@@ -209,7 +219,9 @@ def make_report(
     point: str | None = None,
     as_it_is_now: bool = False,
 ) -> str:
-    """Make the page about results in directories; parameters, warnings and errors are those of `safevar_sumo.report`."""
+    """Make the page about results in directories; parameters, warnings and errors are those of
+    `safevar_sumo.report`.
+    """
     unknown_names = [name for name in only if name not in SECTIONS]
     if unknown_names:
         raise InputError(

@@ -1,4 +1,6 @@
-"""The page about a rated study: matrices and points of the original vehicle and of a worn vehicle, and the points lost by test."""
+"""The page about a rated study: matrices and points of the original vehicle and of a worn vehicle, and the points lost
+by test.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""The section on the tested system: vehicle, driving system, scenario, search, and the characteristics with their domains."""
+"""The section on the tested system: vehicle, driving system, scenario, search, and the characteristics with their
+domains.
+"""
 
 from __future__ import annotations
 

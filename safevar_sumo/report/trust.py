@@ -1,4 +1,6 @@
-"""The section on limits and trust: what the findings do not cover, and how well the study agrees with published data."""
+"""The section on limits and trust: what the findings do not cover, and how well the study agrees with published
+data.
+"""
 
 from __future__ import annotations
 
@@ -19,18 +21,25 @@ from safevar_sumo.study import SAFETY_DEGREE, Study
 
 GENERAL_LIMITS = (
     "A search that finds no failure proves nothing about the settings that it did not try.",
-    "One vehicle in its lane: no steering beyond lane keeping, no separate wheels and axles, no suspension, no wind, no sensor "
+    "One vehicle in its lane: no steering beyond lane keeping, no separate wheels and axles, no suspension, "
+    "no wind, no sensor "
     "noise, no traffic beyond the scenario's own, unless the study says otherwise.",
-    "Driving system and vehicle are models: the tables below show how far they agree with published data, where there is any.",
+    (
+        "Driving system and vehicle are models: the tables below show how far they agree with published data, "
+        "where there is any."
+    ),
 )
 
 
 def describe_agreement(study: Study) -> tuple[str, list[list[str]]]:
-    """How well a study agrees with published data: a sentence, and a row of texts for each file; without such data, no rows."""
+    """How well a study agrees with published data: a sentence, and a row of texts for each file; without such data, no
+    rows.
+    """
     totals = shipped_totals_of(study)
     if not totals:
         return (
-            "This study was not compared with published data: whether another simulator or a real vehicle behaves in the same way "
+            "This study was not compared with published data: whether another simulator or a real vehicle "
+            "behaves in the same way "
             "is unknown.",
             [],
         )
@@ -48,7 +57,8 @@ def _agreement_sentence(file: str, totals: Totals) -> str:
         "no published collision is among them"
         if totals.recall is None
         else (
-            f"{counts['both']} of the {counts['reference']} published collisions collide here too (recall {totals.recall:.2f})"
+            f"{counts['both']} of the {counts['reference']} published collisions collide here too (recall "
+            f"{totals.recall:.2f})"
         )
     )
     if totals.precision is not None:
@@ -64,7 +74,9 @@ def _agreement_sentence(file: str, totals: Totals) -> str:
 
 
 def _agreement_row(file: str, totals: Totals) -> list[str]:
-    """The texts of a row: file, vehicles, rank correlation, mean error, collisions published, here and in both, recall, precision."""
+    """The texts of a row: file, vehicles, rank correlation, mean error, collisions published, here and in both, recall,
+    precision.
+    """
 
     def decimal(value: float | None) -> str:
         return NO_VALUE if value is None else f"{value:.2f}"
@@ -82,8 +94,8 @@ def _agreement_row(file: str, totals: Totals) -> list[str]:
 def describe_limits(data: ReportInput, explained: Explained | None) -> dict[str, Any]:
     """Describe how far the findings of one study hold, and how well it agrees with published data.
 
-    `published` lists metrics of the original vehicle: name, published value, value here. `spread` lists vehicles: name, safety
-    degree here, safety degrees with the study's other parameter sets.
+    `published` lists metrics of the original vehicle: name, published value, value here. `spread` lists vehicles: name,
+    safety degree here, safety degrees with the study's other parameter sets.
     """
     case = data.case
     published = [
@@ -103,9 +115,11 @@ def describe_limits(data: ReportInput, explained: Explained | None) -> dict[str,
         f"{counts[Outcome.SIMULATOR_ERROR]} {of_all} could not be simulated; no result contains them.": counts[
             Outcome.SIMULATOR_ERROR
         ],
-        f"{counts[Outcome.INVALID_TEST]} {of_all} left the tolerance of a test's speed before the driving system acted: they are neither "
+        f"{counts[Outcome.INVALID_TEST]} {of_all} left the tolerance of a test's speed before the driving "
+        "system acted: they are neither "
         "failures nor successes.": counts[Outcome.INVALID_TEST],
-        f"{len(borderline)} of {len(explained.explanations) if explained else 0} failures analysed are borderline: fewer than "
+        f"{len(borderline)} of {len(explained.explanations) if explained else 0} failures analysed are "
+        "borderline: fewer than "
         f"{100 * MIN_ROBUST_SHARE:.0f} % of their neighbours are unsafe too.": explained and explained.explanations,
         "There are no published values of the original vehicle to compare the study with.": not published,
     }

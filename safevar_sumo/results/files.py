@@ -1,4 +1,6 @@
-"""The files of a results directory: their names, contents and writers, and functions that write a whole file or nothing."""
+"""The files of a results directory: their names, contents and writers, and functions that write a whole file or
+nothing.
+"""
 
 from __future__ import annotations
 

@@ -32,12 +32,14 @@ def write_imported(
     original: Mapping[str, float | None] | None,
     files: Mapping[str, str],
 ) -> dict[str, int]:
-    """Write a results directory of imported solutions; returns the numbers of earlier solutions that they replace, by algorithm.
+    """Write a results directory of imported solutions; returns the numbers of earlier solutions that they replace, by
+    algorithm.
 
     Parameters
     ----------
     path
-        The directory, made if it does not exist. It keeps solutions of other algorithms from an earlier import of the same study.
+        The directory, made if it does not exist. It keeps solutions of other algorithms from an earlier import of the
+        same study.
     solutions
         Solutions by algorithm.
     original

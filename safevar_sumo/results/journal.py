@@ -1,8 +1,9 @@
 """The journal of one run: a file of JSON lines, one for each evaluated batch, written before the search continues.
 
-The first line names the study, the run and the characteristics. A batch is a table: a list for each column of `solutions.csv`, the number
-of each evaluation in its run, the collision's speed and the reason of a failure; an undefined value is null. The last line of a finished
-run lists its solutions. A torn last line, left by a killed process or a full disk, is cut off; any other damage is an error.
+The first line names the study, the run and the characteristics. A batch is a table: a list for each column of
+`solutions.csv`, the number of each evaluation in its run, the collision's speed and the reason of a failure; an
+undefined value is null. The last line of a finished run lists its solutions. A torn last line, left by a killed process
+or a full disk, is cut off; any other damage is an error.
 """
 
 from __future__ import annotations
@@ -37,7 +38,9 @@ Line = dict[str, Any]
 
 
 class Head(NamedTuple):
-    """What a journal belongs to: the digest of a study's identity, a run's name; and the names of the characteristics."""
+    """What a journal belongs to: the digest of a study's identity, a run's name; and the names of the
+    characteristics.
+    """
 
     study: str
     run: str
@@ -55,7 +58,9 @@ class Result(NamedTuple):
 
 
 class JournalContent(NamedTuple):
-    """The contents of a journal: evaluations, or None; their positions, results by budget, and the size of a torn tail [bytes]."""
+    """The contents of a journal: evaluations, or None; their positions, results by budget, and the size of a torn tail
+    [bytes].
+    """
 
     positions: list[int]
     evaluations: Evaluations | None
@@ -69,7 +74,9 @@ class JournalContent(NamedTuple):
         return self.evaluations.take([row_of[position] for position in positions])
 
     def requested_within(self, budget: int) -> tuple[list[int], Evaluations | None]:
-        """Positions and evaluations that a run with this budget requested, in the order of its requests; None if there is none."""
+        """Positions and evaluations that a run with this budget requested, in the order of its requests; None if there
+        is none.
+        """
         rows = sorted((position, row) for row, position in enumerate(self.positions) if 0 <= position < budget)
         positions = [position for position, _ in rows]
         return positions, None if self.evaluations is None else self.evaluations.take([row for _, row in rows])
@@ -125,7 +132,9 @@ class Journal:
         self._write(_batch_line(positions, evaluations, self._characteristics))
 
     def finish(self, positions: Sequence[int], asked: int, budget: int) -> None:
-        """Add the result: the positions of the solutions, the number of requested evaluations, and their allowed number; sync all."""
+        """Add the result: the positions of the solutions, the number of requested evaluations, and their allowed
+        number; sync all.
+        """
         self._write({"solutions": list(positions), "asked": asked, "budget": budget}, sync=True)
 
     def retry(self) -> None:
@@ -193,7 +202,9 @@ def read_journal(path: Path, head: Head) -> JournalContent:
 
 
 def files_read_later(directory: Path) -> dict[str, str]:
-    """Digests, by name, of the files that user code read for the first time after the study began, from all journals of a directory."""
+    """Digests, by name, of the files that user code read for the first time after the study began, from all journals of
+    a directory.
+    """
     start, files = msgspec.json.encode({FILES_READ: {}})[:-2], dict[str, str]()
     for path in sorted((directory / RUNS).glob("*.jsonl")):
         with path.open("rb") as file:

@@ -22,7 +22,9 @@ if TYPE_CHECKING:
 
 
 class Failure(NamedTuple):
-    """A setting that could not be simulated: its algorithm, run, number of the evaluation in the run (from 0), and the reason."""
+    """A setting that could not be simulated: its algorithm, run, number of the evaluation in the run (from 0), and the
+    reason.
+    """
 
     algorithm: str
     run: int
@@ -55,7 +57,8 @@ class StoredResults(NamedTuple):
         One row per simulated setting of every run, in the order of the first requests; columns of
         `safevar_sumo.results.evaluations_frame`, and `evaluation`, the position in that order from 0.
     solutions
-        One row per solution of every finished run; the same columns except `evaluation`. Imported solutions belong to no run.
+        One row per solution of every finished run; the same columns except `evaluation`. Imported solutions belong to
+        no run.
     finished
         Algorithm and number of every finished run.
     failures
@@ -70,9 +73,11 @@ class StoredResults(NamedTuple):
 
 
 class RunStatus(NamedTuple):
-    """Progress of one run: how many distinct settings were simulated, collided, and failed; and the `best`, the lowest safety degree.
+    """Progress of one run: how many distinct settings were simulated, collided, and failed; and the `best`, the lowest
+    safety degree.
 
-    `state` is waiting, begun or finished; `best` is a distance [m] or minus a collision speed [m/s], None before the first simulation.
+    `state` is waiting, begun or finished; `best` is a distance [m] or minus a collision speed [m/s], None before the
+    first simulation.
     """
 
     algorithm: str
@@ -87,8 +92,8 @@ class RunStatus(NamedTuple):
 class Status(NamedTuple):
     """Progress of a study.
 
-    `budget` is the largest number of evaluations of a run, `points` are (f_safe, f_diff, f_num_diff) of all M settings so far, shape
-    (M, 3).
+    `budget` is the largest number of evaluations of a run, `points` are (f_safe, f_diff, f_num_diff) of all M settings
+    so far, shape (M, 3).
     """
 
     study: str
@@ -217,7 +222,8 @@ def load_runs(directory: str | Path) -> StoredResults:
 
 
 def status(directory: str | Path) -> Status:
-    """Progress of the study in a results directory; a process may be running the study, as nothing is locked or written.
+    """Progress of the study in a results directory; a process may be running the study, as nothing is locked or
+    written.
 
     Raises
     ------

@@ -1,4 +1,6 @@
-"""The manifest of a results directory: the inputs that its results depend on, and their differences from other inputs."""
+"""The manifest of a results directory: the inputs that its results depend on, and their differences from other
+inputs.
+"""
 
 from __future__ import annotations
 
@@ -42,15 +44,19 @@ IDENTITY = {
     "versions": "those versions",
     "platform": "such a machine",
 }
-"""Inputs that results depend on, each with the remedy if it has changed; an error says "expected: another `out` ..., or REMEDY"."""
+"""Inputs that results depend on, each with the remedy if it has changed; an error says "expected: another `out` ..., or
+REMEDY".
+"""
 LAYERS_OF_FILES = ("network", "sources")
 """Inputs that are a digest for each file; all workers must have the same files."""
 
 
 class Difference(NamedTuple):
-    """A difference between stored and present inputs in words; its layer of `IDENTITY`; and whether it may change simulations.
+    """A difference between stored and present inputs in words; its layer of `IDENTITY`; and whether it may change
+    simulations.
 
-    Other search libraries and machines, other versions of this package with the same `RESULTS`, and new keys of a study do not.
+    Other search libraries and machines, other versions of this package with the same `RESULTS`, and new keys of a study
+    do not.
     """
 
     layer: str
@@ -99,7 +105,10 @@ def differences(stored: Mapping[str, Any], now: Mapping[str, Any]) -> Iterator[D
     for layer in IDENTITY:
         for key, before, after in _changed_values(stored.get(layer, {}), now.get(layer, {})):
             if layer in LAYERS_OF_FILES:
-                text = f"{key} {'no longer exists' if after is None else 'is new' if before is None else 'has changed since'}"
+                text = (
+                    f"{key} "
+                    f"{'no longer exists' if after is None else 'is new' if before is None else 'has changed since'}"
+                )
             else:
                 name = f"version of {key}" if layer == "versions" else key or "the version of the package's results"
                 text = f"{name} was {before!r} and is {after!r} now"
@@ -164,7 +173,9 @@ def read_manifest(directory: Path) -> dict[str, Any]:
 
 
 def folders_of(directory: Path, manifest: Mapping[str, Any]) -> tuple[str, ...]:
-    """Folders of the user code and files of a directory's study: those of the manifest that exist, then the directory's two parents."""
+    """Folders of the user code and files of a directory's study: those of the manifest that exist, then the directory's
+    two parents.
+    """
     folders = [os.path.abspath(directory.resolve() / folder) for folder in manifest.get("folders", ())]
     return tuple(dict.fromkeys([*filter(os.path.isdir, folders), *map(str, directory.resolve().parents[:2])]))
 

@@ -90,7 +90,8 @@ CHOICES = {
 
 
 def choose_handle(solutions: pd.DataFrame, unsafe: Unsafe, choice: str, source: object) -> SolutionId:
-    """The handle of the solution that a choice selects: `most_severe` among all solutions, any other choice among the unsafe ones.
+    """The handle of the solution that a choice selects: `most_severe` among all solutions, any other choice among the
+    unsafe ones.
 
     Parameters
     ----------

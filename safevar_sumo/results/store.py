@@ -1,4 +1,6 @@
-"""The results directory of a study (the same study and seed give the same bytes), and tables of evaluations and solutions."""
+"""The results directory of a study (the same study and seed give the same bytes), and tables of evaluations and
+solutions.
+"""
 
 from __future__ import annotations
 
@@ -87,7 +89,9 @@ class ResultsDirectory:
             raise
 
     def begin(self, original: Evaluations) -> None:
-        """Write the manifest with the original vehicle's evaluation; remove a table of solutions that covers other runs."""
+        """Write the manifest with the original vehicle's evaluation; remove a table of solutions that covers other
+        runs.
+        """
         self._refuse_another_study()  # which may have begun meanwhile
         manifest = {**self.manifest, "original": record(original, row=0)}
         earlier_manifest = read_manifest(self.path) if (self.path / MANIFEST).exists() else manifest
@@ -134,7 +138,9 @@ class ResultsDirectory:
 def input_differences(
     directory: Path, stored: Mapping[str, Any], now: Mapping[str, Any], study: Study
 ) -> list[Difference]:
-    """The differences between the stored inputs of a directory's results, with files that were first read later, and present inputs."""
+    """The differences between the stored inputs of a directory's results, with files that were first read later, and
+    present inputs.
+    """
     later = _later_files(directory, study)
     later_now = {name: digest for name in later if (digest := digest_of(file_by_name(name, study.origin.places)))}
     return list(
@@ -153,7 +159,9 @@ def _later_files(directory: Path, study: Study) -> dict[str, str]:
 
 
 def another_directory(path: Path) -> str:
-    """A remedy that can be typed for results that a study cannot continue: the next free directory, such as results/two-2."""
+    """A remedy that can be typed for results that a study cannot continue: the next free directory, such as
+    results/two-2.
+    """
     stem = path if path.name else path.resolve()
     free_path = next(candidate for number in count(2) if not (candidate := Path(f"{stem}-{number}")).exists())
     return f"another `out`, such as `out={shlex.quote(str(free_path))}`"

@@ -36,13 +36,17 @@ ROAD_LANE = "road_0"
 START_POSITION = 50.0
 """Position of the vehicle's front bumper on the lane at the start [m]."""
 FRONT_POSITION = 0.5
-"""Position of a rotated target's front on the lane beyond the junction [m]; SUMO cannot insert a vehicle on the junction itself."""
+"""Position of a rotated target's front on the lane beyond the junction [m]; SUMO cannot insert a vehicle on the
+junction itself.
+"""
 
 
 class TargetAhead(NamedTuple):
-    """A target `gap` metres ahead of the vehicle under test; the function `speed_at` maps a time [s] to the target's speed [m/s].
+    """A target `gap` metres ahead of the vehicle under test; the function `speed_at` maps a time [s] to the target's
+    speed [m/s].
 
-    The middle of the target's rear is `offset` metres right of the lane's middle. A standing target may be rotated around that point.
+    The middle of the target's rear is `offset` metres right of the lane's middle. A standing target may be rotated
+    around that point.
     """
 
     target: str
@@ -53,7 +57,9 @@ class TargetAhead(NamedTuple):
     direction: Direction = SAME_DIRECTION
 
     def lanes(self, roads: Roads) -> XmlChanges:
-        """Changes that turn the lanes into a rotated target's direction; its rear is on the junction, and its front on the exit lane."""
+        """Changes that turn the lanes into a rotated target's direction; its rear is on the junction, and its front on
+        the exit lane.
+        """
         if not self._is_rotated:
             return {}
         frame, (along, left), length = Frame.of(roads.lane(VUT_LANE)), self.direction, self._body.length
@@ -192,7 +198,8 @@ class TargetAheadTest(TargetTest, frozen=True, kw_only=True, forbid_unknown_fiel
     speed
         Speed of the vehicle under test at the start [km/h].
     impact_location
-        Point of the vehicle's front that would hit the middle of the target's rear, from the left corner [% of the width].
+        Point of the vehicle's front that would hit the middle of the target's rear, from the left corner [% of the
+        width].
     vut_length, vut_width
         Size of the vehicle under test [m].
     grade

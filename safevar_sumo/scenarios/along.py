@@ -15,7 +15,9 @@ IMPACT_LOCATIONS = (50.0, 10.0, 25.0, 75.0, 90.0)
 
 
 class _TestRow(NamedTuple):
-    """A row of the protocol's table: target, its speed [km/h] and acceleration distance [m], tested range, pre-crash type."""
+    """A row of the protocol's table: target, its speed [km/h] and acceleration distance [m], tested range, pre-crash
+    type.
+    """
 
     target: str
     target_speed: float
@@ -42,7 +44,8 @@ class Along(TargetAheadTest, frozen=True, kw_only=True):
     impact_location
         Point of the vehicle's front that would hit the target, from the left corner [% of the width].
     target, target_speed, acceleration_distance
-        `adult`, `child` or `cyclist`; the target's speed [km/h], and the distance within which the target reaches that speed [m].
+        `adult`, `child` or `cyclist`; the target's speed [km/h], and the distance within which the target reaches that
+        speed [m].
     time_to_impact, time_after
         Time from the start to the impact if nobody brakes, and time from the impact to the end of the run [s].
     vut_length, vut_width
@@ -52,7 +55,8 @@ class Along(TargetAheadTest, frozen=True, kw_only=True):
 
     Notes
     -----
-    By default the cyclist rides at 15 km/h from the start; the protocol has 20 km/h in its rows that are rated by the warning.
+    By default the cyclist rides at 15 km/h from the start; the protocol has 20 km/h in its rows that are rated by the
+    warning.
     """
 
     test: Literal["CPLA", "CBLA"] = "CPLA"

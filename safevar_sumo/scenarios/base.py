@@ -24,7 +24,9 @@ MAX_BEND = 0.05
 """Largest deviation of a lane's centre line from a straight line for which the lane counts as straight [m]."""
 Coordinates = tuple[float, float]
 XmlChanges = Mapping[str, Mapping[str, str] | None]
-"""Changes to a network's traffic or lanes: attributes by the XPath of an element below the file's root; None removes the element."""
+"""Changes to a network's traffic or lanes: attributes by the XPath of an element below the file's root; None removes
+the element.
+"""
 
 
 class Lane(NamedTuple):
@@ -35,7 +37,9 @@ class Lane(NamedTuple):
 
 
 class BentLane(Lane):
-    """A lane that is not straight; `bend` is the largest distance between its centre line and the line between its ends [m]."""
+    """A lane that is not straight; `bend` is the largest distance between its centre line and the line between its ends
+    [m].
+    """
 
     name: str
     bend: float
@@ -126,14 +130,15 @@ class Scenario:
     reactive_actors
         False declares that no actor reacts to the vehicle under test: SUMO can play the scene once for all vehicles.
     grade
-        Rise of the road [%]. SUMO's plane then stands for the inclined road; the vehicle models add the force of gravity.
+        Rise of the road [%]. SUMO's plane then stands for the inclined road; the vehicle models add the force of
+        gravity.
     centre_to_centre
         Whether the safety degree is the distance between the centres of two vehicles.
     pre_crash
         The scenario's type in NHTSA's typology; "" if it has none.
     test_speed
-        Speed that a robot holds until the ADS brakes [m/s]; None without a robot. A run that leaves the tolerance before that is an
-        invalid test. Only contacts at the vehicle's front are collisions.
+        Speed that a robot holds until the ADS brakes [m/s]; None without a robot. A run that leaves the tolerance
+        before that is an invalid test. Only contacts at the vehicle's front are collisions.
     """
 
     __slots__ = ()
@@ -182,7 +187,9 @@ SPEED_DIMENSION, LOCATION_DIMENSION = "speed", "impact_location"
 
 
 class Point(NamedTuple):
-    """A scenario in a weather; `name` is its name in the study, `parameters` distinguish it from the study's other points."""
+    """A scenario in a weather; `name` is its name in the study, `parameters` distinguish it from the study's other
+    points.
+    """
 
     scenario: Scenario
     weather: Weather
@@ -191,7 +198,9 @@ class Point(NamedTuple):
 
 
 class PreCrash(StrEnum):
-    """Pre-crash types by NHTSA's names (Najm, Smith, Yanagisawa: Pre-Crash Scenario Typology for Crash Avoidance Research, 2007)."""
+    """Pre-crash types by NHTSA's names (Najm, Smith, Yanagisawa: Pre-Crash Scenario Typology for Crash Avoidance
+    Research, 2007).
+    """
 
     PEDESTRIAN_AFTER_MANOEUVRE = "pedestrian crash with prior vehicle manoeuvre"
     PEDESTRIAN = "pedestrian crash without prior vehicle manoeuvre"

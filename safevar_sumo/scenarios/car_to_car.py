@@ -1,4 +1,6 @@
-"""Euro NCAP's rear-end tests: a car ahead stands (CCRs), is slower (CCRm), brakes (CCRb); a motorcyclist stands (CMRs), brakes (CMRb)."""
+"""Euro NCAP's rear-end tests: a car ahead stands (CCRs), is slower (CCRm), brakes (CCRb); a motorcyclist stands (CMRs),
+brakes (CMRb).
+"""
 
 from __future__ import annotations
 
@@ -19,11 +21,14 @@ NETWORK = "car_to_car"
 FINAL_SPEED = 2.0
 """Speed at which the braking target stops braking [km/h]."""
 STEADY_SPEED_LIMIT = 80.0
-"""Speed of the vehicle up to which the slower target drives at 20 km/h [km/h]; above it, the target is 60 km/h slower."""
+"""Speed of the vehicle up to which the slower target drives at 20 km/h [km/h]; above it, the target is 60 km/h slower.
+"""
 
 
 class _TestRow(NamedTuple):
-    """A row of the protocol's table: target, tested speeds and impact locations, time headway at the start [s], pre-crash type."""
+    """A row of the protocol's table: target, tested speeds and impact locations, time headway at the start [s],
+    pre-crash type.
+    """
 
     target: str
     protocol_range: ProtocolRange
@@ -50,7 +55,8 @@ class CarToCar(TargetAheadTest, frozen=True, kw_only=True):
     speed, target_speed
         Speeds of the vehicle under test and of the target at the start [km/h].
     impact_location
-        Point of the vehicle's front that would hit the middle of the target's rear, from the left corner [% of the width].
+        Point of the vehicle's front that would hit the middle of the target's rear, from the left corner [% of the
+        width].
     headway
         Gap at the start divided by the vehicle's speed [s].
     brakes_at, target_deceleration
@@ -68,8 +74,9 @@ class CarToCar(TargetAheadTest, frozen=True, kw_only=True):
 
     Notes
     -----
-    Robustness layers in the words of Euro NCAP's calculator (euroncap-rating-2026 5.4.9): "-2 m/s^2" is an acceleration, hence a
-    `target_deceleration` of 6; "+0.5s time headway" is a `headway` of 1.5 s; a rotation around the impact point is a `heading`.
+    Robustness layers in the words of Euro NCAP's calculator (euroncap-rating-2026 5.4.9): "-2 m/s^2" is an
+    acceleration, hence a `target_deceleration` of 6; "+0.5s time headway" is a `headway` of 1.5 s; a rotation around
+    the impact point is a `heading`.
     """
 
     test: Literal["CCRs", "CCRm", "CCRb", "CMRs", "CMRb"] = "CCRs"
@@ -140,7 +147,8 @@ class CarToCar(TargetAheadTest, frozen=True, kw_only=True):
     def _time_to_impact(self) -> float:
         """Time to the impact if the vehicle does not brake [s].
 
-        The gap closes at a constant speed. A target that brakes at b m/s^2 makes this speed rise by b per second until it stops braking.
+        The gap closes at a constant speed. A target that brakes at b m/s^2 makes this speed rise by b per second until
+        it stops braking.
         """
         closing_speed, gap = self.speed * KMH - self._target_speed, self._gap
         if not self._target_brakes:

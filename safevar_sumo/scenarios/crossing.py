@@ -59,7 +59,8 @@ class _TestRow(NamedTuple):
     protocol_range: ProtocolRange
 
 
-TESTS = {  # side, target, its speed, lateral start, acceleration distance, hidden, range (slowest, fastest, impact locations)
+# side, target, its speed, lateral start, acceleration distance, hidden, range (slowest, fastest, impact locations)
+TESTS = {
     "CPFA": _TestRow("far", "adult", 8.0, 6.0, 1.5, False, ProtocolRange(10, 60, IMPACT_LOCATIONS)),
     "CPNA": _TestRow("near", "adult", 5.0, 4.0, 1.0, False, ProtocolRange(10, 60, IMPACT_LOCATIONS)),
     "CPNCO": _TestRow("near", "child", 5.0, 4.0, 1.0, True, ProtocolRange(10, 60, IMPACT_LOCATIONS)),
@@ -84,7 +85,8 @@ class _Start(NamedTuple):
     Attributes
     ----------
     mover, direction, extent
-        How SUMO moves the target, the direction of motion, and the size of the target's body along the lane and across it [m].
+        How SUMO moves the target, the direction of motion, and the size of the target's body along the lane and across
+        it [m].
     impact_left
         Distance of the impact to the left of the lane's middle [m].
     distance_to_impact, time_to_impact
@@ -140,7 +142,9 @@ class _Start(NamedTuple):
 
 
 class _CrossingMotion(NamedTuple):
-    """The motion of a target that crosses the lane; `impact_position` is its middle's position along the lane at the impact [m]."""
+    """The motion of a target that crosses the lane; `impact_position` is its middle's position along the lane at the
+    impact [m].
+    """
 
     frame: Frame
     constants: EncounterConstants
@@ -175,25 +179,26 @@ class _CrossingMotion(NamedTuple):
 
 
 class Crossing(TargetTest, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A target crosses the lane ahead of the moving vehicle, timed so that it is hit at the impact location if nobody brakes.
+    """A target crosses the lane ahead of the moving vehicle, timed so that it is hit at the impact location if nobody
+    brakes.
 
     Parameters
     ----------
     test
-        Row of the protocol, the source of parameters that are not set here: CPFA, CPNA, CPNCO (pedestrians), CBFA, CBNA, CBNAO
-        (cyclists), CCCscp or CMCscp (a car or a motorcyclist at a junction).
+        Row of the protocol, the source of parameters that are not set here: CPFA, CPNA, CPNCO (pedestrians), CBFA,
+        CBNA, CBNAO (cyclists), CCCscp or CMCscp (a car or a motorcyclist at a junction).
     speed
         Speed of the vehicle under test at the start [km/h].
     impact_location
-        Point of the vehicle's front that would hit the target's middle, from the side where the target starts [% of the width]; below 0
-        or above 100 the target's middle passes behind or ahead of the vehicle's corner.
+        Point of the vehicle's front that would hit the target's middle, from the side where the target starts [% of the
+        width]; below 0 or above 100 the target's middle passes behind or ahead of the vehicle's corner.
     target, target_speed
         `adult`, `child`, `cyclist`, `motorcyclist` or `car`; its speed once it moves [km/h].
     side
         Side where the target starts: `near` or `far`.
     lateral_start, acceleration_distance
-        Distance of the standing target from the middle of the lane, and distance within which it reaches its speed [m]. Without a
-        `lateral_start` cyclists, motorcyclists and cars start at their speed.
+        Distance of the standing target from the middle of the lane, and distance within which it reaches its speed [m].
+        Without a `lateral_start` cyclists, motorcyclists and cars start at their speed.
     start_share
         Share of the usual distance to the impact at which the target starts [-].
     heading
@@ -203,26 +208,30 @@ class Crossing(TargetTest, frozen=True, kw_only=True, forbid_unknown_fields=True
     sensor_setback
         Distance of the sensors behind the middle of the front bumper [m].
     time_to_impact, time_after
-        Time from the start to the impact, by default 6 s or as long as the target needs, and from there to the end of the run [s].
+        Time from the start to the impact, by default 6 s or as long as the target needs, and from there to the end of
+        the run [s].
     vut_length, vut_width
         Size of the vehicle under test [m].
     grade
         Rise of the road over its length, negative downhill [%].
     network
-        By default `crossing` for a pedestrian who crosses at right angles from the usual start, `junction` for all other targets.
+        By default `crossing` for a pedestrian who crosses at right angles from the usual start, `junction` for all
+        other targets.
 
     Notes
     -----
     `lateral` refers to the target's middle, `gap` to the corner or side of its body that is nearest along the lane.
 
-    Where the protocol leaves a choice, this class follows Euro NCAP's calculator (euroncap-rating-2026 5.4.9). `target_speed`,
-    `start_share` and `heading` express its robustness layers. Assumptions where the calculator leaves a choice too:
+    Where the protocol leaves a choice, this class follows Euro NCAP's calculator (euroncap-rating-2026 5.4.9).
+    `target_speed`, `start_share` and `heading` express its robustness layers. Assumptions where the calculator leaves a
+    choice too:
 
     - With every layer the target still arrives at the impact location.
     - A faster target starts from the usual position; if it starts at its speed, from correspondingly farther away.
-    - With a smaller `start_share` a standing target sets off later, and the run of a moving target begins with the target nearer.
-    - At a junction the middle of the target meets the middle of the front. The target comes from the near side; the calculator chooses a
-      side at random.
+    - With a smaller `start_share` a standing target sets off later, and the run of a moving target begins with the
+      target nearer.
+    - At a junction the middle of the target meets the middle of the front. The target comes from the near side; the
+      calculator chooses a side at random.
     """
 
     test: Literal["CPFA", "CPNA", "CPNCO", "CBNA", "CBFA", "CBNAO", "CCCscp", "CMCscp"] = "CPFA"
@@ -315,7 +324,9 @@ class Crossing(TargetTest, frozen=True, kw_only=True, forbid_unknown_fields=True
         )
 
     def encounter(self, trace: Trace) -> Encounter:
-        """Distance between the vehicle's front and the target's body, along and across the lane; TTC from its rate of change."""
+        """Distance between the vehicle's front and the target's body, along and across the lane; TTC from its rate of
+        change.
+        """
         extent = _Start.of(self).extent
         ahead, across = np.maximum(trace.gap, 0.0), clear_gap(trace.lateral, (self.vut_width + extent.width) / 2)
         distance = np.sqrt(ahead * ahead + across * across)

@@ -1,4 +1,6 @@
-"""How SUMO moves a crossing target: a pedestrian who crosses at right angles on a footpath, any other target as a vehicle on a lane."""
+"""How SUMO moves a crossing target: a pedestrian who crosses at right angles on a footpath, any other target as a
+vehicle on a lane.
+"""
 
 from __future__ import annotations
 
@@ -24,13 +26,17 @@ FOOTPATH_NETWORK = "crossing"
 PEDESTRIAN = "pedestrian"
 CROSSING_LANE = ":crossing_c0_0"
 WALK_EDGES = {1.0: ("footpath", "footpath_on"), -1.0: ("footpath_on", "footpath")}
-"""Edges that a pedestrian walks on, in this order; the key is 1.0 for a walk to the left of the vehicle, -1.0 to the right."""
+"""Edges that a pedestrian walks on, in this order; the key is 1.0 for a walk to the left of the vehicle, -1.0 to the
+right.
+"""
 STOP_DISTANCE = 5.0
 """Distance past the middle of the lane at which a pedestrian stops [m]."""
 
 
 class PersonMover(NamedTuple):
-    """A pedestrian who walks to the left (`sign` 1) or right (-1); `start` is the position in this direction from the lane's middle [m]."""
+    """A pedestrian who walks to the left (`sign` 1) or right (-1); `start` is the position in this direction from the
+    lane's middle [m].
+    """
 
     target: str
     sign: float
@@ -41,7 +47,9 @@ class PersonMover(NamedTuple):
         return {}
 
     def impact_position(self, frame: Frame, roads: Roads | World, impact_left: float) -> float:
-        """Position of the target's middle along the lane when the target is `impact_left` metres to the left of the lane's middle [m]."""
+        """Position of the target's middle along the lane when the target is `impact_left` metres to the left of the
+        lane's middle [m].
+        """
         return frame.lane_coordinates(roads.lane(CROSSING_LANE).start)[0]
 
     def actors(
@@ -81,7 +89,9 @@ class PersonMover(NamedTuple):
         return world.person_positions(PEDESTRIAN)
 
     def middle(self, frame: Frame, positions: FloatArray) -> tuple[FloatArray | None, FloatArray]:
-        """Position of the target's middle along the lane (None: the impact position) and to the left [m], from `positions` of the front."""
+        """Position of the target's middle along the lane (None: the impact position) and to the left [m], from
+        `positions` of the front.
+        """
         return None, frame.left(positions) - self.sign * BODIES[self.target].length / 2
 
     def next_speed(self, profile: SpeedProfile, sample: int, step: float) -> float:
@@ -101,7 +111,9 @@ class VehicleMover(NamedTuple):
     direction: Direction
 
     def lanes(self, frame: Frame, roads: Roads) -> XmlChanges:
-        """Changes that rotate the target's lanes around their crossing with the vehicle's lane; none for a target from the right."""
+        """Changes that rotate the target's lanes around their crossing with the vehicle's lane; none for a target from
+        the right.
+        """
         if self.direction == FROM_RIGHT:
             return {}
         (along, entry), (_, exit_) = (frame.lane_coordinates(point) for point in roads.lane(JUNCTION_LANE))
@@ -111,7 +123,9 @@ class VehicleMover(NamedTuple):
         )
 
     def impact_position(self, frame: Frame, roads: Roads | World, impact_left: float) -> float:
-        """Position of the target's middle along the lane when the target is `impact_left` metres to the left of the lane's middle [m]."""
+        """Position of the target's middle along the lane when the target is `impact_left` metres to the left of the
+        lane's middle [m].
+        """
         along, left = frame.lane_coordinates(roads.lane(ENTRY_LANE).end)
         return along + (impact_left - left) * self.direction.along / self.direction.left
 

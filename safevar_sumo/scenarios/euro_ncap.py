@@ -1,4 +1,5 @@
-"""What scenarios of Euro NCAP's frontal crash avoidance tests (protocol CA-FC, v1.2, July 2026) share: targets, ranges, directions.
+"""What scenarios of Euro NCAP's frontal crash avoidance tests (protocol CA-FC, v1.2, July 2026) share: targets, ranges,
+directions.
 
 Speeds are in km/h and impact locations in per cent of the vehicle's width, as in the protocol.
 """
@@ -64,7 +65,9 @@ class Direction(NamedTuple):
     left: float
 
     def turned(self, heading: float) -> Direction:
-        """The direction turned counterclockwise by `heading` [degrees]; rounded, as sines differ between machines in the last bits."""
+        """The direction turned counterclockwise by `heading` [degrees]; rounded, as sines differ between machines in
+        the last bits.
+        """
         cosine, sine = (round(function(math.radians(heading)), 12) for function in (math.cos, math.sin))
         return Direction(self.along * cosine - self.left * sine, self.left * cosine + self.along * sine)
 
@@ -90,7 +93,8 @@ TARGET_LANE_LENGTH = 300.0
 
 
 def change_target_lanes(frame: Frame, entry: Coordinates, exit_: Coordinates, direction: Direction) -> XmlChanges:
-    """Changes for straight lanes of the target in a direction: `entry` to `exit_` on the junction, and the lanes before and after it.
+    """Changes for straight lanes of the target in a direction: `entry` to `exit_` on the junction, and the lanes before
+    and after it.
 
     Points are given along the vehicle's lane and to its left [m].
     """
@@ -142,7 +146,9 @@ class ProtocolRange(NamedTuple):
 
 
 class SpeedProfile(NamedTuple):
-    """Speed over time of a target that stands, sets off at `begin` [s], and accelerates evenly to `speed` [m/s] within `run_up` [m]."""
+    """Speed over time of a target that stands, sets off at `begin` [s], and accelerates evenly to `speed` [m/s] within
+    `run_up` [m].
+    """
 
     begin: float
     speed: float
@@ -150,7 +156,9 @@ class SpeedProfile(NamedTuple):
 
     @classmethod
     def with_arrival(cls, distance: float, time: float, speed: float, run_up: float) -> SpeedProfile:
-        """The profile that covers `distance` [m] by `time` [s]; past the run-up, distance = speed * (time - begin) - run_up."""
+        """The profile that covers `distance` [m] by `time` [s]; past the run-up, distance = speed * (time - begin) -
+        run_up.
+        """
         if distance < run_up:
             raise InputError(
                 "scenario.parameters",
@@ -184,7 +192,9 @@ class SpeedProfile(NamedTuple):
 
 
 def lateral_offset(location: float, width: float) -> float:
-    """Distance of an impact location from the front's middle [m]; below 0 on the side from which `location` counts [% of `width`]."""
+    """Distance of an impact location from the front's middle [m]; below 0 on the side from which `location` counts [%
+    of `width`].
+    """
     return (location / 100 - 0.5) * width
 
 

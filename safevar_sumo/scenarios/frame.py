@@ -40,7 +40,9 @@ class Frame(NamedTuple):
 
     @classmethod
     def through_origin(cls, lane: Lane) -> Frame:
-        """The network's coordinates rotated into the direction of a lane; exactly unchanged for a lane that leads east."""
+        """The network's coordinates rotated into the direction of a lane; exactly unchanged for a lane that leads
+        east.
+        """
         return cls((0.0, 0.0), cls.of(lane).direction)
 
     def along(self, positions: FloatArray) -> FloatArray:

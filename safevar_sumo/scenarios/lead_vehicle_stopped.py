@@ -54,7 +54,9 @@ class LeadVehicleStopped(Scenario, Struct, frozen=True, kw_only=True, forbid_unk
         return Scene(gap, memory.zeros, memory.zeros, memory.zeros > 0), memory  # never over
 
     def encounter(self, trace: Trace) -> Encounter:
-        """Safety degree: distance between the centres of two vehicles of equal length; TTC = gap / v (docs/method.md, section 4)."""
+        """Safety degree: distance between the centres of two vehicles of equal length; TTC = gap / v (docs/method.md,
+        section 4).
+        """
         return Encounter(
             separation=trace.gap + trace.vehicle_length,
             distance=trace.gap,

@@ -18,8 +18,8 @@ CROSSING_LANE = ":crossing_c0_0"
 
 
 class _Memory(NamedTuple):
-    """The lane's frame; positions of the vehicle's front at which the conflict begins and ends, and the pedestrian's last lateral position
-    [m]; whether the pedestrian has turned round.
+    """The lane's frame; positions of the vehicle's front at which the conflict begins and ends, and the pedestrian's
+    last lateral position [m]; whether the pedestrian has turned round.
     """
 
     frame: Frame
@@ -92,7 +92,8 @@ class PedestrianCrossing(Scenario, Struct, frozen=True, kw_only=True, forbid_unk
         return Scene(gap, lateral, lateral_speed, over), memory._replace(last_lateral=lateral)
 
     def encounter(self, trace: Trace) -> Encounter:
-        """Distance from the front bumper to the pedestrian's path; TTC along the line of sight from the vehicle's centre.
+        """Distance from the front bumper to the pedestrian's path; TTC along the line of sight from the vehicle's
+        centre.
 
         TTC = (centre distance - half length) / (v cos(theta) + v_ped sin(theta)) (docs/method.md, section 4);
         theta is the angle between the lane and the line of sight.

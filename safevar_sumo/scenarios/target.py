@@ -1,7 +1,7 @@
 """A target that does not react to the vehicles under test: the common part of Euro NCAP's scenarios.
 
-As the target's motion does not depend on the vehicles, it is computed once per recorded scene, at all samples, for thousands of
-vehicles.
+As the target's motion does not depend on the vehicles, it is computed once per recorded scene, at all samples, for
+thousands of vehicles.
 """
 
 from __future__ import annotations
@@ -17,15 +17,20 @@ from safevar_sumo.scenarios.base import VUT, Scenario, Scene, World
 from safevar_sumo.scenarios.frame import Frame
 
 APPROACH_SPEED = 0.5
-"""Closing speed above which a vehicle approaches a target ahead [m/s]; if it is later no longer faster, it has avoided the target."""
+"""Closing speed above which a vehicle approaches a target ahead [m/s]; if it is later no longer faster, it has avoided
+the target.
+"""
 PARKED_GAP = 1.0
-"""Gap between vehicle and parked cars, between the nearer car's front and the target's path, and between the two cars [m]."""
+"""Gap between vehicle and parked cars, between the nearer car's front and the target's path, and between the two cars
+[m].
+"""
 Times = float | Sequence[float]
 """One time, or the times of all samples [s]."""
 
 
 class Target(NamedTuple):
-    """Position and speed of a target: numbers, or arrays of shape (M,), either of M copies at one time or of one target at M samples.
+    """Position and speed of a target: numbers, or arrays of shape (M,), either of M copies at one time or of one target
+    at M samples.
 
     - `edge`: position along the lane of the side of the target's body that vehicles reach first [m]
     - `lateral`, `lateral_speed`: as in `Scene` [m, m/s]
@@ -45,9 +50,10 @@ class Target(NamedTuple):
 class EncounterConstants(NamedTuple):
     """Quantities that are constant during a run: numbers, or arrays of shape (N,).
 
-    A vehicle has passed the target when the gap is below `passed_gap` [m]. A vehicle that `follows` the target cannot pass: it has avoided
-    the target once it has approached and is no longer faster. Parked cars hide a `hidden` target. Distances [m]: `edge_to_middle` of the
-    target along the lane, `setback` from the sensors to the front bumper, `parked_offset` from the lane's middle to the parked cars.
+    A vehicle has passed the target when the gap is below `passed_gap` [m]. A vehicle that `follows` the target cannot
+    pass: it has avoided the target once it has approached and is no longer faster. Parked cars hide a `hidden` target.
+    Distances [m]: `edge_to_middle` of the target along the lane, `setback` from the sensors to the front bumper,
+    `parked_offset` from the lane's middle to the parked cars.
     """
 
     passed_gap: Any = -np.inf
@@ -76,7 +82,9 @@ class TargetMotion(Protocol):
         """Positions of the target's front in SUMO; shape (N, 2) [m]."""
 
     def target(self, positions: FloatArray, times: Times) -> Target:
-        """The target with its front at `positions`, shape (M, 2) [m], at one time or at M times; without its lateral speed."""
+        """The target with its front at `positions`, shape (M, 2) [m], at one time or at M times; without its lateral
+        speed.
+        """
 
     def next_speed(self, sample: int, step: float) -> float:
         """The target's speed in the step after a sample [m/s]."""
@@ -86,7 +94,9 @@ class TargetMotion(Protocol):
 
 
 class Memory(NamedTuple):
-    """The target's motion, last lateral position [m], and speed set last [m/s]; the number of samples; which vehicles have approached."""
+    """The target's motion, last lateral position [m], and speed set last [m/s]; the number of samples; which vehicles
+    have approached.
+    """
 
     motion: TargetMotion
     last_lateral: FloatArray
@@ -124,7 +134,9 @@ class TargetTest(Scenario, Struct, frozen=True, kw_only=True, forbid_unknown_fie
         return memory._replace(sample=memory.sample + 1, last_speed=speed)
 
     def at_all_samples(self, world: World, sampled_world: World, step: float) -> tuple[TargetMotion, Target]:
-        """The target's motion in a recorded scene, and the target at its T samples, which are the T copies of `sampled_world`."""
+        """The target's motion in a recorded scene, and the target at its T samples, which are the T copies of
+        `sampled_world`.
+        """
         motion = self._motion(world)
         positions = motion.positions(sampled_world)
         target = motion.target(positions, [sample * step for sample in range(len(positions))])
@@ -138,7 +150,9 @@ class TargetTest(Scenario, Struct, frozen=True, kw_only=True, forbid_unknown_fie
 def scene_of(
     constants: EncounterConstants, target: Target, front: FloatArray, speed: FloatArray, approached: BoolArray
 ) -> tuple[Scene, BoolArray]:
-    """The scene of N vehicles, and which of them have approached; `front` is their fronts' position along the lane [m]."""
+    """The scene of N vehicles, and which of them have approached; `front` is their fronts' position along the lane
+    [m].
+    """
     gap, zeros = target.edge - front, np.zeros_like(front)
     over = np.asarray(target.is_clear | (gap < constants.passed_gap))
     if constants.follows is not False:
@@ -151,7 +165,9 @@ def scene_of(
 
 
 def _visible(constants: EncounterConstants, target: Target, gap: FloatArray) -> BoolArray:
-    """Whether the parked car nearer to the target leaves the line from the sensors to the target's middle free; shape (N,)."""
+    """Whether the parked car nearer to the target leaves the line from the sensors to the target's middle free; shape
+    (N,).
+    """
     to_middle = gap + constants.edge_to_middle + constants.setback
     to_corner = to_middle - target.ahead - PARKED_GAP
     is_free = (to_corner <= 0) | (-target.lateral * to_corner < constants.parked_offset * to_middle)

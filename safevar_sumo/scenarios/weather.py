@@ -43,5 +43,7 @@ def equals_clear(weather: Weather) -> bool:
 
 
 def weather_in_words(weather: Weather) -> str:
-    """The beginning of a sentence: the phrase of a weather of weather.toml; any other weather, of the same name too, is named."""
+    """The beginning of a sentence: the phrase of a weather of weather.toml; any other weather, of the same name too, is
+    named.
+    """
     return _PHRASES[weather.name] if WEATHERS.get(weather.name) == weather else f"With the weather '{weather.name}'"

@@ -16,15 +16,18 @@ from safevar_sumo.records import BoolArray, Evaluations, FloatArray
 from safevar_sumo.vehicles import CharacteristicSet, FeasibleRegion
 
 Search = Generator[FloatArray, Evaluations, Evaluations]
-"""A generator: yields k filtered settings of n characteristics, shape (k, n), receives their evaluations, and returns the run's result."""
+"""A generator: yields k filtered settings of n characteristics, shape (k, n), receives their evaluations, and returns
+the run's result.
+"""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Problem:
     """The characteristics to vary, the original vehicle's evaluation and the budget of evaluations.
 
-    `population` is the number of settings of a generation, for algorithms with generations; `scoring` defines the objectives. `region` is
-    the feasible region of a study with constraints: yielded settings must lie in this region after the filter.
+    `population` is the number of settings of a generation, for algorithms with generations; `scoring` defines the
+    objectives. `region` is the feasible region of a study with constraints: yielded settings must lie in this region
+    after the filter.
     """
 
     characteristics: CharacteristicSet
@@ -62,8 +65,8 @@ class Algorithm:
     def search(self, problem: Problem, rng: np.random.Generator) -> Search:
         """One run, which requests at most `problem.evaluations` evaluations.
 
-        All randomness comes from `rng`, because a resumed run is repeated from its journal. Yielded settings are in the domains and
-        filtered. The result consists of valid evaluations (`problem.scoring.valid`) that the run received.
+        All randomness comes from `rng`, because a resumed run is repeated from its journal. Yielded settings are in the
+        domains and filtered. The result consists of valid evaluations (`problem.scoring.valid`) that the run received.
         """
 
 

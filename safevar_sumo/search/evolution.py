@@ -38,9 +38,11 @@ def fitness_class(objective_count: int) -> type[Any]:
 
 
 class Individual(list[float]):
-    """Unfiltered values of a setting; once evaluated, also its fitness and its `evaluation`: a batch of evaluations and a row in it.
+    """Unfiltered values of a setting; once evaluated, also its fitness and its `evaluation`: a batch of evaluations and
+    a row in it.
 
-    `has_failed` is true if the evaluation is not valid. `standing` is the value by which an algorithm compares survivors: less is better.
+    `has_failed` is true if the evaluation is not valid. `standing` is the value by which an algorithm compares
+    survivors: less is better.
     """
 
     fitness: base.Fitness
@@ -76,7 +78,9 @@ class Variation:
 
     @contextmanager
     def randomness(self) -> Iterator[None]:
-        """Set the global `random`, from which DEAP draws, to this run's state; restore the caller's state afterwards."""
+        """Set the global `random`, from which DEAP draws, to this run's state; restore the caller's state
+        afterwards.
+        """
         state_of_caller = random.getstate()
         random.setstate(self._random_state)
         try:
@@ -95,7 +99,9 @@ class Variation:
         return children[:number]
 
     def draw_distinct_offspring(self, population: list[Individual], number: int) -> list[Individual]:
-        """Draw `number` new individuals; all parents enter equally many tournaments, and copies of existing individuals are drawn again."""
+        """Draw `number` new individuals; all parents enter equally many tournaments, and copies of existing individuals
+        are drawn again.
+        """
         existing, children, draws = set(map(tuple, population)), list[Individual](), 0
         self._candidates = []
         with self.randomness():
@@ -110,7 +116,9 @@ class Variation:
         return children[:number]
 
     def draw_child(self, first: list[Individual], second: list[Individual]) -> Individual:
-        """Draw an individual that is in neither group, from a parent of each group. Call this method within `randomness`."""
+        """Draw an individual that is in neither group, from a parent of each group. Call this method within
+        `randomness`.
+        """
         feasible: list[Individual] = []
         for _ in range(MAX_REDRAWS):
             while not feasible:
@@ -124,9 +132,10 @@ class Variation:
     def _feasible_children(self, children: list[Individual]) -> list[Individual]:
         """The children that satisfy the study's constraints.
 
-        Under constrained domination (Deb 2000) a feasible individual dominates every infeasible one. The first population is feasible,
-        so an infeasible child would not survive: it is not simulated; other children are drawn in its place. After `MAX_MISSES` draws in a
-        row without a feasible child, the next children are moved towards the original until they are feasible.
+        Under constrained domination (Deb 2000) a feasible individual dominates every infeasible one. The first
+        population is feasible, so an infeasible child would not survive: it is not simulated; other children are drawn
+        in its place. After `MAX_MISSES` draws in a row without a feasible child, the next children are moved towards
+        the original until they are feasible.
         """
         if not self._problem.region:
             return children
@@ -210,7 +219,9 @@ def set_standings(individuals: Sequence[Individual]) -> list[list[Individual]]:
 
 
 def set_front_standings(front: Sequence[Individual], rank: int) -> None:
-    """Set the `standing` of a front's individuals to the front's rank, from 0, and the individual's negative crowding distance."""
+    """Set the `standing` of a front's individuals to the front's rank, from 0, and the individual's negative crowding
+    distance.
+    """
     tools.emo.assignCrowdingDist(front)
     for individual in front:
         individual.standing = rank, -individual.fitness.crowding_dist

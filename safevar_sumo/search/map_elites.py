@@ -24,14 +24,15 @@ QUALITY_OFFSET = 1e6
 class MapElites(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """An atlas of distinct failures, an elite for every cell; needs the extra `qd`.
 
-    The elite of a cell is the collision whose largest change is smallest or, without a collision, the most severe setting. A child has an
-    elite's changes: one may be removed, one added; the others mutate. The result is all elites that collide or, if none collides, the
-    elites that are more severe than the original.
+    The elite of a cell is the collision whose largest change is smallest or, without a collision, the most severe
+    setting. A child has an elite's changes: one may be removed, one added; the others mutate. The result is all elites
+    that collide or, if none collides, the elites that are more severe than the original.
 
     Parameters
     ----------
     behaviour
-        Definition of a cell: the set of characteristics changed (changes), or the number of changes and the speed of the collision (speed).
+        Definition of a cell: the set of characteristics changed (changes), or the number of changes and the speed of
+        the collision (speed).
     added, removed
         Probability that a child changes a further characteristic, and probability that it removes a change.
     reach
@@ -148,5 +149,7 @@ class MapElites(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknown_fie
 
 
 def _qualities(evaluated: Evaluations, problem: Problem) -> FloatArray:
-    """Quality of M settings, more is better: collisions by their largest change; other settings, all worse, by the first objective."""
+    """Quality of M settings, more is better: collisions by their largest change; other settings, all worse, by the
+    first objective.
+    """
     return np.where(evaluated.collided, QUALITY_OFFSET - evaluated.f_diff, -problem.scoring.values(evaluated)[:, 0])

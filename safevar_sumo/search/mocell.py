@@ -31,9 +31,9 @@ NEIGHBOURHOODS = {"von_neumann": CROSS, "moore": (*CROSS, (-1, 1), (-1, -1), (1,
 class MoCell(Operators, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Cells on a toroidal grid that mate with their neighbours and with an archive of non-dominated individuals.
 
-    All cells reproduce at once, from the previous grid. A child replaces its cell's individual if the child dominates that individual, or
-    if neither dominates and the child is not the worst of the neighbourhood. The variables are the characteristics' unfiltered values;
-    simulation and results use filtered ones. The result is the archive.
+    All cells reproduce at once, from the previous grid. A child replaces its cell's individual if the child dominates
+    that individual, or if neither dominates and the child is not the worst of the neighbourhood. The variables are the
+    characteristics' unfiltered values; simulation and results use filtered ones. The result is the archive.
 
     Parameters
     ----------
@@ -107,7 +107,9 @@ class MoCell(Operators, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
 
 def choose_survivor(cell: Individual, child: Individual, mates: list[Individual]) -> Individual:
-    """Choose between a cell and its evaluated child; `mates` are the cell and its neighbours, whose `standing` may change."""
+    """Choose between a cell and its evaluated child; `mates` are the cell and its neighbours, whose `standing` may
+    change.
+    """
     if child.has_failed or (not cell.has_failed and cell.fitness.dominates(child.fitness)):
         return cell
     if cell.has_failed or child.fitness.dominates(cell.fitness):
@@ -117,7 +119,8 @@ def choose_survivor(cell: Individual, child: Individual, mates: list[Individual]
 
 
 def update_archive(archive: list[Individual], offspring: list[Individual], size: int) -> list[Individual]:
-    """Select the at most `size` least crowded non-dominated individuals of archive and offspring, without duplicates; sets `standing`.
+    """Select the at most `size` least crowded non-dominated individuals of archive and offspring, without duplicates;
+    sets `standing`.
 
     Offspring are copied into the archive, because archive and grid each set the `standing` of their own copy.
     """

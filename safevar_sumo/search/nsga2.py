@@ -37,7 +37,9 @@ class Nsga2(Operators, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
 
 def select_survivors(individuals: list[Individual], number: int) -> list[Individual]:
-    """Select the best `number` by rank, then by crowding distance, as DEAP's `selNSGA2` does; compiled code sorts faster."""
+    """Select the best `number` by rank, then by crowding distance, as DEAP's `selNSGA2` does; compiled code sorts
+    faster.
+    """
     sorted_individuals = sorted(individuals, key=lambda individual: individual.fitness.wvalues, reverse=True)
     best: list[Individual] = []
     for rank, front in enumerate(sort_into_fronts(sorted_individuals)):

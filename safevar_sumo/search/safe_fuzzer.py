@@ -30,7 +30,8 @@ class SafeFuzzer(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknown_fi
     warm_up
         Evaluations before ranges are narrowed or a generation must improve.
     generations_between_updates, generations_without_improvement
-        Number of generations between two updates of the ranges, and number without an improvement after which the search ends.
+        Number of generations between two updates of the ranges, and number without an improvement after which the
+        search ends.
     safety_weight
         Weight of the first objective in the score; the other objectives have weight 1.
     """
@@ -83,7 +84,9 @@ class _Ranges:
         return self._characteristics.filter(settings)
 
     def _draw_feasible_setting(self, rng: np.random.Generator) -> FloatArray:
-        """A feasible setting; after `MAX_REDRAWS` infeasible draws, the last one moved towards the original until it is feasible."""
+        """A feasible setting; after `MAX_REDRAWS` infeasible draws, the last one moved towards the original until it is
+        feasible.
+        """
         setting = self._draw_setting(rng)
         for _ in range(MAX_REDRAWS):
             if self._problem.feasible(setting[np.newaxis])[0]:
@@ -98,7 +101,9 @@ class _Ranges:
         return setting
 
     def _draw_value(self, i: int, rng: np.random.Generator) -> float:
-        """A value drawn uniformly from the range without the filter's band; the original value if the band covers the whole range."""
+        """A value drawn uniformly from the range without the filter's band; the original value if the band covers the
+        whole range.
+        """
         original, threshold = self._characteristics.original[i], self._characteristics.threshold[i]
         width_below = max(original - threshold - self.lower[i], 0.0)
         width_above = max(self.upper[i] - original - threshold, 0.0)
@@ -108,7 +113,9 @@ class _Ranges:
         return float(self.lower[i] + position if position < width_below else self.upper[i] - (position - width_below))
 
     def narrow(self, window: Evaluations) -> None:
-        """Narrow each range to the mean increase and mean decrease in the settings of `window` that are less safe than the original."""
+        """Narrow each range to the mean increase and mean decrease in the settings of `window` that are less safe than
+        the original.
+        """
         less_safe = window.take(
             self._scoring.valid(window) & (self._scoring.values(window)[:, 0] < self._original_objective)
         )
@@ -143,8 +150,9 @@ def _scores(
 ) -> FloatArray:
     """The score (6 SD_norm + f_diff + num_norm) / 8, of which the search prefers low values; NaN where invalid.
 
-    SD_norm is the safety degree scaled to [0, 1] over `evaluations`; num_norm = (f_num_diff - 1) / (n - 1) for n characteristics.
-    The first of other objectives takes the place of the safety degree; further ones are scaled to [0, 1], too.
+    SD_norm is the safety degree scaled to [0, 1] over `evaluations`; num_norm = (f_num_diff - 1) / (n - 1) for n
+    characteristics. The first of other objectives takes the place of the safety degree; further ones are scaled to [0,
+    1], too.
     """
     values = np.where(scoring.valid(evaluations)[:, np.newaxis], scoring.values(evaluations), np.nan)
     score = safety_weight * _normalise(values[:, 0])

@@ -21,8 +21,8 @@ from safevar_sumo.search.evolution import (
 class Spea2(Operators, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Elitist search by strength and density; an archive, thinned where it is densest, produces the next population.
 
-    The variables are the characteristics' unfiltered values; simulation and results use filtered ones. The result is the
-    non-dominated part of the last archive. A setting whose simulation failed does not survive.
+    The variables are the characteristics' unfiltered values; simulation and results use filtered ones. The result is
+    the non-dominated part of the last archive. A setting whose simulation failed does not survive.
 
     Parameters
     ----------
@@ -54,7 +54,9 @@ class Spea2(Operators, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
 
 def select_archive(individuals: list[Individual], size: int, *, normalised: bool = False) -> list[Individual]:
-    """The publication's environmental selection; sets `standing` to the fitness, which is below 1 for non-dominated individuals."""
+    """The publication's environmental selection; sets `standing` to the fitness, which is below 1 for non-dominated
+    individuals.
+    """
     if not individuals:
         return []
     objectives = objectives_of(individuals)
@@ -77,19 +79,25 @@ def domination_matrix(objectives: FloatArray) -> BoolArray:
 
 
 def _raw_fitness(dominates: BoolArray) -> FloatArray:
-    """Raw fitness: the sum of the strengths of the individuals that dominate; the strength is the number of dominated individuals."""
+    """Raw fitness: the sum of the strengths of the individuals that dominate; the strength is the number of dominated
+    individuals.
+    """
     strength = np.count_nonzero(dominates, axis=1)
     return np.asarray(np.where(dominates, strength[:, np.newaxis], 0).sum(axis=0), dtype=float)
 
 
 def _density(distances: FloatArray) -> FloatArray:
-    """1 / (distance to the k-th nearest individual + 2); k is the root of the number of individuals, and counts from 0 as in pymoo."""
+    """1 / (distance to the k-th nearest individual + 2); k is the root of the number of individuals, and counts from 0
+    as in pymoo.
+    """
     k = min(int(np.sqrt(len(distances))), len(distances) - 1)
     return np.asarray(1 / (np.sort(distances, axis=1)[:, k] + 2))
 
 
 def _distances(objectives: FloatArray) -> FloatArray:
-    """Euclidean distances, infinite from a row to itself; summed objective by objective, so that they do not depend on the shape."""
+    """Euclidean distances, infinite from a row to itself; summed objective by objective, so that they do not depend on
+    the shape.
+    """
     squares = np.zeros((len(objectives), len(objectives)))
     for column in objectives.T:
         squares += (column[:, np.newaxis] - column) ** 2
@@ -106,7 +114,9 @@ def _scale_to_unit_range(objectives: FloatArray) -> FloatArray:
 
 
 def _truncate(indices: np.ndarray, distances: FloatArray, number: int) -> list[int]:
-    """Remove the individual with the nearest neighbour, one by one, until `number` are left; the second nearest decides ties, and so on."""
+    """Remove the individual with the nearest neighbour, one by one, until `number` are left; the second nearest decides
+    ties, and so on.
+    """
     kept: list[int] = indices.tolist()
     while len(kept) > number:
         pair_distances = distances[np.ix_(kept, kept)]

@@ -13,8 +13,8 @@ Description = Annotated[str, Meta(max_length=200)]
 class CharacteristicTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """One row of the characteristics table; its values are in `unit`, and f_diff multiplies its change by `weight`.
 
-    `meaning` describes the characteristic and begins with a short name (up to the first comma or bracket); `counterpart` is the part
-    of a real vehicle that sets it.
+    `meaning` describes the characteristic and begins with a short name (up to the first comma or bracket);
+    `counterpart` is the part of a real vehicle that sets it.
     """
 
     unit: str

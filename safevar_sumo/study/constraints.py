@@ -18,10 +18,11 @@ MAX_MEANING_LENGTH = 400
 class Constraint(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The bounds `at_least` and `at_most` of a quantity that depends on several characteristics.
 
-    The quantity is either a weighted sum, where `sum` holds a weight for each characteristic in its unit, or the result of `function`.
-    A function is named `package.module:Name`; it takes {name: array of shape (N,)} for N settings and returns an array of shape (N,).
-    `unit`, the unit of the quantity and its bounds, is the unit of a characteristic or "-"; it may be omitted if all characteristics of
-    the sum have the same unit. `meaning` explains the constraint and names its source.
+    The quantity is either a weighted sum, where `sum` holds a weight for each characteristic in its unit, or the result
+    of `function`. A function is named `package.module:Name`; it takes {name: array of shape (N,)} for N settings and
+    returns an array of shape (N,). `unit`, the unit of the quantity and its bounds, is the unit of a characteristic or
+    "-"; it may be omitted if all characteristics of the sum have the same unit. `meaning` explains the constraint and
+    names its source.
     """
 
     sum: dict[str, float] = {}
@@ -57,7 +58,9 @@ class Constraint(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 def constraint_mistakes(
     source: object, table: Mapping[str, CharacteristicTable], constraints: Sequence[Constraint]
 ) -> Iterator[InputError]:
-    """Errors for constraints that name unknown characteristics, add quantities of different units, or have no bounds."""
+    """Errors for constraints that name unknown characteristics, add quantities of different units, or have no
+    bounds.
+    """
     for index, constraint in enumerate(constraints):
         key = f"constraints[{index}]"
         if bool(constraint.sum) == bool(constraint.function):

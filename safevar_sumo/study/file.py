@@ -31,7 +31,9 @@ from safevar_sumo.study.validation import contradictions, convert_table, infinit
 WHOLE_TABLES = ("calibration", "published", "repeatability", "spread", "model_error")
 """Tables that a study inherits as a whole or not at all."""
 SYSTEM_KEYS = ("title", "published", "repeatability")
-"""Keys for one combination of vehicle, ADS, scenario, network, weather and matrix; a study with another one does not inherit them."""
+"""Keys for one combination of vehicle, ADS, scenario, network, weather and matrix; a study with another one does not
+inherit them.
+"""
 
 
 class _RawStudy(NamedTuple):
@@ -144,7 +146,9 @@ def _read_file(path: Path, visited_paths: tuple[Path, ...]) -> _RawStudy:
 
 
 def _with_base(raw: _RawStudy, path: Path, visited_paths: tuple[Path, ...]) -> _RawStudy:
-    """The tables of the study that `raw` extends, overridden by the tables of `raw`, with the folders of both studies."""
+    """The tables of the study that `raw` extends, overridden by the tables of `raw`, with the folders of both
+    studies.
+    """
     tables = dict(raw.tables)
     base = tables.pop("extends", None)
     if base is None:
@@ -219,7 +223,9 @@ def _model_and_network(table: object) -> object:
 
 
 def _merge(base: Mapping[str, Any], overrides: Mapping[str, Any]) -> dict[str, Any]:
-    """Override `base` by `overrides`; another `model` or `distribution`, and the tables `WHOLE_TABLES`, replace a whole table."""
+    """Override `base` by `overrides`; another `model` or `distribution`, and the tables `WHOLE_TABLES`, replace a whole
+    table.
+    """
     result = dict(base)
     for key, value in overrides.items():
         result[key] = _merge(base[key], value) if _refines(key, base.get(key), value) else value
@@ -241,7 +247,8 @@ def drop_nulls(raw: Any) -> Any:
 
 
 def write_study(path: Path, study: Study, comment: str) -> None:
-    """Write a complete study file that begins with a comment; the study takes the file's name if that is a legal name of a study.
+    """Write a complete study file that begins with a comment; the study takes the file's name if that is a legal name
+    of a study.
 
     Raises
     ------

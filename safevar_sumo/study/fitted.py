@@ -12,7 +12,9 @@ FITTED_TABLES = ("vehicle.parameters.", "ads.parameters.", "weather.")
 
 
 def locate_parameter(tables: Any, name: str) -> tuple[Any, int | str] | None:
-    """The table or list that holds a parameter that may be fitted, and the parameter's key or index in it; None if there is none."""
+    """The table or list that holds a parameter that may be fitted, and the parameter's key or index in it; None if
+    there is none.
+    """
     if not name.startswith(FITTED_TABLES):
         return None
     *path, last = name.split(".")
@@ -44,7 +46,9 @@ def missing_parameter(source: object, table: str, name: str) -> InputError:
 def contradictions_of_file(
     source: object, stated: Mapping[str, Any], tables: Mapping[str, Any]
 ) -> Iterator[InputError]:
-    """Errors for tables that a file states itself, not inherits, and that do not fit the complete `tables` of its study."""
+    """Errors for tables that a file states itself, not inherits, and that do not fit the complete `tables` of its
+    study.
+    """
     for table in ("calibration", "spread"):
         values = stated.get(table)
         for name in values if isinstance(values, Mapping) else ():

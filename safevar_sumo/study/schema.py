@@ -38,9 +38,9 @@ DESCRIPTION_KEYS = ("meaning", "counterpart")
 class ModelTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A model by its name, or by `package.module:Name`, and its parameters.
 
-    An ADS of the kind `traci` is a controller written for SUMO's TraCI; an ADS of the kind `fmu` is an FMU, named by its path: `inputs`
-    and `outputs` are the FMU's variables by the quantity they receive or return; `step` [s] is the FMU's time step, by default the declared
-    step.
+    An ADS of the kind `traci` is a controller written for SUMO's TraCI; an ADS of the kind `fmu` is an FMU, named by
+    its path: `inputs` and `outputs` are the FMU's variables by the quantity they receive or return; `step` [s] is the
+    FMU's time step, by default the declared step.
     """
 
     model: str
@@ -54,9 +54,10 @@ class ModelTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 class VehicleTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The vehicle under test: its model, the model's parameters, and the characteristics that vary.
 
-    A vehicle of the kind `fmu` is an FMU, named by its path, with `inputs`, `outputs` and `step` as for an ADS. Its parameters are the
-    characteristics, whose rows state only what the FMU does not declare. `sensors` and `sumo_type` map properties of the sensors and of
-    SUMO's vehicle type to a characteristic or a number; `sumo_type` may also name variables of the FMU.
+    A vehicle of the kind `fmu` is an FMU, named by its path, with `inputs`, `outputs` and `step` as for an ADS. Its
+    parameters are the characteristics, whose rows state only what the FMU does not declare. `sensors` and `sumo_type`
+    map properties of the sensors and of SUMO's vehicle type to a characteristic or a number; `sumo_type` may also name
+    variables of the FMU.
     """
 
     model: str
@@ -73,9 +74,10 @@ class VehicleTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
 class Weather(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Weather as data: its effects on the road and on the sensors.
 
-    `road_friction` and `visibility` are factors relative to the dry, clear case [-]; on a `wet` road worn treads lose further friction.
-    `recognition_delay` is the additional time that the sensors need to recognise a road user [s], for every ADS; the reaction time
-    of an ADS is one of its parameters. `light` decides only whether a rating darkens the weather for its tests by night.
+    `road_friction` and `visibility` are factors relative to the dry, clear case [-]; on a `wet` road worn treads lose
+    further friction. `recognition_delay` is the additional time that the sensors need to recognise a road user [s], for
+    every ADS; the reaction time of an ADS is one of its parameters. `light` decides only whether a rating darkens the
+    weather for its tests by night.
     """
 
     name: str
@@ -91,7 +93,8 @@ class MetricsTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
 
     `ttc_threshold` is TTC* [s]; `sampling_interval` [s] is the time between two samples that
     TET, TIT and aveDece are computed from (a whole multiple of the simulation's step; by default the step).
-    `also` names further metrics: metrics of the package, such as `max_jerk`, or users' metrics as `package.module:Name`.
+    `also` names further metrics: metrics of the package, such as `max_jerk`, or users' metrics as
+    `package.module:Name`.
     """
 
     ttc_threshold: PositiveNumber
@@ -102,8 +105,9 @@ class MetricsTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
 class SearchTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The search: `runs` runs of every algorithm, each with `evaluations` simulations.
 
-    A batch of simulations longer than `time_limit` [s] counts as hung. The search minimises `objectives`, and drives metrics in their
-    unsafe direction. `parameters` hold the parameters of algorithms by label; a file has them in tables such as [search.nsga2].
+    A batch of simulations longer than `time_limit` [s] counts as hung. The search minimises `objectives`, and drives
+    metrics in their unsafe direction. `parameters` hold the parameters of algorithms by label; a file has them in
+    tables such as [search.nsga2].
     """
 
     algorithms: Annotated[list[str], Meta(min_length=1)]
@@ -131,8 +135,8 @@ def label_of(algorithm: str) -> str:
 class MatrixTest(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A test of a matrix: a scenario at every combination of the values in `over`, in each of the `weathers`.
 
-    `parameters` are added to those of the study's scenario; a test with a `model` of its own has only its own parameters. A weather is a
-    name or a table.
+    `parameters` are added to those of the study's scenario; a test with a `model` of its own has only its own
+    parameters. A weather is a name or a table.
     """
 
     name: Annotated[str, Meta(min_length=1)]
@@ -143,13 +147,16 @@ class MatrixTest(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
 
 class RatingTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A manufacturer's `claims` for a rating: for each test, the robustness layers that cannot be simulated here, such as glare."""
+    """A manufacturer's `claims` for a rating: for each test, the robustness layers that cannot be simulated here, such
+    as glare.
+    """
 
     claims: dict[str, list[str]] = {}
 
 
 class MatrixTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The test points at which every setting is simulated: those of `tests`, or all cells of a `protocol`, which then rates every setting.
+    """The test points at which every setting is simulated: those of `tests`, or all cells of a `protocol`, which then
+    rates every setting.
 
     `aggregate` combines the points' safety degrees: `worst` takes the lowest one.
     """
@@ -162,8 +169,9 @@ class MatrixTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
 class FreeParameter(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A parameter to calibrate: its bounds in `unit`, and its meaning.
 
-    Studies that are fitted together share one fitted value if their files state the same value; with `own`, a study has its own. The
-    search measures distances of values as differences, or with `log` as ratios, for positive quantities of unknown magnitude.
+    Studies that are fitted together share one fitted value if their files state the same value; with `own`, a study has
+    its own. The search measures distances of values as differences, or with `log` as ratios, for positive quantities of
+    unknown magnitude.
     """
 
     lower: float
@@ -177,9 +185,10 @@ class FreeParameter(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
 class Origin(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Where a study comes from; results do not depend on it.
 
-    `called` is the study's path as given on the command line, empty if the study was given by its name; `point` is the point of the matrix
-    to which the study was reduced, empty for a whole study; `places` are the folders of its file and of the files that it extends, where
-    user code is looked up first; `files` are those of these files that are not shipped; `remarks` are for the user.
+    `called` is the study's path as given on the command line, empty if the study was given by its name; `point` is the
+    point of the matrix to which the study was reduced, empty for a whole study; `places` are the folders of its file
+    and of the files that it extends, where user code is looked up first; `files` are those of these files that are not
+    shipped; `remarks` are for the user.
     """
 
     called: str = ""
@@ -194,20 +203,22 @@ class FitTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
     The loss adds two parts; for a metric m, w_m is the weight in `weights`:
 
-    - `original` * mean_m(w_m 2 max(miss_m / (`tolerance` * published_m) - 1, 0)), where miss_m is |value - published_m| of the original
-      vehicle;
-    - the mean, over the files of published data, of sum_m(w_m (`rank` (1 - rho_m) + mean |error_m| / unit_m)) + `effects` * mean_c
-      |difference of the safety degree's linear effects over the domain of characteristic c| / unit + `collisions` * share of rows that
-      collide on one side only. rho_m is the rank correlation; a unit is the study's repeatability or, if unknown, the standard deviation
-      of the data.
+    - `original` * mean_m(w_m 2 max(miss_m / (`tolerance` * published_m) - 1, 0)), where miss_m is |value - published_m|
+      of the original vehicle;
+    - the mean, over the files of published data, of sum_m(w_m (`rank` (1 - rho_m) + mean |error_m| / unit_m)) +
+      `effects` * mean_c |difference of the safety degree's linear effects over the domain of characteristic c| / unit +
+      `collisions` * share of rows that collide on one side only. rho_m is the rank correlation; a unit is the study's
+      repeatability or, if unknown, the standard deviation of the data.
 
-    The loss of studies that are fitted together is the mean of their losses. One of every `hold_out` rows is only reported, not fitted.
-    Sets of parameters whose loss is within the share `alike` of the lowest loss fit equally well: they become the study's `spread`.
+    The loss of studies that are fitted together is the mean of their losses. One of every `hold_out` rows is only
+    reported, not fitted. Sets of parameters whose loss is within the share `alike` of the lowest loss fit equally well:
+    they become the study's `spread`.
 
-    `trials` sets of parameters are tried, in generations of `population`: in a race of searches from the study's own values and from
-    `starts` random places in the bounds; the worse half gives up after every round. With an `ensemble` of 2 or more, each random start is
-    an ensemble Kalman inversion of so many places, and the search begins at its best place and in its covariance; all inversions have half
-    the trials at most. A search around known values has a third of the `population`. `seed` is the seed of all random numbers.
+    `trials` sets of parameters are tried, in generations of `population`: in a race of searches from the study's own
+    values and from `starts` random places in the bounds; the worse half gives up after every round. With an `ensemble`
+    of 2 or more, each random start is an ensemble Kalman inversion of so many places, and the search begins at its best
+    place and in its covariance; all inversions have half the trials at most. A search around known values has a third
+    of the `population`. `seed` is the seed of all random numbers.
     """
 
     trials: PositiveInt = 1200
@@ -235,15 +246,17 @@ class Study(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     `step_length` is the simulation's time step [s], by default the time step in the network's options;
     `published` are the original vehicle's metrics in the published study, by name, as far as known;
     `repeatability` are standard deviations of repeats of one setting in the published study;
-    `calibration` are the free parameters by their keys in the file, such as `ads.parameters.corridor`, `fit` states how they are fitted,
-    `spread` are sets of their values that fit the published data equally well, a list for each parameter, the study's own value first;
-    `model_error` is the model's further error, by metric, for a vehicle that differs from the original by the full width of a domain;
-    `variation` and `correlations` state how characteristics vary in the world, by name: uniformly by default;
-    `constraints` are conditions that the characteristics of one vehicle satisfy together.
+    `calibration` are the free parameters by their keys in the file, such as `ads.parameters.corridor`, `fit` states how
+    they are fitted, `spread` are sets of their values that fit the published data equally well, a list for each
+    parameter, the study's own value first; `model_error` is the model's further error, by metric, for a vehicle that
+    differs from the original by the full width of a domain; `variation` and `correlations` state how characteristics
+    vary in the world, by name: uniformly by default; `constraints` are conditions that the characteristics of one
+    vehicle satisfy together.
     """
 
-    # A new key that changes no result of a campaign also belongs in KEYS_WITHOUT_EFFECT_ON_RESULTS of results/manifest.py. Any other new
-    # key becomes part of the identity of results: let `evaluation_keys` there omit its default, so that older results keep their identity.
+    # A new key that changes no result of a campaign also belongs in KEYS_WITHOUT_EFFECT_ON_RESULTS of
+    # results/manifest.py. Any other new key becomes part of the identity of results: let `evaluation_keys` there omit
+    # its default, so that older results keep their identity.
     name: Name
     title: str
     scenario: ModelTable

@@ -127,7 +127,9 @@ def _mistakes_of(source: object, error: Any, raw: object, path: Sequence[str | i
 def _missing_keys(
     source: object, names: Sequence[str], table: Mapping[str, Any], raw: Any, path: Sequence[str | int]
 ) -> InputError:
-    """The error for required keys that a table lacks; it may be meant to override single keys of a table with a similar name."""
+    """The error for required keys that a table lacks; it may be meant to override single keys of a table with a similar
+    name.
+    """
     siblings: Any = raw
     for key in path[:-1]:
         siblings = siblings[key]
@@ -139,7 +141,9 @@ def _missing_keys(
 
 
 def _unknown_key(source: object, key_path: str, key: str, names: Iterable[str], *, top_level: bool) -> InputError:
-    """The error for an unknown key: it suggests tables of a study that have this key or a similar one, else the nearest known key."""
+    """The error for an unknown key: it suggests tables of a study that have this key or a similar one, else the nearest
+    known key.
+    """
     definitions = json_schema(Study)["$defs"]
     tables = {
         name: definitions[schema["$ref"].rpartition("/")[2]]["properties"]

@@ -1,4 +1,6 @@
-"""How characteristics vary in the world: the distributions and correlations of a study, in the characteristics' units, and their checks."""
+"""How characteristics vary in the world: the distributions and correlations of a study, in the characteristics' units,
+and their checks.
+"""
 
 from __future__ import annotations
 
@@ -13,8 +15,9 @@ from safevar_sumo.errors import InputError, unknown_name
 from safevar_sumo.study.characteristics import CharacteristicTable, unit_text
 
 MAX_WIDTHS = 100
-"""Largest standard deviation of a normal distribution truncated to the domain [widths of the domain]. A wider distribution differs from the
-uniform one by less than 1/20,000, and its quantiles lose precision."""
+"""Largest standard deviation of a normal distribution truncated to the domain [widths of the domain]. A wider
+distribution differs from the uniform one by less than 1/20,000, and its quantiles lose precision.
+"""
 
 
 class Uniform(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="distribution", tag="uniform"):
@@ -25,7 +28,9 @@ class Uniform(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag
 
 
 class Normal(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="distribution", tag="normal"):
-    """A normal distribution with `mean`, by default the original, and standard deviation `deviation`, cut off at the ends of the domain."""
+    """A normal distribution with `mean`, by default the original, and standard deviation `deviation`, cut off at the
+    ends of the domain.
+    """
 
     deviation: Annotated[float, Meta(gt=0)]
     mean: float | None = None
@@ -34,7 +39,9 @@ class Normal(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_
 class Triangular(
     Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="distribution", tag="triangular"
 ):
-    """A triangular distribution from `lower` to `upper`, by default the domain, with its peak at `mode`, by default the original."""
+    """A triangular distribution from `lower` to `upper`, by default the domain, with its peak at `mode`, by default the
+    original.
+    """
 
     mode: float | None = None
     lower: float | None = None
@@ -63,7 +70,9 @@ Distribution = Uniform | Normal | Triangular | Lognormal | Fixed
 
 
 class Correlation(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The correlation of two characteristics after each is transformed to a standard normal variable (Gaussian copula)."""
+    """The correlation of two characteristics after each is transformed to a standard normal variable (Gaussian
+    copula).
+    """
 
     between: tuple[str, str]
     value: Annotated[float, Meta(gt=-1, lt=1)]

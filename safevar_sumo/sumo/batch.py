@@ -74,7 +74,9 @@ def score(system: System, settings: FloatArray, runs: SimulationRuns) -> Evaluat
 
 
 def reason_for_sumo(system: System) -> str:
-    """The reason why a system is simulated in SUMO, in one copy of the network per vehicle; "" if recorded scenes suffice."""
+    """The reason why a system is simulated in SUMO, in one copy of the network per vehicle; "" if recorded scenes
+    suffice.
+    """
     if isinstance(system.ads, TraciController):
         return "a controller written for TraCI reads the running simulation"
     scenes_or_reasons = record_scenes([point.scenario for point in system.points], step_options(system))
@@ -91,8 +93,8 @@ def drive_all(
     """Simulate N settings of n characteristics, shape (N, n), at every point.
 
     `watch` is called with SUMO's world at every sample, `listen` with what the ADS observes.
-    Several points must share a network and have recorded scenes; SUMO simulates only one point at once. The result holds the
-    runs at the first point, then the runs at the second point, and so on.
+    Several points must share a network and have recorded scenes; SUMO simulates only one point at once. The result
+    holds the runs at the first point, then the runs at the second point, and so on.
 
     Raises
     ------
@@ -215,7 +217,8 @@ def _simulate(
 
 
 def _check_finite(speed: FloatArray, settings: FloatArray, characteristics: CharacteristicSet) -> None:
-    """Refuse speeds that are not finite: SUMO would replace them by 0, and a vehicle whose model diverged would appear to stand.
+    """Refuse speeds that are not finite: SUMO would replace them by 0, and a vehicle whose model diverged would appear
+    to stand.
 
     The error replaces numpy's overflow warnings, which name neither a characteristic nor a value.
     """
@@ -308,7 +311,8 @@ class _Log:
 
 
 class _Outcomes:
-    """Outcomes of N runs (docs/method.md, section 4): `is_open` is true where an outcome can change; `ended_copies` ended in this step.
+    """Outcomes of N runs (docs/method.md, section 4): `is_open` is true where an outcome can change; `ended_copies`
+    ended in this step.
 
     `is_checked` is true where user code is checked: in runs that were open when their vehicles last advanced.
     """

@@ -54,7 +54,9 @@ def ensure_all_cached(folder: str, names: Sequence[str], build: Callable[[Path],
 
 @contextmanager
 def _new_folder(parent: Path) -> Iterator[Path]:
-    """A new folder, which is removed unless it is moved: removing one takes milliseconds on some file systems, moving it does not."""
+    """A new folder, which is removed unless it is moved: removing one takes milliseconds on some file systems, moving
+    it does not.
+    """
     folder = parent / f"new-{uuid4().hex}"
     folder.mkdir()
     try:

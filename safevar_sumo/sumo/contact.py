@@ -16,7 +16,9 @@ FRONT, LEFT, RIGHT, REAR = "front", "left", "right", "rear"
 
 
 class Touch(NamedTuple):
-    """First touches of M vehicles: side, time since then [s], and how far the other body's middle was behind the vehicle's front [m]."""
+    """First touches of M vehicles: side, time since then [s], and how far the other body's middle was behind the
+    vehicle's front [m].
+    """
 
     side: npt.NDArray[np.str_]
     age: FloatArray
@@ -24,7 +26,9 @@ class Touch(NamedTuple):
 
 
 class Contacts:
-    """First contacts of N vehicles; in a Euro NCAP test (`is_tested`) only contacts of the vehicle's front are collisions."""
+    """First contacts of N vehicles; in a Euro NCAP test (`is_tested`) only contacts of the vehicle's front are
+    collisions.
+    """
 
     def __init__(self, n: int, is_tested: BoolArray) -> None:
         self._is_tested, self._side, self._position_on_side = is_tested, np.full(n, "", dtype="U5"), np.full(n, np.nan)
@@ -54,10 +58,11 @@ class Contacts:
 def find_touches(own: Body, other: Body) -> Touch:
     """The first touches of M pairs of overlapping bodies, if their velocities were constant.
 
-    Two bodies of length l, l' and width w, w' at an angle a have the joint half extent r = (l + l' |cos a| + w' |sin a|) / 2 along the
-    first one and (w + l' |sin a| + w' |cos a|) / 2 across it. If their middles are x apart in such a direction and approach each other
-    at v, the overlap in it began (r - |x|) / v ago. The bodies touched in the direction in which the overlap began last, or, if they
-    approach each other in neither direction, in the one with the smaller overlap.
+    Two bodies of length l, l' and width w, w' at an angle a have the joint half extent r = (l + l' |cos a| + w' |sin
+    a|) / 2 along the first one and (w + l' |sin a| + w' |cos a|) / 2 across it. If their middles are x apart in such a
+    direction and approach each other at v, the overlap in it began (r - |x|) / v ago. The bodies touched in the
+    direction in which the overlap began last, or, if they approach each other in neither direction, in the one with the
+    smaller overlap.
     """
     across = np.stack([-own.along[:, 1], own.along[:, 0]], axis=1)
     to_other = other.middle - own.middle
@@ -85,7 +90,9 @@ def _dot(first: FloatArray, second: FloatArray) -> FloatArray:
 
 
 def _overlap_age(overlap: FloatArray, closing_speed: FloatArray) -> FloatArray:
-    """Time since bodies began to overlap in one direction, at a closing speed [s]; infinite if they do not approach each other."""
+    """Time since bodies began to overlap in one direction, at a closing speed [s]; infinite if they do not approach
+    each other.
+    """
     return np.where(
         closing_speed > 0, np.maximum(overlap, 0.0) / np.where(closing_speed > 0, closing_speed, 1.0), np.inf
     )

@@ -74,7 +74,8 @@ def parse_xml(source: Path) -> ElementTree.Element:
 
 
 def write_roads(root: ElementTree.Element, n: int, file: Path, source: Path) -> None:
-    """Write N copies of a built network, tag by tag: SUMO requires edges before junctions, and junctions before connections.
+    """Write N copies of a built network, tag by tag: SUMO requires edges before junctions, and junctions before
+    connections.
 
     Raises
     ------
@@ -116,7 +117,9 @@ def _departures(root: ElementTree.Element) -> Iterable[tuple[ElementTree.Element
 
 
 def parse_seconds(text: str) -> float | None:
-    """Convert a time in SUMO's format, seconds or [days:]hours:minutes:seconds, into seconds; None if the text is no time."""
+    """Convert a time in SUMO's format, seconds or [days:]hours:minutes:seconds, into seconds; None if the text is no
+    time.
+    """
     try:
         total, fields = 0.0, text.split(":")
         for factor, field in zip((86400, 3600, 60, 1)[-len(fields) :], fields, strict=True):

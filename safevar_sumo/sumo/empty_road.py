@@ -1,4 +1,6 @@
-"""The rule on whether a study can judge its ADS: with nobody in sight, the original vehicle drives to the place of the encounter."""
+"""The rule on whether a study can judge its ADS: with nobody in sight, the original vehicle drives to the place of the
+encounter.
+"""
 
 from __future__ import annotations
 
@@ -20,8 +22,9 @@ MIN_SLOWDOWN = 2.0
 def why_no_verdict(system: System) -> str:
     """Why simulations tell nothing about the ADS, in a sentence; "" if they do.
 
-    At every point the original vehicle drives once as on an empty road, as the ADS sees nobody. If it does not reach the place of
-    the encounter before the encounter is over, or brakes on its way, the obstacle is not what keeps it from a collision.
+    At every point the original vehicle drives once as on an empty road, as the ADS sees nobody. If it does not reach
+    the place of the encounter before the encounter is over, or brakes on its way, the obstacle is not what keeps it
+    from a collision.
     """
     try:
         results = simulate_all_points(replace(system, sees_nobody=True), system.characteristics.original[np.newaxis])

@@ -1,6 +1,7 @@
 """Starts and stops SUMO; no other module imports libsumo or traci.
 
-Both libraries have the same API: libsumo runs SUMO in this process, traci controls `sumo` or `sumo-gui` through a socket.
+Both libraries have the same API: libsumo runs SUMO in this process, traci controls `sumo` or `sumo-gui` through a
+socket.
 """
 
 from __future__ import annotations
@@ -24,8 +25,9 @@ CONNECTION_ATTEMPTS = 15
 
 
 class Engine(StrEnum):
-    """What moves the vehicles: numpy in recorded scenes (RECORDED; the same as LIBSUMO if an actor may react to the vehicles), or SUMO: in
-    this process (LIBSUMO), in another process (TRACI), or in another process with a window (GUI).
+    """What moves the vehicles: numpy in recorded scenes (RECORDED; the same as LIBSUMO if an actor may react to the
+    vehicles), or SUMO: in this process (LIBSUMO), in another process (TRACI), or in another process with a window
+    (GUI).
     """
 
     RECORDED = "recorded"

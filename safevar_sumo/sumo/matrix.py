@@ -36,7 +36,9 @@ from safevar_sumo.sumo.recording import Recording, record_scenes
 from safevar_sumo.sumo.system import System, assemble
 
 MAX_COPIES = 200
-"""Largest number of copies of a network in one simulation; beyond it, the processor's caches overflow and each copy costs more time."""
+"""Largest number of copies of a network in one simulation; beyond it, the processor's caches overflow and each copy
+costs more time.
+"""
 MAX_VEHICLES = 4000
 """Largest number of vehicles in recorded scenes at once; 200 steps of these vehicles take about 200 MB."""
 MAX_LANES = 100_000
@@ -63,8 +65,9 @@ class PointResult(NamedTuple):
 def point_record(result: PointResult, row: int = 0) -> dict[str, Any]:
     """Plain values of the setting in row `row` of a result; a value is None if it is undefined.
 
-    Keys: the point and the outcome; impact speeds [m/s]; the largest deviation from the test speed before the ADS acted [km/h]; the time to
-    collision at the first warning [s]; the side of the contact, and the position along that side [%].
+    Keys: the point and the outcome; impact speeds [m/s]; the largest deviation from the test speed before the ADS acted
+    [km/h]; the time to collision at the first warning [s]; the side of the contact, and the position along that side
+    [%].
     """
     evaluations, relative_speed = result.evaluations, result.runs.relative_speed
     values = {
@@ -93,7 +96,8 @@ def vehicle_remarks(system: System) -> list[str]:
     speed = min(max(speeds), float(tables.speeds[-1]))
     drag = float(np.interp(speed, tables.speeds, tables.coasting))
     return [
-        f"the vehicle was fitted to drives of up to {fitted_speed / KMH:.0f} km/h, and is tested at up to {max(speeds) / KMH:.0f} "
+        f"the vehicle was fitted to drives of up to {fitted_speed / KMH:.0f} km/h, and is tested at up to "
+        f"{max(speeds) / KMH:.0f} "
         f"km/h. Beyond its fit the model extrapolates: with the accelerator released, it loses {drag:.1f} m/s^2 at "
         f"{speed / KMH:.0f} km/h"
     ]
@@ -102,8 +106,8 @@ def vehicle_remarks(system: System) -> list[str]:
 def evaluate(system: System, settings: FloatArray, engine: Engine = Engine.RECORDED) -> Evaluations:
     """Simulate filtered settings, shape (N, n), in one batch and score them.
 
-    A pure function: row i of the result depends only on row i of `settings`, to the last bit. In a matrix, row i holds the result of
-    setting i at its worst point.
+    A pure function: row i of the result depends only on row i of `settings`, to the last bit. In a matrix, row i holds
+    the result of setting i at its worst point.
     """
     size = _batch_size(system, engine)
     batches = [settings[start : start + size] for start in range(0, len(settings), size)] or [settings]
@@ -122,7 +126,8 @@ def _evaluate_batch(system: System, settings: FloatArray, engine: Engine) -> Eva
 def rate_settings(
     system: System, settings: FloatArray, engine: Engine = Engine.RECORDED
 ) -> tuple[Evaluations, CellResults]:
-    """Simulate settings, shape (N, n), in all cells of a protocol: their evaluations with rating points, and their results in every cell.
+    """Simulate settings, shape (N, n), in all cells of a protocol: their evaluations with rating points, and their
+    results in every cell.
 
     Traces are dropped, as they would take gigabytes.
     """
@@ -146,7 +151,9 @@ def rate_settings(
 def evaluate_cells(
     system: System, settings: FloatArray, part: tuple[int, int], engine: Engine = Engine.RECORDED
 ) -> Evaluations:
-    """Evaluations, including `cells`, of settings, shape (N, n), in the k-th of m parts of a protocol's cells; `part` is (k, m)."""
+    """Evaluations, including `cells`, of settings, shape (N, n), in the k-th of m parts of a protocol's cells; `part`
+    is (k, m).
+    """
     assert system.rater is not None
     points = tuple(system.matrix[number] for number in cells_of_part(system.rater.protocol, *part))
     evaluations, cells = rate_settings(replace(system, matrix=points, rater=None), settings, engine)
@@ -203,7 +210,9 @@ def simulate(
 
 
 def simulate_all_points(system: System, settings: FloatArray, engine: Engine = Engine.RECORDED) -> list[PointResult]:
-    """Simulate settings, shape (N, n), at every point; results are in the points' order. Raises the errors of `drive_all`."""
+    """Simulate settings, shape (N, n), at every point; results are in the points' order. Raises the errors of
+    `drive_all`.
+    """
     by_name = {result.point.name: result for group in _simulate_groups(system, settings, engine) for result in group}
     return [by_name[point.name] for point in system.points]
 
@@ -243,7 +252,9 @@ def _find_point(system: System, name: str, source: object) -> Point:
 
 
 def _list_similar_points(name: str, names: Sequence[str]) -> str:
-    """The points most similar to an unknown name: those that share most parts between commas with it, then those with the closest text."""
+    """The points most similar to an unknown name: those that share most parts between commas with it, then those with
+    the closest text.
+    """
     if not names:
         return "a study with a matrix"
     words = {word.strip() for word in name.split(",")}
@@ -297,8 +308,8 @@ def _group_points(points: Sequence[Point], size: int, options: Sequence[str]) ->
 def worst_points(at_points: Sequence[PointResult | PointEvaluations]) -> npt.NDArray[np.intp]:
     """For every setting, the number of the point with the least safety degree; of equal points, the first by name.
 
-    A collision in a valid test always counts. Without a collision, a point with an invalid test counts as the worst, because such a test
-    leaves open whether the setting is safe.
+    A collision in a valid test always counts. Without a collision, a point with an invalid test counts as the worst,
+    because such a test leaves open whether the setting is safe.
     """
     order = sorted(range(len(at_points)), key=lambda k: at_points[k].point.name)
     safety_degrees = np.stack([at_points[k].evaluations.f_safe for k in order])

@@ -1,8 +1,9 @@
-"""SUMO networks: their folders, and N copies of a network and its traffic at the same coordinates, without connections between copies.
+"""SUMO networks: their folders, and N copies of a network and its traffic at the same coordinates, without connections
+between copies.
 
-A folder has a recipe (`.netccfg`), by which netconvert builds the network, or a built network (`.net.xml`); its traffic,
-and SUMO's options. The user's cache folder keeps the built network and the copies, in folders named by the content of
-the sources.
+A folder has a recipe (`.netccfg`), by which netconvert builds the network, or a built network (`.net.xml`); its
+traffic, and SUMO's options. The user's cache folder keeps the built network and the copies, in folders named by the
+content of the sources.
 """
 
 from __future__ import annotations
@@ -40,8 +41,8 @@ DIGEST_LENGTH = 16
 class Network(NamedTuple):
     """A network as its files are now.
 
-    `roads` is the recipe or the built network; `digests` are those of `roads`, the recipe's sources, traffic and options,
-    by file name.
+    `roads` is the recipe or the built network; `digests` are those of `roads`, the recipe's sources, traffic and
+    options, by file name.
     """
 
     folder: Path

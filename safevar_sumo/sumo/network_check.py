@@ -1,4 +1,6 @@
-"""Checks of a user's network: SUMO judges it, and own checks refuse what SUMO accepts but a study would measure wrongly."""
+"""Checks of a user's network: SUMO judges it, and own checks refuse what SUMO accepts but a study would measure
+wrongly.
+"""
 
 from __future__ import annotations
 
@@ -65,7 +67,8 @@ def check_network(name: str, source: str) -> None:
 
 
 def network_remarks(name: str, max_speed: float, *, sumo_drives: bool) -> list[str]:
-    """Remarks on parts of a user's network that the simulation does not use, and SUMO's warnings; none on shipped networks.
+    """Remarks on parts of a user's network that the simulation does not use, and SUMO's warnings; none on shipped
+    networks.
 
     Parameters
     ----------
@@ -95,7 +98,8 @@ def network_remarks(name: str, max_speed: float, *, sumo_drives: bool) -> list[s
         )
     unused = (
         [
-            f"{file}: no effect on vehicle {VUT!r}: {', '.join(dict.fromkeys(attributes))}; the study's vehicle and ADS "
+            f"{file}: no effect on vehicle {VUT!r}: {', '.join(dict.fromkeys(attributes))}; the study's "
+            "vehicle and ADS "
             "determine how it drives"
         ]
         if attributes
@@ -136,7 +140,9 @@ def _check_files(network: Network) -> None:
 
 
 def _check_sources(network: Network) -> None:
-    """Refuse sources that the recipe does not name, and a network that was edited in netedit while its sources were not."""
+    """Refuse sources that the recipe does not name, and a network that was edited in netedit while its sources were
+    not.
+    """
     names = [name for name, _ in network.digests]
     for file in sorted(network.folder.glob("*.???.xml")):
         if file.name not in names and re.search(r"\.(nod|edg|con|typ|tll)\.xml$", file.name):
@@ -152,7 +158,10 @@ def _check_sources(network: Network) -> None:
         raise InputError(
             file,
             f"has edits by netedit that {', '.join(names[:-2])} do not have",
-            "those files saved from netedit as plain XML, too; or a folder without those files, so that this network is used",
+            (
+                "those files saved from netedit as plain XML, too; or a folder without those files, so that this "
+                "network is used"
+            ),
         )
 
 
@@ -235,7 +244,9 @@ def _warnings_file(network: Network) -> Path:
 
 
 def _try_network(network: Network, into: Path) -> None:
-    """Load a network in a separate SUMO process, because some broken networks crash SUMO; then compare the traffic of two copies."""
+    """Load a network in a separate SUMO process, because some broken networks crash SUMO; then compare the traffic of
+    two copies.
+    """
     legal = "options and traffic that SUMO loads without an error"
     exit_code, messages = run_program(
         network.folder,

@@ -27,7 +27,9 @@ class Perception:
         self._visibility, self._delay_line = weather.visibility, DelayLine.by(weather.recognition_delay, step)
 
     def observe(self, time: float, speed: FloatArray, scene: Scene) -> Observation:
-        """The observation at this step; must be called in every step. An occluded obstacle appears at rest, infinitely far away."""
+        """The observation at this step; must be called in every step. An occluded obstacle appears at rest, infinitely
+        far away.
+        """
         values = np.empty((len(OCCLUDED_VALUES) + 1, len(speed)))
         values[0], values[1], values[2], values[3], values[4] = (
             scene.gap,
@@ -111,7 +113,9 @@ class PointBatch:
 
 
 def _join(records: Sequence[RecordT], sizes: Sequence[int]) -> RecordT:
-    """Join records of scalars or arrays of shape (size,) into a record of longer arrays; a scalar that all share stays a scalar."""
+    """Join records of scalars or arrays of shape (size,) into a record of longer arrays; a scalar that all share stays
+    a scalar.
+    """
     return type(records[0])._make(_concatenate(column, sizes) for column in zip(*records, strict=True))
 
 

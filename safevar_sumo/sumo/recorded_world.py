@@ -1,8 +1,8 @@
 """Vehicles that drive in recorded scenes, without SUMO.
 
-The vehicles move along the scenes' lanes by SUMO's ballistic update, and collide where bodies overlap. Their positions equal SUMO's to
-the last bit, because this module repeats the operations of `MSVehicle::updateState`, `MSLane::interpolateLanePosToGeometryPos` and
-`PositionVector::positionAtOffset` in the same order.
+The vehicles move along the scenes' lanes by SUMO's ballistic update, and collide where bodies overlap. Their positions
+equal SUMO's to the last bit, because this module repeats the operations of `MSVehicle::updateState`,
+`MSLane::interpolateLanePosToGeometryPos` and `PositionVector::positionAtOffset` in the same order.
 """
 
 from __future__ import annotations
@@ -27,7 +27,9 @@ NUMERICAL_EPS = 0.001
 NO_PAIRS = np.empty((0, 2), dtype=np.intp)
 """No (scene, actor) pairs: an empty array."""
 PARALLEL_COSINE = 1 - 1e-9
-"""Smallest absolute cosine of the angle between two parallel vehicles; vehicles in opposite directions are parallel too."""
+"""Smallest absolute cosine of the angle between two parallel vehicles; vehicles in opposite directions are parallel
+too.
+"""
 
 
 class UnknownActorError(Exception):
@@ -35,7 +37,9 @@ class UnknownActorError(Exception):
 
 
 def distance_covered(old_speed: FloatArray, new_speed: FloatArray, step: float) -> FloatArray:
-    """Distance [m] covered in a time step at constant acceleration, by the operations of SUMO's `MSVehicle::getDeltaPos`."""
+    """Distance [m] covered in a time step at constant acceleration, by the operations of SUMO's
+    `MSVehicle::getDeltaPos`.
+    """
     acceleration = (new_speed - old_speed) / step
     return np.asarray((old_speed + 0.5 * (acceleration * step)) * step)
 
@@ -48,7 +52,8 @@ def absence_error(actor: str, time: float) -> SimulationError:
 class SampledRecording:
     """A recorded scene at all of its T samples at once, with the methods of a world of T copies.
 
-    `absence`, shape (T,), is true where `actor`, the actor queried last, is not on the road; its last position is then repeated.
+    `absence`, shape (T,), is true where `actor`, the actor queried last, is not on the road; its last position is then
+    repeated.
     """
 
     def __init__(self, tracks: Mapping[str, Track]) -> None:
@@ -64,7 +69,8 @@ class SampledRecording:
 
 
 class RecordedWorldSlice:
-    """The N vehicles of a recorded world that drive in the same scene, with the methods of `SumoWorld` that scenarios call.
+    """The N vehicles of a recorded world that drive in the same scene, with the methods of `SumoWorld` that scenarios
+    call.
 
     Arrays have shape (N,) or (N, 2). All other actors move as recorded, so commands to them have no effect.
     """
@@ -128,7 +134,9 @@ class RecordedWorldSlice:
 
 
 class RecordedWorld:
-    """K recorded scenes of one network with `size` vehicles in each, and the methods of `SumoWorld` for these K * size vehicles."""
+    """K recorded scenes of one network with `size` vehicles in each, and the methods of `SumoWorld` for these K * size
+    vehicles.
+    """
 
     def __init__(self, recordings: Sequence[Recording], size: int) -> None:
         self._recordings, self._size, first_recording = recordings, size, recordings[0]
@@ -153,7 +161,9 @@ class RecordedWorld:
         )
 
     def set_types(self, *_: object) -> None:
-        """Do nothing: all vehicles have departed, and their types and decelerations do not limit the commanded speeds."""
+        """Do nothing: all vehicles have departed, and their types and decelerations do not limit the commanded
+        speeds.
+        """
 
     depart = set_decelerations = set_types
 
@@ -234,7 +244,8 @@ class RecordedWorld:
         *,
         only_persons: bool,
     ) -> Iterator[tuple[int, int]]:
-        """Yield the numbers of a body of `others` and of a vehicle that overlap: no edge of either rectangle separates them.
+        """Yield the numbers of a body of `others` and of a vehicle that overlap: no edge of either rectangle separates
+        them.
 
         Two parallel vehicles must overlap by more than a millimetre (SUMO, `MSLane::detectCollisionBetween`).
         """
@@ -275,7 +286,9 @@ class RecordedWorld:
         yield from zip(body[~is_separated].tolist(), vehicle[~is_separated].tolist(), strict=True)
 
     def _adjacent_pairs(self, is_open: BoolArray) -> Any:
-        """Numbers (scene, actor) of the M actors that vehicles of open runs are beside, now or one step ago; shape (M, 2)."""
+        """Numbers (scene, actor) of the M actors that vehicles of open runs are beside, now or one step ago; shape (M,
+        2).
+        """
         coordinates, last_coordinates = self.vehicle_positions(VUT) @ self._recordings[0].along, self._last_coordinates
         self._last_coordinates = coordinates
         if self.sample >= self._extents.shape[1]:
@@ -288,7 +301,9 @@ class RecordedWorld:
         return np.argwhere((starts < foremost[:, np.newaxis]) & (ends > rearmost[:, np.newaxis]))
 
     def bodies(self, copies: Sequence[int]) -> tuple[Body, Body]:
-        """The bodies of vehicles that collide in this step, and of the actors that they collide with, both in columns."""
+        """The bodies of vehicles that collide in this step, and of the actors that they collide with, both in
+        columns.
+        """
         vut, n = self._recordings[0], len(copies)
         own = Body.behind(self.vehicle_positions(VUT)[copies], vut.along, vut.length, vut.width, self._speeds[copies])
         return (

@@ -1,6 +1,8 @@
-"""Scenes that SUMO plays once: if nobody reacts to the vehicle under test, all other actors move identically in every simulation.
+"""Scenes that SUMO plays once: if nobody reacts to the vehicle under test, all other actors move identically in every
+simulation.
 
-While SUMO plays a scene, the vehicle under test stays at its start; `recorded_world.py` moves vehicles in the recorded scene.
+While SUMO plays a scene, the vehicle under test stays at its start; `recorded_world.py` moves vehicles in the recorded
+scene.
 """
 
 from __future__ import annotations
@@ -39,7 +41,8 @@ class UnrecordableError(Exception):
 
 
 class Track(NamedTuple):
-    """An actor at T steps: `position` [m], shape (T, 2); `angle` clockwise from north [degrees] and `speed` [m/s], shape (T,).
+    """An actor at T steps: `position` [m], shape (T, 2); `angle` clockwise from north [degrees] and `speed` [m/s],
+    shape (T,).
 
     Values are NaN while the actor is not on the road; `length` and `width` are in m.
     """
@@ -53,9 +56,11 @@ class Track(NamedTuple):
 
 
 class LaneSequence(NamedTuple):
-    """The L lanes that the vehicle under test follows, in order, which form a straight line; columns of shape (L,) or (L, 2) [m].
+    """The L lanes that the vehicle under test follows, in order, which form a straight line; columns of shape (L,) or
+    (L, 2) [m].
 
-    A lane leads from `first` along `vector`. SUMO counts positions on a lane from 0 to `end`; `stretch` is `shape_length` / `end`.
+    A lane leads from `first` along `vector`. SUMO counts positions on a lane from 0 to `end`; `stretch` is
+    `shape_length` / `end`.
     """
 
     first: FloatArray
@@ -69,17 +74,21 @@ class LaneSequence(NamedTuple):
         return LaneSequence._make(column[lane] for column in self)
 
     def positions(self, lane_position: FloatArray) -> FloatArray:
-        """Coordinates of the front bumpers, shape (N, 2) [m], of vehicles at positions on their lanes, shape (N,) [m]."""
+        """Coordinates of the front bumpers, shape (N, 2) [m], of vehicles at positions on their lanes, shape (N,)
+        [m].
+        """
         share = lane_position * self.stretch / self.shape_length
         return np.asarray(self.first + self.vector * share[:, np.newaxis])
 
 
 @dataclass(frozen=True, kw_only=True)
 class Recording:
-    """A recorded scene, in which the vehicle under test departs at position `start` on the first lane of its `way` [m], at `speed` [m/s].
+    """A recorded scene, in which the vehicle under test departs at position `start` on the first lane of its `way` [m],
+    at `speed` [m/s].
 
     `length` and `width` are the vehicle's [m], `lanes` the shapes of all lanes, `lane_of` each vehicle's first lane.
-    `extents`, shape (2, T, A): at step t, the vehicle is beside actor a while its front is between these coordinates `along` the lanes [m].
+    `extents`, shape (2, T, A): at step t, the vehicle is beside actor a while its front is between these coordinates
+    `along` the lanes [m].
     """
 
     step_length: float
@@ -107,7 +116,8 @@ class Recording:
 
 
 def record_scenes(scenarios: Sequence[Scenario], options: Sequence[str]) -> list[Recording | str]:
-    """Each scenario's scene, played with additional options of SUMO and recorded, or the reason why SUMO must simulate the scenario.
+    """Each scenario's scene, played with additional options of SUMO and recorded, or the reason why SUMO must simulate
+    the scenario.
 
     SUMO plays a scene once per process; scenes of shipped scenarios are also kept in the user's cache folder.
 
@@ -257,7 +267,9 @@ def _record(scenario: Scenario, world: SumoWorld) -> Recording:
 
 
 def _extent_beside(track: Track, along: FloatArray, vut_length: float) -> FloatArray:
-    """First and last coordinate of a vehicle's front while the vehicle is beside an actor, with a margin; shape (2, T) [m]."""
+    """First and last coordinate of a vehicle's front while the vehicle is beside an actor, with a margin; shape (2, T)
+    [m].
+    """
     angle = np.radians(track.angle)  # clockwise from north
     cosine, sine = along @ np.array([np.sin(angle), np.cos(angle)]), along @ np.array([np.cos(angle), -np.sin(angle)])
     middle = track.position @ along - cosine * (track.length / 2)

@@ -39,7 +39,9 @@ def stage_network(scenario: Scenario) -> Network:
 
 
 def stage_networks(scenarios: Sequence[Scenario]) -> list[Network]:
-    """The networks of several scenarios, whose files are read once per network; raises the errors of `stage_network`."""
+    """The networks of several scenarios, whose files are read once per network; raises the errors of
+    `stage_network`.
+    """
     networks = {name: open_network(name) for name in {scenario.network for scenario in scenarios}}
 
     def stage(scenario: Any) -> Network:

@@ -159,9 +159,9 @@ class Models(NamedTuple):
 class System:
     """A study's models, points, metrics and constraints, ready to simulate.
 
-    `source` is the study, as errors name it; `step_length` [s] is None if the network determines the time step; `rater` rates results in
-    the matrix of a protocol; `metrics_table` has the thresholds of the metrics in `measuring`; with `sees_nobody` the ADS sees no other
-    actor, and a run ends at the place of the encounter.
+    `source` is the study, as errors name it; `step_length` [s] is None if the network determines the time step; `rater`
+    rates results in the matrix of a protocol; `metrics_table` has the thresholds of the metrics in `measuring`; with
+    `sees_nobody` the ADS sees no other actor, and a run ends at the place of the encounter.
     """
 
     characteristics: CharacteristicSet
@@ -212,13 +212,15 @@ class System:
         }
         if uses_traci and not self._has_limited_range():
             remarks += [
-                f"weather {name!r}: visibility = {value:g} has no effect: the vehicle has no sensor range, so a controller written "
+                f"weather {name!r}: visibility = {value:g} has no effect: the vehicle has no sensor range, so "
+                "a controller written "
                 "for TraCI sees everything"
                 for name, value in visibilities.items()
             ]
         if not (self.ads.recognition_delay or self.ads.hesitation):
             remarks += [
-                f"weather {name!r} has no effect: its road and its visibility are those of clear weather, and no key of "
+                f"weather {name!r} has no effect: its road and its visibility are those of clear weather, and "
+                "no key of "
                 "[ads.parameters] delays the ADS in it"
                 for name in dict.fromkeys(point.weather.name for point in self.points if equals_clear(point.weather))
             ]
@@ -353,7 +355,8 @@ def _points_of(test: MatrixTest, study: Study, source: str) -> Iterator[Point]:
 
 
 def _locate_network(scenario: Any, search_folders: Sequence[str]) -> Any:
-    """The scenario with the path of its network, if the network is not shipped but is a folder or file beside the study.
+    """The scenario with the path of its network, if the network is not shipped but is a folder or file beside the
+    study.
 
     A folder with sources has priority, because a results directory beside the study may have the same name.
     """

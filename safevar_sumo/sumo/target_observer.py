@@ -1,4 +1,6 @@
-"""Many recorded scenes of one road, observed in one operation: their targets do not react, so all positions are known in advance."""
+"""Many recorded scenes of one road, observed in one operation: their targets do not react, so all positions are known
+in advance.
+"""
 
 from __future__ import annotations
 
@@ -47,7 +49,9 @@ class TargetObserver:
 
     @classmethod
     def of(cls, scenarios: Sequence[Scenario], world: RecordedWorld, size: int) -> TargetObserver | None:
-        """The observer of a world's scenes; None unless every scenario has a target that does not react, and all share one lane."""
+        """The observer of a world's scenes; None unless every scenario has a target that does not react, and all share
+        one lane.
+        """
         if not all(isinstance(scenario, TargetTest) for scenario in scenarios):
             return None
         sampled_recordings = [world_slice.at_all_samples() for world_slice in world.slices]
@@ -62,7 +66,9 @@ class TargetObserver:
         return cls(frames.pop(), constants, targets, sampled_recordings, world, size) if len(frames) == 1 else None
 
     def observe(self, is_open: BoolArray) -> Scene:
-        """The scene of all vehicles at the next sample; raises `SimulationError` if the target of an open run is not on the road."""
+        """The scene of all vehicles at the next sample; raises `SimulationError` if the target of an open run is not on
+        the road.
+        """
         sample, world = min(self._sample, len(self._absence) - 1), self._world
         if self._absence[sample].any():
             absent_scenes = np.flatnonzero(self._absence[sample] & is_open.reshape(-1, self._size).any(axis=1))
@@ -83,7 +89,9 @@ def _per_vehicle(values: Sequence[Any], size: int) -> Any:
 
 
 def _table(columns: Sequence[Any], length: int) -> Any:
-    """K columns of samples, padded with their last values, as a table of shape (length, K); a scalar if all are the same scalar."""
+    """K columns of samples, padded with their last values, as a table of shape (length, K); a scalar if all are the
+    same scalar.
+    """
     if all(np.ndim(column) == 0 and column == columns[0] for column in columns):
         return np.asarray(columns[0])
     table = np.empty((length, len(columns)), dtype=np.result_type(*columns))

@@ -17,7 +17,9 @@ from safevar_sumo.sumo.copies import copied_id, copy_and_name
 from safevar_sumo.vehicles import Sensors, SumoType
 
 INSERTION_DECELERATION = 9.0
-"""Least deceleration of a vehicle while it is inserted [m/s^2]: SUMO inserts only vehicles that could stop before every obstacle."""
+"""Least deceleration of a vehicle while it is inserted [m/s^2]: SUMO inserts only vehicles that could stop before every
+obstacle.
+"""
 MAX_DEPARTURE_SPEED = 200.0
 """Highest speed at which a vehicle may depart while a scene is recorded [m/s]."""
 # TraCI "set speed mode", bit 5: SUMO obeys every speed that is set, and its vehicle yields to nobody on a junction.
@@ -27,7 +29,9 @@ LANE_CHANGE_MODE = 0
 
 
 class Body(NamedTuple):
-    """A vehicle or person as a rectangle, or M of them in columns [m, m/s]; `along`, the direction, is a unit vector."""
+    """A vehicle or person as a rectangle, or M of them in columns [m, m/s]; `along`, the direction, is a unit
+    vector.
+    """
 
     middle: FloatArray
     along: FloatArray
@@ -134,7 +138,8 @@ class SumoWorld:
     def collisions(self, is_open: BoolArray) -> dict[int, float]:
         """Speeds [m/s] of the vehicles under test of open runs that collide in this step, by copy.
 
-        On a junction SUMO's collider is the vehicle that must yield (`MSLane::detectCollisions`): the vehicle under test may be either.
+        On a junction SUMO's collider is the vehicle that must yield (`MSLane::detectCollisions`): the vehicle under
+        test may be either.
         """
         self._struck_ids, speeds = {}, dict[int, float]()
         for collision in self._api.simulation.getCollisions():
@@ -147,7 +152,9 @@ class SumoWorld:
         return speeds
 
     def bodies(self, copies: Sequence[int]) -> tuple[Body, Body]:
-        """The bodies of vehicles that collide in this step, and of the actors that they collide with, both in columns."""
+        """The bodies of vehicles that collide in this step, and of the actors that they collide with, both in
+        columns.
+        """
         return (
             Body.columns([self._body_of(self.ids(VUT)[copy]) for copy in copies]),
             Body.columns([self._body_of(self._struck_ids[copy]) for copy in copies]),
@@ -215,7 +222,9 @@ class SumoWorld:
         return id_ not in self._driving_copies
 
     def actor_poses(self) -> dict[str, tuple[float, float, float]]:
-        """x and y of the front bumper or person [m], and heading clockwise from north [degrees], of all actors on the road, by id."""
+        """x and y of the front bumper or person [m], and heading clockwise from north [degrees], of all actors on the
+        road, by id.
+        """
         domains = (self._api.vehicle, self._api.person)
         return {
             id_: (*domain.getPosition(id_), domain.getAngle(id_)) for domain in domains for id_ in domain.getIDList()

@@ -19,7 +19,9 @@ Positive = Annotated[float, Meta(gt=0, le=1e5)]
 
 
 class Slope(NamedTuple):
-    """Gravity on a road, scalar or shape (N,) [m/s^2]: `back` against the direction of travel, negative downhill; `down` onto the road."""
+    """Gravity on a road, scalar or shape (N,) [m/s^2]: `back` against the direction of travel, negative downhill;
+    `down` onto the road.
+    """
 
     back: float | FloatArray
     down: float | FloatArray
@@ -42,7 +44,8 @@ Characteristics = Mapping[str, FloatArray]
 class SumoType(NamedTuple):
     """The attributes of N SUMO vehicle types, each of shape (N,), in kg, m/s^2, m/s^2, m/s and s.
 
-    `tau`, SUMO's desired headway, holds the actuator lag. It has no effect in SUMO, whose driver models do not drive the vehicle.
+    `tau`, SUMO's desired headway, holds the actuator lag. It has no effect in SUMO, whose driver models do not drive
+    the vehicle.
     """
 
     mass: FloatArray
@@ -101,8 +104,8 @@ class Vehicle:
     ) -> Any:
         """Constants of a run with a time step of `step` seconds.
 
-        `road_friction` is the weather's factor on the tyres' friction; `wet` is for models in which water has further effects. A user's
-        model gets `slope` and `wet` only on roads that have a slope or are wet.
+        `road_friction` is the weather's factor on the tyres' friction; `wet` is for models in which water has further
+        effects. A user's model gets `slope` and `wet` only on roads that have a slope or are wet.
         """
 
     @abstractmethod
@@ -130,11 +133,15 @@ class Vehicle:
         return steady if is_rolling.all() else _select_state(is_rolling, steady, rest)
 
     def hold_gear(self, prepared: Any, state: Any, holds: BoolArray) -> Any:
-        """The state in which vehicles do not change gear where `holds`, shape (N,), is true; the robot of tests at a speed needs it."""
+        """The state in which vehicles do not change gear where `holds`, shape (N,), is true; the robot of tests at a
+        speed needs it.
+        """
         return state
 
     def sensors(self, prepared: Any) -> Sensors | None:
-        """Sensors of the vehicles, for a controller that reads SUMO instead of observations; None if they see everything at once."""
+        """Sensors of the vehicles, for a controller that reads SUMO instead of observations; None if they see
+        everything at once.
+        """
         return None
 
     @abstractmethod
@@ -265,7 +272,9 @@ class GuardedVehicle(Vehicle):
         )
 
     def refuse_sense_without_sensors(self, characteristics: Characteristics) -> None:
-        """Refuse a model that changes observations in `sense` but has no method `sensors`, because a TraCI controller bypasses `sense`."""
+        """Refuse a model that changes observations in `sense` but has no method `sensors`, because a TraCI controller
+        bypasses `sense`.
+        """
         if type(self.model).sensors is not Vehicle.sensors:
             return
         prepared = self.prepare(characteristics, road_friction=1.0, step=PROBE_STEP)
@@ -286,7 +295,10 @@ class GuardedVehicle(Vehicle):
             sensed, state = self.sense(prepared, state, seen)
             for name, value in seen._asdict().items():
                 if not np.array_equal(getattr(sensed, name), value):
-                    problem = f"{self._guard.name} changes {name} in sense, but a controller that reads through TraCI bypasses sense"
+                    problem = (
+                        f"{self._guard.name} changes {name} in sense, but a controller that reads through TraCI "
+                        "bypasses sense"
+                    )
                     raise UserCodeError(
                         self._guard.source,
                         problem,

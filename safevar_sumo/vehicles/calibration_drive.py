@@ -30,7 +30,9 @@ def _original_values(characteristics: CharacteristicSet) -> dict[str, FloatArray
 
 @lru_cache(maxsize=4)
 def _simulated_tables(vehicle: Vehicle, characteristics: CharacteristicSet) -> PedalTables:
-    """Accelerate at full throttle to the highest speed of the tables; from there, coast in one drive and brake lightly in another."""
+    """Accelerate at full throttle to the highest speed of the tables; from there, coast in one drive and brake lightly
+    in another.
+    """
     prepared = vehicle.prepare(_original_values(characteristics), DRY_ROAD_FRICTION, STEP)
     rest = vehicle.at_rest(prepared)
 

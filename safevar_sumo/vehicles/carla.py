@@ -1,8 +1,8 @@
 """LincolnMkz2017 of CARLA 0.9.10: NVIDIA PhysX 3.4, PxVehicleDrive4W, along its path.
 
-The equations and the order of integration come from `PxVehicleUpdate.cpp` and `PxVehicleDefaultTireShader` (PhysX 3.4). One
-equivalent wheel represents the four. A step computes the tyre force from the slip at its beginning, then engine, clutch and wheels
-implicitly and in closed form, so that the stiff clutch does not limit the step.
+The equations and the order of integration come from `PxVehicleUpdate.cpp` and `PxVehicleDefaultTireShader` (PhysX 3.4).
+One equivalent wheel represents the four. A step computes the tyre force from the slip at its beginning, then engine,
+clutch and wheels implicitly and in closed form, so that the stiff clutch does not limit the step.
 """
 
 from __future__ import annotations
@@ -18,7 +18,8 @@ from safevar_sumo.vehicles.base import LEVEL, Characteristics, Positive, Slope, 
 from safevar_sumo.vehicles.sensors import Sensors
 
 Share = Annotated[float, Meta(gt=0, le=1)]
-# Constants used with arrays in every step are arrays themselves: numpy would convert a float each time, which doubles the cost.
+# Constants used with arrays in every step are arrays themselves: numpy would convert a float each time, which doubles
+# the cost.
 ZERO, ONE = map(np.array, (0.0, 1.0))
 NEUTRAL, FIRST_GEAR = ZERO, ONE
 RPM = 2 * math.pi / 60  # rad/s per r/min
@@ -47,10 +48,11 @@ TYRE_STEPS = 3  # per substep, at every speed; PhysX's number below 5 m/s (setSu
 class _Prepared(NamedTuple):
     """Constants of a run, SI; arrays of shape (N,).
 
-    `throttle_rates` and `brake_rates` are the largest fall and rise of a pedal in a substep. Quantities with names in `per_step`
-    are divided by the tyre step. In a tyre step the speed changes by `speed_by_force` per unit of force and by `speed_by_air` per unit of
-    squared speed; the slope pulls with `pull` [N] and reduces it by `speed_by_slope`. Below the speed `standstill` the tyres hold a braked
-    vehicle. `grip` is the largest tyre force [N], `assumed_height` the camera's assumed height over its actual height [-].
+    `throttle_rates` and `brake_rates` are the largest fall and rise of a pedal in a substep. Quantities with names in
+    `per_step` are divided by the tyre step. In a tyre step the speed changes by `speed_by_force` per unit of force and
+    by `speed_by_air` per unit of squared speed; the slope pulls with `pull` [N] and reduces it by `speed_by_slope`.
+    Below the speed `standstill` the tyres hold a braked vehicle. `grip` is the largest tyre force [N], `assumed_height`
+    the camera's assumed height over its actual height [-].
     """
 
     substeps: int
@@ -90,7 +92,9 @@ class _Prepared(NamedTuple):
 
 
 class CarlaState(NamedTuple):
-    """State of N vehicles: speed [m/s], wheel and engine speeds [rad/s], gears [-], time since a shift began [s], pedals [-]."""
+    """State of N vehicles: speed [m/s], wheel and engine speeds [rad/s], gears [-], time since a shift began [s],
+    pedals [-].
+    """
 
     speed: FloatArray
     wheel_speed: FloatArray
@@ -134,7 +138,8 @@ class Carla(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     tyre_friction
         Friction coefficient of a tyre on a dry road per unit of tireFric [-].
     longitudinal_stiffness
-        Longitudinal stiffness of a tyre, over gravity [N s^2/m per unit slip] (PxVehicleTireData.mLongitudinalStiffnessPerUnitGravity).
+        Longitudinal stiffness of a tyre, over gravity [N s^2/m per unit slip]
+        (PxVehicleTireData.mLongitudinalStiffnessPerUnitGravity).
     slip_offset
         Speed added to the denominator of a slip [m/s] (0.1 in PxVehicle's `computeTireSlips`).
     engine_torque
@@ -142,12 +147,13 @@ class Carla(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     throttle_rise, throttle_fall, brake_rise, brake_fall
         Rates of the pedals [1/s] (PxVehiclePadSmoothingData: 6 up, 10 down).
     shift_up, shift_down
-        Engine speeds over max_rpm above and below which the automatic gearbox shifts [-] (PxVehicleAutoBoxData: 0.65 and 0.5).
+        Engine speeds over max_rpm above and below which the automatic gearbox shifts [-] (PxVehicleAutoBoxData: 0.65
+        and 0.5).
     shift_latency
         Minimum time between the beginnings of two shifts [s] (PxVehicleAutoBoxData: 2).
     camera_height, camera_design_radius
-        Height of the camera above the road [m] with wheels of the design radius [m]. Wheels of another radius change the height, and
-        measured gaps scale by the assumed height over the actual height.
+        Height of the camera above the road [m] with wheels of the design radius [m]. Wheels of another radius change
+        the height, and measured gaps scale by the assumed height over the actual height.
     """
 
     UNITS = {
@@ -251,9 +257,11 @@ class Carla(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         return CarlaState(*(zeros for _ in CarlaState._fields))
 
     def at_speed(self, prepared: _Prepared, speed: FloatArray) -> CarlaState:
-        """The steady state with the pedals that hold the speed: every equation of `_roll` with its rate of change set to zero.
+        """The steady state with the pedals that hold the speed: every equation of `_roll` with its rate of change set
+        to zero.
 
-        The gearbox has shifted up to the gear for this speed; where it would now shift down, its last shift has just ended.
+        The gearbox has shifted up to the gear for this speed; where it would now shift down, its last shift has just
+        ended.
         """
         p, zeros = prepared, np.zeros_like(prepared.mass)
         rim, force = self._rim_at(p, speed)
@@ -262,7 +270,8 @@ class Carla(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
         def engine_in(ratio: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
             """Torque through the clutch and torque that remains for the brake [N m], and engine speed [rad/s]."""
-            # Downhill the engine brakes and the brake supplies the rest; then w_e = G w_w + m / k_c with the clutch torque m = -c_e w_e.
+            # Downhill the engine brakes and the brake supplies the rest; then w_e = G w_w + m / k_c with the clutch
+            # torque m = -c_e w_e.
             engine_drag = -p.damping_engaged * ratio * wheel_speed / (1 + p.damping_engaged / p.clutch)
             clutch_torque = np.maximum(resistance / ratio, engine_drag)
             return (
@@ -286,7 +295,9 @@ class Carla(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         )
 
     def hold_gear(self, prepared: _Prepared, state: CarlaState, holds: BoolArray) -> CarlaState:
-        """Hold the gear where `holds`, shape (N,), is true, as a selector lever does; once released, the gearbox may shift at once."""
+        """Hold the gear where `holds`, shape (N,), is true, as a selector lever does; once released, the gearbox may
+        shift at once.
+        """
         since_shift = np.where(state.since_shift < 0, prepared.shift_latency, state.since_shift)
         return state._replace(since_shift=np.where(holds, -np.inf, since_shift))
 
@@ -324,14 +335,16 @@ class Carla(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     def _roll(
         self, p: _Prepared, s: CarlaState, driveline: _Driveline, throttle: FloatArray, brake: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Engine, clutch, wheels, tyres and body over one substep; returns the speeds of vehicle [m/s], wheels and engine [rad/s].
+        """Engine, clutch, wheels, tyres and body over one substep; returns the speeds of vehicle [m/s], wheels and
+        engine [rad/s].
 
         I_e dw_e/dt = throttle T(w_e) - c_e w_e - k_c (w_e - G w_w)
         I_w dw_w/dt = G k_c (w_e - G w_w) - d w_w - T_brake - r F
         m dv/dt = F - D v |v| - m g sin
 
-        Index e is the engine, w the wheels; G is the gear ratio, k_c the clutch strength, c_e and d are damping rates, D is the air drag.
-        The tyre force F is explicit. It may end the slip within a step but never reverse it, so the slip cannot oscillate.
+        Index e is the engine, w the wheels; G is the gear ratio, k_c the clutch strength, c_e and d are damping rates,
+        D is the air drag. The tyre force F is explicit. It may end the slip within a step but never reverse it, so the
+        slip cannot oscillate.
         """
         clutch, clutch_times_ratio = driveline.clutch, driveline.clutch_times_ratio
         engine = driveline.engine_without_throttle + driveline.damping_by_throttle * throttle + clutch
@@ -373,7 +386,9 @@ class Carla(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         return force
 
     def _torque(self, p: _Prepared, engine_speed: FloatArray) -> FloatArray:
-        """Engine torque at full throttle [N m]: linear between the points of the curve; no engine is faster than its limit."""
+        """Engine torque at full throttle [N m]: linear between the points of the curve; no engine is faster than its
+        limit.
+        """
         speed_share = engine_speed / p.engine_limit
         rising_line = TORQUE_IDLE + TORQUE_RISE * speed_share
         falling_line = TORQUE_PEAK - TORQUE_FALL * (speed_share - PEAK_SPEED)
@@ -388,7 +403,9 @@ def _pedal_position(command: FloatArray, pedal: FloatArray, rates: tuple[FloatAr
 
 
 def _shift(p: _Prepared, s: CarlaState, throttle: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Automatic gearbox; returns gear, target gear, and time since the last shift began [s]. During a shift the gear is neutral."""
+    """Automatic gearbox; returns gear, target gear, and time since the last shift began [s]. During a shift the gear is
+    neutral.
+    """
     target, since_shift = s.target_gear, s.since_shift + p.step
     is_neutral, is_ready = s.gear <= NEUTRAL, s.since_shift >= p.shift_latency
     n_neutral = np.count_nonzero(is_neutral)

@@ -29,7 +29,8 @@ FILTER_SHARES = ((1000.0, 0.01), (100.0, 0.02), (1.0, 0.04), (0.0, 0.08))
 class Characteristic:
     """One characteristic of the vehicle under test; all quantities in `unit`. A change counts `weight` times in f_diff.
 
-    `meaning` describes the quantity, `counterpart` names the part of a real vehicle that determines it; both may be empty.
+    `meaning` describes the quantity, `counterpart` names the part of a real vehicle that determines it; both may be
+    empty.
     """
 
     name: str
@@ -43,7 +44,9 @@ class Characteristic:
 
     @property
     def short_name(self) -> str:
-        """The meaning up to the first comma or bracket, such as `engine drag`; the name if the study gives no meaning."""
+        """The meaning up to the first comma or bracket, such as `engine drag`; the name if the study gives no
+        meaning.
+        """
         return re.split(r"[,;(]", self.meaning)[0].strip() or self.name
 
     @property
@@ -77,7 +80,8 @@ class Characteristic:
     ) -> None:
         """Refuse a value that is not a number or not legal (`is_legal`).
 
-        `otherwise` describes further legal values; `switch` is the option that allows values beyond the domain, empty if there is none.
+        `otherwise` describes further legal values; `switch` is the option that allows values beyond the domain, empty
+        if there is none.
 
         Raises
         ------
@@ -164,7 +168,9 @@ class CharacteristicSet:
         return np.asarray(filtered != self.original)
 
     def largest_change(self, filtered: FloatArray) -> FloatArray:
-        """f_diff = max_i w_i |v_i - v''_i| / |v_i|, shape (N,): original v, filtered v'', weights w (method section 3, where w = 1)."""
+        """f_diff = max_i w_i |v_i - v''_i| / |v_i|, shape (N,): original v, filtered v'', weights w (method section 3,
+        where w = 1).
+        """
         return np.asarray(np.max(self.weight * (np.abs(self.original - filtered) / np.abs(self.original)), axis=1))
 
     def number_changed(self, filtered: FloatArray) -> FloatArray:
@@ -174,7 +180,8 @@ class CharacteristicSet:
     def setting(
         self, values: Mapping[str, float], source: object, *, beyond: bool = False, switch: str = "beyond=True"
     ) -> FloatArray:
-        """The original setting with some values replaced, shape (n,); with `beyond`, plausible values outside the domain are legal.
+        """The original setting with some values replaced, shape (n,); with `beyond`, plausible values outside the
+        domain are legal.
 
         `switch` is passed to `Characteristic.check`.
 
@@ -201,7 +208,9 @@ ChangeFunction = Callable[[FloatArray, CharacteristicSet], FloatArray]
 
 
 class Change(Struct, frozen=True, kw_only=True):
-    """A measure of change: `function` takes filtered settings, shape (N, n), and the characteristics; returns shape (N,)."""
+    """A measure of change: `function` takes filtered settings, shape (N, n), and the characteristics; returns shape
+    (N,).
+    """
 
     name: str
     title: str

@@ -30,7 +30,9 @@ from safevar_sumo.vehicles.sensors import Sensors, sensed_observation
 
 PEDALS: Mapping[str, str] = {"throttle": "-", "brake": "-"}
 CONSTANTS: Mapping[str, str] = {"road_friction": "-", "grade": "-", "wet": "-", "initial_speed": "m/s", "step": "s"}
-"""Quantities that are constant during a run: inputs of the FMU, or parameters that are set at the start. A grade is rise over run."""
+"""Quantities that are constant during a run: inputs of the FMU, or parameters that are set at the start. A grade is
+rise over run.
+"""
 OUTPUTS: Mapping[str, str] = {"speed": "m/s", "throttle": "-", "brake": "-", "gear": "-"}
 TYPE_UNITS: Mapping[str, str] = {"mass": "kg", "accel": "m/s^2", "decel": "m/s^2", "max_speed": "m/s", "tau": "s"}
 DEFAULT_LAG = 0.1
@@ -167,7 +169,10 @@ class FmuVehicle(Vehicle):
             []
             if "road_friction" in input_ports
             else [
-                f"{guard.name} has no vehicle.inputs.road_friction: weather has no effect on how it accelerates and brakes"
+                (
+                    f"{guard.name} has no vehicle.inputs.road_friction: weather has no effect on how it "
+                    "accelerates and brakes"
+                )
             ]
         )
 
@@ -245,7 +250,9 @@ class FmuVehicle(Vehicle):
             )
 
         def quantity_values(entry: str | float, name: str) -> FloatArray:
-            """Values of the quantity `name`, shape (n,): its entry is a number, a characteristic, or an output of the FMU."""
+            """Values of the quantity `name`, shape (n,): its entry is a number, a characteristic, or an output of the
+            FMU.
+            """
             if not isinstance(entry, str):
                 return zeros + entry
             if entry not in characteristics:
@@ -278,7 +285,10 @@ class FmuVehicle(Vehicle):
     def at_start(self, prepared: _Prepared, speed: FloatArray) -> _State:
         """The initial state at a speed [m/s], shape (N,)."""
         if np.any(speed > 0) and not self.can_start_moving:
-            problem = f"{self._guard.name} has no vehicle.inputs.initial_speed, and the traffic puts it onto the road in motion"
+            problem = (
+                f"{self._guard.name} has no vehicle.inputs.initial_speed, and the traffic puts it onto the road "
+                "in motion"
+            )
             raise UserCodeError(
                 self._guard.source, problem, "a variable for the initial speed, or traffic that departs with speed 0"
             )

@@ -1,8 +1,8 @@
 """Lincoln2017MKZ of LGSVL 2021.1: VehicleSMI on Unity's WheelColliders, along its path.
 
-The equations come from the simulator's `VehicleSMI.cs` and from the friction of Unity's WheelCollider. One equivalent wheel
-represents the four. In a substep, wheel and body form one linear system with the secant stiffness of the tyre. Its implicit
-solution has a closed form.
+The equations come from the simulator's `VehicleSMI.cs` and from the friction of Unity's WheelCollider. One equivalent
+wheel represents the four. In a substep, wheel and body form one linear system with the secant stiffness of the tyre.
+Its implicit solution has a closed form.
 """
 
 from __future__ import annotations
@@ -16,7 +16,8 @@ from msgspec import Meta, Struct
 from safevar_sumo.records import BoolArray, Command, FloatArray, Observation
 from safevar_sumo.vehicles.base import LEVEL, Characteristics, Slope, SumoType, Vehicle
 
-# Constants used with arrays in every step are arrays themselves: numpy would convert a float each time, which doubles the cost.
+# Constants used with arrays in every step are arrays themselves: numpy would convert a float each time, which doubles
+# the cost.
 ZERO, ONE, TWO, HALF = map(np.array, (0.0, 1.0, 2.0, 0.5))
 RPM_PER_RAD_S = np.array(30 / math.pi)  # r/min per rad/s
 RADIANS = math.pi / 180  # rad per degree
@@ -48,9 +49,9 @@ SUBSTEPS = 2
 class _Prepared(NamedTuple):
     """Constants of a run, SI except engine speeds in r/min; shape (N,) or ().
 
-    `pedal_share` is the share of its error that a pedal makes up in a step, `engine_share` the share that the engine speed makes up in a
-    substep. In a substep the traction control raises or lowers its torque by `traction_change` [N m].
-    `body` is the mass of body and wheels, `steering` the full steering angle.
+    `pedal_share` is the share of its error that a pedal makes up in a step, `engine_share` the share that the engine
+    speed makes up in a substep. In a substep the traction control raises or lowers its torque by `traction_change` [N
+    m]. `body` is the mass of body and wheels, `steering` the full steering angle.
     """
 
     step: FloatArray
@@ -81,8 +82,8 @@ class _Prepared(NamedTuple):
 
 
 class LgsvlState(NamedTuple):
-    """State of N vehicles: speeds [m/s, rad/s, r/min], gear and gear ratios [-], time since the last shift [s], torque that the traction
-    control allows [N m], lateral position [m], heading [rad], pedals [-].
+    """State of N vehicles: speeds [m/s, rad/s, r/min], gear and gear ratios [-], time since the last shift [s], torque
+    that the traction control allows [N m], lateral position [m], heading [rad], pedals [-].
     """
 
     speed: FloatArray
@@ -261,7 +262,8 @@ class Lgsvl(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     def _steer(self, p: _Prepared, s: LgsvlState) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Lane keeping, a kinematic bicycle at small angles: lateral position, heading, and cornering drag [N s/m].
 
-        The lane keeping commands a share of the full steering angle; the share suits the vehicle for which it was designed.
+        The lane keeping commands a share of the full steering angle; the share suits the vehicle for which it was
+        designed.
         """
         share = -(LATERAL_GAIN * s.lateral + HEADING_GAIN * s.heading) / (self.steering_design_angle * RADIANS)
         angle = np.minimum(np.maximum(share, -ONE), ONE) * p.steering
@@ -272,7 +274,9 @@ class Lgsvl(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
 
 def _shift(p: _Prepared, s: LgsvlState) -> LgsvlState:
-    """Automatic gearbox by engine speed; for shiftTime after a shift, the ratio moves linearly from the old one to the new one."""
+    """Automatic gearbox by engine speed; for shiftTime after a shift, the ratio moves linearly from the old one to the
+    new one.
+    """
     share = s.engine_rpm / p.largest_rpm
     is_ready = s.since_shift >= SHIFT_DELAY
     up = is_ready & (share > SHIFT_UP) & (s.gear < LAST_GEAR)
@@ -331,7 +335,9 @@ def _roll(p: _Prepared, s: LgsvlState, gearing: FloatArray, cornering_drag: Floa
 
 
 def _torque_share(share: FloatArray) -> FloatArray:
-    """Engine torque as a share of the largest, at an engine speed as a share of maxRpm: a parabola below 1, zero from 1 on (assumption)."""
+    """Engine torque as a share of the largest, at an engine speed as a share of maxRpm: a parabola below 1, zero from 1
+    on (assumption).
+    """
     torque = TORQUE_IDLE + TORQUE_BEND * share * (ONE - share)
     is_overspeed = share >= ONE
     if np.count_nonzero(is_overspeed):
@@ -340,7 +346,9 @@ def _torque_share(share: FloatArray) -> FloatArray:
 
 
 def _rim_at(p: _Prepared, speed: FloatArray, force: FloatArray) -> FloatArray:
-    """Rim speed [m/s] at which the tyre force is `force` [N]: the rising part of `_tyre_stiffness` solved for the rim speed."""
+    """Rim speed [m/s] at which the tyre force is `force` [N]: the rising part of `_tyre_stiffness` solved for the rim
+    speed.
+    """
     share = np.minimum(np.abs(force) / (p.friction * (p.weight + DOWNFORCE * speed * speed)), 1.0)
     slip = PEAK_SLIP * share / (1 + np.sqrt(1 - share))
     slow_rim = speed + SLIP_FLOOR * slip
@@ -349,7 +357,9 @@ def _rim_at(p: _Prepared, speed: FloatArray, force: FloatArray) -> FloatArray:
 
 
 def _tyre_stiffness(p: _Prepared, speed: FloatArray, rim: FloatArray, slip_speed: FloatArray) -> FloatArray:
-    """Tyre force over slip speed [N s/m], by Unity's WheelCollider: a parabola to the extremum, then a line to the asymptote."""
+    """Tyre force over slip speed [N s/m], by Unity's WheelCollider: a parabola to the extremum, then a line to the
+    asymptote.
+    """
     denominator = np.maximum(np.maximum(speed, rim), SLIP_FLOOR)
     slip = np.abs(slip_speed) / denominator
     friction = (TWO - slip / PEAK_SLIP) / PEAK_SLIP

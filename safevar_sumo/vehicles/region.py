@@ -22,13 +22,17 @@ N_REPAIR_SHARES = 64
 REJECTIONS = 1000
 """Maximum number of settings drawn for each feasible setting."""
 N_PROBES = 512
-"""Number of random settings among which a feasible change is sought, besides vertices of the region and ends of the domains."""
+"""Number of random settings among which a feasible change is sought, besides vertices of the region and ends of the
+domains.
+"""
 DrawSettings = Callable[[int], FloatArray]
 """A function that draws the given number of settings."""
 
 
 class _Bounds(NamedTuple):
-    """A constraint as a computation: `quantity` maps settings, shape (N, n), to values, shape (N,), in a range of size `width`."""
+    """A constraint as a computation: `quantity` maps settings, shape (N, n), to values, shape (N,), in a range of size
+    `width`.
+    """
 
     constraint: Constraint
     condition: str
@@ -65,7 +69,9 @@ class FeasibleRegion:
         return "; ".join(map(str, self.bounds))
 
     def violation(self, settings: FloatArray) -> FloatArray:
-        """Sum of the violations of all constraints, each as a share of the range of its quantity, shape (N,); 0 if feasible."""
+        """Sum of the violations of all constraints, each as a share of the range of its quantity, shape (N,); 0 if
+        feasible.
+        """
         excess = np.zeros(len(settings))
         for bound in self.bounds:
             excess = excess + bound.excess(settings)
@@ -105,7 +111,9 @@ class FeasibleRegion:
         )
 
     def repaired(self, settings: FloatArray, *, filtered: bool = True) -> FloatArray:
-        """Settings moved towards the original until they are feasible; if `filtered`, feasible after the filter. Shape (N, n)."""
+        """Settings moved towards the original until they are feasible; if `filtered`, feasible after the filter. Shape
+        (N, n).
+        """
         repaired = settings.copy()
         infeasible = np.flatnonzero(~self._are_accepted(settings, filtered))
         for share in np.arange(N_REPAIR_SHARES - 1, -1, -1) / N_REPAIR_SHARES:
@@ -127,8 +135,8 @@ class FeasibleRegion:
     ) -> FloatArray:
         """The first `number` feasible settings drawn (if `filtered`, feasible after the filter), shape (number, n).
 
-        If `rejections` draws per setting do not suffice, random mixtures of the region's vertices fill the rest; without `rng`, fewer
-        settings are returned.
+        If `rejections` draws per setting do not suffice, random mixtures of the region's vertices fill the rest;
+        without `rng`, fewer settings are returned.
         """
         batches, draws = [np.zeros((0, len(self.characteristics)))], 0
         while (shortage := number - sum(map(len, batches))) and draws < rejections * number:
@@ -264,7 +272,9 @@ def _refuse_unreachable(source: str, bound: _Bounds, characteristics: Characteri
 
 @lru_cache(maxsize=16)
 def _vertices(linear: tuple[Any, ...], lower: tuple[float, ...], upper: tuple[float, ...]) -> FloatArray | None:
-    """For each characteristic, settings with its least and its greatest value under the linear constraints; None if no setting fits."""
+    """For each characteristic, settings with its least and its greatest value under the linear constraints; None if no
+    setting fits.
+    """
     from scipy.optimize import linprog  # loading takes half a second
 
     inequalities = [

@@ -14,7 +14,8 @@ LONGEST_DELAY = 3600.0
 
 
 def start_history(longest_delay: float, step: float, sample: FloatArray) -> FloatArray:
-    """A history for delays up to `longest_delay` [s], filled with the first sample, shape (..., N); the newest sample comes first.
+    """A history for delays up to `longest_delay` [s], filled with the first sample, shape (..., N); the newest sample
+    comes first.
 
     Raises
     ------
@@ -46,7 +47,8 @@ def delay_signal(past: FloatArray, delay: FloatArray, step: float) -> FloatArray
 
 
 class Sensors(NamedTuple):
-    """Properties of the sensors of N vehicles, each of shape (N,): latency [s], range in clear weather [m], factor on distances [-].
+    """Properties of the sensors of N vehicles, each of shape (N,): latency [s], range in clear weather [m], factor on
+    distances [-].
 
     A vehicle's method `sensors(prepared)` returns them; `Vehicle.sense` applies the same sensors to an observation.
     """
@@ -64,7 +66,9 @@ class Sensors(NamedTuple):
 def sensed_observation(
     seen: Observation, past: FloatArray | None, latency: FloatArray, reach: FloatArray, step: float
 ) -> tuple[Observation, FloatArray]:
-    """The observation `latency` [s] ago, without obstacles beyond `reach` [m] times the visibility; also the history for the next call."""
+    """The observation `latency` [s] ago, without obstacles beyond `reach` [m] times the visibility; also the history
+    for the next call.
+    """
     obstacle_speed = np.broadcast_to(seen.obstacle_speed, seen.gap.shape)
     sample = np.stack([seen.gap, seen.closing_speed, seen.lateral, seen.lateral_speed, obstacle_speed])
     past = start_history(float(np.max(latency)), step, sample) if past is None else extend_history(past, sample)

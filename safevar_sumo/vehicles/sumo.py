@@ -30,7 +30,9 @@ class _Prepared(NamedTuple):
 
 
 class SumoState(NamedTuple):
-    """State of N vehicles: speed [m/s], acceleration by the wheels [m/s^2], actuator positions [-], and histories of delayed signals."""
+    """State of N vehicles: speed [m/s], acceleration by the wheels [m/s^2], actuator positions [-], and histories of
+    delayed signals.
+    """
 
     speed: FloatArray
     acceleration: FloatArray
@@ -124,7 +126,9 @@ class SumoVehicle(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fie
         return Sensors(prepared.reaction_time, prepared.sensor_range, np.ones_like(prepared.sensor_range))
 
     def sense(self, prepared: _Prepared, state: SumoState, seen: Observation) -> tuple[Observation, SumoState]:
-        """Sensors report the scene as it was `reactionTime` ago, and nothing beyond `sensorRange` times the visibility."""
+        """Sensors report the scene as it was `reactionTime` ago, and nothing beyond `sensorRange` times the
+        visibility.
+        """
         sensed, past = sensed_observation(
             seen, state.seen, prepared.reaction_time, prepared.sensor_range, prepared.step
         )

@@ -16,15 +16,19 @@ DEEP_TREAD, HALF_WORN_TREAD, LEGAL_TREAD = 6.7, 3.0, 1.6
 DEEP_TREAD_RATIO = 1.368
 """Stopping distance at 1.6 mm over the distance at 6.7 mm on wet hot rolled asphalt (MIRA for RoSPA) [-]."""
 HALF_WORN_RATIO = 39.9 / 31.7
-"""Stopping distance at 1.6 mm over the distance at 3 mm, from 50 mph on a wet road (MIRA for Continental; both in m) [-]."""
+"""Stopping distance at 1.6 mm over the distance at 3 mm, from 50 mph on a wet road (MIRA for Continental; both in m)
+[-].
+"""
 HALF_WORN_LOSS = (1 - HALF_WORN_RATIO / DEEP_TREAD_RATIO) / (1 - 1 / DEEP_TREAD_RATIO)
 """Loss of friction at 3 mm over the loss at 1.6 mm [-], as friction is proportional to 1 / stopping distance."""
 
 
 class _Prepared(NamedTuple):
-    """Constants of a run, SI, shape (N,): `drive` and `brake` are the accelerations by full pedals, `grip` is the friction coefficient.
+    """Constants of a run, SI, shape (N,): `drive` and `brake` are the accelerations by full pedals, `grip` is the
+    friction coefficient.
 
-    `front_load` and `rear_load` are the axles' shares of the weight at rest [-]; `response` is the dead time of the brakes.
+    `front_load` and `rear_load` are the axles' shares of the weight at rest [-]; `response` is the dead time of the
+    brakes.
     """
 
     step: float
@@ -57,29 +61,33 @@ class WornVehicle(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fie
     Parameters
     ----------
     kerb_mass, kerb_centre, wheelbase, centre_height
-        The empty car: mass [kg], distance of the centre of mass from the front axle, wheelbase, height of the centre of mass [m].
+        The empty car: mass [kg], distance of the centre of mass from the front axle, wheelbase, height of the centre of
+        mass [m].
     drive_force, brake_force, front_share
         Largest forces of engine and brakes [N], and the front axle's share of the brake force [-].
     tyre_friction
         Friction coefficient on a dry road [-].
     tread_loss
-        Share of the friction that tyres worn down to 1.6 mm have lost on a wet road [-]. The default is 1 - 1 / 1.368: their
-        stopping distance was 36.8 % longer than with 6.7 mm (MIRA for RoSPA, hot rolled asphalt). See the notes for other depths.
+        Share of the friction that tyres worn down to 1.6 mm have lost on a wet road [-]. The default is 1 - 1 / 1.368:
+        their stopping distance was 36.8 % longer than with 6.7 mm (MIRA for RoSPA, hot rolled asphalt). See the notes
+        for other depths.
     max_speed
         Top speed [m/s].
 
     Notes
     -----
-    The loss of friction on a wet road is linear in tread depth between published points: none from 6.7 mm on, `tread_loss` at 1.6 mm,
-    and at 3 mm the loss for which stopping at 1.6 mm takes 39.9 / 31.7 times the distance (MIRA for Continental, from 50 mph). The line
-    from 3 mm to 1.6 mm continues below 1.6 mm (assumption). The loss was measured from 50 mph and acts at every speed (assumption; tyres
-    lose less at lower speeds). The weather determines whether a road is wet; on a dry road the tread has no effect.
+    The loss of friction on a wet road is linear in tread depth between published points: none from 6.7 mm on,
+    `tread_loss` at 1.6 mm, and at 3 mm the loss for which stopping at 1.6 mm takes 39.9 / 31.7 times the distance (MIRA
+    for Continental, from 50 mph). The line from 3 mm to 1.6 mm continues below 1.6 mm (assumption). The loss was
+    measured from 50 mph and acts at every speed (assumption; tyres lose less at lower speeds). The weather determines
+    whether a road is wet; on a dry road the tread has no effect.
 
-    Brakes act on the command of `brakeResponse` ago, a dead time without lag. The deceleration a is the smallest of F / m (brake force
-    and mass), mu g, and, for each axle, the a at which that axle reaches its limit while the other axle brakes with its share. With
-    the centre of mass at the height h and the distance x behind the front axle, and the wheelbase L, the limits are
-    mu m (g (L - x) + a h) / L at the front axle and mu m (g x - a h) / L at the rear axle. On a slope, g stands for the
-    component of gravity onto the road, and the component along the road acts in addition to a. The vehicle never rolls back.
+    Brakes act on the command of `brakeResponse` ago, a dead time without lag. The deceleration a is the smallest of F /
+    m (brake force and mass), mu g, and, for each axle, the a at which that axle reaches its limit while the other axle
+    brakes with its share. With the centre of mass at the height h and the distance x behind the front axle, and the
+    wheelbase L, the limits are mu m (g (L - x) + a h) / L at the front axle and mu m (g x - a h) / L at the rear axle.
+    On a slope, g stands for the component of gravity onto the road, and the component along the road acts in addition
+    to a. The vehicle never rolls back.
     """
 
     UNITS = {
@@ -157,7 +165,9 @@ class WornVehicle(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fie
         return Sensors(prepared.latency, prepared.sensor_range, np.ones_like(prepared.sensor_range))
 
     def sense(self, prepared: _Prepared, state: WornState, seen: Observation) -> tuple[Observation, WornState]:
-        """The sensors report the scene as it was `sensorLatency` ago, and nothing beyond `sensorRange` times the visibility."""
+        """The sensors report the scene as it was `sensorLatency` ago, and nothing beyond `sensorRange` times the
+        visibility.
+        """
         sensed, past = sensed_observation(seen, state.seen, prepared.latency, prepared.sensor_range, prepared.step)
         return sensed, state._replace(seen=past)
 

@@ -154,7 +154,9 @@ def test_apollo_brakes_for_nobody_beyond_its_range_which_bad_sight_shortens(visi
 
 
 def test_apollo_asks_for_what_is_needed_to_stand_at_its_gap_through_the_originals_brake_table() -> None:
-    """Beyond the jerk limit: deceleration b = v^2 / (2 (gap - stop gap)), at most the largest; pedal = (b - coasting) / braking."""
+    """Beyond the jerk limit: deceleration b = v^2 / (2 (gap - stop gap)), at most the largest; pedal = (b - coasting) /
+    braking.
+    """
     ads = apollo(jerk=1e4)
     memory = ads.start(1, KNOWN, STEP)
     _, memory = ads.drive(seen(0.0, 8.0, 20.0), memory)

@@ -1,4 +1,6 @@
-"""The reference drivers against SUMO's own models, their formulas worked out by hand, and the numbers of the regulations."""
+"""The reference drivers against SUMO's own models, their formulas worked out by hand, and the numbers of the
+regulations.
+"""
 
 from __future__ import annotations
 
@@ -41,11 +43,14 @@ GAPS, SPEEDS, LEADERS = (
 
 @pytest.fixture(scope="module")
 def sumo(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
-    """libsumo with a vehicle of every model, all with SUMO's default parameters of a passenger car, cruising at 13.89 m/s."""
+    """libsumo with a vehicle of every model, all with SUMO's default parameters of a passenger car, cruising at 13.89
+    m/s.
+    """
     folder = NETWORKS / "car_to_car"
     traffic = tmp_path_factory.mktemp("models") / "traffic.rou.xml"
     kinds = [
-        f'<vType id="{name}" carFollowModel="{name}" minGap="2.5" tau="1" accel="2.6" decel="4.5" maxSpeed="13.89" speedDev="0"'
+        f'<vType id="{name}" carFollowModel="{name}" minGap="2.5" tau="1" accel="2.6" decel="4.5" '
+        'maxSpeed="13.89" speedDev="0"'
         f' sigma="0"/><vehicle id="{name}" type="{name}" route="r" depart="0" departPos="{100 + 300 * i}"/>'
         for i, name in enumerate(("IDM", "ACC", "Krauss"))
     ]
@@ -161,7 +166,9 @@ def test_the_competent_driver_keeps_its_headway_with_the_accelerator_alone() -> 
 
 
 def test_the_competent_driver_perceives_a_crossing_pedestrian_after_a_stray_of_three_eighths_of_a_metre() -> None:
-    """From 2 m aside at 1 m/s, seen at once: it strays at 0.375 s, is perceived at 0.775 s with a TTC below 2 s, brakes 0.75 s later."""
+    """From 2 m aside at 1 m/s, seen at once: it strays at 0.375 s, is perceived at 0.775 s with a TTC below 2 s, brakes
+    0.75 s later.
+    """
     onset_gap, _ = braking(CompetentDriver(), 10.0, 20.0, lateral=-2.0, lateral_speed=1.0)
     assert onset_gap == pytest.approx(20.0 - 10 * (0.375 + 0.4 + 0.75), abs=10 * 2.1 * STEP)
 
@@ -226,7 +233,9 @@ def driven(
 
 
 def test_who_has_stopped_for_a_pedestrian_waits_until_the_way_is_clear() -> None:
-    """The pedestrian stands in the way for 10 s and leaves at 1 m/s, 1.4 m to the edge of the way; then the vehicle goes on."""
+    """The pedestrian stands in the way for 10 s and leaves at 1 m/s, 1.4 m to the edge of the way; then the vehicle
+    goes on.
+    """
 
     def lateral(time: float) -> tuple[float, float]:
         return max(time - 10, 0.0), float(time >= 10)

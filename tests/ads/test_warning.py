@@ -32,7 +32,9 @@ def worn(scenario: Any, latency: float, ads: Any) -> SimulationRuns:
     "scenario", [CarToCar(test="CCRs", speed=60), Along(test="CPLA", speed=60), Along(test="CBLA", speed=70)]
 )
 def test_sensors_that_are_late_warn_as_much_later(scenario: Any, latency: float) -> None:
-    """The first step in which the observed gap / closing speed is below 2.2 s: a true TTC of 2.2 s - latency, or one step less."""
+    """The first step in which the observed gap / closing speed is below 2.2 s: a true TTC of 2.2 s - latency, or one
+    step less.
+    """
     warned = worn(scenario, latency, Aeb(warning_time=2.2)).warning_ttc[0]
     assert 2.2 - latency - STEP <= warned + 1e-9
     assert warned < 2.2 - latency + 1e-9

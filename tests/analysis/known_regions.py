@@ -1,4 +1,6 @@
-"""Made-up studies for tests: characteristics from 0 to 10 with an original of 5, and a pool whose unsafe region is known."""
+"""Made-up studies for tests: characteristics from 0 to 10 with an original of 5, and a pool whose unsafe region is
+known.
+"""
 
 from __future__ import annotations
 
@@ -29,7 +31,9 @@ def made_up_study(n: int) -> Study:
 
 
 class Plant:
-    """A pool in which settings in `region` collide at 1 m/s, settings in `failing` fail, and all others have the safety degree `degree`."""
+    """A pool in which settings in `region` collide at 1 m/s, settings in `failing` fail, and all others have the safety
+    degree `degree`.
+    """
 
     workers = 1
 

@@ -94,7 +94,9 @@ def test_an_obstacle_that_walks_on_leaves_nothing_unexplained() -> None:
 
 
 def test_an_overshooting_cruise_control_does_not_brake_for_the_obstacle() -> None:
-    """Two overshoot; the throttle ends that, or a brake that fades until the hazard. The last one does nothing else before it collides."""
+    """Two overshoot; the throttle ends that, or a brake that fades until the hazard. The last one does nothing else
+    before it collides.
+    """
     runs = drive_of(SAME, SAME, SAME, (10.0, -5.0, 0.2, 6.0))
     runs.trace.brake[50:150, 1:3] = 0.5
     runs.trace.throttle[150:200, 1] = 0.1
@@ -116,7 +118,9 @@ def test_pulses_are_one_braking() -> None:
 
 
 def test_a_creeping_deceleration_is_no_late_pedal() -> None:
-    """Both pedals are down 0.1 s after the command; one vehicle decelerates with 6 m/s^2 at once, the other comes to 6 within a second."""
+    """Both pedals are down 0.1 s after the command; one vehicle decelerates with 6 m/s^2 at once, the other comes to 6
+    within a second.
+    """
     runs = drive_of((10.0, 15.0, 0.1, 6.0), (10.0, 15.0, 0.1, 6.0))
     time, begins = runs.trace.time, 0.5
     rises = np.clip(time - begins - 0.1, 0.0, None)
@@ -137,7 +141,10 @@ def test_a_creeping_deceleration_is_no_late_pedal() -> None:
         (
             0.0,
             3.0,
-            "because it speeds up while the pedal moves and the gear changes from 0 to 2 (from 10.00 to 10.60 instead of from 10.00 to",
+            (
+                "because it speeds up while the pedal moves and the gear changes from 0 to 2 (from 10.00 to "
+                "10.60 instead of from 10.00 to"
+            ),
         ),
         (1.0, 3.0, "because it speeds up more while the pedal moves"),
         (3.0, 1.0, "because it speeds up less while the pedal moves"),

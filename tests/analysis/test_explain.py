@@ -164,7 +164,9 @@ def test_the_failures_that_matter_come_first(case: Case, explained: Explained) -
 
 @pytest.mark.slow
 def test_the_failure_to_lead_with_is_the_smallest_that_is_not_borderline(case: Case, explained: Explained) -> None:
-    """Every failure that is smaller, by number of changes and then by the largest, has less than 80 % of unsafe neighbours."""
+    """Every failure that is smaller, by number of changes and then by the largest, has less than 80 % of unsafe
+    neighbours.
+    """
     (robust,) = [one for one in explained.explanations if "smallest robust" in one.reasons]
     assert explained.explanations[0] == robust
     assert robust.robustness.share >= 0.8
@@ -236,7 +238,9 @@ def test_the_answer_takes_ten_lines_and_the_rest_is_asked_for(explained: Explain
 
 
 def assert_tells_a_manager(paragraph: str, explained: Explained) -> None:
-    """Conditions, original, what suffices for what, how robust, avoidable by whom: the numbers are those of `explain`."""
+    """Conditions, original, what suffices for what, how robust, avoidable by whom: the numbers are those of
+    `explain`.
+    """
     by_reason = {reason: one for one in explained.explanations for reason in one.reasons}
     fewest, robust = by_reason["fewest changes"], by_reason["smallest robust"]
     degree = float(explained.original.f_safe[0])

@@ -26,7 +26,9 @@ def test_a_band_holds_nine_tenths_of_the_sets_and_of_the_repeats() -> None:
 
 
 def test_the_models_error_makes_the_band_wider_with_the_distance_from_the_original_vehicle() -> None:
-    """Three quarters of one domain and half of another: sqrt(13/16) domains away, by Pythagoras. The original counts as 0.3 away."""
+    """Three quarters of one domain and half of another: sqrt(13/16) domains away, by Pythagoras. The original counts as
+    0.3 away.
+    """
     sets = {"spread": {GAP: [OWN, OWN]}, "repeatability": {"safety_degree": 1e-9}}
     bare, study = (load_study("sun", **sets, model_error=error) for error in ({}, {"safety_degree": 0.4}))
     ch = assemble(study).characteristics

@@ -1,4 +1,6 @@
-"""The second vehicle model against the package's equations and closed forms, its tables, and what it says of planted failures."""
+"""The second vehicle model against the package's equations and closed forms, its tables, and what it says of planted
+failures.
+"""
 
 from __future__ import annotations
 
@@ -210,9 +212,11 @@ class Boat(Wrapping):
     UNITS = {"sails": "m^2"}
 
     def prepare(self, c, road_friction, step, slope=LEVEL, wet=False):
-        values = {"treadDepth": 8.0, "brakeTorque": 1.0, "brakeResponse": 0.1, "payload": 75.0, "payloadCentre": 1.4, "sensorRange": 80.0,
+        values = {"treadDepth": 8.0, "brakeTorque": 1.0, "brakeResponse": 0.1, "payload": 75.0, "payloadCentre": 1.4,
+                  "sensorRange": 80.0,
                   "sensorLatency": 0.05}
-        return super().prepare({name: value + 0 * c["sails"] for name, value in values.items()}, road_friction, step, slope, wet)
+        columns = {name: value + 0 * c["sails"] for name, value in values.items()}
+        return super().prepare(columns, road_friction, step, slope, wet)
 """
 ONE_TEST = {"tests": [{"name": "CPNA", "parameters": {"test": "CPNA", "speed": 40}}]}
 
@@ -285,7 +289,9 @@ def test_no_rim_is_much_faster_than_the_car(study: str) -> None:
 
 @pytest.mark.slow
 def test_a_car_whose_wheels_spin_confirms_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without the limit of its torque, worn tyres' rims are 300 m/s faster than the car and push it into a collision at 8 m/s."""
+    """Without the limit of its torque, worn tyres' rims are 300 m/s faster than the car and push it into a collision at
+    8 m/s.
+    """
     cause = CauseToJudge("nsga2:24:1", WORN_TYRES, 0.99, 1.0)
     (calm,) = judge_causes(load_study("rain"), [cause], Unsafe()).opinions
     monkeypatch.setattr("safevar_sumo.analysis.opinion.multi_body.TRACTION_SHARE", np.inf)
@@ -377,7 +383,10 @@ def test_a_report_has_a_badge_for_each_cause_or_says_how_to_install(
         (("smoke",), "smoke: is a study and has no solutions\nexpected: a directory"),
         (
             ("nowhere",),
-            "nowhere: is not a results directory: there is no manifest.json\nexpected: a directory written by the command `study`",
+            (
+                "nowhere: is not a results directory: there is no manifest.json\nexpected: a directory written "
+                "by the command `study`"
+            ),
         ),
         (("{}", "--solution", "nsga2:0:999"), "solution nsga2:0:999"),
         (("{}", "--solutions", "first"), "'first'"),

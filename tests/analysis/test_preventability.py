@@ -1,4 +1,6 @@
-"""Preventability: the driving system's failure if a competent driver avoids it in the same vehicle; the vehicle's if nobody does."""
+"""Preventability: the driving system's failure if a competent driver avoids it in the same vehicle; the vehicle's if
+nobody does.
+"""
 
 from __future__ import annotations
 
@@ -75,14 +77,16 @@ def test_shares_are_told_as_a_range_over_reaction_times_with_two_digits() -> Non
             3,
             7,
             "of 7 collisions, a competent driver "
-            f"avoids 71 % (43 % if he needs 0.4 s longer), {full_braking} another 14 % and 14 % are physically unavoidable.",
+            f"avoids 71 % (43 % if he needs 0.4 s longer), {full_braking} another 14 % and 14 % are "
+            "physically unavoidable.",
         ),
         (
             {by.COMPETENT_DRIVER: 999, by.FULL_BRAKING: 1},
             390,
             3000,
             "of 1000 collisions, drawn at random from "
-            f"3000, a competent driver avoids nearly all (39 % if he needs 0.4 s longer) and {full_braking} hardly any.",
+            f"3000, a competent driver avoids nearly all (39 % if he needs 0.4 s longer) and {full_braking} "
+            "hardly any.",
         ),
         (
             {by.FULL_BRAKING: 17},
@@ -107,7 +111,9 @@ def test_a_child_that_comes_out_late_is_avoided_by_full_braking_alone() -> None:
 
 @pytest.mark.slow
 def test_shares_are_those_of_all_collisions_and_a_sample_is_random() -> None:
-    """Of 60 collisions, the 40 of the lowest engine speeds are the brakeless ones: those that come first when settings are sorted."""
+    """Of 60 collisions, the 40 of the lowest engine speeds are the brakeless ones: those that come first when settings
+    are sorted.
+    """
     here = evaluator(test="CPFA", speed=30)
     brakeless = (vehicle(0.1, 1 - (60 - k) / 1e6) for k in range(40))
     every = collisions(here, *brakeless, *(vehicle(1.0, 1 - k / 1e6) for k in range(20)))
@@ -246,15 +252,17 @@ def test_points_in_words() -> None:
 def test_the_summary_of_a_matrix_names_the_point_of_what_belongs_to_one(
     system: System, weak: np.ndarray, failure: PointComparison
 ) -> None:
-    """The original vehicle has one safety degree, that at its worst point; that at another point stands with the point's name."""
+    """The original vehicle has one safety degree, that at its worst point; that at another point stands with the
+    point's name.
+    """
     study = load_study("euro_ncap_pedestrian", matrix={"tests": TESTS})
     solutions = solutions_frame(system.characteristics.names, [(("nsga2", 0), evaluate(system, weak))])
     original = evaluate(system, system.characteristics.original[np.newaxis])
     case = build_case(study, record(original, 0), solutions, solutions.iloc[:0], [("nsga2", 0)])
     first, count, there, *_, more = summarise_failures(case, original, InlinePool(), "out")
-    assert (
-        first
-        == f"At the worst of 5 test points, the original vehicle passes with a safety degree of {original.f_safe[0]:.2f} m."
+    assert first == (
+        "At the worst of 5 test points, the original vehicle passes with a safety degree of "
+        f"{original.f_safe[0]:.2f} m."
     )
     assert count == "1 of 1 different vehicles are unsafe: collision."
     degree = failure.braking.original.safety_degree

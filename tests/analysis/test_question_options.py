@@ -1,4 +1,6 @@
-"""One set of options: what a record says of a default, flags, Python functions, the report's calls and printed commands follow."""
+"""One set of options: what a record says of a default, flags, Python functions, the report's calls and printed commands
+follow.
+"""
 
 from __future__ import annotations
 
@@ -44,7 +46,8 @@ flag = next(one.default for one in explain.params if one.name == "top")
 signature = inspect.signature(sv.explain).parameters["top"].default
 case = types.SimpleNamespace(solutions=pd.DataFrame())
 asked = ReportInput(study_number=1, directory="it", case=case, manifest={}, system=None).options["explain"]
-print(flag, signature, asked.top, "--top" in asked.command_line("it"), "--top 8" in module.ExplainOptions(top=8).command_line("it"))
+top_8 = module.ExplainOptions(top=8).command_line("it")
+print(flag, signature, asked.top, "--top" in asked.command_line("it"), "--top 8" in top_8)
 """
 
 

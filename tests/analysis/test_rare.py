@@ -105,7 +105,9 @@ def test_two_islands_are_told() -> None:
 
 
 def test_where_no_failure_is_within_reach_a_number_comes_out_all_the_same() -> None:
-    """OpenTURNS raises an error for a probability below the smallest that it estimates, and for samples without any failure."""
+    """OpenTURNS raises an error for a probability below the smallest that it estimates, and for samples without any
+    failure.
+    """
     beyond = rare(linear(9.0), 2, method="subset_simulation")
     assert (beyond.method, beyond.probability) == ("subset_simulation", 0)
     assert "no failure was found" in beyond.remark
@@ -148,7 +150,9 @@ def test_the_limit_of_rare_failures_has_one_owner(monkeypatch: pytest.MonkeyPatc
 
 
 def test_a_share_of_the_domain_is_counted_whatever_is_installed() -> None:
-    """Without [variation] it is no probability, and the shares of `risk`, `rules` and a report are counted on the same vehicles."""
+    """Without [variation] it is no probability, and the shares of `risk`, `rules` and a report are counted on the same
+    vehicles.
+    """
     study = made_up_study(2)
     assert (
         risk(study, unsafe="collision", pool=Plant(study, lambda rows: rows[:, 0] > 9.99), samples=3000).method

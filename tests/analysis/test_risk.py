@@ -1,4 +1,6 @@
-"""Probabilities against analytic volumes, distributions against their moments, sensitivity against Ishigami's function."""
+"""Probabilities against analytic volumes, distributions against their moments, sensitivity against Ishigami's
+function.
+"""
 
 from __future__ import annotations
 

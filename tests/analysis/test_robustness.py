@@ -1,4 +1,6 @@
-"""Whether a failure is robust: shares of unsafe neighbours, and the search for the robust failure with the fewest changes."""
+"""Whether a failure is robust: shares of unsafe neighbours, and the search for the robust failure with the fewest
+changes.
+"""
 
 from __future__ import annotations
 

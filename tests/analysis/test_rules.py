@@ -99,7 +99,9 @@ def test_the_promised_record_the_same_again_and_in_words() -> None:
 
 @pytest.mark.parametrize("constraint", [None, {"sum": {"a": 1.0, "b": 1.0}, "at_most": 12.0}])
 def test_the_share_of_unsafe_vehicles_is_that_of_risk(constraint: dict[str, Any] | None) -> None:
-    """The same vehicles in both, the first ones of a longer sequence in a shorter one: each estimate lies in the other's interval."""
+    """The same vehicles in both, the first ones of a longer sequence in a shorter one: each estimate lies in the
+    other's interval.
+    """
     study = made_up_study(2)
     study = load_study(study, constraints=[constraint]) if constraint else study
     asked = {number: Plant(study, box) for number in (400, 1000)}
@@ -120,7 +122,7 @@ def test_rules_say_over_what_they_hold() -> None:
     printed = " ".join(map(str, of(box).sentences()))
     assert "a above 7 N m and b below 3 N m, the others anywhere: collides in" in printed
     assert (
-        "all characteristics vary together over the whole domain; how far one may go while all others stay as in the original"
-        in printed
-    )
+        "all characteristics vary together over the whole domain; how far one may go while all others stay "
+        "as in the original"
+    ) in printed
     assert "% of 16384 vehicles drawn evenly over the whole domain (" in printed

@@ -130,7 +130,9 @@ def test_the_box_varies_the_characteristics_that_are_asked_for() -> None:
 
 
 def test_the_box_holds_no_unsafe_solution_of_a_search() -> None:
-    """A sliver that begins half of the way to the domain's end; no scan, no random setting and no corner of the domain hits it."""
+    """A sliver that begins half of the way to the domain's end; no scan, no random setting and no corner of the domain
+    hits it.
+    """
 
     def sliver(rows: FloatArray) -> BoolArray:
         return np.asarray(
@@ -160,10 +162,11 @@ def test_the_box_holds_no_unsafe_solution_of_a_search() -> None:
 
 @pytest.mark.slow
 def test_the_bound_of_the_box_holds_where_every_box_is_as_unsafe(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Unsafe: where digits of the logarithm of a change are below q. The share is q in every box: any box with a bound below q is wrong.
+    """Unsafe: where digits of the logarithm of a change are below q. The share is q in every box: any box with a bound
+    below q is wrong.
 
-    Boxes that are drawn anew until a sample of one has no unsafe setting would all be wrong. The search is switched off: it would
-    find that out before the tests do.
+    Boxes that are drawn anew until a sample of one has no unsafe setting would all be wrong. The search is switched
+    off: it would find that out before the tests do.
     """
     for name, value in (
         ("FIRST_SEARCH_POINTS", 1),

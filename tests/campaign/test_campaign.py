@@ -1,4 +1,6 @@
-"""Runs carried by pools whose evaluations are formulas: in any shares, alone and together, with more or fewer evaluations."""
+"""Runs carried by pools whose evaluations are formulas: in any shares, alone and together, with more or fewer
+evaluations.
+"""
 
 from __future__ import annotations
 

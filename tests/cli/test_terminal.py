@@ -77,7 +77,9 @@ def test_on_a_terminal_all_fits_in_its_line(width: int, study: Study, clock: lis
 
 
 def test_what_comes_from_journals_is_not_left_to_be_done(study: Study) -> None:
-    """A finished run of 1000, of 600 different settings; 500 settings of the next run; then 100 simulated, and again."""
+    """A finished run of 1000, of 600 different settings; 500 settings of the next run; then 100 simulated, and
+    again.
+    """
     shows: list[tuple[str, int, int]] = []
     observer = CampaignProgress(lambda *values: shows.append(values), study, all_runs(study))
     observer.finished(state("nsga2", 0, 1000, replayed=1000)._replace(collisions=600))

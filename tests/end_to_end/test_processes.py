@@ -1,4 +1,6 @@
-"""Studies in processes of their own, killed, interrupted, starved and edited: the same bytes or a clear error, nothing left behind."""
+"""Studies in processes of their own, killed, interrupted, starved and edited: the same bytes or a clear error, nothing
+left behind.
+"""
 
 from __future__ import annotations
 
@@ -286,7 +288,8 @@ def test_a_simulation_that_hangs_is_stopped_on_a_cluster_too(
     scheduler: tuple[subprocess.Popen[str], str], start: Start
 ) -> None:
     Path("my_ads.py").write_text(
-        "import time\nfrom safevar_sumo.ads import ScalarAds\n\n\nclass Dozing(ScalarAds):\n    def drive(self, seen):\n"
+        "import time\nfrom safevar_sumo.ads import ScalarAds\n\n\nclass Dozing(ScalarAds):\n    def "
+        "drive(self, seen):\n"
         "        time.sleep(1000)\n"
     )
     Path("dozing.toml").write_text(

@@ -122,7 +122,8 @@ def test_calibrate_finds_back_what_was_changed(data: Path, in_tmp: Path) -> None
 )
 def test_calibrate_touches_nothing_but_parameters(key: str, expected: tuple[str, ...], in_tmp: Path) -> None:
     Path("mine.toml").write_text(
-        f'extends = "sun"\nname = "mine"\n[calibration]\n"{key}" = {{ lower = 1, upper = 2, unit = "-", meaning = "none" }}\n'
+        f'extends = "sun"\nname = "mine"\n[calibration]\n"{key}" = {{ lower = 1, upper = 2, unit = "-", '
+        f'meaning = "none" }}\n'
     )
     refused("calibrate", "mine.toml", "--trials", "1", "--out", "x.toml", message=expected)
 

@@ -58,7 +58,11 @@ name = "exported_vehicle"
 [vehicle]
 kind = "fmu"
 model = "ExportedVehicle.fmu"
-inputs = { throttle = "accelerator", brake = "brake_pedal", road_friction = "friction", step = "interval", initial_speed = "start_speed" }
+inputs.throttle = "accelerator"
+inputs.brake = "brake_pedal"
+inputs.road_friction = "friction"
+inputs.step = "interval"
+inputs.initial_speed = "start_speed"
 outputs = { speed = "v", throttle = "throttle_now", brake = "brake_now" }
 sensors = { latency = "reactionTime", range = "sensorRange" }
 sumo_type = { mass = "mass", accel = "most_accel", decel = "most_decel", max_speed = "maxSpeed", tau = "tau" }
@@ -90,7 +94,9 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def small(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., System]:
-    """The system of an FMU that runs `then` within a gap of 25 m; `table` replaces the study's table, `edit` changes the FMU's file."""
+    """The system of an FMU that runs `then` within a gap of 25 m; `table` replaces the study's table, `edit` changes
+    the FMU's file.
+    """
     monkeypatch.chdir(tmp_path)
 
     def system(

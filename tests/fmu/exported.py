@@ -88,7 +88,8 @@ class ExportedVehicle(Fmi2Slave):
         self.tell()
 
     def tell(self):
-        self.v, self.throttle_now, self.brake_now = (float(one[0]) for one in (self.state.speed, self.state.throttle, self.state.brake))
+        state = self.state
+        self.v, self.throttle_now, self.brake_now = (float(one[0]) for one in (state.speed, state.throttle, state.brake))
 
     def do_step(self, time, step):
         command = Command(np.array([self.accelerator]), np.array([self.brake_pedal]))
@@ -151,11 +152,14 @@ class Third(Fmi3Slave):
     def __init__(self, **kwargs):
         super().__init__(**kwargs)
         self.time, self.speed, self.gap, self.where, self.wish = 0.0, 0.0, 0.0, 0.0, 0.0
-        self.register_units([Unit("km/h", m=1, s=-1, factor=1 / 3.6), Unit("mm", m=1, factor=1e-3), Unit("%", factor=0.01)])
-        self.register_variable(Float64("time", causality=Fmi3Causality.independent, variability=Fmi3Variability.continuous))
+        units = [Unit("km/h", m=1, s=-1, factor=1 / 3.6), Unit("mm", m=1, factor=1e-3), Unit("%", factor=0.01)]
+        self.register_units(units)
+        variability, causality = Fmi3Variability, Fmi3Causality
+        self.register_variable(Float64("time", causality=causality.independent, variability=variability.continuous))
         self.register_variable(Float64("speed", causality=Fmi3Causality.input, unit="km/h"))
         self.register_variable(Float64("gap", causality=Fmi3Causality.input, unit="mm"))
-        self.register_variable(Float64("where", causality=Fmi3Causality.parameter, variability=Fmi3Variability.fixed, unit="mm"))
+        where = Float64("where", causality=causality.parameter, variability=variability.fixed, unit="mm")
+        self.register_variable(where)
         self.register_variable(Float64("wish", causality=Fmi3Causality.output, unit="%"))
 
     def do_step(self, now, step):

@@ -1,4 +1,6 @@
-"""What the standard lets an FMU have: FMI 3.0, units, bounds, a step of its own, one instance in a process, parameters with domains."""
+"""What the standard lets an FMU have: FMI 3.0, units, bounds, a step of its own, one instance in a process, parameters
+with domains.
+"""
 
 from __future__ import annotations
 
@@ -77,7 +79,10 @@ def test_one_instance_in_a_process_is_enough(small: Make) -> None:
 
     table = TABLE.replace("brake", "acceleration").replace("25.0", "1e6")
     expected = degrees(small("self.pedal = 2.0 - 0.1 * self.steps", table))
-    once = "if now > 0 and Small.last is not self: raise RuntimeError('a second instance')\n            Small.last = self; "
+    once = (
+        "if now > 0 and Small.last is not self: raise RuntimeError('a second instance')\n            Small.last "
+        "= self; "
+    )
     with pytest.raises(UserCodeError, match="a second instance"):
         degrees(small(once + "self.pedal = 2.0 - 0.1 * self.steps", table))
     edit = edited('canBeInstantiatedOnlyOncePerProcess="false"', 'canBeInstantiatedOnlyOncePerProcess="true"')
@@ -124,7 +129,9 @@ def cart(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def test_a_vehicles_characteristics_are_the_parameters_that_its_fmu_declares(cart: Path) -> None:
-    """The study's rows override them and may have another unit; a parameter without a bound needs a row to be a characteristic."""
+    """The study's rows override them and may have another unit; a parameter without a bound needs a row to be a
+    characteristic.
+    """
 
     def rows(more: str) -> dict[str, tuple[str, float, float, float]]:
         (cart / "cart.toml").write_text(CART_TABLE.format(more=more))
@@ -208,7 +215,9 @@ def test_what_no_vehicle_has_is_refused(old: str, new: str, problem: str, cart: 
 def test_a_vehicle_of_another_step_is_where_its_line_between_two_points_is_and_goes_back_to_where_it_was(
     cart: Path,
 ) -> None:
-    """A step of 0.4 s in a simulation with steps of 0.1 s; a second drive from a state in the middle is the same as the first."""
+    """A step of 0.4 s in a simulation with steps of 0.1 s; a second drive from a state in the middle is the same as the
+    first.
+    """
     (cart / "cart.toml").write_text(
         CART_TABLE.format(more="step = 0.4\n[vehicle.characteristics]\npower = { original = 10.8 }")
     )

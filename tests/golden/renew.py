@@ -1,6 +1,8 @@
-"""Results of shipped studies: the original vehicle and a small search, computed in this process. As a program: renews golden.json.
+"""Results of shipped studies: the original vehicle and a small search, computed in this process. As a program: renews
+golden.json.
 
-Each entry has rounded values that a person can compare, the reason for the entry (`why`), and digests of the exact values.
+Each entry has rounded values that a person can compare, the reason for the entry (`why`), and digests of the exact
+values.
 """
 
 from __future__ import annotations

@@ -10,7 +10,10 @@ import pytest
 from safevar_sumo.results import RESULTS
 from tests.golden.renew import FILE, WHY, computed, platform_here
 
-CHANGED = "results changed: if that is meant, raise RESULTS in safevar_sumo/results/manifest.py, renew golden.json and say why"
+CHANGED = (
+    "results changed: if that is meant, raise RESULTS in safevar_sumo/results/manifest.py, renew golden.json and "
+    "say why"
+)
 GOLDEN = json.loads(FILE.read_text(encoding="utf-8"))
 
 

@@ -62,7 +62,9 @@ def test_safety_degree_of_a_collision_is_minus_its_speed() -> None:
 
 
 def test_safety_degree_is_the_least_separation_of_the_encounter_alone() -> None:
-    """The encounter ends after 1 s and 7.5 m, at a gap of 4.5 m; the last gap is 2 m. Without an encounter it is undefined."""
+    """The encounter ends after 1 s and 7.5 m, at a gap of 4.5 m; the last gap is 2 m. Without an encounter it is
+    undefined.
+    """
     run = braking_run(10, 5, 12)
     while_it_lasts = run.encounter._replace(in_conflict=run.trace.time[:, np.newaxis] < 1.0)
     assert value("safety_degree", dataclasses.replace(run, encounter=while_it_lasts)) == pytest.approx(

@@ -1,4 +1,6 @@
-"""Planted defects of all kinds are found, with the input that shows them; what is shipped and what is right elsewhere passes."""
+"""Planted defects of all kinds are found, with the input that shows them; what is shipped and what is right elsewhere
+passes.
+"""
 
 from __future__ import annotations
 

@@ -97,7 +97,8 @@ def test_an_ads_over_arrays_that_is_wrong(body: str, expected: str, mine: Mine) 
 
 def vehicle(method: str, body: str) -> str:
     return (
-        "import numpy as np\nfrom safevar_sumo.vehicles.sumo import SumoVehicle\n\n\nclass Mine:\n    UNITS = SumoVehicle.UNITS\n\n"
+        "import numpy as np\nfrom safevar_sumo.vehicles.sumo import SumoVehicle\n\n\nclass Mine:\n    UNITS "
+        "= SumoVehicle.UNITS\n\n"
         "    def __init__(self):\n        self.inner = SumoVehicle(reference_mass=1500)\n\n"
         "    def prepare(self, characteristics, road_friction, step):\n"
         "        return self.inner.prepare(characteristics, road_friction, step)\n\n"
@@ -173,7 +174,8 @@ def test_a_users_vehicle_drives_to_the_bit_like_the_vehicle_that_it_wraps(mine: 
 def scenario(method: str, body: str) -> str:
     return (
         "import numpy as np\nfrom safevar_sumo.scenarios import PedestrianCrossing\n\n\nclass Mine:\n"
-        "    network, duration = 'pedestrian_crossing', 2.0\n\n    def __init__(self):\n        self.inner = PedestrianCrossing()\n\n"
+        "    network, duration = 'pedestrian_crossing', 2.0\n\n    def __init__(self):\n        self.inner = "
+        "PedestrianCrossing()\n\n"
         + "".join(
             f"    def {name}(self, {arguments}):\n        result = self.inner.{name}({arguments})\n"
             f"        {body if name == method else 'pass'}\n        return result\n\n"

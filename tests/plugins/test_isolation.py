@@ -126,7 +126,9 @@ class Mine(ScalarAds):
 
 @pytest.mark.slow
 def test_a_class_that_changes_after_three_hundred_vehicles(mine: Mine, folder: Path, tmp_path: Path) -> None:
-    """The checks at the start do not reveal it; what the run simulates again does, and the same command again does not get by either."""
+    """The checks at the start do not reveal it; what the run simulates again does, and the same command again does not
+    get by either.
+    """
     system = mine(SAFER)
     study = load_study(str(folder / "mine.toml"), search={"algorithms": ["rs"], "evaluations": 450, "runs": 1})
     for _ in range(2):

@@ -1,4 +1,6 @@
-"""What a model does after its vehicle's own run has ended, while others in the batch still drive, is neither checked nor an error."""
+"""What a model does after its vehicle's own run has ended, while others in the batch still drive, is neither checked
+nor an error.
+"""
 
 from __future__ import annotations
 

@@ -1,6 +1,8 @@
-"""Derive `safevar_sumo/protocol/euro_ncap_2026.toml` from the official calculator, in an environment that has the calculator.
+"""Derive `safevar_sumo/protocol/euro_ncap_2026.toml` from the official calculator, in an environment that has the
+calculator.
 
-`python tests/rating/derive.py > safevar_sumo/protocol/euro_ncap_2026.toml` after `pip install euroncap-rating-2026 'pandas<3'`.
+`python tests/rating/derive.py > safevar_sumo/protocol/euro_ncap_2026.toml` after `pip install euroncap-rating-2026
+'pandas<3'`.
 """
 
 from __future__ import annotations
@@ -29,7 +31,8 @@ def quoted(values: object) -> str:
 def block(sheet, frame, name: str) -> list[str]:
     """A matrix of a prediction sheet as TOML."""
     extent = matrix_processing.get_matrix_indices(frame, name)
-    # A choice of function is taken as AEB up to CCRs and CMRs, where AEB is assessed either way, and as FCW for CPLA and CBLA.
+    # A choice of function is taken as AEB up to CCRs and CMRs, where AEB is assessed either way, and as FCW for CPLA
+    # and CBLA.
     top, left, n_rows, n_columns = extent["start_row"] + 2, extent["start_col"] + 1, extent["n_rows"], extent["n_cols"]
     headings = {sheet.cell(top - 2, column).value: column for column in range(2, left + 1)}
     test, _, light = name.partition(" ")
@@ -96,16 +99,20 @@ def main() -> None:
     path = files("data").joinpath("ca_template.xlsx")
     book, frames = openpyxl.load_workbook(str(path)), common.read_excel_file_to_dfs(str(path))
     print(
-        "# Euro NCAP's crash avoidance, frontal collisions, protocol v1.2 (July 2026): matrices, points and robustness layers."
+        "# Euro NCAP's crash avoidance, frontal collisions, protocol v1.2 (July 2026): matrices, points and "
+        "robustness layers."
     )
     print(
-        f"# Derived by tests/rating/derive.py from euroncap-rating-2026 {version('euroncap-rating-2026')} (PyPI, Apache-2.0):"
+        f"# Derived by tests/rating/derive.py from euroncap-rating-2026 {version('euroncap-rating-2026')} "
+        "(PyPI, Apache-2.0):"
     )
     print(
-        "# its template ca_template.xlsx and its modules crash_avoidance.data_model, matrix_processing, robustness_layer. Do not edit."
+        "# its template ca_template.xlsx and its modules crash_avoidance.data_model, matrix_processing, "
+        "robustness_layer. Do not edit."
     )
     print(
-        "# ranges: a letter for each column, S standard, E extended, - no cell; choice: the manufacturer chooses AEB or FCW."
+        "# ranges: a letter for each column, S standard, E extended, - no cell; choice: the manufacturer "
+        "chooses AEB or FCW."
     )
     print(f'\ncalculator = "{version("euroncap-rating-2026")}"')
     colours = {
@@ -119,8 +126,10 @@ def main() -> None:
     )
     best_first = ["green", "yellow", "orange", "brown", "red"]
     print(
-        "\n# From which relative speed at impact [km/h] a cell has a colour, by the speed of the vehicle under test [km/h], the last"
-        "\n# row for all faster ones; and from which time to collision at the warning [s]. Measured values have two decimals."
+        "\n# From which relative speed at impact [km/h] a cell has a colour, by the speed of the vehicle "
+        "under test [km/h], the last"
+        "\n# row for all faster ones; and from which time to collision at the warning [s]. Measured values "
+        "have two decimals."
     )
     print("[mitigation]")
     for vut in (10, 20, 30, 40, 50):

@@ -1,4 +1,6 @@
-"""Euro NCAP's official calculator, from PyPI, accepts this package's spreadsheets and computes equal points and colours."""
+"""Euro NCAP's official calculator, from PyPI, accepts this package's spreadsheets and computes equal points and
+colours.
+"""
 
 from __future__ import annotations
 
@@ -38,7 +40,9 @@ def template(calculator: Calculator, tmp_path_factory: pytest.TempPathFactory) -
 
 
 def agrees(rated: RatedVehicle, calculator: Calculator, template: Path, place: Path) -> None:
-    """Asserts that the calculator's points of every simulated test and its colour of every cell that it draws equal this package's."""
+    """Asserts that the calculator's points of every simulated test and its colour of every cell that it draws equal
+    this package's.
+    """
     place.mkdir(exist_ok=True)
     Template(template, place / "predicted.xlsx").fill(rated)
     drawn = calculator.preprocessed(place / "predicted.xlsx", place / "drawn")

@@ -39,7 +39,9 @@ BANDS = {
     50: [0.01, 10, 20, 30],
     130: [0.01, 10, 20, 30],
 }
-"""From which relative speed on a cell is yellow, orange, brown, red, by the speed of the vehicle (protocol 5.2); one number: red alone."""
+"""From which relative speed on a cell is yellow, orange, brown, red, by the speed of the vehicle (protocol 5.2); one
+number: red alone.
+"""
 
 
 def results(impact: Any = np.nan, warning: Any = 2.0, vehicles: int = 1) -> CellResults:
@@ -157,7 +159,8 @@ def test_remarks_name_the_required_cells_that_are_not_green() -> None:
     unchecked = [number for number in cpna if remarks_on(number)]
     assert {(CELLS[number].impact_location, CELLS[number].range_or_layer) for number in unchecked} == {(75, "standard")}
     assert remarks_on(unchecked[0]) == [
-        "original: CPNA at 10 km/h and 75 % is not green, which Euro NCAP requires; Euro NCAP's calculator 5.4.9 does not check this, "
+        "original: CPNA at 10 km/h and 75 % is not green, which Euro NCAP requires; Euro NCAP's calculator "
+        "5.4.9 does not check this, "
         "nor do these points."
     ]
 
@@ -165,7 +168,9 @@ def test_remarks_name_the_required_cells_that_are_not_green() -> None:
 @settings(max_examples=40, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.floats(0, 1), st.floats(0.5, 40))
 def test_faster_impacts_never_gain_points_in_a_matrix(seed: int, share: float, more: float) -> None:
-    """Where a layer asks for the colour of its cell or better, a cell that turns worse lowers what the layer must reach."""
+    """Where a layer asks for the colour of its cell or better, a cell that turns worse lowers what the layer must
+    reach.
+    """
     rng = np.random.default_rng(seed)
     impact = np.where(rng.random(N) < share, rng.uniform(0, 45, N), np.nan)
     worse = np.where(rng.random(N) < 0.3, np.nan_to_num(impact, nan=0.0) + more, impact)

@@ -1,4 +1,6 @@
-"""Tolerance, explain, report and the summary of a rated study, in a protocol of two matrices, computed in this process."""
+"""Tolerance, explain, report and the summary of a rated study, in a protocol of two matrices, computed in this
+process.
+"""
 
 from __future__ import annotations
 

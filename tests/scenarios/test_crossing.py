@@ -1,4 +1,6 @@
-"""Crossing pedestrians: their position over time, the point of impact, occlusion by parked cars, and agreement with SUMO."""
+"""Crossing pedestrians: their position over time, the point of impact, occlusion by parked cars, and agreement with
+SUMO.
+"""
 
 from __future__ import annotations
 
@@ -51,7 +53,9 @@ def test_a_pedestrian_in_the_place_of_a_cyclist_starts_at_speed() -> None:
 
 @pytest.mark.parametrize("test", NUMBERS)
 def test_the_pedestrian_moves_as_the_closed_form_says(test: str) -> None:
-    """s = a (t - t0)^2 / 2 up to the acceleration distance, with a = u^2 / (2 s_a); then steady; at the impact location at 6 s."""
+    """s = a (t - t0)^2 / 2 up to the acceleration distance, with a = u^2 / (2 s_a); then steady; at the impact location
+    at 6 s.
+    """
     speed, start, run_up = NUMBERS[test]
     trace = driven(Crossing(test=test, speed=20.0), Hold(np.array([0.0]))).trace
     acceleration = speed**2 / (2 * run_up)
@@ -101,7 +105,9 @@ def test_sumo_reports_a_crash_exactly_if_bodies_overlap() -> None:
 
 @pytest.mark.parametrize("setback", [0.0, 2.0])
 def test_a_child_is_seen_once_the_line_to_it_passes_the_parked_cars_corner(setback: float) -> None:
-    """The corner is 1 m from the vehicle's side and 1 m before the child's path; similar triangles from the sensors in the middle."""
+    """The corner is 1 m from the vehicle's side and 1 m before the child's path; similar triangles from the sensors in
+    the middle.
+    """
     scenario = Crossing(test="CPNCO", speed=40.0, sensor_setback=setback)
     recorder = _Recorder()
     run = driven(scenario, recorder)

@@ -83,7 +83,9 @@ def test_the_pedestrian_has_left_the_lane_when_he_walks_away_beyond_its_edge(
 
 
 def test_the_pedestrian_turns_in_the_last_step_that_keeps_him_within_the_distance() -> None:
-    """At 1.8 m/s (0.09 m a step) the pedestrian turns, once only, in the step after which the next would lead beyond 0.7 m."""
+    """At 1.8 m/s (0.09 m a step) the pedestrian turns, once only, in the step after which the next would lead beyond
+    0.7 m.
+    """
     scenario, world = PedestrianCrossing(), ArtificialWorld(0.0, 0.0)
     memory, turns = scenario.begin(world), []
     for k in range(1, 12):
@@ -125,7 +127,9 @@ def trace(gap: np.ndarray, speed: np.ndarray, lateral: np.ndarray, lateral_speed
 
 
 def test_closing_speed_of_a_pedestrian_has_both_speeds_along_the_line_of_sight() -> None:
-    """Vehicle's centre at (0, 0), pedestrian at (4, -3): distance 5, cos(theta) = 0.8; v cos + v_ped sin = 0.8 * 6 + 0.6 * 1.5."""
+    """Vehicle's centre at (0, 0), pedestrian at (4, -3): distance 5, cos(theta) = 0.8; v cos + v_ped sin = 0.8 * 6 +
+    0.6 * 1.5.
+    """
     encounter = PedestrianCrossing().encounter(
         trace(np.array([4.0 - LENGTH / 2]), np.array([6.0]), np.array([-3.0]), np.array([1.5]))
     )

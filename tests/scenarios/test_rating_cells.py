@@ -1,4 +1,6 @@
-"""Cells of Euro NCAP's rating and their robustness layers: time, place and speed of the impact of a vehicle that does not brake."""
+"""Cells of Euro NCAP's rating and their robustness layers: time, place and speed of the impact of a vehicle that does
+not brake.
+"""
 
 from __future__ import annotations
 
@@ -34,7 +36,9 @@ class Cell(NamedTuple):
 
 
 class Row(NamedTuple):
-    """A crossing test of the protocol: side, target speed [km/h], lateral start and run-up [m], headings and speed changes of layers."""
+    """A crossing test of the protocol: side, target speed [km/h], lateral start and run-up [m], headings and speed
+    changes of layers.
+    """
 
     side: int
     speed: float
@@ -89,7 +93,9 @@ def behind(test: str, speed: float, location: float, target_speed: float) -> Ite
 
 
 def behind_braking(test: str, speed: float, location: float) -> Iterator[Cell]:
-    """Headway of 1 s; from 3 s on, the target brakes at b = 4 m/s^2 down to 2 km/h: gap = closing^2 / (2 b), then a steady speed."""
+    """Headway of 1 s; from 3 s on, the target brakes at b = 4 m/s^2 down to 2 km/h: gap = closing^2 / (2 b), then a
+    steady speed.
+    """
     for headway, deceleration in ((1, 4), (1.5, 4), (0.5, 4), (1, 6), (1, 2)):
         gap, speed_loss = headway * speed * KMH, (speed - 2) * KMH
         closing = min(math.sqrt(2 * deceleration * gap), speed_loss)
@@ -195,7 +201,9 @@ def test_cells_and_layers_of_all_tests_agree_with_the_closed_forms() -> None:
     ids=lambda scenario: scenario.test,
 )
 def test_other_targets_are_hit_in_a_recorded_scene_as_in_sumo_to_the_last_bit(scenario: Any) -> None:
-    """Vehicles that never brake, or brake at any time up to the impact: impacts at the front and the corners, and passed targets."""
+    """Vehicles that never brake, or brake at any time up to the impact: impacts at the front and the corners, and
+    passed targets.
+    """
     n, arrival = 30, scenario.duration - scenario.time_after
     brakes_at = np.append(np.random.default_rng(4).uniform(arrival - 3, arrival + 0.3, n - 1), 99.0)
     system = replace(CARLA, ads=Hold(brakes_at), matrix=(Point(scenario, WEATHERS["clear"]),))
@@ -227,7 +235,9 @@ def test_a_scenario_of_ones_own_may_turn_lanes(in_tmp: Path, monkeypatch: pytest
 
 
 def test_a_cyclist_behind_parked_cars_is_seen_past_the_corner_whatever_his_direction() -> None:
-    """The line from the front's middle to the cyclist's middle passes the corner 1 m beside the vehicle, 1 m before the impact."""
+    """The line from the front's middle to the cyclist's middle passes the corner 1 m beside the vehicle, 1 m before the
+    impact.
+    """
     for heading in (0.0, -10.0, 20.0):
         scenario = Crossing(test="CBNAO", heading=heading)
         trace = driven(scenario).trace

@@ -1,4 +1,6 @@
-"""Every point of the shipped matrices: place and time of the impact without braking, and that the original vehicles avoid it."""
+"""Every point of the shipped matrices: place and time of the impact without braking, and that the original vehicles
+avoid it.
+"""
 
 from __future__ import annotations
 

@@ -148,7 +148,9 @@ def dtlz2(characteristics: CharacteristicSet, settings: np.ndarray) -> Evaluatio
 
 @pytest.mark.slow
 def test_hypervolumes_are_those_of_jmetalpy_on_dtlz2() -> None:
-    """The published study used jMetalPy; ten runs of each implementation with equal settings do not differ significantly."""
+    """The published study used jMetalPy; ten runs of each implementation with equal settings do not differ
+    significantly.
+    """
     variables, evaluations = 7, 3000
 
     class Unfiltered(CharacteristicSet):

@@ -215,7 +215,9 @@ def test_spea2_ranks_what_nothing_dominates_by_its_distance_to_the_third_nearest
 @pytest.mark.slow
 @pytest.mark.parametrize("hundred", range(10))
 def test_survivors_of_spea2_are_those_of_pymoo_on_random_fronts(hundred: int) -> None:
-    """Equal objectives, equally often; among dominated individuals of equal fitness, pymoo's sort does not define the last survivor."""
+    """Equal objectives, equally often; among dominated individuals of equal fitness, pymoo's sort does not define the
+    last survivor.
+    """
     for seed in range(100 * hundred, 100 * (hundred + 1)):
         objectives = random_front(seed)
         number = int(np.random.default_rng(seed + 10_000).integers(1, len(objectives) + 1))

@@ -1,4 +1,6 @@
-"""Constraints among characteristics: what every command reports satisfies them, and what cannot be satisfied is refused."""
+"""Constraints among characteristics: what every command reports satisfies them, and what cannot be satisfied is
+refused.
+"""
 
 from __future__ import annotations
 

@@ -70,7 +70,9 @@ def test_vehicles_at_the_ends_of_all_domains_move_and_have_a_typed_outcome(any_s
 
 
 def test_sumo_moves_the_vehicle_at_the_speeds_of_the_vehicle_model(any_system: System) -> None:
-    """SUMO's position is the integral of the commanded speeds: in each step the mean of both speeds, by the ballistic method."""
+    """SUMO's position is the integral of the commanded speeds: in each step the mean of both speeds, by the ballistic
+    method.
+    """
     trace = simulate(any_system, drawn(any_system, 3, 11)).trace
     travelled = np.add.accumulate((trace.speed[1:] + trace.speed[:-1]) / 2 * trace.step, axis=0)
     until = trace.active[1:]
@@ -78,7 +80,9 @@ def test_sumo_moves_the_vehicle_at_the_speeds_of_the_vehicle_model(any_system: S
 
 
 def judged(*samples: tuple[float, bool, float | None]) -> tuple[str, list[bool], float]:
-    """Outcome, active samples and collision speed of one vehicle; a sample is (speed, encounter has ended, collision speed)."""
+    """Outcome, active samples and collision speed of one vehicle; a sample is (speed, encounter has ended, collision
+    speed).
+    """
     outcomes, active = _Outcomes(1), []
     for i, (speed, over, crash) in enumerate(samples):
         collisions = {} if crash is None else {0: crash}
@@ -183,7 +187,9 @@ TIMES = np.arange(12) * STEP
 
 
 def observed(delay: float) -> tuple[np.ndarray, np.ndarray]:
-    """Observed own speeds and (gap, closing speed, lateral, lateral speed) of one vehicle whose scene changes linearly."""
+    """Observed own speeds and (gap, closing speed, lateral, lateral speed) of one vehicle whose scene changes
+    linearly.
+    """
     perception = Perception(Weather(name="any", road_friction=1.0, visibility=0.7, recognition_delay=delay), STEP)
     seen = []
     for time in TIMES:

@@ -1,4 +1,6 @@
-"""With nobody in sight the original vehicle must drive to the encounter; else no command gives a verdict on its driving system."""
+"""With nobody in sight the original vehicle must drive to the encounter; else no command gives a verdict on its driving
+system.
+"""
 
 from __future__ import annotations
 

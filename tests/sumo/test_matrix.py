@@ -1,4 +1,6 @@
-"""Settings in a matrix: the worst point counts, independently of the batch, the order of points and the other points."""
+"""Settings in a matrix: the worst point counts, independently of the batch, the order of points and the other
+points.
+"""
 
 from __future__ import annotations
 

@@ -94,7 +94,9 @@ def test_a_variant_of_a_network_is_checked_before_use_as_well(tmp_path: Path, mo
 
 
 def test_a_folder_of_the_cache_is_moved_into_place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A rating needs 2,200 of them; removing a temporary folder for each took two thirds of the time on some file systems."""
+    """A rating needs 2,200 of them; removing a temporary folder for each took two thirds of the time on some file
+    systems.
+    """
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setattr(os, "rmdir", lambda *_, **__: pytest.fail("a folder is removed"))
     folder = ensure_all_cached("road", ["a"], lambda into: into.joinpath("a").touch())
@@ -173,14 +175,27 @@ def with_traffic(mine: Path, more: str) -> str:
 
 GOOD = {
     "a flow": '<flow id="f" type="car" from="oncoming" to="oncoming_on" begin="0" end="9" period="3"/>',
-    "a flow on a route": '<route id="r" edges="oncoming"/><flow id="f" type="car" route="r" begin="0" end="9" number="2"/>',
+    "a flow on a route": '<route id="r" edges="oncoming"/>'
+    '<flow id="f" type="car" route="r" begin="0" end="9" number="2"/>',
     "a trip": '<trip id="t" type="car" depart="0" from="oncoming" to="oncoming_on"/>',
     "a trip by a via": '<trip id="t" type="car" depart="0" from="oncoming" via="oncoming" to="oncoming_on"/>',
-    "a late vehicle": '<vehicle id="t" type="car" depart="0:0:2"><route edges="oncoming"/><stop edge="oncoming" duration="1"/></vehicle>',
-    "a person's trip": '<person id="w" type="walker" depart="0"><personTrip from="footpath" to="footpath_on"/></person>',
-    "a flow of persons": '<personFlow id="w" type="walker" begin="0" end="4" period="2"><walk from="footpath" to="footpath_on"/></personFlow>',
-    "stop and walk": '<person id="w" type="walker" depart="0"><stop lane="footpath_0" duration="2"/><walk edges="footpath"/></person>',
-    "parameters": '<vehicle id="v" type="car" depart="0"><route edges="oncoming"/><param key="note" value="approach"/></vehicle>',
+    "a late vehicle": (
+        '<vehicle id="t" type="car" depart="0:0:2"><route edges="oncoming"/><stop edge="oncoming" '
+        'duration="1"/></vehicle>'
+    ),
+    "a person's trip": '<person id="w" type="walker" depart="0">'
+    '<personTrip from="footpath" to="footpath_on"/></person>',
+    "a flow of persons": (
+        '<personFlow id="w" type="walker" begin="0" end="4" period="2"><walk from="footpath" '
+        'to="footpath_on"/></personFlow>'
+    ),
+    "stop and walk": (
+        '<person id="w" type="walker" depart="0"><stop lane="footpath_0" duration="2"/><walk '
+        'edges="footpath"/></person>'
+    ),
+    "parameters": (
+        '<vehicle id="v" type="car" depart="0"><route edges="oncoming"/><param key="note" value="approach"/></vehicle>'
+    ),
 }
 
 

@@ -1,4 +1,6 @@
-"""A user's network is simulated with its recipe, edge types and traffic lights, or as a single `.net.xml`; otherwise it is refused."""
+"""A user's network is simulated with its recipe, edge types and traffic lights, or as a single `.net.xml`; otherwise it
+is refused.
+"""
 
 from __future__ import annotations
 
@@ -169,7 +171,9 @@ def test_a_remark_lists_the_networks_attributes_of_the_vehicle_that_are_not_used
 
 
 def test_no_id_of_a_built_network_belongs_to_two_copies(tmp_path: Path) -> None:
-    """A network with sidewalks, crossings, traffic lights and opposite lanes: its copies contain no id of the original."""
+    """A network with sidewalks, crossings, traffic lights and opposite lanes: its copies contain no id of the
+    original.
+    """
     netgenerate = str(Path(sumo.SUMO_HOME) / "bin" / "netgenerate")
     subprocess.run(
         [

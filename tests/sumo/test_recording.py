@@ -71,7 +71,9 @@ def test_vehicles_in_recorded_scenes_give_the_same_bits_as_in_sumo(any_system: S
 
 
 def test_the_distance_of_a_step_has_sumos_order_of_operations() -> None:
-    """The mean of both speeds gave positions 1.4e-14 m off for 2 of 7,168 settings: their positions before and after a step in SUMO."""
+    """The mean of both speeds gave positions 1.4e-14 m off for 2 of 7,168 settings: their positions before and after a
+    step in SUMO.
+    """
     before, after = np.array([0.0, 0.49783446695015615]), np.array([0.4348049848410796, 1.0073508794958133])
     there = np.array([28.196, 28.208445861673756]) + distance_covered(before, after, 0.05)
     assert there.tolist() == [28.206870124621027, 28.246075495334903]
@@ -86,7 +88,9 @@ def test_a_vehicle_at_full_throttle_collides_as_in_sumo(study: str) -> None:
 def test_a_scene_from_the_cache_equals_the_scene_that_sumo_played(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """In an empty cache: SUMO plays the scene, the next process reads the file, and a truncated file is written again."""
+    """In an empty cache: SUMO plays the scene, the next process reads the file, and a truncated file is written
+    again.
+    """
     monkeypatch.setattr(platformdirs, "user_cache_path", lambda name: tmp_path)
     scenario = assemble(load_study("sun")).scenario
 

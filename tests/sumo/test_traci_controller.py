@@ -113,7 +113,9 @@ def step(traci, vehicle_id):
 
 
 def test_a_controller_reads_other_actors_through_the_sensors(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The gap to the leader is the trace's gap one reaction time and one recognition delay ago, linear between two steps."""
+    """The gap to the leader is the trace's gap one reaction time and one recognition delay ago, linear between two
+    steps.
+    """
     weather = {"name": "haze", "road_friction": 1.0, "visibility": 0.5, "recognition_delay": 0.1, "light": "day"}
     runs = system("step", tmp_path, monkeypatch, LOOKS, weather=weather)
     trace = simulate(runs, changed(runs, reactionTime=0.25, sensorRange=80)).trace
@@ -156,7 +158,8 @@ class Reads:
         assert found == {vehicle_id: traci.vehicle.getSubscriptionResults(vehicle_id)}, found
         assert found[vehicle_id][tc.VAR_LANE_ID] == "road_0" and found[vehicle_id][tc.VAR_LEADER][0] == "parked_ahead"
         around = traci.vehicle.getContextSubscriptionResults(vehicle_id)
-        assert around[vehicle_id] == {tc.VAR_ROAD_ID: "road"} and set(around) <= {vehicle_id, "parked_ahead", "parked_beside"}
+        assert around[vehicle_id] == {tc.VAR_ROAD_ID: "road"}
+        assert set(around) <= {vehicle_id, "parked_ahead", "parked_beside"}
         assert ("parked_ahead" in around) == (85 - traci.vehicle.getPosition(vehicle_id)[0] <= 70)
         assert traci.simulation.convertRoad(10.0, 0.0) == ("road", 10.0, 1)
         assert traci.vehicle.getIDCount() == traci.simulation.getMinExpectedNumber() == 3

@@ -19,7 +19,9 @@ Pedals = Callable[[float], tuple[Any, Any]]
 
 
 class Drive(NamedTuple):
-    """States of N vehicles at T times 0, step, 2 step, ... [s]; speeds [m/s] and travelled distances [m] have shape (T, N)."""
+    """States of N vehicles at T times 0, step, 2 step, ... [s]; speeds [m/s] and travelled distances [m] have shape (T,
+    N).
+    """
 
     prepared: Any
     states: list[Any]
@@ -51,7 +53,9 @@ def drive(
     grade: float = 0.0,
     wet: bool = False,
 ) -> Drive:
-    """Drive settings, shape (N, n); pedals(t) -> (throttle, brake), for all vehicles or one each. `rolling` is the initial speed [m/s]."""
+    """Drive settings, shape (N, n); pedals(t) -> (throttle, brake), for all vehicles or one each. `rolling` is the
+    initial speed [m/s].
+    """
     system = SYSTEMS[model]
     values = dict(zip(system.characteristics.names, np.ascontiguousarray(settings.T), strict=True))
     prepared = system.vehicle.prepare(values, road, step, slope_of(np.full(len(settings), grade)), wet)

@@ -46,7 +46,9 @@ def test_vehicles_of_the_domain_reach_the_speed_up_to_which_the_vehicle_was_fitt
 
 
 def test_driving_and_braking_follow_the_differential_equations() -> None:
-    """Stated bound: 0.1 m/s against an adaptive integrator with a tolerance of 1e-8, from the first gear on until 0.5 m/s."""
+    """Stated bound: 0.1 m/s against an adaptive integrator with a tolerance of 1e-8, from the first gear on until 0.5
+    m/s.
+    """
     vehicle, pedals = carla(), braking_after(1.4)
     for setting in drawn("carla", 5, 21):
         values = dict(zip(SYSTEMS["carla"].characteristics.names, setting, strict=True))
@@ -116,7 +118,9 @@ def test_a_camera_on_smaller_wheels_overestimates_the_gap() -> None:
 
 
 def test_carla_shifts_up_above_its_engine_speed_and_not_before_its_latency() -> None:
-    """The first switch begins with the first substep of 1/60 s and takes 0.5 s; so does the next, spent in neutral too."""
+    """The first switch begins with the first substep of 1/60 s and takes 0.5 s; so does the next, spent in neutral
+    too.
+    """
     values = dict(zip(SYSTEMS["carla"].characteristics.names, np.ascontiguousarray(original("carla").T), strict=True))
     gears = {}
     for up in (0.3, 0.6):
@@ -137,7 +141,9 @@ SLOW = pytest.mark.slow
 
 
 def multi_body(deceleration: float, **changed: float) -> float:
-    """Mean deceleration for the brake torque that would give `deceleration` to the unchanged vehicle on rigid wheels [m/s^2]."""
+    """Mean deceleration for the brake torque that would give `deceleration` to the unchanged vehicle on rigid wheels
+    [m/s^2].
+    """
     from scipy.integrate import solve_ivp
     from vehiclemodels.init_mb import init_mb
     from vehiclemodels.vehicle_dynamics_mb import vehicle_dynamics_mb
@@ -208,7 +214,9 @@ def carla_deceleration(deceleration: float, **changed: float) -> float:
 @SLOW
 @pytest.mark.parametrize("deceleration", [2.0, 6.0, 8.0])
 def test_below_the_limit_both_brake_alike(deceleration: float) -> None:
-    """Within 3 %: the wheels of the multi-body model are heavier (1.7 against 1.2 kg m^2 each) and slow down a little later."""
+    """Within 3 %: the wheels of the multi-body model are heavier (1.7 against 1.2 kg m^2 each) and slow down a little
+    later.
+    """
     assert carla_deceleration(deceleration) == pytest.approx(multi_body(deceleration), rel=0.03)
 
 
@@ -226,7 +234,9 @@ def test_mass_and_radius_act_alike(name: str, factor: float) -> None:
 def test_beyond_the_limit_carla_keeps_the_friction_that_the_multi_body_model_loses(
     friction: float, least_share: float
 ) -> None:
-    """Friction limits both models. PhysX's tyre keeps its friction when the wheels lock; Pacejka's tyre loses up to a half."""
+    """Friction limits both models. PhysX's tyre keeps its friction when the wheels lock; Pacejka's tyre loses up to a
+    half.
+    """
     limit = friction * GRAVITY
     assert carla_deceleration(9.5, p_dx1=friction) == pytest.approx(limit, rel=0.03)
     assert least_share * limit < multi_body(9.5, p_dx1=friction) < limit

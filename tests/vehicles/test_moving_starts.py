@@ -110,7 +110,9 @@ def test_wheels_have_inertia_and_no_weight_of_their_own_to_pull_them(model: str,
 @pytest.mark.parametrize("model", sorted(SYSTEMS))
 @pytest.mark.parametrize("grade", [8.0, -8.0])
 def test_the_way_to_stop_is_v2_over_twice_what_the_tyres_hold_and_the_slope_adds(model: str, grade: float) -> None:
-    """On ice, where the tyres limit the deceleration to mu g cos; between 10 and 4 m/s, after the brake has built up."""
+    """On ice, where the tyres limit the deceleration to mu g cos; between 10 and 4 m/s, after the brake has built
+    up.
+    """
 
     def distance(grade: float) -> float:
         run = drive(model, original(model), lambda time: (0.0, 1.0), 25.0, rolling=12.0, road=0.25, grade=grade)

@@ -68,7 +68,9 @@ def test_carlas_gearbox_shifts_up_at_065_and_down_at_050_of_the_engines_maximum_
 
 
 def test_carlas_gearbox_shifts_as_soon_as_the_selector_lets_go_of_the_gear() -> None:
-    """In first gear at 90 % of the engine's maximum: the gearbox waits while the selector holds the gear, and has no latency afterwards."""
+    """In first gear at 90 % of the engine's maximum: the gearbox waits while the selector holds the gear, and has no
+    latency afterwards.
+    """
     vehicle, p, one = SYSTEMS["carla"].vehicle, prepared("carla"), np.ones(1)
     rim = 0.9 * 5800 * 2 * np.pi / 60 / (2.85 * 4)
     state = vehicle.at_rest(p)._replace(
@@ -164,7 +166,9 @@ def test_sumos_sensor_sees_less_far_in_bad_sight(visibility: float, seen: bool) 
 
 
 def test_who_brakes_sumos_vehicle_does_not_go_on_speeding_up_until_the_lag_of_its_actuators_is_over() -> None:
-    """A lag of 0.5 s leaves most of full throttle's acceleration to the next step; a tenth of the brake ends it at once."""
+    """A lag of 0.5 s leaves most of full throttle's acceleration to the next step; a tenth of the brake ends it at
+    once.
+    """
     vehicle, p = SYSTEMS["sumo"].vehicle, prepared("sumo", tau=0.5, brakeDelay=0.0)
     state = vehicle.at_rest(p)
     for _ in range(40):

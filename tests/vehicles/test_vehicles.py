@@ -41,7 +41,9 @@ def kinetic_energy(model: str, run: Drive) -> np.ndarray:
 
 
 def at_random(model: str, then_brake: float | None = None) -> Drive:
-    """Many settings with pedals that change at random every second; after four, if so asked, the throttle closed and one brake."""
+    """Many settings with pedals that change at random every second; after four, if so asked, the throttle closed and
+    one brake.
+    """
     n, rng = 300, np.random.default_rng(12)
     throttle, brake = rng.choice([0.0, 0.4, 1.0], (8, n)), rng.choice([0.0, 0.0, 0.3, 1.0], (8, n))
 

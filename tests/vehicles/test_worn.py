@@ -53,7 +53,9 @@ def stopping_distance(tread: float, wet: bool = True) -> float:
 def test_two_axles_brake_together_and_none_beyond_the_friction_of_its_load(
     road: float, changes: dict[str, float]
 ) -> None:
-    """Expected: the bisection of m a = sum of min(share F, mu N(a)); the load N moves forward with the deceleration a."""
+    """Expected: the bisection of m a = sum of min(share F, mu N(a)); the load N moves forward with the deceleration
+    a.
+    """
     p = prepared(road, **changes)
     mass, mu, force = float(p.mass[0]), float(p.grip[0]), float(p.brake[0] * p.mass[0])
     values = {**HEALTHY, **changes}
@@ -75,7 +77,9 @@ def test_two_axles_brake_together_and_none_beyond_the_friction_of_its_load(
 
 
 def test_sumo_is_told_what_the_worn_car_can_do() -> None:
-    """3900 N of engine on dry road, 0.9 of g times the road's friction on ice; the brakes respond after 0.1 s and a step."""
+    """3900 N of engine on dry road, 0.9 of g times the road's friction on ice; the brakes respond after 0.1 s and a
+    step.
+    """
     dry, icy = CAR.sumo_type(prepared(1.0)), CAR.sumo_type(prepared(0.1))
     assert dry.accel[0] == pytest.approx(3900 / (1500 + 75))
     assert (icy.accel[0], icy.decel[0]) == pytest.approx((0.09 * GRAVITY, 0.09 * GRAVITY))
@@ -84,7 +88,9 @@ def test_sumo_is_told_what_the_worn_car_can_do() -> None:
 
 @pytest.mark.slow
 def test_stopping_distances_of_worn_tyres_are_in_the_published_ratios_on_a_wet_road_and_equal_on_a_dry_one() -> None:
-    """MIRA for RoSPA: +36.8 % from 6.7 to 1.6 mm; MIRA for Continental, from 50 mph: 31.7 m at 3 mm, 39.9 m at 1.6 mm."""
+    """MIRA for RoSPA: +36.8 % from 6.7 to 1.6 mm; MIRA for Continental, from 50 mph: 31.7 m at 3 mm, 39.9 m at 1.6
+    mm.
+    """
     worn = stopping_distance(1.6)
     assert worn / stopping_distance(6.7) == pytest.approx(1.368, rel=0.01)
     assert worn / stopping_distance(3) == pytest.approx(39.9 / 31.7, rel=0.01)

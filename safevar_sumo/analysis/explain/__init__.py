@@ -1,6 +1,7 @@
 """Why does a vehicle fail? Which changes cause the failure, how small a change is enough, and is the failure robust?
 
-The options and the function of the library are defined here, so that a command's help can be shown without loading the computation.
+The options and the function of the library are defined here, so that a command's help can be shown without loading the
+computation.
 """
 
 from __future__ import annotations
@@ -31,8 +32,10 @@ class ExplainOptions(Options):
         flag="--solution",
         metavar="ALG:RUN:N",
         form="repeated",
-        python='Handles of solutions, such as "nsga2:3:0". By default the robust failure with the fewest changes, the failures with the '
-        "fewest changes and with the smallest largest change, the most severe failure, and one failure of each distinct cause, the "
+        python='Handles of solutions, such as "nsga2:3:0". By default the robust failure with the fewest changes, '
+        "the failures with the "
+        "fewest changes and with the smallest largest change, the most severe failure, and one failure of "
+        "each distinct cause, the "
         "most frequent first.",
     )
     unsafe: str | None = unsafe_option()
@@ -65,7 +68,8 @@ def explain(
     Parameters
     ----------
     source
-        Results or their directory: their solutions are explained. A study: failures drawn from its whole domain are explained.
+        Results or their directory: their solutions are explained. A study: failures drawn from its whole domain are
+        explained.
     """
     from safevar_sumo.analysis.explain.compute import explain_failures
 

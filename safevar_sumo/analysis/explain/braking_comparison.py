@@ -1,7 +1,7 @@
 """Why a setting is less safe than the original: compares two runs, and splits the lost margin into parts.
 
-The brake is commanded with a gap G ahead, at a speed v. The brake pedal follows within a time t. During t the mean speed
-is v - e, and the speed falls by d. After t the mean deceleration is a. The stopping distance is
+The brake is commanded with a gap G ahead, at a speed v. The brake pedal follows within a time t. During t the mean
+speed is v - e, and the speed falls by d. After t the mean deceleration is a. The stopping distance is
 
     D = (v - e) t + (v - d)^2 / (2 a),
 
@@ -73,7 +73,9 @@ class Braking(NamedTuple):
 
     @property
     def stopping_distance(self) -> float:
-        """Distance by which the gap shrinks from the command on [m], if the mean deceleration continues after the run."""
+        """Distance by which the gap shrinks from the command on [m], if the mean deceleration continues after the
+        run.
+        """
         speed_after_delay = self.closing_speed - self.speed_lost
         return (self.closing_speed - self.speed_deficit) * self.delay + speed_after_delay**2 / (2 * self.deceleration)
 
@@ -86,8 +88,8 @@ class Braking(NamedTuple):
 class RunSummary(NamedTuple):
     """Summary of one run; `braking` is None if the vehicle did not brake for the obstacle.
 
-    `safety_degree` is a distance [m] or, on a collision, minus its speed [m/s]; NaN if undefined. `least_gap` is the gap when the obstacle
-    is nearest [m], NaN on a collision.
+    `safety_degree` is a distance [m] or, on a collision, minus its speed [m/s]; NaN if undefined. `least_gap` is the
+    gap when the obstacle is nearest [m], NaN on a collision.
     """
 
     outcome: str
@@ -100,8 +102,8 @@ class RunSummary(NamedTuple):
 class BrakingComparison(NamedTuple):
     """Runs of the original and of the changed vehicle, and the parts of the margin that the changed vehicle lost [m].
 
-    One of the `parts` is the remainder, which no difference explains; `parts` is empty if one of the vehicles never braked. `point` is the
-    name of a test point.
+    One of the `parts` is the remainder, which no difference explains; `parts` is empty if one of the vehicles never
+    braked. `point` is the name of a test point.
     """
 
     original: RunSummary
@@ -116,13 +118,15 @@ class BrakingComparison(NamedTuple):
 
 
 def brake_onset(runs: SimulationRuns, column: int) -> int | None:
-    """The sample at which vehicle `column` begins to brake for the obstacle, before the obstacle is nearest; None if it does not brake.
+    """The sample at which vehicle `column` begins to brake for the obstacle, before the obstacle is nearest; None if it
+    does not brake.
 
-    A braking manoeuvre begins where the brake command starts to rise to at least `REGULATION_SHARE` times the largest command; it ends
-    where the throttle or a smaller brake command regulates the speed again. The manoeuvre that counts is
+    A braking manoeuvre begins where the brake command starts to rise to at least `REGULATION_SHARE` times the largest
+    command; it ends where the throttle or a smaller brake command regulates the speed again. The manoeuvre that counts
+    is
 
-    1. the one under way when the vehicle last cruises (at `CRUISE_SHARE` of its highest speed or more), as earlier manoeuvres, such
-       as those of a cruise control after an overshoot, did not slow the vehicle down;
+    1. the one under way when the vehicle last cruises (at `CRUISE_SHARE` of its highest speed or more), as earlier
+       manoeuvres, such as those of a cruise control after an overshoot, did not slow the vehicle down;
     2. otherwise the first one after that;
     3. otherwise none if the vehicle collides, and its last one if it does not.
     """
@@ -201,7 +205,9 @@ def compare_braking(original: RunSummary, changed: RunSummary, point: str = "") 
 
 
 def _braking_to_compare(changed: RunSummary, original: RunSummary) -> Braking | None:
-    """The braking of a changed vehicle; if it collides without braking, the original vehicle's braking at the changed vehicle's speed."""
+    """The braking of a changed vehicle; if it collides without braking, the original vehicle's braking at the changed
+    vehicle's speed.
+    """
     if changed.braking is not None or original.braking is None or not np.isfinite(changed.collision_speed):
         return changed.braking
     least = original.braking.speed_lost + original.braking.obstacle_speed  # so that no speed is negative
@@ -262,7 +268,9 @@ def ending_in_words(run: RunSummary) -> str:
 
 
 def sentence(comparison: BrakingComparison, *, full: bool = False) -> str:
-    """Why the changed vehicle is less safe than the original, in one sentence or two; `full` explains what the lost margin is."""
+    """Why the changed vehicle is less safe than the original, in one sentence or two; `full` explains what the lost
+    margin is.
+    """
     subject = f"At {comparison.point}: the" if comparison.point else "The"
     endings = (
         f"{subject} original {ending_in_words(comparison.original)}; this one {ending_in_words(comparison.changed)}."
@@ -276,7 +284,8 @@ def sentence(comparison: BrakingComparison, *, full: bool = False) -> str:
     parts, is_lost = comparison.parts, comparison.lost_margin >= 0
     loss_prefix, gain_prefix = ("", "gained ") if is_lost else ("lost ", "")
     phrases = [
-        f"{abs(parts[name]):.2f} m {loss_prefix if parts[name] > 0 else gain_prefix}because {_phrase_of(comparison, name)}"
+        f"{abs(parts[name]):.2f} m {loss_prefix if parts[name] > 0 else gain_prefix}because "
+        f"{_phrase_of(comparison, name)}"
         f"{_quantities_in_words(comparison, name)}"
         for name in sorted(PART_PHRASES, key=lambda name: -parts[name])
         if abs(parts[name]) >= MIN_PART
@@ -290,7 +299,8 @@ def sentence(comparison: BrakingComparison, *, full: bool = False) -> str:
         f"Of the {margin} {'lost' if is_lost else 'gained'}"
         if not full
         else (
-            f"Its margin, the gap at the brake command less the distance needed to stop, is {margin} {'smaller' if is_lost else 'larger'}"
+            f"Its margin, the gap at the brake command less the distance needed to stop, is {margin} "
+            f"{'smaller' if is_lost else 'larger'}"
         )
     )
     return f"{endings}{no_effect} {introduction}: {join_phrases(phrases)}."
@@ -309,7 +319,10 @@ def _phrase_of(comparison: BrakingComparison, part: str) -> str:
             return "it does not speed up while the pedal moves"
         before, after = changed.gears
         gear = "" if before == after else f" and the gear changes from {before:g} to {after:g}"
-        return f"it speeds up {'' if original.speed_lost >= 0 else 'less ' if gains else 'more '}while the pedal moves{gear}"
+        return (
+            f"it speeds up {'' if original.speed_lost >= 0 else 'less ' if gains else 'more '}while the pedal "
+            f"moves{gear}"
+        )
     return PART_PHRASES[part][gains]
 
 

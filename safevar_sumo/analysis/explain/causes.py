@@ -1,7 +1,7 @@
 """Minimal causes: the smallest subsets of a setting's changes that are unsafe by themselves.
 
-Outcomes need not be monotone: a change may undo the effect of another change. So all subsets of a size are simulated, size by size,
-until some are unsafe. These are minimal, as no smaller subset is unsafe.
+Outcomes need not be monotone: a change may undo the effect of another change. So all subsets of a size are simulated,
+size by size, until some are unsafe. These are minimal, as no smaller subset is unsafe.
 """
 
 from __future__ import annotations
@@ -42,7 +42,8 @@ class _Subset(NamedTuple):
 
 
 def find_minimal_causes(evaluator: Evaluator, settings: FloatArray, unsafe: Unsafe) -> list[list[MinimalCause]]:
-    """All smallest unsafe subsets of the changes of each of M settings, shape (M, n); an empty list if no subset is unsafe.
+    """All smallest unsafe subsets of the changes of each of M settings, shape (M, n); an empty list if no subset is
+    unsafe.
 
     The empty subset counts too: if the original vehicle is unsafe, no change is needed.
     """
@@ -65,7 +66,8 @@ def find_minimal_causes(evaluator: Evaluator, settings: FloatArray, unsafe: Unsa
 
 
 def estimate_subset_count(changes: int) -> int:
-    """Estimated number of subsets to simulate, for a setting with this number of changes, until the smallest unsafe subsets appear.
+    """Estimated number of subsets to simulate, for a setting with this number of changes, until the smallest unsafe
+    subsets appear.
 
     The estimate assumes causes with half of the changes, about as in the shipped studies.
     """
@@ -73,7 +75,9 @@ def estimate_subset_count(changes: int) -> int:
 
 
 def select_affordable_rows(settings: FloatArray, evaluator: Evaluator, max_evaluations: int) -> list[int]:
-    """Rows whose minimal causes together take at most about `max_evaluations`: all rows of `settings`, or a random sample."""
+    """Rows whose minimal causes together take at most about `max_evaluations`: all rows of `settings`, or a random
+    sample.
+    """
     costs = [estimate_subset_count(int(changes)) for changes in evaluator.characteristics.number_changed(settings)]
     if sum(costs) <= max_evaluations:
         return list(range(len(settings)))
@@ -93,7 +97,9 @@ def involved_columns(causes: Sequence[MinimalCause]) -> frozenset[int]:
 
 
 LINE_SETTINGS = 32
-"""Number of settings first simulated on each `Line`. The search finds every unsafe stretch of the line that is as long as their spacing."""
+"""Number of settings first simulated on each `Line`. The search finds every unsafe stretch of the line that is as long
+as their spacing.
+"""
 PARTS_PER_ROUND = 8
 """Number of parts into which each of `ROUNDS` rounds divides the interval with the boundary."""
 ROUNDS = 3
@@ -116,8 +122,9 @@ class BoundaryState(StrEnum):
 class Boundary(NamedTuple):
     """The smallest unsafe share of a cause's changes, and the setting there, shape (n,).
 
-    `single_limits` has for each column the value to which its change can be reduced while the other changes stay. `state_below` is
-    the state just below `fraction`; at the filter's threshold, `at_threshold` is the column whose change the filter removes.
+    `single_limits` has for each column the value to which its change can be reduced while the other changes stay.
+    `state_below` is the state just below `fraction`; at the filter's threshold, `at_threshold` is the column whose
+    change the filter removes.
     """
 
     fraction: float
@@ -128,7 +135,9 @@ class Boundary(NamedTuple):
 
 
 def find_boundaries(evaluator: Evaluator, causes: list[MinimalCause], unsafe: Unsafe) -> list[Boundary]:
-    """Shrink causes, all changes by a common factor and each change by itself, while they stay unsafe and above the filter's thresholds."""
+    """Shrink causes, all changes by a common factor and each change by itself, while they stay unsafe and above the
+    filter's thresholds.
+    """
     all_changes = [(cause, cause.columns) for cause in causes]
     single_changes = [(cause, (column,)) for cause in causes for column in cause.columns]
     lines = [Line.from_original(evaluator, cause, columns) for cause, columns in [*all_changes, *single_changes]]
@@ -154,7 +163,9 @@ def find_boundaries(evaluator: Evaluator, causes: list[MinimalCause], unsafe: Un
 
 
 def shorten(evaluator: Evaluator, settings: FloatArray, unsafe: Unsafe) -> FloatArray:
-    """K unsafe settings, shape (K, n), in as few digits as they need to stay unsafe with the same safety degree to 1 cm."""
+    """K unsafe settings, shape (K, n), in as few digits as they need to stay unsafe with the same safety degree to 1
+    cm.
+    """
     characteristics = evaluator.characteristics
     rounded = [
         np.array([[float(f"{value:.{digits}g}") for value in setting] for setting in settings.tolist()])
@@ -185,7 +196,9 @@ def shorten(evaluator: Evaluator, settings: FloatArray, unsafe: Unsafe) -> Float
 
 
 class Line(NamedTuple):
-    """A straight line of settings from `start` to `end`, shape (n,) each; the search begins above the share `lowest` of the line."""
+    """A straight line of settings from `start` to `end`, shape (n,) each; the search begins above the share `lowest` of
+    the line.
+    """
 
     start: FloatArray
     end: FloatArray
@@ -215,7 +228,9 @@ class Line(NamedTuple):
 def find_first_unsafe_shares(
     evaluator: Evaluator, lines: list[Line], unsafe: Unsafe, stage: str = "boundaries"
 ) -> FloatArray:
-    """The first unsafe share of every line; its end must be unsafe. The error is at most `RESOLUTION` times the line above `lowest`."""
+    """The first unsafe share of every line; its end must be unsafe. The error is at most `RESOLUTION` times the line
+    above `lowest`.
+    """
     return find_boundary_shares(evaluator, lines, unsafe, stage)[0]
 
 
@@ -224,7 +239,8 @@ def find_boundary_shares(
 ) -> tuple[FloatArray, list[BoundaryState]]:
     """The first unsafe share of every line, as `find_first_unsafe_shares`, and what lies just below this share.
 
-    A setting that cannot be simulated is neither safe nor unsafe; just below the share, it gives the state `NOT_SIMULATED`.
+    A setting that cannot be simulated is neither safe nor unsafe; just below the share, it gives the state
+    `NOT_SIMULATED`.
     """
     lowest = np.array([line.lowest for line in lines])
     low, high, low_is_valid = lowest, np.ones(len(lines)), np.ones(len(lines), dtype=bool)

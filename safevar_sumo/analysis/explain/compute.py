@@ -1,4 +1,6 @@
-"""Explains failures: the changes that cause them, how small a change is enough, the reason in words, and the robustness."""
+"""Explains failures: the changes that cause them, how small a change is enough, the reason in words, and the
+robustness.
+"""
 
 from __future__ import annotations
 
@@ -60,14 +62,16 @@ def explain_failures(
     progress: Progress = show_no_progress,
     statistics: bool = True,
 ) -> Explained:
-    """Explain the failures that matter among the solutions of results, or among settings drawn from a study's whole domain.
+    """Explain the failures that matter among the solutions of results, or among settings drawn from a study's whole
+    domain.
 
     Without `statistics`, only the failures that matter by their size or severity, and nothing of all the others.
 
     Raises
     ------
     InputError
-        If `unsafe` or a handle cannot be read, a handle is no solution of the results, or the study cannot be assembled.
+        If `unsafe` or a handle cannot be read, a handle is no solution of the results, or the study cannot be
+        assembled.
     """
     study = study_in(source)
     with open_evaluator(study, pool, jobs, progress) as evaluator:
@@ -114,8 +118,8 @@ def explain_failures(
 class _Found(NamedTuple):
     """Evaluated settings, safe ones too, and the rows to explain: the unsafe ones, or those that the options name.
 
-    Equal solutions of several runs are one row. `handles` are None for settings that are no solutions; `deviations` counts
-    settings whose outcome differs from that in the results.
+    Equal solutions of several runs are one row. `handles` are None for settings that are no solutions; `deviations`
+    counts settings whose outcome differs from that in the results.
     """
 
     evaluations: Evaluations
@@ -154,7 +158,9 @@ def _evaluate(
 
 
 def _collisions(study: Study, evaluations: Evaluations) -> Evaluations:
-    """The collisions whose preventability is assessed; none in a rated study, where every vehicle collides in some cell."""
+    """The collisions whose preventability is assessed; none in a rated study, where every vehicle collides in some
+    cell.
+    """
     return evaluations.take(evaluations.collided & (not is_rated(study)))
 
 
@@ -283,8 +289,8 @@ class PointComparison(NamedTuple):
     braking
         Comparison of the original vehicle with the failure at the failure's worst point.
     failing_points
-        Names of the points of a test matrix at which the failure is unsafe; in a rated study, of the cells whose colour is worse
-        than the original's. In the study's order.
+        Names of the points of a test matrix at which the failure is unsafe; in a rated study, of the cells whose colour
+        is worse than the original's. In the study's order.
     """
 
     braking: BrakingComparison
@@ -325,7 +331,9 @@ def compare_at_cells(evaluator: Evaluator, original: FloatArray, settings: Float
 
 
 def _compare_runs(result: PointResult, row: int, point: str) -> BrakingComparison:
-    """Compare the original vehicle, setting 0 of a result, with the setting in `row`, at the test point named `point`."""
+    """Compare the original vehicle, setting 0 of a result, with the setting in `row`, at the test point named
+    `point`.
+    """
     original_run, changed_run = (summarise_run(result.runs, k, float(result.evaluations.f_safe[k])) for k in (0, row))
     return compare_braking(original_run, changed_run, point)
 

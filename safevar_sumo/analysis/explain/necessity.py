@@ -41,11 +41,11 @@ def necessity_frame(
     Returns
     -------
     pandas.DataFrame
-        One row per characteristic: `characteristic`, and the shares of failures in which it is `changed`, `necessary` (part of every
-        minimal cause) and `involved` (part of at least one). `necessary_lower` and `necessary_upper` are the 95 % interval of
-        `necessary` among all failures: Clopper and Pearson's for a sample (slightly too wide, because the sample is drawn without
-        replacement from finitely many failures), the share itself if all failures were analysed. Ordered by necessary, involved,
-        changed; no rows if there is no failure.
+        One row per characteristic: `characteristic`, and the shares of failures in which it is `changed`, `necessary`
+        (part of every minimal cause) and `involved` (part of at least one). `necessary_lower` and `necessary_upper` are
+        the 95 % interval of `necessary` among all failures: Clopper and Pearson's for a sample (slightly too wide,
+        because the sample is drawn without replacement from finitely many failures), the share itself if all failures
+        were analysed. Ordered by necessary, involved, changed; no rows if there is no failure.
     """
     columns = range(len(characteristics) if len(changed) else 0)
     counts = {
@@ -80,8 +80,8 @@ def count_distinct_causes(characteristics: CharacteristicSet, causes: Sequence[S
     Returns
     -------
     pandas.DataFrame
-        Columns `cause`, a tuple of changes with their directions; `failures`, the number of failures with this cause; and `share`, their
-        share of all failures.
+        Columns `cause`, a tuple of changes with their directions; `failures`, the number of failures with this cause;
+        and `share`, their share of all failures.
     """
     counts = Counter(
         key for failure_causes in causes for key in {cause_key(characteristics, cause) for cause in failure_causes}

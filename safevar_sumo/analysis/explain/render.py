@@ -31,7 +31,9 @@ MAX_DISTINCT_CAUSES = 10
 
 
 def print_explained(console: Console, subject: str, result: Explained, point: str = "", *, full: bool = False) -> None:
-    """Print the answer in about ten lines; `full` explains every chosen failure. Printed commands name `subject` and `point`."""
+    """Print the answer in about ten lines; `full` explains every chosen failure. Printed commands name `subject` and
+    `point`.
+    """
     print_heading(console, result.study.title, result.no_verdict)
     for line in result.sentences()[bool(result.no_verdict) :]:
         print_text(console, line)
@@ -58,8 +60,10 @@ def _accuracy_in_words(result: Explained) -> str:
     if step is None or braking is None:
         return ""
     return (
-        f"Accuracy: the driving system decides every {step:g} s, in which the vehicle covers {braking.speed * step:.2f} m at "
-        f"{braking.speed:.1f} m/s. Along a characteristic the safety degree is a sawtooth of about that height: more digits of "
+        f"Accuracy: the driving system decides every {step:g} s, in which the vehicle covers "
+        f"{braking.speed * step:.2f} m at "
+        f"{braking.speed:.1f} m/s. Along a characteristic the safety degree is a sawtooth of about that "
+        "height: more digits of "
         "a value than a command has mean nothing."
     )
 
@@ -102,7 +106,10 @@ def _print_explanation(console: Console, failure: Explanation, result: Explained
         word = "borderline" if failure.robustness.borderline else "robust"
         print_text(
             console,
-            f"Unsafe neighbours within the filter's thresholds: {shares}; {word} ({100 * failure.robustness.share:.0f} %).",
+            (
+                f"Unsafe neighbours within the filter's thresholds: {shares}; {word} "
+                f"({100 * failure.robustness.share:.0f} %)."
+            ),
         )
 
 
@@ -135,7 +142,9 @@ BRAKING_ROWS: Mapping[str, tuple[str, str, str | None]] = {
     "distance needed": ("m", "stopping_distance", None),
     "distance there - needed": ("m", "margin", "all"),
 }
-"""Rows of the table of two brakings: unit, attribute of `Braking`, and the part of the lost margin that the row explains."""
+"""Rows of the table of two brakings: unit, attribute of `Braking`, and the part of the lost margin that the row
+explains.
+"""
 
 
 def _braking_table(comparison: BrakingComparison) -> WholeTable:
@@ -171,7 +180,8 @@ def _print_statistics(console: Console, result: Explained) -> None:
         ""
         if result.analysed == result.failures
         else (
-            f" In brackets: {100 * CONFIDENCE:.0f} % intervals for all {result.failures} (Clopper and Pearson's, slightly too wide)."
+            f" In brackets: {100 * CONFIDENCE:.0f} % intervals for all {result.failures} (Clopper and "
+            "Pearson's, slightly too wide)."
         )
     )
     print_text(

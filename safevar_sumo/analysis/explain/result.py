@@ -35,19 +35,21 @@ class Cause:
     changes
         The failure's values of these characteristics, in their units.
     boundary
-        The values after every change is multiplied by `fraction`, the smallest factor at which the vehicle stays unsafe.
+        The values after every change is multiplied by `fraction`, the smallest factor at which the vehicle stays
+        unsafe.
     alone
-        For each characteristic, the value to which it can return towards the original while the others stay as in `changes`.
+        For each characteristic, the value to which it can return towards the original while the others stay as in
+        `changes`.
     outcome, safety_degree
         Outcome, and safety degree [m, or -m/s], of a vehicle with these changes only.
     end, at_threshold
-        The end of the shrinking: the state just below `fraction`; at the filter's threshold, the characteristic whose change
-        the filter would remove.
+        The end of the shrinking: the state just below `fraction`; at the filter's threshold, the characteristic whose
+        change the filter would remove.
     short_changes, short_boundary
         `changes` and `boundary` in as few digits as a vehicle needs to end alike, for commands.
     neighbours
-        Robustness of these changes by themselves, estimated from the setting's neighbours; None in a rated study, where the
-        simulations would take too long.
+        Robustness of these changes by themselves, estimated from the setting's neighbours; None in a rated study, where
+        the simulations would take too long.
     """
 
     changes: dict[str, float]
@@ -95,10 +97,10 @@ class Cause:
 class Explanation:
     """The explanation of one failure; `handle` is None if the setting is no solution.
 
-    `reasons` state why the failure was chosen. `safety_degree` is in m, or -m/s. `because` states why it is less safe: the
-    comparison of its braking with the original vehicle's. `preventable` is the `PreventableBy` of a collision, as text.
-    `points` are the names of the test points at which the setting is unsafe; in a rated study, of the cells whose colour is
-    worse than the original's.
+    `reasons` state why the failure was chosen. `safety_degree` is in m, or -m/s. `because` states why it is less safe:
+    the comparison of its braking with the original vehicle's. `preventable` is the `PreventableBy` of a collision, as
+    text. `points` are the names of the test points at which the setting is unsafe; in a rated study, of the cells whose
+    colour is worse than the original's.
     """
 
     handle: SolutionId | None
@@ -129,7 +131,9 @@ class Explanation:
 
     @property
     def cause(self) -> Cause | None:
-        """The cause that is named: the most robust, the first of several or in a rated study; None if the setting is not unsafe."""
+        """The cause that is named: the most robust, the first of several or in a rated study; None if the setting is
+        not unsafe.
+        """
         return max(self.causes, key=lambda cause: cause.robustness or 0.0, default=None)
 
     @property
@@ -241,9 +245,9 @@ class Explained:
     def to_frame(self) -> pd.DataFrame:
         """One row for each change of each minimal cause of each explanation.
 
-        Columns: `failure`, counted from 0, `algorithm`, `run`, `index`, `cause`, counted from 0, `characteristic`, `unit`,
-        `original`, `value`, `boundary`, `alone` [unit], `fraction`, `outcome`, `safety_degree` [m or -m/s], `robustness`,
-        `whose`, the class `preventable` of the failure, and `points`, separated by semicolons.
+        Columns: `failure`, counted from 0, `algorithm`, `run`, `index`, `cause`, counted from 0, `characteristic`,
+        `unit`, `original`, `value`, `boundary`, `alone` [unit], `fraction`, `outcome`, `safety_degree` [m or -m/s],
+        `robustness`, `whose`, the class `preventable` of the failure, and `points`, separated by semicolons.
         """
         rows = [
             (

@@ -1,4 +1,6 @@
-"""Whether a failure is robust: the share of a setting's neighbours that are unsafe too, and the smallest robust failure."""
+"""Whether a failure is robust: the share of a setting's neighbours that are unsafe too, and the smallest robust
+failure.
+"""
 
 from __future__ import annotations
 
@@ -51,11 +53,16 @@ def is_borderline(share: float) -> bool:
 
 def robustness_in_words(share: float) -> str:
     """A phrase such as `borderline: only 44 % of the neighbours are unsafe too`."""
-    return f"{'borderline: only' if is_borderline(share) else 'robust:'} {100 * share:.0f} % of the neighbours are unsafe too"
+    return (
+        f"{'borderline: only' if is_borderline(share) else 'robust:'} {100 * share:.0f} % of the neighbours are "
+        "unsafe too"
+    )
 
 
 def draw_neighbours(characteristics: CharacteristicSet, settings: FloatArray, seed: int) -> FloatArray:
-    """The neighbours of M settings, shape (M, n), one setting after the other; they differ from it by at most the filter's threshold."""
+    """The neighbours of M settings, shape (M, n), one setting after the other; they differ from it by at most the
+    filter's threshold.
+    """
     offsets = (
         np.random.default_rng(seed).uniform(-1, 1, (NEIGHBOUR_COUNT, len(characteristics))) * characteristics.threshold
     )
@@ -69,8 +76,9 @@ def estimate_robustness(
 ) -> list[Robustness]:
     """The robustness of each of M settings, shape (M, n).
 
-    A setting's neighbours differ from it in each characteristic by at most the filter's threshold. They are simulated without the filter,
-    with each of `factors` times the study's time step (`step` seconds). Neighbours that cannot be simulated do not count.
+    A setting's neighbours differ from it in each characteristic by at most the filter's threshold. They are simulated
+    without the filter, with each of `factors` times the study's time step (`step` seconds). Neighbours that cannot be
+    simulated do not count.
     """
     neighbours, shares = draw_neighbours(evaluator.characteristics, settings, evaluator.study.search.seed), {}
     for factor in factors:
@@ -91,8 +99,8 @@ def find_smallest_robust_failure(
 ) -> int | None:
     """The row of the robust failure with the fewest changes; of several, the one whose largest change is smallest.
 
-    Failures are tried in this order until one is robust, or about `max_evaluations` settings are evaluated; None if no tried failure is
-    robust. Other time steps than the study's are left out where they could not make a failure robust.
+    Failures are tried in this order until one is robust, or about `max_evaluations` settings are evaluated; None if no
+    tried failure is robust. Other time steps than the study's are left out where they could not make a failure robust.
     """
     order = np.lexsort([failures.f_safe, failures.f_diff, failures.f_num_diff])
     least_share = len(STEP_FACTORS) * MIN_ROBUST_SHARE - len(

@@ -1,4 +1,6 @@
-"""The answer of `explain` in sentences, the verdict first: the summary of `study`, `explain` and reports say the same."""
+"""The answer of `explain` in sentences, the verdict first: the summary of `study`, `explain` and reports say the
+same.
+"""
 
 from __future__ import annotations
 
@@ -62,14 +64,21 @@ def answer_in_words(result: Explained) -> list[str]:
 
 def counts_in_words(result: Explained) -> str:
     """The criterion, and how many settings are unsafe by it."""
-    unsafe = f"{result.failures} of {number_of(result.looked_at, 'different vehicle')} are unsafe: {result.unsafe.description}."
+    unsafe = (
+        f"{result.failures} of {number_of(result.looked_at, 'different vehicle')} are unsafe: "
+        f"{result.unsafe.description}."
+    )
     if not result.otherwise:
         return unsafe
-    return f"{unsafe} {number_of(result.otherwise, 'setting')} with another outcome than recorded: has the version or the code changed?"
+    return (
+        f"{unsafe} {number_of(result.otherwise, 'setting')} with another outcome than recorded: has the version "
+        "or the code changed?"
+    )
 
 
 def verdict_in_words(result: Explained) -> list[str]:
-    """The verdict in sentences: the situation, the failure to lead with, the robust one, and who would have avoided the collisions.
+    """The verdict in sentences: the situation, the failure to lead with, the robust one, and who would have avoided the
+    collisions.
 
     The failure to lead with has the fewest changes; of several the robust one, else the most severe.
     """
@@ -120,7 +129,10 @@ def situation_in_words(
         return f"{where[0].upper()}{where[1:]}, the original vehicle {own_ending}."
     other = f"{original.f_safe[0]:.2f} m" if nearest.outcome[0] == original.outcome[0] else own_ending
     ending = _ending_in_words(system, nearest)
-    return f"No collision in {number_of(number, 'vehicle')}; the worst {ending}, the original {other}, {where[0].lower()}{where[1:]}."
+    return (
+        f"No collision in {number_of(number, 'vehicle')}; the worst {ending}, the original {other}, "
+        f"{where[0].lower()}{where[1:]}."
+    )
 
 
 def _ending_in_words(system: System, run: Evaluations) -> str:
@@ -139,7 +151,9 @@ def _ending_in_words(system: System, run: Evaluations) -> str:
 
 
 def finding_in_words(characteristics: CharacteristicSet, failure: Explanation) -> str:
-    """A sentence such as `a collision at 1.5 m/s, 5 km/h (rs:0:4, robust: ...) was found with ten changes: ...; three of them suffice`."""
+    """A sentence such as `a collision at 1.5 m/s, 5 km/h (rs:0:4, robust: ...) was found with ten changes: ...; three
+    of them suffice`.
+    """
     number, cause = len(failure.changed), failure.cause
     effect = f"{effect_in_words(failure)} ({failure.name}, {failure.robustness})"
     shares = [
@@ -149,9 +163,15 @@ def finding_in_words(characteristics: CharacteristicSet, failure: Explanation) -
     changes = ", ".join(f"{name} {100 * share:+.0f} %" for share, name in largest[:MAX_CHANGES_LISTED])
     changes += f" and {number - MAX_CHANGES_LISTED} more" if number > MAX_CHANGES_LISTED else ""
     if cause is None or len(cause.changes) == number:
-        return f"{_count_in_words(number)} {'change suffices' if number == 1 else 'changes suffice'} for {effect}: {changes}."
+        return (
+            f"{_count_in_words(number)} {'change suffices' if number == 1 else 'changes suffice'} for {effect}: "
+            f"{changes}."
+        )
     robustness = "" if cause.neighbours is None else f" ({cause.neighbours})"
-    needed = f"{_count_in_words(len(cause.changes))} of them {'suffices' if len(cause.changes) == 1 else 'suffice'}{robustness}"
+    needed = (
+        f"{_count_in_words(len(cause.changes))} of them "
+        f"{'suffices' if len(cause.changes) == 1 else 'suffice'}{robustness}"
+    )
     return f"{effect} was found with {_count_in_words(number)} changes: {changes}; {needed}."
 
 

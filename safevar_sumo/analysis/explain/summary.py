@@ -1,4 +1,6 @@
-"""The first lines of a study's summary: the verdict that `explain` gives, then the failures that matter with their causes."""
+"""The first lines of a study's summary: the verdict that `explain` gives, then the failures that matter with their
+causes.
+"""
 
 from __future__ import annotations
 
@@ -59,7 +61,10 @@ def summarise_failures(
         evaluations = Evaluator(study, pool, progress).evaluate(rows[names].to_numpy(float), "worst points")
         lines = [
             situation_in_words(system, original, evaluations.take([0]), len(distinct)),
-            f"{int(unsafe.rows(distinct).sum())} of {len(distinct)} different vehicles are unsafe: {unsafe.description}.",
+            (
+                f"{int(unsafe.rows(distinct).sum())} of {len(distinct)} different vehicles are unsafe: "
+                f"{unsafe.description}."
+            ),
         ]
         if len(rows) > 1 and evaluations.worst_points is not None:
             point = system.points[evaluations.worst_points[1]].name

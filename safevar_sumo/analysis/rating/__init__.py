@@ -1,6 +1,7 @@
 """How many Euro NCAP points does a vehicle earn, and how many does a worn variant lose?
 
-The options and the function of the library are defined here, so that a command's help can be shown without loading the computation.
+The options and the function of the library are defined here, so that a command's help can be shown without loading the
+computation.
 """
 
 from __future__ import annotations
@@ -21,7 +22,9 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class RatingOptions(Options):
-    """The variant that is rated beside the original vehicle: a solution of results, changed characteristics, or both."""
+    """The variant that is rated beside the original vehicle: a solution of results, changed characteristics, or
+    both.
+    """
 
     question: ClassVar[str] = "rating"
     changes: Mapping[str, float] | None = option(
@@ -30,7 +33,10 @@ class RatingOptions(Options):
         flag="--set",
         metavar="NAME=VALUE",
         form="repeated",
-        python="Values of characteristics of the variant, in their units; the others are the original's, or the solution's.",
+        python=(
+            "Values of characteristics of the variant, in their units; the others are the original's, or the "
+            "solution's."
+        ),
     )
     solution: str | None = option(
         None, "The variant is the N-th solution of a run, from 0, of a results directory.", metavar="ALG:RUN:N"
@@ -53,7 +59,8 @@ def rating(
     Parameters
     ----------
     study
-        A study, or results or their directory, whose vehicle and driving system are rated; tests by day take place in the study's weather.
+        A study, or results or their directory, whose vehicle and driving system are rated; tests by day take place in
+        the study's weather.
     """
     from safevar_sumo.analysis.rating.compute import rate_variant
 

@@ -1,4 +1,6 @@
-"""Rates the original vehicle and variants: simulates all cells and robustness layers, and scores them by the official rules."""
+"""Rates the original vehicle and variants: simulates all cells and robustness layers, and scores them by the official
+rules.
+"""
 
 from __future__ import annotations
 
@@ -46,9 +48,11 @@ DECIMALS = 9
 
 @dataclass(frozen=True, kw_only=True)
 class RatedTest:
-    """One vehicle's result in a test (by day or by night if the test has both); `points` are in the order of `POINT_KINDS`.
+    """One vehicle's result in a test (by day or by night if the test has both); `points` are in the order of
+    `POINT_KINDS`.
 
-    `layers` states whether each robustness layer holds, None if it is neither simulated nor claimed; day and night have the same layers.
+    `layers` states whether each robustness layer holds, None if it is neither simulated nor claimed; day and night have
+    the same layers.
     """
 
     matrix: CellMatrix
@@ -62,7 +66,9 @@ class RatedTest:
 
 @dataclass(frozen=True, kw_only=True)
 class RatedVehicle:
-    """One vehicle with its setting, results and points; `fails`: a required cell is not green, so that the vehicle earns nothing."""
+    """One vehicle with its setting, results and points; `fails`: a required cell is not green, so that the vehicle
+    earns nothing.
+    """
 
     name: str
     setting: Mapping[str, float]
@@ -199,7 +205,9 @@ class Rating:
         return round(open_points, DECIMALS)
 
     def colour_changes(self) -> list[tuple[Cell, str | None, str | None]]:
-        """Cells whose colour in the variant differs from the original's, with the original's and the variant's colour."""
+        """Cells whose colour in the variant differs from the original's, with the original's and the variant's
+        colour.
+        """
         variant = self.variant
         if variant is None:
             return []
@@ -258,8 +266,8 @@ def rate_variant(
     Raises
     ------
     InputError
-        If the results have no such solution, a value is outside its domain, the changed variant violates a constraint, or the study
-        cannot be assembled.
+        If the results have no such solution, a value is outside its domain, the changed variant violates a constraint,
+        or the study cannot be assembled.
     SimulationError
         If a vehicle cannot be simulated.
     """
@@ -331,23 +339,28 @@ def remarks(rating: Rating) -> list[str]:
     lines = []
     if weather.wet or weather.road_friction != 1:
         lines.append(
-            f"Euro NCAP tests on a dry road; this rating has the weather {weather.name!r}, by night {darken(weather).name!r}."
+            f"Euro NCAP tests on a dry road; this rating has the weather {weather.name!r}, by night "
+            f"{darken(weather).name!r}."
         )
     for vehicle in rating.vehicles:
         if vehicle.fails:
             lines.append(
-                f"{vehicle.name}: it earns nothing, because {_describe_cells(REQUIRED_CELLS, vehicle.protocol)} is not green in "
+                f"{vehicle.name}: it earns nothing, because "
+                f"{_describe_cells(REQUIRED_CELLS, vehicle.protocol)} is not green in "
                 "the whole standard range."
             )
         elif any(vehicle.colour(cell_number) != "green" for cell_number in UNCHECKED_CELLS.numbers(vehicle.protocol)):
             lines.append(
-                f"{vehicle.name}: {_describe_cells(UNCHECKED_CELLS, vehicle.protocol)} is not green, which Euro NCAP requires; "
-                f"Euro NCAP's calculator {vehicle.protocol.calculator_version} does not check this, nor do these points."
+                f"{vehicle.name}: {_describe_cells(UNCHECKED_CELLS, vehicle.protocol)} is not green, which "
+                "Euro NCAP requires; "
+                f"Euro NCAP's calculator {vehicle.protocol.calculator_version} does not check this, nor do "
+                "these points."
             )
         invalid_cells = int(np.count_nonzero(~vehicle.cells.valid))
         if invalid_cells:
             lines.append(
-                f"{vehicle.name}: {invalid_cells} cells are no valid tests and earn nothing: the vehicle cannot hold the speed."
+                f"{vehicle.name}: {invalid_cells} cells are no valid tests and earn nothing: the vehicle "
+                "cannot hold the speed."
             )
     if all(np.isnan(vehicle.cells.warning).all() for vehicle in rating.vehicles):
         lines.append("The driving system never warns: rows with FCW are red.")

@@ -45,10 +45,15 @@ def print_rating(console: Console, rating: Rating) -> None:
 
 
 def rating_in_words(rating: Rating) -> str:
-    """The rating in a sentence: how many points the variant loses and in which test; without a variant, the original's points."""
+    """The rating in a sentence: how many points the variant loses and in which test; without a variant, the original's
+    points.
+    """
     maximum, variant = max_points(rating.protocol), rating.variant
     if variant is None:
-        return f"The original vehicle earns {rating.original.points:.2f} of the {maximum:g} points of the tests that are simulated."
+        return (
+            f"The original vehicle earns {rating.original.points:.2f} of the {maximum:g} points of the tests that "
+            "are simulated."
+        )
     changes = _changes_in_words(rating, variant)
     of_original_points = (
         f"of the {rating.original.points:.2f} points that the original earns (of {maximum:g} that are simulated)"
@@ -56,13 +61,19 @@ def rating_in_words(rating: Rating) -> str:
     if not rating.lost:
         return f"With {changes} the vehicle keeps all {of_original_points}."
     if rating.lost < 0:
-        return f"With {changes} the vehicle earns {-rating.lost:.2f} points more, {variant.points:.2f} instead {of_original_points}."
+        return (
+            f"With {changes} the vehicle earns {-rating.lost:.2f} points more, {variant.points:.2f} instead "
+            f"{of_original_points}."
+        )
     losses = lost_by_test(rating)
     test, loss = losses[0]
     share = (
         "all" if math.isclose(loss, rating.lost, abs_tol=1e-6) else "most" if loss > rating.lost / 2 else f"{loss:.2f}"
     )
-    return f"With {changes} the vehicle loses {rating.lost:.2f} {of_original_points}, {share} of them in {test_in_words(test)}."
+    return (
+        f"With {changes} the vehicle loses {rating.lost:.2f} {of_original_points}, {share} of them in "
+        f"{test_in_words(test)}."
+    )
 
 
 def lost_by_test(rating: Rating) -> list[tuple[RatedTest, float]]:
@@ -75,7 +86,9 @@ def lost_by_test(rating: Rating) -> list[tuple[RatedTest, float]]:
 
 
 def colour_changes_in_words(rating: Rating) -> list[tuple[str, str]]:
-    """Tests with matrix cells whose colour the variant changes, each with a text on the colours and on speeds of the vehicle."""
+    """Tests with matrix cells whose colour the variant changes, each with a text on the colours and on speeds of the
+    vehicle.
+    """
     tests: dict[str, dict[tuple[str, str], list[str]]] = {}
     for cell, before, after in rating.colour_changes():
         if not cell.is_robustness_cell:
@@ -99,7 +112,10 @@ def not_simulated(rating: Rating) -> str:
     tests = ", ".join(f"{test} {points:g}" for test, points in points_by_test.items())
     text = f"Not simulated, neither passed nor failed: {tests}; {sum(points_by_test.values()):g} points."
     if rating.unclaimed_points:
-        text += f" Robustness layers that are neither simulated nor claimed: {rating.unclaimed_points:.2f} points of the simulated tests."
+        text += (
+            f" Robustness layers that are neither simulated nor claimed: {rating.unclaimed_points:.2f} points of "
+            "the simulated tests."
+        )
     return text
 
 
@@ -110,7 +126,10 @@ def test_in_words(test: RatedTest) -> str:
 def _changes_in_words(rating: Rating, variant: RatedVehicle) -> str:
     characteristics = CharacteristicSet.of(rating.study.vehicle.characteristics)
     changes = [
-        f"{characteristic.short_name} {float(characteristic.text(variant.setting[characteristic.name])):g}{characteristic.suffix}"
+        (
+            f"{characteristic.short_name} "
+            f"{float(characteristic.text(variant.setting[characteristic.name])):g}{characteristic.suffix}"
+        )
         for characteristic in characteristics
         if variant.setting[characteristic.name] != characteristic.original
     ]
@@ -149,7 +168,9 @@ def _format_sum(points: Sequence[float]) -> str:
 
 
 def _build_layers_table(rating: Rating) -> WholeTable:
-    """The layers that are simulated or claimed, the same by day and night; a variant has a row only where it differs from the original."""
+    """The layers that are simulated or claimed, the same by day and night; a variant has a row only where it differs
+    from the original.
+    """
     table = WholeTable(
         "test", "vehicle", "layers that hold", "layers that fail", "claimed layers", title="Robustness layers"
     )
@@ -172,7 +193,9 @@ def _build_layers_table(rating: Rating) -> WholeTable:
 
 
 def print_matrices(console: Console, rating: Rating) -> None:
-    """Print every matrix: for each cell a letter, a colour, and the impact speed [km/h] or the time to collision at the warning [s]."""
+    """Print every matrix: for each cell a letter, a colour, and the impact speed [km/h] or the time to collision at the
+    warning [s].
+    """
     for matrix in rating.protocol.matrices:
         columns = [f"{location:g} %" for location in matrix.impact_locations] or [
             f"{speed:g}" for speed in matrix.target_speeds
@@ -226,7 +249,9 @@ def _format_cell_of_vehicle(vehicle: RatedVehicle, cell_number: int, *, with_val
 
 
 def matrices_figure(rating: Rating) -> Figure:
-    """All matrices of every vehicle; cells of the extended range are hatched, cells with another colour than the original's framed."""
+    """All matrices of every vehicle; cells of the extended range are hatched, cells with another colour than the
+    original's framed.
+    """
     matrices = rating.protocol.matrices
     rows = math.ceil(len(matrices) / FIGURE_COLUMNS)
     figure, axes = new_figure(points_title(rating), rows, FIGURE_COLUMNS, (15, 2.6 * rows))
@@ -235,7 +260,8 @@ def matrices_figure(rating: Rating) -> Figure:
     for axis, matrix in zip(axes.flat, matrices, strict=False):
         _draw_matrices(axis, rating, matrix)
     figure.supxlabel(
-        f"impact location [% of the width], or speed of the target [km/h] in CCCscp and CMCscp; {LEGEND}; hatched: extended "
+        f"impact location [% of the width], or speed of the target [km/h] in CCCscp and CMCscp; {LEGEND}; "
+        "hatched: extended "
         "range; thick frame: colour differs from the original's",
         fontsize=FONT,
     )

@@ -50,6 +50,7 @@ def summarise_rated_solutions(
         lines.append(f"{title}: {handle} loses {loss:.2f} points with {list_of_changes(characteristics, setting)}.")
     return [
         *lines,
-        f"Which cells change colour: {question_command('rating', directory)} --solution {quote(str(handle))} --matrix; which "
+        f"Which cells change colour: {question_command('rating', directory)} --solution {quote(str(handle))} "
+        "--matrix; which "
         f"changes cause it: {question_command('explain', directory)}",
     ]

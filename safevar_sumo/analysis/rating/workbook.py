@@ -1,7 +1,8 @@
 """Fills in the two spreadsheets of Euro NCAP's official calculator.
 
-`Template` takes predictions, claimed layers and input parameters. From it the calculator makes a `PreprocessedFile` with cells drawn at
-random, which takes measurements. Headings are checked before anything is written; a spreadsheet with other headings is refused.
+`Template` takes predictions, claimed layers and input parameters. From it the calculator makes a `PreprocessedFile`
+with cells drawn at random, which takes measurements. Headings are checked before anything is written; a spreadsheet
+with other headings is refused.
 """
 
 from __future__ import annotations
@@ -28,7 +29,9 @@ VERIFICATION_HEADINGS = ("Scenario", "Test point", "Range", "Value")
 
 
 class _Spreadsheet:
-    """A spreadsheet that a command of the calculator writes. The constructor reads and checks it; `fill` fills and saves it."""
+    """A spreadsheet that a command of the calculator writes. The constructor reads and checks it; `fill` fills and
+    saves it.
+    """
 
     command: ClassVar[str]
 
@@ -120,7 +123,9 @@ class Template(_Spreadsheet):
                 yield test, str(sheet.cell(row, 6).value).strip(), sheet.cell(row, 7)
 
     def fill(self, vehicle: RatedVehicle) -> None:
-        """Fill in a vehicle's colours, rows' functions, layers that hold or are claimed, and which tests' parameters are self-claimed."""
+        """Fill in a vehicle's colours, rows' functions, layers that hold or are claimed, and which tests' parameters
+        are self-claimed.
+        """
         for cell_number, cell in enumerate(self.protocol.cells):
             if not cell.is_robustness_cell:
                 top, left = coordinate_to_tuple(cell.matrix.first_cell)
@@ -146,7 +151,9 @@ class Template(_Spreadsheet):
 
 
 class PreprocessedFile(_Spreadsheet):
-    """The file that the calculator has preprocessed, with randomly drawn cells whose measurements are to be filled in."""
+    """The file that the calculator has preprocessed, with randomly drawn cells whose measurements are to be filled
+    in.
+    """
 
     command = "preprocess"
 
@@ -198,7 +205,9 @@ class PreprocessedFile(_Spreadsheet):
         return drawn_cells
 
     def fill(self, vehicle: RatedVehicle) -> None:
-        """Fill in each drawn cell's simulated value and, if a variation is drawn with the cell, whether the robustness cell passes."""
+        """Fill in each drawn cell's simulated value and, if a variation is drawn with the cell, whether the robustness
+        cell passes.
+        """
         robustness_cells = {
             (cell.matrix.name, cell.row, cell.column, cell.range_or_layer, cell.condition): cell_number
             for cell_number, cell in enumerate(self.protocol.cells)
@@ -219,7 +228,9 @@ class PreprocessedFile(_Spreadsheet):
 
 
 def _measurement(vehicle: RatedVehicle, cell_number: int) -> float:
-    """Relative impact speed [km/h], 0 without an impact; in a row with FCW, the time to collision at the warning [s]."""
+    """Relative impact speed [km/h], 0 without an impact; in a row with FCW, the time to collision at the warning
+    [s].
+    """
     is_warning = vehicle.protocol.cells[cell_number].judged_by == "warning"
     value = float((vehicle.cells.warning if is_warning else vehicle.cells.impact)[0, cell_number])
     return 0.0 if math.isnan(value) else float(round_half_up(max(value, 0.0), DECIMALS))  # type: ignore[arg-type]

@@ -1,6 +1,7 @@
 """How likely is an unsafe outcome when vehicles vary as a study specifies, and which characteristic decides?
 
-The command's options and the Python function `risk` are defined here, so that help can be shown without loading the computation.
+The command's options and the Python function `risk` are defined here, so that help can be shown without loading the
+computation.
 """
 
 from __future__ import annotations
@@ -26,7 +27,9 @@ RARE_BELOW = 1e-2
 PILOT_VEHICLES = 1000
 """Number of vehicles first drawn by plain Monte Carlo, whose outcomes decide the method."""
 ENOUGH_FAILURES = 100
-"""Plain Monte Carlo is kept if the share of failures in the pilot, times the number of requested vehicles, is at least this."""
+"""Plain Monte Carlo is kept if the share of failures in the pilot, times the number of requested vehicles, is at least
+this.
+"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,7 +97,8 @@ def risk(
     progress: bool | Progress = False,
     as_it_is_now: bool = False,
 ) -> Risk:
-    """Estimate how likely an unsafe outcome is when vehicles vary as the study says, and which characteristic decides whether one occurs.
+    """Estimate how likely an unsafe outcome is when vehicles vary as the study says, and which characteristic decides
+    whether one occurs.
 
     Parameters
     ----------

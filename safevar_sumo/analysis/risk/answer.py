@@ -71,8 +71,8 @@ class Risk(Estimate):
     samples
         Number of simulated vehicles.
     sensitivity, sensitivity_of_unsafe
-        The two frames of `compute_sensitivities`; None if characteristics are correlated or bound by constraints, because
-        Sobol indices are then undefined.
+        The two frames of `compute_sensitivities`; None if characteristics are correlated or bound by constraints,
+        because Sobol indices are then undefined.
     """
 
     study: Study
@@ -128,7 +128,8 @@ class Risk(Estimate):
         }
 
     def to_frame(self) -> pd.DataFrame:
-        """Sensitivity of the safety degree and of the unsafe outcome, one row per output and characteristic; empty if correlated.
+        """Sensitivity of the safety degree and of the unsafe outcome, one row per output and characteristic; empty if
+        correlated.
 
         Columns: `output` (safety_degree or unsafe), and the columns of `compute_sensitivities`.
         """
@@ -152,7 +153,9 @@ class Risk(Estimate):
         sampling = "" if self.method == "monte_carlo" else f", drawn by {self.method.replace('_', ' ')}"
         yield f"Unsafe: {self.unsafe.description}. {self.failures} of {self.samples} vehicles{sampling}."
         label = "Share of the domain that is unsafe:" if self.is_share_of_domain else "Probability"
-        yield f"{label} {self.probability:.4g}, with {100 * self.confidence:g} % confidence from {low:.4g} to {high:.4g}."
+        yield (
+            f"{label} {self.probability:.4g}, with {100 * self.confidence:g} % confidence from {low:.4g} to {high:.4g}."
+        )
         if self.remark:
             yield f"note: {self.remark}."
         if self.design_point is not None:
@@ -162,7 +165,8 @@ class Risk(Estimate):
             yield f"The most probable failure: {values}."
         if self.is_share_of_domain:
             yield (
-                "warning: this is not a probability in the field: the study has no [variation] table for how real vehicles "
+                "warning: this is not a probability in the field: the study has no [variation] table for how "
+                "real vehicles "
                 "vary."
             )
         elif 0 < self.probability < RARE_BELOW:
@@ -198,7 +202,8 @@ class Risk(Estimate):
             yield "There are no indices of the unsafe outcome, because too few settings are unsafe or too few are safe."
         yield meanings(characteristics)
         yield (
-            f"Sobol indices, first order and total, with half of their {100 * self.confidence:g} % intervals: estimates, "
+            f"Sobol indices, first order and total, with half of their {100 * self.confidence:g} % intervals: "
+            "estimates, "
             "which may exceed 1 or fall below 0 by their error."
         )
 

@@ -1,4 +1,6 @@
-"""Estimates how likely an unsafe outcome is for vehicles that vary as a study specifies, and which characteristic decides."""
+"""Estimates how likely an unsafe outcome is for vehicles that vary as a study specifies, and which characteristic
+decides.
+"""
 
 from __future__ import annotations
 
@@ -37,7 +39,8 @@ def estimate_risk(
     jobs: int | None = None,
     progress: Progress = show_no_progress,
 ) -> Risk:
-    """Estimate the probability of an unsafe outcome. The filter of small changes is not applied, as no search changes vehicles.
+    """Estimate the probability of an unsafe outcome. The filter of small changes is not applied, as no search changes
+    vehicles.
 
     Raises
     ------
@@ -72,7 +75,9 @@ def estimate_risk(
 
 
 def _draw_vehicles(evaluator: Evaluator, model: VariationModel, unsafe: Unsafe, options: RiskOptions) -> Estimate:
-    """Draw vehicles by plain Monte Carlo; if few of the first `PILOT_VEHICLES` are unsafe, switch to a method for rare failures."""
+    """Draw vehicles by plain Monte Carlo; if few of the first `PILOT_VEHICLES` are unsafe, switch to a method for rare
+    failures.
+    """
     rng, vehicles, failures, errors, remark = np.random.default_rng(evaluator.study.search.seed), 0, 0, 0, ""
     is_pilot, requested = _needs_pilot(options, evaluator.study) and not evaluator.region, options.samples
     if options.requires_rare_method:
@@ -133,7 +138,9 @@ def _draw_vehicles(evaluator: Evaluator, model: VariationModel, unsafe: Unsafe, 
 
 
 def _needs_pilot(options: RiskOptions, study: Study) -> bool:
-    """Whether a method for rare failures may follow; unless required, not for a share of the domain, which `rules` counts likewise."""
+    """Whether a method for rare failures may follow; unless required, not for a share of the domain, which `rules`
+    counts likewise.
+    """
     may_be_rare = options.method == "auto" and bool(study.variation) and options.width is None
     return options.requires_rare_method or (may_be_rare and options.samples >= 2 * PILOT_VEHICLES)
 
@@ -142,12 +149,14 @@ def _try_rare_method(response: Response, responses: FloatArray, options: RiskOpt
     """The estimate by a method for rare failures; why plain Monte Carlo has to continue if there is none."""
     if is_plateau(responses):
         return (
-            "the response is a plateau: most vehicles nearest to failure have the same safety degree, so that methods for "
+            "the response is a plateau: most vehicles nearest to failure have the same safety degree, so "
+            "that methods for "
             "rare failures cannot approach failures; plain Monte Carlo is used"
         )
     if not options.requires_rare_method and find_spec("openturns") is None:
         return (
-            f"fewer than {100 * RARE_BELOW:g} % of the first vehicles are unsafe; for a method that needs fewer vehicles "
+            f"fewer than {100 * RARE_BELOW:g} % of the first vehicles are unsafe; for a method that needs "
+            "fewer vehicles "
             "for rare failures, in the checkout: pip install '.[rare]'"
         )
     method = "cross_entropy" if options.method == "cross_entropy" else "subset_simulation"

@@ -1,7 +1,8 @@
-"""Probabilities of rare failures in standard normal space: subset simulation and cross-entropy importance sampling, by OpenTURNS.
+"""Probabilities of rare failures in standard normal space: subset simulation and cross-entropy importance sampling, by
+OpenTURNS.
 
-Au and Beck, Estimation of small failure probabilities in high dimensions by subset simulation, Probabilistic Engineering Mechanics 16
-(2001); Rubinstein and Kroese, The cross-entropy method (2004).
+Au and Beck, Estimation of small failure probabilities in high dimensions by subset simulation, Probabilistic
+Engineering Mechanics 16 (2001); Rubinstein and Kroese, The cross-entropy method (2004).
 """
 
 from __future__ import annotations
@@ -23,21 +24,29 @@ from safevar_sumo.records import BoolArray, Evaluations, FloatArray
 LEVEL_SHARE = 0.1
 """p0: share of a level's vehicles (those nearest to failure) from which the next level starts."""
 LEVEL_SIZE = 1000
-"""N: number of vehicles of a level. A block has p0 N vehicles, so that no vehicle continues from another vehicle of its block."""
+"""N: number of vehicles of a level. A block has p0 N vehicles, so that no vehicle continues from another vehicle of its
+block.
+"""
 REPEATS, VERY_RARE_REPEATS = 4, 8
 """Number of independent repeats for probabilities of at least `VERY_RARE_BELOW`, and for lower probabilities."""
 VERY_RARE_BELOW = 3e-4
 INFLATION = 1.3
-"""Factor on OpenTURNS' coefficient of variation, which wrongly assumes that the levels of a subset simulation are independent. In 240
-repeats with linear limit states (probability 1e-3 to 1e-6, 5 to 12 dimensions) the observed coefficients were 1.1 to 1.3 times as large."""
+"""Factor on OpenTURNS' coefficient of variation, which wrongly assumes that the levels of a subset simulation are
+independent. In 240 repeats with linear limit states (probability 1e-3 to 1e-6, 5 to 12 dimensions) the observed
+coefficients were 1.1 to 1.3 times as large.
+"""
 PRIOR_DEGREES = 3
-"""Degrees of freedom of the interval in addition to the number of repeats, for the information in OpenTURNS' own estimates."""
+"""Degrees of freedom of the interval in addition to the number of repeats, for the information in OpenTURNS' own
+estimates.
+"""
 MIN_PROBABILITY = 1e-10
 """Probability at which a subset simulation gives up."""
 PROPOSAL_WIDTH = 2.0
 """Width of the uniform proposals of a subset simulation's Markov chains."""
 SAFE_RESPONSE = 1e6
-"""Response where the safety degree is undefined or the simulation failed; it stands for the greatest distance from failure."""
+"""Response where the safety degree is undefined or the simulation failed; it stands for the greatest distance from
+failure.
+"""
 MIN_RESPONSE = 1e-9
 """Smallest absolute value of a response, so that its sign always shows whether the vehicle is unsafe."""
 PLATEAU_SHARE = 0.5
@@ -59,7 +68,9 @@ class RareMethodError(Exception):
 
 
 class Response:
-    """The response g(u) at a point u of standard normal space, below 0 where the vehicle is unsafe; counts simulations, stores failures."""
+    """The response g(u) at a point u of standard normal space, below 0 where the vehicle is unsafe; counts simulations,
+    stores failures.
+    """
 
     def __init__(self, evaluator: Evaluator, settings_of: SettingsFunction, unsafe: Unsafe) -> None:
         self._evaluator, self._settings_of, self._unsafe = evaluator, settings_of, unsafe
@@ -139,7 +150,8 @@ def estimate_rare(response: Response, method: str, confidence: float, seed: int)
     Raises
     ------
     RareMethodError
-        If the response does not show which vehicles are nearer to failure, or cross-entropy sampling loses all failures.
+        If the response does not show which vehicles are nearer to failure, or cross-entropy sampling loses all
+        failures.
     """
     estimate_once = _run_subset_simulation if method == "subset_simulation" else _run_cross_entropy
     probabilities, variations, thresholds = [], [], list[float]()
@@ -234,7 +246,9 @@ def _run_subset_simulation(response: Response, seed: int) -> tuple[float, float,
 
 
 def _run_cross_entropy(response: Response, seed: int) -> tuple[float, float, list[float]]:
-    """Probability and coefficient of variation by cross-entropy importance sampling with independent normal variables; no thresholds."""
+    """Probability and coefficient of variation by cross-entropy importance sampling with independent normal variables;
+    no thresholds.
+    """
     ot = load_openturns()
     algorithm = ot.StandardSpaceCrossEntropyImportanceSampling(
         _failure_event(ot, response, response.dimensions), 2 * LEVEL_SHARE
@@ -255,7 +269,9 @@ def _run_cross_entropy(response: Response, seed: int) -> tuple[float, float, lis
 
 
 def _remark_on_islands(response: Response, thresholds: list[float], rng: np.random.Generator) -> str:
-    """A remark if failures lie on islands with safe settings between them: straight paths between islands do not stay near failure."""
+    """A remark if failures lie on islands with safe settings between them: straight paths between islands do not stay
+    near failure.
+    """
     failures = response.failure_points
     if len(failures) < 2:
         return ""
@@ -273,7 +289,8 @@ def _remark_on_islands(response: Response, thresholds: list[float], rng: np.rand
     if island_count < 2:
         return ""
     return (
-        f"failures lie on {island_count} islands with safe settings between them, and this method may have missed others; "
+        f"failures lie on {island_count} islands with safe settings between them, and this method may have "
+        "missed others; "
         "plain Monte Carlo misses none, with many samples"
     )
 
@@ -289,7 +306,9 @@ def _select_distant_points(points: FloatArray) -> FloatArray:
 
 
 def _find_design_point(response: Response, rng: np.random.Generator) -> FloatArray | None:
-    """The failure nearest to the origin, searched between the nearest known failure and the origin, and around that failure."""
+    """The failure nearest to the origin, searched between the nearest known failure and the origin, and around that
+    failure.
+    """
     if not len(response.failure_points):
         return None
     nearest, response.stage = _nearest_point(response.failure_points), "most probable failure"

@@ -1,4 +1,6 @@
-"""Vehicles that vary as a study's [variation] and [[correlations]] specify, and which characteristic decides: Sobol indices."""
+"""Vehicles that vary as a study's [variation] and [[correlations]] specify, and which characteristic decides: Sobol
+indices.
+"""
 
 from __future__ import annotations
 
@@ -55,7 +57,9 @@ class VariationModel:
         return self._factor is not None
 
     def settings(self, probabilities: FloatArray) -> FloatArray:
-        """Settings at N independent points of the unit cube, shape (N, n); the settings are correlated as the study specifies."""
+        """Settings at N independent points of the unit cube, shape (N, n); the settings are correlated as the study
+        specifies.
+        """
         if self._factor is not None:
             return self.settings_of_normal(scipy.stats.norm.ppf(probabilities))
         return self._settings_at(probabilities)
@@ -127,8 +131,8 @@ def compute_sensitivities(
     -------
     tuple of pandas.DataFrame
         One row per characteristic: `characteristic`, `first_order`, `total` [share of the variance], and the intervals'
-        ends `first_order_lower`, `first_order_upper`, `total_lower`, `total_upper`; NaN where nothing varies, or too few
-        settings are unsafe (or safe).
+        ends `first_order_lower`, `first_order_upper`, `total_lower`, `total_upper`; NaN where nothing varies, or too
+        few settings are unsafe (or safe).
     """
     from SALib.sample import sobol  # takes a second to load
 
@@ -144,7 +148,9 @@ def compute_sensitivities(
 
 
 def _sobol_indices(problem: dict[str, Any], output: FloatArray, confidence: float, seed: int) -> pd.DataFrame:
-    """Sobol indices of an output over the design, without base points at which the output is undefined for any setting."""
+    """Sobol indices of an output over the design, without base points at which the output is undefined for any
+    setting.
+    """
     from SALib.analyze import sobol
 
     blocks = output.reshape(BASE_POINTS, -1)

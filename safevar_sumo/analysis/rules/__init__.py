@@ -1,6 +1,7 @@
 """In which regions of the domain do failures lie, in physical units?
 
-The command's options and the Python function `rules` are defined here, so that help can be shown without loading the computation.
+The command's options and the Python function `rules` are defined here, so that help can be shown without loading the
+computation.
 """
 
 from __future__ import annotations

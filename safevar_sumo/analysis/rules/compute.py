@@ -1,8 +1,8 @@
 """Finds rules in physical units that say where a study is unsafe, from random vehicles, and validates them on others.
 
-A classification tree (CART, by scikit-learn) cuts the domain into boxes. The tree is pruned to the smallest tree whose score in
-cross-validation is within a standard error of the best score. Its boxes with more unsafe than safe settings become rules. A rule
-then loses the conditions that do not make it denser.
+A classification tree (CART, by scikit-learn) cuts the domain into boxes. The tree is pruned to the smallest tree whose
+score in cross-validation is within a standard error of the best score. Its boxes with more unsafe than safe settings
+become rules. A rule then loses the conditions that do not make it denser.
 """
 
 from __future__ import annotations
@@ -37,7 +37,8 @@ FOLDS, MAX_DEPTH, MAX_PRUNINGS = 5, 6, 24
 MIN_ADDED_SHARE = 0.01
 """Share of the unsafe settings that a rule must cover in addition to the rules before it."""
 RULES_NOTE = (
-    "Shares of vehicles that did not form the rules. In a rule all characteristics vary together over the whole domain; how far "
+    "Shares of vehicles that did not form the rules. In a rule all characteristics vary together over the "
+    "whole domain; how far "
     "one may go while all others stay as in the original says `tolerance`."
 )
 """What the shares of rules are shares of."""
@@ -90,7 +91,9 @@ class Rule:
         return not self.limits or (self.density_interval is not None and self.density_interval[0] > share)
 
     def in_words(self, characteristics: CharacteristicSet, unsafe: Unsafe) -> str:
-        """Itself with its shares: `mass above 2500 kg, the others anywhere: collides in 92 % (..), covers 61 % (..)`."""
+        """Itself with its shares: `mass above 2500 kg, the others anywhere: collides in 92 % (..), covers 61 %
+        (..)`.
+        """
         others = ", the others anywhere" if 0 < len(self.limits) < len(characteristics) else ""
         conditions = [
             _condition_in_words(characteristic, *self.limits[characteristic.name])
@@ -123,7 +126,9 @@ class Rule:
 
 @dataclass(frozen=True, kw_only=True)
 class Rules:
-    """Rules of a study, ordered by coverage; of `samples` settings, `unsafe_share` were unsafe, with its 95 % interval."""
+    """Rules of a study, ordered by coverage; of `samples` settings, `unsafe_share` were unsafe, with its 95 %
+    interval.
+    """
 
     study: Study
     unsafe: Unsafe
@@ -135,13 +140,16 @@ class Rules:
     no_verdict: str = ""
 
     def to_dict(self) -> list[dict[str, Any]]:
-        """The JSON of `rules`: a list with an entry for each rule, and a summary if no verdict on the ADS is possible."""
+        """The JSON of `rules`: a list with an entry for each rule, and a summary if no verdict on the ADS is
+        possible.
+        """
         return [*(rule.to_dict() for rule in self.rules), *summary_entry(self.no_verdict)]
 
     def to_frame(self) -> pd.DataFrame:
         """One row for each condition of each rule; a rule without conditions, which holds everywhere, has one row.
 
-        Columns: `rule`, counted from 0, `characteristic`, `at_least`, `at_most` [unit], `density`, `coverage` [fraction].
+        Columns: `rule`, counted from 0, `characteristic`, `at_least`, `at_most` [unit], `density`, `coverage`
+        [fraction].
         """
         return pd.DataFrame(
             [
@@ -160,7 +168,8 @@ class Rules:
         """Every rule with its density and coverage."""
         characteristics, (low, high) = CharacteristicSet.of(self.study.vehicle.characteristics), self.unsafe_interval
         yield (
-            f"Unsafe: {self.unsafe.description}; {100 * self.unsafe_share:.2f} % of {self.samples} vehicles drawn evenly over "
+            f"Unsafe: {self.unsafe.description}; {100 * self.unsafe_share:.2f} % of {self.samples} vehicles "
+            "drawn evenly over "
             f"the whole domain ({100 * low:.2f} % to {100 * high:.2f} %)."
         )
         yield from constraints_in_words(self.study)
@@ -216,7 +225,8 @@ def find_rules(
         boxes = [np.repeat([[-np.inf], [np.inf]], len(characteristics), axis=1)]
     elif min(unsafe_count, len(is_unsafe) - unsafe_count) < MIN_SETTINGS:
         remark = (
-            f"{unsafe_count} of {len(is_unsafe)} settings are unsafe: rules need at least {MIN_SETTINGS} unsafe and as many safe "
+            f"{unsafe_count} of {len(is_unsafe)} settings are unsafe: rules need at least {MIN_SETTINGS} "
+            "unsafe and as many safe "
             "settings (the command rules --samples N simulates more)"
         )
     else:
@@ -235,7 +245,9 @@ def find_rules(
 
 
 def _find_boxes(settings: FloatArray, is_unsafe: BoolArray, characteristics: CharacteristicSet) -> list[FloatArray]:
-    """The boxes that become rules, ordered by coverage; a box that adds few unsafe settings to those before it is dropped."""
+    """The boxes that become rules, ordered by coverage; a box that adds few unsafe settings to those before it is
+    dropped.
+    """
     lower, width = characteristics.lower, characteristics.upper - characteristics.lower
     tree = _fit_pruned_tree((settings - lower) / width, is_unsafe).tree_
     everywhere = np.repeat([[-np.inf], [np.inf]], len(width), axis=1)

@@ -1,6 +1,7 @@
 """How far may each characteristic go by itself, in pairs, and together with all others?
 
-The options and the function of the library are defined here, so that a command's help can be shown without loading the computation.
+The options and the function of the library are defined here, so that a command's help can be shown without loading the
+computation.
 """
 
 from __future__ import annotations
@@ -31,7 +32,10 @@ class ToleranceOptions(Options):
         "Only these characteristics, separated by commas.  [default: all]",
         metavar="A,B",
         form="commas",
-        python="Characteristics that vary alone, in pairs, and together in the joint box; the others keep their values. By default all.",
+        python=(
+            "Characteristics that vary alone, in pairs, and together in the joint box; the others keep their "
+            "values. By default all."
+        ),
     )
     pairs: bool = option(False, "Evaluate every pair too.", kind=bool)
 
@@ -53,7 +57,8 @@ def tolerance(
     Parameters
     ----------
     study
-        A study; or results or their directory: their study is examined, and the joint box holds none of their unsafe solutions.
+        A study; or results or their directory: their study is examined, and the joint box holds none of their unsafe
+        solutions.
     """
     from safevar_sumo.analysis.tolerance.compute import find_tolerances
 

@@ -36,7 +36,9 @@ MAX_PAIRS, MAX_PAIRS_DRAWN = 12, 6
 
 @dataclass(frozen=True, kw_only=True)
 class Tolerance:
-    """How far characteristics may go: each by itself (`alone`), two together (`pairs`, None if not requested), and all (`joint`)."""
+    """How far characteristics may go: each by itself (`alone`), two together (`pairs`, None if not requested), and all
+    (`joint`).
+    """
 
     study: Study
     unsafe: Unsafe
@@ -62,7 +64,8 @@ class Tolerance:
         if self.unsafe_pairs:
             pairs = ", ".join(" with ".join(pair.names) for pair in self.unsafe_pairs)
             return (
-                f"No single characteristic makes it unsafe, but {len(self.unsafe_pairs)} of {len(self.pairs or [])} pairs: "
+                f"No single characteristic makes it unsafe, but {len(self.unsafe_pairs)} of "
+                f"{len(self.pairs or [])} pairs: "
                 f"{pairs}."
             )
         return f"No single characteristic {'makes' if self.pairs is None else 'and no pair makes'} it unsafe."
@@ -186,7 +189,8 @@ class Tolerance:
         return figure
 
     def pairs_figure(self) -> Figure:
-        """The planes of the worst pairs: with the largest unsafe share, or the lowest safety degree where nothing is unsafe.
+        """The planes of the worst pairs: with the largest unsafe share, or the lowest safety degree where nothing is
+        unsafe.
 
         Raises
         ------
@@ -253,7 +257,8 @@ def _losses_in_words(scan: OneAtATimeScan) -> str:
         else f"the first point is lost at {whole_point:.5g}{characteristic.suffix}"
     )
     return (
-        f"{characteristic.name}: points are lost from {any_loss:.5g}{characteristic.suffix} on; {first}; the minimum is "
+        f"{characteristic.name}: points are lost from {any_loss:.5g}{characteristic.suffix} on; {first}; the "
+        "minimum is "
         f"{min((scan.points or {}).values()):.2f} points."
     )
 

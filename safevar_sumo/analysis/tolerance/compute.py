@@ -29,14 +29,16 @@ def find_tolerances(
     jobs: int | None = None,
     progress: Progress = show_no_progress,
 ) -> Tolerance:
-    """Find how far the characteristics of a study may go. The filter is not applied, as the question is about the vehicle.
+    """Find how far the characteristics of a study may go. The filter is not applied, as the question is about the
+    vehicle.
 
     The joint box holds none of the unsafe solutions of results.
 
     Raises
     ------
     InputError
-        If `unsafe` or a name cannot be used, the study cannot be assembled, or hardly any setting of a box satisfies its constraints.
+        If `unsafe` or a name cannot be used, the study cannot be assembled, or hardly any setting of a box satisfies
+        its constraints.
     """
     study = study_in(source)
     columns = _columns_of(study, options.characteristics)

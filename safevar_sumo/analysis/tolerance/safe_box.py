@@ -20,7 +20,9 @@ from safevar_sumo.vehicles.region import REJECTIONS
 MAX_UNSAFE_SHARE = 0.003
 """Upper bound of a box's unsafe share, with 95 % confidence, if every sampled setting is safe."""
 FIRST_SEARCH_POINTS, SECOND_SEARCH_POINTS = 256, 1024
-"""Number of Sobol points, and of corners, in the first search of a box, and in a second search if the first finds nothing unsafe."""
+"""Number of Sobol points, and of corners, in the first search of a box, and in a second search if the first finds
+nothing unsafe.
+"""
 MAX_LINES = 16
 """Maximum number of unsafe settings, the nearest first, from which the search goes back towards the original."""
 STEP_BACK = 0.999
@@ -32,10 +34,10 @@ MIN_FACTOR = 1e-6
 class SafeBox(NamedTuple):
     """A box around the original, `factor` times as wide as the domain; no setting of a random sample in it is unsafe.
 
-    With `confidence`, at most `unsafe_at_most` of all settings in the box are unsafe or cannot be simulated: `failed` of the
-    `samples` settings could not be simulated, and count as unsafe in that bound. `attempts` boxes were tested. Only
-    `characteristics` vary; the others keep their original values. If no box is safe, because the original or a setting
-    arbitrarily near to it is unsafe, `factor` is 0 and the bound is 1.
+    With `confidence`, at most `unsafe_at_most` of all settings in the box are unsafe or cannot be simulated: `failed`
+    of the `samples` settings could not be simulated, and count as unsafe in that bound. `attempts` boxes were tested.
+    Only `characteristics` vary; the others keep their original values. If no box is safe, because the original or a
+    setting arbitrarily near to it is unsafe, `factor` is 0 and the bound is 1.
     """
 
     factor: float = 0.0
@@ -71,20 +73,23 @@ def find_safe_box(
 
     Notes
     -----
-    The search of a box simulates Sobol points and as many corners, where all changes add up. From unsafe settings the search goes back
-    towards the original, and the box shrinks to end before the first unsafe setting on the way, until the search finds nothing unsafe.
-    These settings determined the box, so they prove nothing about it.
+    The search of a box simulates Sobol points and as many corners, where all changes add up. From unsafe settings the
+    search goes back towards the original, and the box shrinks to end before the first unsafe setting on the way, until
+    the search finds nothing unsafe. These settings determined the box, so they prove nothing about it.
 
-    The box is then tested with settings drawn independently and uniformly in it, by a separate random generator. If any is unsafe,
-    the box shrinks and is searched and tested again. Test k, k = 1, 2, ..., may be wrong with probability alpha_k = alpha / 2^k, alpha
-    = 1 - `confidence`: if test k accepts, the bound is Clopper and Pearson's upper bound at confidence 1 - alpha_k for the share of the
-    box that is unsafe or cannot be simulated. Box k depends on earlier samples alone, so given box k the bound fails with probability
-    at most alpha_k; all tests together fail with probability sum alpha_k <= alpha, whichever of them accepts. Later tests draw more
-    settings, so that the bound stays `MAX_UNSAFE_SHARE` if all of them can be simulated.
+    The box is then tested with settings drawn independently and uniformly in it, by a separate random generator. If any
+    is unsafe, the box shrinks and is searched and tested again. Test k, k = 1, 2, ..., may be wrong with probability
+    alpha_k = alpha / 2^k, alpha = 1 - `confidence`: if test k accepts, the bound is Clopper and Pearson's upper bound
+    at confidence 1 - alpha_k for the share of the box that is unsafe or cannot be simulated. Box k depends on earlier
+    samples alone, so given box k the bound fails with probability at most alpha_k; all tests together fail with
+    probability sum alpha_k <= alpha, whichever of them accepts. Later tests draw more settings, so that the bound stays
+    `MAX_UNSAFE_SHARE` if all of them can be simulated.
     """
 
     def shrunk(factor: float, unsafe_found: FloatArray) -> float:
-        """The factor of a box that ends before all unsafe settings found on the straight ways from the original to some of these."""
+        """The factor of a box that ends before all unsafe settings found on the straight ways from the original to some
+        of these.
+        """
         nearest = unsafe_found[np.argsort(_box_factors(evaluator, unsafe_found), kind="stable")[:MAX_LINES]]
         lines = [Line(evaluator.characteristics.original, end, 0.0) for end in nearest]
         shares = find_first_unsafe_shares(evaluator, lines, unsafe, "nearest unsafe settings")
@@ -149,7 +154,9 @@ def _settings_in_box(evaluator: Evaluator, columns: Sequence[int], factor: float
 def _random_settings(
     evaluator: Evaluator, columns: Sequence[int], factor: float, number: int, rng: np.random.Generator
 ) -> FloatArray:
-    """Feasible settings drawn uniformly in a box; fewer than `number` where few are feasible, an error where none is."""
+    """Feasible settings drawn uniformly in a box; fewer than `number` where few are feasible, an error where none
+    is.
+    """
     settings = evaluator.region.draw_feasible(
         lambda count: _settings_in_box(evaluator, columns, factor, rng.random((count, len(columns)))), number
     )
@@ -164,7 +171,9 @@ def _random_settings(
 
 
 def refuse_tied(evaluator: Evaluator, columns: Sequence[int]) -> None:
-    """Refuse characteristics that constraints tie so closely that hardly any setting in a box is feasible; raises `InputError`."""
+    """Refuse characteristics that constraints tie so closely that hardly any setting in a box is feasible; raises
+    `InputError`.
+    """
     _random_settings(evaluator, columns, 1.0, 1, np.random.default_rng(evaluator.study.search.seed))
 
 

@@ -1,4 +1,6 @@
-"""Scans of the domains of characteristics one at a time, and of the plane of two; all others keep their original values."""
+"""Scans of the domains of characteristics one at a time, and of the plane of two; all others keep their original
+values.
+"""
 
 from __future__ import annotations
 
@@ -42,8 +44,9 @@ class OneAtATimeScan:
     Attributes
     ----------
     profile
-        Columns `value` [unit], `safety_degree` [m, or -m/s], `state` ("safe", "unsafe", "not_simulated" or "infeasible"),
-        and in a rated study `rating_points`, in the order of the values, which are closer together where the state changes.
+        Columns `value` [unit], `safety_degree` [m, or -m/s], `state` ("safe", "unsafe", "not_simulated" or
+        "infeasible"), and in a rated study `rating_points`, in the order of the values, which are closer together where
+        the state changes.
     """
 
     characteristic: Characteristic
@@ -180,13 +183,13 @@ class Pair:
     values
         Values of both characteristics, shape (2, GRID_VALUES), each in its unit.
     safety_degree, unsafe, valid, infeasible
-        Evaluations on the grid, shape (GRID_VALUES, GRID_VALUES), with the first characteristic on axis 0; safety degrees
-        in m, or -m/s. A setting that is not valid could not be simulated, or violates a constraint (`infeasible`), and is
-        neither safe nor unsafe.
+        Evaluations on the grid, shape (GRID_VALUES, GRID_VALUES), with the first characteristic on axis 0; safety
+        degrees in m, or -m/s. A setting that is not valid could not be simulated, or violates a constraint
+        (`infeasible`), and is neither safe nor unsafe.
     nearest
-        The two values of the unsafe setting that is nearest to the original by distance in domain widths, exact to a 5120th
-        of them; None if no setting of the grid is unsafe. Unsafe settings that lie only between safe values of the grid are
-        not found.
+        The two values of the unsafe setting that is nearest to the original by distance in domain widths, exact to a
+        5120th of them; None if no setting of the grid is unsafe. Unsafe settings that lie only between safe values of
+        the grid are not found.
     """
 
     characteristics: tuple[Characteristic, ...]
@@ -271,11 +274,12 @@ def scan_pairs(evaluator: Evaluator, columns: Sequence[int], unsafe: Unsafe) -> 
 def _search_nearest(
     grid: BoolArray, original: FloatArray, lower: FloatArray, upper: FloatArray
 ) -> Generator[FloatArray, BoolArray | None, tuple[float, float] | None]:
-    """Find the unsafe setting of a plane nearest to the original, from where its grid is unsafe; distances are in domain widths.
+    """Find the unsafe setting of a plane nearest to the original, from where its grid is unsafe; distances are in
+    domain widths.
 
-    Yields values of the two characteristics, shape (K, 2), and is sent which are unsafe. A branch and bound search: a square
-    with an unsafe corner is divided into smaller squares if it comes nearer to the original than the nearest unsafe setting
-    so far; each round divides the `MAX_SQUARES` nearest squares.
+    Yields values of the two characteristics, shape (K, 2), and is sent which are unsafe. A branch and bound search: a
+    square with an unsafe corner is divided into smaller squares if it comes nearer to the original than the nearest
+    unsafe setting so far; each round divides the `MAX_SQUARES` nearest squares.
     """
 
     def distances(offset: FloatArray) -> FloatArray:

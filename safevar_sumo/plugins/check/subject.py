@@ -64,7 +64,9 @@ NAMES: Mapping[str, tuple[str, Callable[[Study], list[str]]]] = {
 
 
 class Subject(NamedTuple):
-    """A subject and the study in which it is tried; `remark` says how the study was found, `is_guest` that no study names the subject."""
+    """A subject and the study in which it is tried; `remark` says how the study was found, `is_guest` that no study
+    names the subject.
+    """
 
     name: str
     kind: str
@@ -173,7 +175,9 @@ def _kind_of(target: Any) -> str:
 
 
 def _put_in(study: Study, kind: str, name: str) -> Study:
-    """A study that names a subject without parameters; raises an `InputError` for a vehicle, whose characteristics only a study knows."""
+    """A study that names a subject without parameters; raises an `InputError` for a vehicle, whose characteristics only
+    a study knows.
+    """
     if kind in ("ads", "traci"):
         return replace(study, ads=ModelTable(model=name, kind="traci" if kind == "traci" else ""))
     if kind == "scenario":

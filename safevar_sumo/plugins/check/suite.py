@@ -18,19 +18,30 @@ from safevar_sumo.sumo.empty_road import why_no_verdict
 from safevar_sumo.sumo.system import assemble
 
 CHECKS: Mapping[str, str] = {
-    "contract": "return what the base class documents, leave arguments as they are, and guard divisions and roots where the domain ends",
-    "repetition": "draw nothing at random (an algorithm: from `rng` alone), read no clock, and keep nothing in a class or a module",
+    "contract": (
+        "return what the base class documents, leave arguments as they are, and guard divisions and roots where "
+        "the domain ends"
+    ),
+    "repetition": (
+        "draw nothing at random (an algorithm: from `rng` alone), read no clock, and keep nothing in a class or "
+        "a module"
+    ),
     "order": "compute element i of a result from element i of the arguments alone, whatever its place",
-    "alone": "compute element i of a result from element i of the arguments alone: no mean, sum or maximum over the vehicles; keep what a "
+    "alone": "compute element i of a result from element i of the arguments alone: no mean, sum or maximum over the "
+    "vehicles; keep what a "
     "vehicle remembers in the memory that is handed on or in its own instance, not in a class or a module",
     "reaction": "check that the code reads the quantity that it should react to, with the right sign and unit",
 }
-"""The checks, with advice on a failure. All but `reaction`, of which every answer itself warns, also keep a study from starting."""
+"""The checks, with advice on a failure. All but `reaction`, of which every answer itself warns, also keep a study from
+starting.
+"""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Finding:
-    """A failed check: file and line of the user code, the expected result, the actual one with the input that shows it, and advice."""
+    """A failed check: file and line of the user code, the expected result, the actual one with the input that shows it,
+    and advice.
+    """
 
     check: str
     file: str

@@ -19,7 +19,9 @@ from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.vehicles import CharacteristicSet, region_of
 
 SIMULATED, SIMULATED_BY_TRACI, COMPUTED = 100, 20, 200
-"""Numbers of settings that are simulated, with a controller that reads SUMO, and to which a constraint's function is applied."""
+"""Numbers of settings that are simulated, with a controller that reads SUMO, and to which a constraint's function is
+applied.
+"""
 SMALLER_BATCHES = 4
 """Number of batches into which the settings are divided."""
 MATRIX_POINTS = 2
@@ -155,7 +157,9 @@ def _results(evaluations: Evaluations) -> Outputs:
 
 
 def _search(study: Study, name: str, seeds: tuple[int, ...]) -> FloatArray:
-    """All settings that a run with the last seed, after runs with the others, requests, and then those that it returns; shape (k, n)."""
+    """All settings that a run with the last seed, after runs with the others, requests, and then those that it returns;
+    shape (k, n).
+    """
     system, lookup, label = assemble(study), Lookup(study.source, study.origin.places), name.rpartition(":")[2]
     member = lookup.find(ALGORITHMS, name, "search.algorithms")
     parameters = lookup.with_paths(member, study.search.parameters.get(label, {}), f"search.{label}")
@@ -183,7 +187,9 @@ def _search(study: Study, name: str, seeds: tuple[int, ...]) -> FloatArray:
 
 
 def _smooth_evaluations(system: System, settings: FloatArray) -> Evaluations:
-    """Evaluations in which the safety degree falls from 1 at the lower ends of the domains to -0.5 at the upper ends."""
+    """Evaluations in which the safety degree falls from 1 at the lower ends of the domains to -0.5 at the upper
+    ends.
+    """
     characteristics, scoring = system.characteristics, system.measuring.scoring
     share = (settings - characteristics.lower) / (characteristics.upper - characteristics.lower)
     safety_degree = 1.0 - np.add.accumulate(share, axis=1)[:, -1] / len(characteristics) * 1.5
