@@ -107,7 +107,9 @@ class Returning(Ads):
 @given(what=COMMANDS)
 def test_whatever_an_ads_commands_is_two_pedals_for_each_vehicle_or_an_error(what: object) -> None:
     guard = Guard("mine.toml", "ads.model = 'mine:Mine'")
-    for ads in (GuardedAds(Returning((what, None)), guard), PerVehicleAds(lambda: Returning(what), guard)):  # type: ignore[arg-type, return-value]
+    batched: Any = Returning((what, None))
+    single: Any = lambda: Returning(what)  # noqa: E731
+    for ads in (GuardedAds(batched, guard), PerVehicleAds(single, guard)):
         try:
             command, _ = ads.drive(SEEN, ads.start(2, KNOWN, 0.05))
         except UserCodeError:

@@ -132,7 +132,8 @@ def _columns_of(protocol: Protocol) -> _Columns:
         )
 
     def cells_where(condition: object) -> npt.NDArray[np.intp]:
-        return np.array([number for number, cell in enumerate(cells) if condition(cell)], dtype=np.intp)  # type: ignore[operator]
+        numbers = [number for number, cell in enumerate(cells) if condition(cell)]  # type: ignore[operator]
+        return np.array(numbers, dtype=np.intp)
 
     ranges = {
         (matrix.name, name): cells_where(lambda cell, b=matrix, n=name: cell.matrix is b and cell.range_or_layer == n)

@@ -307,4 +307,5 @@ def direction_of(angle: float) -> FloatArray:
 def _api_function(api: Any, domain: str, name: str) -> Callable[..., Any]:
     """A function of traci, or one of libsumo without its Python wrapper, which takes as long as the function itself."""
     compiled = getattr(api, "_libsumo", None)
-    return getattr(getattr(api, domain), name) if compiled is None else getattr(compiled, f"{domain}_{name}")  # type: ignore[no-any-return]
+    wrapped = getattr(api, domain) if compiled is None else compiled
+    return getattr(wrapped, name if compiled is None else f"{domain}_{name}")  # type: ignore[no-any-return]

@@ -46,7 +46,8 @@ def rare(limit: Limit, n: int, seed: int = 1, **options: object) -> Risk:
         study, search=msgspec.structs.replace(study.search, seed=seed), variation={"a": Uniform()}
     )
     plant = Plant(study, lambda settings: limit(of_normal(settings)) < 0, lambda settings: limit(of_normal(settings)))
-    return risk(study, unsafe="collision", pool=plant, progress=passes_no_end, **{"rare": True, **options})  # type: ignore[arg-type]
+    chosen = {"unsafe": "collision", "pool": plant, "progress": passes_no_end, "rare": True, **options}
+    return risk(study, **chosen)  # type: ignore[arg-type]
 
 
 def passes_no_end(stage: str, done: int, total: int) -> None:

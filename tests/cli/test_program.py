@@ -58,7 +58,8 @@ def test_every_command_and_each_of_its_options_has_a_whole_sentence_of_help(comm
     result = CliRunner().invoke(commands, [command, "--help"])
     assert result.exit_code == 0
     for option in results.params:
-        assert isinstance(option, click.Argument) or str(option.help).endswith((".", "]")), option.name  # type: ignore[attr-defined]
+        sentence = isinstance(option, click.Argument) or str(option.help).endswith((".", "]"))  # type: ignore[attr-defined]
+        assert sentence, option.name
 
 
 def test_the_package_and_the_help_load_nothing_heavy() -> None:

@@ -89,7 +89,8 @@ class ExportedVehicle(Fmi2Slave):
 
     def tell(self):
         state = self.state
-        self.v, self.throttle_now, self.brake_now = (float(one[0]) for one in (state.speed, state.throttle, state.brake))
+        outputs = (state.speed, state.throttle, state.brake)
+        self.v, self.throttle_now, self.brake_now = (float(one[0]) for one in outputs)
 
     def do_step(self, time, step):
         command = Command(np.array([self.accelerator]), np.array([self.brake_pedal]))

@@ -24,8 +24,9 @@ ROWS = "\n".join(
 
 
 def failing(system: object) -> str:
+    settings = np.repeat(system.characteristics.original[None], 3, axis=0)  # type: ignore[attr-defined]
     with pytest.raises(UserCodeError) as caught:
-        evaluate(system, np.repeat(system.characteristics.original[None], 3, axis=0))  # type: ignore[arg-type, attr-defined]
+        evaluate(system, settings)  # type: ignore[arg-type]
     assert len(str(caught.value).splitlines()) <= 2
     return str(caught.value)
 

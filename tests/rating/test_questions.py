@@ -172,7 +172,8 @@ def test_a_rating_prints_draws_and_stands_in_a_page() -> None:
     assert matrices_figure(result).get_axes()
     assert draw_matrices(result) == draw_matrices(result)
     assert str(draw_matrices(result)).startswith("<svg")
-    assert result.to_frame().groupby("vehicle")["total"].sum().loc["variant"] == pytest.approx(result.variant.points)  # type: ignore[union-attr]
+    total = result.to_frame().groupby("vehicle")["total"].sum().loc["variant"]
+    assert total == pytest.approx(result.variant.points)  # type: ignore[union-attr]
 
 
 @pytest.mark.slow

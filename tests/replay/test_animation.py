@@ -99,7 +99,8 @@ def test_the_same_bytes_twice(kind: str, crash: Comparison, tmp_path: Path) -> N
 
 def test_the_page_holds_every_place_to_the_centimetre(crash: Comparison) -> None:
     page, scene = animation_page(lay_out_scene(crash)), lay_out_scene(crash)
-    data = json.loads(re.search(r'<script type="application/json">(.*?)</script>', page, re.DOTALL)[1])  # type: ignore[index]
+    script = re.search(r'<script type="application/json">(.*?)</script>', page, re.DOTALL)
+    data = json.loads(script[1])  # type: ignore[index]
     assert data["step"] == scene.step
     vuts = [body for body in data["bodies"] if body["drive"] is not None]
     for shown, body in zip(vuts, [one for one in scene.bodies if one.is_vut], strict=True):

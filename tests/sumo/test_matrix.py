@@ -89,7 +89,8 @@ def test_results_do_not_depend_on_the_batch_the_order_of_points_or_the_size_of_s
 
 
 def test_named_point_finds_a_point_and_suggests_similar_names() -> None:
-    assert system_at_point(SYSTEM, "CPLA, speed 30, clear", "--point").scenario.speed == 30  # type: ignore[attr-defined]
+    system = system_at_point(SYSTEM, "CPLA, speed 30, clear", "--point")
+    assert system.scenario.speed == 30  # type: ignore[attr-defined]
     with pytest.raises(InputError, match="CPNCO, speed 40, clear"):
         system_at_point(SYSTEM, "CPNCO", "--point")
 

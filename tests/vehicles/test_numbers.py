@@ -79,7 +79,8 @@ def test_carlas_gearbox_shifts_as_soon_as_the_selector_lets_go_of_the_gear() -> 
     for _ in range(100):
         state = step("carla", vehicle.hold_gear(p, state, one > 0), throttle=1.0)  # type: ignore[attr-defined]
         assert state.target_gear[0] == 1
-    assert step("carla", vehicle.hold_gear(p, state, one < 0), throttle=1.0).target_gear[0] == 2  # type: ignore[attr-defined]
+    held = vehicle.hold_gear(p, state, one < 0)
+    assert step("carla", held, throttle=1.0).target_gear[0] == 2  # type: ignore[attr-defined]
 
 
 def test_carlas_pedals_rise_and_fall_at_their_own_rates() -> None:
@@ -154,7 +155,8 @@ def test_lgsvls_tyres_follow_unitys_curve(slip: float, share: float) -> None:
     """A parabola up to the extremum at slip 0.4, a line down to half of it at 0.8; load with 2 v^2 N of downforce."""
     p, rim, one = prepared("lgsvl"), 10.0, np.ones(1)
     speed = rim * (1 - slip)
-    force = float(_tyre_stiffness(p, speed * one, rim * one, (rim - speed) * one)[0]) * (rim - speed)  # type: ignore[arg-type]
+    stiffness = _tyre_stiffness(p, speed * one, rim * one, (rim - speed) * one)  # type: ignore[arg-type]
+    force = float(stiffness[0]) * (rim - speed)
     assert force == pytest.approx(share * (2120 * GRAVITY + 2 * speed * speed))
 
 
