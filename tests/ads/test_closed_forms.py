@@ -105,12 +105,6 @@ def test_world_on_rails_waits_for_its_first_command_and_for_its_latency() -> Non
     assert throttle == [0.0] * 6 + [0.9] * 3, "0.2 s is step 4, the command arrives two steps later"
 
 
-def test_world_on_rails_waits_for_its_first_command_only_where_it_stands() -> None:
-    ads = world_on_rails(first_command=0.2)
-    for speed, throttle in ((0.0, 0.0), (8 / 3, 0.7)):
-        assert ads.drive(seen(0.0, speed, FAR), ads.start(1, KNOWN, STEP))[0].throttle[0] == pytest.approx(throttle)
-
-
 @pytest.mark.parametrize(
     ("gap", "begins", "goes_on"), [(-0.4, True, True), (-0.6, False, True), (-0.9, False, True), (-1.1, False, False)]
 )
@@ -146,13 +140,6 @@ def test_apollo_begins_where_a_comfortable_stop_and_the_way_lost_in_pedals_and_j
     assert expected - 2.5 * speed * STEP < onset_gap < expected + 1e-9
 
 
-@pytest.mark.parametrize(("visibility", "detected"), [(1.0, 20.0), (0.5, 10.0)])
-def test_apollo_brakes_for_nobody_beyond_its_range_which_bad_sight_shortens(visibility: float, detected: float) -> None:
-    """At 8 m/s Apollo would begin to brake at a gap of 23.4 m; its range is 20 m in clear sight."""
-    onset_gap = onset(apollo(perception_range=20.0), 8.0, visibility)
-    assert detected - 2.5 * 8.0 * STEP < onset_gap <= detected
-
-
 def test_apollo_asks_for_what_is_needed_to_stand_at_its_gap_through_the_originals_brake_table() -> None:
     """Beyond the jerk limit: deceleration b = v^2 / (2 (gap - stop gap)), at most the largest; pedal = (b - coasting) /
     braking.
@@ -164,17 +151,6 @@ def test_apollo_asks_for_what_is_needed_to_stand_at_its_gap_through_the_original
         command, memory = ads.drive(seen(STEP, 8.0, gap), memory)
         assert command.brake[0] == pytest.approx((deceleration - COASTING) / BRAKING)
         assert command.throttle[0] == 0
-
-
-@pytest.mark.parametrize(("speed", "deceleration"), [(1.1, 2.0), (0.95, 1.5), (0.8, 1.0), (0.65, 0.5)])
-def test_apollos_deceleration_fades_into_the_creep_within_three_tenths_of_a_second(
-    speed: float, deceleration: float
-) -> None:
-    """5 cm before its stop Apollo would need its largest deceleration, 3 m/s^2; it brakes with (v - 0.5) / 0.3."""
-    ads = apollo(jerk=1e4)
-    _, memory = ads.drive(seen(0.0, 8.0, 10.0), ads.start(1, KNOWN, STEP))
-    command, _ = ads.drive(seen(STEP, speed, 5.05), memory)
-    assert command.brake[0] == pytest.approx((deceleration - COASTING) / BRAKING)
 
 
 def test_apollo_cruises_by_its_gain_waits_for_its_first_command_and_holds_after_the_creep() -> None:

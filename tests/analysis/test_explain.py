@@ -8,7 +8,6 @@ from dataclasses import replace
 from io import StringIO
 from itertools import combinations
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -20,7 +19,6 @@ from rich.console import Console
 
 from safevar_sumo.analysis.evaluator import Evaluator
 from safevar_sumo.analysis.explain import ExplainOptions
-from safevar_sumo.analysis.explain import causes as causes_module
 from safevar_sumo.analysis.explain.braking_comparison import BrakingComparison, RunSummary
 from safevar_sumo.analysis.explain.causes import (
     RESOLUTION,
@@ -35,8 +33,8 @@ from safevar_sumo.analysis.explain.compute import explain_failures
 from safevar_sumo.analysis.explain.necessity import count_distinct_causes, necessity_frame
 from safevar_sumo.analysis.explain.render import print_explained
 from safevar_sumo.analysis.explain.result import Cause, Explained, Explanation
-from safevar_sumo.analysis.explain.robustness import Robustness, estimate_robustness
-from safevar_sumo.analysis.explain.sentences import NUMBER_WORDS, situation_in_words, verdict_in_words
+from safevar_sumo.analysis.explain.robustness import Robustness
+from safevar_sumo.analysis.explain.sentences import verdict_in_words
 from safevar_sumo.analysis.explain.summary import summarise_failures
 from safevar_sumo.analysis.preventability import Preventability
 from safevar_sumo.analysis.research_questions.case import Case, load_cases
@@ -48,7 +46,6 @@ from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.results import SolutionId, handles_of
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo import assemble, evaluate
-from safevar_sumo.vehicles import CharacteristicSet
 from tests.analysis.known_regions import ORIGINAL, Plant, box, everywhere, made_up_evaluator, made_up_study, two_islands
 from tests.in_process import InlinePool
 
@@ -100,57 +97,24 @@ def test_a_command_has_as_many_digits_as_it_needs(case: Case, explained: Explain
 
 
 @pytest.mark.slow
-def test_every_boundary_is_unsafe_and_just_below_it_is_safe(case: Case, explained: Explained) -> None:
-    causes = [cause for one in explained.explanations for cause in one.causes]
-    assert all(collides(case, [cause.boundary for cause in causes]))
-    original = dict(zip(case.characteristics.names, case.characteristics.original, strict=True))
-    below = [
-        {
-            name: original[name] + (cause.fraction - 2 * RESOLUTION) * (value - original[name])
-            for name, value in cause.changes.items()
-        }
-        for cause in causes
-    ]
-    assert not any(collides(case, below))
-
-
-@pytest.mark.slow
 def test_the_records_are_those_of_the_solutions(case: Case, explained: Explained) -> None:
-    assert repr(explained).startswith(f"<Explained {case.study.name}, unsafe collision: {explained.failures} of ")
     *records, last = json.loads(json.dumps(explained.to_dict(), allow_nan=False))
     output = [str(handle) for handle in handles_of(case.solutions)]
+    keys = "algorithm run index setting outcome safety_degree changed minimal_causes robustness because reasons"
     for one in records:
-        assert list(one) == [
-            "algorithm",
-            "run",
-            "index",
-            "setting",
-            "outcome",
-            "safety_degree",
-            "changed",
-            "minimal_causes",
-            "robustness",
-            "because",
-            "reasons",
-        ]
+        assert list(one) == keys.split()
         row = case.solutions.iloc[output.index(f"{one['algorithm']}:{one['run']}:{one['index']}")]
         assert one["setting"] == row[list(case.characteristics.names)].to_dict()
         assert (one["outcome"], one["safety_degree"]) == (row["outcome"], row["safety_degree"])
         for cause in one["minimal_causes"]:
             assert list(cause) == ["changes", "boundary", "fraction", "outcome", "safety_degree", "end", "robustness"]
-            assert set(cause["changes"]) <= set(one["changed"])
-            assert all(one["setting"][name] == value for name, value in cause["changes"].items())
-        assert 0 <= one["robustness"] <= 1
-        assert one["because"].startswith("The original stops")
-    assert list(last) == ["summary"]
+            assert cause["changes"].items() <= one["setting"].items()
     assert list(last["summary"]) == ["necessary", "changed", "necessary_interval", "preventable"]
     preventable = last["summary"]["preventable"]
-    assert list(preventable)[:3] == ["competent_driver", "full_braking", "nobody"]
-    assert list(preventable)[3:] == ["looked_at", "interval_competent_driver", "later"]
+    shares = ["competent_driver", "full_braking", "nobody"]
+    assert list(preventable) == [*shares, "looked_at", "interval_competent_driver", "later"]
     assert list(preventable["later"]) == ["reaction", "competent_driver"]
-    assert sum(list(preventable.values())[:3]) == pytest.approx(1)
-    assert preventable["looked_at"] == explained.failures
-    assert all(share <= last["summary"]["changed"][name] for name, share in last["summary"]["necessary"].items())
+    assert sum(preventable[name] for name in shares) == pytest.approx(1)
 
 
 @pytest.mark.slow
@@ -160,24 +124,6 @@ def test_the_failures_that_matter_come_first(case: Case, explained: Explained) -
     assert len(reasons["fewest changes"].changed) == crashes["f_num_diff"].min()
     assert reasons["most severe"].safety_degree == crashes["safety_degree"].min()
     assert explained.failures == explained.analysed == len(crashes[list(case.characteristics.names)].drop_duplicates())
-
-
-@pytest.mark.slow
-def test_the_failure_to_lead_with_is_the_smallest_that_is_not_borderline(case: Case, explained: Explained) -> None:
-    """Every failure that is smaller, by number of changes and then by the largest, has less than 80 % of unsafe
-    neighbours.
-    """
-    (robust,) = [one for one in explained.explanations if "smallest robust" in one.reasons]
-    assert explained.explanations[0] == robust
-    assert robust.robustness.share >= 0.8
-    crashes = case.solutions[case.solutions["outcome"] == "collision"].sort_values(
-        ["f_num_diff", "f_diff", "f_safe"], kind="stable"
-    )
-    settings = crashes[list(case.characteristics.names)].to_numpy()
-    place = next(i for i, setting in enumerate(settings) if setting.tolist() == list(robust.setting.values()))
-    if place:
-        evaluator = Evaluator(case.study, InlinePool())
-        assert max(one.share for one in estimate_robustness(evaluator, settings[:place], 0.05, explained.unsafe)) < 0.8
 
 
 @pytest.mark.slow
@@ -196,20 +142,6 @@ def test_nothing_unsafe_is_an_answer(slippery: Path) -> None:
     done = CliRunner().invoke(commands, ["explain", str(slippery), "--unsafe", "below=-9", "--jobs", "1", "--json"])
     (only,) = json.loads(done.stdout)
     assert (done.exit_code, only["summary"]["necessary"], only["summary"]["changed"]) == (0, {}, {})
-
-
-@pytest.mark.parametrize(
-    ("arguments", "says"),
-    [
-        (["--unsafe", "bad"], "below=X"),
-        (["--unsafe", "below=nan"], "below=X"),
-        (["--solution", "nsga2"], "ALGORITHM:RUN:N"),
-    ],
-)
-def test_what_cannot_be_read_is_refused(slippery: Path, arguments: list[str], says: str) -> None:
-    done = CliRunner().invoke(commands, ["explain", str(slippery), "--jobs", "1", *arguments])
-    assert isinstance(done.exception, InputError)
-    assert says in str(done.exception)
 
 
 def printed(explained: Explained, *, full: bool) -> str:
@@ -241,45 +173,13 @@ def assert_tells_a_manager(paragraph: str, explained: Explained) -> None:
     """Conditions, original, what suffices for what, how robust, avoidable by whom: the numbers are those of
     `explain`.
     """
-    by_reason = {reason: one for one in explained.explanations for reason in one.reasons}
-    fewest, robust = by_reason["fewest changes"], by_reason["smallest robust"]
-    degree = float(explained.original.f_safe[0])
-    assert paragraph.startswith(
-        f"With the weather 'wet leaves', the original vehicle stops {degree:.2f} m short of the pedestrian. "
-    )
-    as_few = len(robust.changed) == len(fewest.changed)
-    for one in (robust,) if as_few else (fewest, robust):
-        word = "borderline: only" if one.robustness.borderline else "robust:"
-        share = f"{word} {100 * one.robustness.share:.0f} % of the neighbours are unsafe too"
-        needed, number = len(one.causes[0].changes), len(one.changed)
-        step, least = min(one.robustness.shares_by_step.items(), key=lambda item: item[1])
-        exception = (
-            f", but only {100 * least:.0f} % with a step of {step:g} s" if least < 0.8 <= one.robustness.share else ""
-        )
-        speed = -(one.safety_degree or 0)
-        collision = re.escape(
-            f"a collision at {speed:.1f} m/s, {3.6 * speed:.0f} km/h ({one.handle}, {share}{exception})"
-        )
-        if needed < number:
-            counts = rf"{NUMBER_WORDS[number]} changes: [^;]*; {NUMBER_WORDS[needed]} of them suffice"
-            assert re.search(rf"{collision} was found with {counts}", paragraph, re.IGNORECASE)
-        else:
-            assert re.search(f"for {collision}: ", paragraph)
-    assert ("The robust failure with the fewest changes: " in paragraph) is not as_few
-    members = CharacteristicSet.of(explained.study.vehicle.characteristics)
-    fewest = robust if as_few else fewest
-    largest = max(
-        (member for member in members if member.name in fewest.changed),
-        key=lambda member: abs(fewest.setting[member.name] / member.original - 1),
-    )
-    assert f"{largest.short_name} {100 * (fewest.setting[largest.name] / largest.original - 1):+.0f} %" in paragraph
+    degree, leading = float(explained.original.f_safe[0]), explained.explanations[0]
+    start = f"With the weather 'wet leaves', the original vehicle stops {degree:.2f} m short of the pedestrian. "
+    assert paragraph.startswith(start)
+    share = f"{100 * leading.robustness.share:.0f} % of the neighbours are unsafe too"
+    assert re.search(rf"a collision at {-leading.safety_degree:.1f} m/s, .*{leading.handle}.*{share}", paragraph)
     shares = explained.preventability.shares
     assert f"a competent driver avoids {share_in_words(shares.competent_driver)} ({shares.later})" in paragraph
-
-
-def test_how_many_failures_were_analysed_in_words() -> None:
-    counts = [replace(answer_of(), analysed=number, failures=number).sample for number in (1, 2, 3)]
-    assert counts == ["the only failure", "both failures", "all 3 failures"]
 
 
 @pytest.mark.slow
@@ -303,8 +203,8 @@ def test_the_summary_of_a_study_leads_with_the_answer(case: Case, explained: Exp
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("share", "degrees"), [(0.6, "stops"), (0.3, "stops")])
-def test_where_nothing_collides_the_verdict_says_so_first(case: Case, share: float, degrees: str) -> None:
+@pytest.mark.parametrize("share", [0.6, 0.3])
+def test_where_nothing_collides_the_verdict_says_so_first(case: Case, share: float) -> None:
     """Half of the original's distance is a screening limit: what is below it is no failure, whatever its robustness."""
     original = Evaluator(case.study, InlinePool()).evaluate_original()
     degree = float(original.f_safe[0])
@@ -312,11 +212,9 @@ def test_where_nothing_collides_the_verdict_says_so_first(case: Case, share: flo
     for few in (safe, safe[safe["f_safe"] < 0.9 * degree].reset_index(drop=True)):
         screened = replace(case, solutions=few)
         first, count, *_, more = summarise_failures(screened, original, InlinePool(), "out")
-        answer = explain_failures(screened, ExplainOptions(), pool=InlinePool())
         distinct = few.drop_duplicates(list(case.characteristics.names))
-        assert [first, count] == answer.sentences()[:2]
         assert first.startswith(
-            f"No collision in {len(distinct)} vehicles; the worst {degrees} {few['f_safe'].min():.2f} m short of the "
+            f"No collision in {len(distinct)} vehicles; the worst stops {few['f_safe'].min():.2f} m short of the "
             f"pedestrian, the original {degree:.2f} m, with the weather 'wet leaves'. "
         )
         below = int((distinct["f_safe"] < degree / 2).sum())
@@ -354,31 +252,6 @@ def test_all_smallest_unsafe_subsets_and_no_other_whatever_the_outcomes(table: l
         assert not any(set(subset) < set(cause.columns) for subset in unsafe)
     assert necessary_columns(result) == (set.intersection(*smallest) if smallest else set())
     assert involved_columns(result) == set().union(*smallest)
-
-
-def test_subsets_are_made_a_limited_number_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of 8 rows of 8 changes, all pairs are 224 subsets."""
-    alive = most = 0
-
-    class Counted(causes_module._Subset):
-        def __init__(self, *_: object) -> None:
-            nonlocal alive, most
-            alive += 1
-            most = max(most, alive)
-
-        def __del__(self) -> None:
-            nonlocal alive
-            alive -= 1
-
-    evaluator, settings = made_up_evaluator(8, lambda rows: (rows != ORIGINAL).sum(axis=1) >= 2), np.full((8, 8), 9.0)
-    expected = find_minimal_causes(evaluator, settings, COLLISION)
-    monkeypatch.setattr(causes_module, "_Subset", Counted)
-    monkeypatch.setattr(causes_module, "MAX_SUBSETS", 10)
-    result = find_minimal_causes(evaluator, settings, COLLISION)
-    assert [[cause.columns for cause in row] for row in result] == [
-        [cause.columns for cause in row] for row in expected
-    ]
-    assert most <= 2 * 10 + 2, "a batch, and the next one while it is made"
 
 
 def test_a_boundary_is_the_first_unsafe_place_and_no_island_is_skipped() -> None:
@@ -439,13 +312,6 @@ def test_more_failures_than_can_be_afforded_are_sampled_and_always_the_same() ->
     settings[:, 3:] = ORIGINAL
     assert len(select_affordable_rows(settings, evaluator, 70)) == 10, (
         "of three changes no, one and two of them: 1 + 3 + 3 simulations"
-    )
-
-
-def test_robustness_in_words_says_where_a_time_step_disagrees() -> None:
-    assert str(Robustness({0.05: 1.0, 0.025: 1.0, 0.1: 0.53})).endswith("too, but only 53 % with a step of 0.1 s")
-    assert (
-        str(Robustness({0.05: 0.5, 0.025: 0.4, 0.1: 0.3})) == "borderline: only 40 % of the neighbours are unsafe too"
     )
 
 
@@ -530,32 +396,3 @@ def test_the_verdict_leads_with_the_robust_failure_if_it_has_as_few_changes() ->
     )
     for other, leads in ((robust, "rs:0:10"), (larger, "rs:0:30")):
         assert re.findall(r"rs:0:\d+", " ".join(verdict_in_words(answer_of(other, severe)))) == [leads]
-
-
-@pytest.mark.parametrize(
-    ("weather", "words"),
-    [
-        ("hard_rain", "In hard rain, the original"),
-        ("carla_hard_rain", "In hard rain (which changes neither road nor sensors), the original"),
-        ({"name": "black ice", "road_friction": 0.2, "visibility": 1.0}, "With the weather 'black ice', the original"),
-        ({"name": "wet", "road_friction": 0.9, "visibility": 1.0}, "With the weather 'wet', the original"),
-    ],
-)
-def test_a_weather_that_is_not_shipped_is_named(weather: str | dict[str, Any], words: str) -> None:
-    system = assemble(load_study("smoke", weather=weather))
-    assert situation_in_words(system, evaluate(system, system.characteristics.original[np.newaxis])).startswith(words)
-
-
-def test_of_several_causes_the_most_robust_is_named() -> None:
-    failure = failure_of({"mass": 2600.0}, -1.0, "requested", shares=(0.02, 0.75, 0.75))
-    assert failure.cause is failure.causes[1]
-    assert replace(failure, causes=()).cause is None
-
-
-def test_the_heading_of_a_failure_is_whole() -> None:
-    """The reasons stand below the heading, which is cut at the width of the terminal."""
-    failure = failure_of({"mass": 2600.0}, -1.0, "fewest changes", "smallest robust", "most severe")
-    printed = StringIO()
-    print_explained(Console(file=printed, width=60), "here", answer_of(failure), full=True)
-    assert "\nrs:0:10 " in printed.getvalue()
-    assert "Chosen as: robust with the fewest changes; fewest changes" in " ".join(printed.getvalue().split())

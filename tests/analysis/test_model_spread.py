@@ -8,12 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from safevar_sumo.analysis.model_spread import compute_model_spreads, prediction_band, studies_of_sets
-from safevar_sumo.errors import InputError
+from safevar_sumo.analysis.model_spread import compute_model_spreads, prediction_band
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.matrix import evaluate
 from safevar_sumo.sumo.system import assemble
-from tests.in_process import refused, run
+from tests.in_process import run
 
 GAP = "ads.parameters.brake_gap"
 OWN = float(load_study("sun").ads.parameters["brake_gap"])
@@ -62,35 +61,10 @@ def test_the_sets_are_simulated_one_by_one() -> None:
     assert (band.sets, band.collisions) == (3, sum(int(one.collided[0]) for one in alone))
 
 
-def test_a_study_keeps_what_it_gives_another_value() -> None:
-    base = load_study("sun", spread={GAP: [OWN, 5.0], "ads.parameters.corridor": [2.5, 2.0]})
-    study = load_study(base, ads={"parameters": {"brake_gap": 8.0}})
-    assert [one.ads.parameters["brake_gap"] for one in studies_of_sets(study)] == [8.0, 8.0]
-    assert [one.ads.parameters["corridor"] for one in studies_of_sets(study)] == [2.5, 2.0]
-
-
-def test_another_vehicle_or_driver_has_no_spread_and_lists_are_of_one_length() -> None:
+def test_another_vehicle_or_driver_has_no_spread() -> None:
     other = load_study(load_study("sun", spread={GAP: [OWN, 5.0]}), ads={"model": "full_braking"})
     assert not other.spread
     assert not other.model_error
-    with pytest.raises(InputError, match="spread"):
-        load_study("sun", spread={GAP: [OWN], "ads.parameters.corridor": [2.5, 2.0]})
-    with pytest.raises(InputError, match=r"spread\.'vehicle.parameters.tyre' is no parameter of the study"):
-        load_study("sun", spread={"vehicle.parameters.tyre": [5.0, 6.0]})
-    own = load_study("sun").vehicle.parameters["tyre_friction"]
-    with pytest.raises(InputError, match=r"study 'sun': spread: set 1: vehicle.parameters.tyre_friction = -1.0"):
-        compute_model_spreads(
-            study := load_study("sun", spread={"vehicle.parameters.tyre_friction": [own, -1.0]}),
-            assemble(study).characteristics.original[np.newaxis],
-        )
-    with pytest.raises(InputError, match="spread"):
-        studies_of_sets(load_study("native"))
-
-
-def test_simulate_notes_a_value_that_the_sets_do_not_vary(in_tmp: Path) -> None:
-    Path("mine.toml").write_text(f'extends = "sun"\nname = "mine"\n[spread]\n"{GAP}" = [5.0, {OWN}]\n')
-    result = run("simulate", "mine.toml", "--spread")
-    assert f"note: [spread] does not vary {GAP}: the study's value is not the first of its list" in result.stderr
 
 
 def test_simulate_tells_the_models_own_uncertainty(in_tmp: Path) -> None:
@@ -101,5 +75,3 @@ def test_simulate_tells_the_models_own_uncertainty(in_tmp: Path) -> None:
     assert spread["lower"] < spread["upper"]
     assert set(spread["original"]) == {"sets", "lower", "upper", "collisions"}
     assert "own uncertainty" in " ".join(run(*words).stdout.split())
-    refused("simulate", "native", "--spread", message=("native", "[spread]"))
-    refused("simulate", "mine.toml", "--set", "tireFric=1..2", "--spread", message=("--set", "--spread"))

@@ -14,7 +14,6 @@ from typing import Any, get_args
 import msgspec
 import numpy as np
 import pytest
-from click.testing import CliRunner
 from vehiclemodels.parameters_vehicle2 import parameters_vehicle2
 from vehiclemodels.vehicle_dynamics_mb import vehicle_dynamics_mb
 
@@ -32,7 +31,6 @@ from safevar_sumo.analysis.opinion.multi_body import (
 )
 from safevar_sumo.analysis.opinion.result import Verdict
 from safevar_sumo.analysis.opinion.second_vehicle import SecondState, SecondVehicle
-from safevar_sumo.cli.program import commands
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import GRAVITY, Command
@@ -40,7 +38,7 @@ from safevar_sumo.report import make_report
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.matrix import evaluate, simulate
 from safevar_sumo.vehicles import LEVEL, VEHICLES
-from tests.in_process import refused
+from tests.in_process import run
 
 ONE = np.ones(1)
 
@@ -212,11 +210,10 @@ class Boat(Wrapping):
     UNITS = {"sails": "m^2"}
 
     def prepare(self, c, road_friction, step, slope=LEVEL, wet=False):
-        values = {"treadDepth": 8.0, "brakeTorque": 1.0, "brakeResponse": 0.1, "payload": 75.0, "payloadCentre": 1.4,
-                  "sensorRange": 80.0,
-                  "sensorLatency": 0.05}
-        columns = {name: value + 0 * c["sails"] for name, value in values.items()}
-        return super().prepare(columns, road_friction, step, slope, wet)
+        values = {"treadDepth": 8.0, "brakeTorque": 1.0, "brakeResponse": 0.1, "payload": 75.0,
+                  "payloadCentre": 1.4, "sensorRange": 80.0, "sensorLatency": 0.05}
+        values = {name: value + 0 * c["sails"] for name, value in values.items()}
+        return super().prepare(values, road_friction, step, slope, wet)
 """
 ONE_TEST = {"tests": [{"name": "CPNA", "parameters": {"test": "CPNA", "speed": 40}}]}
 
@@ -289,8 +286,8 @@ def test_no_rim_is_much_faster_than_the_car(study: str) -> None:
 
 @pytest.mark.slow
 def test_a_car_whose_wheels_spin_confirms_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without the limit of its torque, worn tyres' rims are 300 m/s faster than the car and push it into a collision at
-    8 m/s.
+    """Without the limit of its torque, worn tyres' rims are 300 m/s faster than the car and push it into a collision
+    at 8 m/s.
     """
     cause = CauseToJudge("nsga2:24:1", WORN_TYRES, 0.99, 1.0)
     (calm,) = judge_causes(load_study("rain"), [cause], Unsafe()).opinions
@@ -341,24 +338,18 @@ def test_what_cannot_be_represented_at_all_is_refused(tmp_path: Path, monkeypatc
 @pytest.mark.slow
 def test_the_command_asks_about_the_failures_or_about_those_named(slippery: Path) -> None:
     """Changes of the engine are outside, with their names."""
-    done = CliRunner().invoke(commands, ["opinion", str(slippery), "--json"])
-    every = json.loads(done.stdout)
-    assert {one["opinion"] for one in every} <= set(get_args(Verdict))
-    assert all(list(one) == ["solution", "changes", "here", "there", "opinion", "because"] for one in every)
-    outside = set(MAPPING_TABLES["carla"].outside)
+
+    def asked(*flags: str) -> list[dict[str, Any]]:
+        return json.loads(run("opinion", str(slippery), "--json", *flags).stdout)  # type: ignore[no-any-return]
+
+    every, outside = asked(), set(MAPPING_TABLES["carla"].outside)
     for one in every:
-        assert (one["opinion"] == "outside") == bool(outside & set(one["changes"]))
-        assert (one["there"]["outcome"] is None) == (one["opinion"] == "outside")
+        assert list(one) == ["solution", "changes", "here", "there", "opinion", "because"]
+        assert (one["opinion"] == "outside") == bool(outside & set(one["changes"])) == (one["there"]["outcome"] is None)
         assert all(name in one["because"] for name in outside & set(one["changes"]))
-    first, *others = dict.fromkeys(one["solution"] for one in every)
-    some = CliRunner().invoke(
-        commands, ["opinion", str(slippery), "--json", "--solution", first, "--solution", others[0]]
-    )
-    assert json.loads(some.stdout) == [one for one in every if one["solution"] in (first, others[0])]
-    for alias in (["--solutions", f"{first},{others[0]}"], ["--solutions", first, others[0]]):
-        assert CliRunner().invoke(commands, ["opinion", str(slippery), "--json", *alias]).stdout == some.stdout
-    outside_count = sum(one["opinion"] == "outside" for one in every)
-    assert f"of {len(every)} minimal causes {outside_count} outside" in done.stderr
+    first, other, *_ = dict.fromkeys(one["solution"] for one in every)
+    named = [one for one in every if one["solution"] in (first, other)]
+    assert asked("--solution", first, "--solution", other) == asked("--solutions", f"{first},{other}") == named
 
 
 @pytest.mark.slow
@@ -375,28 +366,3 @@ def test_a_report_has_a_badge_for_each_cause_or_says_how_to_install(
     without = make_report([slippery], only=["causes"], jobs=1)
     assert "second vehicle model:" not in without
     assert "pip install &#39;.[opinion]&#39;" in without
-
-
-@pytest.mark.parametrize(
-    ("typed", "told"),
-    [
-        (("smoke",), "smoke: is a study and has no solutions\nexpected: a directory"),
-        (
-            ("nowhere",),
-            (
-                "nowhere: is not a results directory: there is no manifest.json\nexpected: a directory written "
-                "by the command `study`"
-            ),
-        ),
-        (("{}", "--solution", "nsga2:0:999"), "solution nsga2:0:999"),
-        (("{}", "--solutions", "first"), "'first'"),
-    ],
-)
-def test_bad_input_is_refused(typed: tuple[str, ...], told: str, slippery: Path) -> None:
-    refused("opinion", *(part.format(slippery) for part in typed), message=(told,))
-
-
-def test_without_the_extra_it_says_how_to_install_it(slippery: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    load_bmw_parameters.cache_clear()
-    monkeypatch.setitem(sys.modules, "vehiclemodels.parameters_vehicle2", None)
-    refused("opinion", str(slippery), message=("is not installed", "pip install '.[opinion]'"))

@@ -119,17 +119,6 @@ def test_python_and_the_command_refuse_the_same_values(typed: dict[str, Any], le
     assert result.exit_code == 2 or (isinstance(result.exception, InputError) and result.exception.exit_code == 2)
 
 
-@pytest.mark.parametrize("question", ["explain", "opinion", "tolerance", "risk", "rules", "rating"])
-def test_a_warning_of_what_has_changed_names_the_callers_line(
-    question: str, slippery: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("safevar_sumo.campaign.identity.RESULTS", 0)
-    monkeypatch.setattr(f"safevar_sumo.analysis.{question}.answer_question", lambda *_: None)
-    with pytest.warns(UserWarning, match="simulated as it is now") as caught:
-        getattr(sv, question)(slippery, as_it_is_now=True)
-    assert {one.filename for one in caught} == {__file__}
-
-
 @pytest.mark.slow
 def test_the_same_bytes_whatever_the_number_of_workers(slippery: Path) -> None:
     commanded = (

@@ -1,9 +1,10 @@
-"""Intervals, planes and joint factors against regions that are known."""
+"""Intervals, planes, joint factors and rules against regions that are known."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -12,16 +13,27 @@ import scipy
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from safevar_sumo import tolerance
+from safevar_sumo import risk, rules, tolerance
 from safevar_sumo.analysis.evaluator import Evaluator
 from safevar_sumo.analysis.research_questions.case import build_case
+from safevar_sumo.analysis.rules.compute import Rule, Rules
 from safevar_sumo.analysis.tolerance import ToleranceOptions, safe_box
 from safevar_sumo.analysis.tolerance.answer import Tolerance
 from safevar_sumo.analysis.tolerance.compute import find_tolerances
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.results import record, solutions_frame
-from tests.analysis.known_regions import Plant, Region, box, everywhere, made_up_study, nowhere, two_islands
+from safevar_sumo.study import load_study
+from tests.analysis.known_regions import (
+    Plant,
+    Region,
+    box,
+    diagonal_band,
+    everywhere,
+    made_up_study,
+    nowhere,
+    two_islands,
+)
 
 
 def of(
@@ -211,12 +223,87 @@ def test_the_promised_record() -> None:
     ]
 
 
-@pytest.mark.parametrize(
-    ("region", "expected"),
-    [
-        (nowhere, "dot: the original vehicle"),
-        (two_islands, "dot: the original vehicle;\nhatched: unsafe;\nbelow the dashed line: collisions"),
-    ],
-)
-def test_the_figure_explains_what_it_draws_and_nothing_else(region: Region, expected: str) -> None:
-    assert of(1, region).figure().get_supxlabel() == expected
+def rules_of(region: Region, n: int = 4, **options: Any) -> Rules:
+    study = made_up_study(n)
+    return rules(study, unsafe="collision", pool=Plant(study, region), **options)
+
+
+def test_a_box_is_one_rule_of_its_two_conditions() -> None:
+    result = rules_of(box)
+    (rule,) = result.rules
+    assert rule.limits == {"a": (pytest.approx(7, abs=0.02), None), "b": (None, pytest.approx(3, abs=0.02))}
+    assert rule.density == pytest.approx(1, abs=0.02)
+    assert rule.coverage == pytest.approx(1, abs=0.02)
+    assert result.unsafe_share == pytest.approx(0.09, abs=0.005)
+    assert rule.density_interval is not None
+    assert rule.density_interval[0] <= rule.density <= rule.density_interval[1]
+
+
+@pytest.mark.slow
+def test_a_region_that_is_no_box_is_covered_with_honest_densities() -> None:
+    result = rules_of(diagonal_band, n=2)
+    fresh = np.random.default_rng(5).uniform(0, 10, (20_000, 2))
+    assert result.rules
+    for rule in result.rules:
+        inside = np.ones(len(fresh), dtype=bool)
+        for name, (low, high) in rule.limits.items():
+            values = fresh[:, "ab".index(name)]
+            inside &= (values >= (low or 0)) & (values <= (10 if high is None else high))
+        assert rule.density_interval is not None
+        assert rule.density_interval[0] - 0.1 <= diagonal_band(fresh)[inside].mean() <= rule.density_interval[1] + 0.1
+
+
+def test_nothing_everything_and_too_little() -> None:
+    assert rules_of(nowhere).to_dict() == []
+    (rule,) = rules_of(everywhere).rules
+    assert (dict(rule.limits), rule.density, rule.coverage) == ({}, 1.0, 1.0)
+    few = rules_of(lambda settings: (settings > 9.5).all(axis=1), n=2, samples=400)
+    assert few.rules == []
+    assert "the command rules --samples N" in few.remark
+
+
+def test_a_rule_is_denser_than_a_share_below_its_interval() -> None:
+    """8 rules_of 10: Clopper and Pearson have 44.4 to 97.5 %."""
+    rule = Rule({"a": (7.0, None)}, inside=10, unsafe_inside=8, unsafe_everywhere=20, confidence=0.95)
+    assert rule.density_interval == pytest.approx((0.444, 0.975), abs=5e-4)
+    assert [rule.is_denser_than(share) for share in (0.4, 0.5, 0.9)] == [True, False, False]
+
+
+def test_the_promised_record_and_the_same_again() -> None:
+    first, again = (rules_of(box), rules_of(box))
+    assert json.dumps(first.to_dict(), allow_nan=False) == json.dumps(again.to_dict(), allow_nan=False)
+    assert repr(first).endswith("settings, 1 rules>")
+    (record,) = first.to_dict()
+    assert list(record) == ["conditions", "density", "coverage", "density_interval", "coverage_interval"]
+    assert [list(condition) for condition in record["conditions"]] == [["characteristic", "at_least", "at_most"]] * 2
+
+
+@pytest.mark.parametrize("constraint", [None, {"sum": {"a": 1.0, "b": 1.0}, "at_most": 12.0}])
+def test_the_share_of_unsafe_vehicles_is_that_of_risk(constraint: dict[str, Any] | None) -> None:
+    """The same vehicles in both, the first ones rules_of a longer sequence in a shorter one: each estimate lies in the
+    other's interval.
+    """
+    study = made_up_study(2)
+    study = load_study(study, constraints=[constraint]) if constraint else study
+    asked = {number: Plant(study, box) for number in (400, 1000)}
+    shares = {number: rules(study, unsafe="collision", pool=pool, samples=number) for number, pool in asked.items()}
+    estimate = risk(study, unsafe="collision", pool=(plant := Plant(study, box)), samples=1000, method="monte_carlo")
+    assert asked[400].seen < asked[1000].seen <= plant.seen
+    assert (shares[1000].unsafe_share, shares[1000].unsafe_interval) == (
+        estimate.probability,
+        pytest.approx(estimate.interval),
+    )
+    for one, other in ((400, 1000), (1000, 400)):
+        low, high = shares[one].unsafe_interval
+        assert low < shares[other].unsafe_share < high
+
+
+def test_rules_say_over_what_they_hold() -> None:
+    """In a rule all characteristics vary, in a tolerance one alone: otherwise their limits contradict each other."""
+    printed = " ".join(map(str, rules_of(box).sentences()))
+    assert "a above 7 N m and b below 3 N m, the others anywhere: collides in" in printed
+    assert (
+        "all characteristics vary together over the whole domain; how far one may go while all others stay "
+        "as in the original"
+    ) in printed
+    assert "% rules_of 16384 vehicles drawn evenly over the whole domain (" in printed

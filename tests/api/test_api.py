@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
-import re
 import subprocess
 import sys
 import warnings
@@ -15,7 +13,6 @@ import pandas as pd
 import pytest
 
 import safevar_sumo as sv
-from safevar_sumo.report import report
 from safevar_sumo.study import load_study, tables_of
 from safevar_sumo.sumo.matrix import simulate, simulate_all_points, study_at, worst_points
 from safevar_sumo.sumo.system import assemble
@@ -48,15 +45,6 @@ def test_changes_override_a_study_as_a_file_that_extends_it_would(in_tmp: Path) 
     assert sv.load_study(changed, search={"seed": 7}).search.runs == 2
 
 
-def test_a_study_needs_no_file() -> None:
-    tables = {"extends": "sun", "name": "mine", "weather": {"name": "ice", "road_friction": 0.2, "visibility": 0.9}}
-    mine = sv.load_study(tables, name="other")
-    assert (mine.name, mine.vehicle) == ("other", sv.load_study("sun").vehicle)
-    assert mine.weather == sv.Weather(name="ice", road_friction=0.2, visibility=0.9)
-    assert tables["name"] == "mine", "what was given is left as it was"
-    assert sv.simulate(mine).study.name == "other"
-
-
 def test_simulate_returns_the_setting_and_the_original_beside_it() -> None:
     result = sv.simulate("rain", {"tireFric": 1.5, "mass": 2410.0})
     assert result.setting["tireFric"] == 1.5
@@ -70,12 +58,6 @@ def test_simulate_returns_the_setting_and_the_original_beside_it() -> None:
     assert result.original.original is result.original
     assert result.original.metrics != result.metrics
     assert sv.simulate("rain", {"mass": 2410.0}, filtered=False).objectives["f_num_diff"] == 1
-
-
-@pytest.mark.parametrize("value", ["+8%", "heavy", None, [2500.0]])
-def test_a_value_that_is_no_number_is_refused(value: object) -> None:
-    with pytest.raises(sv.InputError, match=r"^changes: mass = .*\nexpected: a number in \[2040, 2700\] kg"):
-        sv.simulate("rain", {"mass": value})  # type: ignore[dict-item]
 
 
 @pytest.mark.parametrize("value", [0.0, -5.0, 1e300])
@@ -123,34 +105,6 @@ def test_a_value_that_is_missing_is_the_originals() -> None:
     pd.testing.assert_frame_equal(sv.evaluate("sun", table, jobs=1), frame)
 
 
-def test_the_functions_share_one_convention_and_its_types_are_public() -> None:
-    """Every argument is documented in its function, every class of a signature is a name of the package."""
-    several = [sv.run, sv.evaluate, sv.explain, sv.tolerance, sv.risk, sv.rules, report]
-    others = [
-        "None",
-        "str",
-        "int",
-        "float",
-        "bool",
-        "Path",
-        "Sequence",
-        "Mapping",
-        "tuple",
-        "list",
-        "pd",
-        "DataFrame",
-        "npt",
-        "ArrayLike",
-    ]
-    for function in (*several, sv.simulate, sv.compare, sv.load, sv.tables, sv.figures):
-        signature = inspect.signature(function)
-        annotations = [*(str(one.annotation) for one in signature.parameters.values()), signature.return_annotation]
-        assert set(re.findall(r"\w+", " ".join(annotations))) <= {*others, *sv.__all__}
-        assert set(signature.parameters) <= set(re.findall(r"^(\w+)$", inspect.getdoc(function) or "", re.MULTILINE))
-        if function in several:
-            assert [signature.parameters[name].default for name in ("jobs", "progress")] == [None, False]
-
-
 def test_a_criterion_is_a_number_a_word_or_an_object() -> None:
     criteria: list[sv.Criterion] = [1.5, "below=1.5", sv.Unsafe(below=1.5)]
     assert {sv.Unsafe.parse(criterion) for criterion in criteria} == {sv.Unsafe(1.5)}
@@ -164,15 +118,6 @@ def test_compare_needs_a_study_and_changes_alone() -> None:
     assert comparison.changes == ["tireFric 3.5 → 1.2 (-66\N{NO-BREAK SPACE}%)"]
     assert (
         comparison.evaluations.f_safe.tolist() == sv.evaluate("sun", [{}, {"tireFric": 1.2}], jobs=1)["f_safe"].tolist()
-    )
-
-
-def test_a_report_of_results_is_a_page(results: sv.Results, tmp_path: Path) -> None:
-    page = sv.report(results, out=tmp_path / "page.html", only=["tested", "reproduce"], jobs=1)
-    assert (
-        (tmp_path / "page.html").read_text(encoding="utf-8")
-        == page
-        == sv.make_report([results.directory], ["tested", "reproduce"], 1)
     )
 
 
@@ -202,18 +147,6 @@ def test_load_reads_the_results_of_run(results: sv.Results) -> None:
     assert set(again.finished) == {("nsga2", 0), ("nsga2", 1), ("rs", 0), ("rs", 1)}
     stored = pd.read_csv(results.directory / "solutions.csv")
     pd.testing.assert_frame_equal(again.solutions, stored, check_dtype=False)
-
-
-@pytest.mark.slow
-def test_tables_and_figures_are_frames_and_figures(results: sv.Results) -> None:
-    answers = sv.tables(results)
-    assert {"rq1", "rq2", "rq3.1", "collisions"} <= set(answers)
-    assert list(sv.tables(results.directory, question="rq1")) == ["rq1"]
-    assert "RQ1" in sv.tables(results, question="rq1")._repr_markdown_()
-    assert set(answers.notes) == set(answers)
-    assert {"pareto-fronts", "convergence"} <= set(sv.figures(results))
-    with pytest.raises(sv.InputError, match="rq9"):
-        sv.tables(results, question="rq9")
 
 
 @pytest.mark.slow

@@ -13,7 +13,7 @@ from safevar_sumo.campaign.batches import source_digests
 from safevar_sumo.campaign.evaluation import evaluate_batch, pack_study
 from safevar_sumo.campaign.identity import identity_of, network_digests
 from safevar_sumo.errors import InputError
-from safevar_sumo.plugins import changed_files, digest_of
+from safevar_sumo.plugins import changed_files
 from safevar_sumo.results.manifest import IDENTITY
 from safevar_sumo.shipped import NETWORKS
 from safevar_sumo.study import load_study
@@ -154,13 +154,3 @@ def test_an_edit_of_whatever_was_read_is_seen(name: str, place: Path) -> None:
         (place / name).write_text((place / name).read_text() + "\nY = 2\n")
     after = read(place)
     assert [one for one in after if after[one] != before.get(one)] == [name]
-
-
-def test_the_digest_of_a_file_is_of_its_bytes(tmp_path: Path) -> None:
-    contents = (b"x = 1\n", b"x = 1  # one\n", b"x = 1\r\n", b"x = 1\n")
-    for number, content in enumerate(contents):
-        (tmp_path / str(number)).write_bytes(content)
-    one, *different, same = (digest_of(tmp_path / str(number)) for number in range(len(contents)))
-    assert same == one
-    assert len({one, *different}) == 3
-    assert digest_of(tmp_path / "missing") == ""

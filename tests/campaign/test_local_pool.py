@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import signal
-import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
@@ -15,7 +14,7 @@ import numpy as np
 import psutil
 import pytest
 
-from safevar_sumo.campaign.checks import find_difference, refuse_unlike_sumo
+from safevar_sumo.campaign.checks import refuse_unlike_sumo
 from safevar_sumo.campaign.evaluation import pack_study
 from safevar_sumo.campaign.interrupts import defer_interrupts, wait_for_first, wait_for_result
 from safevar_sumo.campaign.local import LocalPool, local_pool
@@ -54,17 +53,6 @@ def test_workers_start_when_they_are_needed_and_end_with_the_block() -> None:
     assert not processes()
     with pytest.raises(PoolLostError):
         pool.submit(SMOKE, ORIGINAL)
-
-
-@pytest.mark.slow
-def test_the_end_does_not_wait_for_what_is_computed() -> None:
-    with local_pool(1, 600.0) as pool:
-        pool.submit(SMOKE, ORIGINAL).result(timeout=30)
-        futures = [pool.submit(SMOKE, np.repeat(ORIGINAL, 2000, axis=0)) for _ in range(3)]
-        time.sleep(0.3)
-        start = time.monotonic()
-    assert time.monotonic() - start < 2
-    assert all(future.done() for future in futures)
 
 
 def test_a_killed_worker_is_told_and_replaced(pool: LocalPool) -> None:
@@ -109,14 +97,6 @@ def test_ctrl_c_is_raised_where_a_result_is_waited_for_and_nowhere_else() -> Non
     assert signal.getsignal(signal.SIGINT) is before
     with defer_interrupts():
         assert wait_for_first([]) == set(), "what was pressed before is forgotten"
-
-
-def test_ctrl_c_during_a_wait_is_noticed_soon() -> None:
-    threading.Timer(0.1, os.kill, (os.getpid(), signal.SIGINT)).start()
-    start = time.monotonic()
-    with pytest.raises(KeyboardInterrupt), defer_interrupts():
-        wait_for_first([Future()])
-    assert time.monotonic() - start < 5
 
 
 STUDY = load_study("sun")
@@ -167,16 +147,6 @@ class ToldPool:
         return future
 
 
-def test_metrics_that_only_one_side_has_are_a_difference() -> None:
-    one = evaluated(settings(1))
-    assert find_difference(one, one) is None
-    fewer = replace(one, metrics={name: values for name, values in one.metrics.items() if name != "safety_degree"})
-    for both in ((one, fewer), (fewer, one)):
-        name, *lists = find_difference(*both) or ("no difference",)
-        assert name == "the list of metrics"
-        assert sum("safety_degree" in str(names) for names in lists) == 1
-
-
 def test_settings_that_all_fail_in_sumo_lack_the_users_metrics() -> None:
     once = evaluated(settings(1))
     recorded = replace(once, metrics={**once.metrics, "mine": np.array([1.0])})
@@ -213,26 +183,10 @@ def test_the_setting_that_kills_its_worker_alone_is_told_from_the_others() -> No
     assert pool.tried == [8, 8] + [1] * (6 + 2 * 3), "each alone, the original, and once more"
 
 
-def test_what_the_study_is_at_fault_for_ends_at_once_with_that_fault() -> None:
-    pool = ToldPool(lambda rows, before: InputError("study", "ads.model = 'x' cannot be imported"))
-    with pytest.raises(InputError, match="cannot be imported"):
-        RetryingPool(pool, STUDY).submit(b"", settings(1000)).result(timeout=5)
-    assert len(pool.tried) == 1
-
-
 @pytest.mark.parametrize("fault", [SimulationError("SUMO failed: no place"), WorkerLostError("died")])
 def test_a_setting_is_blamed_only_if_the_original_vehicle_can_be_simulated(fault: Exception) -> None:
     with pytest.raises(EnvironmentFault, match=f"{fault}; the original vehicle cannot be simulated either"):
         RetryingPool(ToldPool(lambda rows, before: fault), STUDY).submit(b"", settings(4)).result(timeout=5)
-
-
-def test_a_fault_of_the_surroundings_is_an_error_and_no_outcome() -> None:
-    pool = ToldPool(
-        lambda rows, before: EnvironmentFault("the disk is full") if np.isin(rows[:, 0], 4302).any() else None
-    )
-    with pytest.raises(EnvironmentFault, match="the disk is full"):
-        RetryingPool(pool, STUDY).submit(b"", settings(4)).result(timeout=5)
-    assert pool.tried == [4, 4]
 
 
 def test_what_a_users_code_does_on_one_setting_is_an_error_that_names_it() -> None:
@@ -280,22 +234,3 @@ def test_settings_that_fail_one_after_the_other_without_end_are_a_fault_of_the_s
     assert not pool.submit(b"", settings(19)).result(timeout=5).valid.any()
     with pytest.raises(WorkerLostError, match="exit code -9"):
         pool.submit(b"", settings(2)).result(timeout=5)
-
-
-def test_failures_between_successes_are_no_fault_of_the_study() -> None:
-    every_second = 4300 + np.arange(0, 200, 2)
-    result = RetryingPool(ToldPool(deadly(*every_second)), STUDY).submit(b"", settings(200)).result(timeout=5)
-    assert np.count_nonzero(~result.valid) == 100
-
-
-def test_the_original_vehicle_must_succeed() -> None:
-    with pytest.raises(WorkerLostError):
-        RetryingPool(ToldPool(deadly(4300)), STUDY).submit(b"", settings(1), must_succeed=True).result(timeout=5)
-
-
-@pytest.mark.parametrize("error", [ZeroDivisionError("a bug"), PoolLostError("gone")])
-def test_a_bug_and_a_lost_pool_are_not_tried_again(error: Exception) -> None:
-    pool = ToldPool(lambda rows, before: error)
-    with pytest.raises(type(error), match=str(error)):
-        RetryingPool(pool, STUDY).submit(b"", settings(5)).result(timeout=5)
-    assert pool.tried == [5]

@@ -1,8 +1,9 @@
-"""The commands as a user types them."""
+"""The commands as a user types them; a study carried out in parts, and gone on with after damage."""
 
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -11,7 +12,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from safevar_sumo.shipped import STUDIES
+from safevar_sumo.results import load_runs
+from safevar_sumo.results.manifest import write_manifest
+from tests.end_to_end.processes import STUDY, solutions, study, written
 from tests.in_process import refused, run
 
 SLOW = pytest.mark.slow
@@ -44,30 +47,6 @@ def test_study_leaves_manifest_and_solutions_and_nothing_else(in_tmp: Path) -> N
     ]
     assert set(frame["run"]) == {0, 1}
     assert set(frame["algorithm"]) == {"nsga2", "rs"}
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("study", ["rain", pytest.param("lgsvl", marks=SLOW), pytest.param("native", marks=SLOW)])
-def test_the_same_bytes_for_every_batch_size_and_from_run_to_run(study: str, in_tmp: Path) -> None:
-    contents = set()
-    for out, batch in (("a", "7"), ("b", "50"), *((("c", "1"),) if study != "rain" else ())):
-        run(
-            "study",
-            study,
-            "--algorithms",
-            "nsga2",
-            "--runs",
-            "1",
-            "--evaluations",
-            "60",
-            "--batch",
-            batch,
-            "--out",
-            out,
-            "--quiet",
-        )
-        contents.add(((in_tmp / out / "solutions.csv").read_bytes(), (in_tmp / out / "manifest.json").read_bytes()))
-    assert len(contents) == 1
 
 
 def test_simulate_prints_the_promised_json() -> None:
@@ -126,88 +105,6 @@ def test_trace_has_every_quantity_with_its_unit(study: str, in_tmp: Path) -> Non
     assert np.allclose(np.diff(frame["speed [m/s]"]) / step, frame["acceleration [m/s^2]"][1:])
 
 
-@pytest.mark.slow
-def test_a_users_scalar_ads_is_named_in_a_study(in_tmp: Path) -> None:
-    Path("my_ads.py").write_text(
-        "from safevar_sumo.ads import ScalarAds\n\n\n"
-        "class Careful(ScalarAds):\n"
-        "    def __init__(self, margin):\n        self.margin = margin\n\n"
-        "    def drive(self, seen):\n"
-        "        stopping = seen.speed**2 / (2 * 0.5 * self.nominal.decel)\n"
-        "        return (0.0, 1.0) if seen.gap < stopping + self.margin else (0.3, 0.0)\n"
-    )
-    Path("mine.toml").write_text(
-        'extends = "sun"\nname = "mine"\n[ads]\nmodel = "my_ads:Careful"\nparameters = { margin = 2.0 }\n'
-        '[search]\nruns = 1\nevaluations = 10\nalgorithms = ["rs"]\n'
-    )
-    program = str(Path(sys.executable).parent / "safevar-sumo")
-    done = subprocess.run([program, "simulate", "mine.toml", "--json"], capture_output=True, text=True, check=True)
-    assert json.loads(done.stdout)["outcome"] in ("stopped", "passed")
-    run("study", "mine.toml", "--quiet")
-    assert Path("results/mine/solutions.csv").is_file()
-
-
-@pytest.mark.parametrize(
-    ("arguments", "expected"),
-    [
-        (["study", "sum"], ("sum", "rain")),
-        (["study", "sun", "--algorithms", "nsga3"], ("nsga3", "nsga2")),
-        (["study", "sun", "--batch", "many"], ("--batch", "many")),
-        (["study", "sun", "--out", "/proc/nowhere"], ("--out", "/proc/nowhere")),
-        (["simulate", "sun", "--set", "mass=5000"], ("mass = 5000", "[2040, 2700] kg")),
-        (["simulate", "sun", "--set", "weight=1"], ("weight", "mass")),
-        (["simulate", "sun", "--trace", "/proc/nowhere/trace.csv"], ("--trace", "/proc/nowhere/trace.csv")),
-        (
-            ["study", "smoke", "--out", "link"],
-            ("--out: cannot write to link: it is a link whose target does not exist",),
-        ),
-        (["tables", "out"], ("out: is not a results directory",)),
-        (["simulate", "/"], ("/",)),
-        (["simulate", "sun", "--as-it-is-now"], ("--as-it-is-now: a study is simulated as it is now anyway",)),
-        (
-            ["validate", "sun", "none.csv", "--jobs", "1025"],
-            ("--jobs", "1025", "see python -m safevar_sumo validate --help"),
-        ),
-        (["study", "sun", "--seed"], ("--seed", "see python -m safevar_sumo study --help")),
-        (["study"], ("Missing argument 'STUDY'",)),
-        (["simulate", "sun", "--nothing"], ("No such option '--nothing'",)),
-    ],
-)
-def test_bad_input_ends_with_code_2_and_says_what_is_legal(
-    arguments: list[str], expected: tuple[str, ...], in_tmp: Path
-) -> None:
-    Path("link").symlink_to("nowhere")
-    refused(*arguments, message=expected)
-    assert not list(in_tmp.rglob("*.csv"))
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "expected"),
-    [
-        ('model = "carla"', 'model = "carl"', ("vehicle.model", "carl", "lgsvl")),
-        ('model = "world_on_rails"', 'model = "wor"', ("ads.model", "wor", "apollo")),
-        ('model = "pedestrian_crossing"', 'model = "crosing"', ("scenario.model", "crosing", "lead_vehicle_stopped")),
-        ('weather = "clear"', 'weather = "hail"', ("weather", "hail", "hard_rain")),
-        ("tireFric         =", "tyreFric         =", ("tyreFric", "tireFric")),
-        (
-            "ttc_threshold = 1.5",
-            "ttc_threshold = 1.5\nsampling_interval = 0.07",
-            ("mine.toml: metrics.sampling_interval = 0.07", "0.05 s"),
-        ),
-        ("[vehicle]", "parameters = { duration = 0 }\n[vehicle]", ("scenario.parameters.duration = 0",)),
-        ("[vehicle]", 'parameters = { network = "x" }\n[vehicle]', ("network 'x'", "lead_vehicle_stopped")),
-        ('unit = "kg", ', 'unit = "t", ', ("vehicle.characteristics.mass.unit", "'t'", "kg")),
-        ("ensemble = 200", "ensemble = 1", ("fit.ensemble = 1", "at least 2")),
-        ("lower = 2040, upper = 2700", "lower = 2700, upper = 2040", ("vehicle.characteristics.mass", "lower < upper")),
-    ],
-)
-def test_a_bad_study_file_ends_with_code_2(old: str, new: str, expected: tuple[str, ...], in_tmp: Path) -> None:
-    text = (STUDIES / "sun.toml").read_text()
-    assert old in text
-    Path("mine.toml").write_text(text.replace(old, new))
-    refused("simulate", "mine.toml", message=expected)
-
-
 @pytest.mark.parametrize("where", ["__init__", "drive"])
 def test_an_ads_that_exits_is_a_fault_and_no_success(where: str, in_tmp: Path) -> None:
     arguments = {"__init__": "self", "drive": "self, seen"}[where]
@@ -253,3 +150,86 @@ def test_a_study_ends_with_a_summary(in_tmp: Path) -> None:
         "python -m safevar_sumo tables results/smoke",
     ):
         assert part in output
+
+
+pytestmark = pytest.mark.usefixtures("small")
+
+
+@pytest.mark.slow
+def test_shards_and_one_run_are_the_same_as_in_the_whole(whole: Path) -> None:
+    for k in (1, 2):
+        study("--out", "out", "--shard", f"{k}/2")
+    assert not Path("out/solutions.csv").exists()
+    assert len(load_runs("out").solutions.groupby(["algorithm", "run"])) == 6
+    before = written(Path("out"))
+    study("--out", "out", "--batch", "7")
+    assert written(Path("out")) == before, "nothing was left to simulate"
+    assert solutions("out") == solutions(whole)
+    assert "No solution." in run("study", "small.toml", "--out", "none", "--shard", "9/9").stdout
+    study("--out", "alone", "--only", "nsga2:1")
+    assert [path.name for path in Path("alone/runs").glob("*-*")] == ["nsga2-01.jsonl"]
+    expected = load_runs(whole).solutions.query("algorithm == 'nsga2' and run == 1").reset_index(drop=True)
+    pd.testing.assert_frame_equal(load_runs("alone").solutions, expected)
+
+
+def test_results_of_another_size_are_continued_with_a_warning(copied: Path) -> None:
+    assert "warning" not in study("--out", "out")
+    longer = study("--out", "out", "--evaluations", "160")
+    assert (
+        "out: each run had 150 evaluations before and has 160 now: an id such as nsga2:0:0 may name another solution"
+        in longer
+    )
+    assert "left out" not in longer
+    fewer = study("--out", "out", "--evaluations", "160", "--runs", "1", "--algorithms", "nsga2,rs")
+    assert "out: 4 earlier runs left out of the results: nsga2-01, rs-01, safe_fuzzer-00, safe_fuzzer-01" in fewer
+    assert "evaluations before" not in fewer
+
+
+def test_results_of_another_version_or_seed_are_refused_and_left_alone(copied: Path) -> None:
+    before = {path: path.read_bytes() for path in copied.rglob("*.*")}
+    assert "search.seed was 1 and is 9 now" in study("--out", "out", "--seed", "9", expect=2)
+    assert {path: path.read_bytes() for path in copied.rglob("*.*")} == before
+    manifest = json.loads((copied / "manifest.json").read_text())
+    manifest["versions"]["libsumo"] = "1.20.0"
+    write_manifest(copied, manifest)
+    assert "version of libsumo was '1.20.0' and is '1.28.0' now" in study("--out", "out", expect=2)
+    (copied / "manifest.json").unlink()
+    (copied / "runs" / "original.jsonl").unlink()
+    Path("small.toml").write_text(STUDY + "seed = 2\n")
+    assert "belongs to another study or version" in study("--out", "out", expect=2)
+
+
+def test_torn_tails_are_cut_off_with_a_warning_and_damage_in_the_middle_names_its_place(
+    copied: Path, whole: Path
+) -> None:
+    for name, lost in (("nsga2-00", 20), ("safe_fuzzer-01", 9000)):
+        path = copied / "runs" / f"{name}.jsonl"
+        os.truncate(path, path.stat().st_size - lost)
+    with (copied / "runs" / "rs-00.jsonl").open("ab") as file:
+        file.write(b'{"evaluation":[7, rubbish')
+    result = study("--out", "out")
+    assert result.count("warning") == 3
+    assert "nsga2-00.jsonl" in result
+    assert solutions("out") == solutions(whole)
+    path = copied / "runs" / "rs-00.jsonl"
+    path.write_bytes(content := path.read_bytes().replace(b'"outcome":', b'"outcome', 1))
+    assert "rs-00.jsonl: is damaged in line 2" in study("--out", "out", expect=2)
+    assert path.read_bytes() == content
+
+
+def test_a_dry_run_tells_what_it_would_take_and_writes_nothing() -> None:
+    output = run("study", "small.toml", "--dry-run").stdout
+    for word in ("nsga2, rs, safe_fuzzer", "900", "evaluations/s", " s ", "kB"):
+        assert word in output
+    assert max(map(len, output.splitlines())) <= 80
+    assert not Path("results").exists()
+
+
+def test_an_ads_that_always_fails_ends_the_study_with_that_fault() -> None:
+    Path("my_ads.py").write_text(
+        "from safevar_sumo.ads import ScalarAds\n\n\nclass Bad(ScalarAds):\n"
+        "    def drive(self, seen):\n        return 1 / 0\n"
+    )
+    Path("bad.toml").write_text('extends = "small.toml"\nname = "bad"\n[ads]\nmodel = "my_ads:Bad"\n')
+    for options in ([], ["--dry-run"]):
+        refused("study", "bad.toml", "--out", "out", *options, message=("ZeroDivisionError", "simulate bad.toml"))

@@ -59,26 +59,6 @@ def edited(path: str, old: str, new: str) -> None:
     Path(path).write_text(text.replace(old, new))
 
 
-@pytest.mark.slow
-def test_results_go_with_the_files_that_they_were_computed_with() -> None:
-    study()
-    before = Path("out/solutions.csv").read_bytes()
-    edits = (
-        ("my_ads.py", "0.5", "0.65"),
-        ("my_map.py", "9.0", "8.25"),
-        ("my_net/traffic.rou.xml", "<route", "<!-- --><route"),
-    )
-    for path, old, new in edits:
-        edited(path, old, new)
-        result = refused("study", "mine.toml", "--out", "out")
-        assert f"{Path(path).name} has changed since" in result
-        assert "another --out, such as --out out-2, or the" in result
-        edited(path, new, old)
-    Path("mine.toml").write_text(STUDY.replace('name = "mine"', 'name = "mine"\ntitle = "Another title"'))
-    study()
-    assert Path("out/solutions.csv").read_bytes() == before
-
-
 MATRIX = """
 [matrix]
 [[matrix.tests]]

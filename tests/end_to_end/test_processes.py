@@ -1,5 +1,5 @@
-"""Studies in processes of their own, killed, interrupted, starved and edited: the same bytes or a clear error, nothing
-left behind.
+"""Studies in processes of their own, killed, interrupted, starved and edited: the same bytes or a clear error,
+nothing left behind.
 """
 
 from __future__ import annotations
@@ -21,52 +21,12 @@ import pytest
 from safevar_sumo.campaign import cluster
 from safevar_sumo.errors import InputError
 from safevar_sumo.results import load_runs
-from tests.end_to_end.processes import (
-    STUDY,
-    ended,
-    killed,
-    left_of_group,
-    solutions,
-    started,
-    study,
-    until,
-    workers_of,
-    written,
-)
-from tests.in_process import refused, run
+from tests.end_to_end.processes import ended, killed, left_of_group, solutions, started, until, workers_of, written
+from tests.in_process import run
 
 pytestmark = pytest.mark.usefixtures("small")
 SLOW = pytest.mark.slow
 OUT = Path("out")
-
-
-def killed_and_resumed(times: int) -> None:
-    """Kill the study so often, a moment after it has got further, and finish it."""
-    moments = random.Random(4)
-    for _ in range(times):
-        before = written(OUT)
-        process = started("study", "small.toml", "--out", "out", "--jobs", "1", "--batch", "1")
-        until(lambda: written(OUT) > before, process)  # noqa: B023
-        time.sleep(moments.uniform(0, 0.1))
-        assert process.poll() is None, "the study is too short to be killed so often"
-        killed(process)
-        until(lambda: not left_of_group(process))  # noqa: B023
-    assert not (OUT / "solutions.csv").exists()
-    study("--out", "out")
-
-
-@pytest.mark.slow
-def test_killed_and_resumed(whole: Path) -> None:
-    killed_and_resumed(1)
-    assert solutions("out") == solutions(whole)
-
-
-@SLOW
-def test_killed_a_hundred_times_at_random_moments_and_resumed() -> None:
-    Path("small.toml").write_text(STUDY.replace("evaluations = 150", "evaluations = 400"))
-    study("--out", "whole")
-    killed_and_resumed(100)
-    assert solutions("out") == solutions("whole")
 
 
 @SLOW
@@ -108,15 +68,6 @@ def test_ctrl_c_ends_everything_with_code_130(when: float | str) -> None:
         if process.poll() is None:
             os.killpg(process.pid, signal.SIGINT)
     assert "interrupted" in ended(process, 130)
-
-
-@SLOW
-def test_sigterm_leaves_no_worker_behind() -> None:
-    process = started("study", "rain", "--out", "out")
-    until(lambda: written(OUT) > 0, process)
-    process.terminate()
-    process.communicate(timeout=20)
-    until(lambda: not left_of_group(process))
 
 
 @SLOW
@@ -283,49 +234,9 @@ def test_two_workers_of_which_one_is_killed_leave_the_same_bytes(
     assert (load_runs("out").evaluations["outcome"] != "simulator-error").all()
 
 
-@pytest.mark.slow
-def test_a_simulation_that_hangs_is_stopped_on_a_cluster_too(
-    scheduler: tuple[subprocess.Popen[str], str], start: Start
-) -> None:
-    Path("my_ads.py").write_text(
-        "import time\nfrom safevar_sumo.ads import ScalarAds\n\n\nclass Dozing(ScalarAds):\n    def "
-        "drive(self, seen):\n"
-        "        time.sleep(1000)\n"
-    )
-    Path("dozing.toml").write_text(
-        'extends = "smoke"\nname = "dozing"\n[ads]\nmodel = "my_ads:Dozing"\n'
-        '[search]\nalgorithms = ["rs"]\nruns = 1\nevaluations = 10\ntime_limit = 2\n'
-    )
-    _, address = scheduler
-    worker(start, address, "--nanny")
-    errors = ended(started("study", "dozing.toml", "--cluster", address, "--out", "out"), 2)
-    assert "workers of the cluster died" in errors
-
-
-@pytest.mark.slow
-def test_an_address_that_nobody_answers_is_told_in_time(in_tmp: Path) -> None:
-    began = time.monotonic()
-    refused(
-        "study",
-        "smoke",
-        "--cluster",
-        "tcp://127.0.0.1:9",
-        "--out",
-        "out",
-        message=("--cluster: no scheduler answers at 'tcp://127.0.0.1:9'",),
-    )
-    assert time.monotonic() - began < 15
-    assert not Path("out").exists()
-
-
 def test_an_encrypted_scheduler_needs_certificates_from_the_configuration() -> None:
     with (
         pytest.raises(InputError, match=r"certificates in Dask's configuration"),
         cluster.cluster_pool("tls://127.0.0.1:9", 9.0),
     ):
         pass
-
-
-def test_a_worker_with_other_versions_computes_nothing() -> None:
-    with pytest.raises(cluster.PoolLostError, match=r"1\.20\.0"):
-        cluster._evaluate(9.0, {"libsumo": "1.20.0"}, b"", np.zeros((1, 12)))

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -51,24 +49,6 @@ def imported(in_tmp: Path) -> Path:
     package_csv(in_tmp / "rs.csv", 30, 2, SaftyDegree=2.5)
     run("import", "sun", "--out", "imported", "--nsga2", "nsga2.csv", "--rs", "rs.csv")
     return in_tmp / "imported"
-
-
-def test_a_second_import_says_what_it_replaces(imported: Path) -> None:
-    package_csv(Path("new.csv"), 20, 3)
-    done = run("import", "sun", "--out", "imported", "--nsga2", "new.csv")
-    assert "20 solutions of nsga2" in done.stdout
-    assert done.stderr == "note: they replace 40 solutions of nsga2 of an earlier import\n"
-    refused(
-        "import",
-        "sun",
-        "--out",
-        "imported",
-        "--rs",
-        "rs.csv",
-        "--original",
-        "sd=1,sd=2",
-        message=("--original", "'sd=2' in 'sd=1,sd=2'", "each metric once"),
-    )
 
 
 def test_tables_agree_with_the_solutions_that_are_stored(results: Path) -> None:
@@ -123,35 +103,6 @@ def test_imported_results_answer_what_needs_no_runs(imported: Path) -> None:
     assert "imported" in done.stderr
 
 
-def test_a_csv_of_another_vehicle_is_refused(in_tmp: Path) -> None:
-    package_csv(in_tmp / "a.csv", 5, 1)
-    refused("import", "native", "--out", "out", "--nsga2", "a.csv", message=("--original",))
-    refused("import", "lgsvl", "--out", "out", "--nsga2", "a.csv", message=("a.csv", "lacks the columns"))
-    refused("import", "sun", "--out", "out", "--nsga2", ".", message=("is no regular file",))
-    assert not Path("out").exists()
-
-
-def test_what_is_no_result_is_refused(results: Path, in_tmp: Path) -> None:
-    Path("empty").mkdir()
-    Path("file").write_text("{}")
-    Path("other").mkdir()
-    Path("other/manifest.json").write_text('{"study": {}, "versions": {}, "original": {}}')
-    for name in ("nowhere", "empty", "file", "other"):
-        for command in (("tables", name), ("figures", name, "--out", "pictures")):
-            refused(*command, message=(name,))
-    refused("tables", str(results), str(results), message=("given twice",))
-    refused("tables", str(results), "--rq", "rq4", message=("rq4", "rq3.1"))
-    refused("tables", str(results), "--format", "html", message=("html", "latex"))
-    refused("figures", str(results), "--out", "file", message=("--out", "file"))
-    refused("tables", str(results), "--out", "file", message=("--out", "file"))
-    refused("tables", str(results), "--rq", "weather", message=("weather",))
-    assert not Path("pictures").exists()
-
-
-def test_results_are_no_published_data_of_themselves(results: Path) -> None:
-    refused("replicate", str(results), "--published", str(results), message=("--published", "given as results too"))
-
-
 def test_an_unfinished_campaign_is_answered_as_far_as_it_went(results: Path, in_tmp: Path) -> None:
     shutil.copytree(results, "part")
     Path("part/runs/rs-01.jsonl").unlink()
@@ -166,15 +117,3 @@ def test_an_unfinished_campaign_is_answered_as_far_as_it_went(results: Path, in_
         path.write_bytes(path.read_bytes()[:-20])
     refused("tables", "part", message=("no finished run",))
     refused("figures", "part", "--out", "pictures", message=("no finished run",))
-
-
-@pytest.mark.slow
-def test_sumo_is_not_needed(results: Path, in_tmp: Path) -> None:
-    code = (
-        "import sys\nfrom click.testing import CliRunner\nfrom safevar_sumo.cli.program import commands\n"
-        f"for line in (['tables', {str(results)!r}], ['figures', {str(results)!r}, '--out', 'pictures']):\n"
-        "    assert CliRunner().invoke(commands, line).exit_code == 0\n"
-        "print(sorted({name.partition('.')[0] for name in sys.modules} & {'libsumo', 'traci', 'sumo'}))"
-    )
-    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "[]\n"
-    assert {path.read_bytes()[:4] for path in Path("pictures").iterdir()} == {b"\x89PNG"}, "the default"

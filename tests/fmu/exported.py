@@ -89,8 +89,8 @@ class ExportedVehicle(Fmi2Slave):
 
     def tell(self):
         state = self.state
-        outputs = (state.speed, state.throttle, state.brake)
-        self.v, self.throttle_now, self.brake_now = (float(one[0]) for one in outputs)
+        self.v, self.throttle_now = float(state.speed[0]), float(state.throttle[0])
+        self.brake_now = float(state.brake[0])
 
     def do_step(self, time, step):
         command = Command(np.array([self.accelerator]), np.array([self.brake_pedal]))

@@ -1,6 +1,4 @@
-"""What the standard lets an FMU have: FMI 3.0, units, bounds, a step of its own, one instance in a process, parameters
-with domains.
-"""
+"""Shipped models as FMUs drive as the originals; what the standard lets an FMU have."""
 
 from __future__ import annotations
 
@@ -8,8 +6,10 @@ import re
 from pathlib import Path
 
 import numpy as np
+import psutil
 import pytest
 
+import safevar_sumo as sv
 from safevar_sumo.errors import InputError, UserCodeError
 from safevar_sumo.records import Command
 from safevar_sumo.study import load_study
@@ -168,16 +168,6 @@ def test_a_characteristic_reaches_its_fmu_in_the_unit_that_it_declares(cart: Pat
         assemble(load_study("cart.toml"))
 
 
-def test_a_characteristic_is_no_input_too(cart: Path) -> None:
-    """Otherwise the value from the scenario or the weather would be lost."""
-    text = CART_TABLE.replace("inputs = {{", 'inputs = {{ initial_speed = "top",')
-    (cart / "cart.toml").write_text(
-        text.format(more="[vehicle.characteristics]\npower = { original = 10.8 }\ntop = { upper = 40 }")
-    )
-    with pytest.raises(InputError, match="'top' and 'top' have one value"):
-        assemble(load_study("cart.toml"))
-
-
 @pytest.mark.parametrize(
     ("old", "new", "problem"),
     [
@@ -230,3 +220,52 @@ def test_a_vehicle_of_another_step_is_where_its_line_between_two_points_is_and_g
     braked = vehicle.advance(prepared, states[4], Command(np.zeros(1), np.ones(1)))
     again = vehicle.advance(prepared, states[4], Command(np.ones(1), np.zeros(1)))
     np.testing.assert_allclose([braked.speed[0], again.speed[0]], [4 - 0.8, 5])
+
+
+SETTINGS = 200
+SIMULATIONS = 10_000
+MOST_MEMORY = 20e6
+"""Largest growth of the memory of all processes over these simulations [bytes]."""
+
+
+def memory() -> int:
+    """Memory of this process and its child processes [bytes]."""
+    me = psutil.Process()
+    return sum(process.memory_info().rss for process in (me, *me.children(recursive=True)))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["exported_aeb", "exported_vehicle"])
+def test_an_exported_model_drives_as_the_original(made: Path, name: str) -> None:
+    native, fmu = (assemble(load_study(str(made / f"{one}.toml"))) for one in ("native_aeb", name))
+    rng, members = np.random.default_rng(5), native.characteristics
+    drawn = rng.uniform(members.lower, members.upper, (SETTINGS, len(members)))
+    settings = members.filter(members.original + 0.6 * (drawn - members.original))
+    expected, results = evaluate(native, settings), evaluate(fmu, settings)
+    assert 20 < np.sum(expected.outcome == "collision") < 180
+    np.testing.assert_array_equal(results.outcome, expected.outcome)
+    for metric, values in expected.metrics.items():
+        np.testing.assert_allclose(results.metrics[metric], values, rtol=0, atol=1e-9, err_msg=metric)
+    traces = [
+        sv.simulate(str(made / f"{one}.toml"), {"mass": 1900.0, "reactionTime": 0.2}).trace
+        for one in ("native_aeb", name)
+    ]
+    assert list(traces[0]) == list(traces[1])
+    np.testing.assert_allclose(traces[1].to_numpy(), traces[0].to_numpy(), rtol=0, atol=1e-9)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["small", "cart"])
+def test_ten_thousand_simulations_leave_nothing_behind(made: Path, name: str) -> None:
+    system = assemble(load_study(str(made / f"{name}.toml")))
+    members = system.characteristics
+    settings = members.filter(np.random.default_rng(6).uniform(members.lower, members.upper, (SETTINGS, len(members))))
+    first = evaluate(system, settings).f_safe
+    for _ in range(2):  # fills caches
+        evaluate(system, settings)
+    before = memory()
+    for _ in range(SIMULATIONS // SETTINGS):
+        last = evaluate(system, settings).f_safe
+    print(f"{name}: {(memory() - before) / 1e6:.1f} MB")
+    assert memory() - before < MOST_MEMORY
+    np.testing.assert_array_equal(last, first)

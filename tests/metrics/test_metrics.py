@@ -1,17 +1,31 @@
-"""Metrics against closed forms: a vehicle approaches a standing obstacle and brakes evenly, or does not brake."""
+"""Metrics against closed forms and scipy's filters."""
 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy import signal
 
+import safevar_sumo as sv
 from safevar_sumo.errors import InputError
-from safevar_sumo.metrics import F_DIFF, F_NUM_DIFF, F_SAFE, METRICS, Objective, Scoring, Unsafe, time_to_collision
+from safevar_sumo.metrics import (
+    F_DIFF,
+    F_SAFE,
+    METRICS,
+    OPTIONAL_METRICS,
+    Objective,
+    Scoring,
+    Unsafe,
+    time_to_collision,
+)
+from safevar_sumo.metrics.comfort import weight_acceleration
 from safevar_sumo.records import Encounter, Evaluations, Outcome, SimulationRuns, Trace
-from safevar_sumo.study import OBJECTIVES, MetricsTable
-from safevar_sumo.vehicles import CHANGES
+from safevar_sumo.study import MetricsTable, load_study
+from safevar_sumo.sumo.system import assemble
 
 STEP = 0.01
 THRESHOLDS = MetricsTable(ttc_threshold=2.0)
@@ -216,12 +230,6 @@ def test_a_batch_that_failed_as_a_whole_has_no_valid_objective() -> None:
     assert np.isnan(scoring.values(failed)[:, 2]).all()
 
 
-def test_measures_of_change_are_the_published_objectives() -> None:
-    changes = [Objective(name=change.name, title=change.title, unit=change.unit) for change in CHANGES.values()]
-    assert changes == [F_DIFF, F_NUM_DIFF]
-    assert tuple(change.name for change in changes) == OBJECTIVES[1:]
-
-
 def test_average_deceleration_is_that_of_the_braking_cycle() -> None:
     assert value("ave_dece", braking_run(10, 5, 12)) == pytest.approx(5.0, rel=1e-9)
     assert value(
@@ -244,3 +252,107 @@ def test_a_vehicle_with_exactly_the_points_of_the_limit_is_unsafe() -> None:
         metrics={"safety_degree": undefined, "rating_points": np.array([40.0, 39.25, 39.0, 38.5])},
     )
     assert unsafe.of(rated).tolist() == [False, False, True, True]
+
+
+SAMPLED = 0.05
+
+
+def comfort(name: str, speed: np.ndarray, until: float = np.inf, collision_speed: float = np.nan) -> np.ndarray:
+    v = speed.reshape(len(speed), -1)
+    time, zero = np.arange(len(v)) * SAMPLED, np.zeros_like(v)
+    trace = Trace(
+        step=SAMPLED,
+        vehicle_length=4.0,
+        time=time,
+        position=zero,
+        speed=v,
+        gap=zero,
+        lateral=zero,
+        lateral_speed=zero,
+        throttle=zero,
+        brake=zero,
+        gear=zero,
+        active=np.repeat((time <= until)[:, np.newaxis], v.shape[1], axis=1),
+    )
+    runs = SimulationRuns(
+        trace=trace,
+        encounter=Encounter(zero, zero, zero, zero > 0),
+        outcome=np.full(v.shape[1], "stopped"),
+        collision_speed=np.full(v.shape[1], collision_speed),
+    )
+    return OPTIONAL_METRICS[name](runs, MetricsTable(ttc_threshold=2.0))
+
+
+def sampled(speed: Callable[[np.ndarray], np.ndarray], seconds: float = 6.0) -> np.ndarray:
+    return speed(np.arange(0, seconds + SAMPLED / 2, SAMPLED))
+
+
+def test_harshness_of_a_constant_deceleration_equals_it_and_jerk_occurs_only_at_its_ends() -> None:
+    """5 m/s^2 from 15 m/s, for 3 s; at the stop the deceleration ends within the second over which jerk is averaged."""
+    speed = sampled(lambda t: np.maximum(15 - 5 * t, 0))
+    assert comfort("brake_harshness", speed)[0] == pytest.approx(5.0)
+    assert comfort("max_jerk", speed)[0] == pytest.approx(5.0)
+    assert comfort("max_jerk", speed, until=2.9)[0] == pytest.approx(0.0, abs=1e-9), (
+        "what follows the run's end does not count"
+    )
+
+
+def test_jerk_of_a_ramp_is_its_slope_and_harshness_the_mean_of_its_last_half_second() -> None:
+    """Deceleration 2 t: jerk 2 everywhere; the mean over the last half of the first 3 seconds is 2 (3 - 0.25)."""
+    speed = sampled(lambda t: 20 - t**2, 3.0)
+    assert comfort("max_jerk", speed)[0] == pytest.approx(2.0)
+    assert comfort("brake_harshness", speed)[0] == pytest.approx(5.5)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("frequency", [0.2, 0.5, 1.0, 2.0, 5.0])
+def test_weighting_agrees_with_iso_2631_1(frequency: float) -> None:
+    """The magnitude of H(s) by the standard's formula, on a settled sine sampled with a short step."""
+    step, f = 0.001, frequency
+    time = np.arange(0, 40, step)
+    low = np.abs(1j * f) ** 2 / np.abs((1j * f) ** 2 + np.sqrt(2) * 0.4 * 1j * f + 0.4**2)
+    shape = np.abs((1 + 1j * f / 2) / (1 + 1j * f / (0.63 * 2) - (f / 2) ** 2))
+    settled = weight_acceleration(np.sin(2 * np.pi * f * time)[:, np.newaxis], step)[len(time) // 2 :]
+    assert np.sqrt(2 * np.mean(settled**2)) == pytest.approx(low * shape, rel=2e-3)
+
+
+def test_rms_agrees_with_scipys_filters() -> None:
+    rng = np.random.default_rng(1)
+    speed = np.cumsum(rng.normal(size=(200, 3)), axis=0)
+    high, corner = 2 * np.pi * 0.4, 2 * np.pi * 2
+    first = signal.bilinear(*signal.butter(2, high, "high", analog=True), fs=1 / SAMPLED)
+    second = signal.bilinear([corner, corner**2], [1, corner / 0.63, corner**2], fs=1 / SAMPLED)
+    expected = np.diff(speed, axis=0) / SAMPLED
+    for taps in (first, second):
+        expected = signal.lfilter(*taps, expected, axis=0)
+    assert comfort("rms_acceleration", speed) == pytest.approx(np.sqrt((expected**2).mean(axis=0)), rel=1e-9)
+
+
+@pytest.mark.parametrize("name", OPTIONAL_METRICS)
+def test_each_vehicle_counts_for_itself_to_the_bit_and_not_on_a_collision(name: str) -> None:
+    speed = np.cumsum(np.random.default_rng(2).normal(size=(150, 7)), axis=0)
+    assert np.array_equal(comfort(name, speed)[[4]], comfort(name, speed[:, 4].copy()))
+    assert np.isnan(comfort(name, speed, collision_speed=3.0)).all()
+
+
+@pytest.mark.slow
+def test_the_study_makes_braking_as_jerky_as_it_can_and_reports_what_it_costs(in_tmp: Path) -> None:
+    study = load_study("comfort", search={"algorithms": ["nsga2"], "runs": 1, "evaluations": 60, "population": 20})
+    system = assemble(study)
+    assert [one.name for one in system.measuring.scoring.objectives] == ["max_jerk", "f_diff", "f_num_diff"]
+    results = sv.run(study, out="out", jobs=1)
+    assert (results.solutions["outcome"] != "collision").all()
+    assert results.solutions["max_jerk"].max() >= results.evaluations["max_jerk"].max()
+    assert {"rms_acceleration", "brake_harshness"} <= set(results.solutions)
+    assert {"max_jerk", "brake_harshness"} <= set(sv.tables(results)["rq1"]["metric"])
+
+
+def test_studies_that_name_no_comfort_have_none() -> None:
+    assert [one.name for one in assemble(load_study("sun")).measuring.scoring.metrics] == [
+        "safety_degree",
+        "tet",
+        "tit",
+        "ave_dece",
+    ]
+    with pytest.raises(InputError, match="did you mean 'max_jerk'"):
+        assemble(load_study("sun", metrics={"also": ["max_jark"]}))

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.system import System, assemble
-from tests.plugins.beside import ADS, Mine
+
+Mine = Callable[..., System]
+SCALAR = "from safevar_sumo.ads import ScalarAds\n\n\nclass Mine(ScalarAds):\n"
+ADS = '[ads]\nmodel = "mine:Mine"\n'
+"""Modules and tables that tests write beside a study file."""
 
 
 @pytest.fixture

@@ -5,16 +5,15 @@ passes.
 from __future__ import annotations
 
 import json
-import shutil
 from pathlib import Path
 from typing import NamedTuple
 
 import pytest
 
 from safevar_sumo import testing
-from safevar_sumo.plugins.check import KINDS, check, find_subject
+from safevar_sumo.plugins.check import check
 from safevar_sumo.study import study_names
-from tests.in_process import refused, run
+from tests.in_process import run
 
 SIX = Path(__file__).parent / "six"
 SCALAR = """import random
@@ -277,34 +276,6 @@ def test_what_is_shipped_passes(study: str) -> None:
     assert report.passed, "\n".join(map(str, report.findings))
 
 
-def test_every_shipped_name_is_found_and_of_its_kind() -> None:
-    for kind, members in KINDS.items():
-        for name in members:
-            assert find_subject(name).kind == kind
-
-
-@pytest.mark.parametrize(
-    ("subject", "message"),
-    [
-        (("mine:Nothing",), "has no 'Nothing'"),
-        (("nothing:Mine",), "No module named 'nothing'"),
-        (("aebb",), "did you mean 'aeb'?"),
-        (("missing.toml",), "missing.toml"),
-        (("builtins:int",), "no study names 'builtins:int'"),
-        (("missing.fmu",), "there is no file"),
-        (("smoke", "--study", "smoke"), "is itself a study"),
-        (("mine:Mine", "--study", "nope"), "nope"),
-        (("broken:Mine",), "ZeroDivisionError: division by zero"),
-        (("cart:Mine",), "no study gives the characteristics of 'cart:Mine'"),
-    ],
-)
-def test_a_subject_that_cannot_be_loaded_is_refused(subject: tuple[str, ...], message: str, in_tmp: Path) -> None:
-    (in_tmp / "mine.py").write_text(RIGHT["scalar ads"])
-    (in_tmp / "cart.py").write_text(VEHICLE)
-    (in_tmp / "broken.py").write_text("1 / 0\n")
-    refused("check", *subject, message=(message,))
-
-
 def test_the_command_prints_the_json_and_ends_with_its_exit_codes(in_tmp: Path) -> None:
     (in_tmp / "mine.py").write_text(DEFECTS["out of range"].module)
     (in_tmp / "mine.toml").write_text('extends = "smoke"\n[ads]\nmodel = "mine:Mine"\n')
@@ -318,13 +289,6 @@ def test_the_command_prints_the_json_and_ends_with_its_exit_codes(in_tmp: Path) 
     ).stdout.replace("\n", "")
     (in_tmp / "mine.py").write_text(RIGHT["scalar ads"])
     assert json.loads(run("check", "mine:Mine", "--study", "mine.toml", "--json").stdout)["findings"] == []
-
-
-@pytest.mark.slow
-def test_everything_that_a_study_names_is_checked(in_tmp: Path) -> None:
-    shutil.copytree(SIX, "six")
-    report = check("six/mine.toml")
-    assert report.passed, "\n".join(map(str, report.findings))
 
 
 def test_an_authors_test_class_has_a_test_for_each_check(in_tmp: Path) -> None:

@@ -1,8 +1,10 @@
-"""Every exception and every wrong result of a user's model is a UserCodeError; a model cannot alter measurements."""
+"""User code: looked up by its name, checked before a call, and every fault of it is an error that names it."""
 
 from __future__ import annotations
 
 import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +14,127 @@ from safevar_sumo.errors import InputError, UserCodeError
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.matrix import evaluate
 from safevar_sumo.sumo.system import assemble
-from tests.plugins.beside import SCALAR, Mine
+from tests.plugins.conftest import ADS, SCALAR, Mine
+
+CONSTANT = SCALAR + "    def drive(self, seen):\n        return {}, 0.0\n"
+
+
+def throttle(study: Path) -> float:
+    system = assemble(load_study(str(study)))
+    evaluate(system, system.characteristics.original[None])
+    driver = system.ads.start(1, system.nominal, 0.05)[0]
+    return float(driver.drive(None)[0])
+
+
+def test_beside_the_study_comes_before_the_working_directory(mine: Mine, folder: Path) -> None:
+    Path("mine.py").write_text(CONSTANT.format(0.1))
+    mine(CONSTANT.format(0.9))
+    assert throttle(folder / "mine.toml") == 0.9
+    (folder / "mine.py").unlink()
+    assert throttle(folder / "mine.toml") == 0.1
+
+
+def test_two_studies_with_modules_of_one_name_get_their_own_whatever_the_order(tmp_path: Path) -> None:
+    for place, value in (("a", 0.2), ("b", 0.4)):
+        (tmp_path / place).mkdir()
+        (tmp_path / place / "mine.toml").write_text(f'extends = "smoke"\nname = "mine"\n{ADS}')
+        (tmp_path / place / "mine.py").write_text("from sibling import VALUE\n" + CONSTANT.format("VALUE"))
+        (tmp_path / place / "sibling.py").write_text(f"VALUE = {value}\n")
+    result = [throttle(tmp_path / place / "mine.toml") for place in ("a", "b", "a")]
+    assert result == [0.2, 0.4, 0.2]
+
+
+def test_a_module_that_was_edited_is_read_anew_and_so_is_what_it_imports(mine: Mine, folder: Path) -> None:
+    (folder / "sibling.py").write_text("VALUE = 0.2\n")
+    mine("from sibling import VALUE\n" + CONSTANT.format("VALUE"))
+    assert throttle(folder / "mine.toml") == 0.2
+    (folder / "sibling.py").write_text("VALUE = 0.6\n")  # as long as before, within the same second
+    assert throttle(folder / "mine.toml") == 0.6
+
+
+def test_a_file_with_the_name_of_an_installed_module_is_refused_where_it_is_meant_and_ignored_where_not(
+    mine: Mine, folder: Path
+) -> None:
+    (folder / "scipy.py").write_text("raise RuntimeError('not scipy')")
+    mine("import numpy, scipy\n" + CONSTANT.format(0.1))
+    (folder / "numpy.py").write_text(CONSTANT.format(0.1))
+    with pytest.raises(InputError, match=r"cannot be imported: AttributeError: .*numpy/__init__.py has no 'Mine'"):
+        mine("", '[ads]\nmodel = "numpy:Mine"\n')
+
+
+@pytest.mark.parametrize(
+    ("model", "expected"),
+    [
+        ("os:system", "is a function, not a class"),
+        ("os:path", "is a module, not a class"),
+        ("subprocess:Popen", "has no method start(n, nominal, step)"),
+        ("mine:Mine", "has no method drive(seen)"),
+        ("mine:NotEnough", "has a method drive that does not take (seen, memory)"),
+        ("mine:Scalar", "has a method drive that does not take (seen)"),
+        ("mine:Odd", "has drive = 3 instead of a method drive(seen, memory)"),
+        ("mine:nothing", "has no 'nothing'"),
+        ("__main__:Mine", "cannot import from __main__"),
+        ("mine:", "mine:"),
+        (":Mine", ":Mine"),
+        ("no where:Mine", "no where:Mine"),
+        ("mine:Mine.Inner", "mine:Mine.Inner"),
+    ],
+)
+def test_a_class_that_does_not_meet_the_contract_is_refused_before_a_call(
+    model: str, expected: str, mine: Mine, folder: Path
+) -> None:
+    module = (
+        SCALAR + "    pass\n\n\nclass Called:\n    def __init__(self):\n        open('called', 'w').close()\n\n"
+        "    def start(self, n, nominal, step): ...\n\n\nclass NotEnough(Called):\n    def drive(self, seen): ...\n\n\n"
+        "class Odd(Called):\n    drive = 3\n\n\nclass Scalar(ScalarAds):\n    def drive(self, seen, memory): ...\n"
+    )
+    with pytest.raises(InputError) as caught:
+        mine(module, f'[ads]\nmodel = "{model}"\nparameters = {{ command = "touch called" }}\n')
+    assert expected in str(caught.value)
+    assert len(str(caught.value).splitlines()) <= 2
+    assert not Path("called").exists()
+
+
+@pytest.mark.parametrize(
+    ("module", "expected"),
+    [
+        ("import nothing_of_that_name\n", "ModuleNotFoundError: No module named 'nothing_of_that_name' ({}:1)"),
+        ("\nraise SystemExit(3)\n", "SystemExit: 3 ({}:2)"),
+        ("\n\n1 / 0\n", "ZeroDivisionError: division by zero ({}:3)"),
+        ("x = (\n", "SyntaxError: '(' was never closed"),
+    ],
+)
+def test_a_module_that_fails_is_reported_with_its_line_and_can_be_corrected(
+    module: str, expected: str, mine: Mine, folder: Path
+) -> None:
+    with pytest.raises(InputError) as caught:
+        mine(module)
+    assert expected.format(folder / "mine.py") in str(caught.value)
+    mine(CONSTANT.format(0.3))
+    assert "mine" in sys.modules
+
+
+@pytest.mark.slow
+def test_a_numpy_py_in_the_working_directory_is_not_numpy(tmp_path: Path) -> None:
+    for name in ("numpy", "random"):
+        (tmp_path / f"{name}.py").write_text("raise RuntimeError('not this one')\n")
+    command = [
+        sys.executable,
+        "-m",
+        "safevar_sumo",
+        "study",
+        "smoke",
+        "--runs",
+        "1",
+        "--evaluations",
+        "10",
+        "--jobs",
+        "1",
+        "--quiet",
+    ]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
 
 VEHICLE = '[vehicle]\nmodel = "mine:Mine"\n[vehicle.characteristics]\n{}\n[ads]\nmodel = "krauss"\n'
 SCENARIO = '[scenario]\nmodel = "mine:Mine"\n'
@@ -79,7 +201,7 @@ def test_a_wrong_parameter_is_named_with_the_study_s_file(mine: Mine, folder: Pa
     assert str(caught.value).startswith(f"{folder / 'mine.toml'}: ads.parameters.nothing: there is no such key")
 
 
-ADS = "class Mine:\n    def start(self, n, nominal, step):\n        return n\n\n    def drive(self, seen, memory):\n"
+ARRAYS = "class Mine:\n    def start(self, n, nominal, step):\n        return n\n\n    def drive(self, seen, memory):\n"
 
 
 @pytest.mark.parametrize(
@@ -93,7 +215,7 @@ ADS = "class Mine:\n    def start(self, n, nominal, step):\n        return n\n\n
     ],
 )
 def test_an_ads_over_arrays_that_is_wrong(body: str, expected: str, mine: Mine) -> None:
-    assert expected in failing(mine(ADS + f"        {body}\n"))
+    assert expected in failing(mine(ARRAYS + f"        {body}\n"))
 
 
 def vehicle(method: str, body: str) -> str:
@@ -158,20 +280,6 @@ def test_a_vehicle_that_is_wrong(method: str, body: str, expected: str, mine: Mi
     assert "vehicle.model = 'mine:Mine'" in str(caught.value)
 
 
-def test_a_users_vehicle_drives_to_the_bit_like_the_vehicle_that_it_wraps(mine: Mine, folder: Path) -> None:
-    guarded = mine(vehicle("", ""), VEHICLE.format(ROWS))
-    (folder / "ours.toml").write_text(
-        'extends = "smoke"\nname = "ours"\n'
-        + VEHICLE.format(ROWS).replace('"mine:Mine"', '"sumo"\nparameters = { reference_mass = 1500 }')
-    )
-    ours = assemble(load_study(str(folder / "ours.toml")))
-    settings = np.random.default_rng(1).uniform(
-        ours.characteristics.lower, ours.characteristics.upper, (4, len(ours.characteristics))
-    )
-    one, other = evaluate(guarded, settings), evaluate(ours, settings)
-    assert all(np.array_equal(one.metrics[name], other.metrics[name], equal_nan=True) for name in one.metrics)
-
-
 def scenario(method: str, body: str) -> str:
     return (
         "import numpy as np\nfrom safevar_sumo.scenarios import PedestrianCrossing\n\n\nclass Mine:\n"
@@ -218,17 +326,3 @@ def test_a_scenario_that_is_wrong(method: str, body: str, expected: str, mine: M
     message = failing(mine(scenario(method, body), SCENARIO))
     assert expected in message
     assert "scenario.model = 'mine:Mine'" in message
-
-
-@pytest.mark.parametrize(
-    "values",
-    [
-        "network, duration = 7, 2.0",
-        "network, duration = 'pedestrian_crossing', 'long'",
-        "network, duration = 'pedestrian_crossing', -1",
-        "network = 'pedestrian_crossing'",
-    ],
-)
-def test_a_scenario_without_a_network_or_a_duration_is_refused(values: str, mine: Mine) -> None:
-    with pytest.raises(UserCodeError, match=r"network|duration"):
-        mine(scenario("", "").replace("network, duration = 'pedestrian_crossing', 2.0", values), SCENARIO)

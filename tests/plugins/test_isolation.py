@@ -1,23 +1,31 @@
-"""Checks before a search find models in which one setting affects another; options that write files are refused."""
+"""Checks before a search find models in which one setting affects another; a run ends with its end."""
 
 from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
+from safevar_sumo.ads import Ads, PerVehicleAds, ScalarAds
 from safevar_sumo.api.running import carry_out_runs
 from safevar_sumo.campaign import all_runs
-from safevar_sumo.errors import UserCodeError
+from safevar_sumo.errors import InputError, UserCodeError
+from safevar_sumo.plugins import Guard
 from safevar_sumo.plugins.check import refuse_defects
+from safevar_sumo.records import Command, Evaluations, Nominal, Observation
 from safevar_sumo.results import load_runs
 from safevar_sumo.study import load_study
+from safevar_sumo.sumo.matrix import evaluate, simulate
+from safevar_sumo.sumo.system import System, assemble
+from safevar_sumo.vehicles import GuardedVehicle
 from tests.in_process import InlinePool, SilentObserver, refused, run
-from tests.plugins.beside import ADS as USES_ADS
-from tests.plugins.beside import Mine
+from tests.plugins.conftest import ADS as USES_ADS
+from tests.plugins.conftest import Mine
 
 
 def checked(mine: Mine, module: str, folder: Path, table: str = USES_ADS) -> None:
@@ -104,64 +112,6 @@ def test_an_algorithm_whose_runs_learn_from_each_other(
         searched()
 
 
-SAFER = """
-from safevar_sumo.ads import ScalarAds
-
-
-class Mine(ScalarAds):
-    made = 0
-
-    def start(self, nominal, step):
-        super().start(nominal, step)
-        Mine.made += 1
-        self.margin = 4.0 if Mine.made > 300 else 2.0
-
-    def drive(self, seen):
-        stopping = seen.speed**2 / (2 * 0.6 * self.nominal.decel)
-        if seen.gap < stopping + self.margin and abs(seen.lateral) < 2.5:
-            return 0.0, 1.0
-        return (0.5, 0.0) if seen.speed < 5 else (0.0, 0.0)
-"""
-
-
-@pytest.mark.slow
-def test_a_class_that_changes_after_three_hundred_vehicles(mine: Mine, folder: Path, tmp_path: Path) -> None:
-    """The checks at the start do not reveal it; what the run simulates again does, and the same command again does not
-    get by either.
-    """
-    system = mine(SAFER)
-    study = load_study(str(folder / "mine.toml"), search={"algorithms": ["rs"], "evaluations": 450, "runs": 1})
-    for _ in range(2):
-        with pytest.raises(
-            UserCodeError, match=r"rs-00 and \S+ alone; to reproduce it: python -m safevar_sumo simulate"
-        ) as caught:
-            carry_out_runs(study, system, all_runs(study), tmp_path / "out", InlinePool(), SilentObserver(), 50)
-        assert "ads.model = 'mine:Mine' a result depends on what else is simulated" in str(caught.value)
-    assert not (tmp_path / "out/solutions.csv").exists()
-
-
-CLOCK = """
-import time
-
-import numpy as np
-
-
-class Mine:
-    def search(self, problem, rng):
-        for _ in range(2):
-            rng = np.random.default_rng(1 + _ * time.time_ns())
-            evaluated = yield problem.characteristics.filter(problem.uniform(10, rng))
-        return evaluated.take([0])
-"""
-
-
-def test_an_algorithm_that_draws_from_the_clock(mine: Mine, folder: Path, tmp_path: Path) -> None:
-    system = mine(CLOCK, '[search]\nalgorithms = ["mine:Mine"]\nevaluations = 20\nruns = 1\n')
-    study = load_study(str(folder / "mine.toml"))
-    with pytest.raises(UserCodeError, match=r"'mine:Mine' setting 10 is .* in another run .*mine.py:7"):
-        carry_out_runs(study, system, all_runs(study), tmp_path / "out", InlinePool(), SilentObserver(), None)
-
-
 GREEDY = """
 class Mine:
     def search(self, problem, rng):
@@ -218,3 +168,94 @@ def test_members_of_user_code_are_searched_and_tabulated(six: None) -> None:
     for question in ("rq1", "rq2"):
         rows = json.loads(run("tables", "out", "--rq", question, "--format", "json").stdout)
         assert "jerk" in {row["metric"] for row in rows}
+
+
+NATIVE = assemble(load_study("native"))
+GUARD = Guard("it.toml", "vehicle.model = 'mine:Mine'")
+ORIGINAL = NATIVE.characteristics.original
+MASS = NATIVE.characteristics.names.index("mass")
+HEAVY = np.where(np.arange(len(ORIGINAL)) == MASS, 1700.0, ORIGINAL)
+
+
+class Brakes(Ads):
+    """Full throttle; a vehicle brakes if it is the light one of two."""
+
+    def start(self, n: int, nominal: Nominal, step: float) -> None:
+        return None
+
+    def drive(self, seen: Observation, memory: Any) -> tuple[Command, Any]:
+        brakes = (np.arange(len(seen.speed)) > 0) & (seen.time > 1)
+        return Command(np.where(brakes, 0.05, 1.0), np.zeros(len(seen.speed))), memory
+
+
+class Diverges:
+    """The heavy vehicle has this speed from so many steps on."""
+
+    def __init__(self, steps: int, speed: float) -> None:
+        self._inner, self.steps, self.speed = NATIVE.vehicle, steps, speed
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._inner, name)
+
+    def prepare(self, characteristics: Any, *arguments: Any) -> Any:
+        self._is_heavy, self._calls = characteristics["mass"] == HEAVY[MASS], 0
+        return self._inner.prepare(characteristics, *arguments)
+
+    def advance(self, prepared: Any, state: Any, command: Command) -> Any:
+        self._calls += 1
+        result = self._inner.advance(prepared, state, command)
+        return result._replace(speed=np.where(self._is_heavy & (self._calls >= self.steps), self.speed, result.speed))
+
+
+def systems(steps: int, speed: float) -> list[System]:
+    """A shipped vehicle that diverges, and a user's."""
+    shipped = Diverges(steps, speed)
+    guarded = GuardedVehicle(Diverges(steps, speed), GUARD)
+    return [
+        replace(NATIVE, ads=Brakes(), vehicle=vehicle)
+        for vehicle in ([shipped, guarded] if np.isnan(speed) else [guarded])
+    ]
+
+
+def bits(evaluations: Evaluations) -> list[bytes]:
+    return [evaluations.collision_speed.tobytes(), *(values.tobytes() for values in evaluations.metrics.values())]
+
+
+LENGTH = len(simulate(replace(NATIVE, ads=Brakes()), HEAVY[np.newaxis]).trace.time)
+BOTH = np.stack([HEAVY, ORIGINAL])
+
+
+@pytest.mark.parametrize("speed", [np.nan, -3.0, 900.0, 5000.0])
+def test_a_vehicle_that_diverges_after_its_own_collision_has_the_result_that_it_has_alone(speed: float) -> None:
+    for system in systems(LENGTH, speed):
+        alone, together = evaluate(system, BOTH[:1]), evaluate(system, BOTH)
+        assert len(simulate(system, BOTH).trace.time) > LENGTH, "the other vehicle drives longer"
+        assert bits(together.take([0])) == bits(alone)
+        assert alone.collided.all()
+
+
+@pytest.mark.parametrize("speed", [np.nan, -3.0, 900.0, 5000.0])
+def test_a_vehicle_that_diverges_before_its_end_is_an_error_in_every_batch(speed: float) -> None:
+    for system in systems(LENGTH - 1, speed):
+        for settings in (BOTH[:1], BOTH):
+            with pytest.raises(InputError, match=f"speed (is|=) {speed}".replace(".", r"\.")):
+                evaluate(system, settings)
+
+
+class Ends(ScalarAds):
+    """Drives one vehicle, and fails when it is called after its collision."""
+
+    has_collided = False
+
+    def drive(self, seen: Any) -> tuple[float, float]:
+        if self.has_collided:
+            raise ValueError("the drive is over")
+        self.has_collided = seen.gap < 0
+        return 1.0, 0.0
+
+
+def test_an_ads_for_one_vehicle_is_not_asked_after_the_end() -> None:
+    system = replace(NATIVE, ads=PerVehicleAds(Ends, GUARD))
+    slow = np.where(np.arange(len(ORIGINAL)) == NATIVE.characteristics.names.index("accel"), 2.0, ORIGINAL)
+    settings = np.stack([ORIGINAL, slow])
+    assert bits(evaluate(system, settings).take([0])) == bits(evaluate(system, settings[:1]))

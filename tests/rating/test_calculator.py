@@ -1,6 +1,4 @@
-"""Euro NCAP's official calculator, from PyPI, accepts this package's spreadsheets and computes equal points and
-colours.
-"""
+"""Euro NCAP's official calculator, from PyPI, computes equal points and colours."""
 
 from __future__ import annotations
 
@@ -155,3 +153,27 @@ def test_the_pages_commands_run_as_typed(
         done = subprocess.run(line, shell=True, cwd=tmp_path, capture_output=True, text=True, check=False)
         assert done.returncode == 0, f"{line}\n{done.stdout}\n{done.stderr}"
     assert list(tmp_path.glob("scored/*_report.xlsx"))
+
+
+STUDY = load_study("euro_ncap_rating")
+MEMBERS = CharacteristicSet.of(STUDY.vehicle.characteristics)
+GAIN = {
+    "treadDepth": 4.2,
+    "brakeTorque": 0.87,
+    "brakeResponse": 0.16,
+    "payload": 200.0,
+    "sensorRange": 56.0,
+    "sensorLatency": 0.16,
+}
+"""The vehicle of docs/rating.md, which has gained a layer since its tread was 5.1 mm deep."""
+
+
+def test_a_layer_may_be_gained_where_its_cell_is_lost() -> None:
+    """The case that docs/rating.md explains, with its numbers."""
+    rating = rate(STUDY, {str(tread): MEMBERS.setting({**GAIN, "treadDepth": tread}, "it") for tread in (5.1, 4.2)})
+    newer, older = rating.vehicles[1:]
+    before, after = (next(test for test in one.tests if test.matrix.name == "CPNCO day") for one in (newer, older))
+    assert [round(one.points, 2) for one in (newer, older)] == [33.64, 32.64]
+    assert [round(one.points[0], 3) for one in (before, after)] == [0.792, 0.667]
+    assert [round(one.points[2], 3) for one in (before, after)] == [0.025, 0.05]
+    assert [one.layers["Trajectory/Heading"] for one in (before, after)] == [False, True]

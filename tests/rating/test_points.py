@@ -16,16 +16,14 @@ from hypothesis import strategies as st
 
 from safevar_sumo.analysis.rating.compute import RatedVehicle, Rating, remarks
 from safevar_sumo.analysis.rating.render import rating_in_words
-from safevar_sumo.analysis.rating.workbook import PreprocessedFile, Template
 from safevar_sumo.cli.program import commands
 from safevar_sumo.errors import InputError
-from safevar_sumo.protocol import COLOURS, EURO_NCAP_2026, cells_of_part, points_of, protocol_of
+from safevar_sumo.protocol import COLOURS, EURO_NCAP_2026, points_of, protocol_of
 from safevar_sumo.protocol.points import colours_of
 from safevar_sumo.protocol.rater import darken
 from safevar_sumo.records import CellResults
 from safevar_sumo.scenarios import WEATHERS
 from safevar_sumo.study import load_study
-from safevar_sumo.sumo.matrix import evaluate, evaluate_cells, simulate_all_points, study_at
 from safevar_sumo.sumo.system import assemble
 
 PROTOCOL = protocol_of(EURO_NCAP_2026)
@@ -124,22 +122,6 @@ def test_robustness_counts_from_half_of_the_standard_range_and_claims_count_as_h
     assert shares == pytest.approx([held / len(layers), (held + 1) / len(layers)])
 
 
-def test_a_layer_of_a_test_whose_cells_are_all_red_does_not_hold() -> None:
-    """No cell has variations that could hold; a single cell that is not red is enough."""
-    layers = [("CBNA", one.name) for one in PROTOCOL.layers_of("CBNA") if one.simulated_conditions]
-    for red, holds in ((12, False), (11, True)):
-        impact = np.full(N, np.nan)
-        impact[numbers("CBNA", "standard")[:red]] = 50.0
-        assert {points_of(PROTOCOL, results(impact)).layers[key][0] for key in layers} == {holds}
-
-
-def test_a_required_cell_that_is_not_green_costs_everything() -> None:
-    impact = np.full(N, np.nan)
-    impact[numbers("CCRs", "standard")[0]] = 1.0
-    assert points_of(PROTOCOL, results(impact)).total.tolist() == [0.0]
-    assert points_of(PROTOCOL, results(impact)).fails.tolist() == [True]
-
-
 def test_remarks_name_the_required_cells_that_are_not_green() -> None:
     def remarks_on(cell_number: int) -> list[str]:
         impact = np.full(N, np.nan)
@@ -187,36 +169,6 @@ def test_a_weather_by_night_keeps_its_road_and_multiplies_both_visibilities() ->
     assert dark.visibility == pytest.approx(0.68 * 0.75)
     assert darken(dark) == dark
     assert darken(WEATHERS["clear"]) == WEATHERS["night"]
-
-
-@pytest.mark.slow
-def test_a_cell_has_equal_results_alone_and_in_any_batch() -> None:
-    study = load_study("euro_ncap_rating")
-    system = assemble(study)
-    settings_ = np.array([system.characteristics.original, system.characteristics.lower])
-    found, numbers_ = evaluate_cells(system, settings_, (7, 620)), cells_of_part(PROTOCOL, 7, 620)
-    assert found.cells is not None
-    assert sorted(number for k in range(620) for number in cells_of_part(PROTOCOL, k, 620)) == list(range(N))
-    points = [system.matrix[number] for number in numbers_]
-    assert [point.name.rpartition(", ")[0] for point in points] == [CELLS[number].name for number in numbers_]
-    for column, point in enumerate(points):
-        (alone,) = simulate_all_points(assemble(study_at(study, point.name, "")), settings_[::-1])
-        np.testing.assert_array_equal(found.cells.impact[:, column], alone.runs.relative_speed[::-1] * 3.6)
-        np.testing.assert_array_equal(found.cells.warning[:, column], np.broadcast_to(alone.runs.warning_ttc, 2)[::-1])
-
-
-def test_a_rated_study_has_its_points_as_an_objective_and_another_one_has_not() -> None:
-    system = assemble(load_study("euro_ncap_rating"))
-    few = replace(system, matrix=system.matrix[::930], rater=None)
-    assert "rating_points" in system.measuring.metrics
-    assert [objective.name for objective in system.measuring.scoring.objectives] == [
-        "rating_points",
-        "f_diff",
-        "f_num_diff",
-    ]
-    assert len(evaluate(few, system.characteristics.original[np.newaxis])) == 1
-    with pytest.raises(InputError, match="rating_points"):
-        assemble(load_study("wear", search={"objectives": ["rating_points", "f_diff"]}))
 
 
 @pytest.mark.parametrize(
@@ -299,12 +251,3 @@ def test_what_a_command_cannot_write_or_read_is_refused_before_anything_is_simul
         assert isinstance(error, InputError), (arguments, error)
         assert message in str(error), (arguments, str(error))
     assert not Path(new).exists()
-
-
-@pytest.mark.parametrize("kind", [Template, PreprocessedFile])
-def test_a_spreadsheet_of_another_version_is_refused_by_its_version(kind: Any, tmp_path: Path) -> None:
-    book = openpyxl.Workbook()
-    book.create_sheet("Version")["B1"] = "6.0.0"
-    book.save(path := tmp_path / "other.xlsx")
-    with pytest.raises(InputError, match=r"version '6\.0\.0'"):
-        kind(path, tmp_path / "out.xlsx")

@@ -5,16 +5,14 @@ process.
 from __future__ import annotations
 
 import re
-from concurrent.futures import Future
 from io import StringIO
 from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any
 
 import msgspec
 import numpy as np
 import pandas as pd
 import pytest
-from click.testing import CliRunner
 from rich.console import Console
 
 from safevar_sumo.analysis.evaluator import Evaluator
@@ -24,22 +22,11 @@ from safevar_sumo.analysis.explain.render import print_explained
 from safevar_sumo.analysis.explain.summary import summarise_failures
 from safevar_sumo.analysis.rating import RatingOptions, compute
 from safevar_sumo.analysis.rating.render import colour_changes_in_words, matrices_figure, print_matrices, print_rating
-from safevar_sumo.analysis.research_questions.case import build_case
-from safevar_sumo.analysis.risk.rare import Response
-from safevar_sumo.analysis.subject import at_point
 from safevar_sumo.analysis.tolerance import ToleranceOptions
 from safevar_sumo.analysis.tolerance.compute import find_tolerances
-from safevar_sumo.api.simulation import Simulation
-from safevar_sumo.campaign.pool import WorkerLostError
-from safevar_sumo.cli.program import commands
-from safevar_sumo.cli.simulate import _rating_command
-from safevar_sumo.cli.target import CommandTarget
-from safevar_sumo.errors import SimulationError
-from safevar_sumo.metrics import Unsafe
 from safevar_sumo.protocol import EURO_NCAP_2026, protocol_of, rater
-from safevar_sumo.records import Evaluations
 from safevar_sumo.report.rated import draw_matrices
-from safevar_sumo.results import SolutionId, record, solutions_frame
+from safevar_sumo.results import solutions_frame
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.system import assemble
 from tests.in_process import InlinePool
@@ -126,23 +113,6 @@ def test_explain_names_the_cells_of_a_worse_colour_and_the_summary_the_points_th
     assert isinstance(case.solutions, pd.DataFrame)
 
 
-def test_simulate_prints_the_command_that_rates_the_simulated_vehicle() -> None:
-    done = CliRunner(env={"COLUMNS": "300"}).invoke(
-        commands, ["simulate", STUDY.name, "--set", "payload=200", "--set", "brakeTorque=0.6"]
-    )
-    (words,) = re.findall(r"run `python -m safevar_sumo (rating .*)`", done.stdout)
-    assert sorted(words.split()) == sorted(
-        ["rating", "euro_ncap_rating", "--set", "payload=200.0", "--set", "brakeTorque=0.6", "--matrix"]
-    )
-    system = assemble(STUDY)
-    solution = system.characteristics.setting({"payload": 200.0, "brakeTorque": 0.6}, "it")
-    target = CommandTarget(STUDY, "my results", SolutionId("nsga2", 3, 0), solution)
-    for changes, flags in (({}, ""), ({"payload": 100.0}, " --set payload=100.0")):
-        setting = dict(zip(system.characteristics.names, solution.tolist(), strict=True)) | changes
-        command = _rating_command(target, system, cast("Simulation", SimpleNamespace(setting=setting)))
-        assert command == f"python -m safevar_sumo rating 'my results'{flags} --solution nsga2:3:0 --matrix"
-
-
 def test_only_cells_of_a_worse_colour_explain_a_failure(monkeypatch: pytest.MonkeyPatch) -> None:
     """Neither cells of a better colour nor cells of an unknown colour, of either vehicle, count as worse."""
     evaluator, matrix = Evaluator(STUDY, TwoWorkers()), assemble(STUDY).matrix
@@ -172,64 +142,4 @@ def test_a_rating_prints_draws_and_stands_in_a_page() -> None:
     assert matrices_figure(result).get_axes()
     assert draw_matrices(result) == draw_matrices(result)
     assert str(draw_matrices(result)).startswith("<svg")
-    total = result.to_frame().groupby("vehicle")["total"].sum().loc["variant"]
-    assert total == pytest.approx(result.variant.points)  # type: ignore[union-attr]
-
-
-@pytest.mark.slow
-def test_at_one_cell_a_collision_is_unsafe_and_points_are_no_column() -> None:
-    """One cell has no rating: metres would be compared with points of the whole study."""
-    evaluator = Evaluator(STUDY, TwoWorkers())
-    settings = np.array([evaluator.characteristics.setting({"brakeTorque": value}, "it") for value in (0.5, 0.99)])
-    evaluations = evaluator.evaluate(settings, "it")
-    solutions = solutions_frame(evaluator.characteristics.names, [(("nsga2", 0), evaluations)])
-    scoring = assemble(STUDY).measuring.scoring
-    case = build_case(
-        STUDY, record(evaluator.evaluate_original(), 0), solutions, pd.DataFrame(), [("nsga2", 0)], scoring=scoring
-    )
-    assert case.unsafe.points is not None
-    here = at_point(case, "CCRs, 80 km/h, 100 %, wet")
-    stated = RatingOptions(solution="nsga2:0:1", changes={"payload": 200.0})
-    variant = compute.rate_variant(case, stated, pool=TwoWorkers()).variant
-    assert variant is not None
-    assert (variant.name, variant.setting["brakeTorque"], variant.setting["payload"]) == (
-        "nsga2:0:1 changed",
-        0.99,
-        200.0,
-    )
-    assert stated.command_line("it").endswith("rating it --set payload=200.0 --solution nsga2:0:1")
-    assert here.unsafe == Unsafe()
-    assert here.unsafe.rows(here.solutions).tolist() == [True, False]
-    assert "rating_points" not in {*here.solutions, *here.original, *(one.name for one in here.scoring.metrics)}
-
-
-def test_rare_failures_are_approached_by_points_where_points_are_the_criterion() -> None:
-    evaluator = Evaluator(STUDY, TwoWorkers())
-    evaluations = evaluator.evaluate(evaluator.characteristics.original[np.newaxis], "it")
-    points = float(evaluations.column("rating_points")[0])
-    response = Response(evaluator, lambda where: where, Unsafe(points=points - 2))
-    assert response.record(evaluations.settings, evaluations) == pytest.approx([2.0])
-
-
-class LosingPool(InlinePool):
-    """A pool whose workers die with every batch of several settings, and with these masses."""
-
-    def __init__(self, *masses: float) -> None:
-        super().__init__()
-        self._masses = masses
-
-    def submit(self, work: bytes, settings: np.ndarray) -> Future[Evaluations]:
-        if len(settings) == 1 and settings[0, 0] not in self._masses:
-            return super().submit(work, settings)
-        future: Future[Evaluations] = Future()
-        future.set_exception(WorkerLostError(f"lost with {settings[-1, 0]:g}"))
-        return future
-
-
-def test_parts_of_a_divided_batch_have_the_cells_of_the_whole() -> None:
-    original = Evaluator(STUDY, InlinePool()).characteristics.original
-    settings = np.stack([original, np.where(np.arange(len(original)) == 0, original + 100, original)])
-    whole, parts = (Evaluator(STUDY, pool).simulate_cells(settings, "") for pool in (InlinePool(), LosingPool()))
-    assert all(np.array_equal(one, other, equal_nan=True) for one, other in zip(whole, parts, strict=True))
-    with pytest.raises(SimulationError, match=f"a vehicle cannot be simulated: lost with {settings[1, 0]:g}"):
-        Evaluator(STUDY, LosingPool(settings[1, 0])).simulate_cells(settings, "")
+    assert result.to_frame().groupby("vehicle")["total"].sum().loc["variant"] == pytest.approx(result.variant.points)  # type: ignore[union-attr]

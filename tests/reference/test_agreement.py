@@ -11,7 +11,7 @@ import pytest
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import Evaluations
-from safevar_sumo.reference.agreement import measure_agreement, plot_agreement, rank_correlation
+from safevar_sumo.reference.agreement import measure_agreement, rank_correlation
 from safevar_sumo.reference.rows import ReferenceData, package_filter, read_reference
 from safevar_sumo.study import Study, load_study
 from safevar_sumo.vehicles import Characteristic, CharacteristicSet
@@ -86,16 +86,6 @@ def test_rank_correlation_of_known_orders() -> None:
     assert rank_correlation(np.array([1.0, 2, 3]), np.array([3.0, 2, 1])) == pytest.approx(-1)
     for undefined in ([1.0, 1, 1], [1.0], list[float]()):
         assert rank_correlation(np.arange(len(undefined)), np.array(undefined)) is None
-
-
-@pytest.mark.slow
-def test_the_picture_is_drawn_whatever_the_data(tmp_path: Path) -> None:
-    for rows in (1, 40):
-        safety = np.linspace(-1, 3, rows).tolist()
-        plot_agreement(
-            tmp_path / f"{rows}.png", "title", ONE, reference(safety, [1.0] * rows), here(safety, [1.0] * rows)
-        )
-        assert (tmp_path / f"{rows}.png").stat().st_size > 10_000
 
 
 SUN = CharacteristicSet.of(load_study("sun").vehicle.characteristics)

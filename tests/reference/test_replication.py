@@ -7,7 +7,6 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-import msgspec
 import numpy as np
 import pandas as pd
 import pytest
@@ -15,7 +14,6 @@ from click.testing import CliRunner, Result
 
 from safevar_sumo.analysis.research_questions.case import load_cases
 from safevar_sumo.cli.program import commands
-from safevar_sumo.errors import InputError
 from safevar_sumo.reference import agreement
 from safevar_sumo.reference.agreement import Agreement, rank_correlation, shipped_totals_of, write_totals
 from safevar_sumo.reference.conclusions import (
@@ -204,27 +202,6 @@ def test_the_page_says_how_well_the_study_agrees_with_every_file(totals: Path) -
     ):
         assert words in sentence
     assert rows[0] == ["made_up.csv", "80", "0.61", "0.25", "40", "20", "10", "0.25", "0.50"]
-
-
-@pytest.mark.usefixtures("totals")
-def test_nobody_elses_agreement_is_claimed() -> None:
-    """Another weather, or the same study with another parameter, simulates something else."""
-    rain = load_study("rain")
-    other = msgspec.structs.replace(
-        rain, ads=msgspec.structs.replace(rain.ads, parameters={**rain.ads.parameters, "margin": 9.0})
-    )
-    for study in (load_study("sun"), other):
-        assert shipped_totals_of(study) == {}
-        assert "was not compared with published data" in describe_agreement(study)[0]
-
-
-def test_an_entry_is_replaced_and_others_stay(totals: Path) -> None:
-    write_totals(totals, load_study("sun"), "made_up.csv", MADE_UP)
-    write_totals(totals, load_study("rain"), "made_up.csv", Agreement(**{**MADE_UP.to_dict(), "rows": 7}))
-    assert [shipped_totals_of(load_study(name))["made_up.csv"].rows for name in ("rain", "sun")] == [7, 80]
-    totals.write_text("[rain]\nrows = 3\n")
-    with pytest.raises(InputError, match="holds no totals"):
-        shipped_totals_of(load_study("rain"))
 
 
 def test_what_ships_is_what_the_trust_page_says() -> None:

@@ -1,36 +1,48 @@
-"""ReplayOutputs: solutions of a results directory are simulated again with the same results, and seen from above."""
+"""Solutions of a results directory are simulated again with the same results, seen from above, and animated."""
 
 from __future__ import annotations
 
 import dataclasses
 import json
 import os
+import re
 import shutil
 import subprocess
+import sys
 from collections.abc import Iterator
-from itertools import combinations
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 from click.testing import CliRunner, Result
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from PIL import Image
 
-from safevar_sumo.analysis.figures import save
 from safevar_sumo.analysis.research_questions.case import Case, load_cases
 from safevar_sumo.cli.program import commands
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import METRICS
-from safevar_sumo.replay.comparison import Comparison, compare_setting, find_divergence, find_moments, list_differences
+from safevar_sumo.replay.animation import PANEL_HEIGHT, WIDTH, animate, draw_scene, find_ffmpeg
+from safevar_sumo.replay.comparison import (
+    COLOURS,
+    Comparison,
+    compare_setting,
+    find_divergence,
+    find_moments,
+    list_differences,
+)
 from safevar_sumo.replay.figure import draw_comparison
 from safevar_sumo.replay.film import record_film
 from safevar_sumo.replay.gui import show_in_gui
+from safevar_sumo.replay.page import animation_page
+from safevar_sumo.replay.scene import FlatScene, lay_out_scene
 from safevar_sumo.results import handles_of
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.batch import score
 from safevar_sumo.sumo.matrix import simulate, study_at
-from safevar_sumo.sumo.system import System, assemble
+from safevar_sumo.sumo.system import assemble
+from tests.in_process import refused
 
 
 @pytest.fixture
@@ -54,15 +66,6 @@ def test_the_command_replays_every_solution_of_solutions_csv(slippery: Path) -> 
         assert [output[name] for name in METRICS] == [None if np.isnan(row[name]) else row[name] for name in METRICS]
 
 
-@pytest.mark.parametrize(
-    ("flag", "column"), [("--most-severe", "f_safe"), ("--smallest", "f_diff"), ("--fewest", "f_num_diff")]
-)
-def test_the_most_severe_the_smallest_and_the_fewest(flag: str, column: str, slippery: Path) -> None:
-    frame = pd.read_csv(slippery / "solutions.csv")
-    output = json.loads(simulated(str(slippery), flag, "--json").stdout)
-    assert output[column] == frame[frame["outcome"] == "collision"][column].min()
-
-
 def test_a_replay_that_differs_from_its_row_is_reported(slippery: Path, case: Case) -> None:
     comparison = compare_setting(case.study, assemble(case.study), case.characteristics.original)
     result = list_differences(comparison.evaluations, {"safety_degree": 1.0, "tet": np.nan, "outcome": "collision"})
@@ -71,22 +74,6 @@ def test_a_replay_that_differs_from_its_row_is_reported(slippery: Path, case: Ca
     )
     assert list_differences(rated, {"rating_points": 3.0, "outcome": "stopped"}) == [], "a single cell has no points"
     assert [one.split(" was ")[0] for one in result] == ["the outcome", "safety_degree", "tet"]
-
-
-@pytest.mark.parametrize(
-    ("arguments", "legal"),
-    [
-        (["rain", "--fewest"], "a directory"),
-        (["DIR", "--solution", "nsga2:0:99"], "N from 0 to"),
-        (["DIR", "--solution", "x"], "ALGORITHM:RUN:N"),
-        (["DIR", "--solution", "nsga2:0:0", "--fewest"], "one of them"),
-        (["DIR", "--plot", "x.bmp"], ".png"),
-    ],
-)
-def test_what_cannot_be_replayed_is_refused(arguments: list[str], legal: str, slippery: Path) -> None:
-    done = simulated(*(str(slippery) if one == "DIR" else one for one in arguments))
-    assert isinstance(done.exception, InputError)
-    assert legal in str(done.exception)
 
 
 @pytest.mark.parametrize("study", ["rain", "lgsvl", "native"])
@@ -103,16 +90,6 @@ def test_a_film_shows_what_is_simulated(study: str) -> None:
     for row, end in enumerate(result.last_samples):
         assert result.runs.trace.active[end, row]
         assert not result.runs.trace.active[end + 1 :, row].any()
-
-
-def test_a_film_of_the_crossing_has_its_pedestrian_and_its_crossing(sun: System) -> None:
-    result = record_film(sun, sun.characteristics.original[np.newaxis])
-    pedestrian = result.tracks["pedestrian"]
-    assert pedestrian.is_person
-    assert np.allclose(pedestrian.y[:, 0] - result.tracks["vut"].y[:, 0], result.runs.trace.lateral[:, 0])
-    (crossing,) = [lane for lane in result.road if lane.kind == "crossing"]
-    assert np.allclose(crossing.line[:, 0], pedestrian.x[0, 0], atol=0.01)
-    assert {lane.kind for lane in result.road} == {"road", "path", "crossing", "area"}
 
 
 def test_moments_of_a_drive(case: Case) -> None:
@@ -166,47 +143,6 @@ def test_the_figure_draws_both_drives_until_their_ends(comparison: Comparison) -
         assert change in heading
 
 
-def test_the_words_of_the_figure_lie_within_their_axes_and_overlap_nothing(comparison: Comparison) -> None:
-    figure = draw_comparison(comparison)
-    figure.canvas.draw()
-    for axis in figure.axes[:2]:
-        words = [text.get_window_extent() for text in axis.texts if text.get_text()]
-        assert words
-        assert not any(one.overlaps(other) for one, other in combinations(words, 2))
-        for box in words:
-            assert axis.bbox.x0 < box.x0 < box.x1 < axis.bbox.x1
-            assert axis.bbox.y0 < box.y0 < box.y1 < axis.bbox.y1
-    impact = next(text for text in figure.axes[1].texts if text.get_text() == "impact").get_window_extent()
-    assert impact.y1 < figure.axes[1].transData.transform((0, 0))[1], "below the ground, where no line is"
-
-
-def test_the_figure_of_one_vehicle_has_no_line_or_entry_of_another() -> None:
-    study = load_study("smoke")
-    system = assemble(study)
-    figure = draw_comparison(compare_setting(study, system, system.characteristics.original))
-    assert not any("diverge" in text.get_text() for text in figure.legends[0].get_texts())
-    figure.canvas.draw()
-    for text in figure.axes[1].texts:
-        assert text.get_bbox_patch().get_facecolor() == (1.0, 1.0, 1.0, 1.0), (
-            "the ground's line does not strike the number through"
-        )
-
-
-@pytest.mark.parametrize("friction", [1.1, 1.9])
-def test_the_larger_gap_has_its_number_above(friction: float) -> None:
-    study = load_study("smoke")
-    system = assemble(study)
-    setting = system.characteristics.original.copy()
-    setting[system.characteristics.names.index("tireFric")] = friction
-    shown = compare_setting(study, system, setting)
-    degrees = shown.evaluations.metrics["safety_degree"]
-    assert (degrees[1] > degrees[0]) == (friction == 1.9), (
-        "of the two one is safer than the original, or the test tells nothing"
-    )
-    heights = {text.get_text(): text.xyann[1] for text in draw_comparison(shown).axes[1].texts}
-    assert heights[f"{degrees.max():.2f} m"] > 0 > heights[f"{degrees.min():.2f} m"]
-
-
 def test_at_an_impact_the_pedals_are_those_that_were_in_force() -> None:
     """AEB releases the brake once there is no gap, which is after the collision."""
     study = study_at(load_study("euro_ncap_pedestrian"), "CPLA, speed 60, clear", "point")
@@ -220,14 +156,6 @@ def test_at_an_impact_the_pedals_are_those_that_were_in_force() -> None:
     assert runs.trace.brake[end, 0] == 0
     assert trace.brake[end, 1] == trace.brake[end - 1, 1] == runs.trace.brake[end - 1, 0] == 1
     assert shown.evaluations.metrics["safety_degree"][1] == -runs.collision_speed[0]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", ["png", "svg"])
-def test_the_same_bytes_twice(kind: str, comparison: Comparison, tmp_path: Path) -> None:
-    for name in ("a", "b"):
-        save(draw_comparison(comparison), tmp_path / f"{name}.{kind}")
-    assert (tmp_path / f"a.{kind}").read_bytes() == (tmp_path / f"b.{kind}").read_bytes()
 
 
 @pytest.fixture
@@ -276,21 +204,83 @@ def test_both_vehicles_are_in_the_window_at_the_nearest_moment(slippery: Path, t
     assert len(of_colour(picture, 255, 51, 0)) > 20, "the changed vehicle's brake lights"
 
 
-def test_without_a_display_it_is_refused(slippery: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv("DISPLAY", raising=False)
-    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+@pytest.fixture(scope="module")
+def crash(slippery: Path) -> Comparison:
     (case,) = load_cases([slippery])
-    comparison = compare_setting(case.study, assemble(case.study), case.characteristics.original)
-    with pytest.raises(InputError, match="needs a display"):
-        show_in_gui(comparison)
-
-
-def test_a_verdict_names_the_comfort_that_the_study_optimises() -> None:
-    study = load_study("comfort")
-    system = assemble(study)
-    comparison = compare_setting(
-        study, system, system.characteristics.setting({"mass": 2105.0, "maxBrakeTorque": 1360.0}, "it")
+    return compare_setting(
+        case.study, assemble(case.study), case.solutions[list(case.characteristics.names)].to_numpy()[0]
     )
-    for row in comparison.rows:
-        jerk = comparison.evaluations.metrics["max_jerk"][row]
-        assert comparison.verdict(row).endswith(f" m to spare, jerk {jerk:.1f} m/s^3")
+
+
+def frame(scene: FlatScene, sample: int) -> np.ndarray:
+    """The picture of a sample, shape (height, width, 3)."""
+    figure, show = draw_scene(scene)
+    show(sample)
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    return np.asarray(canvas.buffer_rgba())[:, :, :3]
+
+
+def where(picture: np.ndarray, colour: str) -> tuple[np.ndarray, np.ndarray]:
+    """Rows and columns of the pixels of a colour, below the words."""
+    pixels = picture.astype(int)[PANEL_HEIGHT:]
+    wanted = [int(colour[i : i + 2], 16) for i in (1, 3, 5)]
+    return np.nonzero(np.abs(pixels - wanted).max(axis=2) < 26)
+
+
+def test_both_vehicles_are_drawn_at_their_positions_to_scale(crash: Comparison) -> None:
+    scene = lay_out_scene(crash)
+    picture = frame(scene, 0)  # the changed vehicle stands on the original's place
+    scale = WIDTH / scene.view.width
+    rows, columns = where(picture, COLOURS[0])
+    vut = next(body for body in scene.bodies if body.is_vut)
+    assert columns.max() - columns.min() == pytest.approx(vut.length * scale, abs=4)
+    assert rows.max() - rows.min() == pytest.approx(vut.width * scale, abs=4)
+    end = frame(scene, scene.sample_count - 1)
+    for row, body in enumerate(one for one in scene.bodies if one.is_vut):
+        _, columns = where(end, COLOURS[row])
+        assert columns.max() == pytest.approx((body.x[-1] - scene.view.left_ends[-1]) * scale, abs=4)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["gif", "html", pytest.param("mp4", marks=pytest.mark.slow)])
+def test_the_same_bytes_twice(kind: str, crash: Comparison, tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        animate(crash, tmp_path / f"{name}.{kind}")
+    assert (tmp_path / f"a.{kind}").read_bytes() == (tmp_path / f"b.{kind}").read_bytes()
+    assert (tmp_path / f"a.{kind}").stat().st_size < 1_000_000
+    if kind == "gif":
+        with Image.open(tmp_path / "a.gif") as image:
+            durations = []
+            for frame in range(image.n_frames):
+                image.seek(frame)
+                durations.append(image.info["duration"])
+        seconds = lay_out_scene(crash).sample_count * crash.film.runs.trace.step
+        assert sum(durations[:-1]) / 1000 == pytest.approx(seconds, abs=0.3), "it lasts as long as the drive"
+    if kind == "mp4":
+        assert (tmp_path / "a.mp4").read_bytes()[4:8] == b"ftyp"
+
+
+def test_the_page_holds_every_place_to_the_centimetre(crash: Comparison) -> None:
+    page, scene = animation_page(lay_out_scene(crash)), lay_out_scene(crash)
+    data = json.loads(re.search(r'<script type="application/json">(.*?)</script>', page, re.DOTALL)[1])  # type: ignore[index]
+    assert data["step"] == scene.step
+    vuts = [body for body in data["bodies"] if body["drive"] is not None]
+    for shown, body in zip(vuts, [one for one in scene.bodies if one.is_vut], strict=True):
+        assert np.allclose(shown["x"], body.x, atol=0.0051)
+    assert [drive["end"] for drive in data["drives"]] == crash.film.last_samples.tolist()
+
+
+def test_text_of_a_study_stays_text(crash: Comparison) -> None:
+    page = animation_page(lay_out_scene(dataclasses.replace(crash, title="<script>alert(1)</script></title>")))
+    assert "<script>alert" not in page
+    assert "&lt;script&gt;alert(1)&lt;/script&gt;" in page
+    assert "http" not in page.replace("http-equiv", ""), "nothing is fetched from elsewhere"
+
+
+def test_without_ffmpeg_a_film_is_refused_before_anything_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PATH", "/nowhere")
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    with pytest.raises(InputError, match="ffmpeg"):
+        find_ffmpeg()
+    refused("simulate", "sun", "--animate", str(tmp_path / "it.mp4"), message=("--animate", "ffmpeg"))

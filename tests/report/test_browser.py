@@ -5,16 +5,12 @@ from __future__ import annotations
 import base64
 import json
 import os
-import re
 import shutil
 import subprocess
 import tarfile
 import time
 from collections.abc import Iterator
-from functools import partial
-from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from threading import Thread
 from typing import Any
 
 import pytest
@@ -22,7 +18,6 @@ from selenium import webdriver
 from selenium.webdriver import Chrome
 from selenium.webdriver.chrome.service import Service
 from selenium.webdriver.common.by import By
-from selenium.webdriver.support.ui import WebDriverWait
 
 from safevar_sumo.analysis.research_questions.case import load_cases
 from safevar_sumo.replay.animation import animate
@@ -201,36 +196,6 @@ def test_without_javascript_it_stands_still_and_tells_the_same(browser: Chrome, 
         assert player.find_element(By.CSS_SELECTOR, ".changed").is_displayed()
     finally:
         browser.execute_cdp_cmd("Emulation.setScriptExecutionDisabled", {"value": False})
-
-
-@pytest.mark.slow
-def test_the_documentation_is_searched(browser: Chrome) -> None:
-    """Words lead to the page that explains them; a word that stands nowhere leads to none."""
-    site = Path(__file__).parents[2] / "site"
-    if not site.is_dir() and not os.environ.get(REQUIRED):
-        pytest.skip("make docs has not built the site")
-    with ThreadingHTTPServer(("127.0.0.1", 0), partial(SimpleHTTPRequestHandler, directory=str(site))) as server:
-        Thread(target=server.serve_forever, daemon=True).start()
-        try:
-            for words, page in (
-                ("repeatability", "/study_file/"),
-                ("gearSwitchTime", "/glossary/"),
-                ("cluster_pool_of_nobody", ""),
-            ):
-                browser.get(f"http://127.0.0.1:{server.server_port}/")
-                browser.find_element(By.CSS_SELECTOR, "[data-md-component=search-query]").send_keys(words)
-                WebDriverWait(browser, 20).until(lambda one: searched(one) is not None)
-                links = searched(browser) or []
-                assert any(page in link for link in links) if page else not links, f"{words}: {links}"
-        finally:
-            server.shutdown()
-
-
-def searched(browser: Chrome) -> list[str] | None:
-    """Where the results of a search lead; None before the search has ended."""
-    if not re.match(r"No|\d", browser.find_element(By.CSS_SELECTOR, ".md-search-result__meta").text):
-        return None
-    return [str(one.get_attribute("href")) for one in browser.find_elements(By.CSS_SELECTOR, ".md-search-result__link")]
 
 
 REQUIRED = "SAFEVAR_BROWSER"

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import html
 import json
-import math
 import re
 import shutil
 from dataclasses import replace
@@ -15,7 +14,6 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import msgspec
 import numpy as np
 import pytest
 from click.testing import CliRunner
@@ -30,8 +28,6 @@ from safevar_sumo.analysis.tolerance.safe_box import SafeBox
 from safevar_sumo.campaign import local
 from safevar_sumo.cli.program import commands
 from safevar_sumo.errors import InputError
-from safevar_sumo.metrics import Unsafe
-from safevar_sumo.records import Evaluations
 from safevar_sumo.replay.comparison import format_number
 from safevar_sumo.report import SECTIONS, make_report
 from safevar_sumo.report import input as report_input
@@ -39,7 +35,7 @@ from safevar_sumo.report import page as report_page
 from safevar_sumo.report.causes import make_verdict
 from safevar_sumo.report.input import AVOIDED_TEXT, tabulate_failing_points
 from safevar_sumo.report.page import COMMAND_OF_SECTION, DOMAIN_QUESTIONS, read_inputs
-from safevar_sumo.report.tested import describe_conditions, describe_tested_system
+from safevar_sumo.report.tested import describe_conditions
 from safevar_sumo.results.manifest import write_manifest
 from safevar_sumo.scenarios import Point, weather_of
 from safevar_sumo.sumo.system import assemble
@@ -176,21 +172,6 @@ def test_every_figure_has_its_values_beside_it(page: str, explained: Explained) 
 
 
 @pytest.mark.slow
-def test_where_nothing_collides_the_page_says_so_first_and_calls_half_a_screening_limit(
-    slippery: Path, explained: Explained, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (data,) = read_inputs([slippery])
-    nearest = Evaluations.concatenate([explained.original])
-    half = dataclasses.replace(
-        explained, nearest=nearest, explanations=(), failures=0, unsafe=Unsafe(0.9, is_half=True)
-    )
-    verdict = make_verdict(data, half, None)
-    assert verdict["sentences"][0].startswith(f"No collision in {explained.looked_at} vehicles; the worst stops ")
-    assert verdict["sentences"][-1].endswith("safety degree below 0.9 m (half of the original's, a screening limit).")
-    assert [value for _, value, _ in verdict["key_figures"]][1].startswith("safety degree ")
-
-
-@pytest.mark.slow
 def test_the_key_figures_are_those_of_the_answers(slippery: Path, explained: Explained) -> None:
     (data,) = read_inputs([slippery])
     counts = {PreventableBy.COMPETENT_DRIVER: 9996, PreventableBy.NOBODY: 4}
@@ -230,11 +211,6 @@ def test_every_replay_that_is_linked_is_there_and_hits_as_recorded(page: str, sl
 
 
 @pytest.mark.slow
-def test_the_same_results_give_the_same_bytes(slippery: Path, few_samples: None) -> None:
-    assert len({make_report([slippery], only=["verdict", "risk", "rules"], jobs=jobs) for jobs in (1, 2)}) == 1
-
-
-@pytest.mark.slow
 def test_what_is_not_as_the_results_say_any_more_is_told(
     page: str, slippery: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -268,14 +244,6 @@ def test_text_of_a_study_stays_text(bad: str, slippery: Path, tmp_path: Path) ->
 
 
 @pytest.mark.slow
-def test_studies_stand_side_by_side(slippery: Path, tmp_path: Path) -> None:
-    shutil.copytree(slippery, tmp_path / "other", ignore=shutil.ignore_patterns("answers"))
-    page = make_report([slippery, tmp_path / "other"], only=["tested", "verdict", "trust", "reproduce"])
-    assert page.count('<div class="card verdict bad">') == 2
-    assert len(Outline(page).ids) == len(set(Outline(page).ids))
-
-
-@pytest.mark.slow
 def test_results_without_a_solution_have_a_report(slippery: Path, tmp_path: Path) -> None:
     shutil.copytree(
         slippery, tmp_path / "begun", ignore=shutil.ignore_patterns("answers", "nsga2*", "rs*", "solutions.csv")
@@ -302,11 +270,6 @@ def test_the_command_writes_the_page_and_refuses_what_it_cannot(slippery: Path, 
         assert isinstance(report(*arguments), InputError)
 
 
-def test_an_empty_point_is_no_point(slippery: Path) -> None:
-    with pytest.raises(InputError, match="point: ''"):
-        make_report([slippery], only=["verdict"], point="")
-
-
 def point(name: str, **place: Any) -> Point:
     return Point(None, None, name, tuple(place.items()))  # type: ignore[arg-type]
 
@@ -329,14 +292,6 @@ def test_tests_and_weathers_stand_down_and_speeds_across() -> None:
         "near, night": [AVOIDED_TEXT, "50 %", "25 %, 50 %", ""],
         "along, clear": ["", "", AVOIDED_TEXT, "fails"],
     }
-
-
-def test_a_matrix_of_something_else_than_speeds_has_a_table_too() -> None:
-    result = tabulate_failing_points(
-        [point("a", test="a", weather="fog", slope=0.1), point("b", test="b", weather="fog")], ["a"]
-    )
-    assert result.frame.T.to_dict("list") == {"a, fog, slope 0.1": ["fails"]}
-    assert tabulate_failing_points([point("b", test="b", weather="fog")], []).frame.empty
 
 
 def test_a_study_that_cannot_be_simulated_has_its_page(slippery: Path, tmp_path: Path) -> None:
@@ -371,26 +326,6 @@ def test_of_an_original_that_collides_no_change_is_called_the_cause(
     page = make_report([slippery], only=["verdict", "causes"], jobs=1)
     assert "the original vehicle itself collides, at 3.9 m/s, 14 km/h. No change is needed for it to be unsafe." in page
     assert "Cause 1" not in page
-
-
-def test_user_code_is_called_by_its_name_once(slippery: Path) -> None:
-    (data,) = read_inputs([slippery])
-    scenario = SimpleNamespace(pre_crash="", centre_to_centre=False, test_speed=None)
-    study = msgspec.structs.replace(
-        data.case.study, ads=msgspec.structs.replace(data.case.study.ads, model="my_controller:Pilot")
-    )
-    points = [Point(scenario, data.case.weather)]  # type: ignore[arg-type]
-    others: Any = SimpleNamespace(
-        case=dataclasses.replace(data.case, study=study),
-        manifest=data.manifest,
-        problem="",
-        point="",
-        system=SimpleNamespace(points=points, matrix=(), vehicle=SimpleNamespace(FITTED_UP_TO=math.inf)),
-    )
-    result = describe_tested_system(others)
-    assert "Driving system: my_controller:Pilot. Scenario: pedestrian_crossing (" in result["subject"]
-    assert "NSGA-II (1 run)" in result["search"]
-    assert not result["tags"]
 
 
 @pytest.mark.parametrize(

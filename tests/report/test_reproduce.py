@@ -18,7 +18,6 @@ from click.testing import CliRunner
 import safevar_sumo
 from safevar_sumo.cli import study as command
 from safevar_sumo.cli.program import commands
-from safevar_sumo.errors import InputError
 from safevar_sumo.report import input as report_input
 from safevar_sumo.report import make_report
 from safevar_sumo.report.page import commands_to_reproduce, read_inputs
@@ -126,14 +125,3 @@ def test_all_of_it_is_of_the_point(results: Path) -> None:
     worst = there.case.solutions["f_safe"].min()
     assert (f"a collision at {-worst:.1f} m/s" if worst < 0 else f"; the worst stops {worst:.2f} m short") in page
     assert f"only at the point {DAY} of its matrix" in page
-
-
-def test_its_commands_ask_about_the_point_and_a_wrong_one_is_refused(results: Path) -> None:
-    page = make_report([results], ["reproduce"], jobs=1, point=DAY)
-    assert all(
-        "simulate" not in command and "tables" not in command for command in re.findall("<code>(.*?)</code>", page)
-    )
-    with pytest.raises(InputError, match="point: 'crossing, snow'"):
-        make_report([results], ["verdict"], jobs=1, point="crossing, snow")
-    with pytest.raises(InputError, match="whole studies"):
-        make_report([results], ["questions"], jobs=1, point=DAY)

@@ -1,29 +1,206 @@
-"""RQ3 and the discussion on made-up solutions with values that one can count by hand."""
+"""RQ1 to RQ3 and the discussion on made-up solutions with values that one can count by hand."""
 
 from __future__ import annotations
 
-import dataclasses
+import itertools
 import math
+import re
 
-import pandas as pd
+import numpy as np
 import pytest
+import scipy
 
+from safevar_sumo.analysis.research_questions.algorithm_figures import draw_critical_differences
 from safevar_sumo.analysis.research_questions.answer import answer_questions
-from safevar_sumo.analysis.research_questions.case import UnanswerableError
+from safevar_sumo.analysis.research_questions.case import Case, UnanswerableError
 from safevar_sumo.analysis.research_questions.changes import (
     compare_weathers,
     count_collisions,
     critical_solutions,
     find_weather_pairs,
-    frequent_combinations,
     rq31,
     rq32,
     rq33,
     rq33_safety,
 )
+from safevar_sumo.analysis.research_questions.comparisons import (
+    compare_pairs,
+    rank_algorithms,
+    rq1,
+    rq1_runs,
+    rq2,
+    rq2_runs,
+    significance_change_line,
+    summary_lines,
+)
+from safevar_sumo.analysis.research_questions.statistics import ALPHA, compare_samples, correct_by_holm
 from safevar_sumo.errors import InputError
-from safevar_sumo.study import CharacteristicTable, MetricsTable, load_study
+from safevar_sumo.study import MetricsTable
 from tests.research_questions.made_up import ORIGINAL, made_up, made_up_study, only, row
+
+RUNS = 12
+
+
+def three_algorithms() -> Case:
+    """The second finds more severe solutions than the first, the third as the first; run 3 of the third finds none."""
+    study = made_up_study(algorithms=["nsga2", "spea2", "mocell"], runs=RUNS)
+    rng, rows = np.random.default_rng(1), []
+    for (name, worse), run in itertools.product((("nsga2", 0.0), ("spea2", 1.0), ("mocell", 0.0)), range(RUNS)):
+        if (name, run) != ("mocell", 3):
+            rows += [
+                row(
+                    name,
+                    run,
+                    (900.0, 1.5, 0.1),
+                    sd=2 - worse - share - 0.2 * rng.random(),
+                    f_diff=0.3 * share + 0.05 * rng.random(),
+                )
+                for share in (0.2, 0.5, 0.8)
+            ]
+    return made_up(*rows, study=study, finished=list(itertools.product(("nsga2", "spea2", "mocell"), range(RUNS))))
+
+
+def test_rq1_is_small_where_solutions_are_more_unsafe() -> None:
+    frame = rq1(made_up(*(row(sd=1 + i / 10, tet=2, tit=1, ave_dece=3) for i in range(5))))
+    assert frame["metric"].tolist() == ["safety_degree", "tet", "tit", "ave_dece"]
+    assert frame[["effect_size", "magnitude", "n1", "n2"]].drop_duplicates().values.tolist() == [[0, "large", 5, 5]]
+    safer = rq1(made_up(*(row(sd=3, tet=0.5, tit=0.1, ave_dece=7) for _ in range(5))))
+    assert safer["effect_size"].tolist() == [1, 1, 1, 1]
+
+
+def test_a_tet_that_stands_at_a_collision_is_not_counted() -> None:
+    case = made_up(
+        {**row(sd=-3), "tet": 0.0}, row(sd=1, tet=1.4), {**row("rs", sd=-3), "tet": 9.0}, row("rs", sd=1, tet=1.3)
+    )
+    assert only(rq1(case), algorithm="nsga2", metric="tet")["mean"] == 1.4
+    assert only(rq2(case), metric="tet")["effect_size"] == 1
+
+
+def test_rq1_says_which_values_are_undefined() -> None:
+    result = answer_questions([made_up(row(tet=None), row(sd=-1), row(), original={**ORIGINAL, "tit": None})], "rq1")[0]
+    assert only(result.frame, metric="tet")["n1"] == 1
+    assert only(result.frame, metric="tit")["p_value"] is None
+    notes = "".join(result.notes)
+    assert "tet is undefined in 1 of 2 solutions" in notes
+    assert "the original vehicle's tit is undefined" in notes
+
+
+def test_rq2_is_high_where_nsga2_is_better() -> None:
+    rows = [
+        *(row(run=run, sd=0.5 - run / 10, tet=2, tit=1, ave_dece=3, f_diff=0.1) for run in (0, 1, 2)),
+        *(row("rs", run=run, sd=1.5 + run / 10, f_diff=0.6) for run in (0, 1, 2)),
+    ]
+    frame = rq2(made_up(*rows))
+    assert frame["metric"].tolist() == ["igd", "igd_plus", "hypervolume", "safety_degree", "tet", "tit", "ave_dece"]
+    assert frame["effect_size"].tolist() == [1] * 7
+    exchanged = [{**one, "algorithm": {"rs": "nsga2", "nsga2": "rs"}[one["algorithm"]]} for one in rows]
+    assert rq2(made_up(*exchanged))["effect_size"].tolist() == [0] * 7
+
+
+def test_rq2_compares_runs_by_front_and_pooled_solutions_by_metric() -> None:
+    rows = (row(), row(), row(run=1), row("rs"), row("rs", run=1), row("rs", run=1), row("rs", run=1))
+    sizes = {metric: (n1, n2) for metric, n1, n2 in rq2(made_up(*rows))[["metric", "n1", "n2"]].to_numpy()}
+    assert (sizes["igd"], sizes["tet"]) == ((2, 2), (3, 4))
+    (imported,) = answer_questions([made_up(*rows, has_runs=False)], "rq2")
+    assert only(imported.frame, metric="igd")["p_value"] is None
+    assert only(imported.frame, metric="tet")["n1"] == 3
+    assert any("need runs" in note for note in imported.notes)
+
+
+@pytest.mark.parametrize(
+    ("case", "expected"),
+    [(made_up(row("rs")), "no finished run of nsga2"), (made_up(row()), "only nsga2"), (made_up(), "no finished run")],
+)
+def test_rq2_without_an_algorithm_is_refused(case: Case, expected: str) -> None:
+    with pytest.raises(InputError, match=expected):
+        answer_questions([case], "rq2")
+
+
+def test_every_pair_is_tested_once_and_corrected_for_all() -> None:
+    case = three_algorithms()
+    frame = compare_pairs(case)
+    pairs = {("nsga2", "spea2"), ("nsga2", "mocell"), ("spea2", "mocell")}
+    assert set(zip(frame["algorithm"], frame["other"], strict=True)) == pairs
+    assert len(frame) == 3 * 7
+    means = case.solutions.groupby(["algorithm", "run"])["safety_degree"].mean()
+    expected = compare_samples(means["mocell"], means["spea2"])
+    chosen = only(frame, metric="safety_degree", algorithm="spea2")
+    assert (chosen["p_value"], chosen["effect_size"], expected.effect_size) == (expected.p_value, 1, 1)
+    assert (chosen["n1"], chosen["n2"]) == (RUNS, RUNS - 1)
+    assert frame["p_holm"].tolist() == correct_by_holm(frame["p_value"].tolist())
+
+
+def test_ranks_are_friedmans_over_the_runs_that_all_have() -> None:
+    case = three_algorithms()
+    frame = rank_algorithms(case)
+    part = frame[frame["metric"] == "safety_degree"].set_index("algorithm")
+    means = case.solutions.groupby(["run", "algorithm"])["safety_degree"].mean().unstack().dropna()
+    assert part["runs"].tolist() == [RUNS - 1] * 3
+    assert part.loc["nsga2", "p_value"] == pytest.approx(scipy.stats.friedmanchisquare(*means.to_numpy().T).pvalue)
+    assert part.loc["spea2", "mean_rank"] == 1
+    assert part["mean_rank"].sum() == pytest.approx(6)
+    by_metric = frame.drop_duplicates("metric")
+    assert by_metric["p_holm"].tolist() == correct_by_holm(by_metric["p_value"].tolist())
+
+
+def test_what_cannot_be_asked_says_why() -> None:
+    """The largest difference of three mean ranks is 2; with two runs the critical difference is 2.9."""
+    degrees = {"nsga2": 1.0, "rs": 1.5, "mocell": 2.0}
+    two_runs = made_up(*(row(name, run, sd=sd) for name, sd in degrees.items() for run in (0, 1)))
+    for question, case, problem in (
+        (rank_algorithms, made_up(row("nsga2"), row("rs")), "of 2 algorithms"),
+        (compare_pairs, made_up(row("nsga2")), "of 1 algorithm"),
+        (compare_pairs, made_up(row("nsga2"), row("rs"), has_runs=False), "imported"),
+        (draw_critical_differences, two_runs, "2 runs are too few for a figure of critical diff"),
+    ):
+        with pytest.raises(UnanswerableError, match=problem):
+            question(case)
+
+
+def test_the_brief_lines_and_notes_say_what_the_data_allows() -> None:
+    five = made_up(
+        *(row(name, run=run, sd=sd + run / 10) for name, sd in (("nsga2", 1.0), ("rs", 2.5)) for run in range(5))
+    )
+    lines = "\n".join(summary_lines(five))
+    few = re.escape("too few runs for a test (8 are needed)")
+    assert re.search(rf"A12 of NSGA-II against the original vehicle: SD 0\.00, .*{few}", lines)
+    assert re.search(r"A12 of NSGA-II against RS: IGD (?!.*too few)", lines), "five runs can differ significantly"
+    assert "RQ2 over runs: only nsga2 has finished runs" in "\n".join(summary_lines(made_up(row())))
+    (rq1_answer,), (rq2_answer,) = (answer_questions([five], name) for name in ("rq1-runs", "rq2-runs"))
+    assert any("too few runs for all 8 tests of RQ1 (8 are needed)" in note for note in rq1_answer.notes)
+    assert not any("too few runs" in note for note in rq2_answer.notes)
+    two = made_up(*(row(name, run=run) for name in ("nsga2", "rs") for run in range(2)))
+    notes = "".join(answer_questions([two], "rq2-runs")[0].notes)
+    assert "too few runs for all 7 tests of RQ2 (5 are needed)" in notes
+    assert "pooled" not in notes, "no test can be significant"
+
+
+def test_solutions_of_one_run_are_not_taken_for_independent() -> None:
+    """Runs of 40 copies each: pooled, rank tests see 320 against 320 values; over runs they see the 8 against 8 that
+    there are.
+    """
+    ours, theirs = [1.0, 1.1, 1.2, 1.3, 1.4, 1.6, 1.7, 2.2], [1.5, 1.8, 1.9, 2.3, 2.4, 2.5, 2.6, 2.7]
+    case = made_up(
+        *(
+            row(name, run=run, sd=sd, values=(1100.0 + run, 2.0, 0.1))
+            for name, degrees in (("nsga2", ours), ("rs", theirs))
+            for run, sd in enumerate(degrees)
+            for _ in range(40)
+        )
+    )
+    paper, runs = (only(frame, metric="safety_degree") for frame in (rq2(case), rq2_runs(case)))
+    assert paper["p_value"] < 1e-30
+    assert (runs["n1"], runs["n2"], runs["effect_size"]) == (8, 8, 1 - (0 + 0 + 0 + 0 + 0 + 1 + 1 + 3) / 64)
+    assert runs["p_value"] == scipy.stats.mannwhitneyu(ours, theirs, method="exact").pvalue > ALPHA / 10
+    line = significance_change_line(case)
+    assert re.search(r"\d+ of \d+ tests are no longer significant: .*; RQ2 RS .*SD", line)
+    notes = {answer.name: "".join(answer.notes) for answer in answer_questions([case]) if answer.name.endswith("-runs")}
+    assert (line in notes["rq1-runs"], line in notes["rq2-runs"]) == (True, False), "once, not below both tables"
+    assert line in "".join(answer_questions([case], "rq2-runs")[0].notes)
+    original = only(rq1_runs(case), algorithm="nsga2", metric="safety_degree")
+    assert original["p_value"] == 2 * 2 / 2**8, "all signed ranks but the smallest are negative"
+    assert (original["effect_size"], original["p_holm"] >= original["p_value"] * 2) == (1 / 8, True)
+
 
 HEAVY, GRIPLESS, BOTH = (1100.0, 2.0, 0.1), (1000.0, 1.0, 0.1), (1200.0, 1.5, 0.1)
 
@@ -97,20 +274,6 @@ def test_collisions_and_their_share() -> None:
     assert frame.to_numpy().tolist() == [["made-up", "nsga2", 3, 2, pytest.approx(2 / 3)], ["made-up", "rs", 1, 0, 0]]
 
 
-def test_combinations_of_exactly_four() -> None:
-    tables = {name: CharacteristicTable(unit="-", original=1, lower=0.5, upper=2) for name in "abcdef"}
-    case = made_up(study=made_up_study(characteristics=tables), finished=[("nsga2", 0)])
-    solutions = pd.DataFrame(
-        [
-            {**row(), **{name: 2.0 if name in changed else 1.0 for name in tables}}
-            for changed in ("abcd", "bcde", "abcd", "cdef", "abcf", "abcde", "abc")
-        ]
-    )
-    result = frequent_combinations(dataclasses.replace(case, solutions=solutions))
-    assert result["characteristics"].tolist() == [list("abcd"), list("abcf"), list("bcde")]
-    assert (result["percent"].tolist(), result["rank"].tolist()) == ([40, 20, 20], [1, 2, 2])
-
-
 def test_weather_compares_cases_that_differ_in_it_alone() -> None:
     clear = made_up(row(values=HEAVY), row(values=GRIPLESS))
     wet = made_up(row(values=BOTH), study=made_up_study(name="wet", weather="hard_rain"))
@@ -136,9 +299,3 @@ def test_the_clearer_weather_comes_first(clearer: str, other: str) -> None:
         [made_up(row(), study=made_up_study(name=name, weather=name)) for name in (other, clearer)]
     )
     assert [one.name for one in pair] == [clearer, other]
-
-
-def test_the_reaction_in_rain_that_was_fitted_apart_belongs_to_the_weather() -> None:
-    sun, rain = (made_up(row(values=HEAVY), study=load_study(name)) for name in ("sun", "rain"))
-    assert sun.study.ads.parameters["brake_place"] != rain.study.ads.parameters["brake_place"]
-    assert [(clearer.name, other.name) for clearer, other in find_weather_pairs([rain, sun])] == [("sun", "rain")]

@@ -17,16 +17,10 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 
-from safevar_sumo.analysis.research_questions.algorithm_figures import draw_attainment_surfaces, draw_pareto_fronts
 from safevar_sumo.analysis.research_questions.answer import answer_questions
 from safevar_sumo.analysis.research_questions.case import Case
 from safevar_sumo.analysis.research_questions.change_figures import draw_change_counts
-from safevar_sumo.analysis.research_questions.gallery import (
-    COUNTS_FIGURE,
-    FIGURES_OF_ONE_CASE,
-    draw_figures,
-    save_figures,
-)
+from safevar_sumo.analysis.research_questions.gallery import COUNTS_FIGURE, FIGURES_OF_ONE_CASE
 from safevar_sumo.analysis.research_questions.layout import PAPER_LAYOUTS, Layouts
 from safevar_sumo.analysis.research_questions.tables import (
     FORMATS,
@@ -37,11 +31,10 @@ from safevar_sumo.analysis.research_questions.tables import (
     as_text,
     escaped_for_latex,
 )
-from safevar_sumo.errors import InputError
 from safevar_sumo.study import CharacteristicTable, load_study
 from safevar_sumo.vehicles import CharacteristicSet
 from tests.research_questions.made_up import CHARACTERISTICS, made_up, made_up_study, row
-from tests.research_questions.test_algorithms import three_algorithms
+from tests.research_questions.test_questions import three_algorithms
 
 
 def rich_case(**changes: Any) -> Case:
@@ -123,13 +116,6 @@ def test_latex_compiles(cases: list[Case], tmp_path: Path) -> None:
 )
 def test_special_characters_are_escaped(plain: str, latex_form: str) -> None:
     assert escaped_for_latex(plain) == latex_form
-
-
-@pytest.mark.parametrize("cases", CASES.values(), ids=CASES)
-def test_markdown_rows_are_as_wide_as_their_heads(cases: list[Case]) -> None:
-    for block in as_markdown(answer_questions(cases)).split("\n\n"):
-        lines = [line.replace(r"\|", "") for line in block.splitlines() if line.startswith("|")]
-        assert len({line.count("|") for line in lines}) <= 1
 
 
 @pytest.mark.parametrize(
@@ -257,44 +243,3 @@ def _texts(figure: Figure) -> Iterator[Text]:
         for axis in (axes.xaxis, axes.yaxis):
             low, high = sorted(axis.get_view_interval())
             yield from (tick.label1 for tick in axis.get_major_ticks() if low - 1e-9 <= tick.get_loc() <= high + 1e-9)
-
-
-@pytest.mark.slow
-def test_cases_stand_side_by_side_in_one_figure() -> None:
-    result, lacking = draw_figures([dataclasses.replace(rich_case(), name=f"case {i}") for i in range(2)])
-    assert [axis.get_title() for axis in result[COUNTS_FIGURE].axes if axis.axison] == ["case 0", "case 1"]
-    assert "case 1-convergence" in result
-    assert not lacking
-
-
-def test_numbers_of_changes_stand_in_the_order_of_numbers() -> None:
-    (axis,) = (axis for axis in draw_change_counts([random_case("sun")]).axes if axis.axison)
-    assert [label.get_text() for label in axis.get_xticklabels()] == [str(j) for j in range(1, 13)]
-
-
-def test_the_original_vehicle_and_the_line_of_collisions_are_in_the_fronts() -> None:
-    case = rich_case()
-    for axis, marked in zip(draw_pareto_fronts(case).axes, (True, True, False), strict=True):
-        (original,) = (marks for marks in axis.collections if marks.get_label() == "original vehicle")
-        expected = case.original["safety_degree"] if marked else 0.0
-        assert np.asarray(original.get_offsets())[0, 0] == expected
-        assert any(line.get_label() == "collision: 0 or less" for line in axis.lines) == marked
-
-
-def test_attainment_panels_have_the_same_axes() -> None:
-    axes = [axis for axis in draw_attainment_surfaces(three_algorithms()).axes if axis.axison]
-    assert [axis.get_title() for axis in axes] == ["NSGA-II", "SPEA2", "MOCell"]
-    assert len({(axis.get_xlim(), axis.get_ylim()) for axis in axes}) == 1
-
-
-@pytest.mark.slow
-def test_what_cannot_be_drawn_says_why_and_names_become_files(tmp_path: Path) -> None:
-    imported = dataclasses.replace(made_up(row(values=(1100, 2, 0.1)), has_runs=False), name="a$b$c ^/é")
-    written, lacking = save_figures([imported], tmp_path, "svg")
-    names = ("rq3.2-changed-characteristics", "rq3.3-sizes-of-changes", "pareto-fronts")
-    assert [path.name for path in written] == [f"a-b-c---é-{name}.svg" for name in names]
-    assert any("imported" in reason for reason in lacking)
-    _, lacking = draw_figures([made_up(row(sd=9))])
-    assert any("no critical solution" in reason for reason in lacking)
-    with pytest.raises(InputError, match="no finished run"):
-        save_figures([made_up()], tmp_path, "png")

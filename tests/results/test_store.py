@@ -16,12 +16,10 @@ from click.testing import CliRunner
 import safevar_sumo as sv
 from safevar_sumo.analysis.research_questions.case import load_cases
 from safevar_sumo.cli.program import commands
-from safevar_sumo.errors import InputError, SafevarError
+from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
-from safevar_sumo.plugins import digest_of
 from safevar_sumo.records import Evaluations
 from safevar_sumo.results import (
-    JournalBusyError,
     ResultsDirectory,
     SolutionId,
     choose_handle,
@@ -33,7 +31,7 @@ from safevar_sumo.results import (
     status,
 )
 from safevar_sumo.results.manifest import differences, identity_digest
-from safevar_sumo.study import ModelTable, Study, load_study, tables_of
+from safevar_sumo.study import Study, load_study
 
 NAMES = ("a", "b")
 
@@ -117,16 +115,6 @@ def test_undefined_values_stay_undefined() -> None:
     assert "nan" not in solutions_frame(NAMES, [(("nsga2", 0), evaluations(-1.5))]).to_csv()
 
 
-def test_the_manifest_holds_study_versions_and_original(tmp_path: Path, study: Study) -> None:
-    written(tmp_path / "new" / "out", study)
-    manifest = json.loads((tmp_path / "new" / "out" / "manifest.json").read_text())
-    assert manifest["study"] == tables_of(study)
-    assert manifest["seed"] == study.search.seed
-    assert manifest["original"]["safety_degree"] == 2.5
-    assert manifest["versions"]["libsumo"] == "1.28.0"
-    assert sorted(path.name for path in (tmp_path / "new" / "out").iterdir()) == ["manifest.json", "solutions.csv"]
-
-
 def test_results_of_another_study_are_not_overwritten(tmp_path: Path, study: Study) -> None:
     written(tmp_path, study)
     ResultsDirectory(tmp_path, study)
@@ -135,19 +123,6 @@ def test_results_of_another_study_are_not_overwritten(tmp_path: Path, study: Stu
         ResultsDirectory(tmp_path, with_search(study, seed=2))
     with pytest.raises(InputError, match="holds results of another study"):
         ResultsDirectory(tmp_path, load_study("native"))
-
-
-def test_the_error_names_the_changed_file_and_both_remedies(tmp_path: Path, study: Study) -> None:
-    ResultsDirectory(tmp_path, study, {"sources": {"my_ads.py": "abc", "my_map.py": "def"}}).begin(evaluations(2.5))
-    with pytest.raises(InputError) as caught:
-        ResultsDirectory(tmp_path, study, {"sources": {"my_ads.py": "abc", "my_map.py": "012"}})
-    assert "my_map.py has changed since" in str(caught.value)
-    assert caught.value.legal == f"another `out`, such as `out={tmp_path}-2`, or the file as it was"
-    Path(f"{tmp_path}-2").mkdir()
-    with pytest.raises(InputError, match=rf"such as `out={tmp_path}-3`, or"):
-        ResultsDirectory(tmp_path, study, {"sources": {"my_ads.py": "abc", "my_map.py": "012"}})
-    with pytest.raises(InputError, match=r"my_map\.py no longer exists"):
-        ResultsDirectory(tmp_path, study, {"sources": {"my_ads.py": "abc"}})
 
 
 def test_a_change_without_effect_on_results_is_accepted(tmp_path: Path, study: Study) -> None:
@@ -161,16 +136,6 @@ def test_a_change_without_effect_on_results_is_accepted(tmp_path: Path, study: S
         assert identity_digest(directory.manifest) == identity_digest(ResultsDirectory(tmp_path, study).manifest)
 
 
-def test_a_whole_number_is_not_the_same_as_one_with_a_point(tmp_path: Path, study: Study) -> None:
-    one, other = (
-        msgspec.structs.replace(study, ads=ModelTable(model="my_ads:Mine", parameters={"margin": margin}))
-        for margin in (2, 2.0)
-    )
-    ResultsDirectory(tmp_path, one).begin(evaluations(2.5))
-    with pytest.raises(InputError, match=r"ads\.parameters\.margin was 2 and is 2\.0 now"):
-        ResultsDirectory(tmp_path, other)
-
-
 def test_a_folder_that_holds_other_things_is_refused(tmp_path: Path, study: Study) -> None:
     (tmp_path / "thesis.tex").write_text("")
     with pytest.raises(InputError, match=r"holds other files: thesis\.tex"):
@@ -178,42 +143,11 @@ def test_a_folder_that_holds_other_things_is_refused(tmp_path: Path, study: Stud
     assert sorted(path.name for path in tmp_path.iterdir()) == ["thesis.tex"]
 
 
-def test_a_directory_belongs_to_its_first_study(tmp_path: Path, study: Study) -> None:
-    first = ResultsDirectory(tmp_path, study)
-    second, same = ResultsDirectory(tmp_path, with_search(study, seed=2)), ResultsDirectory(tmp_path, study)
-    journal = first.journal("original")
-    with pytest.raises(InputError, match="belongs to another study"):
-        second.journal("original")
-    with pytest.raises(JournalBusyError):
-        same.journal("original")
-    journal.append([0], wide(study))
-    journal.close()
-    with pytest.raises(InputError, match="belongs to another study"):
-        second.journal("original")
-
-
 @pytest.mark.parametrize("text", ["", "{}", "[]", "null", '{"study": 3', "\x00"])
 def test_a_file_that_is_no_manifest_is_refused(tmp_path: Path, study: Study, text: str) -> None:
     (tmp_path / "manifest.json").write_text(text)
     with pytest.raises(InputError, match=r"manifest\.json"):
         ResultsDirectory(tmp_path, study)
-
-
-def test_a_failed_write_leaves_the_file_unchanged(
-    tmp_path: Path, study: Study, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    directory = written(tmp_path, study)
-    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
-
-    def full(*_: object) -> None:
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr("os.fsync", full)
-    with pytest.raises(SafevarError, match="No space left"):
-        directory.begin(evaluations(9.9))
-    with pytest.raises(SafevarError, match="No space left"):
-        directory.finish({})
-    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
 def test_simulations_depend_on_files_and_the_number_of_results_but_not_on_new_keys() -> None:
@@ -341,35 +275,6 @@ def test_results_in_another_format_are_refused_with_the_release_that_wrote_them(
     assert contents(tmp_path) == before
 
 
-def test_a_torn_manifest_is_called_torn_and_written_again(tmp_path: Path, study: Study) -> None:
-    written(tmp_path, study)
-    manifest = tmp_path / "manifest.json"
-    manifest.write_text(text := manifest.read_text()[:300])
-    with pytest.raises(
-        InputError, match=rf"manifest\.json: is torn or was edited, line {len(text.splitlines())} is no JSON"
-    ):
-        load_runs(tmp_path)
-    manifest.unlink()
-    (tmp_path / "runs").mkdir()
-    written(tmp_path, study)
-    assert json.loads(manifest.read_text())["original"]["safety_degree"] == 2.5
-
-
-def test_a_file_that_was_read_later_is_an_input(tmp_path: Path, in_tmp: Path) -> None:
-    study = msgspec.structs.replace(load_study("smoke"), ads=ModelTable(model="my_ads:Mine"))
-    Path("tile.txt").write_text("a tile")
-    journal = written(tmp_path / "out", study).journal("rs-00")
-    journal.append([0], wide(study), {"tile.txt": digest_of("tile.txt")})
-    journal.close()
-    assert "tile.txt" in ResultsDirectory(tmp_path / "out", study).inputs["sources"]
-    Path("tile.txt").write_text("another tile")
-    with pytest.raises(InputError, match=r"tile\.txt has changed since"):
-        ResultsDirectory(tmp_path / "out", study)
-    Path("tile.txt").unlink()
-    with pytest.raises(InputError, match=r"tile\.txt no longer exists"):
-        ResultsDirectory(tmp_path / "out", study)
-
-
 def contents(place: Path) -> dict[str, tuple[bytes, int]]:
     return {
         str(path): (path.read_bytes(), path.stat().st_mtime_ns) for path in sorted(place.rglob("*")) if path.is_file()
@@ -432,27 +337,3 @@ def test_a_lost_journal_of_a_finished_study_is_named_with_its_remedy(slippery: P
         InputError, match=r"rs-00\.jsonl: is missing, although solutions\.csv holds.*\nexpected: .*the same study again"
     ):
         load_runs(tmp_path / "it")
-
-
-def test_every_command_about_solutions_says_which_runs_are_unfinished(slippery: Path, tmp_path: Path) -> None:
-    shutil.copytree(slippery, tmp_path / "it")
-    (tmp_path / "it/runs/rs-00.jsonl").unlink()
-    (tmp_path / "it/solutions.csv").unlink()
-    for command in (
-        ["explain", str(tmp_path / "it"), "--top", "1"],
-        ["simulate", str(tmp_path / "it"), "--most-severe"],
-    ):
-        done = CliRunner().invoke(commands, command)
-        assert done.exit_code == 0, done.output
-        assert "unfinished, rs 0 of 1 runs" in done.stderr
-    assert "unfinished" not in CliRunner().invoke(commands, ["simulate", str(tmp_path / "it")]).output
-
-
-def test_watching_ends_with_the_study_and_json_is_json(slippery: Path) -> None:
-    done = CliRunner().invoke(commands, ["status", str(slippery), "--watch"])
-    assert done.exit_code == 0
-    assert "Finished." in done.output
-    assert done.output.endswith("\n")
-    output = json.loads(CliRunner().invoke(commands, ["status", str(slippery), "--json"]).output)
-    assert output["finished"] is True
-    assert np.isfinite(output["runs"][0]["best"])

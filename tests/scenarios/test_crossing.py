@@ -16,7 +16,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from safevar_sumo.ads.aeb import Aeb
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import Outcome
 from safevar_sumo.scenarios.car_to_car import CarToCar
@@ -24,9 +23,9 @@ from safevar_sumo.scenarios.crossing import Crossing
 from safevar_sumo.scenarios.euro_ncap import VUT_WIDTH, SpeedProfile
 from safevar_sumo.shipped import NETWORKS
 from safevar_sumo.study import load_study
-from safevar_sumo.sumo.matrix import evaluate, simulate
+from safevar_sumo.sumo.matrix import simulate
 from safevar_sumo.sumo.system import assemble
-from tests.scenarios.holding import CARLA, NATIVE, Hold, at_contact, driven
+from tests.scenarios.holding import CARLA, Hold, at_contact, driven
 
 STANDARD = [("CPFA", 50.0), ("CPNA", 25.0), ("CPNA", 50.0), ("CPNA", 75.0), ("CPNCO", 50.0)]
 NUMBERS = {"CPFA": (8 / 3.6, 6.0, 1.5), "CPNA": (5 / 3.6, 4.0, 1.0), "CPNCO": (5 / 3.6, 4.0, 1.0)}
@@ -46,15 +45,10 @@ def test_a_vehicle_that_does_not_brake_hits_the_impact_location_at_the_time_to_i
     assert struck == pytest.approx(location / 100, abs=1e-6)
 
 
-def test_a_pedestrian_in_the_place_of_a_cyclist_starts_at_speed() -> None:
-    run = driven(Crossing(test="CBNA", target="adult", speed=20.0))
-    assert at_contact(run, run.trace.time) == pytest.approx(6.0, abs=1e-6)
-
-
 @pytest.mark.parametrize("test", NUMBERS)
 def test_the_pedestrian_moves_as_the_closed_form_says(test: str) -> None:
-    """s = a (t - t0)^2 / 2 up to the acceleration distance, with a = u^2 / (2 s_a); then steady; at the impact location
-    at 6 s.
+    """s = a (t - t0)^2 / 2 up to the acceleration distance, with a = u^2 / (2 s_a); then steady; at the impact
+    location at 6 s.
     """
     speed, start, run_up = NUMBERS[test]
     trace = driven(Crossing(test=test, speed=20.0), Hold(np.array([0.0]))).trace
@@ -76,84 +70,6 @@ def test_a_target_arrives_in_time_with_any_speed_profile(speed: float, run_up: f
     assert profile.travelled(profile.begin) == 0
     if run_up:
         assert profile.travelled(profile.begin + 2 * run_up / speed) == pytest.approx(run_up, abs=1e-9)
-
-
-def test_sumo_reports_a_crash_exactly_if_bodies_overlap() -> None:
-    """Many braking times, targets from both sides: bodies overlap clearly or do not touch, and SUMO agrees."""
-    half_width, seen = VUT_WIDTH / 2, set()
-    for test, location, (length, width) in (
-        ("CPFA", 20.0, (0.6, 0.5)),
-        ("CPNA", 60.0, (0.6, 0.5)),
-        ("CPNCO", 5.0, (0.711, 0.298)),
-    ):
-        brakes_at = np.linspace(3.0, 6.2, 60)
-        run = driven(
-            Crossing(test=test, speed=30.0, impact_location=location),
-            Hold(brakes_at),
-            np.repeat(CARLA.characteristics.original[np.newaxis], 60, axis=0),
-        )
-        trace, collided = run.trace, run.outcome == Outcome.COLLISION
-        away, reach = np.abs(trace.lateral), half_width + length / 2
-        behind = -width - trace.vehicle_length
-        overlaps = trace.active & (away < reach - 0.03) & (trace.gap < -0.03) & (trace.gap > behind + 0.03)
-        touches = trace.active & (away < reach + 0.03) & (trace.gap < 0.03) & (trace.gap > behind - 0.03)
-        assert np.all(collided[overlaps.any(axis=0)])
-        assert np.all(touches.any(axis=0)[collided])
-        seen |= set(collided.tolist())
-    assert seen == {True, False}
-
-
-@pytest.mark.parametrize("setback", [0.0, 2.0])
-def test_a_child_is_seen_once_the_line_to_it_passes_the_parked_cars_corner(setback: float) -> None:
-    """The corner is 1 m from the vehicle's side and 1 m before the child's path; similar triangles from the sensors in
-    the middle.
-    """
-    scenario = Crossing(test="CPNCO", speed=40.0, sensor_setback=setback)
-    recorder = _Recorder()
-    run = driven(scenario, recorder)
-    trace = run.trace
-    away = trace.gap[:, 0] + 0.298 / 2 + setback
-    at_corner = -trace.lateral[:, 0] * (away - 1.0) / away
-    expected = at_corner < VUT_WIDTH / 2 + 1.0
-    assert np.isfinite(recorder.gaps).tolist() == expected.tolist()
-    first = int(np.argmax(expected))
-    assert 0.9 < 6.0 - trace.time[first] < 2.0
-    assert np.isinf(recorder.laterals[:first]).all(), "nothing of what is hidden is told"
-
-
-class _Recorder(Hold):
-    """Holds the pedals and records the observations."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self._gaps: list[float] = []
-        self._laterals: list[float] = []
-
-    def drive(self, seen, memory):  # type: ignore[no-untyped-def]
-        self._gaps.append(seen.gap[0])
-        self._laterals.append(seen.lateral[0])
-        return super().drive(seen, memory)
-
-    gaps = property(lambda self: np.array(self._gaps))
-    laterals = property(lambda self: np.array(self._laterals))
-
-
-@pytest.mark.parametrize(("test", "location"), STANDARD)
-def test_the_original_with_aeb_avoids_and_with_half_its_brakes_does_not(test: str, location: float) -> None:
-    half = CARLA.characteristics.original.copy()
-    half[CARLA.characteristics.names.index("maxBrakeTorque")] /= 2
-    both = np.stack([CARLA.characteristics.original, half])
-    outcomes = (
-        np.stack(
-            [
-                driven(Crossing(test=test, speed=speed, impact_location=location), Aeb(), both).outcome
-                for speed in (10.0, 20.0, 30.0, 40.0)
-            ]
-        )
-        == Outcome.COLLISION
-    )
-    assert not outcomes[:, 0].any()
-    assert outcomes[2, 1]
 
 
 @pytest.mark.parametrize(
@@ -195,51 +111,6 @@ def values() -> dict[str, np.ndarray]:
         name: np.full(1, value)
         for name, value in zip(WORN.characteristics.names, WORN.characteristics.original, strict=True)
     }
-
-
-@pytest.mark.parametrize("grade", [6.0, -6.0])
-def test_a_vehicle_that_does_not_brake_keeps_its_speed_uphill_and_downhill(grade: float) -> None:
-    for system in (CARLA, NATIVE, WORN):
-        run = driven(Crossing(test="CPFA", speed=40.0, grade=grade), Aeb(reach=0.1), system=system)
-        assert run.trace.speed[:100, 0] == pytest.approx(40 / 3.6, rel=1e-3)
-    run = driven(Crossing(test="CPNA", speed=40.0, impact_location=25.0, grade=grade))
-    assert at_contact(run, run.trace.time) == pytest.approx(6.0, abs=0.01)
-    assert at_contact(run, run.trace.lateral[:, 0]) / VUT_WIDTH + 0.5 == pytest.approx(0.25, abs=0.02)
-
-
-def test_points_of_a_matrix_may_differ_in_grade_and_do_not_depend_on_each_other() -> None:
-    tests = [{"name": "CPLA", "model": "along", "parameters": {"speed": 40}, "over": {"grade": [-8, 0, 8]}}]
-    together = assemble(load_study("euro_ncap_pedestrian", matrix={"tests": tests}))
-    original = together.characteristics.original[None]
-    assert [point.name for point in together.points] == [
-        "CPLA, grade -8, clear",
-        "CPLA, grade 0, clear",
-        "CPLA, grade 8, clear",
-    ]
-    degrees = [evaluate(together.at(point), original).f_safe[0] for point in together.points]
-    assert evaluate(together, original).f_safe[0] == min(degrees)
-    assert len(set(degrees)) == 3
-
-
-def test_a_vehicle_model_without_slopes_is_refused_on_a_slope(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "flat.py").write_text(
-        "from safevar_sumo.vehicles.sumo import SumoVehicle\n\n\nclass Flat(SumoVehicle, frozen=True):\n"
-        "    def prepare(self, characteristics, road_friction, step):\n"
-        "        return super().prepare(characteristics, road_friction, step)\n"
-    )
-    native = load_study("native")
-    vehicle = msgspec.structs.replace(native.vehicle, model="flat:Flat")
-    for grade in (0.0, 4.0):
-        scenario = msgspec.structs.replace(native.scenario, parameters={"grade": grade})
-        system = assemble(msgspec.structs.replace(native, vehicle=vehicle, scenario=scenario))
-        if grade:
-            with pytest.raises(
-                InputError, match=r"TypeError: .*prepare\(\) takes 4 positional arguments but 5 were.*flat\.py:5"
-            ):
-                simulate(system, system.characteristics.original[None])
-        else:
-            assert simulate(system, system.characteristics.original[None]).trace.speed.max() > 5
 
 
 TURNS = {"north": (0.0, 1.0), "west": (-1.0, 0.0), "north-west": (-0.6, 0.8)}

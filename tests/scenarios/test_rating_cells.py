@@ -1,25 +1,21 @@
-"""Cells of Euro NCAP's rating and their robustness layers: time, place and speed of the impact of a vehicle that does
-not brake.
-"""
+"""Cells of Euro NCAP's tests: time, place and speed of the impact without braking; shipped points are avoided."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
 
-from safevar_sumo.errors import InputError
 from safevar_sumo.records import Outcome
-from safevar_sumo.scenarios import WEATHERS, Along, CarToCar, Crossing, Point
+from safevar_sumo.scenarios import WEATHERS, Along, CarToCar, Crossing, Point, pre_crash_sentence
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo import Engine
-from safevar_sumo.sumo.matrix import simulate, simulate_all_points
-from safevar_sumo.sumo.system import assemble
+from safevar_sumo.sumo.matrix import simulate_all_points
+from safevar_sumo.sumo.system import System, assemble
 from tests.scenarios.holding import CARLA, NATIVE, Hold, at_contact, driven
 
 KMH = 1 / 3.6
@@ -217,23 +213,6 @@ def test_other_targets_are_hit_in_a_recorded_scene_as_in_sumo_to_the_last_bit(sc
         np.testing.assert_array_equal(ours, theirs)
 
 
-def test_a_scenario_of_ones_own_may_turn_lanes(in_tmp: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.syspath_prepend(in_tmp)
-    Path("mine_at_an_angle.py").write_text(
-        "from safevar_sumo.scenarios import Crossing\n\n\nclass Mine(Crossing, frozen=True, kw_only=True):\n    pass\n"
-    )
-    turned = {"test": "CBNA", "heading": 20}
-    studies = [
-        load_study("euro_ncap_pedestrian", title="", matrix=None, scenario={"model": model, "parameters": turned})
-        for model in ("mine_at_an_angle:Mine", "crossing")
-    ]
-    mine, ours = (
-        simulate(system, system.characteristics.original[np.newaxis], Engine.LIBSUMO)
-        for system in map(assemble, studies)
-    )
-    np.testing.assert_array_equal(mine.trace.gap, ours.trace.gap)
-
-
 def test_a_cyclist_behind_parked_cars_is_seen_past_the_corner_whatever_his_direction() -> None:
     """The line from the front's middle to the cyclist's middle passes the corner 1 m beside the vehicle, 1 m before the
     impact.
@@ -267,24 +246,57 @@ class _GapRecorder(Hold):
         return super().drive(seen, memory)
 
 
+BRAKE = {"euro_ncap_pedestrian": "maxBrakeTorque", "euro_ncap_car_to_car": "maxBrakeTorque", "wear": "brakeTorque"}
+
+
+def original_and_half_its_brakes(study: str, system: System) -> np.ndarray:
+    half = system.characteristics.original.copy()
+    half[system.characteristics.names.index(BRAKE[study])] /= 2
+    return np.stack([system.characteristics.original, half])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("study", BRAKE)
+def test_the_originals_avoid_every_shipped_point_and_with_half_their_brakes_some_fail(study: str) -> None:
+    system = assemble(load_study(study))
+    collided = np.stack(
+        [one.evaluations.collided for one in simulate_all_points(system, original_and_half_its_brakes(study, system))]
+    )
+    assert not collided[:, 0].any()
+    assert collided[:, 1].any()
+
+
+PEDESTRIAN = "pedestrian crash without prior vehicle manoeuvre"
+
+
 @pytest.mark.parametrize(
-    ("kind", "parameters", "message"),
+    ("study", "types"),
     [
-        (CarToCar, {"test": "CCRm", "heading": 10}, "a moving target"),
-        (Crossing, {"test": "CBFA", "target_speed": 90, "time_to_impact": 13}, "has no lane"),
-        (Crossing, {"test": "CBNA", "acceleration_distance": 1.0}, "lateral_start"),
+        ("sun", "pedestrian crash with prior vehicle manoeuvre; by day"),
+        ("lgsvl", "lead vehicle stopped; by day"),
+        ("euro_ncap_pedestrian", f"{PEDESTRIAN}; by day and by night"),
+        ("wear", f"{PEDESTRIAN}; by day"),
+        (
+            "euro_ncap_car_to_car",
+            "lead vehicle stopped; lead vehicle moving at lower constant speed; lead vehicle decelerating; by day",
+        ),
     ],
 )
-def test_impossible_targets_are_refused(kind: type, parameters: dict[str, Any], message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        driven(kind(**parameters), system=NATIVE)
+def test_the_tags_of_the_shipped_studies(study: str, types: str) -> None:
+    assert pre_crash_sentence(assemble(load_study(study)).points) == f"NHTSA's pre-crash types: {types}."
 
 
-def test_a_speed_outside_the_protocol_is_allowed_with_a_remark() -> None:
-    assert Crossing(test="CMCscp", speed=90).remarks() == [
-        "CMCscp: speed = 90 km/h is outside the protocol's 20 to 80 km/h"
-    ]
-    assert CarToCar(test="CMRs", speed=10, impact_location=125).remarks() == [
-        "CMRs: impact_location = 125 % is none of the protocol's 50, 10, 25, 75, 90 %"
-    ]
-    assert not Along(test="CBLA", speed=80, target_speed=20).remarks()
+STOPS_AT_ONCE = Hold(np.array([0.0]))
+
+
+def test_the_braking_car_moves_as_the_closed_form_says() -> None:
+    """The car drives at 80 km/h and from 3 s on brakes at 4 m/s^2 down to 2 km/h; the vehicle stands behind it."""
+    trace = driven(CarToCar(test="CCRb", speed=80), STOPS_AT_ONCE, system=NATIVE).trace
+    first, last = 80 * KMH, 2 * KMH
+    since = np.clip(trace.time - 3, 0, (first - last) / 4)
+    after = np.maximum(trace.time - 3 - (first - last) / 4, 0)
+    place = first * np.minimum(trace.time, 3) + first * since - 2 * since**2 + last * after
+    assert trace.gap[:, 0] + trace.position[:, 0] - trace.position[0, 0] == pytest.approx(first + place, abs=0.05)
+    assert trace.obstacle_speed[:, 0] == pytest.approx(
+        np.where(trace.time < 3, first, np.maximum(first - 4 * (trace.time - 3), last))
+    )

@@ -2,53 +2,14 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 
-import msgspec
 import pytest
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.shipped import STUDIES
-from safevar_sumo.study import load_study, write_study
+from safevar_sumo.study import load_study
 from safevar_sumo.sumo.system import assemble
-
-
-def test_the_published_settings_are_searched_as_published() -> None:
-    for name, population, evaluations, threshold in (
-        ("sun", 50, 5000, 1.5),
-        ("rain", 50, 5000, 1.5),
-        ("lgsvl", 30, 3000, 3.0),
-    ):
-        study = load_study(name)
-        assert (study.search.population, study.search.evaluations, study.search.runs) == (population, evaluations, 30)
-        assert study.metrics.ttc_threshold == threshold
-        assert len(study.vehicle.characteristics) == 12
-
-
-REACTS = {"hesitation", "brake_place"}
-
-
-def test_rain_differs_from_sun_only_in_weather_and_reaction_of_its_driver() -> None:
-    sun, rain = load_study("sun"), load_study("rain")
-    assert rain.weather != sun.weather
-    assert {
-        name: value for name, value in rain.ads.parameters.items() if sun.ads.parameters.get(name) != value
-    }.keys() == REACTS
-    assert msgspec.structs.replace(rain.ads, parameters=sun.ads.parameters) == sun.ads
-    same = {
-        "name": sun.name,
-        "title": sun.title,
-        "published": sun.published,
-        "calibration": sun.calibration,
-        "repeatability": sun.repeatability,
-        "fit": sun.fit,
-        "spread": sun.spread,
-        "model_error": sun.model_error,
-    }
-    assert msgspec.structs.replace(rain, weather=sun.weather, ads=sun.ads, **same) == sun
-    assert set(rain.calibration) == {f"ads.parameters.{name}" for name in REACTS}
-    assert all(row.own for row in rain.calibration.values())
 
 
 def variant(tmp_path: Path, old: str, new: str) -> str:
@@ -246,27 +207,3 @@ def test_another_system_inherits_neither_title_nor_published_values(text: str, i
     own = load_study("rain")
     assert own.published["safety_degree"] == 2.2
     assert not own.origin.remarks
-
-
-def test_a_written_study_is_called_as_its_file(tmp_path: Path) -> None:
-    write_study(tmp_path / "fitted.toml", load_study("sun"), "A comment\nof \x1b two lines.")
-    output = load_study(str(tmp_path / "fitted.toml"))
-    assert output.name == "fitted"
-    assert output.published == load_study("sun").published
-
-
-@pytest.mark.parametrize(
-    ("base", "reason"),
-    [
-        ("nope.toml", "there is no study or file 'nope.toml'"),
-        (".", "is no regular file but a directory"),
-        ("LOOP", "cannot be read: Too many levels of symbolic links"),
-    ],
-)
-def test_an_unreadable_base_is_named_with_file_and_key(tmp_path: Path, base: str, reason: str) -> None:
-    loop = tmp_path / "loop.toml"
-    loop.symlink_to(loop)
-    base = str(loop) if base == "LOOP" else base
-    (tmp_path / "mine.toml").write_text(f'extends = "{base}"\n')
-    with pytest.raises(InputError, match=re.escape(f"{tmp_path / 'mine.toml'}: extends = {base!r}: {reason}")):
-        load_study(tmp_path / "mine.toml")

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from safevar_sumo.ads import ADS, Ads
+from safevar_sumo.ads import Ads
 from safevar_sumo.ads.driver import DelayLine
 from safevar_sumo.records import Command, Evaluations, Nominal, Observation, Outcome, SimulationRuns, Trace
 from safevar_sumo.scenarios.base import Scene
@@ -253,23 +253,6 @@ def test_rains_driver_releases_the_accelerator_at_once_and_brakes_after_the_hesi
     (_, decides), (late, brakes) = driven(0.0), driven(0.2)
     assert (brakes - decides) * late.step == pytest.approx(0.2)
     assert late.throttle[decides:brakes].max() == 0
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", sorted({*ADS} - {"world_on_rails", "apollo"}))
-def test_with_another_driver_rain_equals_sun_unless_the_weather_changes_road_or_sensors(name: str) -> None:
-    """The shipped rain changes neither; a weather that changes them has the same effect in both studies."""
-    mine = {"name": "mine", "road_friction": 0.8, "visibility": 0.9, "recognition_delay": 0.1}
-    parameters = {"cruise_speed": 5.5} if "cruise_speed" in ADS[name].__struct_fields__ else {}
-
-    def driven(study: str, **changes: Any) -> Trace:
-        system = assemble(load_study(study, ads={"model": name, "parameters": parameters}, **changes))
-        return simulate(system, system.characteristics.original[np.newaxis]).trace
-
-    rain, sun = driven("rain"), driven("sun")
-    assert sun.speed.max() > 0
-    assert np.array_equal(rain.position, sun.position)
-    assert np.array_equal(driven("rain", weather=mine).position, driven("sun", weather=mine).position)
 
 
 def test_a_remark_says_that_a_weather_has_no_effect() -> None:

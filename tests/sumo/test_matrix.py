@@ -18,10 +18,9 @@ from safevar_sumo.records import Command, Evaluations, FloatArray, Nominal, Obse
 from safevar_sumo.scenarios import Crossing, Point, Scenario
 from safevar_sumo.scenarios.car_to_car import CarToCar
 from safevar_sumo.study import MatrixTable, MatrixTest, Study, load_study
-from safevar_sumo.sumo import matrix
 from safevar_sumo.sumo.batch import score
 from safevar_sumo.sumo.contact import find_touches
-from safevar_sumo.sumo.matrix import evaluate, simulate, simulate_all_points, system_at_point, vehicle_remarks
+from safevar_sumo.sumo.matrix import evaluate, simulate, simulate_all_points, system_at_point
 from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.sumo.world import Body
 
@@ -74,18 +73,6 @@ def test_the_worst_point_decides_a_settings_result_and_points_do_not_affect_each
     assert same(whole, score(SYSTEM, population, simulate(SYSTEM, population)))
     collided = [one.evaluations.collided for one in points]
     assert whole.collided.tolist() == np.any(collided, axis=0).tolist()
-
-
-@pytest.mark.slow
-def test_results_do_not_depend_on_the_batch_the_order_of_points_or_the_size_of_simulations(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    population = drawn(SYSTEM, 3)
-    whole = evaluate(SYSTEM, population)
-    assert same(evaluate(SYSTEM, population[1:3]), whole.take([1, 2]))
-    assert same(evaluate(assemble(study(TESTS[::-1])), population), whole)
-    monkeypatch.setattr(matrix, "MAX_COPIES", 7)
-    assert same(evaluate(SYSTEM, population), whole)
 
 
 def test_named_point_finds_a_point_and_suggests_similar_names() -> None:
@@ -165,19 +152,6 @@ def test_unbraked_a_vehicle_holds_the_tests_speed_in_one_gear_and_hits_with_its_
     assert runs.contact.place == pytest.approx(np.full(len(settings), 50.0), abs=2.0)
 
 
-@pytest.mark.parametrize("location", [0.0, 25.0, 75.0])
-def test_an_unbraked_vehicle_hits_at_the_tests_impact_location(location: float) -> None:
-    scenarios = (
-        Crossing(test="CPNA", speed=40.0, impact_location=location),
-        Crossing(test="CPFA", speed=40.0, impact_location=location),
-        CarToCar(test="CCRs", speed=40.0, impact_location=location),
-    )
-    for scenario in scenarios:
-        contact = run(scenario).contact
-        assert contact.side[0] == "front"
-        assert contact.place[0] == pytest.approx(location, abs=1.0)
-
-
 def test_a_vehicle_that_cannot_hold_the_speed_makes_the_test_invalid_unless_it_brakes_before() -> None:
     """The slope requires 2404 kg g sin(atan 0.2) 0.355 m / (1.35 * 4) = 304 N m; the engine has 0.5 * 500 N m."""
     steep = CarToCar(test="CCRs", speed=50.0, grade=20.0)
@@ -248,11 +222,3 @@ def test_bodies_touch_at_the_side_where_the_overlap_began_last(
     assert touch.age == pytest.approx(contact[1])
     if contact[2] is not None:
         assert touch.distance_behind_front == pytest.approx(contact[2] - 0.2)
-
-
-def test_a_remark_says_that_tests_are_faster_than_the_vehicle_was_fitted_to() -> None:
-    (remark,) = vehicle_remarks(assemble(load_study("euro_ncap_pedestrian")))
-    assert "23 km/h" in remark
-    assert "60 km/h" in remark
-    assert not vehicle_remarks(SUN)
-    assert not vehicle_remarks(assemble(load_study("wear")))

@@ -123,14 +123,6 @@ def test_contacts_are_those_that_sumo_finds() -> None:
     assert 40 < outcomes.count(Outcome.COLLISION) < 220
 
 
-@pytest.mark.slow
-def test_points_of_different_length_share_a_batch() -> None:
-    system = assemble(load_study("euro_ncap_car_to_car"))
-    lengths = {point.scenario.duration for point in system.points}
-    assert len(lengths) > 2
-    assert_same(system, 3, 8)
-
-
 def test_a_shipped_scenario_on_a_users_network_is_simulated_in_sumo() -> None:
     scenario = SCENARIOS["crossing"](network="my_town")
     (scene,) = record_scenes([scenario], ())

@@ -10,11 +10,10 @@ import msgspec
 import numpy as np
 import pytest
 
-import safevar_sumo as sv
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import Outcome
 from safevar_sumo.study import ModelTable, load_study
-from safevar_sumo.sumo.matrix import evaluate, simulate
+from safevar_sumo.sumo.matrix import simulate
 from safevar_sumo.sumo.system import System, assemble
 from tests.in_process import run
 
@@ -130,18 +129,6 @@ def test_a_controller_reads_other_actors_through_the_sensors(tmp_path: Path, mon
     assert np.all((x == -1073741824)[~near])
     assert np.array_equal(listed.astype(bool), near)
     assert set(number[near]) <= {2, 3}
-
-
-def test_one_simulation_has_the_sensors_of_a_batch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "my_controller.py").write_text(SCRIPT)
-    monkeypatch.chdir(tmp_path)
-    study = msgspec.structs.replace(load_study("native"), ads=ModelTable(model="my_controller:step", kind="traci"))
-    near = sv.simulate(study, {"sensorRange": 15.0}, beyond=True)
-    batch = evaluate(assemble(study), np.array([list(sim.setting.values()) for sim in (near.original, near)]))
-    assert batch.outcome.tolist() == [near.original.outcome, near.outcome] == [Outcome.STOPPED, Outcome.COLLISION]
-    assert near.original.metrics == {name: values[0] for name, values in batch.metrics.items()}
-    assert near.collision_speed == batch.collision_speed[1]
-    assert np.allclose(near.trace["seen gap [m]"].dropna().max(), 15, atol=2), "the trace shows what the sensors report"
 
 
 SUBSCRIBES = """

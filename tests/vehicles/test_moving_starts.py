@@ -133,26 +133,3 @@ def test_whoever_stands_with_the_brake_on_stays_and_nobody_rolls_back(model: str
     assert np.all(braked.speed[-100:] == 0)
     released = drive(model, original(model), lambda time: (0.0, 0.0), 3.0, grade=grade).speed[-1, 0]
     assert released == 0 if grade > 0 else released > 1
-
-
-@pytest.mark.parametrize("model", sorted(SYSTEMS))
-def test_each_vehicle_is_on_a_slope_of_its_own(model: str) -> None:
-    system, n = SYSTEMS[model], 3
-    values = {
-        name: np.full(n, value)
-        for name, value in zip(system.characteristics.names, system.characteristics.original, strict=True)
-    }
-    prepared = system.vehicle.prepare(values, 1.0, STEP, slope_of(np.array([0.0, 5.0, -5.0])))
-    state = system.vehicle.at_rest(prepared)
-    alone = [
-        drive(model, original(model), lambda time: (0.4, 0.0), 2.0, grade=grade).speed[-1, 0]
-        for grade in (0.0, 5.0, -5.0)
-    ]
-    for _ in range(round(2.0 / STEP)):
-        state = system.vehicle.advance(prepared, state, Command(np.full(n, 0.4), np.zeros(n)))
-    assert state.speed.tolist() == alone
-    level = system.vehicle.prepare({name: column[:1] for name, column in values.items()}, 1.0, STEP)
-    state = system.vehicle.at_rest(level)
-    for _ in range(round(2.0 / STEP)):
-        state = system.vehicle.advance(level, state, Command(np.full(1, 0.4), np.zeros(1)))
-    assert state.speed[0] == alone[0]

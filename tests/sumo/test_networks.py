@@ -1,26 +1,27 @@
-"""Copies of a network: their number is right, all are equal, and no two are connected."""
+"""Networks: copies are equal and not connected; a user's network is simulated, or refused by name."""
 
 from __future__ import annotations
 
-import os
 import re
 import shutil
 import subprocess
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
+import numpy as np
 import pytest
 import sumo
 
-from safevar_sumo.errors import EnvironmentFault, InputError
+from safevar_sumo.errors import InputError
 from safevar_sumo.shipped import NETWORKS
-from safevar_sumo.sumo.cache import CHECKSUM_FILE, ensure_all_cached
+from safevar_sumo.study import load_study
+from safevar_sumo.sumo.cache import CHECKSUM_FILE
 from safevar_sumo.sumo.engine import open_world
-from safevar_sumo.sumo.network import copied_network, open_network
+from safevar_sumo.sumo.matrix import simulate
+from safevar_sumo.sumo.network import built_network, copied_network, open_network
 from safevar_sumo.sumo.network_check import check_network
-from safevar_sumo.sumo.staging import _store_network
+from safevar_sumo.sumo.system import System, assemble
 
 FOLDERS = sorted(path.name for path in NETWORKS.iterdir() if path.is_dir())
 BINARIES = Path(sumo.SUMO_HOME) / "bin"
@@ -76,73 +77,6 @@ def test_a_damaged_file_in_the_cache_is_built_again(spoil: Callable[[Path], None
     assert getattr(copied_network(open_network("lead_vehicle_stopped"), 2), which) == file
     assert file.read_bytes() == built
     assert {path.name for path in file.parent.iterdir()} == {file.name, CHECKSUM_FILE}
-
-
-def test_a_variant_of_a_network_is_checked_before_use_as_well(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    files = ("traffic.rou.xml", b"<routes/>"), ("scenario.sumocfg", b"<configuration/>"), ("network.net.xml", b"<net/>")
-    build = _store_network.__wrapped__
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    folder = build("road", files).folder
-    (folder / files[0][0]).write_bytes(b"<rou")
-    (folder / files[1][0]).unlink()
-    assert build("road", files).folder == folder
-    assert {name: (folder / name).read_bytes() for name, _ in files} == dict(files)
-    (tmp_path / "file").touch()
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
-    with pytest.raises(EnvironmentFault, match="cannot write the cache of networks"):
-        build("road", files)
-
-
-def test_a_folder_of_the_cache_is_moved_into_place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A rating needs 2,200 of them; removing a temporary folder for each took two thirds of the time on some file
-    systems.
-    """
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.setattr(os, "rmdir", lambda *_, **__: pytest.fail("a folder is removed"))
-    folder = ensure_all_cached("road", ["a"], lambda into: into.joinpath("a").touch())
-    assert [path.name for path in folder.parent.iterdir()] == ["road"]
-
-
-def test_two_processes_may_build_the_same_folder_of_the_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-
-    def build(into: Path) -> None:
-        (into / "a").write_bytes(b"same")
-
-    def build_later(into: Path) -> None:
-        ensure_all_cached("road", ["a"], build)
-        build(into)
-
-    folder = ensure_all_cached("road", ["a"], build_later)
-    assert {path.name for path in folder.iterdir()} == {"a", CHECKSUM_FILE}
-    assert [path.name for path in folder.parent.iterdir()] == ["road"]
-    ensure_all_cached("road", ["a"], lambda _: pytest.fail("the folder is built again"))
-
-
-@pytest.mark.parametrize(("loss", "n"), [("half", 12), ("nothing", 25), ("error", 60)])
-def test_a_full_disk_during_a_build_leaves_no_files(
-    loss: str, n: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """In an empty cache, because other tests may have built as many copies already."""
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    ran = subprocess.run
-
-    def full(command: list[str], **options: Any) -> Any:
-        done = ran(command, **options)
-        target = Path(command[command.index("-o") + 1])
-        if loss == "error":
-            target.unlink()
-            return subprocess.CompletedProcess(
-                command, 1, "", f"Error: Could not build output file '{target}' (No space left)"
-            )
-        target.write_bytes(target.read_bytes()[: len(target.read_bytes()) // 2 if loss == "half" else 0])
-        return done
-
-    monkeypatch.setattr(subprocess, "run", full)
-    with pytest.raises(EnvironmentFault, match="netconvert"):
-        copied_network(open_network("lead_vehicle_stopped"), n)
-    monkeypatch.setattr(subprocess, "run", ran)
-    ElementTree.parse(copied_network(open_network("lead_vehicle_stopped"), n).network)
 
 
 def test_sources_that_netconvert_refuses_are_an_error(tmp_path: Path) -> None:
@@ -303,3 +237,157 @@ def test_the_vehicle_under_test_must_depart_at_time_0(mine: Path, old: str, new:
     with pytest.raises(InputError) as caught:
         check_network(str(mine), "study")
     assert message in str(caught.value)
+
+
+def rewritten(file: Path, old: str, new: str) -> None:
+    text = file.read_text()
+    assert old in text
+    file.write_text(text.replace(old, new))
+
+
+def on(study: str, network: Path) -> System:
+    return assemble(load_study(study, scenario={"parameters": {"network": str(network)}}))
+
+
+def roads(network: Path, n: int = 1) -> ElementTree.Element:
+    return ElementTree.parse(copied_network(open_network(str(network)), n).network).getroot()
+
+
+def test_edge_types_in_a_separate_file_change_the_network(mine: Path) -> None:
+    before = open_network(str(mine)).digests
+    (mine / "network.typ.xml").write_text(
+        '<types><type id="slow" speed="7" numLanes="1" width="3" disallow="pedestrian"/></types>'
+    )
+    with pytest.raises(InputError, match=r"network\.typ\.xml: is not used: network\.netccfg does not name it"):
+        check_network(str(mine), "study")
+    rewritten(mine / "network.netccfg", "</input>", '<type-files value="network.typ.xml"/></input>')
+    rewritten(
+        mine / "network.edg.xml",
+        'id="departure" from="crossing" to="east" numLanes="1" width="4" speed="70" disallow="pedestrian"',
+        'id="departure" from="crossing" to="east" type="slow"',
+    )
+    check_network(str(mine), "study")
+    lane = roads(mine).find(".//lane[@id='0.departure_0']")
+    assert lane is not None
+    assert [float(lane.attrib[name]) for name in ("speed", "width")] == [7, 3]
+    assert open_network(str(mine)).digests != before
+    first = copied_network(open_network(str(mine)), 1).network
+    rewritten(mine / "network.typ.xml", 'speed="7"', 'speed="8"')
+    assert copied_network(open_network(str(mine)), 1).network != first
+
+
+def test_traffic_lights_are_copied_with_their_programmes(mine: Path) -> None:
+    rewritten(mine / "network.nod.xml", 'type="priority"', 'type="traffic_light"')
+    subprocess.run(
+        [
+            str(BINARIES / "netconvert"),
+            "-n",
+            "network.nod.xml",
+            "-e",
+            "network.edg.xml",
+            "-x",
+            "network.con.xml",
+            "--tls.cycle.time",
+            "77",
+            "--plain-output-prefix",
+            "network",
+        ],
+        cwd=mine,
+        check=True,
+        capture_output=True,
+    )
+    rewritten(mine / "network.tll.xml", "duration=", 'name="my own" duration=')
+    check_network(str(mine), "study")
+    copies = roads(mine, 2)
+    lights = copies.findall("tlLogic")
+    assert [light.attrib["id"] for light in lights] == ["0.crossing", "1.crossing"]
+    assert all(phase.attrib["name"] == "my own" for light in lights for phase in light.iter("phase"))
+    controlled = [one for one in copies.findall("connection") if "tl" in one.attrib]
+    assert controlled
+    assert all(
+        one.attrib["tl"].partition(".")[0] == one.attrib["from"].removeprefix(":").partition(".")[0]
+        for one in controlled
+    )
+
+
+def test_a_built_network_without_sources_gives_the_same_results(mine: Path) -> None:
+    settings = np.vstack([original := load_original("smoke"), original * 1.01])
+    expected = simulate(on("smoke", mine), settings).trace.gap
+    for name in ("network.nod.xml", "network.edg.xml", "network.con.xml", "network.netccfg"):
+        (mine / name).unlink()
+    assert np.array_equal(simulate(on("smoke", mine), settings).trace.gap, expected)
+    (mine / "network.net.xml").rename(mine / "town.net.xml")
+    for network in (mine, mine / "town.net.xml"):
+        assert np.array_equal(simulate(on("smoke", network), settings).trace.gap, expected)
+    shutil.copy(mine / "town.net.xml", mine / "village.net.xml")
+    with pytest.raises(InputError, match=r"has town\.net\.xml and village\.net\.xml"):
+        on("smoke", mine)
+    before = open_network(str(mine / "town.net.xml")).digests
+    rewritten(mine / "town.net.xml", "<location", "<!-- --><location")
+    assert open_network(str(mine / "town.net.xml")).digests != before
+
+
+def load_original(study: str) -> np.ndarray:
+    return assemble(load_study(study)).characteristics.original[np.newaxis]
+
+
+@pytest.mark.parametrize(
+    ("file", "old", "new", "message"),
+    [
+        ("network.nod.xml", 'x="80" y="0"', 'x="80" y="0" z="4"', "lane 'departure_0', which rises"),
+        ("network.edg.xml", 'id="approach"', 'id="approach" friction="0.3"', "lane 'approach_0' of friction 0.3"),
+    ],
+)
+def test_a_slope_or_friction_that_has_no_effect_is_refused(
+    mine: Path, file: str, old: str, new: str, message: str
+) -> None:
+    rewritten(mine / file, old, new)
+    with pytest.raises(InputError, match=r"traffic\.rou\.xml: vehicle 'vut' drives on ") as caught:
+        check_network(str(mine), "study")
+    assert message in str(caught.value)
+
+
+def test_no_id_of_a_built_network_belongs_to_two_copies(tmp_path: Path) -> None:
+    """A network with sidewalks, crossings, traffic lights and opposite lanes: its copies contain no id of the
+    original.
+    """
+    netgenerate = str(BINARIES / "netgenerate")
+    subprocess.run(
+        [
+            netgenerate,
+            "--grid",
+            "--grid.number",
+            "3",
+            "--default.lanenumber",
+            "1",
+            "--sidewalks.guess",
+            "--crossings.guess",
+            "--tls.guess",
+            "--tls.default-type",
+            "actuated",
+            "--opposites.guess",
+            "-o",
+            str(tmp_path / "town.net.xml"),
+        ],
+        check=True,
+        capture_output=True,
+    )
+    for name in ("traffic.rou.xml", "scenario.sumocfg"):
+        shutil.copy(NETWORKS / "along" / name, tmp_path / name)
+    root = roads(tmp_path / "town.net.xml", 2)
+    plain = ElementTree.parse(built_network(open_network(str(tmp_path / "town.net.xml")))).getroot()
+    originals = {one.attrib["id"] for one in plain.iter() if one.tag in ("edge", "lane", "junction", "tlLogic")}
+    numbers = ("index", "fromLane", "toLane", "linkIndex", "linkIndex2", "name", "type")
+    kept = {
+        value
+        for child in root
+        if child.tag not in ("location", "type")
+        for element in child.iter()
+        if element.tag != "param"
+        for name, text in element.attrib.items()
+        if name not in numbers
+        for value in text.split()
+    }
+    assert originals
+    assert not originals & kept
+    assert len(root.findall("edge")) == 2 * len(plain.findall("edge"))

@@ -1,0 +1,286 @@
+"""The program itself: what it lists, loads and prints; what simulate is told; progress as a person sees it."""
+
+from __future__ import annotations
+
+import ast
+import errno
+import importlib
+import os
+import pkgutil
+import re
+import subprocess
+import sys
+from io import StringIO
+from pathlib import Path
+
+import click
+import msgspec
+import pytest
+from click.shell_completion import ShellComplete
+from click.testing import CliRunner, Result
+from rich.console import Console
+
+from safevar_sumo import cli
+from safevar_sumo.analysis.evaluator import Evaluator
+from safevar_sumo.api.running import CampaignProgress
+from safevar_sumo.campaign import RunKey, RunProgress, all_runs
+from safevar_sumo.cli.arguments import read_changes
+from safevar_sumo.cli.program import COMMANDS, commands
+from safevar_sumo.errors import InputError
+from safevar_sumo.progress import PartsProgress, open_progress
+from safevar_sumo.study import Study, load_study
+from safevar_sumo.terminal import WholeTable
+from safevar_sumo.vehicles import CharacteristicSet
+from tests.in_process import InlinePool, refused
+
+ROOT = Path(__file__).parents[2]
+HEAVY = {"libsumo", "traci", "matplotlib", "pandas", "scipy", "seaborn", "cma"}
+
+
+def loaded(code: str) -> set[str]:
+    """Which of the heavy packages a fresh interpreter has loaded after some code."""
+    result = f"import sys\n{code}\nprint(*(set(sys.modules) & {HEAVY!r}))"
+    return set(
+        subprocess.run([sys.executable, "-c", result], capture_output=True, text=True, check=True)
+        .stdout.splitlines()[-1]
+        .split()
+    )
+
+
+def test_every_command_is_listed_and_every_listed_one_is_there() -> None:
+    for module in pkgutil.iter_modules(cli.__path__):
+        importlib.import_module(f"safevar_sumo.cli.{module.name}")
+    assert set(commands.commands) == set(COMMANDS)
+    output = " ".join(CliRunner().invoke(commands, ["--help"]).stdout.split())
+    for name, (_, sentence) in COMMANDS.items():
+        assert f" {name} {sentence}" in output
+        assert sentence.endswith(".")
+
+
+@pytest.mark.parametrize("command", list(COMMANDS))
+def test_every_command_and_each_of_its_options_has_a_whole_sentence_of_help(command: str) -> None:
+    results = commands.get_command(None, command)  # type: ignore[arg-type]
+    assert results is not None
+    assert str(results.help).strip().endswith(".")
+    result = CliRunner().invoke(commands, [command, "--help"])
+    assert result.exit_code == 0
+    for option in results.params:
+        assert isinstance(option, click.Argument) or str(option.help).endswith((".", "]")), option.name  # type: ignore[attr-defined]
+
+
+def test_the_package_and_the_help_load_nothing_heavy() -> None:
+    assert loaded("import safevar_sumo") == set()
+    assert loaded("import safevar_sumo.cli") == set()
+
+
+@pytest.mark.slow
+def test_one_simulation_loads_sumo_and_no_statistics() -> None:
+    code = "from click.testing import CliRunner\nfrom safevar_sumo.cli.program import commands\n"
+    assert loaded(code + "print(CliRunner().invoke(commands, ['list']).exit_code)") == set()
+    assert loaded(code + "print(CliRunner().invoke(commands, ['simulate', 'sun', '--json']).exit_code)") <= {
+        "libsumo",
+        "traci",
+    }
+
+
+def test_errors_of_the_library_speak_of_arguments_and_not_of_flags() -> None:
+    for file in (ROOT / "safevar_sumo").rglob("*.py"):
+        if "cli" not in file.parts:
+            for node in ast.walk(ast.parse(file.read_text())):
+                if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id.endswith("Error"):
+                    assert not re.search(r"--[a-z]", re.sub(r"`[^`]*`", "", ast.unparse(node))), f"{file}:{node.lineno}"
+
+
+@pytest.mark.parametrize(
+    ("words", "incomplete", "expected"),
+    [
+        ([], "s", {name for name in COMMANDS if name.startswith("s")}),
+        (["study"], "ra", {"rain"}),
+        (["simulate"], "su", {"sun"}),
+        (["simulate", "native", "--set"], "t", {"tau="}),
+        (["simulate", "sun", "--set"], "ma", {"mass=", "max_rpm=", "maxBrakeTorque="}),
+        (["simulate", "nothing", "--set"], "t", set()),
+        (["validate"], "lg", {"lgsvl"}),
+    ],
+)
+def test_names_complete(words: list[str], incomplete: str, expected: set[str]) -> None:
+    result = ShellComplete(commands, {}, "safevar-sumo", "_SAFEVAR_SUMO_COMPLETE").get_completions(words, incomplete)
+    assert expected == {item.value for item in result if item.type == "plain"} or expected <= {
+        item.value for item in result
+    }
+
+
+def test_80_columns_break_no_word_of_a_heading() -> None:
+    algorithms = ["nsga2", "rs", "safe_fuzzer", "map_elites", "mocell", "spea2"]
+    title = "Euro NCAP pedestrian, day and night: CARLA's LincolnMkz2017 with an AEB"
+    table = WholeTable("", right=["original vehicle", *algorithms], title=title)
+    table.add_row("solutions that collide", *["12.34"] * 7)
+    console = Console(file=StringIO(), width=80)
+    console.print(table)
+    heading, _, head, *_ = console.file.getvalue().splitlines()  # type: ignore[attr-defined]
+    assert heading == title
+    assert [name.strip() for name in head.split("┃")[3:-1]] == algorithms
+    assert len(head) <= 80
+
+
+SUN = CharacteristicSet.of(load_study("sun").vehicle.characteristics)
+
+
+def simulate(*arguments: str) -> Result:
+    return CliRunner(env={"COLUMNS": "80"}).invoke(commands, ["simulate", *arguments])
+
+
+@pytest.mark.parametrize(
+    ("change", "values"),
+    [
+        ("mass=2500", [2500.0]),
+        ("mass=+10%", [2644.4]),
+        ("mass=-5%", [2283.8]),
+        ("tireFric=1.0..1.5:3", [1.0, 1.25, 1.5]),
+        ("tireFric=1.5..1:2", [1.5, 1.0]),
+        ("tireFric = 1.0..2.0", [1 + i / 10 for i in range(11)]),
+        ("mass=2.5e3", [2500.0]),
+    ],
+)
+def test_a_change_is_a_value_a_share_or_a_sweep(change: str, values: list[float]) -> None:
+    (result,) = read_changes((change,), SUN, beyond=False).values()
+    assert result == pytest.approx(values)
+
+
+@pytest.mark.parametrize(
+    ("changes", "expected"),
+    [
+        (("mass",), "NAME=VALUE"),
+        (("mass=",), "NAME=VALUE"),
+        (("mass=10%",), "NAME=VALUE"),
+        (("mass=1..",), "NAME=VALUE"),
+        (("mass=2300", "mass=2400"), "mass is set twice"),
+        (("weight=1",), "weight"),
+        (("mass=+50%",), "mass = 3606"),
+        (("mass=2100..9000",), "mass = 2790"),
+        (("mass=2100..2200:999", "tireFric=1..2:999"), "more than 10000 settings"),
+        (("mass=nan",), "NAME=VALUE"),
+        (("mass=2_500",), "NAME=VALUE"),
+    ],
+)
+def test_a_change_that_cannot_be_used_is_told(changes: tuple[str, ...], expected: str) -> None:
+    with pytest.raises(InputError, match=expected):
+        read_changes(changes, SUN, beyond=False)
+
+
+def test_the_original_stands_beside_the_changed_vehicle_and_a_verdict_under_them() -> None:
+    result = simulate("rain", "--set", "tireFric=1.1", "--set", "mass=2600", "--set", "dragCoeff=0.301")
+    assert "original" in result.stdout
+    assert "The original vehicle stops, with a safety degree of 1.93 m" in result.stdout
+    assert "less safe than the original" in result.stdout
+    assert (
+        "note: dragCoeff = 0.301 differs from the original by less than the filter threshold and was reset to 0.3"
+        in result.stderr
+    )
+    assert "changed vehicle" not in simulate("rain").stdout
+    assert " m from centre to centre." in simulate("native").stdout
+
+
+def test_an_output_that_fails_leaves_the_old_file_and_no_new_one(in_tmp: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    replace = os.replace
+
+    def full(source: Path, target: Path) -> None:
+        if target.parent == in_tmp:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        replace(source, target)
+
+    monkeypatch.setattr(os, "replace", full)
+    for flag, name in (("--trace", "trace.csv"), ("--plot", "plot.png"), ("--animate", "film.html")):
+        refused("simulate", "sun", flag, name, message=(flag, name, "No space left on device", "with space for it"))
+        assert list(in_tmp.iterdir()) == []
+        Path(name).write_text("old")
+        refused("simulate", "sun", flag, name, message=(flag, name))
+        assert Path(name).read_text() == "old"
+        Path(name).unlink()
+
+
+@pytest.fixture
+def study() -> Study:
+    rain = load_study("rain")
+    return msgspec.structs.replace(rain, search=msgspec.structs.replace(rain.search, runs=2, evaluations=1000))
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+    """What the time is: change its only element."""
+    now = [100.0]
+    monkeypatch.setattr("time.monotonic", lambda: now[0])
+    return now
+
+
+def state(algorithm: str, run: int, asked: int, replayed: int = 0) -> RunProgress:
+    """A run whose settings all collide."""
+    return RunProgress(RunKey(algorithm, run), asked, replayed, collisions=asked, best=-5.63)
+
+
+def shown(study: Study, clock: list[float], width: int) -> list[str]:
+    """What a terminal shows of 500 evaluations, 100 every ten seconds, of two algorithms in turn; then a run ends."""
+    out = StringIO()
+    console = Console(file=out, force_terminal=True, width=width, _environ={})
+    with open_progress(True, console) as show:
+        observer = CampaignProgress(show, study, all_runs(study))
+        for i in range(5):
+            clock[0] += 10
+            observer.progressed([state(("nsga2", "rs")[i % 2], 0, 100 * (i // 2 + 1))])
+        observer.finished(state("nsga2", 0, 300))
+    return [re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", line).rstrip() for line in out.getvalue().splitlines()]
+
+
+@pytest.mark.parametrize("width", [120, 80])
+def test_on_a_terminal_all_fits_in_its_line(width: int, study: Study, clock: list[float]) -> None:
+    """6 runs of 1000 evaluations, of which one ends after 300: 5300 in all, 500 of them done in 50 s."""
+    lines = shown(study, clock, width)
+    last = [line for line in lines if "rain" in line][-1]
+    assert re.fullmatch(r"rain: runs 1/6, 500 collisions, best SD -5\.63 [━╸╺ ]+ 500/5300 0:08:00 left", last)
+    assert max(map(len, lines)) <= width
+
+
+def test_what_comes_from_journals_is_not_left_to_be_done(study: Study) -> None:
+    """A finished run of 1000, of 600 different settings; 500 settings of the next run; then 100 simulated, and
+    again.
+    """
+    shows: list[tuple[str, int, int]] = []
+    observer = CampaignProgress(lambda *values: shows.append(values), study, all_runs(study))
+    observer.finished(state("nsga2", 0, 1000, replayed=1000)._replace(collisions=600))
+    for asked in (500, 600, 700):
+        observer.progressed([state("nsga2", 1, asked, replayed=500)._replace(collisions=min(asked, 600))])
+    assert shows[0] == ("rain: runs 0/6", 0, 6000)
+    assert shows[-1] == ("rain: runs 1/6, 1200 collisions, best SD -5.63", 200, 4500)
+
+
+def test_parts_have_one_counter_that_never_passes_its_end() -> None:
+    shows: list[tuple[str, int, int]] = []
+    parts = PartsProgress(lambda *values: shows.append(values), {"causes": 100, "stored": 50, "rules": 10})
+    for part, stages in {
+        "causes": (("a", 0, 20), ("a", 20, 20), ("b", 0, 20), ("b", 20, 20)),
+        "stored": (),
+        "rules": (("c", 0, 30), ("c", 15, 30), ("c", 30, 30)),
+    }.items():
+        show = parts.begin(part)
+        for stage in stages:
+            show(*stage)
+    assert shows == [
+        ("starting", 0, 160),
+        ("causes: a", 0, 160),
+        ("causes: a", 20, 160),
+        ("causes: b", 20, 160),
+        ("causes: b", 40, 160),
+        ("rules: c", 40, 70),
+        ("rules: c", 55, 70),
+        ("rules: c", 70, 70),
+    ]
+
+
+def test_a_few_settings_in_a_long_matrix_are_several_batches(monkeypatch: pytest.MonkeyPatch) -> None:
+    """So that the time left is known before the end."""
+    shows: list[tuple[str, int, int]] = []
+    study = load_study("euro_ncap_pedestrian")
+    evaluator = Evaluator(study, InlinePool(), lambda *values: shows.append(values))
+    evaluator.evaluate(evaluator.feasible_settings(32), "settings")
+    assert len(shows) == 5
+    assert shows[-1][1:] == (32, 32)

@@ -1,0 +1,149 @@
+"""What a user may type wrongly, and what the command says in one or two lines before it ends with code 2."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import pytest
+
+from tests.in_process import refused
+
+FILES = {
+    "file": "",
+    "solutions.csv": "stored",
+    "weather.toml": 'extends = "sun"\nweather = "fogg"\n',
+    "model.toml": 'extends = "sun"\n[ads]\nmodel = "world_on_rail"\n',
+    "key.toml": 'extends = "sun"\n[search]\nrunns = 3\n',
+    "heavy.toml": 'extends = "smoke"\n[[constraints]]\nsum = { mass = 1 }\nat_least = 2500\n',
+    "base.toml": 'extends = "sun"\n',
+    "child.toml": 'extends = "base.toml"\nname = "child"\n',
+    "mine.csv": "mass,radius\n1,2\n",
+    "broken.py": "1 / 0\n",
+    "mine.py": "class Mine: ...\n",
+    "other/manifest.json": '{"study": {}, "versions": {}, "original": {}}',
+    "results/smoke/manifest.json": "{}",
+}
+CALIBRATED = {
+    "original": "vehicle.characteristics.mass.original",
+    "nothing": "ads.parameters.nothing",
+    "name": "weather.name",
+    "friction": "weather.road_friction",
+}
+"""Keys that no calibration may change, or not so far; one study file each."""
+TYPED = [
+    ("study sum", "'sum'; did you mean 'sun'?"),
+    ("study sun --algorithms nsga3", "'nsga3'"),
+    ("study sun --batch many", "many"),
+    ("study sun --out /proc/nowhere", "--out: cannot write to /proc/nowhere"),
+    ("study smoke --out link", "--out: cannot write to link: it is a link whose target does not exist"),
+    ("study smoke --out file", "--out"),
+    ("study sun --seed", "see python -m safevar_sumo study --help"),
+    ("study", "Missing argument 'STUDY'"),
+    ("study smoke --algorithms rs,rs --dry-run", "same name"),
+    ("study smoke --jobs 0", "--jobs"),
+    ("study smoke --shard 3/2", "K in 1..N"),
+    ("study smoke --only nonsense", "ALGORITHM:RUN"),
+    ("study smoke --only nsga2:2", "'nsga2:2'"),
+    ("study smoke --cluster nowhere", "tcp://host:8786"),
+    ("study smoke --cluster tcp://127.0.0.1:9", "no scheduler answers at 'tcp://127.0.0.1:9'"),
+    ("study heavy.toml", "heavy.toml: the original vehicle: violates a constraint: mass = 2404 kg"),
+    ("status results/smoke --every 1", "together with --watch"),
+    ("status smoke", "did you mean results/smoke?"),
+    ("simlate rain", "did you mean 'simulate'?"),
+    ("simulate rian", "did you mean 'rain'?"),
+    ("simulate /", "/"),
+    ("simulate folder", "folder"),
+    ("simulate weather.toml", "did you mean 'fog'?"),
+    ("simulate model.toml", "did you mean 'world_on_rails'?"),
+    ("simulate key.toml", "runns: there is no such key; did you mean 'runs'?"),
+    ("simulate sun --nothing", "No such option '--nothing'"),
+    ("simulate sun --as-it-is-now", "a study is simulated as it is now anyway"),
+    ("simulate sun --set mass=5000", "[2040, 2700] kg"),
+    ("simulate sun --set mass=+8", "or mass=+8% of the original, or any with --beyond"),
+    ("simulate sun --set mass=2_404", "mass=2_404"),
+    ("simulate sun --set weight=1", "weight"),
+    ("simulate rain --set tirefric=1", "did you mean 'tireFric'?"),
+    ("simulate sun --set tireFric=1..2:1", "at least 2"),
+    ("simulate sun --set mass=2100..2200 --trace x.csv", "is a sweep"),
+    ("simulate sun --slower 2", "--gui"),
+    ("simulate sun --trace folder.csv", "folder.csv"),
+    ("simulate sun --trace /proc/nowhere/trace.csv", "--trace"),
+    ("simulate sun --trace solutions.csv", "solutions.csv"),
+    ("simulate sun --plot base.toml", "base.toml"),
+    ("simulate sun --fewest", "a directory"),
+    ("simulate native --spread", "[spread]"),
+    ("simulate sun --set tireFric=1..2 --spread", "--spread"),
+    ("explain rian", "did you mean 'rain'?"),
+    ("explain smoke --unsafe bad", "below=X"),
+    ("explain smoke --unsafe below=nan", "below=X"),
+    ("explain smoke --unsafe points=1", "not rated"),
+    ("opinion smoke", "smoke: is a study and has no solutions"),
+    ("opinion nowhere", "nowhere: is not a results directory: there is no manifest.json"),
+    ("tolerance rain --characteristics mas", "did you mean 'mass'?"),
+    ("tolerance sun --characteristics mass,mass", "once"),
+    ("tolerance sun --characteristics mass --pairs", "at least two"),
+    ("tolerance smoke --plot folder.png", "folder.png"),
+    ("risk sun --confidence nan", "below 1"),
+    ("risk sun --unsafe points=1", "not rated"),
+    ("rules rian", "is neither a results directory, a study nor a file; did you mean 'rain'?"),
+    ("rating euro_ncap_rating --set treadDepth=300", "[1.6, 8] mm"),
+    ("rating euro_ncap_rating --set treadDepth", "NAME=+10% of the original"),
+    ("rating euro_ncap_rating --force", "--xlsx"),
+    ("report results/smoke --only verdct", "did you mean 'verdict'?"),
+    ("check mine:Nothing", "has no 'Nothing'"),
+    ("check nothing:Mine", "No module named 'nothing'"),
+    ("check broken:Mine", "ZeroDivisionError: division by zero"),
+    ("check builtins:int", "no study names 'builtins:int'"),
+    ("check missing.fmu", "there is no file"),
+    ("check smoke --study nope", "nope"),
+    ("check smoke --study smoke", "is itself a study"),
+    ("tables nowhere", "nowhere: is not a results directory"),
+    ("tables file", "file"),
+    ("tables folder", "folder"),
+    ("tables other", "other"),
+    ("tables smoke", "did you mean results/smoke?"),
+    ("tables results/smoke --format html", "latex"),
+    ("figures file --out pictures", "file"),
+    ("import native --out out --nsga2 mine.csv", "--original"),
+    ("import lgsvl --out out --nsga2 mine.csv", "lacks the columns"),
+    ("import sun --out out --nsga2 .", "is no regular file"),
+    ("validate sun none.csv --jobs 1025", "see python -m safevar_sumo validate --help"),
+    ("validate sun folder", "folder"),
+    ("calibrate original.toml --trials 1 --out x.toml", "vehicle.characteristics.mass.original"),
+    ("calibrate nothing.toml --trials 1 --out x.toml", "ads.parameters.nothing"),
+    ("calibrate name.toml --trials 1 --out x.toml", "weather.name"),
+    ("calibrate friction.toml --trials 1 --out x.toml", "lower = -3"),
+    ("calibrate sun mine.csv --trials 1 --out mine.csv", "mine.csv"),
+    ("calibrate child.toml --trials 1 --out base.toml", "base.toml is an input of the command"),
+]
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with something wrong of every kind."""
+    folder = tmp_path_factory.mktemp("bad")
+    rows = 'lower = -3, upper = 3, unit = "-", meaning = "none"'
+    tables = {
+        f"{name}.toml": f'extends = "sun"\n[calibration]\n"{key}" = {{ {rows} }}\n' for name, key in CALIBRATED.items()
+    }
+    for name, text in {**FILES, **tables}.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text(text)
+    for name in ("folder", "folder.csv", "folder.png"):
+        (folder / name).mkdir()
+    (folder / "link").symlink_to("nowhere")
+    return folder
+
+
+@pytest.mark.parametrize(("typed", "told"), TYPED, ids=[typed for typed, _ in TYPED])
+def test_bad_input_ends_with_code_2_and_changes_no_file(
+    typed: str, told: str, place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shutil.copytree(place, tmp_path / "here", symlinks=True)
+    monkeypatch.chdir(tmp_path / "here")
+    refused(*typed.split(), message=(told,))
+    after = {str(path.relative_to(tmp_path / "here")) for path in (tmp_path / "here").rglob("*")}
+    before = {str(path.relative_to(place)) for path in place.rglob("*")}
+    assert {name for name in after - before if "__pycache__" not in name} == set()
+    assert Path("solutions.csv").read_text() == "stored"
