@@ -263,7 +263,7 @@ def test_nothing_everything_and_too_little() -> None:
 
 
 def test_a_rule_is_denser_than_a_share_below_its_interval() -> None:
-    """8 rules_of 10: Clopper and Pearson have 44.4 to 97.5 %."""
+    """8 of 10: Clopper and Pearson have 44.4 to 97.5 %."""
     rule = Rule({"a": (7.0, None)}, inside=10, unsafe_inside=8, unsafe_everywhere=20, confidence=0.95)
     assert rule.density_interval == pytest.approx((0.444, 0.975), abs=5e-4)
     assert [rule.is_denser_than(share) for share in (0.4, 0.5, 0.9)] == [True, False, False]
@@ -280,7 +280,7 @@ def test_the_promised_record_and_the_same_again() -> None:
 
 @pytest.mark.parametrize("constraint", [None, {"sum": {"a": 1.0, "b": 1.0}, "at_most": 12.0}])
 def test_the_share_of_unsafe_vehicles_is_that_of_risk(constraint: dict[str, Any] | None) -> None:
-    """The same vehicles in both, the first ones rules_of a longer sequence in a shorter one: each estimate lies in the
+    """The same vehicles in both, the first ones of a longer sequence in a shorter one: each estimate lies in the
     other's interval.
     """
     study = made_up_study(2)
@@ -306,4 +306,4 @@ def test_rules_say_over_what_they_hold() -> None:
         "all characteristics vary together over the whole domain; how far one may go while all others stay "
         "as in the original"
     ) in printed
-    assert "% rules_of 16384 vehicles drawn evenly over the whole domain (" in printed
+    assert "% of 16384 vehicles drawn evenly over the whole domain (" in printed

@@ -17,12 +17,13 @@ from safevar_sumo.results.manifest import write_manifest
 from tests.end_to_end.processes import STUDY, solutions, study, written
 from tests.in_process import refused, run
 
+pytestmark = pytest.mark.usefixtures("small")
 SLOW = pytest.mark.slow
 
 
 def test_study_leaves_manifest_and_solutions_and_nothing_else(in_tmp: Path) -> None:
     run("study", "smoke", "--evaluations", "100", "--quiet")
-    assert [path.name for path in in_tmp.iterdir()] == ["results"]
+    assert {path.name for path in in_tmp.iterdir()} == {"small.toml", "results"}
     assert sorted(path.name for path in (in_tmp / "results/smoke").iterdir()) == [
         "manifest.json",
         "runs",
@@ -150,9 +151,6 @@ def test_a_study_ends_with_a_summary(in_tmp: Path) -> None:
         "python -m safevar_sumo tables results/smoke",
     ):
         assert part in output
-
-
-pytestmark = pytest.mark.usefixtures("small")
 
 
 @pytest.mark.slow
