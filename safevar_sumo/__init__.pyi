@@ -1,5 +1,5 @@
 from .analysis.explain import explain as explain
-from .analysis.explain.result import Cause as Cause
+from .analysis.explain.causes import Cause as Cause
 from .analysis.explain.result import Explained as Explained
 from .analysis.explain.result import Explanation as Explanation
 from .analysis.opinion import opinion as opinion

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from datetime import timedelta
 from threading import Event, Thread
@@ -76,32 +76,3 @@ def open_progress(progress: bool | Progress, console: Console | None = None) -> 
         finally:
             ended.set()
             lines.join()
-
-
-class PartsProgress:
-    """The progress of several parts as one, so that the time left is that of all parts.
-
-    Parameters
-    ----------
-    progress
-        Shows the progress of all parts.
-    expected
-        The amount that each part is expected to do at most, by the part's name; a part that does less ends early.
-    """
-
-    def __init__(self, progress: Progress, expected: Mapping[str, int]) -> None:
-        self._progress, self._left, self._done = progress, dict(expected), 0
-        progress("starting", 0, sum(expected.values()))
-
-    def begin(self, part: str) -> Progress:
-        """End the previous part and begin another; yields the function that shows the progress of the part's stages."""
-        expected, done_before, done_in_stage = self._left.pop(part), self._done, 0
-
-        def show(stage: str, done: int, total: int) -> None:
-            nonlocal done_in_stage
-            self._done += max(done - done_in_stage, 0)
-            done_in_stage = done
-            part_total = max(expected, self._done - done_before + total - done)
-            self._progress(f"{part}: {stage}", self._done, done_before + part_total + sum(self._left.values()))
-
-        return show

@@ -105,7 +105,7 @@ def test_every_question_has_its_table_picture_or_sentence(tmp_path: Path) -> Non
     notebook = _executed("answers", tmp_path, timeout=900)
     outputs = [output for cell in notebook.cells if cell.cell_type == "code" for output in cell.outputs]
     shown = [output.get("data", {}) for output in outputs]
-    assert (sum("text/html" in data for data in shown), sum("image/png" in data for data in shown)) == (3, 4)
+    assert (sum("text/html" in data for data in shown), sum("image/png" in data for data in shown)) == (3, 3)
     printed = "".join(
         output["text"] for output in outputs if output.output_type == "stream" and output.name == "stdout"
     )

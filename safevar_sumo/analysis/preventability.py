@@ -12,15 +12,14 @@ from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Any, NamedTuple
+from typing import Any
 
-import msgspec
 import numpy as np
 from msgspec.structs import replace
 
 from safevar_sumo.ads.competent_driver import CompetentDriver
 from safevar_sumo.analysis.evaluator import Evaluator, clopper_pearson
-from safevar_sumo.analysis.words import join_phrases, number_of, share_in_words
+from safevar_sumo.analysis.words import number_of, share_in_words
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.study import ModelTable
 from safevar_sumo.sumo.matrix import simulate, study_at
@@ -46,38 +45,8 @@ class PreventableBy(StrEnum):
     NOBODY = "physically unavoidable"
 
 
-class Avoidance(NamedTuple):
-    """The weakest driver who avoids a collision, and whether the competent driver does with `LATER_REACTION`."""
-
-    by: PreventableBy
-    later: bool
-
-
-class LaterReaction(msgspec.Struct, frozen=True, kw_only=True):
-    """The share of the collisions that the competent driver avoids with the later reaction time `reaction` [s]."""
-
-    reaction: float
-    competent_driver: float | None
-
-    def __str__(self) -> str:
-        """Its words after those of the share, such as `39 % if he needs 0.4 s longer`."""
-        return f"{share_in_words(self.competent_driver or 0.0)} if he needs {DELAY:g} s longer"
-
-
-class PreventedShares(msgspec.Struct, frozen=True, kw_only=True):
-    """Shares of the simulated collisions (see `Preventability`) by category in the JSON of `explain`, None without a
-    collision.
-
-    `looked_at` is the number of simulated collisions; `interval_competent_driver` the 95 % interval of the share
-    `competent_driver`; `later` the share with a later reaction.
-    """
-
-    competent_driver: float | None
-    full_braking: float | None
-    nobody: float | None
-    looked_at: int
-    interval_competent_driver: list[float] | None
-    later: LaterReaction
+Avoidance = tuple[PreventableBy, bool]
+"""The weakest driver who avoids a collision, and whether the competent driver does with `LATER_REACTION`."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -106,51 +75,46 @@ class Preventability:
         """Number of collisions simulated with the reference drivers."""
         return sum(self.counts.values())
 
-    def share(self, category: PreventableBy) -> float | None:
-        """The share of a category among the simulated collisions; None if no collision was simulated."""
-        return self.counts.get(category, 0) / self.looked_at if self.looked_at else None
+    def share(self, category: PreventableBy) -> float:
+        """The share of a category among the simulated collisions; 0 if no collision was simulated."""
+        return self.counts.get(category, 0) / max(self.looked_at, 1)
 
-    def interval(self, category: PreventableBy) -> tuple[float, float] | None:
-        """95 % confidence interval of a category's share in all `collisions`; None if no collision was simulated.
+    def to_dict(self) -> dict[str, Any]:
+        """The shares, None without a simulated collision, and the competent driver's 95 % interval, for JSON.
 
         If all collisions were simulated, the share has no sampling error and the interval is the share itself. For a
         sample the interval is Clopper and Pearson's. It is slightly too wide, as it has no correction for a finite
         population.
         """
-        share = self.share(category)
-        if share is None:
-            return None
-        if self.looked_at == self.collisions:
-            return share, share
-        return clopper_pearson(self.counts.get(category, 0), self.looked_at)
+        number, share = self.looked_at, self.share(PreventableBy.COMPETENT_DRIVER)
+        count = self.counts.get(PreventableBy.COMPETENT_DRIVER, 0)
+        interval = (share, share) if number == self.collisions else clopper_pearson(count, max(number, 1))
+        return {
+            **{by.name.lower(): self.share(by) if number else None for by in PreventableBy},
+            "looked_at": number,
+            "interval_competent_driver": list(interval) if number else None,
+            "later": {"reaction": LATER_REACTION, "competent_driver": self.later / number if number else None},
+        }
 
     @property
-    def shares(self) -> PreventedShares:
-        """The shares as `explain --json` prints them."""
-        interval = self.interval(PreventableBy.COMPETENT_DRIVER)
-        later = self.later / self.looked_at if self.looked_at else None
-        return PreventedShares(
-            competent_driver=self.share(PreventableBy.COMPETENT_DRIVER),
-            full_braking=self.share(PreventableBy.FULL_BRAKING),
-            nobody=self.share(PreventableBy.NOBODY),
-            looked_at=self.looked_at,
-            interval_competent_driver=None if interval is None else list(interval),
-            later=LaterReaction(reaction=LATER_REACTION, competent_driver=later),
-        )
+    def range_in_words(self) -> str:
+        """The share that the competent driver avoids: `71 % (39 % if he needs 0.4 s longer)`."""
+        later = share_in_words(self.later / max(self.looked_at, 1))
+        share = share_in_words(self.share(PreventableBy.COMPETENT_DRIVER))
+        return f"{share} ({later} if he needs {DELAY:g} s longer)"
 
     def __str__(self) -> str:
         """A sentence; empty if no collision was simulated."""
         if not self.looked_at:
             return ""
-        competent_driver, full_braking, nobody = (share_in_words(self.share(by) or 0.0) for by in PreventableBy)
-        parts = [f"a competent driver avoids {competent_driver} ({self.shares.later})"]
-        if self.counts.get(PreventableBy.FULL_BRAKING):
-            another = "another " if competent_driver != "none" and full_braking.endswith("%") else ""
-            parts.append(f"only full braking at the first possible moment avoids {another}{full_braking}")
-        if self.counts.get(PreventableBy.NOBODY):
-            parts.append(f"{nobody} are physically unavoidable")
+        full_braking, nobody = (
+            share_in_words(self.share(by)) for by in (PreventableBy.FULL_BRAKING, PreventableBy.NOBODY)
+        )
         sample = "" if self.looked_at == self.collisions else f", drawn at random from {self.collisions}"
-        return f"In the same vehicle, of {number_of(self.looked_at, 'collision')}{sample}, {join_phrases(parts)}."
+        return (
+            f"In the same vehicle, of {number_of(self.looked_at, 'collision')}{sample}, a competent driver avoids "
+            f"{self.range_in_words}; only full braking at the first possible moment: {full_braking}; nobody: {nobody}."
+        )
 
 
 def assess_preventability(
@@ -164,11 +128,11 @@ def assess_preventability(
     distinct = np.unique(collisions.settings, axis=0, return_index=True)[1]
     shuffled = np.random.default_rng(evaluator.study.search.seed).permutation(distinct)
     sample = shuffled[: max(max_simulations // SIMULATIONS, 1)]
-    avoidances = [avoidance for avoidance in classify_collisions(evaluator, collisions.take(sample)) if avoidance]
+    avoidances = list(filter(None, classify_collisions(evaluator, collisions.take(sample))))
     return Preventability(
-        counts=Counter(avoidance.by for avoidance in avoidances),
+        counts=Counter(by for by, _ in avoidances),
         collisions=len(distinct),
-        later=sum(avoidance.later for avoidance in avoidances),
+        later=sum(later for _, later in avoidances),
     )
 
 
@@ -178,10 +142,10 @@ def classify_collisions(evaluator: Evaluator, collisions: Evaluations) -> list[A
     system = assemble(evaluator.study)
     worst = np.zeros(len(collisions), dtype=np.intp) if collisions.worst_points is None else collisions.worst_points
     for point_index in np.unique(worst).tolist():
-        rows, point = np.flatnonzero(worst == point_index), system.points[point_index]
+        rows, point = np.flatnonzero(worst == point_index).tolist(), system.points[point_index]
         study = study_at(evaluator.study, point.name, source=point.name) if system.matrix else evaluator.study
         at_point = _classify_at_point(evaluator.for_study(study), system.at(point), collisions.settings[rows])
-        for row, avoidance in zip(rows.tolist(), at_point, strict=True):
+        for row, avoidance in zip(rows, at_point, strict=True):
             avoidances[row] = avoidance
     return avoidances
 
@@ -190,20 +154,24 @@ def _classify_at_point(evaluator: Evaluator, system: System, settings: FloatArra
     """Who avoids collisions at one point; full braking is tried only if the competent driver collides."""
     approach = approach_parameters(system)
 
-    def drive(driver: str, rows: FloatArray, stage: str, **parameters: float) -> Evaluations:
+    def drive(driver: str, rows: FloatArray, **parameters: float) -> Evaluations:
         ads = ModelTable(model=driver, parameters={**approach, **parameters})
-        return evaluator.for_study(replace(evaluator.study, ads=ads)).evaluate(rows, f"{stage} in the same vehicle")
+        return evaluator.for_study(replace(evaluator.study, ads=ads)).evaluate(
+            rows, "reference drivers in the same vehicle"
+        )
 
-    competent_driver = drive("competent_driver", settings, "a competent driver")
-    later = drive("competent_driver", settings, f"the same driver {DELAY:g} s later", reaction_time=LATER_REACTION)
-    collisions = np.flatnonzero(competent_driver.collided)
-    full_braking = drive("full_braking", settings[collisions], "full braking")
-    categories = [PreventableBy.COMPETENT_DRIVER if valid else None for valid in competent_driver.valid]
-    for row, collided, valid in zip(collisions.tolist(), full_braking.collided, full_braking.valid, strict=True):
-        categories[row] = (PreventableBy.NOBODY if collided else PreventableBy.FULL_BRAKING) if valid else None
+    first, later = (
+        drive("competent_driver", settings, **parameters) for parameters in ({}, {"reaction_time": LATER_REACTION})
+    )
+    full_braking = drive("full_braking", settings[first.collided])
+    category = np.full(len(settings), PreventableBy.COMPETENT_DRIVER, dtype=object)
+    category[first.collided] = np.where(full_braking.collided, PreventableBy.NOBODY, PreventableBy.FULL_BRAKING)
+    valid = first.valid.copy()
+    valid[first.collided] = full_braking.valid
+    avoided = (later.valid & ~later.collided).tolist()
     return [
-        None if category is None else Avoidance(category, avoided)
-        for category, avoided in zip(categories, (later.valid & ~later.collided).tolist(), strict=True)
+        (PreventableBy(by), late) if is_valid else None
+        for by, late, is_valid in zip(category, avoided, valid, strict=True)
     ]
 
 

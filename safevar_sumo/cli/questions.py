@@ -95,7 +95,7 @@ def explain(
     is enough, why.
     """
     from safevar_sumo.analysis.explain.compute import explain_failures
-    from safevar_sumo.analysis.explain.render import print_explained
+    from safevar_sumo.analysis.explain.sentences import print_explained
     from safevar_sumo.analysis.figures import save
 
     subject = load_results_or_study(source, point)
@@ -140,13 +140,7 @@ def opinion(
     _print(result, as_json)
 
 
-@add_question(
-    ToleranceOptions,
-    "STUDY|DIR",
-    _plot_option(
-        "Draw the profiles to this file: png, pdf or svg; with --pairs, the worst pairs to a second file beside it."
-    ),
-)
+@add_question(ToleranceOptions, "STUDY|DIR", _plot_option("Draw the profiles to this file: png, pdf or svg."))
 def tolerance(
     source: str, point: str | None, jobs: int | None, as_json: bool, plot: Path | None, **values: Any
 ) -> None:
@@ -154,17 +148,13 @@ def tolerance(
     from safevar_sumo.analysis.figures import save
     from safevar_sumo.analysis.tolerance.compute import find_tolerances
 
-    options, subject = ToleranceOptions(**values), load_results_or_study(source, point)
-    pairs_plot = None if plot is None or not options.pairs else plot.with_stem(f"{plot.stem}-pairs")
-    for path in (plot, pairs_plot):
-        if path is not None:
-            check_output(path, "--plot", PICTURE_ENDINGS)
-    result = _compute_with_bar(find_tolerances, subject, options, jobs)
+    subject = load_results_or_study(source, point)
+    if plot is not None:
+        check_output(plot, "--plot", PICTURE_ENDINGS)
+    result = _compute_with_bar(find_tolerances, subject, ToleranceOptions(**values), jobs)
     _print(result, as_json)
     if plot is not None:
         save(result.figure(), plot, "--plot")
-    if pairs_plot is not None:
-        save(result.pairs_figure(), pairs_plot, "--plot")
 
 
 @add_question(RiskOptions, "STUDY|DIR", _plot_option("Draw the sensitivity indices to this file: png, pdf or svg."))

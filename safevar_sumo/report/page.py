@@ -8,19 +8,27 @@ import json
 import re
 import shlex
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from functools import partial
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
-import msgspec
 import pandas as pd
 from markupsafe import Markup
 
 from safevar_sumo.analysis.explain.compute import explain_failures
 from safevar_sumo.analysis.explain.result import Explained
+from safevar_sumo.analysis.rating import RatingOptions
+from safevar_sumo.analysis.rating.compute import rate_variant, remarks
+from safevar_sumo.analysis.rating.render import (
+    colour_changes_in_words,
+    lost_by_test,
+    matrices_figure,
+    not_simulated,
+    rating_in_words,
+    test_in_words,
+)
 from safevar_sumo.analysis.research_questions.answer import answer_questions
 from safevar_sumo.analysis.research_questions.case import Case, UnanswerableError
 from safevar_sumo.analysis.research_questions.gallery import draw_figures
@@ -28,18 +36,17 @@ from safevar_sumo.analysis.research_questions.layout import BoldText, lay_out
 from safevar_sumo.analysis.risk.compute import estimate_risk
 from safevar_sumo.analysis.rules.compute import find_rules
 from safevar_sumo.analysis.tolerance.compute import find_tolerances
+from safevar_sumo.analysis.words import question_command
 from safevar_sumo.errors import InputError, did_you_mean, warn
-from safevar_sumo.progress import PartsProgress, Progress, show_no_progress
+from safevar_sumo.progress import Progress, show_no_progress
 from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.replay.comparison import format_number, superscript_powers
 from safevar_sumo.replay.page import player_files, template_environment
+from safevar_sumo.report.background import describe_agreement, describe_limits, describe_tested_system
 from safevar_sumo.report.causes import make_cause_sections, make_verdict, reason_without_opinion, replay_solutions
-from safevar_sumo.report.input import ReportInput, read_inputs
-from safevar_sumo.report.rated import rated_study_data
-from safevar_sumo.report.tested import describe_tested_system
-from safevar_sumo.report.trust import describe_agreement, describe_limits
+from safevar_sumo.report.input import ReportInput, page_options, read_inputs
 from safevar_sumo.shipped import PROGRAM_COMMAND
-from safevar_sumo.study import Study, load_study, study_names
+from safevar_sumo.sumo.empty_road import why_no_verdict
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -128,67 +135,34 @@ def _picture(name: str, figure: Figure) -> dict[str, str]:
     }
 
 
-def commands_to_reproduce(inputs: Sequence[ReportInput], questions: Sequence[str]) -> list[dict[str, str]]:
-    """List the commands that reproduce the numbers of the page; `questions` are those that the page answers."""
-    directories = " ".join(shlex.quote(str(data.directory)) for data in inputs)
+def commands_to_reproduce(inputs: Sequence[ReportInput], questions: Sequence[str]) -> list[tuple[str, str]]:
+    """What the commands reproduce, and the commands that give the numbers of the page, which answers `questions`."""
     commands = []
     for data in inputs:
-        directory, study = shlex.quote(str(data.directory)), data.case.study
-        flag = " --as-it-is-now" if data.later_changes else ""
+        directory, flag = str(data.directory), " --as-it-is-now" if data.later_changes else ""
         if data.case.has_runs:
-            commands.append(
-                {
-                    "what": f"The study {study.name}, as its manifest.json records it, into another directory",
-                    "command": _rerun_command(study, f"{data.directory}-again", data.directory),
-                }
+            study = f"sv.load({json.dumps(directory)}).study"
+            script = (
+                f"import safevar_sumo as sv; sv.run({study}, out={json.dumps(f'{directory}-again')}, progress=True)"
             )
-        has_opinion = "explain" in questions and data.system is not None and not reason_without_opinion(data)
+            what = f"The study {data.case.study.name}, as its manifest.json records it, into another directory"
+            commands.append((what, f"python -c {shlex.quote(script)}"))
+        asked = [*questions, *(["opinion"] if "explain" in questions and not reason_without_opinion(data) else [])]
         commands += [
-            {
-                "what": f"The part {name}",
-                "command": data.options[name].command_line(str(data.directory), data.point) + flag,
-            }
-            for name in (*questions, *(["opinion"] if has_opinion else []))
+            (f"The part {name}", page_options()[name].command_line(directory, data.point) + flag) for name in asked
         ]
-        if data.point:
-            continue
-        commands.append(
-            {
-                "what": "A replay, with figure and animation",
-                "command": f"{PROGRAM_COMMAND} simulate {directory} --most-severe --plot it.png "
-                f"--animate it.html{flag}",
-            }
-        )
+        if not data.point:
+            options = f"--most-severe --plot it.png --animate it.html{flag}"
+            simulate = f"{PROGRAM_COMMAND} simulate {shlex.quote(directory)} {options}"
+            commands.append(("A replay, with figure and animation", simulate))
     if any(data.point for data in inputs):
         return commands
-    commands.append({"what": "The tables of RQ1 to RQ3", "command": f"{PROGRAM_COMMAND} tables {directories}"})
-    commands.append({"what": "The figures", "command": f"{PROGRAM_COMMAND} figures {directories} --out figures"})
-    return commands
-
-
-def _rerun_command(study: Study, out: str, directory: Path) -> str:
-    """The command that runs a study again: `study` with options for a shipped study, else Python's `run` with the
-    recorded study.
-    """
-    search = study.search
-    if study.name in study_names():
-        options = {name: getattr(search, name) for name in ("seed", "runs", "evaluations", "algorithms")}
-        shipped = load_study(study.name)
-        if (
-            msgspec.structs.replace(
-                shipped, search=msgspec.structs.replace(shipped.search, **options), origin=study.origin
-            )
-            == study
-        ):
-            flags = {**options, "algorithms": shlex.quote(",".join(search.algorithms)), "out": shlex.quote(out)}
-            return " ".join(
-                [f"{PROGRAM_COMMAND} study {study.name}", *(f"--{name} {value}" for name, value in flags.items())]
-            )
-    script = (
-        f"import safevar_sumo as sv; sv.run(sv.load({json.dumps(str(directory))}).study, out={json.dumps(out)}, "
-        "progress=True)"
-    )
-    return f"python -c {shlex.quote(script)}"
+    directories = " ".join(shlex.quote(str(data.directory)) for data in inputs)
+    return [
+        *commands,
+        ("The tables of RQ1 to RQ3", f"{PROGRAM_COMMAND} tables {directories}"),
+        ("The figures", f"{PROGRAM_COMMAND} figures {directories} --out figures"),
+    ]
 
 
 TEMPLATE_FOLDER = Path(__file__).parent / "web"
@@ -222,96 +196,62 @@ def make_report(
     """Make the page about results in directories; parameters, warnings and errors are those of
     `safevar_sumo.report`.
     """
-    unknown_names = [name for name in only if name not in SECTIONS]
-    if unknown_names:
-        raise InputError(
-            "only",
-            f"there is no section {unknown_names[0]!r}{did_you_mean(unknown_names[0], SECTIONS)}",
-            f"some of {','.join(SECTIONS)}",
-        )
-    sections = [name for name in SECTIONS if not only or name in only]
-    if point is not None:
-        if "questions" in only:
-            raise InputError(
-                "only", "the research questions are about whole studies", "sections other than questions with `point`"
-            )
-        sections = [name for name in sections if name != "questions"]
+    unknown_name = next((name for name in only if name not in SECTIONS), None)
+    if unknown_name is not None:
+        hint = did_you_mean(unknown_name, SECTIONS)
+        raise InputError("only", f"there is no section {unknown_name!r}{hint}", f"some of {','.join(SECTIONS)}")
+    if point is not None and "questions" in only:
+        legal = "sections other than questions with `point`"
+        raise InputError("only", "the research questions are about whole studies", legal)
+    sections = {
+        name: heading
+        for name, heading in SECTIONS.items()
+        if (not only or name in only) and not (point is not None and name == "questions")
+    }
     inputs = read_inputs(directories, point, as_it_is_now=as_it_is_now)
     for data in inputs:
         for change in data.later_changes:
             warn(f"{data.directory}: {change}")
-    are_rated = [is_rated(data.case.study) and point is None for data in inputs]
-    if any(are_rated):
-        if not all(are_rated):
-            raise InputError(
-                "directories", "some hold results of rated studies, others do not", "a report for each kind"
-            )
-        return (
-            template_environment(TEMPLATE_FOLDER)
-            .get_template("rated.html.j2")
-            .render(
-                title=f"Euro NCAP rating: {', '.join(data.case.name for data in inputs)}",
-                css=_web_file("report.css"),
-                studies=[rated_study_data(data, jobs, progress) for data in inputs],
-            )
-            + "\n"
-        )
+    names = ", ".join(data.case.name for data in inputs)
+    are_rated = {is_rated(data.case.study) and point is None for data in inputs}
+    if len(are_rated) > 1:
+        problem = "some hold results of rated studies, others do not"
+        raise InputError("directories", problem, "a report for each kind")
+    if True in are_rated:
+        studies = [rated_study_data(data, jobs, progress) for data in inputs]
+        return _render("rated.html.j2", title=f"Euro NCAP rating: {names}", studies=studies)
     cases = [data.case for data in inputs] if "questions" in sections else []
-    parts = PartsProgress(
-        progress,
-        {
-            f"{data.directory}: {name}": number
-            for data in inputs
-            for name, number in data.simulation_counts.items()
-            if name in sections
-        },
+    questions = [command for name, command in COMMAND_OF_SECTION.items() if name in sections]
+    return _render(
+        "report.html.j2",
+        title=f"Safety report: {names}",
+        sections=sections,
+        studies=[_study_data(data, sections, jobs, progress) for data in inputs],
+        tables=list_tables(cases) if cases else [],
+        figures=embed_figures(cases) if cases else [],
+        commands=commands_to_reproduce(inputs, questions) if "reproduce" in sections else [],
+        player=player_files(),
+        js=_web_file("report.js"),
     )
-    studies = [_study_data(data, sections, jobs, parts) for data in inputs]
-    progress("tables and figures", 0, 1)
-    page = (
-        template_environment(TEMPLATE_FOLDER)
-        .get_template("report.html.j2")
-        .render(
-            title=f"Safety report: {', '.join(data.case.name for data in inputs)}",
-            sections={name: SECTIONS[name] for name in sections},
-            studies=studies,
-            tables=list_tables(cases) if cases else [],
-            figures=embed_figures(cases) if cases else [],
-            commands=commands_to_reproduce(
-                inputs, [command for name, command in COMMAND_OF_SECTION.items() if name in sections]
-            )
-            if "reproduce" in sections
-            else [],
-            simulated_sections=list(COMMAND_OF_SECTION),
-            as_table=partial(table_data, title="Failing points"),
-            player=player_files(),
-            css=_web_file("report.css"),
-            js=_web_file("report.js"),
-        )
-    )
-    progress("tables and figures", 1, 1)
-    return page + "\n"
 
 
 def _study_data(
-    data: ReportInput, sections: Sequence[str], jobs: int | None, parts: PartsProgress
+    data: ReportInput, sections: Collection[str], jobs: int | None, progress: Progress
 ) -> Mapping[str, Any]:
     """Make the data of one study that the templates of these sections need."""
-
-    def answer(name: str, compute: Callable[..., Any], progress: Progress, **options: bool) -> Any:
-        return compute(data.case, data.options[name], jobs=jobs, progress=progress, **options)
-
-    progress = parts.begin(f"{data.directory}: causes") if "causes" in sections else show_no_progress
+    options = page_options()
     explained: Explained | None = None
-    if data.system is not None and {"verdict", "causes"} & {*sections} and len(data.case.solutions):
-        explained = answer("explain", explain_failures, progress, statistics="causes" in sections)
-    solutions = replay_solutions(data, explained, progress) if "causes" in sections else []
+    if {"verdict", "causes"} & {*sections} and len(data.case.solutions):
+        explained = explain_failures(
+            data.case, options["explain"], jobs=jobs, progress=progress, statistics="causes" in sections
+        )
+    replays = replay_solutions(data, explained, progress) if "causes" in sections else []
     answers = {
-        name: answer(name, compute, parts.begin(f"{data.directory}: {name}"))
+        name: compute(data.case, options[name], jobs=jobs, progress=progress)
         for name, compute in DOMAIN_QUESTIONS.items()
-        if name in sections and data.system is not None
+        if name in sections
     }
-    different = [solution["handle"] for solution in solutions if solution["differences"]]
+    different = [solution["handle"] for solution in replays if solution["differences"]]
     if different:
         warn(
             f"{data.directory}: simulated again with different results: {', '.join(different)}; "
@@ -327,13 +267,12 @@ def _study_data(
         "name": data.case.name,
         "title": data.case.study.title,
         "anchor": data.anchor(),
-        "replays": solutions,
+        "replays": replays,
         "different": different,
         "agreement": describe_agreement(data.case.study),
-        "problem": data.problem,
-        "no_verdict": data.no_verdict,
+        "no_verdict": why_no_verdict(data.system),
         "later_changes": data.later_changes,
-        "opinion_problem": "" if data.system is None else reason_without_opinion(data),
+        "opinion_problem": reason_without_opinion(data),
         "statistics": figure_data(explained.figure(), explained.necessity)
         if explained and explained.analysed
         else None,
@@ -348,6 +287,43 @@ def _study_data(
         },
         **{name: make() for name, make in makers.items() if name in sections},
     }
+
+
+def rated_study_data(data: ReportInput, jobs: int | None, progress: Progress) -> dict[str, Any]:
+    """The page's data about one rated study: the original vehicle, and the solution with the fewest changes that loses
+    a point, simulated in all cells.
+    """
+    case, directory, options = data.case, str(data.directory), RatingOptions()
+    if data.any_unsafe:
+        options = RatingOptions(solution=data.select_handles("fewest")[0])
+    rating = rate_variant(case, options, jobs=jobs, progress=progress)
+    available = sum(sum(matrix.points) for matrix in rating.protocol.matrices)
+    return {
+        "title": case.study.title,
+        "sentence": f"{rating.no_verdict} {rating_in_words(rating)}".lstrip(),
+        "notes": remarks(rating),
+        "points": [
+            *(
+                (tests[0].matrix.name, [f"{test.total:.2f}" for test in tests], f"{sum(tests[0].matrix.points):g}")
+                for tests in zip(*(vehicle.tests for vehicle in rating.vehicles), strict=True)
+            ),
+            ("all", [f"{vehicle.points:.2f}" for vehicle in rating.vehicles], f"{available:g}"),
+        ],
+        "lost": [(test_in_words(test), f"{lost:.2f}") for test, lost in lost_by_test(rating)],
+        "turned": colour_changes_in_words(rating),
+        "picture": _picture("matrices", matrices_figure(rating)),
+        "names": [vehicle.name for vehicle in rating.vehicles],
+        "not_simulated": not_simulated(rating),
+        "commands": [
+            options.command_line(directory),
+            *(question_command(question, directory) for question in ("tolerance", "explain")),
+        ],
+    }
+
+
+def _render(template: str, **values: Any) -> str:
+    page = template_environment(TEMPLATE_FOLDER).get_template(template)
+    return page.render(css=_web_file("report.css"), **values) + "\n"
 
 
 def _web_file(name: str) -> Markup:

@@ -104,7 +104,7 @@ def test_an_overshooting_cruise_control_does_not_brake_for_the_obstacle() -> Non
     plain, overshot, settling, unbraked = (summarise_run(runs, column, 1.0).braking for column in range(4))
     assert overshot == settling == plain
     assert plain is not None
-    assert plain.time == pytest.approx(0.5)
+    assert plain.gap == pytest.approx(15.0)
     assert unbraked is None
 
 

@@ -23,22 +23,20 @@ from safevar_sumo.analysis.explain.braking_comparison import BrakingComparison, 
 from safevar_sumo.analysis.explain.causes import (
     RESOLUTION,
     BoundaryState,
-    find_boundaries,
+    Cause,
+    MinimalCause,
+    count_distinct_causes,
+    describe_causes,
     find_minimal_causes,
-    involved_columns,
-    necessary_columns,
+    necessity_frame,
     select_affordable_rows,
 )
-from safevar_sumo.analysis.explain.compute import explain_failures
-from safevar_sumo.analysis.explain.necessity import count_distinct_causes, necessity_frame
-from safevar_sumo.analysis.explain.render import print_explained
-from safevar_sumo.analysis.explain.result import Cause, Explained, Explanation
+from safevar_sumo.analysis.explain.compute import explain_failures, summarise_failures
+from safevar_sumo.analysis.explain.result import Explained, Explanation
 from safevar_sumo.analysis.explain.robustness import Robustness
-from safevar_sumo.analysis.explain.sentences import verdict_in_words
-from safevar_sumo.analysis.explain.summary import summarise_failures
+from safevar_sumo.analysis.explain.sentences import effect_in_words, print_explained, verdict_in_words
 from safevar_sumo.analysis.preventability import Preventability
 from safevar_sumo.analysis.research_questions.case import Case, load_cases
-from safevar_sumo.analysis.words import share_in_words
 from safevar_sumo.cli.program import commands
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
@@ -178,8 +176,7 @@ def assert_tells_a_manager(paragraph: str, explained: Explained) -> None:
     assert paragraph.startswith(start)
     share = f"{100 * leading.robustness.share:.0f} % of the neighbours are unsafe too"
     assert re.search(rf"a collision at {-leading.safety_degree:.1f} m/s, .*{leading.handle}.*{share}", paragraph)
-    shares = explained.preventability.shares
-    assert f"a competent driver avoids {share_in_words(shares.competent_driver)} ({shares.later})" in paragraph
+    assert f"a competent driver avoids {explained.preventability.range_in_words}" in paragraph
 
 
 @pytest.mark.slow
@@ -194,7 +191,7 @@ def test_the_summary_of_a_study_leads_with_the_answer(case: Case, explained: Exp
         (line,) = [
             line
             for line in others
-            if line.startswith(f"{failure.title.capitalize()}: {failure.handle}, collision, SD ")
+            if line.startswith(f"{failure.title.capitalize()}: {failure.handle}, {effect_in_words(failure)}. ")
         ]
         assert failure.cause is not None
         named = re.findall(r"(\w+) [\d.]+ -> ", line.partition(" These changes alone cause it: ")[2])
@@ -250,28 +247,32 @@ def test_all_smallest_unsafe_subsets_and_no_other_whatever_the_outcomes(table: l
     assert [set(cause.columns) for cause in result] == smallest
     for cause in result:
         assert not any(set(subset) < set(cause.columns) for subset in unsafe)
-    assert necessary_columns(result) == (set.intersection(*smallest) if smallest else set())
-    assert involved_columns(result) == set().union(*smallest)
+
+
+def described(evaluator: Evaluator, causes: list[MinimalCause]) -> Cause:
+    (result,) = describe_causes(evaluator, causes, COLLISION, [None])
+    return result
 
 
 def test_a_boundary_is_the_first_unsafe_place_and_no_island_is_skipped() -> None:
     evaluator = made_up_evaluator(3, two_islands)
     (causes,) = find_minimal_causes(evaluator, np.array([[9.5, 1.0, 8.0]]), COLLISION)
-    (result,) = find_boundaries(evaluator, causes, COLLISION)
+    result = described(evaluator, causes)
     assert result.fraction == pytest.approx(1.5 / 4.5, abs=2 * RESOLUTION)
-    assert result.setting[0] > 6.5 >= result.setting[0] - 2 * RESOLUTION * 4.5
-    assert result.single_limits == {0: result.setting[0]}
-    assert (result.state_below, result.at_threshold) == (BoundaryState.SAFE, None)
+    assert result.boundary["a"] > 6.5 >= result.boundary["a"] - 2 * RESOLUTION * 4.5
+    assert result.alone == result.boundary
+    assert (result.end, result.at_threshold) == (BoundaryState.SAFE, None)
 
 
 def test_nothing_is_shrunk_into_what_the_filter_takes_for_no_change() -> None:
     evaluator = made_up_evaluator(1, lambda settings: settings[:, 0] > ORIGINAL)
     (causes,) = find_minimal_causes(evaluator, np.array([[9.0]]), COLLISION)
-    (result,) = find_boundaries(evaluator, causes, COLLISION)
+    result = described(evaluator, causes)
     threshold = evaluator.characteristics.threshold[0]
-    assert result.setting[0] == pytest.approx(ORIGINAL + threshold, rel=1e-3)
-    assert evaluator.characteristics.filter(result.setting)[0] == result.setting[0]
-    assert (result.state_below, result.at_threshold) == (BoundaryState.FILTER, 0)
+    limit = result.boundary["a"]
+    assert limit == pytest.approx(ORIGINAL + threshold, rel=1e-3)
+    assert evaluator.characteristics.filter(np.array([limit]))[0] == limit
+    assert (result.end, result.at_threshold) == (BoundaryState.FILTER, "a")
 
 
 def test_a_boundary_that_ends_where_nothing_can_be_simulated_says_so() -> None:
@@ -280,8 +281,8 @@ def test_a_boundary_that_ends_where_nothing_can_be_simulated_says_so() -> None:
         study, Plant(study, lambda rows: rows[:, 0] > 7, failing=lambda rows: (rows[:, 0] > 6) & (rows[:, 0] <= 7))
     )
     (causes,) = find_minimal_causes(evaluator, np.array([[9.0]]), COLLISION)
-    (result,) = find_boundaries(evaluator, causes, COLLISION)
-    assert (result.setting[0], result.state_below) == (pytest.approx(7, abs=1e-3), BoundaryState.NOT_SIMULATED)
+    result = described(evaluator, causes)
+    assert (result.boundary["a"], result.end) == (pytest.approx(7, abs=1e-3), BoundaryState.NOT_SIMULATED)
 
 
 def test_necessary_and_changed_over_failures() -> None:
@@ -323,10 +324,7 @@ def failure_of(
     changes: dict[str, float], degree: float, *reasons: str, needed: int = 0, shares: tuple[float, ...] = ()
 ) -> Explanation:
     """A robust failure of `SUN`, with a cause of the first `needed` of its changes for each of these shares."""
-    run, part = (
-        RunSummary("stopped", np.nan, None, np.nan, np.nan),
-        dict(list(changes.items())[: needed or len(changes)]),
-    )
+    run, part = (RunSummary("stopped", np.nan, None), dict(list(changes.items())[: needed or len(changes)]))
     causes = [
         Cause(
             changes=part,

@@ -16,14 +16,18 @@ from safevar_sumo.ads.competent_driver import CompetentDriver
 from safevar_sumo.analysis.evaluator import Evaluator
 from safevar_sumo.analysis.explain import ExplainOptions
 from safevar_sumo.analysis.explain.braking_comparison import sentence
-from safevar_sumo.analysis.explain.compute import PointComparison, compare_at_points, explain_failures
+from safevar_sumo.analysis.explain.compute import (
+    PointComparison,
+    compare_at_points,
+    explain_failures,
+    summarise_failures,
+)
 from safevar_sumo.analysis.explain.robustness import (
     STEP_FACTORS,
     Robustness,
     estimate_robustness,
     find_smallest_robust_failure,
 )
-from safevar_sumo.analysis.explain.summary import summarise_failures
 from safevar_sumo.analysis.preventability import (
     Preventability,
     PreventableBy,
@@ -32,8 +36,7 @@ from safevar_sumo.analysis.preventability import (
     classify_collisions,
 )
 from safevar_sumo.analysis.research_questions.case import build_case
-from safevar_sumo.analysis.tolerance.answer import Tolerance
-from safevar_sumo.analysis.tolerance.safe_box import SafeBox
+from safevar_sumo.analysis.tolerance.answer import SafeBox, Tolerance
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.results import record, solutions_frame
@@ -116,36 +119,28 @@ def collisions(here: Evaluator, *settings: FloatArray) -> Evaluations:
 
 def categories(here: Evaluator, *settings: FloatArray) -> list[PreventableBy | None]:
     """The weakest driver who avoids each collision."""
-    return [avoidance and avoidance.by for avoidance in classify_collisions(here, collisions(here, *settings))]
+    return [avoidance and avoidance[0] for avoidance in classify_collisions(here, collisions(here, *settings))]
 
 
 def test_shares_are_told_as_a_range_over_reaction_times_with_two_digits() -> None:
-    by, full_braking = PreventableBy, "only full braking at the first possible moment avoids"
-    for counts, later, number, words in (
-        (
-            {by.COMPETENT_DRIVER: 5, by.FULL_BRAKING: 1, by.NOBODY: 1},
-            3,
-            7,
-            "of 7 collisions, a competent driver "
-            f"avoids 71 % (43 % if he needs 0.4 s longer), {full_braking} another 14 % and 14 % are "
-            "physically unavoidable.",
-        ),
+    by = PreventableBy
+    for counts, later, number, collisions, shares, others in (
+        ({by.COMPETENT_DRIVER: 5, by.FULL_BRAKING: 1, by.NOBODY: 1}, 3, 7, "7", "71 % (43 %", "14 %; nobody: 14 %"),
         (
             {by.COMPETENT_DRIVER: 999, by.FULL_BRAKING: 1},
             390,
             3000,
-            "of 1000 collisions, drawn at random from "
-            f"3000, a competent driver avoids nearly all (39 % if he needs 0.4 s longer) and {full_braking} "
-            "hardly any.",
+            "1000",
+            "nearly all (39 %",
+            "hardly any; nobody: none",
         ),
-        (
-            {by.FULL_BRAKING: 17},
-            0,
-            17,
-            f"of 17 collisions, a competent driver avoids none (none if he needs 0.4 s longer) and {full_braking} all.",
-        ),
+        ({by.FULL_BRAKING: 17}, 0, 17, "17", "none (none", "all; nobody: none"),
     ):
-        assert str(Preventability(counts=counts, collisions=number, later=later)) == f"In the same vehicle, {words}"
+        sample = ", drawn at random from 3000" if number == 3000 else ""
+        assert str(Preventability(counts=counts, collisions=number, later=later)) == (
+            f"In the same vehicle, of {collisions} collisions{sample}, a competent driver avoids {shares} if he needs "
+            f"0.4 s longer); only full braking at the first possible moment: {others}."
+        )
 
 
 @pytest.mark.slow
@@ -167,7 +162,7 @@ def test_shares_are_those_of_all_collisions_and_a_sample_is_random() -> None:
     here = evaluator(test="CPFA", speed=30)
     brakeless = (vehicle(0.1, 1 - (60 - k) / 1e6) for k in range(40))
     every = collisions(here, *brakeless, *(vehicle(1.0, 1 - k / 1e6) for k in range(20)))
-    whole = msgspec.to_builtins(assess_preventability(here, Evaluations.concatenate([every, every])).shares)
+    whole = assess_preventability(here, Evaluations.concatenate([every, every])).to_dict()
     later = whole.pop("later")
     assert whole == {
         "competent_driver": pytest.approx(1 / 3),
@@ -177,10 +172,10 @@ def test_shares_are_those_of_all_collisions_and_a_sample_is_random() -> None:
         "interval_competent_driver": [pytest.approx(1 / 3)] * 2,
     }
     assert (later["reaction"], later["competent_driver"]) == (pytest.approx(1.15), pytest.approx(1 / 3))
-    sample = msgspec.to_builtins(assess_preventability(here, every, max_simulations=90).shares)
+    sample = assess_preventability(here, every, max_simulations=90).to_dict()
     assert sample["looked_at"] == 30
     reverse = every.take(np.arange(60)[::-1])
-    assert sample == msgspec.to_builtins(assess_preventability(here, reverse, max_simulations=90).shares)
+    assert sample == assess_preventability(here, reverse, max_simulations=90).to_dict()
     hits = round(sample["competent_driver"] * 30)
     expected = scipy.stats.beta.ppf(0.025, hits, 31 - hits), scipy.stats.beta.ppf(0.975, hits + 1, 30 - hits)
     assert sample["interval_competent_driver"] == pytest.approx(expected)
@@ -260,11 +255,11 @@ def failure(system: System, weak: np.ndarray) -> PointComparison:
 def test_both_vehicles_are_compared_at_the_point_where_the_failure_is_worst(
     system: System, weak: np.ndarray, failure: PointComparison
 ) -> None:
-    assert failure.braking.changed.safety_degree == evaluate(system, weak).f_safe[0]
-    at = next(point for point in system.points if point.name == failure.braking.point)
+    assert failure[0].changed.safety_degree == evaluate(system, weak).f_safe[0]
+    at = next(point for point in system.points if point.name == failure[0].point)
     original = evaluate(system.at(at), system.characteristics.original[np.newaxis])
-    assert failure.braking.original.safety_degree == original.f_safe[0]
-    assert sentence(failure.braking).startswith(f"At {at.name}: the original ")
+    assert failure[0].original.safety_degree == original.f_safe[0]
+    assert sentence(failure[0]).startswith(f"At {at.name}: the original ")
 
 
 @pytest.mark.slow
@@ -284,12 +279,12 @@ def test_the_summary_of_a_matrix_names_the_point_of_what_belongs_to_one(
         f"{original.f_safe[0]:.2f} m."
     )
     assert count == "1 of 1 different vehicles are unsafe: collision."
-    degree = failure.braking.original.safety_degree
+    degree = failure[0].original.safety_degree
     assert degree > original.f_safe[0] + 0.01
     assert there.startswith(
-        f"At {failure.braking.point}, the original vehicle stops {degree:.2f} m short of the pedestrian. "
+        f"At {failure[0].point}, the original vehicle stops {degree:.2f} m short of the pedestrian. "
     )
-    assert more.endswith(f": python -m safevar_sumo explain out --point '{failure.braking.point}'")
+    assert more.endswith(f": python -m safevar_sumo explain out --point '{failure[0].point}'")
     whole = explain_failures(case, ExplainOptions(), pool=InlinePool(), statistics=False)
     tolerated = Tolerance(
         study=study,

@@ -37,15 +37,13 @@ module = sys.modules[package.name] = types.ModuleType(package.name)
 module.__path__ = package.submodule_search_locations
 exec(source.replace("top: int = option(8,", "top: int = option(5,"), module.__dict__)
 
-import pandas as pd
 import safevar_sumo as sv
 from safevar_sumo.cli.questions import explain
-from safevar_sumo.report.input import ReportInput
+from safevar_sumo.report.input import page_options
 
 flag = next(one.default for one in explain.params if one.name == "top")
 signature = inspect.signature(sv.explain).parameters["top"].default
-case = types.SimpleNamespace(solutions=pd.DataFrame())
-asked = ReportInput(study_number=1, directory="it", case=case, manifest={}, system=None).options["explain"]
+asked = page_options()["explain"]
 top_8 = module.ExplainOptions(top=8).command_line("it")
 print(flag, signature, asked.top, "--top" in asked.command_line("it"), "--top 8" in top_8)
 """

@@ -17,7 +17,7 @@ from safevar_sumo import risk, rules, tolerance
 from safevar_sumo.analysis.evaluator import Evaluator
 from safevar_sumo.analysis.research_questions.case import build_case
 from safevar_sumo.analysis.rules.compute import Rule, Rules
-from safevar_sumo.analysis.tolerance import ToleranceOptions, safe_box
+from safevar_sumo.analysis.tolerance import ToleranceOptions, compute
 from safevar_sumo.analysis.tolerance.answer import Tolerance
 from safevar_sumo.analysis.tolerance.compute import find_tolerances
 from safevar_sumo.metrics import Unsafe
@@ -82,11 +82,11 @@ def test_any_interval_is_found_that_is_as_wide_as_two_values_are_apart(ends: lis
 def test_a_plane_with_a_box_in_its_corner() -> None:
     result = of(3, box, pairs=True)
     assert result.pairs is not None
-    shares = {tuple(member.name for member in pair.characteristics): pair.unsafe_share for pair in result.pairs}
+    shares = {tuple(pair.characteristics): pair.unsafe_share for pair in result.pairs}
     assert shares == {("a", "b"): pytest.approx(0.09, abs=0.02), ("a", "c"): 0, ("b", "c"): 0}
     first = result.pairs[0]
-    assert first.nearest == (pytest.approx(7, abs=0.5), pytest.approx(3, abs=0.5))
-    assert box(np.array([first.nearest]))[0]
+    assert first.nearest == {"a": pytest.approx(7, abs=0.5), "b": pytest.approx(3, abs=0.5)}
+    assert box(np.array([list(first.nearest.values())]))[0]
     assert result.pairs[1].nearest is None
     assert result.verdict == "No single characteristic makes it unsafe, but 1 of 3 pairs: a with b."
 
@@ -186,12 +186,12 @@ def test_the_bound_of_the_box_holds_where_every_box_is_as_unsafe(monkeypatch: py
         ("MIN_FACTOR", 1e-3),
         ("MAX_UNSAFE_SHARE", 0.03),
     ):
-        monkeypatch.setattr(safe_box, name, value)
+        monkeypatch.setattr(compute, name, value)
     q, wrong, seeds, study = 0.031, 0, 100, made_up_study(2)
     for seed in range(seeds):
         seeded = msgspec.structs.replace(study, search=msgspec.structs.replace(study.search, seed=seed))
         evaluator = Evaluator(seeded, Plant(seeded, lambda rows: np.log(np.abs(rows[:, 0] - 5) + 1e-99) * 1e6 % 1 < q))
-        result = safe_box.find_safe_box(evaluator, [0, 1], Unsafe(), np.zeros((0, 2)))
+        result = compute.find_safe_box(evaluator, [0, 1], Unsafe(), np.zeros((0, 2)), np.zeros((0, 2)))
         wrong += result.unsafe_at_most < q
     assert 0 < wrong <= 0.05 * seeds
 

@@ -27,7 +27,7 @@ from safevar_sumo.campaign import RunKey, RunProgress, all_runs
 from safevar_sumo.cli.arguments import read_changes
 from safevar_sumo.cli.program import COMMANDS, commands
 from safevar_sumo.errors import InputError
-from safevar_sumo.progress import PartsProgress, open_progress
+from safevar_sumo.progress import open_progress
 from safevar_sumo.study import Study, load_study
 from safevar_sumo.terminal import WholeTable
 from safevar_sumo.vehicles import CharacteristicSet
@@ -251,29 +251,6 @@ def test_what_comes_from_journals_is_not_left_to_be_done(study: Study) -> None:
         observer.progressed([state("nsga2", 1, asked, replayed=500)._replace(collisions=min(asked, 600))])
     assert shows[0] == ("rain: runs 0/6", 0, 6000)
     assert shows[-1] == ("rain: runs 1/6, 1200 collisions, best SD -5.63", 200, 4500)
-
-
-def test_parts_have_one_counter_that_never_passes_its_end() -> None:
-    shows: list[tuple[str, int, int]] = []
-    parts = PartsProgress(lambda *values: shows.append(values), {"causes": 100, "stored": 50, "rules": 10})
-    for part, stages in {
-        "causes": (("a", 0, 20), ("a", 20, 20), ("b", 0, 20), ("b", 20, 20)),
-        "stored": (),
-        "rules": (("c", 0, 30), ("c", 15, 30), ("c", 30, 30)),
-    }.items():
-        show = parts.begin(part)
-        for stage in stages:
-            show(*stage)
-    assert shows == [
-        ("starting", 0, 160),
-        ("causes: a", 0, 160),
-        ("causes: a", 20, 160),
-        ("causes: b", 20, 160),
-        ("causes: b", 40, 160),
-        ("rules: c", 40, 70),
-        ("rules: c", 55, 70),
-        ("rules: c", 70, 70),
-    ]
 
 
 def test_a_few_settings_in_a_long_matrix_are_several_batches(monkeypatch: pytest.MonkeyPatch) -> None:

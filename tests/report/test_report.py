@@ -19,12 +19,12 @@ import pytest
 from click.testing import CliRunner
 
 from safevar_sumo.ads.full_braking import FullBraking
-from safevar_sumo.analysis.explain.result import Cause, Explained
+from safevar_sumo.analysis.explain.causes import Cause
+from safevar_sumo.analysis.explain.result import Explained
 from safevar_sumo.analysis.explain.sentences import counts_in_words, effect_in_words, verdict_in_words
 from safevar_sumo.analysis.preventability import Preventability, PreventableBy
 from safevar_sumo.analysis.research_questions.case import load_cases
-from safevar_sumo.analysis.tolerance.answer import Tolerance
-from safevar_sumo.analysis.tolerance.safe_box import SafeBox
+from safevar_sumo.analysis.tolerance.answer import SafeBox, Tolerance
 from safevar_sumo.campaign import local
 from safevar_sumo.cli.program import commands
 from safevar_sumo.errors import InputError
@@ -32,10 +32,9 @@ from safevar_sumo.replay.comparison import format_number
 from safevar_sumo.report import SECTIONS, make_report
 from safevar_sumo.report import input as report_input
 from safevar_sumo.report import page as report_page
+from safevar_sumo.report.background import describe_conditions
 from safevar_sumo.report.causes import make_verdict
-from safevar_sumo.report.input import AVOIDED_TEXT, tabulate_failing_points
-from safevar_sumo.report.page import COMMAND_OF_SECTION, DOMAIN_QUESTIONS, read_inputs
-from safevar_sumo.report.tested import describe_conditions
+from safevar_sumo.report.page import read_inputs
 from safevar_sumo.results.manifest import write_manifest
 from safevar_sumo.scenarios import Point, weather_of
 from safevar_sumo.sumo.system import assemble
@@ -95,8 +94,6 @@ def page(slippery: Path, explained: Explained) -> str:
         shows: list[tuple[str, int, int]] = []
         page = make_report([slippery], jobs=1, progress=lambda *values: shows.append(values))
         assert shows[0][1] == 0
-        assert shows[0][2] > 1000, "the page's simulations, not those of its first stage"
-        assert [done for _, done, _ in shows[:-2]] == sorted(done for _, done, _ in shows[:-2])
         assert all(done <= total for _, done, total in shows)
         return page
 
@@ -186,9 +183,9 @@ def test_the_key_figures_are_those_of_the_answers(slippery: Path, explained: Exp
         f"{len(robust.changed)} change{'s' if len(robust.changed) > 1 else ''}",
         str(robust.robustness),
     )
-    assert figures[2][1] == "nearly all of the collisions"
-    assert figures[2][2].startswith(
-        "39 % if he needs 0.4 s longer, in the same vehicle (all 10000 collisions analysed)"
+    assert figures[2][1:] == (
+        "nearly all (39 % if he needs 0.4 s longer)",
+        "in the same vehicle; 10000 collisions analysed",
     )
     assert figures[3][1] == "42.0 % of the way"
 
@@ -270,43 +267,14 @@ def test_the_command_writes_the_page_and_refuses_what_it_cannot(slippery: Path, 
         assert isinstance(report(*arguments), InputError)
 
 
-def point(name: str, **place: Any) -> Point:
-    return Point(None, None, name, tuple(place.items()))  # type: ignore[arg-type]
-
-
-def test_tests_and_weathers_stand_down_and_speeds_across() -> None:
-    matrix = [
-        *(
-            point(f"near {speed} {at}", test="near", speed=speed, impact_location=at, weather="night")
-            for speed in (10, 20, 30)
-            for at in (25, 50)
-        ),
-        point("along 30", test="along", speed=30, weather="clear"),
-        point("along 40", test="along", speed=40, weather="clear"),
-        point("safe 10", test="safe", speed=10, weather="clear"),
-    ]
-    result = tabulate_failing_points(matrix, ("near 20 50", "near 30 25", "near 30 50", "along 40"))
-    assert result.summary == "Fails at 4 of 9 points. Percentages are impact locations."
-    assert list(result.frame) == ["10 km/h", "20 km/h", "30 km/h", "40 km/h"]
-    assert result.frame.T.to_dict("list") == {
-        "near, night": [AVOIDED_TEXT, "50 %", "25 %, 50 %", ""],
-        "along, clear": ["", "", AVOIDED_TEXT, "fails"],
-    }
-
-
-def test_a_study_that_cannot_be_simulated_has_its_page(slippery: Path, tmp_path: Path) -> None:
+def test_a_study_that_cannot_be_simulated_has_no_page(slippery: Path, tmp_path: Path) -> None:
     """Its network's folder is gone since."""
-    shutil.copytree(slippery, tmp_path / "copy", ignore=shutil.ignore_patterns("answers"))
+    shutil.copytree(slippery, tmp_path / "copy")
     manifest = json.loads((slippery / "manifest.json").read_text())
     manifest["study"]["scenario"]["parameters"] = {"network": "/nowhere/gone"}
     write_manifest(tmp_path / "copy", manifest)
-    with pytest.warns(UserWarning, match="copy: This study cannot be simulated here: .*gone"):
-        page = make_report(
-            [tmp_path / "copy"], only=["tested", "verdict", *COMMAND_OF_SECTION, "trust", "reproduce"], jobs=1
-        )
-    result = re.findall(r"slippery: This study cannot be simulated here: .*gone", page)
-    assert len(result) == 1 + len(DOMAIN_QUESTIONS), "each section that would take simulations says so"
-    assert '<details class="replay"' in page
+    with pytest.raises(InputError, match="gone"):
+        make_report([tmp_path / "copy"], only=["tested"], jobs=1)
 
 
 @pytest.mark.slow
@@ -332,9 +300,11 @@ def test_of_an_original_that_collides_no_change_is_called_the_cause(
     ("weather", "has_effect"), [("carla_hard_rain", False), ("clear", True), ("hard_rain", True), ("night", True)]
 )
 def test_a_weather_without_effect_is_called_so(weather: str, has_effect: bool) -> None:
-    material: Any = SimpleNamespace(system=None, point="", case=SimpleNamespace(weather=weather_of(weather, "weather")))
+    material: Any = SimpleNamespace(
+        system=SimpleNamespace(matrix=()), point="", case=SimpleNamespace(weather=weather_of(weather, "weather"))
+    )
     assert describe_conditions(material).startswith(f"weather: {weather}")
     assert ("no effect on road and sensors" not in describe_conditions(material)) is has_effect
-    points = (point("x clear", test="x")._replace(weather=weather_of("clear", "weather")),)
+    points = (Point(None, weather_of("clear", "weather"), "x clear", (("test", "x"),)),)  # type: ignore[arg-type]
     matrix: Any = SimpleNamespace(system=SimpleNamespace(matrix=points), point="")
-    assert describe_conditions(matrix).endswith("at all 1 points of a matrix: x (1, clear)")
+    assert describe_conditions(matrix).endswith("at all 1 points of a matrix (x, clear: 1 point)")

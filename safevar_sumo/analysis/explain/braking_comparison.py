@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from safevar_sumo.analysis.words import OUTCOME_VERBS, join_phrases
+from safevar_sumo.analysis.words import OUTCOME_VERBS
 from safevar_sumo.records import STANDSTILL, Outcome, SimulationRuns
 
 PEDAL_SHARE = 0.9
@@ -40,8 +40,8 @@ class Braking(NamedTuple):
 
     Attributes
     ----------
-    time, gap, speed
-        Time, gap and speed when the brake was commanded (`brake_onset`) [s, m, m/s].
+    gap, speed
+        Gap and speed when the brake was commanded (`brake_onset`) [m, m/s].
     delay
         Time from the command until the brake pedal has followed it [s].
     speed_deficit
@@ -50,20 +50,16 @@ class Braking(NamedTuple):
         Speed at the command minus the speed at the end of the delay [m/s].
     deceleration
         Mean deceleration after the delay [m/s^2], averaged over the distance, as in UN R13-H.
-    gears
-        Gear at the command and at the end of the delay.
     obstacle_speed
         Mean speed of the obstacle along the vehicle's path from the command on [m/s]; `deceleration` is relative to it.
     """
 
-    time: float
     gap: float
     speed: float
     delay: float
     speed_deficit: float
     speed_lost: float
     deceleration: float
-    gears: tuple[float, float] = (0, 0)
     obstacle_speed: float = 0.0
 
     @property
@@ -72,31 +68,26 @@ class Braking(NamedTuple):
         return self.speed - self.obstacle_speed
 
     @property
-    def stopping_distance(self) -> float:
-        """Distance by which the gap shrinks from the command on [m], if the mean deceleration continues after the
+    def margin(self) -> float:
+        """Gap at the command minus the distance by which it shrinks [m], if the mean deceleration continues after the
         run.
         """
         speed_after_delay = self.closing_speed - self.speed_lost
-        return (self.closing_speed - self.speed_deficit) * self.delay + speed_after_delay**2 / (2 * self.deceleration)
-
-    @property
-    def margin(self) -> float:
-        """Gap at the command minus the distance needed [m]."""
-        return self.gap - self.stopping_distance
+        while_pedal_moves = (self.closing_speed - self.speed_deficit) * self.delay
+        return self.gap - while_pedal_moves - speed_after_delay**2 / (2 * self.deceleration)
 
 
 class RunSummary(NamedTuple):
     """Summary of one run; `braking` is None if the vehicle did not brake for the obstacle.
 
-    `safety_degree` is a distance [m] or, on a collision, minus its speed [m/s]; NaN if undefined. `least_gap` is the
-    gap when the obstacle is nearest [m], NaN on a collision.
+    `safety_degree` is a distance [m] or, on a collision, minus its speed [m/s]; NaN if undefined. `remainder` is the
+    part of the gap when the obstacle is nearest that the margin does not explain [m], 0 on a collision.
     """
 
     outcome: str
     safety_degree: float
     braking: Braking | None
-    least_gap: float
-    collision_speed: float
+    remainder: float = 0.0
 
 
 class BrakingComparison(NamedTuple):
@@ -149,18 +140,12 @@ def brake_onset(runs: SimulationRuns, column: int) -> int | None:
 
 def summarise_run(runs: SimulationRuns, column: int, safety_degree: float) -> RunSummary:
     """Summary of the run of vehicle `column`."""
-    collision_speed, nearest, onset = (
-        float(runs.collision_speed[column]),
-        runs.nearest(column),
-        brake_onset(runs, column),
-    )
-    least_gap, braking = np.nan, None
-    if nearest is not None and np.isnan(collision_speed):
-        least_gap = float(runs.trace.gap[nearest, column])
-    if onset is not None:
-        last = int(np.flatnonzero(runs.trace.active[:, column])[-1]) if nearest is None else nearest
-        braking = _measure_braking(runs, column, onset, last)
-    return RunSummary(str(runs.outcome[column]), safety_degree, braking, least_gap, collision_speed)
+    outcome, nearest, onset = str(runs.outcome[column]), runs.nearest(column), brake_onset(runs, column)
+    last = int(np.flatnonzero(runs.trace.active[:, column])[-1]) if nearest is None else nearest
+    braking = None if onset is None else _measure_braking(runs, column, onset, last)
+    if braking is None or nearest is None or np.isfinite(runs.collision_speed[column]):
+        return RunSummary(outcome, safety_degree, braking)
+    return RunSummary(outcome, safety_degree, braking, float(runs.trace.gap[nearest, column]) - braking.margin)
 
 
 def _measure_braking(runs: SimulationRuns, column: int, first: int, last: int) -> Braking | None:
@@ -172,176 +157,97 @@ def _measure_braking(runs: SimulationRuns, column: int, first: int, last: int) -
     obstacle_speed = round(float(shift / elapsed), OBSTACLE_DECIMALS) if last > first and np.isfinite(shift) else 0.0
     speed, position = speed - obstacle_speed, position - obstacle_speed * trace.time[: last + 1]  # relative to it
     has_followed = trace.pedal[first : last + 1, column] >= PEDAL_SHARE * trace.brake[first : last + 1, column]
-    end_of_delay = first + int(np.argmax(has_followed))
-    distance = float(position[last] - position[end_of_delay])
-    specific_energy = float(speed[end_of_delay] ** 2 - speed[last] ** 2) / 2  # energy that the brake takes, per mass
+    followed = first + int(np.argmax(has_followed))
+    distance = float(position[last] - position[followed])
+    specific_energy = float(speed[followed] ** 2 - speed[last] ** 2) / 2  # energy that the brake takes, per mass
     if not has_followed.any() or distance <= 0 or specific_energy <= COAST_DECELERATION * distance:
         return None
-    initial_speed, delay = float(speed[first]), (end_of_delay - first) * trace.step
+    initial_speed, delay = float(speed[first]), (followed - first) * trace.step
+    mean_speed = float(position[followed] - position[first]) / delay if delay else initial_speed
     return Braking(
-        time=float(trace.time[first]),
         gap=float(trace.gap[first, column]),
         speed=initial_speed + obstacle_speed,
         delay=delay,
-        speed_deficit=initial_speed - float(position[end_of_delay] - position[first]) / delay
-        if end_of_delay > first
-        else 0.0,
-        speed_lost=initial_speed - float(speed[end_of_delay]),
+        speed_deficit=initial_speed - mean_speed,
+        speed_lost=initial_speed - float(speed[followed]),
         deceleration=specific_energy / distance,
-        gears=(float(trace.gear[first, column]), float(trace.gear[end_of_delay, column])),
         obstacle_speed=obstacle_speed,
     )
 
 
 def compare_braking(original: RunSummary, changed: RunSummary, point: str = "") -> BrakingComparison:
     """Compare a changed vehicle's run with the original vehicle's run at the same test point, whose name is `point`."""
-    original_braking, changed_braking = original.braking, _braking_to_compare(changed, original)
-    if original_braking is None or changed_braking is None:
+    brakings = [run.braking for run in (original, changed) if run.braking is not None]
+    if len(brakings) < 2:
         return BrakingComparison(original, changed, {}, point)
-    parts = _split_lost_margin(original_braking, changed_braking)
-    gap_errors = original.least_gap - original_braking.margin, changed.least_gap - changed_braking.margin
-    remainders = [0.0 if np.isnan(error) else error for error in gap_errors]
-    return BrakingComparison(original, changed, {**parts, "remainder": remainders[0] - remainders[1]}, point)
-
-
-def _braking_to_compare(changed: RunSummary, original: RunSummary) -> Braking | None:
-    """The braking of a changed vehicle; if it collides without braking, the original vehicle's braking at the changed
-    vehicle's speed.
-    """
-    if changed.braking is not None or original.braking is None or not np.isfinite(changed.collision_speed):
-        return changed.braking
-    least = original.braking.speed_lost + original.braking.obstacle_speed  # so that no speed is negative
-    speed = max(changed.collision_speed, least)
-    return original.braking._replace(time=np.nan, gap=0.0, speed=speed)
-
-
-def _split_lost_margin(original: Braking, changed: Braking) -> dict[str, float]:
-    """Parts of the lost margin by cause [m].
-
-    With the two runs' means of t, of v - d and of 1 / a, a vehicle saves e t + d (v - d) / a.
-    """
-    mean_delay, mean_inverse_deceleration = (
-        (original.delay + changed.delay) / 2,
-        (1 / original.deceleration + 1 / changed.deceleration) / 2,
-    )
-    speeds_after_delay = [braking.closing_speed - braking.speed_lost for braking in (original, changed)]
-    mean_speed_after_delay = sum(speeds_after_delay) / 2
-    mean_delay_speeds = [braking.closing_speed - braking.speed_deficit for braking in (original, changed)]
-    savings = [
-        braking.speed_deficit * mean_delay + braking.speed_lost * mean_speed_after_delay * mean_inverse_deceleration
-        for braking in (original, changed)
-    ]
-    return {
-        "gap": original.gap - changed.gap,
-        "speed": (
-            (changed.closing_speed - original.closing_speed)
-            * (mean_delay + mean_speed_after_delay * mean_inverse_deceleration)
-        ),
-        "delay": (changed.delay - original.delay) * sum(mean_delay_speeds) / 2,
-        "slowing": savings[0] - savings[1],
-        "deceleration": (
-            (1 / changed.deceleration - 1 / original.deceleration)
-            * (speeds_after_delay[0] ** 2 + speeds_after_delay[1] ** 2)
-            / 4
-        ),
+    gap, *quantities = np.array(
+        [
+            [one.gap, one.closing_speed, one.delay, one.speed_deficit, one.speed_lost, 1 / one.deceleration]
+            for one in brakings
+        ]
+    ).T
+    speed, delay, deficit, lost, softness = (values.mean() for values in quantities)
+    more_speed, more_delay, more_deficit, more_lost, more_softness = (float(np.diff(one)[0]) for one in quantities)
+    per_speed_after_delay = (speed - lost) * softness
+    speeds_after_delay = quantities[0] - quantities[3]
+    parts = {
+        "gap": gap[0] - gap[1],
+        "speed": more_speed * (delay + per_speed_after_delay),
+        "delay": more_delay * (speed - deficit),
+        "slowing": -more_deficit * delay - more_lost * per_speed_after_delay,
+        "deceleration": more_softness * np.mean(speeds_after_delay**2) / 2,
+        "remainder": original.remainder - changed.remainder,
     }
+    return BrakingComparison(original, changed, {name: float(part) for name, part in parts.items()}, point)
 
 
 MIN_PART = 0.005
 """Smallest part of a distance that a sentence mentions [m]: half a centimetre."""
 PART_PHRASES = {
-    "gap": ("it begins to brake at a smaller gap", "it begins to brake at a larger gap"),
-    "speed": ("it is faster", "it is slower"),
-    "delay": ("its brake pedal follows later", "its brake pedal follows sooner"),
-    "slowing": ("it slows less while the pedal moves", "it slows more while the pedal moves"),
-    "deceleration": ("it decelerates less with the pedal down", "it decelerates more with the pedal down"),
+    "gap": ("gap", "m", "it begins to brake at a smaller gap", "it begins to brake at a larger gap"),
+    "speed": ("speed", "m/s at the command", "it is faster", "it is slower"),
+    "delay": ("delay", "s after the command", "its brake pedal follows later", "its brake pedal follows sooner"),
+    "slowing": (
+        "speed_lost",
+        "m/s",
+        "it loses less speed while the pedal moves",
+        "it loses more speed while the pedal moves",
+    ),
+    "deceleration": (
+        "deceleration",
+        "m/s^2",
+        "it decelerates less with the pedal down",
+        "it decelerates more with the pedal down",
+    ),
 }
-"""Phrases for each part: if it costs distance, and if it gains distance."""
+"""For each part the attribute of `Braking` that explains it, its unit, and phrases: if it costs distance, and if it
+gains distance.
+"""
 
 
 def ending_in_words(run: RunSummary) -> str:
     """How a run ended, in words."""
     if run.outcome == Outcome.COLLISION:
-        return f"collides at {run.collision_speed:.2f} m/s"
-    end = OUTCOME_VERBS.get(Outcome(run.outcome), run.outcome)
+        return f"collides at {-run.safety_degree:.2f} m/s"
+    end = OUTCOME_VERBS[Outcome(run.outcome)]
     return end if np.isnan(run.safety_degree) else f"{end}, safety degree {run.safety_degree:.2f} m"
 
 
-def sentence(comparison: BrakingComparison, *, full: bool = False) -> str:
-    """Why the changed vehicle is less safe than the original, in one sentence or two; `full` explains what the lost
-    margin is.
-    """
+def sentence(comparison: BrakingComparison) -> str:
+    """Why the changed vehicle is less safe than the original; a part below 0 is gained."""
+    original, changed = comparison.original, comparison.changed
     subject = f"At {comparison.point}: the" if comparison.point else "The"
-    endings = (
-        f"{subject} original {ending_in_words(comparison.original)}; this one {ending_in_words(comparison.changed)}."
-    )
-    original_braking, changed_braking = comparison.original.braking, comparison.changed.braking
-    if original_braking is None and changed_braking is None:
-        return f"{endings} Neither of them brakes."
+    endings = f"{subject} original {ending_in_words(original)}; this one {ending_in_words(changed)}."
     if not comparison.parts:
-        return f"{endings} {'The original' if original_braking is None else 'It'} never slows down by braking."
-    no_effect = "" if changed_braking is not None else " Its brake has no effect."
-    parts, is_lost = comparison.parts, comparison.lost_margin >= 0
-    loss_prefix, gain_prefix = ("", "gained ") if is_lost else ("lost ", "")
-    phrases = [
-        f"{abs(parts[name]):.2f} m {loss_prefix if parts[name] > 0 else gain_prefix}because "
-        f"{_phrase_of(comparison, name)}"
-        f"{_quantities_in_words(comparison, name)}"
-        for name in sorted(PART_PHRASES, key=lambda name: -parts[name])
-        if abs(parts[name]) >= MIN_PART
-    ]
-    if abs(parts["remainder"]) > MAX_OMITTED_REMAINDER:
-        phrases.append(f"{parts['remainder']:+.2f} m unexplained")
-    if not phrases:
-        return f"{endings} They brake alike."
-    margin = f"{abs(comparison.lost_margin):.2f} m"
-    introduction = (
-        f"Of the {margin} {'lost' if is_lost else 'gained'}"
-        if not full
-        else (
-            f"Its margin, the gap at the brake command less the distance needed to stop, is {margin} "
-            f"{'smaller' if is_lost else 'larger'}"
-        )
-    )
-    return f"{endings}{no_effect} {introduction}: {join_phrases(phrases)}."
-
-
-def _phrase_of(comparison: BrakingComparison, part: str) -> str:
-    """The phrase for a part; a vehicle that speeds up while its pedal moves does not slow less."""
-    gains, changed, original = comparison.parts[part] < 0, comparison.changed.braking, comparison.original.braking
-    if (
-        part == "slowing"
-        and changed is not None
-        and original is not None
-        and min(changed.speed_lost, original.speed_lost) < 0
-    ):
-        if changed.speed_lost >= 0:
-            return "it does not speed up while the pedal moves"
-        before, after = changed.gears
-        gear = "" if before == after else f" and the gear changes from {before:g} to {after:g}"
-        return (
-            f"it speeds up {'' if original.speed_lost >= 0 else 'less ' if gains else 'more '}while the pedal "
-            f"moves{gear}"
-        )
-    return PART_PHRASES[part][gains]
-
-
-def _quantities_in_words(comparison: BrakingComparison, part: str) -> str:
-    """The quantity that explains a part, for the changed vehicle and for the original vehicle."""
-    original_braking, changed_braking = comparison.original.braking, comparison.changed.braking
-    if original_braking is None or changed_braking is None:
-        return ""
-    if part == "slowing":
-        changes = [
-            f"from {one.speed:.2f} to {one.speed - one.speed_lost:.2f}" for one in (changed_braking, original_braking)
-        ]
-        return f" ({' instead of '.join(changes)} m/s)"
-    quantities = {
-        "gap": (changed_braking.gap, original_braking.gap, "m"),
-        "speed": (changed_braking.speed, original_braking.speed, "m/s at the command"),
-        "delay": (changed_braking.delay, original_braking.delay, "s after the command"),
-        "deceleration": (changed_braking.deceleration, original_braking.deceleration, "m/s^2"),
-    }
-    changed, original, unit = quantities[part]
-    decimals = next((digits for digits in range(2, 9) if f"{changed:.{digits}f}" != f"{original:.{digits}f}"), 2)
-    return f" ({changed:.{decimals}f} instead of {original:.{decimals}f} {unit})"
+        return f"{endings} {'It' if changed.braking is None else 'The original'} never slows down by braking."
+    phrases = []
+    for name, part in sorted(comparison.parts.items(), key=lambda item: -item[1]):
+        if name in PART_PHRASES and abs(part) >= MIN_PART:
+            attribute, unit, costs, gains = PART_PHRASES[name]
+            here, there = (getattr(run.braking, attribute) for run in (changed, original))
+            phrase = costs if part > 0 else gains
+            phrases.append(f"{part:.2f} m because {phrase} ({here:.4g} instead of {there:.4g} {unit})")
+    if abs(comparison.parts["remainder"]) > MAX_OMITTED_REMAINDER:
+        phrases.append(f"{comparison.parts['remainder']:.2f} m unexplained")
+    lost = f"{endings} Its margin, the gap at the brake command less the distance needed to stop, is "
+    return f"{lost}{comparison.lost_margin:.2f} m smaller: {', '.join(phrases) or 'they brake alike'}."

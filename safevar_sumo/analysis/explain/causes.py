@@ -6,17 +6,23 @@ size by size, until some are unsafe. These are minimal, as no smaller subset is 
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 from enum import StrEnum
 from itertools import combinations, islice
 from math import comb
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+import pandas as pd
 
-from safevar_sumo.analysis.evaluator import Evaluator
+from safevar_sumo.analysis.evaluator import Evaluator, clopper_pearson
+from safevar_sumo.analysis.explain.robustness import Robustness
+from safevar_sumo.analysis.words import direction_in_words
 from safevar_sumo.metrics import Unsafe
-from safevar_sumo.records import FloatArray, finite_or_none
+from safevar_sumo.records import BoolArray, FloatArray, finite_or_none
+from safevar_sumo.vehicles import CharacteristicSet
 
 MAX_SUBSETS = 20_000
 """Maximum number of subsets simulated in one call; further subsets are made only after it, which bounds the memory."""
@@ -34,13 +40,6 @@ class MinimalCause(NamedTuple):
     safety_degree: float | None
 
 
-class _Subset(NamedTuple):
-    """A subset of the changes of one setting."""
-
-    row: int
-    columns: tuple[int, ...]
-
-
 def find_minimal_causes(evaluator: Evaluator, settings: FloatArray, unsafe: Unsafe) -> list[list[MinimalCause]]:
     """All smallest unsafe subsets of the changes of each of M settings, shape (M, n); an empty list if no subset is
     unsafe.
@@ -52,48 +51,109 @@ def find_minimal_causes(evaluator: Evaluator, settings: FloatArray, unsafe: Unsa
     causes: list[list[MinimalCause]] = [[] for _ in settings]
     for size in range(max(map(len, columns_by_row), default=0) + 1):
         open_rows = [row for row in range(len(settings)) if not causes[row]]
-        subsets = (_Subset(row, columns) for row in open_rows for columns in combinations(columns_by_row[row], size))
+        subsets = ((row, columns) for row in open_rows for columns in combinations(columns_by_row[row], size))
         while chunk := list(islice(subsets, MAX_SUBSETS)):
             partial_settings = np.tile(original, (len(chunk), 1))
             for index, (row, columns) in enumerate(chunk):
                 partial_settings[index, list(columns)] = settings[row, list(columns)]
             evaluations = evaluator.evaluate(partial_settings, f"subsets of {size} changes")
             for index in np.flatnonzero(unsafe.of(evaluations)).tolist():
-                subset, degree = chunk[index], finite_or_none(evaluations.f_safe[index])
-                cause = MinimalCause(subset.columns, partial_settings[index], str(evaluations.outcome[index]), degree)
-                causes[subset.row].append(cause)
+                (row, columns), degree = chunk[index], finite_or_none(evaluations.f_safe[index])
+                outcome = str(evaluations.outcome[index])
+                causes[row].append(MinimalCause(columns, partial_settings[index], outcome, degree))
     return causes
-
-
-def estimate_subset_count(changes: int) -> int:
-    """Estimated number of subsets to simulate, for a setting with this number of changes, until the smallest unsafe
-    subsets appear.
-
-    The estimate assumes causes with half of the changes, about as in the shipped studies.
-    """
-    return sum(comb(changes, size) for size in range((changes + 1) // 2 + 1))
 
 
 def select_affordable_rows(settings: FloatArray, evaluator: Evaluator, max_evaluations: int) -> list[int]:
     """Rows whose minimal causes together take at most about `max_evaluations`: all rows of `settings`, or a random
     sample.
+
+    The estimate assumes causes with half of the changes, about as in the shipped studies.
     """
-    costs = [estimate_subset_count(int(changes)) for changes in evaluator.characteristics.number_changed(settings)]
-    if sum(costs) <= max_evaluations:
+    costs = np.array(
+        [
+            sum(comb(changes, size) for size in range((changes + 1) // 2 + 1))
+            for changes in evaluator.characteristics.number_changed(settings).astype(int).tolist()
+        ]
+    )
+    if costs.sum() <= max_evaluations:
         return list(range(len(settings)))
     order = np.random.default_rng(evaluator.study.search.seed).permutation(len(settings))
-    is_affordable = np.cumsum([costs[row] for row in order]) <= max_evaluations
-    return sorted(order[is_affordable].tolist())
+    return sorted(order[np.cumsum(costs[order]) <= max_evaluations].tolist())
 
 
-def necessary_columns(causes: Sequence[MinimalCause]) -> frozenset[int]:
-    """Columns that all minimal causes of a setting contain."""
-    return frozenset.intersection(*(frozenset(cause.columns) for cause in causes)) if causes else frozenset()
+def necessity_frame(
+    characteristics: CharacteristicSet, changed: BoolArray, causes: Sequence[Sequence[MinimalCause]], failures: int
+) -> pd.DataFrame:
+    """How often each characteristic is changed, and how often it is needed.
+
+    Parameters
+    ----------
+    changed
+        Which characteristics each of M failures changes, shape (M, n).
+    causes
+        The minimal causes of each of the M failures.
+    failures
+        Number of all failures; if it is larger than M, the M failures are a random sample of them.
+
+    Returns
+    -------
+    pandas.DataFrame
+        One row per characteristic: `characteristic`, and the shares of failures in which it is `changed`, `necessary`
+        (part of every minimal cause) and `involved` (part of at least one). `necessary_lower` and `necessary_upper` are
+        the 95 % interval of `necessary` among all failures: Clopper and Pearson's for a sample (slightly too wide,
+        because the sample is drawn without replacement from finitely many failures), the share itself if all failures
+        were analysed. Ordered by necessary, involved, changed; no rows if there is no failure.
+    """
+    number = max(len(changed), 1)
+    sets = [[set(cause.columns) for cause in failure_causes] for failure_causes in causes]
+    necessary = Counter(column for columns in sets if columns for column in set.intersection(*columns))
+    involved = Counter(column for columns in sets for column in set().union(*columns))
+    frame = pd.DataFrame(
+        [
+            (
+                name,
+                np.count_nonzero(changed[:, column]) / number,
+                necessary[column] / number,
+                involved[column] / number,
+                *(
+                    clopper_pearson(necessary[column], number)
+                    if len(changed) < failures
+                    else [necessary[column] / number] * 2
+                ),
+            )
+            for column, name in enumerate(characteristics.names)
+        ],
+        columns=["characteristic", "changed", "necessary", "involved", "necessary_lower", "necessary_upper"],
+    )
+    order = ["necessary", "involved", "changed"]
+    return frame[: len(frame) if len(changed) else 0].sort_values(
+        order, ascending=False, kind="stable", ignore_index=True
+    )
 
 
-def involved_columns(causes: Sequence[MinimalCause]) -> frozenset[int]:
-    """Columns that at least one minimal cause of a setting contains."""
-    return frozenset(column for cause in causes for column in cause.columns)
+def cause_key(characteristics: CharacteristicSet, cause: MinimalCause) -> tuple[str, ...]:
+    """The directions of a cause's changes, without their sizes, such as ('mass up', 'tireFric down')."""
+    return tuple(
+        direction_in_words(characteristics.members[column], float(cause.setting[column])) for column in cause.columns
+    )
+
+
+def count_distinct_causes(characteristics: CharacteristicSet, causes: Sequence[Sequence[MinimalCause]]) -> pd.DataFrame:
+    """Every distinct minimal cause, most frequent first.
+
+    Returns
+    -------
+    pandas.DataFrame
+        Columns `cause`, a tuple of changes with their directions; `failures`, the number of failures with this cause;
+        and `share`, their share of all failures.
+    """
+    counts = Counter(
+        key for failure_causes in causes for key in {cause_key(characteristics, cause) for cause in failure_causes}
+    )
+    order = sorted(counts, key=lambda key: (-counts[key], len(key), key))
+    rows = [(key, counts[key], counts[key] / len(causes)) for key in order]
+    return pd.DataFrame(rows, columns=["cause", "failures", "share"])
 
 
 LINE_SETTINGS = 32
@@ -119,47 +179,112 @@ class BoundaryState(StrEnum):
     NOT_SIMULATED = "not simulated"
 
 
-class Boundary(NamedTuple):
-    """The smallest unsafe share of a cause's changes, and the setting there, shape (n,).
+@dataclass(frozen=True, kw_only=True)
+class Cause:
+    """A smallest subset of a failure's changes that is unsafe by itself, all else as in the original vehicle.
 
-    `single_limits` has for each column the value to which its change can be reduced while the other changes stay.
-    `state_below` is the state just below `fraction`; at the filter's threshold, `at_threshold` is the column whose
-    change the filter removes.
+    Attributes
+    ----------
+    changes
+        The failure's values of these characteristics, in their units.
+    boundary
+        The values after every change is multiplied by `fraction`, the smallest factor at which the vehicle stays
+        unsafe.
+    alone
+        For each characteristic, the value to which it can return towards the original while the others stay as in
+        `changes`.
+    outcome, safety_degree
+        Outcome, and safety degree [m, or -m/s], of a vehicle with these changes only.
+    end, at_threshold
+        The end of the shrinking: the state just below `fraction`; at the filter's threshold, the characteristic whose
+        change the filter would remove.
+    short_changes, short_boundary
+        `changes` and `boundary` in as few digits as a vehicle needs to end alike, for commands.
+    neighbours
+        Robustness of these changes by themselves, estimated from the setting's neighbours; None in a rated study, where
+        the simulations would take too long.
     """
 
+    changes: dict[str, float]
+    boundary: dict[str, float]
     fraction: float
-    setting: FloatArray
-    single_limits: dict[int, float]
-    state_below: BoundaryState = BoundaryState.SAFE
-    at_threshold: int | None = None
+    alone: dict[str, float]
+    outcome: str
+    safety_degree: float | None
+    end: BoundaryState = BoundaryState.SAFE
+    at_threshold: str | None = None
+    neighbours: Robustness | None = None
+    short_changes: dict[str, float] = field(default_factory=dict)
+    short_boundary: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def robustness(self) -> float | None:
+        """Share of the neighbours of these changes that are unsafe too."""
+        return None if self.neighbours is None else self.neighbours.share
+
+    @property
+    def limit(self) -> str:
+        """A sentence on the smallest unsafe share of the changes, and on what lies just below this share."""
+        below = {
+            BoundaryState.SAFE: "slightly less is safe",
+            BoundaryState.FILTER: f"with less, the change of {self.at_threshold} falls below the filter's threshold "
+            "and counts as none",
+            BoundaryState.NOT_SIMULATED: "slightly less could not be simulated",
+        }[self.end]
+        return f"Scaling all changes to {100 * self.fraction:.1f} % is still unsafe; {below}."
+
+    def to_dict(self) -> dict[str, Any]:
+        """An entry of `minimal_causes` in `explain --json`."""
+        names = ("changes", "boundary", "fraction", "outcome", "safety_degree", "end", "robustness")
+        return {name: getattr(self, name) for name in names}
 
 
-def find_boundaries(evaluator: Evaluator, causes: list[MinimalCause], unsafe: Unsafe) -> list[Boundary]:
+def describe_causes(
+    evaluator: Evaluator,
+    causes: Sequence[MinimalCause],
+    unsafe: Unsafe,
+    robustnesses: Sequence[Robustness | None],
+    *,
+    has_short_forms: bool = True,
+) -> list[Cause]:
     """Shrink causes, all changes by a common factor and each change by itself, while they stay unsafe and above the
     filter's thresholds.
     """
-    all_changes = [(cause, cause.columns) for cause in causes]
-    single_changes = [(cause, (column,)) for cause in causes for column in cause.columns]
-    lines = [Line.from_original(evaluator, cause, columns) for cause, columns in [*all_changes, *single_changes]]
-    fractions, states = find_boundary_shares(evaluator, lines, unsafe)
-    single_shares = iter(zip(lines[len(causes) :], fractions[len(causes) :], strict=True))
-    boundaries = []
-    for cause, line, fraction, state in zip(
-        causes, lines, fractions, states, strict=False
-    ):  # the lines of single changes follow
-        if not cause.columns:
-            boundaries.append(Boundary(0.0, cause.setting, {}))
-            continue
-        single_limits = {}
-        for column in cause.columns:
-            single_line, single_fraction = next(single_shares)
-            single_limits[column] = float(single_line.settings_at(np.array([single_fraction]))[0, column])
-        setting = line.settings_at(np.array([fraction]))[0]
-        filtered_column = (
-            line.first_filtered(evaluator.characteristics.threshold) if state == BoundaryState.FILTER else None
+    characteristics = evaluator.characteristics
+    names, original = characteristics.names, characteristics.original
+    groups = [(cause, group) for cause in causes for group in (cause.columns, *((one,) for one in cause.columns))]
+    ends = np.array([cause.setting for cause, _ in groups]).reshape(-1, len(names))
+    is_scaled = np.array([np.isin(range(len(names)), group) for _, group in groups], dtype=bool).reshape(ends.shape)
+    thresholds = np.divide(
+        characteristics.threshold, np.abs(ends - original), out=np.zeros(ends.shape), where=is_scaled
+    )
+    starts = np.where(is_scaled, original, ends)
+    shares, states = find_boundary_shares(evaluator, starts, ends, unsafe, thresholds.max(axis=1, initial=0.0))
+    limits = settings_on_lines(starts, ends, shares[:, np.newaxis])[:, 0]
+    rows = np.cumsum([0, *(1 + len(cause.columns) for cause in causes)])[:-1]
+    exact = short = np.array([*(cause.setting for cause in causes), *limits[rows]]).reshape(-1, len(names))
+    if has_short_forms and len(exact):
+        short = shorten(evaluator, exact, unsafe)
+
+    def values(cause: MinimalCause, setting: FloatArray) -> dict[str, float]:
+        return {names[column]: float(setting[column]) for column in cause.columns}
+
+    return [
+        Cause(
+            changes=values(cause, cause.setting),
+            boundary=values(cause, limits[row]),
+            fraction=float(shares[row]) if cause.columns else 0.0,
+            alone={names[one]: float(limits[row + k, one]) for k, one in enumerate(cause.columns, 1)},
+            outcome=cause.outcome,
+            safety_degree=cause.safety_degree,
+            end=states[row] if cause.columns else BoundaryState.SAFE,
+            at_threshold=names[np.argmax(thresholds[row])] if states[row] == BoundaryState.FILTER else None,
+            neighbours=robustness,
+            short_changes=values(cause, short[index]),
+            short_boundary=values(cause, short[len(causes) + index]),
         )
-        boundaries.append(Boundary(float(fraction), setting, single_limits, state, filtered_column))
-    return boundaries
+        for index, (cause, row, robustness) in enumerate(zip(causes, rows.tolist(), robustnesses, strict=True))
+    ]
 
 
 def shorten(evaluator: Evaluator, settings: FloatArray, unsafe: Unsafe) -> FloatArray:
@@ -167,22 +292,10 @@ def shorten(evaluator: Evaluator, settings: FloatArray, unsafe: Unsafe) -> Float
     cm.
     """
     characteristics = evaluator.characteristics
-    rounded = [
-        np.array([[float(f"{value:.{digits}g}") for value in setting] for setting in settings.tolist()])
-        for digits in SHORT_DIGITS
-    ]
+    rounded = [np.vectorize(lambda value, k=digits: float(f"{value:.{k}g}"))(settings) for digits in SHORT_DIGITS]
+    within = [characteristics.filter(np.clip(one, characteristics.lower, characteristics.upper)) for one in rounded]
     candidates = np.array(
-        [
-            *(
-                np.where(
-                    settings == characteristics.original,
-                    settings,
-                    characteristics.filter(np.clip(values, characteristics.lower, characteristics.upper)),
-                )
-                for values in rounded
-            ),
-            settings,
-        ]
+        [*(np.where(settings == characteristics.original, settings, one) for one in within), settings]
     )
     evaluations = evaluator.evaluate(candidates.reshape(-1, settings.shape[1]), "digits of commands")
     outcome, degree, is_unsafe = (
@@ -195,69 +308,40 @@ def shorten(evaluator: Evaluator, settings: FloatArray, unsafe: Unsafe) -> Float
     return np.asarray(candidates[np.argmax(ends_alike, axis=0), np.arange(len(settings))])
 
 
-class Line(NamedTuple):
-    """A straight line of settings from `start` to `end`, shape (n,) each; the search begins above the share `lowest` of
-    the line.
-    """
-
-    start: FloatArray
-    end: FloatArray
-    lowest: float
-
-    @classmethod
-    def from_original(cls, evaluator: Evaluator, cause: MinimalCause, columns: tuple[int, ...]) -> Line:
-        """The line on which some columns of a cause go from their original values to their values in the cause."""
-        characteristics = evaluator.characteristics
-        indices = list(columns)
-        start = cause.setting.copy()
-        start[indices] = characteristics.original[indices]
-        distances = np.abs(cause.setting - characteristics.original)[indices]
-        return cls(start, cause.setting, float(np.max(characteristics.threshold[indices] / distances, initial=0.0)))
-
-    def first_filtered(self, threshold: FloatArray) -> int:
-        """The column whose change first falls to the filter's threshold on the way from `end` to `start`."""
-        distance = np.abs(self.end - self.start)
-        return int(np.argmax(np.divide(threshold, distance, out=np.zeros_like(distance), where=distance > 0)))
-
-    def settings_at(self, shares: FloatArray) -> FloatArray:
-        """The settings at K shares of the line, shape (K, n)."""
-        factors = shares[:, np.newaxis]
-        return np.where(factors >= 1, self.end, self.start + factors * (self.end - self.start))
-
-
-def find_first_unsafe_shares(
-    evaluator: Evaluator, lines: list[Line], unsafe: Unsafe, stage: str = "boundaries"
-) -> FloatArray:
-    """The first unsafe share of every line; its end must be unsafe. The error is at most `RESOLUTION` times the line
-    above `lowest`.
-    """
-    return find_boundary_shares(evaluator, lines, unsafe, stage)[0]
+def settings_on_lines(starts: FloatArray, ends: FloatArray, shares: FloatArray) -> FloatArray:
+    """Settings at K shares of each of M lines, shape (M, K), from `starts` to `ends`, shape (M, n); shape (M, K, n)."""
+    factors, first, last = shares[..., np.newaxis], starts[:, np.newaxis], ends[:, np.newaxis]
+    return np.where(factors >= 1, last, first + factors * (last - first))
 
 
 def find_boundary_shares(
-    evaluator: Evaluator, lines: list[Line], unsafe: Unsafe, stage: str = "boundaries"
+    evaluator: Evaluator,
+    starts: FloatArray,
+    ends: FloatArray,
+    unsafe: Unsafe,
+    lowest: FloatArray | float = 0.0,
+    stage: str = "boundaries",
 ) -> tuple[FloatArray, list[BoundaryState]]:
-    """The first unsafe share of every line, as `find_first_unsafe_shares`, and what lies just below this share.
+    """The first unsafe share above `lowest` of each of M lines, whose end must be unsafe, and what lies just below it.
 
-    A setting that cannot be simulated is neither safe nor unsafe; just below the share, it gives the state
-    `NOT_SIMULATED`.
+    The error is at most `RESOLUTION` times the line above `lowest`. A setting that cannot be simulated is neither safe
+    nor unsafe; just below the share, it gives the state `NOT_SIMULATED`.
     """
-    lowest = np.array([line.lowest for line in lines])
-    low, high, low_is_valid = lowest, np.ones(len(lines)), np.ones(len(lines), dtype=bool)
+    number, rows = len(starts), np.arange(len(starts))
+    lowest = np.broadcast_to(lowest, number)
+    low, high, low_is_valid = lowest, np.ones(number), np.ones(number, dtype=bool)
     for parts in (LINE_SETTINGS, *(PARTS_PER_ROUND,) * ROUNDS):
         shares = low[:, np.newaxis] + (high - low)[:, np.newaxis] * np.arange(1, parts + 1) / parts
         shares[:, -1] = high
-        settings_by_line = [line.settings_at(line_shares[:-1]) for line, line_shares in zip(lines, shares, strict=True)]
-        inner_settings = np.concatenate(settings_by_line) if lines else np.zeros((0, 0))
-        evaluations = evaluator.evaluate(inner_settings, stage)
+        inner = settings_on_lines(starts, ends, shares[:, :-1])
+        evaluations = evaluator.evaluate(inner.reshape(-1, starts.shape[1]), stage)
         is_unsafe, is_valid = (np.ones(shares.shape, dtype=bool) for _ in range(2))
-        is_unsafe[:, :-1] = unsafe.of(evaluations).reshape(len(lines), parts - 1)
-        is_valid[:, :-1] = evaluations.valid.reshape(len(lines), parts - 1)
+        is_unsafe[:, :-1] = unsafe.of(evaluations).reshape(number, parts - 1)
+        is_valid[:, :-1] = evaluations.valid.reshape(number, parts - 1)
         index = np.argmax(is_unsafe, axis=1)
-        rows = np.arange(len(lines))
-        low_is_valid = np.where(index > 0, is_valid[rows, np.maximum(index - 1, 0)], low_is_valid)
-        low, high = np.where(index > 0, shares[rows, np.maximum(index - 1, 0)], low), shares[rows, index]
+        below = rows, np.maximum(index - 1, 0)
+        low_is_valid = np.where(index > 0, is_valid[below], low_is_valid)
+        low, high = np.where(index > 0, shares[below], low), shares[rows, index]
     states = np.where(low_is_valid, BoundaryState.SAFE, BoundaryState.NOT_SIMULATED)
-    return high, [
-        BoundaryState(state) for state in np.where((low == lowest) & (lowest > 0), BoundaryState.FILTER, states)
-    ]
+    states = np.where((low == lowest) & (lowest > 0), BoundaryState.FILTER, states)
+    return high, [BoundaryState(state) for state in states]

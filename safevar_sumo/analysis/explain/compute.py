@@ -5,7 +5,6 @@ robustness.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from itertools import zip_longest
 from typing import NamedTuple
 
 import numpy as np
@@ -14,33 +13,38 @@ from safevar_sumo.analysis.evaluator import Evaluator, open_evaluator
 from safevar_sumo.analysis.explain import ExplainOptions
 from safevar_sumo.analysis.explain.braking_comparison import BrakingComparison, compare_braking, summarise_run
 from safevar_sumo.analysis.explain.causes import (
-    Boundary,
     MinimalCause,
-    find_boundaries,
+    cause_key,
+    count_distinct_causes,
+    describe_causes,
     find_minimal_causes,
+    necessity_frame,
     select_affordable_rows,
-    shorten,
 )
-from safevar_sumo.analysis.explain.necessity import cause_key, count_distinct_causes, necessity_frame
-from safevar_sumo.analysis.explain.result import Cause, Explained, Explanation
-from safevar_sumo.analysis.explain.robustness import (
-    STEP_FACTORS,
-    Robustness,
-    estimate_robustness,
-    find_smallest_robust_failure,
+from safevar_sumo.analysis.explain.result import Explained, Explanation
+from safevar_sumo.analysis.explain.robustness import STEP_FACTORS, estimate_robustness, find_smallest_robust_failure
+from safevar_sumo.analysis.explain.sentences import (
+    DISTINCT_CAUSE,
+    REASONS,
+    ROBUST,
+    choices_in_words,
+    counts_in_words,
+    situation_in_words,
+    verdict_in_words,
 )
-from safevar_sumo.analysis.explain.sentences import DISTINCT_CAUSE, REASONS, ROBUST
 from safevar_sumo.analysis.preventability import assess_preventability, classify_collisions
+from safevar_sumo.analysis.rating.summary import summarise_rated_solutions
 from safevar_sumo.analysis.research_questions.case import Case
-from safevar_sumo.analysis.subject import study_in
+from safevar_sumo.analysis.subject import at_point, study_in
+from safevar_sumo.analysis.words import question_command
 from safevar_sumo.campaign.pool import Pool
 from safevar_sumo.errors import InputError
-from safevar_sumo.metrics import Unsafe
+from safevar_sumo.metrics import RATING_POINTS, Unsafe
 from safevar_sumo.progress import Progress, show_no_progress
 from safevar_sumo.protocol.points import UNKNOWN as UNKNOWN_COLOUR
 from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.records import Evaluations, FloatArray, finite_or_none
-from safevar_sumo.results import CHOICES, UNKNOWN, SolutionId, handles_of, row_of_handle
+from safevar_sumo.results import CHOICES, UNKNOWN, SolutionId, choose_handle, handles_of, row_of_handle
 from safevar_sumo.study import Study
 from safevar_sumo.sumo.matrix import PointResult, simulate, simulate_all_points, worst_points
 from safevar_sumo.sumo.system import System, assemble
@@ -167,12 +171,14 @@ def _collisions(study: Study, evaluations: Evaluations) -> Evaluations:
 def _choose_rows(found: _Found, evaluator: Evaluator, original: Evaluations, limit: int) -> Reasons:
     """Choose the failures that are smallest robust, of the fewest changes, most severe, and of the smallest changes."""
     reasons: Reasons = {}
+    if not found.rows:
+        return reasons
     candidates = found.evaluations.take(found.rows)
-    if found.rows and not is_rated(evaluator.study) and not found.unsafe.of(original)[0]:
+    if not is_rated(evaluator.study) and not found.unsafe.of(original)[0]:
         step = _time_step(assemble(evaluator.study))
         index = find_smallest_robust_failure(evaluator, candidates, step, found.unsafe, limit)
         reasons = {} if index is None else {found.rows[index]: (ROBUST,)}
-    for choice in ("fewest", "most_severe", "smallest") if found.rows else ():
+    for choice in ("fewest", "most_severe", "smallest"):
         order = np.lexsort([getattr(candidates, name) for name in reversed(CHOICES[choice])])
         row = found.rows[int(order[0])]
         reasons[row] = (*reasons.get(row, ()), REASONS[choice])
@@ -183,19 +189,13 @@ def _add_distinct_causes(
     found: _Found, evaluator: Evaluator, sample: Sequence[int], reasons: Reasons, causes: CausesByRow, top: int
 ) -> Reasons:
     """Add the simplest failure of every minimal cause that no chosen failure has, until `top` failures are chosen."""
-    chosen = dict(list(reasons.items())[:top])
-    keys = {
-        row: {cause_key(evaluator.characteristics, cause) for cause in row_causes} for row, row_causes in causes.items()
-    }
+    chosen, evaluations = dict(list(reasons.items())[:top]), found.evaluations
+    keys = {row: {cause_key(evaluator.characteristics, one) for one in causes[row]} for row in causes}
     for key in count_distinct_causes(evaluator.characteristics, [causes[row] for row in sample])["cause"]:
-        if len(chosen) >= top:
-            break
-        if not any(key in keys[row] for row in chosen):
-            sizes = found.evaluations.f_num_diff, found.evaluations.f_diff
-            simplest = min(
-                (row for row in sample if key in keys[row]), key=lambda row: (*(size[row] for size in sizes), row)
-            )
-            chosen[simplest] = (DISTINCT_CAUSE,)
+        if len(chosen) < top and not any(key in keys[row] for row in chosen):
+            rows = np.array([row for row in sample if key in keys[row]])
+            order = np.lexsort([rows, evaluations.f_diff[rows], evaluations.f_num_diff[rows]])
+            chosen[int(rows[order[0]])] = (DISTINCT_CAUSE,)
     return chosen
 
 
@@ -203,109 +203,69 @@ def _explain_rows(
     found: _Found, evaluator: Evaluator, original: Evaluations, causes: CausesByRow, reasons: Reasons
 ) -> tuple[Explanation, ...]:
     """Explanations of the chosen failures."""
-    rows, unsafe, system = list(reasons), found.unsafe, assemble(evaluator.study)
+    rows, unsafe, system, rated = list(reasons), found.unsafe, assemble(evaluator.study), is_rated(evaluator.study)
     if not rows:
         return ()
-    chosen, names = found.evaluations.take(rows), evaluator.characteristics.names
+    chosen, characteristics = found.evaluations.take(rows), evaluator.characteristics
     all_causes = [cause for row in rows for cause in causes[row]]
-    if is_rated(evaluator.study):  # each neighbour is simulated in all cells, which takes too long for all causes
+    if rated:  # each neighbour is simulated in all cells, which takes too long for all causes
         comparisons = compare_at_cells(evaluator, original.settings, chosen.settings)
         robustnesses = estimate_robustness(evaluator, chosen.settings, _time_step(system), unsafe, STEP_FACTORS[:1])
     else:
         comparisons = compare_at_points(system, original.settings, chosen.settings, unsafe)
         settings = np.array([*chosen.settings, *(cause.setting for cause in all_causes)])
         robustnesses = estimate_robustness(evaluator, settings, _time_step(system), unsafe)
-    boundaries = find_boundaries(evaluator, all_causes, unsafe)
-    exact = np.array([one.setting for ones in (all_causes, boundaries) for one in ones]).reshape(-1, len(names))
-    short = exact if is_rated(evaluator.study) or not len(exact) else shorten(evaluator, exact, unsafe)
-    described = iter(
-        [
-            _describe_cause(names, *parts)
-            for parts in zip_longest(all_causes, boundaries, *np.split(short, 2), robustnesses[len(rows) :])
-        ]
-    )
+    of_causes = [None] * len(all_causes) if rated else robustnesses[len(rows) :]
+    described = iter(describe_causes(evaluator, all_causes, unsafe, of_causes, has_short_forms=not rated))
     collisions = _collisions(evaluator.study, chosen)
     avoidances = dict(zip(map(bytes, collisions.settings), classify_collisions(evaluator, collisions), strict=True))
-    explanations = list[Explanation]()
-    for row, setting, comparison, robustness in zip(rows, chosen.settings, comparisons, robustnesses, strict=False):
-        avoidance, index = avoidances.get(bytes(setting)), len(explanations)
-        changed = evaluator.characteristics.changed(setting)
+    explanations = []
+    for index, (row, (comparison, points)) in enumerate(zip(rows, comparisons, strict=True)):
+        setting = dict(zip(characteristics.names, chosen.settings[index].tolist(), strict=True))
+        avoidance = avoidances.get(bytes(chosen.settings[index]))
         explanations.append(
             Explanation(
                 handle=found.handles[row],
                 reasons=reasons[row],
-                setting=dict(zip(names, setting.tolist(), strict=True)),
+                setting=setting,
                 outcome=str(chosen.outcome[index]),
                 safety_degree=finite_or_none(chosen.f_safe[index]),
-                changed=tuple(name for name, is_changed in zip(names, changed, strict=True) if is_changed),
+                changed=tuple(item.name for item in characteristics if setting[item.name] != item.original),
                 causes=tuple(next(described) for _ in causes[row]),
-                robustness=robustness,
-                because=comparison.braking,
-                points=comparison.failing_points,
-                preventable=str(avoidance.by) if avoidance else "",
+                robustness=robustnesses[index],
+                because=comparison,
+                points=points,
+                preventable=str(avoidance[0]) if avoidance else "",
             )
         )
     return tuple(explanations)
 
 
-def _describe_cause(
-    names: Sequence[str],
-    cause: MinimalCause,
-    boundary: Boundary,
-    short_changes: FloatArray,
-    short_boundary: FloatArray,
-    robustness: Robustness | None,
-) -> Cause:
-    def values(setting: FloatArray) -> dict[str, float]:
-        return {names[column]: float(setting[column]) for column in cause.columns}
-
-    return Cause(
-        changes=values(cause.setting),
-        boundary=values(boundary.setting),
-        fraction=boundary.fraction,
-        short_changes=values(short_changes),
-        short_boundary=values(short_boundary),
-        alone={names[column]: value for column, value in boundary.single_limits.items()},
-        outcome=cause.outcome,
-        safety_degree=cause.safety_degree,
-        end=boundary.state_below,
-        neighbours=robustness,
-        at_threshold=None if boundary.at_threshold is None else names[boundary.at_threshold],
-    )
-
-
 def _time_step(system: System) -> float:
     """The time step of the simulations [s]."""
-    return simulate(
-        system.at(system.points[0]) if system.matrix else system, system.characteristics.original[np.newaxis]
-    ).trace.step
+    here = system.at(system.points[0]) if system.matrix else system
+    return simulate(here, system.characteristics.original[np.newaxis]).trace.step
 
 
-class PointComparison(NamedTuple):
-    """One failure at the test points of a study.
-
-    Attributes
-    ----------
-    braking
-        Comparison of the original vehicle with the failure at the failure's worst point.
-    failing_points
-        Names of the points of a test matrix at which the failure is unsafe; in a rated study, of the cells whose colour
-        is worse than the original's. In the study's order.
-    """
-
-    braking: BrakingComparison
-    failing_points: tuple[str, ...]
+PointComparison = tuple[BrakingComparison, tuple[str, ...]]
+"""One failure at the test points of a study: the comparison with the original vehicle at the failure's worst point, and
+the names of the points of a test matrix at which it is unsafe; in a rated study, of the cells whose colour is worse
+than the original's. In the study's order.
+"""
 
 
 def compare_at_points(
     system: System, original: FloatArray, settings: FloatArray, unsafe: Unsafe
 ) -> list[PointComparison]:
     """Compare settings, shape (M, n), with the original, shape (1, n)."""
-    point_results = simulate_all_points(system, np.concatenate([original, settings]))
-    failing_points, worst = unsafe_points_of(system, point_results, unsafe)[1:], worst_points(point_results)[1:]
+    results = simulate_all_points(system, np.concatenate([original, settings]))
+    is_unsafe = np.stack([unsafe.of(result.evaluations) for result in results])
     return [
-        PointComparison(_compare_runs(point_results[index], row, point_results[index].point.name), names)
-        for row, (names, index) in enumerate(zip(failing_points, worst.tolist(), strict=True), 1)
+        (
+            _compare_runs(results[index], row, results[index].point.name),
+            tuple(point.name for point, fails in zip(system.matrix, is_unsafe[:, row], strict=False) if fails),
+        )
+        for row, index in enumerate(worst_points(results)[1:].tolist(), 1)
     ]
 
 
@@ -316,34 +276,66 @@ def compare_at_cells(evaluator: Evaluator, original: FloatArray, settings: Float
     """
     system = assemble(evaluator.study)
     assert system.rater is not None
-    stage = "cells whose colour is worse"
-    colours = system.rater.points(evaluator.simulate_cells(np.concatenate([original, settings]), stage)).colours.astype(
-        int
-    )
+    cells = evaluator.simulate_cells(np.concatenate([original, settings]), "cells whose colour is worse")
+    colours = system.rater.points(cells).colours.astype(int)
     losses = np.where(colours[0] == UNKNOWN_COLOUR, 0, np.maximum(colours[1:] - colours[0], 0))
     comparisons = []
     for setting, loss in zip(settings, losses, strict=True):
         point = system.matrix[int(np.argmax(loss))]
         (worst,) = simulate_all_points(system.at(point), np.concatenate([original, setting[np.newaxis]]))
         worse_cells = tuple(system.matrix[index].name for index in np.flatnonzero(loss).tolist())
-        comparisons.append(PointComparison(_compare_runs(worst, 1, point.name), worse_cells))
+        comparisons.append((_compare_runs(worst, 1, point.name), worse_cells))
     return comparisons
 
 
 def _compare_runs(result: PointResult, row: int, point: str) -> BrakingComparison:
-    """Compare the original vehicle, setting 0 of a result, with the setting in `row`, at the test point named
-    `point`.
-    """
+    """Compare the original vehicle, setting 0 of a result, with the setting in `row`, at the test point `point`."""
     original_run, changed_run = (summarise_run(result.runs, k, float(result.evaluations.f_safe[k])) for k in (0, row))
     return compare_braking(original_run, changed_run, point)
 
 
-def unsafe_points_of(system: System, point_results: list[PointResult], unsafe: Unsafe) -> list[tuple[str, ...]]:
-    """Names of the points of the test matrix at which each setting is unsafe; empty without a test matrix."""
-    if not system.matrix:
-        return [() for _ in point_results[0].evaluations.settings]
-    unsafe_by_point = np.stack([unsafe.of(result.evaluations) for result in point_results])
-    return [
-        tuple(result.point.name for result, is_unsafe in zip(point_results, flags, strict=True) if is_unsafe)
-        for flags in unsafe_by_point.T
-    ]
+def summarise_failures(
+    case: Case, original: Evaluations, pool: Pool, directory: str, progress: Progress = show_no_progress
+) -> list[str]:
+    """Summarise results in lines: the verdict first, the command for the next step last; no line without a solution.
+
+    Of a matrix, the failures are those at the worst point of the failure with the fewest changes.
+
+    Parameters
+    ----------
+    original
+        The original vehicle's evaluation.
+    pool
+        Simulates subsets of the solutions' changes.
+    directory
+        The directory of the results, for the command.
+    """
+    study, solutions, names = case.study, case.solutions, list(case.characteristics.names)
+    if RATING_POINTS.name in original.metrics:
+        return summarise_rated_solutions(study, solutions, original, directory)
+    if original.collided[0]:
+        return ["The original vehicle itself collides: no change is needed."]
+    lines, point, unsafe, system = list[str](), "", case.unsafe, assemble(study)
+    any_unsafe = bool(unsafe.rows(solutions).any())
+    if system.matrix:
+        distinct = solutions.drop_duplicates(names)
+        choices = ("most_severe", *(["fewest"] if any_unsafe else []))
+        handles = [choose_handle(solutions, unsafe, choice, study.name) for choice in choices]
+        rows = solutions.iloc[[row_of_handle(solutions, handle) for handle in handles]]
+        evaluations = Evaluator(study, pool, progress).evaluate(rows[names].to_numpy(float), "worst points")
+        count = int(unsafe.rows(distinct).sum())
+        lines = [
+            situation_in_words(system, original, evaluations.take([0]), len(distinct)),
+            f"{count} of {len(distinct)} different vehicles are unsafe: {unsafe.description}.",
+        ]
+        if any_unsafe and evaluations.worst_points is not None:
+            point = system.points[evaluations.worst_points[1]].name
+            case = at_point(case, point)
+    if point or not system.matrix:
+        explained = explain_failures(case, ExplainOptions(), pool=pool, progress=progress, statistics=False)
+        verdict, counts = " ".join(verdict_in_words(explained)), counts_in_words(explained)
+        lines += [verdict, f"{'There, ' if point else ''}{counts}", *choices_in_words(explained)]
+    if not any_unsafe:
+        return [*lines, f"How far each characteristic may go: {question_command('tolerance', directory)}"]
+    at_worst = f", at the worst point of the first (without --point: at all {len(system.points)}, which takes long)"
+    return [*lines, f"Causes and limits{at_worst if point else ''}: {question_command('explain', directory, point)}"]

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-import msgspec
 import pandas as pd
 
 from safevar_sumo.analysis.explain.braking_comparison import BrakingComparison, sentence
-from safevar_sumo.analysis.explain.causes import BoundaryState
+from safevar_sumo.analysis.explain.causes import Cause
 from safevar_sumo.analysis.explain.robustness import Robustness
 from safevar_sumo.analysis.explain.sentences import DISTINCT_CAUSE, LABELS, answer_in_words
 from safevar_sumo.analysis.figures import BLUE, FONT, GREY, SKY_BLUE, escape_dollars, new_figure
@@ -24,73 +23,6 @@ from safevar_sumo.vehicles import CharacteristicSet
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-
-@dataclass(frozen=True, kw_only=True)
-class Cause:
-    """A smallest subset of a failure's changes that is unsafe by itself, all else as in the original vehicle.
-
-    Attributes
-    ----------
-    changes
-        The failure's values of these characteristics, in their units.
-    boundary
-        The values after every change is multiplied by `fraction`, the smallest factor at which the vehicle stays
-        unsafe.
-    alone
-        For each characteristic, the value to which it can return towards the original while the others stay as in
-        `changes`.
-    outcome, safety_degree
-        Outcome, and safety degree [m, or -m/s], of a vehicle with these changes only.
-    end, at_threshold
-        The end of the shrinking: the state just below `fraction`; at the filter's threshold, the characteristic whose
-        change the filter would remove.
-    short_changes, short_boundary
-        `changes` and `boundary` in as few digits as a vehicle needs to end alike, for commands.
-    neighbours
-        Robustness of these changes by themselves, estimated from the setting's neighbours; None in a rated study, where
-        the simulations would take too long.
-    """
-
-    changes: dict[str, float]
-    boundary: dict[str, float]
-    fraction: float
-    alone: dict[str, float]
-    outcome: str
-    safety_degree: float | None
-    end: BoundaryState = BoundaryState.SAFE
-    at_threshold: str | None = None
-    neighbours: Robustness | None = None
-    short_changes: dict[str, float] = field(default_factory=dict)
-    short_boundary: dict[str, float] = field(default_factory=dict)
-
-    @property
-    def robustness(self) -> float | None:
-        """Share of the neighbours of these changes that are unsafe too."""
-        return None if self.neighbours is None else self.neighbours.share
-
-    @property
-    def limit(self) -> str:
-        """A sentence on the smallest unsafe share of the changes, and on what lies just below this share."""
-        below = {
-            BoundaryState.SAFE: "slightly less is safe",
-            BoundaryState.FILTER: f"with less, the change of {self.at_threshold} falls below the filter's threshold "
-            "and counts as none",
-            BoundaryState.NOT_SIMULATED: "slightly less could not be simulated",
-        }[self.end]
-        return f"Scaling all changes to {100 * self.fraction:.1f} % is still unsafe; {below}."
-
-    def to_dict(self) -> dict[str, Any]:
-        """An entry of `minimal_causes` in `explain --json`."""
-        return {
-            "changes": self.changes,
-            "boundary": self.boundary,
-            "fraction": self.fraction,
-            "outcome": self.outcome,
-            "safety_degree": self.safety_degree,
-            "end": str(self.end),
-            "robustness": self.robustness,
-        }
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -123,11 +55,6 @@ class Explanation:
     def title(self) -> str:
         """Why it was chosen, as a title."""
         return "; ".join(label for reason, label in LABELS.items() if reason in self.reasons) or ", ".join(self.reasons)
-
-    @property
-    def changes(self) -> dict[str, float]:
-        """The changed values by name, in their units."""
-        return {name: self.setting[name] for name in self.changed}
 
     @property
     def cause(self) -> Cause | None:
@@ -199,6 +126,10 @@ class Explained:
     no_verdict: str = ""
 
     @property
+    def characteristics(self) -> CharacteristicSet:
+        return CharacteristicSet.of(self.study.vehicle.characteristics)
+
+    @property
     def choices(self) -> list[Explanation]:
         """The failures that were chosen by their size or severity, in the order in which they are shown."""
         titles = [reason for reason in LABELS if reason != DISTINCT_CAUSE]
@@ -231,7 +162,7 @@ class Explained:
             "necessary": columns("necessary"),
             "changed": columns("changed"),
             "necessary_interval": columns("necessary_lower", "necessary_upper"),
-            "preventable": msgspec.to_builtins(self.preventability.shares),
+            "preventable": self.preventability.to_dict(),
         }
         return [
             *(failure.to_dict() for failure in self.explanations),
@@ -269,7 +200,7 @@ class Explained:
             )
             for failure_index, failure in enumerate(self.explanations)
             for cause_index, cause in enumerate(failure.causes)
-            for item in CharacteristicSet.of(self.study.vehicle.characteristics)
+            for item in self.characteristics
             if item.name in cause.changes
         ]
         return pd.DataFrame(

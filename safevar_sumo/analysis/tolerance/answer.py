@@ -4,18 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import pandas as pd
 from rich.table import Table
 
+from safevar_sumo.analysis.evaluator import CONFIDENCE
 from safevar_sumo.analysis.explain.sentences import situation_in_words
 from safevar_sumo.analysis.figures import BLUE, DEGREE_LABEL, FONT, VERMILION, as_formula, escape_dollars, new_panels
-from safevar_sumo.analysis.tolerance.safe_box import SafeBox
 from safevar_sumo.analysis.tolerance.scans import WHOLE_POINT_LOSS, OneAtATimeScan, Pair
 from safevar_sumo.analysis.words import two_decimals
-from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import RATING_POINTS, Unsafe
 from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.records import Evaluations
@@ -27,11 +26,28 @@ from safevar_sumo.vehicles import Characteristic
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.collections import QuadMesh
     from matplotlib.figure import Figure
 
-MAX_PAIRS, MAX_PAIRS_DRAWN = 12, 6
-"""Maximum number of pairs in the table and in the figure."""
+MAX_PAIRS = 12
+"""Maximum number of pairs in the table."""
+
+
+class SafeBox(NamedTuple):
+    """A box around the original, `factor` times as wide as the domain; no setting of a random sample in it is unsafe.
+
+    With `confidence`, at most `unsafe_at_most` of all settings in the box are unsafe or cannot be simulated: `failed`
+    of the `samples` settings could not be simulated, and count as unsafe in that bound. `attempts` boxes were tested.
+    Only `characteristics` vary; the others keep their original values. If no box is safe, because the original or a
+    setting arbitrarily near to it is unsafe, `factor` is 0 and the bound is 1.
+    """
+
+    factor: float = 0.0
+    confidence: float = CONFIDENCE
+    samples: int = 0
+    failed: int = 0
+    attempts: int = 0
+    unsafe_at_most: float = 1.0
+    characteristics: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,7 +78,7 @@ class Tolerance:
         if names := [scan.characteristic.name for scan in self.alone if scan.unsafe]:
             return f"Unsafe alone, all others as in the original: {', '.join(names)}."
         if self.unsafe_pairs:
-            pairs = ", ".join(" with ".join(pair.names) for pair in self.unsafe_pairs)
+            pairs = ", ".join(" with ".join(pair.characteristics) for pair in self.unsafe_pairs)
             return (
                 f"No single characteristic makes it unsafe, but {len(self.unsafe_pairs)} of "
                 f"{len(self.pairs or [])} pairs: "
@@ -76,37 +92,19 @@ class Tolerance:
         Columns: `characteristic`, `unit`, `original`, `lower` and `upper` of the domain, `safe_from`, `safe_to` [unit],
         `margin_from`, `margin_to`, the safety degrees there [m], and `unsafe` and `not_simulated`, lists of intervals.
         """
-        columns = [
-            "characteristic",
-            "unit",
-            "original",
-            "lower",
-            "upper",
-            "safe_from",
-            "safe_to",
-            "margin_from",
-            "margin_to",
-            "unsafe",
-            "not_simulated",
-        ]
-        members = [(scan, scan.characteristic) for scan in self.alone]
         return pd.DataFrame(
             [
-                (
-                    one.name,
-                    one.unit,
-                    one.original,
-                    one.lower,
-                    one.upper,
-                    *(scan.safe or (None, None)),
-                    *scan.margins,
-                    scan.unsafe,
-                    scan.not_simulated,
-                )
-                for scan, one in members
+                {
+                    **{name: getattr(one, name) for name in ("unit", "original", "lower", "upper")},
+                    **dict(zip(("safe_from", "safe_to"), scan.safe or (None, None), strict=True)),
+                    **dict(zip(("margin_from", "margin_to"), scan.margins, strict=True)),
+                    "unsafe": scan.unsafe,
+                    "not_simulated": scan.not_simulated,
+                }
+                for scan, one in ((scan, scan.characteristic) for scan in self.alone)
             ],
-            columns=columns,
-        )
+            index=pd.Index([scan.characteristic.name for scan in self.alone], name="characteristic"),
+        ).reset_index()
 
     def to_dict(self) -> dict[str, Any]:
         """The JSON of `tolerance`."""
@@ -115,7 +113,7 @@ class Tolerance:
             **driven_entry(self.no_verdict),
             "unsafe": str(self.unsafe),
             "alone": [scan.to_dict() for scan in self.alone],
-            "pairs": [pair.to_dict() for pair in self.pairs or []],
+            "pairs": [pair._asdict() for pair in self.pairs or []],
             "joint": self.joint._asdict(),
         }
 
@@ -138,12 +136,10 @@ class Tolerance:
             title=f"Pairs with unsafe settings: {len(worst)} of {len(self.pairs or [])}",
         )
         for pair in worst[:MAX_PAIRS]:
-            nearest = ", ".join(
-                f"{name} {value:.5g}" for name, value in zip(pair.names, pair.nearest or (), strict=True)
-            )
+            nearest = ", ".join(f"{name} {value:.5g}" for name, value in (pair.nearest or {}).items())
             lost = pair.not_simulated_share
             failed = f" ({100 * lost:.1f} % could not be simulated)" if lost else ""
-            table.add_row(" with ".join(pair.names), f"{100 * pair.unsafe_share:.1f} %{failed}", nearest)
+            table.add_row(" with ".join(pair.characteristics), f"{100 * pair.unsafe_share:.1f} %{failed}", nearest)
         yield table
         if len(worst) > MAX_PAIRS:
             yield f"... and {len(worst) - MAX_PAIRS} more (--json has all)."
@@ -186,34 +182,6 @@ class Tolerance:
             "below the dashed line: collisions": column == SAFETY_DEGREE and bool(degrees.size) and degrees.min() <= 0,
         }
         figure.supxlabel(";\n".join(words for words, is_drawn in notes.items() if is_drawn), fontsize=FONT)
-        return figure
-
-    def pairs_figure(self) -> Figure:
-        """The planes of the worst pairs: with the largest unsafe share, or the lowest safety degree where nothing is
-        unsafe.
-
-        Raises
-        ------
-        InputError
-            If the result has no pairs.
-        """
-        if not self.pairs:
-            raise InputError("pairs", "there is no pair to draw", "at least two characteristics, evaluated in pairs")
-        worst = sorted(self.pairs, key=lambda pair: (-pair.unsafe_share, np.nanmin(pair.safety_degree)))[
-            :MAX_PAIRS_DRAWN
-        ]
-        degrees = np.stack([pair.safety_degree for pair in worst])
-        title = f"{self.study.name}: the worst pairs (unsafe: {self.unsafe})"
-        figure, axes = new_panels(title, len(worst), 3, (3.0, 2.4), min_width=4.6, title_height=1.1)
-        limits = float(np.nanmin(degrees)), float(np.nanmax(degrees))
-        colours = [_draw_plane(axis, pair, limits) for axis, pair in zip(axes, worst, strict=True)]
-        bar = figure.colorbar(colours[-1], ax=figure.axes, shrink=0.9)
-        bar.set_label(DEGREE_LABEL, fontsize=FONT)
-        bar.ax.tick_params(labelsize=FONT)
-        figure.supxlabel(
-            "dot: the original vehicle; hatched: unsafe;\ncross: the unsafe setting nearest to the original",
-            fontsize=FONT,
-        )
         return figure
 
 
@@ -275,21 +243,3 @@ def _draw_profile(axis: Axes, scan: OneAtATimeScan, column: str) -> None:
     axis.set_title(escape_dollars(characteristic.name), fontsize=FONT)
     axis.set_xlabel(f"[{as_formula(characteristic.unit)}]")
     axis.locator_params(axis="x", nbins=4)
-
-
-def _draw_plane(axis: Axes, pair: Pair, limits: tuple[float, float]) -> QuadMesh:
-    """Draw one plane, with the first characteristic on the horizontal axis."""
-    colours = axis.pcolormesh(
-        *pair.values, pair.safety_degree.T, cmap="cividis", vmin=limits[0], vmax=limits[1], shading="nearest"
-    )
-    if pair.unsafe.any():
-        axis.contourf(*pair.values, pair.unsafe.T.astype(float), levels=[0.5, 1.5], colors="none", hatches=["////"])
-        axis.contour(*pair.values, pair.unsafe.T.astype(float), levels=[0.5], colors=VERMILION, linewidths=1.2)
-    first, second = pair.characteristics
-    axis.plot(first.original, second.original, marker="o", color="white", markeredgecolor="black", markersize=5)
-    if pair.nearest is not None:
-        axis.plot(*pair.nearest, marker="X", color=VERMILION, markeredgecolor="white", markersize=7)
-    xlabel, ylabel = (f"{escape_dollars(one.name)} [{as_formula(one.unit)}]" for one in pair.characteristics)
-    axis.set(xlabel=xlabel, ylabel=ylabel, xlim=(first.lower, first.upper), ylim=(second.lower, second.upper))
-    axis.grid(visible=False)
-    return colours

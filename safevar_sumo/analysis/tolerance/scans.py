@@ -8,7 +8,7 @@ import math
 from collections.abc import Generator, Sequence
 from dataclasses import dataclass
 from itertools import combinations
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -16,9 +16,9 @@ import pandas as pd
 from safevar_sumo.analysis.evaluator import Evaluator
 from safevar_sumo.metrics import RATING_POINTS, Unsafe
 from safevar_sumo.protocol.rater import is_rated
-from safevar_sumo.records import BoolArray, FloatArray, finite_or_none
+from safevar_sumo.records import BoolArray, Evaluations, FloatArray, finite_or_none
 from safevar_sumo.study import SAFETY_DEGREE
-from safevar_sumo.vehicles import Characteristic
+from safevar_sumo.vehicles import Characteristic, CharacteristicSet
 
 SCAN_VALUES, RATED_SCAN_VALUES = 201, 33
 """Number of values over the domain, besides the original; fewer in a rated study: each takes a whole test matrix."""
@@ -34,7 +34,6 @@ PARTS_PER_SIDE, PLANE_ROUNDS, MAX_SQUARES = 4, 4, 12
 """Search for the nearest unsafe setting of a plane: number of parts of a divided square's side, of rounds (down to a
 5120th of the domain), and maximum number of squares divided in each round."""
 Interval = tuple[float, float]
-_TRAPEZOIDAL_WEIGHTS = np.outer(*[np.where(np.isin(np.arange(GRID_VALUES), (0, GRID_VALUES - 1)), 0.5, 1.0)] * 2)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -174,56 +173,24 @@ def _settings_with(original: FloatArray, columns: Sequence[int], values: FloatAr
     return settings
 
 
-@dataclass(frozen=True, kw_only=True)
-class Pair:
+class Pair(NamedTuple):
     """The plane of two characteristics.
 
     Attributes
     ----------
-    values
-        Values of both characteristics, shape (2, GRID_VALUES), each in its unit.
-    safety_degree, unsafe, valid, infeasible
-        Evaluations on the grid, shape (GRID_VALUES, GRID_VALUES), with the first characteristic on axis 0; safety
-        degrees in m, or -m/s. A setting that is not valid could not be simulated, or violates a constraint
-        (`infeasible`), and is neither safe nor unsafe.
+    unsafe_share, not_simulated_share
+        Unsafe share of the simulated part of the plane, and the share that could not be simulated, by the trapezoidal
+        rule on the grid. A setting that could not be simulated, or violates a constraint, is neither safe nor unsafe.
     nearest
         The two values of the unsafe setting that is nearest to the original by distance in domain widths, exact to a
         5120th of them; None if no setting of the grid is unsafe. Unsafe settings that lie only between safe values of
         the grid are not found.
     """
 
-    characteristics: tuple[Characteristic, ...]
-    values: FloatArray
-    safety_degree: FloatArray
-    unsafe: BoolArray
-    valid: BoolArray
-    infeasible: BoolArray
-    nearest: tuple[float, float] | None
-
-    @property
-    def unsafe_share(self) -> float:
-        """Unsafe share of the simulated part of the plane, by the trapezoidal rule."""
-        weight = np.sum(_TRAPEZOIDAL_WEIGHTS * self.valid)
-        return float(np.sum(_TRAPEZOIDAL_WEIGHTS * self.unsafe) / weight) if weight else 0.0
-
-    @property
-    def not_simulated_share(self) -> float:
-        """Share of the plane that could not be simulated, by the same rule."""
-        lost = ~self.valid & ~self.infeasible
-        return float(np.sum(_TRAPEZOIDAL_WEIGHTS * lost) / np.sum(_TRAPEZOIDAL_WEIGHTS))
-
-    @property
-    def names(self) -> list[str]:
-        return [characteristic.name for characteristic in self.characteristics]
-
-    def to_dict(self) -> dict[str, Any]:
-        """The entry of `pairs` in `tolerance --json`."""
-        return {
-            "characteristics": self.names,
-            "unsafe_share": self.unsafe_share,
-            "not_simulated_share": self.not_simulated_share,
-            "nearest": None if self.nearest is None else dict(zip(self.names, self.nearest, strict=True)),
-        }
+    characteristics: list[str]
+    unsafe_share: float
+    not_simulated_share: float
+    nearest: dict[str, float] | None
 
 
 def scan_pairs(evaluator: Evaluator, columns: Sequence[int], unsafe: Unsafe) -> list[Pair]:
@@ -231,78 +198,73 @@ def scan_pairs(evaluator: Evaluator, columns: Sequence[int], unsafe: Unsafe) -> 
     characteristics, planes = evaluator.characteristics, [list(plane) for plane in combinations(columns, 2)]
     axes = np.linspace(characteristics.lower, characteristics.upper, GRID_VALUES).T
     grids = [np.stack(np.meshgrid(*axes[plane], indexing="ij"), axis=-1).reshape(-1, 2) for plane in planes]
-    settings = [
-        _settings_with(characteristics.original, plane, grid) for plane, grid in zip(planes, grids, strict=True)
-    ]
-    evaluations = evaluator.evaluate(np.concatenate(settings), "two characteristics at a time")
-    shape = len(planes), GRID_VALUES, GRID_VALUES
-    degrees, is_unsafe = evaluations.f_safe.reshape(shape), unsafe.of(evaluations).reshape(shape)
-    valid, infeasible = evaluations.valid.reshape(shape), evaluations.infeasible.reshape(shape)
-    ends = [
-        [values[plane] for values in (characteristics.original, characteristics.lower, characteristics.upper)]
-        for plane in planes
-    ]
-    searches = [_search_nearest(grid, *its_ends) for grid, its_ends in zip(is_unsafe, ends, strict=True)]
-    answers: dict[int, BoolArray | None] = dict.fromkeys(range(len(planes)))
-    nearest: list[tuple[float, float] | None] = [None] * len(planes)
-    while answers:
-        requests = {}
-        for number, answer in answers.items():
-            try:
-                requests[number] = searches[number].send(answer)
-            except StopIteration as stop:
-                nearest[number] = stop.value
-        answers = {}
-        if requests:
-            settings = [_settings_with(characteristics.original, planes[k], values) for k, values in requests.items()]
-            found = unsafe.of(evaluator.evaluate(np.concatenate(settings), "nearest unsafe settings"))
-            answers = dict(zip(requests, np.split(found, np.cumsum(list(map(len, settings)))[:-1]), strict=True))
+
+    def evaluate(values: Sequence[FloatArray], stage: str) -> Evaluations:
+        settings = [_settings_with(characteristics.original, *pair) for pair in zip(planes, values, strict=True)]
+        return evaluator.evaluate(np.concatenate(settings), stage)
+
+    evaluations = evaluate(grids, "two characteristics at a time")
+    is_unsafe, is_valid, is_lost = (
+        flags.reshape(len(planes), GRID_VALUES, GRID_VALUES)
+        for flags in (unsafe.of(evaluations), evaluations.valid, ~evaluations.valid & ~evaluations.infeasible)
+    )
+    searches = [_search_nearest(grid, characteristics, plane) for grid, plane in zip(is_unsafe, planes, strict=True)]
+    values = [next(search) for search in searches]
+    for _ in range(PLANE_ROUNDS):
+        found = unsafe.of(evaluate(values, "nearest unsafe settings"))
+        parts = np.split(found, np.cumsum(list(map(len, values)))[:-1])
+        values = [search.send(part) for search, part in zip(searches, parts, strict=True)]
+    ends = np.where(np.isin(np.arange(GRID_VALUES), (0, GRID_VALUES - 1)), 0.5, 1.0)
+    unsafe_area, valid_area, lost_area = (
+        np.sum(np.outer(ends, ends) * flags, axis=(1, 2)) for flags in (is_unsafe, is_valid, is_lost)
+    )
+    names = [[characteristics.names[column] for column in plane] for plane in planes]
     return [
         Pair(
-            characteristics=tuple(characteristics.members[column] for column in plane),
-            values=axes[plane],
-            safety_degree=degrees[k],
-            unsafe=is_unsafe[k],
-            valid=valid[k],
-            infeasible=infeasible[k],
-            nearest=nearest[k],
+            characteristics=names[k],
+            unsafe_share=float(unsafe_area[k] / valid_area[k]) if valid_area[k] else 0.0,
+            not_simulated_share=float(lost_area[k] / ends.sum() ** 2),
+            nearest=dict(zip(names[k], nearest[0].tolist(), strict=True)) if len(nearest) else None,
         )
-        for k, plane in enumerate(planes)
+        for k, nearest in enumerate(values)
     ]
 
 
 def _search_nearest(
-    grid: BoolArray, original: FloatArray, lower: FloatArray, upper: FloatArray
-) -> Generator[FloatArray, BoolArray | None, tuple[float, float] | None]:
+    grid: BoolArray, characteristics: CharacteristicSet, plane: list[int]
+) -> Generator[FloatArray, BoolArray]:
     """Find the unsafe setting of a plane nearest to the original, from where its grid is unsafe; distances are in
     domain widths.
 
-    Yields values of the two characteristics, shape (K, 2), and is sent which are unsafe. A branch and bound search: a
-    square with an unsafe corner is divided into smaller squares if it comes nearer to the original than the nearest
-    unsafe setting so far; each round divides the `MAX_SQUARES` nearest squares.
+    Yields values of the two characteristics, shape (K, 2), and is sent which are unsafe; at last, after `PLANE_ROUNDS`,
+    yields the setting's values, shape (1, 2), or (0, 2) if there is none. A branch and bound search: a square with an
+    unsafe corner is divided into smaller squares if it comes nearer to the original than the nearest unsafe setting so
+    far; each round divides the `MAX_SQUARES` nearest squares.
     """
 
     def distances(offset: FloatArray) -> FloatArray:
         return np.asarray(np.sqrt(np.sum((offset / width) ** 2, axis=-1)))
 
+    original, lower, upper = (
+        ends[plane] for ends in (characteristics.original, characteristics.lower, characteristics.upper)
+    )
     width = upper - lower
     size = width / (GRID_VALUES - 1)
     values = lower + np.argwhere(np.ones_like(grid)) * size
     steps = np.argwhere(np.ones((PARTS_PER_SIDE + 1,) * 2))
-    nearest, least = None, math.inf
-    corners, grids = lower[np.newaxis], grid[np.newaxis]
+    nearest, corners, grids = np.zeros((0, 2)), lower[np.newaxis], grid[np.newaxis]
     for round_number in range(PLANE_ROUNDS + 1):
-        found = values[grids.ravel()]
-        if len(found) and (closest := np.min(distances(found - original))) < least:
-            least, nearest = closest, found[np.argmin(distances(found - original))]
+        known = np.concatenate([nearest, values[grids.ravel()]])
+        nearest = known[np.argsort(distances(known - original), kind="stable")[:1]]
+        if round_number == PLANE_ROUNDS:
+            break
         square, i, j = np.nonzero(grids[:, 1:, 1:] | grids[:, :-1, 1:] | grids[:, 1:, :-1] | grids[:, :-1, :-1])
         corners = corners[square] + np.stack([i, j], axis=1) * size
         offset = corners - original
         gaps = distances(np.maximum(np.maximum(offset, -offset - size), 0.0))
-        squares = [k for k in np.argsort(gaps, kind="stable") if gaps[k] < least][:MAX_SQUARES]
-        if round_number == PLANE_ROUNDS or not squares:
-            break
-        corners, size = corners[squares], size / PARTS_PER_SIDE
+        order = np.argsort(gaps, kind="stable")
+        order = order[gaps[order] < np.min(distances(nearest - original), initial=math.inf)][:MAX_SQUARES]
+        corners, size = corners[order], size / PARTS_PER_SIDE
         values = np.minimum(corners[:, np.newaxis] + steps * size, lower + width).reshape(-1, 2)
-        grids = np.asarray((yield values)).reshape(-1, PARTS_PER_SIDE + 1, PARTS_PER_SIDE + 1)
-    return None if nearest is None else (float(nearest[0]), float(nearest[1]))
+        grids = (yield values).reshape(-1, PARTS_PER_SIDE + 1, PARTS_PER_SIDE + 1)
+    yield nearest
