@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from msgspec.structs import replace
 
-from safevar_sumo.ads.competent_driver import CompetentDriver
+from safevar_sumo.ads.reference_drivers import CompetentDriver
 from safevar_sumo.analysis.evaluator import Evaluator, clopper_pearson
 from safevar_sumo.analysis.words import number_of, share_in_words
 from safevar_sumo.records import Evaluations, FloatArray

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from safevar_sumo.ads.apollo import Apollo
-from safevar_sumo.ads.krauss import Krauss
+from safevar_sumo.ads.car_following import Krauss
 from safevar_sumo.ads.world_on_rails import WorldOnRails
 from safevar_sumo.records import Nominal, Observation, PedalTables
 

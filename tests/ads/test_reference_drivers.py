@@ -10,12 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from safevar_sumo.ads.acc import Acc
-from safevar_sumo.ads.competent_driver import CompetentDriver
-from safevar_sumo.ads.fuzzy_safety import FuzzySafety
-from safevar_sumo.ads.idm import Idm
-from safevar_sumo.ads.r157 import R157
-from safevar_sumo.ads.rss import Rss
+from safevar_sumo.ads.car_following import Acc, Idm
+from safevar_sumo.ads.reference_drivers import R157, CompetentDriver, FuzzySafety, Rss
 from safevar_sumo.records import Nominal, Observation, PedalTables
 from safevar_sumo.shipped import NETWORKS
 from safevar_sumo.sumo.engine import open_world

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import scipy
 
-from safevar_sumo.ads.competent_driver import CompetentDriver
+from safevar_sumo.ads.reference_drivers import CompetentDriver
 from safevar_sumo.analysis.evaluator import Evaluator
 from safevar_sumo.analysis.explain import ExplainOptions
 from safevar_sumo.analysis.explain.braking_comparison import sentence

@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from safevar_sumo.ads.full_braking import FullBraking
+from safevar_sumo.ads.reference_drivers import FullBraking
 from safevar_sumo.analysis.explain.causes import Cause
 from safevar_sumo.analysis.explain.result import Explained
 from safevar_sumo.analysis.explain.sentences import counts_in_words, effect_in_words, verdict_in_words

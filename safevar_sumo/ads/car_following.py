@@ -1,0 +1,146 @@
+"""Car-following models as ADSs: Krauss, the intelligent driver model, and adaptive cruise control, as SUMO computes them."""
+
+from __future__ import annotations
+
+import math
+from abc import abstractmethod
+from typing import Annotated
+
+import numpy as np
+from msgspec import Meta, Struct
+
+from safevar_sumo.ads.base import Ads, NonNegativeParameter, PositiveParameter
+from safevar_sumo.ads.driver import LARGEST_GAP, Trim, is_in_the_way, pedals_for, trim_at
+from safevar_sumo.records import Command, FloatArray, Nominal, Observation
+
+# Gains of the modes of MSCFModel_ACC [1/s for speeds, 1/s^2 for gaps] and its thresholds: defaults.
+SPEED_GAIN = -0.4
+CLOSING_GAINS = 0.8, 0.04
+KEEPING_GAINS = 0.07, 0.23
+AVOIDING_GAINS = 0.23, 0.8
+FOLLOWING_GAP = 100.0  # m, largest gap at which it follows
+GAP_TOLERANCE, SPEED_TOLERANCE = 0.2, 0.1  # m, m/s: errors below which it keeps the gap
+LEAST_GAP = 0.001  # m; NUMERICAL_EPS of SUMO
+
+
+class CarFollowing(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Base of models that compute an acceleration from gap and speeds, which becomes pedals; they ignore obstacles beside the way."""
+
+    cruise_speed: PositiveParameter = 13.89
+    headway: PositiveParameter = 1.0
+    standing_gap: Annotated[float, Meta(ge=0, le=100)] = 2.5
+    corridor: PositiveParameter = 1.4
+
+    def start(self, n: int, nominal: Nominal, step: float) -> tuple[Nominal, Trim | None]:
+        return nominal, None
+
+    def drive(
+        self, seen: Observation, memory: tuple[Nominal, Trim | None]
+    ) -> tuple[Command, tuple[Nominal, Trim | None]]:
+        nominal, trim = memory
+        initial_trim = trim_at(nominal, seen) if trim is None else trim
+        gap = np.where(is_in_the_way(seen, self.corridor), seen.gap, LARGEST_GAP)
+        acceleration = self.acceleration_at(gap, seen.speed, seen.obstacle_speed)
+        return pedals_for(nominal, seen.speed, acceleration, initial_trim), (nominal, initial_trim)
+
+    @abstractmethod
+    def acceleration_at(self, gap: FloatArray, speed: FloatArray, leader_speed: FloatArray) -> FloatArray:
+        """Commanded acceleration [m/s^2] at a gap from bumper to bumper [m] and speeds [m/s], shape (N,)."""
+
+
+class Acc(CarFollowing, frozen=True, kw_only=True):
+    """Holds a speed, or a time headway behind a leader (Milanes and Shladover 2014; Xiao, Wang, van Arem 2017; `MSCFModel_ACC`).
+
+    Parameters
+    ----------
+    cruise_speed
+        Speed to hold [m/s].
+    headway, standing_gap
+        Desired time headway [s], and additional gap [m].
+    corridor
+        Half the width of the corridor that it watches [m].
+    """
+
+    def acceleration_at(self, gap: FloatArray, speed: FloatArray, leader_speed: FloatArray) -> FloatArray:
+        """The control law of the mode that applies; near standstill it keeps 2 m more than the headway (Xiao et al. 2017)."""
+        excess_speed, relative_speed = speed - self.cruise_speed, leader_speed - speed
+        standing_distance = np.minimum(np.maximum(75 / np.maximum(speed, 1.0) - 5, 0.0), 2.0)
+        gap_error = gap - self.standing_gap - standing_distance - self.headway * speed
+        closing, keeping, avoiding = (
+            by_speed * relative_speed + by_gap * gap_error
+            for by_speed, by_gap in (CLOSING_GAINS, KEEPING_GAINS, AVOIDING_GAINS)
+        )
+        keeps_gap = (np.abs(gap_error) < GAP_TOLERANCE) & (np.abs(excess_speed) < SPEED_TOLERANCE)
+        acceleration = np.where(keeps_gap, keeping, np.where(gap_error < 0, avoiding, closing))
+        return np.where(gap - self.standing_gap > FOLLOWING_GAP, SPEED_GAIN * excess_speed, acceleration)
+
+
+class Idm(CarFollowing, frozen=True, kw_only=True):
+    """The intelligent driver model (Treiber, Hennecke, Helbing 2000; `MSCFModel_IDM`).
+
+    dv/dt = a (1 - (v / v0)^4 - (s* / s)^2), s* = s0 + max(0, v T + v (v - u) / (2 sqrt(a b))) at speed v, gap s, leader speed u.
+
+    Parameters
+    ----------
+    cruise_speed
+        v0 [m/s].
+    headway, standing_gap
+        T [s], s0 [m].
+    acceleration, deceleration
+        a, b [m/s^2].
+    corridor
+        Half the width of the corridor that it watches [m].
+    """
+
+    acceleration: PositiveParameter = 2.6
+    deceleration: PositiveParameter = 4.5
+
+    def acceleration_at(self, gap: FloatArray, speed: FloatArray, leader_speed: FloatArray) -> FloatArray:
+        """dv/dt [m/s^2]."""
+        speed_ratio = speed / self.cruise_speed
+        closing_term = speed * (speed - leader_speed) / (2 * math.sqrt(self.acceleration * self.deceleration))
+        desired_gap = self.standing_gap + np.maximum(speed * self.headway + closing_term, 0.0)
+        positive_gap = np.maximum(gap, LEAST_GAP)
+        free_road = 1 - speed_ratio * speed_ratio * speed_ratio * speed_ratio
+        return np.asarray(self.acceleration * (free_road - desired_gap * desired_gap / (positive_gap * positive_gap)))
+
+
+class Krauss(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """SUMO's default model (Krauss 1998; `MSCFModel_Krauss`).
+
+    It never drives faster than a speed from which the original vehicle can stop behind the obstacle after a reaction time.
+
+    Parameters
+    ----------
+    cruise_speed
+        Desired speed [m/s].
+    standing_gap
+        Intended gap at standstill [m].
+    braking_share
+        Planned deceleration as a share of the original vehicle's greatest deceleration [-].
+    reaction_time
+        Planned time until braking begins [s].
+    """
+
+    cruise_speed: PositiveParameter = 13.89
+    standing_gap: NonNegativeParameter = 2.5
+    braking_share: Annotated[float, Meta(gt=0, le=1)] = 0.6
+    reaction_time: NonNegativeParameter = 1.0
+
+    def start(self, n: int, nominal: Nominal, step: float) -> tuple[Nominal, float]:
+        return nominal, step
+
+    def drive(self, seen: Observation, memory: tuple[Nominal, float]) -> tuple[Command, tuple[Nominal, float]]:
+        """Aim at v_safe = -b t + sqrt((b t)^2 + 2 b gap), with the planned deceleration b and the reaction time t.
+
+        From v_safe the vehicle comes to rest behind a standing obstacle.
+        """
+        nominal, step = memory
+        deceleration = self.braking_share * nominal.decel
+        reaction_speed = deceleration * self.reaction_time
+        gap = np.minimum(np.maximum(seen.gap - self.standing_gap, 0.0), LARGEST_GAP)
+        safe_speed = np.sqrt(reaction_speed * reaction_speed + 2 * deceleration * gap) - reaction_speed
+        acceleration = (np.minimum(safe_speed, self.cruise_speed) - seen.speed) / (step + nominal.actuator_lag)
+        throttle = np.minimum(np.maximum(acceleration / nominal.accel, 0.0), 1.0)
+        brake = np.minimum(np.maximum(-acceleration / nominal.decel, 0.0), 1.0)
+        return Command(throttle, brake), memory

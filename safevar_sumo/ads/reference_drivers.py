@@ -1,0 +1,335 @@
+"""Reference drivers, with which an ADS is compared: they hold their speed until they see a danger, react, and brake.
+
+UN Regulation No. 157 means its drivers for cars that cut in, cut out or brake on motorways; their use for pedestrians is ours.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, NamedTuple
+
+import numpy as np
+from msgspec import Meta, Struct
+
+from safevar_sumo.ads.base import Ads, NonNegativeParameter, PositiveParameter
+from safevar_sumo.ads.car_following import KEEPING_GAINS
+from safevar_sumo.ads.driver import Trim, is_in_the_way, pedals_for, time_to_reach, trim_at
+from safevar_sumo.records import GRAVITY, TIME_ROUNDING, BoolArray, Command, FloatArray, Nominal, Observation
+
+HARDEST_BRAKING = 0.774 * GRAVITY
+"""Deceleration of the competent and careful driver [m/s^2] (UN R157, annex 4, appendix 3)."""
+JERK = 12.65
+"""Jerk limit while that deceleration builds up [m/s^3] (UN R157, annex 4, appendix 3)."""
+UNLIMITED_BRAKING = 1e6
+"""Deceleration beyond every brake [m/s^2]; it presses the pedal fully."""
+CRUISE_GAIN = 1.0
+"""Acceleration per speed error [1/s]."""
+LEAST_DIVISOR = 1e-9
+"""Lower bound of accelerations and widths by which numbers are divided [m/s^2, m]."""
+StartThrottle = tuple[Annotated[float, Meta(ge=0, le=1)], ...]
+"""Throttle in the run's first steps, one value per step [-]: the replayed start of another driver."""
+
+
+class Reaction(NamedTuple):
+    """The original vehicle; time between calls [s]; speed to hold [m/s], trim and brake pedal [-], as first observed.
+
+    `speed` is that of the last call [m/s], `danger_time` the time since the danger was first seen [s], negative before;
+    `coasting` is the deceleration that the driver felt before braking, `braking` the intended one [m/s^2]. Shape (N,).
+    """
+
+    nominal: Nominal
+    step: float
+    cruise: tuple[FloatArray, Trim, FloatArray] | None
+    speed: FloatArray
+    danger_time: FloatArray
+    coasting: FloatArray
+    braking: FloatArray
+
+
+class ReferenceDriver(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Base of the drivers; the original vehicle's tables were written in other gears, so they brake by the deceleration that they feel."""
+
+    cruise_speed: PositiveParameter | None = None
+    corridor: PositiveParameter = 1.4
+
+    def start(self, n: int, nominal: Nominal, step: float) -> Any:
+        return Reaction(nominal, step, None, np.zeros(n), np.full(n, -1.0), np.zeros(n), np.zeros(n))
+
+    def react(
+        self,
+        seen: Observation,
+        memory: Reaction,
+        danger: BoolArray,
+        deceleration: FloatArray | float,
+        reaction_time: float,
+        jerk: float = JERK,
+        start: StartThrottle = (),
+        following: FloatArray | float = np.inf,
+    ) -> tuple[Command, Reaction]:
+        """Drive on, or react to a danger: release the accelerator, and brake when the reaction time is over.
+
+        The danger is over when no obstacle ahead approaches or blocks the way.
+
+        Parameters
+        ----------
+        danger
+            Whether the driver sees a danger now; shape (N,).
+        deceleration
+            Deceleration after the reaction time [m/s^2]; it rises at `jerk` [m/s^3].
+        reaction_time
+            Time from the first sight of the danger to braking [s].
+        start
+            Throttle in the first steps without a danger.
+        following
+            Upper limit of the acceleration when following a leader [m/s^2].
+        """
+        nominal, step, cruise, last_speed = memory[:4]
+        if cruise is None:
+            last_speed = seen.speed
+            speed = seen.speed if self.cruise_speed is None else np.full_like(seen.speed, self.cruise_speed)
+            cruise = speed, trim_at(nominal, seen), seen.brake
+        speed_to_hold, initial_trim, initial_brake = cruise
+        blocks_the_way = (np.abs(seen.lateral) <= self.corridor) | (np.sign(seen.lateral) * seen.lateral_speed < 0)
+        danger_lasts = (
+            np.isfinite(seen.gap)
+            & (seen.gap > 0)
+            & ((seen.closing_speed > 0) | ((seen.closing_speed >= 0) & blocks_the_way))
+        )
+        is_aware, was_braking = memory.danger_time >= 0, memory.danger_time >= reaction_time - TIME_ROUNDING
+        is_reacting = np.where(is_aware, danger_lasts, danger)
+        danger_time = np.where(is_reacting, np.where(is_aware, memory.danger_time + step, 0.0), -1.0)
+        is_braking = danger_time >= reaction_time - TIME_ROUNDING
+        coasting = np.where(was_braking, memory.coasting, np.maximum((last_speed - seen.speed) / step, 0.0))
+        rising = np.minimum(np.maximum(memory.braking, coasting) + jerk * step, deceleration)
+        braking = np.where(is_braking, rising, 0.0)
+        brake = np.minimum(initial_brake + np.maximum(braking - coasting, 0.0) / nominal.braking, 1.0)
+        if (step_index := round(seen.time / step)) < len(start):
+            calm = Command(np.full_like(brake, start[step_index]), np.zeros_like(brake))
+        else:
+            acceleration = np.minimum(CRUISE_GAIN * (speed_to_hold - seen.speed), following)
+            calm = pedals_for(nominal, seen.speed, acceleration, initial_trim)
+        command = Command(np.where(is_reacting, 0.0, calm.throttle), np.where(is_reacting, brake, calm.brake))
+        return command, Reaction(nominal, step, cruise, seen.speed, danger_time, coasting, braking)
+
+
+class FullBraking(ReferenceDriver, frozen=True, kw_only=True):
+    """Brakes fully as soon as an obstacle is in its way or will be there when the vehicle arrives: the best that a driver can do.
+
+    Parameters
+    ----------
+    cruise_speed
+        Speed to hold [m/s], by default the initial speed.
+    corridor
+        Half the width of the corridor that it watches [m].
+    start_throttle
+        Throttle in the run's first steps, one value per step, until it brakes [-].
+    """
+
+    start_throttle: StartThrottle = ()
+
+    def drive(self, seen: Observation, memory: Reaction) -> tuple[Command, Reaction]:
+        danger, jerk = is_in_the_way(seen, self.corridor), UNLIMITED_BRAKING / memory.step
+        return self.react(seen, memory, danger, UNLIMITED_BRAKING, 0.0, jerk, self.start_throttle)
+
+
+class R157(ReferenceDriver, frozen=True, kw_only=True):
+    """Reacts to a TTC below (v - u) / (2 * 6 m/s^2) + 0.35 s + 0.1 s, and brakes with 6 m/s^2 at once.
+
+    v and u are the speeds of the vehicle and the obstacle. UN R157, 5.2.5.2, requires this braking of an automated lane keeping system.
+
+    Parameters
+    ----------
+    cruise_speed
+        Speed to hold [m/s], by default the initial speed.
+    deceleration, reaction_time, margin
+        6 m/s^2, 0.35 s and 0.1 s in the regulation.
+    corridor
+        Half the width of the corridor that it watches [m].
+    """
+
+    deceleration: PositiveParameter = 6.0
+    reaction_time: NonNegativeParameter = 0.35
+    margin: NonNegativeParameter = 0.1
+
+    def drive(self, seen: Observation, memory: Reaction) -> tuple[Command, Reaction]:
+        critical_ttc = seen.closing_speed / (2 * self.deceleration) + self.reaction_time + self.margin
+        danger = is_in_the_way(seen, self.corridor) & (time_to_reach(seen) < critical_ttc)
+        jerk = self.deceleration / memory.step
+        return self.react(seen, memory, danger, self.deceleration, self.reaction_time, jerk)
+
+
+class Rss(ReferenceDriver, frozen=True, kw_only=True):
+    """Responsibility-sensitive safety (Shalev-Shwartz, Shammah, Shashua 2017), longitudinal part.
+
+    A gap below the safe distance is a danger, to which it reacts and brakes with up to 0.774 g.
+    safe distance = v rt + a rt^2 / 2 + (v + rt a)^2 / (2 b) - u^2 / (2 b_u), with the speeds v and u of vehicle and leader.
+
+    Parameters
+    ----------
+    cruise_speed
+        Speed to hold [m/s], by default the initial speed.
+    reaction_time
+        rt [s].
+    acceleration, deceleration, leader_deceleration
+        Acceleration a while it reacts, deceleration b of its own braking and b_u of the leader's braking [m/s^2].
+    corridor
+        Half the width of the corridor that it watches [m].
+    """
+
+    reaction_time: NonNegativeParameter = 0.75
+    acceleration: NonNegativeParameter = 0.0
+    deceleration: PositiveParameter = HARDEST_BRAKING
+    leader_deceleration: PositiveParameter = HARDEST_BRAKING
+
+    def drive(self, seen: Observation, memory: Reaction) -> tuple[Command, Reaction]:
+        is_near = seen.gap < self.safe_distance(seen.speed, seen.obstacle_speed)
+        danger = is_in_the_way(seen, self.corridor) & is_near
+        return self.react(seen, memory, danger, self.deceleration, self.reaction_time)
+
+    def safe_distance(self, speed: FloatArray, leader_speed: FloatArray) -> FloatArray:
+        """Smallest safe gap [m], at speeds [m/s] of shape (N,)."""
+        rt, reaction_speed = self.reaction_time, speed + self.reaction_time * self.acceleration
+        distance = (
+            speed * rt + self.acceleration * rt * rt / 2 + reaction_speed * reaction_speed / (2 * self.deceleration)
+        )
+        return np.asarray(np.maximum(distance - leader_speed * leader_speed / (2 * self.leader_deceleration), 0.0))
+
+
+class FuzzySafety(ReferenceDriver, frozen=True, kw_only=True):
+    """The fuzzy safety model (Mattas et al. 2020, "Fuzzy Surrogate Safety Metrics"), in UN R157 as amended.
+
+    It brakes according to two metrics: PFS rises as the gap falls below the safe distance, CFS as a collision nears.
+
+    Parameters
+    ----------
+    cruise_speed
+        Speed to hold [m/s], by default the initial speed.
+    reaction_time
+        Reaction time rt [s].
+    comfortable, hardest, leader_deceleration
+        Decelerations b_min and b_max of its own braking, b_u of the leader's braking [m/s^2].
+    margin
+        Added to the safe distance and subtracted from the gap [m].
+    corridor
+        Half the width of the corridor that it watches [m].
+    """
+
+    reaction_time: NonNegativeParameter = 0.75
+    comfortable: PositiveParameter = 4.0
+    hardest: PositiveParameter = 6.0
+    leader_deceleration: PositiveParameter = 7.0
+    margin: NonNegativeParameter = 2.0
+
+    def drive(self, seen: Observation, memory: Reaction) -> tuple[Command, Reaction]:
+        acceleration = (seen.speed - (seen.speed if memory.cruise is None else memory.speed)) / memory.step
+        gap = np.where(is_in_the_way(seen, self.corridor), seen.gap, np.inf)
+        pfs = self.proactive_metric(gap, seen.speed, seen.obstacle_speed)
+        cfs = self.critical_metric(gap, seen.speed, seen.obstacle_speed, acceleration)
+        near = cfs * (self.hardest - self.comfortable) + self.comfortable
+        deceleration = np.minimum(np.where(cfs > 0, near, pfs * self.comfortable), HARDEST_BRAKING)
+        return self.react(seen, memory, (pfs > 0) | (cfs > 0), deceleration, self.reaction_time)
+
+    def proactive_metric(self, gap: FloatArray, v: FloatArray, u: FloatArray) -> FloatArray:
+        """PFS in [0, 1] at a gap [m] and speeds v and u (leader) [m/s], shape (N,): 0 above the safe distance, 1 below the unsafe one."""
+        leader_stop = u * u / (2 * self.leader_deceleration)
+        safe_distance = v * self.reaction_time + v * v / (2 * self.comfortable) - leader_stop + self.margin
+        unsafe_distance = v * self.reaction_time + v * v / (2 * self.hardest) - leader_stop
+        return _falling_ramp(gap - self.margin, unsafe_distance, safe_distance)
+
+    def critical_metric(self, gap: FloatArray, v: FloatArray, u: FloatArray, a: FloatArray) -> FloatArray:
+        """CFS in [0, 1] at a gap [m], speeds v and u [m/s] and the acceleration a of the vehicle [m/s^2], shape (N,)."""
+        acceleration = np.maximum(a, -self.comfortable)
+        next_speed = v + self.reaction_time * acceleration
+        approach = (v + acceleration * self.reaction_time / 2 - u) * self.reaction_time
+        square = (next_speed - u) * (next_speed - u)
+        fuzzy_value = _falling_ramp(
+            gap, approach + square / (2 * self.hardest), approach + square / (2 * self.comfortable)
+        )
+        stop = (v - u) * (v - u) / (2 * np.maximum(np.abs(acceleration), LEAST_DIVISOR))
+        return np.where(v <= u, 0.0, np.where(next_speed < u, np.where(gap < stop, 1.0, 0.0), fuzzy_value))
+
+
+def _falling_ramp(value: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
+    """1 below `low`, 0 above `high`, linear between them."""
+    width = np.maximum(high - low, LEAST_DIVISOR)
+    return np.minimum(np.maximum((high - np.minimum(value, high + width)) / width, 0.0), 1.0)
+
+
+class _Perceiving(NamedTuple):
+    """The reaction; the lateral position of the obstacle when it was first sensed [m], infinite until then; whether it was in the way
+    there; the time since it strayed from there [s], negative until it does.
+    """
+
+    reaction: Reaction
+    first_lateral: FloatArray
+    first_in_way: BoolArray
+    stray_time: FloatArray
+
+
+class CompetentDriver(ReferenceDriver, frozen=True, kw_only=True):
+    """The competent and careful human driver of UN R157, annex 4, appendix 3 (longitudinal part).
+
+    Holds its speed or a headway; perceives obstacles that move into its way, reacts to a TTC below 2 s, and brakes with up to 0.774 g.
+
+    While it reacts it releases the accelerator, and the vehicle coasts. After a stop it waits until the way is clear.
+    Behind a moving leader it keeps its headway by the accelerator only:
+    a = 0.07 (u - v) + 0.23 (gap - headway v), the gap control of Milanes and Shladover (2014), but at least `-lets_go`;
+    u and v are the speeds of leader and vehicle.
+
+    Parameters
+    ----------
+    cruise_speed
+        Speed to hold [m/s], by default the initial speed.
+    critical_ttc, reaction_time
+        Time to collision that counts as a danger, and reaction time before braking [s].
+    stray, perception_time
+        An obstacle that enters the way is perceived `perception_time` after it has moved `stray` from its first lateral position [m, s].
+    lets_go
+        Largest deceleration while it increases its gap [m/s^2].
+    headway
+        Time headway at which it follows [s].
+    corridor
+        Half the width of the corridor that it watches [m].
+    start_throttle
+        Throttle in the run's first steps, one value per step, until it sees a danger [-].
+    """
+
+    critical_ttc: PositiveParameter = 2.0
+    reaction_time: NonNegativeParameter = 0.75
+    stray: NonNegativeParameter = 0.375
+    perception_time: NonNegativeParameter = 0.4
+    lets_go: NonNegativeParameter = 0.4
+    headway: PositiveParameter = 2.0
+    start_throttle: StartThrottle = ()
+
+    def start(self, n: int, nominal: Nominal, step: float) -> _Perceiving:
+        reaction: Reaction = ReferenceDriver.start(self, n, nominal, step)
+        return _Perceiving(reaction, np.full(n, np.inf), np.zeros(n, dtype=bool), np.full(n, -1.0))
+
+    def drive(self, seen: Observation, memory: _Perceiving) -> tuple[Command, _Perceiving]:
+        is_perceived, memory = self._perceive(seen, memory)
+        is_in_way = is_perceived & is_in_the_way(seen, self.corridor)
+        danger, following = is_in_way & (time_to_reach(seen) < self.critical_ttc), self._following(seen, is_in_way)
+        command, reaction = self.react(
+            seen, memory.reaction, danger, HARDEST_BRAKING, self.reaction_time, JERK, self.start_throttle, following
+        )
+        return command, memory._replace(reaction=reaction)
+
+    def _following(self, seen: Observation, is_in_way: BoolArray) -> FloatArray:
+        """Acceleration that keeps the headway to a moving leader [m/s^2]; infinite if no leader is in the way."""
+        gap = np.where(is_in_way, seen.gap, 0.0)
+        by_speed, by_gap = KEEPING_GAINS
+        gap_control = by_speed * (seen.obstacle_speed - seen.speed) + by_gap * (gap - self.headway * seen.speed)
+        return np.where(is_in_way & (seen.obstacle_speed > 0), np.maximum(gap_control, -self.lets_go), np.inf)
+
+    def _perceive(self, seen: Observation, memory: _Perceiving) -> tuple[BoolArray, _Perceiving]:
+        """Whether the obstacle is perceived: it was in the way at first, or strayed from its first position `perception_time` ago."""
+        is_sighted = np.isfinite(seen.gap) & np.isfinite(seen.lateral)
+        lateral = np.where(is_sighted, seen.lateral, 0.0)
+        appears = is_sighted & ~np.isfinite(memory.first_lateral)
+        first_lateral = np.where(appears, lateral, memory.first_lateral)
+        first_in_way = memory.first_in_way | (appears & (np.abs(lateral) <= self.corridor))
+        deviation = np.abs(lateral - np.where(np.isfinite(first_lateral), first_lateral, 0.0))
+        starts = np.where(is_sighted & (deviation >= self.stray), 0.0, -1.0)
+        stray_time = np.where(memory.stray_time >= 0, memory.stray_time + memory.reaction.step, starts)
+        is_perceived = first_in_way | (stray_time >= self.perception_time - TIME_ROUNDING)
+        return is_perceived, _Perceiving(memory.reaction, first_lateral, first_in_way, stray_time)
