@@ -1,4 +1,6 @@
-"""Car-following models as ADSs: Krauss, the intelligent driver model, and adaptive cruise control, as SUMO computes them."""
+"""Car-following models as ADSs: Krauss, the intelligent driver model, and adaptive cruise control, as SUMO computes
+them.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +26,9 @@ LEAST_GAP = 0.001  # m; NUMERICAL_EPS of SUMO
 
 
 class CarFollowing(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Base of models that compute an acceleration from gap and speeds, which becomes pedals; they ignore obstacles beside the way."""
+    """Base of models that compute an acceleration from gap and speeds, which becomes pedals; they ignore obstacles
+    beside the way.
+    """
 
     cruise_speed: PositiveParameter = 13.89
     headway: PositiveParameter = 1.0
@@ -49,7 +53,8 @@ class CarFollowing(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields
 
 
 class Acc(CarFollowing, frozen=True, kw_only=True):
-    """Holds a speed, or a time headway behind a leader (Milanes and Shladover 2014; Xiao, Wang, van Arem 2017; `MSCFModel_ACC`).
+    """Holds a speed, or a time headway behind a leader (Milanes and Shladover 2014; Xiao, Wang, van Arem 2017;
+    `MSCFModel_ACC`).
 
     Parameters
     ----------
@@ -62,7 +67,9 @@ class Acc(CarFollowing, frozen=True, kw_only=True):
     """
 
     def acceleration_at(self, gap: FloatArray, speed: FloatArray, leader_speed: FloatArray) -> FloatArray:
-        """The control law of the mode that applies; near standstill it keeps 2 m more than the headway (Xiao et al. 2017)."""
+        """The control law of the mode that applies; near standstill it keeps 2 m more than the headway (Xiao et al.
+        2017).
+        """
         excess_speed, relative_speed = speed - self.cruise_speed, leader_speed - speed
         standing_distance = np.minimum(np.maximum(75 / np.maximum(speed, 1.0) - 5, 0.0), 2.0)
         gap_error = gap - self.standing_gap - standing_distance - self.headway * speed
@@ -78,7 +85,8 @@ class Acc(CarFollowing, frozen=True, kw_only=True):
 class Idm(CarFollowing, frozen=True, kw_only=True):
     """The intelligent driver model (Treiber, Hennecke, Helbing 2000; `MSCFModel_IDM`).
 
-    dv/dt = a (1 - (v / v0)^4 - (s* / s)^2), s* = s0 + max(0, v T + v (v - u) / (2 sqrt(a b))) at speed v, gap s, leader speed u.
+    dv/dt = a (1 - (v / v0)^4 - (s* / s)^2), s* = s0 + max(0, v T + v (v - u) / (2 sqrt(a b))) at speed v, gap s, leader
+    speed u.
 
     Parameters
     ----------
@@ -108,7 +116,8 @@ class Idm(CarFollowing, frozen=True, kw_only=True):
 class Krauss(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """SUMO's default model (Krauss 1998; `MSCFModel_Krauss`).
 
-    It never drives faster than a speed from which the original vehicle can stop behind the obstacle after a reaction time.
+    It never drives faster than a speed from which the original vehicle can stop behind the obstacle after a reaction
+    time.
 
     Parameters
     ----------

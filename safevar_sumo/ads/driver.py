@@ -36,7 +36,9 @@ class DelayLine(NamedTuple):
         return cls(int(steps), fraction)
 
     def delayed(self, values: FloatArray) -> tuple[FloatArray, DelayLine]:
-        """The values one delay ago, linear between two steps, and the next delay line; before the first step the first values hold."""
+        """The values one delay ago, linear between two steps, and the next delay line; before the first step the first
+        values hold.
+        """
         past = (*(self.past[1:] or (values,) * (self.steps + 1)), values)
         older, newer = past[0], past[1]
         if self.fraction:
@@ -53,7 +55,9 @@ class DelayLine(NamedTuple):
 
 
 class Trim(NamedTuple):
-    """Pedal positions of a rolling vehicle minus the positions that hold the original vehicle's speed on a level road [-]."""
+    """Pedal positions of a rolling vehicle minus the positions that hold the original vehicle's speed on a level road
+    [-].
+    """
 
     throttle: FloatArray
     brake: FloatArray
@@ -94,7 +98,8 @@ def time_to_reach(seen: Observation) -> FloatArray:
 
 
 def is_in_the_way(seen: Observation, corridor: float, reach: float = np.inf) -> BoolArray:
-    """Whether a detected obstacle ahead is within `corridor` of the lane's middle [m], or will be when the vehicle reaches it.
+    """Whether a detected obstacle ahead is within `corridor` of the lane's middle [m], or will be when the vehicle
+    reaches it.
 
     `reach` is the sensors' range in clear weather [m].
     """

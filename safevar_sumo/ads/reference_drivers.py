@@ -1,6 +1,7 @@
 """Reference drivers, with which an ADS is compared: they hold their speed until they see a danger, react, and brake.
 
-UN Regulation No. 157 means its drivers for cars that cut in, cut out or brake on motorways; their use for pedestrians is ours.
+UN Regulation No. 157 means its drivers for cars that cut in, cut out or brake on motorways; their use for pedestrians
+is ours.
 """
 
 from __future__ import annotations
@@ -46,7 +47,9 @@ class Reaction(NamedTuple):
 
 
 class ReferenceDriver(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Base of the drivers; the original vehicle's tables were written in other gears, so they brake by the deceleration that they feel."""
+    """Base of the drivers; the original vehicle's tables were written in other gears, so they brake by the deceleration
+    that they feel.
+    """
 
     cruise_speed: PositiveParameter | None = None
     corridor: PositiveParameter = 1.4
@@ -112,7 +115,8 @@ class ReferenceDriver(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fie
 
 
 class FullBraking(ReferenceDriver, frozen=True, kw_only=True):
-    """Brakes fully as soon as an obstacle is in its way or will be there when the vehicle arrives: the best that a driver can do.
+    """Brakes fully as soon as an obstacle is in its way or will be there when the vehicle arrives: the best that a
+    driver can do.
 
     Parameters
     ----------
@@ -134,7 +138,8 @@ class FullBraking(ReferenceDriver, frozen=True, kw_only=True):
 class R157(ReferenceDriver, frozen=True, kw_only=True):
     """Reacts to a TTC below (v - u) / (2 * 6 m/s^2) + 0.35 s + 0.1 s, and brakes with 6 m/s^2 at once.
 
-    v and u are the speeds of the vehicle and the obstacle. UN R157, 5.2.5.2, requires this braking of an automated lane keeping system.
+    v and u are the speeds of the vehicle and the obstacle. UN R157, 5.2.5.2, requires this braking of an automated lane
+    keeping system.
 
     Parameters
     ----------
@@ -160,8 +165,8 @@ class R157(ReferenceDriver, frozen=True, kw_only=True):
 class Rss(ReferenceDriver, frozen=True, kw_only=True):
     """Responsibility-sensitive safety (Shalev-Shwartz, Shammah, Shashua 2017), longitudinal part.
 
-    A gap below the safe distance is a danger, to which it reacts and brakes with up to 0.774 g.
-    safe distance = v rt + a rt^2 / 2 + (v + rt a)^2 / (2 b) - u^2 / (2 b_u), with the speeds v and u of vehicle and leader.
+    A gap below the safe distance is a danger, to which it reacts and brakes with up to 0.774 g. safe distance = v rt +
+    a rt^2 / 2 + (v + rt a)^2 / (2 b) - u^2 / (2 b_u), with the speeds v and u of vehicle and leader.
 
     Parameters
     ----------
@@ -229,14 +234,18 @@ class FuzzySafety(ReferenceDriver, frozen=True, kw_only=True):
         return self.react(seen, memory, (pfs > 0) | (cfs > 0), deceleration, self.reaction_time)
 
     def proactive_metric(self, gap: FloatArray, v: FloatArray, u: FloatArray) -> FloatArray:
-        """PFS in [0, 1] at a gap [m] and speeds v and u (leader) [m/s], shape (N,): 0 above the safe distance, 1 below the unsafe one."""
+        """PFS in [0, 1] at a gap [m] and speeds v and u (leader) [m/s], shape (N,): 0 above the safe distance, 1 below
+        the unsafe one.
+        """
         leader_stop = u * u / (2 * self.leader_deceleration)
         safe_distance = v * self.reaction_time + v * v / (2 * self.comfortable) - leader_stop + self.margin
         unsafe_distance = v * self.reaction_time + v * v / (2 * self.hardest) - leader_stop
         return _falling_ramp(gap - self.margin, unsafe_distance, safe_distance)
 
     def critical_metric(self, gap: FloatArray, v: FloatArray, u: FloatArray, a: FloatArray) -> FloatArray:
-        """CFS in [0, 1] at a gap [m], speeds v and u [m/s] and the acceleration a of the vehicle [m/s^2], shape (N,)."""
+        """CFS in [0, 1] at a gap [m], speeds v and u [m/s] and the acceleration a of the vehicle [m/s^2], shape
+        (N,).
+        """
         acceleration = np.maximum(a, -self.comfortable)
         next_speed = v + self.reaction_time * acceleration
         approach = (v + acceleration * self.reaction_time / 2 - u) * self.reaction_time
@@ -255,8 +264,8 @@ def _falling_ramp(value: FloatArray, low: FloatArray, high: FloatArray) -> Float
 
 
 class _Perceiving(NamedTuple):
-    """The reaction; the lateral position of the obstacle when it was first sensed [m], infinite until then; whether it was in the way
-    there; the time since it strayed from there [s], negative until it does.
+    """The reaction; the lateral position of the obstacle when it was first sensed [m], infinite until then; whether it
+    was in the way there; the time since it strayed from there [s], negative until it does.
     """
 
     reaction: Reaction
@@ -268,7 +277,8 @@ class _Perceiving(NamedTuple):
 class CompetentDriver(ReferenceDriver, frozen=True, kw_only=True):
     """The competent and careful human driver of UN R157, annex 4, appendix 3 (longitudinal part).
 
-    Holds its speed or a headway; perceives obstacles that move into its way, reacts to a TTC below 2 s, and brakes with up to 0.774 g.
+    Holds its speed or a headway; perceives obstacles that move into its way, reacts to a TTC below 2 s, and brakes with
+    up to 0.774 g.
 
     While it reacts it releases the accelerator, and the vehicle coasts. After a stop it waits until the way is clear.
     Behind a moving leader it keeps its headway by the accelerator only:
@@ -282,7 +292,8 @@ class CompetentDriver(ReferenceDriver, frozen=True, kw_only=True):
     critical_ttc, reaction_time
         Time to collision that counts as a danger, and reaction time before braking [s].
     stray, perception_time
-        An obstacle that enters the way is perceived `perception_time` after it has moved `stray` from its first lateral position [m, s].
+        An obstacle that enters the way is perceived `perception_time` after it has moved `stray` from its first lateral
+        position [m, s].
     lets_go
         Largest deceleration while it increases its gap [m/s^2].
     headway
@@ -322,7 +333,9 @@ class CompetentDriver(ReferenceDriver, frozen=True, kw_only=True):
         return np.where(is_in_way & (seen.obstacle_speed > 0), np.maximum(gap_control, -self.lets_go), np.inf)
 
     def _perceive(self, seen: Observation, memory: _Perceiving) -> tuple[BoolArray, _Perceiving]:
-        """Whether the obstacle is perceived: it was in the way at first, or strayed from its first position `perception_time` ago."""
+        """Whether the obstacle is perceived: it was in the way at first, or strayed from its first position
+        `perception_time` ago.
+        """
         is_sighted = np.isfinite(seen.gap) & np.isfinite(seen.lateral)
         lateral = np.where(is_sighted, seen.lateral, 0.0)
         appears = is_sighted & ~np.isfinite(memory.first_lateral)

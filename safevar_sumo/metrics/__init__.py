@@ -2,10 +2,7 @@
 
 from safevar_sumo.metrics.base import F_DIFF, F_NUM_DIFF, F_SAFE, Metric, MetricFacts, Objective, Scoring, guard_metric
 from safevar_sumo.metrics.comfort import BRAKE_HARSHNESS, MAX_JERK, RMS_ACCELERATION
-from safevar_sumo.metrics.deceleration import AVE_DECE
-from safevar_sumo.metrics.rating_points import RATING_POINTS
-from safevar_sumo.metrics.safety_degree import SAFETY_DEGREE_METRIC
-from safevar_sumo.metrics.time_to_collision import TET, TIT, time_to_collision
+from safevar_sumo.metrics.safety import AVE_DECE, RATING_POINTS, SAFETY_DEGREE_METRIC, TET, TIT, time_to_collision
 from safevar_sumo.metrics.unsafe import Criterion, Unsafe
 
 METRICS = {metric.name: metric for metric in (SAFETY_DEGREE_METRIC, TET, TIT, AVE_DECE)}

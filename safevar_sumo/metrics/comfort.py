@@ -4,8 +4,6 @@ names them.
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 
 from safevar_sumo.metrics.base import Metric, mask_collisions, sum_in_order
@@ -21,43 +19,27 @@ HIGH_PASS, TRANSITION, TRANSITION_QUALITY = 0.4, 2.0, 0.63
 """W_d of ISO 2631-1, annex A: f_1 and f_3 = f_4 [Hz], Q_4 [-]; the high pass is Butterworth's."""
 
 
-class _BiquadFilter(NamedTuple):
-    """A second-order filter; coefficients from the latest sample to the oldest; the output's first coefficient is 1 and
-    not stored.
+def _filter(
+    samples: FloatArray, numerator: tuple[float, float, float], denominator: tuple[float, float, float], step: float
+) -> FloatArray:
+    """Samples after a second-order filter along the first axis, from rest, sample by sample: no result depends on N.
+
+    The filter is a transfer function in s, with coefficients from the highest power, by Tustin's rule.
     """
-
-    input_coefficients: tuple[float, float, float]
-    output_coefficients: tuple[float, float]
-
-    @classmethod
-    def bilinear(
-        cls, numerator: tuple[float, float, float], denominator: tuple[float, float, float], step: float
-    ) -> _BiquadFilter:
-        """The filter with a transfer function in s, by Tustin's rule; coefficients of polynomials from the highest
-        power.
-        """
-        k = 2 / step
-
-        def in_z(polynomial: tuple[float, float, float]) -> tuple[float, float, float]:
-            a, b, c = polynomial
-            return a * k * k + b * k + c, 2 * (c - a * k * k), a * k * k - b * k + c
-
-        leading, *outputs = in_z(denominator)
-        inputs = in_z(numerator)
-        return cls(
-            (inputs[0] / leading, inputs[1] / leading, inputs[2] / leading),
-            (outputs[0] / leading, outputs[1] / leading),
-        )
-
-    def apply(self, samples: FloatArray) -> FloatArray:
-        """Filter samples along the first axis, from rest, sample by sample, so that results do not depend on N."""
-        (b0, b1, b2), (a1, a2) = self
-        result = np.zeros_like(samples)
-        x1 = x2 = y1 = y2 = np.zeros(samples.shape[1:])
-        for i, x in enumerate(samples):
-            result[i] = b0 * x + b1 * x1 + b2 * x2 - a1 * y1 - a2 * y2
-            x1, x2, y1, y2 = x, x1, result[i], y1
-        return result
+    k, (a, b, c) = 2 / step, denominator
+    leading = a * k * k + b * k + c
+    gains = [
+        value / leading
+        for a, b, c in (numerator, denominator)
+        for value in (a * k * k + b * k + c, 2 * (c - a * k * k), a * k * k - b * k + c)
+    ]
+    b0, b1, b2, _, a1, a2 = gains
+    result = np.zeros_like(samples)
+    x1 = x2 = y1 = y2 = np.zeros(samples.shape[1:])
+    for i, x in enumerate(samples):
+        result[i] = b0 * x + b1 * x1 + b2 * x2 - a1 * y1 - a2 * y2
+        x1, x2, y1, y2 = x, x1, result[i], y1
+    return result
 
 
 def weight_acceleration(acceleration: FloatArray, step: float) -> FloatArray:
@@ -67,15 +49,10 @@ def weight_acceleration(acceleration: FloatArray, step: float) -> FloatArray:
     rate.
     """
     high_pass_rate, transition = 2 * np.pi * HIGH_PASS, 2 * np.pi * TRANSITION
-    high_pass = _BiquadFilter.bilinear(
-        (1.0, 0.0, 0.0), (1.0, float(np.sqrt(2.0)) * high_pass_rate, high_pass_rate * high_pass_rate), step
-    )
-    weighting = _BiquadFilter.bilinear(
-        (0.0, transition, transition * transition),
-        (1.0, transition / TRANSITION_QUALITY, transition * transition),
-        step,
-    )
-    return weighting.apply(high_pass.apply(acceleration))
+    butterworth = 1.0, float(np.sqrt(2.0)) * high_pass_rate, high_pass_rate * high_pass_rate
+    passed = _filter(acceleration, (1.0, 0.0, 0.0), butterworth, step)
+    band_limit = 1.0, transition / TRANSITION_QUALITY, transition * transition
+    return _filter(passed, (0.0, transition, transition * transition), band_limit, step)
 
 
 def max_jerk(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
