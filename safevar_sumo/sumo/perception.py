@@ -1,21 +1,35 @@
-"""What an ADS observes: its own speed without delay, and everything else with the recognition delay of the weather."""
+"""What ADSs observe: observations of the obstacle, delayed by the weather; and for controllers that read SUMO, the
+traffic as the vehicle's sensors report it.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any, TypeVar
+import math
+from collections import defaultdict, deque
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
-from safevar_sumo.ads.driver import DelayLine
+from safevar_sumo.ads.driver import STEP_DECIMALS, DelayLine
 from safevar_sumo.records import ALL_TRUE, BoolArray, Encounter, FloatArray, Observation, Trace
-from safevar_sumo.scenarios import Point
-from safevar_sumo.scenarios.base import Scene
+from safevar_sumo.scenarios import VUT, Point, Scenario, Scene
+from safevar_sumo.scenarios.frame import Frame
+from safevar_sumo.scenarios.target import EncounterConstants, Target, TargetTest, scene_of
 from safevar_sumo.study import Weather
-from safevar_sumo.sumo.recorded_world import RecordedWorld
-from safevar_sumo.sumo.target_observer import TargetObserver
-from safevar_sumo.sumo.world import begin
+from safevar_sumo.sumo.copies import copied_id, copy_and_name
+from safevar_sumo.sumo.recorded_world import RecordedWorld, SampledRecording, absence_error
+from safevar_sumo.sumo.world import SumoWorld, begin
 
+LEADER_RANGE = 1000.0  # distance within which SUMO looks for a leader [m]
+MOTION = ("getPosition", "getPosition3D", "getSpeed", "getAngle", "getRoadID", "getLaneID", "getLanePosition")
+SENSED_FUNCTIONS: Mapping[str, tuple[str, ...]] = {
+    "vehicle": (*MOTION, "getLaneIndex", "getAcceleration", "getLateralSpeed", "getLateralLanePosition", "getSignals"),
+    "person": MOTION,
+}
+"""TraCI's functions, by domain, that return values of other actors that sensors can measure."""
+Values = dict[str, Any]
+"""An actor's values, by function; its length, too."""
 OCCLUDED_VALUES = np.array([[np.inf], [np.inf], [0.0], [0.0]])
 """Gap and lateral position [m], lateral speed and speed [m/s] of an occluded obstacle."""
 
@@ -125,3 +139,178 @@ def _concatenate(columns: Sequence[Any], sizes: Sequence[int]) -> Any:
     return np.concatenate(
         [column if np.ndim(column) else np.full(size, column) for column, size in zip(columns, sizes, strict=True)]
     )
+
+
+class TargetObserver:
+    """Observes the targets of K recorded scenes with `size` vehicles each; `observe` must be called once per sample.
+
+    Parameters
+    ----------
+    frame
+        Frame of the lane that the vehicles are on.
+    constants, targets
+        Constants and targets of the K scenes; a target's columns have one row per sample.
+    sampled_recordings
+        The K recordings at all samples, which tell when a target is not on the road.
+    """
+
+    def __init__(
+        self,
+        frame: Frame,
+        constants: Sequence[EncounterConstants],
+        targets: Sequence[Target],
+        sampled_recordings: Sequence[SampledRecording],
+        world: RecordedWorld,
+        size: int,
+    ) -> None:
+        self._frame, self._world, self._size, self._sampled_recordings = frame, world, size, sampled_recordings
+        self._constants = EncounterConstants._make(
+            _per_vehicle(column, size) for column in zip(*constants, strict=True)
+        )
+        length = max(len(target.edge) for target in targets)
+        self._target = [_table(column, length) for column in zip(*targets, strict=True)]
+        self._absence = _table([sampled.absence for sampled in sampled_recordings], length)
+        self._sample, self._has_approached = 0, np.zeros(world.n, dtype=bool)
+
+    @classmethod
+    def of(cls, scenarios: Sequence[Scenario], world: RecordedWorld, size: int) -> TargetObserver | None:
+        """The observer of a world's scenes; None unless every scenario has a target that does not react, and all share
+        one lane.
+        """
+        if not all(isinstance(scenario, TargetTest) for scenario in scenarios):
+            return None
+        sampled_recordings = [world_slice.at_all_samples() for world_slice in world.slices]
+        motions, targets = zip(
+            *(
+                scenario.at_all_samples(*arguments, world.step_length)  # type: ignore[attr-defined]
+                for scenario, *arguments in zip(scenarios, world.slices, sampled_recordings, strict=True)
+            ),
+            strict=True,
+        )
+        frames, constants = {motion.frame for motion in motions}, [motion.constants for motion in motions]
+        return cls(frames.pop(), constants, targets, sampled_recordings, world, size) if len(frames) == 1 else None
+
+    def observe(self, is_open: BoolArray) -> Scene:
+        """The scene of all vehicles at the next sample; raises `SimulationError` if the target of an open run is not on
+        the road.
+        """
+        sample, world = min(self._sample, len(self._absence) - 1), self._world
+        if self._absence[sample].any():
+            absent_scenes = np.flatnonzero(self._absence[sample] & is_open.reshape(-1, self._size).any(axis=1))
+            if len(absent_scenes):
+                raise absence_error(self._sampled_recordings[absent_scenes[0]].actor, self._sample * world.step_length)
+        target = Target._make(
+            column if column.ndim == 0 else column[sample].repeat(self._size) for column in self._target
+        )
+        front = self._frame.along(world.vehicle_positions(VUT))
+        scene, self._has_approached = scene_of(self._constants, target, front, world.speeds(), self._has_approached)
+        self._sample += 1
+        return scene
+
+
+def _per_vehicle(values: Sequence[Any], size: int) -> Any:
+    """The value of all scenes as a scalar if they agree, else the scene's value for each vehicle, shape (K * size,)."""
+    return values[0] if all(value == values[0] for value in values) else np.repeat(values, size)
+
+
+def _table(columns: Sequence[Any], length: int) -> Any:
+    """K columns of samples, padded with their last values, as a table of shape (length, K); a scalar if all are the
+    same scalar.
+    """
+    if all(np.ndim(column) == 0 and column == columns[0] for column in columns):
+        return np.asarray(columns[0])
+    table = np.empty((length, len(columns)), dtype=np.result_type(*columns))
+    for k, column in enumerate(columns):
+        table[:, k] = column if np.ndim(column) == 0 else column[np.minimum(np.arange(length), len(column) - 1)]
+    return table
+
+
+class Snapshot(NamedTuple):
+    """The traffic at one time: values by function of the vehicle itself, and of other actors by domain and name; the
+    leader with its gap [m].
+    """
+
+    own: Values
+    actors: Mapping[str, dict[str, Values]]
+    leader: tuple[str, float] | None
+
+
+class SensedTraffic:
+    """The traffic around N vehicles in their copies of the network, delayed and limited by the vehicles' sensors."""
+
+    def __init__(self, world: SumoWorld, step: float) -> None:
+        self._world = world
+        self._past = [
+            deque[Snapshot](maxlen=1 + round(round(age, STEP_DECIMALS)))
+            for age in (world.sensors.latency / step).tolist()
+        ]
+        self._sensed: dict[int, Snapshot] = {}
+        self._names: dict[tuple[int, str], list[str]] = {}
+
+    def record_step(self) -> None:
+        """Record the traffic of this step; must be called in every step."""
+        self._sensed, self._names = {}, {}
+        for copy, past in enumerate(self._past):
+            if past.maxlen != 1:
+                past.append(self._take_snapshot(copy))
+
+    def snapshot(self, copy: int) -> Snapshot:
+        """What the sensors of a vehicle report now; the first snapshot until the latency is over."""
+        if copy not in self._sensed:
+            past = self._past[copy]
+            if past.maxlen == 1:
+                past.append(self._take_snapshot(copy))
+            reach, scale = (float(values[copy]) for values in self._world.sensors[1:])
+            self._sensed[copy] = _limit_to_range(past[0], reach, scale)
+        return self._sensed[copy]
+
+    def _take_snapshot(self, copy: int) -> Snapshot:
+        api, vut = self._world.api, copied_id(copy, VUT)
+        if self._world.has_left(vut):
+            return Snapshot({}, {domain: {} for domain in SENSED_FUNCTIONS}, None)
+        if not self._names:
+            self._names = defaultdict(list)
+            for domain in SENSED_FUNCTIONS:
+                for number, name in map(copy_and_name, getattr(api, domain).getIDList()):
+                    self._names[number, domain].append(name)
+        actors: dict[str, dict[str, Values]] = {}
+        for domain, functions in SENSED_FUNCTIONS.items():
+            getters = [(name, getattr(getattr(api, domain), name)) for name in (*functions, "getLength")]
+            actors[domain] = {
+                actor: {name: get(copied_id(copy, actor)) for name, get in getters}
+                for actor in self._names[copy, domain]
+            }
+        own, leader = actors["vehicle"].pop(VUT), api.vehicle.getLeader(vut, LEADER_RANGE)
+        return Snapshot(own, actors, (copy_and_name(leader[0])[1], float(leader[1])) if leader and leader[0] else None)
+
+
+def _limit_to_range(snapshot: Snapshot, reach: float, scale: float) -> Snapshot:
+    """The snapshot without actors beyond the sensors' range, and with distances multiplied by the sensors' scale."""
+    if not snapshot.own or (reach == math.inf and scale == 1):
+        return snapshot
+
+    def seen(values: Values) -> Values:
+        own = snapshot.own
+        return values | {
+            name: tuple(here + scale * (there - here) for here, there in zip(own[name], values[name], strict=True))
+            for name in MOTION[:2]
+            if scale != 1
+        }
+
+    actors = {
+        domain: {
+            name: seen(values)
+            for name, values in members.items()
+            if _distance(snapshot.own["getPosition"], values, values["getLength"] * (domain == "vehicle")) <= reach
+        }
+        for domain, members in snapshot.actors.items()
+    }
+    leader = snapshot.leader if snapshot.leader and snapshot.leader[0] in actors["vehicle"] else None
+    return Snapshot(snapshot.own, actors, leader and (leader[0], leader[1] * scale))
+
+
+def _distance(position: tuple[float, float], values: Values, length: float) -> float:
+    """Distance from a position to the nearer end of an actor, whose front and rear are `length` apart [m]."""
+    heading, (x, y) = math.radians(values["getAngle"]), values["getPosition"]
+    rear = x - length * math.sin(heading), y - length * math.cos(heading)
+    return min(math.dist(position, (x, y)), math.dist(position, rear))

@@ -1,8 +1,11 @@
-"""Substitutes for the modules traci and libsumo, whose functions call those of the vehicle that a controller drives."""
+"""What a controller calls: substitutes for the modules traci and libsumo, and the commands to the vehicle that it
+drives.
+"""
 
 from __future__ import annotations
 
 import inspect
+import math
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -11,6 +14,7 @@ from types import ModuleType
 from typing import Any
 
 from safevar_sumo.errors import InputError
+from safevar_sumo.records import Nominal
 from safevar_sumo.sumo.engine import Engine, engine_api
 
 LOOP_FUNCTIONS = (
@@ -135,3 +139,69 @@ def all_arguments(domain: str, name: str, arguments: tuple[Any, ...], named: Map
 @cache
 def _signature(domain: str, name: str) -> inspect.Signature:
     return inspect.signature(getattr(getattr(real_traci(), domain) if domain else real_traci(), name))
+
+
+COMMANDS: Mapping[str, tuple[str, ...]] = {
+    "setSpeed": ("speed",),
+    "slowDown": ("speed", "duration"),
+    "setAcceleration": ("acceleration", "duration"),
+    "setAccel": ("accel",),
+    "setDecel": ("decel",),
+    "setMaxSpeed": ("speed",),
+    "setSpeedMode": ("mode",),
+}
+"""The commands that a controller may give, each with its numeric arguments."""
+SUMO_CONTROL = -1.0
+"""Value of a speed or speed mode with which a command returns control to SUMO's own driver."""
+LEGAL_NUMBERS = (
+    "a finite number from 0 on; any acceleration; a whole mode up to 127; speed or mode -1 for SUMO's driver"
+)
+
+
+class CommandedSpeed:
+    """A controller's commands, and the acceleration that results from them under SUMO's speed modes."""
+
+    LIMIT_TO_SAFE_SPEED, LIMIT_ACCELERATION, LIMIT_DECELERATION, DEFAULT_MODE = 1, 2, 4, 31
+
+    def __init__(self, nominal: Nominal, step: float) -> None:
+        self._step, self.nominal_decel = step, nominal.decel
+        self._limits = {"setAccel": nominal.accel, "setDecel": nominal.decel, "setMaxSpeed": math.inf}
+        self._mode = self.DEFAULT_MODE
+        self._speed: float | None = None
+        self._end_time, self._speed_rate = -1.0, 0.0
+
+    def command(self, name: str, time: float, speed: float, values: tuple[Any, ...]) -> None:
+        """Process a command of the vehicle domain.
+
+        Raises
+        ------
+        InputError
+            If an argument is no legal number.
+        """
+        for argument, value in zip(COMMANDS[name], values, strict=True):
+            gives_back = value == SUMO_CONTROL and name in ("setSpeed", "setSpeedMode")
+            is_mode = argument != "mode" or value in range(-1, 128)
+            if not (gives_back or (math.isfinite(value) and is_mode and (value >= 0 or argument == "acceleration"))):
+                raise InputError(f"traci.vehicle.{name}", f"{argument} = {value!r}", LEGAL_NUMBERS)
+        first, *rest = map(float, values)
+        if name == "setSpeedMode":
+            self._mode = self.DEFAULT_MODE if first == SUMO_CONTROL else int(first)
+        elif name in self._limits:
+            self._limits[name] = first
+        else:
+            duration = max(rest[0], self._step) if name == "slowDown" else sum(rest)
+            self._speed = first if name == "setSpeed" and first != SUMO_CONTROL else None
+            self._end_time = time + duration
+            self._speed_rate = (first - speed) / duration if name == "slowDown" else first
+
+    def acceleration(self, speed: float, time: float, sumo_speed: float) -> float:
+        """The acceleration by the commands [m/s^2]; SUMO's own driver would choose `sumo_speed` next [m/s]."""
+        accel, decel, max_speed = self._limits.values()
+        next_speed = sumo_speed if self._speed is None else self._speed
+        if time < self._end_time:
+            next_speed = speed + self._speed_rate * self._step
+        if self._mode & self.LIMIT_TO_SAFE_SPEED and next_speed > sumo_speed:
+            next_speed = min(next_speed, max(sumo_speed, speed - decel * self._step))
+        acceleration = (min(next_speed, max_speed) - speed) / self._step
+        acceleration = min(acceleration, accel) if self._mode & self.LIMIT_ACCELERATION else acceleration
+        return max(acceleration, -decel) if self._mode & self.LIMIT_DECELERATION else acceleration

@@ -8,31 +8,20 @@ from collections.abc import Mapping
 from typing import Any
 
 from safevar_sumo.errors import InputError
-from safevar_sumo.records import Nominal
 from safevar_sumo.scenarios import VUT
 from safevar_sumo.sumo.copies import copied_id
-from safevar_sumo.sumo.sensing import SENSED_FUNCTIONS, SensedTraffic
-from safevar_sumo.sumo.traci_module import all_arguments, full_name, real_traci, refuse_own_loop
+from safevar_sumo.sumo.perception import SENSED_FUNCTIONS, SensedTraffic
+from safevar_sumo.sumo.traci_module import (
+    COMMANDS,
+    CommandedSpeed,
+    all_arguments,
+    full_name,
+    real_traci,
+    refuse_own_loop,
+)
 from safevar_sumo.sumo.world import SumoWorld
 
-COMMANDS: Mapping[str, tuple[str, ...]] = {
-    "setSpeed": ("speed",),
-    "slowDown": ("speed", "duration"),
-    "setAcceleration": ("acceleration", "duration"),
-    "setAccel": ("accel",),
-    "setDecel": ("decel",),
-    "setMaxSpeed": ("speed",),
-    "setSpeedMode": ("mode",),
-}
-"""The commands that a controller may give, each with its numeric arguments."""
-SUMO_CONTROL = -1.0
-"""Value of a speed or speed mode with which a command returns control to SUMO's own driver."""
 DISPLAY_FUNCTIONS = ("setColor", "highlight")
-LARGEST_MODE = 127
-LEGAL_NUMBERS = (
-    f"a whole number from 0 to {LARGEST_MODE}, or -1 for SUMO's own mode",
-    "a finite number, of an acceleration any, else from 0 on; a speed of -1 gives control back to SUMO",
-)
 LISTS = ("getIDList", "getIDCount")
 CONSTANT_FUNCTIONS = (
     "getTypeID",
@@ -176,69 +165,14 @@ Variables = dict[int, tuple[str, tuple[Any, ...]]]
 """Requested variables, each with its function and that function's arguments after the actor's id."""
 
 
-class CommandedSpeed:
-    """A controller's commands, and the acceleration that results from them under SUMO's speed modes."""
-
-    LIMIT_TO_SAFE_SPEED, LIMIT_ACCELERATION, LIMIT_DECELERATION, DEFAULT_MODE = 1, 2, 4, 31
-
-    def __init__(self, nominal: Nominal, step: float) -> None:
-        self._step = step
-        self._limits = {"setAccel": nominal.accel, "setDecel": nominal.decel, "setMaxSpeed": math.inf}
-        self._mode = self.DEFAULT_MODE
-        self._speed: float | None = None
-        self._end_time, self._speed_rate = -1.0, 0.0
-
-    def command(self, name: str, time: float, speed: float, values: tuple[Any, ...]) -> None:
-        """Process a command of the vehicle domain.
-
-        Raises
-        ------
-        InputError
-            If an argument is no legal number.
-        """
-        numbers = [_legal_number(name, argument, value) for argument, value in zip(COMMANDS[name], values, strict=True)]
-        if name == "setSpeed":
-            self._speed, self._end_time = (None if numbers[0] == SUMO_CONTROL else numbers[0]), -1.0
-        elif name == "slowDown":
-            duration = max(numbers[1], self._step)
-            self._speed, self._end_time, self._speed_rate = None, time + duration, (numbers[0] - speed) / duration
-        elif name == "setAcceleration":
-            self._speed, self._end_time, self._speed_rate = None, time + numbers[1], numbers[0]
-        elif name == "setSpeedMode":
-            self._mode = self.DEFAULT_MODE if numbers[0] == SUMO_CONTROL else int(numbers[0])
-        else:
-            self._limits[name] = numbers[0]
-
-    def acceleration(self, speed: float, time: float, sumo_speed: float) -> float:
-        """The acceleration by the commands [m/s^2]; SUMO's own driver would choose `sumo_speed` next [m/s]."""
-        accel, decel, max_speed = self._limits.values()
-        next_speed = sumo_speed if self._speed is None else self._speed
-        if time < self._end_time:
-            next_speed = speed + self._speed_rate * self._step
-        if self._mode & self.LIMIT_TO_SAFE_SPEED and next_speed > sumo_speed:
-            next_speed = min(next_speed, max(sumo_speed, speed - decel * self._step))
-        acceleration = (min(next_speed, max_speed) - speed) / self._step
-        acceleration = min(acceleration, accel) if self._mode & self.LIMIT_ACCELERATION else acceleration
-        return max(acceleration, -decel) if self._mode & self.LIMIT_DECELERATION else acceleration
-
-
-def _legal_number(name: str, argument: str, value: Any) -> float:
-    number = float(value)
-    returns_control = number == SUMO_CONTROL and name in ("setSpeed", "setSpeedMode")
-    is_legal = math.isfinite(number) and (number >= 0 or returns_control or argument == "acceleration")
-    if not is_legal or (argument == "mode" and number not in range(-1, LARGEST_MODE + 1)):
-        raise InputError(f"traci.vehicle.{name}", f"{argument} = {value!r}", LEGAL_NUMBERS[name != "setSpeedMode"])
-    return number
-
-
 class TraciView:
     """TraCI's functions for one vehicle, with the ids of the traffic file."""
 
-    def __init__(self, world: SumoWorld, copy: int, traffic: SensedTraffic, nominal: Nominal, step: float) -> None:
-        self._world, self._copy, self._traffic, self._decel = world, copy, traffic, nominal.decel
+    def __init__(self, world: SumoWorld, copy: int, traffic: SensedTraffic, commands: CommandedSpeed) -> None:
+        self._world, self._copy, self._traffic = world, copy, traffic
         self._vut = copied_id(copy, VUT)
         self._subscriptions: dict[tuple[bool, str, str], tuple[str, float, Variables]] = {}
-        self.commanded_speed, self.time = CommandedSpeed(nominal, step), 0.0
+        self.commands, self.time = commands, 0.0
         self.last_error: InputError | None = None
         """The last error raised to the controller, even if the controller caught it."""
 
@@ -292,7 +226,7 @@ class TraciView:
             self._sumo_value("vehicle", name, arguments)
         else:
             speed = float(self._world.api.vehicle.getSpeed(self._vut))
-            self.commanded_speed.command(name, self.time, speed, arguments[1:])
+            self.commands.command(name, self.time, speed, arguments[1:])
 
     def _query(self, domain: str, name: str, /, *given: Any, **named: Any) -> Any:
         allowed = QUERIES.get(domain, ())
@@ -326,7 +260,10 @@ class TraciView:
         actors = self._traffic.snapshot(self._copy).actors[domain]
         if arguments[0] in actors:
             return _original_ids(actors[arguments[0]][name])
-        return _invalid_value(self._sumo_value(domain, name, arguments))
+        value = self._sumo_value(domain, name, arguments)
+        if isinstance(value, tuple):
+            return (float(INVALID_NUMBER),) * len(value)
+        return "" if isinstance(value, str) else type(value)(INVALID_NUMBER)
 
     def _ids(self, domain: str) -> tuple[str, ...]:
         if domain in SENSED_FUNCTIONS:
@@ -337,7 +274,7 @@ class TraciView:
         """The leader and the gap to it minus minGap, if at most `dist` [m]; 0 means the stopping distance."""
         speed = float(self._world.api.vehicle.getSpeed(self._vut))
         leader = self._traffic.snapshot(self._copy).leader
-        return leader if leader and leader[1] <= (dist or speed**2 / (2 * self._decel)) else None
+        return leader if leader and leader[1] <= (dist or speed**2 / (2 * self.commands.nominal_decel)) else None
 
     def _actors_on_road(self, domain: str, name: str, road: str) -> Any:
         """Actors on a lane or edge, or their number, as the sensors report them."""
@@ -432,10 +369,3 @@ def _original_ids(value: Any) -> Any:
 
 def _constant(name: str) -> int:
     return int(getattr(real_traci().constants, name))
-
-
-def _invalid_value(value: Any) -> Any:
-    """The value of this type that SUMO returns for an actor that is not on the road."""
-    if isinstance(value, tuple):
-        return tuple(map(_invalid_value, value))
-    return "" if isinstance(value, str) else type(value)(INVALID_NUMBER)
