@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Hashable, Iterable, Iterator, Sequence
-from dataclasses import fields, replace
-from difflib import SequenceMatcher
+from dataclasses import replace
+from difflib import get_close_matches
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,17 +15,7 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import RATING_POINTS
 from safevar_sumo.protocol import cells_of_part
 from safevar_sumo.protocol.rater import join_cells, rated_quantities, reduce_to_cells
-from safevar_sumo.records import (
-    CellResults,
-    Contact,
-    Encounter,
-    Evaluations,
-    FloatArray,
-    Outcome,
-    SimulationRuns,
-    Trace,
-    finite_or_none,
-)
+from safevar_sumo.records import CellResults, Evaluations, FloatArray, Outcome, SimulationRuns, finite_or_none
 from safevar_sumo.scenarios import Point
 from safevar_sumo.scenarios.euro_ncap import KMH
 from safevar_sumo.study import SAFETY_DEGREE, Study
@@ -198,15 +188,9 @@ def simulate(
 ) -> SimulationRuns:
     """Run the scenario once for every setting, shape (N, n); `watch` is called with the world at every sample.
 
-    In a matrix, the result holds each setting's run at its worst point; with `watch`, all settings run at the worst
-    point of the last setting. Raises the errors of `drive_all`.
+    In a matrix, all settings run at the worst point of the last setting. Raises the errors of `drive_all`.
     """
-    if not system.matrix:
-        return drive_all(system, settings, engine, watch)
-    if watch is not None:
-        return drive_all(system_at_worst_point(system, settings), settings, engine, watch)
-    at_points = simulate_all_points(system, settings, engine)
-    return _select_runs([result.runs for result in at_points], worst_points(at_points))
+    return drive_all(system_at_worst_point(system, settings), settings, engine, watch)
 
 
 def simulate_all_points(system: System, settings: FloatArray, engine: Engine = Engine.RECORDED) -> list[PointResult]:
@@ -247,22 +231,11 @@ def system_at_point(system: System, name: str, source: object) -> System:
 def _find_point(system: System, name: str, source: object) -> Point:
     points = {point.name: point for point in system.matrix}
     if name not in points:
-        raise InputError(source, repr(name), _list_similar_points(name, list(points)))
+        similar = (
+            f"one of {len(points)} points, such as {'; '.join(get_close_matches(name, points, N_SIMILAR_POINTS, 0))}"
+        )
+        raise InputError(source, repr(name), similar if points else "a study with a matrix")
     return points[name]
-
-
-def _list_similar_points(name: str, names: Sequence[str]) -> str:
-    """The points most similar to an unknown name: those that share most parts between commas with it, then those with
-    the closest text.
-    """
-    if not names:
-        return "a study with a matrix"
-    words = {word.strip() for word in name.split(",")}
-    points = sorted(
-        names, key=lambda point: (-len(words & set(point.split(", "))), -SequenceMatcher(None, point, name).ratio())
-    )
-    legal = "; ".join(points[:N_SIMILAR_POINTS])
-    return legal if len(names) <= N_SIMILAR_POINTS else f"one of {len(names)} points, the most similar: {legal}"
 
 
 def study_at(study: Study, name: str, source: object) -> Study:
@@ -311,49 +284,11 @@ def worst_points(at_points: Sequence[PointResult | PointEvaluations]) -> npt.NDA
     A collision in a valid test always counts. Without a collision, a point with an invalid test counts as the worst,
     because such a test leaves open whether the setting is safe.
     """
-    order = sorted(range(len(at_points)), key=lambda k: at_points[k].point.name)
-    safety_degrees = np.stack([at_points[k].evaluations.f_safe for k in order])
-    safety_degrees = np.where(np.isnan(safety_degrees), np.inf, safety_degrees)
-    is_invalid = np.stack([at_points[k].evaluations.outcome == Outcome.INVALID_TEST for k in order])
-    if is_invalid.any():
-        has_collided = np.stack([at_points[k].evaluations.collided for k in order]).any(axis=0)
-        safety_degrees = np.where(is_invalid & ~has_collided, -np.inf, safety_degrees)
-    return np.asarray(np.array(order)[np.argmin(safety_degrees, axis=0)])
-
-
-def _select_runs(runs_at_points: Sequence[SimulationRuns], point_numbers: npt.NDArray[np.intp]) -> SimulationRuns:
-    """Every vehicle's run at its own point; shorter runs repeat their last sample, which is marked as inactive."""
-    length, vehicle_numbers = max(len(runs.trace.time) for runs in runs_at_points), np.arange(len(point_numbers))
-
-    def select_samples(values: Sequence[np.ndarray]) -> np.ndarray:
-        padded = [
-            np.concatenate([samples, np.repeat(samples[-1:], length - len(samples), axis=0)]) for samples in values
-        ]
-        return np.stack(padded)[point_numbers, :, vehicle_numbers].T
-
-    def select(values: Iterable[np.ndarray]) -> np.ndarray:
-        return np.stack([np.broadcast_to(column, point_numbers.shape) for column in values])[
-            point_numbers, vehicle_numbers
-        ]
-
-    longest_trace = max((runs.trace for runs in runs_at_points), key=lambda trace: len(trace.time))
-    names = [field.name for field in fields(Trace) if np.ndim(getattr(longest_trace, field.name)) == 2]
-    columns_of: dict[str, Any] = {
-        name: select_samples([getattr(runs.trace, name) for runs in runs_at_points]) for name in names
-    }
-    trace = replace(longest_trace, **columns_of)
-    lengths = np.array([len(runs.trace.time) for runs in runs_at_points])[point_numbers]
-    active = trace.active & (np.arange(length)[:, np.newaxis] < lengths)
-    encounters, contacts = (
-        [*zip(*(getattr(runs, name) for runs in runs_at_points), strict=True)] for name in ("encounter", "contact")
-    )
-    vehicle_values: dict[str, Any] = {
-        name: select(getattr(runs, name) for runs in runs_at_points)
-        for name in ("outcome", "collision_speed", "test_speed_error", "warning_ttc")
-    }
-    return SimulationRuns(
-        trace=replace(trace, active=active),
-        encounter=Encounter._make(map(select_samples, encounters)),
-        contact=Contact._make(map(select, contacts)),
-        **vehicle_values,
-    )
+    order = np.argsort([result.point.name for result in at_points])
+    in_order = [at_points[k].evaluations for k in order]
+    safety_degrees = np.stack([evaluations.f_safe for evaluations in in_order])
+    safety_degrees[np.isnan(safety_degrees)] = np.inf
+    is_invalid = np.stack([evaluations.outcome == Outcome.INVALID_TEST for evaluations in in_order])
+    has_collided = np.stack([evaluations.collided for evaluations in in_order]).any(axis=0)
+    safety_degrees[is_invalid & ~has_collided] = -np.inf
+    return np.asarray(order[np.argmin(safety_degrees, axis=0)])

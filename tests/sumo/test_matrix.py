@@ -18,7 +18,6 @@ from safevar_sumo.records import Command, Evaluations, FloatArray, Nominal, Obse
 from safevar_sumo.scenarios import Crossing, Point, Scenario
 from safevar_sumo.scenarios.car_to_car import CarToCar
 from safevar_sumo.study import MatrixTable, MatrixTest, Study, load_study
-from safevar_sumo.sumo.batch import score
 from safevar_sumo.sumo.contact import find_touches
 from safevar_sumo.sumo.matrix import evaluate, simulate, simulate_all_points, system_at_point
 from safevar_sumo.sumo.system import System, assemble
@@ -70,7 +69,6 @@ def test_the_worst_point_decides_a_settings_result_and_points_do_not_affect_each
         assert same(alone, one.evaluations), one.point.name
     whole = evaluate(SYSTEM, population)
     assert whole.f_safe.tolist() == np.min([one.evaluations.f_safe for one in points], axis=0).tolist()
-    assert same(whole, score(SYSTEM, population, simulate(SYSTEM, population)))
     collided = [one.evaluations.collided for one in points]
     assert whole.collided.tolist() == np.any(collided, axis=0).tolist()
 
