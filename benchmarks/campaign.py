@@ -39,7 +39,7 @@ from safevar_sumo.results import ResultsDirectory
 from safevar_sumo.study import Study, load_study
 from safevar_sumo.sumo.engine import Engine
 from safevar_sumo.sumo.matrix import MAX_VEHICLES, simulate
-from safevar_sumo.sumo.staging import stage_network
+from safevar_sumo.sumo.network import stage_network
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet
 

@@ -32,8 +32,7 @@ from safevar_sumo.study import load_study
 from safevar_sumo.sumo.batch import drive
 from safevar_sumo.sumo.engine import Engine, open_world, sumo_command
 from safevar_sumo.sumo.matrix import evaluate, simulate
-from safevar_sumo.sumo.network import copied_network
-from safevar_sumo.sumo.staging import stage_network
+from safevar_sumo.sumo.network import copied_network, stage_network
 from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.sumo.world import SumoWorld
 

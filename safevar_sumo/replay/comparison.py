@@ -21,8 +21,7 @@ from safevar_sumo.results import UNKNOWN
 from safevar_sumo.study import Study, StudyLike, unit_text
 from safevar_sumo.sumo.batch import score
 from safevar_sumo.sumo.matrix import system_at_worst_point
-from safevar_sumo.sumo.network import Network
-from safevar_sumo.sumo.staging import stage_network
+from safevar_sumo.sumo.network import Network, stage_network
 from safevar_sumo.sumo.system import Measuring, System
 from safevar_sumo.vehicles import CharacteristicSet
 

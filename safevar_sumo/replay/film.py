@@ -12,8 +12,7 @@ import numpy as np
 from safevar_sumo.records import FloatArray, SimulationRuns
 from safevar_sumo.sumo.copies import copy_and_name
 from safevar_sumo.sumo.matrix import simulate, system_at_worst_point
-from safevar_sumo.sumo.network import Network, built_network
-from safevar_sumo.sumo.staging import stage_network
+from safevar_sumo.sumo.network import Network, built_network, stage_network
 from safevar_sumo.sumo.system import System
 from safevar_sumo.sumo.world import SumoWorld
 

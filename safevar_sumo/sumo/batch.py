@@ -29,11 +29,10 @@ from safevar_sumo.scenarios.base import Scene
 from safevar_sumo.scenarios.frame import Frame
 from safevar_sumo.sumo.contact import Contacts
 from safevar_sumo.sumo.engine import Engine, open_world
-from safevar_sumo.sumo.network import copied_network
+from safevar_sumo.sumo.network import copied_network, stage_network
 from safevar_sumo.sumo.perception import PointBatch
 from safevar_sumo.sumo.recorded_world import RecordedWorld
 from safevar_sumo.sumo.recording import Recording, record_scenes
-from safevar_sumo.sumo.staging import stage_network
 from safevar_sumo.sumo.system import System
 from safevar_sumo.sumo.traci_controller import TraciController
 from safevar_sumo.sumo.world import INSERTION_DECELERATION, SumoWorld

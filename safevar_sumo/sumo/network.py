@@ -13,17 +13,18 @@ import os
 import re
 import subprocess
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Sequence
-from functools import cache, partial
+from collections.abc import Mapping, Sequence
+from functools import cache, lru_cache, partial
 from importlib.metadata import version
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from safevar_sumo.errors import EnvironmentFault, InputError, did_you_mean
+from safevar_sumo.scenarios import GuardedScenario, Lane, Scenario
+from safevar_sumo.scenarios.base import XmlChanges, lane_through
 from safevar_sumo.shipped import NETWORKS
 from safevar_sumo.sumo import copies
-from safevar_sumo.sumo.cache import ensure_cached
-from safevar_sumo.sumo.copies import parse_xml, write_demand, write_roads
+from safevar_sumo.sumo.copies import ensure_all_cached, ensure_cached, parse_xml, write_demand, write_roads
 
 TRAFFIC_FILE, OPTIONS_FILE, NETWORK_FILE = "traffic.rou.xml", "scenario.sumocfg", "network.net.xml"
 NETWORK_ENDING, RECIPE_ENDING = ".net.xml", ".netccfg"
@@ -250,3 +251,98 @@ def _drop_header(file: Path) -> None:
     except (ElementTree.ParseError, UnicodeDecodeError) as error:
         raise EnvironmentFault(f"{file}: netconvert left an incomplete network: {error}") from None
     file.write_text(text[text.index("<net ") :], encoding="utf-8")
+
+
+def stage_network(scenario: Scenario) -> Network:
+    """The scenario's network, with lanes and traffic changed by the scenario's parameters.
+
+    Raises
+    ------
+    InputError
+        If the parameters are impossible, or change an element that the network or the traffic file lacks.
+    EnvironmentFault
+        If the cache cannot be written.
+    """
+    return stage_networks([scenario])[0]
+
+
+def stage_networks(scenarios: Sequence[Scenario]) -> list[Network]:
+    """The networks of several scenarios, whose files are read once per network; raises the errors of
+    `stage_network`.
+    """
+    networks = {name: open_network(name) for name in {scenario.network for scenario in scenarios}}
+
+    def stage(scenario: Any) -> Network:
+        may_vary = isinstance(scenario, GuardedScenario)  # a user's scenario may return different changes in each call
+        return (_stage.__wrapped__ if may_vary else _stage)(scenario, networks[scenario.network])
+
+    return [stage(scenario) for scenario in scenarios]
+
+
+@lru_cache(maxsize=10_000)
+def _stage(scenario: Scenario, network: Network) -> Network:
+    if changes := scenario.lanes(_BuiltRoads(network)):
+        network = _variant(network, {NETWORK_FILE: _change_xml(built_network(network), changes)})
+    if changes := scenario.actors(_BuiltRoads(network)):
+        network = _variant(network, {TRAFFIC_FILE: _change_xml(network.path(TRAFFIC_FILE), changes)})
+    return network
+
+
+class _BuiltRoads:
+    """The lanes of a built network."""
+
+    def __init__(self, network: Network) -> None:
+        self._network = network
+
+    def lane(self, lane: str) -> Lane:
+        lanes = _read_lanes(self._network)
+        if lane not in lanes:
+            raise InputError(self._network.folder, f"there is no lane {lane!r}")
+        return lanes[lane]
+
+
+@lru_cache(maxsize=100)
+def _read_lanes(network: Network) -> dict[str, Lane]:
+    lanes = {}
+    for lane in ElementTree.fromstring(built_network(network).read_bytes()).iter("lane"):
+        coordinates = [
+            (float(x), float(y)) for x, y in (point.split(",")[:2] for point in lane.attrib["shape"].split())
+        ]
+        lanes[lane.attrib["id"]] = lane_through(lane.attrib["id"], coordinates)
+    return lanes
+
+
+def _variant(network: Network, changed_files: Mapping[str, bytes]) -> Network:
+    """A built network with changed files, in the cache."""
+    gui_settings = options_of(network.path(OPTIONS_FILE)).get("gui-settings-file", "")
+    sources = {
+        NETWORK_FILE: built_network(network),
+        **{name: network.path(name) for name in (TRAFFIC_FILE, OPTIONS_FILE, gui_settings)},
+    }
+    contents = {name: changed_files.get(name) or file.read_bytes() for name, file in sources.items() if file.is_file()}
+    return _store_network(network.folder.name, tuple(contents.items()))
+
+
+@lru_cache(maxsize=1000)
+def _store_network(name: str, files: tuple[tuple[str, bytes], ...]) -> Network:
+    folder = f"staged-{_digest(repr(files).encode())}/{name or 'network'}"
+
+    def write(into: Path) -> None:
+        for file, content in files:
+            (into / file).write_bytes(content)
+
+    return open_network(str(ensure_all_cached(folder, [file for file, _ in files], write)))
+
+
+def _change_xml(file: Path, changes: XmlChanges) -> bytes:
+    root = parse_xml(file)
+    for path, attributes in changes.items():
+        elements = root.findall(path)
+        if not elements:
+            raise InputError(file, f"has no {path}")
+        for element in elements:
+            if attributes is None:
+                root.remove(element)
+            else:
+                element.attrib.update(attributes)
+    return ElementTree.tostring(root)

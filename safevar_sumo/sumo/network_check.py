@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import re
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Mapping
 from functools import lru_cache, partial
 from pathlib import Path
 
@@ -14,11 +13,9 @@ import numpy as np
 
 from safevar_sumo.errors import EnvironmentFault, InputError, SimulationError
 from safevar_sumo.scenarios import VUT
-from safevar_sumo.sumo.cache import ensure_cached
-from safevar_sumo.sumo.copies import parse_seconds, parse_xml
+from safevar_sumo.sumo.copies import ensure_cached, parse_seconds, parse_xml
 from safevar_sumo.sumo.engine import open_world
 from safevar_sumo.sumo.network import (
-    NETWORK_FILE,
     OPTIONS_FILE,
     TRAFFIC_FILE,
     Network,
@@ -45,10 +42,16 @@ DRIVER_ATTRIBUTES = re.compile(
 """Attributes of SUMO's own driver."""
 SETTING_ATTRIBUTES = ("mass", "accel", "decel", "emergencyDecel", "apparentDecel", "maxSpeed", "tau")
 """Attributes of the type of the vehicle under test that the vehicle model replaces by values of the setting."""
-SIGMA_MODELS, DETERMINISTIC_MODELS = ("Krauss", "KraussOrig1", "KraussPS"), ("IDM", "IDMM", "ACC", "CACC")
-"""Car-following models that are random unless sigma is 0, and models that are never random."""
 NO_EFFECT = {"sigma": "0", "speedDev": "0", "speedFactor": "1"}
 """Values of attributes of SUMO's own driver that no remark mentions."""
+SIGMA_MODELS, DETERMINISTIC_MODELS = ("Krauss", "KraussOrig1", "KraussPS"), ("IDM", "IDMM", "ACC", "CACC")
+"""Car-following models that are random unless sigma is 0, and models that are never random."""
+LEGAL_OPTIONS = (
+    f"a step-length from {SHORTEST_STEP:g} to {LONGEST_STEP:g} [s], no remote-port, all traffic in {TRAFFIC_FILE}: "
+    "safevar_sumo starts SUMO itself"
+)
+LEGAL_VUT = f"type {VUT!r}, a vType of its own, which each setting changes; depart 0; no stops: its ADS drives it"
+LEGAL_ROAD = "a level road of friction 1: the scenario's `grade` sets a slope, the weather's `road_friction` a friction"
 
 
 def check_network(name: str, source: str) -> None:
@@ -90,138 +93,78 @@ def network_remarks(name: str, max_speed: float, *, sumo_drives: bool) -> list[s
         or (DRIVER_ATTRIBUTES.fullmatch(name) and not sumo_drives and value != NO_EFFECT.get(name))
     ]
     lanes = [] if sumo_drives else _lanes_of_vut(traffic, parse_xml(built_network(network)))
-    slow_lanes = [lane for lane in lanes if float(lane.get("speed", "inf")) < max_speed]
-    if slow_lanes:
-        attributes.append(
-            f"the speed limit of lane {slow_lanes[0].get('id')!r} ({float(slow_lanes[0].get('speed', 'nan')):g} m/s)"
-            f"{f' and of {len(slow_lanes) - 1} more' if len(slow_lanes) > 1 else ''}"
-        )
+    attributes += [
+        f"the speed limit of lane {lane.get('id')!r} ({float(lane.get('speed', 'inf')):g} m/s)"
+        for lane in lanes
+        if float(lane.get("speed", "inf")) < max_speed
+    ]
     unused = (
-        [
-            f"{file}: no effect on vehicle {VUT!r}: {', '.join(dict.fromkeys(attributes))}; the study's "
-            "vehicle and ADS "
-            "determine how it drives"
-        ]
-        if attributes
-        else []
+        f"{file}: no effect on vehicle {VUT!r}: {', '.join(dict.fromkeys(attributes))}; the study's vehicle and ADS "
     )
+    remarks = [f"{unused}determine how it drives"] if attributes else []
     warnings = _warnings_file(network).read_text(encoding="utf-8")
-    return [*unused, *([f"{network.folder}: {warnings}"] if warnings else [])]
+    return [*remarks, *([f"{network.folder}: {warnings}"] if warnings else [])]
 
 
 @lru_cache(maxsize=100)
 def _check_files(network: Network) -> None:
-    options = options_of(network.path(OPTIONS_FILE))
-    step = options.get("step-length", "1")
-    if not SHORTEST_STEP <= (parse_seconds(step) or 0.0) <= LONGEST_STEP:
-        raise InputError(
-            network.path(OPTIONS_FILE),
-            f"step-length = {step!r}",
-            f"a number from {SHORTEST_STEP:g} to {LONGEST_STEP:g} [s]",
-        )
-    if "remote-port" in options:  # SUMO would wait for a client
-        raise InputError(
-            network.path(OPTIONS_FILE),
-            f"remote-port = {options['remote-port']!r}",
-            "no remote-port: safevar_sumo starts SUMO itself",
-        )
-    if options.get("route-files", TRAFFIC_FILE) != TRAFFIC_FILE:
-        raise InputError(
-            network.path(OPTIONS_FILE),
-            f"route-files = {options['route-files']!r}",
-            f"{TRAFFIC_FILE}, all traffic in one file",
-        )
-    traffic = parse_xml(network.path(TRAFFIC_FILE))
-    _check_vut(network, traffic)
-    _check_types(network, traffic, options)
+    file = network.path(OPTIONS_FILE)
+    options = {"step-length": "1", "route-files": TRAFFIC_FILE, **options_of(file)}
+    is_illegal = {
+        "step-length": not SHORTEST_STEP <= (parse_seconds(options["step-length"]) or 0.0) <= LONGEST_STEP,
+        "remote-port": "remote-port" in options,  # SUMO would wait for a client
+        "route-files": options["route-files"] != TRAFFIC_FILE,
+    }
+    for name in filter(is_illegal.__getitem__, is_illegal):
+        raise InputError(file, f"{name} = {options[name]!r}", LEGAL_OPTIONS)
+    _check_vut(network)
+    _refuse_random_types(network)
     _warnings_file(network)
-    if not network.is_built:
-        _check_sources(network)
-
-
-def _check_sources(network: Network) -> None:
-    """Refuse sources that the recipe does not name, and a network that was edited in netedit while its sources were
-    not.
-    """
-    names = [name for name, _ in network.digests]
-    for file in sorted(network.folder.glob("*.???.xml")):
-        if file.name not in names and re.search(r"\.(nod|edg|con|typ|tll)\.xml$", file.name):
+    sources = [name for name, _ in network.digests]
+    for source in () if network.is_built else sorted(network.folder.glob("*.???.xml")):
+        if source.name not in sources and re.search(r"\.(nod|edg|con|typ|tll)\.xml$", source.name):
             raise InputError(
-                file, f"is not used: {network.roads} does not name it", f"sources that {network.roads} names"
+                source, f"is not used: {network.roads} does not name it", f"sources that {network.roads} names"
             )
-    file = network.path(options_of(network.path(network.roads)).get("output-file", NETWORK_FILE))
-    sources = [network.path(name) for name in names[:-2]]
-    if not file.is_file() or max(source.stat().st_mtime for source in sources) >= file.stat().st_mtime:
-        return
-    header, _, roads = file.read_text(encoding="utf-8", errors="replace").partition("<net ")
-    if "netedit" in header and f"<net {roads}".strip() != built_network(network).read_text(encoding="utf-8").strip():
-        raise InputError(
-            file,
-            f"has edits by netedit that {', '.join(names[:-2])} do not have",
-            (
-                "those files saved from netedit as plain XML, too; or a folder without those files, so that this "
-                "network is used"
-            ),
-        )
 
 
-def _check_types(network: Network, traffic: ElementTree.Element, options: Mapping[str, str]) -> None:
-    """Refuse types whose drivers are random: they differ between copies, so that a result would depend on its batch."""
-    persons = [actor.get("type") for actor in traffic if actor.tag in ("person", "personFlow")]
-    vehicles = [actor.get("type") for actor in traffic if actor.tag in ("vehicle", "trip", "flow")]
-    for kind in traffic.findall("vType"):
-        name, model = kind.get("id"), kind.get("carFollowModel", options.get("default.carfollowmodel", "Krauss"))
-        if name == VUT or name not in (*persons, *vehicles):
-            continue
-        values = {"speedDev": kind.get("speedDev", options.get("default.speeddev", "0.1"))}
-        if name in vehicles and model not in DETERMINISTIC_MODELS:
-            values["sigma" if model in SIGMA_MODELS else "carFollowModel"] = (
-                kind.get("sigma", "0.5") if model in SIGMA_MODELS else model
-            )
-        for attribute, value in values.items():
-            if not re.fullmatch(r"0*\.?0*", value):
-                raise InputError(
-                    network.path(TRAFFIC_FILE),
-                    f"vType {name!r} drives at random: {attribute} = {value}",
-                    f'speedDev="0"; for vehicles sigma="0" or carFollowModel {", ".join(DETERMINISTIC_MODELS)}',
-                )
-
-
-def _check_vut(network: Network, traffic: ElementTree.Element) -> None:
+def _check_vut(network: Network) -> None:
     """Refuse a vehicle under test with stops or a shared type, and a sloping or slippery road of this vehicle."""
     file = network.path(TRAFFIC_FILE)
+    traffic = parse_xml(file)
     vut = next((actor for actor in traffic if actor.tag in ("vehicle", "trip") and actor.get("id") == VUT), None)
     if vut is None:
-        raise InputError(
-            file, f"has no vehicle {VUT!r}", f'<vehicle id="{VUT}" type="{VUT}" depart="0" ...>, the vehicle under test'
-        )
-    if vut.get("type") != VUT or len(traffic.findall(f"*[@type='{VUT}']")) > 1:
-        raise InputError(
-            file,
-            f"vehicle {VUT!r}: type = {vut.get('type')!r}",
-            f"{VUT!r}, a vType of its own, which each setting changes",
-        )
-    if parse_seconds(vut.get("depart", "")) != 0:
-        raise InputError(file, f"vehicle {VUT!r}: depart = {vut.get('depart')!r}", "0")
-    if any(
-        element.find("stop") is not None
-        for element in (vut, *vut, *traffic.findall(f"route[@id='{vut.get('route')}']"))
-    ):
-        raise InputError(file, f"vehicle {VUT!r} has a stop", "none: its ADS drives it")
+        raise InputError(file, f"has no vehicle {VUT!r}", f'<vehicle id="{VUT}" type="{VUT}" depart="0" ...>')
+    routes = traffic.findall(f"route[@id='{vut.get('route')}']")
+    is_illegal = {
+        f"type = {vut.get('type')!r}": vut.get("type") != VUT or len(traffic.findall(f"*[@type='{VUT}']")) > 1,
+        f"depart = {vut.get('depart')!r}": parse_seconds(vut.get("depart", "")) != 0,
+        "has a stop": any(element.find("stop") is not None for element in (vut, *vut, *routes)),
+    }
+    for problem in filter(is_illegal.__getitem__, is_illegal):
+        raise InputError(file, f"vehicle {VUT!r}: {problem}", LEGAL_VUT)
     for lane in _lanes_of_vut(traffic, parse_xml(built_network(network))):
         heights = [float((*point.split(","), "0")[2]) for point in lane.get("shape", "").split()]
-        climb = max(heights, default=0.0) - min(heights, default=0.0)
-        if climb > MAX_SLOPE * float(lane.get("length", 0)):
+        climb, friction = max(heights, default=0.0) - min(heights, default=0.0), float(lane.get("friction", 1))
+        if climb > MAX_SLOPE * float(lane.get("length", 0)) or friction != 1:
+            problem = f"drives on lane {lane.get('id')!r}, which rises {climb:.2f} m and has friction {friction:g}"
+            raise InputError(file, f"vehicle {VUT!r} {problem}", LEGAL_ROAD)
+
+
+def _refuse_random_types(network: Network) -> None:
+    """Refuse types whose drivers are random, though traffic that reacts to the vehicle may show it in no copy at
+    first.
+    """
+    traffic = parse_xml(network.path(TRAFFIC_FILE))
+    names = {actor.get("type") for actor in traffic if actor.tag in ("vehicle", "trip", "flow")} - {VUT}
+    for kind in (kind for kind in traffic.findall("vType") if kind.get("id") in names):
+        model, speed_dev = kind.get("carFollowModel", "Krauss"), kind.get("speedDev", "0.1")
+        sigma = kind.get("sigma", "0.5") if model in SIGMA_MODELS else "0"
+        if float(speed_dev) or float(sigma) or model not in (*SIGMA_MODELS, *DETERMINISTIC_MODELS):
             raise InputError(
-                file,
-                f"vehicle {VUT!r} drives on lane {lane.get('id')!r}, which rises {climb:.2f} m",
-                "a level road, as netconvert's option `flatten` makes it; the scenario's `grade` sets a slope",
-            )
-        if float(lane.get("friction", 1)) != 1:
-            raise InputError(
-                file,
-                f"vehicle {VUT!r} drives on lane {lane.get('id')!r} of friction {lane.get('friction')}",
-                "friction 1; `road_friction` of the study's [weather] sets another one",
+                network.path(TRAFFIC_FILE),
+                f"vType {kind.get('id')!r} drives at random: speedDev = {speed_dev}, sigma = {sigma}, {model}",
+                f'speedDev="0"; sigma="0" or carFollowModel {", ".join(DETERMINISTIC_MODELS)}',
             )
 
 

@@ -20,11 +20,9 @@ from msgspec import msgpack, to_builtins
 from safevar_sumo.records import FloatArray
 from safevar_sumo.scenarios import VUT, GuardedScenario, Scenario
 from safevar_sumo.scenarios.target import TargetTest
-from safevar_sumo.sumo.cache import ensure_cached
-from safevar_sumo.sumo.copies import copied_id, copy_and_name
+from safevar_sumo.sumo.copies import copied_id, copy_and_name, ensure_cached
 from safevar_sumo.sumo.engine import Engine, open_world
-from safevar_sumo.sumo.network import Network, copied_network, is_shipped, sumo_version
-from safevar_sumo.sumo.staging import stage_networks
+from safevar_sumo.sumo.network import Network, copied_network, is_shipped, stage_networks, sumo_version
 from safevar_sumo.sumo.world import SumoWorld, begin, direction_of
 
 MAX_RECORDINGS = 4000
