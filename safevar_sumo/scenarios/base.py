@@ -82,9 +82,6 @@ class World(Protocol):
     def vehicle_length(self, actor: str) -> float:
         """Length of a vehicle [m]."""
 
-    def lane_start(self, lane: str) -> tuple[float, float]:
-        """First point of a lane's centre line, the same in all copies [m]."""
-
     def lane(self, lane: str) -> Lane:
         """A lane by its id, the same in all copies."""
 

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import fields
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from safevar_sumo.ads import Ads
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics.base import STUDY_SOURCE
 from safevar_sumo.plugins import check_open_runs, open_rows
@@ -25,9 +25,7 @@ from safevar_sumo.records import (
     Trace,
 )
 from safevar_sumo.scenarios import VUT, Lane, Point
-from safevar_sumo.scenarios.base import Scene
 from safevar_sumo.scenarios.frame import Frame
-from safevar_sumo.sumo.contact import Contacts
 from safevar_sumo.sumo.engine import Engine, open_world
 from safevar_sumo.sumo.network import copied_network, stage_network
 from safevar_sumo.sumo.perception import PointBatch
@@ -35,7 +33,7 @@ from safevar_sumo.sumo.recorded_world import RecordedWorld
 from safevar_sumo.sumo.recording import Recording, record_scenes
 from safevar_sumo.sumo.system import System
 from safevar_sumo.sumo.traci_controller import TraciController
-from safevar_sumo.sumo.world import INSERTION_DECELERATION, SumoWorld
+from safevar_sumo.sumo.world import INSERTION_DECELERATION, Contacts, SumoWorld
 from safevar_sumo.vehicles import LEVEL, CharacteristicSet, Sensors, Slope, slope_of
 
 Watcher = Callable[[SumoWorld], None]
@@ -148,9 +146,7 @@ def _simulate(
 ) -> SimulationRuns:
     vehicle, step, n = system.vehicle, world.step_length, len(settings)
     characteristics = dict(zip(system.characteristics.names, np.ascontiguousarray(settings.T), strict=True))
-    prepared = vehicle.prepare(
-        characteristics, _road_friction(system.points, n), step, *_slope_and_wetness(system.points, n)
-    )
+    prepared = vehicle.prepare(characteristics, *_roads(system.points, n, step))
     types = vehicle.sumo_type(prepared)
     world.set_types(types._replace(decel=np.maximum(types.decel, INSERTION_DECELERATION)))
     world.depart()
@@ -164,7 +160,7 @@ def _simulate(
     batch = PointBatch(system.points, world, n)
     log = _Log(n, int(batch.last_step.max()) + 1, frame)
     robot = DrivingRobot(system.points, vehicle, prepared, state, step)
-    contacts, warnings = Contacts(n, robot.has_test_speed), _FirstWarnings(system.ads, n)
+    contacts, warning_ttc = Contacts(n, robot.has_test_speed), np.full(n, np.nan)
     for sample in range(log.length):
         if watch is not None:
             watch(world)
@@ -179,7 +175,10 @@ def _simulate(
         if listen is not None:
             listen(observation)
         command, ads_memory = system.ads.drive(observation, ads_memory)
-        warnings.update(ads_memory, speed, scene, outcomes.is_open)
+        if (warned := system.ads.warns(ads_memory)) is not None:
+            closing_speed = speed - scene.obstacle_speed  # true, not sensed
+            is_first = warned & outcomes.is_open & np.isnan(warning_ttc) & (closing_speed > 0)
+            np.copyto(warning_ttc, scene.gap / closing_speed, where=is_first)
         command, state = robot.drive(command, state, outcomes.is_open)
         log.write(
             sample,
@@ -211,7 +210,7 @@ def _simulate(
         collision_speed=np.where(robot.invalid, np.nan, outcomes.collision_speed),
         contact=contacts.first_contacts(),
         test_speed_error=robot.error,
-        warning_ttc=warnings.time_to_collision,
+        warning_ttc=warning_ttc,
     )
 
 
@@ -234,67 +233,32 @@ def _check_finite(speed: FloatArray, settings: FloatArray, characteristics: Char
             )
 
 
-def _road_friction(points: Sequence[Point], n: int) -> Any:
-    """Factor on the tyres' friction: a number if all points share it, else an array of shape (n,)."""
-    factors = [point.weather.road_friction for point in points]
-    return factors[0] if len(set(factors)) == 1 else np.repeat(factors, n // len(points))
-
-
-def _slope_and_wetness(points: Sequence[Point], n: int) -> tuple[Slope, bool | BoolArray]:
-    """Slope and wetness of the roads of n vehicles."""
+def _roads(points: Sequence[Point], n: int, step: float) -> tuple[Any, float, Slope, bool | BoolArray]:
+    """Factor on the tyres' friction (a number if all points share it), time step, slope and wetness, of n vehicles."""
+    frictions, size = [point.weather.road_friction for point in points], n // len(points)
+    friction = frictions[0] if len(set(frictions)) == 1 else np.repeat(frictions, size)
     grades, wetness = [point.scenario.grade for point in points], [point.weather.wet for point in points]
-    slope = slope_of(np.repeat(grades, n // len(points))) if any(grades) else LEVEL
-    return slope, np.repeat(wetness, n // len(points)) if any(wetness) else False
+    slope = slope_of(np.repeat(grades, size)) if any(grades) else LEVEL
+    return friction, step, slope, np.repeat(wetness, size) if any(wetness) else False
 
 
 def _sensors_in_weather(system: System, prepared: Any, n: int) -> Sensors:
-    """The vehicles' sensors: each point's weather adds its recognition delay and scales the range by its visibility."""
-    sensors = system.vehicle.sensors(prepared) or Sensors.perfect(n)
-    weathers = [point.weather for point in system.points]
-    delay = np.repeat([weather.recognition_delay for weather in weathers], n // len(weathers))
-    visibility = np.repeat([weather.visibility for weather in weathers], n // len(weathers))
-    reach = np.full(n, -1.0) if system.sees_nobody else sensors.reach * visibility
-    return Sensors(sensors.latency + delay, reach, sensors.scale)
-
-
-class _FirstWarnings:
-    """The times to collision at which the ADSs of N vehicles first warn the driver [s]; NaN if an ADS never does."""
-
-    def __init__(self, ads: Ads, n: int) -> None:
-        self._ads = ads
-        self.time_to_collision = np.full(n, np.nan)
-
-    def update(self, ads_memory: Any, speed: FloatArray, scene: Scene, is_open: BoolArray) -> None:
-        """Process one sample; `scene` holds the true position of the obstacle, not the sensed position."""
-        warned = self._ads.warns(ads_memory)
-        if warned is None:
-            return
-        closing_speed = speed - scene.obstacle_speed
-        is_first = warned & is_open & np.isnan(self.time_to_collision) & (closing_speed > 0)
-        if is_first.any():
-            self.time_to_collision = np.where(is_first, scene.gap / closing_speed, self.time_to_collision)
+    """The vehicles' sensors: the weather adds its recognition delay and scales the range by its visibility."""
+    (point,) = system.points  # SUMO simulates one point at once
+    latency, reach, scale = system.vehicle.sensors(prepared) or Sensors.perfect(n)
+    reach = np.full(n, -1.0) if system.sees_nobody else reach * point.weather.visibility
+    return Sensors(latency + point.weather.recognition_delay, reach, scale)
 
 
 class _Log:
     """T samples of N runs in arrays of shape (T, N), and positions of the vehicles on SUMO's plane, shape (T, N, 2)."""
 
-    _NAMES = (
-        "speed",
-        "gap",
-        "lateral",
-        "lateral_speed",
-        "throttle",
-        "brake",
-        "gear",
-        "active",
-        "obstacle_speed",
-        "pedal",
-    )
-
     def __init__(self, n: int, length: int, frame: Frame) -> None:
-        self.length, self._frame = length, frame
-        self._columns = {name: np.zeros((length, n), dtype=bool if name == "active" else float) for name in self._NAMES}
-        self._positions = np.zeros((length, n, 2))
+        self.length, self._frame, self._positions = length, frame, np.zeros((length, n, 2))
+        names = (
+            field.name for field in fields(Trace) if field.name not in ("step", "vehicle_length", "time", "position")
+        )
+        self._columns = {name: np.zeros((length, n), dtype=bool if name == "active" else float) for name in names}
 
     def write(self, sample: int, position: FloatArray, **columns: FloatArray | BoolArray) -> None:
         self._positions[sample] = position

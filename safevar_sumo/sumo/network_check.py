@@ -233,8 +233,7 @@ def _first_difference(network: Network) -> tuple[str, float]:
     The vehicle under test stays at its start.
     """
     with open_world(copied_network(network, 2), 2) as world:
-        world.allow_departure()
-        world.depart()
+        world.depart(at_any_speed=True)
         for step in range(1, N_STEPS + 1):
             world.advance(np.zeros(2))
             poses = world.actor_poses()

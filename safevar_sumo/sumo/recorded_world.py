@@ -108,17 +108,11 @@ class RecordedWorldSlice:
     def vehicle_length(self, actor: str) -> float:
         return self._recording.length if actor == VUT else self._track(actor).length
 
-    def vehicle_width(self, actor: str) -> float:
-        return self._recording.width if actor == VUT else self._track(actor).width
-
     def person_width(self, actor: str) -> float:
         return self._track(actor).width
 
     def lane(self, lane: str) -> Lane:
         return lane_through(lane, self._look_up(self._recording.lanes, lane))
-
-    def lane_start(self, lane: str) -> tuple[float, float]:
-        return self._look_up(self._recording.lanes, lane)[0]  # type: ignore[no-any-return]
 
     def lane_of(self, vehicle: str) -> Lane:
         return self.lane(self._look_up(self._recording.lane_of, vehicle))

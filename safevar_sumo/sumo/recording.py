@@ -204,8 +204,7 @@ def _unpacked_array(_: Any, packed: Any) -> FloatArray:
 def _play(scenario: Any, network: Network, options: tuple[str, ...]) -> Recording | str:
     """The scene, or the reason why it cannot be recorded."""
     with open_world(copied_network(network, 1), 1, Engine.LIBSUMO, options) as world:
-        world.allow_departure()
-        world.depart()
+        world.depart(at_any_speed=True)
         try:
             return _record(scenario, world)
         except UnrecordableError as error:
@@ -254,7 +253,7 @@ def _record(scenario: Scenario, world: SumoWorld) -> Recording:
         start=start,
         speed=speed,
         length=vut_length,
-        width=world.vehicle_width(VUT),
+        width=float(api.vehicle.getWidth(vut)),
         way=lane_sequence,
         along=along,
         lanes=lanes,

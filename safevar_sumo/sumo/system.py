@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import product
@@ -84,75 +84,51 @@ def measuring_of(study: Study, lookup: Lookup) -> Measuring:
         If a metric or measure of change does not exist, is invalid, or has a name that is taken.
     """
     metrics = {**METRICS, **({RATING_POINTS.name: RATING_POINTS} if is_rated(study) else {})}
-    default_metrics = dict(metrics)
-    changes = {name: change for name, change in CHANGES.items() if name not in RESULT_COLUMNS}
-    by_name: dict[str, Metric | Change] = {}
+    shipped, changes = {**metrics, **OPTIONAL_METRICS}, dict[str, Change]()
+    objectives_alone, users = {**CHANGES, **METRIC_OF_OBJECTIVE}, dict[str, Metric | Change]()
 
     def look_up(name: str, key: str) -> Metric | Change:
-        if name in by_name:
-            return by_name[name]
-        shipped = {
-            **default_metrics,
-            **OPTIONAL_METRICS,
-            **({**CHANGES, **METRIC_OF_OBJECTIVE} if key == OBJECTIVES_KEY else {}),
-        }
-        member = lookup.find(shipped, name, key)
+        if name in users:
+            return users[name]
+        member = lookup.find({**shipped, **(objectives_alone if key == OBJECTIVES_KEY else {})}, name, key)
+        record: Metric | Change = member.target
         if member.guard is None:
             if name in OPTIONAL_METRICS:
-                metrics[name] = member.target
-            return member.target  # type: ignore[no-any-return]
-        is_change = isinstance(member.target, Change) and key == OBJECTIVES_KEY
-        record = guard_change(member.target, member.guard) if is_change else guard_metric(member.target, member.guard)
+                metrics[name] = OPTIONAL_METRICS[name]
+            return record
+        is_change = isinstance(record, Change) and key == OBJECTIVES_KEY
+        record = (guard_change if is_change else guard_metric)(record, member.guard)
         if record.name in (*RESULT_COLUMNS, *metrics, *OPTIONAL_METRICS, *changes, *study.vehicle.characteristics):
             raise InputError(lookup.source, f"{key} = {name!r}: the name {record.name!r} is taken", "a unique name")
         if isinstance(record, Change):
             changes[record.name] = record
         else:
             metrics[record.name] = record
-        by_name[name] = by_name[record.name] = record
+        users[name] = users[record.name] = record
         return record
 
     for name in study.metrics.also:
         if name in METRICS:
-            raise InputError(
-                lookup.source,
-                f"metrics.also = {study.metrics.also}: every study has {name!r}",
-                f"{one_of(OPTIONAL_METRICS)}, or package.module:Name",
-            )
+            problem = f"metrics.also = {study.metrics.also}: every study has {name!r}"
+            raise InputError(lookup.source, problem, f"{one_of(OPTIONAL_METRICS)}, or package.module:Name")
         look_up(name, "metrics.also")
-    names = [
-        METRIC_OF_OBJECTIVE[name].name if name in METRIC_OF_OBJECTIVE else name for name in study.search.objectives
-    ]
-    objectives = [_objective_of(look_up(name, OBJECTIVES_KEY)) for name in names]
-    _check_duplicates(objectives, lookup.source)
+    objectives = []
+    for name in study.search.objectives:
+        record = look_up(METRIC_OF_OBJECTIVE[name].name if name in METRIC_OF_OBJECTIVE else name, OBJECTIVES_KEY)
+        if isinstance(record, Metric):
+            objectives.append(Objective.of(record))
+        else:
+            objectives.append(Objective(name=record.name, title=record.title, unit=record.unit))
+    names = [objective.name for objective in objectives]
+    if len(set(names)) < len(names):
+        problem = f"search.objectives: one of {', '.join(names)} is named twice"
+        raise InputError(lookup.source, problem, one_of([*METRICS, *OPTIONAL_METRICS, *CHANGES]))
     scoring = Scoring(metrics=tuple(metric.facts for metric in metrics.values()), objectives=tuple(objectives))
     return Measuring(metrics, changes, scoring)
 
 
-def _objective_of(record: Metric | Change) -> Objective:
-    if isinstance(record, Metric):
-        return Objective.of(record)
-    return Objective(name=record.name, title=record.title, unit=record.unit)
-
-
-def _check_duplicates(objectives: Iterable[Objective], source: str) -> None:
-    names = [objective.name for objective in objectives]
-    if len(set(names)) < len(names):
-        choices = one_of([*METRICS, *OPTIONAL_METRICS, *CHANGES])
-        raise InputError(source, f"search.objectives: one of {', '.join(names)} is named twice", choices)
-
-
 CONTROLLER_FORMS = "a function step(traci, vehicle_id) with the body of a script's loop, or a class with that method"
 """The legal forms of a controller written for TraCI."""
-
-
-class Models(NamedTuple):
-    """A study's models with their parameters."""
-
-    vehicle: Vehicle
-    ads: Ads
-    scenario: Scenario
-    weather: Weather
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -200,30 +176,23 @@ class System:
     def remarks(self) -> list[str]:
         """Remarks for the user on parts of networks and weathers that are not used or have no effect."""
         uses_traci = isinstance(self.ads, TraciController)
-        networks = dict.fromkeys(point.scenario.network for point in self.points)
         remarks = [
             remark
-            for network in networks
+            for network in dict.fromkeys(point.scenario.network for point in self.points)
             for remark in network_remarks(network, self.nominal.max_speed, sumo_drives=uses_traci)
         ]
         remarks += self.vehicle.remarks
-        visibilities = {
-            point.weather.name: point.weather.visibility for point in self.points if point.weather.visibility != 1
-        }
-        if uses_traci and not self._has_limited_range():
-            remarks += [
-                f"weather {name!r}: visibility = {value:g} has no effect: the vehicle has no sensor range, so "
-                "a controller written "
-                "for TraCI sees everything"
-                for name, value in visibilities.items()
-            ]
-        if not (self.ads.recognition_delay or self.ads.hesitation):
-            remarks += [
-                f"weather {name!r} has no effect: its road and its visibility are those of clear weather, and "
-                "no key of "
-                "[ads.parameters] delays the ADS in it"
-                for name in dict.fromkeys(point.weather.name for point in self.points if equals_clear(point.weather))
-            ]
+        for weather in {point.weather.name: point.weather for point in self.points}.values():
+            if weather.visibility != 1 and uses_traci and not self._has_limited_range():
+                remarks.append(
+                    f"weather {weather.name!r}: visibility = {weather.visibility:g} has no effect: the vehicle has no "
+                    "sensor range, so a controller written for TraCI sees everything"
+                )
+            if equals_clear(weather) and not (self.ads.recognition_delay or self.ads.hesitation):
+                remarks.append(
+                    f"weather {weather.name!r} has no effect: its road and its visibility are those of clear weather, "
+                    "and no key of [ads.parameters] delays the ADS in it"
+                )
         return remarks
 
     def _has_limited_range(self) -> bool:
@@ -242,9 +211,11 @@ def assemble(study: Study, source: str = "") -> System:
     """
     source = source or study.source
     unload_user_modules()  # so that each system has the code as it is now, and no state of another one
-    models = models_of(study, source)
+    vehicle, ads, scenario, weather = models_of(study, source)
     is_shipped_vehicle = study.vehicle.model in VEHICLES
-    _check_units(study, models.vehicle, is_shipped_vehicle, source)
+    _check_units(study, vehicle, is_shipped_vehicle, source)
+    if isinstance(ads, TraciController) and isinstance(vehicle, GuardedVehicle):
+        vehicle.require_sensors()
     measuring = measuring_of(study, Lookup(source, study.origin.places))
     tables_by_metric = {
         "published": study.published,
@@ -253,31 +224,22 @@ def assemble(study: Study, source: str = "") -> System:
         "fit.weights": study.fit.weights,
     }
     for key, table in tables_by_metric.items():
-        for name in table:
-            if name not in measuring.metrics:
-                raise unknown_name(source, f"{key}.{name} is no metric", name, measuring.metrics)
+        for name in (name for name in table if name not in measuring.metrics):
+            raise unknown_name(source, f"{key}.{name} is no metric", name, measuring.metrics)
     rater = rater_of(study, source)
-    matrix = _matrix_points(study if rater is None else expand_protocol(study, models.weather), source)
-    for network in dict.fromkeys(
-        scenario.network for scenario in (models.scenario, *(point.scenario for point in matrix))
-    ):
+    matrix = _matrix_points(study if rater is None else expand_protocol(study, weather), source)
+    for network in dict.fromkeys([scenario.network, *(point.scenario.network for point in matrix)]):
         check_network(network, f"{source}: {NETWORK_KEY}")
     region = region_of(study, source)
-    characteristics = region.characteristics
-    nominal = calibration_drive(models.vehicle, characteristics)
-    if isinstance(models.ads, TraciController) and isinstance(models.vehicle, GuardedVehicle):
-        extremes = np.stack([characteristics.original, characteristics.lower, characteristics.upper])
-        models.vehicle.refuse_sense_without_sensors(
-            dict(zip(characteristics.names, np.ascontiguousarray(extremes.T), strict=True))
-        )
+    nominal = calibration_drive(vehicle, region.characteristics)
     if not is_shipped_vehicle:
         nominal.tables()  # so that errors of a user's vehicle do not depend on the ADS
     return System(
-        characteristics=characteristics,
-        vehicle=models.vehicle,
-        ads=models.ads,
-        scenario=models.scenario,
-        weather=models.weather,
+        characteristics=region.characteristics,
+        vehicle=vehicle,
+        ads=ads,
+        scenario=scenario,
+        weather=weather,
         metrics_table=study.metrics,
         nominal=nominal,
         measuring=measuring,
@@ -289,15 +251,11 @@ def assemble(study: Study, source: str = "") -> System:
     )
 
 
-def models_of(study: Study, source: str) -> Models:
+def models_of(study: Study, source: str) -> tuple[Vehicle, Ads, Scenario, Weather]:
     """The study's models with their parameters; raises the errors of `assemble`."""
     lookup = Lookup(source, study.origin.places)
-    return Models(
-        _create_vehicle(study.vehicle, lookup),
-        _create_ads(study.ads, lookup),
-        _create_scenario(study.scenario, lookup),
-        weather_of(study.weather, source),
-    )
+    vehicle, ads = _create_vehicle(study.vehicle, lookup), _create_ads(study.ads, lookup)
+    return vehicle, ads, _create_scenario(study.scenario, lookup), weather_of(study.weather, source)
 
 
 def _create_traci_controller(table: ModelTable, lookup: Lookup) -> Ads:
@@ -323,18 +281,14 @@ def _create_traci_controller(table: ModelTable, lookup: Lookup) -> Ads:
 
 def _matrix_points(study: Study, source: str) -> tuple[Point, ...]:
     """The points of a study's matrix; raises an error if several points share a name."""
-    points = (
-        []
-        if study.matrix is None
-        else [point for test in study.matrix.tests for point in _points_of(test, study, source)]
-    )
-    counts = Counter(point.name for point in points)
-    for name, count in counts.items():
-        if count > 1:
-            raise InputError(
-                source, f"matrix.tests: {count} points are {name!r}", "unique names of tests, and each value once"
-            )
-    return tuple(points)
+    tests = () if study.matrix is None else study.matrix.tests
+    points = tuple(point for test in tests for point in _points_of(test, study, source))
+    ((name, count),) = Counter(point.name for point in points).most_common(1) or [("", 0)]
+    if count > 1:
+        raise InputError(
+            source, f"matrix.tests: {count} points are {name!r}", "unique names of tests, and each value once"
+        )
+    return points
 
 
 def _points_of(test: MatrixTest, study: Study, source: str) -> Iterator[Point]:
@@ -375,69 +329,61 @@ def _locate_network(scenario: Any, search_folders: Sequence[str]) -> Any:
 
 def _check_units(study: Study, vehicle: Vehicle, is_shipped_vehicle: bool, source: str) -> None:
     table, units = study.vehicle.characteristics, vehicle.UNITS
-    for name in table:
+    for name, entry in table.items():
+        key = f"vehicle.characteristics.{name}"
         if name in RESULT_COLUMNS:
-            raise InputError(
-                source,
-                f"vehicle.characteristics.{name}: the name is a column of results",
-                f"none of {', '.join(RESULT_COLUMNS)}",
-            )
+            raise InputError(source, f"{key}: the name is a column of results", f"none of {', '.join(RESULT_COLUMNS)}")
         if name not in units:
-            raise unknown_name(
-                source, f"vehicle.characteristics.{name}: {study.vehicle.model} has no such characteristic", name, units
-            )
-        if table[name].unit != units[name]:
-            raise InputError(source, f"vehicle.characteristics.{name}.unit = {table[name].unit!r}", repr(units[name]))
-        if is_shipped_vehicle and table[name].lower <= 0:
-            raise InputError(source, f"vehicle.characteristics.{name}.lower = {table[name].lower}", "a value above 0")
+            raise unknown_name(source, f"{key}: {study.vehicle.model} has no such characteristic", name, units)
+        if entry.unit != units[name]:
+            raise InputError(source, f"{key}.unit = {entry.unit!r}", repr(units[name]))
+        if is_shipped_vehicle and entry.lower <= 0:
+            raise InputError(source, f"{key}.lower = {entry.lower}", "a value above 0")
     for name in units:
         if name not in table:
             raise InputError(source, f"vehicle.characteristics.{name} is missing", f"all of {', '.join(units)}")
 
 
+def _class_and_creator(
+    kind: str, shipped: Mapping[str, Any], table: ModelTable | VehicleTable, lookup: Lookup, *bases: type
+) -> tuple[Member, Callable[[], Any]]:
+    """The class that the table `kind` names, and the function that creates an instance with the table's parameters."""
+    traci = f'with ads.kind = "traci" {CONTROLLER_FORMS}' if kind == "ads" else ""
+    member = lookup.class_of(shipped, table.model, f"{kind}.model", *bases, otherwise=traci)
+    parameters = lookup.with_paths(member, table.parameters, f"{kind}.parameters")
+    name = f"{kind}.model = {table.model!r}"
+    return member, partial(instance_of, member, parameters, name, f"{kind}.parameters", lookup.source)
+
+
 def _create_vehicle(table: VehicleTable, lookup: Lookup) -> Vehicle:
     if table.kind == "fmu":
         guard = Guard(lookup.source, f"vehicle.model = {table.model!r}")
-        fmu_table = {
-            **msgspec.structs.asdict(table),
-            "parameters": lookup.with_paths(Member(FmuVehicle, guard), table.parameters, "vehicle.parameters"),
-        }
+        parameters = lookup.with_paths(Member(FmuVehicle, guard), table.parameters, "vehicle.parameters")
         units = {name: row.unit for name, row in table.characteristics.items()}
         description = description_of(table.model, lookup.folders, lookup.source, "vehicle.model")
-        return FmuVehicle(description, units, fmu_table, guard)
-    member = lookup.class_of(VEHICLES, table.model, "vehicle.model", Vehicle)
-    parameters = lookup.with_paths(member, table.parameters, "vehicle.parameters")
-    vehicle = instance_of(member, parameters, f"vehicle.model = {table.model!r}", "vehicle.parameters", lookup.source)
+        return FmuVehicle(description, units, {**msgspec.structs.asdict(table), "parameters": parameters}, guard)
+    member, create = _class_and_creator("vehicle", VEHICLES, table, lookup, Vehicle)
+    vehicle: Vehicle = create()
     return vehicle if member.guard is None else GuardedVehicle(vehicle, member.guard)
 
 
 def _create_scenario(table: ModelTable, lookup: Lookup) -> Scenario:
-    member = lookup.class_of(SCENARIOS, table.model, "scenario.model", Scenario)
-    parameters = lookup.with_paths(member, table.parameters, "scenario.parameters")
-    scenario = instance_of(
-        member, parameters, f"scenario.model = {table.model!r}", "scenario.parameters", lookup.source
-    )
-    located: Scenario = _locate_network(
-        scenario if member.guard is None else GuardedScenario(scenario, member.guard), lookup.folders
-    )
+    member, create = _class_and_creator("scenario", SCENARIOS, table, lookup, Scenario)
+    scenario = create() if member.guard is None else GuardedScenario(create(), member.guard)
+    located: Scenario = _locate_network(scenario, lookup.folders)
     return located
 
 
 def _create_ads(table: ModelTable, lookup: Lookup) -> Ads:
     if table.kind == "traci":
         return _create_traci_controller(table, lookup)
+    guard = Guard(lookup.source, f"ads.model = {table.model!r}")
     if table.kind == "fmu":
-        guard = Guard(lookup.source, f"ads.model = {table.model!r}")
         parameters = lookup.with_paths(Member(FmuAds, guard), table.parameters, "ads.parameters")
         description = description_of(table.model, lookup.folders, lookup.source, "ads.model")
         return FmuAds(description, table.inputs, table.outputs, parameters, table.step, guard)
-    member = lookup.class_of(
-        ADS, table.model, "ads.model", ScalarAds, Ads, otherwise=f'with ads.kind = "traci" {CONTROLLER_FORMS}'
-    )
-    name = f"ads.model = {table.model!r}"
-    parameters = lookup.with_paths(member, table.parameters, "ads.parameters")
-    create_ads = partial(instance_of, member, parameters, name, "ads.parameters", lookup.source)
-    ads = create_ads()  # also for a ScalarAds, so that wrong parameters raise errors here
+    member, create = _class_and_creator("ads", ADS, table, lookup, ScalarAds, Ads)
+    ads: Ads = create()  # also for a ScalarAds, so that wrong parameters raise errors here
     if issubclass(member.target, ScalarAds):
-        return PerVehicleAds(create_ads, member.guard or Guard(lookup.source, name))
+        return PerVehicleAds(create, member.guard or guard)
     return ads if member.guard is None else GuardedAds(ads, member.guard)

@@ -1,4 +1,4 @@
-"""N copies of a network in a running simulation, and queries about their actors."""
+"""N copies of a network in a running simulation: queries about their actors, and where bodies touch first."""
 
 from __future__ import annotations
 
@@ -8,10 +8,11 @@ from itertools import chain
 from typing import Any, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from safevar_sumo.errors import InputError, SimulationError
-from safevar_sumo.records import BoolArray, FloatArray
-from safevar_sumo.scenarios import VUT, Lane, Scenario
+from safevar_sumo.records import BoolArray, Contact, FloatArray
+from safevar_sumo.scenarios import VUT, Lane, Scenario, Scene
 from safevar_sumo.scenarios.base import lane_through
 from safevar_sumo.sumo.copies import copied_id, copy_and_name
 from safevar_sumo.vehicles import Sensors, SumoType
@@ -54,7 +55,7 @@ class SumoWorld:
     """N copies of a network in a running simulation, created by `open_world`. Arrays have shape (N,) or (N, 2)."""
 
     def __init__(self, api: Any, n: int) -> None:
-        self._api, self.n = api, n
+        self.api, self.n = api, n
         self._set_speed, self._get_speed = (
             _api_function(api, "vehicle", "setSpeed"),
             _api_function(api, "vehicle", "getSpeed"),
@@ -85,7 +86,7 @@ class SumoWorld:
         return self._ids[name]
 
     def set_types(self, types: SumoType) -> None:
-        vehicletype = self._api.vehicletype
+        vehicletype = self.api.vehicletype
         columns = (values.tolist() for values in (types.mass, types.accel, types.max_speed, types.tau))
         for id_, mass, accel, max_speed, tau in zip(self.ids(VUT), *columns, strict=True):
             vehicletype.setMass(id_, mass)
@@ -94,20 +95,14 @@ class SumoWorld:
             vehicletype.setTau(id_, tau)
         self.set_decelerations(types.decel)
 
-    def allow_departure(self) -> None:
-        """Set SUMO vehicle types that let SUMO insert the vehicles under test at any speed."""
-        for id_ in self.ids(VUT):
-            self._api.vehicletype.setMaxSpeed(id_, MAX_DEPARTURE_SPEED)
-        self.set_decelerations(np.full(self.n, INSERTION_DECELERATION))
-
     def set_decelerations(self, decel: FloatArray) -> None:
         """Set the largest decelerations of the vehicles under test, also in emergencies [m/s^2]."""
         for id_, value in zip(self.ids(VUT), decel.tolist(), strict=True):
-            self._api.vehicletype.setDecel(id_, value)
-            self._api.vehicletype.setEmergencyDecel(id_, value)
+            self.api.vehicletype.setDecel(id_, value)
+            self.api.vehicletype.setEmergencyDecel(id_, value)
 
-    def depart(self) -> None:
-        """Insert all actors, and take control of the vehicles under test.
+    def depart(self, *, at_any_speed: bool = False) -> None:
+        """Insert all actors, and take control of the vehicles under test; `at_any_speed` changes their types for that.
 
         Raises
         ------
@@ -116,13 +111,17 @@ class SumoWorld:
         """
         global _current_world
         _current_world = self
-        self._api.simulationStep()
-        departed = set(self._api.vehicle.getIDList())
+        if at_any_speed:
+            for id_ in self.ids(VUT):
+                self.api.vehicletype.setMaxSpeed(id_, MAX_DEPARTURE_SPEED)
+            self.set_decelerations(np.full(self.n, INSERTION_DECELERATION))
+        self.api.simulationStep()
+        departed = set(self.api.vehicle.getIDList())
         for id_ in self.ids(VUT):
             if id_ not in departed:
                 raise SimulationError(f"SUMO could not insert vehicle {id_!r}; check the network's traffic file")
-            self._api.vehicle.setSpeedMode(id_, SPEED_MODE)
-            self._api.vehicle.setLaneChangeMode(id_, LANE_CHANGE_MODE)
+            self.api.vehicle.setSpeedMode(id_, SPEED_MODE)
+            self.api.vehicle.setLaneChangeMode(id_, LANE_CHANGE_MODE)
 
     def advance(self, speeds: FloatArray) -> None:
         """Simulate one step, in which the vehicles under test reach `speeds` [m/s]."""
@@ -131,7 +130,7 @@ class SumoWorld:
         for copy, speed in zip(changed_copies.tolist(), speeds[changed_copies].tolist(), strict=True):
             set_speed(ids[copy], speed)
         self._commanded_speeds = speeds
-        self._api.simulationStep()
+        self.api.simulationStep()
         self._positions.clear()
         self._speeds_now = None
 
@@ -142,7 +141,7 @@ class SumoWorld:
         test may be either.
         """
         self._struck_ids, speeds = {}, dict[int, float]()
-        for collision in self._api.simulation.getCollisions():
+        for collision in self.api.simulation.getCollisions():
             pairs = [(collision.collider, collision.colliderSpeed, collision.victim)]
             if collision.type == "junction":
                 pairs.append((collision.victim, collision.victimSpeed, collision.collider))
@@ -161,14 +160,12 @@ class SumoWorld:
         )
 
     def _body_of(self, id_: str) -> Body:
-        domain = self._api.person if id_ in self._api.person.getIDList() else self._api.vehicle
-        return Body.behind(
-            np.array(domain.getPosition(id_)),
-            direction_of(domain.getAngle(id_)),
-            domain.getLength(id_),
-            domain.getWidth(id_),
-            domain.getSpeed(id_),
-        )
+        domain, (_, length, width) = self._domain_of(id_), self.actor_size(id_)
+        front, along = np.array(domain.getPosition(id_)), direction_of(domain.getAngle(id_))
+        return Body.behind(front, along, length, width, domain.getSpeed(id_))
+
+    def _domain_of(self, id_: str) -> Any:
+        return self.api.person if id_ in self.api.person.getIDList() else self.api.vehicle
 
     def end_runs(self, copies: Sequence[int]) -> None:
         """Remove vehicles whose runs end from SUMO's simulation, and keep their last positions and speeds."""
@@ -179,7 +176,7 @@ class SumoWorld:
             self.vehicle_positions(VUT)[copies],
         )
         for id_ in [self.ids(VUT)[copy] for copy in copies]:
-            self._api.vehicle.remove(id_)
+            self.api.vehicle.remove(id_)
             del self._driving_copies[id_]
         self._driving_numbers = np.array([*self._driving_copies.values()], dtype=np.intp)
 
@@ -210,12 +207,7 @@ class SumoWorld:
     @property
     def lookup_errors(self) -> tuple[type[Exception], ...]:
         """Errors raised by queries for actors or lanes that do not exist."""
-        return (self._api.TraCIException,)
-
-    @property
-    def api(self) -> Any:
-        """The module libsumo or traci."""
-        return self._api
+        return (self.api.TraCIException,)
 
     def has_left(self, id_: str) -> bool:
         """Whether a vehicle under test has left the road, for good."""
@@ -225,47 +217,39 @@ class SumoWorld:
         """x and y of the front bumper or person [m], and heading clockwise from north [degrees], of all actors on the
         road, by id.
         """
-        domains = (self._api.vehicle, self._api.person)
+        domains = (self.api.vehicle, self.api.person)
         return {
             id_: (*domain.getPosition(id_), domain.getAngle(id_)) for domain in domains for id_ in domain.getIDList()
         }
 
     def actor_size(self, id_: str) -> tuple[bool, float, float]:
         """Whether an actor is a person, and its length and width [m]."""
-        is_person = id_ in self._api.person.getIDList()
-        domain = self._api.person if is_person else self._api.vehicle
-        return is_person, domain.getLength(id_), domain.getWidth(id_)
+        domain = self._domain_of(id_)
+        return domain is self.api.person, domain.getLength(id_), domain.getWidth(id_)
 
     def vehicle_length(self, actor: str) -> float:
-        return float(self._api.vehicle.getLength(self.ids(actor)[0]))
-
-    def vehicle_width(self, actor: str) -> float:
-        return float(self._api.vehicle.getWidth(self.ids(actor)[0]))
+        return float(self.api.vehicle.getLength(self.ids(actor)[0]))
 
     def lane(self, lane: str) -> Lane:
-        return lane_through(lane, self._api.lane.getShape(copied_id(0, lane)))
+        return lane_through(lane, self.api.lane.getShape(copied_id(0, lane)))
 
     def lane_of(self, vehicle: str) -> Lane:
-        return self.lane(copy_and_name(self._api.vehicle.getLaneID(self.ids(vehicle)[0]))[1])
-
-    def lane_start(self, lane: str) -> tuple[float, float]:
-        x, y = self._api.lane.getShape(copied_id(0, lane))[0]
-        return x, y
+        return self.lane(copy_and_name(self.api.vehicle.getLaneID(self.ids(vehicle)[0]))[1])
 
     def person_width(self, actor: str) -> float:
-        return float(self._api.person.getWidth(self.ids(actor)[0]))
+        return float(self.api.person.getWidth(self.ids(actor)[0]))
 
     def walk(self, person: str, speed: float) -> None:
         for id_ in self.ids(person):
-            self._api.person.setSpeed(id_, speed)
+            self.api.person.setSpeed(id_, speed)
 
     def drive(self, vehicle: str, speed: float) -> None:
         for id_ in self.ids(vehicle):
-            self._api.vehicle.setSpeedMode(id_, SPEED_MODE)
-            self._api.vehicle.setSpeed(id_, speed)
+            self.api.vehicle.setSpeedMode(id_, SPEED_MODE)
+            self.api.vehicle.setSpeed(id_, speed)
 
     def turn_back(self, person: str) -> None:
-        api = self._api.person
+        api = self.api.person
         for id_ in self.ids(person):
             back = [api.getRoadID(id_), api.getEdges(id_)[0]]
             api.appendWalkingStage(id_, back, 0.0, speed=api.getSpeed(id_))
@@ -309,3 +293,79 @@ def _api_function(api: Any, domain: str, name: str) -> Callable[..., Any]:
     compiled = getattr(api, "_libsumo", None)
     wrapped = getattr(api, domain) if compiled is None else compiled
     return getattr(wrapped, name if compiled is None else f"{domain}_{name}")  # type: ignore[no-any-return]
+
+
+FRONT, LEFT, RIGHT, REAR = "front", "left", "right", "rear"
+
+
+class Contacts:
+    """First contacts of N vehicles; in a Euro NCAP test (`is_tested`) only contacts of the vehicle's front are
+    collisions.
+    """
+
+    def __init__(self, n: int, is_tested: BoolArray) -> None:
+        self._is_tested, self._side, self._position_on_side = is_tested, np.full(n, "", dtype="U5"), np.full(n, np.nan)
+
+    def record_collisions(self, world: Any, is_open: BoolArray, scene: Scene) -> dict[int, float]:
+        """Process one sample; returns the speeds [m/s] of the vehicles of open runs that collide, by vehicle number."""
+        speeds = world.collisions(is_open)
+        new_copies = [copy for copy in speeds if not self._side[copy]]
+        if new_copies:
+            own, other = world.bodies(new_copies)
+            self._locate(new_copies, own, other, scene)
+        return {copy: speed for copy, speed in speeds.items() if not self._is_tested[copy] or self._side[copy] == FRONT}
+
+    def _locate(self, copies: Sequence[int], own: Body, other: Body, scene: Scene) -> None:
+        side, age, distance_behind_front = find_touches(own, other)
+        lateral = scene.lateral[copies] - np.broadcast_to(scene.lateral_speed, scene.lateral.shape)[copies] * age
+        is_at_end = (side == FRONT) | (side == REAR)
+        share = np.where(is_at_end, lateral / own.width + 0.5, distance_behind_front / own.length)
+        self._side[copies] = side
+        self._position_on_side[copies] = 100 * np.minimum(np.maximum(share, 0.0), 1.0)
+
+    def first_contacts(self) -> Contact:
+        return Contact(self._side, self._position_on_side)
+
+
+def find_touches(own: Body, other: Body) -> tuple[npt.NDArray[np.str_], FloatArray, FloatArray]:
+    """The first touches of M pairs of overlapping bodies, if their velocities were constant: the side of the first
+    body, the time since then [s], and how far the other's middle was behind the first one's front [m].
+
+    Two bodies of length l, l' and width w, w' at an angle a have the joint half extent r = (l + l' |cos a| + w' |sin
+    a|) / 2 along the first one and (w + l' |sin a| + w' |cos a|) / 2 across it. If their middles are x apart in such a
+    direction and approach each other at v, the overlap in it began (r - |x|) / v ago. The bodies touched in the
+    direction in which the overlap began last, or, if they approach each other in neither direction, in the one with the
+    smaller overlap.
+    """
+    across = np.stack([-own.along[:, 1], own.along[:, 0]], axis=1)
+    to_other = other.middle - own.middle
+    relative_velocity = own.along * own.speed[:, np.newaxis] - other.along * other.speed[:, np.newaxis]
+    cosine, sine = np.abs(_dot(other.along, own.along)), np.abs(_dot(other.along, across))
+    extent_along = (own.length + other.length * cosine + other.width * sine) / 2
+    extent_across = (own.width + other.length * sine + other.width * cosine) / 2
+    x_ahead, x_left = _dot(to_other, own.along), _dot(to_other, across)
+    speed_ahead = _dot(relative_velocity, own.along)
+    age_along = _overlap_age(extent_along - np.abs(x_ahead), np.copysign(1.0, x_ahead) * speed_ahead)
+    age_across = _overlap_age(
+        extent_across - np.abs(x_left), np.copysign(1.0, x_left) * _dot(relative_velocity, across)
+    )
+    is_approaching = np.isfinite(np.minimum(age_along, age_across))
+    is_lengthwise = np.where(
+        is_approaching, age_along < age_across, extent_along - np.abs(x_ahead) < extent_across - np.abs(x_left)
+    )
+    age = np.where(is_approaching, np.where(is_lengthwise, age_along, age_across), 0.0)
+    side = np.where(is_lengthwise, np.where(x_ahead > 0, FRONT, REAR), np.where(x_left > 0, LEFT, RIGHT))
+    return side, age, own.length / 2 - (x_ahead + age * speed_ahead)
+
+
+def _dot(first: FloatArray, second: FloatArray) -> FloatArray:
+    return first[:, 0] * second[:, 0] + first[:, 1] * second[:, 1]
+
+
+def _overlap_age(overlap: FloatArray, closing_speed: FloatArray) -> FloatArray:
+    """Time since bodies began to overlap in one direction, at a closing speed [s]; infinite if they do not approach
+    each other.
+    """
+    return np.where(
+        closing_speed > 0, np.maximum(overlap, 0.0) / np.where(closing_speed > 0, closing_speed, 1.0), np.inf
+    )

@@ -164,7 +164,6 @@ def _select_state(is_rolling: BoolArray, steady: Any, rest: Any) -> Any:
 HIGHEST_SPEED = 1000.0
 """Highest speed of a vehicle [m/s]; beyond it a model has diverged."""
 SPEED_ROUNDING = 1e-9  # relative tolerance of speeds
-PROBE_STEP = 0.1  # s
 _LEGAL_RANGES = {"speed": (0.0, HIGHEST_SPEED), "throttle": (0.0, 1.0), "brake": (0.0, 1.0)}
 _MAY_BE_INFINITE = ("gap", "lateral")
 """Quantities of an observation that are infinite while no obstacle is detected."""
@@ -271,41 +270,16 @@ class GuardedVehicle(Vehicle):
             )
         )
 
-    def refuse_sense_without_sensors(self, characteristics: Characteristics) -> None:
-        """Refuse a model that changes observations in `sense` but has no method `sensors`, because a TraCI controller
-        bypasses `sense`.
-        """
-        if type(self.model).sensors is not Vehicle.sensors:
-            return
-        prepared = self.prepare(characteristics, road_friction=1.0, step=PROBE_STEP)
-        state, zeros = self.at_rest(prepared), np.zeros(prepared.n)
-        for sample, gap in enumerate((60.0, 5.0, 2000.0)):
-            seen = Observation(
-                time=sample * PROBE_STEP,
-                speed=zeros,
-                gap=zeros + gap,
-                closing_speed=zeros + sample,
-                lateral=zeros - 1 - sample,
-                lateral_speed=zeros + sample,
-                visibility=0.5,
-                obstacle_speed=zeros - sample,
-                throttle=zeros,
-                brake=zeros,
+    def require_sensors(self) -> None:
+        """Refuse a model without a method `sensors`: a controller that reads through TraCI bypasses `sense`."""
+        if type(self.model).sensors is Vehicle.sensors:
+            problem = (
+                f"{self._guard.name} has no method sensors, and a controller that reads through TraCI bypasses sense"
             )
-            sensed, state = self.sense(prepared, state, seen)
-            for name, value in seen._asdict().items():
-                if not np.array_equal(getattr(sensed, name), value):
-                    problem = (
-                        f"{self._guard.name} changes {name} in sense, but a controller that reads through TraCI "
-                        "bypasses sense"
-                    )
-                    raise UserCodeError(
-                        self._guard.source,
-                        problem,
-                        "a method sensors(prepared) that returns "
-                        "safevar_sumo.vehicles.Sensors(latency, reach, scale); or an ADS that gets the sensed values, "
-                        'without ads.kind = "traci"',
-                    )
+            expected = (
+                "a method sensors(prepared) that returns safevar_sumo.vehicles.Sensors(latency, reach, scale), or None"
+            )
+            raise UserCodeError(self._guard.source, problem, expected)
 
     def sense(self, prepared: _Prepared, state: _State, seen: Observation) -> tuple[Observation, _State]:
         result = self._guard.call(

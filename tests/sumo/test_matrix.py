@@ -18,10 +18,9 @@ from safevar_sumo.records import Command, Evaluations, FloatArray, Nominal, Obse
 from safevar_sumo.scenarios import Crossing, Point, Scenario
 from safevar_sumo.scenarios.car_to_car import CarToCar
 from safevar_sumo.study import MatrixTable, MatrixTest, Study, load_study
-from safevar_sumo.sumo.contact import find_touches
 from safevar_sumo.sumo.matrix import evaluate, simulate, simulate_all_points, system_at_point
 from safevar_sumo.sumo.system import System, assemble
-from safevar_sumo.sumo.world import Body
+from safevar_sumo.sumo.world import Body, find_touches
 
 BASE = load_study("euro_ncap_pedestrian")
 TESTS = [
@@ -215,8 +214,8 @@ def test_bodies_touch_at_the_side_where_the_overlap_began_last(
     middle: tuple[float, float], along: tuple[float, float], speed: float, contact: tuple[str, float, float | None]
 ) -> None:
     own, other = Body(np.zeros(2), EAST, 4.0, 2.0, 10.0), Body(np.array(middle), np.array(along), 0.6, 0.4, speed)
-    touch = find_touches(Body.columns([own]), Body.columns([other]))
-    assert touch.side == contact[0]
-    assert touch.age == pytest.approx(contact[1])
+    side, age, distance_behind_front = find_touches(Body.columns([own]), Body.columns([other]))
+    assert side == contact[0]
+    assert age == pytest.approx(contact[1])
     if contact[2] is not None:
-        assert touch.distance_behind_front == pytest.approx(contact[2] - 0.2)
+        assert distance_behind_front == pytest.approx(contact[2] - 0.2)
