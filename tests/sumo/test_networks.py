@@ -335,7 +335,12 @@ def load_original(study: str) -> np.ndarray:
     ("file", "old", "new", "message"),
     [
         ("network.nod.xml", 'x="80" y="0"', 'x="80" y="0" z="4"', "lane 'departure_0', which rises"),
-        ("network.edg.xml", 'id="approach"', 'id="approach" friction="0.3"', "lane 'approach_0', which rises 0.00 m and has friction 0.3"),
+        (
+            "network.edg.xml",
+            'id="approach"',
+            'id="approach" friction="0.3"',
+            "lane 'approach_0', which rises 0.00 m and has friction 0.3",
+        ),
     ],
 )
 def test_a_slope_or_friction_that_has_no_effect_is_refused(
