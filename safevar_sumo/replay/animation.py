@@ -5,19 +5,21 @@ from __future__ import annotations
 import shutil
 import subprocess
 from collections.abc import Callable
+from functools import cache
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from safevar_sumo.errors import InputError, SafevarError
 from safevar_sumo.output import whole_file
+from safevar_sumo.records import FloatArray
 from safevar_sumo.replay.comparison import COLOURS, ORIGINAL, Comparison
-from safevar_sumo.replay.page import animation_page
 from safevar_sumo.replay.scene import SEAM_WIDTH, FlatBody, FlatScene, crossing_stripes, lay_out_scene, strip_corners
 
 if TYPE_CHECKING:
+    from jinja2 import Environment
     from matplotlib.animation import AbstractMovieWriter
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
@@ -53,6 +55,13 @@ EXACT = [
     "-1",
 ]
 """Options of ffmpeg for small files of the same bytes each time."""
+
+
+PLAYER_FOLDER = Path(__file__).parent / "web"
+WIDTH_IN_TEXT_HEIGHTS = 65
+"""Width of a scene [heights of its text]."""
+DECIMALS = 2
+"""Decimals of a position [m]; a heading has one decimal [degrees]."""
 
 
 def animate(comparison: Comparison, path: Path) -> None:
@@ -129,7 +138,7 @@ def draw_scene(scene: FlatScene) -> tuple[Figure, Callable[[int], list[Patch]]]:
     from matplotlib.figure import Figure
     from matplotlib.transforms import Affine2D
 
-    view, trace = scene.view, scene.comparison.film.runs.trace
+    view = scene.view
     height = round(WIDTH * view.height / view.width / 2) * 2
     figure = Figure(figsize=(WIDTH / DPI, (PANEL_HEIGHT + height) / DPI), dpi=DPI)
     axis = figure.add_axes(
@@ -161,18 +170,13 @@ def draw_scene(scene: FlatScene) -> tuple[Figure, Callable[[int], list[Patch]]]:
         axis.set_xlim(view.left_ends[sample], view.left_ends[sample] + view.width)
         for body, patches, lights in bodies:
             pose = Affine2D().rotate(body.heading[sample]).translate(body.x[sample], body.y[sample])
-            brakes = trace.brake[min(sample, scene.moments[body.row].end), body.row] > 0
             for patch in [*patches, *lights]:
                 patch.set_transform(pose + axis.transData)
-                patch.set_visible(bool(np.isfinite(body.x[sample]) and (brakes or patch not in lights)))
+                is_shown = np.isfinite(body.x[sample]) and (patch not in lights or scene.brakes(body, sample))
+                patch.set_visible(bool(is_shown))
         clock.set_text(f"{sample * scene.step:.2f} s")
         for row, text in enumerate(texts):
-            moments = scene.moments[row]
-            now = min(sample, moments.end)
-            is_finished = sample >= (moments.end if moments.nearest is None else moments.nearest)
-            ending = scene.comparison.verdict(row) if is_finished else "brakes" if trace.brake[now, row] > 0 else ""
-            gap = f"gap {max(trace.gap[now, row], 0):.1f} m" if np.isfinite(trace.gap[now, row]) else ""
-            text.set_text(f"{scene.comparison.name(row)}  {trace.speed[now, row]:4.1f} m/s  {gap:10}  {ending}")
+            text.set_text(f"{scene.comparison.name(row)}  {scene.reading(row, sample)}")
         return []
 
     return figure, show
@@ -233,3 +237,153 @@ def _draw_body(axis: Axes, body: FlatBody, scene: FlatScene) -> tuple[list[Patch
         if body.is_vut
     ]
     return [axis.add_patch(patch) for patch in patches], [axis.add_patch(light) for light in lights]
+
+
+@cache
+def player_files() -> dict[str, str]:
+    """The style sheet and the script of the player, to include in a page."""
+    from markupsafe import Markup
+
+    return {name: Markup((PLAYER_FOLDER / f"player.{name}").read_text(encoding="utf-8")) for name in ("css", "js")}
+
+
+def template_environment(*folders: Path) -> Environment:
+    """The jinja2 environment for templates in these folders and for the player; it escapes all values."""
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
+    return Environment(
+        loader=FileSystemLoader([*folders, PLAYER_FOLDER]),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+
+
+def animation_page(scene: FlatScene) -> str:
+    """A self-contained page that shows one scene."""
+    template = template_environment().get_template("animation.html.j2")
+    comparison = scene.comparison
+    return template.render(
+        title=comparison.title, changes=comparison.changes, data=player_data(scene), **player_files()
+    )
+
+
+def player_data(scene: FlatScene) -> dict[str, Any]:
+    """The data of the template `player`: the still picture, and under `played` the data of the script. y points
+    down.
+    """
+    view, key_sample = scene.view, scene.key_sample
+    drives = [_drive_data(scene, row) for row in scene.comparison.rows]
+    bodies = sorted(scene.bodies, key=lambda body: (body.is_vut, body.row))
+    left_ends = _rounded_or_constant(view.left_ends)
+    box = {
+        "left": left_ends,
+        "top": round(-view.bottom - view.height, DECIMALS),
+        "width": round(view.width, DECIMALS),
+        "height": round(view.height, DECIMALS),
+    }
+    common_data = {"step": scene.step, "length": scene.sample_count, "key": key_sample, "view": box, "drives": drives}
+    return {
+        **common_data,
+        "description": _describe_scene(scene),
+        "moments": _list_jumps(scene),
+        "bottom": round(-view.bottom, DECIMALS),
+        "letters": round(view.width / WIDTH_IN_TEXT_HEIGHTS, DECIMALS),
+        "road": [
+            _lane_data(lane)
+            for kind in ("area", "path", "road", "crossing")
+            for lane in scene.road
+            if lane.kind == kind
+        ],
+        "ticks": scene.all_marks,
+        "bodies": [_still_body_data(body, scene) for body in bodies],
+        "played": {**common_data, "bodies": [_moving_body_data(body) for body in bodies]},
+    }
+
+
+def _describe_scene(scene: FlatScene) -> str:
+    """Describe the still picture in words."""
+    comparison = scene.comparison
+    vehicles = " and ".join(
+        f"the {comparison.name(row)} vehicle, which {comparison.verdict(row)}" for row in comparison.rows
+    )
+    return f"Seen from above after {scene.key_sample * scene.step:.2f} s: {vehicles}"
+
+
+def _list_jumps(scene: FlatScene) -> list[dict[str, Any]]:
+    """The moments that the player's buttons jump to, in order of time."""
+    jumps = []
+    for row, moments in enumerate(scene.moments):
+        name = scene.comparison.name(row)
+        if moments.braking_start is not None:
+            jumps.append({"name": f"{name} brakes", "sample": moments.braking_start})
+        if moments.nearest is not None:
+            is_impact = not np.isnan(scene.comparison.film.runs.collision_speed[row])
+            jumps.append({"name": f"{name} {'collides' if is_impact else 'is nearest'}", "sample": moments.nearest})
+    return sorted(jumps, key=lambda moment: moment["sample"])
+
+
+def _drive_data(scene: FlatScene, row: int) -> dict[str, Any]:
+    trace, moments = scene.comparison.film.runs.trace, scene.moments[row]
+    samples = slice(0, moments.end + 1)
+    return {
+        "name": scene.comparison.name(row),
+        "verdict": scene.comparison.verdict(row),
+        "end": moments.end,
+        "nearest": moments.end if moments.nearest is None else moments.nearest,
+        "speed": _rounded_list(trace.speed[samples, row]),
+        "gap": _rounded_list(trace.gap[samples, row]),
+        "brakes": (trace.brake[samples, row] > 0).astype(int).tolist(),
+    }
+
+
+def _lane_data(lane: Any) -> dict[str, Any]:
+    return {
+        "kind": lane.kind,
+        "width": round(lane.width, 3),
+        "inside": round(lane.width - SEAM_WIDTH, 3),
+        "points": " ".join(f"{x:.2f},{-y:.2f}" for x, y in lane.line.tolist()),
+    }
+
+
+def _moving_body_data(body: FlatBody) -> dict[str, Any]:
+    degrees = -np.rad2deg(np.unwrap(body.heading)) if np.isfinite(body.heading).all() else -np.rad2deg(body.heading)
+    return {
+        "drive": body.row if body.is_vut else None,
+        "x": _rounded_or_constant(body.x),
+        "y": _rounded_or_constant(-body.y),
+        "heading": _rounded_or_constant(degrees, decimals=1),
+    }
+
+
+def _still_body_data(body: FlatBody, scene: FlatScene) -> dict[str, Any]:
+    """One body at the key sample."""
+    place = np.array([values[scene.key_sample] for values in (body.x, -body.y, -np.rad2deg(body.heading))])
+    x, y, heading = _rounded_list(place)
+    name = scene.comparison.name(body.row) if body.is_vut else "other"
+    return {
+        "name": body.name,
+        "person": body.is_person,
+        "length": body.length,
+        "width": body.width,
+        "look": name,
+        "title": f"{name} vehicle" if body.is_vut else body.name,
+        "radius": max(body.length, body.width) / 2,
+        "drive": body.row if body.is_vut else None,
+        "brakes_key": scene.brakes(body, scene.key_sample),
+        "x_key": x,
+        "y_key": y,
+        "heading_key": heading,
+    }
+
+
+def _rounded_list(values: FloatArray, decimals: int = DECIMALS) -> list[float | None]:
+    """Rounded numbers for JSON; null for an undefined number."""
+    return [round(value, decimals) + 0.0 if np.isfinite(value) else None for value in values.tolist()]
+
+
+def _rounded_or_constant(values: FloatArray, decimals: int = DECIMALS) -> list[float | None] | float | None:
+    """Rounded numbers, or a single number if all are equal."""
+    numbers = _rounded_list(values, decimals)
+    return numbers[0] if len(set(numbers)) == 1 else numbers

@@ -9,7 +9,7 @@ import numpy as np
 
 from safevar_sumo.metrics import time_to_collision
 from safevar_sumo.records import STANDSTILL, SimulationRuns
-from safevar_sumo.replay.comparison import COLOURS, Comparison, find_divergence, find_moments
+from safevar_sumo.replay.comparison import COLOURS, Comparison, find_moments
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 BRAKING_MARK, NEAREST_MARK, IMPACT_MARK = "v", "o", "X"
 MAX_TTC = 6.0
 """Largest time to collision that is drawn [s]."""
+MIN_DIVERGENCE = 0.1
+"""Difference in speed above which two vehicles have diverged [m/s]."""
 FONT_SIZE = 9
 LINE_LENGTH = 118
 """Length of a line of the heading [characters]."""
@@ -32,8 +34,9 @@ def draw_comparison(comparison: Comparison) -> Figure:
     with matplotlib.style.context(["seaborn-v0_8-whitegrid", {"font.size": FONT_SIZE, "axes.labelsize": FONT_SIZE}]):
         figure = Figure(figsize=(9.6, 6.2), layout=ConstrainedLayoutEngine(h_pad=0.06, w_pad=0.08))
         axes = figure.subplots(2, 2, sharex=True).ravel()
-    runs, divergence_time = comparison.film.runs, _divergence_time(comparison)
+    runs, divergence = comparison.film.runs, find_divergence(comparison.film.runs)
     trace, ttc = runs.trace, time_to_collision(runs)
+    divergence_time = None if divergence is None else float(trace.time[divergence])
     quantities = {
         "speed [m/s]": trace.speed,
         "gap to the obstacle [m]": np.where(np.isfinite(trace.gap), trace.gap, np.nan),
@@ -172,12 +175,14 @@ def _draw_legend(figure: Figure, comparison: Comparison, divergence_time: float 
     figure.legend(handles=entries, loc="outside lower center", ncols=3, frameon=False)
 
 
-def _divergence_time(comparison: Comparison) -> float | None:
-    """The time at which the speeds of two vehicles diverge [s]; None for a single vehicle or speeds that stay
-    together.
+def find_divergence(runs: SimulationRuns) -> int | None:
+    """The first sample at which the speeds of the original and the changed vehicle have diverged; None if they never
+    do, or if nothing is changed.
     """
-    sample = find_divergence(comparison.film.runs) if len(comparison.rows) > 1 else None
-    return None if sample is None else float(comparison.film.runs.trace.time[sample])
+    trace = runs.trace
+    both = trace.active.all(axis=1)
+    (samples,) = np.nonzero(both & (np.ptp(trace.speed, axis=1) > MIN_DIVERGENCE))
+    return int(samples[0]) if samples.size else None
 
 
 def _heading(comparison: Comparison) -> str:

@@ -8,24 +8,23 @@ import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from itertools import pairwise, product
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from safevar_sumo.errors import SimulationError
-from safevar_sumo.records import FloatArray
 from safevar_sumo.replay.animation import ACTOR_COLOUR, PATH_COLOUR, PERSON_COLOUR, ROAD_COLOUR
-from safevar_sumo.replay.comparison import CHANGED, COLOURS, Comparison
-from safevar_sumo.replay.film import ActorTrack, LaneLine
-from safevar_sumo.replay.scene import FlatScene, crossing_stripes, lay_out_scene, strip_corners
-from safevar_sumo.scenarios import VUT
+from safevar_sumo.replay.comparison import COLOURS, Comparison
+from safevar_sumo.replay.scene import FlatBody, FlatScene, crossing_stripes, lay_out_scene, strip_corners
 from safevar_sumo.sumo.engine import Engine, engine_api, program_path, start_engine, stop_engine
 from safevar_sumo.sumo.network import Network, copied_network
 
 PAUSE = 2.0
 """Pause at the nearest moment and at the end [s]."""
+ORIGIN = 20_000.0
+"""Coordinates of the scene's origin in the window [m]: beside the network, which sumo-gui needs in order to start."""
 ROAD_SPACING = 5.0
 """Space between the two roads [m]."""
 LEGEND_HEIGHT = 1.8
@@ -78,23 +77,17 @@ def show_in_gui(
     SimulationError
         If SUMO cannot load the network, or its window was closed before the end.
     """
-    scene, tracks = lay_out_scene(comparison), comparison.film.tracks
-    heading = np.deg2rad(90 - tracks[VUT].angle[0, 0])
-    leftward = np.array([-np.sin(heading), np.cos(heading)])
-    offsets = [-leftward * row * (scene.view.height + ROAD_SPACING) for row in comparison.rows]
+    scene = lay_out_scene(comparison)
     with _open_window(comparison.network, scene.step) as api:
-        for row, (name, track) in product(comparison.rows, tracks.items()):
-            colour = COLOURS[row] if name == VUT else PERSON_COLOUR if track.is_person else ACTOR_COLOUR
-            _add_actor(api, f"{row}.{name}", track, colour)
-        if len(offsets) > 1:  # SUMO draws only the original's road
-            for i, lane in enumerate(comparison.film.road):
-                _paint_lane(api, f"lane.{i}", lane, offsets[CHANGED])
+        for body in scene.bodies:
+            _add_actor(api, body)
         for row in comparison.rows:
+            _paint_road(api, scene, row)
             api.poi.add(f"legend.{row}", 0, 0, (0, 0, 0, 0), layer=200)
         pauses = {moments.nearest for moments in scene.moments} | {scene.sample_count - 1}
         start = time.monotonic()
         for sample in range(scene.sample_count):
-            _show_sample(api, scene, sample, offsets, heading)
+            _show_sample(api, scene, sample)
             if sample in pauses:
                 if pictures is not None:
                     api.gui.screenshot(VIEW_NAME, str(pictures / f"{sample:04d}.png"))
@@ -141,11 +134,18 @@ def _open_window(network: Network, step: float) -> Iterator[Any]:
             stop_engine(api)
 
 
-def _add_actor(api: Any, name: str, track: ActorTrack, colour: str) -> None:
+def _road_origin(scene: FlatScene, row: int) -> tuple[float, float]:
+    """Where the origin of a row's road is in the window [m]."""
+    return ORIGIN, ORIGIN - row * (scene.view.height + ROAD_SPACING)
+
+
+def _add_actor(api: Any, body: FlatBody) -> None:
     """Add an actor, which is a vehicle in sumo-gui; persons only have another shape."""
-    length, width = (max(track.length, track.width),) * 2 if track.is_person else (track.length, track.width)
+    name = f"{body.row}.{body.name}"
+    colour = COLOURS[body.row] if body.is_vut else PERSON_COLOUR if body.is_person else ACTOR_COLOUR
+    length, width = (max(body.length, body.width),) * 2 if body.is_person else (body.length, body.width)
     api.vehicletype.copy("DEFAULT_VEHTYPE", name)
-    api.vehicletype.setShapeClass(name, "pedestrian" if track.is_person else "evehicle")
+    api.vehicletype.setShapeClass(name, "pedestrian" if body.is_person else "evehicle")
     api.vehicletype.setLength(name, length)
     api.vehicletype.setWidth(name, width)
     api.vehicletype.setColor(name, _rgba(colour))
@@ -155,43 +155,34 @@ def _add_actor(api: Any, name: str, track: ActorTrack, colour: str) -> None:
     api.vehicle.setLaneChangeMode(name, 0)
 
 
-def _paint_lane(api: Any, name: str, lane: LaneLine, offset: FloatArray) -> None:
-    strips = [strip_corners(start, end, lane.width - 0.1) for start, end in pairwise(lane.line)]
-    outlines = {"area": [lane.line], "crossing": list(crossing_stripes(lane))}.get(lane.kind, strips)
-    colour = _rgba({"road": ROAD_COLOUR, "crossing": "#ffffff"}.get(lane.kind, PATH_COLOUR))
-    for i, outline in enumerate(outlines):
-        points = [tuple(point) for point in (outline + offset).tolist()]
-        api.polygon.add(f"{name}.{i}", points, colour, fill=True, layer=2 if lane.kind == "crossing" else 0)
+def _paint_road(api: Any, scene: FlatScene, row: int) -> None:
+    for i, lane in enumerate(scene.road):
+        strips = [strip_corners(start, end, lane.width - 0.1) for start, end in pairwise(lane.line)]
+        outlines = {"area": [lane.line], "crossing": list(crossing_stripes(lane))}.get(lane.kind, strips)
+        colour = _rgba({"road": ROAD_COLOUR, "crossing": "#ffffff"}.get(lane.kind, PATH_COLOUR))
+        for j, outline in enumerate(outlines):
+            points = [tuple(point) for point in (outline + _road_origin(scene, row)).tolist()]
+            layer = ("area", "path", "road", "crossing").index(lane.kind)
+            api.polygon.add(f"lane.{row}.{i}.{j}", points, colour, fill=True, layer=layer)
 
 
-def _show_sample(api: Any, scene: FlatScene, sample: int, offsets: list[FloatArray], heading: float) -> None:
+def _show_sample(api: Any, scene: FlatScene, sample: int) -> None:
     """Show the actors, the camera and the legend at one sample."""
-    comparison, view, trace = scene.comparison, scene.view, scene.comparison.film.runs.trace
-    vut, (cos, sin) = comparison.film.tracks[VUT], (np.cos(heading), np.sin(heading))
-    left = float(view.left_ends[sample])
-    flat = np.array([[x, y] for x in (left, left + view.width) for y in (view.bottom, view.bottom + view.height)])
-    corners = flat @ np.array([[cos, sin], [-sin, cos]]) + [vut.x[0, 0], vut.y[0, 0]]
-    for row, offset in enumerate(offsets):
-        moments = scene.moments[row]
-        now = min(sample, moments.end)
-        for name, track in comparison.film.tracks.items():
-            x, y, angle = (float(values[now, row]) for values in (track.x, track.y, track.angle))
-            if not np.isnan(x):
-                api.vehicle.moveToXY(
-                    f"{row}.{name}", "", 0, x + offset[0], y + offset[1], angle, keepRoute=ANY_POSITION
-                )
-                api.vehicle.setSignals(f"{row}.{name}", BRAKE_LIGHT if name == VUT and trace.brake[now, row] > 0 else 0)
-        is_finished = sample >= (moments.end if moments.nearest is None else moments.nearest)
-        ending = comparison.verdict(row) if is_finished else f"{sample * scene.step:.2f} s"
-        x, y = (corners + offset).mean(axis=0)[0], (corners + offset).min(axis=0)[1] + LEGEND_HEIGHT
-        api.poi.setPosition(f"legend.{row}", x, y)
-        api.poi.setParameter(
-            f"legend.{row}",
-            "words",
-            f"{comparison.name(row)} ({('blue', 'orange')[row]}): {trace.speed[now, row]:.1f} m/s, {ending}",
-        )
-    everything = np.concatenate([corners + offset for offset in offsets])
-    api.gui.setBoundary(VIEW_NAME, *everything.min(axis=0), *everything.max(axis=0))
+    comparison, view = scene.comparison, scene.view
+    for body in scene.bodies:
+        x, y, angle = body.x[sample], body.y[sample], 90 - np.rad2deg(body.heading[sample])
+        if not np.isnan(x):
+            name, (right, up) = f"{body.row}.{body.name}", _road_origin(scene, body.row)
+            api.vehicle.moveToXY(name, "", 0, x + right, y + up, angle, keepRoute=ANY_POSITION)
+            api.vehicle.setSignals(name, BRAKE_LIGHT if scene.brakes(body, sample) else 0)
+    left = view.left_ends[sample]
+    for row in comparison.rows:
+        right, up = _road_origin(scene, row)
+        words = f"{comparison.name(row)} ({('blue', 'orange')[row]}): {scene.reading(row, sample)}"
+        api.poi.setPosition(f"legend.{row}", right + left + view.width / 2, up + view.bottom + LEGEND_HEIGHT)
+        api.poi.setParameter(f"legend.{row}", "words", words)
+    top = ORIGIN + view.bottom + view.height  # `up` is the last road's
+    api.gui.setBoundary(VIEW_NAME, ORIGIN + left, up + view.bottom, ORIGIN + left + view.width, top)
     api.simulationStep()
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import NamedTuple
@@ -11,8 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from safevar_sumo.records import FloatArray
-from safevar_sumo.replay.comparison import CHANGED, Comparison, Moments, find_moments
-from safevar_sumo.replay.film import ActorTrack, Film, LaneLine
+from safevar_sumo.replay.comparison import Comparison, Film, LaneLine, Moments, find_moments
 from safevar_sumo.scenarios import VUT
 
 SEAM_WIDTH = 0.12
@@ -58,7 +57,7 @@ class View(NamedTuple):
     height: float
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class FlatScene:
     """A comparison laid out for drawing; `sample_count` samples, `step` seconds apart."""
 
@@ -78,6 +77,20 @@ class FlatScene:
         last = self.moments[-1]
         return last.nearest if last.nearest is not None else last.end
 
+    def brakes(self, body: FlatBody, sample: int) -> bool:
+        """Whether an actor is the vehicle under test and brakes; after the end of its run, whether it braked then."""
+        now = min(sample, self.moments[body.row].end)
+        return body.is_vut and bool(self.comparison.film.runs.trace.brake[now, body.row] > 0)
+
+    def reading(self, row: int, sample: int) -> str:
+        """Speed and gap of a vehicle, whether it brakes and, from the nearest moment on, how its run ends."""
+        trace, moments = self.comparison.film.runs.trace, self.moments[row]
+        now = min(sample, moments.end)
+        is_finished = sample >= (moments.end if moments.nearest is None else moments.nearest)
+        ending = self.comparison.verdict(row) if is_finished else "brakes" if trace.brake[now, row] > 0 else ""
+        gap = f"gap {max(trace.gap[now, row], 0):.1f} m" if np.isfinite(trace.gap[now, row]) else ""
+        return f"{trace.speed[now, row]:4.1f} m/s  {gap:10}  {ending}"
+
     @property
     def all_marks(self) -> list[int]:
         """The marks that ever come into view, by their distance from the start [m]."""
@@ -94,48 +107,18 @@ def lay_out_scene(comparison: Comparison) -> FlatScene:
     start = np.array([vut.x[0, 0], vut.y[0, 0]])
     all_moments = tuple(find_moments(film.runs, row) for row in comparison.rows)
     sample_count = max(run_moments.end for run_moments in all_moments) + 1
-    bodies = tuple(
-        _lay_out_body(name, track, row, all_moments[row].end, sample_count, rotation, start, turn)
-        for name, track in film.tracks.items()
-        for row in comparison.rows
-        if name == VUT or (_is_near(film, name, row) and not _is_duplicate(comparison, name, row))
-    )
+    bodies = []
+    for name, track in film.tracks.items():
+        for row in comparison.rows:
+            if _is_near(film, name, row):
+                samples = np.minimum(np.arange(sample_count), all_moments[row].end)  # then the actor stays in place
+                x, y = rotation @ (np.stack([track.x[samples, row], track.y[samples, row]]) - start[:, np.newaxis])
+                heading = np.deg2rad(90 - track.angle[samples, row]) - turn
+                body = FlatBody(name, row, name == VUT, track.is_person, track.length, track.width, x, y, heading)
+                bodies.append(body)
     road = tuple(lane._replace(line=(lane.line - start) @ rotation.T) for lane in film.road)
-    return FlatScene(
-        comparison=comparison,
-        step=film.runs.trace.step,
-        sample_count=sample_count,
-        road=road,
-        bodies=bodies,
-        moments=all_moments,
-        view=_choose_view(bodies, sample_count),
-    )
-
-
-def _lay_out_body(
-    name: str,
-    track: ActorTrack,
-    row: int,
-    end: int,
-    sample_count: int,
-    rotation: FloatArray,
-    start: FloatArray,
-    turn: float,
-) -> FlatBody:
-    """An actor until its simulation ends; afterwards the actor stays in place."""
-    samples = np.minimum(np.arange(sample_count), end)
-    x, y = rotation @ (np.stack([track.x[samples, row], track.y[samples, row]]) - start[:, np.newaxis])
-    return FlatBody(
-        name=name,
-        row=row,
-        is_vut=name == VUT,
-        is_person=track.is_person,
-        length=track.length,
-        width=track.width,
-        x=x,
-        y=y,
-        heading=np.deg2rad(90 - track.angle[samples, row]) - turn,
-    )
+    view = _choose_view(bodies, sample_count)
+    return FlatScene(comparison, film.runs.trace.step, sample_count, road, tuple(bodies), all_moments, view)
 
 
 def _is_near(film: Film, name: str, row: int) -> bool:
@@ -145,18 +128,7 @@ def _is_near(film: Film, name: str, row: int) -> bool:
     return bool(np.any(distance < MAX_DISTANCE + track.length))
 
 
-def _is_duplicate(comparison: Comparison, name: str, row: int) -> bool:
-    """Whether the changed vehicle's copy of an actor is always at the same position, so that only this copy is
-    drawn.
-    """
-    if row == CHANGED or len(comparison.rows) == 1:
-        return False
-    track, end = comparison.film.tracks[name], int(comparison.film.last_samples.min()) + 1
-    offset = np.hypot(track.x[:end, 0] - track.x[:end, CHANGED], track.y[:end, 0] - track.y[:end, CHANGED])
-    return _is_near(comparison.film, name, CHANGED) and bool(np.all((offset < MAX_OFFSET) | np.isnan(offset)))
-
-
-def _choose_view(bodies: tuple[FlatBody, ...], sample_count: int) -> View:
+def _choose_view(bodies: Sequence[FlatBody], sample_count: int) -> View:
     """The whole road or, in a long scene, the view of a camera that follows the vehicles."""
     left_end = min(float(np.nanmin(body.x)) - body.length for body in bodies) - MARGIN / 2
     right_end = max(float(np.nanmax(body.x)) + (0 if body.is_vut else body.length) for body in bodies) + MARGIN

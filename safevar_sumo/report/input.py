@@ -19,8 +19,8 @@ from safevar_sumo.analysis.rules import RulesOptions
 from safevar_sumo.analysis.subject import at_point, changes_since
 from safevar_sumo.analysis.tolerance import ToleranceOptions
 from safevar_sumo.records import FloatArray
+from safevar_sumo.replay.animation import player_data
 from safevar_sumo.replay.comparison import Comparison, changes_in_words, compare_setting
-from safevar_sumo.replay.page import player_data
 from safevar_sumo.replay.scene import lay_out_scene
 from safevar_sumo.results import choose_handle, handles_of
 from safevar_sumo.sumo.system import System, assemble

@@ -23,19 +23,17 @@ from safevar_sumo.analysis.research_questions.case import Case, load_cases
 from safevar_sumo.cli.program import commands
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import METRICS
-from safevar_sumo.replay.animation import PANEL_HEIGHT, WIDTH, animate, draw_scene, find_ffmpeg
+from safevar_sumo.replay.animation import PANEL_HEIGHT, WIDTH, animate, animation_page, draw_scene, find_ffmpeg
 from safevar_sumo.replay.comparison import (
     COLOURS,
     Comparison,
     compare_setting,
-    find_divergence,
     find_moments,
     list_differences,
+    record_film,
 )
-from safevar_sumo.replay.figure import draw_comparison
-from safevar_sumo.replay.film import record_film
+from safevar_sumo.replay.figure import draw_comparison, find_divergence
 from safevar_sumo.replay.gui import show_in_gui
-from safevar_sumo.replay.page import animation_page
 from safevar_sumo.replay.scene import FlatScene, lay_out_scene
 from safevar_sumo.results import handles_of
 from safevar_sumo.study import load_study
