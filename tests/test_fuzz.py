@@ -7,7 +7,6 @@ from __future__ import annotations
 import math
 import tempfile
 from collections.abc import Iterator
-from concurrent.futures import Future
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -21,17 +20,15 @@ from hypothesis import strategies as st
 
 import safevar_sumo.cli.study
 from safevar_sumo.ads import Ads, GuardedAds, PerVehicleAds
-from safevar_sumo.campaign.pool import Report, Share
-from safevar_sumo.campaign.share import carry_out_share
 from safevar_sumo.cli.program import commands
 from safevar_sumo.errors import InputError, SafevarError, UserCodeError
-from safevar_sumo.metrics import METRICS
 from safevar_sumo.plugins import Guard
-from safevar_sumo.records import Evaluations, FloatArray, Nominal, Observation, PedalTables
+from safevar_sumo.records import Nominal, Observation, PedalTables
 from safevar_sumo.study import Study, load_study, tables_of
 from safevar_sumo.study.file import drop_nulls
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet
+from tests.campaign.formulas import FormulaPool
 
 TABLES = drop_nulls(tables_of(load_study("smoke")))
 SCALARS = st.one_of(
@@ -225,41 +222,9 @@ SIMULATE = st.lists(
 )
 
 
-class Formula:
-    """A pool whose evaluations cost nothing."""
-
-    workers = 1
-
-    def submit(self, study: bytes, settings: FloatArray) -> Future[Evaluations]:
-        future: Future[Evaluations] = Future()
-        future.set_result(evaluated(study, settings))
-        return future
-
-    def carry(self, share: Share, report: Report) -> Future[None]:
-        future: Future[None] = Future()
-        try:
-            future.set_result(carry_out_share(share, report, evaluated))
-        except Exception as error:
-            future.set_exception(error)
-        return future
-
-
-def evaluated(study: bytes, settings: FloatArray) -> Evaluations:
-    """Evaluations by a formula."""
-    safety = np.abs(settings / SMOKE.original - 1).max(axis=1)
-    return Evaluations(
-        settings=settings,
-        outcome=np.full(len(settings), "stopped", dtype="U16"),
-        collision_speed=np.full(len(settings), np.nan),
-        metrics=dict.fromkeys(METRICS, 1.0 - safety),
-        f_diff=SMOKE.largest_change(settings),
-        f_num_diff=SMOKE.number_changed(settings),
-    )
-
-
 @contextmanager
-def no_pool(*_: object) -> Iterator[Formula]:
-    yield Formula()
+def no_pool(*_: object) -> Iterator[FormulaPool]:
+    yield FormulaPool()
 
 
 def tried(*arguments: str) -> None:

@@ -48,17 +48,6 @@ def test_stored_outputs_are_of_todays_vehicle() -> None:
     results = [text for name in SHOWN for text in texts[name] if text.startswith("<Results of sun")]
     assert len(results) == len(SHOWN)
     assert len(set(results)) == 1
-    traces = {value: sv.simulate("sun", {"tireFric": value}).trace for value in (3.5, 1.5)}
-    begins = {value: trace[trace["brake [-]"] > 0].iloc[0] for value, trace in traces.items()}
-    ways = {value: trace["position [m]"].iloc[-1] - begins[value]["position [m]"] for value, trace in traces.items()}
-    delay, advance = (begins[1.5][name] - begins[3.5][name] for name in ("time [s]", "position [m]"))
-    sentence = (
-        f"brakes {delay:.2f} s later, {advance:.2f} m farther on, and the way to a stop is "
-        f"{ways[1.5] - ways[3.5]:.2f} m longer"
-    )
-    assert sentence in (NOTEBOOKS / "quickstart.ipynb").read_text()
-    degrees = [sv.simulate("sun", {"tireFric": value}).metrics["safety_degree"] for value in (2.0, 3.5, 1.5)]
-    assert degrees == sorted(degrees, reverse=True)  # "down to a friction of 2.0 the vehicle keeps *more* distance"
     assert "SD is below 1.1 in" in "".join(texts["answers"])
     assert all(path.stat().st_size < 500_000 for path in NOTEBOOKS.glob("*.ipynb"))
 

@@ -153,23 +153,6 @@ def test_apollo_asks_for_what_is_needed_to_stand_at_its_gap_through_the_original
         assert command.throttle[0] == 0
 
 
-def test_apollo_cruises_by_its_gain_waits_for_its_first_command_and_holds_after_the_creep() -> None:
-    ads = apollo(jerk=1e4, first_command=0.1, creep_time=0.975)
-    memory = ads.start(1, KNOWN, STEP)
-    command, memory = ads.drive(seen(0.05, 0.0, FAR), memory)
-    assert command.throttle[0] == command.brake[0] == 0
-    command, memory = ads.drive(seen(0.1, 7.0, FAR), memory)
-    assert command.throttle[0] == pytest.approx((1.0 + COASTING) / (FULL + COASTING))
-    _, memory = ads.drive(seen(0.15, 8.0, 10.0), memory)
-    pedals = []
-    for k in range(30):
-        command, memory = ads.drive(seen(0.2 + k * STEP, 0.4, 5.5), memory)
-        pedals.append(float(command.brake[0]))
-    creeping = 19  # steps that take 0.95 s; the twentieth would be beyond
-    assert pedals[:creeping] == [0.0] * creeping
-    assert pedals[-1] == pytest.approx((2.0 - COASTING) / BRAKING), "2 m/s^2 to stay where it stands"
-
-
 @given(speed=st.floats(0, 20), gap=st.floats(0, 100))
 def test_krauss_aims_at_the_speed_from_which_it_can_still_stop(speed: float, gap: float) -> None:
     """v tau + v^2 / (2 b) = gap - standing gap, reached within a step and the vehicle's own lag."""

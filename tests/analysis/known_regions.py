@@ -15,6 +15,7 @@ from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray
 from safevar_sumo.study import CharacteristicTable, Study, load_study
 from safevar_sumo.vehicles import CharacteristicSet
+from tests.made_up import made_up_evaluations
 
 ORIGINAL, LOWER, UPPER = 5.0, 0.0, 10.0
 Region = Callable[[FloatArray], BoolArray]
@@ -57,13 +58,12 @@ class Plant:
         self.seen |= {row.tobytes() for row in settings}
         future: Future[Evaluations] = Future()
         future.set_result(
-            Evaluations(
+            made_up_evaluations(
+                degree,
                 settings=settings,
                 outcome=np.where(fails, "simulator-error", np.where(collides, "collision", "stopped")).astype("U16"),
                 collision_speed=np.where(collides, 1.0, np.nan),
-                metrics={
-                    name: degree if name == "safety_degree" else np.full(len(settings), np.nan) for name in METRICS
-                },
+                metrics={**dict.fromkeys(METRICS, np.full(len(settings), np.nan)), "safety_degree": degree},
                 f_diff=self._characteristics.largest_change(settings),
                 f_num_diff=self._characteristics.number_changed(settings),
             )

@@ -7,8 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from safevar_sumo.analysis.explain.braking_comparison import BrakingComparison, compare_braking, sentence, summarise_run
-from safevar_sumo.records import Encounter, Outcome, SimulationRuns, Trace
+from safevar_sumo.analysis.explain.braking_comparison import BrakingComparison, compare_braking, summarise_run
+from safevar_sumo.records import SimulationRuns
+from tests.made_up import made_up_runs
 
 STEP, OBSTACLE = 0.002, 20.0
 
@@ -16,7 +17,7 @@ STEP, OBSTACLE = 0.002, 20.0
 def drive_of(*vehicles: tuple[float, float, float, float]) -> SimulationRuns:
     """Vehicles of (speed, gap at which the brake is commanded, delay, deceleration) towards an obstacle at 20 m."""
     time = np.arange(0, 8, STEP)
-    columns = []
+    drives = []
     for v, gap, delay, deceleration in vehicles:
         begins = (OBSTACLE - gap) / v
         braking = np.maximum(time - begins - delay, 0.0)
@@ -25,34 +26,14 @@ def drive_of(*vehicles: tuple[float, float, float, float]) -> SimulationRuns:
         place = np.where(
             time < begins + delay, v * time, v * (begins + delay) + v * braking - deceleration * braking**2 / 2
         )
-        columns.append((speed, place, np.where(time >= begins, 1.0, 0.0), np.where(time >= begins + delay, 1.0, 0.0)))
-    speed, place, brake, pedal = (np.stack(part, axis=1) for part in zip(*columns, strict=True))
+        drives.append((speed, place, np.where(time >= begins, 1.0, 0.0), np.where(time >= begins + delay, 1.0, 0.0)))
+    speed, place, brake, pedal = (np.stack(part, axis=1) for part in zip(*drives, strict=True))
     hit = place >= OBSTACLE
     collision_speed = np.where(hit.any(axis=0), speed[np.argmax(hit, axis=0), np.arange(len(vehicles))], np.nan)
     active = np.cumsum(hit, axis=0) <= 1
-    nothing, throttle = np.zeros_like(speed), np.zeros_like(speed)
-    trace = Trace(
-        step=STEP,
-        vehicle_length=5.0,
-        time=time,
-        position=place,
-        speed=speed,
-        gap=OBSTACLE - place,
-        lateral=nothing,
-        lateral_speed=nothing,
-        throttle=throttle,
-        brake=brake,
-        gear=nothing,
-        active=active,
-        pedal=pedal,
-    )
-    outcome = np.where(np.isnan(collision_speed), Outcome.STOPPED.value, Outcome.COLLISION.value)
-    return SimulationRuns(
-        trace=trace,
-        encounter=Encounter(trace.gap, trace.gap, speed, trace.gap > 0),
-        outcome=outcome,
-        collision_speed=collision_speed,
-    )
+    gap, throttle = OBSTACLE - place, np.zeros_like(speed)
+    columns = {"position": place, "throttle": throttle, "brake": brake, "pedal": pedal, "active": active}
+    return made_up_runs(STEP, speed, gap, collision_speed, **columns)
 
 
 def compared(one: tuple[float, float, float, float], other: tuple[float, float, float, float]) -> BrakingComparison:
@@ -106,21 +87,3 @@ def test_an_overshooting_cruise_control_does_not_brake_for_the_obstacle() -> Non
     assert plain is not None
     assert plain.gap == pytest.approx(15.0)
     assert unbraked is None
-
-
-def test_a_creeping_deceleration_is_no_late_pedal() -> None:
-    """Both pedals are down 0.1 s after the command; one vehicle decelerates with 6 m/s^2 at once, the other comes to
-    6 within a second.
-    """
-    runs = drive_of((10.0, 15.0, 0.1, 6.0), (10.0, 15.0, 0.1, 6.0))
-    time, begins = runs.trace.time, 0.5
-    rises = np.clip(time - begins - 0.1, 0.0, None)
-    slower = 10 - np.where(rises < 1, 3 * rises**2, 3 + 6 * (rises - 1))
-    runs.trace.speed[:, 1] = np.maximum(slower, 0.0)
-    runs.trace.position[1:, 1] = np.cumsum((runs.trace.speed[1:, 1] + runs.trace.speed[:-1, 1]) / 2) * STEP
-    runs.trace.gap[:, 1] = OBSTACLE - runs.trace.position[:, 1]
-    comparison = compare_braking(*(summarise_run(runs, column, 1.0) for column in (0, 1)))
-    assert comparison.parts["delay"] == 0
-    assert comparison.parts["deceleration"] == pytest.approx(comparison.lost_margin)
-    assert "later" not in sentence(comparison)
-    assert "decelerates less with the pedal down" in sentence(comparison)

@@ -19,7 +19,6 @@ from rich.console import Console
 
 from safevar_sumo.analysis.evaluator import Evaluator
 from safevar_sumo.analysis.explain import ExplainOptions
-from safevar_sumo.analysis.explain.braking_comparison import BrakingComparison, RunSummary
 from safevar_sumo.analysis.explain.causes import (
     RESOLUTION,
     BoundaryState,
@@ -32,17 +31,14 @@ from safevar_sumo.analysis.explain.causes import (
     select_affordable_rows,
 )
 from safevar_sumo.analysis.explain.compute import explain_failures, summarise_failures
-from safevar_sumo.analysis.explain.result import Explained, Explanation
-from safevar_sumo.analysis.explain.robustness import Robustness
-from safevar_sumo.analysis.explain.sentences import effect_in_words, print_explained, verdict_in_words
-from safevar_sumo.analysis.preventability import Preventability
+from safevar_sumo.analysis.explain.result import Explained
+from safevar_sumo.analysis.explain.sentences import effect_in_words, print_explained
 from safevar_sumo.analysis.research_questions.case import Case, load_cases
 from safevar_sumo.cli.program import commands
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import BoolArray, FloatArray
-from safevar_sumo.results import SolutionId, handles_of
-from safevar_sumo.study import load_study
+from safevar_sumo.results import handles_of
 from safevar_sumo.sumo import assemble, evaluate
 from tests.analysis.known_regions import ORIGINAL, Plant, box, everywhere, made_up_evaluator, made_up_study, two_islands
 from tests.in_process import InlinePool
@@ -314,83 +310,3 @@ def test_more_failures_than_can_be_afforded_are_sampled_and_always_the_same() ->
     assert len(select_affordable_rows(settings, evaluator, 70)) == 10, (
         "of three changes no, one and two of them: 1 + 3 + 3 simulations"
     )
-
-
-SUN = load_study("sun")
-ORIGINALS = {name: table.original for name, table in SUN.vehicle.characteristics.items()}
-
-
-def failure_of(
-    changes: dict[str, float], degree: float, *reasons: str, needed: int = 0, shares: tuple[float, ...] = ()
-) -> Explanation:
-    """A robust failure of `SUN`, with a cause of the first `needed` of its changes for each of these shares."""
-    run, part = (RunSummary("stopped", np.nan, None), dict(list(changes.items())[: needed or len(changes)]))
-    causes = [
-        Cause(
-            changes=part,
-            boundary=part,
-            fraction=1.0,
-            alone=part,
-            outcome="collision",
-            safety_degree=-1.0,
-            neighbours=Robustness({0.05: share}),
-        )
-        for share in shares or (0.98,)
-    ]
-    return Explanation(
-        handle=SolutionId("rs", 0, round(-10 * degree)),
-        setting={**ORIGINALS, **changes},
-        outcome="collision",
-        safety_degree=degree,
-        changed=tuple(changes),
-        causes=tuple(causes),
-        robustness=Robustness({0.05: 0.98}),
-        because=BrakingComparison(run, run, {}),
-        reasons=reasons,
-    )
-
-
-def answer_of(*failures: Explanation) -> Explained:
-    system = assemble(SUN)
-    original, characteristics = evaluate(system, system.characteristics.original[np.newaxis]), system.characteristics
-    return Explained(
-        study=SUN,
-        unsafe=COLLISION,
-        original=original,
-        nearest=original.take([]),
-        explanations=failures,
-        looked_at=9,
-        failures=1,
-        necessity=necessity_frame(characteristics, np.zeros((0, len(ORIGINALS)), dtype=bool), [], 0),
-        analysed=0,
-        otherwise=0,
-        distinct=count_distinct_causes(characteristics, []),
-        preventability=Preventability(counts={}, collisions=0, later=0),
-    )
-
-
-def test_the_verdict_names_the_most_robust_cause_and_says_how_robust_it_is() -> None:
-    one = failure_of(
-        {"tireFric": 1.04, "radius": 32.05, "mass": 2500.0},
-        -1.5,
-        "fewest changes",
-        "smallest robust",
-        needed=2,
-        shares=(0.02, 0.44),
-    )
-    paragraph = " ".join(verdict_in_words(answer_of(one)))
-    assert "a collision at 1.5 m/s, 5 km/h (rs:0:15, robust: 98 % of" in paragraph.lower()
-    assert "; two of them suffice (borderline: only 44 % of the neighbours are unsafe too)." in paragraph
-
-
-def test_the_verdict_leads_with_the_robust_failure_if_it_has_as_few_changes() -> None:
-    severe, robust, larger = (
-        failure_of(changes, degree, reason)
-        for changes, degree, reason in (
-            ({"radius": 32.0}, -3.0, "fewest changes"),
-            ({"radius": 33.0}, -1.0, "smallest robust"),
-            ({"radius": 34.0, "mass": 2600.0}, -1.0, "smallest robust"),
-        )
-    )
-    for other, leads in ((robust, "rs:0:10"), (larger, "rs:0:30")):
-        assert re.findall(r"rs:0:\d+", " ".join(verdict_in_words(answer_of(other, severe)))) == [leads]

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import json
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -12,7 +9,6 @@ from safevar_sumo.analysis.model_spread import compute_model_spreads, prediction
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.matrix import evaluate
 from safevar_sumo.sumo.system import assemble
-from tests.in_process import run
 
 GAP = "ads.parameters.brake_gap"
 OWN = float(load_study("sun").ads.parameters["brake_gap"])
@@ -65,13 +61,3 @@ def test_another_vehicle_or_driver_has_no_spread() -> None:
     other = load_study(load_study("sun", spread={GAP: [OWN, 5.0]}), ads={"model": "full_braking"})
     assert not other.spread
     assert not other.model_error
-
-
-def test_simulate_tells_the_models_own_uncertainty(in_tmp: Path) -> None:
-    Path("mine.toml").write_text(f'extends = "sun"\nname = "mine"\n[spread]\n"{GAP}" = [{OWN}, 8.0]\n')
-    words = ("simulate", "mine.toml", "--set", "tireFric=1.1", "--spread")
-    spread = json.loads(run(*words, "--json").stdout)["spread"]
-    assert spread["sets"] == 2
-    assert spread["lower"] < spread["upper"]
-    assert set(spread["original"]) == {"sets", "lower", "upper", "collisions"}
-    assert "own uncertainty" in " ".join(run(*words).stdout.split())

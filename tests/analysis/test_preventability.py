@@ -214,19 +214,6 @@ def test_a_vehicle_with_half_the_engine_drag_slows_down_while_its_driver_reacts(
     assert np.diff(trace.speed[released:braking, 0])[6:].max() < 0  # 0.3 s later, when the wheels no longer push
 
 
-@pytest.mark.slow
-def test_in_a_matrix_the_worst_point_counts() -> None:
-    """The child that comes out late is hit at twice the speed: full braking avoids it, a competent driver does not."""
-    speeds = {"CPFA": 20, "CPNCO": 40}
-    tests = [
-        msgspec.structs.replace(one, over={}, parameters={**one.parameters, "speed": speeds[one.name]}, weathers=[])
-        for one in STUDY.matrix.tests
-        if one.name in speeds
-    ]
-    study = msgspec.structs.replace(STUDY, ads=BLIND, matrix=msgspec.structs.replace(STUDY.matrix, tests=tests))
-    assert categories(Evaluator(study, InlinePool()), vehicle()) == [PreventableBy.FULL_BRAKING]
-
-
 TESTS = [
     {"name": "CPLA", "model": "along", "over": {"speed": [20, 40]}, "weathers": ["clear", "night"]},
     {"name": "CPFA", "parameters": {"test": "CPFA"}, "over": {"speed": [30]}},

@@ -25,7 +25,6 @@ from safevar_sumo.analysis.risk import RiskOptions
 from safevar_sumo.analysis.rules import RulesOptions
 from safevar_sumo.analysis.tolerance import ToleranceOptions
 from safevar_sumo.cli.program import commands
-from safevar_sumo.errors import InputError
 
 OTHER_DEFAULT = """
 import inspect, pathlib, sys, types
@@ -97,24 +96,6 @@ def test_a_printed_command_asks_for_the_same_options(options: Options) -> None:
         for name, value in vars(options).items()
         if value != getattr(type(options), name)
     )
-
-
-@pytest.mark.parametrize(
-    ("typed", "legal"),
-    [
-        ({"samples": 0}, "at least 1 "),
-        ({"samples": 10.5}, "whole number"),
-        ({"confidence": 1.0}, "below 1"),
-        ({"confidence": float("nan")}, "above 0"),
-        ({"width": True}, "a number"),
-    ],
-)
-def test_python_and_the_command_refuse_the_same_values(typed: dict[str, Any], legal: str) -> None:
-    with pytest.raises(InputError, match=legal):
-        RiskOptions(**typed)
-    ((name, value),) = typed.items()
-    result = CliRunner().invoke(commands, ["risk", "smoke", f"--{name}", str(value)])
-    assert result.exit_code == 2 or (isinstance(result.exception, InputError) and result.exception.exit_code == 2)
 
 
 @pytest.mark.slow

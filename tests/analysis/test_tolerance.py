@@ -24,16 +24,7 @@ from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.results import record, solutions_frame
 from safevar_sumo.study import load_study
-from tests.analysis.known_regions import (
-    Plant,
-    Region,
-    box,
-    diagonal_band,
-    everywhere,
-    made_up_study,
-    nowhere,
-    two_islands,
-)
+from tests.analysis.known_regions import Plant, Region, box, everywhere, made_up_study, nowhere, two_islands
 
 
 def of(
@@ -133,14 +124,6 @@ def test_what_cannot_be_simulated_is_neither_safe_nor_unsafe() -> None:
     assert box.unsafe_at_most == pytest.approx(exact.high)
 
 
-def test_the_box_varies_the_characteristics_that_are_asked_for() -> None:
-    region = lambda rows: (rows[:, 0] > 9) | (rows[:, 2] > 6)  # noqa: E731
-    assert of(3, region).joint.factor == pytest.approx(0.2, rel=0.02)
-    result = of(3, region, characteristics=["a", "b"]).joint
-    assert result.factor == pytest.approx(0.8, rel=0.02)
-    assert result.characteristics == ("a", "b")
-
-
 def test_the_box_holds_no_unsafe_solution_of_a_search() -> None:
     """A sliver that begins half of the way to the domain's end; no scan, no random setting and no corner of the domain
     hits it.
@@ -196,16 +179,6 @@ def test_the_bound_of_the_box_holds_where_every_box_is_as_unsafe(monkeypatch: py
     assert 0 < wrong <= 0.05 * seeds
 
 
-def test_nothing_and_everything() -> None:
-    safe, unsafe = of(2, nowhere, pairs=True), of(2, everywhere, pairs=True)
-    assert safe.verdict == "No single characteristic and no pair makes it unsafe."
-    assert unsafe.verdict == "The original vehicle itself is unsafe."
-    assert unsafe.alone[0].safe is None
-    assert unsafe.alone[0].unsafe == [(0.0, 10.0)]
-    assert unsafe.pairs is not None
-    assert unsafe.pairs[0].unsafe_share == pytest.approx(1)
-
-
 def test_the_promised_record() -> None:
     record = json.loads(json.dumps(of(2, two_islands, pairs=True).to_dict(), allow_nan=False))
     assert list(record) == ["study", "unsafe", "alone", "pairs", "joint"]
@@ -237,20 +210,6 @@ def test_a_box_is_one_rule_of_its_two_conditions() -> None:
     assert result.unsafe_share == pytest.approx(0.09, abs=0.005)
     assert rule.density_interval is not None
     assert rule.density_interval[0] <= rule.density <= rule.density_interval[1]
-
-
-@pytest.mark.slow
-def test_a_region_that_is_no_box_is_covered_with_honest_densities() -> None:
-    result = rules_of(diagonal_band, n=2)
-    fresh = np.random.default_rng(5).uniform(0, 10, (20_000, 2))
-    assert result.rules
-    for rule in result.rules:
-        inside = np.ones(len(fresh), dtype=bool)
-        for name, (low, high) in rule.limits.items():
-            values = fresh[:, "ab".index(name)]
-            inside &= (values >= (low or 0)) & (values <= (10 if high is None else high))
-        assert rule.density_interval is not None
-        assert rule.density_interval[0] - 0.1 <= diagonal_band(fresh)[inside].mean() <= rule.density_interval[1] + 0.1
 
 
 def test_nothing_everything_and_too_little() -> None:

@@ -17,6 +17,7 @@ from safevar_sumo.records import Evaluations
 from safevar_sumo.results import ResultsDirectory
 from safevar_sumo.study import Study, load_study
 from safevar_sumo.vehicles import CharacteristicSet
+from tests.made_up import made_up_evaluations
 
 SUN = CharacteristicSet.of(load_study("sun").vehicle.characteristics)
 
@@ -25,17 +26,13 @@ def evaluated(settings: np.ndarray) -> Evaluations:
     """Settings are safer the nearer they are to the original, measured by the sum of all relative changes."""
     share = (settings - SUN.original) / (SUN.upper - SUN.lower)
     safety = 3.0 - 4.0 * np.add.accumulate(np.abs(share), axis=1)[:, -1]
-    collided = safety <= 0
-    return Evaluations(
+    metrics = {name: np.where(safety <= 0, np.nan, share[:, i]) for i, name in enumerate(METRICS)}
+    return made_up_evaluations(
+        safety,
         settings=settings,
-        outcome=np.where(collided, "collision", "stopped").astype("U16"),
-        collision_speed=np.where(collided, -safety, np.nan),
         f_diff=SUN.largest_change(settings),
         f_num_diff=SUN.number_changed(settings),
-        metrics={
-            name: safety if name == "safety_degree" else np.where(collided, np.nan, share[:, i])
-            for i, name in enumerate(METRICS)
-        },
+        metrics={**metrics, "safety_degree": safety},
     )
 
 

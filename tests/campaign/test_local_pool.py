@@ -7,26 +7,24 @@ import signal
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
-from dataclasses import replace
 
 import msgspec
 import numpy as np
 import psutil
 import pytest
 
-from safevar_sumo.campaign.checks import refuse_unlike_sumo
 from safevar_sumo.campaign.evaluation import pack_study
 from safevar_sumo.campaign.interrupts import defer_interrupts, wait_for_first, wait_for_result
 from safevar_sumo.campaign.local import LocalPool, local_pool
 from safevar_sumo.campaign.pool import PoolLostError, WorkerLostError
 from safevar_sumo.campaign.retrying import RetryingPool, reproduction_command
 from safevar_sumo.errors import EnvironmentFault, InputError, SimulationError, UserCodeError
-from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import Evaluations, Outcome
 from safevar_sumo.study import ModelTable, Origin, Study, load_study
 from safevar_sumo.sumo.matrix import study_at
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet
+from tests.campaign.formulas import evaluated
 
 pytestmark = pytest.mark.usefixtures("worker_processes")
 SMOKE = pack_study(load_study("smoke"))
@@ -113,17 +111,6 @@ def settings(number: int) -> np.ndarray:
     return rows
 
 
-def evaluated(rows: np.ndarray) -> Evaluations:
-    return Evaluations(
-        settings=rows,
-        outcome=np.full(len(rows), "stopped", dtype="U16"),
-        collision_speed=np.full(len(rows), np.nan),
-        metrics={name: rows[:, 0] / 3 for name in METRICS},
-        f_diff=SUN.largest_change(rows),
-        f_num_diff=SUN.number_changed(rows),
-    )
-
-
 class ToldPool:
     """Fails with what `fault` answers to (settings, how often they were tried before)."""
 
@@ -147,28 +134,12 @@ class ToldPool:
         return future
 
 
-def test_settings_that_all_fail_in_sumo_lack_the_users_metrics() -> None:
-    once = evaluated(settings(1))
-    recorded = replace(once, metrics={**once.metrics, "mine": np.array([1.0])})
-    failed = replace(once, outcome=np.array([Outcome.SIMULATOR_ERROR.value], dtype="U16"))
-    refuse_unlike_sumo(STUDY, recorded, failed)
-    with pytest.raises(InputError, match=r"mine is 1\.0 in the recorded scene and 2\.0 in SUMO"):
-        refuse_unlike_sumo(STUDY, recorded, replace(recorded, metrics={**once.metrics, "mine": np.array([2.0])}))
-
-
 def died() -> WorkerLostError:
     return WorkerLostError("the worker process died (exit code -9)")
 
 
 def deadly(*values: float) -> Callable[[np.ndarray, int], Exception | None]:
     return lambda rows, before: died() if np.isin(rows[:, 0], values).any() else None
-
-
-def test_a_batch_that_lost_its_worker_once_is_tried_again() -> None:
-    pool = ToldPool(lambda rows, before: None if before else died())
-    result = RetryingPool(pool, STUDY).submit(b"", settings(8)).result(timeout=5)
-    assert pool.tried == [8, 8]
-    assert result.valid.all()
 
 
 def test_the_setting_that_kills_its_worker_alone_is_told_from_the_others() -> None:
@@ -178,7 +149,7 @@ def test_the_setting_that_kills_its_worker_alone_is_told_from_the_others() -> No
     assert np.array_equal(result.valid, ~np.isin(settings(8)[:, 0], (4302, 4305)))
     assert result.outcome[2] == Outcome.SIMULATOR_ERROR
     assert np.isnan(result.objectives[2, 0])
-    assert np.array_equal(result.f_safe[result.valid], settings(8)[result.valid, 0] / 3)
+    assert np.array_equal(result.f_safe[result.valid], evaluated(settings(8)).f_safe[result.valid])
     assert np.array_equal(result.f_num_diff, SUN.number_changed(settings(8)))
     assert pool.tried == [8, 8] + [1] * (6 + 2 * 3), "each alone, the original, and once more"
 
@@ -227,10 +198,3 @@ def test_the_command_that_reproduces_a_setting_keeps_small_changes_and_the_point
     rated = load_study("euro_ncap_rating")
     cell = assemble(rated).matrix[3].name
     assert f"--point '{cell}'" in reproduced(study_at(rated, cell, "test"))
-
-
-def test_settings_that_fail_one_after_the_other_without_end_are_a_fault_of_the_study() -> None:
-    pool = RetryingPool(ToldPool(deadly(*4300 + np.arange(40))), STUDY)
-    assert not pool.submit(b"", settings(19)).result(timeout=5).valid.any()
-    with pytest.raises(WorkerLostError, match="exit code -9"):
-        pool.submit(b"", settings(2)).result(timeout=5)

@@ -106,18 +106,6 @@ def test_trace_has_every_quantity_with_its_unit(study: str, in_tmp: Path) -> Non
     assert np.allclose(np.diff(frame["speed [m/s]"]) / step, frame["acceleration [m/s^2]"][1:])
 
 
-@pytest.mark.parametrize("where", ["__init__", "drive"])
-def test_an_ads_that_exits_is_a_fault_and_no_success(where: str, in_tmp: Path) -> None:
-    arguments = {"__init__": "self", "drive": "self, seen"}[where]
-    Path("my_ads.py").write_text(
-        "import sys\nfrom safevar_sumo.ads import ScalarAds\n\n\nclass Careful(ScalarAds):\n"
-        "    def drive(self, seen):\n        return 0.5, 0.0\n\n"
-        f"    def {where}({arguments}):\n        sys.exit(3)\n"
-    )
-    Path("mine.toml").write_text('extends = "sun"\nname = "mine"\n[ads]\nmodel = "my_ads:Careful"\n')
-    refused("simulate", "mine.toml", message=("my_ads:Careful", "SystemExit", "my_ads.py:10"))
-
-
 def test_an_ads_that_closes_standard_output_ends_in_one_line(in_tmp: Path) -> None:
     Path("my_ads.py").write_text(
         "import sys\nfrom safevar_sumo.ads import ScalarAds\n\n\nclass Careful(ScalarAds):\n"

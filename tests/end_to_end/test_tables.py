@@ -93,16 +93,6 @@ def test_imported_solutions_are_filtered_and_counted_anew(imported: Path) -> Non
     assert set(frame.loc[frame["safety_degree"] > 0, "outcome"]) == {"unknown"}
 
 
-def test_imported_results_answer_what_needs_no_runs(imported: Path) -> None:
-    output = run("tables", str(imported)).stdout
-    assert "igd, igd_plus and hypervolume need runs" in output
-    assert "sun: is imported" in output
-    refused("tables", str(imported), "--rq", "rq3.1", message=("sun", "imported"))
-    done = run("figures", str(imported), "--out", "pictures")
-    assert len(done.stdout.split()) == 3
-    assert "imported" in done.stderr
-
-
 def test_an_unfinished_campaign_is_answered_as_far_as_it_went(results: Path, in_tmp: Path) -> None:
     shutil.copytree(results, "part")
     Path("part/runs/rs-01.jsonl").unlink()

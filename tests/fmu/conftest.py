@@ -9,7 +9,7 @@ import pytest
 
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.system import System, assemble
-from tests.fmu.exported import CART, SEEN, SMALL, SMALL_3, VEHICLE, aeb, exported
+from tests.fmu.exported import SEEN, SMALL, SMALL_3, VEHICLE, aeb, exported
 
 NATIVE = """
 extends = "native"
@@ -37,20 +37,6 @@ model = "Small.fmu"
 parameters = { where = 1e9 }
 inputs = { gap = "gap", speed = "speed" }
 outputs = { acceleration = "pedal" }
-"""
-QUICK_PLANT = """
-extends = "native"
-name = "cart"
-[vehicle]
-kind = "fmu"
-model = "Cart.fmu"
-inputs = { throttle = "accelerator", brake = "brake_pedal" }
-outputs = { speed = "v" }
-sumo_type = { mass = 1500, accel = "power", decel = "grip", max_speed = "top" }
-[vehicle.characteristics]
-power = { unit = "m/s^2", lower = 2.0, upper = 4.0 }
-grip = { unit = "m/s^2", lower = 5.0, upper = 9.0 }
-top = { unit = "m/s", lower = 20.0, upper = 40.0 }
 """
 PLANT = """
 extends = "native_aeb.toml"
@@ -84,9 +70,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
         for name, row in study.vehicle.characteristics.items()
     )
     exported(SMALL.format(then="self.pedal = 8.0 - self.speed if self.gap > 15 else -9.0"), folder, "small")
-    exported(CART, folder, "cart")
     (folder / "small.toml").write_text(QUICK_ADS)
-    (folder / "cart.toml").write_text(QUICK_PLANT)
     (folder / "exported_aeb.toml").write_text(ADS)
     (folder / "exported_vehicle.toml").write_text(PLANT + rows)
     return folder

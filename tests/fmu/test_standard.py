@@ -223,8 +223,8 @@ def test_a_vehicle_of_another_step_is_where_its_line_between_two_points_is_and_g
 
 
 SETTINGS = 200
-SIMULATIONS = 10_000
-MOST_MEMORY = 20e6
+SIMULATIONS = 2_000
+MOST_MEMORY = 8e6
 """Largest growth of the memory of all processes over these simulations [bytes]."""
 
 
@@ -255,9 +255,8 @@ def test_an_exported_model_drives_as_the_original(made: Path, name: str) -> None
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["small", "cart"])
-def test_ten_thousand_simulations_leave_nothing_behind(made: Path, name: str) -> None:
-    system = assemble(load_study(str(made / f"{name}.toml")))
+def test_two_thousand_simulations_leave_nothing_behind(made: Path) -> None:
+    system = assemble(load_study(str(made / "small.toml")))
     members = system.characteristics
     settings = members.filter(np.random.default_rng(6).uniform(members.lower, members.upper, (SETTINGS, len(members))))
     first = evaluate(system, settings).f_safe
@@ -266,6 +265,5 @@ def test_ten_thousand_simulations_leave_nothing_behind(made: Path, name: str) ->
     before = memory()
     for _ in range(SIMULATIONS // SETTINGS):
         last = evaluate(system, settings).f_safe
-    print(f"{name}: {(memory() - before) / 1e6:.1f} MB")
     assert memory() - before < MOST_MEMORY
     np.testing.assert_array_equal(last, first)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from safevar_sumo.ads import Ads, PerVehicleAds, ScalarAds
+from safevar_sumo.ads import Ads
 from safevar_sumo.api.running import carry_out_runs
 from safevar_sumo.campaign import all_runs
 from safevar_sumo.errors import InputError, UserCodeError
@@ -240,22 +240,3 @@ def test_a_vehicle_that_diverges_before_its_end_is_an_error_in_every_batch(speed
         for settings in (BOTH[:1], BOTH):
             with pytest.raises(InputError, match=f"speed (is|=) {speed}".replace(".", r"\.")):
                 evaluate(system, settings)
-
-
-class Ends(ScalarAds):
-    """Drives one vehicle, and fails when it is called after its collision."""
-
-    has_collided = False
-
-    def drive(self, seen: Any) -> tuple[float, float]:
-        if self.has_collided:
-            raise ValueError("the drive is over")
-        self.has_collided = seen.gap < 0
-        return 1.0, 0.0
-
-
-def test_an_ads_for_one_vehicle_is_not_asked_after_the_end() -> None:
-    system = replace(NATIVE, ads=PerVehicleAds(Ends, GUARD))
-    slow = np.where(np.arange(len(ORIGINAL)) == NATIVE.characteristics.names.index("accel"), 2.0, ORIGINAL)
-    settings = np.stack([ORIGINAL, slow])
-    assert bits(evaluate(system, settings).take([0])) == bits(evaluate(system, settings[:1]))

@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 import os
-import shutil
 import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
-import openpyxl
 import pytest
 
 from safevar_sumo.analysis.rating.compute import RatedVehicle, rate
 from safevar_sumo.analysis.rating.workbook import PreprocessedFile, Template
-from safevar_sumo.errors import InputError
 from safevar_sumo.protocol import EURO_NCAP_2026, points_of, protocol_of
 from safevar_sumo.records import CellResults
 from safevar_sumo.study import load_study
@@ -116,27 +113,6 @@ def test_the_original_half_the_brakes_the_worst_wear_and_who_never_brakes(
         agrees(vehicle, calculator, template, tmp_path / str(number))
     assert result.original.points > result.vehicles[1].points > result.vehicles[2].points
     assert idle.original.points == 0
-
-
-def test_other_cells_and_sheets_are_refused_by_name(template: Path, tmp_path: Path) -> None:
-    for sheet, cell, value, message in (
-        ("FC - Car & PTW pred.", "A3", "15 km/h", "A3"),
-        ("FC - Ped & Cyc pred.", "A72", "CPNX day", "A72"),
-        ("FC - Ped & Cyc robust. pred.", "B3", "Velocity", "B3"),
-        ("Version", "B1", "5.9.0", "Version"),
-    ):
-        book = openpyxl.load_workbook(shutil.copy(template, tmp_path / "other.xlsx"))
-        book[sheet][cell] = value
-        book.save(tmp_path / "other.xlsx")
-        with pytest.raises(InputError, match=message):
-            Template(tmp_path / "other.xlsx", tmp_path / "out.xlsx")
-    book = openpyxl.load_workbook(template)
-    del book["FC - Car & PTW pred."]
-    book.save(tmp_path / "other.xlsx")
-    with pytest.raises(InputError, match=r"has no sheet 'FC - Car & PTW pred\.'"):
-        Template(tmp_path / "other.xlsx", tmp_path / "out.xlsx")
-    with pytest.raises(InputError, match=r"has no sheet 'FC - Car & PTW verif.'"):
-        PreprocessedFile(template, tmp_path / "out.xlsx")
 
 
 def test_the_pages_commands_run_as_typed(

@@ -4,7 +4,6 @@ process.
 
 from __future__ import annotations
 
-import re
 from io import StringIO
 from types import SimpleNamespace
 from typing import Any
@@ -19,8 +18,6 @@ from safevar_sumo.analysis.evaluator import Evaluator
 from safevar_sumo.analysis.explain import ExplainOptions
 from safevar_sumo.analysis.explain.compute import compare_at_cells, explain_failures, summarise_failures
 from safevar_sumo.analysis.explain.sentences import print_explained
-from safevar_sumo.analysis.rating import RatingOptions, compute
-from safevar_sumo.analysis.rating.render import colour_changes_in_words, matrices_figure, print_matrices, print_rating
 from safevar_sumo.analysis.tolerance import ToleranceOptions
 from safevar_sumo.analysis.tolerance.compute import find_tolerances
 from safevar_sumo.protocol import EURO_NCAP_2026, protocol_of, rater
@@ -122,20 +119,3 @@ def test_only_cells_of_a_worse_colour_explain_a_failure(monkeypatch: pytest.Monk
     ((comparison, worse_cells),) = compare_at_cells(evaluator, original, original)
     assert worse_cells == (matrix[0].name, matrix[4].name)
     assert comparison.point == matrix[4].name
-
-
-@pytest.mark.slow
-def test_a_rating_prints_draws_and_stands_in_a_page() -> None:
-    result = compute.rate_variant(STUDY, RatingOptions(changes={"brakeTorque": 0.5}), pool=TwoWorkers())
-    assert result.lost > 0
-    turned = dict(colour_changes_in_words(result))
-    assert set(turned) <= {matrix.name for matrix in result.protocol.matrices}
-    assert re.search(r"green to \w+ at (\d+ and )?80 km/h \(\d+ cells\)", turned["CCRs"])
-    console = Console(record=True, width=80, file=StringIO())
-    print_rating(console, result)
-    print_matrices(console, result)
-    text = console.export_text()
-    assert "loses" in text
-    assert "G>" in text
-    assert matrices_figure(result).get_axes()
-    assert result.to_frame().groupby("vehicle")["total"].sum().loc["variant"] == pytest.approx(result.variant.points)  # type: ignore[union-attr]

@@ -15,6 +15,7 @@ from safevar_sumo.reference.agreement import measure_agreement, rank_correlation
 from safevar_sumo.reference.rows import ReferenceData, package_filter, read_reference
 from safevar_sumo.study import Study, load_study
 from safevar_sumo.vehicles import Characteristic, CharacteristicSet
+from tests.made_up import made_up_evaluations
 
 ONE = CharacteristicSet((Characteristic(name="c", unit="kg", original=5.0, lower=1.0, upper=9.0),))
 
@@ -34,15 +35,8 @@ def reference(safety: list[float], tet: list[float]) -> ReferenceData:
 
 def here(safety: list[float], tet: list[float]) -> Evaluations:
     data = reference(safety, tet)
-    values, collided = data.metrics["safety_degree"], data.collided
-    return Evaluations(
-        settings=data.settings,
-        outcome=np.where(collided, "collision", "stopped"),
-        f_diff=values * 0,
-        collision_speed=np.where(collided, -values, np.nan),
-        f_num_diff=values * 0,
-        metrics={**data.metrics, "ave_dece": np.ones(len(values))},
-    )
+    metrics = {**data.metrics, "ave_dece": np.ones(len(safety))}
+    return made_up_evaluations(safety, settings=data.settings, metrics=metrics)
 
 
 def test_every_number_is_what_it_says() -> None:

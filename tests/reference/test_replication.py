@@ -14,8 +14,7 @@ from click.testing import CliRunner, Result
 
 from safevar_sumo.analysis.research_questions.case import load_cases
 from safevar_sumo.cli.program import commands
-from safevar_sumo.reference import agreement
-from safevar_sumo.reference.agreement import Agreement, rank_correlation, shipped_totals_of, write_totals
+from safevar_sumo.reference.agreement import rank_correlation, shipped_totals_of
 from safevar_sumo.reference.conclusions import (
     DIFFERS,
     HOLDS,
@@ -25,7 +24,6 @@ from safevar_sumo.reference.conclusions import (
     draw_conclusions,
     judge_test,
 )
-from safevar_sumo.report.background import describe_agreement
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo import simulate
 from safevar_sumo.sumo.batch import score
@@ -143,65 +141,6 @@ def test_the_page_has_both_sides_and_says_what_is_missing(sides: Path) -> None:
         typed("replicate", sides / "one", "--published", sides / "other").output
         == typed("replicate", "--published", sides / "other", "--reference", "--", sides / "one").output
     )
-
-
-@pytest.mark.parametrize(
-    ("arguments", "problem"),
-    [
-        (("one", "--published", "rain"), "none of sun"),
-        (("one", "same", "--published", "other"), "two results of a study"),
-        (("one", "rain", "--published", "other", "wet", "--reference", "rs.csv"), "may belong to any of sun, rain"),
-        (("one", "--published", "other", "--reference", "nowhere.csv"), "cannot be read"),
-    ],
-)
-def test_what_cannot_be_held_against_each_other_is_refused(
-    sides: Path, arguments: tuple[str, ...], problem: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(sides)
-    done = typed("replicate", *arguments)
-    assert problem in str(done.exception)
-
-
-MADE_UP = Agreement(
-    rows=80,
-    spearman={"safety_degree": 0.61234, "tet": None},
-    mean_absolute_error={"safety_degree": 0.25},
-    bias={},
-    collisions={"reference": 40, "here": 20, "both": 10},
-    original={},
-    precision=0.5,
-    recall=0.25,
-    collision_speed={},
-    in_repeats={},
-    undecided={},
-    by_predicted=[],
-)
-
-
-@pytest.fixture
-def totals(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The only entry is made up: 10 of 40 published collisions collide here, which are half of the 20 here."""
-    path = tmp_path / "totals.toml"
-    write_totals(path, load_study("rain"), "made_up.csv", MADE_UP)
-    monkeypatch.setattr(agreement, "SHIPPED_TOTALS", path)
-    return path
-
-
-def test_the_page_says_how_well_the_study_agrees_with_every_file(totals: Path) -> None:
-    worse = Agreement(**{**MADE_UP.to_dict(), "rows": 90, "spearman": {"safety_degree": 0.1}})
-    write_totals(totals, load_study("rain"), "worse.csv", worse)
-    sentence = describe_agreement(load_study("rain", title="Mine", search={"seed": 5, "evaluations": 100}))
-    for words in (
-        "made_up.csv, 80 vehicles",
-        "mean error is 0.25 m",
-        "rank correlation of the safety degrees is 0.61 (1: the same order, 0: none)",
-        "10 of the 40 published collisions",
-        "recall 0.25",
-        "precision 0.50",
-        "worse.csv, 90 vehicles",
-        "is 0.10",
-    ):
-        assert words in sentence
 
 
 def test_what_ships_is_what_the_trust_page_says() -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import html
 import json
 import re
@@ -14,17 +13,13 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import numpy as np
 import pytest
 from click.testing import CliRunner
 
 from safevar_sumo.ads.reference_drivers import FullBraking
-from safevar_sumo.analysis.explain.causes import Cause
 from safevar_sumo.analysis.explain.result import Explained
 from safevar_sumo.analysis.explain.sentences import counts_in_words, effect_in_words, verdict_in_words
-from safevar_sumo.analysis.preventability import Preventability, PreventableBy
 from safevar_sumo.analysis.research_questions.case import load_cases
-from safevar_sumo.analysis.tolerance.answer import SafeBox, Tolerance
 from safevar_sumo.campaign import local
 from safevar_sumo.cli.program import commands
 from safevar_sumo.errors import InputError
@@ -33,7 +28,6 @@ from safevar_sumo.report import SECTIONS, make_report
 from safevar_sumo.report import input as report_input
 from safevar_sumo.report import page as report_page
 from safevar_sumo.report.background import describe_conditions
-from safevar_sumo.report.causes import make_verdict
 from safevar_sumo.report.page import read_inputs
 from safevar_sumo.results.manifest import write_manifest
 from safevar_sumo.scenarios import Point, weather_of
@@ -169,28 +163,6 @@ def test_every_figure_has_its_values_beside_it(page: str, explained: Explained) 
 
 
 @pytest.mark.slow
-def test_the_key_figures_are_those_of_the_answers(slippery: Path, explained: Explained) -> None:
-    (data,) = read_inputs([slippery])
-    counts = {PreventableBy.COMPETENT_DRIVER: 9996, PreventableBy.NOBODY: 4}
-    shares = dataclasses.replace(explained, preventability=Preventability(counts=counts, collisions=10_000, later=3900))
-    box = SafeBox(0.42, 0.95, 1024, 0, 1, 0.003, ("mass",))
-    tolerated = Tolerance(
-        study=explained.study, unsafe=explained.unsafe, original=explained.original, alone=[], pairs=None, joint=box
-    )
-    figures = make_verdict(data, shares, tolerated)["key_figures"]
-    robust = explained.by_reason["smallest robust"]
-    assert figures[0][1:] == (
-        f"{len(robust.changed)} change{'s' if len(robust.changed) > 1 else ''}",
-        str(robust.robustness),
-    )
-    assert figures[2][1:] == (
-        "nearly all (39 % if he needs 0.4 s longer)",
-        "in the same vehicle; 10000 collisions analysed",
-    )
-    assert figures[3][1] == "42.0 % of the way"
-
-
-@pytest.mark.slow
 def test_every_replay_that_is_linked_is_there_and_hits_as_recorded(page: str, slippery: Path) -> None:
     (data,) = read_inputs([slippery])
     players = re.findall(
@@ -275,25 +247,6 @@ def test_a_study_that_cannot_be_simulated_has_no_page(slippery: Path, tmp_path: 
     write_manifest(tmp_path / "copy", manifest)
     with pytest.raises(InputError, match="gone"):
         make_report([tmp_path / "copy"], only=["tested"], jobs=1)
-
-
-@pytest.mark.slow
-def test_of_an_original_that_collides_no_change_is_called_the_cause(
-    slippery: Path, explained: Explained, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    run = dataclasses.replace(
-        explained.original, outcome=np.array(["collision"]), metrics={"safety_degree": np.array([-3.9])}
-    )
-    none = Cause(changes={}, boundary={}, fraction=0.0, alone={}, outcome="collision", safety_degree=-3.9)
-    failures = tuple(dataclasses.replace(failure, causes=(none,)) for failure in explained.explanations)
-    monkeypatch.setattr(
-        report_page,
-        "explain_failures",
-        lambda *_, **__: dataclasses.replace(explained, original=run, nearest=run, explanations=failures),
-    )
-    page = make_report([slippery], only=["verdict", "causes"], jobs=1)
-    assert "the original vehicle itself collides, at 3.9 m/s, 14 km/h. No change is needed for it to be unsafe." in page
-    assert "Cause 1" not in page
 
 
 @pytest.mark.parametrize(

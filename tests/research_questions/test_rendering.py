@@ -6,34 +6,23 @@ import dataclasses
 import json
 import shutil
 import subprocess
-from collections.abc import Iterator
-from itertools import combinations
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
-from matplotlib.text import Text
 
 from safevar_sumo.analysis.research_questions.answer import answer_questions
 from safevar_sumo.analysis.research_questions.case import Case
-from safevar_sumo.analysis.research_questions.change_figures import draw_change_counts
-from safevar_sumo.analysis.research_questions.gallery import COUNTS_FIGURE, FIGURES_OF_ONE_CASE
 from safevar_sumo.analysis.research_questions.layout import PAPER_LAYOUTS, Layouts
 from safevar_sumo.analysis.research_questions.tables import (
-    FORMATS,
     FORMATS_WITH_LAYOUT,
     as_json,
     as_latex,
-    as_markdown,
     as_text,
     escaped_for_latex,
 )
-from safevar_sumo.study import CharacteristicTable, load_study
-from safevar_sumo.vehicles import CharacteristicSet
-from tests.research_questions.made_up import CHARACTERISTICS, made_up, made_up_study, row
+from safevar_sumo.study import CharacteristicTable
+from tests.research_questions.made_up import made_up, made_up_study, row
 from tests.research_questions.test_questions import three_algorithms
 
 
@@ -137,16 +126,6 @@ def test_json_records_have_the_promised_keys(question: str, keys: str) -> None:
         )
 
 
-def test_significant_and_notable_cells_stand_out() -> None:
-    result = answer_questions([made_up(*(row(run=i % 8, sd=1 - i / 100) for i in range(30)))], "rq1")
-    assert "<0.001*  0.000*" in as_text(result)
-    assert r"\textbf{<0.001} & \textbf{0.000}" in as_latex(result)
-    assert r"**\<0.001** | **0.000**" in as_markdown(result)
-    assert "<0.001 / 0.000*" in as_text(result, PAPER_LAYOUTS)
-    even = as_text(answer_questions([made_up(row(sd=1), row(sd=3))], "rq1")).splitlines()
-    assert next(line for line in even if " SD " in line).count("*") == 0
-
-
 @pytest.mark.parametrize("layouts", [None, PAPER_LAYOUTS])
 def test_pooled_solutions_of_too_few_runs_do_not_stand_out_either(layouts: Layouts | None) -> None:
     """As at the end of a study: seven runs are too few for RQ1, five are enough for RQ2, whatever the number of
@@ -176,70 +155,7 @@ def test_a_large_effect_of_too_few_runs_does_not_stand_out(question: str) -> Non
     assert r"\textbf" not in document
 
 
-@pytest.mark.parametrize("kind", list(FORMATS))
-def test_what_cannot_be_told_is_never_a_nan(kind: str) -> None:
-    cases = [made_up(row(sd=-1), row("rs", tet=None, ave_dece=None), original={"safety_degree": 0.5})]
-    assert "nan" not in FORMATS[kind](answer_questions(cases)).lower()
-
-
 def test_every_rendering_has_every_effect() -> None:
     answers = answer_questions([three_algorithms()])
     for output in (render(answers) for render in FORMATS_WITH_LAYOUT.values()):
         assert all(f"{effect:.3f}" in output for answer in answers for effect in answer.frame.get("effect_size", ()))
-
-
-def random_case(name: str) -> Case:
-    """A shipped study's characteristics, some with long names, and three algorithms."""
-    rng, study = np.random.default_rng(4), load_study(name)
-    characteristics = CharacteristicSet.of(study.vehicle.characteristics)
-    rows = [
-        row(algorithm, run, sd=rng.uniform(-5, 11))
-        for algorithm in study.search.algorithms
-        for run in range(3)
-        for _ in range(100)
-    ]
-    base = made_up(
-        *rows,
-        original={"safety_degree": 10.1},
-        study=study,
-        evaluations=[{**one, "evaluation": i % 100} for i, one in enumerate(rows)],
-    )
-    drawn = rng.uniform(characteristics.lower, characteristics.upper, (len(rows), len(characteristics)))
-    drawn = np.where(rng.random(drawn.shape) < 0.5, drawn, characteristics.original)
-    values = {**dict(zip(characteristics.names, drawn.T, strict=True)), "f_diff": characteristics.largest_change(drawn)}
-    return dataclasses.replace(base, solutions=base.solutions.drop(columns=list(CHARACTERISTICS)).assign(**values))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", [COUNTS_FIGURE, *FIGURES_OF_ONE_CASE])
-def test_axes_are_labelled_and_no_text_lies_on_another(name: str) -> None:
-    case = three_algorithms() if name == "critical-differences" else random_case("lgsvl")
-    figure = draw_change_counts([case]) if name == COUNTS_FIGURE else FIGURES_OF_ONE_CASE[name](case)
-    FigureCanvasAgg(figure).draw()
-    for axis in figure.axes:
-        if axis.axison and axis.get_label() != "<colorbar>":
-            assert axis.get_xlabel()
-            assert axis.get_ylabel() or figure.get_supylabel()
-    boxes = [
-        (text.get_text(), text.get_window_extent())
-        for text in _texts(figure)
-        if text.get_visible() and text.get_text().strip()
-    ]
-    assert len(boxes) > 8
-    for (first, box), (second, other) in combinations(boxes, 2):
-        lower, upper = (one.padded(0, -0.1 * one.height) for one in (box, other))
-        assert not lower.overlaps(upper), f"{first!r} and {second!r}"
-    for words, box in boxes:
-        assert min(box.x0, box.y0, figure.bbox.x1 - box.x1, figure.bbox.y1 - box.y1) > -1, f"{words!r} is cut off"
-
-
-def _texts(figure: Figure) -> Iterator[Text]:
-    """Every text that is drawn; ticks beyond an axis's ends exist but are not."""
-    yield from figure.texts
-    for legend in figure.legends:
-        yield from legend.get_texts()
-    for axes in (axes for axes in figure.axes if axes.axison):
-        yield from (axes.title, axes.xaxis.label, axes.yaxis.label, *axes.texts)
-        for axis in (axes.xaxis, axes.yaxis):
-            low, high = sorted(axis.get_view_interval())
-            yield from (tick.label1 for tick in axis.get_major_ticks() if low - 1e-9 <= tick.get_loc() <= high + 1e-9)

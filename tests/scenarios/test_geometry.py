@@ -10,6 +10,7 @@ from safevar_sumo.scenarios import Lane
 from safevar_sumo.scenarios.lead_vehicle_stopped import LeadVehicleStopped
 from safevar_sumo.scenarios.pedestrian_crossing import PedestrianCrossing
 from safevar_sumo.scenarios.target import EncounterConstants, Target, scene_of
+from tests.made_up import made_up_runs
 
 STEP, LENGTH, LANE, PATH, WIDTH = 0.05, 5.0, 14.0, 40.0, 0.5
 
@@ -110,38 +111,24 @@ def test_a_vehicle_has_avoided_a_target_ahead_once_it_has_approached_at_half_a_m
     assert over == [False, False, False, avoids], "who keeps its distance from the start has not avoided anything"
 
 
-def trace(gap: np.ndarray, speed: np.ndarray, lateral: np.ndarray, lateral_speed: np.ndarray) -> Trace:
-    columns = {
-        name: values[:, np.newaxis]
-        for name, values in {"gap": gap, "speed": speed, "lateral": lateral, "lateral_speed": lateral_speed}.items()
-    }
-    nothing = np.zeros_like(columns["gap"])
-    unused = {
-        name: nothing
-        for name in Trace.__dataclass_fields__
-        if name not in (*columns, "step", "vehicle_length", "time", "active")
-    }
-    return Trace(
-        step=STEP, vehicle_length=LENGTH, time=STEP * np.arange(len(gap)), active=nothing == 0, **columns, **unused
-    )
+def trace(gap: list[float], speed: list[float], lateral: list[float], lateral_speed: list[float]) -> Trace:
+    columns = (np.array(values)[:, np.newaxis] for values in (speed, gap, lateral, lateral_speed))
+    v, gaps, across, across_speed = columns
+    return made_up_runs(STEP, v, gaps, lateral=across, lateral_speed=across_speed).trace
 
 
 def test_closing_speed_of_a_pedestrian_has_both_speeds_along_the_line_of_sight() -> None:
     """Vehicle's centre at (0, 0), pedestrian at (4, -3): distance 5, cos(theta) = 0.8; v cos + v_ped sin = 0.8 * 6 +
     0.6 * 1.5.
     """
-    encounter = PedestrianCrossing().encounter(
-        trace(np.array([4.0 - LENGTH / 2]), np.array([6.0]), np.array([-3.0]), np.array([1.5]))
-    )
+    encounter = PedestrianCrossing().encounter(trace([4.0 - LENGTH / 2], [6.0], [-3.0], [1.5]))
     assert encounter.distance[0, 0] == pytest.approx(5.0 - LENGTH / 2)
     assert encounter.closing_speed[0, 0] == pytest.approx(0.8 * 6 + 0.6 * 1.5)
     assert encounter.separation[0, 0] == pytest.approx(4.0 - LENGTH / 2)
 
 
 def test_a_parked_vehicle_is_separated_by_centres_and_closed_in_on_by_bumpers() -> None:
-    encounter = LeadVehicleStopped().encounter(
-        trace(np.array([3.0, -0.1]), np.array([2.0, 2.0]), np.zeros(2), np.zeros(2))
-    )
+    encounter = LeadVehicleStopped().encounter(trace([3.0, -0.1], [2.0, 2.0], [0.0, 0.0], [0.0, 0.0]))
     assert encounter.separation[:, 0].tolist() == [3.0 + LENGTH, -0.1 + LENGTH]
     assert encounter.distance[:, 0].tolist() == [3.0, -0.1]
     assert encounter.closing_speed[:, 0].tolist() == [2.0, 2.0]

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from safevar_sumo.records import Outcome
-from safevar_sumo.scenarios import WEATHERS, Along, CarToCar, Crossing, Point, pre_crash_sentence
+from safevar_sumo.scenarios import WEATHERS, Along, CarToCar, Crossing, Point
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo import Engine
 from safevar_sumo.sumo.matrix import simulate_all_points
@@ -264,26 +264,6 @@ def test_the_originals_avoid_every_shipped_point_and_with_half_their_brakes_some
     )
     assert not collided[:, 0].any()
     assert collided[:, 1].any()
-
-
-PEDESTRIAN = "pedestrian crash without prior vehicle manoeuvre"
-
-
-@pytest.mark.parametrize(
-    ("study", "types"),
-    [
-        ("sun", "pedestrian crash with prior vehicle manoeuvre; by day"),
-        ("lgsvl", "lead vehicle stopped; by day"),
-        ("euro_ncap_pedestrian", f"{PEDESTRIAN}; by day and by night"),
-        ("wear", f"{PEDESTRIAN}; by day"),
-        (
-            "euro_ncap_car_to_car",
-            "lead vehicle stopped; lead vehicle moving at lower constant speed; lead vehicle decelerating; by day",
-        ),
-    ],
-)
-def test_the_tags_of_the_shipped_studies(study: str, types: str) -> None:
-    assert pre_crash_sentence(assemble(load_study(study)).points) == f"NHTSA's pre-crash types: {types}."
 
 
 STOPS_AT_ONCE = Hold(np.array([0.0]))

@@ -10,6 +10,8 @@ from safevar_sumo.records import Evaluations, Outcome
 from safevar_sumo.search import ALGORITHMS, Algorithm, Problem, Search
 from safevar_sumo.study import load_study
 from safevar_sumo.vehicles import CharacteristicSet
+from safevar_sumo.vehicles.region import FeasibleRegion
+from tests.made_up import made_up_evaluations
 
 SUN = CharacteristicSet.of(load_study("sun").vehicle.characteristics)
 POPULATION = 20
@@ -17,12 +19,12 @@ Evaluate = Callable[[CharacteristicSet, np.ndarray], Evaluations]
 
 
 def evaluated(characteristics: CharacteristicSet, settings: np.ndarray, safety: np.ndarray) -> Evaluations:
-    undefined = np.full(len(settings), np.nan)
-    return Evaluations(
+    """Vehicles that stop, whatever their safety degree."""
+    return made_up_evaluations(
+        safety,
         settings=settings,
         outcome=np.full(len(settings), Outcome.STOPPED.value, dtype="U16"),
-        collision_speed=undefined,
-        metrics={"safety_degree": safety},
+        collision_speed=np.full(len(settings), np.nan),
         f_diff=characteristics.largest_change(settings),
         f_num_diff=characteristics.number_changed(settings),
     )
@@ -35,11 +37,20 @@ def sphere(characteristics: CharacteristicSet, settings: np.ndarray) -> Evaluati
 
 
 def begun(
-    name: str, seed: int, evaluations: int, characteristics: CharacteristicSet = SUN, algorithm: Algorithm | None = None
+    name: str,
+    seed: int,
+    evaluations: int,
+    characteristics: CharacteristicSet = SUN,
+    algorithm: Algorithm | None = None,
+    region: FeasibleRegion | None = None,
 ) -> Search:
     original = sphere(characteristics, characteristics.original[np.newaxis])
     problem = Problem(
-        characteristics=characteristics, original=original, evaluations=evaluations, population=POPULATION
+        characteristics=characteristics,
+        original=original,
+        evaluations=evaluations,
+        population=POPULATION,
+        region=region,
     )
     return (algorithm or ALGORITHMS[name]()).search(problem, np.random.default_rng(seed))
 
@@ -51,9 +62,10 @@ def searched(
     characteristics: CharacteristicSet = SUN,
     evaluate: Evaluate = sphere,
     algorithm: Algorithm | None = None,
+    region: FeasibleRegion | None = None,
 ) -> tuple[Evaluations, list[np.ndarray]]:
     """Run an algorithm to its end; returns its result and all populations that it requested."""
-    search = begun(name, seed, evaluations, characteristics, algorithm)
+    search = begun(name, seed, evaluations, characteristics, algorithm, region)
     populations = [next(search)]
     while True:
         try:

@@ -17,11 +17,11 @@ from hypothesis import strategies as st
 
 import safevar_sumo as sv
 from safevar_sumo.errors import InputError
-from safevar_sumo.search import ALGORITHMS, Problem
+from safevar_sumo.search import ALGORITHMS
 from safevar_sumo.study import Study, load_study
 from safevar_sumo.vehicles import region_of
 from tests.in_process import run
-from tests.search.problems import SUN, sphere
+from tests.search.problems import SUN, searched
 
 ROUND = """
 def spread(values):
@@ -133,27 +133,13 @@ def test_searches_and_designs_stay_in_any_linear_region_around_the_original(data
     study = load_study(
         "smoke", constraints=[{"sum": weights, "unit": unit, "at_least": middle - room[0], "at_most": middle + room[1]}]
     )
-    region = region_of(study)
-    problem = Problem(
-        characteristics=SUN,
-        original=sphere(SUN, SUN.original[np.newaxis]),
-        evaluations=60,
-        population=12,
-        region=region,
-    )
-    for name, algorithm in ALGORITHMS.items():
-        search = algorithm().search(problem, np.random.default_rng(data.draw(st.integers(0, 9))))
-        asked, total = next(search), 0
-        while True:
+    for name in ALGORITHMS:
+        _, populations = searched(name, data.draw(st.integers(0, 9)), 60, region=region_of(study))
+        for asked in populations:
             value = sum(weight * asked[:, SUN.names.index(name)] for name, weight in weights.items())
             assert np.all((value >= middle - room[0] - 1e-6) & (value <= middle + room[1] + 1e-6)), name
             assert np.array_equal(SUN.filter(asked), asked)
-            total += len(asked)
-            try:
-                asked = search.send(sphere(SUN, asked))
-            except StopIteration:
-                break
-        assert total == 60
+        assert sum(map(len, populations)) == 60
 
 
 def constrained(*constraints: Mapping[str, Any]) -> Study:

@@ -244,17 +244,6 @@ def test_hesitation_delays_braking_but_not_the_release_of_the_brake() -> None:
     assert pressed(0.12, wanted) == pytest.approx([0.0, 0.0, 0.0, 0.0, 0.6, 1.0, 1.0, 0.2, 0.0, 0.0])
 
 
-def test_rains_driver_releases_the_accelerator_at_once_and_brakes_after_the_hesitation() -> None:
-    def driven(hesitation: float) -> tuple[Trace, int]:
-        rain = assemble(load_study("rain", ads={"parameters": {"hesitation": hesitation}}))
-        trace = simulate(rain, rain.characteristics.original[np.newaxis]).trace
-        return trace, int(np.argmax(trace.brake[:, 0] == 1))
-
-    (_, decides), (late, brakes) = driven(0.0), driven(0.2)
-    assert (brakes - decides) * late.step == pytest.approx(0.2)
-    assert late.throttle[decides:brakes].max() == 0
-
-
 def test_a_remark_says_that_a_weather_has_no_effect() -> None:
     sentence = "weather 'carla_hard_rain' has no effect"
     for driver, says in (({"model": "full_braking"}, True), ({}, False)):

@@ -18,7 +18,7 @@ from safevar_sumo.records import Command, Evaluations, FloatArray, Nominal, Obse
 from safevar_sumo.scenarios import Crossing, Point, Scenario
 from safevar_sumo.scenarios.car_to_car import CarToCar
 from safevar_sumo.study import MatrixTable, MatrixTest, Study, load_study
-from safevar_sumo.sumo.matrix import evaluate, simulate, simulate_all_points, system_at_point
+from safevar_sumo.sumo.matrix import evaluate, simulate, simulate_all_points
 from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.sumo.world import Body, find_touches
 
@@ -70,13 +70,6 @@ def test_the_worst_point_decides_a_settings_result_and_points_do_not_affect_each
     assert whole.f_safe.tolist() == np.min([one.evaluations.f_safe for one in points], axis=0).tolist()
     collided = [one.evaluations.collided for one in points]
     assert whole.collided.tolist() == np.any(collided, axis=0).tolist()
-
-
-def test_named_point_finds_a_point_and_suggests_similar_names() -> None:
-    system = system_at_point(SYSTEM, "CPLA, speed 30, clear", "--point")
-    assert system.scenario.speed == 30  # type: ignore[attr-defined]
-    with pytest.raises(InputError, match="CPNCO, speed 40, clear"):
-        system_at_point(SYSTEM, "CPNCO", "--point")
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import shutil
 import subprocess
 import xml.etree.ElementTree as ElementTree
@@ -39,24 +38,6 @@ def test_the_recipe_builds_the_network_that_is_kept(folder: str, tmp_path: Path)
         return lines[next(i for i, line in enumerate(lines) if line.startswith("<net ")) :]
 
     assert without_head(tmp_path / folder / "network.net.xml") == without_head(NETWORKS / folder / "network.net.xml")
-
-
-def test_copies_share_coordinates_and_nothing_else() -> None:
-    text = copied_network(open_network("pedestrian_crossing"), 2).network.read_text()
-    shapes = {
-        copy: [
-            line.split('shape="')[1].split('"')[0]
-            for line in text.splitlines()
-            if f'lane id="{copy}.approach_0"' in line
-        ]
-        for copy in (0, 1)
-    }
-    assert shapes[0] == shapes[1] != []
-    connections = [
-        dict(re.findall(r'(from|to)=":?(\d+)\.', line)) for line in text.splitlines() if "<connection " in line
-    ]
-    assert {one["from"] for one in connections} == {"0", "1"}
-    assert all(one["from"] == one["to"] for one in connections)
 
 
 @pytest.mark.parametrize(
@@ -274,40 +255,6 @@ def test_edge_types_in_a_separate_file_change_the_network(mine: Path) -> None:
     first = copied_network(open_network(str(mine)), 1).network
     rewritten(mine / "network.typ.xml", 'speed="7"', 'speed="8"')
     assert copied_network(open_network(str(mine)), 1).network != first
-
-
-def test_traffic_lights_are_copied_with_their_programmes(mine: Path) -> None:
-    rewritten(mine / "network.nod.xml", 'type="priority"', 'type="traffic_light"')
-    subprocess.run(
-        [
-            str(BINARIES / "netconvert"),
-            "-n",
-            "network.nod.xml",
-            "-e",
-            "network.edg.xml",
-            "-x",
-            "network.con.xml",
-            "--tls.cycle.time",
-            "77",
-            "--plain-output-prefix",
-            "network",
-        ],
-        cwd=mine,
-        check=True,
-        capture_output=True,
-    )
-    rewritten(mine / "network.tll.xml", "duration=", 'name="my own" duration=')
-    check_network(str(mine), "study")
-    copies = roads(mine, 2)
-    lights = copies.findall("tlLogic")
-    assert [light.attrib["id"] for light in lights] == ["0.crossing", "1.crossing"]
-    assert all(phase.attrib["name"] == "my own" for light in lights for phase in light.iter("phase"))
-    controlled = [one for one in copies.findall("connection") if "tl" in one.attrib]
-    assert controlled
-    assert all(
-        one.attrib["tl"].partition(".")[0] == one.attrib["from"].removeprefix(":").partition(".")[0]
-        for one in controlled
-    )
 
 
 def test_a_built_network_without_sources_gives_the_same_results(mine: Path) -> None:

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import msgspec
 import numpy as np
@@ -14,9 +12,8 @@ import platformdirs
 import pytest
 
 import safevar_sumo as sv
-from safevar_sumo.ads import Ads
 from safevar_sumo.errors import InputError
-from safevar_sumo.records import Command, Nominal, Observation, Outcome
+from safevar_sumo.records import Outcome
 from safevar_sumo.scenarios import SCENARIOS
 from safevar_sumo.shipped import NETWORKS
 from safevar_sumo.study import load_study
@@ -55,16 +52,6 @@ def assert_same(system: System, number: int, seed: int) -> list[str]:
     return outcomes
 
 
-class FullThrottle(Ads):
-    """Drives at full throttle into any obstacle."""
-
-    def start(self, n: int, nominal: Nominal, step: float) -> None:
-        return None
-
-    def drive(self, seen: Observation, memory: Any) -> tuple[Command, Any]:
-        return Command(np.ones_like(seen.speed), np.zeros_like(seen.speed)), memory
-
-
 def test_vehicles_in_recorded_scenes_give_the_same_bits_as_in_sumo(any_system: System) -> None:
     assert reason_for_sumo(any_system) == ""
     assert_same(any_system, 60, 5)
@@ -77,12 +64,6 @@ def test_the_distance_of_a_step_has_sumos_order_of_operations() -> None:
     before, after = np.array([0.0, 0.49783446695015615]), np.array([0.4348049848410796, 1.0073508794958133])
     there = np.array([28.196, 28.208445861673756]) + distance_covered(before, after, 0.05)
     assert there.tolist() == [28.206870124621027, 28.246075495334903]
-
-
-@pytest.mark.parametrize("study", ["rain", "sun", "lgsvl", "native"])
-def test_a_vehicle_at_full_throttle_collides_as_in_sumo(study: str) -> None:
-    outcomes = assert_same(replace(assemble(load_study(study)), ads=FullThrottle()), 12, 7)
-    assert Outcome.COLLISION in outcomes
 
 
 def test_a_scene_from_the_cache_equals_the_scene_that_sumo_played(

@@ -245,22 +245,6 @@ def test_a_script_with_a_loop_of_its_own_is_told_once_what_to_change(model: str,
     )
 
 
-def test_a_script_stops_the_original_but_not_a_vehicle_with_weak_brakes(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    runs = system("step", tmp_path, monkeypatch)
-    weak = runs.characteristics.original.copy()
-    weak[runs.characteristics.names.index("decel")] = 4.5
-    weak[runs.characteristics.names.index("brakeGain")] = 0.6
-    both = np.stack([runs.characteristics.original, weak])
-    run = simulate(runs, both)
-    assert run.outcome.tolist() == [Outcome.STOPPED, Outcome.COLLISION]
-    alone = simulate(runs, both[1:])
-    length = len(alone.trace.time)
-    assert alone.trace.speed[:, 0].tobytes() == np.ascontiguousarray(run.trace.speed[:length, 1]).tobytes()
-    assert run.trace.speed.max() == pytest.approx(12, abs=0.7)
-
-
 def test_the_vehicle_model_limits_a_commanded_acceleration(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     runs = system("Harsh", tmp_path, monkeypatch)
     run = simulate(runs, runs.characteristics.original[np.newaxis])

@@ -16,7 +16,7 @@ from safevar_sumo.study import load_study
 from safevar_sumo.sumo.matrix import simulate
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import LEVEL, slope_of
-from tests.vehicles.runs import STEP, SYSTEMS, drawn, drive, original
+from tests.vehicles.runs import STEP, SYSTEMS, drive, original
 
 SPEEDS = (10, 20, 30, 40, 50, 60)  # km/h, where the original vehicles' gearboxes hold their gear
 
@@ -39,22 +39,6 @@ def test_nothing_changes_while_the_pedals_stay(model: str, kmh: float, grade: fl
     for name in ("speed", "wheel_speed", "engine_speed", "engine_rpm", "gear", "traction_torque"):
         if hasattr(state, name):
             assert getattr(state, name) == pytest.approx(getattr(before, name), rel=1e-12), name
-
-
-def test_whoever_stands_and_whoever_rolls_start_together_and_each_as_if_alone() -> None:
-    for model, system in SYSTEMS.items():
-        settings = drawn(model, 4, 9)
-        values = dict(zip(system.characteristics.names, np.ascontiguousarray(settings.T), strict=True))
-        prepared = system.vehicle.prepare(values, 1.0, STEP)
-        mixed = system.vehicle.at_start(prepared, np.array([0.0, 8.0, 0.0, 12.0]))
-        rest, rolling = (
-            system.vehicle.at_rest(prepared),
-            system.vehicle.at_start(prepared, np.array([3.0, 8.0, 4.0, 12.0])),
-        )
-        for one, stands, rolls in zip(mixed, rest, rolling, strict=True):
-            if one is not None:
-                assert one[..., [0, 2]].tolist() == stands[..., [0, 2]].tolist()
-                assert one[..., [1, 3]].tolist() == rolls[..., [1, 3]].tolist()
 
 
 @pytest.mark.parametrize("study", ["sun", "lgsvl", "native"])
@@ -93,18 +77,6 @@ def test_a_grade_is_the_tangent_of_the_slopes_angle_and_none_is_level_to_the_bit
 def test_who_coasts_loses_or_gains_g_sin(model: str, grade: float, gained: float) -> None:
     run = drive(model, original(model), lambda time: (0.0, 0.0), 4.0, rolling=12.0, grade=grade)
     assert run.speed[-1, 0] - 12.0 == pytest.approx(4.0 * gained)
-
-
-@pytest.mark.parametrize(("model", "wheels"), [("carla", 4 * 0.5 * 20.0), ("lgsvl", 4 * 0.5 * 30.0)])
-def test_wheels_have_inertia_and_no_weight_of_their_own_to_pull_them(model: str, wheels: float) -> None:
-    """Out of gear, the slope changes the speed by m g sin / (m + I / r^2) per second, compared with a level road."""
-    speeds = [
-        drive(model, original(model), lambda time: (0.0, 0.0), 1.0, rolling=12.0, grade=grade).speed[-1, 0]
-        for grade in (0.0, 8.0)
-    ]
-    characteristics = SYSTEMS[model].characteristics
-    mass = characteristics.original[characteristics.names.index("mass")]
-    assert speeds[0] - speeds[1] == pytest.approx(G * math.sin(ANGLE) * mass / (mass + wheels), rel=0.02)
 
 
 @pytest.mark.parametrize("model", sorted(SYSTEMS))

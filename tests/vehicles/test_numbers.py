@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import msgspec
 import numpy as np
 import pytest
 from msgspec.structs import replace
 from scipy.integrate import solve_ivp
 
 from safevar_sumo.records import GRAVITY, Command, Observation
-from safevar_sumo.study import load_study
-from safevar_sumo.sumo.matrix import simulate
-from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles.carla import AIR_DENSITY, ENGINE_INERTIA, FINAL_RATIO, FRONTAL_AREA, GEAR_RATIOS, RPM, Carla
 from safevar_sumo.vehicles.lgsvl import _tyre_stiffness
 from tests.vehicles.runs import STEP, SYSTEMS, braking_after, drawn, drive, ends, full_throttle, original
@@ -202,12 +198,6 @@ def tyre_force(vehicle: Carla, friction: float, load: float, speed: float, rim: 
     return float(np.sign(slip) * friction * load * (k - k * k / 3 + k**3 / 27))
 
 
-@pytest.mark.parametrize("study", ["sun", "rain"])
-def test_vehicles_of_the_domain_reach_the_speed_up_to_which_the_vehicle_was_fitted_and_no_more(study: str) -> None:
-    runs = simulate(assemble(load_study(study)), drawn("carla", 1000, 3))
-    assert 0.9 * Carla.FITTED_UP_TO < runs.trace.speed.max() <= Carla.FITTED_UP_TO
-
-
 def test_driving_and_braking_follow_the_differential_equations() -> None:
     """Stated bound: 0.1 m/s against an adaptive integrator with a tolerance of 1e-8, from the first gear on until
     0.5 m/s.
@@ -278,23 +268,6 @@ def test_a_camera_on_smaller_wheels_overestimates_the_gap() -> None:
     )
     assert np.all(np.diff(seen.gap) < 0)
     assert np.interp(35.5, population[:, 10], seen.gap) == pytest.approx(8.0, rel=1e-3)
-
-
-def test_carla_shifts_up_above_its_engine_speed_and_not_before_its_latency() -> None:
-    """The first switch begins with the first substep of 1/60 s and takes 0.5 s; so does the next, spent in neutral
-    too.
-    """
-    values = dict(zip(SYSTEMS["carla"].characteristics.names, np.ascontiguousarray(original("carla").T), strict=True))
-    gears = {}
-    for up in (0.3, 0.6):
-        vehicle = msgspec.structs.replace(carla(), shift_up=up, shift_latency=1.0)
-        prepared = vehicle.prepare(values, 1.0, STEP)
-        states = [vehicle.at_rest(prepared)]
-        while len(states) <= 32:
-            states.append(vehicle.advance(prepared, states[-1], Command(np.ones(1), np.zeros(1))))
-        gears[up] = [int(state.gear[0]) for state in states]
-    assert gears[0.3] == [0] * 11 + [1] * 10 + [0] * 10 + [2] * 2
-    assert gears[0.6][:23] == [0] * 11 + [1] * 12
 
 
 SPEED, UNTIL = 15.0, 2.0

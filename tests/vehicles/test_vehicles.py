@@ -16,7 +16,6 @@ from tests.vehicles.runs import (
     STEP,
     SYSTEMS,
     Drive,
-    braking_after,
     coasting_after,
     drawn,
     drive,
@@ -113,14 +112,6 @@ def test_halving_the_time_step_changes_a_trajectory_by_little(model: str) -> Non
     coarse, fine = (drive(model, original(model), pedals, 8, step) for step in (STEP, STEP / 2))
     assert np.abs(coarse.speed - fine.speed[::2]).max() < 0.3
     assert coarse.distance[-1, 0] == pytest.approx(fine.distance[-1, 0], rel=0.02)
-
-
-@pytest.mark.parametrize("model", MODELS)
-def test_no_vehicle_knows_of_another(model: str) -> None:
-    population = drawn(model, 9, 3)
-    together = drive(model, population, braking_after(3.0, 0.5), 8).speed
-    alone = drive(model, population[4:5], braking_after(3.0, 0.5), 8).speed
-    assert together[:, 4].tobytes() == alone[:, 0].tobytes()
 
 
 # Measurements in which a characteristic acts, over a grid of its domain.

@@ -1,0 +1,45 @@
+"""Made-up records: runs of vehicles by their speeds and gaps, and evaluations by their safety degrees."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from safevar_sumo.records import Encounter, Evaluations, FloatArray, Outcome, SimulationRuns, Trace
+
+
+def made_up_runs(
+    step: float, speed: FloatArray, gap: FloatArray | float = 0.0, collision_speed: Any = np.nan, **columns: FloatArray
+) -> SimulationRuns:
+    """Vehicles of these speeds, shape (T, N), that end by standing or colliding; other columns of the trace are 0."""
+    zero, gaps = np.zeros_like(speed), np.broadcast_to(gap, speed.shape)
+    names = ("position", "lateral", "lateral_speed", "throttle", "brake", "gear")
+    active = {"active": np.ones_like(speed, dtype=bool)}
+    trace = Trace(
+        step=step,
+        vehicle_length=5.0,
+        time=np.arange(len(speed)) * step,
+        speed=speed,
+        gap=gaps,
+        **{**dict.fromkeys(names, zero), **active, **columns},  # type: ignore[arg-type]
+    )
+    crash = np.full(speed.shape[1], collision_speed)
+    outcome = np.where(np.isnan(crash), Outcome.STOPPED.value, Outcome.COLLISION.value)
+    encounter = Encounter(gaps, gaps, speed, gaps > 0)
+    return SimulationRuns(trace=trace, encounter=encounter, outcome=outcome, collision_speed=crash)
+
+
+def made_up_evaluations(safety: Any, **columns: Any) -> Evaluations:
+    """Vehicles of these safety degrees: collisions where these are 0 or less."""
+    values = np.asarray(safety, dtype=float)
+    collided = values <= 0
+    made_up: dict[str, Any] = {
+        "settings": np.ones((len(values), 1)),
+        "outcome": np.where(collided, "collision", "stopped").astype("U16"),
+        "collision_speed": np.where(collided, -values, np.nan),
+        "metrics": {"safety_degree": values},
+        "f_diff": np.zeros(len(values)),
+        "f_num_diff": np.zeros(len(values)),
+    }
+    return Evaluations(**{**made_up, **columns})
