@@ -29,8 +29,7 @@ from measuring import Record, clock_seconds, print_records
 
 from safevar_sumo.campaign import all_runs, run_campaign
 from safevar_sumo.campaign.cluster import cluster_pool
-from safevar_sumo.campaign.evaluation import evaluate_batch, pack_study
-from safevar_sumo.campaign.identity import identity_of
+from safevar_sumo.campaign.evaluation import evaluate_batch, identity_of, pack_study
 from safevar_sumo.campaign.local import local_pool
 from safevar_sumo.campaign.pool import Pool, Report, Share
 from safevar_sumo.campaign.share import carry_out_share

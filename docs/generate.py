@@ -147,7 +147,9 @@ def metric_columns() -> str:
 
 def results_files() -> str:
     """Every file of a results directory."""
-    return _table(("file", "content", "written by"), [(f"`{one.name}`", one.content, one.writer) for one in FILES])
+    return _table(
+        ("file", "content", "written by"), [(f"`{name}`", content, writer) for name, content, writer in FILES]
+    )
 
 
 TABLES: dict[str, Callable[[], str]] = {

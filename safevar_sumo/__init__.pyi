@@ -1,51 +1,38 @@
 from .analysis.explain import explain as explain
 from .analysis.explain.causes import Cause as Cause
-from .analysis.explain.result import Explained as Explained
-from .analysis.explain.result import Explanation as Explanation
+from .analysis.explain.result import Explained as Explained, Explanation as Explanation
 from .analysis.opinion import opinion as opinion
-from .analysis.opinion.result import Opinion as Opinion
-from .analysis.opinion.result import Opinions as Opinions
+from .analysis.opinion.result import Opinion as Opinion, Opinions as Opinions
 from .analysis.rating import rating as rating
 from .analysis.rating.compute import Rating as Rating
 from .analysis.risk import risk as risk
 from .analysis.risk.answer import Risk as Risk
 from .analysis.rules import rules as rules
-from .analysis.rules.compute import Rule as Rule
-from .analysis.rules.compute import Rules as Rules
-from .analysis.subject import Results as Results
-from .analysis.subject import load as load
+from .analysis.rules.compute import Rule as Rule, Rules as Rules
+from .analysis.subject import Results as Results, load as load
 from .analysis.tolerance import tolerance as tolerance
 from .analysis.tolerance.answer import Tolerance as Tolerance
-from .api.research_questions import Figures as Figures
-from .api.research_questions import Tables as Tables
-from .api.research_questions import figures as figures
-from .api.research_questions import tables as tables
+from .api.research_questions import Figures as Figures, Tables as Tables, figures as figures, tables as tables
 from .api.running import run as run
-from .api.simulation import Simulation as Simulation
-from .api.simulation import evaluate as evaluate
-from .api.simulation import simulate as simulate
+from .api.simulation import Simulation as Simulation, evaluate as evaluate, simulate as simulate
 from .campaign import Observer as Observer
 from .campaign.pool import Pool as Pool
-from .errors import InputError as InputError
-from .errors import SafevarError as SafevarError
-from .errors import SimulationError as SimulationError
-from .metrics import Criterion as Criterion
-from .metrics import Unsafe as Unsafe
-from .progress import Progress as Progress
+from .errors import InputError as InputError, SafevarError as SafevarError, SimulationError as SimulationError
+from .metrics import Criterion as Criterion, Unsafe as Unsafe
 from .records import Outcome as Outcome
 from .replay.animation import animate as animate
-from .replay.comparison import Comparison as Comparison
-from .replay.comparison import compare as compare
+from .replay.comparison import Comparison as Comparison, compare as compare
 from .replay.figure import draw_comparison as draw_comparison
 from .replay.gui import show_in_gui as show_in_gui
-from .report import make_report as make_report
-from .report import report as report
-from .results import Status as Status
-from .results import status as status
-from .study import Study as Study
-from .study import StudyLike as StudyLike
-from .study import Weather as Weather
-from .study import load_study as load_study
-from .study import study_names as study_names
+from .report import make_report as make_report, report as report
+from .results import Status as Status, status as status
+from .study import (
+    Study as Study,
+    StudyLike as StudyLike,
+    Weather as Weather,
+    load_study as load_study,
+    study_names as study_names,
+)
+from .terminal import Progress as Progress
 
 __version__: str

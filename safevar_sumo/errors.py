@@ -6,7 +6,6 @@ import inspect
 import warnings
 from collections.abc import Iterable
 from difflib import get_close_matches
-from pathlib import Path
 
 INTERRUPT_EXIT_CODE = 130
 """Exit code after Ctrl-C, as in shells: 128 plus the signal's number."""
@@ -112,32 +111,3 @@ def did_you_mean(name: object, names: Iterable[str]) -> str:
 def one_of(names: Iterable[str]) -> str:
     """The text `one of`, with all legal names, for an error message."""
     return "one of " + ", ".join(sorted(names))
-
-
-STREAM_PATHS = ("/dev/stdin", "/dev/stdout", "/dev/stderr", "/dev/null")
-DESCRIPTOR_FOLDERS = ("/dev/fd", "/proc/self/fd")
-
-
-def refuse_other_than_file(path: Path, source: object = None, *, streams: bool = False) -> None:
-    """Refuse an existing path that is no regular file: reading from a pipe may never end.
-
-    Parameters
-    ----------
-    path
-        The file to be read or written.
-    source
-        The source that the error names; by default the path.
-    streams
-        Whether to accept a shell's streams, such as `/dev/stdout` and `<(zcat data.csv.gz)`.
-
-    Raises
-    ------
-    InputError
-        If the path is a directory, a pipe or a device.
-    """
-    is_stream = streams and (str(path) in STREAM_PATHS or str(path.parent) in DESCRIPTOR_FOLDERS)
-    if path.exists() and not path.is_file() and not is_stream:
-        problem = "is no regular file but a directory" if path.is_dir() else "is no regular file"
-        raise InputError(
-            path if source is None else source, problem if source is None else f"{path} {problem}", "a file"
-        )

@@ -1,11 +1,11 @@
-"""Output files: written as a whole or not at all, and checked before the work begins."""
+"""Files that users name: output files, written as a whole or not at all; and files beside a study."""
 
 from __future__ import annotations
 
 import os
 import secrets
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -51,3 +51,13 @@ def check_writable(path: Path, source: str = "out") -> None:
 def unwritable(path: Path, source: str, error: Exception) -> InputError:
     """The error for an output file that cannot be written."""
     return InputError(source, f"cannot write {path}: {getattr(error, 'strerror', None) or error}", WRITABLE)
+
+
+def file_beside(text: str, folders: Sequence[str]) -> str:
+    """The file that a text names, relative to the folder of the study's file or of a file that it extends; "" if there
+    is none.
+    """
+    try:
+        return next((os.path.abspath(path) for folder in folders if (path := Path(folder, text)).is_file()), "")
+    except (OSError, ValueError):  # the text is no path
+        return ""

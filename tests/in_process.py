@@ -16,8 +16,7 @@ from typing import NamedTuple
 import pytest
 
 from safevar_sumo.campaign import all_runs, run_campaign
-from safevar_sumo.campaign.evaluation import evaluate_batch
-from safevar_sumo.campaign.identity import identity_of
+from safevar_sumo.campaign.evaluation import evaluate_batch, identity_of
 from safevar_sumo.campaign.pool import Report, Share
 from safevar_sumo.campaign.share import carry_out_share
 from safevar_sumo.cli.program import main

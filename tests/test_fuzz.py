@@ -15,8 +15,7 @@ import numpy as np
 import pytest
 import tomli_w
 from click.testing import CliRunner
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
+from hypothesis import HealthCheck, given, settings, strategies as st
 
 import safevar_sumo.cli.study
 from safevar_sumo.ads import Ads, GuardedAds, PerVehicleAds

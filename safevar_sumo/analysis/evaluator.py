@@ -13,18 +13,17 @@ import numpy as np
 from safevar_sumo.analysis.research_questions.case import Case
 from safevar_sumo.campaign.batches import ask_why_no_verdict, evaluate_all, inputs_of
 from safevar_sumo.campaign.evaluation import pack_study
-from safevar_sumo.campaign.interrupts import wait_for_first
 from safevar_sumo.campaign.local import available_cores, local_pool
-from safevar_sumo.campaign.pool import Pool
+from safevar_sumo.campaign.pool import Pool, wait_for_first
 from safevar_sumo.campaign.retrying import RetryingPool
 from safevar_sumo.errors import InputError, SimulationError
 from safevar_sumo.metrics import METRICS, RATING_POINTS, Unsafe
-from safevar_sumo.progress import Progress, show_no_progress
 from safevar_sumo.protocol import cells_of_part
 from safevar_sumo.protocol.rater import is_rated, rater_of
 from safevar_sumo.records import CellResults, Evaluations, FloatArray, Outcome
 from safevar_sumo.study import Study
 from safevar_sumo.sumo.system import assemble
+from safevar_sumo.terminal import Progress, show_no_progress
 from safevar_sumo.vehicles import CharacteristicSet, region_of
 
 PARTS_PER_WORKER = 2

@@ -10,7 +10,7 @@ from typing import Any
 import msgspec
 
 from safevar_sumo.scenarios import weather_of
-from safevar_sumo.study import Study, error_with_key, locate_parameter, missing_parameter
+from safevar_sumo.study import Study, convert_table, locate_parameter, missing_parameter
 
 
 def with_values(study: Study, values: Mapping[str, float], stated_in: str = "calibration") -> Study:
@@ -26,10 +26,7 @@ def with_values(study: Study, values: Mapping[str, float], stated_in: str = "cal
     for name, value in values.items():
         table, key = _locate(study, tables, name, stated_in)
         table[key] = value
-    try:
-        return msgspec.convert(tables, Study)
-    except msgspec.ValidationError as error:
-        raise error_with_key(study.source, tables, error) from None
+    return convert_table(study.source, tables, Study)
 
 
 def value_of(study: Study, name: str, stated_in: str = "calibration") -> float:

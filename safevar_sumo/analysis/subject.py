@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from safevar_sumo.analysis.options import Options
 from safevar_sumo.errors import InputError, did_you_mean, one_of, warn
-from safevar_sumo.progress import open_progress
 from safevar_sumo.results import MANIFEST, input_differences, manifest_of, read_manifest
 from safevar_sumo.study import Study, StudyLike, load_study, study_names
+from safevar_sumo.terminal import open_progress
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -187,7 +187,7 @@ def changes_since(directory: Path, case: Case, *, as_it_is_now: bool = False) ->
     """
     from safevar_sumo.campaign import files_read_by_algorithms
     from safevar_sumo.campaign.batches import source_digests
-    from safevar_sumo.campaign.identity import identity_of
+    from safevar_sumo.campaign.evaluation import identity_of
     from safevar_sumo.campaign.local import local_pool
     from safevar_sumo.sumo.system import assemble
 

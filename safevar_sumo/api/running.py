@@ -21,16 +21,15 @@ from safevar_sumo.campaign import (
 )
 from safevar_sumo.campaign.batches import ask_why_no_verdict, source_digests
 from safevar_sumo.campaign.cluster import cluster_pool
-from safevar_sumo.campaign.identity import identity_of
+from safevar_sumo.campaign.evaluation import identity_of
 from safevar_sumo.campaign.local import available_cores, local_pool
 from safevar_sumo.campaign.pool import Pool
 from safevar_sumo.errors import InputError, SafevarError, one_of, warn
-from safevar_sumo.progress import Progress, open_progress
-from safevar_sumo.results import MANIFEST, ResultsDirectory, read_manifest
-from safevar_sumo.results.files import stored_runs
+from safevar_sumo.results import MANIFEST, ResultsDirectory, read_manifest, stored_runs
 from safevar_sumo.study import Study, StudyLike
 from safevar_sumo.sumo import Engine, reason_for_sumo, settings_per_batch
 from safevar_sumo.sumo.system import System
+from safevar_sumo.terminal import Progress, open_progress
 
 ENGINES = (str(Engine.RECORDED), str(Engine.LIBSUMO))
 """The engines that a study may name."""

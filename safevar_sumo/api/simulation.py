@@ -14,7 +14,6 @@ import numpy.typing as npt
 from safevar_sumo.analysis.words import OUTCOME_VERBS
 from safevar_sumo.errors import InputError, unknown_name
 from safevar_sumo.metrics import Scoring, time_to_collision
-from safevar_sumo.progress import Progress, open_progress, show_no_progress
 from safevar_sumo.records import (
     STANDSTILL,
     TIME_DECIMALS,
@@ -32,13 +31,14 @@ from safevar_sumo.sumo.empty_road import driven_entry, why_no_verdict
 from safevar_sumo.sumo.engine import Engine
 from safevar_sumo.sumo.matrix import system_at_worst_point
 from safevar_sumo.sumo.system import System, assemble
+from safevar_sumo.terminal import Progress, open_progress, show_no_progress
 from safevar_sumo.vehicles import CharacteristicSet
 
 if TYPE_CHECKING:
     import pandas as pd
 
     from safevar_sumo.campaign.pool import Pool
-    from safevar_sumo.progress import Progress
+    from safevar_sumo.terminal import Progress
 
 
 OBSERVATION_HEADS = {

@@ -7,29 +7,18 @@ dies is replaced, and the next one continues from the journals; no result depend
 the batch. Questions ask the same pool for single batches.
 """
 
-from safevar_sumo.campaign.campaign import Campaign, Observer, run_campaign
-from safevar_sumo.campaign.forecast import Forecast, forecast
-from safevar_sumo.campaign.keys import (
-    RunKey,
-    algorithm_class,
-    algorithm_of,
-    all_runs,
-    files_read_by_algorithms,
-    random_generator_of,
+from safevar_sumo.campaign.campaign import (
+    Campaign as Campaign,
+    Forecast as Forecast,
+    Observer as Observer,
+    forecast as forecast,
+    run_campaign as run_campaign,
 )
-from safevar_sumo.campaign.pool import RunProgress
-
-__all__ = [
-    "Campaign",
-    "Forecast",
-    "Observer",
-    "RunKey",
-    "RunProgress",
-    "algorithm_class",
-    "algorithm_of",
-    "all_runs",
-    "files_read_by_algorithms",
-    "forecast",
-    "random_generator_of",
-    "run_campaign",
-]
+from safevar_sumo.campaign.pool import RunKey as RunKey, RunProgress as RunProgress
+from safevar_sumo.campaign.run import (
+    algorithm_class as algorithm_class,
+    algorithm_of as algorithm_of,
+    all_runs as all_runs,
+    files_read_by_algorithms as files_read_by_algorithms,
+    random_generator_of as random_generator_of,
+)

@@ -1,24 +1,28 @@
-"""Evaluation of many settings by a pool, in batches; and the files on which the results depend."""
+"""Evaluation of many settings by a pool, in batches; checks of results; and the files on which the results depend."""
 
 from __future__ import annotations
 
+import hashlib
+import json
 import math
 import os
 from collections.abc import Callable
+from contextlib import suppress
+from importlib.metadata import version
 from typing import Any
 
 import numpy as np
+import platformdirs
 
-from safevar_sumo.campaign.checks import VERIFIED_SETTINGS, check_code, refuse_unlike_sumo, works_for_sumo
-from safevar_sumo.campaign.evaluation import pack_study
-from safevar_sumo.campaign.identity import Inputs, network_digests
-from safevar_sumo.campaign.interrupts import wait_for_first, wait_for_result
-from safevar_sumo.campaign.pool import Pool
+from safevar_sumo.campaign.evaluation import Inputs, network_digests, pack_study
+from safevar_sumo.campaign.pool import Pool, wait_for_first, wait_for_result
 from safevar_sumo.campaign.retrying import RetryingPool
-from safevar_sumo.errors import warn
+from safevar_sumo.errors import InputError, UserCodeError
 from safevar_sumo.plugins import Files, digest_of, digests, file_by_name, files_named_in
-from safevar_sumo.records import Evaluations, FloatArray
-from safevar_sumo.study import Study, fmus_of, user_code_names
+from safevar_sumo.protocol.rater import study_for_sumo_check
+from safevar_sumo.records import ROUNDING, Evaluations, FloatArray, differences
+from safevar_sumo.results import RESULTS
+from safevar_sumo.study import Study, fmus_of, tables_of, user_code_names
 from safevar_sumo.sumo import Engine, assemble, reason_for_sumo, settings_per_batch
 from safevar_sumo.vehicles import CharacteristicSet
 
@@ -32,6 +36,16 @@ _verified_counts: dict[bytes, int] = {}
 """Number of settings with verified results, by packed study."""
 _files_read: dict[tuple[bytes, str], Files] = {}
 """Files that models have read in this process, by packed study and working directory."""
+VERIFIED_SETTINGS = 50
+"""Number of settings to verify in SUMO: of a study in questions; and of each run of a campaign, besides the
+solutions.
+"""
+EXPECTED_RESULTS = (
+    "results of a vehicle that depend on this vehicle alone: nothing kept in a class, a module or the model itself "
+    "from one call or setting to another, no mean or sum over the batch, nothing random"
+)
+_passed_checks: set[str] = set()
+"""Identity of the studies whose code has passed in this process, in case the cache folder is not writable."""
 
 
 def choose_batch_size(study: Study) -> tuple[int, bool]:
@@ -51,8 +65,7 @@ def evaluate_all(
     `done` is called with the number of settings of every finished batch.
     """
     retrying_pool, work = RetryingPool(pool, study), pack_study(study, inputs := inputs_of(study, pool))
-    for remark in check_code(study, inputs, retrying_pool):
-        warn(remark)
+    check_code(study, inputs, retrying_pool)
     distinct_settings, row_of = np.unique(settings, axis=0, return_inverse=True)
     if work not in _batch_sizes:
         _batch_sizes[work] = choose_batch_size(study)
@@ -79,7 +92,7 @@ def evaluate_all(
     evaluations = Evaluations.concatenate([evaluations_by_start[start] for start in starts])
     if sumo_future is not None:
         expected = evaluations.take(sample) if recorded_future is None else wait_for_result(recorded_future)
-        refuse_unlike_sumo(study, expected.take(~expected.failed), wait_for_result(sumo_future).take(~expected.failed))
+        refuse_unlike_sumo(study, expected, wait_for_result(sumo_future))
         _verified_counts[work] = _verified_counts.get(work, 0) + len(sample)
     return evaluations.take(row_of.ravel())
 
@@ -136,3 +149,80 @@ def _all_parameters(study: Study) -> list[Any]:
         *(table for test in tests for table in (test.parameters, test.over)),
         [path for _, path in fmus_of(study)],
     ]
+
+
+def check_code(study: Study, inputs: Inputs, pool: RetryingPool) -> None:
+    """Check the user code of a study in a worker, unless it has passed before with the same files.
+
+    Raises
+    ------
+    UserCodeError
+        With file, line and advice of the first finding that makes results wrong.
+    """
+    if not (user_code_names(study) or any(":" in name for name in study.search.algorithms)):
+        return
+    identity = json.dumps([tables_of(study), inputs, RESULTS, version("safevar_sumo")], sort_keys=True, default=str)
+    name = hashlib.sha256(identity.encode()).hexdigest()
+    marker = platformdirs.user_cache_path("safevar_sumo") / "checks" / name
+    if name in _passed_checks or marker.exists():
+        return
+    original = CharacteristicSet.of(study.vehicle.characteristics).original[np.newaxis]
+    wait_for_result(pool.submit(pack_study(study, inputs, check=True), original, must_succeed=True))
+    _passed_checks.add(name)
+    with suppress(OSError):  # without the marker, the next process checks again
+        marker.parent.mkdir(parents=True, exist_ok=True)
+        marker.touch()
+
+
+def refuse_difference(study: Study, run: str, in_run: Evaluations, isolated: Evaluations, command: str) -> None:
+    """Refuse a setting whose evaluation in a run differs from its isolated evaluation, which `command` reproduces.
+
+    Raises
+    ------
+    UserCodeError
+        With the models, the first result that differs, and the contract.
+    """
+    if in_run.failed[0] or isolated.failed[0]:
+        return
+    for _, difference in differences(isolated.results, in_run.results):
+        problem = (
+            f"with {' and '.join(user_code_names(study))} a result depends on what else is simulated: "
+            f"{difference} in run {run}; to reproduce it: {command}"
+        )
+        raise UserCodeError(f"study {study.name!r}", problem, EXPECTED_RESULTS)
+
+
+def works_for_sumo(study: Study, inputs: Inputs) -> tuple[bytes, bytes]:
+    """The packed study with which SUMO verifies results, and a packed study with comparable results from recorded
+    scenes.
+
+    SUMO repeats only a few cells of a rating; the second study then has the same cells. Otherwise it is empty.
+    """
+    sumo_study = study_for_sumo_check(study, assemble(study).weather)
+    if sumo_study is study:
+        return pack_study(study, inputs, engine=Engine.LIBSUMO), b""
+    inputs = {**inputs, "network": network_digests(assemble(sumo_study))}
+    return pack_study(sumo_study, inputs, engine=Engine.LIBSUMO), pack_study(sumo_study, inputs)
+
+
+def refuse_unlike_sumo(study: Study, recorded: Evaluations, in_sumo: Evaluations) -> None:
+    """Refuse settings with different results in a recorded scene and in SUMO; skip settings that SUMO could not
+    simulate.
+
+    Raises
+    ------
+    InputError
+        With the first such setting and both values.
+    """
+    both = ~(recorded.failed | in_sumo.failed)
+    if not both.any():
+        return  # evaluations that have failed lack the user's metrics
+    recorded, in_sumo = recorded.take(both), in_sumo.take(both)
+    for row, difference in differences(in_sumo.results, recorded.results, ROUNDING):
+        pairs = zip(study.vehicle.characteristics, recorded.settings[row], strict=True)
+        values = ", ".join(f"{name} = {value:.17g}" for name, value in pairs)
+        raise InputError(
+            f"study {study.name!r}",
+            f"{difference} in the recorded scene and in SUMO with {values}",
+            "scenario: reactive_actors = True, if anybody reacts to the vehicle under test; or `engine=sumo`",
+        )

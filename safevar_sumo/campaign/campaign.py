@@ -1,44 +1,58 @@
-"""A study's runs, dealt out to the workers of a pool in shares."""
+"""A study's runs, dealt out to the workers of a pool in shares; and the cost of such a campaign, from a short
+measurement.
+"""
 
 from __future__ import annotations
 
 import math
+import tempfile
+import time
 from collections import deque
 from collections.abc import Generator, Iterable, Sequence
 from concurrent.futures import Future
-from contextlib import closing
+from contextlib import closing, suppress
 from functools import partial
+from pathlib import Path
 from queue import SimpleQueue
 from typing import NamedTuple, Protocol
 
+import msgspec
 import numpy as np
 
-from safevar_sumo.campaign.checks import check_code, works_for_sumo
-from safevar_sumo.campaign.evaluation import pack_study
-from safevar_sumo.campaign.interrupts import wait_for_next, wait_for_result
-from safevar_sumo.campaign.keys import RunKey
+from safevar_sumo.campaign.batches import check_code, source_digests, works_for_sumo
+from safevar_sumo.campaign.evaluation import identity_of, pack_study
 from safevar_sumo.campaign.pool import (
-    Attempt,
-    Busy,
     Message,
     Pool,
     PoolLostError,
+    RunKey,
     RunProgress,
     RunResult,
     Share,
     WorkerLostError,
+    wait_for_next,
+    wait_for_result,
 )
 from safevar_sumo.campaign.retrying import ATTEMPTS, RetryingPool
+from safevar_sumo.campaign.run import all_runs
 from safevar_sumo.errors import InputError
-from safevar_sumo.metrics import PUBLISHED_SCORING, Scoring
+from safevar_sumo.metrics import METRICS, PUBLISHED_SCORING, Scoring
 from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.records import Evaluations
 from safevar_sumo.results import ORIGINAL, Failure, JournalBusyError, ResultsDirectory
 from safevar_sumo.study import Study
-from safevar_sumo.sumo import Engine
-from safevar_sumo.sumo.matrix import MAX_COPIES
+from safevar_sumo.sumo import Engine, assemble
+from safevar_sumo.sumo.matrix import MAX_COPIES, MAX_VEHICLES
 from safevar_sumo.vehicles import CharacteristicSet
 
+PROBE_VEHICLES = 2 * MAX_VEHICLES
+"""Largest number of vehicles in a batch of the measurement, over all points of a matrix."""
+PROBE_SECONDS = 2.0
+"""Shortest measurement [s], unless the runs are over before."""
+CHARACTERS_PER_NUMBER = 18
+"""Characters of a number in a journal, at most, with its comma."""
+NUMBERS_BESIDE_METRICS = 5
+"""Values in a journal besides the metrics of a setting: f_diff, f_num_diff, collision speed, position, outcome."""
 BATCHES_PER_SHARE = 2
 """Number of largest batches that the populations of a share's runs fill at most."""
 MAX_RUNS = 256
@@ -115,8 +129,7 @@ def run_campaign(
         pack_study(study, results.inputs, engine=engine),
         batch or MAX_COPIES,
     )
-    for remark in check_code(study, results.inputs, retrying_pool):
-        observer.warned(remark)
+    check_code(study, results.inputs, retrying_pool)
     original = _evaluate_original(study, work, results, retrying_pool, observer)
     if not original.valid[0]:
         raise InputError(
@@ -150,8 +163,8 @@ def run_campaign(
             if isinstance(message, RunResult):
                 run_results[message.progress.key] = message
                 observer.finished(message.progress)
-            elif isinstance(message, Busy):
-                busy.append(message.key)
+            elif isinstance(message, RunKey):
+                busy.append(message)
             elif isinstance(message, str):
                 observer.warned(message)
             elif isinstance(message, list):
@@ -183,19 +196,19 @@ class _ShareUnderWay:
 
     def __init__(self, share: Share) -> None:
         self.share = share
-        self._attempt: Attempt | None = None
+        self._attempt: bytes | None = None
         self._other_deaths = 0
 
     def note(self, message: Message) -> None:
         """Note what a worker reports: the next worker does not carry out finished runs, and knows of deaths in the
         present round only.
         """
-        if isinstance(message, Attempt):
+        if isinstance(message, bytes):
             self._attempt = message
         elif isinstance(message, list):
             self._attempt, self._other_deaths, self.share = None, 0, self.share._replace(deaths={})
-        elif isinstance(message, RunResult | Busy):
-            finished = message.key if isinstance(message, Busy) else message.progress.key
+        elif isinstance(message, RunResult | RunKey):
+            finished = message if isinstance(message, RunKey) else message.progress.key
             self.share = self.share._replace(keys=tuple(key for key in self.share.keys if key != finished))
 
     def note_death(self, error: WorkerLostError) -> None:
@@ -205,7 +218,7 @@ class _ShareUnderWay:
             if self._other_deaths > ATTEMPTS:
                 raise error
             return
-        setting, deaths = self._attempt.setting, self.share.deaths
+        setting, deaths = self._attempt, self.share.deaths
         self.share = self.share._replace(deaths={**deaths, setting: (*deaths.get(setting, ()), str(error))})
         self._attempt = None
 
@@ -274,3 +287,69 @@ def _evaluate_original(
         return evaluations
     finally:
         journal.close()
+
+
+class Forecast(NamedTuple):
+    """Upper limits for a campaign: evaluations, `seconds`, and `size` of the results [bytes]; `rate` is in evaluations
+    per second.
+    """
+
+    evaluations: int
+    rate: float
+    seconds: float
+    size: int
+
+
+class _Enough(Exception):
+    """The measurement is long enough."""
+
+
+class _Stopwatch:
+    """Measures the evaluations per second of all workers together, from the first batch of the last worker on."""
+
+    def __init__(self, run_count: int) -> None:
+        self._run_count = run_count
+        self._asked: dict[object, int] = {}
+        self._start = (time.perf_counter(), 0)
+        self._is_warm = False
+        self.rate = 0.0
+
+    def progressed(self, runs: Sequence[RunProgress]) -> None:
+        self._asked |= {run.key: run.asked for run in runs}
+        now, asked = time.perf_counter(), sum(self._asked.values())
+        if asked > self._start[1]:
+            self.rate = (asked - self._start[1]) / (now - self._start[0])
+        if not self._is_warm and len(self._asked) == self._run_count:
+            self._is_warm, self._start = True, (now, asked)
+        elif self._is_warm and now - self._start[0] > PROBE_SECONDS:
+            raise _Enough
+
+    def finished(self, run: RunProgress) -> None:
+        self.progressed([run])
+
+    def warned(self, message: str) -> None: ...
+
+
+def forecast(
+    study: Study, runs: int, pool: Pool, batch: int = MAX_COPIES, engine: Engine = Engine.RECORDED
+) -> Forecast:
+    """Estimate upper limits for a number of runs, from a short measurement of some of them in a temporary directory."""
+    system = assemble(study, study.source)
+    settings_at_once = min(batch, max(PROBE_VEHICLES // len(system.points), 1))
+    search = study.search
+    probe = msgspec.structs.replace(
+        study, search=msgspec.structs.replace(search, population=min(search.population, settings_at_once))
+    )
+    runs_of_worker = min(math.ceil(settings_at_once / probe.search.population), math.ceil(runs / pool.workers))
+    keys = all_runs(probe)[: max(runs_of_worker, 1) * pool.workers]
+    stopwatch = _Stopwatch(len(keys))
+    with tempfile.TemporaryDirectory(prefix="safevar-", ignore_cleanup_errors=True) as folder:
+        identity = identity_of(probe, system, source_digests(probe, pool))
+        results = ResultsDirectory(Path(folder), probe, identity, system.measuring.scoring)
+        with suppress(_Enough):
+            run_campaign(probe, keys, results, pool, stopwatch, batch, engine=engine)
+    evaluations = runs * search.evaluations
+    numbers = len(CharacteristicSet.of(study.vehicle.characteristics)) + len(METRICS) + NUMBERS_BESIDE_METRICS
+    return Forecast(
+        evaluations, stopwatch.rate, evaluations / stopwatch.rate, evaluations * numbers * CHARACTERS_PER_NUMBER
+    )

@@ -5,9 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import pickle
-import re
 import threading
-import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from contextlib import contextmanager, suppress
@@ -16,23 +14,20 @@ from importlib.metadata import version
 from typing import Any
 from uuid import uuid4
 
-import numpy as np
-
 from safevar_sumo.campaign.evaluation import Evaluate, evaluate_in_time
-from safevar_sumo.campaign.interrupts import defer_interrupts
-from safevar_sumo.campaign.pool import Message, PoolLostError, Report, Share, WorkerLostError
+from safevar_sumo.campaign.pool import Message, PoolLostError, Report, Share, WorkerLostError, defer_interrupts
 from safevar_sumo.campaign.share import carry_out_share
 from safevar_sumo.errors import InputError, SafevarError, describe_error
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.results import RESULTS
 
-ADDRESS = re.compile(r"[a-z]+://[^\s/]+:\d+/?")
-CERTIFICATES = (
-    "for tls:// certificates in Dask's configuration: distributed.comm.tls.ca-file and .client.cert, .client.key"
+CLUSTER = (
+    "the address of a Dask scheduler, such as tcp://host:8786; for tls:// certificates in Dask's configuration: "
+    "distributed.comm.tls.ca-file and .client.cert, .client.key"
 )
 CONNECT_TIMEOUT = 10.0
 """Longest time for the scheduler to answer [s]."""
-SECONDS_BETWEEN_COUNTS, SECONDS_BETWEEN_LOOKS = 5.0, 0.5
+SECONDS_BETWEEN_LOOKS = 0.5
 VERSIONED_PACKAGES = ("safevar_sumo", "libsumo", "numpy")
 """Packages that must have the same version in this process and on every worker."""
 _libsumo_lock = threading.Lock()
@@ -58,17 +53,12 @@ def cluster_pool(address: str, time_limit: float) -> Iterator[ClusterPool]:
         from distributed import Client
     except ImportError:
         raise InputError("cluster", "Dask is not installed", "in the checkout: pip install '.[cluster]'") from None
-    legal = "the address of a Dask scheduler, such as tcp://host:8786"
-    if not ADDRESS.fullmatch(address):
-        raise InputError("cluster", repr(address), legal)
     for name in ("distributed", "distributed.client"):
         logging.getLogger(name).setLevel(logging.CRITICAL)  # this package reports errors itself
     try:
         client = Client(address, timeout=CONNECT_TIMEOUT, set_as_default=False)
-    except (OSError, TimeoutError, ValueError) as error:
-        raise InputError("cluster", f"no scheduler answers at {address!r}: {error}", legal) from None
-    except (TypeError, RuntimeError) as error:
-        raise InputError("cluster", f"{address!r}: {describe_error(error)}", CERTIFICATES) from None
+    except (OSError, TimeoutError, ValueError, TypeError, RuntimeError) as error:
+        raise InputError("cluster", f"no scheduler answers at {address!r}: {describe_error(error)}", CLUSTER) from None
     with defer_interrupts():
         try:
             yield ClusterPool(client, time_limit)
@@ -82,19 +72,14 @@ class ClusterPool:
     def __init__(self, client: Any, time_limit: float) -> None:
         self._executor = client.get_executor(pure=False)
         self._client, self._time_limit = client, time_limit
-        self._workers, self._time_of_count = 1, -np.inf
 
     @property
     def workers(self) -> int:
-        """Number of worker processes, counted every few seconds; each process computes one batch at a time."""
-        now = time.monotonic()
-        if now - self._time_of_count > SECONDS_BETWEEN_COUNTS:
-            try:
-                self._workers = max(1, len(self._client.nthreads()))
-            except (OSError, TimeoutError) as error:
-                raise PoolLostError(f"the cluster does not answer any more: {error}") from None
-            self._time_of_count = now
-        return self._workers
+        """Number of worker processes; each computes one batch at a time."""
+        try:
+            return max(1, len(self._client.nthreads()))
+        except (OSError, TimeoutError) as error:
+            raise PoolLostError(f"the cluster does not answer any more: {error}") from None
 
     def submit(self, work: bytes, settings: FloatArray) -> Future[Evaluations]:
         future: Future[Evaluations] = Future()

@@ -1,26 +1,35 @@
-"""Evaluation of a batch: a pure function for any process on any machine."""
+"""Evaluation of a batch, a pure function for any process on any machine; and the identity of a study: all inputs of its
+results.
+"""
 
 from __future__ import annotations
 
 import faulthandler
+import platform
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import lru_cache
+from pathlib import Path
+from types import MappingProxyType
 from typing import IO, Any
 
 import msgspec
 
-from safevar_sumo.campaign.identity import Inputs, network_digests
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import METRICS
-from safevar_sumo.plugins import Files, changed_files, digests, note_inputs, unload_user_modules
+from safevar_sumo.plugins import changed_files, digests, files_named_in, note_inputs, unload_user_modules
 from safevar_sumo.records import Evaluations, FloatArray
-from safevar_sumo.results import LAYERS_OF_FILES
+from safevar_sumo.results import LAYERS_OF_FILES, RESULTS, evaluation_keys
 from safevar_sumo.study import Study, user_code_packages
 from safevar_sumo.sumo.empty_road import why_no_verdict
 from safevar_sumo.sumo.engine import Engine
 from safevar_sumo.sumo.matrix import evaluate, evaluate_cells
+from safevar_sumo.sumo.network import open_network
 from safevar_sumo.sumo.system import System, assemble
+
+Inputs = dict[str, dict[str, str]]
+"""Digests of files, by layer and name."""
+
 
 Evaluate = Callable[[bytes, FloatArray], Evaluations]
 """A function that evaluates settings of a packed study, as `evaluate_batch` does."""
@@ -63,7 +72,7 @@ def pack_study(
     afresh
         Whether models are reloaded, which removes all state of earlier batches from their modules and classes.
     check
-        Whether the worker only checks the user code; the `reasons` of the result are then remarks on this code.
+        Whether the worker only checks the user code.
     cells
         (k, n): for a rated study, results in part k of n parts of the cells, instead of points for all cells.
     empty_road
@@ -94,15 +103,14 @@ def evaluate_batch(work: bytes, settings: FloatArray) -> Evaluations:
     if task.check:
         from safevar_sumo.plugins.check import refuse_defects  # slow to import, and rarely needed
 
-        remarks = refuse_defects(task.study)
-        return replace(
-            Evaluations.none(settings.shape[1], METRICS), reasons={remark.encode(): remark for remark in remarks}
-        )
+        refuse_defects(task.study)
+        return Evaluations.none(settings.shape[1], METRICS)
     if task.afresh:
         unload_user_modules()
     with note_inputs() as reading:
         system = assemble(task.study) if task.afresh else system_of(work)
-        _refuse_changed_networks(task.inputs, system)
+        if "network" in task.inputs:
+            refuse_changed_files(changed_files(task.inputs["network"], network_digests(system)))
         if task.empty_road:
             reason = why_no_verdict(system)
             evaluations = replace(Evaluations.none(settings.shape[1], METRICS), reasons={b"": reason} if reason else {})
@@ -110,9 +118,10 @@ def evaluate_batch(work: bytes, settings: FloatArray) -> Evaluations:
             evaluations = evaluate_cells(system, settings, task.cells, task.engine)
         else:
             evaluations = evaluate(system, settings, task.engine)
-    _refuse_changed_networks(task.inputs, system)
     files_read = digests(reading.files(user_code_packages(task.study)), task.study.origin.places)
-    return replace(evaluations, files=_find_unknown_files(task, files_read))
+    known = task.inputs.get("sources", {})
+    refuse_changed_files([name for name, digest in files_read.items() if known.get(name, digest) != digest])
+    return replace(evaluations, files={name: digest for name, digest in files_read.items() if name not in known})
 
 
 def evaluate_in_time(work: bytes, settings: FloatArray, time_limit: float, last_words: IO[str]) -> Evaluations:
@@ -138,18 +147,6 @@ def _assemble_packed(study_and_inputs: bytes) -> System:
     return assemble(study)
 
 
-def _refuse_changed_networks(expected: Inputs, system: System) -> None:
-    if "network" in expected:
-        refuse_changed_files(changed_files(expected["network"], network_digests(system)))
-
-
-def _find_unknown_files(task: Task, files: Files) -> Files:
-    """The files that were not known when the study began; refuses known files that have changed."""
-    sources = task.inputs.get("sources", {})
-    refuse_changed_files([name for name, digest in files.items() if sources.get(name, digest) != digest])
-    return {name: digest for name, digest in files.items() if name not in sources}
-
-
 def refuse_changed_files(files: list[str]) -> None:
     """Raise an error if there are files that have changed since the study began."""
     if files:
@@ -158,3 +155,46 @@ def refuse_changed_files(files: list[str]) -> None:
             "is not the file that this study began with: it was changed meanwhile, or a worker has another one",
             "the file as it was, and the same command; or another `out`",
         )
+
+
+def identity_of(study: Study, system: System, sources: Mapping[str, str] = MappingProxyType({})) -> dict[str, Any]:
+    """The layers of a manifest except the study: plain values that are the same in every process.
+
+    `resolved` are the tables of the study with all defaults of models and all numbers of the weather; `network` and
+    `sources` are digests by file; `results` is the version of the results; `platform` are properties of the machine
+    that may affect the last bit of a result.
+
+    Parameters
+    ----------
+    sources
+        Digests of the files that user code reads: see `safevar_sumo.campaign.batches.source_digests`.
+    """
+    resolved = evaluation_keys(study)
+    for table, model in (("vehicle", system.vehicle), ("ads", system.ads), ("scenario", system.scenario)):
+        if isinstance(model, msgspec.Struct):
+            texts_and_paths = {
+                key: value
+                for key, value in resolved[table]["parameters"].items()
+                if isinstance(value, str) or any(files_named_in(value, study.origin.places))
+            }
+            resolved[table] = {**resolved[table], "parameters": {**msgspec.to_builtins(model), **texts_and_paths}}
+    resolved["weather"] = msgspec.to_builtins(system.weather)
+    if system.matrix and system.rater is None:
+        resolved["weathers"] = [msgspec.to_builtins(point.weather) for point in system.matrix]
+    return {
+        "resolved": resolved,
+        "network": network_digests(system),
+        "sources": dict(sources),
+        "results": RESULTS,
+        "platform": {"system": platform.system(), "machine": platform.machine()},
+    }
+
+
+def network_digests(system: System) -> dict[str, str]:
+    """Digests of the files of all networks in the simulations."""
+    folders = list(dict.fromkeys(point.scenario.network for point in system.points))
+    if len(folders) == 1:
+        return dict(open_network(folders[0]).digests)
+    return {
+        f"{Path(folder).name}/{name}": digest for folder in folders for name, digest in open_network(folder).digests
+    }

@@ -21,8 +21,7 @@ from types import ModuleType
 from typing import Any
 
 from safevar_sumo.campaign.evaluation import Evaluate, evaluate_in_time
-from safevar_sumo.campaign.interrupts import block_interrupts, defer_interrupts
-from safevar_sumo.campaign.pool import PoolLostError, Report, Share, WorkerLostError
+from safevar_sumo.campaign.pool import PoolLostError, Report, Share, WorkerLostError, block_interrupts, defer_interrupts
 from safevar_sumo.campaign.share import carry_out_share
 from safevar_sumo.errors import EnvironmentFault, SafevarError, describe_error
 from safevar_sumo.plugins import added_import_folders, inherit_import_folders

@@ -13,16 +13,14 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
-from safevar_sumo.campaign.checks import VERIFIED_SETTINGS, refuse_difference, refuse_unlike_sumo
+from safevar_sumo.campaign.batches import refuse_difference, refuse_unlike_sumo
 from safevar_sumo.campaign.evaluation import Evaluate, pack_study, refuse_changed_files, system_of, task_of
-from safevar_sumo.campaign.keys import RunKey, make_search, random_generator_of
-from safevar_sumo.campaign.pool import Attempt, Busy, Report, Share, WorkerLostError
+from safevar_sumo.campaign.pool import Report, RunKey, Share, WorkerLostError
 from safevar_sumo.campaign.retrying import Retries, reproduction_command
-from safevar_sumo.campaign.run import Run
+from safevar_sumo.campaign.run import Run, make_search, random_generator_of
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import Evaluations, FloatArray
-from safevar_sumo.results import MANIFEST, PATIENCE, Head, Journal, JournalBusyError
-from safevar_sumo.results.files import journal_file
+from safevar_sumo.results import MANIFEST, PATIENCE, Head, Journal, JournalBusyError, journal_file
 from safevar_sumo.search import Problem
 from safevar_sumo.study import user_code_names
 from safevar_sumo.sumo.matrix import MAX_COPIES
@@ -70,10 +68,9 @@ class _Carrier:
         try:
             while runs:
                 ended = [run for run in runs if run.is_finished or run.advance()]
-                for group in _groups(ended):
-                    self._verify(group)
-                    for run in group:
-                        self._report(run.finish())
+                self._verify(ended)
+                for run in ended:
+                    self._report(run.finish())
                 runs = [run for run in runs if run not in ended]
                 self._simulate(runs)
                 self._report([run.progress for run in runs])
@@ -90,7 +87,7 @@ class _Carrier:
                 try:
                     journal = Journal(path, Head(self._share.identity, str(key), self._characteristics.names), deadline)
                 except JournalBusyError:
-                    self._report(Busy(key))
+                    self._report(key)
                     continue
                 if journal.content.tail_size:
                     self._report(
@@ -139,7 +136,7 @@ class _Carrier:
         setting = settings.tobytes() if len(settings) == 1 else b""
         if self._deaths.get(setting):
             raise WorkerLostError(self._deaths[setting].pop(0))
-        self._report(Attempt(setting))
+        self._report(setting)
         return self._evaluate(work, settings)
 
     def _verify(self, runs: Sequence[Run]) -> None:
@@ -200,15 +197,3 @@ def _parts(number: int, size: int) -> Iterator[tuple[int, int]]:
     parts = math.ceil(number / size)
     for part in range(parts):
         yield number * part // parts, number * (part + 1) // parts
-
-
-def _groups(runs: Sequence[Run]) -> Iterator[list[Run]]:
-    """Groups of runs that are verified together: SUMO simulates about as many settings at once as it can."""
-    group: list[Run] = []
-    for run in runs:
-        if group and (len(group) + 1) * VERIFIED_SETTINGS + sum(len(run.result) for run in [*group, run]) > MAX_COPIES:
-            yield group
-            group = []
-        group.append(run)
-    if group:
-        yield group

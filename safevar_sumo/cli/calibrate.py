@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -10,24 +9,17 @@ import click
 import msgspec
 from rich.console import Console
 
-from safevar_sumo.campaign.identity import input_files
-from safevar_sumo.campaign.interrupts import terminate_as_interrupt
 from safevar_sumo.campaign.local import available_cores, local_pool
-from safevar_sumo.cli.arguments import PICTURE_ENDINGS, check_output, complete_study, refuse_overwriting
+from safevar_sumo.campaign.pool import terminate_as_interrupt
+from safevar_sumo.cli.arguments import PICTURE_ENDINGS, check_output, complete_study, file_option, jobs_option
 from safevar_sumo.cli.program import commands
 from safevar_sumo.cli.reference import find_owner, print_by_metric, read_rows
-from safevar_sumo.cli.target import jobs_option
 from safevar_sumo.errors import InputError
-from safevar_sumo.output import check_writable
-from safevar_sumo.progress import open_progress
 from safevar_sumo.reference.calibration import Calibration, FitSubject, calibrate, describe_fit
 from safevar_sumo.reference.profiles import plot_profiles
 from safevar_sumo.study import FITTED_TABLES, Study, load_study, study_names, write_study
 from safevar_sumo.sumo.system import assemble
-from safevar_sumo.terminal import WholeTable, print_text
-
-SECONDS_BETWEEN_SAVES = 60.0
-"""Least time between two study files with the best values so far, which remain if the process is killed [s]."""
+from safevar_sumo.terminal import WholeTable, open_progress, print_text
 
 
 @commands.command(name="calibrate")
@@ -44,12 +36,11 @@ SECONDS_BETWEEN_SAVES = 60.0
 )
 @click.option("--from-scratch", is_flag=True, help="Start only from random points, not from the values in the studies.")
 @jobs_option
-@click.option("--plot", type=click.Path(path_type=Path), metavar="FILE.png", help="Draw the loss over every parameter.")
-@click.option(
+@file_option("--plot", "Draw the loss over every parameter.", metavar="FILE.png")
+@file_option(
     "--out",
-    type=click.Path(path_type=Path),
+    "Study file to write; for several studies, the directory for their files.  [default: STUDY-calibrated.toml]",
     metavar="FILE.toml",
-    help="Study file to write; for several studies, the directory for their files.  [default: STUDY-calibrated.toml]",
 )
 def calibrate_command(
     study: str,
@@ -82,10 +73,8 @@ def calibrate_command(
     if len({path.name for _, path in owners}) < len(owners):
         raise InputError("REFERENCE.csv", "two files have the same name", "files of different names")
     targets = _choose_targets(studies, out)
-    inputs = [file for item, system in zip(studies, systems, strict=True) for file in input_files(item, system)]
     for target in targets:
-        refuse_overwriting(target, "--out", *names, *inputs, *(path for _, path in owners))
-        check_writable(target)
+        check_output(target, "--out", (".toml",))
     subjects = [
         FitSubject(
             item, {path.name: read_rows(path, system.characteristics) for owner, path in owners if owner == index}
@@ -111,28 +100,14 @@ def calibrate_command(
 def _fit(
     subjects: Sequence[FitSubject], targets: Sequence[Path], from_scratch: bool, jobs: int | None
 ) -> list[Calibration]:
-    """Fit the studies with progress; now and then, and if it is interrupted, write the best so far, without the spread
-    before the fit.
-    """
+    """Fit the studies with progress; if it is interrupted, write the best so far, without the spread before the fit."""
     studies = [subject.study for subject in subjects]
-    fit, done, lowest_loss, best, last_save = studies[0].fit, 0, 0.0, list(studies), time.monotonic()
-
-    def save_best(ending: str) -> None:
-        comment = f"Best of {done} of {fit.trials} trials, {ending} (seed {fit.seed}). Loss {lowest_loss:.4f}."
-        _write_studies(
-            targets,
-            studies,
-            [msgspec.structs.replace(item, spread={}, model_error={}) for item in best],
-            [comment] * len(studies),
-        )
+    fit, done, lowest_loss, best = studies[0].fit, 0, 0.0, list(studies)
 
     def after_trial(loss: float, best_studies: tuple[Study, ...]) -> None:
-        nonlocal done, lowest_loss, best, last_save
+        nonlocal done, lowest_loss, best
         done, lowest_loss, best = done + 1, loss, list(best_studies)
         show_progress(f"trials, lowest loss {loss:.4f}", done, fit.trials)
-        if time.monotonic() - last_save > SECONDS_BETWEEN_SAVES:
-            save_best("while more are tried")
-            last_save = time.monotonic()
 
     try:
         with (
@@ -144,7 +119,11 @@ def _fit(
             return calibrate(subjects, pool, after_trial, from_scratch=from_scratch)
     except KeyboardInterrupt:
         if done:
-            save_best("then interrupted")
+            comment = (
+                f"Best of {done} of {fit.trials} trials, then interrupted (seed {fit.seed}). Loss {lowest_loss:.4f}."
+            )
+            found = [msgspec.structs.replace(item, spread={}, model_error={}) for item in best]
+            _write_studies(targets, studies, found, [comment] * len(studies))
             click.echo(f"interrupted: the best of {done} trials is in {', '.join(map(str, targets))}", err=True)
         raise
 

@@ -1,8 +1,7 @@
-"""The command `list`, which shows studies, models, weathers, algorithms, metrics and objectives."""
+"""The commands `list`, which shows studies, models, weathers, algorithms, metrics and objectives, and `check`."""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -11,8 +10,8 @@ import msgspec
 from rich.console import Console
 
 from safevar_sumo.ads import ADS
-from safevar_sumo.cli.program import commands
-from safevar_sumo.cli.target import json_option
+from safevar_sumo.cli.arguments import json_option
+from safevar_sumo.cli.program import commands, print_json
 from safevar_sumo.metrics import METRIC_OF_OBJECTIVE, METRICS, OPTIONAL_METRICS, RATING_POINTS
 from safevar_sumo.scenarios import SCENARIOS, WEATHERS, equals_clear
 from safevar_sumo.search import ALGORITHMS
@@ -33,30 +32,17 @@ def list_command(section: str | None, as_json: bool) -> None:
     studies = [load_study(name) for name in study_names()]
     if as_json:
         catalogue = _catalogue(studies)
-        click.echo(json.dumps({section: catalogue[section]} if section else catalogue, indent=2))
+        print_json({section: catalogue[section]} if section else catalogue)
     else:
         _print_catalogue(Console(), studies, [section] if section else SECTIONS)
 
 
 def _catalogue(studies: list[Study]) -> dict[str, Any]:
-    characteristics: dict[str, list[dict[str, Any]]] = {}
-    for study in studies:
-        characteristics.setdefault(
-            study.vehicle.model,
-            [
-                {
-                    "name": item.name,
-                    "unit": item.unit,
-                    "original": item.original,
-                    "lower": item.lower,
-                    "upper": item.upper,
-                    "threshold": item.threshold,
-                    "meaning": item.meaning,
-                    "counterpart": item.counterpart,
-                }
-                for item in CharacteristicSet.of(study.vehicle.characteristics)
-            ],
-        )
+    keys = ("name", "unit", "original", "lower", "upper", "threshold", "meaning", "counterpart")
+    characteristics = {
+        name: [{key: getattr(item, key) for key in keys} for item in members]
+        for name, members in _characteristics(studies).items()
+    }
     return {
         "studies": [
             {
@@ -95,6 +81,11 @@ def _catalogue(studies: list[Study]) -> dict[str, Any]:
     }
 
 
+def _characteristics(studies: list[Study]) -> dict[str, CharacteristicSet]:
+    """The characteristics of each vehicle, in the first study that has it."""
+    return {study.vehicle.model: CharacteristicSet.of(study.vehicle.characteristics) for study in reversed(studies)}
+
+
 def _weather_name(study: Study) -> str:
     return study.weather if isinstance(study.weather, str) else study.weather.name
 
@@ -109,9 +100,7 @@ def _print_catalogue(console: Console, studies: list[Study], sections: Sequence[
     study_rows = [(name, title, ", ".join(models)) for name, title, *models in map(dict.values, catalogue["studies"])]
     if study_rows:
         print_names(console, "Studies", study_rows, ("name", "title", "vehicle, ADS, scenario, weather"))
-    sets_by_vehicle: dict[str, CharacteristicSet] = {}
-    for study in studies:
-        sets_by_vehicle.setdefault(study.vehicle.model, CharacteristicSet.of(study.vehicle.characteristics))
+    sets_by_vehicle = _characteristics(studies)
     for vehicle in catalogue["vehicles"]:
         rows = [
             (row["name"], row["unit"], *(f"{row[key]:g}" for key in ("original", "lower", "upper", "threshold")))
@@ -149,3 +138,36 @@ def _print_catalogue(console: Console, studies: list[Study], sections: Sequence[
             print_names(
                 console, title, [(row["name"], row["description"]) for row in catalogue[key]], ("name", "description")
             )
+
+
+@commands.command(name="check")
+@click.argument("subject", metavar="SUBJECT")
+@click.option(
+    "--study",
+    metavar="STUDY",
+    help="Study to try SUBJECT in.  [default: a study beside it that names it, else a shipped study]",
+)
+@json_option
+def check_command(subject: str, study: str | None, as_json: bool) -> int:
+    """Check whether your driving system, vehicle, scenario, metric, objective, algorithm or TraCI controller works with
+    this package.
+
+    SUBJECT is package.module:Name, the name of a shipped model, or the name or path of a study to check everything that
+    it names. The exit code is 0 if SUBJECT passes, 1 with findings, 2 if it cannot be loaded.
+    """
+    from safevar_sumo.plugins.check import check
+
+    report = check(subject, study)
+    if as_json:
+        print_json(report.to_dict())
+        return 0 if report.passed else 1
+    console = Console()
+    for finding in report.findings:
+        print_text(console, str(finding))
+        print_text(console, f"  expected: {finding.expected}")
+        print_text(console, f"  advice: {finding.advice}")
+    if report.remark:
+        print_text(console, f"note: {report.remark}")
+    verdict = "passed" if report.passed else f"{len(report.findings)} finding{'s' * (len(report.findings) > 1)}"
+    print_text(console, f"{subject} ({report.kind}): {verdict}, {report.seconds:.1f} s")
+    return 0 if report.passed else 1

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import faulthandler
 import importlib
+import json
 import os
 import re
 import signal
@@ -13,7 +14,7 @@ import warnings
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from functools import partial
-from typing import TYPE_CHECKING, Any, NoReturn, TextIO
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import click
 
@@ -28,7 +29,7 @@ COMMANDS = {
     "status": ("study", "Show the progress of a study running in another process: runs, front, collisions, time left."),
     "simulate": ("simulate", "Simulate a study once: how it ends, its safety metrics and objectives."),
     "check": (
-        "check",
+        "catalogue",
         "Check your own driving system, vehicle, scenario, metric, objective, algorithm or TraCI controller.",
     ),
     "list": ("catalogue", "List studies, vehicles, ADSs, scenarios, weathers, algorithms, metrics and objectives."),
@@ -38,7 +39,7 @@ COMMANDS = {
     "risk": ("questions", "Estimate the probability of an unsafe outcome, and which characteristics decide it."),
     "rules": ("questions", "Find rules, in physical units, that describe the unsafe settings."),
     "rating": (
-        "rating",
+        "questions",
         "Rate a vehicle and a worn variant of it as Euro NCAP does: points, colours, robustness layers.",
     ),
     "tables": ("report", "Answer the research questions as tables."),
@@ -132,10 +133,6 @@ def main() -> None:
         _exit_with_error("interrupted", INTERRUPT_EXIT_CODE)
     except OSError as error:
         _exit_with_error(f"{error.strerror or error}{f': {error.filename}' if error.filename else ''}", 1)
-    except ValueError:
-        if not sys.stdout.closed:
-            raise
-        _exit_with_error("user code has closed standard output", 1)
     sys.exit(code if isinstance(code, int) else 0)
 
 
@@ -145,16 +142,9 @@ def _error_in_two_lines(error: click.ClickException) -> str:
     return f"{' '.join(error.format_message().split())}\nexpected: see {command} --help"
 
 
-def _show_warning(
-    message: Warning | str,
-    category: type[Warning],
-    filename: str,
-    lineno: int,
-    file: TextIO | None = None,
-    line: str | None = None,
-) -> None:
+def _show_warning(message: Warning | str, *_: object, **__: object) -> None:
     """Show a warning without its file and line."""
-    click.echo(f"warning: {message}", err=True)
+    print_warning(message)
 
 
 @contextmanager
@@ -182,7 +172,22 @@ def _exit_with_error(message: str, code: int) -> NoReturn:
     sys.exit(code)
 
 
+def print_json(value: Any) -> None:
+    """Print a value as JSON."""
+    click.echo(json.dumps(value, indent=2, allow_nan=False))
+
+
+def print_note(message: object) -> None:
+    """Print a note to standard error."""
+    click.echo(f"note: {message}", err=True)
+
+
+def print_warning(message: object) -> None:
+    """Print a warning to standard error."""
+    click.echo(f"warning: {message}", err=True)
+
+
 def print_remarks(study: Study, further_remarks: Iterable[str] = ()) -> None:
     """Print the remarks on a study, such as a key that has no effect, to standard error."""
     for remark in (*study.origin.remarks, *further_remarks):
-        click.echo(f"note: {remark}", err=True)
+        print_note(remark)

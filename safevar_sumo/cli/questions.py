@@ -1,4 +1,4 @@
-"""Commands that simulate many settings to answer a question: explain, opinion, tolerance, risk, rules."""
+"""Commands that simulate many settings to answer a question: explain, opinion, tolerance, risk, rules, rating."""
 
 from __future__ import annotations
 
@@ -13,25 +13,32 @@ from rich.console import Console
 from safevar_sumo.analysis.explain import ExplainOptions
 from safevar_sumo.analysis.opinion import OpinionOptions
 from safevar_sumo.analysis.options import Options
+from safevar_sumo.analysis.rating import RatingOptions
 from safevar_sumo.analysis.risk import RiskOptions
 from safevar_sumo.analysis.rules import RulesOptions
 from safevar_sumo.analysis.subject import study_in
 from safevar_sumo.analysis.tolerance import ToleranceOptions
-from safevar_sumo.cli.arguments import PICTURE_ENDINGS, check_output
-from safevar_sumo.cli.program import commands
-from safevar_sumo.cli.target import (
+from safevar_sumo.cli.arguments import (
+    PICTURE_ENDINGS,
     CommandFunction,
     add_flags,
     as_it_is_now_option,
+    check_output,
+    file_option,
     jobs_option,
     json_option,
     load_results_or_study,
     point_option,
+    read_changes,
 )
+from safevar_sumo.cli.program import commands, print_json, print_note, print_warning
 from safevar_sumo.errors import InputError
-from safevar_sumo.progress import open_progress
 from safevar_sumo.results import make_directory, write_whole
-from safevar_sumo.terminal import print_answer
+from safevar_sumo.study import Study
+from safevar_sumo.terminal import open_progress, print_answer
+from safevar_sumo.vehicles import CharacteristicSet
+
+SPREADSHEET_ENDINGS = (".xlsx",)
 
 
 def add_question(
@@ -73,20 +80,11 @@ def _print(result: Any, as_json: bool) -> None:
         print_answer(Console(), result.study, result.no_verdict, result.sentences())
 
 
-def _plot_option(help_text: str) -> Callable[[CommandFunction], CommandFunction]:
-    return click.option("--plot", type=click.Path(path_type=Path), metavar="FILE", help=help_text)
-
-
 @add_question(
     ExplainOptions,
     "DIR|STUDY",
     click.option("--full", is_flag=True, help="Print every explanation in full, not only the answer."),
-    click.option(
-        "--out",
-        type=click.Path(path_type=Path),
-        metavar="DIR",
-        help="Write causes.json, causes.csv and a figure there.",
-    ),
+    file_option("--out", "Write causes.json, causes.csv and a figure there.", metavar="DIR"),
 )
 def explain(
     source: str, full: bool, point: str | None, jobs: int | None, as_json: bool, out: Path | None, **values: Any
@@ -136,11 +134,11 @@ def opinion(
     result = _compute_with_bar(ask_for_opinions, load_results_or_study(source, point, results_only=True), options, jobs)
     if as_json:
         for note in result.notes:
-            click.echo(f"note: {note}", err=True)
+            print_note(note)
     _print(result, as_json)
 
 
-@add_question(ToleranceOptions, "STUDY|DIR", _plot_option("Draw the profiles to this file: png, pdf or svg."))
+@add_question(ToleranceOptions, "STUDY|DIR", file_option("--plot", "Draw the profiles to this file: png, pdf or svg."))
 def tolerance(
     source: str, point: str | None, jobs: int | None, as_json: bool, plot: Path | None, **values: Any
 ) -> None:
@@ -157,7 +155,9 @@ def tolerance(
         save(result.figure(), plot, "--plot")
 
 
-@add_question(RiskOptions, "STUDY|DIR", _plot_option("Draw the sensitivity indices to this file: png, pdf or svg."))
+@add_question(
+    RiskOptions, "STUDY|DIR", file_option("--plot", "Draw the sensitivity indices to this file: png, pdf or svg.")
+)
 def risk(source: str, point: str | None, jobs: int | None, as_json: bool, plot: Path | None, **values: Any) -> None:
     """Estimate how likely an unsafe outcome is if vehicles vary as defined in STUDY's [variation], and which
     characteristics decide it.
@@ -169,21 +169,11 @@ def risk(source: str, point: str | None, jobs: int | None, as_json: bool, plot: 
     study = study_in(subject)
     if plot is not None:
         check_output(plot, "--plot", PICTURE_ENDINGS)
-        if study.correlations:
-            raise InputError(
-                "--plot",
-                "sensitivity indices of correlated characteristics are not defined",
-                "a study without correlations",
-            )
-        if options.requires_rare_method:
-            raise InputError(
-                "--plot", "a method for rare failures computes no sensitivity indices to draw", "--method auto"
-            )
     result = _compute_with_bar(estimate_risk, subject, options, jobs)
     if study.correlations:
-        click.echo("note: no sensitivity indices: they are not defined for correlated characteristics", err=True)
+        print_note("no sensitivity indices: they are not defined for correlated characteristics")
     if result.errors:
-        click.echo(f"warning: {result.errors} vehicles could not be simulated and are left out", err=True)
+        print_warning(f"{result.errors} vehicles could not be simulated and are left out")
     _print(result, as_json)
     if plot is not None:
         save(result.figure(), plot, "--plot")
@@ -198,5 +188,102 @@ def rules(source: str, point: str | None, jobs: int | None, as_json: bool, **val
 
     result = _compute_with_bar(find_rules, load_results_or_study(source, point), RulesOptions(**values), jobs)
     if as_json and result.remark:
-        click.echo(f"note: {result.remark}", err=True)
+        print_note(result.remark)
     _print(result, as_json)
+
+
+@commands.command(name="rating")
+@click.argument("source", metavar="STUDY|DIR")
+@add_flags(RatingOptions)
+@click.option(
+    "--matrix", is_flag=True, help="Print every matrix: speed by impact location, with the colours of the cells."
+)
+@file_option("--plot", "Draw the matrices to this file: png, pdf or svg.")
+@file_option(
+    "--xlsx",
+    "Write the official spreadsheet with the predictions of the variant, if any, else "
+    "of the original, to this file; needs --template or --preprocessed.",
+)
+@file_option("--template", "Output of the official calculator's generate-template: ca_template.xlsx.")
+@file_option(
+    "--preprocessed",
+    "Output of the calculator's preprocess: its verification sheets are "
+    "filled with simulated results, in --xlsx, or with --force in this file.",
+)
+@click.option("--force", is_flag=True, help="Overwrite existing files.")
+@as_it_is_now_option
+@jobs_option
+@json_option
+def rating(
+    source: str,
+    changes: tuple[str, ...],
+    solution: str | None,
+    matrix: bool,
+    plot: Path | None,
+    xlsx: Path | None,
+    template: Path | None,
+    preprocessed: Path | None,
+    force: bool,
+    jobs: int | None,
+    as_json: bool,
+) -> None:
+    """Rate the vehicle of STUDY as Euro NCAP does in 2026, and one variant: points, colours, robustness layers."""
+    from safevar_sumo.analysis.figures import save
+    from safevar_sumo.analysis.rating.compute import rate_variant, remarks
+    from safevar_sumo.analysis.rating.render import matrices_figure, print_matrices, print_rating
+
+    subject = load_results_or_study(source)
+    study = subject if isinstance(subject, Study) else subject.study
+    options = RatingOptions(changes=_read_single_changes(study, changes), solution=solution)
+    if force and xlsx is None and preprocessed is None and plot is None:
+        raise InputError("--force", "there is no file to overwrite", "together with --xlsx, --preprocessed or --plot")
+    if plot is not None:
+        check_output(plot, "--plot", PICTURE_ENDINGS)
+        _refuse_existing(plot, "--plot", force)
+    spreadsheet = _open_spreadsheet(xlsx, template, preprocessed, force)
+    with open_progress(True) as progress:
+        result = rate_variant(subject, options, jobs=jobs, progress=progress)
+    for remark in remarks(result):
+        print_note(remark)
+    if as_json:
+        print_json(result.to_dict())
+    else:
+        print_rating(Console(), result)
+    if matrix and not as_json:
+        print_matrices(Console(), result)
+    if plot is not None:
+        save(matrices_figure(result), plot, "--plot")
+    if spreadsheet is not None:
+        vehicle = result.variant or result.original
+        spreadsheet.fill(vehicle)
+        click.echo(f"Spreadsheet of {vehicle.name}: {spreadsheet.output}", err=True)
+
+
+def _read_single_changes(study: Study, changes: tuple[str, ...]) -> dict[str, float]:
+    """Parse --set into the value of each changed characteristic."""
+    values = read_changes(changes, CharacteristicSet.of(study.vehicle.characteristics), beyond=False, single=True)
+    return {name: value for name, (value,) in values.items()}
+
+
+def _refuse_existing(path: Path, flag: str, force: bool) -> None:
+    if path.exists() and not force:
+        raise InputError(flag, f"{path} exists", "another file, or --force")
+
+
+def _open_spreadsheet(xlsx: Path | None, template: Path | None, preprocessed: Path | None, force: bool) -> Any:
+    """The spreadsheet to fill, read and checked before any simulation; None without --xlsx and --preprocessed."""
+    if xlsx is None and template is None and preprocessed is None:
+        return None
+    source_file = preprocessed if template is None else template
+    if source_file is None or (template is not None and (xlsx is None or preprocessed is not None)):
+        problem = "a spreadsheet needs the official template, or the calculator's preprocessed file, but not both"
+        raise InputError("--xlsx", problem, "--xlsx with --template or --preprocessed, or --preprocessed alone")
+    output = xlsx if xlsx is not None else source_file
+    flag = "--xlsx" if xlsx is not None else "--preprocessed"
+    _refuse_existing(output, flag, force)
+    check_output(output, flag, SPREADSHEET_ENDINGS)
+    try:
+        from safevar_sumo.analysis.rating.workbook import PreprocessedFile, Template
+    except ModuleNotFoundError:
+        raise InputError(flag, "openpyxl is not installed", "in the checkout: pip install '.[rating]'") from None
+    return (PreprocessedFile if template is None else Template)(source_file, output)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -12,13 +11,17 @@ from rich.console import Console
 
 from safevar_sumo.analysis.research_questions.case import load_cases
 from safevar_sumo.api.simulation import evaluate_settings
-from safevar_sumo.cli.arguments import PICTURE_ENDINGS, check_output, complete_study, refuse_overwriting
-from safevar_sumo.cli.program import commands, print_remarks
-from safevar_sumo.cli.target import jobs_option, json_option
+from safevar_sumo.cli.arguments import (
+    PICTURE_ENDINGS,
+    check_output,
+    complete_study,
+    file_option,
+    jobs_option,
+    json_option,
+)
+from safevar_sumo.cli.program import commands, print_json, print_note, print_remarks, print_warning
 from safevar_sumo.errors import InputError, SimulationError
 from safevar_sumo.metrics import METRICS
-from safevar_sumo.output import check_writable
-from safevar_sumo.progress import open_progress
 from safevar_sumo.reference import replication
 from safevar_sumo.reference.agreement import measure_agreement, plot_agreement, write_totals
 from safevar_sumo.reference.effects import ABSOLUTE_TOLERANCE, RELATIVE_TOLERANCE, effects_of, measure_coverage
@@ -26,7 +29,7 @@ from safevar_sumo.reference.rows import ReferenceData, evaluations_of, original_
 from safevar_sumo.results import MANIFEST, write_imported, write_whole
 from safevar_sumo.study import Study, load_study
 from safevar_sumo.sumo.system import assemble
-from safevar_sumo.terminal import WholeTable
+from safevar_sumo.terminal import WholeTable, open_progress
 from safevar_sumo.vehicles import CharacteristicSet
 
 
@@ -34,15 +37,12 @@ from safevar_sumo.vehicles import CharacteristicSet
 @click.argument("study", shell_complete=complete_study)
 @click.argument("reference", type=click.Path(path_type=Path), metavar="REFERENCE.csv")
 @jobs_option
-@click.option(
-    "--plot", type=click.Path(path_type=Path), metavar="FILE.png", help="Plot simulated against reference values."
-)
+@file_option("--plot", "Plot simulated against reference values.", metavar="FILE.png")
 @json_option
-@click.option(
+@file_option(
     "--totals",
-    type=click.Path(path_type=Path),
+    "Also save rank correlations, errors and counts of collisions to this file, without any row.",
     metavar="FILE.toml",
-    help="Also save rank correlations, errors and counts of collisions to this file, without any row.",
 )
 @click.option(
     "--effects",
@@ -83,7 +83,7 @@ def validate(
         raise SimulationError(f"study {study!r} cannot be simulated with {vehicle}")
     if not valid.all():
         number = np.count_nonzero(~valid)
-        click.echo(f"warning: {reference}: {number} rows could not be simulated and are left out", err=True)
+        print_warning(f"{reference}: {number} rows could not be simulated and are left out")
     data, simulated = data.take(valid), evaluations.take(1 + np.flatnonzero(valid))
     result = measure_agreement(data, simulated, loaded_study, evaluations.take([0]))
     if plot is not None:
@@ -95,7 +95,7 @@ def validate(
     if as_json:
         extras = {"effects": {name: effect._asdict() for name, effect in effects.items()}} if with_effects else {}
         extras |= {} if coverage is None else {"spread": coverage._asdict()}
-        click.echo(json.dumps({**result.to_dict(), **extras}, indent=2, allow_nan=False))
+        print_json({**result.to_dict(), **extras})
         return
     console, original = (
         Console(),
@@ -146,10 +146,10 @@ def print_by_metric(console: Console, title: str, columns: Mapping[str, Sequence
 
 @commands.command(name="import")
 @click.argument("study", shell_complete=complete_study)
-@click.option("--out", type=click.Path(path_type=Path), required=True, metavar="DIR", help="Directory for the results.")
-@click.option("--nsga2", type=click.Path(path_type=Path), metavar="FILE.csv", help="Solutions of NSGA-II.")
-@click.option("--rs", type=click.Path(path_type=Path), metavar="FILE.csv", help="Solutions of random search.")
-@click.option("--safe-fuzzer", type=click.Path(path_type=Path), metavar="FILE.csv", help="Solutions of SafeFuzzer.")
+@file_option("--out", "Directory for the results.", metavar="DIR", required=True)
+@file_option("--nsga2", "Solutions of NSGA-II.", metavar="FILE.csv")
+@file_option("--rs", "Solutions of random search.", metavar="FILE.csv")
+@file_option("--safe-fuzzer", "Solutions of SafeFuzzer.", metavar="FILE.csv")
 @click.option(
     "--original",
     metavar="sd=2.7,tet=1.2,tit=0.44,ave_dece=5.97",
@@ -173,14 +173,14 @@ def import_command(study: str, out: Path, original: str | None, **paths: Path | 
     )
     click.echo(f"Results: {out}, {', '.join(f'{len(rows)} solutions of {name}' for name, rows in solutions.items())}")
     for name, count in replaced_counts.items():
-        click.echo(f"note: they replace {count} solutions of {name} of an earlier import", err=True)
+        print_note(f"they replace {count} solutions of {name} of an earlier import")
 
 
 def read_rows(path: Path, characteristics: CharacteristicSet) -> ReferenceData:
     """Read a reference file, and warn of rows outside the domains."""
     data = read_reference(path, characteristics)
     if data.skipped:
-        click.echo(f"warning: {path}: {data.skipped} rows with values outside the domains are left out", err=True)
+        print_warning(f"{path}: {data.skipped} rows with values outside the domains are left out")
     return data
 
 
@@ -232,7 +232,7 @@ class _MultivalueCommand(click.Command):
     metavar="DIR...",
     help="Imported results (command import).",
 )
-@click.option("--out", type=click.Path(path_type=Path), metavar="FILE.md", help="Write the page to this file.")
+@file_option("--out", "Write the page to this file.", metavar="FILE.md")
 @click.option(
     "--reference",
     "references",
@@ -246,13 +246,7 @@ def replicate(
 ) -> None:
     """Compare the results DIR... with published ones: tables side by side, and whether each conclusion holds."""
     if out is not None:
-        refuse_overwriting(out, "--out", *directories, *published, *references)
-        check_writable(out)
-    for directory in published:
-        if Path(directory).resolve() in [Path(other).resolve() for other in directories]:
-            raise InputError(
-                "--published", f"{directory} is given as results too", "results that the command `import` has written"
-            )
+        check_output(out, "--out", (".md",))
     cases, data = load_cases(directories), dict[str, list[ReferenceData]]()
     for reference in references:
         index, path = find_owner(reference, [case.study for case in cases])

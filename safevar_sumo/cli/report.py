@@ -10,13 +10,18 @@ import click
 
 from safevar_sumo.analysis.research_questions.answer import QUESTIONS, answer_questions
 from safevar_sumo.analysis.research_questions.case import load_cases
-from safevar_sumo.analysis.research_questions.gallery import FORMATS as PICTURE_FORMATS
-from safevar_sumo.analysis.research_questions.gallery import save_figures
+from safevar_sumo.analysis.research_questions.gallery import FORMATS as PICTURE_FORMATS, save_figures
 from safevar_sumo.analysis.research_questions.layout import LAYOUTS_BY_NAME
 from safevar_sumo.analysis.research_questions.tables import ENDINGS, FORMATS, FORMATS_WITH_LAYOUT
-from safevar_sumo.cli.arguments import check_output
-from safevar_sumo.cli.program import commands
-from safevar_sumo.cli.target import as_it_is_now, as_it_is_now_option, jobs_option, point_option
+from safevar_sumo.cli.arguments import (
+    as_it_is_now,
+    as_it_is_now_option,
+    check_output,
+    file_option,
+    jobs_option,
+    point_option,
+)
+from safevar_sumo.cli.program import commands, print_note, print_warning
 from safevar_sumo.errors import InputError
 from safevar_sumo.results import make_directory, write_whole
 
@@ -42,9 +47,7 @@ FORMATS_WITHOUT_NOTES = ("csv", "json")
     show_default=True,
     help="Everything, or only RQ1, RQ2 and the combinations, laid out as in the paper.",
 )
-@click.option(
-    "--out", type=click.Path(path_type=Path), metavar="DIR", help="Write each table to a file in this directory."
-)
+@file_option("--out", "Write each table to a file in this directory.", metavar="DIR")
 def tables(directories: tuple[str, ...], question: str | None, format_name: str, layout: str, out: Path | None) -> None:
     """Answer the research questions as tables, from the results directories DIR..., one for each case."""
     if layout != "full" and format_name not in FORMATS_WITH_LAYOUT:
@@ -75,9 +78,7 @@ def tables(directories: tuple[str, ...], question: str | None, format_name: str,
 
 @commands.command()
 @click.argument("directories", nargs=-1, required=True, metavar="DIR...")
-@click.option(
-    "--out", type=click.Path(path_type=Path), required=True, metavar="DIR", help="Directory for the pictures."
-)
+@file_option("--out", "Directory for the pictures.", metavar="DIR", required=True)
 @click.option(
     "--format",
     "format_name",
@@ -98,19 +99,12 @@ def figures(directories: tuple[str, ...], out: Path, format_name: str) -> None:
 
 def _print_notes(notes: list[str]) -> None:
     for note in notes:
-        click.echo(f"note: {note}", err=True)
+        print_note(note)
 
 
 @commands.command()
 @click.argument("directories", nargs=-1, required=True, metavar="DIR...")
-@click.option(
-    "--out",
-    type=click.Path(path_type=Path),
-    default=Path("report.html"),
-    show_default=True,
-    metavar="FILE.html",
-    help="File to write the page to.",
-)
+@file_option("--out", "File to write the page to.", metavar="FILE.html", default=Path("report.html"), show_default=True)
 @click.option(
     "--only", metavar="SECTION,...", help="Only these sections, separated by commas: tested, verdict, causes, ..."
 )
@@ -119,8 +113,8 @@ def _print_notes(notes: list[str]) -> None:
 @jobs_option
 def report(directories: tuple[str, ...], out: Path, only: str | None, point: str | None, jobs: int | None) -> None:
     """Write one self-contained page about the results directories DIR...: verdict, causes, replays, tables, figures."""
-    from safevar_sumo.progress import open_progress
     from safevar_sumo.report import make_report
+    from safevar_sumo.terminal import open_progress
 
     check_output(out, "--out", (".html", ".htm"))
     sections = [name.strip() for name in only.split(",")] if only is not None else []
@@ -128,6 +122,6 @@ def report(directories: tuple[str, ...], out: Path, only: str | None, point: str
         warnings.simplefilter("always", UserWarning)
         page = make_report(directories, sections, jobs, progress, point=point, as_it_is_now=as_it_is_now())
     for warning in caught:
-        click.echo(f"warning: {warning.message}", err=True)
+        print_warning(warning.message)
     write_whole(out, page)
     click.echo(f"Report: {out} ({len(page.encode()) / 1e6:.2f} MB)")

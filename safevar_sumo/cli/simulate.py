@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -23,21 +22,20 @@ from safevar_sumo.analysis.words import points_in_words
 from safevar_sumo.api.simulation import Simulation, evaluate_settings, simulate_with_original
 from safevar_sumo.cli.arguments import (
     PICTURE_ENDINGS,
+    CommandTarget,
+    as_it_is_now_option,
     check_output,
     combine_values,
     complete_changes,
     complete_study,
-    read_changes,
-)
-from safevar_sumo.cli.program import commands
-from safevar_sumo.cli.target import (
-    CommandTarget,
-    as_it_is_now_option,
+    file_option,
     json_option,
     load_target,
     point_option,
+    read_changes,
     replay_options,
 )
+from safevar_sumo.cli.program import commands, print_json, print_note, print_warning
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.output import whole_file
@@ -50,8 +48,6 @@ from safevar_sumo.sumo.matrix import PointResult, point_record, simulate_all_poi
 from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.terminal import WholeTable, print_heading, print_meanings, print_text
 from safevar_sumo.vehicles import CharacteristicSet
-
-FILE = click.Path(path_type=Path)
 
 
 @commands.command(name="simulate")
@@ -69,19 +65,9 @@ FILE = click.Path(path_type=Path)
 @click.option(
     "--beyond", is_flag=True, help="Also accept values beyond the domains, and settings that violate a constraint."
 )
-@click.option("--trace", type=FILE, metavar="FILE.csv", help="Write the simulation step by step.")
-@click.option(
-    "--plot",
-    type=FILE,
-    metavar="FILE",
-    help="Draw the simulation beside the original vehicle's to this file: png, pdf or svg.",
-)
-@click.option(
-    "--animate",
-    type=FILE,
-    metavar="FILE",
-    help="Animate both simulations, seen from above, in this file: gif, mp4 or html.",
-)
+@file_option("--trace", "Write the simulation step by step.", metavar="FILE.csv")
+@file_option("--plot", "Draw the simulation beside the original vehicle's to this file: png, pdf or svg.")
+@file_option("--animate", "Animate both simulations, seen from above, in this file: gif, mp4 or html.")
 @click.option("--gui", is_flag=True, help="Show both simulations in sumo-gui, each on its own road.")
 @click.option(
     "--slower",
@@ -124,8 +110,6 @@ def simulate_command(
     if not beyond and changes:
         system.check_feasible(requested_settings, "--set", filtered=not no_filter, switch="--beyond")
     _check_outputs(trace, plot, animate)
-    if slower is not None and not gui:
-        raise InputError("--slower", f"{slower:g} without --gui", "together with --gui")
     if any(len(values) > 1 for values in values_by_name.values()):
         if trace or plot or animate or gui or spread:
             expected = "one value for each characteristic with --trace, --plot, --animate, --gui or --spread"
@@ -134,7 +118,7 @@ def simulate_command(
         return
     parameter_sets = studies_of_sets(target.study) if spread else []
     for name in parameters_outside_sets(target.study) if spread else ():
-        click.echo(f"note: [spread] does not vary {name}: the study's value is not the first of its list", err=True)
+        print_note(f"[spread] does not vary {name}: the study's value is not the first of its list")
     simulation = simulate_with_original(target.study, system, requested_settings[0], filtered=not no_filter)
     if target.row is not None and not changes:
         _warn_of_differences(target, simulation)
@@ -205,18 +189,15 @@ def _simulate_sweep(
             }
             for row, setting in enumerate(evaluations.settings.tolist())
         ]
-        click.echo(json.dumps([*records[1:], *summary_entry(no_verdict)], indent=2, allow_nan=False))
+        print_json([*records[1:], *summary_entry(no_verdict)])
     else:
         print_heading(Console(), target.study.title, no_verdict)
         print_sweep(Console(), system.characteristics, names, evaluations)
     reset_count = int(np.count_nonzero((settings != requested_settings).any(axis=1)))
     if reset_count:
-        click.echo(
-            (
-                f"note: in {reset_count} of {len(requested_settings)} settings the filter reset small changes; "
-                "--no-filter keeps them"
-            ),
-            err=True,
+        print_note(
+            f"in {reset_count} of {len(requested_settings)} settings the filter reset small changes; "
+            "--no-filter keeps them"
         )
 
 
@@ -229,7 +210,7 @@ def _print_results(
         solution = {} if target.handle is None else {"solution": str(target.handle)}
         matrix = {"points": [point_record(result) for result in results_at_points]} if results_at_points else {}
         spread = {"spread": {**spreads[0].to_dict(), "original": spreads[1].to_dict()}} if spreads else {}
-        click.echo(json.dumps({**simulation.to_dict(), **solution, **matrix, **spread}, indent=2, allow_nan=False))
+        print_json({**simulation.to_dict(), **solution, **matrix, **spread})
     else:
         print_simulation(Console(), simulation)
         for vehicle, model_spread in zip(("the simulated vehicle", "the original"), spreads, strict=False):
@@ -245,12 +226,11 @@ def _print_results(
             print_text(Console(), types)
     remarks = [remark for point in system.points for remark in point.scenario.remarks()]
     for remark in dict.fromkeys([*remarks, *system.remarks, *vehicle_remarks(system)]):
-        click.echo(f"note: {remark}", err=True)
+        print_note(remark)
     for name, value in simulation.reset_values.items():
-        click.echo(
-            f"note: {name} = {value:g} differs from the original by less than the filter threshold and was reset to "
-            f"{simulation.setting[name]:g}; --no-filter keeps it",
-            err=True,
+        print_note(
+            f"{name} = {value:g} differs from the original by less than the filter threshold and was reset to "
+            f"{simulation.setting[name]:g}; --no-filter keeps it"
         )
 
 
@@ -274,12 +254,8 @@ def _warn_of_differences(target: CommandTarget, simulation: Simulation) -> None:
 
     assert target.row is not None
     for difference in list_differences(simulation.evaluation, target.row):
-        click.echo(
-            (
-                f"warning: {target.handle} of {target.source}: {difference}; have versions or code changed since "
-                "the study?"
-            ),
-            err=True,
+        print_warning(
+            f"{target.handle} of {target.source}: {difference}; have versions or code changed since the study?"
         )
 
 

@@ -23,17 +23,15 @@ from safevar_sumo.analysis.words import change_texts, two_decimals
 from safevar_sumo.api.running import ENGINES, carry_out_runs, choose_engine, load_for_search, open_observer, open_pool
 from safevar_sumo.campaign import Campaign, Forecast, RunKey, all_runs, forecast
 from safevar_sumo.campaign.pool import Pool
-from safevar_sumo.cli.arguments import complete_study
-from safevar_sumo.cli.program import commands, print_remarks
-from safevar_sumo.cli.target import jobs_option
+from safevar_sumo.cli.arguments import complete_study, file_option, jobs_option
+from safevar_sumo.cli.program import commands, print_note, print_remarks, print_warning
 from safevar_sumo.errors import InputError
-from safevar_sumo.progress import open_progress
 from safevar_sumo.records import Outcome
 from safevar_sumo.results import Status, evaluations_frame, failure_lines, record, solutions_frame
 from safevar_sumo.shipped import PROGRAM_COMMAND
 from safevar_sumo.study import Study, load_study
 from safevar_sumo.sumo import settings_per_batch, vehicle_remarks
-from safevar_sumo.terminal import WholeTable, print_text
+from safevar_sumo.terminal import WholeTable, open_progress, print_text
 from safevar_sumo.vehicles import CharacteristicSet
 
 
@@ -57,7 +55,7 @@ from safevar_sumo.vehicles import CharacteristicSet
     "the vehicles; "
     "results are verified in SUMO. sumo: always SUMO.",
 )
-@click.option("--out", type=click.Path(path_type=Path), help="Directory of the results.  [default: results/STUDY]")
+@file_option("--out", "Directory of the results.  [default: results/STUDY]", metavar="PATH")
 @jobs_option
 @click.option("--cluster", metavar="ADDRESS", help="Compute on the workers of this Dask scheduler instead.")
 @click.option("--only", metavar="ALGORITHM:RUN", help="Only this run; runs count from 0.")
@@ -88,21 +86,19 @@ def study(
     print_remarks(loaded_study, [*system.remarks, *vehicle_remarks(system)])
     keys = _select_runs(all_runs(loaded_study), only, shard)
     if not keys:
-        click.echo(f"warning: --shard {shard} selects none of the runs", err=True)
+        print_warning(f"--shard {shard} selects none of the runs")
     directory = out or Path("results") / loaded_study.name
     with open_pool(loaded_study, jobs, cluster) as pool:
         if dry_run:
             used_engine, reason = choose_engine(system, engine)
             size = batch or settings_per_batch(system, used_engine)
             if system.matrix:
-                click.echo(f"note: measuring the time of a few vehicles at {len(system.matrix)} points", err=True)
+                print_note(f"measuring the time of a few vehicles at {len(system.matrix)} points")
             cost = forecast(loaded_study, len(keys), pool, size, used_engine)
             print_forecast(Console(), loaded_study, len(keys), cost, f"{used_engine}: {reason}")
             return
         try:
-            with open_observer(
-                not quiet, loaded_study, keys, lambda message: click.echo(f"warning: {message}", err=True)
-            ) as observer:
+            with open_observer(not quiet, loaded_study, keys, print_warning) as observer:
                 campaign = carry_out_runs(
                     loaded_study, system, keys, directory, pool, observer, batch, engine, retry_failed=retry_failed
                 )
@@ -154,8 +150,6 @@ def status(directory: str, watch: bool, every: float | None, as_json: bool) -> N
     """Show the progress of the study in DIR, without disturbing it: runs, front, collisions, time left."""
     from safevar_sumo.results import status as read_status
 
-    if every is not None and not watch:
-        raise InputError("--every", f"{every:g} without --watch", "together with --watch")
     progress, start_time, console = read_status(directory), time.monotonic(), Console()
     start_share, rate = progress.share, None
     with Live(console=console, auto_refresh=False) if watch and not as_json else nullcontext() as live:

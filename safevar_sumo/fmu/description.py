@@ -1,22 +1,107 @@
-"""An FMU's model description, as FMPy reads it: which variables, units and steps a study may use."""
+"""An FMU's model description, as FMPy reads it: the variables, units and steps that a study may use; and units."""
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from hashlib import sha256
-from math import isfinite
 from pathlib import Path
-from typing import TYPE_CHECKING
-from zipfile import ZipFile
+from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
-from safevar_sumo.errors import InputError, describe_error, did_you_mean
-from safevar_sumo.fmu.units import BASE_UNITS, COMMON_UNITS, Unit
+import numpy as np
+import numpy.typing as npt
+
+from safevar_sumo.errors import InputError, describe_error, unknown_name
+from safevar_sumo.output import file_beside
 
 if TYPE_CHECKING:
     from fmpy.model_description import ModelDescription, ModelVariable
+
+Values = TypeVar("Values", float, npt.NDArray[np.float64])
+BASE_UNITS = ("kg", "m", "s", "A", "K", "mol", "cd", "rad")
+"""FMI's base units (FMI 2.0.4, section 2.2.2)."""
+
+
+class Unit(NamedTuple):
+    """A unit: value in SI = `factor` * value + `offset`; `exponents` belong to the units `BASE_UNITS`."""
+
+    exponents: tuple[int, ...]
+    factor: float = 1.0
+    offset: float = 0.0
+
+    def fits(self, other: Unit) -> bool:
+        """Whether both measure the same kind of quantity; radians count as plain numbers."""
+        return self.exponents[:-1] == other.exponents[:-1]
+
+    def to(self, other: Unit, value: Values) -> Values:
+        """A value or an array converted to another unit of the same kind; unchanged where both units are equal."""
+        if (self.factor, self.offset) == (other.factor, other.offset):
+            return value
+        return (self.factor * value + (self.offset - other.offset)) / other.factor
+
+
+def _unit(factor: float = 1.0, offset: float = 0.0, **exponents: int) -> Unit:
+    return Unit(tuple(exponents.get(base, 0) for base in BASE_UNITS), factor, offset)
+
+
+SI: Mapping[str, Unit] = {
+    "-": _unit(),
+    "s": _unit(s=1),
+    "m": _unit(m=1),
+    "m/s": _unit(m=1, s=-1),
+    "m/s^2": _unit(m=1, s=-2),
+    "kg": _unit(kg=1),
+}
+"""Units of the quantities that vehicles and driving systems exchange."""
+_FORCE, _TORQUE = {"kg": 1, "m": 1, "s": -2}, {"kg": 1, "m": 2, "s": -2}
+_POWER, _PRESSURE = {"kg": 1, "m": 2, "s": -3}, {"kg": 1, "m": -1, "s": -2}
+COMMON_UNITS: Mapping[str, Unit] = {
+    **SI,
+    "": _unit(),
+    "1": _unit(),
+    "%": _unit(0.01),
+    "rad": _unit(rad=1),
+    "deg": _unit(math.pi / 180, rad=1),
+    "ms": _unit(1e-3, s=1),
+    "min": _unit(60.0, s=1),
+    "h": _unit(3600.0, s=1),
+    "1/s": _unit(s=-1),
+    "Hz": _unit(s=-1),
+    "mm": _unit(1e-3, m=1),
+    "cm": _unit(1e-2, m=1),
+    "km": _unit(1e3, m=1),
+    "m2": _unit(m=2),
+    "m^2": _unit(m=2),
+    "m.s-1": _unit(m=1, s=-1),
+    "km/h": _unit(1 / 3.6, m=1, s=-1),
+    "kph": _unit(1 / 3.6, m=1, s=-1),
+    "mph": _unit(0.44704, m=1, s=-1),
+    "m/s2": _unit(m=1, s=-2),
+    "m/s**2": _unit(m=1, s=-2),
+    "m.s-2": _unit(m=1, s=-2),
+    "g": _unit(1e-3, kg=1),
+    "t": _unit(1e3, kg=1),
+    "rad/s": _unit(rad=1, s=-1),
+    "rpm": _unit(math.pi / 30, rad=1, s=-1),
+    "r/min": _unit(math.pi / 30, rad=1, s=-1),
+    "N": _unit(**_FORCE),
+    "kN": _unit(1e3, **_FORCE),
+    "N.m": _unit(**_TORQUE),
+    "Nm": _unit(**_TORQUE),
+    "J": _unit(**_TORQUE),
+    "W": _unit(**_POWER),
+    "kW": _unit(1e3, **_POWER),
+    "Pa": _unit(**_PRESSURE),
+    "kPa": _unit(1e3, **_PRESSURE),
+    "bar": _unit(1e5, **_PRESSURE),
+    "K": _unit(K=1),
+    "degC": _unit(1.0, 273.15, K=1),
+}
+"""Units by their common names, for models whose description does not define them."""
+
 
 REAL_TYPES = ("Real", "Float64", "Float32")
 """Types of variables that have units."""
@@ -89,24 +174,13 @@ class Description:
         InputError
             If the variable does not exist, or has another causality or type.
         """
-        names = [
-            other.name
-            for other in self.variables.values()
-            if causality_of(other) in causalities and other.type in types
-        ]
-        listing = ", ".join(names[:MAX_LISTED]) + ", ..." * (len(names) > MAX_LISTED)
         variable = self.variables.get(name)
-        if variable is None:
-            problem = f"{Path(self.path).name} has no such variable{did_you_mean(name, names)}"
-        elif name not in names:
-            problem = f"that variable is {_with_article(causality_of(variable))} of type {variable.type}"
-        else:
+        if variable is not None and causality_of(variable) in causalities and variable.type in types:
             return variable
-        raise InputError(
-            source,
-            f"{key} = {name!r}: {problem}",
-            f"{_with_article(' or '.join(causalities))} of the FMU with a number: {listing or 'it has none'}",
-        )
+        others = self.variables.values()
+        names = [other.name for other in others if causality_of(other) in causalities and other.type in types]
+        problem = f"is no {' or '.join(causalities)} of {Path(self.path).name} that holds a number"
+        raise unknown_name(source, f"{key} = {name!r} {problem}", name, names[:MAX_LISTED])
 
     def unit_of(self, variable: ModelVariable) -> Unit | None:
         """The unit of a variable; None if it declares none, or one that is not defined."""
@@ -192,24 +266,14 @@ def number_of(variable: ModelVariable, name: str) -> float | None:
         number = float(declared(variable, name))
     except (TypeError, ValueError):
         return None
-    return number if isfinite(number) else None
+    return number if math.isfinite(number) else None
 
 
 def file_of(model: str, folders: Sequence[str]) -> str:
     """The path of the FMU that a study names: relative to the folders of the study's files, else to the working
     directory.
     """
-    try:
-        return next(
-            (
-                os.path.abspath(path)
-                for folder in (folders or (os.getcwd(),))
-                if (path := Path(folder, model)).is_file()
-            ),
-            "",
-        )
-    except (OSError, ValueError):  # not a valid path
-        return ""
+    return file_beside(model, folders or (os.getcwd(),))
 
 
 def description_of(model: str, folders: Sequence[str], source: str, key: str) -> Description:
@@ -223,18 +287,18 @@ def description_of(model: str, folders: Sequence[str], source: str, key: str) ->
     """
     path = file_of(model, folders)
     if not path:
-        folder = folders[0] if folders else os.getcwd()
-        problem = (
-            "is a directory" if os.path.isdir(os.path.join(folder, model)) else f"there is no such file in {folder}"
+        raise InputError(
+            source,
+            f"{key} = {model!r}: there is no such file in {folders[0] if folders else os.getcwd()}",
+            SUPPORTED_FMU,
         )
-        raise InputError(source, f"{key} = {model!r}: {problem}", SUPPORTED_FMU)
     return _read_description(path, sha256(Path(path).read_bytes()).hexdigest(), source, f"{key} = {model!r}")
 
 
 @lru_cache(maxsize=32)
 def _read_description(path: str, digest: str, source: str, name: str) -> Description:
     try:
-        from fmpy import platform, platform_tuple
+        from fmpy import platform, platform_tuple, supported_platforms
         from fmpy.model_description import read_model_description
     except ImportError:
         raise InputError(
@@ -242,22 +306,17 @@ def _read_description(path: str, digest: str, source: str, name: str) -> Descrip
         ) from None
     try:
         model = read_model_description(path, validate=False)
-        with ZipFile(path) as archive:
-            platforms = sorted(
-                {name.split("/")[1] for name in archive.namelist() if name.startswith("binaries/")} - {""}
-            )
+        platforms = {*supported_platforms(path)}
     except Exception as error:  # any error of FMPy about a user's file
         raise InputError(source, f"{name} cannot be read as an FMU: {describe_error(error)}", SUPPORTED_FMU) from None
-    if not model.fmiVersion.startswith(("2.", "3.")):
-        raise InputError(source, f"{name} is of FMI {model.fmiVersion}", SUPPORTED_FMU)
-    if model.coSimulation is None:
-        kind = "model exchange" if model.modelExchange is not None else "scheduled execution"
-        raise InputError(source, f"{name} is for {kind} only, without a solver of its own", SUPPORTED_FMU)
-    if not {platform, platform_tuple} & set(platforms):
-        others = f"only for {', '.join(platforms)}" if platforms else "nor for any other"
+    if not model.fmiVersion.startswith(("2.", "3.")) or model.coSimulation is None:
+        kind = "" if model.coSimulation is None else "for co-simulation"
         raise InputError(
-            source, f"{name} has no binary for this machine ({platform}), {others}", f"binaries/{platform}"
+            source, f"{name} is of FMI {model.fmiVersion}, {kind or 'not for co-simulation'}", SUPPORTED_FMU
         )
+    if not {platform, platform_tuple} & platforms:
+        problem = f"{name} has no binary for this machine, only for {', '.join(sorted(platforms)) or 'none'}"
+        raise InputError(source, problem, f"binaries/{platform}")
     units = {
         unit.name: Unit(
             tuple(int(getattr(unit.baseUnit, base)) for base in BASE_UNITS),
@@ -269,7 +328,3 @@ def _read_description(path: str, digest: str, source: str, name: str) -> Descrip
     }
     variables = {variable.name: variable for variable in model.modelVariables if not variable.dimensions}
     return Description(path, digest, model, units, variables)
-
-
-def _with_article(word: str) -> str:
-    return f"{'an' if word[0] in 'aeiou' else 'a'} {word}"

@@ -15,6 +15,7 @@ from hashlib import file_digest
 from pathlib import Path
 from typing import Any
 
+from safevar_sumo.output import file_beside
 from safevar_sumo.shipped import NETWORKS, PACKAGE, STUDIES
 
 DIGEST_LENGTH = 16
@@ -199,16 +200,6 @@ def files_named_in(value: Any, folders: Sequence[str]) -> Iterator[str]:
             yield from files_named_in(item, folders)
     elif isinstance(value, str) and (path := file_beside(value, folders or (os.getcwd(),))):
         yield path
-
-
-def file_beside(text: str, folders: Sequence[str]) -> str:
-    """The file that a text names, relative to the folder of the study's file or of a file that it extends; "" if there
-    is none.
-    """
-    try:
-        return next((os.path.abspath(path) for folder in folders if (path := Path(folder, text)).is_file()), "")
-    except (OSError, ValueError):  # the text is no path
-        return ""
 
 
 def _import_folders() -> list[str]:

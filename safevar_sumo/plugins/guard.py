@@ -10,21 +10,17 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import fields, is_dataclass, replace
-from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple, ParamSpec, TypeVar
 
 import numpy as np
 
 from safevar_sumo.errors import InputError, UserCodeError, describe_error
-from safevar_sumo.plugins.files import audit_hook
+from safevar_sumo.plugins.files import audit_hook, is_user_file
 from safevar_sumo.records import BoolArray, FloatArray, IntArray
 
 Parameters = ParamSpec("Parameters")
 Result = TypeVar("Result")
-_PACKAGE_FOLDER = str(Path(__file__).resolve().parents[1])
-_STANDARD_LIBRARY_FOLDER = str(Path(os.__file__).parent)
-LIBRARY_FOLDER = "site-packages"
 INFINITY = float("inf")
 _open_runs: ContextVar[BoolArray | None] = ContextVar("open_runs", default=None)
 """Which of N runs have not ended yet, shape (N,); None outside a simulation."""
@@ -243,14 +239,8 @@ class Guard(NamedTuple):
         infinite, undefined
             Whether infinities and NaN are legal.
         """
-        bounds = (
-            ""
-            if (lowest, highest) == (-INFINITY, INFINITY)
-            else f" {'above' if above else 'from'} {lowest:g}"
-            if highest == INFINITY
-            else f" in {'(' if above else '['}{lowest:g}, {highest:g}]"
-        )
-        expected = f"numbers{bounds}, {'' if infinite else 'finite, '}shape {shape}"
+        bounds = f"{'above' if above else 'from'} {lowest:g} to {highest:g}"
+        expected = f"numbers {bounds}, {'' if infinite else 'finite, '}shape {shape}"
         numbers = self._array(method, quantity, value, shape, "biuf", expected).astype(float)
         is_valid = (numbers > lowest) if above else (numbers >= lowest)
         is_valid &= numbers <= highest
@@ -282,20 +272,14 @@ class Guard(NamedTuple):
         return np.broadcast_to(array, shape)
 
     def _place(self, error: BaseException) -> str:
-        """File and line of the innermost frame in the user code's folder, else outside libraries and this package; ""
-        if there is none.
-        """
+        """File and line of the innermost frame in user code; "" if there is none."""
         frames = [(frame.filename, frame.lineno) for frame in traceback.extract_tb(error.__traceback__)]
         if isinstance(error, SyntaxError) and error.filename:
             frames.append((error.filename, error.lineno))
-        frames = [
-            frame for frame in frames if not frame[0].startswith((_PACKAGE_FOLDER, _STANDARD_LIBRARY_FOLDER, "<frozen"))
-        ]
-        user_frames = [frame for frame in frames if self.folder and frame[0].startswith(self.folder)]
-        frames_outside = [
-            frame for frame in user_frames or frames if LIBRARY_FOLDER in self.folder or LIBRARY_FOLDER not in frame[0]
-        ]
-        return "{}:{}".format(*frames_outside[-1]) if frames_outside else ""
+        for file, line in reversed(frames):
+            if os.path.isabs(file) and (is_user_file(file) or (self.folder and file.startswith(self.folder))):
+                return f"{file}:{line}"
+        return ""
 
 
 def _short_text(value: object) -> str:

@@ -17,7 +17,8 @@ from typing import Any, NamedTuple
 import msgspec
 
 from safevar_sumo.errors import InputError, UserCodeError, did_you_mean, one_of
-from safevar_sumo.plugins.files import audit_hook, file_beside, file_of_module
+from safevar_sumo.output import file_beside
+from safevar_sumo.plugins.files import audit_hook, file_of_module
 from safevar_sumo.plugins.guard import Guard, completed, contract_of, violation
 from safevar_sumo.study import convert_table
 

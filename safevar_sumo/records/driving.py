@@ -1,13 +1,44 @@
-"""What passes between the vehicles and their driving system: observations, commands, and the original vehicle as an ADS
-knows it.
-"""
+"""What a vehicle sees and does, and what a simulation leaves: outcomes, traces, geometry of encounters, contacts."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass, field, fields, replace
+from enum import StrEnum
 from typing import NamedTuple
 
-from safevar_sumo.records.base import ZERO, FloatArray
+import numpy as np
+import numpy.typing as npt
+
+FloatArray = npt.NDArray[np.float64]
+BoolArray = npt.NDArray[np.bool_]
+IntArray = npt.NDArray[np.int_]
+
+STANDSTILL = 1e-3
+"""Speed below which a vehicle counts as standing [m/s] (method section 4)."""
+KMH_PER_MS = 3.6
+"""km/h per m/s."""
+GRAVITY = 9.81
+"""Acceleration of gravity [m/s^2]."""
+TIME_ROUNDING = 1e-9
+"""Difference below which two sums of time steps count as the same time [s]."""
+TOUCH_OVERLAP = 2e-3
+"""Overlap up to which bodies count as touching, not colliding: SUMO ignores an overlap of a millimetre [m]."""
+TIME_DECIMALS = 9
+"""Decimals to which sums of time steps are rounded: 0.15 s, not 0.15000000000000002 s."""
+ZERO: FloatArray = np.zeros(())
+"""Scalar zero, broadcast to all N vehicles."""
+ALL_TRUE: BoolArray = np.ones((), dtype=bool)
+"""Scalar True, broadcast to all N vehicles."""
+UNDEFINED: FloatArray = np.array(np.nan)
+"""Scalar NaN, broadcast to all N vehicles."""
+for _constant in (ZERO, ALL_TRUE, UNDEFINED):
+    _constant.flags.writeable = False
+
+
+def finite_or_none(value: float) -> float | None:
+    """Make a number fit for JSON, which has neither NaN nor infinities: such a number becomes None."""
+    return float(value) if np.isfinite(value) else None
 
 
 class Observation(NamedTuple):
@@ -82,3 +113,153 @@ class Nominal(NamedTuple):
     @property
     def braking(self) -> float:
         return self.tables().braking
+
+
+class Outcome(StrEnum):
+    """How a simulation ended."""
+
+    STOPPED = "stopped"
+    PASSED = "passed"
+    COLLISION = "collision"
+    TIMEOUT = "timeout"
+    NEVER_MOVED = "never-moved"
+    INVALID_TEST = "invalid-test"
+    SIMULATOR_ERROR = "simulator-error"
+    INFEASIBLE = "infeasible"
+
+
+class Encounter(NamedTuple):
+    """The geometry of N vehicles and their obstacle at T samples; shape (T, N).
+
+    The safety degree uses `separation`, the time to collision `distance` and `closing_speed`
+    [m, m, m/s]; both metrics count only samples `in_conflict`.
+    """
+
+    separation: FloatArray
+    distance: FloatArray
+    closing_speed: FloatArray
+    in_conflict: BoolArray
+
+
+@dataclass(frozen=True, kw_only=True)
+class Trace:
+    """T samples of N vehicles, `step` seconds apart; arrays of shape (T, N), `time` (T,).
+
+    A vehicle's samples count while `active`; later samples are meaningless, as SUMO continues with the rest of the
+    batch.
+
+    - `vehicle_length`, `position` along the path, `gap` and `lateral` are in m, all speeds in m/s.
+    - `throttle` and `brake` are the pedals as commanded, `pedal` is the brake pedal's position.
+    - `obstacle_speed` is the obstacle's speed along the vehicle's path.
+    """
+
+    step: float
+    vehicle_length: float
+    time: FloatArray
+    position: FloatArray
+    speed: FloatArray
+    gap: FloatArray
+    lateral: FloatArray
+    lateral_speed: FloatArray
+    throttle: FloatArray
+    brake: FloatArray
+    gear: FloatArray
+    active: BoolArray
+    obstacle_speed: FloatArray = field(default_factory=lambda: ZERO)
+    pedal: FloatArray = field(default_factory=lambda: ZERO)
+
+    def of(self, vehicles: slice) -> Trace:
+        """The trace of some of the vehicles."""
+        arrays = {item.name: getattr(self, item.name) for item in fields(self)}
+        return replace(self, **{name: values[:, vehicles] for name, values in arrays.items() if np.ndim(values) == 2})
+
+
+class Contact(NamedTuple):
+    """The position of the first contact on the outline of each of N vehicles, shape (N,).
+
+    `side` is front, left, right or rear; empty without a contact. `place` is the position of the obstacle's middle, 0
+    to 100; NaN without a contact. At the front or rear it is in % of the vehicle's width, from the side on which
+    `lateral` is negative; at the left or right in % of its length, from the front.
+    """
+
+    side: npt.NDArray[np.str_]
+    place: FloatArray
+
+
+NO_CONTACT = Contact(np.array("", dtype="U5"), np.array(np.nan))
+"""No contact of N vehicles."""
+for _array in NO_CONTACT:
+    _array.flags.writeable = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class SimulationRuns:
+    """Trajectories and outcomes of N simulations; `outcome` holds values of `Outcome`, `collision_speed` is NaN without
+    a collision [m/s].
+
+    `test_speed_error` is the largest deviation from the test's speed before the driving system acted, NaN if no speed
+    is prescribed [m/s]; `warning_ttc` the time to collision at which the system first warned its driver, NaN if it
+    never did [s].
+    """
+
+    trace: Trace
+    encounter: Encounter
+    outcome: npt.NDArray[np.str_]
+    collision_speed: FloatArray
+    contact: Contact = NO_CONTACT
+    test_speed_error: FloatArray = field(default_factory=lambda: UNDEFINED)
+    warning_ttc: FloatArray = field(default_factory=lambda: UNDEFINED)
+
+    def of(self, vehicles: slice) -> SimulationRuns:
+        """The runs of some of the vehicles."""
+
+        def select(values: np.ndarray) -> np.ndarray:
+            return values[vehicles] if values.ndim else values
+
+        return SimulationRuns(
+            trace=self.trace.of(vehicles),
+            encounter=Encounter._make(values[:, vehicles] for values in self.encounter),
+            outcome=self.outcome[vehicles],
+            collision_speed=self.collision_speed[vehicles],
+            contact=Contact._make(map(select, self.contact)),
+            test_speed_error=select(self.test_speed_error),
+            warning_ttc=select(self.warning_ttc),
+        )
+
+    def nearest(self, vehicle: int) -> int | None:
+        """The sample of the impact or, without a collision, of the smallest separation in conflict; None if never in
+        conflict.
+        """
+        active = self.trace.active[:, vehicle]
+        if np.isfinite(self.collision_speed[vehicle]):
+            return int(np.flatnonzero(active)[-1])
+        in_conflict = active & self.encounter.in_conflict[:, vehicle]
+        return (
+            int(np.argmin(np.where(in_conflict, self.encounter.separation[:, vehicle], np.inf)))
+            if in_conflict.any()
+            else None
+        )
+
+    @property
+    def relative_speed(self) -> FloatArray:
+        """Speed of a collision relative to the obstacle along the vehicle's path [m/s], shape (N,); NaN without a
+        collision.
+
+        A gap d that closes within a time step, from the relative speed v at the relative acceleration a, closes at
+        sqrt(v^2 + 2 a d); where no gap closes, the speed at the end of the step counts: `collision_speed` minus the
+        obstacle's speed.
+        """
+        trace, vehicles = self.trace, np.arange(len(self.collision_speed))
+        last_sample = len(trace.time) - 1 - np.argmax(trace.active[::-1], axis=0)
+        obstacle_speed = np.broadcast_to(trace.obstacle_speed, trace.speed.shape)
+        (first_speed, end_speed), (gap, gap_after) = (
+            ([values[np.maximum(last_sample - 1, 0), vehicles], values[last_sample, vehicles]])
+            for values in (trace.speed - obstacle_speed, trace.gap)
+        )
+        gap_closes = (gap > -TOUCH_OVERLAP) & np.isfinite(gap) & (gap_after <= 0) & (first_speed > 0)
+        distance = np.where(gap_closes, np.maximum(gap, 0.0), 0.0)
+        squared_speed = first_speed * first_speed + 2 * (end_speed - first_speed) / trace.step * distance
+        min_speed, max_speed = np.minimum(first_speed, end_speed), np.maximum(first_speed, end_speed)
+        at_contact = np.minimum(np.maximum(np.sqrt(np.maximum(squared_speed, 0.0)), min_speed), max_speed)
+        at_end_of_step = self.collision_speed - obstacle_speed[last_sample, vehicles]
+        return np.asarray(np.where(gap_closes & ~np.isnan(self.collision_speed), at_contact, at_end_of_step))

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from safevar_sumo.records.base import BoolArray, FloatArray
-from safevar_sumo.records.runs import Outcome
+from safevar_sumo.records.driving import BoolArray, FloatArray, Outcome
 from safevar_sumo.study import SAFETY_DEGREE
+
+Results = Mapping[str, npt.NDArray[np.generic]]
+"""Results by name, one element for each setting."""
+ROUNDING = 1e-9
+"""Largest accepted difference between a result in a recorded scene and in SUMO."""
 
 
 class CellResults(NamedTuple):
@@ -60,6 +64,11 @@ class Evaluations:
     def f_safe(self) -> FloatArray:
         """First objective: the safety degree (method section 3) [m, or -m/s on a collision]."""
         return self.metrics[SAFETY_DEGREE]
+
+    @property
+    def results(self) -> Results:
+        """Outcomes and metrics by name."""
+        return {"outcome": self.outcome, "collision_speed": self.collision_speed, **self.metrics}
 
     def column(self, name: str) -> FloatArray:
         """A metric, f_safe, f_diff or f_num_diff by name; shape (M,). A metric without values is NaN everywhere."""
@@ -154,3 +163,13 @@ class Evaluations:
             if len(cells) == len(batches)
             else None,
         )
+
+
+def differences(outputs: Results, others: Results, tolerance: float = 0.0) -> Iterator[tuple[int, str]]:
+    """For each result that differs, the first row that does, and both values."""
+    for name, values in outputs.items():
+        is_same = values == others[name]
+        if values.dtype.kind == "f":
+            is_same |= np.isclose(values, others[name], rtol=0, atol=tolerance, equal_nan=True)
+        for row in np.flatnonzero(~is_same)[:1].tolist():
+            yield row, f"{name} is {others[name][row]} instead of {values[row]}"

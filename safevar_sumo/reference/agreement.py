@@ -19,7 +19,7 @@ from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray, finite_or_none
 from safevar_sumo.reference.rows import ReferenceData
 from safevar_sumo.results import evaluation_keys, write_whole
-from safevar_sumo.study import SAFETY_DEGREE, Study, load_study, refuse_other_than_file, study_names, unit_text
+from safevar_sumo.study import SAFETY_DEGREE, Study, load_study, study_names, unit_text
 from safevar_sumo.vehicles import CharacteristicSet
 
 if TYPE_CHECKING:
@@ -311,7 +311,6 @@ def _rounded(values: Mapping[str, float | None]) -> dict[str, float]:
 
 
 def _read_totals(path: Path) -> dict[str, dict[str, Totals]]:
-    refuse_other_than_file(path)
     try:
         return msgspec.toml.decode(path.read_bytes(), type=dict[str, dict[str, Totals]])
     except (OSError, ValueError):

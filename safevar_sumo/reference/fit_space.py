@@ -16,8 +16,7 @@ import numpy as np
 from safevar_sumo.analysis.parameters import value_of, with_values
 from safevar_sumo.campaign.batches import inputs_of
 from safevar_sumo.campaign.evaluation import pack_study
-from safevar_sumo.campaign.interrupts import wait_for_result
-from safevar_sumo.campaign.pool import Pool
+from safevar_sumo.campaign.pool import Pool, wait_for_result
 from safevar_sumo.campaign.retrying import RetryingPool
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import Evaluations, FloatArray

@@ -19,7 +19,7 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray, Outcome
 from safevar_sumo.results import UNKNOWN
-from safevar_sumo.study import SAFETY_DEGREE, refuse_other_than_file
+from safevar_sumo.study import SAFETY_DEGREE
 from safevar_sumo.vehicles import CharacteristicSet
 
 COLUMNS = {SAFETY_DEGREE: "SaftyDegree", "tet": "TET", "tit": "TIT", "ave_dece": "Dece"}
@@ -76,7 +76,6 @@ def read_reference(path: Path, characteristics: CharacteristicSet) -> ReferenceD
         range.
     """
     try:
-        refuse_other_than_file(path, streams=True)
         content = path.read_bytes()  # once: a pipe cannot be read again
         lines = pd.read_csv(
             io.BytesIO(content), dtype=str, skipinitialspace=True, skip_blank_lines=False, encoding="utf-8-sig"

@@ -9,12 +9,12 @@ from types import ModuleType
 from typing import TYPE_CHECKING
 
 from safevar_sumo.analysis.subject import Results
-from safevar_sumo.progress import open_progress
 from safevar_sumo.report.page import SECTIONS, make_report
 from safevar_sumo.results import write_whole
+from safevar_sumo.terminal import open_progress
 
 if TYPE_CHECKING:
-    from safevar_sumo.progress import Progress
+    from safevar_sumo.terminal import Progress
 
 
 def report(

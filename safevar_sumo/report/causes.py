@@ -15,11 +15,11 @@ from safevar_sumo.analysis.opinion.result import Opinion
 from safevar_sumo.analysis.tolerance.answer import Tolerance
 from safevar_sumo.analysis.words import number_of, points_in_words
 from safevar_sumo.errors import InputError
-from safevar_sumo.progress import Progress
 from safevar_sumo.records import KMH_PER_MS
 from safevar_sumo.replay.comparison import list_differences, quantity_text, superscript_powers
 from safevar_sumo.report.input import ReportInput
 from safevar_sumo.scenarios import distance_in_words
+from safevar_sumo.terminal import Progress
 
 MAX_CAUSES = 6
 """Maximum number of minimal causes in a report."""

@@ -38,7 +38,6 @@ from safevar_sumo.analysis.rules.compute import find_rules
 from safevar_sumo.analysis.tolerance.compute import find_tolerances
 from safevar_sumo.analysis.words import question_command
 from safevar_sumo.errors import InputError, did_you_mean, warn
-from safevar_sumo.progress import Progress, show_no_progress
 from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.replay.animation import player_files, template_environment
 from safevar_sumo.replay.comparison import format_number, superscript_powers
@@ -47,6 +46,7 @@ from safevar_sumo.report.causes import make_cause_sections, make_verdict, reason
 from safevar_sumo.report.input import ReportInput, page_options, read_inputs
 from safevar_sumo.shipped import PROGRAM_COMMAND
 from safevar_sumo.sumo.empty_road import why_no_verdict
+from safevar_sumo.terminal import Progress, show_no_progress
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -1,55 +1,49 @@
 """Results of campaigns: journalled, written, and read back."""
 
-from safevar_sumo.results.files import FILES, MANIFEST, ORIGINAL, SOLUTIONS, make_directory, write_whole
-from safevar_sumo.results.imported import UNKNOWN, write_imported
-from safevar_sumo.results.journal import PATIENCE, SPARE_POSITION, Head, Journal, JournalBusyError
-from safevar_sumo.results.load import Failure, RunStatus, Status, StoredResults, failure_lines, load_runs, status
-from safevar_sumo.results.manifest import (
-    LAYERS_OF_FILES,
-    RESULTS,
-    evaluation_keys,
-    folders_of,
-    manifest_of,
-    read_manifest,
+from safevar_sumo.results.journal import (
+    PATIENCE as PATIENCE,
+    SPARE_POSITION as SPARE_POSITION,
+    Head as Head,
+    Journal as Journal,
+    JournalBusyError as JournalBusyError,
 )
-from safevar_sumo.results.solution_id import CHOICES, SolutionId, choose_handle, handles_of, row_of_handle
-from safevar_sumo.results.store import ResultsDirectory, evaluations_frame, input_differences, record, solutions_frame
-
-__all__ = [
-    "CHOICES",
-    "FILES",
-    "LAYERS_OF_FILES",
-    "MANIFEST",
-    "ORIGINAL",
-    "PATIENCE",
-    "RESULTS",
-    "SOLUTIONS",
-    "SPARE_POSITION",
-    "UNKNOWN",
-    "Failure",
-    "Head",
-    "Journal",
-    "JournalBusyError",
-    "ResultsDirectory",
-    "RunStatus",
-    "SolutionId",
-    "Status",
-    "StoredResults",
-    "choose_handle",
-    "evaluation_keys",
-    "evaluations_frame",
-    "failure_lines",
-    "folders_of",
-    "handles_of",
-    "input_differences",
-    "load_runs",
-    "make_directory",
-    "manifest_of",
-    "read_manifest",
-    "record",
-    "row_of_handle",
-    "solutions_frame",
-    "status",
-    "write_imported",
-    "write_whole",
-]
+from safevar_sumo.results.load import (
+    CHOICES as CHOICES,
+    Failure as Failure,
+    RunStatus as RunStatus,
+    SolutionId as SolutionId,
+    Status as Status,
+    StoredResults as StoredResults,
+    choose_handle as choose_handle,
+    failure_lines as failure_lines,
+    handles_of as handles_of,
+    load_runs as load_runs,
+    row_of_handle as row_of_handle,
+    status as status,
+)
+from safevar_sumo.results.manifest import (
+    FILES as FILES,
+    LAYERS_OF_FILES as LAYERS_OF_FILES,
+    MANIFEST as MANIFEST,
+    ORIGINAL as ORIGINAL,
+    RESULTS as RESULTS,
+    SOLUTIONS as SOLUTIONS,
+    evaluation_keys as evaluation_keys,
+    folders_of as folders_of,
+    journal_file as journal_file,
+    make_directory as make_directory,
+    manifest_of as manifest_of,
+    read_manifest as read_manifest,
+    run_name as run_name,
+    stored_runs as stored_runs,
+    write_whole as write_whole,
+)
+from safevar_sumo.results.store import (
+    UNKNOWN as UNKNOWN,
+    ResultsDirectory as ResultsDirectory,
+    evaluations_frame as evaluations_frame,
+    input_differences as input_differences,
+    record as record,
+    solutions_frame as solutions_frame,
+    write_imported as write_imported,
+)

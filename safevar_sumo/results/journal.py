@@ -22,15 +22,15 @@ import portalocker
 
 from safevar_sumo.errors import InputError, SafevarError
 from safevar_sumo.records import Evaluations
-from safevar_sumo.results.files import RUNS
-from safevar_sumo.study import refuse_other_than_file
+from safevar_sumo.results.manifest import FORMAT, RUNS
 
-FORMAT = 4
 SPARE_POSITION = -1
 """Position of an evaluation that the search has not requested yet, or not again after its failures were discarded."""
 PATIENCE = 2.0
 """Time within which the workers of a killed process end, which hold locks until then [s]."""
 POSITION, OUTCOME, REASON, FILES_READ = "evaluation", "outcome", "reason", "files"
+UNDAMAGED = "the file as it was, or no file: the run is then simulated again"
+ANOTHER_OWNER = "belongs to another study, version or run"
 OBJECTIVE_COLUMNS = ("collision_speed", "f_diff", "f_num_diff")
 
 Line = dict[str, Any]
@@ -153,7 +153,8 @@ class Journal:
         data = self._file.read()
         lines, end = _parse(data, self.path)
         if lines and lines[0] != head.line():
-            _refuse_another_owner(lines, head, self.path, "another `out`")
+            if any(POSITION in line for line in lines):
+                raise InputError(self.path, ANOTHER_OWNER, "another `out`")
             lines, end, data = [], 0, b""
             self._truncate(0)
         if end < len(data):
@@ -191,13 +192,12 @@ def read_journal(path: Path, head: Head) -> JournalContent:
         If the journal cannot be read, is damaged, or belongs to another study or run.
     """
     try:
-        refuse_other_than_file(path)
         data = path.read_bytes()
     except OSError as error:
         raise InputError(path, f"cannot be read: {error.strerror}") from None
     lines, end = _parse(data, path)
     if lines and lines[0] != head.line():
-        _refuse_another_owner(lines, head, path, "only journals of this study", empty=True)
+        raise InputError(path, ANOTHER_OWNER, "only journals of this study")
     return _content_of(lines, path)._replace(tail_size=len(data) - end)
 
 
@@ -216,7 +216,6 @@ def files_read_later(directory: Path) -> dict[str, str]:
 
 def _open_and_lock(path: Path, deadline: float) -> IO[bytes]:
     try:
-        refuse_other_than_file(path)
         path.parent.mkdir(parents=True, exist_ok=True)
         file = open(path, "a+b", buffering=0)  # noqa: SIM115
     except OSError as error:
@@ -251,37 +250,20 @@ def _parse(data: bytes, path: Path) -> tuple[list[Line], int]:
     end = 0
     for text in data.splitlines(keepends=True):
         try:
-            line = msgspec.json.decode(text, type=Line) if text.endswith(b"\n") else None
+            line = msgspec.json.decode(text, type=Line)
         except msgspec.DecodeError as error:
-            if end + len(text) < len(data):
-                raise InputError(
-                    path,
-                    f"is damaged in line {len(lines) + 1}: {error}",
-                    "the file as it was, or no file: the run is then simulated again",
-                ) from None
-            line = None
-        if line is None:
+            if end + len(text) == len(data):
+                break
+            problem = f"is damaged in line {len(lines) + 1}: {error}"
+            raise InputError(path, problem, UNDAMAGED) from None
+        if not text.endswith(b"\n"):
             break
         lines.append(line)
         end += len(text)
-    if (lines[:1] and "format" not in lines[0]) or (
-        not lines and data.strip(b"\0") and not data.startswith(b'{"format"'[: len(data)])
-    ):
+    is_journal = "format" in lines[0] if lines else data.strip(b"\0")[:9] in b'{"format"'
+    if not is_journal:
         raise InputError(path, "is no journal", "another `out`")
     return lines, end
-
-
-def _refuse_another_owner(lines: Sequence[Line], head: Head, path: Path, expected: str, *, empty: bool = False) -> None:
-    """Refuse a journal with evaluations, or even an empty one, of another study or run."""
-    if not empty and not any(POSITION in line for line in lines):
-        return
-    if lines[0].get("study") == head.study and lines[0].get("run") != head.run:
-        raise InputError(
-            path,
-            f"is the journal of run {lines[0].get('run')}, not of {head.run}: was it renamed or swapped?",
-            f"the journal of {head.run}",
-        )
-    raise InputError(path, "belongs to another study or version", expected)
 
 
 def _batch_line(positions: Sequence[int], evaluations: Evaluations, characteristics: Iterable[str]) -> Line:
@@ -339,9 +321,7 @@ def _content_of(lines: Sequence[Line], path: Path) -> JournalContent:
                 batches, results = [remaining_evaluations], {}
         return JournalContent(positions, Evaluations.concatenate(batches) if positions else None, results)
     except (KeyError, TypeError, ValueError) as error:
-        raise InputError(
-            path, f"was edited: {error!r}", "the file as it was, or no file: the run is then simulated again"
-        ) from None
+        raise InputError(path, f"was edited: {error!r}", UNDAMAGED) from None
 
 
 def _drop_failures(positions: Sequence[int], evaluations: Evaluations) -> tuple[list[int], Evaluations]:

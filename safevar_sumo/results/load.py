@@ -1,8 +1,10 @@
-"""Reads results as tidy frames, or as the progress of a study, without SUMO."""
+"""Reads results without SUMO: as tidy frames, as the progress of a study, and single solutions by their handles or by
+choice.
+"""
 
 from __future__ import annotations
 
-import csv
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -10,11 +12,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from safevar_sumo.errors import InputError, warn
-from safevar_sumo.results.files import MANIFEST, SOLUTIONS, journal_file, run_name
-from safevar_sumo.results.imported import read_imported
+from safevar_sumo.metrics import RATING_POINTS, Unsafe
 from safevar_sumo.results.journal import Head, JournalContent, read_journal
-from safevar_sumo.results.manifest import identity_digest, read_manifest
-from safevar_sumo.results.store import evaluations_frame, solutions_frame
+from safevar_sumo.results.manifest import MANIFEST, identity_digest, journal_file, read_manifest, run_name
+from safevar_sumo.results.store import evaluations_frame, read_imported, solutions_frame
 from safevar_sumo.study import label_of
 
 if TYPE_CHECKING:
@@ -129,48 +130,26 @@ class Status(NamedTuple):
         }
 
 
-class _Search(NamedTuple):
-    """The search of a manifest's study: its runs, the budget of each run [evaluations], and the characteristics."""
-
-    runs: list[tuple[str, int]]
-    budget: int
-    characteristics: tuple[str, ...]
-
-
-def _read_search(folder: Path, manifest: Mapping[str, Any]) -> _Search:
+def _read_search(folder: Path, manifest: Mapping[str, Any]) -> tuple[list[tuple[str, int]], int, tuple[str, ...]]:
+    """The runs of a manifest's study, the budget of each run [evaluations], and the characteristics."""
     try:
-        search = manifest["study"]["search"]
-        runs = [
-            (name, run) for name in dict.fromkeys(map(label_of, search["algorithms"])) for run in range(search["runs"])
-        ]
-        return _Search(runs, int(search["evaluations"]), tuple(manifest["study"]["vehicle"]["characteristics"]))
-    except (KeyError, TypeError, ValueError):
-        raise InputError(
-            folder / MANIFEST, "has no characteristics or no search", "what the command `study` has written"
-        ) from None
+        study = manifest["study"]
+        search, labels = study["search"], dict.fromkeys(map(label_of, study["search"]["algorithms"]))
+        runs = [(name, run) for name in labels for run in range(search["runs"])]
+        return runs, int(search["evaluations"]), tuple(study["vehicle"]["characteristics"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(folder / MANIFEST, f"was edited: {error!r}", "what the command `study` has written") from None
 
 
 def _read_journals(
-    folder: Path, manifest: Mapping[str, Any], search: _Search
+    folder: Path, manifest: Mapping[str, Any], runs: Sequence[tuple[str, int]], characteristics: tuple[str, ...]
 ) -> Iterator[tuple[str, int, JournalContent | None]]:
     """Algorithm, number and journal's content of every run; None for a run without a journal."""
     digest = identity_digest(manifest)
-    for algorithm, run in search.runs:
+    for algorithm, run in runs:
         path = journal_file(folder, run_name(algorithm, run))
-        yield (
-            algorithm,
-            run,
-            read_journal(path, Head(digest, path.stem, search.characteristics)) if path.exists() else None,
-        )
-
-
-def _lost_runs(folder: Path) -> list[tuple[str, int]]:
-    """Runs whose solutions are in the table, which `study` writes after the last run, but whose journal is missing."""
-    if not (folder / SOLUTIONS).exists():
-        return []
-    with (folder / SOLUTIONS).open(encoding="utf-8", newline="") as file:
-        runs = {(row["algorithm"], int(row["run"])) for row in csv.DictReader(file)}
-    return sorted(run for run in runs if not journal_file(folder, run_name(*run)).exists())
+        content = read_journal(path, Head(digest, path.stem, characteristics)) if path.exists() else None
+        yield algorithm, run, content
 
 
 def load_runs(directory: str | Path) -> StoredResults:
@@ -183,24 +162,18 @@ def load_runs(directory: str | Path) -> StoredResults:
     """
     folder = Path(directory)
     manifest = read_manifest(folder)
-    search = _read_search(folder, manifest)
+    runs, budget, characteristics = _read_search(folder, manifest)
     if "imported" in manifest:
-        no_evaluations = evaluations_frame(search.characteristics, []).assign(evaluation=0)
-        return StoredResults(manifest, no_evaluations, read_imported(folder, search.characteristics))
-    for algorithm, run in _lost_runs(folder):
-        raise InputError(
-            journal_file(folder, run_name(algorithm, run)),
-            f"is missing, although {SOLUTIONS} holds solutions of this run",
-            "the file as it was, or the same study again, which computes the run anew",
-        )
+        no_evaluations = evaluations_frame(characteristics, []).assign(evaluation=0)
+        return StoredResults(manifest, no_evaluations, read_imported(folder, characteristics))
     evaluations_of_runs, solutions_of_runs, all_positions, failures = [], [], list[int](), list[Failure]()
-    for algorithm, run, content in _read_journals(folder, manifest, search):
-        if content is not None and content.tail_size and search.budget not in content.results:
+    for algorithm, run, content in _read_journals(folder, manifest, runs, characteristics):
+        if content is not None and content.tail_size and budget not in content.results:
             warn(
                 f"{journal_file(folder, run_name(algorithm, run))}: the last {content.tail_size} bytes are torn, "
                 "so the run counts as unfinished; running the same study again simulates the lost evaluations"
             )
-        positions, evaluations = content.requested_within(search.budget) if content is not None else ([], None)
+        positions, evaluations = content.requested_within(budget) if content is not None else ([], None)
         if content is None or evaluations is None:
             continue
         evaluations_of_runs.append(((algorithm, run), evaluations))
@@ -209,13 +182,11 @@ def load_runs(directory: str | Path) -> StoredResults:
             Failure(algorithm, run, positions[i], evaluations.reason(i))
             for i in np.flatnonzero(evaluations.failed).tolist()
         ]
-        if search.budget in content.results:
-            solutions_of_runs.append(
-                ((algorithm, run), content.take_positions(content.results[search.budget].positions))
-            )
-    frame = evaluations_frame(search.characteristics, evaluations_of_runs)
+        if budget in content.results:
+            solutions_of_runs.append(((algorithm, run), content.take_positions(content.results[budget].positions)))
+    frame = evaluations_frame(characteristics, evaluations_of_runs)
     frame.insert(2, "evaluation", all_positions)
-    solutions = solutions_frame(search.characteristics, solutions_of_runs)
+    solutions = solutions_frame(characteristics, solutions_of_runs)
     return StoredResults(
         manifest, frame, solutions, tuple(run_key for run_key, _ in solutions_of_runs), tuple(failures)
     )
@@ -234,14 +205,16 @@ def status(directory: str | Path) -> Status:
     manifest = read_manifest(folder)
     if "imported" in manifest:
         raise InputError(folder, "holds imported solutions, which have no runs", "results of the command `study`")
-    search = _read_search(folder, manifest)
-    runs = [_summarise_run(*journal, search.budget) for journal in _read_journals(folder, manifest, search)]
+    runs, budget, characteristics = _read_search(folder, manifest)
+    summaries = [
+        _summarise_run(*journal, budget) for journal in _read_journals(folder, manifest, runs, characteristics)
+    ]
     return Status(
         study=str(manifest["study"].get("name")),
         title=str(manifest["study"].get("title")),
-        budget=search.budget,
-        runs=tuple(run for run, _ in runs),
-        points=np.concatenate([objectives for _, objectives in runs]),
+        budget=budget,
+        runs=tuple(run for run, _ in summaries),
+        points=np.concatenate([objectives for _, objectives in summaries]),
     )
 
 
@@ -270,3 +243,95 @@ def _summarise_run(
         ),
         valid_evaluations.objectives,
     )
+
+
+HANDLE_FORMAT = "ALGORITHM:RUN:N, the N-th row of that run in solutions.csv, from 0"
+
+
+class SolutionId(NamedTuple):
+    """The handle of a solution: the `row`-th of its run's solutions in the order of solutions.csv, from 0.
+
+    Imported solutions belong to no run; their run number is 0.
+    """
+
+    algorithm: str
+    run: int
+    row: int
+
+    def __str__(self) -> str:
+        return f"{self.algorithm}:{self.run}:{self.row}"
+
+    @classmethod
+    def parse(cls, text: str, source: object = "solution") -> SolutionId:
+        """Read a handle.
+
+        Raises
+        ------
+        InputError
+            If the text is no handle.
+        """
+        match = re.fullmatch(r"([^:]+):([0-9]{1,9}):([0-9]{1,9})", text)
+        if match is None:
+            raise InputError(source, repr(text), HANDLE_FORMAT)
+        return cls(match[1], int(match[2]), int(match[3]))
+
+
+def handles_of(solutions: pd.DataFrame) -> list[SolutionId]:
+    """The handle of every row of `solutions`, a frame of solutions from `safevar_sumo.results.load_runs`."""
+    import pandas as pd
+
+    runs = solutions["run"] if "run" in solutions else pd.Series(0, index=solutions.index)
+    rows = solutions.groupby([solutions["algorithm"], runs], sort=False).cumcount()
+    return [
+        SolutionId(str(algorithm), int(run), int(row))
+        for algorithm, run, row in zip(solutions["algorithm"], runs, rows, strict=True)
+    ]
+
+
+def row_of_handle(solutions: pd.DataFrame, handle: SolutionId, source: object = "solution") -> int:
+    """The row number, in the frame, of the solution with this handle.
+
+    Raises
+    ------
+    InputError
+        If there is no such solution.
+    """
+    all_handles = handles_of(solutions)
+    if handle in all_handles:
+        return all_handles.index(handle)
+    last_handles = {(other.algorithm, other.run): str(other) for other in all_handles}
+    expected = f"{HANDLE_FORMAT}; the last ones are {', '.join([*last_handles.values()][:6])}"
+    raise InputError(source, f"there is no solution {handle}", expected)
+
+
+CHOICES = {
+    "most_severe": ["f_safe", "f_num_diff", "f_diff"],
+    "fewest": ["f_num_diff", "f_safe", "f_diff"],
+    "smallest": ["f_diff", "f_safe", "f_num_diff"],
+    "most_points": [RATING_POINTS.name, "f_num_diff", "f_diff"],
+}
+"""Objectives that decide a choice, in order; smaller values first."""
+
+
+def choose_handle(solutions: pd.DataFrame, unsafe: Unsafe, choice: str, source: object) -> SolutionId:
+    """The handle of the solution that a choice selects: `most_severe` among all solutions, any other choice among the
+    unsafe ones.
+
+    Parameters
+    ----------
+    unsafe
+        The criterion for unsafe.
+    choice
+        A name of `CHOICES`.
+
+    Raises
+    ------
+    InputError
+        If there is no such solution.
+    """
+    table = solutions.reset_index(drop=True)
+    candidates = table if choice == "most_severe" else table[unsafe.rows(table)]
+    if candidates.empty:
+        problem = f"these results hold no {'unsafe ' * (len(table) > 0)}solution"
+        raise InputError(source, problem, "other results, the most severe solution, or a solution by its handle")
+    return handles_of(table)[int(candidates.sort_values(CHOICES[choice], kind="stable").index[0])]

@@ -1,22 +1,23 @@
-"""The manifest of a results directory: the inputs that its results depend on, and their differences from other
-inputs.
+"""The files of a results directory, and its manifest: the inputs that its results depend on, and their differences from
+other inputs.
 """
 
 from __future__ import annotations
 
 import json
 import os
+import tempfile
 from collections.abc import Iterator, Mapping
 from hashlib import sha256
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from safevar_sumo.errors import InputError
-from safevar_sumo.results.files import MANIFEST, write_whole
-from safevar_sumo.results.journal import FORMAT
-from safevar_sumo.study import DESCRIPTION_KEYS, Study, refuse_other_than_file, tables_of
+from safevar_sumo.errors import InputError, SafevarError
+from safevar_sumo.output import whole_file
+from safevar_sumo.study import DESCRIPTION_KEYS, Study, tables_of
 
+FORMAT = 4
 RESULTS = 6
 """Version number of the package's results, raised whenever they change (enforced by tests/golden)."""
 SIMULATORS = ("libsumo", "eclipse-sumo")
@@ -51,6 +52,75 @@ LAYERS_OF_FILES = ("network", "sources")
 """Inputs that are a digest for each file; all workers must have the same files."""
 
 
+MANIFEST, SOLUTIONS, RUNS = "manifest.json", "solutions.csv", "runs"
+ORIGINAL = "original"
+"""Name of the original vehicle's journal."""
+FILES = (
+    (
+        MANIFEST,
+        "the study as it was run, the original vehicle's metrics, versions, digests of files, and folders of your own "
+        "code and files: [what results depend on](results.md)",
+        "`study`, `import`",
+    ),
+    (SOLUTIONS, "a row for each solution of each finished run", "`study` after its last run, `import`"),
+    (
+        f"{RUNS}/*-*.jsonl",
+        "every evaluation of the run ALGORITHM-NN, from which an interrupted study continues",
+        "`study` after each batch",
+    ),
+    (f"{RUNS}/{ORIGINAL}.jsonl", "the original vehicle's evaluation", "`study` before its first run"),
+)
+"""Every file of a results directory: its name or a pattern of names, its content, and the command that writes it."""
+
+
+def run_name(algorithm: str, run: int) -> str:
+    """The name of an algorithm's run in its journal and in messages, such as nsga2-03."""
+    return f"{algorithm}-{run:02d}"
+
+
+def journal_file(directory: Path, run: str) -> Path:
+    """The journal of a run, by the run's name, or of the `ORIGINAL`."""
+    return directory / RUNS / f"{run}.jsonl"
+
+
+def stored_runs(directory: Path) -> set[str]:
+    """Names of the runs that have a journal."""
+    return {path.stem for path in (directory / RUNS).glob("*.jsonl")} - {ORIGINAL}
+
+
+def make_directory(path: Path) -> None:
+    """Make a directory for results, if there is none, and check that it can be written.
+
+    Raises
+    ------
+    InputError
+        If the directory cannot be written.
+    """
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=path):
+            pass
+    except OSError as error:
+        raise InputError(
+            "out", f"cannot write to {path}: {error.strerror}", "a directory that can be written"
+        ) from None
+
+
+def write_whole(path: Path, text: str) -> None:
+    """Write a file as a whole or not at all.
+
+    Raises
+    ------
+    SafevarError
+        If the file cannot be written.
+    """
+    try:
+        with whole_file(path) as temporary_file, open(temporary_file, "x", encoding="utf-8", newline="") as file:
+            file.write(text)
+    except OSError as error:
+        raise SafevarError(f"{path}: cannot be written: {error.strerror}; earlier data stays valid") from None
+
+
 class Difference(NamedTuple):
     """A difference between stored and present inputs in words; its layer of `IDENTITY`; and whether it may change
     simulations.
@@ -70,7 +140,7 @@ def manifest_of(study: Study, identity: Mapping[str, Any]) -> dict[str, Any]:
     Parameters
     ----------
     identity
-        Inputs of the results besides the study file, by `IDENTITY`; see `safevar_sumo.campaign.identity.identity_of`.
+        Inputs of the results besides the study file, by `IDENTITY`; see `safevar_sumo.campaign.evaluation.identity_of`.
     """
     return {
         "format": FORMAT,
@@ -140,29 +210,20 @@ def read_manifest(directory: Path) -> dict[str, Any]:
         If there is no manifest, or it is damaged or of another format.
     """
     file = directory / MANIFEST
-    expected = "a directory written by the command `study`"
     try:
-        refuse_other_than_file(file)
         manifest = json.loads(file.read_text(encoding="utf-8", errors="replace"))
-        study, written_by, number = manifest["study"], manifest["versions"]["safevar_sumo"], manifest.get("format", 1)
+        manifest["study"]["name"]
+        written_by, number = manifest["versions"]["safevar_sumo"], manifest.get("format", 1)
     except FileNotFoundError:
         likely_path = Path("results") / directory.name
-        hint = (
-            f"; did you mean {likely_path}?" if likely_path != directory and (likely_path / MANIFEST).is_file() else ""
-        )
-        raise InputError(directory, f"is not a results directory: there is no {MANIFEST}{hint}", expected) from None
-    except OSError as error:
-        raise InputError(file, f"cannot be read: {error.strerror}") from None
-    except json.JSONDecodeError as error:
+        hint = f"; did you mean {likely_path}?" if likely_path != directory and likely_path.is_dir() else ""
+        problem = f"is not a results directory: there is no {MANIFEST}{hint}"
+        raise InputError(directory, problem, "a directory written by the command `study`") from None
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        problem = f"cannot be read, is torn or was edited: {error!r}"
         raise InputError(
-            file,
-            f"is torn or was edited, line {error.lineno} is no JSON: {error.msg}",
-            "the file as it was, or no file: the same command then writes it again",
+            file, problem, "the file as it was, or no file: the same command then writes it again"
         ) from None
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
-        study = None
-    if not isinstance(study, dict):
-        raise InputError(file, "is not a manifest of this program", expected)
     if number != FORMAT:
         raise InputError(
             directory,
@@ -182,13 +243,7 @@ def folders_of(directory: Path, manifest: Mapping[str, Any]) -> tuple[str, ...]:
 
 def relative_folders(directory: Path, study: Study) -> list[str]:
     """The folders of a study's files, relative to the directory."""
-    folders = []
-    for folder in study.origin.places:
-        try:
-            folders.append(os.path.relpath(folder, directory.resolve()))
-        except ValueError:  # on another drive
-            folders.append(folder)
-    return folders
+    return [os.path.relpath(folder, directory.resolve()) for folder in study.origin.places]
 
 
 def _changed_values(first: Any, second: Any, key: str = "") -> Iterator[tuple[str, Any, Any]]:

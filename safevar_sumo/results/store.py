@@ -1,12 +1,11 @@
-"""The results directory of a study (the same study and seed give the same bytes), and tables of evaluations and
-solutions.
+"""The results directory of a study (same study and seed, same bytes) or of imported solutions; tables of evaluations
+and solutions.
 """
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Iterable, Mapping
-from itertools import count
+from importlib.metadata import version
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
@@ -18,21 +17,27 @@ from safevar_sumo.errors import InputError, SafevarError
 from safevar_sumo.metrics import METRICS, PUBLISHED_SCORING, Scoring
 from safevar_sumo.plugins import digest_of, file_by_name
 from safevar_sumo.records import Evaluations, finite_or_none
-from safevar_sumo.results.files import MANIFEST, RUNS, SOLUTIONS, journal_file, make_directory, write_whole
 from safevar_sumo.results.journal import Head, Journal, JournalBusyError, files_read_later, read_journal
 from safevar_sumo.results.manifest import (
+    FORMAT,
     IDENTITY,
     LAYERS_OF_FILES,
+    MANIFEST,
+    RUNS,
+    SOLUTIONS,
     Difference,
     differences,
     identity_digest,
+    journal_file,
+    make_directory,
     manifest_of,
     read_manifest,
     relative_folders,
     search_extent_of,
     write_manifest,
+    write_whole,
 )
-from safevar_sumo.study import Study, user_code_names
+from safevar_sumo.study import Study, tables_of, user_code_names
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -48,14 +53,14 @@ class ResultsDirectory:
     study
         The study as it is run.
     identity
-        Inputs of the study's results besides the study file; see `safevar_sumo.campaign.identity.identity_of`.
+        Inputs of the study's results besides the study file; see `safevar_sumo.campaign.evaluation.identity_of`.
     scoring
         Metrics and objectives.
 
     Raises
     ------
     InputError
-        If the directory cannot be written, holds other files, or belongs to another study or version.
+        If the directory cannot be written, or belongs to another study or version.
     """
 
     def __init__(
@@ -110,29 +115,14 @@ class ResultsDirectory:
         write_whole(self.path / SOLUTIONS, frame.to_csv(index=False, lineterminator="\n"))
 
     def _refuse_another_study(self) -> None:
-        expected = another_directory(self.path)
         if not (self.path / MANIFEST).exists():
-            other_files = sorted(
-                name for path in self.path.iterdir() if (name := path.name) not in (RUNS, SOLUTIONS) and name[0] != "."
-            )
-            if (
-                other_files and not (self.path / RUNS).exists()
-            ):  # if there are journals, their owner decides whose directory this is
-                raise InputError(
-                    "out",
-                    f"{self.path} holds other files: {other_files[0]}",
-                    "an empty directory, or one of this study",
-                )
             return
         stored = read_manifest(self.path)
+        problem = "holds results of another study"
         if "imported" in stored:
-            raise InputError(self.path, "holds results of another study: they are imported", expected)
-        for difference in input_differences(self.path, stored, self.manifest, self._study):
-            raise InputError(
-                self.path,
-                f"holds results of another study: {difference.text}",
-                f"{expected}, or {IDENTITY[difference.layer]}",
-            )
+            raise InputError(self.path, f"{problem}: they are imported", "another `out`")
+        for layer, text, _ in input_differences(self.path, stored, self.manifest, self._study):
+            raise InputError(self.path, f"{problem}: {text}", f"another `out`, or {IDENTITY[layer]}")
 
 
 def input_differences(
@@ -156,15 +146,6 @@ def input_differences(
 def _later_files(directory: Path, study: Study) -> dict[str, str]:
     has_user_code = user_code_names(study) or any(":" in name for name in study.search.algorithms)
     return files_read_later(directory) if has_user_code else {}
-
-
-def another_directory(path: Path) -> str:
-    """A remedy that can be typed for results that a study cannot continue: the next free directory, such as
-    results/two-2.
-    """
-    stem = path if path.name else path.resolve()
-    free_path = next(candidate for number in count(2) if not (candidate := Path(f"{stem}-{number}")).exists())
-    return f"another `out`, such as `out={shlex.quote(str(free_path))}`"
 
 
 def solutions_frame(
@@ -223,3 +204,105 @@ def record(evaluations: Evaluations, row: int) -> dict[str, Any]:
         **{name: finite_or_none(value) for name, value in numbers.items()},
         "f_num_diff": int(evaluations.f_num_diff[row]),
     }
+
+
+UNKNOWN = "unknown"
+"""Outcome of an imported solution that did not collide."""
+
+
+def write_imported(
+    path: Path,
+    study: Study,
+    solutions: Mapping[str, Evaluations],
+    original: Mapping[str, float | None] | None,
+    files: Mapping[str, str],
+) -> dict[str, int]:
+    """Write a results directory of imported solutions; returns the numbers of earlier solutions that they replace, by
+    algorithm.
+
+    Parameters
+    ----------
+    path
+        The directory, made if it does not exist. It keeps solutions of other algorithms from an earlier import of the
+        same study.
+    solutions
+        Solutions by algorithm.
+    original
+        The original vehicle's metrics, by name; None keeps the metrics of an earlier import.
+    files
+        Name of the solutions' file, by algorithm.
+
+    Raises
+    ------
+    InputError
+        If the directory cannot be written, or holds results of a campaign or of another study.
+    """
+    import pandas as pd
+
+    make_directory(path)
+    tables, characteristics = tables_of(study), tuple(study.vehicle.characteristics)
+    earlier_manifest = _earlier_manifest(path, tables)
+    frame = solutions_frame(
+        characteristics, [((algorithm, 0), evaluations) for algorithm, evaluations in solutions.items()]
+    )
+    frame = frame.drop(columns="run")
+    replaced_counts: dict[str, int] = {}
+    if earlier_manifest:
+        stored = read_imported(path, characteristics)
+        is_replaced = stored["algorithm"].isin(list(solutions))
+        replaced_counts = {
+            str(name): int(count) for name, count in stored["algorithm"][is_replaced].value_counts().items()
+        }
+        frame = pd.concat([stored[~is_replaced], frame], ignore_index=True)
+        frame = frame.sort_values(
+            ["algorithm", "f_safe", "f_diff", "f_num_diff", *characteristics], kind="stable", ignore_index=True
+        )
+    manifest: dict[str, Any] = {
+        "format": FORMAT,
+        "study": tables,
+        "imported": {"files": {**earlier_manifest.get("imported", {}).get("files", {}), **files}},
+        "versions": {"safevar_sumo": version("safevar_sumo")},
+        "original": dict(earlier_manifest.get("original", {}) if original is None else original),
+    }
+    write_whole(path / SOLUTIONS, frame.to_csv(index=False, lineterminator="\n"))
+    write_manifest(path, manifest)
+    return replaced_counts
+
+
+def _earlier_manifest(path: Path, study: dict[str, Any]) -> dict[str, Any]:
+    """The manifest of an earlier import of the study; empty if there is none."""
+    if not (path / RUNS).exists() and not (path / MANIFEST).exists():
+        return {}
+    manifest = read_manifest(path) if (path / MANIFEST).exists() else {}
+    if (path / RUNS).exists() or "imported" not in manifest:
+        raise InputError(path, "holds results of a campaign", "another directory")
+    if manifest["study"] != study:
+        raise InputError(
+            path,
+            f"holds solutions of another study or another version of it, {manifest['study'].get('name')!r}",
+            "another directory",
+        )
+    return manifest
+
+
+def read_imported(path: Path, characteristics: tuple[str, ...]) -> pd.DataFrame:
+    """The imported solutions, without a run column.
+
+    Raises
+    ------
+    InputError
+        If the file is missing or damaged.
+    """
+    import pandas as pd
+
+    file = path / SOLUTIONS
+    numeric_columns = [*characteristics, "f_safe", "f_diff", "f_num_diff", *METRICS]
+    try:
+        frame = pd.read_csv(file, dtype=str, keep_default_na=False)[["algorithm", *numeric_columns, "outcome"]]
+        numbers = frame.replace({name: {"": "nan"} for name in numeric_columns}).astype(
+            dict.fromkeys(numeric_columns, float)
+        )
+        return numbers.astype({"f_num_diff": int})
+    except (OSError, KeyError, ValueError) as error:
+        problem = f"holds no imported solutions: {str(error).splitlines()[0]}"
+        raise InputError(file, problem, "what the command `import` has written") from None

@@ -1,10 +1,17 @@
-"""The characteristics of a study: their rows in its table, and their units as texts show them."""
+"""The characteristics of a study, how they vary in the world, and the constraints that they satisfy together; and the
+checks of all three.
+"""
 
 from __future__ import annotations
 
+import re
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Annotated
 
+import msgspec
 from msgspec import Meta, Struct
+
+from safevar_sumo.errors import InputError, one_of, unknown_name
 
 PositiveNumber = Annotated[float, Meta(gt=0, le=1e6)]
 Description = Annotated[str, Meta(max_length=200)]
@@ -29,3 +36,189 @@ class CharacteristicTable(Struct, frozen=True, kw_only=True, forbid_unknown_fiel
 def unit_text(unit: str, layout: str = " {}") -> str:
     """A unit as text after a number or, in another `layout`, after a name; empty for a pure number."""
     return "" if unit == "-" else layout.format(unit)
+
+
+class Uniform(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="distribution", tag="uniform"):
+    """Every value from `lower` to `upper` is equally likely; by default the whole domain."""
+
+    lower: float | None = None
+    upper: float | None = None
+
+
+class Normal(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="distribution", tag="normal"):
+    """A normal distribution with `mean`, by default the original, and standard deviation `deviation`, cut off at the
+    ends of the domain.
+    """
+
+    deviation: PositiveNumber
+    mean: float | None = None
+
+
+class Triangular(
+    Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="distribution", tag="triangular"
+):
+    """A triangular distribution from `lower` to `upper`, by default the domain, with its peak at `mode`, by default the
+    original.
+    """
+
+    mode: float | None = None
+    lower: float | None = None
+    upper: float | None = None
+
+
+class Lognormal(
+    Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="distribution", tag="lognormal"
+):
+    """A lognormal distribution with `median`, by default the original, cut off at the ends of the domain.
+
+    `sigma` [-] is the standard deviation of the value's logarithm.
+    """
+
+    sigma: PositiveNumber
+    median: float | None = None
+
+
+class Fixed(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="distribution", tag="fixed"):
+    """The characteristic always has `value`, by default the original."""
+
+    value: float | None = None
+
+
+Distribution = Uniform | Normal | Triangular | Lognormal | Fixed
+
+
+class Correlation(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The correlation of two characteristics after each is transformed to a standard normal variable (Gaussian
+    copula).
+    """
+
+    between: tuple[str, str]
+    value: Annotated[float, Meta(gt=-1, lt=1)]
+
+
+def variation_mistakes(
+    source: object,
+    rows: Mapping[str, CharacteristicTable],
+    variation: Mapping[str, Distribution],
+    correlations: Sequence[Correlation],
+) -> Iterator[InputError]:
+    """Errors for distributions and correlations that do not fit the characteristics' domains, or each other."""
+    for name, distribution in variation.items():
+        if name in rows:
+            yield from _distribution_mistakes(source, f"variation.{name}", rows[name], distribution)
+        else:
+            yield unknown_name(source, f"variation.{name}: there is no such characteristic", name, rows)
+    yield from _correlation_mistakes(source, list(rows), correlations)
+
+
+def _distribution_mistakes(
+    source: object, key: str, row: CharacteristicTable, distribution: Distribution
+) -> Iterator[InputError]:
+    domain_lower, domain_upper, unit = row.lower, row.upper, unit_text(row.unit)
+    for field, value in msgspec.structs.asdict(distribution).items():
+        if field not in ("deviation", "sigma") and value is not None and not domain_lower <= value <= domain_upper:
+            yield InputError(
+                source, f"{key}.{field} = {value:g}", f"a number in [{domain_lower:g}, {domain_upper:g}]{unit}"
+            )
+    if isinstance(distribution, Uniform | Triangular):
+        lower = domain_lower if distribution.lower is None else distribution.lower
+        upper = domain_upper if distribution.upper is None else distribution.upper
+        if lower >= upper:
+            yield InputError(source, f"{key}: lower = {lower:g} and upper = {upper:g}", "lower < upper")
+        elif isinstance(distribution, Triangular) and not (
+            lower <= (mode := row.original if distribution.mode is None else distribution.mode) <= upper
+        ):
+            yield InputError(source, f"{key}.mode = {mode:g}", f"a number in [{lower:g}, {upper:g}]{unit}")
+    elif isinstance(distribution, Lognormal) and domain_lower <= 0:
+        yield InputError(source, f"{key}: lognormal, with a domain that begins at {domain_lower:g}", "a domain above 0")
+
+
+def _correlation_mistakes(
+    source: object, names: Sequence[str], correlations: Sequence[Correlation]
+) -> Iterator[InputError]:
+    pairs = set[frozenset[str]]()
+    for between in (correlation.between for correlation in correlations):
+        for name in between:
+            if name not in names:
+                yield unknown_name(source, f"correlations.between: there is no characteristic {name!r}", name, names)
+        if between[0] == between[1] or frozenset(between) in pairs:
+            yield InputError(source, f"correlations.between = {list(between)}", "two characteristics, each pair once")
+        pairs.add(frozenset(between))
+
+
+class Constraint(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The bounds `at_least` and `at_most` of a quantity that depends on several characteristics.
+
+    The quantity is either a weighted sum, where `sum` holds a weight for each characteristic in its unit, or the result
+    of `function`. A function is named `package.module:Name`; it takes {name: array of shape (N,)} for N settings and
+    returns an array of shape (N,). `unit`, the unit of the quantity and its bounds, is the unit of a characteristic or
+    "-"; it may be omitted if all characteristics of the sum have the same unit. `meaning` explains the constraint and
+    names its source.
+    """
+
+    sum: dict[str, float] = {}
+    function: str = ""
+    at_least: float | None = None
+    at_most: float | None = None
+    unit: str | None = None
+    meaning: Annotated[str, Meta(max_length=400)] = ""
+
+    @property
+    def quantity(self) -> str:
+        """The quantity in words, such as `mass - 2 radius`."""
+        if self.function:
+            return self.function
+        terms = [
+            f"{'-' if weight < 0 else '+'} {'' if abs(weight) == 1 else f'{abs(weight):g} '}{name}"
+            for name, weight in self.sum.items()
+        ]
+        return re.sub("^- ", "-", " ".join(terms).removeprefix("+ "))
+
+    def unit_of(self, table: Mapping[str, CharacteristicTable]) -> str:
+        """The unit of the quantity; `table` holds the vehicle's characteristics."""
+        units = {table[name].unit for name in self.sum if name in table}
+        return self.unit if self.unit is not None else next(iter(units), "-")
+
+    def bounds_in_words(self, table: Mapping[str, CharacteristicTable]) -> str:
+        """The bounds in words."""
+        unit = unit_text(self.unit_of(table))
+        bounds = {"at least": self.at_least, "at most": self.at_most}
+        return " and ".join(f"{word} {value:g}{unit}" for word, value in bounds.items() if value is not None)
+
+
+def constraint_mistakes(
+    source: object, table: Mapping[str, CharacteristicTable], constraints: Sequence[Constraint]
+) -> Iterator[InputError]:
+    """Errors for constraints that name unknown characteristics, add quantities of different units, or have no
+    bounds.
+    """
+    for index, constraint in enumerate(constraints):
+        key = f"constraints[{index}]"
+        if bool(constraint.sum) == bool(constraint.function):
+            yield InputError(
+                source,
+                f"{key}: {'both sum and function' if constraint.sum else 'neither sum nor function'}",
+                "one of them",
+            )
+        for name, weight in constraint.sum.items():
+            if name not in table:
+                yield unknown_name(source, f"{key}.sum.{name}: there is no such characteristic", name, table)
+            if weight == 0:
+                yield InputError(source, f"{key}.sum.{name} = 0", "a number other than 0")
+        at_least, at_most = constraint.at_least, constraint.at_most
+        if at_least is None and at_most is None:
+            yield InputError(source, f"{key}: neither at_least nor at_most", "one of them, or both")
+        elif at_least is not None and at_most is not None and at_least > at_most:
+            yield InputError(source, f"{key}: at_least = {at_least:g} and at_most = {at_most:g}", "at_least <= at_most")
+        yield from _unit_mistakes(source, key, constraint, table)
+
+
+def _unit_mistakes(
+    source: object, key: str, constraint: Constraint, table: Mapping[str, CharacteristicTable]
+) -> Iterator[InputError]:
+    units = {table[name].unit for name in constraint.sum if name in table}
+    legal_units = {"-", *(units if len(units) == 1 else (row.unit for row in table.values()))}
+    if (constraint.unit is None and len(units) > 1) or constraint.unit not in (None, *legal_units):
+        terms = ", ".join(f"{name} [{table[name].unit}]" for name in constraint.sum if name in table)
+        problem = f"{key}: unit = {constraint.unit!r}" + (f" for the sum of {terms}" if terms else "")
+        yield InputError(source, problem, f"{one_of(legal_units)}; weights may convert units")

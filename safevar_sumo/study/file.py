@@ -15,18 +15,14 @@ import tomli_w
 from safevar_sumo.errors import InputError
 from safevar_sumo.output import whole_file
 from safevar_sumo.shipped import STUDIES
-from safevar_sumo.study.fitted import contradictions_of_file
-from safevar_sumo.study.schema import (
-    NAME_PATTERN,
-    Origin,
-    SearchTable,
-    Study,
-    StudyLike,
-    is_file,
-    study_path,
-    tables_of,
+from safevar_sumo.study.schema import NAME_PATTERN, Origin, SearchTable, Study, StudyLike, study_path, tables_of
+from safevar_sumo.study.validation import (
+    contradictions,
+    contradictions_of_file,
+    convert_table,
+    infinite_numbers,
+    raise_mistakes,
 )
-from safevar_sumo.study.validation import contradictions, convert_table, infinite_numbers, raise_mistakes
 
 WHOLE_TABLES = ("calibration", "published", "repeatability", "spread", "model_error")
 """Tables that a study inherits as a whole or not at all."""
@@ -132,12 +128,9 @@ def _read_file(path: Path, visited_paths: tuple[Path, ...]) -> _RawStudy:
     """Read a TOML file and the study that it `extends`; keys of the file override that study, table by table."""
     try:
         tables = tomllib.loads(path.read_text(encoding="utf-8-sig"))
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(path, f"is not TOML: {error}") from None
-    except UnicodeDecodeError as error:
-        raise InputError(path, f"is not UTF-8 text: {error}") from None
-    except OSError as error:
-        raise InputError(path, f"cannot be read: {error.strerror}") from None
+    except (OSError, ValueError) as error:
+        reason = (isinstance(error, OSError) and error.strerror) or error
+        raise InputError(path, f"cannot be read as TOML: {reason}", "the path of a study file") from None
     folders = () if path.parent == STUDIES else (str(path.resolve().parent),)
     origin = Origin(
         called=str(path) if folders else "", places=folders, files=(os.path.abspath(path),) if folders else ()
@@ -160,15 +153,11 @@ def _with_base(raw: _RawStudy, path: Path, visited_paths: tuple[Path, ...]) -> _
         tables["name"] = path.stem
     sibling = path.parent / base
     try:
-        base_path = sibling if is_file(sibling) else study_path(base)
+        base_path = study_path(str(sibling) if os.path.isfile(sibling) else base)
     except InputError as error:
         raise InputError(raw.source, f"extends = {base!r}: {error.problem}", error.legal) from None
     if base_path in (*visited_paths, path):
-        raise InputError(
-            raw.source,
-            f"extends = {base!r} leads back to {'this file' if base_path == path else base_path}",
-            "a study that does not extend this one",
-        )
+        raise InputError(raw.source, f"extends = {base!r} leads back to {base_path}", "another study")
     base_study = _read_file(base_path, (*visited_paths, path))
     merged_study = _with_overrides(base_study, tables, raw.source)
     folders = tuple(dict.fromkeys((*raw.origin.places, *base_study.origin.places)))

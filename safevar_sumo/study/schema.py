@@ -10,11 +10,15 @@ from typing import Annotated, Any, Final, Literal
 import msgspec
 from msgspec import Meta, Struct
 
-from safevar_sumo.errors import InputError, refuse_other_than_file, unknown_name
+from safevar_sumo.errors import unknown_name
 from safevar_sumo.shipped import STUDIES
-from safevar_sumo.study.characteristics import CharacteristicTable, PositiveNumber
-from safevar_sumo.study.constraints import Constraint
-from safevar_sumo.study.variation import Correlation, Distribution
+from safevar_sumo.study.characteristics import (
+    CharacteristicTable,
+    Constraint,
+    Correlation,
+    Distribution,
+    PositiveNumber,
+)
 
 PositiveInt = Annotated[int, Meta(ge=1, le=10_000_000)]
 FmuStep = Annotated[float, Meta(ge=1e-6, le=10)]
@@ -315,23 +319,14 @@ def study_path(study: str) -> Path:
     Raises
     ------
     InputError
-        If there is neither such a study nor such a file, or the file cannot be read.
+        If there is neither such a study nor such a file.
     """
     if study in study_names():
         return STUDIES / f"{study}.toml"
-    path = Path(study)
-    if is_file(path):
-        return path
-    try:
-        os.stat(study)
-        refuse_other_than_file(path)
-    except (FileNotFoundError, ValueError):  # not even a path: a null character
-        pass
-    except OSError as error:
-        raise InputError(path, f"cannot be read: {error.strerror}", "the path of a study file (TOML)") from None
-    raise unknown_name(
-        "study", f"there is no study or file {study!r}", study, study_names(), ", or the path of a study file (TOML)"
-    )
+    if os.path.exists(study):
+        return Path(study)
+    problem = f"there is no study or file {study!r}"
+    raise unknown_name("study", problem, study, study_names(), ", or the path of a study file (TOML)")
 
 
 def user_code_names(study: Study) -> list[str]:
@@ -372,10 +367,3 @@ def _keys_of_user_code(study: Study) -> list[tuple[str, str]]:
         for name in dict.fromkeys(names)
         if ":" in name and (key, name) not in fmus
     ]
-
-
-def is_file(path: Path) -> bool:
-    try:
-        return path.is_file()
-    except OSError:  # for example a name that is too long
-        return False

@@ -13,8 +13,7 @@ import numpy as np
 import pytest
 import scipy
 from click.testing import CliRunner
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 from rich.console import Console
 
 from safevar_sumo.analysis.evaluator import Evaluator

@@ -10,8 +10,7 @@ import msgspec
 import numpy as np
 import pytest
 import scipy
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from safevar_sumo import risk, rules, tolerance
 from safevar_sumo.analysis.evaluator import Evaluator

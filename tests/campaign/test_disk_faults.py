@@ -14,7 +14,7 @@ import pytest
 from safevar_sumo import output
 from safevar_sumo.campaign import all_runs, run_campaign
 from safevar_sumo.errors import SafevarError
-from safevar_sumo.results import ResultsDirectory, files, journal, load_runs
+from safevar_sumo.results import ResultsDirectory, journal, load_runs, manifest
 from safevar_sumo.study import Study, load_study
 from tests.campaign.formulas import EventLog, FormulaPool
 
@@ -90,7 +90,7 @@ def carried_out(study: Study, path: Path) -> bytes:
 def broken(study: Study, path: Path, disk: Disk) -> bool:
     """Carry the study out on a disk that fails; whether it ended with an error."""
     with pytest.MonkeyPatch.context() as patch:
-        for module in (files, journal, output):
+        for module in (manifest, journal, output):
             patch.setattr(module, "open", disk.open, raising=False)
         for name in ("fsync", "replace", "mkdir", "open", "unlink"):
             patch.setattr(os, name, disk.failing(getattr(os, name)))

@@ -10,8 +10,7 @@ import msgspec
 import pytest
 
 from safevar_sumo.campaign.batches import source_digests
-from safevar_sumo.campaign.evaluation import evaluate_batch, pack_study
-from safevar_sumo.campaign.identity import identity_of, network_digests
+from safevar_sumo.campaign.evaluation import evaluate_batch, identity_of, network_digests, pack_study
 from safevar_sumo.errors import InputError
 from safevar_sumo.plugins import changed_files
 from safevar_sumo.results.manifest import IDENTITY

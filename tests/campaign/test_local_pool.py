@@ -14,9 +14,8 @@ import psutil
 import pytest
 
 from safevar_sumo.campaign.evaluation import pack_study
-from safevar_sumo.campaign.interrupts import defer_interrupts, wait_for_first, wait_for_result
 from safevar_sumo.campaign.local import LocalPool, local_pool
-from safevar_sumo.campaign.pool import PoolLostError, WorkerLostError
+from safevar_sumo.campaign.pool import PoolLostError, WorkerLostError, defer_interrupts, wait_for_first, wait_for_result
 from safevar_sumo.campaign.retrying import RetryingPool, reproduction_command
 from safevar_sumo.errors import EnvironmentFault, InputError, SimulationError, UserCodeError
 from safevar_sumo.records import Evaluations, Outcome

@@ -27,9 +27,8 @@ from safevar_sumo.campaign import RunKey, RunProgress, all_runs
 from safevar_sumo.cli.arguments import read_changes
 from safevar_sumo.cli.program import COMMANDS, commands
 from safevar_sumo.errors import InputError
-from safevar_sumo.progress import open_progress
 from safevar_sumo.study import Study, load_study
-from safevar_sumo.terminal import WholeTable
+from safevar_sumo.terminal import WholeTable, open_progress
 from safevar_sumo.vehicles import CharacteristicSet
 from tests.in_process import InlinePool, refused
 

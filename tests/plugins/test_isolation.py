@@ -24,8 +24,7 @@ from safevar_sumo.sumo.matrix import evaluate, simulate
 from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.vehicles import GuardedVehicle
 from tests.in_process import InlinePool, SilentObserver, refused, run
-from tests.plugins.conftest import ADS as USES_ADS
-from tests.plugins.conftest import Mine
+from tests.plugins.conftest import ADS as USES_ADS, Mine
 
 
 def checked(mine: Mine, module: str, folder: Path, table: str = USES_ADS) -> None:

@@ -10,8 +10,7 @@ import numpy as np
 import openpyxl
 import pytest
 from click.testing import CliRunner
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from safevar_sumo.analysis.rating.compute import RatedVehicle, Rating
 from safevar_sumo.analysis.rating.render import rating_in_words
@@ -198,11 +197,11 @@ def test_what_a_command_cannot_write_or_read_is_refused_before_anything_is_simul
     (text := tmp_path / "text.xlsx").write_text("no spreadsheet")
     new = str(tmp_path / "new.xlsx")
     for arguments, message in (
-        (["--xlsx", new], "--template FILE"),
-        (["--template", str(there)], "--xlsx FILE"),
+        (["--xlsx", new], "--xlsx with --template"),
+        (["--template", str(there)], "--xlsx with --template"),
         (["--template", str(there), "--xlsx", str(there)], "--force"),
         (["--preprocessed", str(there)], "--force"),
-        (["--template", str(there), "--preprocessed", str(there), "--xlsx", new], "one of them"),
+        (["--template", str(there), "--preprocessed", str(there), "--xlsx", new], "but not both"),
         (["--template", "nothing.xlsx", "--xlsx", new], "nothing.xlsx: there is no such file"),
         (["--template", str(tmp_path), "--xlsx", new], ": is a directory"),
         (["--template", str(text), "--xlsx", new], "text.xlsx"),

@@ -22,8 +22,7 @@ from selenium.webdriver.common.by import By
 from safevar_sumo.analysis.research_questions.case import load_cases
 from safevar_sumo.replay.animation import animate
 from safevar_sumo.replay.comparison import compare_setting
-from safevar_sumo.report import input as report_input
-from safevar_sumo.report import make_report
+from safevar_sumo.report import input as report_input, make_report
 from safevar_sumo.sumo.system import assemble
 
 ORDER = "return [...arguments[0].tBodies[0].rows].map((row) => parseFloat(row.cells[2].textContent))"

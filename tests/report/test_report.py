@@ -24,9 +24,7 @@ from safevar_sumo.campaign import local
 from safevar_sumo.cli.program import commands
 from safevar_sumo.errors import InputError
 from safevar_sumo.replay.comparison import format_number
-from safevar_sumo.report import SECTIONS, make_report
-from safevar_sumo.report import input as report_input
-from safevar_sumo.report import page as report_page
+from safevar_sumo.report import SECTIONS, input as report_input, make_report, page as report_page
 from safevar_sumo.report.background import describe_conditions
 from safevar_sumo.report.page import read_inputs
 from safevar_sumo.results.manifest import write_manifest

@@ -17,8 +17,7 @@ from click.testing import CliRunner
 
 import safevar_sumo
 from safevar_sumo.cli.program import commands
-from safevar_sumo.report import input as report_input
-from safevar_sumo.report import make_report
+from safevar_sumo.report import input as report_input, make_report
 from safevar_sumo.report.page import commands_to_reproduce, read_inputs
 from safevar_sumo.study import Study, load_study
 from tests.in_process import searched

@@ -10,8 +10,7 @@ import moocore
 import numpy as np
 import pytest
 import scipy
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from safevar_sumo.analysis.research_questions.indicators import (
     compute_attainment,

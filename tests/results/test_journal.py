@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
-import re
 import subprocess
 import sys
 import time
@@ -15,8 +14,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
+from hypothesis import HealthCheck, given, settings, strategies as st
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import Evaluations
@@ -180,19 +178,13 @@ def test_a_damaged_line_is_cut_at_the_end_and_an_error_with_its_number_elsewhere
     assert path.read_bytes() == damaged, "a damaged file is left as it is"
 
 
-@pytest.mark.parametrize(
-    ("study", "run", "reason"),
-    [
-        ("other", "nsga2-00", "belongs to another study or version"),
-        ("study", "nsga2-01", "is the journal of run nsga2-00, not of nsga2-01: was it renamed or swapped?"),
-    ],
-)
+@pytest.mark.parametrize(("study", "run"), [("other", "nsga2-00"), ("study", "nsga2-01")])
 @pytest.mark.parametrize("opened", [Journal, read_journal])
 def test_a_journal_of_another_study_or_run_is_refused(
-    tmp_path: Path, opened: Callable[..., object], study: str, run: str, reason: str
+    tmp_path: Path, opened: Callable[..., object], study: str, run: str
 ) -> None:
     write(tmp_path / "a.jsonl")
-    with pytest.raises(InputError, match=re.escape(reason)):
+    with pytest.raises(InputError, match="belongs to another study, version or run"):
         opened(tmp_path / "a.jsonl", Head(study, run, ("a", "b")))
 
 

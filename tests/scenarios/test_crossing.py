@@ -11,8 +11,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import Outcome

@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 import safevar_sumo as sv
 from safevar_sumo.errors import InputError
@@ -183,9 +182,12 @@ MASS = {"sum": {"mass": 1.0}}
         ),
         (
             [{**MASS, "at_least": 1.0, "unit": "t"}],
-            "constraints[0].unit = 't'\nexpected: 'kg', the unit of mass, or '-'",
+            "constraints[0]: unit = 't' for the sum of mass [kg]\nexpected: one of -, kg",
         ),
-        ([{"sum": {"mass": 1.0, "radius": 1.0}, "at_least": 1.0}], "constraints[0].sum adds mass [kg], radius [cm]"),
+        (
+            [{"sum": {"mass": 1.0, "radius": 1.0}, "at_least": 1.0}],
+            "constraints[0]: unit = None for the sum of mass [kg], radius [cm]",
+        ),
         ([{**MASS}], "neither at_least nor at_most"),
         ([{**MASS, "at_least": 2.0, "at_most": 1.0}], "at_least = 2 and at_most = 1"),
         ([{"at_least": 2.0}], "neither sum nor function"),

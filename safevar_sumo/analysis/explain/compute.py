@@ -40,7 +40,6 @@ from safevar_sumo.analysis.words import question_command
 from safevar_sumo.campaign.pool import Pool
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import RATING_POINTS, Unsafe
-from safevar_sumo.progress import Progress, show_no_progress
 from safevar_sumo.protocol.points import UNKNOWN as UNKNOWN_COLOUR
 from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.records import Evaluations, FloatArray, finite_or_none
@@ -48,6 +47,7 @@ from safevar_sumo.results import CHOICES, UNKNOWN, SolutionId, choose_handle, ha
 from safevar_sumo.study import Study
 from safevar_sumo.sumo.matrix import PointResult, simulate, simulate_all_points, worst_points
 from safevar_sumo.sumo.system import System, assemble
+from safevar_sumo.terminal import Progress, show_no_progress
 
 CausesByRow = Mapping[int, list[MinimalCause]]
 """The minimal causes of settings, by the setting's row."""

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from safevar_sumo.analysis.opinion.result import Opinions
     from safevar_sumo.campaign.pool import Pool
     from safevar_sumo.metrics import Criterion
-    from safevar_sumo.progress import Progress
+    from safevar_sumo.terminal import Progress
 
 
 @dataclass(frozen=True, kw_only=True)

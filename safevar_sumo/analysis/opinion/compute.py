@@ -19,11 +19,11 @@ from safevar_sumo.analysis.research_questions.case import Case
 from safevar_sumo.campaign.pool import Pool
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
-from safevar_sumo.progress import Progress, show_no_progress
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray, finite_or_none
 from safevar_sumo.study import Study
 from safevar_sumo.sumo.matrix import evaluate
 from safevar_sumo.sumo.system import System, assemble
+from safevar_sumo.terminal import Progress, show_no_progress
 
 SIMULATION_LIMIT = 12_000
 """Approximate number of simulations that search the minimal causes, the same as for a report."""

@@ -17,7 +17,7 @@ from safevar_sumo.study import StudyLike
 if TYPE_CHECKING:
     from safevar_sumo.analysis.rating.compute import Rating
     from safevar_sumo.campaign.pool import Pool
-    from safevar_sumo.progress import Progress
+    from safevar_sumo.terminal import Progress
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -18,7 +18,6 @@ from safevar_sumo.analysis.research_questions.case import Case
 from safevar_sumo.analysis.words import join_phrases
 from safevar_sumo.campaign.pool import Pool
 from safevar_sumo.errors import InputError
-from safevar_sumo.progress import Progress, show_no_progress
 from safevar_sumo.protocol import (
     COLOURS,
     EURO_NCAP_2026,
@@ -39,6 +38,7 @@ from safevar_sumo.results import SolutionId, row_of_handle
 from safevar_sumo.scenarios import weather_of
 from safevar_sumo.study import Study
 from safevar_sumo.sumo.empty_road import driven_entry
+from safevar_sumo.terminal import Progress, show_no_progress
 from safevar_sumo.vehicles import CharacteristicSet, region_of
 
 POINT_KINDS = ("standard", "extended", "robustness")

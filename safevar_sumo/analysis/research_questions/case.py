@@ -19,7 +19,7 @@ from safevar_sumo.metrics import PUBLISHED_SCORING, MetricFacts, Scoring, Unsafe
 from safevar_sumo.records import Outcome
 from safevar_sumo.results import MANIFEST, Failure, failure_lines, folders_of, load_runs
 from safevar_sumo.scenarios import weather_of
-from safevar_sumo.study import Origin, Study, Weather, error_with_key
+from safevar_sumo.study import Origin, Study, Weather, convert_table
 from safevar_sumo.vehicles import CharacteristicSet
 
 NSGA2 = "nsga2"
@@ -200,10 +200,7 @@ def load_cases(directories: Iterable[str | Path]) -> list[Case]:
 
 def _load_case(directory: Path) -> Case:
     manifest, evaluations, solutions, finished, failures = load_runs(directory)
-    try:
-        study = msgspec.convert(manifest["study"], Study)
-    except msgspec.ValidationError as error:
-        raise error_with_key(directory / MANIFEST, manifest["study"], error, "study") from None
+    study = convert_table(directory / MANIFEST, manifest["study"], Study, "study")
     scoring = msgspec.convert(manifest["scoring"], Scoring) if "scoring" in manifest else PUBLISHED_SCORING
     study = msgspec.structs.replace(study, origin=Origin(places=folders_of(directory, manifest)))
     return build_case(

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from safevar_sumo.analysis.risk.answer import Risk
     from safevar_sumo.campaign.pool import Pool
     from safevar_sumo.metrics import Criterion
-    from safevar_sumo.progress import Progress
+    from safevar_sumo.terminal import Progress
 
 METHODS = ("auto", "monte_carlo", "subset_simulation", "cross_entropy")
 """Methods that estimate a probability."""

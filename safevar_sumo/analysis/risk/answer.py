@@ -17,7 +17,7 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import finite_or_none
 from safevar_sumo.study import SAFETY_DEGREE, Study
-from safevar_sumo.study.variation import Uniform
+from safevar_sumo.study.characteristics import Uniform
 from safevar_sumo.sumo.empty_road import driven_entry
 from safevar_sumo.terminal import WholeTable, constraints_in_words, meanings
 from safevar_sumo.vehicles import CharacteristicSet

@@ -20,9 +20,9 @@ from safevar_sumo.analysis.subject import study_in
 from safevar_sumo.campaign.pool import Pool
 from safevar_sumo.errors import InputError, SimulationError
 from safevar_sumo.metrics import Unsafe
-from safevar_sumo.progress import Progress, show_no_progress
 from safevar_sumo.records import FloatArray
 from safevar_sumo.study import Study
+from safevar_sumo.terminal import Progress, show_no_progress
 from safevar_sumo.vehicles.region import REJECTIONS
 
 VEHICLES_PER_CHECK = 1000

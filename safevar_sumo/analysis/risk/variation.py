@@ -16,7 +16,7 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import FloatArray
 from safevar_sumo.study import Study
-from safevar_sumo.study.variation import Correlation, Distribution, Fixed, Lognormal, Normal, Triangular, Uniform
+from safevar_sumo.study.characteristics import Correlation, Distribution, Fixed, Lognormal, Normal, Triangular, Uniform
 from safevar_sumo.vehicles import Characteristic, CharacteristicSet
 
 BASE_POINTS = 512

@@ -23,11 +23,10 @@ from safevar_sumo.analysis.subject import study_in
 from safevar_sumo.analysis.words import join_phrases, number_of
 from safevar_sumo.campaign.pool import Pool
 from safevar_sumo.metrics import Unsafe
-from safevar_sumo.progress import Progress, show_no_progress
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.study import Study
 from safevar_sumo.sumo.empty_road import summary_entry
-from safevar_sumo.terminal import constraints_in_words, meanings
+from safevar_sumo.terminal import Progress, constraints_in_words, meanings, show_no_progress
 from safevar_sumo.vehicles import Characteristic, CharacteristicSet
 
 MIN_SETTINGS = 10

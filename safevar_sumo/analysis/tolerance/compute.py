@@ -19,10 +19,10 @@ from safevar_sumo.analysis.tolerance.scans import OneAtATimeScan, Pair, scan, sc
 from safevar_sumo.campaign.pool import Pool
 from safevar_sumo.errors import InputError, unknown_name
 from safevar_sumo.metrics import Unsafe
-from safevar_sumo.progress import Progress, show_no_progress
 from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.records import FloatArray
 from safevar_sumo.study import Study
+from safevar_sumo.terminal import Progress, show_no_progress
 from safevar_sumo.vehicles.region import REJECTIONS
 
 MAX_UNSAFE_SHARE = 0.003

@@ -2,17 +2,14 @@
 this package.
 """
 
-from safevar_sumo.plugins.check.subject import KINDS, Subject, find_subject
-from safevar_sumo.plugins.check.suite import CHECKS, Finding, Report, check, check_subject, refuse_defects
-
-__all__ = [
-    "CHECKS",
-    "KINDS",
-    "Finding",
-    "Report",
-    "Subject",
-    "check",
-    "check_subject",
-    "find_subject",
-    "refuse_defects",
-]
+from safevar_sumo.plugins.check.suite import (
+    CHECKS as CHECKS,
+    KINDS as KINDS,
+    Finding as Finding,
+    Report as Report,
+    Subject as Subject,
+    check as check,
+    check_subject as check_subject,
+    find_subject as find_subject,
+    refuse_defects as refuse_defects,
+)

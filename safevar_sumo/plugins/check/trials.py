@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from safevar_sumo.plugins import Lookup, instance_of, unload_user_modules
-from safevar_sumo.records import Evaluations, FloatArray
+from safevar_sumo.records import ROUNDING, Evaluations, FloatArray, Results, differences
 from safevar_sumo.search import ALGORITHMS, GuardedAlgorithm, Problem
 from safevar_sumo.study import Study
 from safevar_sumo.sumo import Engine, reason_for_sumo
@@ -28,19 +27,11 @@ MATRIX_POINTS = 2
 """Approximate number of a study's test points that are simulated."""
 MAX_EVALUATIONS, MAX_POPULATION = 57, 20
 """Largest budget of an algorithm's runs."""
-ROUNDING = 1e-9
-"""Largest accepted difference between a result in a recorded scene and in SUMO."""
 Rows = npt.NDArray[np.intp]
-Outputs = Mapping[str, npt.NDArray[np.generic]]
-"""Results by name, one element for each row of the settings."""
 
 
-class Failure(NamedTuple):
-    """A failed check, the expected result, and the actual one with the input that shows it."""
-
-    check: str
-    expected: str
-    got: str
+Failure = tuple[str, str, str]
+"""A failed check, the expected result, and the actual one with the input that shows it."""
 
 
 def try_simulations(study: Study) -> Iterator[Failure]:
@@ -52,18 +43,16 @@ def try_simulations(study: Study) -> Iterator[Failure]:
         )
     )
 
-    def load() -> Callable[[Rows], Outputs]:
+    def load() -> Callable[[Rows], Results]:
         system = _system(study)
-        return lambda rows: _results(evaluate(system, settings[rows]))
+        return lambda rows: evaluate(system, settings[rows]).results
 
     yield from _try(load, region.characteristics, settings)
     system = _system(study)
     if ":" in study.scenario.model and not reason_for_sumo(system):
-        recorded, in_sumo = (
-            _results(evaluate(system, settings, engine)) for engine in (Engine.RECORDED, Engine.LIBSUMO)
-        )
-        for row, difference in _differences(recorded, in_sumo, ROUNDING):
-            yield Failure(
+        recorded, in_sumo = (evaluate(system, settings, engine).results for engine in (Engine.RECORDED, Engine.LIBSUMO))
+        for row, difference in differences(recorded, in_sumo, ROUNDING):
+            yield (
                 "contract",
                 "reactive_actors = True where somebody reacts to the vehicle under test",
                 f"{difference} in SUMO and in the recorded scene{_inputs(region.characteristics, settings[row])}",
@@ -75,7 +64,7 @@ def try_constraint(study: Study, function: str) -> Iterator[Failure]:
     characteristics = CharacteristicSet.of(study.vehicle.characteristics)
     settings = _settings(characteristics, COMPUTED)
 
-    def load() -> Callable[[Rows], Outputs]:
+    def load() -> Callable[[Rows], Results]:
         unload_user_modules()
         bounds = next(bounds for bounds in region_of(study).bounds if bounds.constraint.function == function)
         return lambda rows: {"the value": bounds.quantity(settings[rows])}
@@ -86,20 +75,17 @@ def try_constraint(study: Study, function: str) -> Iterator[Failure]:
 def try_algorithm(study: Study, name: str) -> Iterator[Failure]:
     """Let an algorithm minimise a smooth function in place of simulations, twice, the second time after another run."""
     outputs, others = _search(study, name, seeds=(1,)), _search(study, name, seeds=(2, 1))
+    expected = "the same in every run with the same random numbers, to the bit"
     if len(outputs) != len(others):
-        yield Failure(
-            "repetition", "the same in every run", f"{len(others)} settings instead of {len(outputs)} in another run"
-        )
-    for row in np.flatnonzero((outputs != others).any(axis=1))[:1] if len(outputs) == len(others) else ():
-        yield Failure(
-            "repetition",
-            "the same in every run with the same random numbers, to the bit",
-            f"setting {row} is {others[row].tolist()} instead of {outputs[row].tolist()} in another run",
-        )
+        yield "repetition", expected, f"{len(others)} settings instead of {len(outputs)} in another run"
+        return
+    for row in np.flatnonzero((outputs != others).any(axis=1))[:1]:
+        difference = f"setting {row} is {others[row].tolist()} instead of {outputs[row].tolist()} in another run"
+        yield "repetition", expected, difference
 
 
 def _try(
-    load: Callable[[], Callable[[Rows], Outputs]], characteristics: CharacteristicSet, settings: FloatArray
+    load: Callable[[], Callable[[Rows], Results]], characteristics: CharacteristicSet, settings: FloatArray
 ) -> Iterator[Failure]:
     """Compare a run of all settings with other runs; `load` loads all user code again."""
     run, everything = load(), np.arange(len(settings))
@@ -112,22 +98,12 @@ def _try(
     ]
     for check, circumstance, rows in others:
         other_outputs = (run if check == "repetition" else run_anew)(rows)
-        for row, difference in _differences({name: values[rows] for name, values in outputs.items()}, other_outputs):
-            yield Failure(
+        for row, difference in differences({name: values[rows] for name, values in outputs.items()}, other_outputs):
+            yield (
                 check,
                 "the same, to the bit",
                 f"{difference} {circumstance}{_inputs(characteristics, settings[rows[row]])}",
             )
-
-
-def _differences(outputs: Outputs, others: Outputs, tolerance: float = 0.0) -> Iterator[tuple[int, str]]:
-    """For each result that differs, the first row that does, and both values."""
-    for name, values in outputs.items():
-        is_same = values == others[name]
-        if values.dtype.kind == "f":
-            is_same |= np.isclose(values, others[name], rtol=0, atol=tolerance, equal_nan=True)
-        for row in np.flatnonzero(~is_same)[:1].tolist():
-            yield row, f"{name} is {others[name][row]} instead of {values[row]}"
 
 
 def _inputs(characteristics: CharacteristicSet, setting: FloatArray) -> str:
@@ -150,10 +126,6 @@ def _system(study: Study) -> System:
     """The system of a study, with only a few points of its matrix; `assemble` loads all user code again."""
     system = assemble(study)
     return replace(system, matrix=system.matrix[:: max(len(system.matrix) // MATRIX_POINTS, 1)], rater=None)
-
-
-def _results(evaluations: Evaluations) -> Outputs:
-    return {"outcome": evaluations.outcome, "collision_speed": evaluations.collision_speed, **evaluations.metrics}
 
 
 def _search(study: Study, name: str, seeds: tuple[int, ...]) -> FloatArray:
@@ -193,15 +165,9 @@ def _smooth_evaluations(system: System, settings: FloatArray) -> Evaluations:
     characteristics, scoring = system.characteristics, system.measuring.scoring
     share = (settings - characteristics.lower) / (characteristics.upper - characteristics.lower)
     safety_degree = 1.0 - np.add.accumulate(share, axis=1)[:, -1] / len(characteristics) * 1.5
-    names = {
-        name
-        for name in (
-            *(metric.name for metric in scoring.metrics),
-            *(objective.name for objective in scoring.objectives),
-        )
-        if not name.startswith("f_")
-    }
-    metrics = {name: np.abs(safety_degree) for name in sorted(names)} | {"safety_degree": safety_degree}
+    names = {*(metric.name for metric in scoring.metrics), *(objective.name for objective in scoring.objectives)}
+    own_names = sorted(name for name in names if not name.startswith("f_"))
+    metrics = dict.fromkeys(own_names, np.abs(safety_degree)) | {"safety_degree": safety_degree}
     collided = safety_degree < 0
     return Evaluations(
         settings=settings,
