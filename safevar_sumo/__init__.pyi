@@ -12,7 +12,7 @@ from .analysis.rules.compute import Rule as Rule, Rules as Rules
 from .analysis.subject import Results as Results, load as load
 from .analysis.tolerance import tolerance as tolerance
 from .analysis.tolerance.answer import Tolerance as Tolerance
-from .api.research_questions import Figures as Figures, Tables as Tables, figures as figures, tables as tables
+from .api import Figures as Figures, Tables as Tables, figures as figures, tables as tables
 from .api.running import run as run
 from .api.simulation import Simulation as Simulation, evaluate as evaluate, simulate as simulate
 from .campaign import Observer as Observer

@@ -1,11 +1,100 @@
-"""The public library without the questions of `safevar_sumo.analysis`; `import safevar_sumo` re-exports the names."""
+"""The public library without the questions of `safevar_sumo.analysis`, but with the research questions as tables and
+figures; `import safevar_sumo` re-exports the names.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 from safevar_sumo.analysis.subject import Results as Results, load as load
-from safevar_sumo.api.research_questions import (
-    Figures as Figures,
-    Tables as Tables,
-    figures as figures,
-    tables as tables,
-)
 from safevar_sumo.api.running import run as run
 from safevar_sumo.api.simulation import Simulation as Simulation, evaluate as evaluate, simulate as simulate
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.figure import Figure
+
+    from safevar_sumo.analysis.research_questions.answer import Answer
+    from safevar_sumo.analysis.research_questions.case import Case
+
+
+class Tables(dict[str, "pd.DataFrame"]):
+    """Answers by name, each a tidy frame over all results; a notebook shows them in the paper's layout."""
+
+    def __init__(self, answers: list[Answer]) -> None:
+        super().__init__({answer.name: answer.frame for answer in answers})
+        self.answers = answers
+
+    @property
+    def notes(self) -> dict[str, tuple[str, ...]]:
+        """Notes by name: what is missing or left out, and why."""
+        return {answer.name: answer.notes for answer in self.answers}
+
+    def _repr_markdown_(self) -> str:
+        from safevar_sumo.analysis.research_questions.tables import as_markdown
+
+        return as_markdown(self.answers)
+
+
+class Figures(dict[str, "Figure"]):
+    """Figures by name; `lacking` says why some could not be drawn."""
+
+    lacking: tuple[str, ...] = ()
+
+
+def tables(*results: Results | str | Path, question: str | None = None) -> Tables:
+    """Answer the research questions.
+
+    Parameters
+    ----------
+    results
+        Results, or their directories, one for each case in the tables.
+    question
+        Answer only this question, such as "rq1".
+
+    Returns
+    -------
+    Tables
+        Frames by name; the functions in `safevar_sumo.analysis` describe the columns.
+
+    Raises
+    ------
+    InputError
+        If there is no such question, or no results can answer it.
+    """
+    from safevar_sumo.analysis.research_questions.answer import answer_questions
+
+    return Tables(answer_questions(_load_cases(results), question))
+
+
+def figures(*results: Results | str | Path) -> Figures:
+    """Draw every figure that the results hold.
+
+    Parameters
+    ----------
+    results
+        Results, or their directories.
+
+    Returns
+    -------
+    Figures
+        By name, such as "pareto-fronts"; with several results, the case's name comes first: "rain-pareto-fronts".
+
+    Raises
+    ------
+    InputError
+        If no figure can be drawn.
+    """
+    from safevar_sumo.analysis.research_questions.gallery import draw_figures
+
+    figures_by_name, lacking = draw_figures(_load_cases(results))
+    drawn_figures = Figures(figures_by_name)
+    drawn_figures.lacking = tuple(lacking)
+    return drawn_figures
+
+
+def _load_cases(results: tuple[Results | str | Path, ...]) -> list[Case]:
+    from safevar_sumo.analysis.research_questions.case import load_cases
+
+    return load_cases([source.directory if isinstance(source, Results) else source for source in results])

@@ -1,15 +1,371 @@
-"""The command `check`: does user code keep the promises that results rest on? Nothing below `sumo` and `search` imports
-this package.
+"""The command `check`: does user code keep the promises that results rest on? A result depends on its setting alone,
+and every call keeps its contract. Nothing below `sumo` and `search` imports this package.
 """
 
-from safevar_sumo.plugins.check.suite import (
-    CHECKS as CHECKS,
-    KINDS as KINDS,
-    Finding as Finding,
-    Report as Report,
-    Subject as Subject,
-    check as check,
-    check_subject as check_subject,
-    find_subject as find_subject,
-    refuse_defects as refuse_defects,
-)
+from __future__ import annotations
+
+import inspect
+import shlex
+import time
+import tomllib
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from msgspec.structs import replace
+
+from safevar_sumo.ads import ADS, ScalarAds
+from safevar_sumo.errors import InputError, SafevarError, UserCodeError, unknown_name
+from safevar_sumo.metrics import METRIC_OF_OBJECTIVE, METRICS, OPTIONAL_METRICS, Metric
+from safevar_sumo.plugins import Lookup, Member, unload_user_modules
+from safevar_sumo.plugins.check.trials import Failure, try_algorithm, try_constraint, try_simulations
+from safevar_sumo.scenarios import SCENARIOS
+from safevar_sumo.search import ALGORITHMS
+from safevar_sumo.shipped import PROGRAM_COMMAND
+from safevar_sumo.study import ModelTable, Study, load_study, study_names
+from safevar_sumo.sumo.empty_road import why_no_verdict
+from safevar_sumo.sumo.system import assemble
+from safevar_sumo.sumo.traci_module import substitute_traci
+from safevar_sumo.vehicles import CHANGES, VEHICLES, Change
+
+KINDS: Mapping[str, Mapping[str, Any]] = {
+    "ads": ADS,
+    "vehicle": VEHICLES,
+    "scenario": SCENARIOS,
+    "metric": {**METRICS, **OPTIONAL_METRICS},
+    "objective": CHANGES,
+    "algorithm": ALGORITHMS,
+    "traci": {},
+    "constraint": {},
+}
+"""Kinds of subjects, each with its shipped subjects by name."""
+METHODS: Mapping[str, tuple[str, ...]] = {
+    "ads": ("start", "drive"),
+    "vehicle": ("prepare", "sumo_type", "at_rest", "sense", "advance"),
+    "scenario": ("begin", "observe", "encounter"),
+    "algorithm": ("search",),
+    "traci": ("step",),
+}
+"""Methods by which a class is recognised, by kind."""
+DEFAULT_STUDIES = {"traci": "native"}
+"""Study to try a subject of a kind in if no study names it; `smoke` for all other kinds."""
+MAX_FILES = 50
+"""Maximum number of study files that are read in a directory."""
+NAMES: Mapping[str, tuple[str, Callable[[Study], list[str]]]] = {
+    "traci": ("ads.model", lambda study: [study.ads.model] if study.ads.kind == "traci" else []),
+    "ads": ("ads.model", lambda study: [study.ads.model] if study.ads.kind != "traci" else []),
+    "vehicle": ("vehicle.model", lambda study: [study.vehicle.model]),
+    "scenario": (
+        "scenario.model",
+        lambda study: [
+            study.scenario.model,
+            *filter(None, (test.model for test in (study.matrix.tests if study.matrix else ()))),
+        ],
+    ),
+    "metric": ("metrics.also", lambda study: study.metrics.also),
+    "objective": ("search.objectives", lambda study: study.search.objectives),
+    "algorithm": ("search.algorithms", lambda study: study.search.algorithms),
+    "constraint": ("constraints.function", lambda study: [one.function for one in study.constraints if one.function]),
+}
+"""The key that names subjects of a kind, and the names that a study gives there."""
+
+
+class Subject(NamedTuple):
+    """A subject and the study in which it is tried; `remark` says how the study was found, `is_guest` that no study
+    names the subject.
+    """
+
+    name: str
+    kind: str
+    study: Study
+    remark: str = ""
+    is_guest: bool = False
+
+    @property
+    def key(self) -> str:
+        """The key and name of the subject, as in errors about a study."""
+        return f"{NAMES[self.kind][0]} = {self.name!r}"
+
+    @property
+    def is_user_code(self) -> bool:
+        return ":" in self.name or self.name.endswith(".fmu")
+
+    @property
+    def definition(self) -> str:
+        """File and line at which user code is defined; "" for anything else."""
+        member = _look_up(self.name, self.study) if ":" in self.name else Member(None)
+        return member.guard.definition("") if member.guard else ""
+
+
+def subjects_of(study: Study) -> list[Subject]:
+    """Every subject that a study names."""
+    return [
+        Subject(name, kind, study) for kind, (_, names_of) in NAMES.items() for name in dict.fromkeys(names_of(study))
+    ]
+
+
+def find_subject(name: str, study: str | None = None) -> Subject:
+    """Find a subject by its name.
+
+    Parameters
+    ----------
+    name
+        The name of a shipped subject, `package.module:Name`, or the path of an FMU.
+    study
+        A study to try the subject in; by default a study file beside it that names it, or else a shipped study.
+
+    Raises
+    ------
+    InputError
+        If nothing has this name, or no study can try the subject.
+    """
+    given_study = None if study is None else load_study(study)
+    name = METRIC_OF_OBJECTIVE[name].name if name in METRIC_OF_OBJECTIVE else name
+    kind = next((kind for kind, members in KINDS.items() if name in members), "")
+    if kind:
+        candidates = iter([given_study]) if given_study else map(load_study, study_names())
+    elif ":" in name or name.endswith(".fmu"):
+        member = _look_up(name, given_study) if ":" in name else Member(None)
+        kind, folder = _kind_of(member.target), Path(member.guard.folder if member.guard else name).absolute()
+        candidates = (
+            iter([given_study])
+            if given_study
+            else _studies_beside(Path(name).name, folder if member.guard else folder.parent)
+        )
+    else:
+        names = [*study_names(), *METRIC_OF_OBJECTIVE, *(member for members in KINDS.values() for member in members)]
+        raise unknown_name(
+            "check",
+            f"there is nothing called {name!r}",
+            name,
+            names,
+            ", package.module:Name, or the path of a study file",
+        )
+    for candidate in candidates:
+        for subject in subjects_of(candidate):
+            if subject.name == name or (name.endswith(".fmu") and Path(subject.name).name == Path(name).name):
+                remark = (
+                    ""
+                    if given_study or name in KINDS[subject.kind]
+                    else f"tried in {candidate.origin.called}, which names it"
+                )
+                return subject._replace(kind=kind if subject.kind == "objective" else subject.kind, remark=remark)
+    if not kind:
+        problem = f"no study names {name!r}" if ":" in name or Path(name).exists() else f"there is no file {name!r}"
+        raise InputError(
+            "check",
+            problem,
+            "a model, metric, algorithm or controller that a study can name, or `study=STUDY` that names it",
+        )
+    return Subject(
+        name, kind, _put_in(given_study or load_study(DEFAULT_STUDIES.get(kind, "smoke")), kind, name), is_guest=True
+    )
+
+
+def _look_up(name: str, study: Study | None) -> Member:
+    unload_user_modules()
+    with substitute_traci():
+        return Lookup("check", study.origin.places if study else ()).find({}, name, "SUBJECT")
+
+
+def _kind_of(target: Any) -> str:
+    """The kind of an object; "" if the object is of no kind."""
+    if isinstance(target, Metric | Change):
+        return "metric" if isinstance(target, Metric) else "objective"
+    if not inspect.isclass(target):
+        return "traci" if inspect.isfunction(target) else ""
+    if issubclass(target, ScalarAds):
+        return "ads"
+    shares = {kind: sum(hasattr(target, name) for name in names) / len(names) for kind, names in METHODS.items()}
+    likeliest_kind = max(shares, key=lambda kind: shares[kind])
+    return likeliest_kind if shares[likeliest_kind] > 0 else ""
+
+
+def _put_in(study: Study, kind: str, name: str) -> Study:
+    """A study that names a subject without parameters; raises an `InputError` for a vehicle, whose characteristics only
+    a study knows.
+    """
+    if kind in ("ads", "traci"):
+        return replace(study, ads=ModelTable(model=name, kind="traci" if kind == "traci" else ""))
+    if kind == "scenario":
+        return replace(study, scenario=ModelTable(model=name), matrix=None)
+    if kind == "algorithm":
+        return replace(study, search=replace(study.search, algorithms=[name], parameters={}))
+    if kind == "metric":
+        return replace(study, metrics=replace(study.metrics, also=[] if name in METRICS else [name]))
+    if kind == "objective":
+        return replace(study, search=replace(study.search, objectives=["safety_degree", name]))
+    raise InputError(
+        "check",
+        f"no study gives the characteristics of {name!r}",
+        "`study=STUDY`, or a study file beside it that names it",
+    )
+
+
+def _studies_beside(name: str, folder: Path) -> Iterator[Study]:
+    """Studies in the working directory, or in the folder of a subject, that contain its name."""
+    for directory in dict.fromkeys((Path.cwd(), folder)):
+        for file in sorted(directory.glob("*.toml"))[:MAX_FILES]:
+            with suppress(SafevarError, OSError, UnicodeDecodeError, tomllib.TOMLDecodeError):
+                if name in file.read_text(encoding="utf-8"):
+                    yield load_study(str(file.relative_to(Path.cwd()) if file.is_relative_to(Path.cwd()) else file))
+
+
+CHECKS: Mapping[str, str] = {
+    "contract": (
+        "return what the base class documents, leave arguments as they are, and guard divisions and roots where "
+        "the domain ends"
+    ),
+    "repetition": (
+        "draw nothing at random (an algorithm: from `rng` alone), read no clock, and keep nothing in a class or "
+        "a module"
+    ),
+    "order": "compute element i of a result from element i of the arguments alone, whatever its place",
+    "alone": "compute element i of a result from element i of the arguments alone: no mean, sum or maximum over the "
+    "vehicles; keep what a "
+    "vehicle remembers in the memory that is handed on or in its own instance, not in a class or a module",
+    "reaction": "check that the code reads the quantity that it should react to, with the right sign and unit",
+}
+"""The checks, with advice on a failure. All but `reaction`, of which every answer itself warns, also keep a study from
+starting.
+"""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """A failed check: file and line of the user code, the expected result, the actual one with the input that shows it,
+    and advice.
+    """
+
+    check: str
+    file: str
+    line: int
+    expected: str
+    got: str
+    advice: str
+
+    def __str__(self) -> str:
+        return f"{self.file}:{self.line}: {self.check}: {self.got}"
+
+
+@dataclass(kw_only=True)
+class Report:
+    """The findings on a subject or a study; `remark` says in which study a subject was tried."""
+
+    subject: str
+    kind: str
+    findings: list[Finding] = field(default_factory=list)
+    remark: str = ""
+    seconds: float = 0.0
+
+    @property
+    def passed(self) -> bool:
+        return not self.findings
+
+    def to_dict(self) -> dict[str, str | bool | float | list[dict[str, str | int]]]:
+        """The JSON output of the command `check`."""
+        return {
+            "subject": self.subject,
+            "kind": self.kind,
+            "passed": self.passed,
+            "findings": list(map(asdict, self.findings)),
+            "seconds": round(self.seconds, 3),
+        }
+
+
+def check(name: str, study: str | None = None) -> Report:
+    """Check a subject, or everything that a study names.
+
+    Parameters
+    ----------
+    name
+        `package.module:Name`, the name of a shipped subject, the path of an FMU, or the name or path of a study.
+    study
+        The study to try a subject in.
+
+    Raises
+    ------
+    InputError
+        If the subject or the study cannot be loaded.
+    """
+    if ":" in name or not (name in study_names() or name.endswith(".toml")):
+        return check_subject(find_subject(name, study))
+    if study is not None:
+        raise InputError("study", f"{study!r} is given, and {name!r} is itself a study", "one of them")
+    start, loaded = time.perf_counter(), load_study(name)
+    findings = [finding for _, finding in _findings_in(loaded, subjects_of(loaded))] or _reaction(
+        subjects_of(loaded)[0]
+    )
+    return Report(subject=name, kind="study", findings=findings, seconds=time.perf_counter() - start)
+
+
+def check_subject(subject: Subject) -> Report:
+    """Check one subject. Raises the errors of `check`."""
+    start = time.perf_counter()
+    findings = [finding for _, finding in _findings_in(subject.study, [subject])]
+    if subject.kind in ("ads", "traci") and not subject.is_guest:
+        findings = findings or _reaction(subject)
+    return Report(
+        subject=subject.name,
+        kind=subject.kind,
+        findings=findings,
+        remark=subject.remark,
+        seconds=time.perf_counter() - start,
+    )
+
+
+def refuse_defects(study: Study) -> None:
+    """Check the user code that a study names.
+
+    Raises
+    ------
+    UserCodeError
+        With the first defect, the input that shows it, file and line, and advice.
+    """
+    for names, finding in _findings_in(study, [subject for subject in subjects_of(study) if subject.is_user_code]):
+        place, command = (
+            f"{finding.file}:{finding.line}",
+            f"{PROGRAM_COMMAND} check {shlex.quote(study.origin.called or study.name)}",
+        )
+        problem = f"{names} {finding.got}{'' if place in finding.got else f' ({place})'}; to reproduce it: {command}"
+        raise UserCodeError(study.source, problem, f"{finding.expected}; {finding.advice}", place)
+
+
+def _findings_in(study: Study, subjects: list[Subject]) -> Iterator[tuple[str, Finding]]:
+    """The first failure of each trial, and the code on trial; all subjects that are simulated share one trial."""
+    simulated = [subject for subject in subjects if subject.kind not in ("algorithm", "constraint")]
+    for trial in ([simulated] if simulated else []) + [[subject] for subject in subjects if subject not in simulated]:
+        code = [subject for subject in trial if subject.is_user_code] or trial
+        try:
+            with np.errstate(all="ignore"):
+                failure, place = next(_failures(study, trial[0]), None), ""
+        except UserCodeError as error:
+            problem = next(
+                (error.problem.removeprefix(f"{one.key} ") for one in code if error.problem.startswith(one.key)),
+                error.problem,
+            )
+            failure, place = ("contract", error.legal or "no exception", problem), error.place
+        if failure is not None:
+            yield " and ".join(subject.key for subject in code), _finding(code[0], failure, place)
+
+
+def _reaction(driver: Subject) -> list[Finding]:
+    """The finding on a driver who does not drive to the encounter with nobody in sight."""
+    reason = why_no_verdict(assemble(driver.study))
+    expected = "a drive to the encounter, with no braking while nobody is in sight"
+    return [_finding(driver, ("reaction", expected, reason))] if reason else []
+
+
+def _finding(subject: Subject, failure: Failure, place: str = "") -> Finding:
+    file, _, line = (place or subject.definition).rpartition(":")
+    check, expected, got = failure
+    return Finding(check, file or subject.name, int(line or 1), expected, got, CHECKS[check])
+
+
+def _failures(study: Study, subject: Subject) -> Iterator[Failure]:
+    if subject.kind == "algorithm":
+        return try_algorithm(study, subject.name)
+    return try_constraint(study, subject.name) if subject.kind == "constraint" else try_simulations(study)
