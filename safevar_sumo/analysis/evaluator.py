@@ -14,7 +14,7 @@ from safevar_sumo.analysis.research_questions.case import Case
 from safevar_sumo.campaign.batches import ask_why_no_verdict, evaluate_all, inputs_of
 from safevar_sumo.campaign.evaluation import pack_study
 from safevar_sumo.campaign.local import available_cores, local_pool
-from safevar_sumo.campaign.pool import Pool, wait_for_first
+from safevar_sumo.campaign.pool import Pool, wait_for_result
 from safevar_sumo.campaign.retrying import RetryingPool
 from safevar_sumo.errors import InputError, SimulationError
 from safevar_sumo.metrics import METRICS, RATING_POINTS, Unsafe
@@ -54,17 +54,8 @@ class Evaluator:
         self._pool, self.progress = pool, progress
         self.simulated = 0
 
-    def evaluate(
-        self,
-        settings: FloatArray,
-        stage: str,
-        done_before: int = 0,
-        total: int | None = None,
-        *,
-        ignore_constraints: bool = False,
-    ) -> Evaluations:
-        """Evaluate M settings, shape (M, n). Progress is shown for `stage`; `done_before` of its `total` settings are
-        already done.
+    def evaluate(self, settings: FloatArray, stage: str, *, ignore_constraints: bool = False) -> Evaluations:
+        """Evaluate M settings, shape (M, n). Progress is shown for `stage`.
 
         Settings that violate a constraint of the study are not simulated and get the outcome `infeasible`, unless
         `ignore_constraints` is true.
@@ -72,25 +63,21 @@ class Evaluator:
         if self.region and not ignore_constraints:
             feasible = self.region.feasible(settings)
             if not feasible.all():
-                groups = [
-                    self.evaluate(settings[feasible], stage, done_before, total),
-                    self._infeasible_evaluations(settings[~feasible]),
-                ]
+                groups = [self.evaluate(settings[feasible], stage), self._infeasible_evaluations(settings[~feasible])]
                 order = np.argsort(np.argsort(~feasible, kind="stable"), kind="stable")
                 return Evaluations.concatenate(groups).take(order)  # restores the order of the settings
         if not len(settings):
             return Evaluations.none(len(self.characteristics), METRICS)
-        done, distinct_settings = done_before, len(np.unique(settings, axis=0))
-        stage_total = distinct_settings if total is None else total
-        self.progress(stage, done, stage_total)
+        done, total = 0, len(np.unique(settings, axis=0))
+        self.progress(stage, done, total)
 
         def show_more_done(increment: int) -> None:
             nonlocal done
             done += increment
-            self.progress(stage, done, stage_total)
+            self.progress(stage, done, total)
 
         evaluations = evaluate_all(self.study, settings, self._pool, show_more_done)
-        self.simulated += distinct_settings
+        self.simulated += total
         return evaluations
 
     def _infeasible_evaluations(self, settings: FloatArray) -> Evaluations:
@@ -116,7 +103,7 @@ class Evaluator:
             """The next `count` settings of the Sobol sequence."""
             nonlocal drawn
             drawn += count
-            return sobol_settings(self.characteristics, drawn, seed)[drawn - count :]
+            return sobol_settings(self.characteristics, drawn, seed)[-count:]
 
         return self.region.draw_feasible(
             draw_next, number, rng, filtered=feasible_after_filter, rejections=MAX_REJECTIONS
@@ -126,13 +113,13 @@ class Evaluator:
         """The first `number` random vehicles of the study, uniform over the domain's feasible part: those that `risk`
         draws, too.
         """
-        rng, bounds = np.random.default_rng(self.study.search.seed), self.characteristics
-
-        def draw_next(count: int) -> FloatArray:
-            return np.asarray(bounds.lower + rng.random((count, len(bounds))) * (bounds.upper - bounds.lower))
-
+        bounds, seed = self.characteristics, self.study.search.seed
+        rng = np.random.default_rng(seed)
         return self.region.draw_feasible(
-            draw_next, number, np.random.default_rng(self.study.search.seed), rejections=MAX_REJECTIONS
+            lambda count: np.asarray(bounds.lower + rng.random((count, len(bounds))) * (bounds.upper - bounds.lower)),
+            number,
+            np.random.default_rng(seed),
+            rejections=MAX_REJECTIONS,
         )
 
     def simulate_cells(self, settings: FloatArray, stage: str) -> CellResults:
@@ -148,24 +135,21 @@ class Evaluator:
         cell_count = len(rater.protocol.cells)
         parts = min(PARTS_PER_WORKER * self._pool.workers, cell_count)
         inputs, pool = inputs_of(self.study, self._pool), RetryingPool(self._pool, self.study)
-        self.progress(stage, 0, cell_count)
-        futures = {
-            pool.submit(pack_study(self.study, inputs, cells=(part, parts)), settings): part for part in range(parts)
-        }
-        results_by_part, done = dict[int, CellResults](), 0
-        while len(results_by_part) < parts:
-            for future in wait_for_first([future for future, part in futures.items() if part not in results_by_part]):
-                evaluations = future.result()
-                if evaluations.cells is None:
-                    reason = evaluations.reason(int(np.argmax(evaluations.failed)))
-                    raise SimulationError(f"study {self.study.name!r}: a vehicle cannot be simulated: {reason}")
-                results_by_part[futures[future]] = evaluations.cells
-                done += evaluations.cells.impact.shape[1]
-                self.progress(stage, done, cell_count)
-        order = np.argsort(np.concatenate([cells_of_part(rater.protocol, part, parts) for part in range(parts)]))
+        cells = [cells_of_part(rater.protocol, part, parts) for part in range(parts)]
+        work = [pack_study(self.study, inputs, cells=(part, parts)) for part in range(parts)]
+        futures, results, done = [pool.submit(one, settings) for one in work], list[CellResults](), 0
+        for future, numbers in zip(futures, cells, strict=True):
+            self.progress(stage, done, cell_count)
+            evaluations = wait_for_result(future)
+            if evaluations.cells is None:
+                reason = evaluations.reason(int(np.argmax(evaluations.failed)))
+                raise SimulationError(f"study {self.study.name!r}: a vehicle cannot be simulated: {reason}")
+            results.append(evaluations.cells)
+            done += len(numbers)
+        self.progress(stage, done, cell_count)
         self.simulated += len(settings)
-        columns = zip(*(results_by_part[part] for part in range(parts)), strict=True)
-        return CellResults._make(np.concatenate(column, axis=1)[:, order] for column in columns)
+        order = np.argsort(np.concatenate(cells))
+        return CellResults._make(np.concatenate(column, axis=1)[:, order] for column in zip(*results, strict=True))
 
     def evaluate_original(self) -> Evaluations:
         """Evaluation of the original vehicle.

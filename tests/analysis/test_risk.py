@@ -16,7 +16,7 @@ import scipy
 
 from safevar_sumo import risk
 from safevar_sumo.analysis.risk.answer import Risk
-from safevar_sumo.analysis.risk.variation import VariationModel
+from safevar_sumo.analysis.risk.compute import VariationModel
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import FloatArray
 from safevar_sumo.study import load_study
@@ -221,10 +221,6 @@ def curved(radius: float) -> Limit:
     return lambda u: radius - np.linalg.norm(u, axis=1)
 
 
-def islands(beta: float) -> Limit:
-    return lambda u: beta - np.abs(u[:, 0])
-
-
 def rare(limit: Limit, n: int, seed: int = 1, **options: object) -> Risk:
     study = made_up_study(n)
     study = msgspec.structs.replace(
@@ -279,12 +275,6 @@ def test_a_rare_failure_its_interval_and_its_most_probable_point() -> None:
     assert set(record) >= {"method", "simulations", "coefficient_of_variation", "design_point", "remark"}
     assert estimate.of_fleet(1000) == pytest.approx(1 - (1 - estimate.probability) ** 1000)
     assert rare(linear(beta_of(1e-5)), 3).to_dict() == record
-
-
-def test_two_islands_are_told() -> None:
-    estimate = rare(islands(beta_of(5e-5)), 2)
-    assert estimate.interval[0] <= 1e-4 <= estimate.interval[1]
-    assert "2 islands" in estimate.remark
 
 
 def test_where_no_failure_is_within_reach_a_number_comes_out_all_the_same() -> None:

@@ -5,9 +5,12 @@ decides.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from importlib.util import find_spec
+from typing import Any
 
 import numpy as np
+import pandas as pd
 import scipy
 
 from safevar_sumo.analysis.evaluator import Evaluator, clopper_pearson, open_evaluator
@@ -15,20 +18,31 @@ from safevar_sumo.analysis.research_questions.case import Case
 from safevar_sumo.analysis.risk import ENOUGH_FAILURES, PILOT_VEHICLES, RARE_BELOW, RiskOptions
 from safevar_sumo.analysis.risk.answer import Estimate, Risk
 from safevar_sumo.analysis.risk.rare import RareMethodError, Response, estimate_rare, is_plateau, load_openturns
-from safevar_sumo.analysis.risk.variation import VariationModel, compute_sensitivities
 from safevar_sumo.analysis.subject import study_in
 from safevar_sumo.campaign.pool import Pool
 from safevar_sumo.errors import InputError, SimulationError
 from safevar_sumo.metrics import Unsafe
-from safevar_sumo.records import FloatArray
+from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.study import Study
+from safevar_sumo.study.characteristics import Distribution, Fixed, Lognormal, Normal, Triangular, Uniform
 from safevar_sumo.terminal import Progress, show_no_progress
+from safevar_sumo.vehicles import Characteristic, CharacteristicSet
 from safevar_sumo.vehicles.region import REJECTIONS
 
 VEHICLES_PER_CHECK = 1000
 """Number of vehicles drawn between two checks of the interval's width."""
 MAX_VEHICLES_PER_CALL = 50_000
 """Maximum number of vehicles evaluated in one call if no `width` is requested; bounds the memory of a process."""
+
+
+BASE_POINTS = 512
+"""Number of base points of Saltelli's design, which has n + 2 settings for each base point."""
+MIN_OUTCOMES = 100
+"""Minimum number of unsafe settings, and of safe settings, in the design for Sobol indices of unsafe outcomes."""
+BOOTSTRAP_SAMPLES = 200
+"""Number of bootstrap samples for the intervals."""
+QuantileFunction = Callable[[FloatArray], FloatArray]
+"""Turns probabilities into values in the characteristic's unit."""
 
 
 def estimate_risk(
@@ -78,60 +92,44 @@ def _draw_vehicles(evaluator: Evaluator, model: VariationModel, unsafe: Unsafe, 
     """Draw vehicles by plain Monte Carlo; if few of the first `PILOT_VEHICLES` are unsafe, switch to a method for rare
     failures.
     """
-    rng, vehicles, failures, errors, remark = np.random.default_rng(evaluator.study.search.seed), 0, 0, 0, ""
-    is_pilot, requested = _needs_pilot(options, evaluator.study) and not evaluator.region, options.samples
+    study, remark = evaluator.study, ""
+    rng, requested, counts = np.random.default_rng(study.search.seed), options.samples, np.zeros(3, dtype=int)
+
+    def simulate(settings: FloatArray) -> Evaluations:
+        """Simulate vehicles, and count all, those that could be simulated and the unsafe ones."""
+        evaluations = evaluator.evaluate(settings, "sampling vehicles")
+        counts[:] += len(settings), np.count_nonzero(evaluations.valid), np.count_nonzero(unsafe.of(evaluations))
+        return evaluations
+
     if options.requires_rare_method:
         load_openturns()  # raises if the module is missing
         requested = max(requested, PILOT_VEHICLES)
         remark = "the study has constraints, which only plain Monte Carlo supports" if evaluator.region else ""
-    interval = 0.0, 1.0
-    while vehicles + errors < requested and not (
-        options.width is not None and interval[1] - interval[0] <= options.width
-    ):
-        largest_number = (
-            PILOT_VEHICLES if is_pilot else (MAX_VEHICLES_PER_CALL if options.width is None else VEHICLES_PER_CHECK)
-        )
-        number = min(largest_number, requested - vehicles - errors)
-        probabilities = rng.random((number, len(evaluator.characteristics))) if is_pilot else None
-        settings = (
-            _draw_feasible_vehicles(evaluator, model, number, rng)
-            if probabilities is None
-            else model.settings(probabilities)
-        )
-        evaluations = evaluator.evaluate(settings, "sampling vehicles", done_before=vehicles + errors, total=requested)
-        valid = int(np.count_nonzero(evaluations.valid))
-        vehicles, errors = vehicles + valid, errors + number - valid
-        failures += int(np.count_nonzero(unsafe.of(evaluations)))
-        if probabilities is not None:
-            is_pilot = False
-            response = Response(evaluator, model.settings_of_normal, unsafe)
-            responses = response.record(scipy.stats.norm.ppf(probabilities), evaluations)
-            is_frequent = not options.requires_rare_method and failures * (requested / number) >= ENOUGH_FAILURES
-            if valid and failures < RARE_BELOW * valid and not is_frequent:
-                estimate = _try_rare_method(response, responses, options, evaluator.study.search.seed)
-                if isinstance(estimate, Estimate):
-                    return estimate
-                remark = estimate
-            elif options.requires_rare_method:
-                pilot = (
-                    f"at least {100 * RARE_BELOW:g} % of {valid} vehicles are unsafe"
-                    if valid
-                    else (f"none of the first {number} vehicles could be simulated")
-                )
-                remark = f"{pilot}: plain Monte Carlo is used"
-        if vehicles:
-            interval = clopper_pearson(failures, vehicles, options.confidence)
-    if not vehicles:
-        raise SimulationError(f"study {evaluator.study.name!r}: none of {errors} vehicles could be simulated")
-    share = failures / vehicles
-    variation = float(np.sqrt((1 - share) / failures)) if failures else math.nan
+    if _needs_pilot(options, study) and not evaluator.region:
+        probabilities = rng.random((PILOT_VEHICLES, len(evaluator.characteristics)))
+        response = Response(evaluator, model.settings_of_normal, unsafe)
+        responses = response.record(scipy.stats.norm.ppf(probabilities), simulate(model.settings(probabilities)))
+        estimate = _try_rare_method(response, responses, options, requested, study.search.seed)
+        if isinstance(estimate, Estimate):
+            return estimate
+        remark = estimate
+    while True:
+        drawn, valid, failures = counts.tolist()
+        interval = clopper_pearson(failures, valid, options.confidence) if valid else (0.0, 1.0)
+        if drawn >= requested or (options.width is not None and interval[1] - interval[0] <= options.width):
+            break
+        number = min(MAX_VEHICLES_PER_CALL if options.width is None else VEHICLES_PER_CHECK, requested - drawn)
+        simulate(_draw_feasible_vehicles(evaluator, model, number, rng))
+    if not valid:
+        raise SimulationError(f"study {study.name!r}: none of {drawn} vehicles could be simulated")
+    share = failures / valid
     return Estimate(
         probability=share,
-        coefficient_of_variation=variation,
+        coefficient_of_variation=math.sqrt((1 - share) / failures) if failures else math.nan,
         interval=interval,
         failures=failures,
-        errors=errors,
-        simulations=vehicles + errors,
+        errors=drawn - valid,
+        simulations=drawn,
         method="monte_carlo",
         remark=remark,
     )
@@ -145,19 +143,27 @@ def _needs_pilot(options: RiskOptions, study: Study) -> bool:
     return options.requires_rare_method or (may_be_rare and options.samples >= 2 * PILOT_VEHICLES)
 
 
-def _try_rare_method(response: Response, responses: FloatArray, options: RiskOptions, seed: int) -> Estimate | str:
+def _try_rare_method(
+    response: Response, responses: FloatArray, options: RiskOptions, requested: int, seed: int
+) -> Estimate | str:
     """The estimate by a method for rare failures; why plain Monte Carlo has to continue if there is none."""
+    valid, failures = response.simulations - response.errors, response.failure_count
+    expected_failures = failures * requested / PILOT_VEHICLES
+    if not valid or failures >= RARE_BELOW * valid:
+        frequent = f"at least {100 * RARE_BELOW:g} % of {valid} vehicles are unsafe"
+        pilot = frequent if valid else f"none of the first {PILOT_VEHICLES} vehicles could be simulated"
+        return f"{pilot}: plain Monte Carlo is used" if options.requires_rare_method else ""
+    if not options.requires_rare_method and expected_failures >= ENOUGH_FAILURES:
+        return ""
     if is_plateau(responses):
         return (
-            "the response is a plateau: most vehicles nearest to failure have the same safety degree, so "
-            "that methods for "
-            "rare failures cannot approach failures; plain Monte Carlo is used"
+            "the response is a plateau: most vehicles nearest to failure have the same safety degree, so that methods "
+            "for rare failures cannot approach failures; plain Monte Carlo is used"
         )
     if not options.requires_rare_method and find_spec("openturns") is None:
         return (
-            f"fewer than {100 * RARE_BELOW:g} % of the first vehicles are unsafe; for a method that needs "
-            "fewer vehicles "
-            "for rare failures, in the checkout: pip install '.[rare]'"
+            f"fewer than {100 * RARE_BELOW:g} % of the first vehicles are unsafe; for a method that needs fewer "
+            "vehicles for rare failures, in the checkout: pip install '.[rare]'"
         )
     method = "cross_entropy" if options.method == "cross_entropy" else "subset_simulation"
     try:
@@ -180,3 +186,124 @@ def _draw_feasible_vehicles(
             "a [variation] and [[constraints]] that agree",
         )
     return settings
+
+
+class VariationModel:
+    """The random variation of a study's characteristics, by its `[variation]` and `[[correlations]]`.
+
+    Raises
+    ------
+    InputError
+        If the correlations contradict each other.
+    """
+
+    def __init__(self, study: Study) -> None:
+        self._characteristics = CharacteristicSet.of(study.vehicle.characteristics)
+        self._quantiles = [
+            _quantile_function(characteristic, study.variation.get(characteristic.name, Uniform()))
+            for characteristic in self._characteristics
+        ]
+        self.is_correlated, matrix = bool(study.correlations), np.eye(len(self._characteristics))
+        for correlation in study.correlations:
+            first, second = map(self._characteristics.names.index, correlation.between)
+            matrix[first, second] = matrix[second, first] = correlation.value
+        try:
+            self._factor = np.linalg.cholesky(matrix)
+        except np.linalg.LinAlgError:
+            pairs = ", ".join(f"{' and '.join(one.between)} {one.value:g}" for one in study.correlations)
+            problem = f"correlations contradict each other: {pairs}"
+            raise InputError(study.source, problem, "a positive definite matrix") from None
+
+    def settings(self, probabilities: FloatArray) -> FloatArray:
+        """Settings at N independent points of the unit cube, shape (N, n); the settings are correlated as the study
+        specifies.
+        """
+        if self.is_correlated:
+            return self.settings_of_normal(scipy.stats.norm.ppf(probabilities))
+        return self._settings_at(probabilities)
+
+    def settings_of_normal(self, points: FloatArray) -> FloatArray:
+        """Settings at N points of standard normal space, shape (N, n), correlated as the study specifies."""
+        return self._settings_at(scipy.stats.norm.cdf(points @ self._factor.T if self.is_correlated else points))
+
+    def _settings_at(self, probabilities: FloatArray) -> FloatArray:
+        columns = [quantile(column) for quantile, column in zip(self._quantiles, probabilities.T, strict=True)]
+        return np.clip(np.stack(columns, axis=1), self._characteristics.lower, self._characteristics.upper)
+
+
+def _quantile_function(characteristic: Characteristic, distribution: Distribution) -> QuantileFunction:
+    low, high = characteristic.lower, characteristic.upper
+    match distribution:
+        case Fixed():
+            value = _or_default(distribution.value, characteristic.original)
+            return lambda p: np.full_like(p, value)
+        case Uniform() | Triangular():
+            lower, upper = _or_default(distribution.lower, low), _or_default(distribution.upper, high)
+            if isinstance(distribution, Uniform):
+                return lambda p: lower + p * (upper - lower)
+            mode = _or_default(distribution.mode, characteristic.original)
+            triangle = scipy.stats.triang((mode - lower) / (upper - lower), loc=lower, scale=upper - lower)
+            return lambda p: np.asarray(triangle.ppf(p))
+        case Normal():
+            mean = _or_default(distribution.mean, characteristic.original)
+            normal = _truncated_normal(low, high, mean, distribution.deviation)
+            return lambda p: np.asarray(normal.ppf(p))
+        case Lognormal():
+            log_median = np.log(_or_default(distribution.median, characteristic.original))
+            logarithm = _truncated_normal(np.log(low), np.log(high), log_median, distribution.sigma)
+            return lambda p: np.exp(logarithm.ppf(p))
+
+
+def _truncated_normal(low: float, high: float, mean: float, deviation: float) -> Any:
+    return scipy.stats.truncnorm((low - mean) / deviation, (high - mean) / deviation, loc=mean, scale=deviation)
+
+
+def _or_default(value: float | None, default: float) -> float:
+    return default if value is None else value
+
+
+def compute_sensitivities(
+    evaluator: Evaluator, model: VariationModel, unsafe: Unsafe, confidence: float
+) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """Sensitivity of the safety degree, and of the unsafe outcome.
+
+    Returns
+    -------
+    tuple of pandas.DataFrame
+        One row per characteristic: `characteristic`, `first_order`, `total` [share of the variance], and the intervals'
+        ends `first_order_lower`, `first_order_upper`, `total_lower`, `total_upper`; NaN where nothing varies, or too
+        few settings are unsafe (or safe).
+    """
+    from SALib.sample import sobol  # takes a second to load
+
+    seed, names = evaluator.study.search.seed % 2**32, evaluator.characteristics.names
+    problem = {"num_vars": len(names), "names": list(names), "bounds": [[0.0, 1.0]] * len(names)}
+    points = sobol.sample(problem, BASE_POINTS, calc_second_order=False, seed=seed)
+    evaluations = evaluator.evaluate(model.settings(np.asarray(points)), "sensitivity analysis")
+    degree = np.where(evaluations.valid, evaluations.f_safe, np.nan)
+    is_unsafe = np.where(evaluations.valid, unsafe.of(evaluations).astype(float), np.nan)
+    if min(np.count_nonzero(is_unsafe == outcome) for outcome in (0, 1)) < MIN_OUTCOMES:
+        is_unsafe[:] = np.nan
+    return _sobol_indices(problem, degree, confidence, seed), _sobol_indices(problem, is_unsafe, confidence, seed)
+
+
+def _sobol_indices(problem: dict[str, Any], output: FloatArray, confidence: float, seed: int) -> pd.DataFrame:
+    """Sobol indices of an output over the design, without base points at which the output is undefined for any
+    setting.
+    """
+    from SALib.analyze import sobol
+
+    blocks = output.reshape(BASE_POINTS, -1)
+    outputs = blocks[np.isfinite(blocks).all(axis=1)].ravel()
+    names = problem["names"]
+    if not outputs.size or np.ptp(outputs) == 0:
+        indices = {name: np.full(len(names), np.nan) for name in ("S1", "ST", "S1_conf", "ST_conf")}
+    else:
+        indices = sobol.analyze(
+            problem, outputs, calc_second_order=False, num_resamples=BOOTSTRAP_SAMPLES, conf_level=confidence, seed=seed
+        )
+    frame = pd.DataFrame({"characteristic": names, "first_order": indices["S1"], "total": indices["ST"]})
+    for name, key in (("first_order", "S1"), ("total", "ST")):
+        for end, sign in (("lower", -1), ("upper", 1)):
+            frame[f"{name}_{end}"] = frame[name] + sign * indices[f"{key}_conf"]
+    return frame
