@@ -4,16 +4,17 @@ equally well.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
+import msgspec
 import numpy as np
 
-from safevar_sumo.analysis.parameters import value_of, with_values
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import Evaluations, FloatArray, finite_or_none
-from safevar_sumo.study import SAFETY_DEGREE, Study
+from safevar_sumo.scenarios import weather_of
+from safevar_sumo.study import SAFETY_DEGREE, Study, error_with_key, locate_parameter, missing_parameter
 from safevar_sumo.sumo.matrix import evaluate, system_at_point
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet
@@ -166,3 +167,41 @@ def parameters_outside_sets(study: Study) -> list[str]:
         for key, values in study.spread.items()
         if not np.isclose(value_of(study, key, "spread"), values[0], rtol=ROUNDING_TOLERANCE, atol=0)
     ]
+
+
+def with_values(study: Study, values: Mapping[str, float], stated_in: str = "calibration") -> Study:
+    """A study with other values of some parameters, named by their keys in the study file; errors name the table
+    `stated_in`.
+
+    Raises
+    ------
+    InputError
+        If the study lacks a parameter, or a value is not allowed for its parameter.
+    """
+    tables = _as_tables(study)
+    for name, value in values.items():
+        table, key = _locate(study, tables, name, stated_in)
+        table[key] = value
+    try:
+        return msgspec.convert(tables, Study)
+    except msgspec.ValidationError as error:
+        raise error_with_key(study.source, tables, error) from None
+
+
+def value_of(study: Study, name: str, stated_in: str = "calibration") -> float:
+    """The value of a parameter in the study."""
+    table, key = _locate(study, _as_tables(study), name, stated_in)
+    return float(table[key])
+
+
+def _as_tables(study: Study) -> Any:
+    """The study as plain tables; a weather's name is replaced by the weather's table."""
+    return msgspec.to_builtins(msgspec.structs.replace(study, weather=weather_of(study.weather, study.source)))
+
+
+def _locate(study: Study, tables: Any, name: str, stated_in: str) -> tuple[Any, int | str]:
+    """The table or list that holds a parameter, and the parameter's key or index in it."""
+    place = locate_parameter(tables, name)
+    if place is None:
+        raise missing_parameter(study.source, stated_in, name)
+    return place

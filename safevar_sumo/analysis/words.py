@@ -48,8 +48,10 @@ def direction_in_words(characteristic: Characteristic, value: float) -> str:
 
 
 def simulate_command(study: str, values: Mapping[str, float], point: str = "") -> str:
-    """The command that simulates changes of a study; `point` may name a point of the study's matrix."""
-    changes = (f"--set {quote(f'{name}={value!r}'.removesuffix('.0'))}" for name, value in values.items())
+    """The command that simulates changes of a study, in eight digits; `point` may name a point of the study's
+    matrix.
+    """
+    changes = (f"--set {quote(f'{name}={value:.8g}')}" for name, value in values.items())
     return " ".join([question_command("simulate", study, point), *changes])
 
 

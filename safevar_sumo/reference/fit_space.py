@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from safevar_sumo.analysis.parameters import value_of, with_values
+from safevar_sumo.analysis.model_spread import value_of, with_values
 from safevar_sumo.campaign.batches import inputs_of
 from safevar_sumo.campaign.evaluation import pack_study
 from safevar_sumo.campaign.pool import Pool, wait_for_result

@@ -13,7 +13,7 @@ import scipy
 from hypothesis import given, settings, strategies as st
 
 from safevar_sumo import risk, rules, tolerance
-from safevar_sumo.analysis.evaluator import Evaluator
+from safevar_sumo.analysis.evaluator import Evaluator, clopper_pearson
 from safevar_sumo.analysis.research_questions.case import build_case
 from safevar_sumo.analysis.rules.compute import Rule, Rules
 from safevar_sumo.analysis.tolerance import ToleranceOptions, compute
@@ -222,7 +222,7 @@ def test_nothing_everything_and_too_little() -> None:
 
 def test_a_rule_is_denser_than_a_share_below_its_interval() -> None:
     """8 of 10: Clopper and Pearson have 44.4 to 97.5 %."""
-    rule = Rule({"a": (7.0, None)}, inside=10, unsafe_inside=8, unsafe_everywhere=20, confidence=0.95)
+    rule = Rule({"a": (7.0, None)}, 0.8, 0.4, clopper_pearson(8, 10), clopper_pearson(8, 20))
     assert rule.density_interval == pytest.approx((0.444, 0.975), abs=5e-4)
     assert [rule.is_denser_than(share) for share in (0.4, 0.5, 0.9)] == [True, False, False]
 

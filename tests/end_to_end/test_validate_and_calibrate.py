@@ -15,7 +15,7 @@ import pandas as pd
 import pytest
 from click.testing import CliRunner
 
-from safevar_sumo.analysis.parameters import with_values
+from safevar_sumo.analysis.model_spread import with_values
 from safevar_sumo.cli import calibrate
 from safevar_sumo.cli.program import commands
 from safevar_sumo.reference.calibration import FitSubject

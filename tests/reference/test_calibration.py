@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.special import logit
 
-from safevar_sumo.analysis.parameters import value_of, with_values
+from safevar_sumo.analysis.model_spread import value_of, with_values
 from safevar_sumo.records import FloatArray
 from safevar_sumo.reference.calibration import Calibration, FitSubject, calibrate
 from safevar_sumo.reference.effects import Regression, error_beyond_spread, measure_coverage

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from enum import StrEnum
 from itertools import combinations, islice
 from math import comb
@@ -163,10 +163,6 @@ as their spacing.
 PARTS_PER_ROUND = 8
 """Number of parts into which each of `ROUNDS` rounds divides the interval with the boundary."""
 ROUNDS = 3
-SHORT_DIGITS = (3, 4, 5, 6, 8)
-"""Numbers of significant digits that commands may print."""
-SHORT_DEGREE = 0.01
-"""Difference of safety degrees that a rounded setting may make [m, or m/s]."""
 RESOLUTION = 1 / (LINE_SETTINGS * PARTS_PER_ROUND**ROUNDS)
 """Accuracy of a boundary, as a share of the line."""
 
@@ -198,8 +194,6 @@ class Cause:
     end, at_threshold
         The end of the shrinking: the state just below `fraction`; at the filter's threshold, the characteristic whose
         change the filter would remove.
-    short_changes, short_boundary
-        `changes` and `boundary` in as few digits as a vehicle needs to end alike, for commands.
     neighbours
         Robustness of these changes by themselves, estimated from the setting's neighbours; None in a rated study, where
         the simulations would take too long.
@@ -214,8 +208,6 @@ class Cause:
     end: BoundaryState = BoundaryState.SAFE
     at_threshold: str | None = None
     neighbours: Robustness | None = None
-    short_changes: dict[str, float] = field(default_factory=dict)
-    short_boundary: dict[str, float] = field(default_factory=dict)
 
     @property
     def robustness(self) -> float | None:
@@ -240,12 +232,7 @@ class Cause:
 
 
 def describe_causes(
-    evaluator: Evaluator,
-    causes: Sequence[MinimalCause],
-    unsafe: Unsafe,
-    robustnesses: Sequence[Robustness | None],
-    *,
-    has_short_forms: bool = True,
+    evaluator: Evaluator, causes: Sequence[MinimalCause], unsafe: Unsafe, robustnesses: Sequence[Robustness | None]
 ) -> list[Cause]:
     """Shrink causes, all changes by a common factor and each change by itself, while they stay unsafe and above the
     filter's thresholds.
@@ -262,9 +249,6 @@ def describe_causes(
     shares, states = find_boundary_shares(evaluator, starts, ends, unsafe, thresholds.max(axis=1, initial=0.0))
     limits = settings_on_lines(starts, ends, shares[:, np.newaxis])[:, 0]
     rows = np.cumsum([0, *(1 + len(cause.columns) for cause in causes)])[:-1]
-    exact = short = np.array([*(cause.setting for cause in causes), *limits[rows]]).reshape(-1, len(names))
-    if has_short_forms and len(exact):
-        short = shorten(evaluator, exact, unsafe)
 
     def values(cause: MinimalCause, setting: FloatArray) -> dict[str, float]:
         return {names[column]: float(setting[column]) for column in cause.columns}
@@ -280,32 +264,9 @@ def describe_causes(
             end=states[row] if cause.columns else BoundaryState.SAFE,
             at_threshold=names[np.argmax(thresholds[row])] if states[row] == BoundaryState.FILTER else None,
             neighbours=robustness,
-            short_changes=values(cause, short[index]),
-            short_boundary=values(cause, short[len(causes) + index]),
         )
-        for index, (cause, row, robustness) in enumerate(zip(causes, rows.tolist(), robustnesses, strict=True))
+        for cause, row, robustness in zip(causes, rows.tolist(), robustnesses, strict=True)
     ]
-
-
-def shorten(evaluator: Evaluator, settings: FloatArray, unsafe: Unsafe) -> FloatArray:
-    """K unsafe settings, shape (K, n), in as few digits as they need to stay unsafe with the same safety degree to 1
-    cm.
-    """
-    characteristics = evaluator.characteristics
-    rounded = [np.vectorize(lambda value, k=digits: float(f"{value:.{k}g}"))(settings) for digits in SHORT_DIGITS]
-    within = [characteristics.filter(np.clip(one, characteristics.lower, characteristics.upper)) for one in rounded]
-    candidates = np.array(
-        [*(np.where(settings == characteristics.original, settings, one) for one in within), settings]
-    )
-    evaluations = evaluator.evaluate(candidates.reshape(-1, settings.shape[1]), "digits of commands")
-    outcome, degree, is_unsafe = (
-        values.reshape(len(candidates), -1)
-        for values in (evaluations.outcome, evaluations.f_safe, unsafe.of(evaluations))
-    )
-    changes_alike = (characteristics.changed(candidates) == characteristics.changed(settings)).all(axis=2)
-    ends_alike = changes_alike & is_unsafe & (outcome == outcome[-1]) & (np.abs(degree - degree[-1]) < SHORT_DEGREE)
-    ends_alike[-1] = True
-    return np.asarray(candidates[np.argmax(ends_alike, axis=0), np.arange(len(settings))])
 
 
 def settings_on_lines(starts: FloatArray, ends: FloatArray, shares: FloatArray) -> FloatArray:

@@ -216,7 +216,7 @@ def _explain_rows(
         settings = np.array([*chosen.settings, *(cause.setting for cause in all_causes)])
         robustnesses = estimate_robustness(evaluator, settings, _time_step(system), unsafe)
     of_causes = [None] * len(all_causes) if rated else robustnesses[len(rows) :]
-    described = iter(describe_causes(evaluator, all_causes, unsafe, of_causes, has_short_forms=not rated))
+    described = iter(describe_causes(evaluator, all_causes, unsafe, of_causes))
     collisions = _collisions(evaluator.study, chosen)
     avoidances = dict(zip(map(bytes, collisions.settings), classify_collisions(evaluator, collisions), strict=True))
     explanations = []

@@ -102,30 +102,21 @@ def find_smallest_robust_failure(
     Failures are tried in this order until one is robust, or about `max_evaluations` settings are evaluated; None if no
     tried failure is robust. Other time steps than the study's are left out where they could not make a failure robust.
     """
-    order = np.lexsort([failures.f_safe, failures.f_diff, failures.f_num_diff])
-    least_share = len(STEP_FACTORS) * MIN_ROBUST_SHARE - len(
-        STEP_FACTORS[1:]
-    )  # with it, the mean is just robust if all others are 1
-    neighbour_sets = 0
+    order, settings = np.lexsort([failures.f_safe, failures.f_diff, failures.f_num_diff]), failures.settings
+    others, neighbour_sets = STEP_FACTORS[1:], 0
+    least_share = len(STEP_FACTORS) * MIN_ROBUST_SHARE - len(others)  # just robust if all other shares are 1
     for start in range(0, len(order), FAILURES_PER_BATCH):
         rows = order[start : start + FAILURES_PER_BATCH]
-        candidates = [
-            (row, estimate)
-            for row, estimate in zip(
-                rows.tolist(),
-                estimate_robustness(evaluator, failures.settings[rows], step, unsafe, STEP_FACTORS[:1]),
-                strict=True,
-            )
-            if estimate.share >= least_share
-        ]
+        neighbour_sets += len(rows)
+        estimates = estimate_robustness(evaluator, settings[rows], step, unsafe, STEP_FACTORS[:1])
+        candidates = [pair for pair in zip(rows.tolist(), estimates, strict=True) if pair[1].share >= least_share]
         if candidates:
-            other_steps = estimate_robustness(
-                evaluator, failures.settings[[row for row, _ in candidates]], step, unsafe, STEP_FACTORS[1:]
-            )
-            for (row, estimate), others in zip(candidates, other_steps, strict=True):
-                if not Robustness(estimate.shares_by_step | others.shares_by_step).borderline:
+            neighbour_sets += len(others) * len(candidates)
+            rows = np.array([row for row, _ in candidates])
+            further = estimate_robustness(evaluator, settings[rows], step, unsafe, others)
+            for (row, estimate), other in zip(candidates, further, strict=True):
+                if not Robustness(estimate.shares_by_step | other.shares_by_step).borderline:
                     return int(row)
-        neighbour_sets += len(rows) + len(STEP_FACTORS[1:]) * len(candidates)
         if neighbour_sets * NEIGHBOUR_COUNT >= max_evaluations:
             break
     return None

@@ -237,7 +237,7 @@ def _parts(subject: str, result: Explained, point: str, *, full: bool) -> Iterat
         yield f"How far each characteristic may go: {question_command('tolerance', subject, point)}"
         return
     if (cause := result.explanations[0].cause) and cause.changes:
-        yield f"Try it: {simulate_command(subject, cause.short_boundary, point)}"
+        yield f"Try it: {simulate_command(subject, cause.boundary, point)}"
     yield from constraints_in_words(result.study)
     if not full:
         command = f"{question_command('explain', subject, point)} --full"
@@ -277,7 +277,7 @@ def _parts_of_failure(failure: Explanation, result: Explained, subject: str, poi
         yield table
         yield meanings(changed)
         robustness = "" if cause.neighbours is None else f"By themselves, these changes are {cause.neighbours}. "
-        yield f"{cause.limit} {robustness}{simulate_command(subject, cause.short_changes, point)}"
+        yield f"{cause.limit} {robustness}{simulate_command(subject, cause.changes, point)}"
     if len(failure.causes) > MAX_CAUSES:
         yield f"... and {len(failure.causes) - MAX_CAUSES} more of the same number of changes (--json has all)."
     if len(failure.causes) > 1:

@@ -29,6 +29,7 @@ FLEET_VEHICLES = 1000
 """Number of vehicles of the fleet in examples."""
 INDICES = ("first_order", "total")
 """Sobol indices."""
+ERROR_STYLE = {"elinewidth": 0.8, "ecolor": "black"}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -183,20 +184,10 @@ class Risk(Estimate):
             right=("SD alone", "SD in all", "unsafe alone", "unsafe in all"),
             title="What decides: share of the variance",
         )
-        indices = self.sensitivity.merge(self.sensitivity_of_unsafe, on="characteristic", suffixes=("", "_of_unsafe"))
-        for row in indices.sort_values("total", ascending=False, kind="stable").to_dict("records"):
-            shares = (
-                [row[f"{name}{end}{output}"] for end in ("", "_lower", "_upper")]
-                for output in ("", "_of_unsafe")
-                for name in INDICES
-            )
-            table.add_row(
-                row["characteristic"],
-                *(
-                    "-" if math.isnan(share) else f"{share:.2f} ±{(upper - lower) / 2:.2f}"
-                    for share, lower, upper in shares
-                ),
-            )
+        outputs = [frame.set_index("characteristic") for frame in (self.sensitivity, self.sensitivity_of_unsafe)]
+        for name in outputs[0].sort_values("total", ascending=False, kind="stable").index:
+            rows = [output.loc[name] for output in outputs]
+            table.add_row(name, *(_index_in_words(row, index) for row in rows for index in INDICES))
         yield table
         if self.sensitivity_of_unsafe["total"].isna().all():
             yield "There are no indices of the unsafe outcome, because too few settings are unsafe or too few are safe."
@@ -221,43 +212,33 @@ class Risk(Estimate):
                 "there are no sensitivity indices of characteristics that are correlated or bound by constraints",
                 "a study without correlations and constraints",
             )
-        names = self.sensitivity.sort_values("total", kind="stable")["characteristic"].to_list()
+        order = self.sensitivity.sort_values("total", kind="stable")["characteristic"]
         title = f"{self.study.name}: what decides ({100 * self.confidence:g} % intervals)"
-        figure, (axes,) = new_figure(title, rows=1, columns=2, size=(7.2, 1.5 + 0.28 * max(len(names), 4)))
+        figure, (axes,) = new_figure(title, rows=1, columns=2, size=(7.2, 1.5 + 0.28 * max(len(order), 4)), sharey=True)
         frames = {"safety degree": self.sensitivity, f"unsafe ({self.unsafe})": self.sensitivity_of_unsafe}
+        names = [escape_dollars(name) for name in order]
         for axis, (output, frame) in zip(axes, frames.items(), strict=True):
-            rows = frame.set_index("characteristic").loc[names]
-            for column, label, colour, shift in (
+            rows = frame.set_index("characteristic").loc[order]
+            for index, label, colour, shift in (
                 ("total", "total: with all others", GREY, 0.2),
                 ("first_order", "alone", BLUE, -0.2),
             ):
-                axis.barh(
-                    np.arange(len(names)) + shift,
-                    rows[column],
-                    height=0.36,
-                    color=colour,
-                    label=label,
-                    xerr=(rows[f"{column}_upper"] - rows[column]).clip(lower=0),
-                    error_kw={"elinewidth": 0.8, "ecolor": "black"},
-                )
-            axis.set_yticks(np.arange(len(names)), [escape_dollars(name) for name in names])
+                error = (rows[f"{index}_upper"] - rows[index]).clip(lower=0)
+                places = np.arange(len(names)) + shift
+                axis.barh(places, rows[index], height=0.36, color=colour, label=label, xerr=error, error_kw=ERROR_STYLE)
+            axis.set_yticks(np.arange(len(names)), names)
             axis.set_title(escape_dollars(output), fontsize=FONT)
             axis.set(xlabel="share of the variance [-]", xlim=(0, 1))
-            if rows["total"].isna().all():
-                axis.text(
-                    0.5,
-                    0.5,
-                    "too few settings are unsafe,\nor safe, for indices",
-                    transform=axis.transAxes,
-                    ha="center",
-                    fontsize=FONT,
-                )
             axis.grid(visible=False, axis="y")
-        axes[1].set_yticklabels([])
-        figure.legend(
-            *axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=2, frameon=False, fontsize=FONT
-        )
+        handles, labels = axes[0].get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside lower center", ncols=2, frameon=False, fontsize=FONT)
         return figure
+
+
+def _index_in_words(row: pd.Series[float], index: str) -> str:
+    """A Sobol index with half of its interval."""
+    half = (row[f"{index}_upper"] - row[f"{index}_lower"]) / 2
+    return "-" if math.isnan(row[index]) else f"{row[index]:.2f} ±{half:.2f}"
 
 
 def _how_vehicles_vary(study: Study) -> str:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -45,82 +45,59 @@ LIMIT_DIGITS = 3
 """Limits are rounded to this many digits of the domain's width."""
 
 
-@dataclass(frozen=True)
-class Rule:
+Interval = tuple[float, float]
+
+
+class Rule(NamedTuple):
     """A box of settings, and how dense unsafe settings are in it.
 
     Attributes
     ----------
     limits
         Lower and upper limit by name; None if there is no such limit.
-    inside, unsafe_inside, unsafe_everywhere
-        Numbers of validation settings: inside the box, unsafe inside the box, and unsafe in the whole domain.
+    density, coverage
+        Unsafe share of the validation settings inside the box, and the share of all unsafe ones that lie inside the
+        box; None if there are no such settings.
+    density_interval, coverage_interval
+        The 95 % intervals of these shares.
     """
 
     limits: Mapping[str, tuple[float | None, float | None]]
-    inside: int
-    unsafe_inside: int
-    unsafe_everywhere: int
-    confidence: float
-
-    @property
-    def density(self) -> float | None:
-        """Unsafe share of the settings inside the box; None if no setting is inside."""
-        return self.unsafe_inside / self.inside if self.inside else None
-
-    @property
-    def coverage(self) -> float | None:
-        """Share of all unsafe settings that lie inside the box; None if no setting is unsafe."""
-        return self.unsafe_inside / self.unsafe_everywhere if self.unsafe_everywhere else None
-
-    @property
-    def density_interval(self) -> tuple[float, float] | None:
-        return clopper_pearson(self.unsafe_inside, self.inside, self.confidence) if self.inside else None
-
-    @property
-    def coverage_interval(self) -> tuple[float, float] | None:
-        return (
-            clopper_pearson(self.unsafe_inside, self.unsafe_everywhere, self.confidence)
-            if self.unsafe_everywhere
-            else None
-        )
+    density: float | None
+    coverage: float | None
+    density_interval: Interval | None
+    coverage_interval: Interval | None
 
     def is_denser_than(self, share: float) -> bool:
         """Whether the density is significantly above a share; always true of a rule without limits."""
         return not self.limits or (self.density_interval is not None and self.density_interval[0] > share)
 
     def in_words(self, characteristics: CharacteristicSet, unsafe: Unsafe) -> str:
-        """Itself with its shares: `mass above 2500 kg, the others anywhere: collides in 92 % (..), covers 61 %
-        (..)`.
-        """
+        """Itself with its shares: `mass above 2500 kg, the others anywhere: collides in 92 % (..), covers 61 %`."""
         others = ", the others anywhere" if 0 < len(self.limits) < len(characteristics) else ""
         conditions = [
             _condition_in_words(characteristic, *self.limits[characteristic.name])
             for characteristic in characteristics
             if characteristic.name in self.limits
         ]
-        shares = [
-            f"{word} -"
-            if share is None or interval is None
-            else f"{word} {100 * share:.0f} % ({100 * interval[0]:.0f} % to {100 * interval[1]:.0f} %)"
-            for word, share, interval in (
-                (f"{unsafe.in_words} in", self.density, self.density_interval),
-                ("covers", self.coverage, self.coverage_interval),
+        density, coverage = (
+            f"{100 * share:.0f} % ({100 * interval[0]:.0f} % to {100 * interval[1]:.0f} %)" if interval else "-"
+            for share, interval in (
+                (self.density or 0.0, self.density_interval),
+                (self.coverage or 0.0, self.coverage_interval),
             )
-        ]
-        return f"{join_phrases(conditions) if conditions else 'everywhere'}{others}: {', '.join(shares)}"
+        )
+        return (
+            f"{join_phrases(conditions or ['everywhere'])}{others}: {unsafe.in_words} in {density}, covers {coverage}"
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """An entry of `rules --json`."""
-        return {
-            "conditions": [
-                {"characteristic": name, "at_least": low, "at_most": high} for name, (low, high) in self.limits.items()
-            ],
-            "density": self.density,
-            "coverage": self.coverage,
-            "density_interval": None if self.density_interval is None else list(self.density_interval),
-            "coverage_interval": None if self.coverage_interval is None else list(self.coverage_interval),
-        }
+        limits, *shares = self
+        conditions = [
+            {"characteristic": name, "at_least": low, "at_most": high} for name, (low, high) in limits.items()
+        ]
+        return {"conditions": conditions, **dict(zip(self._fields[1:], shares, strict=True))}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -184,7 +161,7 @@ class Rules:
         if self.rules:
             named = {name for rule in dense for name in rule.limits}
             yield meanings(characteristic for characteristic in characteristics if characteristic.name in named)
-            yield f"{RULES_NOTE} In brackets: {100 * self.rules[0].confidence:.0f} % intervals."
+            yield f"{RULES_NOTE} In brackets: {100 * CONFIDENCE:.0f} % intervals."
 
 
 def _condition_in_words(characteristic: Characteristic, low: float | None, high: float | None) -> str:
@@ -234,7 +211,7 @@ def find_rules(
     return Rules(
         study=study,
         unsafe=unsafe,
-        rules=sorted(rules, key=lambda rule: -rule.unsafe_inside),
+        rules=sorted(rules, key=lambda rule: -(rule.coverage or 0.0)),
         remark=remark,
         no_verdict=no_verdict,
         samples=samples,
@@ -329,17 +306,19 @@ def is_within(box: FloatArray, settings: FloatArray) -> BoolArray:
 
 
 def _validate_rule(box: FloatArray, settings: FloatArray, is_unsafe: BoolArray, names: Sequence[str]) -> Rule:
-    """The rule of a box, with the numbers of validation settings."""
+    """The rule of a box, with its shares of validation settings."""
     is_inside = is_within(box, settings)
     limits = {
         name: (None if low == -np.inf else low, None if high == np.inf else high)
         for name, low, high in zip(names, *box.tolist(), strict=True)
         if np.isfinite([low, high]).any()
     }
+    count = int(np.count_nonzero(is_inside & is_unsafe))
+    inside, everywhere = int(np.count_nonzero(is_inside)), int(np.count_nonzero(is_unsafe))
     return Rule(
-        limits=limits,
-        inside=int(np.count_nonzero(is_inside)),
-        confidence=CONFIDENCE,
-        unsafe_inside=int(np.count_nonzero(is_inside & is_unsafe)),
-        unsafe_everywhere=int(np.count_nonzero(is_unsafe)),
+        limits,
+        density=count / inside if inside else None,
+        coverage=count / everywhere if everywhere else None,
+        density_interval=clopper_pearson(count, inside) if inside else None,
+        coverage_interval=clopper_pearson(count, everywhere) if everywhere else None,
     )

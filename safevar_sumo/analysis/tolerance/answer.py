@@ -6,7 +6,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-import numpy as np
 import pandas as pd
 from rich.table import Table
 
@@ -169,19 +168,13 @@ class Tolerance:
         column = RATING_POINTS.name if is_rated(self.study) else SAFETY_DEGREE
         title = f"{self.study.name}: one characteristic at a time (unsafe: {self.unsafe})"
         figure, axes = new_panels(title, len(self.alone), 4, (2.3, 1.75), min_width=4.6, title_height=1.0)
-        degrees = np.concatenate([scan.profile[column].dropna() for scan in self.alone])
-        margin = 0.05 * (np.ptp(degrees) if degrees.size else 0.0) or 0.5
         for axis, scan in zip(axes, self.alone, strict=True):
+            if axis is not axes[0]:
+                axis.sharey(axes[0])  # so that steep profiles stand out
             _draw_profile(axis, scan, column)
-            if degrees.size:  # equal for all panels, so that steep profiles stand out
-                axis.set_ylim(degrees.min() - margin, degrees.max() + margin)
         figure.supylabel(DEGREE_LABEL if column == SAFETY_DEGREE else RATING_POINTS.title, fontsize=FONT)
-        notes = {
-            "dot: the original vehicle": True,
-            "hatched: unsafe": any(scan.unsafe for scan in self.alone),
-            "below the dashed line: collisions": column == SAFETY_DEGREE and bool(degrees.size) and degrees.min() <= 0,
-        }
-        figure.supxlabel(";\n".join(words for words, is_drawn in notes.items() if is_drawn), fontsize=FONT)
+        dashed = ";\nbelow a dashed line: collisions" if column == SAFETY_DEGREE else ""
+        figure.supxlabel(f"dot: the original vehicle; hatched: unsafe{dashed}", fontsize=FONT)
         return figure
 
 
