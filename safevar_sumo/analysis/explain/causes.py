@@ -191,9 +191,8 @@ class Cause:
         `changes`.
     outcome, safety_degree
         Outcome, and safety degree [m, or -m/s], of a vehicle with these changes only.
-    end, at_threshold
-        The end of the shrinking: the state just below `fraction`; at the filter's threshold, the characteristic whose
-        change the filter would remove.
+    end
+        The end of the shrinking: the state just below `fraction`.
     neighbours
         Robustness of these changes by themselves, estimated from the setting's neighbours; None in a rated study, where
         the simulations would take too long.
@@ -206,7 +205,6 @@ class Cause:
     outcome: str
     safety_degree: float | None
     end: BoundaryState = BoundaryState.SAFE
-    at_threshold: str | None = None
     neighbours: Robustness | None = None
 
     @property
@@ -219,8 +217,7 @@ class Cause:
         """A sentence on the smallest unsafe share of the changes, and on what lies just below this share."""
         below = {
             BoundaryState.SAFE: "slightly less is safe",
-            BoundaryState.FILTER: f"with less, the change of {self.at_threshold} falls below the filter's threshold "
-            "and counts as none",
+            BoundaryState.FILTER: "with less, a change falls below the filter's threshold and counts as none",
             BoundaryState.NOT_SIMULATED: "slightly less could not be simulated",
         }[self.end]
         return f"Scaling all changes to {100 * self.fraction:.1f} % is still unsafe; {below}."
@@ -262,7 +259,6 @@ def describe_causes(
             outcome=cause.outcome,
             safety_degree=cause.safety_degree,
             end=states[row] if cause.columns else BoundaryState.SAFE,
-            at_threshold=names[np.argmax(thresholds[row])] if states[row] == BoundaryState.FILTER else None,
             neighbours=robustness,
         )
         for cause, row, robustness in zip(causes, rows.tolist(), robustnesses, strict=True)

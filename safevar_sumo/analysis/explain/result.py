@@ -14,6 +14,7 @@ from safevar_sumo.analysis.explain.robustness import Robustness
 from safevar_sumo.analysis.explain.sentences import DISTINCT_CAUSE, LABELS, answer_in_words
 from safevar_sumo.analysis.figures import BLUE, FONT, GREY, SKY_BLUE, escape_dollars, new_figure
 from safevar_sumo.analysis.preventability import Preventability
+from safevar_sumo.analysis.words import number_of
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import Evaluations
 from safevar_sumo.results import SolutionId
@@ -144,7 +145,7 @@ class Explained:
     def sample(self) -> str:
         """Which failures the statistics cover, in words."""
         if self.analysed == self.failures:
-            return {1: "the only failure", 2: "both failures"}.get(self.failures, f"all {self.failures} failures")
+            return f"all of {number_of(self.failures, 'failure')}"
         return f"random sample: {self.analysed} of {self.failures} failures"
 
     def sentences(self) -> list[str]:

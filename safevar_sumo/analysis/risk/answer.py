@@ -243,13 +243,8 @@ def _index_in_words(row: pd.Series[float], index: str) -> str:
 
 def _how_vehicles_vary(study: Study) -> str:
     """How vehicles vary, in a sentence."""
-    not_uniform = [
-        f"{name} {distribution.__struct_config__.tag}"
-        for name, distribution in study.variation.items()
-        if distribution != Uniform()
-    ]
+    parts = [f"{name} {one.__struct_config__.tag}" for name, one in study.variation.items() if one != Uniform()]
+    if len(parts) < len(study.vehicle.characteristics):
+        parts.append("the others uniformly" if parts else "uniformly over the whole domain")
     pairs = ", ".join(f"{' with '.join(pair.between)} {pair.value:g}" for pair in study.correlations)
-    others = "" if len(not_uniform) == len(study.vehicle.characteristics) else "; the others uniformly"
-    specified = f"as the study specifies: {'; '.join(not_uniform)}{others}"
-    manner = specified if not_uniform else "uniformly over the whole domain"
-    return f"They vary {manner}{f', correlated: {pairs}' if pairs else ''}."
+    return f"They vary as the study specifies: {'; '.join(parts)}{f', correlated: {pairs}' if pairs else ''}."

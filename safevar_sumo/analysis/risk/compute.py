@@ -9,6 +9,7 @@ from collections.abc import Callable
 from importlib.util import find_spec
 from typing import Any
 
+import msgspec
 import numpy as np
 import pandas as pd
 import scipy
@@ -232,34 +233,30 @@ class VariationModel:
 
 
 def _quantile_function(characteristic: Characteristic, distribution: Distribution) -> QuantileFunction:
-    low, high = characteristic.lower, characteristic.upper
+    low, high, stated = characteristic.lower, characteristic.upper, msgspec.structs.asdict(distribution)
+    defaults = {"lower": low, "upper": high}
+    values = {
+        name: defaults.get(name, characteristic.original) if value is None else value for name, value in stated.items()
+    }
     match distribution:
         case Fixed():
-            value = _or_default(distribution.value, characteristic.original)
-            return lambda p: np.full_like(p, value)
-        case Uniform() | Triangular():
-            lower, upper = _or_default(distribution.lower, low), _or_default(distribution.upper, high)
-            if isinstance(distribution, Uniform):
-                return lambda p: lower + p * (upper - lower)
-            mode = _or_default(distribution.mode, characteristic.original)
-            triangle = scipy.stats.triang((mode - lower) / (upper - lower), loc=lower, scale=upper - lower)
+            return lambda p: np.full_like(p, values["value"])
+        case Uniform():
+            return lambda p: values["lower"] + p * (values["upper"] - values["lower"])
+        case Triangular():
+            lower, width = values["lower"], values["upper"] - values["lower"]
+            triangle = scipy.stats.triang((values["mode"] - lower) / width, loc=lower, scale=width)
             return lambda p: np.asarray(triangle.ppf(p))
         case Normal():
-            mean = _or_default(distribution.mean, characteristic.original)
-            normal = _truncated_normal(low, high, mean, distribution.deviation)
+            normal = _truncated_normal(low, high, values["mean"], values["deviation"])
             return lambda p: np.asarray(normal.ppf(p))
         case Lognormal():
-            log_median = np.log(_or_default(distribution.median, characteristic.original))
-            logarithm = _truncated_normal(np.log(low), np.log(high), log_median, distribution.sigma)
+            logarithm = _truncated_normal(np.log(low), np.log(high), np.log(values["median"]), values["sigma"])
             return lambda p: np.exp(logarithm.ppf(p))
 
 
 def _truncated_normal(low: float, high: float, mean: float, deviation: float) -> Any:
     return scipy.stats.truncnorm((low - mean) / deviation, (high - mean) / deviation, loc=mean, scale=deviation)
-
-
-def _or_default(value: float | None, default: float) -> float:
-    return default if value is None else value
 
 
 def compute_sensitivities(
