@@ -14,7 +14,7 @@ import numpy as np
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import Evaluations, FloatArray, finite_or_none
 from safevar_sumo.scenarios import weather_of
-from safevar_sumo.study import SAFETY_DEGREE, Study, error_with_key, locate_parameter, missing_parameter
+from safevar_sumo.study import SAFETY_DEGREE, Study, convert_table, locate_parameter, missing_parameter
 from safevar_sumo.sumo.matrix import evaluate, system_at_point
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet
@@ -182,10 +182,7 @@ def with_values(study: Study, values: Mapping[str, float], stated_in: str = "cal
     for name, value in values.items():
         table, key = _locate(study, tables, name, stated_in)
         table[key] = value
-    try:
-        return msgspec.convert(tables, Study)
-    except msgspec.ValidationError as error:
-        raise error_with_key(study.source, tables, error) from None
+    return convert_table(study.source, tables, Study)
 
 
 def value_of(study: Study, name: str, stated_in: str = "calibration") -> float:

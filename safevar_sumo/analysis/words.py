@@ -75,13 +75,11 @@ MAX_POINTS_NAMED = 6
 """Maximum number of failing test points that a sentence names."""
 
 
-def points_in_words(failing_points: Sequence[str], point_count: int, limit: int = MAX_POINTS_NAMED) -> str:
-    """A sentence such as `Fails at 2 of 72 points: CPNA, speed 40, impact_location 25, night; CPLA, speed 60,
-    clear.`
-    """
-    names, rest = "; ".join(failing_points[:limit]), len(failing_points) - limit
-    others = f" and {rest} more" if rest > 0 else ""
-    return f"Fails at {len(failing_points)} of {point_count} points{': ' + names if failing_points else ''}{others}."
+def points_in_words(failing_points: Sequence[str], point_count: int) -> str:
+    """A sentence such as `Fails at 2 of 72 points: CPNA, speed 40, impact_location 25; CPLA, speed 60, clear.`"""
+    rest = len(failing_points) - MAX_POINTS_NAMED
+    names = "; ".join(failing_points[:MAX_POINTS_NAMED]) + (f" and {rest} more" if rest > 0 else "")
+    return f"Fails at {len(failing_points)} of {point_count} points{names and f': {names}'}."
 
 
 def share_in_words(share: float) -> str:
