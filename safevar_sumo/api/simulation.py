@@ -38,8 +38,6 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from safevar_sumo.campaign.pool import Pool
-    from safevar_sumo.terminal import Progress
-
 
 OBSERVATION_HEADS = {
     "speed": "seen speed [m/s]",
