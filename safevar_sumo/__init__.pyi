@@ -2,7 +2,7 @@ from .analysis.explain import explain as explain
 from .analysis.explain.causes import Cause as Cause
 from .analysis.explain.result import Explained as Explained, Explanation as Explanation
 from .analysis.opinion import opinion as opinion
-from .analysis.opinion.result import Opinion as Opinion, Opinions as Opinions
+from .analysis.opinion.compute import Opinion as Opinion, Opinions as Opinions
 from .analysis.rating import rating as rating
 from .analysis.rating.compute import Rating as Rating
 from .analysis.risk import risk as risk

@@ -86,7 +86,7 @@ def figures(*results: Results | str | Path) -> Figures:
     InputError
         If no figure can be drawn.
     """
-    from safevar_sumo.analysis.research_questions.gallery import draw_figures
+    from safevar_sumo.analysis.research_questions.figures import draw_figures
 
     figures_by_name, lacking = draw_figures(_load_cases(results))
     drawn_figures = Figures(figures_by_name)

@@ -15,8 +15,7 @@ from safevar_sumo.cli.arguments import PICTURE_ENDINGS, check_output, complete_s
 from safevar_sumo.cli.program import commands
 from safevar_sumo.cli.reference import find_owner, print_by_metric, read_rows
 from safevar_sumo.errors import InputError
-from safevar_sumo.reference.calibration import Calibration, FitSubject, calibrate, describe_fit
-from safevar_sumo.reference.profiles import plot_profiles
+from safevar_sumo.reference.calibration import Calibration, FitSubject, calibrate, describe_fit, plot_profiles
 from safevar_sumo.study import FITTED_TABLES, Study, load_study, study_names, write_study
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.terminal import WholeTable, open_progress, print_text

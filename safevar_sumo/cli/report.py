@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import warnings
-from functools import partial
 from pathlib import Path
 
 import click
 
 from safevar_sumo.analysis.research_questions.answer import QUESTIONS, answer_questions
 from safevar_sumo.analysis.research_questions.case import load_cases
-from safevar_sumo.analysis.research_questions.gallery import FORMATS as PICTURE_FORMATS, save_figures
-from safevar_sumo.analysis.research_questions.layout import LAYOUTS_BY_NAME
-from safevar_sumo.analysis.research_questions.tables import ENDINGS, FORMATS, FORMATS_WITH_LAYOUT
+from safevar_sumo.analysis.research_questions.figures import FORMATS as PICTURE_FORMATS, save_figures
+from safevar_sumo.analysis.research_questions.tables import ENDINGS, FORMATS
 from safevar_sumo.cli.arguments import (
     as_it_is_now,
     as_it_is_now_option,
@@ -22,7 +20,6 @@ from safevar_sumo.cli.arguments import (
     point_option,
 )
 from safevar_sumo.cli.program import commands, print_note, print_warning
-from safevar_sumo.errors import InputError
 from safevar_sumo.results import make_directory, write_whole
 
 FORMATS_WITHOUT_NOTES = ("csv", "json")
@@ -40,27 +37,10 @@ FORMATS_WITHOUT_NOTES = ("csv", "json")
     show_default=True,
     help="Format of the tables.",
 )
-@click.option(
-    "--layout",
-    type=click.Choice(list(LAYOUTS_BY_NAME)),
-    default="full",
-    show_default=True,
-    help="Everything, or only RQ1, RQ2 and the combinations, laid out as in the paper.",
-)
 @file_option("--out", "Write each table to a file in this directory.", metavar="DIR")
-def tables(directories: tuple[str, ...], question: str | None, format_name: str, layout: str, out: Path | None) -> None:
+def tables(directories: tuple[str, ...], question: str | None, format_name: str, out: Path | None) -> None:
     """Answer the research questions as tables, from the results directories DIR..., one for each case."""
-    if layout != "full" and format_name not in FORMATS_WITH_LAYOUT:
-        raise InputError(
-            "--layout",
-            f"{layout!r}, but --format {format_name} has no layout",
-            f"--format {', '.join(FORMATS_WITH_LAYOUT)}",
-        )
-    write = (
-        partial(FORMATS_WITH_LAYOUT[format_name], layouts=LAYOUTS_BY_NAME[layout])
-        if format_name in FORMATS_WITH_LAYOUT
-        else FORMATS[format_name]
-    )
+    write = FORMATS[format_name]
     answers = answer_questions(load_cases(directories), question)
     if format_name in FORMATS_WITHOUT_NOTES:
         _print_notes(list(dict.fromkeys(note for answer in answers for note in answer.notes)))

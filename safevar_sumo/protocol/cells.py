@@ -12,10 +12,14 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import msgspec
+import numpy as np
 from msgspec import Struct
 
+from safevar_sumo.records import FloatArray
+
 EURO_NCAP_2026 = "euro_ncap_2026"
-PROTOCOLS = (EURO_NCAP_2026,)
+COLOURS = ("green", "yellow", "orange", "brown", "red")
+"""Colours from best to worst; arrays hold indices of this tuple."""
 STANDARD, EXTENDED = "standard", "extended"
 NOT_RED, NO_WORSE = "Not red", "Same or better than predicted"
 MITIGATION, WARNING = "mitigation", "warning"
@@ -28,6 +32,8 @@ the impact.
 """
 MODELS = {"CCR": "car_to_car", "CMR": "car_to_car", "CPLA": "along", "CBLA": "along"}
 """Scenario models by the prefix of a test's name; the model of all other tests is `crossing`."""
+REQUIRED, UNCHECKED = "CCRs at 10 and 20 km/h", "CPNA at 10 km/h and 75 %"
+"""The cells that the protocol requires to be green, and those that the calculator does not check, in words."""
 TARGET_DECELERATION, TARGET_HEADWAY = 4.0, 1.0
 """The target's deceleration [m/s^2] and its headway at the start [s] in CCRb and CMRb; robustness layers vary both."""
 
@@ -82,6 +88,11 @@ class CellMatrix(
     def name(self) -> str:
         return self.test_name if self.light is None else f"{self.test_name} {self.light}"
 
+    @property
+    def column_values(self) -> tuple[float, ...]:
+        """The impact locations [%] of the columns or, without them, the target's speeds [km/h]."""
+        return self.impact_locations or self.target_speeds
+
     def is_rated_by_warning(self, row: int) -> bool:
         """Whether a row is rated by the time to collision at the warning."""
         return self.rows[row].has_function_choice and self.test_name in WARNING_TESTS
@@ -113,14 +124,6 @@ class Layer(
         if self.name == NIGHT:  # the calculator lists no condition for CBLA by night, which is rated like other tests
             return self.conditions or (Condition(IN_DARKNESS, NOT_RED),)
         return self.conditions if self.name in (SPEED, ACCELERATION, OFFSET, HEADING) else ()
-
-
-class CellScenario(NamedTuple):
-    """The simulation of a cell: scenario model, parameters, and whether it is by night."""
-
-    model: str
-    parameters: dict[str, Any]
-    night: bool
 
 
 class Cell(NamedTuple):
@@ -166,7 +169,8 @@ class Cell(NamedTuple):
         return f"{self.matrix.name}, {self.vut_speed:g} km/h{function}, {column}{variation}"
 
     @property
-    def scenario(self) -> CellScenario:
+    def scenario(self) -> tuple[str, dict[str, Any], bool]:
+        """The simulation of the cell: scenario model, parameters, and whether it is by night."""
         test = self.matrix.test_name
         model = next((model for prefix, model in MODELS.items() if test.startswith(prefix)), "crossing")
         parameters: dict[str, Any] = {"test": test, "speed": self.vut_speed, "target_speed": self.target_speed}
@@ -181,7 +185,7 @@ class Cell(NamedTuple):
             parameters["start_share"] = 1 + _leading_number(self.condition) / 100
         elif self.range_or_layer == HEADING:
             parameters["heading"] = _leading_number(self.condition)
-        return CellScenario(model, parameters, night)
+        return model, parameters, night
 
 
 def _leading_number(condition: str) -> float:
@@ -225,6 +229,48 @@ class Protocol(
         only.
         """
         return (*self._iterate_matrix_cells(), *self._iterate_robustness_cells())
+
+    def numbers_of(self, test: str, range_or_layer: str, matrix: CellMatrix | None = None) -> list[int]:
+        """Indices in `cells` of the cells of a range or a layer of a test, or of one of its matrices."""
+        return [
+            number
+            for number, cell in enumerate(self.cells)
+            if cell.matrix.test_name == test and cell.range_or_layer == range_or_layer and matrix in (None, cell.matrix)
+        ]
+
+    @cached_property
+    def colour_starts(self) -> FloatArray:
+        """The measured value from which on each cell has each of the `COLOURS`, shape (cells, 5); infinite for colours
+        that it cannot have.
+        """
+        fastest = max(map(int, self.starts_by_vut_speed))
+        starts = [
+            self.starts_by_vut_speed[str(min(int(cell.vut_speed), fastest))]
+            if cell.judged_by == MITIGATION
+            else self.starts_by_measure[cell.judged_by]
+            for cell in self.cells
+        ]
+        return np.array([[of_cell.get(colour, np.inf) for colour in COLOURS] for of_cell in starts])
+
+    @cached_property
+    def nominal_numbers(self) -> list[int]:
+        """For every cell the index of the matrix cell that it varies; of a matrix cell its own."""
+        return [self.matrix_cell_numbers[cell.matrix.name, cell.row, cell.column] for cell in self.cells]
+
+    @property
+    def required_cells(self) -> list[int]:
+        """Indices of the cells of which each must be green, as otherwise all frontal collisions score nothing:
+        `REQUIRED`.
+        """
+        return [number for number in self.numbers_of("CCRs", STANDARD) if self.cells[number].vut_speed <= 20]
+
+    @property
+    def unchecked_cells(self) -> list[int]:
+        """Indices of the cells that the calculator also intends to require, `UNCHECKED`; version 5.4.9 does not find
+        them.
+        """
+        numbers = self.numbers_of("CPNA", STANDARD)
+        return [n for n in numbers if self.cells[n].vut_speed <= 10 and self.cells[n].impact_location == 75]
 
     @cached_property
     def matrix_cell_numbers(self) -> dict[tuple[str, int, int], int]:
@@ -286,9 +332,9 @@ def cells_of_part(protocol: Protocol, part: int, parts: int) -> list[int]:
     """Numbers of the cells in one of `parts` parts; cells with the same network share a part as far as possible."""
 
     def network_of(number: int) -> tuple[Any, ...]:
-        cell = protocol.cells[number]
-        variation = (cell.scenario.parameters.get("heading", 0.0), "start_share" in cell.scenario.parameters)
-        return cell.scenario.model, cell.matrix.test_name in ("CPNA", "CPFA", "CPNCO"), variation, cell.matrix.test_name
+        (model, parameters, _), test = protocol.cells[number].scenario, protocol.cells[number].matrix.test_name
+        variation = (parameters.get("heading", 0.0), "start_share" in parameters)
+        return model, test in ("CPNA", "CPFA", "CPNCO"), variation, test
 
     numbers = sorted(range(len(protocol.cells)), key=network_of)
     return numbers[len(numbers) * part // parts : len(numbers) * (part + 1) // parts]
@@ -296,6 +342,6 @@ def cells_of_part(protocol: Protocol, part: int, parts: int) -> list[int]:
 
 @lru_cache
 def protocol_of(name: str) -> Protocol:
-    """A protocol by its name, one of `PROTOCOLS`."""
+    """A protocol by its name."""
     tables: Mapping[str, Any] = tomllib.loads(Path(__file__).with_name(f"{name}.toml").read_text(encoding="utf-8"))
     return msgspec.convert(tables, Protocol)

@@ -1,20 +1,36 @@
-"""Turns the cells of a protocol into tests to simulate, and rates the simulated vehicles."""
+"""Rates simulated vehicles: the tests of a protocol's cells, the colours of cells and the points of tests, by Euro
+NCAP's calculator.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 from msgspec.structs import replace
 
 from safevar_sumo.errors import InputError, unknown_name
-from safevar_sumo.protocol import Points, Protocol, points_of, protocol_of
-from safevar_sumo.records import KMH_PER_MS, CellResults, FloatArray, Outcome, SimulationRuns
+from safevar_sumo.protocol.cells import COLOURS, EXTENDED, NOT_RED, STANDARD, WARNING, CellMatrix, Protocol, protocol_of
+from safevar_sumo.records import KMH_PER_MS, BoolArray, CellResults, FloatArray, Outcome, SimulationRuns
 from safevar_sumo.scenarios import weather_of
 from safevar_sumo.study import OBJECTIVES, MatrixTable, MatrixTest, RatingTable, Study, Weather
 
+GREEN, RED = 0, len(COLOURS) - 1
+UNKNOWN = -1
+"""Colour of a cell whose test is invalid; it earns nothing."""
+WEIGHTS = np.array([1.0, 0.75, 0.5, 0.25, 0.0, 0.0])
+"""Weight of a standard-range cell by its colour's index (protocol 5.2); UNKNOWN is -1 and so takes the last one."""
+EXTENDED_STEPS = (0.5, 0.75, 1.0)
+"""Share of extended-range cells that are not red, from which on this share of the range's points is earned."""
+ROBUSTNESS_SHARE = 0.5
+"""Share of the standard range's points from which on robustness earns points."""
+DECIMALS = 2
+"""Decimals to which the calculator rounds measured values, half up."""
+SHARE_DECIMALS = 6
+"""Decimals to which the calculator rounds shares before a comparison."""
 SHARED_PARAMETERS = ("vut_length", "vut_width", "grade")
 """Parameters of a study's scenario that apply to every cell."""
 SUMO_CELLS = 8
@@ -22,16 +38,112 @@ SUMO_CELLS = 8
 
 
 @dataclass(frozen=True, kw_only=True)
+class Points:
+    """Points of M vehicles.
+
+    - `colours`: indices of `COLOURS`, shape (M, cells).
+    - `tests`: by matrix name the points of the standard range, the extended range and robustness, shape (M, 3).
+    - `layers`: by test and layer, for simulated layers only, whether the layer holds, shape (M,).
+    - `fails`: whether a required cell is not green, so that the vehicle earns nothing, shape (M,).
+    """
+
+    colours: npt.NDArray[np.int8]
+    tests: Mapping[str, FloatArray]
+    layers: Mapping[tuple[str, str], BoolArray]
+    fails: BoolArray
+
+    @property
+    def total(self) -> FloatArray:
+        """Sum of all points, shape (M,)."""
+        points = np.concatenate([*self.tests.values()], axis=1)
+        return np.where(self.fails, 0.0, np.round(sum(points.T), SHARE_DECIMALS))
+
+
+@dataclass(frozen=True, kw_only=True)
 class Rater:
-    """Rates vehicles that were simulated in all cells of a protocol, in the order of the cells; `claims` are claimed
-    layers by test.
+    """Rates vehicles that were simulated in all cells of a protocol, in the order of the cells.
+
+    `claims` lists, for each test, layers that are not simulated and count as if they held.
     """
 
     protocol: Protocol
-    claims: dict[str, list[str]]
+    claims: Mapping[str, Sequence[str]]
 
     def points(self, results: CellResults) -> Points:
-        return points_of(self.protocol, results, self.claims)
+        """Points of M vehicles."""
+        protocol, colours = self.protocol, colours_of(self.protocol, results)
+        layers = _which_layers_hold(protocol, colours)
+        fails = (colours[:, protocol.required_cells] != GREEN).any(axis=1)
+        tests = {}
+        for test, matrices in protocol.tests.items():
+            claimed, test_layers = self.claims.get(test, ()), protocol.layers_of(test)
+            held = sum(
+                layers.get((test, layer.name), np.full(len(fails), layer.name in claimed)) for layer in test_layers
+            )
+            for matrix in matrices:
+                standard, extended = _range_points(protocol, matrix, colours)
+                earns_robustness = _rounded_share(standard) >= _rounded_share(ROBUSTNESS_SHARE * matrix.points[0])
+                robustness = np.where(earns_robustness, held / len(test_layers) * matrix.points[2], 0.0)
+                tests[matrix.name] = np.where(fails, 0.0, [standard, extended, robustness]).T
+        return Points(colours=colours, tests=tests, layers=layers, fails=fails)
+
+
+def round_half_up(values: FloatArray, decimals: int) -> FloatArray:
+    """Round values to decimals; a half rounds up."""
+    scale = 10.0**decimals
+    return np.asarray(np.floor(np.round(values * scale, 4) + 0.5) / scale)
+
+
+def _rounded_share(values: FloatArray | float) -> FloatArray:
+    return round_half_up(np.asarray(values), SHARE_DECIMALS)
+
+
+def colours_of(protocol: Protocol, results: CellResults) -> npt.NDArray[np.int8]:
+    """The colour of every cell, shape (M, cells); a value at which two colours meet makes an impact the worse one, a
+    warning the better.
+    """
+    is_warning = [cell.judged_by == WARNING for cell in protocol.cells]
+    measured = np.where(is_warning, results.warning, results.impact)
+    values = round_half_up(np.maximum(np.nan_to_num(measured, nan=0.0), 0.0), DECIMALS)[..., np.newaxis]
+    starts = np.where(values >= protocol.colour_starts, protocol.colour_starts, -np.inf)
+    return np.where(results.valid, starts.argmax(axis=-1), UNKNOWN).astype(np.int8)
+
+
+def _range_points(
+    protocol: Protocol, matrix: CellMatrix, colours: npt.NDArray[np.int8]
+) -> tuple[FloatArray, FloatArray]:
+    """Points of the standard range and of the extended range, shape (M,) each."""
+    standard, extended = (
+        colours[:, protocol.numbers_of(matrix.test_name, name, matrix)] for name in (STANDARD, EXTENDED)
+    )
+    is_good = (extended != RED) & (extended != UNKNOWN)
+    good_points = _rounded_share(is_good.mean(axis=1) * matrix.points[1])
+    steps = np.array(EXTENDED_STEPS) * matrix.points[1]
+    earned = np.append(0.0, steps)[np.searchsorted(_rounded_share(steps), good_points, side="right")]
+    return WEIGHTS[standard].mean(axis=1) * matrix.points[0], earned
+
+
+def _which_layers_hold(protocol: Protocol, colours: npt.NDArray[np.int8]) -> dict[tuple[str, str], BoolArray]:
+    """Whether simulated layers hold, shape (M,) each: some standard-range cell is not red, and every such cell passes
+    in all variations.
+    """
+    passes, nominal = passing_cells(protocol, colours), colours[:, protocol.nominal_numbers]
+    is_counted = (nominal != RED) & (nominal != UNKNOWN)
+    holds: dict[tuple[str, str], BoolArray] = {}
+    for layer in protocol.layers:
+        if layer.simulated_conditions:
+            numbers = protocol.numbers_of(layer.test_name, layer.name)
+            has_counted = is_counted[:, numbers].any(axis=1)
+            holds[layer.test_name, layer.name] = has_counted & (passes | ~is_counted)[:, numbers].all(axis=1)
+    return holds
+
+
+def passing_cells(protocol: Protocol, colours: npt.NDArray[np.int8]) -> BoolArray:
+    """Whether robustness cells meet their criteria, shape (M, cells): not red, or the colour of the cell that they vary
+    or a better one.
+    """
+    nominal, only_not_red = colours[:, protocol.nominal_numbers], [cell.criterion == NOT_RED for cell in protocol.cells]
+    return np.asarray((colours != UNKNOWN) & np.where(only_not_red, colours != RED, colours <= nominal))
 
 
 def rated_quantities(runs: SimulationRuns) -> tuple[FloatArray, FloatArray, Any]:
@@ -126,13 +238,13 @@ def expand_protocol(study: Study, weather: Weather) -> Study:
     shared_parameters = {name: value for name, value in study.scenario.parameters.items() if name in SHARED_PARAMETERS}
     weather_by_night, tests = darken(weather), []
     for cell in protocol_of(study.matrix.protocol).cells:
-        scenario = cell.scenario
+        model, parameters, by_night = cell.scenario
         tests.append(
             MatrixTest(
                 name=cell.name,
-                model=scenario.model,
-                parameters={**shared_parameters, **scenario.parameters},
-                weathers=[weather_by_night if scenario.night else weather],
+                model=model,
+                parameters={**shared_parameters, **parameters},
+                weathers=[weather_by_night if by_night else weather],
             )
         )
     no_parameters = replace(study.scenario, parameters={})  # each test has its own parameters

@@ -12,7 +12,7 @@ import pandas as pd
 
 from safevar_sumo.analysis.research_questions.answer import answer_questions
 from safevar_sumo.analysis.research_questions.case import ALGORITHM_TITLES, Case, UnanswerableError
-from safevar_sumo.analysis.research_questions.changes import ANY, changes_of, critical_solutions, masks_by_change_count
+from safevar_sumo.analysis.research_questions.changes import ANY, change_numbers, changes_of, critical_solutions
 from safevar_sumo.analysis.research_questions.statistics import ALPHA, magnitude_of
 from safevar_sumo.records import FloatArray
 from safevar_sumo.reference.agreement import rank_correlation
@@ -33,21 +33,15 @@ KEY_COLUMNS: Mapping[str, list[str]] = {
 UNCOMPARED_COLUMNS = ["method", "n1", "n2"]
 
 
-Row = Mapping[Any, Any]
-"""A row of a table by column."""
-
-Rows = list[tuple[Row, Row]]
-"""Pairs of a row here and the published row with the same keys."""
-
-
 class ComparedTable(NamedTuple):
-    """A table: pairs of a row here and the published row with the same keys, the quantities of a row, and notes on the
-    table.
+    """A table, and notes on it.
+
+    The columns of the frame are the quantities here, then those published; its index has the keys. It is empty if one
+    side has no rows.
     """
 
     name: str
-    rows: Rows
-    quantities: list[str]
+    frame: pd.DataFrame
     notes: list[str]
 
 
@@ -64,31 +58,19 @@ def compare_tables(here: Sequence[Case], published: Sequence[Case]) -> list[Comp
         notes = [f"{side}: {note}" for side in sides for note in answers[side][name].notes]
         empty_sides = [side for side, frame in frames.items() if frame.empty]
         if empty_sides:
-            tables.append(
-                ComparedTable(name, [], [], [*notes, f"No table: nothing to show {' and '.join(empty_sides)}."])
-            )
+            notes.append(f"No table: nothing to show {' and '.join(empty_sides)}.")
+            tables.append(ComparedTable(name, pd.DataFrame(), notes))
             continue
-        if name == "combinations":  # those of equal rank are compared
-            frames = {
-                side: frame.assign(
-                    place=frame.groupby("setting").cumcount() + 1,
-                    characteristics=frame["characteristics"].map(", ".join),
-                )
-                for side, frame in frames.items()
-            }
-        rows_of_sides = [
-            {tuple(row[key] for key in keys): row for row in frame.to_dict("records")} for frame in frames.values()
-        ]
-        rows = [
-            [rows.get(key, dict(zip(keys, key, strict=True))) for rows in rows_of_sides]
-            for key in dict.fromkeys(key for rows in rows_of_sides for key in rows)
-        ]
-        quantities = [
-            str(column)
-            for column in frames[HERE]
-            if column in frames[PUBLISHED] and column not in (*keys, *UNCOMPARED_COLUMNS)
-        ]
-        tables.append(ComparedTable(name, [(row, other) for row, other in rows], quantities, notes))
+        for side, frame in frames.items():
+            if name == "combinations":  # those of equal rank are compared
+                places, combinations = frame.groupby("setting").cumcount() + 1, frame["characteristics"].map(", ".join)
+                frame = frame.assign(place=places, characteristics=combinations)
+            frames[side] = frame.astype(object).set_index(keys)
+        ours, theirs = frames.values()
+        quantities = [column for column in ours if column in theirs and column not in UNCOMPARED_COLUMNS]
+        rows = ours.index.append(theirs.index[~theirs.index.isin(ours.index)])
+        sides_by_name = {side: frame.reindex(rows)[quantities] for side, frame in frames.items()}
+        tables.append(ComparedTable(name, pd.concat(sides_by_name, axis=1), notes))
     return tables
 
 
@@ -99,14 +81,11 @@ def _tabulate_change_numbers(cases: Sequence[Case]) -> pd.DataFrame:
     rows: list[dict[str, Any]] = []
     for case in cases:
         try:
-            masks = masks_by_change_count(case, changes_of(case, critical_solutions(case)))
+            counts = np.count_nonzero(changes_of(case, critical_solutions(case)), axis=1).astype(str)
         except UnanswerableError:
             continue
-        rows += [
-            {"setting": case.name, "j": j, "percent": 100 * float(np.mean(mask)) if len(mask) else None}
-            for j, mask in masks.items()
-            if j != ANY
-        ]
+        shares = {j: 100 * float(np.mean(counts == j)) if len(counts) else None for j in change_numbers(case)}
+        rows += [{"setting": case.name, "j": j, "percent": percent} for j, percent in shares.items()]
     return pd.DataFrame(rows)
 
 
@@ -163,176 +142,144 @@ class Conclusion(NamedTuple):
 
 def draw_conclusions(tables: Sequence[ComparedTable]) -> list[Conclusion]:
     """All published conclusions, in the order of the questions."""
-    return [conclusion for table in tables for conclusion in TABLE_READERS[table.name](_any_number(table.rows))]
+    conclusions = list[Conclusion]()
+    for name, frame, _ in tables:
+        if "j" in frame.index.names and name != "rq3.1":
+            frame = frame[frame.index.get_level_values("j") == ANY]
+        if len(frame):
+            conclusions += TABLE_READERS[name](frame)
+    return conclusions
 
 
-def _any_number(rows: Rows) -> Rows:
-    """The rows over all numbers of changes, if the table has some."""
-    return [pair for pair in rows if pair[0]["j"] == ANY] if any(row.get("j") == ANY for row, _ in rows) else rows
-
-
-def _by(rows: Rows, *keys: str) -> Iterator[tuple[str, Rows]]:
-    """The rows of each combination of keys."""
-    for names in dict.fromkeys(tuple(row[key] for key in keys) for row, _ in rows):
-        yield ", ".join(names), [pair for pair in rows if tuple(pair[0][key] for key in keys) == names]
-
-
-def _numbers(rows: Rows, quantity: str) -> FloatArray:
+def _numbers(frame: pd.DataFrame, quantity: str) -> FloatArray:
     """The values of a quantity here and published, shape (rows, 2); NaN where undefined."""
-    return np.array([[row.get(quantity) for row in pair] for pair in rows], dtype=float)
+    return np.stack([frame[side][quantity].to_numpy(dtype=float) for side in COMPARED_SIDES], axis=1)
+
+
+def _missing(values: FloatArray) -> str:
+    """What is missing if a value here or published is undefined; else empty."""
+    sides = [side for side, is_missing in zip(COMPARED_SIDES, np.isnan(values), strict=True) if is_missing]
+    return f"no value {' and '.join(sides)}" if sides else ""
 
 
 def judge_test(effect: float, p: float, published_effect: float, published_p: float) -> ReplicationVerdict:
     """Whether a published test holds here, by direction, magnitude and significance."""
     is_same_direction = (effect - 0.5) * (published_effect - 0.5) > 0
     magnitudes = {magnitude_of(effect), magnitude_of(published_effect)}
-    if (
-        (p < ALPHA) == (published_p < ALPHA)
-        and len(magnitudes) == 1
-        and (is_same_direction or p >= ALPHA or magnitudes == {"negligible"})
-    ):
-        return HOLDS
-    return IN_DIRECTION if is_same_direction else DIFFERS
+    is_equal = (p < ALPHA) == (published_p < ALPHA) and len(magnitudes) == 1
+    return _judge(is_equal and (is_same_direction or p >= ALPHA or magnitudes == {"negligible"}), is_same_direction)
 
 
 def _judge(holds: bool, holds_in_direction: bool) -> ReplicationVerdict:
     return HOLDS if holds else IN_DIRECTION if holds_in_direction else DIFFERS
 
 
-def _read_tests(question: str, subject: str, if_larger: str, if_smaller: str, rows: Rows) -> Iterator[Conclusion]:
+def _read_tests(question: str, if_larger: str, if_smaller: str, frame: pd.DataFrame) -> Iterator[Conclusion]:
     """Statistical tests; `if_larger` and `if_smaller` describe effect sizes above and below 0.5."""
-    for (row, _), effects, p_values in zip(rows, _numbers(rows, "effect_size"), _numbers(rows, "p_value"), strict=True):
-        name = f"{ALGORITHM_TITLES.get(row[subject], row[subject])}, {row['metric']}"
-        if np.isnan(effects).any():
-            yield Conclusion(
-                question, row["setting"], name, UNDECIDED, f"no test {COMPARED_SIDES[int(np.isnan(effects).argmax())]}"
-            )
+    values = zip(frame.index, _numbers(frame, "effect_size"), _numbers(frame, "p_value"), strict=True)
+    for (setting, algorithm, metric), effects, p_values in values:
+        name = f"{ALGORITHM_TITLES.get(algorithm, algorithm)}, {metric}"
+        if missing := _missing(effects):
+            yield Conclusion(question, setting, name, UNDECIDED, missing)
             continue
         difference = "no difference" if p_values[1] >= ALPHA else if_larger if effects[1] > 0.5 else if_smaller
         numbers = (
             f"{effect:.2f} {side} ({magnitude_of(effect)}, p {p:.2g})"
             for side, effect, p in zip(COMPARED_SIDES, effects, p_values, strict=True)
         )
-        yield Conclusion(
-            question,
-            row["setting"],
-            f"{name}: {difference}",
-            judge_test(effects[0], p_values[0], effects[1], p_values[1]),
-            f"effect size {', '.join(numbers)}",
-        )
+        verdict = judge_test(effects[0], p_values[0], effects[1], p_values[1])
+        yield Conclusion(question, setting, f"{name}: {difference}", verdict, f"effect size {', '.join(numbers)}")
 
 
-def _read_ratios(question: str, subject: str, quantity: str, meaning: str, rows: Rows) -> Iterator[Conclusion]:
+def _read_ratios(question: str, quantity: str, meaning: str, frame: pd.DataFrame) -> Iterator[Conclusion]:
     """Comparisons of a quantity in each row by the ratio of its two values."""
-    for (row, _), values in zip(rows, _numbers(rows, quantity), strict=True):
-        statement, (value, published_value) = f"{ALGORITHM_TITLES.get(row[subject], row[subject])}: {meaning}", values
-        if np.isnan(values).any():
-            sides = " and ".join(
-                side for side, is_missing in zip(COMPARED_SIDES, np.isnan(values), strict=True) if is_missing
-            )
-            yield Conclusion(question, row["setting"], statement, UNDECIDED, f"no value {sides}")
-            continue
+    for (setting, subject, *_), values in zip(frame.index, _numbers(frame, quantity), strict=True):
+        (value, published_value), missing = values, _missing(values)
         is_same_sign = value * published_value > 0
         is_equal = value == published_value or (
             is_same_sign and 1 / MAX_FACTOR <= value / published_value <= MAX_FACTOR
         )
-        yield Conclusion(
-            question,
-            row["setting"],
-            statement,
-            _judge(is_equal, is_same_sign),
-            f"{value:.3g} here, {published_value:.3g} published",
-        )
+        verdict = UNDECIDED if missing else _judge(is_equal, is_same_sign)
+        evidence = missing or f"{value:.3g} here, {published_value:.3g} published"
+        yield Conclusion(question, setting, f"{ALGORITHM_TITLES.get(subject, subject)}: {meaning}", verdict, evidence)
 
 
-def _read_change_numbers(rows: Rows) -> Iterator[Conclusion]:
-    for case, group in _by(rows, "setting"):
-        percents, numbers = np.nan_to_num(_numbers(group, "percent")), np.array([int(row["j"]) for row, _ in group])
+def _read_change_numbers(frame: pd.DataFrame) -> Iterator[Conclusion]:
+    for case, group in frame.groupby(level="setting", sort=False):
+        percents = np.nan_to_num(_numbers(group, "percent"))
+        numbers = group.index.get_level_values("j").astype(int).to_numpy()
         if percents.any(axis=0).all():
             mode, published_mode = numbers[percents.argmax(axis=0)]
             mean, published_mean = numbers @ percents / percents.sum(axis=0)
             yield Conclusion(
                 "RQ3.1",
-                case,
+                str(case),
                 f"most critical solutions change {published_mode} characteristics",
                 _judge(mode == published_mode, abs(mean - published_mean) <= 1),
                 f"most frequent {mode} here, {published_mode} published; mean {mean:.1f} and {published_mean:.1f}",
             )
 
 
-def _read_orders(question: str, keys: Sequence[str], quantity: str, rows: Rows) -> Iterator[Conclusion]:
+def _read_orders(question: str, keys: Sequence[str], quantity: str, frame: pd.DataFrame) -> Iterator[Conclusion]:
     """Orders of the characteristics by a quantity."""
-    for case, group in _by(rows, *keys):
+    for names, group in frame.groupby(level=keys, sort=False):
         values = _numbers(group, quantity)
         is_defined = ~np.isnan(values).any(axis=1)
         if is_defined.any():
-            names = np.array([row["characteristic"] for row, _ in group])[is_defined]
+            characteristics = group.index.get_level_values("characteristic").to_numpy()[is_defined]
             here, published = (
-                ", ".join(names[np.argsort(-column, kind="stable")][:3]) for column in values[is_defined].T
+                ", ".join(characteristics[np.argsort(-column, kind="stable")][:3]) for column in values[is_defined].T
             )
             rho = rank_correlation(*values[is_defined].T)
             verdict = UNDECIDED if rho is None else _judge(rho >= MIN_RHO, rho >= MIN_RHO_IN_DIRECTION)
             evidence = "no rank correlation" if rho is None else f"rank correlation {rho:.2f}"
-            yield (
-                Conclusion(question, case, f"changed most often: {published}", verdict, f"{evidence}; here {here}")
-                if question == "RQ3.2"
-                else Conclusion(
-                    question,
-                    case,
-                    "how much more often each characteristic is changed in the worse weather",
-                    verdict,
-                    evidence,
-                )
-            )
+            statement = "how much more often each characteristic is changed in the worse weather"
+            if question == "RQ3.2":
+                statement, evidence = f"changed most often: {published}", f"{evidence}; here {here}"
+            yield Conclusion(question, ", ".join(map(str, names)), statement, verdict, evidence)
 
 
-def _read_directions(rows: Rows) -> Iterator[Conclusion]:
-    for case, group in _by(rows, "setting"):
-        same, opposite = list[str](), list[str]()
-        for name, pairs in _by(group, "characteristic"):
-            counts = {pair[0]["direction"]: numbers for pair, numbers in zip(pairs, _numbers(pairs, "n"), strict=True)}
-            differences, totals = counts["increase"] - counts["decrease"], counts["increase"] + counts["decrease"]
-            if totals[1] and abs(differences[1]) / totals[1] >= MIN_LEAN:
-                is_same = totals[0] > 0 and np.sign(differences[0]) == np.sign(differences[1])
-                (same if is_same else opposite).append(name)
-        if same or opposite:
-            share = len(same) / len([*same, *opposite])
+def _read_directions(frame: pd.DataFrame) -> Iterator[Conclusion]:
+    for case, group in frame.groupby(level="setting", sort=False):
+        counts = group.xs("n", axis=1, level=1).astype(float).unstack("direction", sort=False)
+        ours, theirs = (counts[side]["increase"] - counts[side]["decrease"] for side in COMPARED_SIDES)
+        totals = counts[PUBLISHED]["increase"] + counts[PUBLISHED]["decrease"]
+        leaning = theirs[theirs.abs() >= MIN_LEAN * totals.clip(lower=1)]
+        is_same = np.sign(ours[leaning.index]) == np.sign(leaning)
+        if len(leaning):
+            opposite = ", ".join(is_same.index[~is_same].get_level_values("characteristic"))
             yield Conclusion(
                 "RQ3.3",
-                case,
-                f"{len([*same, *opposite])} characteristics are changed mostly one way",
-                _judge(share >= MIN_SHARE, share >= MIN_SHARE_IN_DIRECTION),
-                f"{len(same)} of them the same way here" + (f", but not {', '.join(opposite)}" if opposite else ""),
+                str(case),
+                f"{len(leaning)} characteristics are changed mostly one way",
+                _judge(is_same.mean() >= MIN_SHARE, is_same.mean() >= MIN_SHARE_IN_DIRECTION),
+                f"{is_same.sum()} of them the same way here" + (f", but not {opposite}" if opposite else ""),
             )
 
 
-def _read_combinations(rows: Rows) -> Iterator[Conclusion]:
-    for case, group in _by(rows, "setting"):
-        here, published = (
-            [pair[side]["characteristics"] for pair in group if "characteristics" in pair[side]] for side in (0, 1)
-        )
+def _read_combinations(frame: pd.DataFrame) -> Iterator[Conclusion]:
+    for case, group in frame.groupby(level="setting", sort=False):
+        here, published = (group[side]["characteristics"].dropna().tolist() for side in COMPARED_SIDES)
         if here and published:
             shared_count = len(set(here[0].split(", ")) & set(published[0].split(", ")))
             is_similar = published[0] in here or here[0] in published or shared_count >= 3
             yield Conclusion(
                 "combinations",
-                case,
+                str(case),
                 f"the four most often changed together: {published[0]}",
                 _judge(here[0] == published[0], is_similar),
                 f"here {here[0]}; {shared_count} of four the same",
             )
 
 
-TABLE_READERS: Mapping[str, Callable[[Rows], Iterator[Conclusion]]] = {
-    "rq1": partial(
-        _read_tests, "RQ1", "algorithm", "safer than the original vehicle", "more unsafe than the original vehicle"
-    ),
-    "rq2": partial(_read_tests, "RQ2", "baseline", "NSGA-II does better", "NSGA-II does worse"),
+TABLE_READERS: Mapping[str, Callable[[pd.DataFrame], Iterator[Conclusion]]] = {
+    "rq1": partial(_read_tests, "RQ1", "safer than the original vehicle", "more unsafe than the original vehicle"),
+    "rq2": partial(_read_tests, "RQ2", "NSGA-II does better", "NSGA-II does worse"),
     "rq3.1": _read_change_numbers,
     "rq3.2": partial(_read_orders, "RQ3.2", ["setting"], "percent"),
     "rq3.3": _read_directions,
-    "rq3.3-safety": partial(_read_ratios, "RQ3.3", "quantity", "value", "mean change of safety in critical solutions"),
-    "collisions": partial(_read_ratios, "collisions", "algorithm", "share", "share of the solutions that collide"),
+    "rq3.3-safety": partial(_read_ratios, "RQ3.3", "value", "mean change of safety in critical solutions"),
+    "collisions": partial(_read_ratios, "collisions", "share", "share of the solutions that collide"),
     "combinations": _read_combinations,
     "weather": partial(_read_orders, "weather", ["setting", "other"], "difference"),
 }

@@ -19,11 +19,9 @@ from safevar_sumo.reference.conclusions import (
     HERE,
     HOLDS,
     IN_DIRECTION,
-    KEY_COLUMNS,
     PUBLISHED,
     RULES,
     UNDECIDED,
-    ComparedTable,
     Conclusion,
     ReplicationVerdict,
     compare_tables,
@@ -116,7 +114,7 @@ def replicate(
         lines += [
             f"### {TITLES[table.name]}",
             "",
-            *([_render_table(table), ""] if table.rows else []),
+            *([_render_table(table.frame), ""] if len(table.frame) else []),
             *(f"{note}  " for note in table.notes),
             "",
         ]
@@ -134,10 +132,12 @@ def _head_lines(pairs: Sequence[tuple[Case, Case]], conclusions: Sequence[Conclu
             for size in sizes
         )
         lines.append(f"- {pair[0].study.title} ({name}): {' here, '.join(texts)} published.")
-        for side, case, other in ((PUBLISHED, *pair), (HERE, *pair[::-1])):
-            for algorithm in (algorithm for algorithm in case.algorithms if algorithm not in other.algorithms):
-                effect = "; RQ2, RQ3 and the weathers need them and are not compared" if algorithm == NSGA2 else ""
-                lines.append(f"- {name}: no solutions of {algorithm} {side}{effect}.")
+        one_sided = set(pair[0].algorithms) ^ set(pair[1].algorithms)
+        if one_sided:
+            effect = "; RQ2, RQ3 and the weathers need them" if NSGA2 in one_sided else ""
+            lines.append(
+                f"- {name}: solutions on one side only are not compared: {', '.join(sorted(one_sided))}{effect}."
+            )
         lines += [f"- {note}" for note in pair[0].remarks]
     return lines
 
@@ -185,16 +185,12 @@ def compare_with_nearest_rows(case: Case, references: Sequence[ReferenceData]) -
     return results
 
 
-def _render_table(table: ComparedTable) -> str:
-    keys = KEY_COLUMNS[table.name]
-    rows = [
-        [
-            *(pair[0][key] for key in keys),
-            *(" / ".join(_cell_text(row.get(name)) for row in pair) for name in table.quantities),
-        ]
-        for pair in table.rows
-    ]
-    return _markdown_table([*keys, *(f"{name} {HERE} / {PUBLISHED}" for name in table.quantities)], rows)
+def _render_table(frame: pd.DataFrame) -> str:
+    texts = frame.map(_cell_text)
+    quantities = frame.columns.get_level_values(1).unique()
+    cells = {f"{name} {HERE} / {PUBLISHED}": texts[HERE, name] + " / " + texts[PUBLISHED, name] for name in quantities}
+    table = pd.DataFrame(cells).reset_index()
+    return _markdown_table([*table], table.to_numpy().tolist())
 
 
 def _markdown_table(headings: Sequence[object], rows: Iterable[Sequence[object]]) -> str:
@@ -204,6 +200,6 @@ def _markdown_table(headings: Sequence[object], rows: Iterable[Sequence[object]]
 def _cell_text(value: object) -> str:
     if isinstance(value, ReplicationVerdict):
         return f"*{value}*"
-    if value is None or (isinstance(value, float) and pd.isna(value)):
+    if str(value) in ("None", "nan", "<NA>"):
         return "-"
     return f"{value:.3g}" if isinstance(value, float) else str(value).replace("|", r"\|").replace("\n", " ")

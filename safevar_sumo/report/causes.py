@@ -10,8 +10,7 @@ from safevar_sumo.analysis.explain.braking_comparison import sentence
 from safevar_sumo.analysis.explain.causes import Cause
 from safevar_sumo.analysis.explain.result import Explained, Explanation
 from safevar_sumo.analysis.explain.sentences import ROBUST, counts_in_words, effect_in_words, verdict_in_words
-from safevar_sumo.analysis.opinion.compute import CauseToJudge, assemble_both_systems, judge_causes
-from safevar_sumo.analysis.opinion.result import Opinion
+from safevar_sumo.analysis.opinion.compute import CauseToJudge, Opinion, assemble_both_systems, judge_causes
 from safevar_sumo.analysis.tolerance.answer import Tolerance
 from safevar_sumo.analysis.words import number_of, points_in_words
 from safevar_sumo.errors import InputError

@@ -31,8 +31,8 @@ from safevar_sumo.analysis.rating.render import (
 )
 from safevar_sumo.analysis.research_questions.answer import answer_questions
 from safevar_sumo.analysis.research_questions.case import Case, UnanswerableError
-from safevar_sumo.analysis.research_questions.gallery import draw_figures
-from safevar_sumo.analysis.research_questions.layout import BoldText, lay_out
+from safevar_sumo.analysis.research_questions.figures import draw_figures
+from safevar_sumo.analysis.research_questions.tables import BoldText, lay_out
 from safevar_sumo.analysis.risk.compute import estimate_risk
 from safevar_sumo.analysis.rules.compute import find_rules
 from safevar_sumo.analysis.tolerance.compute import find_tolerances

@@ -17,8 +17,7 @@ import pytest
 from vehiclemodels.parameters_vehicle2 import parameters_vehicle2
 from vehiclemodels.vehicle_dynamics_mb import vehicle_dynamics_mb
 
-from safevar_sumo.analysis.opinion.compute import CauseToJudge, assemble_both_systems, judge_causes
-from safevar_sumo.analysis.opinion.mapping import MAPPING_TABLES
+from safevar_sumo.analysis.opinion.compute import CauseToJudge, Verdict, assemble_both_systems, judge_causes
 from safevar_sumo.analysis.opinion.multi_body import (
     MultiBodyState,
     Plant,
@@ -29,8 +28,7 @@ from safevar_sumo.analysis.opinion.multi_body import (
     load_bmw_parameters,
     tyre_forces,
 )
-from safevar_sumo.analysis.opinion.result import Verdict
-from safevar_sumo.analysis.opinion.second_vehicle import SecondState, SecondVehicle
+from safevar_sumo.analysis.opinion.second_vehicle import MAPPING_TABLES, SecondState, SecondVehicle
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import GRAVITY, Command
 from safevar_sumo.report import make_report
@@ -269,21 +267,6 @@ def test_no_rim_is_much_faster_than_the_car(study: str) -> None:
     point = max(system.points, key=lambda one: getattr(one.scenario, "test_speed", None) or 0.0)
     simulate(replace(system.at(point), vehicle=spy), np.stack(extremes))
     assert -0.5 < spy.largest < 1.0
-    assert not spy.spinning
-
-
-@pytest.mark.slow
-def test_a_car_whose_wheels_spin_confirms_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without the limit of its torque, worn tyres' rims are 300 m/s faster than the car and push it into a collision
-    at 8 m/s.
-    """
-    cause = CauseToJudge("nsga2:24:1", WORN_TYRES, 0.99, 1.0)
-    (calm,) = judge_causes(load_study("rain"), [cause], Unsafe()).opinions
-    monkeypatch.setattr("safevar_sumo.analysis.opinion.multi_body.TRACTION_SHARE", np.inf)
-    (spinning,) = judge_causes(load_study("rain"), [cause], Unsafe()).opinions
-    assert (spinning.opinion, spinning.there.outcome) == ("outside", "collision")
-    assert "spin" in spinning.because
-    assert (calm.there.safety_degree or 0.0) > -4 > -7 > (spinning.there.safety_degree or 0.0)
 
 
 @pytest.mark.slow

@@ -12,7 +12,8 @@ import pytest
 
 from safevar_sumo.analysis.rating.compute import RatedVehicle, rate
 from safevar_sumo.analysis.rating.workbook import PreprocessedFile, Template
-from safevar_sumo.protocol import EURO_NCAP_2026, points_of, protocol_of
+from safevar_sumo.protocol import EURO_NCAP_2026, protocol_of
+from safevar_sumo.protocol.rater import Rater
 from safevar_sumo.records import CellResults
 from safevar_sumo.study import load_study
 from safevar_sumo.vehicles import CharacteristicSet
@@ -83,10 +84,8 @@ def test_vehicles_with_any_colours_score_alike(
         CellResults(impact[:, nominal], warning[:, nominal], np.ones((1, N), dtype=bool)),
         CLAIMS if seed % 3 else {},
     )
-    rated = RatedVehicle(
-        name="any", setting={}, protocol=PROTOCOL, cells=cells, scores=points_of(PROTOCOL, cells, claims), claims=claims
-    )
-    assert rated.fails == (seed == 0)
+    rated = RatedVehicle(name="any", setting={}, rater=Rater(protocol=PROTOCOL, claims=claims), cells=cells)
+    assert rated.scores.fails[0] == (seed == 0)
     agrees(rated, calculator, template, tmp_path)
 
 

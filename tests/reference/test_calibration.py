@@ -11,14 +11,11 @@ from scipy.special import logit
 
 from safevar_sumo.analysis.model_spread import value_of, with_values
 from safevar_sumo.records import FloatArray
-from safevar_sumo.reference.calibration import Calibration, FitSubject, calibrate
+from safevar_sumo.reference.calibration import Calibration, FitSubject, Profiles, calibrate
 from safevar_sumo.reference.effects import Regression, error_beyond_spread, measure_coverage
-from safevar_sumo.reference.ensemble import invert
-from safevar_sumo.reference.fit_space import FitSpace, FittedParameter
-from safevar_sumo.reference.loss import ReferenceLoss
-from safevar_sumo.reference.profiles import Profiles
+from safevar_sumo.reference.fit_space import FitSpace, FittedParameter, ReferenceLoss
 from safevar_sumo.reference.rows import ReferenceData
-from safevar_sumo.reference.search import Misfit, SearchRace
+from safevar_sumo.reference.search import Misfit, SearchRace, invert
 from safevar_sumo.study import FitTable, FreeParameter, Study, load_study
 from safevar_sumo.sumo.matrix import evaluate
 from safevar_sumo.sumo.system import assemble

@@ -13,14 +13,7 @@ import pytest
 
 from safevar_sumo.analysis.research_questions.answer import answer_questions
 from safevar_sumo.analysis.research_questions.case import Case
-from safevar_sumo.analysis.research_questions.layout import PAPER_LAYOUTS, Layouts
-from safevar_sumo.analysis.research_questions.tables import (
-    FORMATS_WITH_LAYOUT,
-    as_json,
-    as_latex,
-    as_text,
-    escaped_for_latex,
-)
+from safevar_sumo.analysis.research_questions.tables import as_json, as_latex, as_markdown, as_text, escaped_for_latex
 from safevar_sumo.study import CharacteristicTable
 from tests.research_questions.made_up import made_up, made_up_study, row
 from tests.research_questions.test_questions import three_algorithms
@@ -75,7 +68,7 @@ DOCUMENT = r"""\documentclass{article}
 @pytest.mark.parametrize("cases", CASES.values(), ids=CASES)
 def test_latex_compiles(cases: list[Case], tmp_path: Path) -> None:
     answers = answer_questions(cases)
-    document = DOCUMENT % (as_latex(answers) + as_latex(answers, PAPER_LAYOUTS).replace("tab:", "tab:paper-"))
+    document = DOCUMENT % as_latex(answers)
     (tmp_path / "tables.tex").write_text(document, encoding="utf-8")
     done = subprocess.run(
         ["pdflatex", "-halt-on-error", "-interaction=nonstopmode", "tables.tex"],
@@ -126,18 +119,16 @@ def test_json_records_have_the_promised_keys(question: str, keys: str) -> None:
         )
 
 
-@pytest.mark.parametrize("layouts", [None, PAPER_LAYOUTS])
-def test_pooled_solutions_of_too_few_runs_do_not_stand_out_either(layouts: Layouts | None) -> None:
+def test_pooled_solutions_of_too_few_runs_do_not_stand_out_either() -> None:
     """As at the end of a study: seven runs are too few for RQ1, five are enough for RQ2, whatever the number of
     solutions.
     """
     case = made_up(
         *(row(name, run=i % 7, sd=sd - i / 100) for name, sd in (("nsga2", 0.5), ("rs", 1.5)) for i in range(30))
     )
-    options = {} if layouts is None else {"layouts": layouts}
     for question, stands_out in (("rq1", False), ("rq2", True)):
         (answer,) = answer_questions([case], question)
-        lines = [line for line in as_text([answer], **options).splitlines() if "<0.001" in line]
+        lines = [line for line in as_text([answer]).splitlines() if "<0.001" in line]
         assert lines
         assert any("*" in line for line in lines) is stands_out
         assert (
@@ -145,7 +136,7 @@ def test_pooled_solutions_of_too_few_runs_do_not_stand_out_either(layouts: Layou
             is not stands_out
         )
     (imported,) = answer_questions([dataclasses.replace(case, has_runs=False)], "rq1")
-    assert "*" in as_text([imported], **options).replace("(or *)", ""), "the runs of imported solutions are unknown"
+    assert "*" in as_text([imported]).replace("(or *)", ""), "the runs of imported solutions are unknown"
 
 
 @pytest.mark.parametrize("question", ["rq1-runs", "rq2-runs"])
@@ -157,5 +148,5 @@ def test_a_large_effect_of_too_few_runs_does_not_stand_out(question: str) -> Non
 
 def test_every_rendering_has_every_effect() -> None:
     answers = answer_questions([three_algorithms()])
-    for output in (render(answers) for render in FORMATS_WITH_LAYOUT.values()):
+    for output in (render(answers) for render in (as_text, as_markdown, as_latex)):
         assert all(f"{effect:.3f}" in output for answer in answers for effect in answer.frame.get("effect_size", ()))

@@ -33,15 +33,14 @@ from safevar_sumo.analysis.explain.sentences import (
     verdict_in_words,
 )
 from safevar_sumo.analysis.preventability import assess_preventability, classify_collisions
-from safevar_sumo.analysis.rating.summary import summarise_rated_solutions
+from safevar_sumo.analysis.rating.render import summarise_rated_solutions
 from safevar_sumo.analysis.research_questions.case import Case
 from safevar_sumo.analysis.subject import at_point, study_in
 from safevar_sumo.analysis.words import question_command
 from safevar_sumo.campaign.pool import Pool
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import RATING_POINTS, Unsafe
-from safevar_sumo.protocol.points import UNKNOWN as UNKNOWN_COLOUR
-from safevar_sumo.protocol.rater import is_rated
+from safevar_sumo.protocol.rater import UNKNOWN as UNKNOWN_COLOUR, is_rated
 from safevar_sumo.records import Evaluations, FloatArray, finite_or_none
 from safevar_sumo.results import CHOICES, UNKNOWN, SolutionId, choose_handle, handles_of, row_of_handle
 from safevar_sumo.study import Study

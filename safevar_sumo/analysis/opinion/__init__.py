@@ -14,7 +14,7 @@ from safevar_sumo.analysis.options import Options, document_options, option, uns
 from safevar_sumo.analysis.subject import Results, answer_question, study_or_case
 
 if TYPE_CHECKING:
-    from safevar_sumo.analysis.opinion.result import Opinions
+    from safevar_sumo.analysis.opinion.compute import Opinions
     from safevar_sumo.campaign.pool import Pool
     from safevar_sumo.metrics import Criterion
     from safevar_sumo.terminal import Progress

@@ -4,7 +4,7 @@ rules.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -12,27 +12,14 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from safevar_sumo.analysis.evaluator import Evaluator, open_evaluator
+from safevar_sumo.analysis.evaluator import open_evaluator
 from safevar_sumo.analysis.rating import RatingOptions
 from safevar_sumo.analysis.research_questions.case import Case
-from safevar_sumo.analysis.words import join_phrases
 from safevar_sumo.campaign.pool import Pool
 from safevar_sumo.errors import InputError
-from safevar_sumo.protocol import (
-    COLOURS,
-    EURO_NCAP_2026,
-    NOT_RED,
-    RED,
-    REQUIRED_CELLS,
-    UNCHECKED_CELLS,
-    Cell,
-    CellMatrix,
-    Points,
-    Protocol,
-    RequiredCells,
-    points_of,
-)
-from safevar_sumo.protocol.rater import darken, rater_of, with_protocol
+from safevar_sumo.protocol import COLOURS, EURO_NCAP_2026, CellMatrix, Protocol
+from safevar_sumo.protocol.cells import REQUIRED, UNCHECKED
+from safevar_sumo.protocol.rater import Points, Rater, darken, rater_of, with_protocol
 from safevar_sumo.records import CellResults, FloatArray, finite_or_none
 from safevar_sumo.results import SolutionId, row_of_handle
 from safevar_sumo.scenarios import weather_of
@@ -66,92 +53,76 @@ class RatedTest:
 
 @dataclass(frozen=True, kw_only=True)
 class RatedVehicle:
-    """One vehicle with its setting, results and points; `fails`: a required cell is not green, so that the vehicle
-    earns nothing.
-    """
+    """One vehicle with its setting, its results in every cell, and the points that they earn."""
 
     name: str
     setting: Mapping[str, float]
-    protocol: Protocol
+    rater: Rater
     cells: CellResults
-    scores: Points
-    claims: Mapping[str, Sequence[str]]
+
+    @property
+    def protocol(self) -> Protocol:
+        return self.rater.protocol
+
+    @cached_property
+    def scores(self) -> Points:
+        return self.rater.points(self.cells)
 
     @property
     def points(self) -> float:
         return float(self.scores.total[0])
 
-    @property
-    def fails(self) -> bool:
-        return bool(self.scores.fails[0])
-
     @cached_property
     def tests(self) -> list[RatedTest]:
         tests = []
         for matrix in self.protocol.matrices:
-            standard, extended, robustness = (
-                round(float(value), DECIMALS) for value in self.scores.tests[matrix.name][0]
-            )
-            tests.append(
-                RatedTest(matrix=matrix, points=(standard, extended, robustness), layers=self._held_layers(matrix))
-            )
+            test = matrix.test_name
+            standard, extended, robustness = self.scores.tests[matrix.name][0].round(DECIMALS).tolist()
+            layers: dict[str, bool | None] = {}
+            for layer in self.protocol.layers_of(test):
+                claimed = layer.name in self.rater.claims.get(test, ()) or None
+                held = self.scores.layers.get((test, layer.name))
+                layers[layer.name] = claimed if held is None else bool(held[0])
+            tests.append(RatedTest(matrix=matrix, points=(standard, extended, robustness), layers=layers))
         return tests
-
-    def _held_layers(self, matrix: CellMatrix) -> dict[str, bool | None]:
-        claimed = self.claims.get(matrix.test_name, ())
-        return {
-            layer.name: bool(self.scores.layers[matrix.test_name, layer.name][0])
-            if layer.simulated_conditions
-            else True
-            if layer.name in claimed
-            else None
-            for layer in self.protocol.layers_of(matrix.test_name)
-        }
 
     def colour(self, cell_number: int) -> str | None:
         """Colour of a cell; None if the vehicle could not drive the test."""
         colour = int(self.scores.colours[0, cell_number])
         return None if colour < 0 else COLOURS[colour]
 
-    def passes(self, cell_number: int) -> bool:
-        """Whether a robustness cell meets its criterion."""
-        colour, nominal = self.scores.colours[0, [cell_number, self.matrix_cell_number(cell_number)]].tolist()
-        return bool(
-            colour >= 0
-            and (colour < RED if self.protocol.cells[cell_number].criterion == NOT_RED else colour <= nominal)
+    def measured(self, cell_number: int) -> tuple[float | None, float | None]:
+        """Relative impact speed [km/h] and time to collision at the warning [s] in a cell; None without impact or
+        warning.
+        """
+        impact, warning = (finite_or_none(values[0, cell_number]) for values in (self.cells.impact, self.cells.warning))
+        return None if impact is None else round(impact, DECIMALS), None if warning is None else round(
+            warning, DECIMALS
         )
 
-    def matrix_cell_number(self, cell_number: int) -> int:
-        """Number of the matrix cell that a robustness cell varies; of a matrix cell its own number."""
-        cell = self.protocol.cells[cell_number]
-        return self.protocol.matrix_cell_numbers[cell.matrix.name, cell.row, cell.column]
-
-    def cell_to_dict(self, cell_number: int) -> dict[str, Any]:
-        """A cell as `rating --json` prints it."""
-        cell, impact = self.protocol.cells[cell_number], finite_or_none(self.cells.impact[0, cell_number])
-        warning = finite_or_none(self.cells.warning[0, cell_number])
-        return {
-            "range": cell.range_or_layer,
-            "vut_speed": cell.vut_speed,
-            "target_speed": cell.target_speed,
-            "impact_location": cell.impact_location,
-            "colour": self.colour(cell_number),
-            "relative_impact_speed": None if impact is None else round(impact, DECIMALS),
-            "warning_ttc": None if warning is None else round(warning, DECIMALS),
-        }
-
     def to_dict(self) -> dict[str, Any]:
-        cell_numbers: dict[str, list[int]] = {}
+        cells: dict[str, list[dict[str, Any]]] = {matrix.name: [] for matrix in self.protocol.matrices}
         for cell_number, cell in enumerate(self.protocol.cells):
-            cell_numbers.setdefault(cell.matrix.name, []).append(cell_number)
+            impact, warning = self.measured(cell_number)
+            cells[cell.matrix.name].append(
+                {
+                    "range": cell.range_or_layer,
+                    "vut_speed": cell.vut_speed,
+                    "target_speed": cell.target_speed,
+                    "impact_location": cell.impact_location,
+                    "colour": self.colour(cell_number),
+                    "relative_impact_speed": impact,
+                    "warning_ttc": warning,
+                }
+            )
         tests = [
             {
                 "test": test.matrix.test_name,
                 "light": test.matrix.light,
                 **dict(zip(POINT_KINDS, test.points, strict=True)),
                 "possible": dict(zip(POINT_KINDS, test.matrix.points, strict=True)),
-                "cells": [self.cell_to_dict(cell_number) for cell_number in cell_numbers[test.matrix.name]],
-                "layers": dict(test.layers),
+                "cells": cells[test.matrix.name],
+                "layers": test.layers,
             }
             for test in self.tests
         ]
@@ -174,9 +145,12 @@ class Rating:
     """A rating of the original vehicle, `vehicles[0]`, and of its variants."""
 
     study: Study
-    protocol: Protocol
     vehicles: list[RatedVehicle]
     no_verdict: str = ""
+
+    @property
+    def protocol(self) -> Protocol:
+        return self.original.protocol
 
     @property
     def original(self) -> RatedVehicle:
@@ -192,50 +166,17 @@ class Rating:
         """The original vehicle's points minus the variant's points; negative if the variant earns more."""
         return 0.0 if self.variant is None else round(self.original.points - self.variant.points, DECIMALS)
 
-    @property
-    def unclaimed_points(self) -> float:
-        """Points of the robustness layers of simulated tests that are neither simulated nor claimed."""
-        claims, open_points = self.original.claims, 0.0
-        for test, matrices in self.protocol.tests.items():
-            layers = self.protocol.layers_of(test)
-            open_layers = [
-                layer for layer in layers if not layer.simulated_conditions and layer.name not in claims.get(test, ())
-            ]
-            open_points += sum(matrix.points[2] for matrix in matrices) * len(open_layers) / len(layers)
-        return round(open_points, DECIMALS)
-
-    def colour_changes(self) -> list[tuple[Cell, str | None, str | None]]:
-        """Cells whose colour in the variant differs from the original's, with the original's and the variant's
-        colour.
-        """
-        variant = self.variant
-        if variant is None:
-            return []
-        cell_numbers = np.flatnonzero(self.original.scores.colours[0] != variant.scores.colours[0]).tolist()
-        return [
-            (self.protocol.cells[cell_number], self.original.colour(cell_number), variant.colour(cell_number))
-            for cell_number in cell_numbers
-        ]
-
     def to_frame(self) -> pd.DataFrame:
         """One row for each vehicle and test.
 
         Columns: `vehicle`, `test`, `light`, `standard`, `extended`, `robustness`, `total`, `possible` [points].
         """
-        return pd.DataFrame(
-            [
-                {
-                    "vehicle": vehicle.name,
-                    "test": test.matrix.test_name,
-                    "light": test.matrix.light,
-                    **dict(zip(POINT_KINDS, test.points, strict=True)),
-                    "total": test.total,
-                    "possible": sum(test.matrix.points),
-                }
-                for vehicle in self.vehicles
-                for test in vehicle.tests
-            ]
-        )
+        rows = [
+            (vehicle.name, test.matrix.test_name, test.matrix.light, *test.points, test.total, sum(test.matrix.points))
+            for vehicle in self.vehicles
+            for test in vehicle.tests
+        ]
+        return pd.DataFrame(rows, columns=["vehicle", "test", "light", *POINT_KINDS, "total", "possible"])
 
     def to_dict(self) -> dict[str, Any]:
         """The JSON of `rating`."""
@@ -309,33 +250,23 @@ def rate(
         If a vehicle cannot be simulated.
     """
     with open_evaluator(with_protocol(study, EURO_NCAP_2026), pool, jobs, progress) as evaluator:
-        return rate_on(evaluator, settings)
-
-
-def rate_on(evaluator: Evaluator, settings: Mapping[str, FloatArray]) -> Rating:
-    """Rate the original vehicle and variants with an evaluator of a rated study; `settings` as in `rate`."""
-    rater = rater_of(evaluator.study, evaluator.study.source)
-    assert rater is not None
-    names = CharacteristicSet.of(evaluator.study.vehicle.characteristics).names
-    settings_by_name = {"original": evaluator.characteristics.original, **settings}
-    cells = evaluator.simulate_cells(np.stack(list(settings_by_name.values())), "cells and robustness layers")
-    vehicles = [
-        RatedVehicle(
-            name=name,
-            setting=dict(zip(names, setting.tolist(), strict=True)),
-            protocol=rater.protocol,
-            cells=cells.of([index]),
-            scores=points_of(rater.protocol, cells.of([index]), rater.claims),
-            claims=rater.claims,
-        )
-        for index, (name, setting) in enumerate(settings_by_name.items())
-    ]
-    return Rating(study=evaluator.study, protocol=rater.protocol, vehicles=vehicles, no_verdict=evaluator.no_verdict)
+        rater = rater_of(evaluator.study, evaluator.study.source)
+        assert rater is not None
+        settings_by_name = {"original": evaluator.characteristics.original, **settings}
+        cells = evaluator.simulate_cells(np.stack(list(settings_by_name.values())), "cells and robustness layers")
+        names = evaluator.characteristics.names
+        vehicles = [
+            RatedVehicle(
+                name=name, setting=dict(zip(names, setting.tolist(), strict=True)), rater=rater, cells=cells.of([index])
+            )
+            for index, (name, setting) in enumerate(settings_by_name.items())
+        ]
+        return Rating(study=evaluator.study, vehicles=vehicles, no_verdict=evaluator.no_verdict)
 
 
 def remarks(rating: Rating) -> list[str]:
     """Remarks on the weather, required cells, invalid tests and missing warnings, to be read with the rating."""
-    weather = weather_of(rating.study.weather, f"study {rating.study.name!r}")
+    weather, protocol = weather_of(rating.study.weather, f"study {rating.study.name!r}"), rating.protocol
     lines = []
     if weather.wet or weather.road_friction != 1:
         lines.append(
@@ -343,18 +274,14 @@ def remarks(rating: Rating) -> list[str]:
             f"{darken(weather).name!r}."
         )
     for vehicle in rating.vehicles:
-        if vehicle.fails:
+        if vehicle.scores.fails[0]:
             lines.append(
-                f"{vehicle.name}: it earns nothing, because "
-                f"{_describe_cells(REQUIRED_CELLS, vehicle.protocol)} is not green in "
-                "the whole standard range."
+                f"{vehicle.name}: it earns nothing, because {REQUIRED} is not green in the whole standard range."
             )
-        elif any(vehicle.colour(cell_number) != "green" for cell_number in UNCHECKED_CELLS.numbers(vehicle.protocol)):
+        elif vehicle.scores.colours[0, protocol.unchecked_cells].any():
             lines.append(
-                f"{vehicle.name}: {_describe_cells(UNCHECKED_CELLS, vehicle.protocol)} is not green, which "
-                "Euro NCAP requires; "
-                f"Euro NCAP's calculator {vehicle.protocol.calculator_version} does not check this, nor do "
-                "these points."
+                f"{vehicle.name}: {UNCHECKED} is not green, which Euro NCAP requires; "
+                f"Euro NCAP's calculator {protocol.calculator_version} does not check this, nor do these points."
             )
         invalid_cells = int(np.count_nonzero(~vehicle.cells.valid))
         if invalid_cells:
@@ -365,10 +292,3 @@ def remarks(rating: Rating) -> list[str]:
     if all(np.isnan(vehicle.cells.warning).all() for vehicle in rating.vehicles):
         lines.append("The driving system never warns: rows with FCW are red.")
     return lines
-
-
-def _describe_cells(required: RequiredCells, protocol: Protocol) -> str:
-    """Required cells in words, such as `CPNA at 10 km/h and 75 %`."""
-    speeds = sorted({protocol.cells[cell_number].vut_speed for cell_number in required.numbers(protocol)})
-    location = "" if required.impact_location is None else f" and {required.impact_location:g} %"
-    return f"{required.test_name} at {join_phrases(f'{speed:g}' for speed in speeds)} km/h{location}"

@@ -1,27 +1,33 @@
-"""A rating as text on the terminal, and its matrices as a figure."""
+"""A rating in words, as text on the terminal, and its matrices as a figure."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
+from shlex import quote
 from typing import TYPE_CHECKING
 
+import numpy as np
+import pandas as pd
 from rich.console import Console
 from rich.text import Text
 
-from safevar_sumo.analysis.figures import FONT, escape_dollars, new_figure
+from safevar_sumo.analysis.figures import FONT, escape_dollars, new_panels
 from safevar_sumo.analysis.rating.compute import RatedTest, RatedVehicle, Rating, max_points
-from safevar_sumo.analysis.words import join_phrases, number_of
+from safevar_sumo.analysis.words import join_phrases, list_of_changes, number_of, question_command
+from safevar_sumo.metrics import RATING_POINTS, Unsafe
 from safevar_sumo.protocol import COLOURS, CellMatrix
-from safevar_sumo.terminal import WholeTable, print_heading, print_text
+from safevar_sumo.protocol.cells import EXTENDED, WARNING
+from safevar_sumo.records import Evaluations
+from safevar_sumo.results import choose_handle, record, row_of_handle
+from safevar_sumo.study import Study
+from safevar_sumo.terminal import WholeTable, print_answer, print_text
 from safevar_sumo.vehicles import CharacteristicSet
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-COLOUR_LETTERS = {colour: colour[0].upper() for colour in COLOURS}
-LEGEND = ", ".join(f"{letter} {colour}" for colour, letter in COLOUR_LETTERS.items())
+LEGEND = ", ".join(f"{colour[0].upper()} {colour}" for colour in COLOURS) + "; small letters: extended range"
 TERMINAL_STYLES = {
     "green": "black on green",
     "yellow": "black on bright_yellow",
@@ -29,19 +35,18 @@ TERMINAL_STYLES = {
     "brown": "white on dark_red",
     "red": "white on red",
 }
-DARK_COLOURS = ("green", "brown", "red")
-"""Colours of cells whose text is white."""
 LIGHT_WORDS = {"day": " by day", "night": " by night", None: ""}
-FIGURE_COLUMNS = 4
+SUMMARY_CHOICES = {
+    "fewest": "Fewest changes that cost a point",
+    "smallest": "Smallest largest change that costs a point",
+    "most_points": "Most points lost",
+}
 
 
 def print_rating(console: Console, rating: Rating) -> None:
     """Print the verdict, the points of every test, the robustness layers that hold, and the tests not simulated."""
-    print_heading(console, rating.study.title, rating.no_verdict)
-    print_text(console, rating_in_words(rating))
-    console.print(_build_points_table(rating))
-    console.print(_build_layers_table(rating))
-    print_text(console, not_simulated(rating))
+    tables = _build_points_table(rating), _build_layers_table(rating)
+    print_answer(console, rating.study, rating.no_verdict, [rating_in_words(rating), *tables, not_simulated(rating)])
 
 
 def rating_in_words(rating: Rating) -> str:
@@ -54,26 +59,16 @@ def rating_in_words(rating: Rating) -> str:
             f"The original vehicle earns {rating.original.points:.2f} of the {maximum:g} points of the tests that "
             "are simulated."
         )
-    changes = _changes_in_words(rating, variant)
     of_original_points = (
         f"of the {rating.original.points:.2f} points that the original earns (of {maximum:g} that are simulated)"
     )
-    if not rating.lost:
-        return f"With {changes} the vehicle keeps all {of_original_points}."
-    if rating.lost < 0:
-        return (
-            f"With {changes} the vehicle earns {-rating.lost:.2f} points more, {variant.points:.2f} instead "
-            f"{of_original_points}."
-        )
-    losses = lost_by_test(rating)
-    test, loss = losses[0]
-    share = (
-        "all" if math.isclose(loss, rating.lost, abs_tol=1e-6) else "most" if loss > rating.lost / 2 else f"{loss:.2f}"
+    losses = ", ".join(f"{loss:.2f} of them in {test_in_words(test)}" for test, loss in lost_by_test(rating)[:1])
+    result = (
+        f"loses {rating.lost:.2f} {of_original_points}" + (f", {losses}" if losses else "")
+        if rating.lost >= 0
+        else f"earns {-rating.lost:.2f} points more, {variant.points:.2f} instead {of_original_points}"
     )
-    return (
-        f"With {changes} the vehicle loses {rating.lost:.2f} {of_original_points}, {share} of them in "
-        f"{test_in_words(test)}."
-    )
+    return f"With {_changes_in_words(rating, variant)} the vehicle {result}."
 
 
 def lost_by_test(rating: Rating) -> list[tuple[RatedTest, float]]:
@@ -89,17 +84,19 @@ def colour_changes_in_words(rating: Rating) -> list[tuple[str, str]]:
     """Tests with matrix cells whose colour the variant changes, each with a text on the colours and on speeds of the
     vehicle.
     """
-    tests: dict[str, dict[tuple[str, str], list[str]]] = {}
-    for cell, before, after in rating.colour_changes():
+    tests: dict[str, dict[str, list[str]]] = {}
+    before, after = rating.original, rating.vehicles[-1]
+    for number in np.flatnonzero(before.scores.colours[0] != after.scores.colours[0]).tolist():
+        cell = rating.protocol.cells[number]
         if not cell.is_robustness_cell:
-            colours = before or "unknown", after or "unknown"
+            colours = f"{before.colour(number) or 'unknown'} to {after.colour(number) or 'unknown'}"
             tests.setdefault(cell.matrix.name, {}).setdefault(colours, []).append(f"{cell.vut_speed:g}")
     return [
         (
             test,
             "; ".join(
-                f"{before} to {after} at {join_phrases(dict.fromkeys(speeds))} km/h ({number_of(len(speeds), 'cell')})"
-                for (before, after), speeds in groups.items()
+                f"{colours} at {join_phrases(dict.fromkeys(speeds))} km/h ({number_of(len(speeds), 'cell')})"
+                for colours, speeds in groups.items()
             ),
         )
         for test, groups in tests.items()
@@ -110,13 +107,13 @@ def not_simulated(rating: Rating) -> str:
     """Sentences on the tests and robustness layers without points."""
     points_by_test = rating.protocol.points_not_simulated
     tests = ", ".join(f"{test} {points:g}" for test, points in points_by_test.items())
-    text = f"Not simulated, neither passed nor failed: {tests}; {sum(points_by_test.values()):g} points."
-    if rating.unclaimed_points:
-        text += (
-            f" Robustness layers that are neither simulated nor claimed: {rating.unclaimed_points:.2f} points of "
-            "the simulated tests."
-        )
-    return text
+    open_points = sum(
+        test.matrix.points[2] * [*test.layers.values()].count(None) / len(test.layers) for test in rating.original.tests
+    )
+    return (
+        f"Not simulated, neither passed nor failed: {tests}; {sum(points_by_test.values()):g} points. "
+        f"Robustness layers that are neither simulated nor claimed: {open_points:.2f} points of the simulated tests."
+    )
 
 
 def test_in_words(test: RatedTest) -> str:
@@ -175,20 +172,15 @@ def _build_layers_table(rating: Rating) -> WholeTable:
         "test", "vehicle", "layers that hold", "layers that fail", "claimed layers", title="Robustness layers"
     )
     for test_of_each in zip(*(vehicle.tests for vehicle in rating.vehicles), strict=True):
-        claimed = rating.original.claims.get(test_of_each[0].matrix.test_name, ())
+        name, layers = test_of_each[0].matrix.test_name, test_of_each[0].layers
+        claimed = rating.original.rater.claims.get(name, ())
         for vehicle, test in zip(rating.vehicles, test_of_each, strict=True):
-            if test.matrix.light != "night" and (vehicle is rating.original or test.layers != test_of_each[0].layers):
-                held_layers, failed_layers = (
-                    [layer for layer, holds in test.layers.items() if holds is expected and layer not in claimed]
-                    for expected in (True, False)
+            if test.matrix.light != "night" and (vehicle is rating.original or test.layers != layers):
+                simulated = {layer: holds for layer, holds in test.layers.items() if layer not in claimed}
+                held, failed = (
+                    ", ".join(k for k, holds in simulated.items() if holds is is_held) for is_held in (True, False)
                 )
-                table.add_row(
-                    test.matrix.test_name,
-                    vehicle.name,
-                    ", ".join(held_layers),
-                    ", ".join(failed_layers),
-                    ", ".join(claimed),
-                )
+                table.add_row(name, vehicle.name, held, failed, ", ".join(claimed))
     return table
 
 
@@ -196,28 +188,21 @@ def print_matrices(console: Console, rating: Rating) -> None:
     """Print every matrix: for each cell a letter, a colour, and the impact speed [km/h] or the time to collision at the
     warning [s].
     """
+    numbers = rating.protocol.matrix_cell_numbers
     for matrix in rating.protocol.matrices:
-        columns = [f"{location:g} %" for location in matrix.impact_locations] or [
-            f"{speed:g}" for speed in matrix.target_speeds
-        ]
-        column_meaning = "impact location" if matrix.impact_locations else "speed of the target"
-        headings = ["VUT", *(["target"] if matrix.impact_locations else [])]
-        table = WholeTable(*headings, right=columns, title=f"{matrix.name}: speeds [km/h], {column_meaning}")
+        meaning = "impact location [%]" if matrix.impact_locations else "speed of the target"
+        columns = [f"{value:g}" for value in matrix.column_values]
+        table = WholeTable("VUT", "target", right=columns, title=f"{matrix.name}: speeds [km/h], {meaning}")
         for row_number, row in enumerate(matrix.rows):
-            cells = [
-                _format_cell(rating, matrix, row_number, column) if row.has_cell(column) else Text("")
-                for column in range(len(row.range_letters))
-            ]
-            table.add_row(
-                _format_vut_speed(matrix, row_number),
-                *([] if row.target_speed is None else [f"{row.target_speed:g}"]),
-                *cells,
-            )
+            keys = [(matrix.name, row_number, column) for column in range(len(row.range_letters))]
+            cells = [_format_cell(rating, numbers[key]) if key in numbers else Text("") for key in keys]
+            target = "" if row.target_speed is None else f"{row.target_speed:g}"
+            table.add_row(_format_vut_speed(matrix, row_number), target, *cells)
         console.print(table)
     compared = "; original>variant where they differ" if rating.variant else ""
     print_text(
         console,
-        f"{LEGEND}; small letters: extended range. The number is the relative speed of the impact [km/h]; in rows with "
+        f"{LEGEND}. The number is the relative speed of the impact [km/h]; in rows with "
         f"FCW it is the time to collision at the warning [s]{compared}.",
     )
 
@@ -226,111 +211,102 @@ def _format_vut_speed(matrix: CellMatrix, row_number: int) -> str:
     return f"{matrix.rows[row_number].vut_speed:g}{' FCW' if matrix.is_rated_by_warning(row_number) else ''}"
 
 
-def _format_cell(rating: Rating, matrix: CellMatrix, row_number: int, column: int) -> Text:
-    cell_number = rating.protocol.matrix_cell_numbers[matrix.name, row_number, column]
+def _letter(vehicle: RatedVehicle, cell_number: int) -> str:
+    """The colour of a cell as a letter, small in the extended range."""
+    letter = (vehicle.colour(cell_number) or "?")[0]
+    return letter if vehicle.protocol.cells[cell_number].range_or_layer == EXTENDED else letter.upper()
+
+
+def _format_cell(rating: Rating, cell_number: int) -> Text:
+    """The letters of a cell, of both vehicles where they differ, and what was measured with the last of them."""
     differs = len({vehicle.colour(cell_number) for vehicle in rating.vehicles}) > 1
-    text = Text()
-    for index, vehicle in enumerate(rating.vehicles if differs else rating.vehicles[:1]):
-        text.append(">" if index else "")
-        is_last = index == len(rating.vehicles) - 1 or not differs
-        style = TERMINAL_STYLES.get(vehicle.colour(cell_number) or "", "")
-        text.append(_format_cell_of_vehicle(vehicle, cell_number, with_value=is_last), style=style)
+    vehicles = rating.vehicles if differs else rating.vehicles[:1]
+    styles = [TERMINAL_STYLES.get(vehicle.colour(cell_number) or "", "") for vehicle in vehicles]
+    letters = [_letter(vehicle, cell_number) for vehicle in vehicles]
+    text = Text(">").join(map(Text, letters, styles))
+    is_warning = rating.protocol.cells[cell_number].judged_by == WARNING
+    value = vehicles[-1].measured(cell_number)[is_warning]
+    if value is not None and (is_warning or vehicles[-1].colour(cell_number) != "green"):
+        text.append(f"{value:.{int(value < 10)}f}", style=styles[-1])
     return text
 
 
-def _format_cell_of_vehicle(vehicle: RatedVehicle, cell_number: int, *, with_value: bool) -> str:
-    cell, colour = vehicle.protocol.cells[cell_number], vehicle.colour(cell_number)
-    cell_data = vehicle.cell_to_dict(cell_number)
-    value = cell_data["warning_ttc"] if cell.judged_by == "warning" else cell_data["relative_impact_speed"]
-    capital = "?" if colour is None else COLOUR_LETTERS[colour]
-    letter = capital.lower() if cell.range_or_layer == "extended" else capital
-    shows_value = with_value and value is not None and (colour != "green" or cell.judged_by == "warning")
-    return f"{letter}{value:.1f}" if shows_value and value < 10 else f"{letter}{value:.0f}" if shows_value else letter
-
-
 def matrices_figure(rating: Rating) -> Figure:
-    """All matrices of every vehicle; cells of the extended range are hatched, cells with another colour than the
-    original's framed.
+    """All matrices of every vehicle, side by side; small letters: extended range, asterisk: another colour than the
+    original's.
     """
-    matrices = rating.protocol.matrices
-    rows = math.ceil(len(matrices) / FIGURE_COLUMNS)
-    figure, axes = new_figure(points_title(rating), rows, FIGURE_COLUMNS, (15, 2.6 * rows))
-    for axis in axes.flat[len(matrices) :]:
-        axis.set_axis_off()
-    for axis, matrix in zip(axes.flat, matrices, strict=False):
-        _draw_matrices(axis, rating, matrix)
+    points = "; ".join(f"{vehicle.name}: {vehicle.points:.2f} points" for vehicle in rating.vehicles)
+    arrangement = " (original left, variant right)" if rating.variant else ""
+    title = f"{rating.study.name}: {points} of {max_points(rating.protocol):g}{arrangement}"
+    figure, axes = new_panels(title, len(rating.protocol.matrices), 4, (3.75, 2.6), 15.0, 0.0)
+    for axis, matrix in zip(axes, rating.protocol.matrices, strict=True):
+        _draw_matrix(axis, rating, matrix)
     figure.supxlabel(
         f"impact location [% of the width], or speed of the target [km/h] in CCCscp and CMCscp; {LEGEND}; "
-        "hatched: extended "
-        "range; thick frame: colour differs from the original's",
+        "asterisk: colour differs from the original's",
         fontsize=FONT,
     )
     figure.supylabel("speed of the vehicle under test [km/h]", fontsize=FONT)
     return figure
 
 
-def points_title(rating: Rating) -> str:
-    points = "; ".join(f"{vehicle.name}: {vehicle.points:.2f} points" for vehicle in rating.vehicles)
-    arrangement = " (original left, variant right)" if rating.variant else ""
-    return f"{rating.study.name}: {points} of {max_points(rating.protocol):g}{arrangement}"
+def _draw_matrix(axis: Axes, rating: Rating, matrix: CellMatrix) -> None:
+    import seaborn as sns
+    from matplotlib.colors import ListedColormap
 
-
-def _draw_matrices(axis: Axes, rating: Rating, matrix: CellMatrix) -> None:
-    """Draw a matrix for each vehicle, side by side."""
-    from matplotlib.patches import Rectangle
-
-    columns = max(len(row.range_letters) for row in matrix.rows)
-    column_values = matrix.impact_locations or matrix.target_speeds
-    ticks: list[tuple[float, str]] = []
-    for index, vehicle in enumerate(rating.vehicles):
-        offset = index * (columns + 0.6)
-        ticks += [(offset + column + 0.5, f"{value:g}") for column, value in enumerate(column_values)]
-        for cell_number, cell in enumerate(rating.protocol.cells):
-            if cell.matrix is not matrix or cell.is_robustness_cell:
-                continue
-            colour, is_extended = vehicle.colour(cell_number), cell.range_or_layer == "extended"
-            differs = index > 0 and colour != rating.original.colour(cell_number)
-            fill_colour = f"#{rating.protocol.colours[colour]}" if colour else "#808080"
-            text_colour = "white" if colour in DARK_COLOURS or colour is None else "black"
-            axis.add_patch(
-                Rectangle(
-                    (offset + cell.column, cell.row),
-                    width=1,
-                    height=1,
-                    facecolor=fill_colour,
-                    edgecolor="white",
-                    linewidth=0.6,
-                    hatch="///" if is_extended else None,
-                )
-            )
-            if differs:
-                axis.add_patch(
-                    Rectangle(
-                        (offset + cell.column + 0.08, cell.row + 0.08),
-                        width=0.84,
-                        height=0.84,
-                        fill=False,
-                        edgecolor="black",
-                        linewidth=1.8,
-                    )
-                )
-            axis.text(
-                offset + cell.column + 0.5,
-                cell.row + 0.5,
-                COLOUR_LETTERS.get(colour or "", "?"),
-                ha="center",
-                va="center",
-                fontsize=FONT - 2,
-                color=text_colour,
-                bbox={"facecolor": fill_colour, "edgecolor": "none", "pad": 0.8},
-            )
-    axis.set_xlim(0, len(rating.vehicles) * (columns + 0.6) - 0.6)
-    axis.set_ylim(len(matrix.rows), 0)
-    axis.set_xticks([position for position, _ in ticks], [text for _, text in ticks], fontsize=FONT - 3)
-    row_names = [_format_vut_speed(matrix, row_number) for row_number in range(len(matrix.rows))]
-    axis.set_yticks([k + 0.5 for k in range(len(row_names))], row_names, fontsize=FONT - 2)
-    axis.grid(visible=False)
+    columns, numbers = [*(f"{value:g}" for value in matrix.column_values), ""], rating.protocol.matrix_cell_numbers
+    colours = np.full((len(matrix.rows), len(columns) * len(rating.vehicles)), np.nan)
+    letters = np.full(colours.shape, "", dtype="U2")
+    for row, column in np.ndindex(colours.shape):
+        index, cell_column = divmod(column, len(columns))
+        number, vehicle = numbers.get((matrix.name, row, cell_column)), rating.vehicles[index]
+        if number is not None:
+            differs = vehicle.colour(number) != rating.original.colour(number)
+            colours[row, column] = vehicle.scores.colours[0, number]
+            letters[row, column] = _letter(vehicle, number) + "*" * differs
+    palette = ListedColormap(["#808080", *(f"#{rating.protocol.colours[colour]}" for colour in COLOURS)])
+    rows = [_format_vut_speed(matrix, row) for row in range(len(matrix.rows))]
+    frame = pd.DataFrame(colours, rows, columns * len(rating.vehicles))
+    sns.heatmap(
+        frame, annot=letters, fmt="", cmap=palette, vmin=-1, vmax=len(COLOURS) - 1, cbar=False, linewidths=0.6, ax=axis
+    )
+    axis.tick_params(labelsize=FONT - 2, length=0, rotation=0)
     totals = " / ".join(
         f"{test.total:.2f}" for vehicle in rating.vehicles for test in vehicle.tests if test.matrix is matrix
     )
     axis.set_title(escape_dollars(f"{matrix.name}: {totals} of {sum(matrix.points):g}"), fontsize=FONT)
+
+
+def summarise_rated_solutions(
+    study: Study, solutions: pd.DataFrame, original: Evaluations, directory: str
+) -> list[str]:
+    """Summarise the solutions of a rated study in lines, the last with commands for the next steps.
+
+    `directory` is the results directory in these commands; the other parameters are those of
+    `safevar_sumo.analysis.explain.summary.summarise_failures`, which calls this function for rated studies.
+    """
+    original_points, points_column = float(original.column(RATING_POINTS.name)[0]), RATING_POINTS.name
+    unsafe = Unsafe.default(record(original, 0), solutions["outcome"])
+    has_loss = unsafe.rows(solutions)
+    if not has_loss.any():
+        return [
+            f"No solution loses a point of the original's {original_points:.2f}.",
+            f"Points against each characteristic: {question_command('tolerance', directory)}",
+        ]
+    characteristics = CharacteristicSet.of(study.vehicle.characteristics)
+    lines = [
+        f"The original vehicle earns {original_points:.2f} points. {int(has_loss.sum())} of "
+        f"{number_of(len(solutions), 'solution')} lose at least one point."
+    ]
+    handle = None
+    for choice, title in SUMMARY_CHOICES.items():
+        handle = choose_handle(solutions, unsafe, choice, study.name)
+        row = solutions.iloc[row_of_handle(solutions, handle)]
+        setting = {characteristic: float(row[characteristic]) for characteristic in characteristics.names}
+        loss = original_points - row[points_column]
+        lines.append(f"{title}: {handle} loses {loss:.2f} points with {list_of_changes(characteristics, setting)}.")
+    return [
+        *lines,
+        f"Which cells change colour: {question_command('rating', directory)} --solution {quote(str(handle))} --matrix; "
+        f"which changes cause it: {question_command('explain', directory)}",
+    ]

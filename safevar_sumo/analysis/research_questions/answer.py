@@ -5,6 +5,7 @@ In the frames, the columns `setting` and `other` hold the names of cases.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
@@ -29,7 +30,6 @@ from safevar_sumo.analysis.research_questions.changes import (
     rq33_safety,
 )
 from safevar_sumo.analysis.research_questions.comparisons import (
-    algorithms_with_few_runs,
     compare_pairs,
     notes_over_runs,
     rank_algorithms,
@@ -93,19 +93,23 @@ def answer_questions(cases: Sequence[Case], question: str | None = None) -> list
     if question is not None and question not in QUESTIONS:
         raise unknown_name("question", f"there is no question {question!r}", question, QUESTIONS)
     metrics = tuple({metric.name: metric for case in cases for metric in case.scoring.metrics}.values())
-    answers, all_errors = [], []
+    answers, all_errors = list[Answer](), list[UnanswerableError]()
     for name in QUESTIONS if question is None else ("rq3.3", SAFETY_TABLE) if question == "rq3.3" else (question,):
-        frames, errors = _collect_frames(name, cases)
-        all_errors += errors
+        frames, notes, answered = list[pd.DataFrame](), list[str](), list[Case]()
+        for group in [cases] if name == WEATHER else [[case] for case in cases]:
+            try:
+                if name == WEATHER:
+                    pairs = find_weather_pairs(group)
+                    frames += [compare_weathers(*pair) for pair in pairs]
+                    answered += [case for case in group if any(case is one for pair in pairs for one in pair)]
+                else:
+                    frames.append(FRAMES_OF_ONE_CASE[name](*group))
+                    answered += group
+            except UnanswerableError as error:
+                all_errors.append(error)
+                notes.append(f"{error.source}: {error.problem}.")
         frame = pd.concat(frames, ignore_index=True) if frames else pd.DataFrame()
-        if name == WEATHER:
-            answered = {*frame["setting"], *frame["other"]} if frames else set()
-        else:
-            answered = {case.name for case in cases} - {error.source for error in errors}
-        notes = [f"{error.source}: {error.problem}." for error in errors]
-        notes += [
-            note for case in cases if case.name in answered for note in _notes(name, case, alone=question is not None)
-        ]
+        notes += [note for case in answered for note in _notes(name, case, alone=question is not None)]
         untested = frozenset(
             (case.name, algorithm)
             for case in cases
@@ -118,21 +122,15 @@ def answer_questions(cases: Sequence[Case], question: str | None = None) -> list
     return answers
 
 
-def _collect_frames(name: str, cases: Sequence[Case]) -> tuple[list[pd.DataFrame], list[UnanswerableError]]:
-    """The frames of a question, and an error for each case without a frame; weathers are compared over all cases at
-    once.
+def algorithms_with_few_runs(case: Case, question: str) -> list[str]:
+    """RQ1's algorithms or RQ2's baselines with too few runs for a significant test; none if the runs are unknown
+    (imported).
     """
-    frames, errors = [], []
-    for group in [cases] if name == WEATHER else [[case] for case in cases]:
-        try:
-            frames += (
-                [compare_weathers(*pair) for pair in find_weather_pairs(group)]
-                if name == WEATHER
-                else [FRAMES_OF_ONE_CASE[name](*group)]
-            )
-        except UnanswerableError as error:
-            errors.append(error)
-    return frames, errors
+    if not case.has_runs or (question == "RQ2" and NSGA2 not in case.algorithms):
+        return []
+    runs = {name: len(case.runs_of(name)) for name in case.algorithms}
+    most = runs.pop(NSGA2) if question == "RQ2" else math.inf
+    return [name for name, number in runs.items() if min(number, most) < fewest_runs(question)]
 
 
 def _notes(question: str, case: Case, *, alone: bool) -> list[str]:

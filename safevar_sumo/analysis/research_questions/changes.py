@@ -7,8 +7,7 @@ no run. In the frames, the columns `setting` and `other` hold the names of cases
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from itertools import permutations
 from typing import Any
 
@@ -18,7 +17,7 @@ import pandas as pd
 
 from safevar_sumo.ads import REACTION_PARAMETERS
 from safevar_sumo.analysis.research_questions.case import NSGA2, Case, UnanswerableError, are_collisions
-from safevar_sumo.records import BoolArray, FloatArray
+from safevar_sumo.records import FloatArray
 from safevar_sumo.study import SAFETY_DEGREE
 
 ANY = "any"
@@ -49,25 +48,25 @@ def changes_of(case: Case, solutions: pd.DataFrame) -> FloatArray:
     return np.asarray(solutions[list(case.characteristics.names)].to_numpy(dtype=float) - case.characteristics.original)
 
 
-def masks_by_change_count(case: Case, changes: FloatArray) -> dict[str, BoolArray]:
-    """For j = "1".."n" and "any": whether each solution has j characteristics changed, shape (M,)."""
-    change_counts = np.count_nonzero(changes, axis=1)
-    return {
-        **{str(j): change_counts == j for j in range(1, len(case.characteristics) + 1)},
-        ANY: np.ones(len(changes), dtype=bool),
-    }
+def change_numbers(case: Case) -> list[str]:
+    """The numbers of changed characteristics, "1".."n"."""
+    return [str(j) for j in range(1, len(case.characteristics) + 1)]
 
 
-def _means_by_change_count(case: Case, values: Mapping[tuple[str, ...], FloatArray]) -> list[tuple[Any, ...]]:
-    """For each key and j: key, j, and the mean (or None) and number of the critical solutions' values with j changes;
-    NaN is none.
+def _means_by_change_count(
+    case: Case, labels: Sequence[str], name: str, values: Iterable[tuple[tuple[str, ...], FloatArray]]
+) -> pd.DataFrame:
+    """The mean `name` and number `n` of the critical solutions' values with j changes, for each key and j; NaN is none.
+
+    Columns setting, the `labels` of the keys, j ("1".."n", "any"), `name`, n.
     """
-    rows: list[tuple[Any, ...]] = []
-    for key, column in values.items():
-        for j, mask in masks_by_change_count(case, changes_of(case, critical_solutions(case))).items():
-            sample = column[mask & ~np.isnan(column)]
-            rows.append((*key, j, float(np.mean(sample)) if sample.size else None, sample.size))
-    return rows
+    change_counts = np.count_nonzero(changes_of(case, critical_solutions(case)), axis=1)
+    rows = list[tuple[Any, ...]]()
+    for key, column in values:
+        for j in (*change_numbers(case), ANY):
+            sample = column[~np.isnan(column) & ((j == ANY) | (change_counts.astype(str) == j))]
+            rows.append((case.name, *key, j, np.mean(sample) if sample.size else np.nan, sample.size))
+    return pd.DataFrame(rows, columns=["setting", *labels, "j", name, "n"])
 
 
 def rq31(case: Case) -> pd.DataFrame:
@@ -75,37 +74,27 @@ def rq31(case: Case) -> pd.DataFrame:
     count.
     """
     solutions, runs = critical_solutions(case), case.runs_of(NSGA2)
-    masks = masks_by_change_count(case, changes_of(case, solutions))
-    rows = [
-        (case.name, run, j, int(np.count_nonzero((solutions["run"] == run) & mask)))
-        for run in runs
-        for j, mask in masks.items()
-        if j != ANY
-    ]
-    return pd.DataFrame(rows, columns=["setting", "run", "j", "count"])
+    change_counts = np.count_nonzero(changes_of(case, solutions), axis=1).astype(str)
+    counts = solutions.groupby([solutions["run"], change_counts]).size()
+    index = pd.MultiIndex.from_product([runs, change_numbers(case)], names=["run", "j"])
+    frame = counts.reindex(index, fill_value=0).reset_index(name="count")
+    frame.insert(0, "setting", case.name)
+    return frame
 
 
 def rq32(case: Case) -> pd.DataFrame:
     """For each characteristic and j: the share of the critical solutions with j changes that change this
     characteristic.
 
-    Columns setting, characteristic, j ("1".."n", "any"), percent (None without such a solution), rank (only for
+    Columns setting, characteristic, j ("1".."n", "any"), percent (undefined without such a solution), rank (only for
     j = "any"; ties share the better rank and the next one is skipped).
     """
     changed = changes_of(case, critical_solutions(case)) != 0
-    counts = changed.sum(axis=0)  # solutions that change each characteristic
-    ranks = {
-        name: 1 + int(np.count_nonzero(counts > count))
-        for name, count in zip(case.characteristics.names, counts, strict=True)
-    }
-    shares = _means_by_change_count(
-        case, {(name,): column for name, column in zip(ranks, changed.T.astype(float), strict=True)}
-    )
-    rows = [
-        (case.name, name, j, None if share is None else 100 * share, ranks[name] if j == ANY and len(changed) else None)
-        for name, j, share, _ in shares
-    ]
-    return pd.DataFrame(rows, columns=["setting", "characteristic", "j", "percent", "rank"], dtype=object)
+    values = {(name,): column.astype(float) for name, column in zip(case.characteristics.names, changed.T, strict=True)}
+    frame = _means_by_change_count(case, ["characteristic"], "percent", values.items()).drop(columns="n")
+    frame["percent"] *= 100
+    ranks = frame["percent"].where(frame["j"] == ANY).rank(method="min", ascending=False)
+    return frame.assign(rank=ranks.astype("Int64"))
 
 
 def rq33(case: Case) -> pd.DataFrame:
@@ -113,69 +102,46 @@ def rq33(case: Case) -> pd.DataFrame:
 
     Columns setting, characteristic, direction, j ("1".."n", "any"), pc (the paper's PC, a fraction: mean change
     relative to the original value, without sign), delta (mean signed change in the characteristic's unit), n (number of
-    changes); pc and delta are None where n is 0.
+    changes); pc and delta are undefined where n is 0.
     """
     changes = changes_of(case, critical_solutions(case))
     originals = dict(zip(case.characteristics.names, case.characteristics.original, strict=True))
-    means = _means_by_change_count(
-        case,
-        {
-            (name, direction): np.where(np.sign(column) == sign, column, np.nan)
-            for name, column in zip(originals, changes.T, strict=True)
-            for direction, sign in (("increase", 1), ("decrease", -1))
-        },
-    )
-    rows = [
-        (case.name, name, direction, j, None if mean is None else abs(mean / originals[name]), mean, n)
-        for name, direction, j, mean, n in means
-    ]
-    return pd.DataFrame(rows, columns=["setting", "characteristic", "direction", "j", "pc", "delta", "n"], dtype=object)
+    values = {
+        (name, direction): np.where(np.sign(column) == sign, column, np.nan)
+        for name, column in zip(originals, changes.T, strict=True)
+        for direction, sign in (("increase", 1), ("decrease", -1))
+    }
+    frame = _means_by_change_count(case, ["characteristic", "direction"], "delta", values.items())
+    frame.insert(4, "pc", (frame["delta"] / frame["characteristic"].map(originals)).abs())
+    return frame
 
 
 def rq33_safety(case: Case) -> pd.DataFrame:
     """Effect on safety of the critical solutions with j characteristics changed: the footer of RQ3.3's table.
 
     Columns setting, quantity, j, value, percent (of the original's value), n (number of solutions in the mean); value
-    is None where n is 0. Quantities:
+    is undefined where n is 0. Quantities:
 
     - avgSD_mD: mean reduction of the distance over solutions without collision [m];
     - avgSD_cS: mean collision speed over collisions [m/s]; it has no percent;
     - TET [s], TIT [s^2]: mean increase over solutions without collision;
     - aveDece: mean decrease over all solutions [m/s^2].
     """
-    solutions = critical_solutions(case)
+    solutions, original = critical_solutions(case), case.original
     has_collided = are_collisions(solutions).to_numpy()
     sd, tet, tit, dece = (solutions[name].to_numpy(dtype=float) for name in (SAFETY_DEGREE, "tet", "tit", "ave_dece"))
-    original = case.original
-    originals = {
-        "avgSD_mD": original[SAFETY_DEGREE],
-        "avgSD_cS": np.nan,
-        "TET": original["tet"],
-        "TIT": original["tit"],
-        "aveDece": original["ave_dece"],
+    values = {
+        ("avgSD_mD",): np.where(has_collided, np.nan, original[SAFETY_DEGREE] - sd),
+        ("avgSD_cS",): np.where(has_collided, -sd, np.nan),
+        ("TET",): np.where(has_collided, np.nan, tet - original["tet"]),
+        ("TIT",): np.where(has_collided, np.nan, tit - original["tit"]),
+        ("aveDece",): original["ave_dece"] - dece,
     }
-    means = _means_by_change_count(
-        case,
-        {
-            ("avgSD_mD",): np.where(has_collided, np.nan, original[SAFETY_DEGREE] - sd),
-            ("avgSD_cS",): np.where(has_collided, -sd, np.nan),
-            ("TET",): np.where(has_collided, np.nan, tet - original["tet"]),
-            ("TIT",): np.where(has_collided, np.nan, tit - original["tit"]),
-            ("aveDece",): original["ave_dece"] - dece,
-        },
-    )
-    rows = [
-        (
-            case.name,
-            quantity,
-            j,
-            mean,
-            None if mean is None or not (scale := abs(originals[quantity])) > 0 else 100 * mean / scale,
-            n,
-        )
-        for quantity, j, mean, n in means
-    ]
-    return pd.DataFrame(rows, columns=["setting", "quantity", "j", "value", "percent", "n"], dtype=object)
+    scales = {"avgSD_mD": SAFETY_DEGREE, "TET": "tet", "TIT": "tit", "aveDece": "ave_dece"}
+    frame = _means_by_change_count(case, ["quantity"], "value", values.items())
+    scale = frame["quantity"].map({quantity: abs(original[name]) or np.nan for quantity, name in scales.items()})
+    frame.insert(4, "percent", 100 * frame["value"] / scale)
+    return frame
 
 
 def count_collisions(case: Case) -> pd.DataFrame:
@@ -188,20 +154,17 @@ def count_collisions(case: Case) -> pd.DataFrame:
         If no run is finished.
     """
     case.require_solutions()
-    rows = []
-    for algorithm in case.algorithms:
-        solutions = case.solutions_of(algorithm)
-        collision_count = int(are_collisions(solutions).sum())
-        rows.append(
-            (
-                case.name,
-                algorithm,
-                len(solutions),
-                collision_count,
-                collision_count / len(solutions) if len(solutions) else None,
-            )
-        )
-    return pd.DataFrame(rows, columns=["setting", "algorithm", "solutions", "collisions", "share"], dtype=object)
+    by_algorithm = are_collisions(case.solutions).groupby(case.solutions["algorithm"])
+    counts = by_algorithm.agg(["size", "sum"]).reindex(list(case.algorithms), fill_value=0)
+    return pd.DataFrame(
+        {
+            "setting": case.name,
+            "algorithm": case.algorithms,
+            "solutions": counts["size"].to_numpy(),
+            "collisions": counts["sum"].to_numpy(),
+            "share": (counts["sum"] / counts["size"]).to_numpy(),
+        }
+    )
 
 
 def frequent_combinations(case: Case) -> pd.DataFrame:
@@ -213,17 +176,13 @@ def frequent_combinations(case: Case) -> pd.DataFrame:
     """
     is_changed = changes_of(case, critical_solutions(case)) != 0
     masks = is_changed[np.count_nonzero(is_changed, axis=1) == COMBINATION_SIZE]
-    counts = Counter(tuple(np.flatnonzero(mask).tolist()) for mask in masks)
-    ranking = sorted(counts.items(), key=lambda item: (-item[1], item[0]))[:COMBINATIONS_SHOWN]
-    names = case.characteristics.names
+    # Unique rows come in ascending order: reversed, the combination with the earliest characteristics is the first.
+    combinations, counts = (array[::-1] for array in np.unique(masks, axis=0, return_counts=True))
+    order = np.argsort(-counts, kind="stable")[:COMBINATIONS_SHOWN]
+    names = np.array(case.characteristics.names)
     rows = [
-        (
-            case.name,
-            1 + sum(other > count for other in counts.values()),
-            [names[i] for i in columns],
-            100 * count / len(masks),
-        )
-        for columns, count in ranking
+        (case.name, 1 + int(np.sum(counts > counts[i])), names[combinations[i]].tolist(), 100 * counts[i] / len(masks))
+        for i in order
     ]
     return pd.DataFrame(rows, columns=["setting", "rank", "characteristics", "percent"])
 
@@ -265,33 +224,16 @@ def compare_weathers(clearer: Case, other: Case) -> pd.DataFrame:
     """
     tables = []
     for case in (clearer, other):
-        shares, sizes = rq32(case), rq33(case)
-        deltas = sizes[sizes["j"] == ANY].pivot(index="characteristic", columns="direction", values="delta")
-        tables.append(shares[shares["j"] == ANY].set_index("characteristic")[["percent", "rank"]].join(deltas))
-    table = (
-        tables[0]
-        .join(tables[1].add_suffix("_other"))
-        .assign(
-            setting=clearer.name,
-            other=other.name,
-            difference=lambda rows: rows["percent_other"].astype(float) - rows["percent"].astype(float),
-        )
-    )
-    columns = [
-        "setting",
-        "other",
-        "characteristic",
-        "percent",
-        "percent_other",
-        "difference",
-        "rank",
-        "rank_other",
-        "increase",
-        "increase_other",
-        "decrease",
-        "decrease_other",
-    ]
-    return table.reset_index()[columns]
+        shares, sizes = (frame[frame["j"] == ANY] for frame in (rq32(case), rq33(case)))
+        deltas = sizes.pivot(index="characteristic", columns="direction", values="delta")
+        tables.append(shares.set_index("characteristic")[["percent", "rank"]].join(deltas))
+    ours, theirs = tables
+    columns = [suffixed for name in ("percent", "rank", "increase", "decrease") for suffixed in (name, f"{name}_other")]
+    table = ours.join(theirs.add_suffix("_other"))[columns].reset_index()
+    table.insert(3, "difference", table["percent_other"] - table["percent"])
+    table.insert(0, "other", other.name)
+    table.insert(0, "setting", clearer.name)
+    return table
 
 
 def _clearness(case: Case) -> tuple[float, float, float]:

@@ -9,7 +9,6 @@ In the frames, the column `setting` holds the case's name, and `method` the name
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterable, Mapping
 from itertools import combinations
 from typing import Any
@@ -36,73 +35,18 @@ from safevar_sumo.analysis.research_questions.statistics import (
     friedman_test,
     signed_rank_test,
 )
-from safevar_sumo.analysis.words import number_of
+from safevar_sumo.analysis.words import number_of, two_decimals
 from safevar_sumo.metrics import MetricFacts
 
-RQ1_COLUMNS = [
-    "setting",
-    "algorithm",
-    "metric",
-    "p_value",
-    "effect_size",
-    "magnitude",
-    "n1",
-    "n2",
-    "method",
-    "mean",
-    "original",
-]
-RQ2_COLUMNS = ["setting", "baseline", "metric", "p_value", "effect_size", "magnitude", "n1", "n2", "method"]
-RQ1_RUNS_COLUMNS = [
-    "setting",
-    "algorithm",
-    "metric",
-    "p_value",
-    "p_holm",
-    "effect_size",
-    "magnitude",
-    "runs",
-    "method",
-    "mean",
-    "original",
-]
-RQ2_RUNS_COLUMNS = [
-    "setting",
-    "baseline",
-    "metric",
-    "p_value",
-    "p_holm",
-    "effect_size",
-    "magnitude",
-    "n1",
-    "n2",
-    "method",
-]
-PAIR_COLUMNS = [
-    "setting",
-    "algorithm",
-    "other",
-    "metric",
-    "p_value",
-    "p_holm",
-    "effect_size",
-    "magnitude",
-    "n1",
-    "n2",
-    "method",
-]
-RANK_COLUMNS = [
-    "setting",
-    "metric",
-    "algorithm",
-    "mean_rank",
-    "median",
-    "runs",
-    "statistic",
-    "p_value",
-    "p_holm",
-    "critical_difference",
-]
+TEST_COLUMNS = ["effect_size", "magnitude", "n1", "n2", "method"]
+RQ1_COLUMNS = ["setting", "algorithm", "metric", "p_value", *TEST_COLUMNS, "mean", "original"]
+RQ2_COLUMNS = ["setting", "baseline", "metric", "p_value", *TEST_COLUMNS]
+RQ1_RUNS_COLUMNS = ["setting", "algorithm", "metric", "p_value", "p_holm", "effect_size", "magnitude", "runs", "method"]
+RQ1_RUNS_COLUMNS += ["mean", "original"]
+RQ2_RUNS_COLUMNS = ["setting", "baseline", "metric", "p_value", "p_holm", *TEST_COLUMNS]
+PAIR_COLUMNS = ["setting", "algorithm", "other", "metric", "p_value", "p_holm", *TEST_COLUMNS]
+RANK_COLUMNS = ["setting", "metric", "algorithm", "mean_rank", "median", "runs", "statistic", "p_value", "p_holm"]
+RANK_COLUMNS += ["critical_difference"]
 
 SampleFunction = Callable[[Case, str, MetricFacts], "pd.Series[float]"]
 """Returns an algorithm's values of a metric."""
@@ -360,17 +304,6 @@ def _samples_of_several(case: Case, min_algorithms: int) -> Samples:
     return _samples(case, run_means)
 
 
-def algorithms_with_few_runs(case: Case, question: str) -> list[str]:
-    """RQ1's algorithms or RQ2's baselines with too few runs for a significant test; none if the runs are unknown
-    (imported).
-    """
-    if not case.has_runs or (question == "RQ2" and NSGA2 not in case.algorithms):
-        return []
-    runs = {name: len(case.runs_of(name)) for name in case.algorithms}
-    most = runs.pop(NSGA2) if question == "RQ2" else math.inf
-    return [name for name, number in runs.items() if min(number, most) < fewest_runs(question)]
-
-
 def titles_of(metrics: Iterable[MetricFacts]) -> dict[str, str]:
     """Titles of metrics and quality indicators in tables, by name."""
     return {**INDICATOR_TITLES, **{metric.name: metric.title for metric in metrics}}
@@ -382,11 +315,6 @@ def _tests_over_runs(case: Case) -> pd.DataFrame:
 
     `pooled_p` is the p-value over the paper's pooled solutions; `enough` is whether there are enough runs for the test
     to be significant.
-
-    Raises
-    ------
-    UnanswerableError
-        If `rq1_runs` raises it.
     """
     frames, titles = [], titles_of(case.scoring.metrics)
     for question, frame in compare_over_runs(case).items():
@@ -445,40 +373,27 @@ def significance_change_line(case: Case) -> str:
 
 
 def summary_lines(case: Case) -> list[str]:
-    """Lines on RQ1 and RQ2 for the end of a study: effect sizes over runs, significant ones with an asterisk.
-
-    A line says so if there are too few runs for a significant difference. The last line is `significance_change_line`.
-    """
-    lines, any_testable = list[str](), False
-    questions = (
-        (
-            "RQ1",
-            compare_over_runs,
-            "A12 below 0.5: the runs are more unsafe than the original vehicle",
-            "A12 of {} against the original vehicle",
-        ),
-        ("RQ2", _nsga2_pairs, "A12 above 0.5: NSGA-II is better", "A12 of NSGA-II against {}"),
-    )
-    for question, check, meaning, heading in questions:
-        try:
-            check(case)
-            tests = _tests_over_runs(case)
-        except UnanswerableError as error:
-            lines.append(f"{question} over runs: {error.problem}.")
-            continue
-        lines.append(f"{question} over runs: {meaning}; * p < {ALPHA:g} after Holm's correction")
+    """Lines on RQ1 and RQ2 for the end of a study: effect sizes over runs, significant ones with an asterisk."""
+    try:
+        tests = _tests_over_runs(case)
+    except UnanswerableError as error:
+        return [f"RQ1 and RQ2 over runs: {error.problem}."]
+    lines = list[str]()
+    for question, meaning, heading in (
+        ("RQ1", "below 0.5: the runs are more unsafe than the original vehicle", "{} against the original vehicle"),
+        ("RQ2", "above 0.5: NSGA-II is better", "NSGA-II against {}"),
+    ):
+        lines.append(f"{question} over runs: A12 {meaning}; * p < {ALPHA:g} after Holm's correction")
         for name, group in tests[tests["question"] == question].groupby("algorithm", sort=False):
-            defined_tests = group.dropna(subset="effect_size")
-            untestable = defined_tests.loc[~defined_tests["enough"], "metric"]
-            is_any_testable = bool(defined_tests["enough"].any())
-            named_metrics = f"{', '.join(untestable)}: " if is_any_testable else ""
-            too_few = f"; {named_metrics}too few runs for a test ({fewest_runs(question)} are needed)"
-            effects = [
-                f"{test['metric']} -"
-                if test["p_holm"] is None
-                else f"{test['metric']} {test['effect_size']:.2f}{'*' if test['p_holm'] < ALPHA else ''}"
-                for test in group.to_dict("records")
-            ]
-            lines.append(f"  {heading.format(name)}: {', '.join(effects)}{too_few if len(untestable) else ''}")
-            any_testable = any_testable or is_any_testable
-    return [*lines, significance_change_line(case)] if any_testable else lines
+            marks = np.where(group["p_holm"].astype(float) < ALPHA, "*", "")
+            effects = group["metric"] + " " + group["effect_size"].map(two_decimals) + marks
+            untestable = ", ".join(group.loc[~group["enough"] & group["effect_size"].notna(), "metric"])
+            too_few = (
+                f"; too few runs for a test ({fewest_runs(question)} are needed): {untestable}" if untestable else ""
+            )
+            lines.append(f"  A12 of {heading.format(name)}: {', '.join(effects)}{too_few}")
+    try:
+        _nsga2_pairs(case)
+    except UnanswerableError as error:
+        lines[-1] = f"RQ2 over runs: {error.problem}."
+    return [*lines, significance_change_line(case)] if tests["enough"].any() else lines

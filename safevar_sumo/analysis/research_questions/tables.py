@@ -1,14 +1,274 @@
-"""Answers as text, Markdown, LaTeX, CSV and JSON."""
+"""Answers as tables for readers (text, Markdown, LaTeX), and as data (CSV, JSON)."""
 
 from __future__ import annotations
 
 import json
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
-from safevar_sumo.analysis.research_questions.answer import Answer
-from safevar_sumo.analysis.research_questions.layout import LAYOUTS, BoldText, Layouts, Table, lay_out
+import numpy as np
+import pandas as pd
+
+from safevar_sumo.analysis.research_questions.answer import SAFETY_TABLE, Answer
+from safevar_sumo.analysis.research_questions.case import ALGORITHM_TITLES
+from safevar_sumo.analysis.research_questions.comparisons import titles_of
+from safevar_sumo.analysis.research_questions.statistics import ALPHA, EXACT_TEST, NOTABLE_MAGNITUDES
+from safevar_sumo.analysis.words import join_phrases
+from safevar_sumo.metrics import MetricFacts
+
+UNDEFINED = "-"
+SAFETY_UNITS = {
+    "avgSD_mD": "avgSD_mD [m]",
+    "avgSD_cS": "avgSD_cS [m/s]",
+    "TET": "TET [s]",
+    "TIT": "TIT [s^2]",
+    "aveDece": "aveDece [m/s^2]",
+}
+CELL_FORMATS = {
+    **dict.fromkeys(("mean", "original", "mean_rank", "critical_difference", "value"), ".2f"),
+    **dict.fromkeys(("share", "pc"), ".1%"),
+    **dict.fromkeys(("percent", "percent_other"), ".1f"),
+    "difference": "+.1f",
+    "effect_size": ".3f",
+    **dict.fromkeys(("rank", "rank_other", "n1", "n2", "runs", "solutions", "collisions"), "d"),
+    **dict.fromkeys(("delta", "increase", "increase_other", "decrease", "decrease_other"), "+.3g"),
+    **dict.fromkeys(("min", "Q1", "median", "Q3", "max"), "g"),
+}
+"""Format specifications of the frames' columns."""
+HEADINGS = {
+    "setting": "case",
+    "p_value": "p",
+    "p_holm": "p Holm",
+    "effect_size": "A12",
+    "critical_difference": "critical difference",
+    "pc": "PC",
+    "percent": "%",
+    "percent_other": "% in the other",
+    "rank_other": "rank in the other",
+    "increase_other": "increase in the other",
+    "decrease_other": "decrease in the other",
+}
+
+
+class BoldText(str):
+    """A cell in bold."""
+
+
+class Table(NamedTuple):
+    """A table for readers: cells of text, with the labels of the rows as the frame's index, and headings as columns."""
+
+    title: str
+    frame: pd.DataFrame
+    notes: tuple[str, ...] = ()
+
+
+class Layout(NamedTuple):
+    """A table of an answer: a row for each combination of `labels`, and a block of `columns` for each value of `over`.
+
+    `separate` are columns for whose values there are separate tables; `title` follows the answer's title.
+    """
+
+    labels: Sequence[str]
+    columns: Sequence[str] | str
+    over: str | None = "setting"
+    separate: Sequence[str] = ()
+    title: str = ""
+
+
+TESTS = ["p_value", "effect_size", "magnitude", "n1", "n2"]
+WEATHER_COLUMNS = ["percent", "percent_other", "difference", "rank", "rank_other", "increase", "increase_other"]
+WEATHER_COLUMNS += ["decrease", "decrease_other"]
+HOLM_TESTS = ["p_value", "p_holm", "effect_size", "magnitude"]
+LAYOUTS: Mapping[str, Sequence[Layout]] = {
+    "rq1": [
+        Layout(["algorithm", "metric"], TESTS),
+        Layout(["metric", "original"], "mean", "algorithm", ["setting"], ", mean metrics"),
+    ],
+    "rq2": [Layout(["baseline", "metric"], TESTS)],
+    "rq1-runs": [Layout(["algorithm", "metric"], [*HOLM_TESTS, "runs"])],
+    "rq2-runs": [Layout(["baseline", "metric"], [*HOLM_TESTS, "n1", "n2"])],
+    "rq2-pairs": [Layout(["algorithm", "other", "metric"], HOLM_TESTS)],
+    "rq2-ranks": [
+        Layout(["metric", "runs", "p_value", "p_holm", "critical_difference"], "mean_rank", "algorithm", ["setting"])
+    ],
+    "rq3.1": [Layout(["j"], ["min", "Q1", "median", "Q3", "max"])],
+    "rq3.2": [Layout(["characteristic", "rank"], "percent", "j", ["setting"])],
+    "rq3.3": [
+        Layout(["characteristic", "direction"], "pc", "j", ["setting"], ", PC"),
+        Layout(["characteristic", "direction"], "delta", "j", ["setting"], ", delta"),
+    ],
+    SAFETY_TABLE: [
+        Layout(["quantity"], "value", "j", ["setting"], ", mean"),
+        Layout(["quantity"], "percent", "j", ["setting"], ", % of the original"),
+    ],
+    "collisions": [Layout(["algorithm"], ["solutions", "collisions", "share"])],
+    "combinations": [Layout(["setting", "rank", "characteristics"], ["percent"], None)],
+    "weather": [Layout(["characteristic"], WEATHER_COLUMNS, None, ["setting", "other"])],
+}
+HOLM_LEGEND = f"bold or *: p < {ALPHA:g} after Holm"
+TITLES = {
+    "rq1": "RQ1: solutions against the original vehicle",
+    "rq2": "RQ2: NSGA-II against the other algorithms",
+    "rq1-runs": f"RQ1 over runs: run means against the original vehicle ({HOLM_LEGEND})",
+    "rq2-runs": f"RQ2 over runs: NSGA-II's runs against those of the other algorithms ({HOLM_LEGEND})",
+    "rq2-pairs": f"RQ2 for every pair of algorithms, over runs ({HOLM_LEGEND})",
+    "rq2-ranks": f"RQ2: ranks of the algorithms over runs (1 is best; {HOLM_LEGEND})",
+    "rq3.1": "RQ3.1: number of changed characteristics",
+    "rq3.2": "RQ3.2: % of critical solutions in which a characteristic is changed",
+    "rq3.3": "RQ3.3: size of changes",
+    SAFETY_TABLE: "RQ3.3: effect of the changes on safety",
+    "collisions": "Collisions among the solutions",
+    "combinations": "The most frequent combinations of four changes",
+    "weather": "One weather against another",
+}
+BOLD_NOTE = f"Bold (or *): p < {ALPHA:g}; A12 also of medium or large magnitude."
+HOLM_NOTE = f"Bold (or *): p < {ALPHA:g} after Holm's correction for all tests of a case's RQ1 and RQ2."
+NOTES: Mapping[str, Sequence[str]] = {
+    "rq1": [
+        "A12 below 0.5: the algorithm's solutions are more unsafe than the original vehicle.",
+        "The original vehicle's value is repeated to the sample's size.",
+        BOLD_NOTE,
+    ],
+    "rq2": [
+        "A12 above 0.5: NSGA-II is better. IGD, IGD+ and HV compare runs;",
+        "the other metrics compare pooled solutions.",
+        "IGD on the objectives as they are, IGD+ and hypervolume (HV) on normalised ones.",
+        BOLD_NOTE,
+    ],
+    "rq1-runs": [
+        "One mean for each run against the original vehicle's value; A12 below 0.5: the runs are more unsafe.",
+        HOLM_NOTE,
+    ],
+    "rq2-runs": [
+        "One value for each run (for safety metrics, the mean over its solutions).",
+        "A12 above 0.5: NSGA-II is better.",
+        HOLM_NOTE,
+    ],
+    "rq2-pairs": [
+        "One value for each run; A12 above 0.5: the first is better (a better front, more unsafe solutions).",
+        "Holm's correction is for all pairs and metrics of a case.",
+    ],
+    "rq2-ranks": [
+        "p: Friedman's test; runs with the same number form a block.",
+        "Holm's correction is for all metrics of a case.",
+        f"Ranks closer than the critical difference are not distinguished (Nemenyi, {ALPHA:g}).",
+    ],
+    "rq3.1": ["Critical solutions of a run with exactly j characteristics changed, over the runs."],
+    "rq3.2": ["Columns: number of characteristics changed; ranked by 'any'."],
+    "rq3.3": [
+        "PC: mean of |v - v''| / v (v'': filtered, v: original value).",
+        "delta: mean signed change in the characteristic's unit.",
+    ],
+    SAFETY_TABLE: [
+        "Without collisions: avgSD_mD is the reduction of the distance, TET and TIT are increases.",
+        "avgSD_cS is the speed of the collisions. aveDece is the decrease over all solutions.",
+    ],
+    "combinations": ["Percent of the critical solutions with exactly four characteristics changed."],
+    "weather": ["Over the critical solutions; increase and decrease: mean, in the characteristic's unit."],
+}
+
+
+def lay_out(answer: Answer) -> list[Table]:
+    """The tables of an answer, with notes below the last one; for an empty answer a table with the reason."""
+    if answer.frame.empty:
+        return [Table(TITLES[answer.name], pd.DataFrame(), answer.notes)]
+    frame, tables = _readable_frame(answer), []
+    for layout in LAYOUTS[answer.name]:
+        for key, group in frame.groupby(list(layout.separate), sort=False) if layout.separate else [((), frame)]:
+            title = f"{TITLES[answer.name]}{layout.title}" + (f": {' against '.join(map(str, key))}" if key else "")
+            tables.append(Table(title, _arrange(group, layout)))
+    methods = [
+        f"p{' with e' if method == EXACT_TEST and 'p_holm' not in frame else ''}: {method}."
+        for method in (answer.frame["method"].dropna().unique() if "method" in answer.frame else ())
+    ]
+    metric_notes = [_note_on_metrics(answer.metrics)] if "metric" in answer.frame else []
+    notes = (*methods, *NOTES.get(answer.name, ()), *metric_notes, *answer.notes)
+    return [*tables[:-1], tables[-1]._replace(notes=notes)]
+
+
+def _arrange(frame: pd.DataFrame, layout: Layout) -> pd.DataFrame:
+    labels = frame[list(layout.labels)].rename(columns=HEADINGS)
+    cells = frame.set_index(
+        pd.MultiIndex.from_frame(labels) if len(labels.columns) > 1 else pd.Index(labels.iloc[:, 0])
+    )
+    if layout.over is None:
+        return cells[layout.columns].rename(columns=HEADINGS)
+    blocks = {
+        block: group[layout.columns]
+        if isinstance(layout.columns, str)
+        else group[layout.columns].rename(columns=HEADINGS)
+        for block, group in cells.groupby(layout.over, sort=False)
+    }
+    return pd.concat(blocks, axis=1).fillna(UNDEFINED)
+
+
+def _readable_frame(answer: Answer) -> pd.DataFrame:
+    """The frame with titles in place of names and numbers as text."""
+    name, frame = answer.name, answer.frame
+    if name == "rq3.1":
+        counts, quartiles = frame.groupby(["setting", "j"], sort=False)["count"], ("min", "Q1", "median", "Q3", "max")
+        frame = pd.DataFrame({quartile: counts.quantile(k / 4) for k, quartile in enumerate(quartiles)}).reset_index()
+    if name == "rq3.2":
+        frame = frame.assign(rank=frame.groupby(["setting", "characteristic"], sort=False)["rank"].transform("max"))
+    if name == "combinations":
+        frame = frame.assign(characteristics=frame["characteristics"].map(", ".join))
+    cells, titles = frame.copy(), {**ALGORITHM_TITLES, **SAFETY_UNITS, **titles_of(answer.metrics)}
+    for column in cells.columns.intersection(list(CELL_FORMATS)):
+        cells[column] = [_format(value, CELL_FORMATS[column]) for value in frame[column]]
+    for column in ("algorithm", "baseline", "metric", "quantity", *(["other"] if name == "rq2-pairs" else [])):
+        if column in frame:
+            cells[column] = frame[column].map(lambda value: titles.get(value, value))
+    return _mark_tests(cells, answer) if "p_value" in frame else cells
+
+
+def _mark_tests(cells: pd.DataFrame, answer: Answer) -> pd.DataFrame:
+    """P-values as text, and what stands out in bold: significant p-values (after Holm's correction if the frame has
+    it), and significant effect sizes, without the correction only notable ones.
+    """
+    frame = answer.frame
+    p_values = {name: frame[name].map(_format_p_value) for name in ("p_value", "p_holm") if name in frame}
+    name = list(p_values)[-1]
+    is_significant = is_notable = frame[name].astype(float) < ALPHA
+    if name == "p_value":
+        algorithms = frame["algorithm" if answer.name == "rq1" else "baseline"]
+        is_tested = [pair not in answer.untested for pair in zip(frame["setting"], algorithms, strict=True)]
+        is_significant &= np.array(is_tested)
+        is_notable = is_significant & frame["magnitude"].isin(NOTABLE_MAGNITUDES)
+        p_values[name] += np.where(frame["method"] == EXACT_TEST, "e", "")
+    cells = cells.assign(**p_values)
+    cells[name] = _bold_where(cells[name], is_significant)
+    if "effect_size" in cells:
+        cells["effect_size"] = _bold_where(cells["effect_size"], is_notable)
+    return cells
+
+
+def _format_p_value(value: float | None) -> str:
+    return "<0.001" if value is not None and value < 0.001 else _format(value, ".3f")
+
+
+def _bold_where(cells: pd.Series[str], conditions: pd.Series[bool]) -> list[str]:
+    return [BoldText(cell) if is_bold else cell for cell, is_bold in zip(cells, conditions, strict=True)]
+
+
+def _format(value: float | None, spec: str) -> str:
+    if value is None or pd.isna(value):
+        return UNDEFINED
+    return format(int(value) if spec == "d" else value, spec)
+
+
+def _note_on_metrics(metrics: Iterable[MetricFacts]) -> str:
+    """The metrics' units, and the solutions over which each metric is taken."""
+    titles: dict[bool, list[str]] = {False: [], True: []}
+    for metric in metrics:
+        titles[metric.over_collisions].append(metric.title + (f" [{metric.unit}]" if metric.unit != "-" else ""))
+    parts = [
+        f"{join_phrases(names)} over {which}"
+        for names, which in ((titles[False], "solutions without collision"), (titles[True], "all solutions"))
+        if names
+    ]
+    return f"{'; '.join(parts)}."
+
 
 LATEX_NEEDS = "% In the preamble: " + " ".join(
     rf"\usepackage{name}" for name in ("[T1]{fontenc}", "{textcomp}", "{booktabs}", "{graphicx}")
@@ -24,61 +284,49 @@ _LATEX_CODES = str.maketrans(
 )
 
 
-def as_text(answers: Sequence[Answer], layouts: Layouts = LAYOUTS) -> str:
+def as_text(answers: Sequence[Answer]) -> str:
     """Text for a terminal: aligned columns, bold cells with an asterisk."""
     texts = []
-    for table in (table for answer in answers for table in lay_out(answer, layouts)):
+    for table in (table for answer in answers for table in lay_out(answer)):
         cells = table.frame.map(lambda cell: f"{cell}*" if isinstance(cell, BoldText) else f"{cell} ")
         body = [] if cells.empty else ["\n".join(line.rstrip() for line in cells.to_string().splitlines()), ""]
         texts.append("\n".join([table.title, "", *body, *table.notes, ""]))
     return "\n".join(texts)
 
 
-def as_markdown(answers: Sequence[Answer], layouts: Layouts = LAYOUTS) -> str:
+def as_markdown(answers: Sequence[Answer]) -> str:
     """Markdown tables; a heading over several columns is repeated in each column's heading."""
     texts = []
-    for table in (table for answer in answers for table in lay_out(answer, layouts)):
-        body = (
-            []
-            if table.frame.empty
-            else [
-                markdown_table(
-                    table.headings(), table.frame.reset_index().to_numpy().tolist(), table.frame.index.nlevels
-                ),
-                "",
-            ]
-        )
-        texts.append(
-            "\n".join(
-                [f"**{_markdown(table.title)}**", "", *body, *(f"{_markdown(note)}  " for note in table.notes), ""]
-            )
-        )
+    for table in (table for answer in answers for table in lay_out(answer)):
+        frame, body = table.frame, list[str]()
+        if not frame.empty:
+            columns = frame.columns.to_frame().astype(str)
+            blocks = columns if columns.shape[1] == 1 or columns[0].nunique() > 1 else columns[[1]]
+            headings = [*map(str, frame.index.names), *blocks.agg(": ".join, axis=1)]
+            body = [markdown_table([headings, *frame.reset_index().to_numpy().tolist()], frame.index.nlevels), ""]
+        notes = (f"{_markdown(note)}  " for note in table.notes)
+        texts.append("\n".join([f"**{_markdown(table.title)}**", "", *body, *notes, ""]))
     return "\n".join(texts)
 
 
-def markdown_table(headings: Sequence[str], rows: Iterable[Sequence[str]], label_count: int) -> str:
+def markdown_table(rows: Iterable[Sequence[str]], label_count: int) -> str:
     """A Markdown table of texts; all columns but the first `label_count` are aligned to the right."""
-    rule = [":---" if i < label_count else "---:" for i in range(len(headings))]
-    lines = [
-        rule
-        if cells is rule
-        else [f"**{_markdown(cell)}**" if isinstance(cell, BoldText) else _markdown(cell) for cell in cells]
-        for cells in (headings, rule, *rows)
+    head, *lines = [
+        [f"**{_markdown(cell)}**" if isinstance(cell, BoldText) else _markdown(cell) for cell in cells]
+        for cells in rows
     ]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+    rule = [":---" if i < label_count else "---:" for i in range(len(head))]
+    return "\n".join(f"| {' | '.join(line)} |" for line in (head, rule, *lines))
 
 
 def _markdown(source: str) -> str:
     return re.sub(r"([\\`*_|<>\[\]~^#$])", r"\\\1", source.replace("\n", " "))
 
 
-def as_latex(answers: Sequence[Answer], layouts: Layouts = LAYOUTS) -> str:
+def as_latex(answers: Sequence[Answer]) -> str:
     r"""Booktabs tables for `\input`, each with a label: `tab:rq1`, and `tab:rq1-2` for an answer's second table."""
-    tables = [
-        _render_latex(table, f"{answer.name}-{i}" if i > 1 else answer.name)
-        for answer in answers
-        for i, table in enumerate(lay_out(answer, layouts), 1)
-    ]
+    numbered = ((answer.name, i, table) for answer in answers for i, table in enumerate(lay_out(answer), 1))
+    tables = [_render_latex(table, f"{name}-{i}" if i > 1 else name) for name, i, table in numbered]
     return "\n".join([LATEX_NEEDS, *tables])
 
 
@@ -140,7 +388,11 @@ def as_json(answers: Sequence[Answer]) -> str:
     return json.dumps(rows, indent=2, allow_nan=False) + "\n"
 
 
-FORMATS_WITH_LAYOUT: Mapping[str, Callable[..., str]] = {"text": as_text, "markdown": as_markdown, "latex": as_latex}
-"""Formats for human readers, whose functions take a layout; the other formats hold the frames."""
-FORMATS: Mapping[str, Callable[..., str]] = {**FORMATS_WITH_LAYOUT, "csv": as_csv, "json": as_json}
+FORMATS: Mapping[str, Callable[[Sequence[Answer]], str]] = {
+    "text": as_text,
+    "markdown": as_markdown,
+    "latex": as_latex,
+    "csv": as_csv,
+    "json": as_json,
+}
 ENDINGS = {"text": "txt", "markdown": "md", "latex": "tex", "csv": "csv", "json": "json"}

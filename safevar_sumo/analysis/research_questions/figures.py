@@ -1,0 +1,359 @@
+"""All figures of results by name: how algorithms compare (RQ1, RQ2), and what critical solutions change (RQ3)."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from itertools import combinations, cycle
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from safevar_sumo.analysis.figures import (
+    BLUE,
+    FONT,
+    SKY_BLUE,
+    VERMILION,
+    as_formula,
+    escape_dollars,
+    new_figure,
+    new_panels,
+    save,
+)
+from safevar_sumo.analysis.research_questions.case import ALGORITHM_TITLES, Case, UnanswerableError
+from safevar_sumo.analysis.research_questions.changes import ANY, changes_of, critical_solutions, rq31, rq32
+from safevar_sumo.analysis.research_questions.comparisons import rank_algorithms
+from safevar_sumo.analysis.research_questions.indicators import (
+    INDICATOR_TITLES,
+    REFERENCE_COORDINATE,
+    SURFACE_PERCENTAGES,
+    compute_attainment,
+    compute_convergence,
+    defined_minimised_values,
+    nondominated_points,
+)
+from safevar_sumo.analysis.research_questions.statistics import ALPHA
+from safevar_sumo.analysis.words import number_of
+from safevar_sumo.metrics import F_DIFF, F_NUM_DIFF, F_SAFE, Objective
+from safevar_sumo.study import SAFETY_DEGREE
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
+"""Okabe and Ito's colours, which colour-blind readers can distinguish; each also has its own marker."""
+MARKERS = ("o", "X", "^", "s", "D", "v")
+OBJECTIVE_TITLES = {
+    F_SAFE.name: "f_safe: safety degree [m, -m/s]",
+    F_DIFF.name: "f_diff: largest change [fraction of the original]",
+    F_NUM_DIFF.name: "f_numDiff: characteristics changed",
+}
+LONGEST_NAME = 28
+"""Number of letters of a name that fit above a small axis."""
+BIN_COUNT = 24
+"""Number of bins over a characteristic's domain."""
+
+
+def draw_pareto_fronts(case: Case) -> Figure:
+    """The non-dominated solutions of all runs of each algorithm together, for every pair of objectives.
+
+    Each panel also shows the original vehicle; solutions on the dashed line or to its left are collisions.
+
+    Raises
+    ------
+    UnanswerableError
+        If there is no solution.
+    """
+    objectives = case.scoring.objectives
+    fronts = {
+        algorithm: nondominated_points(points) * [objective.sign for objective in objectives]
+        for algorithm in case.algorithms
+        if len(points := defined_minimised_values(case, case.solutions_of(algorithm)))
+    }
+    if not fronts:
+        raise UnanswerableError(case.name, "has no solution", "results with at least one finished run")
+    pairs = list(combinations(range(len(objectives)), 2))
+    title = f"{case.name}: non-dominated solutions of each algorithm, all runs together"
+    figure, axes = new_panels(title, len(pairs), 3, (3.2, 3.7), min_width=5.0, title_height=0.0)
+    known_values = {F_DIFF.name: 0.0, F_NUM_DIFF.name: 0.0, F_SAFE.name: case.original.get(SAFETY_DEGREE, np.nan)}
+    original = [{**case.original, **known_values}.get(objective.name, np.nan) for objective in objectives]
+    for axis, pair in zip(axes, pairs, strict=True):
+        for (algorithm, points), colour, marker in zip(fronts.items(), cycle(COLOURS), cycle(MARKERS), strict=False):
+            label = f"{_title(algorithm)} ({len(points)})"
+            x, y = points[:, pair].T
+            axis.scatter(x, y, marker=marker, s=16, alpha=0.6, linewidths=0, color=colour, label=label)
+        x, y = (original[i] for i in pair)
+        axis.scatter(x, y, marker="*", s=80, color="black", label="original vehicle")
+        if objectives[pair[0]] == F_SAFE:
+            axis.axvline(0, color="black", linewidth=0.8, linestyle="--", label="collision: 0 or less")
+        _label_axes(axis, [objectives[i] for i in pair])
+    _add_legend_below(figure, axes[0])
+    return figure
+
+
+def draw_convergence(case: Case) -> Figure:
+    """The hypervolume of all settings so far over the number of evaluations, as median and range over the runs."""
+    import seaborn as sns
+
+    growth = compute_convergence(case)
+    runs = growth.groupby("algorithm", sort=False)["run"].nunique()
+    labels = {algorithm: f"{_title(str(algorithm))} ({count} runs)" for algorithm, count in runs.items()}
+    figure, ((axis,),) = new_figure(f"{case.name}: convergence", rows=1, columns=1, size=(6.4, 4.0))
+    sns.lineplot(
+        growth.assign(algorithm=growth["algorithm"].map(labels)),
+        x="evaluations",
+        y="hypervolume",
+        hue="algorithm",
+        style="algorithm",
+        estimator="median",
+        errorbar=("pi", 100),
+        palette=COLOURS[: len(labels)],
+        ax=axis,
+    )
+    axis.set_ylabel(
+        "normalised hypervolume of all settings so far\n(line: median, band: range over runs; "
+        f"reference point {REFERENCE_COORDINATE:g})"
+    )
+    _add_legend_below(figure, axis)
+    axis.get_legend().remove()
+    return figure
+
+
+def draw_critical_differences(case: Case) -> Figure:
+    """Mean ranks of the algorithms for each quality indicator; Nemenyi's test does not distinguish ranks whose bars
+    overlap.
+
+    Raises
+    ------
+    UnanswerableError
+        If there are fewer than three algorithms, or too few runs in which all of them have solutions.
+    """
+    frame = rank_algorithms(case)
+    frame = frame[frame["metric"].isin(list(INDICATOR_TITLES))].dropna(subset="mean_rank")
+    runs, difference = frame[["runs", "critical_difference"]].max().fillna(0.0)
+    if not runs or difference >= frame["algorithm"].nunique() - 1:
+        problem = f"{number_of(int(runs), 'run')} in which every algorithm has solutions are too few for a figure"
+        raise UnanswerableError(
+            case.name, f"{problem} of critical differences: all bars would overlap", "results of more runs"
+        )
+    groups = frame.groupby("metric", sort=False)
+    title = f"{case.name}: mean ranks over {runs} runs, critical difference {difference:.2f}"
+    height = 0.9 + 0.6 * len(groups) + 0.34 * len(frame)
+    figure, axes = new_figure(title, len(groups), 1, (6.8, height))
+    for axis, (metric, ranks) in zip(axes.flat, groups, strict=True):
+        ranks = ranks.sort_values("mean_rank", ascending=False, kind="stable")
+        names = [f"{_title(row['algorithm'])} {row['mean_rank']:.2f}" for row in ranks.to_dict("records")]
+        axis.errorbar(
+            ranks["mean_rank"], names, xerr=difference / 2, linestyle="", marker="o", color=COLOURS[0], capsize=3
+        )
+        axis.set(ylabel=INDICATOR_TITLES[str(metric)], xlabel="mean rank, 1 is best")
+        axis.margins(y=0.25)
+    figure.supxlabel(
+        "bars of one critical difference: ranks whose bars overlap are not distinguished "
+        f"(Nemenyi's test at {ALPHA:g})",
+        fontsize=FONT,
+    )
+    return figure
+
+
+def draw_attainment_surfaces(case: Case) -> Figure:
+    """What at least one run, half of the runs and every run of each algorithm attain in the first two objectives.
+
+    Raises
+    ------
+    UnanswerableError
+        If there are no runs with solutions.
+    """
+    surfaces, objectives = compute_attainment(case), case.scoring.objectives[:2]
+    figure, axes = new_panels(f"{case.name}: empirical attainment", len(surfaces), 3, (3.0, 3.1), 5.2, 0.8)
+    for axis in axes[1:]:
+        axis.sharex(axes[0])
+        axis.sharey(axes[0])
+    signs = np.array([objective.sign for objective in objectives])
+    worst = np.max([np.max(points * signs, axis=0) for surface in surfaces.values() for points in surface.values()], 0)
+    labels = {SURFACE_PERCENTAGES[0]: "half of the runs", SURFACE_PERCENTAGES[1]: "every run"}
+    for axis, (algorithm, surface) in zip(axes, surfaces.items(), strict=True):
+        for (percentage, points), colour, dashes in zip(surface.items(), COLOURS, ("-", "--", "-."), strict=False):
+            minimised = points * signs
+            border = np.vstack([[minimised[0, 0], worst[1]], minimised, [worst[0], minimised[-1, 1]]]) * signs
+            label = labels.get(percentage, "at least one run")
+            axis.step(*border.T, where="post", color=colour, linestyle=dashes, label=label)
+        axis.set_title(_title(algorithm), fontsize=FONT)
+        _label_axes(axis, objectives)
+    _add_legend_below(figure, axes[0])
+    return figure
+
+
+def _label_axes(axis: Axes, objectives: Sequence[Objective]) -> None:
+    labels = [
+        OBJECTIVE_TITLES.get(objective.name) or f"{escape_dollars(objective.title)} [{as_formula(objective.unit)}]"
+        for objective in objectives
+    ]
+    axis.set(xlabel=labels[0], ylabel=labels[1])
+
+
+def _add_legend_below(figure: Figure, axis: Axes) -> None:
+    handles, labels = axis.get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=min(len(labels), 3), frameon=False, fontsize=FONT)
+
+
+def _title(algorithm: str) -> str:
+    return escape_dollars(ALGORITHM_TITLES.get(algorithm, algorithm))
+
+
+def draw_change_counts(cases: Sequence[Case]) -> Figure:
+    """RQ3.1: number of critical solutions of a run with j characteristics changed, as box plots over the runs; a panel
+    per case.
+
+    Raises
+    ------
+    UnanswerableError
+        If `rq31` raises it for a case.
+    """
+    frames = [rq31(case) for case in cases]
+    title = "number of changed characteristics"
+    figure, axes = new_panels(title, len(cases), 3, (3.9, 3.3), min_width=6.4, title_height=0.5)
+    for axis, case, counts in zip(axes, cases, frames, strict=True):
+        numbers, samples = zip(*counts.groupby("j", sort=False)["count"], strict=True)
+        axis.boxplot(samples, tick_labels=numbers, widths=0.8, patch_artist=True, boxprops={"facecolor": SKY_BLUE})
+        runs = counts["run"].nunique()
+        axis.set(xlabel="characteristics changed", ylabel=f"critical solutions per run\n({runs} runs)")
+        axis.set_title(escape_dollars(case.name), fontsize=FONT)
+        axis.locator_params(axis="y", integer=True, min_n_ticks=1)
+    return figure
+
+
+def draw_changed_characteristics(case: Case) -> Figure:
+    """RQ3.2 as a heat map: the share of critical solutions with j changed characteristics in which each characteristic
+    is changed.
+    """
+    import seaborn as sns
+
+    _count_critical_solutions(case)
+    shares = rq32(case)
+    order = shares[shares["j"] == ANY].sort_values("rank", kind="stable")["characteristic"]
+    table = shares.pivot(index="characteristic", columns="j", values="percent").loc[order, list(shares["j"].unique())]
+    title = f"{case.name}: characteristics changed in critical solutions"
+    figure, ((axis,),) = new_figure(title, rows=1, columns=1, size=(7.6, 1.4 + 0.3 * len(table)))
+    sns.heatmap(
+        table.rename(index=escape_dollars),
+        ax=axis,
+        cmap="cividis",
+        vmin=0,
+        vmax=100,
+        annot=True,
+        fmt=".0f",
+        annot_kws={"fontsize": 7},
+        linewidths=0.5,
+        cbar_kws={"label": "critical solutions\nin which it is changed [%]"},
+    )
+    axis.set(
+        xlabel="number of characteristics changed (empty: no such solution)",
+        ylabel="characteristic, most frequent first",
+    )
+    axis.tick_params(axis="both", length=0, rotation=0)
+    return figure
+
+
+def draw_change_sizes(case: Case) -> Figure:
+    """The distribution of each characteristic's signed changes in the critical solutions."""
+    solution_count = _count_critical_solutions(case)
+    title = f"{case.name}: changes in critical solutions"
+    figure, axes = new_panels(title, len(case.characteristics), 4, (2.25, 1.85), min_width=9.0, title_height=1.0)
+    changes_by_characteristic = changes_of(case, critical_solutions(case)).T
+    for axis, characteristic, changes in zip(axes, case.characteristics, changes_by_characteristic, strict=True):
+        low, high = characteristic.lower - characteristic.original, characteristic.upper - characteristic.original
+        increases, decreases = changes[changes > 0], changes[changes < 0]
+        axis.hist([increases, decreases], bins=BIN_COUNT, range=(low, high), color=[VERMILION, BLUE], stacked=True)
+        axis.axvline(0, color="black", linewidth=0.8)
+        axis.set_xlim(low, high)
+        axis.set_title(
+            f"{escape_dollars(characteristic.name)}\n+{len(increases)}, -{len(decreases)}",
+            fontsize=min(FONT, FONT * LONGEST_NAME / len(characteristic.name)),
+        )
+        axis.set_xlabel(f"change [{as_formula(characteristic.unit)}]", fontsize=FONT)
+        axis.locator_params(axis="x", nbins=3, steps=[1, 2, 5, 10])
+        axis.locator_params(axis="y", nbins=4, integer=True, min_n_ticks=1)
+    figure.supylabel(f"number of critical solutions (of {solution_count})", fontsize=9)
+    figure.supxlabel(
+        "orange, right of 0: increases; blue, left of 0: decreases; titles count them;\n"
+        "each axis spans the characteristic's domain",
+        fontsize=FONT,
+    )
+    return figure
+
+
+def _count_critical_solutions(case: Case) -> int:
+    """Number of critical solutions; raises UnanswerableError if there are none."""
+    count = len(critical_solutions(case))
+    if not count:
+        raise UnanswerableError(
+            case.name, "has no critical solution", "results with solutions that are more unsafe than the original"
+        )
+    return count
+
+
+FORMATS = ("png", "pdf", "svg")
+COUNTS_FIGURE = "rq3.1-number-of-changes"
+"""The figure that has all cases side by side."""
+FIGURES_OF_ONE_CASE: Mapping[str, Callable[[Case], Figure]] = {
+    "rq3.2-changed-characteristics": draw_changed_characteristics,
+    "rq3.3-sizes-of-changes": draw_change_sizes,
+    "pareto-fronts": draw_pareto_fronts,
+    "convergence": draw_convergence,
+    "critical-differences": draw_critical_differences,
+    "attainment": draw_attainment_surfaces,
+}
+
+
+def draw_figures(cases: Sequence[Case]) -> tuple[dict[str, Figure], list[str]]:
+    """Every figure of the cases by name, and the reasons for missing figures; with several cases, names start with the
+    case's name.
+
+    Raises
+    ------
+    UnanswerableError
+        If no figure can be drawn.
+    """
+    figures, errors = dict[str, "Figure"](), list[UnanswerableError]()
+    drawings, countable = list[tuple[str, Callable[[], "Figure"]]](), list[Case]()
+    for case in cases:
+        try:
+            rq31(case)
+            countable.append(case)
+        except UnanswerableError as error:
+            errors.append(error)
+        for name, draw in FIGURES_OF_ONE_CASE.items():
+            if draw is not draw_critical_differences or len(case.algorithms) > 2:  # two are compared as a pair
+                drawings.append((name if len(cases) == 1 else f"{case.name}-{name}", partial(draw, case)))
+    if countable:
+        figures[COUNTS_FIGURE] = draw_change_counts(countable)
+    for name, draw_figure in drawings:
+        try:
+            figures[name] = draw_figure()
+        except UnanswerableError as error:
+            errors.append(error)
+    if not figures:
+        raise errors[0]
+    return figures, list(dict.fromkeys(f"{error.source}: {error.problem}" for error in errors))
+
+
+def save_figures(cases: Sequence[Case], directory: Path, file_format: str) -> tuple[list[Path], list[str]]:
+    """Draw every figure into a file; returns the files, and the reasons for missing figures.
+
+    Raises
+    ------
+    InputError
+        If the directory cannot be written, or no figure can be drawn.
+    """
+    figures, reasons = draw_figures(cases)
+    directory.mkdir(parents=True, exist_ok=True)
+    files = []
+    for name, figure in figures.items():
+        file_name = re.sub(r"[^\w.-]", "-", f"{cases[0].name}-{name}" if len(cases) == 1 else name).strip("-")
+        files.append(directory / f"{file_name}.{file_format}")
+        save(figure, files[-1])
+    return files, reasons
